@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from .batching import stack
 from .camera import Camera, LensView, Projected, View, intrinsics
+from .checks import unchecked
 from .distortion import Distortion
 from .epipolar import (
     Depth,
@@ -126,6 +127,7 @@ __all__ = [
     "to_grid",
     "track",
     "triangulate",
+    "unchecked",
     "warp",
     "world_rays",
 ]

@@ -11,6 +11,8 @@ from torch import Tensor
 from torch.utils._pytree import GetAttrKey, register_pytree_node, tree_leaves
 from torch.utils.data._utils.collate import default_collate_fn_map
 
+from .checks import derived
+
 T = TypeVar("T", bound="Batched")
 LABELS = ("name", "sensor")
 """Fields that may differ between what is stacked; the batch has those of the first."""
@@ -111,7 +113,7 @@ def map_tensors(value: Any, f: Callable[[Tensor, int], Tensor], axes: int = 0) -
         return f(value, axes)
     if isinstance(value, Batched):
         held = {g.name: map_tensors(getattr(value, g.name), f, value.item_axes.get(g.name, 0)) for g in _fields(value)}
-        return dataclasses.replace(value, **held)  # type: ignore[type-var]
+        return derived(dataclasses.replace, value, **held)
     if isinstance(value, Mapping):
         return {key: map_tensors(v, f, axes) for key, v in value.items()}
     return tuple(map_tensors(v, f, axes) for v in value) if isinstance(value, tuple) else value
@@ -193,7 +195,7 @@ def _stacked(values: list[Any], where: str) -> Any:
     if isinstance(first, Batched):
         held = {f.name: [getattr(v, f.name) for v in values] for f in _fields(first)}
         made = {n: same[0] if n in LABELS else _stacked(same, f"{where}.{n}") for n, same in held.items()}
-        return dataclasses.replace(first, **made)  # type: ignore[type-var]
+        return derived(dataclasses.replace, first, **made)
     if isinstance(first, Mapping) and all(v.keys() == first.keys() for v in values):
         return {key: _stacked([v[key] for v in values], f"{where}[{key!r}]") for key in first}
     if isinstance(first, tuple) and any(isinstance(v, Tensor) for v in first):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import torch
@@ -11,7 +11,9 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .batching import Batched
+from .checks import check_batches, check_hw, check_K, checking
 from .distortion import Distortion
+from .lenses.model import LensModel
 from .pixels import (
     HW,
     floating,
@@ -49,6 +51,12 @@ class View(Batched):
     hw: HW
     sensor: Sensor = field(default_factory=Sensor)
 
+    def __post_init__(self) -> None:
+        if checking():
+            check_hw(self.hw)
+            if not isinstance(self.sensor, Sensor):
+                raise TypeError(f"sensor is a {type(self.sensor).__name__}: give a Sensor, as Sensor(response='mono')")
+
     def resize(self: AnyView, hw: HW) -> AnyView:
         """The same view at another size."""
         return self.transformed(resize_matrix(self.hw, hw), hw)
@@ -74,6 +82,11 @@ class View(Batched):
         """Undistorted pixels to those of the image: the inverse of `undistort`."""
         return floating(x), torch.ones_like(x[..., 0], dtype=torch.bool)
 
+    @property
+    def has_pinhole_view(self) -> bool:
+        """Whether a pinhole can stand for the view once its image is undistorted."""
+        return True
+
     def contains(self, x: Real[Tensor, "*n 2"]) -> Bool[Tensor, "*n"]:
         """Whether points lie on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5]."""
         return within(x, self.hw)
@@ -98,7 +111,30 @@ class LensView(View):
 
     item_axes: ClassVar = {"K": 2}
     K: Float[Tensor, "*b 3 3"]
-    distortion: Distortion | None = None
+    distortion: LensModel | None = None
+
+    def __init_subclass__(cls, **rest: Any) -> None:
+        super().__init_subclass__(**rest)
+        own = [name for name in ("rays", "project_local") if name in vars(cls)]
+        if own and cls.__module__ != __name__:
+            raise TypeError(
+                f"{cls.__name__} overrides {' and '.join(own)}, which fields do not ask: make it a "
+                "arraygeom.lenses.CameraModel with project and unproject, and give that to a Camera as `distortion`"
+            )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if checking():
+            check_K(self.K)
+            if not isinstance(self.distortion, LensModel | None):
+                kind = type(self.distortion).__name__
+                raise TypeError(
+                    f"distortion is a {kind}: give a Distortion(model, coefficients), or a camera model of your own, "
+                    "a subclass of arraygeom.lenses.CameraModel"
+                )
+            if self.distortion is not None and not is_dataclass(self.distortion):
+                kind = type(self.distortion).__name__
+                raise TypeError(f"{kind} is no dataclass: put @dataclass(frozen=True, eq=False, repr=False) before it")
 
     def project_local(self, X: Real[Tensor, "*n 3"]) -> Projected:
         """Points in the camera's own frame to pixels."""
@@ -113,13 +149,30 @@ class LensView(View):
             return to_homogeneous(normalised), torch.ones_like(normalised[..., 0], dtype=torch.bool)
         return self.distortion.unproject(normalised)
 
+    def ray_origins(self, x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*m 3"]:
+        """Where the rays of pixels start, metres in the camera's frame: its origin, unless its model is not central."""
+        normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
+        if self.distortion is None:
+            return torch.zeros_like(to_homogeneous(normalised))
+        return self.distortion.origins(normalised)
+
+    @property
+    def has_pinhole_view(self) -> bool:
+        """Whether the camera is a pinhole or has a lens: rays of other models may not meet, or be at any angle."""
+        return isinstance(self.distortion, Distortion | None)
+
+    @property
+    def central(self) -> bool:
+        """Whether all rays start in the camera's origin."""
+        return self.distortion is None or self.distortion.central
+
     def undistort(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Pixels of a pinhole with the same K, and which are within the lens model's range."""
-        return self._each_through(Distortion.undistort, x)
+        return self._each_through(lambda lens, xy: lens.undistort(xy), x)
 
     def distort(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Undistorted pixels to those of the image: the inverse of `undistort`."""
-        return self._each_through(Distortion.distort, x)
+        return self._each_through(lambda lens, xy: lens.distort(xy), x)
 
     def transformed(self: AnyLensView, A: Float[Tensor, "3 3"], hw: HW) -> AnyLensView:
         """The camera of the image whose pixels are x' ~ A x, of size `hw`: K' = A K."""
@@ -141,7 +194,7 @@ class LensView(View):
 
 
 AnyLensView = TypeVar("AnyLensView", bound=LensView)
-ThroughLens = Callable[[Distortion, Tensor], tuple[Tensor, Tensor]]
+ThroughLens = Callable[[Any, Tensor], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -159,6 +212,13 @@ class Camera(LensView):
     """
 
     cam_from_world: Pose
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if checking():
+            if not isinstance(self.cam_from_world, Pose):
+                raise TypeError(f"cam_from_world is a {type(self.cam_from_world).__name__}: give a Pose(R, t)")
+            check_batches("K and cam_from_world", self.K.shape[:-2], self.cam_from_world.batch_shape)
 
     @property
     def R(self) -> Float[Tensor, "*b 3 3"]:
@@ -188,6 +248,9 @@ class Camera(LensView):
         z = rays[..., 2]
         valid = valid & (z != 0)
         X = rays * (depth / torch.where(valid, z, 1.0))[..., None]
+        if not self.central:
+            start = self.ray_origins(x)
+            X = X + start - rays * (start[..., 2] / torch.where(valid, z, 1.0))[..., None]
         X = torch.where(valid[..., None], X, torch.nan)
         return self.cam_from_world.inverse().apply(X)
 
@@ -198,7 +261,7 @@ class Camera(LensView):
         """
         from kornia.geometry.camera import PinholeCamera
 
-        if self.distortion is not None:
+        if self.distortion is not None and not self.distortion.harmless:
             raise ValueError("kornia's PinholeCamera has no lens model: undistort first, or drop `distortion`")
         R, t, K = self.R.reshape(-1, 3, 3), self.t.reshape(-1, 3), self.K.reshape(-1, 3, 3)
         row = K.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(K), 1, 4)

@@ -95,7 +95,7 @@ def assembled(lengths: Sequence[int], parts: Iterable[tuple[Tile, Any]], axes: S
     return joined[0] if single else joined
 
 
-def sides_by_work(hw: HW, halo: int, multiple: int, most: float) -> list[tuple[int, int]]:
+def sides_by_work(hw: Sequence[int], halo: int, multiple: int, most: float) -> list[tuple[int, int]]:
     """Heights and widths of tiles of at most `most` pixels with their halos, the least work first."""
     h, w = hw
     sides: dict[tuple[int, int], int] = {}

@@ -27,19 +27,21 @@ Each follows its lens up to some radius or angle. Points past it are not valid; 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
-from .batching import Batched
+from .checks import check_numbers, checking
 from .lenses.brown import Brown, brown_distort, brown_limit, brown_undistort
 from .lenses.central import FOV, MODELS, central_project, central_unproject
 from .lenses.common import WIDEST, finite_points, unit
 from .lenses.fisheye import fisheye_limit, fisheye_project, fisheye_unproject
+from .lenses.model import LensModel
 from .pixels import to_homogeneous
+from .tracing import traced
 
 BROWN_CONRADY = "brown-conrady"
 KANNALA_BRANDT = "kannala-brandt"
@@ -51,7 +53,7 @@ COEFFICIENT_COUNTS = {
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Distortion(Batched):
+class Distortion(LensModel):
     """One lens, or a batch of lenses of one model.
 
     The batch axes of `coefficients` meet the *leading* axes of the points: coefficients (5, 8) go with points
@@ -66,17 +68,34 @@ class Distortion(Batched):
     coefficients: Float[Tensor, "*b n"]
 
     def __post_init__(self) -> None:
+        if checking() and not isinstance(self.coefficients, Tensor):
+            kind = type(self.coefficients).__name__
+            raise TypeError(f"the coefficients are a {kind}: give a tensor, such as torch.tensor([-0.1, 0, 0, 0])")
         if self.model not in COEFFICIENT_COUNTS:
             raise ValueError(f"unknown lens model {self.model!r}: use one of {', '.join(COEFFICIENT_COUNTS)}")
         counts = COEFFICIENT_COUNTS[self.model]
         if self.coefficients.shape[-1] not in counts:
             given, wanted = self.coefficients.shape[-1], " or ".join(map(str, counts))
             raise ValueError(f"{self.model} takes {wanted} coefficients, got {given}: pad with zeros")
+        if checking():
+            check_numbers(self.coefficients, self.coefficients.shape[-1:], f"a lens ({self.model})")
+
+    def with_coefficients(self, coefficients: Tensor) -> Distortion:
+        """The same model with other numbers."""
+        return replace(self, coefficients=coefficients)
 
     @property
     def is_identity(self) -> bool:
         """Whether this lens distorts nothing: Brown-Conrady with all coefficients 0."""
         return self.model == BROWN_CONRADY and not bool(self.coefficients.any())
+
+    @property
+    def harmless(self) -> bool:
+        """Whether the lens can be left out: it distorts nothing, and no gradient is asked of it.
+
+        Never where numbers cannot decide (`traced`).
+        """
+        return not self.coefficients.requires_grad and not traced() and self.is_identity
 
     @property
     def sees_behind(self) -> bool:

@@ -47,12 +47,15 @@ def shift_origin(F: Float[Tensor, "*b 3 3"], first_pixel: float) -> Float[Tensor
 def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*m 3"]:
     """l_beta = F x_alpha, scaled so that l . (x, y, 1) is a distance in pixels.
 
-    At alpha's epipole, and where F is zero, there is no line: all zeros. Batched F as in `map_homogeneous`.
+    At alpha's epipole, to the rounding of x's type, and where F is zero, there is no line: all zeros. Batched F as in
+    `map_homogeneous`.
     """
     size = F.abs().amax((-2, -1), keepdim=True)
     line = map_homogeneous(F / torch.where(size > 0, size, 1.0), x)
     squared = line[..., 0].square() + line[..., 1].square()
-    positive = squared > SMALLEST_SQUARE
+    across = (F / torch.where(size > 0, size, 1.0))[..., :2, :].abs().amax(-2, keepdim=True)
+    rounding = 4 * torch.finfo(line.dtype).eps * map_homogeneous(across.detach(), floating(x).detach().abs())[..., 0]
+    positive = squared > rounding.square().clamp(min=SMALLEST_SQUARE)
     scale = torch.where(positive, torch.where(positive, squared, 1.0).rsqrt(), 0.0)
     return line * scale[..., None]
 
@@ -138,7 +141,7 @@ def clipped(
     is one number for the whole image.
     """
     a, b = track
-    w_far, w_near = (beside(1 / d.to(a.dtype), a.ndim - 1) for d in (far, near))
+    w_far, w_near = (beside((1 / d.to(a.dtype)).clamp(max=HIGHEST), a.ndim - 1) for d in (far, near))
     P, D = a + w_far[..., None] * b, (w_near - w_far)[..., None] * b
     (X, Y, Z), (DX, DY, DZ) = P.unbind(-1), D.unbind(-1)
     low, high = torch.zeros_like(X), torch.ones_like(X)
@@ -151,6 +154,10 @@ def clipped(
     for g, slope in (*bounds, *([(Z - FRONT, DZ)] if in_front else [])):
         low, high, valid = _limited(low, high, valid, g, slope)
     return Clipped(P, D, low, high, valid & (low <= high))
+
+
+HIGHEST = 1e30
+"""Inverse depths (1/m) count as no more than this, so that their products with a baseline in pixels are finite."""
 
 
 def _limited(low: Tensor, high: Tensor, valid: Tensor, g: Tensor, slope: Tensor) -> tuple[Tensor, Tensor, Tensor]:

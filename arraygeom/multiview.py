@@ -45,6 +45,8 @@ def world_rays(camera: Camera, x: Real[Tensor, "*n 2"] | None = None) -> WorldRa
     back = Pose(camera.R.mT, torch.zeros_like(camera.t))
     direction = back.apply(torch.where(valid[..., None], local / local.norm(dim=-1, keepdim=True), 0.0))
     origin = beside(camera.centre, direction.ndim, 1).expand_as(direction)
+    if not camera.central:
+        origin = camera.cam_from_world.inverse().apply(camera.ray_origins(x))
     return WorldRays(origin.to(direction), direction, valid)
 
 
@@ -92,7 +94,11 @@ def _in_beta(pair: Pair, depth: Tensor, x: Tensor | None = None) -> Projected:
     rays, seen = alpha.rays(x.reshape(*[1] * (depth.ndim + 1 - x.ndim), *x.shape))
     known = depth.isfinite() & (depth > 0) & seen & (rays[..., 2] > 0)
     scale = torch.where(known, depth, 1.0) / torch.where(rays[..., 2] > 0, rays[..., 2], 1.0)
-    projected = beta.project_local(pair.beta_from_alpha.apply(rays * scale[..., None]))
+    X = rays * scale[..., None]
+    if not alpha.central:
+        start = alpha.ray_origins(x.reshape(*[1] * (depth.ndim + 1 - x.ndim), *x.shape))
+        X = X + start - rays * (start[..., 2] / torch.where(rays[..., 2] > 0, rays[..., 2], 1.0))[..., None]
+    projected = beta.project_local(pair.beta_from_alpha.apply(X))
     return projected._replace(valid=projected.valid & known & beta.contains(projected.x))
 
 

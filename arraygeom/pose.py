@@ -12,6 +12,7 @@ from jaxtyping import Float, Real
 from torch import Tensor
 
 from .batching import Batched
+from .checks import check_batches, check_numbers, check_rotation, checking, derived
 from .pixels import broadcasts, floating, product
 from .text import angle, range_text
 from .tracing import traced
@@ -25,11 +26,18 @@ class Pose(Batched):
     """A rigid transform named `to_from_from`, for instance `cam_from_world`: X_cam = R X_world + t.
 
     Poses compose where the inner words meet: `b_from_a @ a_from_world` is `b_from_world`. Metres.
+    Raises ValueError for an R that is not a rotation, and for NaN and infinity.
     """
 
     item_axes: ClassVar = {"R": 2, "t": 1}
     R: Float[Tensor, "*b 3 3"]
     t: Float[Tensor, "*b 3"]
+
+    def __post_init__(self) -> None:
+        if checking():
+            check_rotation(self.R)
+            check_numbers(self.t, (3,), "t")
+            check_batches("R and t", self.R.shape[:-2], self.t.shape[:-1])
 
     @classmethod
     def identity(cls, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None) -> Pose:
@@ -101,12 +109,12 @@ class Pose(Batched):
         return Se3(So3(Quaternion(self.quaternion)), self.t)
 
     def __matmul__(self, other: Pose) -> Pose:
-        return Pose(product(self.R, other.R), matvec(self.R, other.t) + self.t)
+        return derived(Pose, product(self.R, other.R), matvec(self.R, other.t) + self.t)
 
     def inverse(self) -> Pose:
         """`from_to_to`: the transform the other way."""
         Rt = self.R.transpose(-1, -2)
-        return Pose(Rt, -matvec(Rt, self.t))
+        return derived(Pose, Rt, -matvec(Rt, self.t))
 
     def apply(self, X: Real[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
         """Points (*n, 3) to R X + t. With batched poses (*b), points are (*b, ..., 3).
@@ -137,7 +145,7 @@ class Pose(Batched):
         `rotation` is a rotation vector in radians, about the axes of `to`.
         """
         R = self.R if rotation is None else nearest_rotation(product(rotation_from_vector(rotation), self.R))
-        return Pose(R, self.t if translation is None else self.t + translation)
+        return derived(Pose, R, self.t if translation is None else self.t + translation)
 
     def _text(self) -> str:
         degrees = angle(self.R).rad2deg()

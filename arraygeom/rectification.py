@@ -40,7 +40,7 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
     baseline is so near an optical axis (motion forwards) that the new images would lie beside the old ones.
     """
     alpha, beta = pair.cameras
-    if alpha.distortion is not None or beta.distortion is not None:
+    if pair.has_lens:
         raise ValueError("rectification by homographies needs pinhole cameras: undistort the images first")
     if alpha.K.ndim > 2 or beta.K.ndim > 2:
         raise ValueError("rectification works on one pair at a time: take one of the batch")

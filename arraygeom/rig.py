@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import fnmatch
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from .batching import Batched, map_tensors
 from .camera import Camera, LensView, View
+from .checks import check_numbers, checking, derived
 from .epipolar import fundamental_matrix
 from .homography import plane_homography
 from .pixels import HW, product, resize_matrix, rot90_matrix, shift_matrix
@@ -41,6 +42,12 @@ class Link(Batched):
     F: Float[Tensor, "*b 3 3"]
     H: Float[Tensor, "*b 3 3"] | None = None
 
+    def __post_init__(self) -> None:
+        if checking():
+            for name, matrix in (("F", self.F), ("H", self.H)):
+                if not (name == "H" and matrix is None):
+                    check_numbers(matrix, (3, 3), name)
+
     def reversed(self) -> Link:
         """The same link with alpha and beta exchanged."""
         return Link(self.F.transpose(-1, -2), None if self.H is None else torch.linalg.inv(self.H))
@@ -64,7 +71,7 @@ class Pair(Batched):
     beta: View
     depth: Depths | None = None
     link: Link | None = None
-    memo: dict[str, Tensor] = field(default_factory=dict, init=False, compare=False, repr=False)
+    memo: dict[str, Any] = field(default_factory=dict, init=False, compare=False, repr=False)
     """Cache of what fields compute once a pair; never copied."""
 
     @property
@@ -74,8 +81,9 @@ class Pair(Batched):
 
     @property
     def has_lens(self) -> bool:
-        """Whether either view has a lens, so that lines are curves in its image."""
-        return any(isinstance(view, LensView) and view.distortion is not None for view in (self.alpha, self.beta))
+        """Whether either view has a lens that distorts, so that lines are curves in its image."""
+        lenses = [view.distortion for view in (self.alpha, self.beta) if isinstance(view, LensView)]
+        return any(lens is not None and not lens.harmless for lens in lenses)
 
     @property
     def cameras(self) -> tuple[Camera, Camera]:
@@ -115,7 +123,7 @@ class Pair(Batched):
             return self.link.F
         if not self.calibrated:
             raise ValueError("neither the cameras' calibration nor F is known for this pair: give the rig a link")
-        alpha, beta = self.cameras
+        alpha, beta = self._central("fundamental matrix")
         F = fundamental_matrix(alpha.K, beta.K, self.beta_from_alpha)
         baseline, rounding = self.beta_from_alpha.t.norm(dim=-1), torch.finfo(alpha.t.dtype).eps
         moved = baseline > 8 * rounding * (alpha.t.norm(dim=-1) + beta.t.norm(dim=-1))
@@ -152,10 +160,18 @@ class Pair(Batched):
 
     def homography_at(self, depth: Float[Tensor, "*d"]) -> Float[Tensor, "*b 3 3"]:
         """The homography of the plane z = depth in alpha's frame (metres; may be inf)."""
-        alpha, beta = self.cameras
+        alpha, beta = self._central("homography")
         normal = alpha.K.new_tensor([0.0, 0.0, 1.0])
         pose = self.beta_from_alpha
         return plane_homography(alpha.K, beta.K, pose.R, pose.t, normal=normal, d=-depth.to(alpha.K))
+
+    def _central(self, what: str) -> tuple[Camera, Camera]:
+        """Both cameras. Raises ValueError if the rays of one do not meet in a point."""
+        for camera in self.cameras:
+            if not camera.central and camera.distortion is not None:
+                model = camera.distortion.model
+                raise ValueError(f"rays of a camera ({model}) do not meet in a point: there is no {what}; use Curved")
+        return self.cameras
 
     def _text(self) -> str:
         views = {"alpha": self.alpha, "beta": self.beta}
@@ -184,9 +200,23 @@ class Rig(Batched):
     name: str = ""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.cameras, Mapping):
+            raise TypeError(f"the cameras are a {type(self.cameras).__name__}: give a mapping of names to cameras")
         object.__setattr__(self, "cameras", {name: _view(name, camera) for name, camera in self.cameras.items()})
         if self.depth is not None:
+            if not isinstance(self.depth, Sequence | Tensor) or len(self.depth) != 2:
+                raise TypeError(f"depth is {self.depth!r}: wanted (near, far), in metres")
             object.__setattr__(self, "depth", depth_range(*self.depth))
+        if checking():
+            self._check_links()
+
+    def _check_links(self) -> None:
+        for names, link in self.links.items():
+            if not isinstance(link, Link):
+                raise TypeError(f"the link {names} is a {type(link).__name__}: give a Link(F)")
+            alpha, beta = names
+            if self.require(alpha) == self.require(beta):
+                raise ValueError(f"a link relates two cameras; this one is from '{alpha}' to itself")
 
     @classmethod
     def from_kornia(cls, cameras: Mapping[str, PinholeCamera], *, batched: bool = False, **fields: Any) -> Rig:
@@ -300,12 +330,22 @@ class Rig(Batched):
         unknown = set(changes) - set(self._parameter_shapes())
         if unknown:
             raise ValueError(f"no such rig parameter: {', '.join(sorted(unknown))}")
-        cameras = {name: _perturbed_camera(name, camera, changes) for name, camera in self.cameras.items()}
+        cameras = {name: derived(_perturbed_camera, name, camera, changes) for name, camera in self.cameras.items()}
         depth = self.depth
         if depth is not None:
             near, far = depth
             depth = near + changes.get("depth.near", 0), far + changes.get("depth.far", 0)
         return self.replace(cameras=cameras, depth=depth)
+
+    def check(self) -> tuple[str, ...]:
+        """What is odd about the rig, a sentence each; none if nothing is.
+
+        Constructors refuse numbers that cannot be; these can, and are mistakes more often than not: another unit, poses
+        of another convention, axes exchanged, views that do not overlap.
+        """
+        from .rig_check import oddities
+
+        return oddities(self)
 
     @classmethod
     def load(cls, path: str | Path) -> Rig:
@@ -339,8 +379,9 @@ class Rig(Batched):
             if isinstance(camera, Camera):
                 known |= {f"{name}.rotation": camera.t, f"{name}.translation": camera.t}
                 known |= {f"{name}.focal": camera.K[..., 0, :2], f"{name}.centre": camera.K[..., :2, 2]}
-            if isinstance(camera, LensView) and camera.distortion is not None:
-                known[f"{name}.distortion"] = camera.distortion.coefficients
+            lens = camera.distortion if isinstance(camera, LensView) else None
+            if lens is not None and lens.coefficients.numel():
+                known[f"{name}.distortion"] = lens.coefficients
         if self.depth is not None:
             known |= {"depth.near": self.depth[0], "depth.far": self.depth[1]}
         return known
@@ -390,7 +431,7 @@ def _perturbed_camera(name: str, camera: View, changes: Mapping[str, Tensor]) ->
     if not mine or not isinstance(camera, LensView):
         return camera
     if "distortion" in mine and (lens := camera.distortion) is not None:
-        lens = dataclasses.replace(lens, coefficients=lens.coefficients + mine["distortion"])
+        lens = lens.with_coefficients(lens.coefficients + mine["distortion"])
         camera = camera.replace(distortion=lens)
     if not isinstance(camera, Camera):
         return camera

@@ -50,7 +50,8 @@ def sample(
 ) -> Sampled:
     """Images (B, C, H, W) at positions x (B, *n, 2), or (1, *n, 2) for the same positions in each, in pixels.
 
-    On the outer half pixel of the area the nearest pixels count. Outside it values are 0 and valid is False; or, if
+    On the outer half pixel of the area the nearest pixels count; "nearest" takes the pixel on whose area a position
+    lies, halves upwards. Outside it values are 0 and valid is False; or, if
     `extended`, they are those of the nearest pixel, which are valid.
     """
     batch, hw = len(image), (image.shape[-2], image.shape[-1])
@@ -59,6 +60,8 @@ def sample(
     if extended:
         x = torch.minimum(x.clamp(min=0), x.new_tensor([hw[1] - 1, hw[0] - 1]))
     valid = on_image(x, hw)
+    if interpolation == "nearest":  # halves go up, as in attention: grid_sample's go either way
+        x = torch.minimum((x + 0.5).floor().clamp(min=0), x.new_tensor([hw[1] - 1, hw[0] - 1]))
     grid = to_grid(torch.where(valid[..., None], x, 0.0), hw).reshape(batch, 1, -1, 2)
     try:
         values = grid_sample(

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
+from .checks import check_above
+
 
 @dataclass(frozen=True)
 class Band:
@@ -13,6 +15,9 @@ class Band:
 
     centre: float
     width: float
+
+    def __post_init__(self) -> None:
+        check_above(0, itself=False, centre=self.centre, width=self.width)
 
 
 @dataclass(frozen=True)
@@ -22,9 +27,15 @@ class Curve:
     wavelength: tuple[float, ...]
     response: tuple[float, ...]
 
+    def __post_init__(self) -> None:
+        if len(self.wavelength) != len(self.response) or not self.wavelength:
+            counts = f"{len(self.wavelength)} wavelengths and {len(self.response)} responses"
+            raise ValueError(f"a curve has a response for each wavelength, one or more; got {counts}")
+
 
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 """Colour filter patterns: the first two pixels of the first row, then of the second."""
+CODINGS = ("srgb", "linear")
 
 
 @dataclass(frozen=True)
@@ -49,6 +60,17 @@ class Sensor:
     black_level: float = 0.0
     exposure: float | None = None
     gain: float | tuple[float, float, float] = 1.0
+
+    def __post_init__(self) -> None:
+        gains = self.gain if isinstance(self.gain, tuple) else (self.gain,)
+        check_above(0, itself=False, frame_rate=self.frame_rate, exposure=self.exposure)
+        for gain in gains:
+            check_above(0, itself=False, gain=gain)
+        check_above(1, whole=True, bits=self.bits)
+        check_above(0, black_level=self.black_level)
+        for name, value, known in (("coding", self.coding, CODINGS), ("bayer", self.bayer, (None, *PATTERNS))):
+            if value not in known:
+                raise ValueError(f"{name} is {value!r}: wanted {' or '.join(repr(v) for v in known if v)}")
 
 
 torch.serialization.add_safe_globals([Band, Curve, Sensor])

@@ -88,8 +88,10 @@ def depth_of(
     """
     alpha, beta = pair.cameras
     x, x_beta = floating(x), floating(x_beta)
-    if alpha.distortion is None and beta.distortion is None:
+    if not pair.has_lens:
         return depth_from_track(track(alpha.K, beta.K, pair.beta_from_alpha, x), x_beta, deviation)
+    if not (alpha.central and beta.central):
+        raise ValueError("rays of one of these cameras do not meet in a point: use arraygeom.fields.ray_depth")
     pose = pair.beta_from_alpha
     normalised, seen = zip(*(_normalised(c.to(x.dtype), p) for c, p in ((alpha, x), (beta, x_beta))))
     eye = torch.eye(3).to(pose.R).expand_as(pose.R)

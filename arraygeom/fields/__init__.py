@@ -13,10 +13,11 @@ A rig whose numbers have batch axes *b takes pixels (*b, ..., 2), or with axes o
 
 from .approximation import approximated, placement_error
 from .curved import Curved, ThroughLenses
-from .default import FIELDS, default_field, recorded_field
+from .default import FIELDS, default_field, named_field, recorded_field
 from .explicit import Dense, Local, NearestVoxels
 from .moved import Moved
 from .protocol import ReceptiveField, SamplingLocations, lazily, sampling_locations
+from .ray_depth import ray_depth
 from .straight import Epipolar, EpipolarLine, HomographyDisplacement, Rectified, covering_displacement, pinhole_track
 from .widened import Widened
 
@@ -39,8 +40,10 @@ __all__ = [
     "covering_displacement",
     "default_field",
     "lazily",
+    "named_field",
     "pinhole_track",
     "placement_error",
+    "ray_depth",
     "recorded_field",
     "sampling_locations",
 ]

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..camera import Camera, LensView, View
+from ..checks import check_above, check_bounds, check_field
 from ..chunks import spans
+from ..distortion import Distortion
 from ..epipolar import FRONT, Track, beside, clipped
 from ..pixels import HW, floating, map_homogeneous, product
 from ..rig import Pair
@@ -35,26 +37,34 @@ class Curved:
     is clipped in closed form, followed at `nodes` points (even in undistorted pixels, or in angle where beta sees more
     than 75 degrees off axis), and what is on the image is divided evenly. `near` and `far` (metres) override the
     pair's own. Positions are exact for their depths; with a lens the spacing, and where an edge of the image cuts the
-    curve, are to the accuracy of straight pieces between nodes. What a fisheye alpha sees at 90 degrees or more off
-    axis has no depth along the axis and no samples.
+    curve, are to the accuracy of straight pieces between nodes. What alpha sees at 90 degrees or more off axis has no
+    depth along the axis and no samples, unless the bounds are of the `distance` along the ray.
     """
 
     samples: int = 96
     near: float | None = None
     far: float | None = None
     nodes: int = 64
+    bounds: Literal["depth", "distance"] = "depth"
+
+    def __post_init__(self) -> None:
+        if self.bounds not in ("depth", "distance"):
+            raise ValueError(f"bounds is {self.bounds!r}: wanted 'depth' or 'distance'")
+        check_above(1, whole=True, samples=self.samples)
+        check_above(2, whole=True, nodes=self.nodes)
+        check_bounds(self.near, self.far)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
         """Positions (*n, samples, 2), differentiable in all numbers of the rig, lenses included."""
         pair.cameras  # noqa: B018  (raises for an uncalibrated pair, before the depth range is asked for)
         near, far = Epipolar(self.near, self.far).bounds(pair)
         x = floating(x)
-        curve = _Curve.of(pair, near, far, x)
+        curve = RayCurve.of(pair, near, far, x, self.bounds)
         if curve.compilable:
             return curve.positions(self.nodes, self.samples)
         even = torch.linspace(0, 1, self.nodes, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], -1)
         nodes, seen = curve.at(even)
-        pieces = visible_pieces(nodes, seen & curve.valid[..., None], pair.beta.hw)
+        pieces = visible_pieces(nodes, seen & curve.valid[..., None], pair.beta.hw, curve.longest_piece)
         xy, seen = curve.at(along_pieces(pieces, sample_fractions(self.samples, like=x)))
         xy, inside = _onto_edge(xy, pair.beta.hw, EDGE)
         mask = inside & seen & (pieces.length.sum(-1, keepdim=True) > 0)
@@ -71,6 +81,10 @@ class ThroughLenses:
 
     field: ReceptiveField
     samples: int = 96
+
+    def __post_init__(self) -> None:
+        check_field(self.field)
+        check_above(1, whole=True, samples=self.samples)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
         """Positions (*n, samples, 2) in beta's own pixels. Raises ValueError for a batch of rigs with lenses."""
@@ -127,10 +141,11 @@ WIDE = math.tan(math.radians(75))
 """A lens whose image reaches further than this from the axis, in undistorted focal lengths, is followed by angle."""
 
 
-class _Curve(NamedTuple):
+class RayCurve(NamedTuple):
     """The points from `first` (towards near) to `last` in beta's frame, in units of their depth in alpha.
 
-    Fractions go evenly in undistorted pixels, or in angle if `wide`.
+    Fractions go evenly in undistorted pixels, or in angle if `wide`; in metres where beta's rays are parallel.
+    `inverse` are the inverse depths (or distances) of both ends.
     """
 
     first: Float[Tensor, "*n 3"]
@@ -138,17 +153,17 @@ class _Curve(NamedTuple):
     valid: Bool[Tensor, "*n"]
     beta: Camera
     wide: bool
+    inverse: tuple[Tensor, Tensor]
 
     @classmethod
-    def of(cls, pair: Pair, near: Tensor, far: Tensor, x: Tensor) -> _Curve:
+    def of(cls, pair: Pair, near: Tensor, far: Tensor, x: Tensor, bounds: str = "depth") -> RayCurve:
         """The curves of alpha's pixels x (*n, 2) from near to far (metres), as far as beta's image may show them."""
         pose = pair.beta_from_alpha.to(x.dtype)
         alpha, beta = (c.to(x.dtype) for c in pair.cameras)
-        rays, seen = alpha.rays(x)
-        ahead = seen & (rays[..., 2] > FRONT)
-        rays = rays / torch.where(ahead, rays[..., 2], 1.0)[..., None]
-        points = Track(_each(pose.R, rays), beside(pose.t, x.ndim, trailing=1))
-        limits = None if beta.distortion is None else undistorted_limits(beta)
+        start, rays, ahead = _lines(alpha, x, bounds)
+        offset = beside(pose.t, x.ndim, trailing=1)
+        points = Track(_each(pose.R, rays), offset if start is None else offset + _each(pose.R, start))
+        limits = None if beta.distortion is None or not beta.central else undistorted_limits(beta)
         if beta.distortion is None:
             h, w = beta.hw
             pixels = Track(_each(beta.K, points.a), _each(beta.K, points.b))
@@ -159,8 +174,21 @@ class _Curve(NamedTuple):
             part = clipped(points, near, far, [beside(v, x.ndim - 1) for v in limits])
         w_far, w_near = (beside(1 / d.to(x.dtype), x.ndim - 1) for d in (far, near))
         ends = (w_far + torch.where(part.valid, s, 0.0) * (w_near - w_far) for s in (part.high, part.low))
-        first, last = (points.a + v[..., None] * points.b for v in ends)
-        return cls(first, last, ahead & part.valid, beta, beta.distortion is not None and limits is None)
+        inverse = (torch.where(part.valid, v, 1.0) for v in ends)
+        near_end, far_end = inverse
+        if not beta.central:
+            near_end, far_end = near_end.clamp(min=REMOTE), far_end.clamp(min=REMOTE)
+        first, last = (points.a + v[..., None] * points.b for v in (near_end, far_end))
+        wide = beta.distortion is not None and limits is None and beta.central
+        return cls(first, last, ahead & part.valid, beta, wide, (near_end, far_end))
+
+    @property
+    def longest_piece(self) -> float:
+        """Pixels of beta from which two nodes are on either side of the seam of its image."""
+        lens = self.beta.distortion
+        if lens is None or not lens.period:
+            return math.inf
+        return 0.5 * lens.period * float(self.beta.K[..., :2, :2].detach().det().abs().sqrt().amax())
 
     @property
     def compilable(self) -> bool:
@@ -168,7 +196,9 @@ class _Curve(NamedTuple):
         lens = self.beta.distortion
         numbers = [self.first, self.last, self.beta.K, *([] if lens is None else [lens.coefficients])]
         free = torch.is_grad_enabled() and any(t.requires_grad for t in numbers)
-        known = lens is None or (lens.model in COMPILED_LENSES and lens.coefficients.shape[-1] < 14)
+        known = lens is None or (
+            isinstance(lens, Distortion) and lens.model in COMPILED_LENSES and lens.coefficients.shape[-1] < 14
+        )
         return not free and known and not self.beta.batch_shape and compilable(self.first)
 
     def positions(self, nodes: int, samples: int) -> Positions:
@@ -194,12 +224,27 @@ class _Curve(NamedTuple):
         weights = self._weights_in_angle(fraction) if self.wide else self._weights_in_pixels(fraction)
         s = (weights[1] / (weights[0] + weights[1]))[..., None]
         X = torch.lerp(self.first[..., None, :], self.last[..., None, :], s)
+        seen = X.square().sum(-1) > FRONT**2
+        if not self.beta.central:
+            X = X / self._inverse_at(s[..., 0])[..., None]
         projected = self.beta.project_local(X)
-        return projected.x, projected.valid & (X.square().sum(-1) > FRONT**2)
+        return projected.x, projected.valid & seen
+
+    def inverse_depth(self, fraction: Tensor) -> Tensor:
+        """The inverse depth (or distance) in alpha of the points at fractions (*n, l)."""
+        weights = self._weights_in_angle(fraction) if self.wide else self._weights_in_pixels(fraction)
+        return self._inverse_at(weights[1] / (weights[0] + weights[1]))
+
+    def _inverse_at(self, s: Tensor) -> Tensor:
+        first, last = (v[..., None] for v in self.inverse)
+        return torch.lerp(first, last, s)
 
     def _weights_in_pixels(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """How much of first and of last there is in the point whose pixel, without the lens, is a fraction u along."""
-        z0, z1 = (torch.where(self.valid, X[..., 2], 1.0)[..., None] for X in (self.first, self.last))
+        lens = self.beta.distortion
+        parallel = lens is not None and not lens.central and lens.even == "distance"
+        ends = self.inverse if parallel else (self.first[..., 2], self.last[..., 2])
+        z0, z1 = (torch.where(self.valid, z, 1.0)[..., None] for z in ends)
         return (1 - u) * z1, u * z0
 
     def _weights_in_angle(self, u: Tensor) -> tuple[Tensor, Tensor]:
@@ -210,6 +255,24 @@ class _Curve(NamedTuple):
         angle = torch.atan2(sine, torch.where(opens, (self.first * self.last).sum(-1), 1.0))[..., None]
         r0, r1 = (X.square().sum(-1, keepdim=True).clamp(min=FRONT**2).sqrt() for X in (self.first, self.last))
         return (1 - u) * torch.sinc((1 - u) * angle / math.pi) * r1, u * torch.sinc(u * angle / math.pi) * r0
+
+
+REMOTE = 1e-5
+"""Inverse metres that count as infinity for a beta whose rays do not meet: there a point is not only a direction."""
+
+
+def _lines(alpha: Camera, x: Tensor, bounds: str) -> tuple[Tensor | None, Tensor, Tensor]:
+    """Where the rays of pixels start, their directions at a depth (or a distance) of 1 m, and which have one.
+
+    The start is in the plane of depth 0, and None if it is alpha's origin.
+    """
+    rays, seen = alpha.rays(x)
+    start = None if alpha.central else alpha.ray_origins(x)
+    if bounds == "distance":
+        return start, rays / rays.square().sum(-1, keepdim=True).clamp(min=TINY).sqrt(), seen
+    ahead = seen & (rays[..., 2] > FRONT)
+    rays = rays / torch.where(ahead, rays[..., 2], 1.0)[..., None]
+    return None if start is None else start - start[..., 2:] * rays, rays, ahead
 
 
 COMPILED_LENSES = {"brown-conrady": 1, "kannala-brandt": 2}
@@ -234,6 +297,7 @@ class LensNumbers(NamedTuple):
         c = lens.coefficients.detach().double()
         padded = np.zeros(14)
         padded[: len(c)] = c.numpy()
+        assert isinstance(lens, Distortion)
         return cls(COMPILED_LENSES[lens.model], padded, lens.squared_limit, np.ascontiguousarray(K), wide)
 
 
@@ -241,7 +305,6 @@ TINY = 1e-24
 """Two rays of which the squared sine, times their squared lengths, is smaller than this have one direction."""
 
 
-@torch.no_grad()
 def undistorted_limits(camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
     """(x low, y low, x high, y high) of a lens's image in normalised undistorted points, (*b) each, 2 % wider.
 
@@ -277,14 +340,17 @@ class Pieces(NamedTuple):
     length: Float[Tensor, "*n m"]
 
 
-def visible_pieces(nodes: Float[Tensor, "*n k 2"], seen: Tensor, hw: HW) -> Pieces:
+def visible_pieces(nodes: Float[Tensor, "*n k 2"], seen: Tensor, hw: HW, longest: float = math.inf) -> Pieces:
     """The parts of a polyline that lie on the image, of pieces with a node that is `seen` (*n, k).
 
-    A visible piece of no length counts as 1e-3 pixels, so that a curve that is a point is somewhere.
+    Pieces of more than `longest` pixels are across a seam, and left out. A visible piece of no length counts as 1e-3
+    pixels, so that a curve that is a point is somewhere.
     """
     first, last = fractions_on_image(nodes[..., :-1, :], nodes[..., 1:, :], hw)
     seen = (seen[..., :-1] | seen[..., 1:]) & (first <= last)
     first, last = torch.where(seen, first, 0.0), torch.where(seen, last, 1.0)
+    if longest < math.inf:
+        seen = seen & (nodes.detach().diff(dim=-2).square().sum(-1) < longest**2)
     step = torch.where(seen[..., None], nodes.diff(dim=-2), 0.0)
     length = (step.square().sum(-1) + 1e-6).sqrt() * (last - first)
     return Pieces(first, last, torch.where(seen, length, 0.0))

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+import difflib
+import importlib
+import sys
+from pathlib import Path
+from typing import Any, Literal
 
+from ..checks import check_field
+from ..epipolar import FRONT
+from ..pixels import coarse_grid
 from ..rig import Pair
 from .curved import Curved, ThroughLenses
 from .explicit import Dense, Local, NearestVoxels
@@ -22,6 +29,34 @@ FIELDS: dict[str, type[Any]] = {
 }
 """The families that can be chosen by name; each can be made without arguments."""
 
+
+def named_field(name: str) -> ReceptiveField:
+    """The field of a name in `FIELDS`, or one's own as "module:object", which is imported from here too.
+
+    A class is made without arguments. Raises ValueError for a name that is neither.
+    """
+    module, colon, attribute = name.partition(":")
+    if not colon:
+        if name in FIELDS:
+            return FIELDS[name]()
+        near = difflib.get_close_matches(name, FIELDS, 1)
+        hint = f"did you mean '{near[0]}'?" if near else f"use one of {', '.join(FIELDS)}, or MODULE:OBJECT"
+        raise ValueError(f"no field is called '{name}': {hint}")
+    try:
+        sys.path.insert(0, str(Path.cwd()))
+        field = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"the field '{name}' cannot be imported: {error}") from None
+    finally:
+        sys.path.pop(0)
+    try:
+        field = field() if isinstance(field, type) else field
+        check_field(field)
+    except TypeError as error:
+        raise ValueError(f"the field '{name}': {error}") from None
+    return field
+
+
 LINE_SHARE = 0.06
 """Displacement from H x along the line of a pair with a link, as a share of beta's longer side."""
 ROW_SHARE = 0.12
@@ -29,13 +64,19 @@ ROW_SHARE = 0.12
 
 
 def default_field(pair: Pair) -> ReceptiveField:
-    """The field for a pair of pinhole views, which is what fusion uses.
+    """The field for a pair, which is what fusion uses; through lenses where a view has one.
 
     A pair with a link has `HomographyDisplacement`, also if it is calibrated: a link was measured between these very
     images. A calibrated one has `Epipolar`, which raises ValueError if the pair has no depth range: a search of the
     whole line is ambiguous and has to be asked for (`EpipolarLine`). A pair of which only the sizes are known counts as
-    rectified, with alpha on either side.
+    rectified, with alpha on either side. With lenses these are `Curved`, or `ThroughLenses` of the field without them.
+    Of cameras without a pinhole view (`View.has_pinhole_view`) it is `Curved`, its bounds by `natural_bounds`.
     """
+    return _through_lenses(straight_field(pair), pair)
+
+
+def straight_field(pair: Pair) -> ReceptiveField:
+    """`default_field` of the pair once its images are undistorted."""
     if pair.link is not None:
         return HomographyDisplacement(LINE_SHARE * max(pair.beta.hw))
     if pair.calibrated:
@@ -43,14 +84,27 @@ def default_field(pair: Pair) -> ReceptiveField:
     return Rectified(ROW_SHARE * pair.beta.hw[1], alpha_is="either")
 
 
+def _through_lenses(field: ReceptiveField, pair: Pair, samples: int = 96, nodes: int = 64) -> ReceptiveField:
+    if not pair.has_lens:
+        return field
+    if not isinstance(field, Epipolar) and all(view.has_pinhole_view for view in (pair.alpha, pair.beta)):
+        return ThroughLenses(field, samples)
+    return Curved(samples, nodes=nodes, bounds="depth" if pair.alpha.has_pinhole_view else natural_bounds(pair))
+
+
+def natural_bounds(pair: Pair) -> Literal["depth", "distance"]:
+    """Of what the depth range of a pair is: the distance along the ray where alpha sees 90 degrees off axis."""
+    alpha = pair.cameras[0]
+    rays, seen = alpha.rays(coarse_grid(alpha.hw).to(alpha.K).reshape(*[1] * len(alpha.batch_shape), -1, 2))
+    return "distance" if bool((seen & (rays[..., 2] <= FRONT * rays.norm(dim=-1))).any()) else "depth"
+
+
 def recorded_field(pair: Pair, *, samples: int = 256, nodes: int = 64) -> ReceptiveField:
-    """`default_field` for the images as recorded: through their lenses, and the whole line without a depth range.
+    """`default_field`, and the whole line without a depth range.
 
     Drawings use it, which need no depth range. `samples` and `nodes` are those of `Curved` and `ThroughLenses`.
     """
-    field = default_field(pair)
+    field = straight_field(pair)
     if isinstance(field, Epipolar) and pair.depth is None:
         field = EpipolarLine()
-    if not pair.has_lens:
-        return field
-    return Curved(samples, nodes=nodes) if isinstance(field, Epipolar) else ThroughLenses(field, samples)
+    return _through_lenses(field, pair, samples, nodes)

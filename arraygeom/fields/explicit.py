@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Real
 from torch import Tensor
 
+from ..checks import check_above
 from ..chunks import chunked, spans
 from ..epipolar import epipolar_lines
 from ..homography import apply_homography
@@ -34,6 +35,10 @@ class NearestVoxels:
     count: int = 96
     window: int = 80
 
+    def __post_init__(self) -> None:
+        check_above(1, whole=True, count=self.count)
+        check_above(0, whole=True, window=self.window)
+
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
         """Positions (*n, count, 2), in beta's pixels. Not differentiable: pixels are whole. Not for lenses."""
         require_straight(pair)
@@ -47,9 +52,9 @@ class NearestVoxels:
         line, centre = line.reshape(-1, 3), centre.reshape(-1, 2)
         if compilable(line):
             xy, mask = self._compiled(line, centre, usable.reshape(-1), pair.beta.hw)
-            return Positions(xy.reshape(*axes, -1, 2), mask.reshape(*axes, -1))
+            return Positions(xy.reshape(*axes, self.count, 2), mask.reshape(*axes, self.count))
         xy, mask = self._nearest(line, centre, pair)
-        xy, mask = xy.reshape(*axes, -1, 2), mask.reshape(*axes, -1) & usable[..., None]
+        xy, mask = xy.reshape(*axes, self.count, 2), mask.reshape(*axes, self.count) & usable[..., None]
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
 
     def _nearest(self, line: Tensor, centre: Tensor, pair: Pair) -> tuple[Tensor, Tensor]:
@@ -124,6 +129,10 @@ class Local:
     size: int = 5
     spacing: float = 1.0
 
+    def __post_init__(self) -> None:
+        check_above(1, whole=True, size=self.size)
+        check_above(0, spacing=self.spacing)
+
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
         """Positions (*n, size^2, 2), row by row, centred on H x. Raises ValueError for lenses."""
         require_straight(pair)
@@ -140,6 +149,9 @@ class Dense:
     """Every `stride`-th pixel of beta; from nothing (small images, and the unphysical control)."""
 
     stride: int = 1
+
+    def __post_init__(self) -> None:
+        check_above(1, whole=True, stride=self.stride)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
         """Positions (*n, H W / stride^2, 2), the same for every alpha pixel."""

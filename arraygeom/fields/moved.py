@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Real
 from torch import Tensor
 
+from ..checks import check_field
 from ..pixels import floating
 from ..rig import Pair
 from ..sampling import sample
@@ -25,6 +26,11 @@ class Moved:
 
     field: ReceptiveField
     displacement: Float[Tensor, "2 h w"]
+
+    def __post_init__(self) -> None:
+        check_field(self.field)
+        if self.displacement.ndim != 3 or len(self.displacement) != 2:
+            raise ValueError(f"displacement has shape {tuple(self.displacement.shape)}; wanted (2, height, width)")
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
         """The field's sampling locations for the points where alpha's pixels x will be."""

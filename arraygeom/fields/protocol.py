@@ -10,6 +10,7 @@ from jaxtyping import Float, Real
 from torch import Tensor
 
 from ..camera import Camera
+from ..checks import check_field, check_pixels
 from ..chunks import chunked
 from ..compiled import can_compile
 from ..pixels import floating, pixel_grid
@@ -30,7 +31,13 @@ class ReceptiveField(Protocol):
 
 
 def sampling_locations(field: ReceptiveField, pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> SamplingLocations:
-    """The field over given pixels, or over alpha's whole image (H, W); a batch of rigs gives (*b, H, W)."""
+    """The field over given pixels, or over alpha's whole image (H, W); a batch of rigs gives (*b, H, W).
+
+    Raises TypeError for what is not a field, such as the class of one.
+    """
+    check_field(field)
+    if x is not None:
+        check_pixels(x)
     return field(pair, all_pixels(pair) if x is None else floating(x))
 
 
@@ -39,6 +46,7 @@ def lazily(field: ReceptiveField, pair: Pair) -> Callable[[Tensor], SamplingLoca
 
     For a batch of rigs it answers for each of them, (*b, n).
     """
+    check_field(field)
     axes = len(pair.batch_shape)
     return lambda x: field(pair, floating(x).reshape(*[1] * axes, *x.shape))
 

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float, Real
 from torch import Tensor
 
+from ..batching import tensors_of
 from ..camera import Camera
+from ..checks import check_above, check_bounds
 from ..chunks import chunked
 from ..epipolar import Track, epipolar_lines, segments_between, track
 from ..homography import apply_homography
 from ..pixels import HW, floating
 from ..rig import Depths, Pair, depth_range
 from ..segments import Segments, clip_to_image
+from ..tracing import followed
 from .protocol import CHUNK, all_pixels, segments_by_rows
 
 
@@ -34,6 +37,9 @@ class Epipolar:
 
     near: float | None = None
     far: float | None = None
+
+    def __post_init__(self) -> None:
+        check_bounds(self.near, self.far)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Segments from near to far, inside beta's image and in front of it. Raises ValueError for lenses."""
@@ -66,7 +72,9 @@ class EpipolarLine:
 
         def across(x: Tensor) -> Segments:
             middle = x.new_tensor([(w - 1) / 2, (h - 1) / 2])
-            return line_piece(epipolar_lines(F, x), middle, x.new_tensor(float(h + w)), (h, w))
+            line = epipolar_lines(F, x)
+            piece = line_piece(line, middle, x.new_tensor(float(h + w)), (h, w))
+            return Segments(piece.start, piece.end, piece.valid & (line[..., :2] != 0).any(-1))
 
         return segments_by_rows(across, pair, floating(x))
 
@@ -87,6 +95,9 @@ class HomographyDisplacement:
     """
 
     displacement: float | None = None
+
+    def __post_init__(self) -> None:
+        check_above(0, displacement=self.displacement)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Segments centred on the point of the line nearest to H x, then clipped to beta's image.
@@ -128,16 +139,31 @@ def _squared_reach(pair: Pair, x: Tensor) -> Tensor:
 
 
 def _widest(pair: Pair) -> Tensor:
-    """The alpha pixel (*b, 1, 2) that needs the largest displacement: searched once a pair."""
-    if "widest" not in pair.memo:
-        grid = all_pixels(pair)
-        with torch.no_grad():
-            rows = CHUNK // grid.shape[-2] + 1
-            disparity = chunked(partial(_squared_reach, pair), grid, rows=rows, axis=len(pair.batch_shape))
-        index = disparity.flatten(-2).argmax(-1)
-        chosen = grid.reshape(-1, 2).index_select(0, index.reshape(-1)).reshape(*index.shape, 1, 2)
-        pair.memo["widest"] = chosen.to(pair.cameras[0].K)
+    """The alpha pixel (*b, 1, 2) that needs the largest displacement: searched once a pair, and anew when it changes.
+
+    Nothing is kept of a trace, nor as a tensor of inference mode, which no gradient could use later.
+    """
+    if followed():
+        return _searched_widest(pair)
+    versions = tuple(None if t.is_inference() else t._version for t, _ in tensors_of(pair))
+    if pair.memo.get("versions") != versions:
+        with torch.inference_mode(mode=False):
+            pair.memo.update(versions=versions, widest=_searched_widest(pair).clone())
     return pair.memo["widest"]
+
+
+def _searched_widest(pair: Pair) -> Tensor:
+    grid = all_pixels(pair)
+    with torch.no_grad():
+        rows = CHUNK // grid.shape[-2] + 1
+        disparity = chunked(partial(_squared_reach, pair), grid, rows=rows, axis=len(pair.batch_shape))
+    index = disparity.flatten(-2).argmax(-1)
+    chosen = grid.reshape(-1, 2).index_select(0, index.reshape(-1)).reshape(*index.shape, 1, 2)
+    return chosen.to(pair.cameras[0].K)
+
+
+SIDES = Literal["left", "right", "either"]
+"""Which camera of a rectified pair alpha is."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +175,12 @@ class Rectified:
     """
 
     max_disparity: float | None = None
-    alpha_is: Literal["left", "right", "either"] = "left"
+    alpha_is: SIDES = "left"
+
+    def __post_init__(self) -> None:
+        check_above(0, max_disparity=self.max_disparity)
+        if self.alpha_is not in get_args(SIDES):
+            raise ValueError(f"alpha_is must be one of {', '.join(get_args(SIDES))}, got {self.alpha_is!r}")
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Segments from the largest disparity (near) to none (far)."""

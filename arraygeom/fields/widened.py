@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Real
 from torch import Tensor
 
+from ..checks import check_above, check_field
 from ..pixels import HW, shift_matrix
 from ..rig import Pair
 from ..segments import Positions, Segments, clip_to_image
@@ -37,8 +38,9 @@ class Widened:
     samples: int = 96
 
     def __post_init__(self) -> None:
-        if min(self.across, self.along) < 0:
-            raise ValueError(f"across and along are pixels, 0 or more; got {self.across} and {self.along}")
+        check_field(self.field)
+        check_above(0, across=self.across, along=self.along)
+        check_above(1, whole=True, samples=self.samples)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
         """Segments if `across` is 0 and the field gives segments, else positions (*n, rows * samples, 2)."""

@@ -19,6 +19,7 @@ from ..camera import Camera, LensView
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
+from ..rig_check import unit_oddity
 from ..sensor import Sensor
 from . import (
     aniposelib,
@@ -41,7 +42,7 @@ from . import (
     syntim,
     xmp,
 )
-from .source import RigFileError, RigFileWarning, RigSource, unit_warning
+from .source import RigFileError, RigFileWarning, RigSource
 
 # In the order in which they are asked whether they recognise a file.
 READERS: dict[str, Any] = {
@@ -103,7 +104,7 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
         raise RigFileError(path, None, f"cannot be read as {format} ({cause}); is the file whole?") from error
     rig = rig if scale == 1.0 else _scaled(rig, scale)
     _check_magnitudes(path, rig)
-    if doubt := unit_warning(rig):
+    if doubt := unit_oddity(rig):
         RigSource(path).warn(doubt)
     return rig
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from torch import Tensor
 
 from ..camera import Camera
-from ..distortion import BROWN_CONRADY, Distortion
+from ..distortion import BROWN_CONRADY
+from ..lenses.model import LensModel
 from ..rig import Rig
 
 
@@ -33,7 +34,7 @@ def focal_and_centre(name: str, camera: Camera, *, first_pixel: float = 0.0) -> 
     return fx, fy, cx + first_pixel, cy + first_pixel
 
 
-def brown_conrady(name: str, lens: Distortion | None, *, at_most: int) -> list[float]:
+def brown_conrady(name: str, lens: LensModel | None, *, at_most: int) -> list[float]:
     """Brown-Conrady coefficients, four or more and no more than `at_most`; zeros for no lens."""
     if lens is None:
         return [0.0] * 4

@@ -18,6 +18,7 @@ import yaml
 from ..camera import Camera
 from ..distortion import BROWN_CONRADY, KANNALA_BRANDT, Distortion
 from ..lenses.central import DOUBLE_SPHERE, EXTENDED_UNIFIED, FOV, UNIFIED
+from ..lenses.model import LensModel
 from ..pose import Pose
 from ..rig import Rig
 from ..sensor import Sensor
@@ -134,7 +135,7 @@ def _entry(name: str, camera: Camera) -> dict[str, Any]:
     }
 
 
-def _spelled(name: str, lens: Distortion | None) -> tuple[str, list[float], str, list[float]]:
+def _spelled(name: str, lens: LensModel | None) -> tuple[str, list[float], str, list[float]]:
     """Camera model, what stands before its focal lengths, distortion model and coefficients."""
     c = [] if lens is None else lens.coefficients.tolist()
     if lens is None:

@@ -37,11 +37,13 @@ Numbers in pixels are converted to ours (first centre at 0) when read; files are
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import MISSING
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import yaml
@@ -50,12 +52,15 @@ from torch import Tensor
 from ..camera import Camera, LensView, View, intrinsics
 from ..distortion import Distortion
 from ..epipolar import shift_origin
+from ..lenses.model import CAMERA_MODELS, CameraModel, LensModel
 from ..pixels import shift_matrix
 from ..pose import Pose, rotation_from_vector
 from ..rig import Link, Rig
-from ..sensor import PATTERNS, Band, Curve, Sensor
+from ..sensor import CODINGS, PATTERNS, Band, Curve, Sensor
 from ..text import short
 from .source import RigSource, float64_of
+
+T = TypeVar("T")
 
 FORMAT = "arraygeom-rig 1"
 UNITS = {"metres": 1.0, "millimetres": 1e-3}
@@ -152,7 +157,7 @@ class _Document(RigSource):
             K=self.K(entry, fields, view.hw),
             cam_from_world=self.stated_pose(entry, fields),
             hw=view.hw,
-            distortion=None if lens is not None and lens.is_identity else lens,
+            distortion=None if isinstance(lens, Distortion) and lens.is_identity else lens,
             sensor=view.sensor,
         )
 
@@ -201,22 +206,40 @@ class _Document(RigSource):
             return self.rotation(self.numbers(value, (3, 3), entry), entry)
         return rotation_from_vector(torch.deg2rad(self.numbers(value, (3,), entry)))
 
-    def distortion(self, entry: str, value: Any) -> Distortion | None:
+    def distortion(self, entry: str, value: Any) -> LensModel | None:
         if value is None:
             return None
+        kind = CAMERA_MODELS.get(str(value.get("model"))) if isinstance(value, dict) else None
+        if kind is not None:
+            return self.model(entry, kind, value)
         self.keys(value, ("model", "coefficients"), entry)
         coefficients = self.numbers(value.get("coefficients"), None, f"{entry}.coefficients")
-        try:
-            return Distortion(str(value.get("model")), coefficients)
-        except ValueError as error:
-            raise self.fail(entry, str(error)) from None
+        return self.made(entry, Distortion, str(value.get("model")), coefficients)
+
+    def model(self, entry: str, kind: type[CameraModel], value: dict[str, Any]) -> CameraModel:
+        """A camera model with its own numbers: tensors, models within it, and what is neither as it is."""
+        known = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+        self.keys(value, ("model", *known), entry)
+        numbers: dict[str, Any] = {}
+        for name, given in value.items():
+            if isinstance(given, dict):
+                numbers[name] = self.distortion(f"{entry}.{name}", given)
+            elif name != "model" and "Tensor" in str(known[name].type):
+                several = isinstance(given, list)
+                numbers[name] = self.numbers(given, None if several else (), f"{entry}.{name}")
+            elif name != "model":
+                numbers[name] = given
+        missing = [n for n, f in known.items() if n not in numbers and f.default is f.default_factory is MISSING]
+        if missing:
+            raise self.fail(entry, f"has no {' or '.join(missing)}, which a {value['model']} camera has")
+        return self.made(entry, lambda: kind(**numbers))
 
     def sensor(self, entry: str, fields: Mapping[str, Any]) -> Sensor:
         response = fields.get("response")
         if isinstance(response, dict):
             response = self.response(f"{entry}.response", response)
         known: dict[str, Any] = {}
-        for key, choices in (("coding", ("srgb", "linear")), ("bayer", PATTERNS)):
+        for key, choices in (("coding", CODINGS), ("bayer", PATTERNS)):
             if fields.get(key) is not None:
                 known[key] = self.one_of(fields[key], choices, f"{entry}.{key}")
         for key, above in (("frame_rate", 0.0), ("time_offset", -math.inf), ("exposure", 0.0)):
@@ -261,10 +284,17 @@ class _Document(RigSource):
         if "centre" in fields:
             self.keys(fields, ("centre", "width"), entry)
             centre, width = self.numbers([fields["centre"], fields.get("width")], (2,), entry).tolist()
-            return Band(centre, width)
+            return self.made(entry, Band, centre, width)
         self.keys(fields, ("wavelength", "response"), entry)
         curve = self.numbers([fields.get("wavelength"), fields.get("response")], None, entry)
-        return Curve(tuple(curve[0].tolist()), tuple(curve[1].tolist()))
+        return self.made(entry, Curve, *(tuple(row) for row in curve.reshape(2, -1).tolist()))
+
+    def made(self, entry: str, kind: Callable[..., T], *numbers: Any) -> T:
+        """What a constructor makes, its refusals with the entry's name."""
+        try:
+            return kind(*numbers)
+        except ValueError as error:
+            raise self.fail(entry, str(error)) from None
 
     def link(self, entry: str, fields: Any, cameras: Mapping[str, View]) -> tuple[tuple[str, str], Link]:
         self.keys(fields, ("alpha", "beta", "F", "H"), entry)
@@ -326,9 +356,26 @@ def _camera_entry(camera: View) -> dict[str, Any]:
         entry |= _K_entry(camera.K, "focal")
         entry |= {"rotation": camera.R.tolist(), "translation": camera.t.tolist()}
     if isinstance(camera, LensView) and (lens := camera.distortion) is not None:
-        entry["distortion"] = {"model": lens.model, "coefficients": lens.coefficients.tolist()}
+        entry["distortion"] = _model_entry(lens)
         entry["distortion"] |= {} if calibrated else _K_entry(camera.K, "scale")
     return entry | _sensor_entry(camera.sensor)
+
+
+def _model_entry(lens: LensModel) -> dict[str, Any]:
+    """A lens or a camera model with its numbers. Raises ValueError for one without a name."""
+    if isinstance(lens, Distortion):
+        return {"model": lens.model, "coefficients": lens.coefficients.tolist()}
+    if not isinstance(lens, CameraModel) or not lens.registered:
+        kind = type(lens).__name__
+        raise ValueError(f"the camera model {kind} has no name for rig files: class {kind}(CameraModel, name=...)")
+    held = {f.name: getattr(lens, f.name) for f in dataclasses.fields(lens)}  # type: ignore[arg-type]
+    entry: dict[str, Any] = {"model": lens.model}
+    for name, value in held.items():
+        if isinstance(value, LensModel):
+            entry[name] = _model_entry(value)
+        elif value is not None:
+            entry[name] = value.tolist() if isinstance(value, Tensor) else value
+    return entry
 
 
 def _K_entry(K: Tensor, scale: str) -> dict[str, Any]:

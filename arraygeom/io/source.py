@@ -14,6 +14,7 @@ import yaml
 from torch import Tensor
 
 from ..camera import Camera
+from ..checks import LARGEST_SIDE, MOST_PIXELS, ROUNDED
 from ..distortion import BROWN_CONRADY, COEFFICIENT_COUNTS, KANNALA_BRANDT, Distortion
 from ..pixels import HW, shift_matrix
 from ..pose import Pose, rotation_error, rotation_from_vector
@@ -21,12 +22,6 @@ from ..rig import Rig
 from ..safe_yaml import load_json, load_yaml, yaml_problem
 from ..text import short
 
-# A baseline outside these bounds, in metres, is more likely a mistaken unit than a camera array.
-SMALLEST_BASELINE, LARGEST_BASELINE = 1e-4, 50.0
-# A size beyond these bounds is more likely a damaged number than an image (the largest sensors have some 4e8 pixels).
-LARGEST_SIDE, MOST_PIXELS = 65_535, 2**30
-# Rotations in text files are rounded: this much of a deviation is put right, more is refused.
-ROUNDED = 1e-3
 # Of a rotation vector, in radians; it may go round a few times.
 LARGEST_ANGLE = 1e3
 
@@ -264,6 +259,13 @@ class RigSource:
             raise self.fail(None, "holds no camera; is the file whole?")
         return Rig(named, **fields)
 
+    def _unique(self, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        fields = dict(pairs)
+        if len(fields) < len(pairs):
+            names = [name for name, _ in pairs]
+            raise self.fail(next(n for n in names if names.count(n) > 1), "occurs twice; keep one")
+        return fields
+
 
 def float64_of(value: Any) -> Tensor | None:
     """Numbers, nested in lists or not, as a float64 tensor; None for what holds anything else, such as true or text."""
@@ -277,23 +279,3 @@ def float64_of(value: Any) -> Tensor | None:
 
 def _has_truth(value: Any) -> bool:
     return isinstance(value, bool) or (isinstance(value, list | tuple) and any(map(_has_truth, value)))
-
-
-def unit_warning(rig: Rig) -> str | None:
-    """What to say of baselines that suggest another unit than metres."""
-    centres = [camera.centre for camera in rig.cameras.values() if isinstance(camera, Camera)]
-    if len(centres) < 2:
-        return None
-    longest = float(torch.pdist(torch.stack(centres)).max())
-    if longest > LARGEST_BASELINE:
-        return (
-            f"has cameras {longest:.3g} m apart: is this file in millimetres? "
-            "Then convert it (`pat rig convert`) and write units: millimetres, or read it with scale=0.001; "
-            "if its scale is arbitrary, all is well"
-        )
-    if 0 < longest < SMALLEST_BASELINE:
-        return (
-            f"has cameras at most {1e3 * longest:.3g} mm apart: is this file in metres, and read as millimetres? "
-            "Then read it with scale=1000"
-        )
-    return None

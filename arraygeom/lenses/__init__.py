@@ -1,1 +1,19 @@
-"""Lens models, a file each family: maps between directions, undistorted and distorted points."""
+"""Camera models: maps between directions and points of the image plane, a file each family.
+
+A model of one's own is a subclass of `CameraModel`; see the page "A camera of one's own" of the documentation.
+"""
+
+from .angular import Equirectangular, PolynomialFisheye
+from .model import CAMERA_MODELS, CameraModel, beside_points
+from .not_central import FlatPort, Orthographic, RollingShutter
+
+__all__ = [
+    "CAMERA_MODELS",
+    "CameraModel",
+    "Equirectangular",
+    "FlatPort",
+    "Orthographic",
+    "PolynomialFisheye",
+    "RollingShutter",
+    "beside_points",
+]

@@ -196,7 +196,9 @@ def _scaramuzza(c: Tensor, X: Tensor) -> Tensor:
     s = torch.where(R > 0, r / torch.where(R > 0, R, 1.0), 1 / torch.where(R > 0, 1.0, z)).detach()
     for _ in range(2):
         depth, slope = _along(c, s * R)
-        s = s - (s * z - depth) / (z - R * slope)
+        turn = z - R * slope
+        step = (s * z - depth) / torch.where(turn != 0, turn, 1.0)
+        s = s - torch.where(step.abs() < 0.1 * s.abs(), step, 0.0)  # at the end of the range the slope is rounding
     return X[..., :2] * s[..., None]
 
 

@@ -62,7 +62,18 @@ def norm(xy: Tensor) -> Tensor:
 
 
 def finite_points(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Points with those that hold a NaN or an infinity at the origin, and which did not."""
+    """Points with those that hold a NaN or an infinity at the origin, and which did not.
+
+    Huge ones of float32 are brought nearer along their direction, as their squares would be infinite.
+    """
     points = floating(points)
     finite = points.isfinite().all(-1)
-    return torch.where(finite[..., None], points, 0.0), finite
+    points = torch.where(finite[..., None], points, 0.0)
+    if points.dtype == torch.float64:
+        return points, finite
+    size = points.detach().abs().amax(-1, keepdim=True).clamp(min=HUGE)
+    return points * (HUGE / size), finite
+
+
+HUGE = 1e9
+"""Of float32: its fourth power is finite, and a direction so far off axis is at 90 degrees to rounding."""

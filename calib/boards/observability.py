@@ -127,7 +127,7 @@ def _with_default(problem: BundleProblem, name: str, entry: str) -> BundleProble
     elif camera.distortion is not None:
         coefficients = camera.distortion.coefficients.clone()
         coefficients[int(index)] = 0.0
-        camera = camera.replace(distortion=type(camera.distortion)(camera.distortion.model, coefficients))
+        camera = camera.replace(distortion=camera.distortion.with_coefficients(coefficients))
     return replace(problem, cameras={**problem.cameras, name: camera})
 
 

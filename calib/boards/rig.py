@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from arraygeom import Camera, Pose, Rig, stack
+from arraygeom.threads import torch_in_one_thread
 
 from .board import Board
 from .bundle import BoardPoses, BundleProblem, BundleResult, Free, Observations, adjust, loss, noise
@@ -73,6 +74,7 @@ class Calibration:
         return dict(zip(self.fit.names, np.sqrt(self.fit.covariance.diagonal()).tolist()))
 
 
+@torch_in_one_thread()
 def calibrate(
     views: Mapping[str, BoardViews],
     board: Board,

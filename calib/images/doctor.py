@@ -19,6 +19,7 @@ from arraygeom import Camera, LensView, Pair, Rig
 from arraygeom.pixels import HW
 from arraygeom.rig import Depths
 from arraygeom.robust import cauchy, least_squares, robust_least_squares
+from arraygeom.threads import torch_in_one_thread
 
 from .held_out import image_parts, trimmed_square
 from .matches import Images, Pairs, PointMatches, match_cameras
@@ -167,6 +168,7 @@ def _rounded(figures: FitStatistics) -> dict[str, float | None]:
     return {name: None if math.isnan(value) else round(value, 4) for name, value in figures._asdict().items()}
 
 
+@torch_in_one_thread()
 def diagnose(rig: Rig, images: Images) -> Diagnosis:
     """Find the usual mistake, if any, in a rig, by one image (C, H, W) of two or more of its cameras.
 

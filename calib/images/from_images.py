@@ -15,6 +15,7 @@ from torch import Tensor
 
 from arraygeom import Rig, View, intrinsics
 from arraygeom.progress import part, stage
+from arraygeom.threads import torch_in_one_thread
 
 from .held_out import median_off, split
 from .lenses import describe_lenses
@@ -60,6 +61,7 @@ class UncalibratedRig(NamedTuple):
         return "\n".join([*lines, *filter(None, [describe_lenses(self.rig)])])
 
 
+@torch_in_one_thread()
 @stage()
 def rig_from_images(
     images: Mapping[str, Float[Tensor, "_ _ _"]], *, focal: Mapping[str, float] | None = None, alpha: str | None = None

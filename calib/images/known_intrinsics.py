@@ -27,7 +27,7 @@ from .self_calibration import depth_bounds
 WINDOW = 0.09
 """Largest displacement between images of parallel views, as a share of the longer side: 15 mm at .15 m, 60 degrees."""
 NEAR = 4.0
-"""Matches this many pixels from the line of a baseline are consistent with it: orientations are known to .2 degrees."""
+"""Points this many pixels from the line of a baseline are consistent with it: orientations are known to .2 degrees."""
 SHARE = 0.4
 """A baseline counts with which at least this share of a pair's matches is consistent: of wrong ones up to .3 are."""
 TRIALS = 500

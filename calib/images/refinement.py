@@ -27,6 +27,7 @@ from torch import Tensor
 
 from arraygeom import Camera, Rig
 from arraygeom.progress import log_step, part, stage
+from arraygeom.threads import torch_in_one_thread
 
 from .depth_change import LARGE_CHANGE, NEGLIGIBLE, DepthChange, depth_modes, log_depths, relative_change, share_behind
 from .held_out import PARTS, held_out_pixels, image_parts, line_distances, line_statistics, median_off, nearer, split
@@ -62,6 +63,7 @@ FITTED = 1.4
 """Seconds that one core takes to fit a rig to the points of a pair, roughly."""
 
 
+@torch_in_one_thread()
 def refine(
     rig: Rig,
     frames: Sequence[Images],

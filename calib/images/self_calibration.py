@@ -20,6 +20,7 @@ from torch import Tensor
 from arraygeom import Camera, Link, Pair, Pose, Rig, View, intrinsics, rotation_from_vector, triangulate
 from arraygeom.pixels import map_homogeneous
 from arraygeom.text import angle
+from arraygeom.threads import torch_in_one_thread
 
 from .held_out import median_off
 from .matches import ENOUGH, LOCALISED, Images, PointMatches, contrast_equalised, line_distance, near_lines
@@ -69,6 +70,7 @@ class RefinedPair(NamedTuple):
     distance: float
 
 
+@torch_in_one_thread()
 def self_calibrated(
     views: Mapping[str, View], link: Link, matches: PointMatches, *, focal: Mapping[str, float]
 ) -> RefinedPair | None:
@@ -96,6 +98,7 @@ def self_calibrated(
     return min(fitting, key=lambda trial: float(angle(_pair(trial.rig).beta_from_alpha.R.T @ upright)))
 
 
+@torch_in_one_thread()
 def refined_by_depth(
     pair: RefinedPair,
     images: Images,

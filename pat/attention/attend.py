@@ -22,15 +22,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.nn.functional import scaled_dot_product_attention
 from torch.utils.checkpoint import checkpoint
 
 from arraygeom.camera import View
 from arraygeom.chunks import chunked
-from arraygeom.fields import Local, lazily
+from arraygeom.fields import Dense, Local, lazily
 from arraygeom.pixels import pixel_coordinates
 from arraygeom.rig import Pair
 from arraygeom.segments import Positions, Segments
-from arraygeom.tracing import transformations
+from arraygeom.tracing import needs_numbers, transformations
 from pat.attention import reference, torch_op
 from pat.attention.reference import Attended, AttentionInputs, SamplePositions, accumulated
 
@@ -53,7 +54,7 @@ def attend(
     query: Float[Tensor, "b d ha wa"],
     key: Float[Tensor, "b d hb wb"],
     value: Float[Tensor, "b dv hb wb"],
-    locations: Locations | Callable[[Tensor], Locations] | Local,
+    locations: Locations | Callable[[Tensor], Locations] | Local | Dense,
     *,
     samples: int | None = None,
     interpolation: Interpolation = "bilinear",
@@ -73,7 +74,7 @@ def attend(
             with the leading axes (Ha, Wa) or (B, Ha, Wa), or a function from (n, 2) alpha pixels (x, y) to
             either, with the leading axes (n) or (B, n), which is called on one piece of alpha at a time and
             again in backward, so that not all explicit positions exist at once. Or the field `Local`: windows, of
-            views of the same field of view.
+            views of the same field of view; or `Dense`: all of beta, by `scaled_dot_product_attention`.
         samples: how many samples a segment has. None: one for each beta pixel of the longest valid one.
         interpolation: `bilinear` (differentiable in the geometry) or `nearest` (the paper's).
         bias: added to the scores; anything that broadcasts to (B, Ha, Wa, L).
@@ -96,7 +97,7 @@ def attend_with_statistics(
     query: Float[Tensor, "b d ha wa"],
     key: Float[Tensor, "b d hb wb"],
     value: Float[Tensor, "b dv hb wb"],
-    locations: Locations | Callable[[Tensor], Locations] | Local,
+    locations: Locations | Callable[[Tensor], Locations] | Local | Dense,
     *,
     samples: int | None = None,
     interpolation: Interpolation = "bilinear",
@@ -114,7 +115,7 @@ def _attend(
     query: Tensor,
     key: Tensor,
     value: Tensor,
-    locations: Locations | Callable[[Tensor], Locations] | Local,
+    locations: Locations | Callable[[Tensor], Locations] | Local | Dense,
     samples: int | None,
     interpolation: Interpolation,
     bias: Tensor | None,
@@ -126,9 +127,12 @@ def _attend(
     query, key, value = _autocast(query, key, value)
     _check(query, key, value, interpolation, backend)
     nearest = interpolation == "nearest"
-    if isinstance(locations, Local):
+    if isinstance(locations, Dense) and backend == "auto" and samples is None and not measured:
+        return (_attend_dense(query, key, value, locations.stride, bias),)
+    if isinstance(locations, Local | Dense):
         values_alone = nearest and samples is None and bias is None and not measured
-        if backend in ("auto", "local") and values_alone and _local_serves(query, key, value, locations):
+        asked = values_alone and backend in ("auto", "local")
+        if isinstance(locations, Local) and asked and _local_serves(query, key, value, locations):
             return _attend_local(query, key, value, locations)
         alpha, beta = (View(hw=(t.shape[2], t.shape[3])) for t in (query, key))
         locations = lazily(locations, Pair(alpha, beta))
@@ -185,6 +189,14 @@ def _attend_local(query: Tensor, key: Tensor, value: Tensor, field: Local) -> tu
     return (cpu.forward_local(query, key, value, field),)
 
 
+def _attend_dense(query: Tensor, key: Tensor, value: Tensor, stride: int, bias: Tensor | None) -> Tensor:
+    """Attention to every `stride`-th pixel of beta by torch's own, which keeps no weights."""
+    (b, _, ha, wa), dv = query.shape, value.shape[1]
+    q, k, v = (t.flatten(2).mT for t in (query, key[..., ::stride, ::stride], value[..., ::stride, ::stride]))
+    mask = None if bias is None else bias.expand(b, ha, wa, k.shape[1]).flatten(1, 2).to(q)
+    return scaled_dot_product_attention(q, k, v, attn_mask=mask, scale=1.0).mT.reshape(b, dv, ha, wa)
+
+
 def sample_positions(locations: Locations, query: Tensor, samples: int | None) -> SamplePositions:
     """Segments or Positions in the one form that the backends take, in the precision that they count in."""
     if isinstance(locations, Segments):
@@ -215,6 +227,7 @@ def sample_positions(locations: Locations, query: Tensor, samples: int | None) -
 
 def samples_for(segments: Segments) -> int:
     """Enough samples for one on each beta pixel of the longest valid segment."""
+    needs_numbers("the number of samples of the longest segment (give `samples`)", segments.start, segments.end)
     lengths = torch.where(segments.valid, segments.length.detach(), 0)
     return int(lengths.max().ceil()) + 1
 

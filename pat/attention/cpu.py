@@ -18,7 +18,7 @@ from torch.nn.functional import pad
 
 from arraygeom.fields import Local
 from arraygeom.segments import sample_fractions
-from arraygeom.threads import in_parallel
+from arraygeom.threads import in_parallel, threads
 from pat.attention import kernels
 from pat.attention.reference import EDGE_SLACK, AttentionInputs, accumulated, channels_last
 
@@ -177,7 +177,7 @@ def _shares(first: int, last: int, call: kernels.Call) -> list[kernels.Share]:
     channels = max(call.channels, call.value_channels)
     return [
         kernels.Share(first, last, size, counter, kernels.block_scratch(samples, channels, number))
-        for _ in range(min(torch.get_num_threads(), -(-(last - first) // size)))
+        for _ in range(min(threads(), -(-(last - first) // size)))
     ]
 
 
@@ -202,7 +202,7 @@ def _channel_tasks(
     if not out.numel():
         return []
     lanes = kernels.LANES
-    width = -(-channels // (lanes * torch.get_num_threads())) * lanes
+    width = -(-channels // (lanes * threads())) * lanes
     flat = _flat(out)
     return [
         partial(kernels.scatter, taps, weights, last, x, channels, c, min(c + width, channels), flat)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tyro.conf import Fixed, Positional, arg
 
 from . import options
-from .options import MaybeOut, MaybePath, Memory, Out, Weights, optional, say, writable
+from .options import FieldName, MaybeOut, MaybePath, Memory, Out, Weights, optional, say, writable
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -153,6 +153,7 @@ class Ablate:
     """Height and width of both images: 96 128, or 240 320 with --families."""
     seed: int = 0
     """Of the scenes."""
+    field: FieldName = "auto"
     out: Out = Path("out/ablate")
     """Folder for ablation.md, ablation.json, ablation.svg and ablation.png; with --families ablation.csv."""
 
@@ -172,13 +173,16 @@ class Ablate:
         say(f"written: {self.out / 'ablation.md'}, and its figures and numbers beside it")
 
     def _families(self, network: Network) -> None:
-        from ..evaluation.ablation import ablate, layered_cases, rendered_cases
+        from ..evaluation.ablation import FieldFamily, ablate, families, layered_cases, rendered_cases
 
         if self.rendered is not None:
             cases = rendered_cases(self.rendered, seed=self.seed)
         else:
             cases = layered_cases(self.scenes, photos=self.photos, hw=self.hw or (240, 320), seed=self.seed)
-        ablate(network, cases, out=self.out)
+        chosen, own = families(), options.field_named(self.field)
+        if own is not None:
+            chosen[self.field] = FieldFamily(lambda disparity: own)
+        ablate(network, cases, out=self.out, chosen=chosen)
 
     def _sweeps(self, network: Network) -> None:
         from ..evaluation.sweep_report import write_report

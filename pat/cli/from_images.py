@@ -221,8 +221,12 @@ def _calibrated(
         log_step(LOG, LINES + (1 - LINES) * i / len(betas), "calibrating %s and %s", alpha, name)
         link, matches = found.rig.links[alpha, name], found.matches[alpha, name]
         views = {n: found.rig[n] for n in (alpha, name)}
-        pair = None if _distorted(found.rig) else self_calibrated(views, link, matches, focal=focal)
+        if _distorted(found.rig):
+            note("no depth: the lens bends lines, and images do not tell its focal length: `pat calibrate` finds both")
+            return None
+        pair = self_calibrated(views, link, matches, focal=focal)
         if pair is None:
+            note(f"no depth: no position of {name} beside {alpha} fits their points as well as lines alone do")
             return None
         note(f"{alpha} > {name}: {pair.points} points, {pair.distance:.2f} px from their lines; refining")
         pairs[name], depths[name] = _refined(pair, images, network)

@@ -68,7 +68,6 @@ class Fuse:
     (a page that shows them) and view.yaml (the rig of the fused view)."""
     weights: Annotated[str | None, arg(metavar="NAME|FILE", help=WEIGHTS_HELP, help_behavior_hint="")] = None
     field: FieldName = "auto"
-    """Receptive field in the other cameras; auto takes what the rig allows."""
     max_memory: Memory = None
     """Memory limit of the whole process, such as 4GiB; larger frames are fused in tiles."""
     normalise_radiometry: bool = False
@@ -286,6 +285,8 @@ class Fuse:
             frame = fuse_with_progress(rig=rig, images=images, alpha=alpha, **further)
             before_writing()
             frame, gain = self._exposed(frame)
+            if found is None and not frame.depth.isfinite().any():
+                self._note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
             view = view_of(rig, alpha, bits=self.bits, bands=len(frame.image))
             found_rig = rig if found is not None else None
             points = rig[alpha] if self.points else None

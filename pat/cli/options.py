@@ -15,7 +15,7 @@ from functools import cache
 from itertools import takewhile
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -47,10 +47,8 @@ def _field_names() -> tuple[str, ...]:
 
 
 FIELD_NAMES = _field_names()
-if TYPE_CHECKING:
-    FieldName = str
-else:
-    FieldName = Literal[("auto", *FIELD_NAMES)]
+FIELD_HELP = f"Receptive field in the other cameras: {', '.join(FIELD_NAMES)}, or MODULE:OBJECT for your own; "
+FieldName = Annotated[str, arg(metavar="NAME|MODULE:OBJECT", help=f"{FIELD_HELP}auto takes what the rig allows.")]
 
 
 def response_of(text: str) -> Any:
@@ -181,10 +179,13 @@ def device_of(name: str) -> str:
 
 
 def field_named(name: str) -> ReceptiveField | None:
-    """The receptive field of that name; None for "auto"."""
-    from arraygeom.fields.default import FIELDS
+    """The receptive field of that name; None for "auto". Raises ValueError for a name that is none."""
+    from arraygeom.fields import named_field
 
-    return None if name == "auto" else FIELDS[name]()
+    try:
+        return None if name == "auto" else named_field(name)
+    except ValueError as error:
+        raise ValueError(f"--field: {error}") from None
 
 
 def load_rig(path: Path, depth: tuple[float, float] | None = None) -> Rig:

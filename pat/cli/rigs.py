@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from tyro.conf import Positional, arg
 
 from . import options
-from .options import FIRST, LAST, Depth, Images, MaybeOut, Numbers, Out, RigFile, load_rig, optional, say
+from .options import FIRST, LAST, Depth, FieldName, Images, MaybeOut, Numbers, Out, RigFile, load_rig, optional, say
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -101,6 +101,7 @@ class Explore:
     """An image of each camera, once each."""
     alpha: Annotated[str | None, optional("NAME")] = None
     """The camera to click in; by default the first with an image."""
+    field: FieldName = "auto"
     port: int = 0
     """Port on localhost; 0 takes a free one."""
     browser: bool = True
@@ -114,7 +115,8 @@ class Explore:
         rig = load_rig(self.rig)
         images = options.read_images(rig, self.image)
         warn_of_misfit(rig, images)
-        serve(rig, images, alpha=self.alpha, port=self.port, browser=self.browser)
+        options.field_named(self.field)
+        serve(rig, images, alpha=self.alpha, field=self.field, port=self.port, browser=self.browser)
 
 
 MOST_CAMERAS = 12
@@ -142,6 +144,8 @@ class Info:
         rig = load_rig(self.rig, self.depth)
         if rig.name:
             say(rig.name)
+        for oddity in rig.check():
+            say(f"pat: {oddity}", style="yellow")
         alpha = None if self.alpha is None else rig.require(self.alpha)
         if alpha is None and len(rig.names) > MOST_CAMERAS:
             alpha = rig.names[0]

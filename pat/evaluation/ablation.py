@@ -31,7 +31,6 @@ from arraygeom import (
     NearestVoxels,
     Pair,
     Pose,
-    Positions,
     ReceptiveField,
     Rectified,
     Rig,
@@ -281,8 +280,6 @@ def unsupported(network: FusionNetwork, field: ReceptiveField, rig: Rig) -> str:
         needed = math.prod(pair.alpha.hw) / 4 * math.prod(pair.beta.hw) * 8
         if needed > DENSE_LIMIT:
             return f"does not fit: {needed / 2**30:.0f} GiB of positions"
-    if network.uses_matches and isinstance(field(pair, torch.zeros(1, 2)), Positions):
-        return "explicit positions: this network samples along segments"
     return ""
 
 

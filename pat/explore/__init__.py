@@ -1,7 +1,8 @@
 """The explorer: click a pixel of alpha and see its segment, samples and match in every beta, and vary the rig.
 
-`explorer(rig, images)` is for a cell of a notebook, `pat explore rig.yaml --image ...` for a page of its own. Both need
-the extra `explore`; `inspect_pixel` does the computation and needs no extra.
+`explore(rig, images)` is a widget for a cell of a notebook that needs neither a server nor a network; `explorer(rig,
+images)` and `pat explore rig.yaml --image ...` make the page with all controls. All need the extra `explore`;
+`inspect_pixel` does the computation and needs no extra.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ __all__ = [
     "ExplorerScene",
     "ExplorerState",
     "PixelReport",
+    "explore",
     "explorer",
     "inspect_pixel",
     "serve",
@@ -23,7 +25,11 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """`explorer` and `serve`, which load the page's libraries on first use."""
+    """`explore`, `explorer` and `serve`, which load their libraries on first use."""
+    if name == "explore":
+        from .widget import explore
+
+        return explore
     if name not in ("explorer", "serve"):
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
     try:

@@ -33,7 +33,11 @@ class Controls:
         self.update = update
         self.changes: dict[str, list[float]] = {name: [0.0] * n for name, n in parameter_lengths(rig).items()}
         self.family = pn.widgets.Select(
-            label="field", options=list(FAMILIES), value=state.family, stylesheets=[WIDGET], sizing_mode="stretch_width"
+            label="field",
+            options=list(dict.fromkeys([*FAMILIES, state.family])),
+            value=state.family,
+            stylesheets=[WIDGET],
+            sizing_mode="stretch_width",
         )
         self.family.param.watch(lambda e: update(family=e.new), "value")
         self.depths = [] if rig.depth is None else depth_controls(rig, update)

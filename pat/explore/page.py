@@ -50,9 +50,9 @@ EMPTY: dict[str, list[float]] = {"x": [], "y": []}
 class Explorer:
     """Widgets and figures of an `ExplorerState`; `report` is what is drawn, `panel()` is for a page or a cell."""
 
-    def __init__(self, scene: ExplorerScene, alpha: str) -> None:
+    def __init__(self, scene: ExplorerScene, alpha: str, field: str = "auto") -> None:
         self.scene = scene
-        self.state = self.initial = ExplorerState(alpha, textured_pixel(scene.guides[alpha]))
+        self.state = self.initial = ExplorerState(alpha, textured_pixel(scene.guides[alpha]), family=field)
         self.betas = [n for n in scene.rig.betas(alpha) if n in scene.images]
         self.marker = ColumnDataSource(dict(EMPTY), name="pixel")
         self.backwards = ColumnDataSource(dict(EMPTY), name="backwards")
@@ -327,14 +327,15 @@ def swatch(colour: Float[Tensor, "c"]) -> str:
 
 
 def explorer(
-    rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]], *, alpha: str | None = None
+    rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]], *, alpha: str | None = None, field: str = "auto"
 ) -> pn.viewable.Viewable:
     """The explorer of a rig and images (C, H, W) by camera name, to show in a cell of a notebook.
 
-    `alpha` is the camera to click in, by default the first with an image. Raises ValueError for a camera the rig
-    lacks, an image of another size, and if alpha or every beta has no image.
+    `alpha` is the camera to click in, by default the first with an image; `field` the name of the one to begin with, or
+    MODULE:OBJECT. Raises ValueError for a camera the rig lacks, an image of another size, and if alpha or every beta
+    has no image.
     """
-    return Explorer(*prepared(rig, images, alpha)).panel()
+    return Explorer(*prepared(rig, images, alpha), field).panel()
 
 
 def prepared(rig: Rig, images: Mapping[str, Tensor], alpha: str | None) -> tuple[ExplorerScene, str]:

@@ -32,13 +32,13 @@ from arraygeom import (
     Rig,
     Segments,
     Widened,
-    apply_homography,
     depth_of,
     pixel_grid,
     sample,
 )
 from arraygeom.fields import covering_displacement
-from arraygeom.fields.default import FIELDS, LINE_SHARE, recorded_field
+from arraygeom.fields.default import FIELDS, LINE_SHARE, named_field, recorded_field
+from arraygeom.fields.ray_depth import ray_depth, rough_transfer
 from arraygeom.pixels import HW
 
 from ..media.colour import luminance
@@ -140,7 +140,7 @@ SIZED: dict[str, Callable[[Pair, ExplorerState], ReceptiveField]] = {
 }
 """Families whose extent is set by the controls or by the images' size."""
 FAMILIES = ("auto", *FIELDS)
-"""Names of the fields: `auto` is the default field, which `pat fuse` uses."""
+"""Names of the fields: `auto` is the default field, which `pat fuse` uses. A state takes MODULE:OBJECT, too."""
 
 
 def chosen_field(pair: Pair, state: ExplorerState) -> ReceptiveField:
@@ -148,7 +148,7 @@ def chosen_field(pair: Pair, state: ExplorerState) -> ReceptiveField:
     family = state.family
     if family in SIZED:
         return SIZED[family](pair, state)
-    found = recorded_field(pair) if family == "auto" else FIELDS[family]()
+    found = recorded_field(pair) if family == "auto" else named_field(family)
     if state.displacement is not None and isinstance(found, HomographyDisplacement | Rectified):
         return SIZED["homography" if isinstance(found, HomographyDisplacement) else "rectified"](pair, state)
     return found
@@ -294,9 +294,9 @@ def correlations(
 
 
 def jacobian(pair: Pair, x: Float[Tensor, "1 2"]) -> Float[Tensor, "2 2"]:
-    """The Jacobian of H at x; the identity where H maps x to infinity."""
+    """The Jacobian at x of the rough transfer to beta; the identity where there is none."""
     ends = torch.cat([x, x + x.new_tensor([[0.5, 0.0], [0.0, 0.5]]), x - x.new_tensor([[0.5, 0.0], [0.0, 0.5]])])
-    transformed, valid = apply_homography(pair.homography.to(x), ends)
+    transformed, valid = rough_transfer(pair, ends)
     return (transformed[1:3] - transformed[3:5]).T if bool(valid.all()) else torch.eye(2, dtype=x.dtype)
 
 
@@ -327,7 +327,8 @@ def depths(
     """The depth in alpha of each sample, NaN where it has none or the pair is not calibrated."""
     if pair.link is not None or not pair.calibrated:
         return torch.full_like(xy[:, 0], torch.nan)
-    found = depth_of(pair, x.expand(len(xy), 2), xy)
+    pinholes = pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view
+    found = (depth_of if pinholes else ray_depth)(pair, x.expand(len(xy), 2), xy)
     return torch.where(found.valid & valid, found.depth, torch.nan)
 
 

@@ -23,6 +23,7 @@ def serve(
     images: Mapping[str, Float[Tensor, "_ _ _"]],
     *,
     alpha: str | None = None,
+    field: str = "auto",
     port: int = 0,
     browser: bool = True,
 ) -> None:
@@ -34,11 +35,11 @@ def serve(
     """
     check_port(port)
     scene, alpha = prepared(rig, images, alpha)
-    Explorer(scene, alpha).panel()  # once beforehand: what is imported and compiled for it must not delay the page
+    Explorer(scene, alpha, field).panel()  # once beforehand: what it imports and compiles must not delay the page
     pn.config.raw_css = [*pn.config.raw_css, PAGE]
     port = port or free_port()
     server = pn.serve(
-        {"/": lambda: Explorer(scene, alpha).panel()},
+        {"/": lambda: Explorer(scene, alpha, field).panel()},
         port=port,
         address="localhost",
         websocket_origin=[f"{name}:{port}" for name in OWN_NAMES],

@@ -65,10 +65,11 @@ def depth_and_confidence(
     for beta, place, position, confidence in zip(part.betas, placements, output.position, output.confidence):
         if not place.has_depth:
             continue
-        pair, track, offset = place.pair, place.track(x), like.new_tensor(beta.offset)
+        pair, offset = place.pair, like.new_tensor(beta.offset)
         where = position[0, :, :h, :w].movedim(0, -1)
-        found = depth_from_track(track, (where + offset).reshape(-1, 2))
-        if beta.field.pixels is not None and pair.depth is not None:
+        found = place.depth(x, (where + offset).reshape(-1, 2))
+        if beta.field.pixels is not None and pair.depth is not None and place.has_track:
+            track = place.track(x)
             near, far = (bound.to(found.depth) for bound in pair.depth)
             beyond = ~(found.valid & (found.depth >= near) & (found.depth <= far))
             if bool(beyond.any()):

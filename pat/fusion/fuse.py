@@ -11,6 +11,7 @@ import torch
 
 from arraygeom import ReceptiveField, Rig
 from arraygeom.chunks import Tile
+from arraygeom.threads import torch_in_one_thread
 
 from ..matching.match import Matcher, match
 from ..matching.radiometry import Given
@@ -34,6 +35,7 @@ Progress = Callable[[Iterable[Tile], int], Iterable[Tile]]
 """Wraps the tiles (and their number) to show how far the work is, as `rich.progress.track` does."""
 
 
+@torch_in_one_thread()
 def fuse(
     network: FusionNetwork,
     rig: Rig,
@@ -154,6 +156,7 @@ def fuse(
         return frame if differentiable else Frame(*(part.detach() for part in frame))
 
 
+@torch_in_one_thread()
 def corrections_of(
     network: FusionNetwork,
     rig: Rig,

@@ -5,20 +5,23 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from arraygeom import Moved, Pair
-from arraygeom.epipolar import Track
+from arraygeom import Curved, Moved, Pair, ReceptiveField, Widened, depth_of
+from arraygeom.epipolar import Depth, Track
 from arraygeom.fields import default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
+from arraygeom.fields.ray_depth import ray_depth
 from arraygeom.pixels import HW
 
 from ..matching.inputs import Beta, Inputs
+from ..matching.matches import combined_bands
+from ..matching.tangents import along_tangents
 from ..networks.protocol import FusionNetwork
 from .steps import FusionStep, Undo
 from .views import Views
@@ -34,15 +37,27 @@ class Placement(NamedTuple):
 
     pair: Pair
     points: Callable[[Tensor], Tensor]
+    bounds: Literal["depth", "distance"] = "depth"
 
     @property
     def has_depth(self) -> bool:
         """Whether positions in beta give depth."""
         return self.pair.link is None and self.pair.calibrated
 
+    @property
+    def has_track(self) -> bool:
+        """Whether they do by a straight track."""
+        return self.has_depth and not self.pair.has_lens
+
     def track(self, x: Float[Tensor, "*n 2"]) -> Track:
-        """The tracks in beta of alpha's pixels."""
+        """The tracks in beta of alpha's pixels, of pinholes."""
         return pinhole_track(self.pair, self.points(x))
+
+    def depth(self, x: Float[Tensor, "*n 2"], x_beta: Float[Tensor, "*n 2"]) -> Depth:
+        """The depth of what alpha's pixels see at beta's pixels, or its distance if `bounds` are of that."""
+        if self.pair.alpha.has_pinhole_view and self.pair.beta.has_pinhole_view and self.bounds == "depth":
+            return depth_of(self.pair, self.points(x), x_beta)
+        return ray_depth(self.pair, self.points(x), x_beta, self.bounds)
 
 
 class FrameInputs(NamedTuple):
@@ -113,13 +128,22 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
         pair = views.pair(name)
         field = views.fields.get(name) or default_field(pair)
         on_grid = FieldOnGrid.of(field, pair, hw=(alpha.shape[-2], alpha.shape[-1]), blocks=m % BLOCK == 0)
-        place = Placement(pair, field.points if isinstance(field, Moved) else lambda x: x)
-        betas.append(Beta(image, on_grid, track=place.track if place.has_depth else None))
+        if network.uses_matches and on_grid.pixels is None:
+            on_grid = along_tangents(alpha, combined_bands(image), on_grid, name)
+        place = Placement(pair, field.points if isinstance(field, Moved) else lambda x: x, bounds_of(field))
+        betas.append(Beta(image, on_grid, track=place.track if place.has_track else None))
         if not on_grid.any_valid(pair.alpha.hw):
             bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} m"
             raise ValueError(f"alpha's and '{name}'s views do not overlap{bounds}: check the poses and the depth range")
         placements.append(place)
     return FrameInputs(Inputs(alpha, tuple(betas), m, network.beta_halo, bands=network.bands), placements, hw)
+
+
+def bounds_of(field: ReceptiveField) -> Literal["depth", "distance"]:
+    """What a field's depth range is of."""
+    while isinstance(field, Widened | Moved):
+        field = field.field
+    return field.bounds if isinstance(field, Curved) else "depth"
 
 
 def padded(image: Tensor, multiple: int) -> Tensor:

@@ -18,6 +18,7 @@ from torch import Tensor
 from arraygeom import sample
 from arraygeom.chunks import chunked
 from arraygeom.pixels import HW
+from arraygeom.threads import torch_in_all_threads
 
 from ..media.colour import luminance
 from ..networks.collaborative import luma_refined, without_noise
@@ -188,6 +189,7 @@ def noisy_view(image: Float[Tensor, "c h w"], level: NoiseLevel) -> NoisyView | 
     return NoisyView(recorded, denoised(recorded, deviation), deviation)
 
 
+@torch_in_all_threads()
 @torch.no_grad()
 def denoised(image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
     """An image without noise of this standard deviation; bands other than three are denoised one by one."""
@@ -198,6 +200,7 @@ def denoised(image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"
     return torch.cat([in_tiles(partial(without_noise, network.band), *band) for band in bands], 1)
 
 
+@torch_in_all_threads()
 @torch.no_grad()
 def jointly_denoised(
     image: Float[Tensor, "3 h w"], alpha: NoisyView, betas: Sequence[NoisyView], found: Float[Tensor, "n 3 h w"]

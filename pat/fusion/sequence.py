@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Moved, ReceptiveField, Rig, Widened
-from arraygeom.fields import default_field
+from arraygeom.fields.default import straight_field
 
 from ..matching.normalisation import mean_moments
 from ..matching.radiometry import Given, Response
@@ -165,7 +165,7 @@ class SequenceFusion:
 
     def _field(self, name: str, index: int, time: float) -> tuple[ReceptiveField, Tensor]:
         """The field of a beta that records at `time`, and the weight of the motion until then."""
-        field = self.field or default_field(self.rig.pair(self.alpha, name))
+        field = self.field or straight_field(self.rig.pair(self.alpha, name))
         weight = torch.ones(self.rig[self.alpha].hw)
         steps = (time - self._time(index)) * self.timeline.rate(self.alpha)
         count = len(self.frames[self.alpha])

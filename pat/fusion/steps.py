@@ -28,12 +28,12 @@ from arraygeom import (
     ThroughLenses,
     View,
     Widened,
-    apply_homography,
     pinhole_view,
     pixel_grid,
     resampled,
 )
 from arraygeom.fields.default import default_field
+from arraygeom.fields.ray_depth import rough_transfer
 from arraygeom.pixels import coarse_grid, map_homogeneous, shift_matrix
 from arraygeom.undistortion import pixels_between, sampled_between
 
@@ -77,7 +77,8 @@ def _as_it_is(frame: Frame) -> Frame:
 
 @dataclass(frozen=True)
 class Undistort:
-    """Pinhole views in place of views with lenses (up to 62 degrees off axis), unless a field goes through lenses.
+    """Pinhole views in place of views with lenses (up to 62 degrees off axis), unless a field goes through lenses, or
+    a camera has no pinhole view.
 
     Undone, the frame is at alpha's own pixels: the fusion's difference from alpha is resampled and added to alpha's
     own image, and what the pinhole view leaves out has confidence 0.
@@ -85,9 +86,9 @@ class Undistort:
 
     def do(self, views: Views) -> Done:
         """Resample every image with a lens."""
-        if not any(_has_lens(views.rig[name]) for name in views.images) or any(
-            map(_through_lenses, views.fields.values())
-        ):
+        cameras = [views.rig[name] for name in views.images]
+        as_recorded = any(map(_through_lenses, views.fields.values())) or not all(c.has_pinhole_view for c in cameras)
+        if as_recorded or not any(map(_has_lens, cameras)):
             return Done(views, _as_it_is)
         rig, images = without_lenses(views.rig, views.images)
         lens, pinhole = views.rig[views.alpha], rig[views.alpha]
@@ -286,5 +287,5 @@ def _steps_in_beta(pair: Pair) -> Float[Tensor, "2 2"] | None:
     h, w = pair.alpha.hw
     middle = torch.tensor([[(w - 1) / 2, (h - 1) / 2]], dtype=torch.float64)
     steps = torch.cat([middle, middle + torch.tensor([[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)])
-    x, valid = apply_homography(pair.homography.detach().double(), steps)
+    x, valid = rough_transfer(pair, steps)
     return x[1:] - x[:1] if bool(valid.all()) else None

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from arraygeom import pixel_grid
 from arraygeom.chunks import Box, Tile, area, assembled, sides_by_work, tiles_of, whole
 from arraygeom.pixels import HW
+from arraygeom.threads import torch_in_all_threads
 
 from ..matching.inputs import Inputs
 from ..matching.matches import Matches
@@ -207,7 +208,8 @@ def _fused(
 ) -> FusedTile:
     top, bottom, left, right = tile.inner
     box = (top - tile.outer[0], bottom - tile.outer[0], left - tile.outer[2], right - tile.outer[2])
-    output = network(inputs, matches).cut(box)
+    with torch_in_all_threads():
+        output = network(inputs, matches).cut(box)
     part = replace(inputs, betas=tuple(replace(beta, field=beta.field.cut(box)) for beta in inputs.betas))
     hw = bottom - top, right - left
     depth, confidence = depth_and_confidence(output, part, frame.placements, hw, (left, top))

@@ -19,6 +19,7 @@ from arraygeom import (
     sampling_locations,
 )
 from arraygeom.fields import FIELDS, default_field, recorded_field
+from arraygeom.fields.default import straight_field
 from tests.arraygeom.rigs import random_rig
 
 HW, BETA_HW = (20, 30), (60, 40)
@@ -64,7 +65,8 @@ def test_recorded_images_are_seen_through_their_lenses():
     assert recorded_field(calibrated(lens=True)) == Curved(256)
     assert recorded_field(calibrated(lens=True), samples=64, nodes=16) == Curved(64, nodes=16)
     through = recorded_field(linked(calibrated(lens=True)), samples=9)
-    assert through == ThroughLenses(default_field(linked(calibrated(lens=True))), 9)
+    assert through == ThroughLenses(straight_field(linked(calibrated(lens=True))), 9)
+    assert default_field(calibrated(lens=True)) == Curved()
 
 
 def test_drawings_need_no_depth_range():

@@ -2,11 +2,12 @@
 
 import threading
 import time
+from contextlib import nullcontext
 
 import pytest
 import torch
 
-from arraygeom.threads import in_parallel
+from arraygeom.threads import in_parallel, threads, torch_in_all_threads, torch_in_one_thread
 
 
 class Noted(list):
@@ -50,3 +51,45 @@ def test_an_error_is_raised_once_no_task_runs_any_more(monkeypatch):
         in_parallel(tasks)
     assert done == ["slow"]
     assert sorted(begun) == ["fails", "slow"]
+
+
+@pytest.fixture
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_torch_runs_in_one_thread_beside_the_pool_and_has_its_own_back(two_threads):
+    """Else its threads and the pool's are more than there are cores."""
+    with torch_in_one_thread():
+        assert (torch.get_num_threads(), threads()) == (1, 2)
+        with torch_in_all_threads():
+            assert torch.get_num_threads() == 2
+        with torch_in_one_thread():
+            assert threads() == 2
+        assert torch.get_num_threads() == 1
+    with pytest.raises(OSError, match="full"), torch_in_one_thread():
+        raise OSError("full")
+    assert (torch.get_num_threads(), threads()) == (2, 2)
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_every_task_has_torch_in_its_own_thread_alone(two_threads, alone):
+    both, counts = threading.Barrier(2, timeout=60), []
+
+    def task():
+        both.wait()
+        counts.append((threading.get_ident(), torch.get_num_threads()))
+
+    with torch_in_one_thread() if alone else nullcontext():
+        in_parallel([task, task])
+    assert [count for _, count in counts] == [1, 1]
+    assert len({thread for thread, _ in counts}) == 2
+    assert torch.get_num_threads() == 2
+    born = []
+    other = threading.Thread(target=lambda: born.append(torch.get_num_threads()))
+    other.start()
+    other.join()
+    assert born == [2]

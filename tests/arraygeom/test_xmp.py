@@ -5,12 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tifffile
 import torch
 
 from arraygeom import Band, Rig
 from arraygeom.io import RigFileError, RigFileWarning, recognise
 from arraygeom.io.xmp import named_by_band
+
+tifffile = pytest.importorskip("tifffile")
 
 FISHEYE = {
     "ModelType": "fisheye",

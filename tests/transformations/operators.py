@@ -31,6 +31,7 @@ def vector(*numbers: float) -> Tensor:
 RIG = random_rig(1)
 PAIR = RIG.pair("alpha", "beta")
 A, B = PAIR.cameras
+ROWS = A.K.new_tensor([[1.0], [1.0], [0.0]])
 BROWN = A.replace(distortion=Distortion("brown-conrady", vector(-0.1, 0.02, 1e-3, -5e-4)))
 FISHEYE = A.replace(distortion=Distortion("kannala-brandt", vector(0.05, -0.01, 0.002, -1e-3)))
 SPHERES = Distortion("double-sphere", vector(-0.2, 0.57))
@@ -120,7 +121,7 @@ GEOMETRY = {
     "sample": Operator(lambda x: ag.sample(_image(), x.reshape(1, -1, 2) / 10).values, X),
     "to_grid": Operator(lambda x: ag.to_grid(pixels(x), (48, 64)), X),
     "Camera.project": Operator(lambda x: A.project(x.reshape(-1, 3) @ A.R + A.centre).x, POINTS),
-    "Camera.resize": Operator(lambda w: A.replace(K=A.K + w[0]).resize((24, 30)).rot90(1).K, W),
+    "Camera.resize": Operator(lambda w: A.replace(K=A.K + w[0] * ROWS).resize((24, 30)).rot90(1).K, W),
     "Pose.perturbed, inverse": Operator(lambda w: A.cam_from_world.perturbed(w[:3], w[3:]).inverse().t, W),
     "Camera.unproject": Operator(lambda x: A.unproject(pixels(x), x[::2]), X),
     "Camera.rays": Operator(lambda x: A.rays(pixels(x))[0], X),

@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d
 from arraygeom import Camera, Pose, Rig
 from pat import fuse, load_weights
 from pat.cli.authors import with_found_rig
-from pat.cli.from_images import camera_names
+from pat.cli.from_images import camera_names, found_rig
 from pat.cli.main import main
 from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
@@ -230,3 +230,13 @@ def test_a_wrong_rig_is_refused_before_the_work_with_the_doctors_verdict(
     assert "behind the cameras or outside the depth range" in text
     assert said in text
     assert not (tmp_path / "out").exists()
+
+
+def test_why_there_is_no_depth_is_said(halved, monkeypatch):
+    """Images of which no pose was found gave none, without a word."""
+    monkeypatch.setattr("pat.cli.from_images.self_calibrated", lambda *given, **options: None)
+    monkeypatch.setattr("pat.cli.from_images.MATCHED", 300)
+    lines = []
+    rig, _ = found_rig(halved[1], "mono", {}, load_weights("mono-colour"), lines.append)
+    assert not isinstance(rig["mono"], Camera)
+    assert any(line.startswith("no depth: no position of colour beside mono") for line in lines)

@@ -1,6 +1,7 @@
 """Fusion of noisy views."""
 
 import warnings
+from dataclasses import replace
 from functools import cache, partial
 
 import pytest
@@ -181,7 +182,7 @@ def test_what_is_held_for_low_light_is_planned_for(network):
 def test_the_time_announced_has_the_correction_in_it(network, monkeypatch):
     sample, images, noise = in_low_light(200, middle=True)
     monkeypatch.setattr(pat.fusion.tiles, "ESTIMATED", 0)
-    monkeypatch.setattr(pat.fusion.low_light, "JOINTLY", 1e4)
+    monkeypatch.setattr(pat.fusion.low_light, "SETTINGS", replace(pat.fusion.low_light.SETTINGS, jointly=1e4))
     plans, steps = [], []
     with steps_shown(steps.append):
         fuse(network, sample.rig, images, alpha=ALPHA, noise=noise, announce=plans.append)

@@ -1,0 +1,170 @@
+"""What constructors refuse: numbers that no camera, pose, lens or field has, each in one sentence.
+
+Numbers cannot be asked while torch compiles, traces or transforms: nothing is checked then, nor within `unchecked`.
+"""
+
+from __future__ import annotations
+
+import operator
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from .tracing import followed
+
+T = TypeVar("T")
+
+LARGEST_SIDE, MOST_PIXELS = 65_535, 2**30
+"""A size beyond these bounds is more likely a damaged number than an image (the largest sensors have 4e8 pixels)."""
+ROUNDED = 1e-3
+"""Numbers in text files are rounded: up to this much of R R^T - I, or in the last row of K, is rounding."""
+SINGULAR = 1e-9
+"""A K whose upper block has a smaller determinant, pixels squared, maps the plane to a line."""
+
+_state = threading.local()
+
+
+@contextmanager
+def unchecked() -> Iterator[None]:
+    """A block in which constructors take what they are given, for loops in which each microsecond counts."""
+    before, _state.off = getattr(_state, "off", False), True
+    try:
+        yield
+    finally:
+        _state.off = before
+
+
+def derived(make: Callable[..., T], *args: Any, **kwargs: Any) -> T:
+    """What is made of numbers that were checked, without asking them again."""
+    if followed():
+        return make(*args, **kwargs)
+    with unchecked():
+        return make(*args, **kwargs)
+
+
+def checking() -> bool:
+    """Whether constructors check their numbers here and now."""
+    return not followed() and not getattr(_state, "off", False)
+
+
+def check_numbers(value: Any, shape: tuple[int, ...], what: str) -> Tensor:
+    """The value, detached, if it is a tensor of finite numbers (\\*b, \\*shape). Raises TypeError or ValueError."""
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{what} is a {type(value).__name__}: give a tensor of {_shape(shape)} numbers")
+    if not value.is_floating_point():
+        raise TypeError(f"{what} holds {value.dtype}: give floating-point numbers, as by `.double()`")
+    if tuple(value.shape[value.ndim - len(shape) :]) != shape or value.ndim < len(shape):
+        raise ValueError(f"{what} has shape {tuple(value.shape)}; wanted (..., {_shape(shape)})")
+    value = value.detach()
+    if not value.is_meta and not bool(value.isfinite().all()):
+        raise ValueError(f"{what} holds NaN or infinity: did the calibration fail?")
+    return value
+
+
+def check_rotation(R: Any) -> None:
+    """Raises ValueError unless R (\\*b, 3, 3) is a rotation but for rounding."""
+    R = check_numbers(R, (3, 3), "R")
+    if R.is_meta or not R.numel():
+        return
+    wide = R.double() if R.dtype != torch.float64 else R
+    if not bool((torch.linalg.det(wide) > 0).all()):
+        raise ValueError("R is a reflection or singular (determinant not 1), not a rotation: was an axis flipped?")
+    error = float((wide @ wide.mT - torch.eye(3, dtype=wide.dtype, device=wide.device)).abs().max())
+    if error > max(ROUNDED, 4 * torch.finfo(R.dtype).eps):
+        raise ValueError(f"R is not a rotation (R R^T is off by {error:.2g}): was it scaled, or a row lost?")
+
+
+def check_K(K: Any) -> None:
+    """Raises ValueError unless K (\\*b, 3, 3) takes the plane z = 1 to pixels."""
+    K = check_numbers(K, (3, 3), "K")
+    if K.is_meta or not K.numel():
+        return
+    if float((K[..., 2, :] - K.new_tensor([0, 0, 1])).abs().max()) > ROUNDED:
+        last = [float(f"{v:.4g}") for v in K[..., 2, :].reshape(-1, 3)[0].tolist()]
+        raise ValueError(f"K has last row {last}, wanted [0, 0, 1]: is it transposed, or scaled?")
+    area = K[..., 0, 0] * K[..., 1, 1] - K[..., 0, 1] * K[..., 1, 0]
+    if not bool((area.abs() > SINGULAR).all()):
+        raise ValueError("K has a focal length of 0: wanted [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], in pixels")
+
+
+def check_hw(hw: Any) -> None:
+    """Raises ValueError unless hw is the (height, width) of an image."""
+    try:
+        h, w = map(operator.index, hw)
+    except (TypeError, ValueError):
+        raise ValueError(f"hw is {hw!r}; wanted (height, width) in whole pixels") from None
+    if min(h, w) < 1:
+        raise ValueError(f"hw is {(h, w)}; wanted (height, width), each 1 or more")
+    if max(h, w) > LARGEST_SIDE or h * w > MOST_PIXELS:
+        raise ValueError(
+            f"hw is {(h, w)}; images of up to {LARGEST_SIDE} pixels a side and {MOST_PIXELS / 1e6:.0f} million in all "
+            "are supported: is it in pixels?"
+        )
+
+
+def check_batches(what: str, *shapes: tuple[int, ...]) -> None:
+    """Raises ValueError unless batch axes broadcast."""
+    try:
+        torch.broadcast_shapes(*shapes)
+    except RuntimeError:
+        listed = " and ".join(map(str, map(tuple, shapes)))
+        raise ValueError(f"the batch axes of {what} are {listed}: give all the same, or none") from None
+
+
+def check_above(least: float, *, whole: bool = False, itself: bool = True, **values: Any) -> None:
+    """Raises unless each value that is not None is a number of at least `least`, or above it if not `itself`.
+
+    TypeError for what is no number.
+    """
+    bound = f"of {least:g} or more" if itself else f"above {least:g}"
+    wanted = f"wanted a {'whole number' if whole else 'number'} {bound}"
+    for name, value in values.items():
+        if value is None or isinstance(value, Tensor):
+            continue
+        try:
+            number = operator.index(value) if whole else float(value)
+        except (TypeError, ValueError):
+            raise TypeError(f"{name} is a {type(value).__name__}: {wanted}") from None
+        if not (number > least or (itself and number == least)):
+            raise ValueError(f"{name} is {value}: {wanted}")
+
+
+def check_bounds(near: Any, far: Any) -> None:
+    """Raises unless near and far, where given, are numbers with 0 < near <= far (metres)."""
+    for name, value in (("near", near), ("far", far)):
+        if value is None or isinstance(value, Tensor):
+            continue
+        if not isinstance(value, int | float):
+            hint = ": a field is made first and called then, as Epipolar()(pair, x)" if name == "near" else ""
+            raise TypeError(f"{name} is a {type(value).__name__}, wanted metres{hint}")
+        if not value > 0:
+            raise ValueError(f"{name} is {value:g}: wanted metres above 0")
+    if isinstance(near, int | float) and isinstance(far, int | float) and near > far:
+        raise ValueError(f"near is {near:g} m and far {far:g} m: exchange them")
+
+
+def check_pixels(x: Any) -> None:
+    """Raises unless x are pixels (\\*n, 2)."""
+    if not isinstance(x, Tensor):
+        raise TypeError(f"the pixels are a {type(x).__name__}: give a tensor of (x, y)")
+    if x.ndim < 1 or x.shape[-1] != 2:
+        raise ValueError(f"the pixels have shape {tuple(x.shape)}; wanted (..., 2), each (x, y)")
+
+
+def check_field(field: Any, where: str = "") -> None:
+    """Raises TypeError unless it is a field that can be called: not its class."""
+    if isinstance(field, type):
+        raise TypeError(f"{where}{field.__name__} is a class: make a field of it, {field.__name__}()")
+    if not callable(field):
+        raise TypeError(
+            f"{where}a field is a function of a pair and alpha's pixels, this is a {type(field).__name__}: "
+            "give a field such as Epipolar()"
+        )
+
+
+def _shape(shape: tuple[int, ...]) -> str:
+    return " x ".join(map(str, shape))

@@ -1,0 +1,116 @@
+"""Camera models by angle: fisheye polynomials of any powers, and the whole sphere."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .common import angle_over_radius, cosine_and_sinc, finite_points
+from .model import CameraModel, beside_points
+
+BISECTIONS, NEWTON = 28, 3
+"""Halvings of a solution's bounds, after which so many steps of Newton's leave rounding, in float64."""
+STEPS = 512
+"""Angles at which a polynomial is checked to increase."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
+    """The angle theta from the axis goes to the radius theta + k2 theta^2 + k3 theta^3 + ...: odd and even powers.
+
+    Without coefficients it is the equidistant fisheye. `widest` is the angle, radians, up to which the lens was
+    calibrated, at most pi; where the radius stops increasing it ends before.
+    """
+
+    item_axes: ClassVar = {"k": 1}
+    k: Float[Tensor, "*b n"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
+    widest: Float[Tensor, "*b"] = field(default_factory=lambda: torch.tensor(math.pi, dtype=torch.float64))
+
+    def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
+        """Directions at up to `widest` from the axis; the point (0, 0, 0) is not seen."""
+        X, finite = finite_points(X)
+        squared = X[..., :2].square().sum(-1)
+        ratio = angle_over_radius(squared, X[..., 2])
+        off = squared > 0
+        theta = torch.where(
+            off, ratio * torch.where(off, squared, 1.0).sqrt(), torch.where(X[..., 2] < 0, math.pi, 0.0)
+        )
+        scale, _ = self._radius_over_angle(theta)
+        valid = finite & (theta <= self._limit(X)) & (X != 0).any(-1)
+        return X[..., :2] * (ratio * scale)[..., None], valid
+
+    def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
+        """Unit directions: the inverse of `project`, by bisection and a step of Newton's, which has the gradient."""
+        xy, finite = finite_points(xy)
+        squared = xy.square().sum(-1)
+        off = squared > 0
+        radius = torch.where(off, torch.where(off, squared, 1.0).sqrt(), 0.0)
+        with torch.no_grad():
+            low, high = torch.zeros_like(radius), self._limit(xy).expand_as(radius).clone()
+            valid = finite & (radius <= high * self._radius_over_angle(high)[0])
+            for _ in range(BISECTIONS):
+                middle = 0.5 * (low + high)
+                beyond = middle * self._radius_over_angle(middle)[0] > radius
+                low, high = torch.where(beyond, low, middle), torch.where(beyond, middle, high)
+            theta = 0.5 * (low + high)
+        for _ in range(NEWTON):
+            scale, slope = self._radius_over_angle(theta)
+            theta = theta + (radius - theta * scale) / torch.where(valid & (slope > 0), slope, 1.0)
+        cosine, sinc = cosine_and_sinc(theta.square())
+        share = torch.where(off, theta / torch.where(off, radius, 1.0), 1.0)
+        return torch.cat([xy * (sinc * share)[..., None], cosine[..., None]], -1), valid
+
+    def _radius_over_angle(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """radius / theta, and the derivative of the radius."""
+        k = beside_points(self.k, theta[..., None], 1)
+        ratio, slope = torch.ones_like(theta), torch.ones_like(theta)
+        for i in range(k.shape[-1]):
+            ratio = ratio + k[..., i] * theta ** (i + 1)
+            slope = slope + (i + 2) * k[..., i] * theta ** (i + 1)
+        return ratio, slope
+
+    @torch.no_grad()
+    def _limit(self, points: Tensor) -> Tensor:
+        """The widest angle, beside points (*b, ..., k)."""
+        widest = self.widest.to(points.dtype).clamp(max=math.pi)
+        batch = torch.broadcast_shapes(widest.shape, self.k.shape[:-1])
+        theta = widest[..., None].expand(*batch, 1) * torch.linspace(0, 1, STEPS).to(widest)
+        increases = (self._radius_over_angle(theta)[1] > 0).long().cumprod(-1)
+        last = (increases.sum(-1, keepdim=True) - 1).clamp(min=0)
+        return beside_points(theta.gather(-1, last)[..., 0], points)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Equirectangular(CameraModel, name="equirectangular"):
+    """Longitude and latitude, radians: x to the right of the axis, up to pi either way, y down, up to pi / 2.
+
+    The K of a whole sphere W pixels wide has the focal length W / (2 pi) and the image's middle as its centre.
+    """
+
+    period: ClassVar[float] = 2 * math.pi
+
+    def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
+        """Any direction; the point (0, 0, 0) is not seen."""
+        X, finite = finite_points(X)
+        x, y, z = X.unbind(-1)
+        squared = x.square() + z.square()
+        off = squared > 0
+        level = torch.where(off, torch.where(off, squared, 1.0).sqrt(), 0.0)
+        longitude = torch.atan2(torch.where(off, x, 0.0), torch.where(off, z, 1.0))
+        seen = finite & (off | (y != 0))
+        return torch.stack([longitude, torch.atan2(y, torch.where(seen, level, 1.0))], -1), seen
+
+    def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
+        """Unit directions."""
+        xy, finite = finite_points(xy)
+        longitude, latitude = xy.unbind(-1)
+        level = latitude.cos()
+        ray = torch.stack([level * longitude.sin(), latitude.sin(), level * longitude.cos()], -1)
+        rounding = 1 + 8 * torch.finfo(xy.dtype).eps
+        on = (longitude.abs() <= math.pi * rounding) & (latitude.abs() <= math.pi / 2 * rounding)
+        return ray, finite & on

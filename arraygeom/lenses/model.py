@@ -1,0 +1,126 @@
+"""The protocol that every camera model follows, and the models by name."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar, Literal, TypeVar
+
+import torch
+from jaxtyping import Bool, Float, Real
+from torch import Tensor
+
+from ..batching import Batched
+from ..pixels import floating, to_homogeneous
+
+AnyLens = TypeVar("AnyLens", bound="LensModel")
+
+CAMERA_MODELS: dict[str, type[CameraModel]] = {}
+"""The models that rig files know by name, each with its own numbers: those that were defined with one."""
+
+
+class LensModel(Batched):
+    """What `Camera.distortion` holds: a `Distortion` or a `CameraModel`."""
+
+    central: ClassVar[bool] = True
+    """Whether all rays start in the camera's origin."""
+    even: ClassVar[Literal["pixels", "distance"]] = "pixels"
+    """Along which a ray of another camera is followed evenly, of models that are not central."""
+    period: ClassVar[float] = 0.0
+    """After how much of the image plane it repeats itself; 0: never."""
+    model: str
+    """Its name in rig files."""
+    coefficients: Float[Tensor, "*b n"]
+    """Its own numbers, one after the other."""
+
+    def project(self, X: Real[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+        """Points in the camera's frame to points of the image plane, and which are seen."""
+        raise NotImplementedError(f"{type(self).__name__} has no project(X): points (..., 3) to (x, y) and valid")
+
+    def unproject(self, xy: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
+        """The directions of rays of points of the image plane, of any length, and which have one."""
+        raise NotImplementedError(f"{type(self).__name__} has no unproject(xy): points (..., 2) to rays and valid")
+
+    def origins(self, xy: Real[Tensor, "*n 2"]) -> Float[Tensor, "*n 3"]:
+        """Where those rays start, metres in the camera's frame."""
+        return torch.zeros_like(to_homogeneous(floating(xy)))
+
+    @property
+    def harmless(self) -> bool:
+        """Whether it is a pinhole after all."""
+        return False
+
+    @property
+    def sees_behind(self) -> bool:
+        """Whether the model may have directions at 90 degrees or more off axis."""
+        return True
+
+    def undistort(self, xy: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+        """Points of the image plane to those of a pinhole, and which it has."""
+        ray, valid = self.unproject(xy)
+        ahead = ray[..., 2] > 0
+        return ray[..., :2] / torch.where(ahead, ray[..., 2], 1.0)[..., None], valid & ahead
+
+    def distort(self, xy: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+        """Points of a pinhole to those of the image plane."""
+        return self.project(to_homogeneous(floating(xy)))
+
+    def with_coefficients(self: AnyLens, coefficients: Float[Tensor, "*b n"]) -> AnyLens:
+        """The same with other numbers."""
+        raise NotImplementedError
+
+
+class CameraModel(LensModel):
+    """How points in a camera's frame become points (x, y) of its image plane, which `K` then takes to pixels.
+
+    A model of one's own is a frozen dataclass with `project` and `unproject`, the one the inverse of the other, and
+    tensors for its numbers; defined with a name, rig files hold it. It goes where a lens does, in `Camera.distortion`.
+    Resizing, cropping and rotating an image change `K` alone. Rays that do not start in the camera's origin also need
+    `origins`, and `central = False`.
+    """
+
+    registered: ClassVar[str] = ""
+
+    def __init_subclass__(cls, *, name: str = "", **rest: Any) -> None:
+        super().__init_subclass__(**rest)
+        cls.registered = name
+        known = CAMERA_MODELS.get(name)
+        if name and known is not None and known.__qualname__ != cls.__qualname__:
+            raise ValueError(f"a camera model named '{name}' exists: {known.__module__}.{known.__qualname__}")
+        if name:
+            CAMERA_MODELS[name] = cls
+
+    @property
+    def model(self) -> str:  # type: ignore[override]
+        """The name in rig files."""
+        return type(self).registered or type(self).__name__
+
+    @property
+    def coefficients(self) -> Float[Tensor, "*b n"]:  # type: ignore[override]
+        """The model's own numbers, one after the other."""
+        numbers = [t.flatten(t.ndim - axes) if axes else t[..., None] for t, axes in self._own().values()]
+        batch = torch.broadcast_shapes(*(t.shape[:-1] for t in numbers))
+        return torch.cat([t.expand(*batch, -1) for t in numbers], -1) if numbers else torch.zeros(0).double()
+
+    def with_coefficients(self: AnyLens, coefficients: Float[Tensor, "*b n"]) -> AnyLens:
+        """The same model with other numbers."""
+        own = self._own()  # type: ignore[attr-defined]
+        sizes = [t.shape[t.ndim - axes :].numel() for t, axes in own.values()]
+        parts = zip(own.items(), coefficients.split(sizes, -1))
+        batch = coefficients.shape[:-1]
+        new = {name: part.reshape((*batch, *t.shape[t.ndim - axes :])) for (name, (t, axes)), part in parts}
+        return dataclasses.replace(self, **new)  # type: ignore[type-var]
+
+    def _text(self) -> str:
+        return self.model
+
+    def _own(self) -> dict[str, tuple[Tensor, int]]:
+        """The model's tensors and the number of their item axes, by field."""
+        held = ((f.name, getattr(self, f.name)) for f in dataclasses.fields(self))  # type: ignore[arg-type]
+        return {name: (t, self.item_axes.get(name, 0)) for name, t in held if isinstance(t, Tensor)}
+
+
+def beside_points(number: Tensor, points: Tensor, axes: int = 0) -> Tensor:
+    """A model's number (*b, and `axes` of its own) for points (*b, ..., k): axes of length 1 for the points'."""
+    batch = number.ndim - axes
+    own = number.shape[batch:]
+    return number.to(points.dtype).reshape((*number.shape[:batch], *[1] * (points.ndim - 1 - batch), *own))

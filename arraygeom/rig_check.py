@@ -1,0 +1,146 @@
+"""What is odd about a rig: numbers that may be, and are mistakes more often than not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations, permutations
+from typing import TYPE_CHECKING
+
+import torch
+
+from .camera import Camera, LensView
+from .checks import derived
+from .pixels import coarse_grid
+
+if TYPE_CHECKING:
+    from .rig import Rig
+
+SMALLEST_BASELINE, LARGEST_BASELINE = 1e-4, 50.0
+"""A baseline outside these bounds, in metres, is more likely a mistaken unit than a camera array."""
+NARROWEST, WIDEST = 0.5, 140.0
+"""Degrees across a pinhole's image outside which its focal length is more likely in another unit than pixels: a 1 m
+telephoto lens on an inch of sensor has 1.5, the widest rectilinear lenses have 130."""
+DECENTRED = 0.1
+"""Principal points farther than this from the image's middle, as a share of its longer side, are more likely of another
+image: exchanging the sides of a 4:3 image moves the middle by 0.18, halving the image by 0.3."""
+LEAST_DISPARITY = 0.5
+"""Pixels that matches move from near to far below which depth is not seen."""
+COVERED = 0.5
+"""Share of an image below which its lens model hardly covers it."""
+RANK = 1e-3
+"""Least over largest singular value of F from which it is not of rank two."""
+
+
+def oddities(rig: Rig) -> tuple[str, ...]:
+    """A sentence for each; of a batch of rigs, those of the first."""
+    if rig.batch_shape:
+        rig = rig[(0,) * len(rig.batch_shape)]
+    with torch.no_grad():
+        return tuple(derived(list, _all(rig)))
+
+
+def unit_oddity(rig: Rig) -> str | None:
+    """What to say of baselines that suggest another unit than metres."""
+    centres = [camera.centre for camera in rig.cameras.values() if isinstance(camera, Camera)]
+    if len(centres) < 2:
+        return None
+    longest = float(torch.pdist(torch.stack(centres)).max())
+    if longest > LARGEST_BASELINE:
+        return (
+            f"has cameras {longest:.3g} m apart: is this file in millimetres? "
+            "Then convert it (`pat rig convert`) and write units: millimetres, or read it with scale=0.001; "
+            "if its scale is arbitrary, all is well"
+        )
+    if 0 < longest < SMALLEST_BASELINE:
+        return (
+            f"has cameras at most {1e3 * longest:.3g} mm apart: is this file in metres, and read as millimetres? "
+            "Then read it with scale=1000"
+        )
+    return None
+
+
+def _all(rig: Rig) -> Iterator[str]:
+    if unit := unit_oddity(rig):
+        yield f"the rig {unit}"
+    for name, camera in rig.cameras.items():
+        if isinstance(camera, LensView):
+            yield from _of_lens(name, camera)
+        if isinstance(camera, Camera):
+            yield from _of_K(name, camera)
+    for pair in permutations([n for n, camera in rig.cameras.items() if isinstance(camera, Camera)], 2):
+        yield from _of_overlap(rig, *pair)
+    for pair in combinations([n for n, camera in rig.cameras.items() if isinstance(camera, Camera)], 2):
+        yield from _of_baseline(rig, *pair)
+    yield from _of_sides(rig)
+    for (alpha, beta), link in rig.links.items():
+        values = torch.linalg.svdvals(link.F.double())
+        if values[0] == 0 or values[2] > RANK * values[0]:
+            yield f"F of '{alpha}' and '{beta}' is not of rank two: was it copied whole?"
+
+
+def _of_K(name: str, camera: Camera) -> Iterator[str]:
+    (h, w), K = camera.hw, camera.K.double()
+    focal = float(K[:2, :2].det().abs().sqrt())
+    if K[:2, :2].det() < 0:
+        yield f"'{name}' has a focal length below 0: its image is mirrored"
+    across = float(torch.rad2deg(2 * torch.atan(torch.tensor(max(h, w) / (2 * focal)))))
+    if camera.distortion is None and not NARROWEST < across < WIDEST:
+        yield (
+            f"'{name}' has a focal length of {focal:.4g} px, {across:.3g} degrees across its {w}x{h} pixels: "
+            "is it in pixels, of images of this size?"
+        )
+    off = (K[:2, 2] - K.new_tensor([(w - 1) / 2, (h - 1) / 2])).norm()
+    if off > DECENTRED * max(h, w):
+        x, y = K[:2, 2].tolist()
+        yield (
+            f"'{name}' has its principal point at ({x:.4g}, {y:.4g}), {off:.3g} px from the middle of {w}x{h}: "
+            "is hw (height, width), and K of whole images of this size?"
+        )
+
+
+def _of_lens(name: str, camera: LensView) -> Iterator[str]:
+    if camera.distortion is None:
+        return
+    share = float(camera.rays(coarse_grid(camera.hw).to(camera.K))[1].double().mean())
+    if share < COVERED:
+        yield f"the lens model of '{name}' covers {100 * share:.0f} % of its image: check the coefficients"
+
+
+def _of_overlap(rig: Rig, alpha: str, beta: str) -> Iterator[str]:
+    from .fields.default import recorded_field
+
+    pair = rig.pair(alpha, beta)
+    found = recorded_field(pair)(pair, coarse_grid(rig[alpha].hw).to(rig[alpha].K))
+    if not bool((found.valid if hasattr(found, "valid") else found.mask).any()):
+        bounds = "" if rig.depth is None else f" between {float(rig.depth[0]):g} and {float(rig.depth[1]):g} m"
+        yield (
+            f"'{beta}' sees nothing of what '{alpha}' sees{bounds}: check the poses, which are X_cam = R X_world + t "
+            "with z forward and y down (OpenGL's look along -z), and the depth range"
+        )
+
+
+def _of_baseline(rig: Rig, a: str, b: str) -> Iterator[str]:
+    baseline = float((rig[a].centre - rig[b].centre).norm())
+    if baseline == 0:
+        yield f"'{a}' and '{b}' are at the same position: between them depth has no effect"
+    elif rig.depth is not None:
+        near, far = map(float, rig.depth)
+        focal = float(rig[b].K[:2, :2].det().abs().sqrt())
+        moved = focal * baseline * (1 / near - 1 / far)
+        if near < far and moved < LEAST_DISPARITY:
+            yield (
+                f"'{a}' and '{b}' are {baseline:.3g} m apart: from {near:g} to {far:g} m a match moves by {moved:.2g} "
+                "px; are depth and poses both in metres?"
+            )
+        if focal * baseline / far > 2 * max(rig[b].hw) * focal / float(rig[a].K[:2, :2].det().abs().sqrt()):
+            yield (
+                f"'{a}' and '{b}' are {baseline:.3g} m apart, which is more than the depth of {far:g} m allows: "
+                "are depth and poses both in metres?"
+            )
+
+
+def _of_sides(rig: Rig) -> Iterator[str]:
+    """Cameras called left and right that are the other way round."""
+    left, right = rig.cameras.get("left"), rig.cameras.get("right")
+    if isinstance(left, Camera) and isinstance(right, Camera) and left.cam_from_world.apply(right.centre)[0] < 0:
+        yield "'right' is to the left of 'left': is t a position (t is -R times that), or of the wrong sign?"

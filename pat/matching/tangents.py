@@ -1,0 +1,228 @@
+"""Fields of explicit positions for networks that sample segments: the tangents of their curves at a first match.
+
+Where a pixel's positions follow each other along a curve they are labels like those of a segment: semi-global matching
+at half the size finds one, among neighbours that agree. Positions without an order (a window, the nearest pixels, all)
+have no neighbours to agree with: the best one of each pixel is taken alone. The line through the match along the curve
+then is the pixel's search segment, in pixels of arc from its last position, and what follows is as for any segment.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from arraygeom import Positions, Segments, sample
+from arraygeom.chunks import spans
+from arraygeom.fields.grid import FieldOnGrid
+from arraygeom.fields.widened import direction
+from arraygeom.pixels import HW, pixel_grid
+
+from ..media.colour import to_bytes
+from . import semi_global_numba as kernels
+from .cost import planes_of
+from .positions_numba import costs_at
+from .semi_global import (
+    DISPARITY_FILL,
+    FINE,
+    HALF_SIZE,
+    Normalisation,
+    filled,
+    inner_and_outer,
+    numpy_of,
+)
+
+ORDERED = 0.95
+"""Share of pixels none of whose steps from one position to the next goes back, from which positions are a curve: those
+of a window and of a whole image go back at the end of each row."""
+LEAST_MARGIN = 0.02
+"""Margin of a match to the second best, as of `BetaMatches.facts`, up to which it is filled from its neighbours.
+*size*: what follows matches again, around it."""
+HALF_WINDOW = 8.0
+"""Of a match in a set of positions: how far its segment goes to either side, pixels. *size*"""
+AT_ONCE = 1 << 21
+"""Positions that are asked for at once."""
+
+
+def along_tangents(
+    alpha: Float[Tensor, "1 1 h w"], guide: Float[Tensor, "1 1 hb wb"], field: FieldOnGrid, name: str = "beta"
+) -> FieldOnGrid:
+    """A field of positions of one rig as segments through its matches in the one beta; sides of images are even.
+
+    Warns of positions that have no order. The label of each pixel is a constant; positions keep their gradients.
+    """
+    grid = _BlockCentres(field, (alpha.shape[-2] // FINE, alpha.shape[-1] // FINE))
+    ordered = grid.ordered()
+    if not ordered:
+        warnings.warn(
+            f"the field in '{name}' is a set of positions without an order: each pixel is matched alone", stacklevel=2
+        )
+    with torch.no_grad():
+        labels = torch.from_numpy(_labels(alpha, guide, grid, ordered=ordered))
+    lines = grid.tangents(labels) if ordered else _around(grid.chosen(labels), to_bytes(alpha[:, 0])[0])
+    longest = float(torch.where(lines.valid, lines.length.detach(), 0.0).max())
+    planes = torch.cat([lines.start, lines.end], -1).movedim(-1, 0)[None]
+
+    def at(x: Tensor) -> Segments:
+        there = ((x + 0.5) / FINE - 0.5).to(planes)[None]
+        ends = sample(planes, there, extended=True).values.mT
+        valid = sample(lines.valid[None, None].to(planes), there, extended=True).values[:, 0] > 0.5
+        return Segments(ends[..., :2], ends[..., 2:], valid)
+
+    return FieldOnGrid.evaluated(at, (alpha.shape[-2], alpha.shape[-1]), int(np.ceil(longest)) + 1)
+
+
+@dataclass(frozen=True)
+class _BlockCentres:
+    """The positions of the centres of alpha's blocks of two by two pixels, asked for some rows at a time."""
+
+    field: FieldOnGrid
+    hw: HW
+
+    def at(self, rows: slice, columns: slice) -> Positions:
+        """The positions (h, w, L) of a part."""
+        h, w = self.hw
+        grid = (pixel_grid((h, w), dtype=torch.float64)[rows, columns] + 0.5) * FINE - 0.5
+        found = self.field.at(grid.reshape(-1, 2))
+        if not isinstance(found, Positions):
+            raise TypeError("this field gives segments for some pixels and positions for others: give one kind")
+        return Positions(
+            *(t.reshape(*grid.shape[:2], *t.shape[t.ndim - n :]) for t, n in ((found.xy, 2), (found.mask, 1)))
+        )
+
+    def by_rows(self) -> list[slice]:
+        """Rows that are asked for at once."""
+        rows = max(1, AT_ONCE // (self.hw[1] * self.field.samples))
+        return [slice(*span) for span in spans(self.hw[0], rows)]
+
+    def ordered(self) -> bool:
+        """Whether a pixel's positions follow each other along a curve."""
+        found = self.at(slice(None, None, 8), slice(None, None, 8))
+        if found.xy.shape[-2] < 3:
+            return False
+        steps = found.xy.detach().diff(dim=-2)
+        on = (steps[..., 1:, :] * steps[..., :-1, :]).sum(-1) >= 0
+        counts = found.mask[..., 2:] & found.mask[..., 1:-1] & found.mask[..., :-2]
+        some = counts.any(-1)
+        return bool(some.any()) and float((on | ~counts).all(-1)[some].double().mean()) >= ORDERED
+
+    def tangents(self, labels: Tensor) -> Segments:
+        """The lines through the labels' positions along the curves, as long as these."""
+        parts = [_tangents(self.at(rows, slice(None)), labels[rows]) for rows in self.by_rows()]
+        return Segments(*(torch.cat(part) for part in zip(*parts)))
+
+    def chosen(self, labels: Tensor) -> Chosen:
+        """The positions of whole labels, and where there are some."""
+        parts = []
+        for rows in self.by_rows():
+            found, index = self.at(rows, slice(None)), labels[rows].long()[..., None]
+            xy = found.xy.gather(-2, index[..., None].expand(*index.shape, 2))[..., 0, :]
+            parts.append((xy, found.mask.gather(-1, index)[..., 0]))
+        return Chosen(*(torch.cat(part) for part in zip(*parts)))
+
+
+class Chosen(NamedTuple):
+    """One position of each pixel (h, w, 2), and where there is one."""
+
+    xy: Tensor
+    valid: Tensor
+
+
+def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool) -> NDArray:
+    """The label of each block of alpha."""
+    own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
+    level = Normalisation.of(own, other)
+    a, b = (numpy_of(p[0, 0]) for p in level.equally_sharp(own, level.normalised(other)))
+    planes, other_planes = planes_of(a), _flat(planes_of(b))
+    label, margin = np.zeros((2, *a.shape), np.float32)
+    rows = [(rows, slice(0, a.shape[1])) for rows in grid.by_rows()]
+    sides = (HALF_SIZE.margin, HALF_SIZE.block, HALF_SIZE.block)
+    for inner, outer in inner_and_outer(a.shape, *sides) if ordered else zip(rows, rows):
+        places = _places(grid, outer, b.shape)
+        lanes = -(-places.shape[-1] // kernels.LANES) * kernels.LANES
+        cost = np.empty((*places.shape[:2], 1, lanes), np.uint8)
+        parts = [np.ascontiguousarray(p[outer]) for p in planes]
+        costs_at(_flat(parts), other_planes, places, cost)
+        total = cost.astype(np.int16)
+        if ordered:
+            first = np.zeros((*places.shape[:2], 1), np.int32)
+            penalties = np.float32(HALF_SIZE.step), np.float32(HALF_SIZE.jump)
+            kernels.aggregate(cost, parts[0], first, places.shape[-1], *penalties, total)
+        corner = tuple(slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, outer))
+        label[inner], margin[inner] = _best(total[corner][:, :, 0, : places.shape[-1]])
+    if not ordered:
+        return label
+    scale = np.float32(8 * kernels.PARTS * HALF_SIZE.jump)
+    weight = np.minimum(margin / scale, 1)
+    dense = filled(label[None], weight + np.float32(1e-5), to_bytes(own[:, 0])[0], DISPARITY_FILL)[0]
+    return cv2.medianBlur(np.where(weight > LEAST_MARGIN, label, dense).astype(np.float32), 5)
+
+
+def _flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
+    """Planes (h, w) as lists of pixels."""
+    return tuple(plane.ravel() for plane in planes)
+
+
+def _places(grid: _BlockCentres, box: tuple[slice, ...], hw: tuple[int, ...]) -> NDArray[np.int32]:
+    """Where positions are in the reduced beta, pixels counted row by row; -1 for those that do not count."""
+    (h, w), (rows, columns) = hw, box
+    parts = []
+    for top, bottom in spans(min(rows.stop, grid.hw[0]) - rows.start, max(1, AT_ONCE // (w * grid.field.samples))):
+        found = grid.at(slice(rows.start + top, rows.start + bottom), columns)
+        x, y = ((found.xy + 0.5) / FINE - 0.5).round().int().unbind(-1)
+        inside = found.mask & (x >= 0) & (y >= 0) & (x < w) & (y < h)
+        parts.append(torch.where(inside, y * w + x, -1).int())
+    return np.ascontiguousarray(torch.cat(parts).numpy())
+
+
+def _best(total: NDArray[np.int16]) -> tuple[NDArray, NDArray]:
+    """The label of the least sum, and by how much it is less than those not beside it."""
+    best = total.argmin(-1)
+    beside = np.abs(np.arange(total.shape[-1]) - best[..., None]) <= 1
+    second = np.where(beside, np.iinfo(np.int16).max, total).min(-1).astype(np.float32)
+    return best.astype(np.float32), second - total.min(-1)
+
+
+def _tangents(found: Positions, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Start, end and validity of the lines of a part."""
+    xy, mask = found.xy, found.mask
+    count = mask.shape[-1]
+    number = torch.arange(count, device=mask.device)
+    nearest = torch.where(mask, (number - labels[..., None]).abs(), torch.inf).argmin(-1, keepdim=True)
+
+    def taken(index: Tensor) -> Tensor:
+        index = index.clamp(0, count - 1)
+        counts = mask.gather(-1, index)
+        index = torch.where(counts, index, nearest)
+        return xy.gather(-2, index[..., None].expand(*index.shape, 2))[..., 0, :]
+
+    here, before, after = (taken(nearest + step) for step in (0, -1, 1))
+    step = (before - after) / 2
+    towards = direction(step)
+    both = mask[..., 1:] & mask[..., :-1]
+    lengths = torch.where(both, xy.diff(dim=-2).square().sum(-1).clamp(min=1e-12).sqrt(), 0.0)
+    fraction = (labels[..., None] - nearest).clamp(-0.5, 0.5).to(xy)
+    beyond = (lengths * (number[:-1] >= nearest)).sum(-1)
+    arc = (beyond - fraction[..., 0] * step.norm(dim=-1)).clamp(min=0)
+    here = here - fraction * step
+    end = here - arc[..., None] * towards
+    start = end + lengths.sum(-1, keepdim=True) * towards
+    return start, end, mask.any(-1)
+
+
+def _around(found: Chosen, guide: NDArray[np.uint8]) -> Segments:
+    """Segments along x around positions that were chosen alone, which a median makes agree with their neighbours."""
+    xy = found.xy.detach().float().numpy()
+    smooth = np.stack([cv2.medianBlur(np.ascontiguousarray(xy[..., i]), 5) for i in range(2)], -1)
+    middle = torch.from_numpy(smooth).to(found.xy)
+    step = middle.new_tensor([HALF_WINDOW, 0.0])
+    return Segments(middle - step, middle + step, found.valid)

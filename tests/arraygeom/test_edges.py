@@ -1,0 +1,218 @@
+"""Halves, huge numbers, empty sets, lenses that are none, epipoles, caches: right formulas, awkward numbers."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from arraygeom import (
+    Camera,
+    Curved,
+    Distortion,
+    Epipolar,
+    EpipolarLine,
+    HomographyDisplacement,
+    Link,
+    NearestVoxels,
+    Pose,
+    Positions,
+    Rectified,
+    Rig,
+    Segments,
+    ThroughLenses,
+    View,
+    depth_of,
+    epipolar_lines,
+    epipoles,
+    intrinsics,
+    pixel_grid,
+    rectify,
+    sample,
+    triangulate,
+)
+from arraygeom.distortion import COEFFICIENT_COUNTS
+from arraygeom.fields.straight import covering_displacement
+from pat.attention import attend
+from tests.arraygeom.rigs import random_rig
+from tests.arraygeom.test_precision import FIELDS, WHOLE
+
+F64 = torch.float64
+EMPTY = torch.zeros(0, 2)
+LENS = Distortion("brown-conrady", torch.tensor([-0.1, 0.02, 1e-3, -5e-4], dtype=F64))
+
+
+def pinholes() -> Rig:
+    return random_rig(1)
+
+
+def bent() -> Rig:
+    rig = random_rig(1)
+    return Rig({name: rig[name].replace(distortion=LENS) for name in rig.names}, depth=rig.depth)
+
+
+@pytest.mark.parametrize("width", [6, 7, 4000, 12_000])
+def test_the_nearest_pixel_of_halves_is_the_same_everywhere(width):
+    """Attention takes the pixel on whose area a position lies; `sample` rounded halves either way."""
+    image = torch.arange(width, dtype=torch.float32).expand(1, 1, 1, width)
+    halves = torch.arange(width - 1, dtype=torch.float32)[-50:] + 0.5
+    x = torch.stack([halves, torch.zeros_like(halves)], -1)
+    found = sample(image, x[None], interpolation="nearest").values[0, 0]
+    assert found.equal(halves + 0.5)
+    where = Positions(x[None, :, None], torch.ones(1, len(x), 1, dtype=torch.bool))
+    query = torch.ones(1, 1, 1, len(x))
+    assert attend(query, torch.ones_like(image), image, where, interpolation="nearest").flatten().equal(found)
+
+
+@pytest.mark.parametrize("model", COEFFICIENT_COUNTS)
+@pytest.mark.parametrize("size", [1e18, 1e20, 3e38])
+def test_lenses_are_finite_at_huge_points_in_float32(model, size):
+    lens = Distortion(model, torch.full((COEFFICIENT_COUNTS[model][0],), 0.01))
+    X = torch.tensor([[size, 0, 1], [size, size, size], [0, 0, size], [size, -size, -size], [1, 1, 1 / size]])
+    X.requires_grad_()
+    for value, _ in (lens.project(X), *(f(X[:, :2]) for f in (lens.distort, lens.undistort, lens.unproject))):
+        assert value.isfinite().all()
+        assert torch.autograd.grad(value[1:4].sum(), X)[0][1:4].isfinite().all()
+    (large, valid), (small, expected) = lens.project(X), lens.project(X.detach() / size)
+    assert valid[1:4].equal(expected[1:4])
+    torch.testing.assert_close(large[1:4][valid[1:4]], small[1:4][valid[1:4]], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("near", [1e-38, 1e-30, 1e-20])
+def test_a_near_bound_of_nothing_is_finite_in_float32(near):
+    pair = pinholes().to(torch.float32).pair("alpha", "beta")
+    tiny, small = (Epipolar(bound)(pair, WHOLE) for bound in (near, 1e-12))
+    assert tiny.start.isfinite().all()
+    assert tiny.end.isfinite().all()
+    assert tiny.valid.equal(small.valid)
+    torch.testing.assert_close(tiny.start, small.start, atol=1e-3, rtol=0)
+
+
+def test_a_lens_of_zeros_is_no_lens():
+    zero = Distortion("brown-conrady", torch.zeros(5, dtype=F64))
+    rig = pinholes()
+    plain, same = (
+        rig.pair("alpha", "beta"),
+        Rig({n: rig[n].replace(distortion=zero) for n in rig.names}, depth=rig.depth).pair("alpha", "beta"),
+    )
+    assert Epipolar()(same, WHOLE) == Epipolar()(plain, WHOLE)
+    assert rectify(same).H_beta.equal(rectify(plain).H_beta)
+    y = WHOLE.reshape(-1, 2)
+    assert depth_of(same, y, y).depth.equal(depth_of(plain, y, y).depth)
+    assert same.alpha.to_kornia().intrinsics.equal(plain.alpha.to_kornia().intrinsics)
+    free = dataclasses.replace(zero, coefficients=zero.coefficients.clone().requires_grad_())
+    with pytest.raises(ValueError, match="pinhole cameras"):  # one that is to be learned is a lens
+        Epipolar()(dataclasses.replace(same, alpha=same.alpha.replace(distortion=free)), WHOLE)
+
+
+@pytest.mark.parametrize("rig", [pinholes(), bent()], ids=["pinholes", "lenses"])
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_no_pixels_have_no_positions(rig, dtype):
+    x = EMPTY.to(dtype)
+    for pair in (rig.pair("alpha", "beta"), rig.pair("beta", "alpha")):
+        for field in [Curved(5), ThroughLenses(Epipolar(), 5)] if pair.has_lens else FIELDS:
+            found = field(pair, x.requires_grad_())
+            assert {len(part) for part in vars(found).values()} == {0}, field
+        assert len(depth_of(pair, x, x).depth) == 0
+        assert triangulate(list(pair.cameras), torch.stack([x, x])).X.shape == (0, 3)
+
+
+def test_nearest_voxels_of_no_pixels_keep_their_shape():
+    assert NearestVoxels(7, 4)(pinholes().pair("alpha", "beta"), EMPTY).xy.shape == (0, 7, 2)
+
+
+def test_alpha_is_left_right_or_either():
+    with pytest.raises((ValueError, TypeError), match="'up'"):  # a TypeError is the tests' own check of types
+        Rectified(alpha_is="up")
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_there_is_no_line_on_the_epipole_nor_of_zero(dtype):
+    F = torch.tensor([[0.0, -1e-3, 0.02], [1e-3, 0, -0.031], [-0.02, 0.031, 0]], dtype=dtype)  # [e]x: e at (31, 20)
+    views = {"a": View(hw=(48, 64)), "b": View(hw=(40, 60))}
+    pair = Rig(views, links={("a", "b"): Link(F)}).pair("a", "b")
+    nothing = Rig(views, links={("a", "b"): Link(torch.zeros_like(F))}).pair("a", "b")
+    e = epipoles(F.double())[0]
+    x = torch.stack([(e[:2] / e[2]).to(dtype), torch.tensor([31.1, 20.0], dtype=dtype)])
+    assert EpipolarLine()(pair, x).valid.tolist() == [False, True]
+    assert not EpipolarLine()(nothing, x).valid.any()
+    assert not epipolar_lines(F, x)[0].any()
+    assert epipolar_lines(F, x)[1].isfinite().all()
+
+
+@pytest.mark.parametrize("lens", ["brown-conrady", "kannala-brandt"])
+def test_gradients_of_curves_by_betas_lens_are_those_of_differences(lens):
+    """Of the function as it is computed: where its nodes lie depends on the lens too."""
+    rig, c = random_rig(2), LENS.coefficients if lens == "brown-conrady" else torch.tensor([0.05, -0.01, 2e-3, -1e-3])
+    x, c = WHOLE.double().reshape(-1, 2), c.double()
+
+    def positions(c):
+        beta = rig["beta"].replace(distortion=Distortion(lens, c))
+        return Curved(16)(rig.with_camera("beta", beta).pair("alpha", "beta"), x).xy
+
+    leaf = c.clone().requires_grad_()
+    weight = torch.randn(positions(c).shape, dtype=F64, generator=torch.Generator().manual_seed(0))
+    (gradient,) = torch.autograd.grad((positions(leaf) * weight).sum(), leaf)
+    steps = 1e-6 * torch.eye(4, dtype=F64)
+    expected = torch.stack([((positions(c + e) - positions(c - e)) * weight).sum() / 2e-6 for e in steps])
+    assert float((gradient - expected).norm() / expected.norm()) < 2e-5
+
+
+def test_a_displacement_follows_its_pair():
+    """Steps in place, inference mode and export do not leave a former answer, nor one that gradients cannot use."""
+    rig = pinholes()
+    K = rig["beta"].K.clone()
+    pair = dataclasses.replace(rig.pair("alpha", "beta"), beta=rig["beta"].replace(K=K))
+    field = HomographyDisplacement()
+    with torch.inference_mode():
+        field(pair, WHOLE)
+    leaf = K.clone().requires_grad_()
+    learned = dataclasses.replace(pair, beta=pair.beta.replace(K=leaf))
+    with torch.inference_mode():
+        field(learned, WHOLE)
+    field(learned, WHOLE).start.sum().backward()
+    assert leaf.grad is not None
+    before = covering_displacement(pair)
+    K[:2] *= 2
+    fresh = dataclasses.replace(pair, beta=pair.beta.replace(K=K))
+    torch.testing.assert_close(covering_displacement(pair), covering_displacement(fresh))
+    assert covering_displacement(pair) != before
+    traced = rig.pair("alpha", "beta")
+
+    class Field(torch.nn.Module):
+        def forward(self, x):
+            return field(traced, x).start
+
+    torch.export.export(Field(), (WHOLE.reshape(-1, 2),))
+    assert field(traced, WHOLE).start.equal(field(rig.pair("alpha", "beta"), WHOLE).start)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_cameras_of_108_megapixels(dtype):
+    """Segments to 0.02 px in float32, of which a pixel of 12,000 is known to 1e-3."""
+    hw = (9000, 12_000)
+    alpha = Camera(K=intrinsics(12_000.0, hw), cam_from_world=Pose.identity(), hw=hw)
+    shift = torch.tensor([-0.1, 0.003, 0.002], dtype=F64)
+    rig = Rig({"alpha": alpha, "beta": alpha.replace(cam_from_world=Pose(alpha.R, shift))}, depth=(2.0, 50.0))
+    x = pixel_grid((90, 120), dtype=F64) * 100
+    exact = Epipolar()(rig.pair("alpha", "beta"), x)
+    found = Epipolar()(rig.to(dtype).pair("alpha", "beta"), x.to(dtype))
+    both = exact.valid & found.valid
+    assert float((exact.valid == found.valid).double().mean()) > 0.999
+    for one, two in ((found.start, exact.start), (found.end, exact.end)):
+        assert float((one.double() - two).abs()[both].max()) < 0.02
+    voxels = [NearestVoxels(9, 3)(rig.to(t).pair("alpha", "beta"), x[::20, ::20].to(t)) for t in (dtype, F64)]
+    off = (voxels[0].xy.double() - voxels[1].xy).abs().amax(-1)
+    assert float((off > 0).double().mean()) < 0.05
+
+
+def test_a_number_of_samples_by_the_longest_segment_cannot_be_traced():
+    segments = Epipolar()(pinholes().pair("alpha", "beta"), WHOLE)
+    query, image = torch.randn(1, 2, *segments.valid.shape), torch.randn(1, 2, 40, 60)
+
+    def attended(start, samples=None):
+        return attend(query, image, image, Segments(start, segments.end, segments.valid), samples=samples)
+
+    starts = torch.stack([segments.start, segments.start + 0.1]).float()
+    with pytest.raises(NotImplementedError, match=r"the longest segment \(give `samples`\) depends on numbers"):
+        torch.vmap(attended)(starts)
+    torch.testing.assert_close(torch.vmap(lambda s: attended(s, 5))(starts)[0], attended(starts[0], 5))

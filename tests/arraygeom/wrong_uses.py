@@ -1,0 +1,186 @@
+"""Wrong uses of the library, by name: what it says of each. Run as a program, where nothing checks types."""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+
+from arraygeom import (
+    Band,
+    Camera,
+    Curve,
+    Curved,
+    Dense,
+    Distortion,
+    Epipolar,
+    HomographyDisplacement,
+    Link,
+    Local,
+    Moved,
+    NearestVoxels,
+    Pose,
+    Rectified,
+    Rig,
+    Sensor,
+    ThroughLenses,
+    Widened,
+    intrinsics,
+    rotation_from_vector,
+    sampling_locations,
+    triangulate,
+)
+
+HW = (48, 64)
+K = intrinsics(60.0, HW)
+EYE, ZERO = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+OPENGL = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
+ASIDE = torch.tensor([-0.1, 0, 0], dtype=torch.float64)
+X = torch.tensor([[20.0, 20.0]], dtype=torch.float64)
+
+
+def camera(**changes: Any) -> Camera:
+    return Camera(**{"K": K, "cam_from_world": Pose(EYE, ZERO), "hw": HW} | changes)
+
+
+def moved(**changes: Any) -> Camera:
+    return camera(cam_from_world=Pose(EYE, ASIDE), **changes)
+
+
+def rig(beta: Camera | None = None, alpha: Camera | None = None, **changes: Any) -> Rig:
+    return Rig({"alpha": alpha or camera(), "beta": beta or moved()}, **{"depth": (1.0, 5.0)} | changes)
+
+
+def pair(**changes: Any) -> Any:
+    return rig(**changes).pair("alpha", "beta")
+
+
+def posed(R: Any = EYE, t: Any = ASIDE) -> Rig:
+    return rig(camera(cam_from_world=Pose(R, t)))
+
+
+def lens(model: Any, coefficients: Any) -> Any:
+    made = Distortion(model, torch.tensor(coefficients, dtype=torch.float64))
+    return rig(moved(distortion=made))
+
+
+def toed_in(angle: float) -> torch.Tensor:
+    return rotation_from_vector(torch.tensor([0.0, angle, 0.0], dtype=torch.float64))
+
+
+def with_nan(t: torch.Tensor) -> torch.Tensor:
+    return torch.where(torch.arange(t.numel()).reshape(t.shape) == 0, torch.nan, t)
+
+
+WRONG: dict[str, Callable[[], Any]] = {
+    "2 R": lambda: posed(2 * EYE),
+    "R a reflection": lambda: posed(torch.diag(EYE.new_tensor([-1, 1, 1]))),
+    "R of NaN": lambda: posed(with_nan(EYE)),
+    "R 4 x 4": lambda: posed(torch.eye(4, dtype=torch.float64)),
+    "R a rotation vector": lambda: posed(ZERO),
+    "R a list": lambda: posed([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]),
+    "R of whole numbers": lambda: posed(torch.eye(3, dtype=torch.int64)),
+    "R with a row lost": lambda: posed(torch.stack([EYE[0], EYE[1], EYE[1]])),
+    "t infinite": lambda: posed(t=ASIDE / 0),
+    "t a column": lambda: posed(t=ASIDE[:, None]),
+    "t in millimetres": lambda: posed(t=1000 * ASIDE),
+    "t in millimetres of a short baseline": lambda: posed(t=100 * ASIDE),
+    "OpenGL's pose for one camera": lambda: posed(OPENGL, OPENGL @ ASIDE),
+    "OpenGL's poses for both cameras, toed in": lambda: rig(
+        camera(cam_from_world=Pose.from_centre(OPENGL @ toed_in(0.6), -10 * ASIDE)),
+        camera(cam_from_world=Pose.from_centre(OPENGL @ toed_in(-0.6), 10 * ASIDE)),
+    ),
+    "world_from_cam for cam_from_world, sides named": lambda: Rig(
+        {"left": camera(), "right": camera(cam_from_world=Pose(EYE, -ASIDE))}, depth=(1, 5)
+    ),
+    "pose a 4 x 4 matrix": lambda: camera(cam_from_world=torch.eye(4)),
+    "2 K": lambda: camera(K=2 * K),
+    "K transposed": lambda: camera(K=K.mT),
+    "K of NaN": lambda: camera(K=with_nan(K)),
+    "K without focal length": lambda: camera(K=intrinsics(0.0, HW)),
+    "K 3 x 4": lambda: camera(K=torch.cat([K, ZERO[:, None]], 1)),
+    "K of whole numbers": lambda: camera(K=K.long()),
+    "K of an image twice the size": lambda: rig(moved(K=intrinsics(120.0, (96, 128)))),
+    "K in millimetres": lambda: rig(moved(K=intrinsics(4.0, HW))),
+    "K normalised": lambda: rig(moved(K=intrinsics(1.0, HW, (0.5, 0.5)))),
+    "K mirrored": lambda: rig(moved(K=intrinsics((-60.0, 60.0), HW))),
+    "hw (width, height)": lambda: rig(moved(hw=HW[::-1])),
+    "hw with channels": lambda: camera(hw=(3, *HW)),
+    "hw 0": lambda: camera(hw=(0, 64)),
+    "hw not whole": lambda: camera(hw=(48.5, 64)),
+    "K and pose of batches unlike": lambda: camera(K=K.expand(2, 3, 3), cam_from_world=Pose(EYE.expand(3, 3, 3), ZERO)),
+    "distortion a tensor": lambda: camera(distortion=torch.zeros(5)),
+    "sensor a word": lambda: camera(sensor="mono"),
+    "unknown lens": lambda: lens("opencv", [0.0, 0, 0, 0]),
+    "three coefficients": lambda: lens("brown-conrady", [0.1, 0, 0]),
+    "coefficients of NaN": lambda: lens("brown-conrady", [math.nan, 0, 0, 0]),
+    "coefficients of another unit": lambda: lens("brown-conrady", [-40.0, 0, 0, 0]),
+    "depth reversed": lambda: rig(depth=(5, 1)),
+    "depth one number": lambda: rig(depth=5.0),
+    "depth in millimetres": lambda: rig(depth=(1000.0, 5000.0)),
+    "cameras a list": lambda: Rig([camera(), camera()]),
+    "a camera that is K": lambda: Rig({"a": K}),
+    "both cameras the same": lambda: Rig({"a": camera(), "b": camera()}, depth=(1, 5)),
+    "a link to a name unknown": lambda: rig(links={("alpha", "gamma"): Link(EYE)}),
+    "F of rank three": lambda: rig(links={("alpha", "beta"): Link(EYE)}),
+    "F of NaN": lambda: Link(with_nan(EYE)),
+    "a field called as a function": lambda: Epipolar(pair(), X),
+    "a class for a field": lambda: sampling_locations(Epipolar, pair(), X),
+    "pixels of three numbers": lambda: sampling_locations(Epipolar(), pair(), ZERO),
+    "near beyond far": lambda: Epipolar(near=5, far=2)(pair(), X),
+    "near below 0": lambda: Curved(near=-1.0),
+    "no samples": lambda: Curved(0),
+    "displacement below 0": lambda: HomographyDisplacement(-5),
+    "disparity below 0": lambda: Rectified(-5),
+    "alpha up": lambda: Rectified(8, alpha_is="up"),
+    "count 0": lambda: NearestVoxels(count=0),
+    "size 0": lambda: Local(0),
+    "stride 0": lambda: Dense(0),
+    "across below 0": lambda: Widened(Epipolar(), across=-1.0),
+    "widened class": lambda: Widened(Epipolar, across=1.0),
+    "lenses on a class": lambda: ThroughLenses(Epipolar),
+    "moved by one plane": lambda: Moved(Epipolar(), torch.zeros(HW)),
+    "frame rate below 0": lambda: Sensor(frame_rate=-30.0),
+    "coding unknown": lambda: Sensor(coding="sRGB"),
+    "band without width": lambda: Band(450, 0),
+    "curve of unlike lengths": lambda: Curve((400.0, 500.0), (1.0,)),
+    "triangulation of one view": lambda: triangulate([camera()], X[None]),
+    # What nothing can know of:
+    "pixels (y, x)": lambda: sampling_locations(Epipolar(), pair(), X.flip(-1)),
+    "pixels normalised": lambda: sampling_locations(Epipolar(), pair(), X / 64),
+    "first pixel at (0.5, 0.5)": lambda: rig(moved(K=intrinsics(60.0, HW, (32.0, 24.0)))),
+    "R transposed, by a little": lambda: posed(toed_in(-0.02)),
+}
+"""Each makes something wrong, and uses it; a rig is asked what is odd about it."""
+
+SILENT = {
+    "pixels (y, x)": "pixels inside of the image",
+    "pixels normalised": "pixels inside of the image",
+    "first pixel at (0.5, 0.5)": "a principal point half a pixel off is no farther off than lenses are mounted",
+    "R transposed, by a little": "a small rotation is as likely as its inverse",
+}
+"""Wrong uses of which nothing is said, and why."""
+
+
+def answer(use: Callable[[], Any]) -> str:
+    """The first sentence that a wrong use gets: an error, a warning or an oddity; empty if none."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            made = use()
+        except (TypeError, ValueError, Warning) as error:
+            return f"{type(error).__name__}: {error}"
+    return " ".join(made.check()[:1]) if isinstance(made, Rig) else ""
+
+
+def answers(names: Iterable[str] = WRONG) -> dict[str, str]:
+    """What each wrong use gets."""
+    return {name: answer(WRONG[name]) for name in names}
+
+
+if __name__ == "__main__":
+    print(json.dumps({"right": answer(rig)} | answers(), indent=1))
