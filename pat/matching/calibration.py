@@ -116,8 +116,9 @@ def reliability(
     """How often matches are right, by the probability stated for them."""
     which = (probability * bins).long().clamp(0, bins - 1)
     count = torch.bincount(which, minlength=bins).double()
-    sums = (torch.bincount(which, x.double(), minlength=bins) for x in (probability, right))
-    return Reliability(*(total / count.clamp(min=1) for total in sums), count / count.sum())
+    stated, fulfilled = (torch.bincount(which, x.double(), minlength=bins) for x in (probability, right))
+    some = count.clamp(min=1)
+    return Reliability(stated / some, fulfilled / some, count / count.sum())
 
 
 def depth_interval(

@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 import torch
@@ -57,13 +57,13 @@ class SizeEncoder(nn.Module):
         self.compare = nn.Conv2d(1, BITS, CENSUS)
         with torch.no_grad():
             self.compare.weight.copy_(comparisons()[:, None])
-            self.compare.bias.zero_()
+            nn.init.zeros_(cast(Tensor, self.compare.bias))
         self.first = nn.Conv2d(planes, width, 3, padding=1)
         self.second = nn.Conv2d(width, width, 3, padding=1)
         self.third = nn.Conv2d(width, width, 3, padding=2, dilation=2)
         self.add = nn.Conv2d(width, BITS, 1)
         nn.init.zeros_(self.add.weight)
-        nn.init.zeros_(self.add.bias)
+        nn.init.zeros_(cast(Tensor, self.add.bias))
 
     def forward(
         self,

@@ -10,6 +10,7 @@ import sys
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import cast
 
 import torch
 import tyro
@@ -95,10 +96,10 @@ def train_features(config: FeatureTraining) -> Path:
             losses = _advance(config, step, encoder, adam, average, sample_of(config, scenes, step))
             step += 1
             if step % config.validate == 0 or step == config.steps:
-                _log(config, step, losses, validated(average.module, kept))
+                _log(config, step, losses, validated(cast(MatchingEncoder, average.module), kept))
             if step % config.save == 0 or step == config.steps:
                 said = {"recipe": _recipe(config), "step": str(step)}
-                save_features(average.module, config.out / WEIGHTS, said)
+                save_features(cast(MatchingEncoder, average.module), config.out / WEIGHTS, said)
                 facts = {"step": step, "best": 0.0, "minutes": 0.0, "done": step == config.steps}
                 state = collect(encoder, adam, average, facts | {"recipe": _recipe(config)})
                 write_checkpoint(config.out / "checkpoints", state)
