@@ -23,7 +23,7 @@ UNIFIED = "unified"
 FOV = "fov"
 SCARAMUZZA = "scaramuzza"
 THIN_PRISM_FISHEYE = "thin-prism-fisheye"
-POLYNOMIAL_FISHEYE = "polynomial-fisheye"
+POLYNOMIAL_FISHEYE = "pix4d-fisheye"
 
 
 class _Model(NamedTuple):

@@ -37,7 +37,8 @@ def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, An
 
 def explorer_state(rig: Rig, alpha: str, controls: Controls) -> ExplorerState:
     """The state of the controls. Betas are rotated about their y axes, and moved along their baselines."""
-    x = image_pixel(*controls["x"], rig[alpha].hw)
+    column, row = controls["x"]
+    x = image_pixel(column, row, rig[alpha].hw)
     changes: dict[str, tuple[float, ...]] = {}
     for name in rig.betas(alpha):
         beta, own = rig[name], rig[alpha]

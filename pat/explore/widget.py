@@ -33,8 +33,8 @@ class FieldWidget(anywidget.AnyWidget):
     """Alpha and betas side by side; `controls` come from the browser, `answer` goes to it."""
 
     _esm = MODULE
-    cameras = traitlets.List().tag(sync=True)
-    ranges = traitlets.List().tag(sync=True)
+    cameras: Any = traitlets.List().tag(sync=True)
+    ranges: Any = traitlets.List().tag(sync=True)
     controls = traitlets.Dict().tag(sync=True)
     answer = traitlets.Dict().tag(sync=True)
 

@@ -96,11 +96,11 @@ FORMULAS = {
         thin_prism_fisheye,
         [(0.05, -0.01, 1e-3, -2e-3, 3e-3, -5e-4, 1e-3, -7e-4), (-0.03, 0, 0, 0, 0, 0.002, 0, 0), (0.0,) * 8],
     ),
-    "polynomial-fisheye": (polynomial_fisheye, [(0.006, -0.056, 0.0), (-0.1, 0.02, 0.004), (0.0, 0.0, 0.0)]),
+    "pix4d-fisheye": (polynomial_fisheye, [(0.006, -0.056, 0.0), (-0.1, 0.02, 0.004), (0.0, 0.0, 0.0)]),
     "scaramuzza": (scaramuzza, [(-0.3, 0.02, -0.01), (-0.2, 0.0, 0.0), (0.05, -0.1, -0.02), (0.0, 0.0, 0.0)]),
 }
 CASES = [(model, c) for model, (_, sets) in FORMULAS.items() for c in sets]
-BEHIND = ("double-sphere", "extended-unified", "unified", "polynomial-fisheye", "scaramuzza")
+BEHIND = ("double-sphere", "extended-unified", "unified", "pix4d-fisheye", "scaramuzza")
 
 
 def lens(model: str, c, dtype=torch.float64) -> Distortion:
