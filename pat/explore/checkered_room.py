@@ -8,7 +8,7 @@ from torch import Tensor
 
 from arraygeom import Camera, Rig, pixel_grid
 
-SQUARES = 6
+SQUARES = 2
 """Squares from the middle of the room to a wall."""
 DEEPEST = 20.0
 """Depth of the back wall in nearest depths where the rig's farthest is beyond it."""

@@ -33,7 +33,11 @@ function cross(context, [x, y], colour) {
 function drawBeta(context, beta) {
   if (beta.problem) { write(context, beta.problem); return beta.problem; }
   const unit = context.canvas.width / 400, top = Math.max(...beta.weights);
-  context.fillStyle = "#e69f00";
+  context.strokeStyle = context.fillStyle = "#e69f00";
+  context.lineWidth = unit;
+  context.beginPath();
+  for (const [x, y] of beta.samples) context.lineTo(x, y);
+  context.stroke();
   context.globalAlpha = 0.7;
   beta.samples.forEach(([x, y], i) => {
     context.beginPath();
