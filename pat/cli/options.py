@@ -252,6 +252,8 @@ def _named_file(option: str, text: str) -> tuple[str, Path]:
     name, _, path = text.partition("=")
     if not (name and path):
         file = path or text
+        if not Path(file).suffix:
+            raise ValueError(f"{option}: '{text}' is not NAME=FILE")
         raise ValueError(f"{option} {text}: which camera is it of? Give NAME=FILE, such as {Path(file).stem}={file}")
     return name, Path(path)
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck, gradgradcheck
 
-from arraygeom import Camera, Curved, Pose, Rig, intrinsics
+from arraygeom import Camera, Curved, Pose, Rig, intrinsics, unchecked
 from arraygeom.distortion import COEFFICIENT_COUNTS, Distortion
 from calib.boards.observability import LENS_TERMS, TYPICAL_COEFFICIENTS
 from tests.oracles import Oracle
@@ -253,8 +253,10 @@ def test_a_batch_of_lenses_is_each_lens(model):
     ],
 )
 def test_coefficients_that_are_no_lens_see_nothing(model, c):
+    with unchecked():
+        made = lens(model, c)
     for method, points in (("project", directions(50)), ("unproject", directions(50)[:, :2])):
-        values, valid = getattr(lens(model, c), method)(points)
+        values, valid = getattr(made, method)(points)
         assert not valid.any()
         assert values.isfinite().all()
 

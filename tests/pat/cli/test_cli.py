@@ -276,7 +276,7 @@ def test_images_stand_anywhere_among_the_options_of_fuse():
 
 def test_writers_take_o_and_out():
     """Every command with an option --out takes -o; all but those that write nothing have it."""
-    nothing = {("explore",), ("rig", "info"), ("systems", "list"), ("data", "info"), ("warm-up",)}
+    nothing = {("explore",), ("settings",), ("rig", "info"), ("systems", "list"), ("data", "info"), ("warm-up",)}
     for path in command_paths():
         command = functools.reduce(lambda group, word: group.commands[word], path, Pat)
         spellings = getattr(command, "spellings", {})
@@ -402,9 +402,10 @@ def test_a_bad_out_is_found_before_the_fusion(small, capsys, monkeypatch):
     ],
 )
 def test_a_bad_out_is_found_before_the_work(command, out, text, tmp_path, monkeypatch, capsys):
-    """Neither rigs nor images nor folders of them exist: they are not looked for before."""
+    """Neither images nor folders of them exist, and the rig is empty: they are not read before."""
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("")
+    (tmp_path / "rig.yaml").write_text("")  # that it is there is looked for first, which is as quick
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
         main([*command, "--out", out])
