@@ -54,7 +54,7 @@ def whole(folder):
 
 
 def test_samples_are_made_and_matched_ahead(folder):
-    """The second while the first is in use; a network that is given their state computes the same."""
+    """The second while the first is in use; a network that is given their matches computes the same."""
     config, asked = short_run(folder), threading.Event()
     network = new_network(config)
 
@@ -68,8 +68,8 @@ def test_samples_are_made_and_matched_ahead(folder):
     assert asked.wait(600)
     made.close()
     objective = Objective(network, config.loss)
-    assert given.state is not None
-    assert torch.equal(objective(given), objective(given._replace(state=None)))
+    assert given.matches is not None
+    assert torch.equal(objective(given), objective(given._replace(matches=None)))
 
 
 class Stopped(Exception):
