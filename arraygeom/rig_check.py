@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import combinations, permutations
+from itertools import combinations, pairwise
 from typing import TYPE_CHECKING
 
 import torch
@@ -27,6 +27,8 @@ LEAST_DISPARITY = 0.5
 """Pixels that matches move from near to far below which depth is not seen."""
 COVERED = 0.5
 """Share of an image below which its lens model hardly covers it."""
+MOST_CAMERAS = 16
+"""Of rigs with more, each is compared with the next alone: pairs are many."""
 RANK = 1e-3
 """Least over largest singular value of F from which it is not of rank two."""
 
@@ -67,9 +69,12 @@ def _all(rig: Rig) -> Iterator[str]:
             yield from _of_lens(name, camera)
         if isinstance(camera, Camera):
             yield from _of_K(name, camera)
-    for pair in permutations([n for n, camera in rig.cameras.items() if isinstance(camera, Camera)], 2):
-        yield from _of_overlap(rig, *pair)
-    for pair in combinations([n for n, camera in rig.cameras.items() if isinstance(camera, Camera)], 2):
+    names = [name for name, camera in rig.cameras.items() if isinstance(camera, Camera)]
+    pairs = list(combinations(names, 2)) if len(names) <= MOST_CAMERAS else list(pairwise(names))
+    for one, other in pairs:
+        yield from _of_overlap(rig, one, other)
+        yield from _of_overlap(rig, other, one)
+    for pair in pairs:
         yield from _of_baseline(rig, *pair)
     yield from _of_sides(rig)
     for (alpha, beta), link in rig.links.items():

@@ -185,7 +185,7 @@ def test_numbers_that_no_camera_has_are_refused(old, new, tmp_path):
     rig = (Path(cases.__file__).parent / "native.yaml").read_text()
     assert old in rig
     (tmp_path / "rig.yaml").write_text(rig.replace(old, new))
-    with pytest.raises(RigFileError, match=r"use pixels|use metres|in metres"):
+    with pytest.raises(RigFileError, match=r"use pixels|use metres|in metres|in pixels"):
         Rig.load(tmp_path / "rig.yaml")
 
 
