@@ -7,8 +7,9 @@ from itertools import combinations, pairwise
 from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
-from .camera import Camera, LensView
+from .camera import Camera, LensView, View
 from .checks import derived
 from .pixels import coarse_grid
 
@@ -83,6 +84,11 @@ def _all(rig: Rig) -> Iterator[str]:
             yield f"F of '{alpha}' and '{beta}' is not of rank two: was it copied whole?"
 
 
+def _grid(camera: View) -> Tensor:
+    """Some pixels all over an image: at most 64 in a row, of huge images too."""
+    return coarse_grid(camera.hw, max(16, max(camera.hw) // 64))
+
+
 def _of_K(name: str, camera: Camera) -> Iterator[str]:
     (h, w), K = camera.hw, camera.K.double()
     focal = float(K[:2, :2].det().abs().sqrt())
@@ -106,7 +112,7 @@ def _of_K(name: str, camera: Camera) -> Iterator[str]:
 def _of_lens(name: str, camera: LensView) -> Iterator[str]:
     if camera.distortion is None:
         return
-    share = float(camera.rays(coarse_grid(camera.hw).to(camera.K))[1].double().mean())
+    share = float(camera.rays(_grid(camera).to(camera.K))[1].double().mean())
     if share < COVERED:
         yield f"the lens model of '{name}' covers {100 * share:.0f} % of its image: check the coefficients"
 
@@ -115,7 +121,7 @@ def _of_overlap(rig: Rig, alpha: str, beta: str) -> Iterator[str]:
     from .fields.default import recorded_field
 
     pair = rig.pair(alpha, beta)
-    found = recorded_field(pair)(pair, coarse_grid(rig[alpha].hw).to(rig[alpha].K))
+    found = recorded_field(pair)(pair, _grid(rig[alpha]).to(rig[alpha].K))
     if not bool((found.valid if hasattr(found, "valid") else found.mask).any()):
         bounds = "" if rig.depth is None else f" between {float(rig.depth[0]):g} and {float(rig.depth[1]):g} m"
         yield (

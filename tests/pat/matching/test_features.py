@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from pat.matching.cost import census
 from pat.matching.features import (
     BITS,
     FeatureConfig,
@@ -15,7 +16,6 @@ from pat.matching.features import (
     save_features,
     words,
 )
-from pat.matching.semi_global_numba import census
 
 SHARP = torch.zeros(1)
 
