@@ -237,3 +237,10 @@ def test_another_number_of_betas_is_refused():
     field = FieldOnGrid.of(Rectified(4), Pair(View(hw=(12, 16)), View(hw=(12, 16))))
     with pytest.raises(ValueError, match="made for 3 betas, got 1"):
         small(betas=3)(Inputs.of(alpha, [beta], [field]))
+
+
+def test_a_text_is_no_checkpoint_and_runs_nothing(tmp_path):
+    path = tmp_path / "README.md"
+    path.write_text("# A text\n")
+    with pytest.raises(ValueError, match=r"README\.md: not a checkpoint, or cut short"):
+        read_authors(path)
