@@ -132,8 +132,8 @@ def with_found_rig(network: Network) -> StereoMethod:
 class Ablate:
     """What calibration is worth: receptive fields compared by one network as the calibration or the rig changes.
 
-    Curves of calibrated segments, rectified and resampled images, rows, a local window and all of beta, on layered
-    scenes with exact positions. Example: pat ablate --sweeps rotation ahead --scenes 4 --out out/ablate
+    Curves of calibrated segments, images that are rectified and the result warped back, rows, a local window and all
+    of beta, on layered scenes with exact positions. Example: pat ablate --sweeps rotation ahead --scenes 4
     """
 
     weights: Weights = "pat-supervised"

@@ -57,6 +57,7 @@ from ..synthesis.rendered import RENDER_FILE, Rendered, is_rendered
 from ..synthesis.rig_distribution import RigDistribution
 from .baseline import classical
 from .metrics import bootstrap_interval, score
+from .rectified import rectified
 from .tables import markdown_table, write_csv
 
 ALPHA, BETA = "alpha", "beta"
@@ -92,10 +93,23 @@ class AblationCase(NamedTuple):
 
 @dataclass(frozen=True)
 class FieldFamily:
-    """A receptive field, given the largest displacement from H x, and the rig that it is computed from."""
+    """A receptive field, given the largest displacement from H x, and the rig that it is computed from.
+
+    If `warped`, both images are rectified by that rig before, and the result is warped back.
+    """
 
     field: Callable[[float], ReceptiveField]
     assumed: Callable[[Rig, Generator], Rig] = lambda rig, g: rig
+    warped: bool = False
+
+    def fuse(self, network: FusionNetwork, rig: Rig, case: AblationCase, far: float) -> tuple[Tensor, Tensor]:
+        """Alpha's view fused (3, H, W), and its depth. Raises ValueError for a rig that cannot be rectified."""
+        if not self.warped:
+            frame = fuse(network, rig, case.images, alpha=ALPHA, field=self.field(far))
+            return frame.image, frame.depth
+        level = rectified(rig, case.images)
+        frame = fuse(network, level.rig, level.images, alpha=ALPHA, field=self.field(far))
+        return level.back(frame.image), level.depth_back(frame.depth)
 
 
 class AblationRow(NamedTuple):
@@ -136,6 +150,7 @@ def families() -> dict[str, FieldFamily]:
     """Every family by name, `calibrated` first."""
     exact = {
         "calibrated": FieldFamily(lambda disparity: Epipolar()),
+        "rectified, warped": FieldFamily(lambda disparity: Epipolar(), warped=True),
         "rectified assumption": FieldFamily(lambda disparity: Rectified(2 * disparity, alpha_is="either")),
         "rows around H x": FieldFamily(HorizontalDisplacement),
         "homography + displacement": FieldFamily(HomographyDisplacement),
@@ -246,11 +261,15 @@ def _case(
         notes["classical"] = str(error)
     for name, family in chosen.items():
         rig = family.assumed(case.rig, Generator().manual_seed(crc32(case.name.encode())))
-        field = family.field(far)
-        notes[name] = unsupported(network, field, rig)
-        if not notes[name]:
-            frame = fuse(network, rig, case.images, alpha=ALPHA, field=field)
-            images[name], errors[name] = frame.image.clamp(0, 1), point_errors(case, frame.depth)
+        notes[name] = unsupported(network, family.field(far), rig)
+        if notes[name]:
+            continue
+        try:
+            image, depth = family.fuse(network, rig, case, far)
+        except ValueError as error:
+            notes[name] = str(error).partition(":")[0]
+            continue
+        images[name], errors[name] = image.clamp(0, 1), point_errors(case, depth)
     names, none = ["alpha alone", "classical", *chosen], (math.nan, math.nan)
     scores = {name: score(image, case.ground_truth) for name, image in images.items()}
     figures = {name: (*scores.get(name, none), *errors.get(name, none)) for name in names}
@@ -292,9 +311,10 @@ def markdown(rows: Sequence[AblationRow]) -> str:
     scenes = len({row.scene for row in rows})
     note = (
         f"{scenes} scenes; the focal ratio is alpha's focal length over beta's. PSNR in dB, behind it a 95% interval.\n"
-        "The rectified assumption takes lines for rows, and both images for the same field of view; 'rows around\n"
-        "H x' is given position and scale, and takes only the lines for rows. Off: mean error in beta of points at\n"
-        "the depth found.\n\n"
+        "Rectified, warped: both images are rectified by the calibration, and the result is warped back. The rectified\n"
+        "assumption takes lines of the images as they are for rows, and both images for the same field of view; 'rows\n"
+        "around H x' is given position and scale, and takes only the lines for rows. Off: mean error in beta of points\n"
+        "at the depth found.\n\n"
     )
     return note + markdown_table(columns, lines, align="l" + "r" * (len(columns) - 2) + "l")
 

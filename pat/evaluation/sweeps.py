@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, pad
 
 from arraygeom import (
     Camera,
@@ -32,7 +32,6 @@ from arraygeom import (
     apply_homography,
     intrinsics,
     pixel_grid,
-    rectify,
     rotation_from_vector,
     sample,
 )
@@ -52,6 +51,7 @@ from ..synthesis.rig_distribution import RigDistribution
 from ..synthesis.rigs import RigBatch
 from .ablation import sample_photographs
 from .metrics import score
+from .rectified import rectified
 
 ALPHA, BETA = "alpha", "beta"
 SIZE: HW = (96, 128)
@@ -59,6 +59,8 @@ NEAR, FAR = 2.0, 16.0
 """Of the scenes, metres."""
 PARALLAX = 24.0
 """Displacement of the nearest points against infinity, alpha's pixels, where it is not what changes."""
+BORDER = 32
+"""Pixels by which beta's border is repeated, for all but the search of all of it."""
 TILT = 3.0
 """Degrees that beta is rotated by in every rig: none is rectified."""
 
@@ -117,40 +119,46 @@ class Way(Protocol):
 
 @dataclass(frozen=True)
 class Directly:
-    """The images as they are, beta resized to about alpha's angular resolution as `fuse` does it, with a field."""
+    """The images as they are, beta resized to about alpha's angular resolution as `fuse` does it, with a field.
+
+    Beta's border is repeated around it, as warped images repeat theirs: what beta does not see is half of the error.
+    """
 
     field: ReceptiveField
 
     def fuse(self, network: Comparing, rig: Rig, images: Mapping[str, Tensor]) -> Result:
         """The network with the field of the pair. All of beta is searched as it is: enlarged it would not fit."""
         pair, beta = rig.pair(ALPHA, BETA), images[BETA]
-        ratio = resolution_ratio(pair)
-        if 0.8 < ratio < 1.25 or isinstance(self.field, Dense):
+        if isinstance(self.field, Dense):
             return fused(network, pair, images[ALPHA], beta, self.field)
-        hw = [round(n / ratio) for n in pair.beta.hw]
-        larger = interpolate(beta[None], hw, mode="bicubic", align_corners=False, antialias=ratio > 1)[0].clamp(0, 1)
-        resized = Pair(pair.alpha, pair.cameras[1].resize((hw[0], hw[1])), pair.depth)
-        found = fused(network, resized, images[ALPHA], larger, self.field)
-        step = found.peak.new_tensor([pair.beta.hw[1] / hw[1], pair.beta.hw[0] / hw[0]])
-        return found._replace(peak=(found.peak + 0.5) * step - 0.5)
+        border = 0 if isinstance(self.field, Rows) else BORDER  # its rows are those of the images as they are
+        hw = (pair.beta.hw[0] + 2 * border, pair.beta.hw[1] + 2 * border)
+        camera = pair.cameras[1].crop(-border, -border, hw)
+        beta = pad(beta[None], (border,) * 4, mode="replicate")
+        ratio = resolution_ratio(pair)
+        if not 0.8 < ratio < 1.25:
+            larger = (round(hw[0] / ratio), round(hw[1] / ratio))
+            beta = interpolate(beta, larger, mode="bicubic", align_corners=False, antialias=ratio > 1).clamp(0, 1)
+            camera = camera.resize(larger)
+        found = fused(network, Pair(pair.alpha, camera, pair.depth), images[ALPHA], beta[0], self.field)
+        step = found.peak.new_tensor([hw[1] / camera.hw[1], hw[0] / camera.hw[0]])
+        return found._replace(peak=(found.peak + 0.5) * step - 0.5 - border)
 
 
 @dataclass(frozen=True)
 class Resampled:
-    """Both images resampled to rows by the calibration, searched along the rows, and the result resampled back."""
+    """Both images warped to rows by the calibration, searched along the rows, and the result warped back."""
 
     field: ReceptiveField = Epipolar()  # noqa: RUF009 - frozen
 
     def fuse(self, network: Comparing, rig: Rig, images: Mapping[str, Tensor]) -> Result:
         """Raises ValueError where the pair cannot be rectified, as of a camera ahead of the other."""
-        pair = rig.pair(ALPHA, BETA)
-        found = rectify(pair)
-        views = (images[ALPHA], found.H_alpha), (images[BETA], found.H_beta)
-        alpha, beta = (warped(image, torch.linalg.inv(H), found.pair.alpha.hw) for image, H in views)
-        result = fused(network, found.pair, alpha, beta, self.field)
-        back = warped(result.image, found.H_alpha, pair.alpha.hw)
-        peaks = warped(result.peak.movedim(-1, 0), found.H_alpha, pair.alpha.hw, interpolation="nearest").movedim(0, -1)
-        return Result(back, apply_homography(torch.linalg.inv(found.H_beta), peaks.double()).x)
+        level = rectified(rig, images)
+        alpha, beta = (level.images[name] for name in (ALPHA, BETA))
+        result = fused(network, level.rectification.pair, alpha, beta, self.field)
+        peaks = level.back(result.peak.movedim(-1, 0), interpolation="nearest").movedim(0, -1)
+        there = apply_homography(torch.linalg.inv(level.rectification.H_beta), peaks.double()).x
+        return Result(level.back(result.image), there)
 
 
 @dataclass(frozen=True)
@@ -164,7 +172,7 @@ class Rows:
 
 FIELDS: dict[str, ReceptiveField | Way] = {
     "calibrated segments": Epipolar(),
-    "rectified and resampled": Resampled(),
+    "rectified, warped": Resampled(),
     "rows": Rows(),
     "local 5x5": Local(),
     "dense": Dense(),
@@ -232,12 +240,6 @@ def fused(network: Comparing, pair: Pair, alpha: Tensor, beta: Tensor, field: Re
     inputs = Inputs.of(alpha[None], [beta[None]], [FieldOnGrid.of(field, pair, blocks=False)])
     output, compared = network.compare(inputs)
     return Result(output.image[0], peak_position(compared[0])[0].movedim(0, -1).double())
-
-
-def warped(image: Tensor, H: Tensor, hw: HW, *, interpolation: str = "bicubic") -> Tensor:
-    """An image (C, h, w) at H x for the pixels x of an image of size hw; its border is repeated beyond."""
-    x = apply_homography(H, pixel_grid(hw, dtype=torch.float64)).x
-    return sample(image[None], x[None].float(), interpolation=interpolation, extended=True).values[0]  # type: ignore[arg-type]
 
 
 def two(rig: Rig) -> Rig:

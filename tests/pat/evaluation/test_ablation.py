@@ -28,7 +28,7 @@ from pat.networks.paper import PAT
 from pat.networks.weights import load_weights
 from pat.synthesis.rendered import RenderedFrame, save_frame
 
-CHOSEN = ("calibrated", "rectified assumption", "rotated by 1 deg", "centre off by 10 px", "local 5x5", "dense")
+CHOSEN = ("calibrated", "rectified, warped", "rectified assumption", "rotated by 1 deg", "centre off by 10 px", "local 5x5", "dense")
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +72,8 @@ def test_unsupported_families_are_named_and_the_rest_is_ordered(case, tmp_path):
     assert rows["local 5x5"].note == rows["dense"].note == ""
     calibrated = rows["calibrated"].psnr
     assert calibrated > rows["rectified assumption"].psnr + 1
+    assert rows["rectified, warped"].psnr == pytest.approx(calibrated, abs=1.5)
+    assert rows["rectified, warped"].within_one > rows["rectified assumption"].within_one + 0.2
     assert calibrated > rows["rotated by 1 deg"].psnr
     assert calibrated > rows["centre off by 10 px"].psnr
     assert calibrated > rows["alpha alone"].psnr + 2

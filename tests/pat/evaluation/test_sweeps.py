@@ -184,5 +184,5 @@ def test_the_command_writes_what_it_says(tmp_path, capsys):
     arguments = ["--sweeps", "ahead", "--without", "dense", "--scenes", "1", "--hw", "48", "64"]
     main(["ablate", *arguments, "--out", str(tmp_path)])
     rows = json.loads((tmp_path / "ablation.json").read_text())
-    assert {row["field"] for row in rows} == {"calibrated segments", "rectified and resampled", "rows", "local 5x5"}
+    assert {row["field"] for row in rows} == {"calibrated segments", "rectified, warped", "rows", "local 5x5"}
     assert "#### ahead" in capsys.readouterr().out

@@ -1,0 +1,77 @@
+"""The fair contender of calibrated segments: both images warped to rows, fused there, and the result warped back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from arraygeom import Pair, Rectification, Rig, apply_homography, intrinsics, pixel_grid, rectify, sample
+from arraygeom.pixels import HW, product
+
+LARGEST = 6.0
+"""A canvas of more than so many times alpha's pixels is refused: a camera nearly ahead stretches it without bound."""
+
+
+class Warped(NamedTuple):
+    """A rectified pair: its two cameras as a rig, their images by name, and the way back."""
+
+    rig: Rig
+    images: dict[str, Tensor]
+    rectification: Rectification
+    original: Pair
+
+    def back(self, image: Float[Tensor, "c h w"], *, interpolation: str = "bicubic") -> Float[Tensor, "c ha wa"]:
+        """An image of the canvas at alpha's pixels."""
+        return warped(image, self.rectification.H_alpha, self.original.alpha.hw, interpolation=interpolation)
+
+    def depth_back(self, depth: Float[Tensor, "h w"]) -> Float[Tensor, "ha wa"]:
+        """Depth of the canvas as alpha's at its pixels, by the nearest pixel."""
+        level, (alpha, _) = self.rectification.pair.cameras[0], self.original.cameras
+        x = apply_homography(self.rectification.H_alpha, pixel_grid(alpha.hw, dtype=torch.float64)).x
+        found = self.back(depth[None], interpolation="nearest")[0].double()
+        return alpha.project(level.unproject(x, found)).depth.to(depth)
+
+
+def rectified(rig: Rig, images: Mapping[str, Tensor]) -> Warped:
+    """The first two cameras of a rig and their images (C, H, W), with epipolar lines as rows.
+
+    The canvas holds all of alpha, with alpha's focal length: nothing of alpha is lost but what resampling costs.
+    Raises ValueError where the pair cannot be rectified, or not onto a canvas of sensible size.
+    """
+    first, second = rig.names[:2]
+    pair = rig.pair(first, second)
+    found = whole_alpha(pair)
+    views = (first, found.H_alpha), (second, found.H_beta)
+    canvas = found.pair.alpha.hw
+    made = {name: warped(images[name], torch.linalg.inv(H), canvas).clamp(0, 1) for name, H in views}
+    level = Rig(dict(zip((first, second), found.pair.cameras)), depth=tuple(float(d) for d in pair.depth_range))
+    return Warped(level, made, found, pair)
+
+
+def whole_alpha(pair: Pair) -> Rectification:
+    """`rectify` at alpha's focal length, onto the canvas that alpha's image fills."""
+    alpha, _ = pair.cameras
+    rough = rectify(pair)
+    h, w = alpha.hw
+    corners = torch.tensor([[-0.5, -0.5], [w - 0.5, -0.5], [-0.5, h - 0.5], [w - 0.5, h - 0.5]]).to(alpha.K)
+    rays = product(rough.R_alpha, alpha.rays(corners)[0][..., None])[..., 0]
+    if not bool((rays[..., 2] > 0).all()):
+        raise ValueError("the baseline is too near an optical axis: part of alpha lies behind the rectified image")
+    focal = alpha.K[:2, :2].det().abs().sqrt()
+    x = focal * rays[..., :2] / rays[..., 2:]
+    low, high = x.amin(0), x.amax(0)
+    columns, rows = (int(n) for n in (high - low).ceil())
+    if rows * columns > LARGEST * h * w:
+        raise ValueError(f"the baseline is near an optical axis: the rectified image has {columns}x{rows} pixels")
+    return rectify(pair, K=intrinsics(focal, (h, w), tuple(-low - 0.5)), hw=(rows, columns))
+
+
+def warped(image: Tensor, H: Tensor, hw: HW, *, interpolation: str = "bicubic") -> Tensor:
+    """An image (C, h, w) at H x for the pixels x of an image of size hw; its border is repeated beyond."""
+    x = apply_homography(H, pixel_grid(hw, dtype=torch.float64)).x
+    return sample(image[None], x[None].float(), interpolation=interpolation, extended=True).values[0]  # type: ignore[arg-type]
