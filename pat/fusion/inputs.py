@@ -20,7 +20,7 @@ from arraygeom.fields.ray_depth import ray_depth
 from arraygeom.pixels import HW
 
 from ..matching.inputs import Beta, Inputs
-from ..matching.matches import combined_bands
+from ..matching.normalisation import combined_bands
 from ..matching.tangents import along_tangents
 from ..networks.protocol import FusionNetwork
 from .steps import FusionStep, Undo

@@ -3,28 +3,32 @@ they are not seen."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments
-from arraygeom.sampling import on_image, sample
+from arraygeom.chunks import Box
 from arraygeom.threads import in_parallel
 
 from ..media.colour import to_bytes
 from ..support.settings import size, tuned
 from . import semi_global_numba as kernels
+from .filters import LocalMoments, box_mean, numpy_of, smoothed
+from .inputs import Beta, Inputs
+from .matches import BetaMatches, Matches, is_consistent
 from .normalisation import SETTINGS as NORMALISATION
-from .normalisation import LocalMoments, Normalisation, Normalisations, box_mean, explained_share, normalised
+from .normalisation import Normalisation, combined_bands, explained_share, normalised
+from .positions import at_matches
 from .radiometry import SpectralMix
-from .semi_global import CONSISTENT, Extent, enlarged, matched_at_half_size, matches, numpy_of, reduced, smoothed
 
 FILLS = 2
 """Size: ways in which colour is diffused, along its regression on brightness, and as it is."""
@@ -107,25 +111,6 @@ def matched_colours(
 
 
 @torch.no_grad()
-def coarse_mix(
-    alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b c hb wb"], segments: Segments, blocks: Segments, factor: int
-) -> SpectralMix:
-    """The combination of beta's bands that is most like alpha, found on images reduced by `factor`.
-
-    `segments` (B or 1, h / factor, w / factor) and `blocks` (half as many) are of the centres of blocks of
-    alpha's pixels, in pixels of the whole beta.
-    """
-    if beta.shape[1] == 1:
-        return SpectralMix.equal(beta)
-    own, bands = avg_pool2d(alpha, factor), avg_pool2d(beta, factor)
-    guide = SpectralMix.equal(bands).of(bands)
-    normalisations = Normalisations.of(own, guide)
-    disparity, facts = matched_at_half_size(own, guide, reduced(blocks, factor), normalisations.half)
-    values, valid = at_matches(bands, reduced(segments, factor), disparity)
-    return SpectralMix.fitted(values, normalisations.whole.softened(own), valid * is_consistent(facts))
-
-
-@torch.no_grad()
 def colours_of_bands(
     alpha: Float[Tensor, "b 1 h w"],
     beta: Float[Tensor, "b c hb wb"],
@@ -161,25 +146,6 @@ def _scaled_to_alpha(colour: Tensor, brightness: Tensor, alpha: Tensor, weight: 
     own, other = (box_mean(image * weight, SETTINGS.surroundings) + least for image in (alpha, brightness))
     ratio = (own / other.clamp(min=least)).clamp(1 / most, most)
     return colour * ratio**SETTINGS.saturation, brightness * ratio
-
-
-def at_matches(
-    beta: Float[Tensor, "b c hb wb"],
-    segments: Segments,
-    disparity: Float[Tensor, "b 1 _ _"],
-    extent: Extent | None = None,
-) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
-    """What beta shows at the matches, at its edge where these are beyond it, and where they are not."""
-    hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, disparity, extent=extent).to(beta)
-    position = middle.reshape(len(beta), -1, 2)
-    inside = position.clamp(min=0).minimum(position.new_tensor([hw[1] - 1, hw[0] - 1]))
-    values = sample(beta, inside, interpolation="bicubic").values
-    return values.reshape(*beta.shape[:2], *middle.shape[1:3]), on_image(middle, hw)[:, None]
-
-
-def is_consistent(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]:
-    """1 where the match is consistent."""
-    return enlarged((facts[:, :1] < CONSISTENT).to(facts))
 
 
 def match_weight(unlike: Float[Tensor, "b 1 h w"], consistent: Tensor, valid: Tensor) -> Float[Tensor, "b 1 h w"]:
@@ -276,3 +242,48 @@ def _diffused(
     floor = SETTINGS.floor
     in_parallel([partial(kernels.regression, brightness, *totals[:3], c, p, floor, *o) for c, p, *o in planes])
     return out
+
+
+def transferred(inputs: Inputs, found: Matches) -> Matches:
+    """The matches with beta's bands at them; those of matches from elsewhere, too.
+
+    Of betas that agree on depth, those that have all of the result's bands share the colour that is diffused; any other
+    has its own. With gradients if images or fields have some and gradients are recorded. Raises ValueError for matches
+    of another size or number of betas.
+    """
+    found.check(inputs.hw, len(inputs.betas))
+    agree, large = inputs.can_agree, len(inputs.pieces) > 1
+    sharing = [agree and inputs.shows_all_bands(beta) for beta in inputs.betas]
+
+    def of(piece: Inputs, box: Box) -> list[Tensor]:
+        parts = _transferred_piece(piece, found.cut(box), sharing)
+        return [part if part.requires_grad or not large else part.half() for part in parts]
+
+    parts = inputs.in_pieces(of)
+    bands, diffused = parts[-len(sharing) :], iter(parts[: -len(sharing)])
+    shared = next(diffused) if any(sharing) else None
+    made = zip(found.betas, bands, sharing)
+    return Matches(tuple(replace(m, bands=b, diffused=shared if s else next(diffused)) for m, b, s in made))
+
+
+def _transferred_piece(piece: Inputs, found: Matches, sharing: Sequence[bool]) -> list[Tensor]:
+    """The diffused colour that betas share, if any do, that of each other beta, and each beta's bands minus alpha."""
+    alpha = piece.alpha
+    alone = [transferred_bands(alpha, *one) for one in zip(piece.betas, found.betas)]
+    shared = []
+    if any(sharing):
+        counting = [(c, w, m.prior) for (c, w), m, counts in zip(alone, found.betas, sharing) if counts]
+        weights = [weight * math.exp(prior) for _, weight, prior in counting]
+        mixed = sum(w * colour for w, (colour, _, _) in zip(weights, counting)) / torch.stack(weights).sum(0)
+        shared = [diffused_from(mixed, alpha, torch.stack([weight for _, weight, _ in counting]).amax(0))]
+    own = [diffused_from(colour, alpha, weight) for (colour, weight), counts in zip(alone, sharing) if not counts]
+    return [*shared, *own, *(colour for colour, _ in alone)]
+
+
+def transferred_bands(alpha: Tensor, beta: Beta, found: BetaMatches) -> tuple[Tensor, Tensor]:
+    """A beta's bands minus alpha at its matches (B, C, H, W), and their weight (B, 1, H, W), 0 to 1."""
+    where, mix = (beta.field.straight, found.disparity, found.facts), found.comparison.mix
+    level = found.comparison.whole
+    if mix is None:
+        return matched_colours(alpha, combined_bands(beta.image), beta.image, *where, level)
+    return colours_of_bands(alpha, beta.image, *where, mix, level)

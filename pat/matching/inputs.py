@@ -86,13 +86,12 @@ class Inputs:
         sides = sides_by_work(self.hw, SETTINGS.halo, self.multiple, SETTINGS.at_once)
         return list(tiles_of(self.hw, sides[0], SETTINGS.halo))
 
-    def in_pieces(self, make: Callable[[Box], Any]) -> Any:
-        """Planes (..., h, w), or several, put together from what is made of each piece, by its box."""
-        return assembled(self.hw, ((piece, make(piece.outer)) for piece in self.pieces))
-
-    def part(self, box: Box) -> Inputs:
-        """A part of alpha as `cut` gives it; of the whole, these inputs."""
-        return self if box == whole(self.hw).outer else self.cut(box)
+    def in_pieces(self, make: Callable[[Inputs, Box], Any]) -> Any:
+        """Planes (..., h, w), or several, put together from what is made of each piece of these inputs and its box."""
+        pieces = self.pieces
+        if len(pieces) == 1:
+            return make(self, pieces[0].outer)
+        return assembled(self.hw, ((piece, make(self.cut(piece.outer), piece.outer)) for piece in pieces))
 
     @property
     def can_agree(self) -> bool:

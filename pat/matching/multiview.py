@@ -26,16 +26,11 @@ from arraygeom.epipolar import FRONT, Track
 
 from ..media.colour import to_bytes
 from ..support.settings import size, tuned
+from .filters import filled
 from .inputs import Beta, Inputs
 from .matches import BetaMatches, Matches
-from .semi_global import (
-    CONSISTENT,
-    DISPARITY_FILL,
-    FINE,
-    Extent,
-    enlarged,
-    filled,
-)
+from .positions import FINE, Extent, enlarged
+from .semi_global import CONSISTENT, DISPARITY_FILL
 
 
 @dataclass(frozen=True)
@@ -306,15 +301,15 @@ def _agree(terms: Tensor, own: Tensor, rise: Tensor, solutions: Float[Tensor, "k
 def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
     """Inverse depth diffused to where no match is consistent, and without outliers."""
 
-    def of(box: Box) -> Tensor:
+    def of(piece: Inputs, box: Box) -> Tensor:
         part = (..., slice(box[0], box[1]), slice(box[2], box[3]))
         plane, known = (x[part].cpu().numpy() for x in (agreement.inverse_depth, agreement.known))
-        guide = to_bytes(inputs.alpha[0, 0][part])
+        guide = to_bytes(piece.alpha[0, 0])
         smooth = filled(plane, known[0].astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
         median = cv2.medianBlur(np.where(known, plane, smooth)[0], 5)
         return torch.from_numpy(median)[None].to(inputs.alpha)
 
-    return agreement._replace(inverse_depth=inputs.in_pieces(of))
+    return agreement._replace(inverse_depth=replace(inputs, betas=()).in_pieces(of))
 
 
 def _of_beta(
