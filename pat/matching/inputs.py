@@ -86,12 +86,14 @@ class Inputs:
         sides = sides_by_work(self.hw, SETTINGS.halo, self.multiple, SETTINGS.at_once)
         return list(tiles_of(self.hw, sides[0], SETTINGS.halo))
 
-    def in_pieces(self, make: Callable[[Inputs, Box], Any]) -> Any:
-        """Planes (..., h, w), or several, put together from what is made of each piece of these inputs and its box."""
+    def in_pieces(self, make: Callable[..., Any], *more: Any) -> Any:
+        """Planes (..., h, w), or several, put together from what is made of each piece of these inputs, and of what
+        is given besides, cut alike."""
         pieces = self.pieces
         if len(pieces) == 1:
-            return make(self, pieces[0].outer)
-        return assembled(self.hw, ((piece, make(self.cut(piece.outer), piece.outer)) for piece in pieces))
+            return make(self, *more)
+        made = (make(*(one.cut(piece.outer) for one in (self, *more))) for piece in pieces)
+        return assembled(self.hw, zip(pieces, made))
 
     @property
     def can_agree(self) -> bool:

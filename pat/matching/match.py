@@ -13,7 +13,6 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments
-from arraygeom.chunks import Box
 
 from ..support.settings import size
 from .colour_transfer import transferred
@@ -23,7 +22,7 @@ from .multiview import agreed
 from .normalisation import Comparison
 from .positions import FINE, at_matches, reduced
 from .radiometry import SpectralMix
-from .semi_global import matched_at_half_size
+from .semi_global import HalfSizeMatches, matched_at_half_size
 from .subpixel import matched_at_full_size
 
 LOG = logging.getLogger(__name__)
@@ -65,12 +64,12 @@ def located_in_one(inputs: Inputs) -> BetaMatches:
     halves = comparison.half_views(inputs.alpha, inputs.betas[0].image)
     half = matched_at_half_size(halves, inputs.betas[0].field.of_blocks(FINE))
 
-    def closer(piece: Inputs, box: Box) -> tuple[Tensor, Tensor]:
+    def closer(piece: Inputs, rough: HalfSizeMatches) -> tuple[Tensor, Tensor]:
         (beta,) = piece.betas
         views = comparison.views(piece.alpha, beta.image)
-        return matched_at_full_size(views, beta.field.straight, half.cut(box).disparity)
+        return matched_at_full_size(views, beta.field.straight, rough.disparity)
 
-    disparity, unlike = inputs.in_pieces(closer)
+    disparity, unlike = inputs.in_pieces(closer, half)
     return BetaMatches(disparity, torch.cat([unlike, half.facts[:, 1:]], 1), comparison)
 
 

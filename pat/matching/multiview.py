@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, depth_from_track, pixel_grid
-from arraygeom.chunks import Box, spans
+from arraygeom.chunks import Tile, assembled, spans
 from arraygeom.epipolar import FRONT, Track
 
 from ..media.colour import to_bytes
@@ -301,15 +301,17 @@ def _agree(terms: Tensor, own: Tensor, rise: Tensor, solutions: Float[Tensor, "k
 def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
     """Inverse depth diffused to where no match is consistent, and without outliers."""
 
-    def of(piece: Inputs, box: Box) -> Tensor:
-        part = (..., slice(box[0], box[1]), slice(box[2], box[3]))
-        plane, known = (x[part].cpu().numpy() for x in (agreement.inverse_depth, agreement.known))
-        guide = to_bytes(piece.alpha[0, 0])
+    def of(tile: Tile) -> Tensor:
+        top, bottom, left, right = tile.outer
+        planes = agreement.inverse_depth, agreement.known, inputs.alpha[0]
+        plane, known, alpha = (x[:, top:bottom, left:right].cpu().numpy() for x in planes)
+        guide = to_bytes(alpha[0])
         smooth = filled(plane, known[0].astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
         median = cv2.medianBlur(np.where(known, plane, smooth)[0], 5)
         return torch.from_numpy(median)[None].to(inputs.alpha)
 
-    return agreement._replace(inverse_depth=replace(inputs, betas=()).in_pieces(of))
+    dense = assembled(inputs.hw, ((tile, of(tile)) for tile in inputs.pieces))
+    return agreement._replace(inverse_depth=dense)
 
 
 def _of_beta(

@@ -33,7 +33,7 @@ from . import semi_global_numba as kernels
 from .cost import planes_of
 from .filters import filled, numpy_of
 from .normalisation import ComparedViews
-from .positions import FINE, along, length_of
+from .positions import FINE, Extent
 
 
 @dataclass(frozen=True)
@@ -125,9 +125,9 @@ def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int
 
     Segments that start within a pixel of beta's edge may have been cut there.
     """
-    length = length_of(segments)
+    length, towards = Extent.of(segments)
     cut = segments.valid & ~on_image(segments.start - 0.5, (hw[0] - 1, hw[1] - 1))
-    end, towards = (segments.end + 0.5) / factor - 0.5, along(segments, length)
+    end = (segments.end + 0.5) / factor - 0.5
     length = torch.where(segments.valid, length / factor, -1.0)
     planes = (numpy_of(x.expand(batch, *x.shape[1:])) for x in (end, towards, length, cut))
     return _Geometry(*planes)

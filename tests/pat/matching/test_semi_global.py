@@ -23,7 +23,7 @@ from arraygeom import (
 )
 from pat.matching.matches import BetaMatches
 from pat.matching.normalisation import Comparison, Normalisation, equalising_blurs
-from pat.matching.positions import length_of, matches
+from pat.matching.positions import matches
 from pat.matching.semi_global import matched_at_half_size
 from pat.support.memory import limited
 from tests.pat.matching.matched_scenes import beside, blurred, faint, semi_global_matching
@@ -33,13 +33,14 @@ HW = (64, 96)
 PARTS = ("disparity", "facts", "bands", "diffused")
 
 
-def test_lengths_of_plain_numbers_are_those_of_the_segments():
+def test_lengths_of_plain_numbers_are_those_with_gradients():
     start, end = 100 * torch.rand(2, 1, 50, 60, 2, generator=torch.Generator().manual_seed(0))
     end[0, 0] = start[0, 0]
     segments = Segments(start, end, torch.ones(1, 50, 60, dtype=torch.bool))
-    assert torch.equal(length_of(segments), segments.length)
+    plain = segments.length
     freed = Segments(start.requires_grad_(), end, segments.valid)
-    (gradient,) = torch.autograd.grad(length_of(freed).sum(), start)
+    assert torch.equal(plain, freed.length.detach())
+    (gradient,) = torch.autograd.grad(freed.length.sum(), start)
     assert bool(gradient.isfinite().all())
 
 
