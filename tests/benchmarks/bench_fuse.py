@@ -4,7 +4,8 @@ The array "wide field - narrow field" at a part of its size, with smooth random 
 the network, what part of the latter convolutions take, and at what rate, beside the rate of this machine's matrix
 products with as many threads in the same run. `--full-runs` instead fuses the rendered frame of 4024x3036 under caps
 (`--caps 4GiB 8GiB 2GiB`; `python -m experiments systems run wide-narrow --full --max-memory ...`), in 4 to 6
-minutes of a core each on a machine that does nothing else, and compares what comes out. Prints figures and puts them into
+minutes of a core each on a machine that does nothing else, and compares what comes out. Prints figures and puts them
+into
 tests/benchmarks/RESULTS_fuse.md, each in its section, beside those that were there.
 """
 
