@@ -197,9 +197,10 @@ class Ablate:
 
         bank = PhotoBank.load(*self.photos) if self.photos else sample_photographs()
         cases = list(field_table.layered_cases(bank, self.scenes))
-        for linked in (True, False) if self.middlebury else ():
-            pairs = of_half(middlebury_pairs(self.middlebury), "report")
-            cases += field_table.rectified_cases(pairs, linked=linked)
+        if self.middlebury is not None:
+            for linked in (True, False):
+                pairs = of_half(middlebury_pairs(self.middlebury), "report")
+                cases += field_table.rectified_cases(pairs, linked=linked)
         shown = options.progress("fusing")(cases, len(cases))
         rows = field_table.evaluate_fields(self._comparing(network), shown)
         write_text(self.out / "ablation.md", field_table.fields_markdown(rows))

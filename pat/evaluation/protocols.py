@@ -144,11 +144,12 @@ def halved(pair: StereoPair) -> StereoPair:
     if pair.disparity is not None:
         value, valid = (t[: 2 * hw[0] : 2, : 2 * hw[1] : 2] for t in pair.disparity)
         disparity = Disparity(value / 2, valid)
-    smaller = [
-        interpolate(_cut_to_multiple(image, 2)[None], hw, mode="bicubic", antialias=True, align_corners=False)[0]
-        for image in (pair.left, pair.right)
-    ]
-    return StereoPair(pair.name, *(image.clamp(0, 1) for image in smaller), pair.max_disparity, disparity)
+
+    def smaller(image: Tensor) -> Tensor:
+        cut = _cut_to_multiple(image, 2)[None]
+        return interpolate(cut, hw, mode="bicubic", antialias=True, align_corners=False)[0].clamp(0, 1)
+
+    return StereoPair(pair.name, smaller(pair.left), smaller(pair.right), pair.max_disparity, disparity)
 
 
 @dataclass(frozen=True)
