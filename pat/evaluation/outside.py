@@ -85,8 +85,10 @@ def _row(pair: StereoPair, task: MonoColourTask, network: FusionNetwork, source:
     seconds = time.perf_counter() - began
     assert pair.disparity is not None
     error, within = disparity_errors(hw[1] / frame.depth, pair.disparity)
+    assert error is not None
+    assert within is not None
     psnr = score(frame.image.clamp(0, 1), task.ground_truth).psnr
-    return OutsideRow(pair.name, source, psnr, error or np.nan, within or np.nan, seconds)
+    return OutsideRow(pair.name, source, psnr, error, within, seconds)
 
 
 def _around(disparity: Float[Tensor, "h w"], known: Tensor, tolerance: float) -> AroundDepth:
