@@ -421,8 +421,8 @@ class Demo:
 
         from ..data.sample_array import ALPHA, BETA, load_sample
         from ..evaluation.baseline import classical
+        from ..evaluation.demo import save_demo_figure
         from ..fusion.results import save_frame
-        from ..systems.demo import save_demo_figure
 
         options.writable(self.out, folder=True)
         sample = load_sample()

@@ -23,6 +23,7 @@ from torch import Tensor
 from arraygeom import Rig
 from arraygeom.atomic import write_text
 from arraygeom.io.native import write as rig_text
+from experiments.hdr import merged, missed, tone_curve, usable_range
 from pat.evaluation.baseline import classical_baseline
 from pat.evaluation.metrics import score
 from pat.evaluation.tables import markdown_table
@@ -40,7 +41,6 @@ from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
 from pat.support.memory import watch_peak
 from pat.support.tensor_files import write_tensors
-from pat.systems.hdr import merged, missed, tone_curve, usable_range
 
 SceneKind = Literal["layered", "rendered"]
 NAMES = ("wide-narrow", "visible-nir", "exposures", "fast-slow")
@@ -115,7 +115,7 @@ def load_system(name: str) -> ArraySystem:
     """A system by name. Raises ValueError listing the names."""
     if name not in NAMES:
         raise ValueError(f"no system '{name}': there are {', '.join(NAMES)}")
-    module = importlib.import_module(f"pat.systems.{name.replace('-', '_')}")
+    module = importlib.import_module(f"experiments.{name.replace('-', '_')}")
     return ArraySystem(name, Rig.load(Path(module.__file__ or "").with_name("rig.yaml")), module)
 
 

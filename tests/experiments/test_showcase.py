@@ -10,12 +10,13 @@ import torch
 
 from arraygeom import Camera, Pose, Rig, apply_homography, epipolar_distance, intrinsics, plane_homography, shift_origin
 from arraygeom import rotation_from_vector as rotation
+from experiments.__main__ import Experiments
+from experiments.showcase import SLOW, SYNTIM, published_matrices, showcase
 from pat.cli.main import main
 from pat.media.images import read_image, write_image
 from pat.networks.configs import GuidedPATConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import save_weights
-from pat.systems.showcase import SLOW, SYNTIM, published_matrices, showcase
 
 SYNTIM_HW, FAST_HW, SLOW_HW = (120, 160), (208, 272), (160, 240)
 PLANE = 2.0
@@ -187,7 +188,8 @@ def test_what_is_missing_is_named(data, tmp_path, capsys, missing):
                 str(tmp_path / "out"),
                 "--weights",
                 str(data / "small.safetensors"),
-            ]
+            ],
+            group=Experiments,
         )
     error = capsys.readouterr().err.strip().splitlines()
     assert stop.value.code == 2

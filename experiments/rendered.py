@@ -10,10 +10,10 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from arraygeom import Camera, Rig
+from experiments.stage import RenderedView, purpose_generator
 from pat.media.colour import srgb_from_linear
 from pat.synthesis.blender import RenderSettings, render
 from pat.synthesis.generators import GENERATORS
-from pat.systems.stage import RenderedView, purpose_generator
 
 FARTHEST = 300.0
 """Metres that the sky is given: haze leaves some of its colour."""

@@ -10,12 +10,12 @@ from collections.abc import Iterable, Iterator, Mapping
 import torch
 from torch import Tensor
 
+from experiments.exposures import banded
+from experiments.rendered import RenderedScene
+from experiments.stage import SystemScene
+from experiments.system import SystemRecording
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.sensors import Clip, Noise, record
-from pat.systems.exposures import banded
-from pat.systems.rendered import RenderedScene
-from pat.systems.stage import SystemScene
-from pat.systems.system import SystemRecording
 
 TITLE = "fast mono alpha, three slow cameras with filters, not synchronised; an object moves"
 REDUCED = 1 / 4

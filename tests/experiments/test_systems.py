@@ -6,8 +6,12 @@ import re
 import pytest
 import torch
 
-import pat.systems.stage
+import experiments.stage
 from arraygeom import Rig
+from experiments import NAMES, load_system, run_system
+from experiments.__main__ import Experiments
+from experiments.hdr import merged, usable_range
+from experiments.stage import SystemScene
 from pat.cli.main import main
 from pat.fusion.results import Frame
 from pat.fusion.steps import resolution_ratio
@@ -16,9 +20,6 @@ from pat.media.colour import linear_from_srgb, srgb_from_linear
 from pat.media.images import read_image
 from pat.media.raw import demosaiced
 from pat.sensors import Mosaic
-from pat.systems import NAMES, load_system, run_system
-from pat.systems.hdr import merged, usable_range
-from pat.systems.stage import SystemScene
 
 
 def angle(focal: float, pixels: int) -> float:
@@ -40,9 +41,9 @@ def test_the_arrays_are_the_papers():
 
 def test_an_unknown_system_is_named(capsys):
     with pytest.raises(SystemExit):
-        main(["systems", "run", "wide-narow"])
+        main(["systems", "run", "wide-narow"], group=Experiments)
     assert "no system 'wide-narow': there are wide-narrow," in " ".join(capsys.readouterr().err.split())
-    main(["systems", "list"])
+    main(["systems", "list"], group=Experiments)
     shown = capsys.readouterr().out
     assert all(name in shown for name in NAMES)
 
@@ -93,7 +94,7 @@ def test_large_images_are_rendered_in_bands(tiny, monkeypatch):
     s = stage("wide-narrow")
     image, depth = s.seen("wide")
     h, w = depth.shape
-    monkeypatch.setattr(pat.systems.stage, "BAND", 9 * w * (h // 3))
+    monkeypatch.setattr(experiments.stage, "BAND", 9 * w * (h // 3))
     banded, banded_depth = s.seen("wide")
     assert (banded - image).abs().max() < 1e-3
     torch.testing.assert_close(banded_depth, depth, rtol=1e-5, atol=0)

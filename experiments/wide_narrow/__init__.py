@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from arraygeom import Rig
+from experiments.rendered import RenderedScene
+from experiments.stage import SystemScene
+from experiments.system import SystemRecording
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.sensors import Clip, DecodeSRGB, GaussianBlur, Mosaic, Noise, record
-from pat.systems.rendered import RenderedScene
-from pat.systems.stage import SystemScene
-from pat.systems.system import SystemRecording
 
 TITLE = "mono telephoto, and a wide colour camera with 10 times fewer pixels on what both see"
 REDUCED = 1 / 8

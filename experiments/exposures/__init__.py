@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from arraygeom import Band
+from experiments.rendered import RenderedScene
+from experiments.stage import SystemScene
+from experiments.system import SystemRecording
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.media.raw import light_of
 from pat.sensors import Clip, Noise, Spectral, record
-from pat.systems.rendered import RenderedScene
-from pat.systems.stage import SystemScene
-from pat.systems.system import SystemRecording
 
 TITLE = "four mono cameras, three filters, four exposures: more range than any one of them has"
 REDUCED = 2 / 5

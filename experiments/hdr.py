@@ -12,10 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Camera, Rig, pixel_grid, sample
-
-from ..fusion.results import Frame
-from ..media.colour import linear_from_srgb, luminance, srgb_from_linear
-from ..media.raw import light_of
+from pat.fusion.results import Frame
+from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
+from pat.media.raw import light_of
 
 WHITE = 0.97
 """Values from here on count as saturated."""

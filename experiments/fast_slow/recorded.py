@@ -9,6 +9,8 @@ from torch import Tensor
 
 from arraygeom import HomographyDisplacement, Rig, Sensor
 from arraygeom.atomic import write_text
+from experiments.showcase import FAST, SCENE, SLOW, FastSlowArray, bright_gain, fast_and_slow_array
+from experiments.system import SystemResult
 from pat.evaluation.tables import markdown_table
 from pat.fusion.results import Frame, save_frame
 from pat.fusion.sequence import SequenceFusion, flicker
@@ -17,8 +19,6 @@ from pat.media.figures import save_panels
 from pat.media.images import read_image
 from pat.media.video import write_video
 from pat.networks.weights import load_weights
-from pat.systems.showcase import FAST, SCENE, SLOW, FastSlowArray, bright_gain, fast_and_slow_array
-from pat.systems.system import SystemResult
 
 FAST_FRAMES, SLOW_FRAMES = range(141, 148), (4, 5)
 RATES = {FAST: 227.0, **dict.fromkeys(SLOW, 30.0)}

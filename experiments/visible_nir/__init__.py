@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import torch
 
+from experiments.rendered import RenderedScene
+from experiments.stage import SystemScene
+from experiments.system import SystemRecording
 from pat.media.colour import from_luma_chroma, linear_from_srgb, srgb_from_linear, to_luma_chroma
 from pat.sensors import Clip, Noise, record
-from pat.systems.rendered import RenderedScene
-from pat.systems.stage import SystemScene
-from pat.systems.system import SystemRecording
 
 TITLE = "near infrared alpha, colour beta: the same materials look different"
 REDUCED = 1 / 5
