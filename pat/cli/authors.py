@@ -54,6 +54,8 @@ class Evaluate:
     """Instead: other responses, exposures, noise, misalignment; by region, with depth. Also conditions.png."""
     only: tuple[str, ...] = ()
     """Of these conditions, by name."""
+    outside: bool = False
+    """Instead: fuse with disparities from elsewhere: OpenCV's SGBM, the true ones, a prior. Writes outside.md."""
     half: Literal["tune", "report", "all"] = "all"
     """The pairs on which settings may be chosen, or those that are reported."""
     out: Out = Path("out/evaluate")
@@ -77,6 +79,8 @@ class Evaluate:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
         writable(self.out, folder=True)
         network, bands = load_weights(self.weights), protocols.PROTOCOLS[self.protocol]
+        if self.outside:
+            return self._from_outside(network, folders)
         if self.conditions or self.only:
             return self._under_conditions(network, folders)
         wrong = protocols.controls(network, bands=bands) if self.controls else {}
@@ -95,6 +99,24 @@ class Evaluate:
         write_csv(self.out / "scores.csv", stereo.StereoRow._fields, every)
         print(text, end="")
         say(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, images in {self.out}")
+
+    def _from_outside(self, network: FusionNetwork, folders: dict[str, Path]) -> None:
+        from arraygeom.atomic import write_text
+
+        from ..evaluation import stereo
+        from ..evaluation.halves import of_half
+        from ..evaluation.outside import evaluate_outside, outside_markdown
+
+        sets = [stereo.DATA_SETS[name](folder) for name, folder in folders.items()]
+        pairs = [pair for found in sets for pair in of_half(found, self.half) if pair.disparity is not None]
+        if not pairs:
+            raise ValueError(f"--half {self.half}: of none of its pairs the true disparity is known")
+        with options.working("evaluating") as retitle:
+            rows = evaluate_outside(pairs, network, each=lambda row: retitle(f"{row.pair}: {row.source}"))
+        text = outside_markdown(rows)
+        write_text(self.out / "outside.md", text)
+        print(text, end="")
+        say(f"written: {self.out / 'outside.md'}")
 
     def _under_conditions(self, network: FusionNetwork, folders: dict[str, Path]) -> None:
         from arraygeom.atomic import write_text

@@ -164,7 +164,8 @@ class MatchedBeta:
     def hidden(self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
         """By how many pixels the nearest point seen at the same pixel of beta differs; infinite outside the image."""
         index = self._index(inverse_depth)
-        apart = self.disparity_of(buffer[index]) - self.disparity_of(inverse_depth)
+        (x, y), (u, v) = self._seen(buffer[index]), self._seen(inverse_depth)
+        apart = torch.hypot(x - u, y - v)  # not along the segments: around a known depth they may be points
         return torch.where(index < len(buffer) - 1, apart, torch.inf)
 
     def _index(self, inverse_depth: Tensor) -> Tensor:
