@@ -28,7 +28,15 @@ from pat.networks.paper import PAT
 from pat.networks.weights import load_weights
 from pat.synthesis.rendered import RenderedFrame, save_frame
 
-CHOSEN = ("calibrated", "rectified, warped", "rectified assumption", "rotated by 1 deg", "centre off by 10 px", "local 5x5", "dense")
+CHOSEN = (
+    "calibrated",
+    "rectified, warped",
+    "rectified assumption",
+    "rotated by 1 deg",
+    "centre off by 10 px",
+    "local 5x5",
+    "dense",
+)
 
 
 @pytest.fixture(scope="module")
