@@ -29,10 +29,10 @@ class Demo:
         from arraygeom.atomic import write_text
 
         from ..data.sample_array import ALPHA, load_motorcycle, load_sample
+        from ..evaluation.demo import Recording, classical_methods, save_demo_figure
         from ..evaluation.metrics import score
         from ..fusion.results import save_frame
         from ..networks.weights import load_weights
-        from ..systems.demo import Recording, classical_methods, save_demo_figure
 
         options.writable(self.out, folder=True)
         network = load_weights(self.weights)

@@ -12,53 +12,27 @@ from arraygeom.chunks import Box
 from arraygeom.pixels import HW
 from arraygeom.sampling import on_image
 
-from ..media.colour import luminance
-from .normalisation import Normalisations
-from .radiometry import SpectralMix
-from .semi_global import FINE, matches
+from .normalisation import Comparison
+from .positions import FINE, enlarged, matches
+from .semi_global import CONSISTENT
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """What of a beta's bands is compared with alpha, and how that is brought to alpha's level and sharpness.
-
-    mix: the combination of bands that alpha sees; None: Rec. 601 luma of three bands, the mean of others.
-    normalisations: of the combination, for whole images.
-    """
-
-    mix: SpectralMix | None
-    normalisations: Normalisations
-
-    @classmethod
-    def of(
-        cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b c hb wb"], mix: SpectralMix | None
-    ) -> Comparison:
-        """That of whole images of even sides, by this mix."""
-        return cls(mix, Normalisations.of(alpha, combined_bands(beta, mix)))
-
-    def combined(self, beta: Float[Tensor, "b c hb wb"]) -> Float[Tensor, "b 1 hb wb"]:
-        """The combination of beta's bands, or of a part of it."""
-        return combined_bands(beta, self.mix)
-
-
-def combined_bands(beta: Float[Tensor, "b c h w"], mix: SpectralMix | None = None) -> Float[Tensor, "b 1 h w"]:
-    """The bands as this mix combines them; without one Rec. 601 luma of three bands, the mean of others."""
-    if mix is not None:
-        return mix.of(beta)
-    return luminance(beta) if beta.shape[1] == 3 else beta.mean(1, keepdim=True)
+def is_consistent(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]:
+    """1 where the match is consistent."""
+    return enlarged((facts[:, :1] < CONSISTENT).to(facts))
 
 
 @dataclass(frozen=True)
 class BetaMatches:
     """The matches of alpha's H x W pixels in one beta.
 
-    disparity: (B, 1, H, W), how far along its segment, from the end, the match is, pixels of beta; where no match is
-        consistent, diffused from where one is.
-    facts: (B, 3, H / 2, W / 2), how far matching back from beta disagrees, by how much the match is better than
-        others, and its cost; each 0 to 1.
+    disparity: (B, 1, H, W), how far along its segment, from the end, the match is, pixels of beta; where no
+        match is consistent, diffused from where one is.
+    facts: (B, 3, H / 2, W / 2), how far matching back from beta disagrees, by how much the match is better
+        than others, and its cost; each 0 to 1.
     comparison: what of beta was compared with alpha.
-    bands: (B, C, H, W), beta's bands minus alpha at the match, with the detail that alpha has and beta has not; None
-        before they are transferred.
+    bands: (B, C, H, W), beta's bands minus alpha at the match, with the detail that alpha has and beta has
+        not; None before they are transferred.
     diffused: (B, fills, C, H, W), the same diffused from pixels of high weight to the others.
     prior: how much more, as a logit, its colours count than another beta's.
     """
@@ -78,7 +52,8 @@ class BetaMatches:
         return self.bands, self.diffused
 
     def positions(self, segments: Segments, hw: HW) -> tuple[Float[Tensor, "b h w 2"], Bool[Tensor, "b h w"]]:
-        """The matches in a beta of this size (x, y), by the segments of alpha's pixels; whether they are on it."""
+        """The matches in a beta of this size (x, y), by the segments of alpha's pixels; whether they are on
+        it."""
         where = matches(segments, self.disparity, beyond_edge=True)
         return where, segments.valid & on_image(where, hw)
 
