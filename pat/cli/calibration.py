@@ -48,7 +48,8 @@ class Calibrate:
         "omni",
         "none",
     ] = "brown-conrady"
-    """Lens model; kannala-brandt or omni for fisheyes. auto compares them on held-out frames and takes what they support."""
+    """Lens model; kannala-brandt or omni for fisheyes. auto compares them on held-out frames and takes the best
+    supported."""
     depth: Depth = None
     """Near and far bounds in metres of the scenes to come, written into the rig."""
     start: Annotated[Path | None, options.optional("RIG")] = None
