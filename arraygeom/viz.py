@@ -1,8 +1,7 @@
 """Drawings of rigs, fields and residuals. Functions give back a figure and show nothing.
 
 Matplotlib figures are made without pyplot, so there is no global state: `figure.savefig("rig.png")`, or leave the
-figure as the last line of a notebook's cell. Matplotlib is imported when something is drawn; `interactive_rig` needs
-plotly.
+figure as the last line of a notebook's cell. Matplotlib is imported when something is drawn.
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ from .rig import Pair, Rig
 from .segments import Segments
 
 if TYPE_CHECKING:
-    import plotly.graph_objects as go
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -63,29 +61,6 @@ def draw_rig(rig: Rig, *, alpha: str | None = None, size: float | None = None, t
     axes.locator_params(nbins=5)
     axes.view_init(elev=24, azim=-62)
     figure.suptitle(title or rig.name, fontsize=10)
-    return figure
-
-
-def interactive_rig(rig: Rig, *, alpha: str | None = None, size: float | None = None) -> go.Figure:
-    """The drawing of `draw_rig` as an interactive plotly figure. Raises ImportError without plotly."""
-    with needs("explore", "the interactive figure"):
-        import plotly.graph_objects as go
-    cameras = calibrated(rig)
-    figure = go.Figure()
-    size = size or frustum_size(cameras)
-    for colour, (name, camera) in zip(cycle(COLOURS), cameras.items()):
-        x, y, z = _upright(_joined(frustum(camera, size)))
-        figure.add_scatter3d(x=x, y=y, z=z, mode="lines", line={"color": colour, "width": 4}, name=name)
-        where = [[v] for v in _upright(numpy(camera.centre))]
-        figure.add_scatter3d(
-            x=where[0], y=where[1], z=where[2], mode="text", text=[name], textfont_color=colour, showlegend=False
-        )
-    outline = depth_outline(rig, cameras, alpha)
-    if outline:
-        x, y, z = _upright(_joined(outline))
-        figure.add_scatter3d(x=x, y=y, z=z, mode="lines", line={"color": "grey", "dash": "dash"}, name="near to far")
-    titles = {"xaxis_title": "x (m)", "yaxis_title": "z (m)", "zaxis_title": "-y (m)"}
-    figure.update_layout(scene={"aspectmode": "data", **titles}, title=rig.name or None)
     return figure
 
 

@@ -45,7 +45,7 @@ def test_rig_files_in_the_pages_are_read(page, tmp_path):
 @those_with("python")
 def test_samples_in_the_pages_run(page, tmp_path, monkeypatch):
     if page.stem == "explorer":
-        pytest.importorskip("panel")
+        pytest.importorskip("anywidget")
     (tmp_path / "rig.yaml").write_text(blocks(ROOT / "docs" / "index.md", "yaml")[0])
     for name, channels in (("a", 1), ("b", 3)):
         write_image(tmp_path / f"{name}.png", torch.rand(channels, 400, 640))

@@ -72,11 +72,11 @@ def test_outputs_are_kept_and_none_is_an_error(path):
 
 @pytest.mark.slow
 def test_the_explorer_is_shown_by_a_cell(tmp_path):
-    pytest.importorskip("panel")
-    imports = "from pat.data.sample_array import load_sample\nfrom pat.explore import explorer\n"
-    source = f"{imports}explorer(*load_sample()[:2])"
+    pytest.importorskip("anywidget")
+    imports = "from pat.data.sample_array import load_sample\nfrom pat.explore import explore\n"
+    source = f"{imports}explore(*load_sample()[:2])"
     cells = [nbformat.v4.new_code_cell(source)]
     fresh = run().execute(nbformat.v4.new_notebook(cells=cells), tmp_path)
     shown = [kind for output in fresh.cells[0].outputs for kind in output.get("data", {})]
-    assert "application/vnd.holoviews_exec.v0+json" in shown
+    assert "application/vnd.jupyter.widget-view+json" in shown
     assert not [o for o in fresh.cells[0].outputs if o.output_type == "error"]

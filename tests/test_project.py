@@ -24,7 +24,7 @@ from pat.media.images import write_image
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("arraygeom", "pat", "calib")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-EXTRAS = {"bpy", "OpenEXR", "Imath", "triton", "jupyterlab", "panel", "plotly"}
+EXTRAS = {"bpy", "OpenEXR", "Imath", "triton", "jupyterlab"}
 """Modules that need not be installed."""
 
 SHAPED = {"Float", "Float32", "Float64", "Bool", "Int", "Int32", "Int64", "UInt8", "Integer", "Real", "Num", "Shaped"}
@@ -156,7 +156,7 @@ GEOMETRY_MAY_USE = {
     "linked.py": {"numba"},
     "opencv.py": {"cv2"},
     "matfile.py": {"scipy"},
-    "viz.py": {"matplotlib", "plotly"},
+    "viz.py": {"matplotlib"},
 }
 """What single files of arraygeom import when it is needed, and say so in one line where it is not there."""
 
@@ -176,7 +176,7 @@ def test_importing_arraygeom_and_fusion_is_light():
 
     assert not loaded("arraygeom") & {"kornia", "cv2", "scipy", "matplotlib"}
     assert "pat.fusion.fuse" in loaded("pat.fusion.batch")
-    assert not loaded("pat.fusion.batch") & {"matplotlib", "av", "plotly", "panel", "bpy"}
+    assert not loaded("pat.fusion.batch") & {"matplotlib", "av", "anywidget", "bpy"}
 
 
 def test_an_optional_package_that_is_missing_is_named_with_its_extra():
@@ -207,7 +207,7 @@ def test_arraygeom_touches_files_only_in_io():
 
 
 def test_arraygeom_draws_only_in_viz():
-    assert [p.name for p in sources("arraygeom") if imports(p) & {"matplotlib", "plotly"} and p.stem != "viz"] == []
+    assert [p.name for p in sources("arraygeom") if imports(p) & {"matplotlib"} and p.stem != "viz"] == []
 
 
 def test_at_most_one_module_imports_blender():

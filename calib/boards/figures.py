@@ -14,6 +14,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.tri import Triangulation
 from torch import Tensor
 
 from arraygeom import Rig
@@ -23,7 +24,7 @@ from .adequacy import CELLS, Coverage
 from .detect import BoardViews
 from .photos import FrameKey, Photos
 from .rig import Calibration
-from .uncertainty import beta_covariance, half_difference, intrinsics_of, rig_covariance, uncertainty
+from .uncertainty import GRID, beta_covariance, half_difference, intrinsics_of, rig_covariance, uncertainty
 from .validation import frame_rms, misfits
 
 THUMBNAIL = 480
@@ -164,7 +165,7 @@ def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figu
         for axes, depth in zip(row, depths):
             x, deviation = uncertainty(known, depth)
             _map(axes, figure, known.camera.hw, x, deviation, f"{name}: uncertainty at {depth:.2g} m")
-        if name in halves:
+        if len(halves.get(name, ((), ()))[0]) > 3:
             x, off = halves[name]
             length = np.linalg.norm(off, axis=1)
             _map(row[2], figure, known.camera.hw, x, length, f"{name}: halves of the frames")
@@ -176,8 +177,12 @@ def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figu
 
 
 def _map(axes: Any, figure: Figure, hw: tuple[int, int], x: np.ndarray, value: np.ndarray, title: str) -> None:
-    drawn = axes.tripcolor(*x.T, np.maximum(value, 1e-4), shading="gouraud", cmap="viridis", norm=LogNorm())
-    axes.set(xlim=(0, hw[1]), ylim=(hw[0], 0), aspect="equal", xticks=[], yticks=[])
+    """Values at pixels of `grid_points`; what lies between pixels that are no neighbours is grey."""
+    triangles = Triangulation(*x.T)
+    spread = np.ptp(x[triangles.triangles], axis=1) * (np.array(GRID)[::-1] - 1) / (hw[1], hw[0])
+    triangles.set_mask((spread > 1.5).any(1))
+    drawn = axes.tripcolor(triangles, np.maximum(value, 1e-4), shading="gouraud", cmap="viridis", norm=LogNorm())
+    axes.set(xlim=(0, hw[1]), ylim=(hw[0], 0), aspect="equal", xticks=[], yticks=[], facecolor="0.85")
     axes.set_title(escaped(f"{title}: median {np.median(value):.2g} px"), fontsize=9, loc="left")
     figure.colorbar(drawn, ax=axes, shrink=0.8)
 

@@ -21,14 +21,13 @@ from .detect import BoardViews, Detection
 from .photos import FrameKey
 from .solve import board_problem, flat_boards, solve
 
-Lens = Literal["brown-conrady", "rational", "thin-prism", "tilted", "kannala-brandt", "double-sphere", "omni", "none"]
+Lens = Literal["brown-conrady", "rational", "thin-prism", "tilted", "kannala-brandt", "omni", "none"]
 LENSES: dict[Lens, tuple[str, int]] = {
     "brown-conrady": ("brown-conrady", 5),
     "rational": ("brown-conrady", 8),
     "thin-prism": ("brown-conrady", 12),
     "tilted": ("brown-conrady", 14),
     "kannala-brandt": ("kannala-brandt", 4),
-    "double-sphere": ("double-sphere", 2),
     "omni": ("unified", 5),
 }
 """Model and number of coefficients; those of Brown and Conrady have all terms of the former."""
@@ -47,7 +46,6 @@ ROUNDS = 3
 """Times that outliers may change."""
 COMPARED: tuple[Lens, ...] = (
     "none",
-    "double-sphere",
     "kannala-brandt",
     "brown-conrady",
     "rational",
@@ -228,7 +226,7 @@ def _with_model(camera: Camera, model: str, count: int) -> Camera:
         coefficients[:2] = torch.from_numpy(values[1:])
         return camera.replace(K=K, distortion=Distortion(model, coefficients))
 
-    first = np.array([0.0, 0.0, 0.5] if model == "double-sphere" else [np.log(2.0), 1.0, 0.0])
+    first = np.array([np.log(2.0), 1.0, 0.0])
     found = least_squares(lambda v: (changed(v).project_local(rays).x - x).numpy().ravel(), first, loss="soft_l1")
     return changed(found.x)
 

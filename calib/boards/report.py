@@ -78,9 +78,9 @@ def report_html(
         parts += [
             "<h2>Adequacy of each camera</h2>",
             "<p>Left, middle: standard deviation (pixels, worst direction) of the projection of points at the nearest "
-            "and the furthest depth of the boards, after the motion of the camera that compensates best. Right: how "
-            "far cameras fitted to every other frame differ: where that is much more, the lens model or the boards are "
-            "inadequate.</p>",
+            "and the furthest depth of the boards, after the motion of the camera that keeps the boards where they "
+            "were seen best. Right: how far cameras fitted to every other frame differ, where boards were seen (grey: "
+            "nowhere): where that is much more, the lens model or the boards are inadequate.</p>",
             image(draw_adequacy(calibration, depths(covers.values()))),
         ]
     if len(calibration.views) > 1 and calibration.fit.covariance is not None:

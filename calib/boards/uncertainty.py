@@ -14,20 +14,23 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from arraygeom import Camera, Pose, Rig
 from arraygeom.atomic import write_text
 from arraygeom.io.source import float64_of
+from arraygeom.pixels import HW
 from arraygeom.safe_yaml import load_json
 
-from .bundle import Solved, readjusted
+from .bundle import BundleProblem, Solved, readjusted
 from .parameters import camera_jacobian, centre_derivatives, parameter_names
 
 FORMAT = "arraygeom-covariance 1"
 GRID = 15, 20
 """Rows and columns of the pixels at which projections are compared."""
 FEWEST_TO_HALVE = 8
+SEEN = 400
+"""Board points of a camera by which its motion is compensated, about."""
 
 
 @dataclass(frozen=True)
@@ -117,22 +120,33 @@ def baseline_deviation(rig: Mapping[str, Camera], a: str, b: str, covariance: Ri
 
 
 class Intrinsics(NamedTuple):
-    """A camera in its own frame, the covariance of its free intrinsics, which they are, and its noise in pixels."""
+    """A camera in its own frame, the covariance of its free intrinsics, which they are, and its noise in pixels.
+
+    seen: some of the board points that it observed, in its frame.
+    """
 
     camera: Camera
     covariance: Float[np.ndarray, "f f"]
     free: Float[np.ndarray, " p"]
     sigma: float
+    seen: Float[np.ndarray, "m 3"]
 
 
 def intrinsics_of(fit: Solved, name: str) -> Intrinsics:
     """One camera of a fit that has a covariance."""
     assert fit.covariance is not None
-    camera = fit.problem.cameras[name].replace(cam_from_world=Pose.identity())
+    camera, seen = _alone(fit.problem, name)
     entries = [f"{name}.{entry}" for entry in parameter_names(camera)]
     free = np.array([i >= 6 and entry in fit.names for i, entry in enumerate(entries)])
     index = [fit.names.index(entry) for entry, is_free in zip(entries, free) if is_free]
-    return Intrinsics(camera, fit.covariance[np.ix_(index, index)], free, fit.sigma[name])
+    return Intrinsics(camera, fit.covariance[np.ix_(index, index)], free, fit.sigma[name], seen)
+
+
+def _alone(problem: BundleProblem, name: str) -> tuple[Camera, Float[np.ndarray, "m 3"]]:
+    """A camera at the origin, and some of the board points that it observed, in its frame."""
+    camera = problem.cameras[name]
+    X = camera.cam_from_world.apply(torch.from_numpy(problem.world(name))).numpy()
+    return camera.replace(cam_from_world=Pose.identity()), X[:: max(1, len(X) // SEEN)]
 
 
 def grid_points(camera: Camera, depth: float) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"]]:
@@ -152,18 +166,26 @@ def uncertainty(known: Intrinsics, depth: float) -> tuple[Float[np.ndarray, "n 2
 
 
 def moved_pixels(known: Intrinsics, depth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels, and how they move with the free intrinsics, after the best motion of the camera: (n, 2), (n, 2, f)."""
+    """Pixels, and how they move with the free intrinsics: (n, 2), (n, 2, f).
+
+    That is after the motion of the camera that keeps the boards where they were seen best, so that points nearer or
+    farther than the boards move more.
+    """
     x, X = grid_points(known.camera, depth)
-    J = camera_jacobian(known.camera, X)
-    moved, pose = J[..., known.free].reshape(2 * len(x), -1), J[..., :6].reshape(2 * len(x), 6)
-    left = moved - pose @ np.linalg.lstsq(pose, moved, rcond=None)[0]
-    return x, left.reshape(len(x), 2, -1)
+    J, at_boards = camera_jacobian(known.camera, X), camera_jacobian(known.camera, known.seen)
+    motion = _compensation(at_boards[..., :6], at_boards[..., known.free])
+    return x, J[..., known.free] - J[..., :6] @ motion
+
+
+def _compensation(by_pose: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """The motion (6, f) of a camera by whose derivatives (m, 2, 6) pixels move like (m, 2, f), by least squares."""
+    return np.asarray(np.linalg.lstsq(by_pose.reshape(-1, 6), moved.reshape(len(by_pose) * 2, -1), rcond=None)[0])
 
 
 def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """By camera: pixels (n, 2), and how far (n, 2) projections differ between fits to every other frame.
+    """By camera: pixels (n, 2) near those of board points, and how far (n, 2) projections differ between two fits.
 
-    Empty if there are too few frames.
+    Each is to every other frame; elsewhere lens models are extrapolated. Empty if there are too few frames.
     """
     count = len(fit.problem.frames)
     if count < FEWEST_TO_HALVE:
@@ -175,10 +197,22 @@ def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np
         return {}
     found = {}
     for name in fit.problem.cameras:
-        a, b = (half.cameras[name].replace(cam_from_world=Pose.identity()) for half in halves)
+        (a, seen), (b, _) = (_alone(half, name) for half in halves)
+        motion = _compensation(camera_jacobian(a, seen)[..., :6], _difference(a, b, seen))
         x, X = grid_points(a, depth)
-        off = b.project_local(torch.from_numpy(X)).x.numpy() - x
-        pose = camera_jacobian(a, X)[..., :6].reshape(2 * len(x), 6)
-        off = off.ravel() - pose @ np.linalg.lstsq(pose, off.ravel(), rcond=None)[0]
-        found[name] = x, off.reshape(-1, 2)
+        near = covered(x, fit.problem.seen[name].x, a.hw)
+        x, X = x[near], X[near]
+        found[name] = x, _difference(a, b, X) - (camera_jacobian(a, X)[..., :6] @ motion)[..., 0]
     return found
+
+
+def _difference(a: Camera, b: Camera, X: np.ndarray) -> Float[np.ndarray, "n 2"]:
+    xa, xb = (camera.project_local(torch.from_numpy(X)).x.numpy() for camera in (a, b))
+    return np.asarray(xb - xa)
+
+
+def covered(x: Float[np.ndarray, "n 2"], seen: Float[np.ndarray, "m 2"], hw: HW) -> Bool[np.ndarray, " n"]:
+    """Which pixels have a board point within a cell of the grid at which projections are compared."""
+    reach = max(hw[0] / GRID[0], hw[1] / GRID[1])
+    nearest = np.array([np.linalg.norm(seen - each, axis=1).min() for each in x])
+    return np.asarray(nearest < reach)

@@ -38,10 +38,18 @@ class Calibrate:
     """The rig file; its report (.html) and covariance (.covariance.json) are written beside it."""
     camera: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=PATTERN")]] = ()
     """Once for each camera, such as left='left*.jpg', where names of folders and files do not show the camera."""
-    lens: Literal["auto", "brown-conrady", "rational", "thin-prism", "tilted", "kannala-brandt", "none"] = (
-        "brown-conrady"
-    )
-    """Lens model; kannala-brandt for fisheyes. auto compares them on held-out frames and takes what they support."""
+    lens: Literal[
+        "auto",
+        "brown-conrady",
+        "rational",
+        "thin-prism",
+        "tilted",
+        "kannala-brandt",
+        "omni",
+        "none",
+    ] = "brown-conrady"
+    """Lens model; kannala-brandt or omni for fisheyes. auto compares them on held-out frames and takes the best
+    supported."""
     depth: Depth = None
     """Near and far bounds in metres of the scenes to come, written into the rig."""
     start: Annotated[Path | None, options.optional("RIG")] = None

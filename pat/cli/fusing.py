@@ -1,4 +1,4 @@
-"""`pat fuse` and `pat demo`: images of an array in, one image out."""
+"""`pat fuse`: images of an array in, one image out."""
 
 from __future__ import annotations
 
@@ -21,14 +21,13 @@ from tyro.conf import Positional, UseAppendAction, arg
 from . import options
 from .known import Known
 from .one_frame import fuse_with_progress
-from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Numbers, Out, Weights, optional, say
+from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Numbers, Out, optional, say
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from arraygeom import Rig
 
-    from ..evaluation.metrics import Score
     from ..fusion.report import Facts
     from ..fusion.results import Frame
     from ..fusion.views import ViewFiles
@@ -404,74 +403,6 @@ class Fuse(Known):
         say(f"{self.out}: {report}" + f", and {video.name}" * (self.sequence and video.is_file()))
         if report.failed:
             sys.exit(1)
-
-
-@dataclass
-class Demo:
-    """Fuse the sample array of the package: image, depth, confidence, a figure, PSNR and SSIM."""
-
-    out: Out = Path("out/demo")
-    """Folder for the results."""
-    weights: Weights = "mono-colour"
-
-    def run(self) -> None:
-        options.compile_at_once()
-        from arraygeom.atomic import write_text
-        from arraygeom.compiled import numba_loaded
-
-        from ..data.sample_array import ALPHA, BETA, load_sample
-        from ..evaluation.baseline import classical
-        from ..evaluation.demo import save_demo_figure
-        from ..fusion.results import save_frame
-
-        options.writable(self.out, folder=True)
-        sample = load_sample()
-        with ThreadPoolExecutor(1) as beside:
-            beside.submit(numba_loaded)
-            say("classical baseline: semi-global matching, warped colour, edge-aware smoothing")
-            baseline = classical(sample.rig, sample.images, ALPHA, BETA)
-            scores = {"alpha alone": beside.submit(_score, sample.images[ALPHA].expand(3, -1, -1), sample.ground_truth)}
-            scores["classical"] = beside.submit(_score, baseline, sample.ground_truth)
-            say(f"fusion with the weights '{self.weights}'")
-            frame = fuse_with_progress(self.weights, sample.rig, sample.images, alpha=ALPHA)
-            scores["fusion"] = beside.submit(_score, frame.image, sample.ground_truth)
-            drawn = beside.submit(save_demo_figure, sample, baseline, frame, self.out / "demo.png")
-            written = save_frame(frame, self.out)
-            drawn.result()
-            rows = {name: found.result() for name, found in scores.items()}
-        lines = [f"{name:12s} {psnr:6.2f} dB  {ssim:.4f}" for name, (psnr, ssim) in rows.items()]
-        table = "\n".join(["                 PSNR    SSIM", *lines, ""])
-        print(table, end="")
-        write_text(self.out / "demo.md", f"```\n{table}```\n")
-        say(f"written: {', '.join(map(str, [*written, self.out / 'demo.png']))}")
-
-
-@dataclass
-class WarmUp:
-    """Compile the kernels that `pat fuse` uses, once for this machine, so that no later command waits for it."""
-
-    def run(self) -> None:
-        """Compile the kernels by fusing the sample array once."""
-        options.compile_at_once()
-        from arraygeom.compiled import cache_folder
-
-        from ..attention.kernels import forward
-        from ..data.sample_array import ALPHA, load_sample
-        from ..fusion.fuse import fuse
-        from ..networks.weights import load_weights
-
-        options.say_when_compiling()
-        sample, begin = load_sample(), time.monotonic()
-        fuse(load_weights("mono-colour"), sample.rig, sample.images, alpha=ALPHA)
-        folder = cache_folder(forward)
-        kept = "" if folder is None else f", kept in {folder}"
-        say(f"kernels are ready: {time.monotonic() - begin:.0f} s{kept}")
-
-
-def _score(image: Tensor, ground_truth: Tensor) -> Score:
-    from ..evaluation.metrics import score
-
-    return score(image.clamp(0, 1), ground_truth)
 
 
 def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> tuple[tuple[str, ...], bool]:

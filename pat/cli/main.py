@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, NoReturn, Union
 
 import tyro
 
-from . import aligning, authors, calibration, fusing, rigs, weights
+from . import aligning, authors, calibration, demo, fusing, rigs, weights
 from .options import refuse_missing_rig, respelled, say
 from .parsing import parsed
 
@@ -29,8 +29,8 @@ class Pat:
         "calibrate": calibration.Calibrate,
         "board": calibration.PrintBoard,
         "rig": rigs.RigCommands,
-        "demo": fusing.Demo,
-        "warm-up": fusing.WarmUp,
+        "demo": demo.Demo,
+        "warm-up": demo.WarmUp,
     }
     authors: ClassVar[Mapping[str, Any]] = {
         "evaluate": authors.Evaluate,

@@ -105,32 +105,42 @@ def _twelve_pixels(hw: tuple[int, int]) -> Tensor:
 
 @dataclass
 class Explore:
-    """Explore receptive fields in the browser: click an alpha pixel, see its search segments, move the rig.
+    """Explore receptive fields in the browser: point at a pixel of alpha, see its segments, move the rig.
 
     Example: pat explore rig.yaml --image mono=a.png --image colour=b.png
     """
 
     rig: RigFile
-    image: Images
-    """An image of each camera, once each."""
+    image: Images = ()
+    """An image of each camera, once each; without any a checkered room is shown."""
     alpha: Annotated[str | None, optional("NAME")] = None
-    """The camera to click in; by default the first with an image."""
+    """The camera to point in; by default the first with an image."""
     field: FieldName = "auto"
+    weights: Annotated[str | None, arg(metavar="NAME|FILE", help_behavior_hint="")] = None
+    """A network of the paper whose attention is shown, such as pat-supervised; by default correlations of windows."""
+    save: Annotated[Path | None, optional("FILE.html")] = None
+    """Write a page of one file that needs no server, and end."""
     port: int = 0
     """Port on localhost; 0 takes a free one."""
     browser: bool = True
     """Open the browser."""
 
     def run(self) -> None:
-        try:
-            from ..explore.serving import serve
-        except ModuleNotFoundError as error:
-            raise ValueError(f"the explorer needs {error.name}: pip install 'arraygeom-pat[explore]'") from None
+        from ..explore import opened, serve
+
         rig = load_rig(self.rig)
-        images = options.read_images(rig, self.image)
-        warn_of_misfit(rig, images)
+        images = options.read_images(rig, self.image) if self.image else None
+        if images:
+            warn_of_misfit(rig, images)
         options.field_named(self.field)
-        serve(rig, images, alpha=self.alpha, field=self.field, port=self.port, browser=self.browser)
+        explorer = opened(rig, images, alpha=self.alpha, network=self.weights, field=self.field)
+        if explorer.error:
+            raise ValueError(explorer.error)
+        if self.save is None:
+            serve(explorer, port=self.port, browser=self.browser)
+        else:
+            explorer.save(self.save)
+            say(f"written: {self.save}")
 
 
 MOST_CAMERAS = 12

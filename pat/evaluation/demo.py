@@ -1,26 +1,83 @@
-"""The figure of the sample array's fusion."""
+"""What `pat demo` fuses: a rendered scene and a photograph, ideal and as real cameras record them; and its figure."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
-from torch import Tensor
+from PIL import Image
+from torch import Generator, Tensor
+
+from arraygeom.atomic import write_atomically
 
 from ..data.sample_array import ALPHA, BETA, SampleArray
-from ..fusion.results import Frame
-from ..media.figures import colour_depth, save_panels
+from ..fusion.fuse import corrections_of
+from ..media.colour import luminance
+from ..media.figures import draw_panels
+from ..networks.protocol import FusionNetwork
+from ..sensors.noise_level import NoiseLevel
+from .baseline import classical, non_local_means
+
+RESPONSE = (0.2, 0.4, 0.4)
+"""Weights of red, green and blue in the real mono camera, whose luminance is not Rec. 601's."""
+EXPOSURE = 0.6
+"""Values of the real colour camera over those of the mono camera."""
+NOISE = NoiseLevel.of_electrons(300, 2.0)
+"""Of both real cameras."""
+CROP = 4
+"""Enlargement of the figure's lower row."""
 
 
-def save_demo_figure(sample: SampleArray, baseline: Tensor, frame: Frame, path: Path) -> None:
-    """One figure: inputs, the classical baseline, the fusion, ground truth, depth and confidence."""
-    panels = {
-        "alpha: mono": sample.images[ALPHA],
-        "beta: colour": sample.images[BETA],
-        "ground truth": sample.ground_truth,
-        "classical": baseline,
-        "fusion": frame.image,
-        "depth (red is near)": colour_depth(frame.depth),
-        "confidence": frame.confidence[None],
-        "fusion's error x 5": (frame.image.clamp(0, 1) - sample.ground_truth).abs() * 5,
+class Recording(NamedTuple):
+    """An array with its images as recorded, and their noise levels by camera if there is noise."""
+
+    array: SampleArray
+    noise: Mapping[str, NoiseLevel] | None = None
+
+    def as_real_cameras(self) -> Recording:
+        """The same array with cameras of another response and exposure, in low light."""
+        generator = Generator().manual_seed(0)
+        ideal = {ALPHA: luminance(self.array.ground_truth, RESPONSE), BETA: EXPOSURE * self.array.images[BETA]}
+        images = {name: NOISE.recorded(image[None], generator)[0] for name, image in ideal.items()}
+        return Recording(self.array._replace(images=images), dict.fromkeys(images, NOISE))
+
+
+def classical_methods(network: FusionNetwork, recording: Recording) -> dict[str, Tensor]:
+    """The classical fusion: plain; with alpha's response corrected; denoised first; and both.
+
+    The response is what our fusion finds in the denoised images; these are by non-local means that know the noise.
+    Plain alone where the cameras are ideal.
+    """
+    rig, images = recording.array.rig, recording.array.images
+    methods = {"classical": classical(rig, images, ALPHA, BETA)}
+    if recording.noise is None:
+        return methods
+    denoised = {
+        name: non_local_means(image, float(recording.noise[name].deviation(image[None]).mean())).clamp(0, 1)
+        for name, image in images.items()
     }
-    save_panels(panels, path, columns=4)
+    response = corrections_of(network, rig, denoised, alpha=ALPHA, align=False).response
+
+    def corrected(given: Mapping[str, Tensor]) -> Tensor:
+        scaled = {ALPHA: response.of_alpha(given[ALPHA]), BETA: response.of_beta(given[BETA])}
+        return response.undone(classical(rig, scaled, ALPHA, BETA)).clamp(0, 1)
+
+    methods["classical, corrected"] = corrected(images)
+    methods["classical, denoised"] = classical(rig, denoised, ALPHA, BETA)
+    methods["classical, denoised and corrected"] = corrected(denoised)
+    return methods
+
+
+def save_demo_figure(panels: Mapping[str, Tensor], corner: tuple[int, int], path: Path) -> None:
+    """Images of one size, three in a row, and below each a window whose corner (row, column) is given, enlarged."""
+    h, w = next(iter(panels.values())).shape[-2:]
+    top, left = corner
+    window = (..., slice(top, top + h // CROP), slice(left, left + w // CROP))
+    drawn = draw_panels(panels, columns=3, width=16)
+    crops = draw_panels({f"{name}, {CROP} x": image[window] for name, image in panels.items()}, columns=3, width=16)
+    both = Image.new("RGB", (drawn.width, drawn.height + crops.height), "white")
+    both.paste(drawn, (0, 0))
+    both.paste(crops, (0, drawn.height))
+    with write_atomically(path) as temporary:
+        both.save(temporary, compress_level=3)

@@ -1,52 +1,147 @@
-"""What the widget and its saved page draw: a state of the controls in, one plain dictionary out."""
+"""What the explorer draws: a state of the controls in, one plain dictionary out."""
 
 from __future__ import annotations
 
 import base64
 import io
 import math
-from collections.abc import Mapping
 from typing import Any
 
+import torch
 from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from arraygeom import Camera, Rig
+from arraygeom import Camera, Distortion, Pose, Rig, rotation_from_vector
+from arraygeom.io.native import write as rig_text
 
 from ..media.colour import to_bytes
-from .pixel import BetaReport, ExplorerScene, ExplorerState, image_pixel, inspect_pixel
+from .pixel import FAMILIES, WINDOWS, BetaReport, ExplorerScene, ExplorerState, image_pixel, inspect_pixel
 
 Controls = dict[str, Any]
-"""Values of the controls: x (alpha's pixel), near, far (metres), baseline (a factor), rotation (degrees)."""
+"""Values of the controls, see `DEFAULTS`; and x, alpha's pixel."""
+DEFAULTS: Controls = {
+    "field": "auto",
+    "second": "none",
+    "weights": WINDOWS,
+    "near": None,
+    "far": None,
+    "baseline": 1.0,
+    "rotation": 0.0,
+    "focal": 1.0,
+    "lens": 0.0,
+    "moved": {},
+    "clicked": None,
+}
+"""The rig as it is. baseline and focal are factors, rotation is in degrees about the betas' y axes, lens is added to
+their k1, `moved` are steps (right, forward) in alpha's axes by beta, metres; near and far are metres. `clicked` is a
+beta and a pixel of it, whose match becomes alpha's pixel."""
 WIDEST = 640
 """Pixels of the longer side of an image that is shown."""
+FARTHEST = 1000.0
+"""Metres at which an infinite far is shown until it is changed."""
+SHIPPED = "pat-supervised"
+"""The network whose attention can be chosen where no other is given."""
 
 
 def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any]:
     """The pixel, its depth, and each beta's samples, weights and match; `error` or `problem` where there are none."""
     try:
-        state = explorer_state(scene.rig, alpha, controls)
-        report = inspect_pixel(scene, state)
+        return _answer(scene, alpha, controls)
     except (ValueError, TypeError, KeyError) as error:
         return {"error": str(error)}
+
+
+def _answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any]:
+    rig = scene.rig
+    scene = scene.with_rig(moved_rig(rig, alpha, controls))
+    backwards: list[Any] = []
+    if controls["clicked"] is not None:
+        controls, backwards = clicked(scene, alpha, controls)
+    report = inspect_pixel(scene, explorer_state(scene.rig, alpha, controls))
     betas: dict[str, Any] = {name: {"problem": text} for name, text in report.problems.items()}
     betas |= {name: drawn(beta) for name, beta in report.betas.items()}
-    return {"x": list(state.x), "depth": number(report.depth), "betas": betas, "code": code(alpha, controls)}
+    if controls["second"] != "none":
+        other = inspect_pixel(scene, explorer_state(scene.rig, alpha, {**controls, "field": controls["second"]}))
+        for name, beta in betas.items():
+            problem = other.problems.get(name)
+            beta["second"] = {"problem": problem} if problem else drawn(other.betas[name])
+    return {
+        "x": list(image_pixel(controls["x"][0], controls["x"][1], scene.rig[alpha].hw)),
+        "depth": number(report.depth),
+        "betas": betas,
+        "backwards": backwards,
+        "top": top_view(scene.rig, alpha),
+        "rig": "" if scene.rig is rig else rig_text(scene.rig),
+    }
+
+
+def clicked(scene: ExplorerScene, alpha: str, controls: Controls) -> tuple[Controls, list[Any]]:
+    """The controls with alpha's pixel that matches the clicked one of a beta, and that one's samples in alpha."""
+    name, column, row = controls["clicked"]
+    x = image_pixel(column, row, scene.rig[name].hw)
+    found = inspect_pixel(scene, explorer_state(scene.rig, alpha, controls).replace(alpha=name, x=x))
+    if alpha in found.problems:
+        raise ValueError(found.problems[alpha])
+    report = drawn(found.betas[alpha])
+    if "problem" in report:
+        raise ValueError(f"no pixel of {alpha} can match ({x[0]:.0f}, {x[1]:.0f}) of {name}")
+    return {**controls, "x": report["match"]}, report["samples"]
+
+
+def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
+    """The rig with every calibrated beta moved, rotated about its centre, of another focal length and lens."""
+    own, cameras = rig[alpha], dict(rig.cameras)
+    if all(controls[name] == DEFAULTS[name] for name in ("baseline", "rotation", "focal", "lens", "moved")):
+        return rig
+    turn = rotation_from_vector(torch.tensor([0.0, math.radians(controls["rotation"]), 0.0], dtype=torch.float64))
+    for name in rig.betas(alpha):
+        beta = rig[name]
+        if not (isinstance(beta, Camera) and isinstance(own, Camera)):
+            continue
+        right, forward = controls["moved"].get(name, (0.0, 0.0))
+        step = own.R.T @ own.R.new_tensor([right, 0.0, forward])
+        centre = own.centre + controls["baseline"] * (beta.centre - own.centre) + step
+        K = torch.cat([beta.K[:2, :2] * controls["focal"], beta.K[:2, 2:]], 1)
+        cameras[name] = beta.replace(
+            K=torch.cat([K, beta.K[2:]]),
+            cam_from_world=Pose.from_centre(turn.to(beta.R) @ beta.R, centre),
+            distortion=with_k1(beta, controls["lens"]),
+        )
+    return rig.replace(cameras=cameras)
+
+
+def with_k1(camera: Camera, k1: float) -> Any:
+    """The camera's lens with another k1. Raises ValueError for a lens that has none."""
+    lens = camera.distortion
+    if k1 == 0:
+        return lens
+    if lens is None:
+        return Distortion("brown-conrady", camera.K.new_tensor([k1, 0, 0, 0]))
+    if not has_k1(camera):
+        raise ValueError("the lens slider changes k1, which this lens has not: set it back to 0")
+    change = torch.zeros_like(lens.coefficients)
+    change[..., 0] = k1
+    return lens.replace(coefficients=lens.coefficients + change)
+
+
+def has_k1(camera: Camera) -> bool:
+    """Whether the lens slider can change the camera."""
+    lens = camera.distortion
+    return lens is None or (isinstance(lens, Distortion) and lens.model == "brown-conrady")
 
 
 def explorer_state(rig: Rig, alpha: str, controls: Controls) -> ExplorerState:
-    """The state of the controls. Betas are rotated about their y axes, and moved along their baselines."""
-    column, row = controls["x"]
-    x = image_pixel(column, row, rig[alpha].hw)
-    changes: dict[str, tuple[float, ...]] = {}
-    for name in rig.betas(alpha):
-        beta, own = rig[name], rig[alpha]
-        if isinstance(beta, Camera) and isinstance(own, Camera):
-            longer = (controls["baseline"] - 1) * (beta.t + beta.R @ own.centre)
-            changes[f"{name}.translation"] = tuple(longer.tolist())
-            changes[f"{name}.rotation"] = (0.0, math.radians(controls["rotation"]), 0.0)
-    return ExplorerState(alpha, x, near=controls["near"], far=controls["far"], changes=changes)
+    """The state of the controls, for a rig that they have moved."""
+    x = image_pixel(controls["x"][0], controls["x"][1], rig[alpha].hw)
+    return ExplorerState(
+        alpha,
+        x,
+        family=controls["field"],
+        near=controls["near"],
+        far=controls["far"],
+        weights=controls["weights"],
+    )
 
 
 def drawn(beta: BetaReport) -> dict[str, Any]:
@@ -57,10 +152,24 @@ def drawn(beta: BetaReport) -> dict[str, Any]:
     return {
         "samples": rounded(beta.xy[beta.valid]),
         "weights": rounded(beta.weight[beta.valid], 4),
+        "depths": [number(float(d)) for d in beta.depth[beta.valid]],
         "match": rounded(beta.xy[best]),
         "depth": number(float(beta.depth[best])),
         "off": None if beta.offset is None else round(beta.offset.distance, 2),
     }
+
+
+def top_view(rig: Rig, alpha: str) -> list[dict[str, Any]]:
+    """The cameras from above, in alpha's axes: each one's centre (right, forward) and where it looks; metres."""
+    own = rig[alpha]
+    if not isinstance(own, Camera):
+        return []
+    shown = []
+    for name, camera in rig.cameras.items():
+        if isinstance(camera, Camera):
+            centre, ahead = own.R @ (camera.centre - own.centre), own.R @ camera.R[2]
+            shown.append({"name": name, "at": rounded(centre[[0, 2]], 5), "ahead": rounded(ahead[[0, 2]], 4)})
+    return shown
 
 
 def rounded(values: Tensor, digits: int = 2) -> list[Any]:
@@ -73,17 +182,33 @@ def number(value: float) -> float | None:
     return float(f"{value:.4g}") if math.isfinite(value) else None
 
 
-def code(alpha: str, controls: Controls) -> str:
-    """The line of Python that makes the same view."""
-    changed = {name: controls[name] for name in ("near", "far", "baseline", "rotation")}
-    kept = {name: v for name, v in changed.items() if v is not None and v != DEFAULTS[name]}
-    x = tuple(round(v) for v in controls["x"])
-    settings = "".join(f", {name}={v:.6g}" for name, v in kept.items())
-    return f"explore(rig, images, alpha={alpha!r}, x={x}{settings})"
+def slider_ranges(rig: Rig) -> list[list[Any]]:
+    """Name, label and (low, high, step, value) of each slider that the rig has a use for."""
+    ranges: list[list[Any]] = []
+    if rig.depth is not None:
+        near, far = (min(float(d), FARTHEST) for d in rig.depth)
+        ranges.append(["near", "near (m)", [near / 4, far, (far - near / 4) / 500, near]])
+        ranges.append(["far", "far (m)", [near, 4 * far, (4 * far - near) / 500, far]])
+    cameras = [camera for camera in rig.cameras.values() if isinstance(camera, Camera)]
+    if cameras:
+        ranges.append(["baseline", "baseline (times)", [0.1, 4.0, 0.05, 1.0]])
+        ranges.append(["rotation", "rotation (degrees)", [-3.0, 3.0, 0.05, 0.0]])
+        ranges.append(["focal", "focal length (times)", [0.8, 1.25, 0.005, 1.0]])
+    if cameras and all(map(has_k1, cameras)):
+        ranges.append(["lens", "lens (k1)", [-0.3, 0.3, 0.01, 0.0]])
+    return ranges
 
 
-DEFAULTS: Controls = {"near": None, "far": None, "baseline": 1.0, "rotation": 0.0}
-"""The rig as it is."""
+def choices(scene: ExplorerScene, controls: Controls) -> list[list[Any]]:
+    """Name, label and options of each choice."""
+    fields = [*FAMILIES, *scene.fields]
+    own = [name for name in (controls["field"], controls["second"]) if name not in ("none", *fields)]
+    weights = [WINDOWS, *(scene.networks or [SHIPPED])]
+    return [
+        ["field", "field", [*fields, *own]],
+        ["second", "compared with", ["none", *fields, *own]],
+        ["weights", "weights by", weights],
+    ]
 
 
 def shown_cameras(scene: ExplorerScene, alpha: str) -> list[dict[str, Any]]:
@@ -103,15 +228,3 @@ def data_url(image: Tensor) -> str:
     file = io.BytesIO()
     Image.fromarray(to_bytes(image.clamp(0, 1)).transpose(1, 2, 0)).save(file, "PNG")
     return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()
-
-
-def grid_answers(scene: ExplorerScene, alpha: str, controls: Controls, columns: int) -> dict[str, Any]:
-    """Answers for a grid of alpha's pixels by "column,row", and the grid's size: what a page without a kernel draws."""
-    h, w = scene.rig[alpha].hw
-    rows = max(1, round(columns * h / w))
-    answers: Mapping[str, Any] = {
-        f"{i},{j}": answer(scene, alpha, {**controls, "x": [(i + 0.5) * w / columns, (j + 0.5) * h / rows]})
-        for i in range(columns)
-        for j in range(rows)
-    }
-    return {"columns": columns, "rows": rows, "answers": answers}

@@ -1,9 +1,9 @@
 """The explorer's computation: one alpha pixel and a state of the controls in, everything that is drawn out.
 
 Only one pixel is computed, so that an answer takes milliseconds whatever the images' size; no widget is used here. The
-weights are those of C3 attention with the simplest features: luminance in a window around each point, of mean zero and
-length one, so that scores are normalised correlations. Windows of beta are warped by the rough homography, so that
-cameras of other focal lengths and orientations compare the same patch.
+weights are those of C3 attention: of a network, or with the simplest features, luminance in a window around each point,
+of mean zero and length one, so that scores are normalised correlations. Windows of beta are warped by the rough
+homography, so that cameras of other focal lengths and orientations compare the same patch.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -41,7 +42,13 @@ from arraygeom.fields.default import FIELDS, LINE_SHARE, named_field, recorded_f
 from arraygeom.fields.ray_depth import ray_depth, rough_transfer
 from arraygeom.pixels import HW
 
+from ..fusion.steps import at_alphas_resolution
 from ..media.colour import luminance
+from ..networks.paper import PAT, QueryAndKey
+from ..networks.weights import load_weights
+
+WINDOWS = "windows"
+"""Weights by the correlation of windows."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +57,8 @@ class ExplorerState:
 
     `x` is alpha's pixel. `near` and `far` (metres) replace the rig's, `displacement` (pixels of beta) the one that
     covers the depth range; None keeps them. `across` widens the field (pixels). `changes` are steps of the rig's
-    parameters, with the names and units of `Rig.parameters` (radians, metres, pixels). `sharpness` multiplies scores.
+    parameters, with the names and units of `Rig.parameters` (radians, metres, pixels). `weights` are by windows, whose
+    scores `sharpness` multiplies, or by a network of that name.
     """
 
     alpha: str
@@ -61,6 +69,7 @@ class ExplorerState:
     displacement: float | None = None
     across: float = 0.0
     sharpness: float = 30.0
+    weights: str = WINDOWS
     changes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     def replace(self, **changes: object) -> ExplorerState:
@@ -113,19 +122,61 @@ class PixelReport(NamedTuple):
 
 @dataclass(frozen=True)
 class ExplorerScene:
-    """A rig and its images (C, H, W), with the luminances that are compared, computed once."""
+    """A rig and its images (C, H, W); fields of one's own and networks by name.
+
+    The luminances that windows compare are computed once, and so are a network's features when it is first asked.
+    """
 
     rig: Rig
     images: Mapping[str, Tensor]
-    guides: dict[str, Tensor] = field(default_factory=dict, init=False)
+    fields: Mapping[str, ReceptiveField] = field(default_factory=dict)
+    networks: Mapping[str, PAT] = field(default_factory=dict)
+    guides: dict[str, Tensor] = field(default_factory=dict)
+    features: dict[tuple[str, str, str], QueryAndKey] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, image in self.images.items():
+            if name in self.guides:
+                continue
             hw = self.rig[name].hw
             if tuple(image.shape[1:]) != hw:
                 got, wanted = f"{image.shape[2]}x{image.shape[1]}", f"{hw[1]}x{hw[0]}"
                 raise ValueError(f"the image of '{name}' is {got}, the rig says {wanted}: give the right image")
             self.guides[name] = (luminance(image) if image.shape[0] == 3 else image.mean(0, keepdim=True))[None]
+
+    def with_rig(self, rig: Rig) -> ExplorerScene:
+        """The same images with a rig that was moved."""
+        return dataclasses.replace(self, rig=rig)
+
+    def query(self, network: str, alpha: str) -> Float[Tensor, "1 d h w"]:
+        """What the network's attention compares of alpha's image."""
+        return self._once(network, alpha, self.images[alpha], "query").query
+
+    def key(self, network: str, beta: str, pair: Pair) -> Float[Tensor, "1 d h w"]:
+        """What it compares of a beta's image, at alpha's resolution if the network wants that."""
+        image = self.images[beta]
+        if self._network(network).equal_resolution and (network, beta, "key") not in self.features:
+            image = at_alphas_resolution(image, pair)
+        return self._once(network, beta, image, "key").key
+
+    def _network(self, name: str) -> PAT:
+        return self.networks[name] if name in self.networks else shipped_attention(name)
+
+    def _once(self, network: str, camera: str, image: Tensor, part: str) -> QueryAndKey:
+        which = network, camera, part
+        if which not in self.features:
+            with torch.no_grad():
+                self.features[which] = self._network(network).query_and_key(image[None])
+        return self.features[which]
+
+
+@cache
+def shipped_attention(name: str) -> PAT:
+    """Weights of the paper's network. Raises ValueError for others."""
+    found = load_weights(name)
+    if not isinstance(found, PAT):
+        raise ValueError(f"weights '{name}' are not of the paper's network: its attention alone can be shown")
+    return found
 
 
 DENSE = 2048
@@ -191,6 +242,8 @@ def inspect_pixel(scene: ExplorerScene, state: ExplorerState) -> PixelReport:
             betas[name] = beta_report(scene, rig.pair(state.alpha, name), name, state)
         except ValueError as error:
             problems[name] = str(error)
+        except Exception as error:  # of a field of one's own
+            problems[name] = f"the field '{state.family}' failed: {type(error).__name__}: {error}"
     return PixelReport(rig, betas, problems, fused_colour(scene, betas, state), joint_depth(betas))
 
 
@@ -202,12 +255,18 @@ def pixel_of(state: ExplorerState) -> Float[Tensor, "1 2"]:
 def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerState) -> BetaReport:
     """The pixel's samples in one beta, their weights and depths. Raises ValueError where the field does not fit."""
     x = pixel_of(state)
-    chosen = chosen_field(pair, state)
+    chosen = scene.fields[state.family] if state.family in scene.fields else chosen_field(pair, state)
     found = (Widened(chosen, across=state.across) if state.across else chosen)(pair, x)
     samples = found.positions(samples_along(found)) if isinstance(found, Segments) else found
     xy, valid = samples.xy[0], samples.mask[0]
-    scores = correlations(scene.guides[state.alpha], scene.guides[name], pair, x, xy)
-    weight = softmax(state.sharpness * scores, valid)
+    if state.weights == WINDOWS:
+        scores = state.sharpness * correlations(scene.guides[state.alpha], scene.guides[name], pair, x, xy)
+    else:
+        query = sampled(scene.query(state.weights, state.alpha), x)
+        key = scene.key(state.weights, name, pair)
+        larger = xy.new_tensor([key.shape[-1] / pair.beta.hw[1], key.shape[-2] / pair.beta.hw[0]])
+        scores = (query.T @ sampled(key, (xy + 0.5) * larger - 0.5))[0]
+    weight = softmax(scores, valid)
     position = weight @ xy
     value = sampled(scene.images[name][None], xy) @ weight
     return BetaReport(

@@ -1,83 +1,84 @@
-"""Serving the explorer to this machine alone."""
+"""Serving the explorer to this machine alone, by the standard library."""
 
 from __future__ import annotations
 
-import re
+import json
 import socket
-from collections.abc import Mapping
+import threading
+import webbrowser
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-import panel as pn
-from jaxtyping import Float
-from torch import Tensor
-from tornado.web import RequestHandler
+from .page import Explorer
 
-from arraygeom import Rig
-
-from .page import Explorer, prepared
-from .theme import PAGE
-
-
-def serve(
-    rig: Rig,
-    images: Mapping[str, Float[Tensor, "_ _ _"]],
-    *,
-    alpha: str | None = None,
-    field: str = "auto",
-    port: int = 0,
-    browser: bool = True,
-) -> None:
-    """Serve the explorer to this machine alone until interrupted; port 0 takes a free one.
-
-    Requests for other host names than this machine's are refused, whatever their origin: a foreign page whose name is
-    made to resolve to this machine must not read the images. Raises as `explorer`, and ValueError for a port that is
-    none or in use.
-    """
-    check_port(port)
-    scene, alpha = prepared(rig, images, alpha)
-    Explorer(scene, alpha, field).panel()  # once beforehand: what it imports and compiles must not delay the page
-    pn.config.raw_css = [*pn.config.raw_css, PAGE]
-    port = port or free_port()
-    server = pn.serve(
-        {"/": lambda: Explorer(scene, alpha, field).panel()},
-        port=port,
-        address="localhost",
-        websocket_origin=[f"{name}:{port}" for name in OWN_NAMES],
-        show=False,
-        start=False,
-        title=f"pat explore {rig.name}".strip(),
-        verbose=False,
-    )
-    refuse_foreign_hosts(server)
-    print(f"the explorer is at http://localhost:{port} (Ctrl+C ends it)", flush=True)
-    server.start()
-    if browser:
-        server.show("/")
-    try:
-        server.io_loop.start()
-    except KeyboardInterrupt:
-        pass
-    finally:
-        server.stop()
-
-
+LARGEST = 1 << 16
+"""Bytes of a question."""
 OWN_NAMES = ("localhost", "127.0.0.1")
 """Host names of this machine."""
 
 
-class ForeignHost(RequestHandler):
-    """The answer to requests for another host."""
+def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
+    """Serve the explorer to this machine alone until interrupted; port 0 takes a free one.
 
-    def prepare(self) -> None:
-        """Refuse."""
-        self.set_status(403)
-        self.finish("the explorer answers to localhost alone\n")
+    Requests for other host names than this machine's, or from pages of other origins, are refused: a foreign page whose
+    name is made to resolve to this machine must not read the images. Raises ValueError for a port that is none or
+    in use.
+    """
+    check_port(port)
+    page = explorer.served_page().encode()  # computes once what the first answer would wait for
+    turn = threading.Lock()
 
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            if self._is_own() and self.path == "/":
+                self._send(200, "text/html; charset=utf-8", page)
+            else:
+                self._refuse()
 
-def refuse_foreign_hosts(server: Any) -> None:
-    """Refuse every request, WebSockets included, whose Host is not this machine's, before any other rule applies."""
-    own = "|".join(map(re.escape, OWN_NAMES))
-    server._tornado.add_handlers(f"(?!(?:{own})$).*", [(r".*", ForeignHost)])
+        def do_POST(self) -> None:
+            length = self.headers.get("Content-Length", "")
+            if not (self._is_own() and self.path == "/answer" and length.isdigit() and int(length) <= LARGEST):
+                self._refuse()
+                return
+            try:
+                controls = {**explorer.controls, **json.loads(self.rfile.read(int(length)))}
+            except (ValueError, TypeError):
+                self._send(400, "text/plain", b"the question is not a JSON object\n")
+                return
+            with turn:
+                text = json.dumps(explorer.answer(controls))
+            self._send(200, "application/json", text.encode())
+
+        def _is_own(self) -> bool:
+            hosts = [f"{name}:{self.server.server_port}" for name in OWN_NAMES]  # type: ignore[attr-defined]
+            origin = self.headers.get("Origin")
+            return self.headers.get("Host") in hosts and (origin is None or origin.partition("://")[2] in hosts)
+
+        def _refuse(self) -> None:
+            own = self._is_own()
+            self._send(404 if own else 403, "text/plain", b"nothing here\n" if own else b"for localhost alone\n")
+
+        def _send(self, status: int, kind: str, body: bytes) -> None:
+            self.send_response(status)
+            self.send_header("Content-Type", kind)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, format: str, *args: Any) -> None:
+            """Say nothing of each request."""
+
+    server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+    address = f"http://localhost:{server.server_port}"
+    print(f"the explorer is at {address} (Ctrl+C ends it)", flush=True)
+    if browser:
+        webbrowser.open(address)
+    try:
+        server.serve_forever()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        server.server_close()
 
 
 def check_port(port: int) -> None:
@@ -87,13 +88,6 @@ def check_port(port: int) -> None:
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind(("localhost", port))
+            probe.bind(("127.0.0.1", port))
         except OSError as error:
             raise ValueError(f"--port {port}: {error.strerror}: give another, or 0 for a free one") from None
-
-
-def free_port() -> int:
-    """A port on localhost that nothing listens at."""
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        return probe.getsockname()[1]

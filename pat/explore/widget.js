@@ -1,16 +1,27 @@
 const STYLE = `
 .pat { font: 13px system-ui, sans-serif; color: light-dark(#1c2127, #e8eaed); background: light-dark(#fff, #1d2125);
-  padding: 8px; color-scheme: light dark }
-.pat .views { display: flex; flex-wrap: wrap; gap: 8px } .pat figure { flex: 1 1 300px; margin: 0; max-width: 640px }
-.pat canvas { width: 100%; display: block } .pat .controls { display: flex; flex-wrap: wrap; gap: 12px; margin-top: 8px }
-.pat label { display: flex; flex-direction: column } .pat figcaption { min-height: 1.4em }`;
-
-const metres = (d) => (d == null ? "no depth" : `${d} m`);
+  --line: light-dark(#cfd5dc, #434a52); --soft: light-dark(#5d6670, #a5aeb8); padding: 10px; color-scheme: light dark }
+.pat .views { display: flex; flex-wrap: wrap; gap: 10px } .pat figure { flex: 1 1 300px; margin: 0; max-width: 640px }
+.pat canvas { width: 100%; display: block; border-radius: 4px } .pat figcaption { min-height: 2.8em; margin-top: 4px }
+.pat .profile { height: 56px; border-radius: 0; margin-top: 4px } .pat .top { width: 240px; height: 180px }
+.pat .top { border: 1px solid var(--line); touch-action: none } .pat canvas[data-camera] { cursor: crosshair }
+.pat .below, .pat .controls, .pat .buttons { display: flex; flex-wrap: wrap; gap: 12px; align-items: start }
+.pat .below { margin-top: 6px } .pat .controls { flex: 1 1 300px } .pat .buttons { flex-basis: 100% }
+.pat label { display: flex; flex-direction: column; gap: 2px; width: 180px; color: var(--soft) }
+.pat select, .pat button { font: inherit; color: inherit; background: light-dark(#f3f5f7, #2a2f35);
+  border: 1px solid var(--line); border-radius: 5px; padding: 3px 8px } .pat button { cursor: pointer }
+.pat button:disabled { opacity: .4 } .pat :focus-visible { outline: 2px solid #0a84ff; outline-offset: 1px } .pat kbd { font: inherit; opacity: .6 }`;
+const FIRST = "#e69f00", SECOND = "#cc79a7", MATCH = "#00bfff", BACK = "#ff6d3a";
+const metres = (d) => (d == null ? "no depth" : `depth ${d} m`);
+const make = (tag, properties = {}, ...children) => {
+  const made = Object.assign(document.createElement(tag), properties);
+  made.append(...children);
+  return made;
+};
 
 function write(context, text) {
-  const { canvas } = context, size = canvas.width / 32;
+  const { canvas } = context, size = canvas.width / 32, lines = [""];
   context.font = `${size}px system-ui`;
-  const lines = [""];
   for (const word of text.split(" ")) {
     if (context.measureText(`${lines.at(-1)} ${word}`).width > 0.92 * canvas.width) lines.push("");
     lines.push(`${lines.pop()} ${word}`);
@@ -21,106 +32,263 @@ function write(context, text) {
   lines.forEach((line, i) => context.fillText(line, 0.03 * canvas.width, (i + 1) * 1.3 * size));
 }
 
-function cross(context, [x, y], colour) {
-  const r = context.canvas.width / 50;
-  context.strokeStyle = colour;
-  context.lineWidth = context.canvas.width / 300;
-  context.beginPath();
-  for (const [dx, dy] of [[r, 0], [0, r]]) { context.moveTo(x - dx, y - dy); context.lineTo(x + dx, y + dy); }
-  context.stroke();
+// What is drawn over an image, once for the canvas and once for the SVG: lines, dots and crosses in its pixels.
+function marks(camera, answer) {
+  const found = [], beta = answer.betas?.[camera.name], radius = camera.hw[1] / 50;
+  const cross = ([x, y], colour) => [[1, 0], [-1, 0], [0, 1], [0, -1]].forEach(([u, v]) => found.push(
+    { line: [0.4 * radius, radius].map((r) => [x + r * u, y + r * v]), colour }));
+  const field = (report, colour) => {
+    if (!report || report.problem) return;
+    const top = Math.max(...report.weights), unit = camera.hw[1] / 400;
+    found.push({ line: report.samples, colour });
+    report.samples.forEach((at, i) => found.push({ dot: at, radius: unit * (0.6 + 4 * report.weights[i] / top), colour }));
+  };
+  if (camera.alpha) {
+    if (answer.backwards?.length) found.push({ line: answer.backwards, colour: BACK });
+    if (answer.x) cross(answer.x, MATCH);
+    return found;
+  }
+  field(beta?.second, SECOND);
+  field(beta, FIRST);
+  if (beta?.match) cross(beta.match, MATCH);
+  return found;
 }
 
-function drawBeta(context, beta) {
-  if (beta.problem) { write(context, beta.problem); return beta.problem; }
-  const unit = context.canvas.width / 400, top = Math.max(...beta.weights);
-  context.strokeStyle = context.fillStyle = "#e69f00";
-  context.lineWidth = unit;
-  context.beginPath();
-  for (const [x, y] of beta.samples) context.lineTo(x, y);
-  context.stroke();
-  context.globalAlpha = 0.7;
-  beta.samples.forEach(([x, y], i) => {
+function drawMarks(context, camera, answer) {
+  const unit = camera.hw[1] / 400;
+  for (const { line, dot, radius, colour } of marks(camera, answer)) {
+    context.strokeStyle = context.fillStyle = colour;
     context.beginPath();
-    context.arc(x, y, unit * (0.8 + 4 * beta.weights[i] / top), 0, 7);
-    context.fill();
-  });
-  context.globalAlpha = 1;
-  cross(context, beta.match, "#0bf");
-  const off = beta.off == null ? "no clear match near the line" : `${beta.off} px off the line`;
-  return `match (${beta.match.map((v) => v.toFixed(1)).join(", ")}), ${metres(beta.depth)}, ` +
-    `${beta.samples.length} samples, ${off}`;
+    if (line) {
+      for (const [x, y] of line) context.lineTo(x, y);
+      context.lineWidth = unit * 1.3;
+      context.stroke();
+    } else {
+      context.globalAlpha = 0.7;
+      context.arc(...dot, radius, 0, 7);
+      context.fill();
+      context.globalAlpha = 1;
+    }
+  }
 }
 
-function slider(name, value, [low, high, step], changed) {
-  const label = document.createElement("label"), input = document.createElement("input");
-  const text = document.createElement("span");
-  Object.assign(input, { type: "range", min: low, max: high, step, value });
-  const show = () => { text.textContent = `${name} ${Number(input.value).toPrecision(3)}`; };
-  input.dataset.control = name.split(" ")[0];
-  input.addEventListener("input", () => { show(); changed(Number(input.value)); });
-  label.append(text, input);
-  show();
-  return label;
+// Weights along the segment from one end to the other, the highest being 1.
+function drawProfile(canvas, beta) {
+  const context = canvas.getContext("2d"), width = (canvas.width = 2 * canvas.clientWidth || 600);
+  const height = (canvas.height = 112);
+  [[beta?.second, SECOND], [beta, FIRST]].forEach(([report, colour]) => {
+    if (!report || report.problem) return;
+    const top = Math.max(...report.weights), last = Math.max(report.weights.length - 1, 1);
+    context.strokeStyle = colour;
+    context.lineWidth = 3;
+    context.beginPath();
+    report.weights.forEach((w, i) => context.lineTo(3 + i / last * (width - 6), height - 4 - (w / top) * (height - 34)));
+    context.stroke();
+  });
+  if (!beta || beta.problem) return;
+  context.font = "22px system-ui";
+  context.fillStyle = getComputedStyle(canvas).color;
+  const ends = [beta.depths[0], beta.depths.at(-1)].map((d) => (d == null ? "" : `${d} m`));
+  context.fillText(ends[0], 0, 20);
+  context.textAlign = "center";
+  context.fillText("weight along the segment", width / 2, 20);
+  context.textAlign = "right";
+  context.fillText(ends[1], width, 20);
+}
+
+function betaText(beta) {
+  if (beta.problem) return beta.problem;
+  const off = beta.off === undefined ? "" : beta.off == null ? ", no clear match near the line" : `, ${beta.off} px off the line`;
+  const second = beta.second && (beta.second.problem ?? `${beta.second.samples.length} samples`);
+  return `match (${beta.match.map((v) => v.toFixed(1)).join(", ")}), ${metres(beta.depth)}, ` +
+    `${beta.samples.length} samples${off}` + (second ? `; compared: ${second}` : "");
+}
+
+// Python that makes the same view.
+function code(cameras, controls, defaults, x) {
+  const python = (v) => (v === null ? "None" : typeof v === "number" ? String(Number(v.toPrecision(6))) : JSON.stringify(v));
+  const kept = Object.keys(defaults).filter((n) => n !== "clicked" && python(controls[n]) !== python(defaults[n]));
+  const changes = kept.map((n) => `, ${n}=${python(controls[n])}`).join("");
+  const alpha = cameras.find((camera) => camera.alpha).name;
+  return `explore(rig, images, alpha=${python(alpha)}, x=(${x.map((v) => Math.round(v)).join(", ")})${changes})`;
+}
+
+function svg(cameras, answer) {
+  const gap = 10, wide = 640, escaped = (text) => text.replace(/[&<"]/g, (c) => `&#${c.charCodeAt(0)};`);
+  const parts = cameras.map((camera, i) => {
+    const [h, w] = camera.hw, drawn = marks(camera, answer).map(({ line, dot, radius, colour }) => line
+      ? `<polyline points="${line.map((p) => p.join()).join(" ")}" fill="none" stroke="${colour}" stroke-width="${w / 300}"/>`
+      : `<circle cx="${dot[0]}" cy="${dot[1]}" r="${radius}" fill="${colour}" fill-opacity=".7"/>`).join("");
+    return `<svg x="${i * (wide + gap)}" y="24" width="${wide}" height="${wide * h / w}" viewBox="-.5 -.5 ${w} ${h}">` +
+      `<image x="-.5" y="-.5" width="${w}" height="${h}" href="${camera.src}"/>${drawn}</svg>` +
+      `<text x="${i * (wide + gap)}" y="16" font-family="sans-serif" font-size="14">${escaped(camera.name)}</text>`;
+  });
+  const high = 24 + Math.max(...cameras.map(({ hw }) => wide * hw[0] / hw[1]));
+  return `<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 ${cameras.length * (wide + gap)} ${high}">${parts.join("")}</svg>`;
+}
+
+function download(name, text, type) {
+  const link = make("a", { href: URL.createObjectURL(new Blob([text], { type })), download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+}
+
+// The cameras from above; a beta that is dragged moves.
+function topView(canvas, model, change) {
+  canvas.width = 480;
+  canvas.height = 360;
+  let held = null, scale = 1;
+  const place = ([x, z]) => [240 + scale * x, 270 - scale * z];
+  const draw = () => {
+    const shown = model.get("answer").top ?? [], context = canvas.getContext("2d");
+    canvas.style.display = shown.length ? "" : "none";
+    if (!held) scale = 150 / Math.max(1e-9, ...shown.map(({ at }) => Math.hypot(...at)));
+    context.clearRect(0, 0, 480, 360);
+    context.font = "22px system-ui";
+    context.lineWidth = 3;
+    for (const { name, at, ahead } of shown) {
+      const [x, y] = place(at), alpha = !Math.hypot(...at);
+      context.strokeStyle = context.fillStyle = alpha ? MATCH : FIRST;
+      const angle = Math.atan2(ahead[0], ahead[1]);
+      context.beginPath();
+      for (const side of [-0.35, 0.35]) {
+        context.moveTo(x, y);
+        context.lineTo(x + 60 * Math.sin(angle + side), y - 60 * Math.cos(angle + side));
+      }
+      context.stroke();
+      context.beginPath();
+      context.arc(x, y, 9, 0, 7);
+      context.fill();
+      context.fillStyle = getComputedStyle(canvas).color;
+      context.fillText(name, x + 12, y + 26);
+    }
+  };
+  const at = (event) => [2 * event.offsetX, 2 * event.offsetY];
+  canvas.addEventListener("pointerdown", (event) => {
+    const [x, y] = at(event), near = ([a, b]) => Math.hypot(a - x, b - y) < 30;
+    const camera = (model.get("answer").top ?? []).find((one) => Math.hypot(...one.at) && near(place(one.at)));
+    held = camera && { name: camera.name, from: [x, y], before: model.get("controls").moved[camera.name] ?? [0, 0] };
+    if (held) canvas.setPointerCapture(event.pointerId);
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    if (!held) return;
+    const [x, y] = at(event);
+    const step = [held.before[0] + (x - held.from[0]) / scale, held.before[1] - (y - held.from[1]) / scale];
+    change({ moved: { ...model.get("controls").moved, [held.name]: step.map((v) => Number(v.toFixed(4))) } });
+  });
+  canvas.addEventListener("pointerup", () => { held = null; draw(); });
+  return draw;
 }
 
 function render({ model, el }) {
-  const root = document.createElement("div"), views = document.createElement("div");
-  const style = document.createElement("style");
-  root.className = "pat"; views.className = "views"; style.textContent = STYLE;
-  root.append(style, views);
-  el.append(root);
+  const views = make("div", { className: "views" }), bar = make("div", { className: "controls" });
+  const root = make("div", { className: "pat", tabIndex: 0 }, make("style", { textContent: STYLE }), views);
+  const first = model.get("controls");
   let waiting = null;
-  const change = (part) => {
+  const change = (part) => { // at most once a frame; alpha's pixel is that of the last answer if a beta was clicked
     if (!waiting) requestAnimationFrame(() => { model.set("controls", waiting); model.save_changes(); waiting = null; });
-    waiting = { ...(waiting ?? model.get("controls")), ...part };
+    const now = waiting ?? model.get("controls");
+    waiting = { ...now, ...(now.clicked && model.get("answer").x ? { x: model.get("answer").x } : {}), clicked: null, ...part };
   };
   const cameras = model.get("cameras").length ? model.get("cameras") : [{ name: "", hw: [240, 640], src: "" }];
-  const parts = cameras.map(({ name, hw, src, alpha }) => {
-    const figure = document.createElement("figure"), canvas = document.createElement("canvas");
-    const caption = document.createElement("figcaption"), image = new Image();
-    [canvas.height, canvas.width] = hw;
+  const parts = cameras.map((camera) => {
+    const { name, hw, src, alpha } = camera, canvas = make("canvas", { width: hw[1], height: hw[0] });
+    const caption = make("figcaption"), profile = make("canvas", { className: "profile" }), image = new Image();
     canvas.dataset.camera = name;
-    figure.append(canvas, caption);
-    views.append(figure);
+    views.append(make("figure", {}, canvas, ...(alpha || !src ? [] : [profile]), caption));
+    const pixel = (event) => [
+      (event.offsetX / canvas.clientWidth) * hw[1] - 0.5, (event.offsetY / canvas.clientHeight) * hw[0] - 0.5];
     let held = false;
-    const point = (event) => change({ x: [
-      (event.offsetX / canvas.clientWidth) * hw[1] - 0.5, (event.offsetY / canvas.clientHeight) * hw[0] - 0.5] });
-    if (alpha) {
-      canvas.addEventListener("click", (event) => { held = !held; point(event); });
-      canvas.addEventListener("pointermove", (event) => { if (!held) point(event); });
-    }
+    canvas.addEventListener("click", (event) => {
+      root.focus({ preventScroll: true });
+      held = !held;
+      change(alpha ? { x: pixel(event) } : { clicked: [name, ...pixel(event)] });
+    });
+    if (alpha) canvas.addEventListener("pointermove", (event) => { if (!held) change({ x: pixel(event) }); });
     image.onload = () => draw();
     image.src = src;
-    return { name, alpha, canvas, caption, image };
+    return { camera, canvas, caption, profile, image };
   });
+  const top = make("canvas", { className: "top", title: "from above: drag a camera" });
+  const drawTop = topView(top, model, change);
   function draw() {
     const answer = model.get("answer");
-    for (const { name, alpha, canvas, caption, image } of parts) {
-      const context = canvas.getContext("2d");
+    for (const { camera, canvas, caption, profile, image } of parts) {
+      const context = canvas.getContext("2d"), { name, alpha } = camera;
       context.setTransform(1, 0, 0, 1, 0, 0);
       context.clearRect(0, 0, canvas.width, canvas.height);
       if (image.complete && image.naturalWidth) context.drawImage(image, 0, 0, canvas.width, canvas.height);
-      if (answer.error) { write(context, answer.error); caption.textContent = answer.error; continue; }
+      const beta = answer.betas?.[name], problem = answer.error ?? beta?.problem;
+      if (problem) write(context, problem);
       context.translate(0.5, 0.5); // the centre of the first pixel is (0, 0)
-      if (alpha) cross(context, answer.x, "#0bf");
-      const text = alpha ? `pixel (${answer.x}), ${metres(answer.depth)}` : drawBeta(context, answer.betas[name]);
-      caption.textContent = `${name}: ${text}`;
+      if (!answer.error) drawMarks(context, camera, answer);
+      if (!alpha) drawProfile(profile, beta);
+      const text = answer.error ?? (alpha ? `pixel (${answer.x}), ${metres(answer.depth)}` : betaText(beta));
+      caption.textContent = `${name}${alpha ? " (alpha)" : ""}: ${text}`;
     }
+    drawTop();
   }
-  const bar = document.createElement("div"), controls = model.get("controls");
-  bar.className = "controls";
-  for (const [name, text, range] of model.get("ranges"))
-    bar.append(slider(text, controls[name] ?? range[3], range, (value) => change({ [name]: value })));
-  const copy = document.createElement("button");
-  copy.textContent = "copy code";
-  copy.addEventListener("click", async () => {
-    const { code } = model.get("answer");
-    try { await navigator.clipboard.writeText(code); copy.textContent = "copied"; } catch { copy.textContent = code; }
+  const inputs = model.get("choices").map(([name, text, options]) => {
+    const select = make("select", {}, ...options.map((value) => make("option", { value, textContent: value })));
+    select.value = first[name];
+    select.addEventListener("change", () => change({ [name]: select.value }));
+    bar.append(make("label", {}, text, select));
+    return { show: (controls) => { select.value = controls[name]; }, input: select, name };
   });
-  bar.append(copy);
-  root.append(bar);
-  model.on("change:answer", draw);
+  for (const [name, text, [min, max, step, usual]] of model.get("ranges")) {
+    const input = make("input", { type: "range", min, max, step }), label = make("span");
+    const show = (controls) => {
+      input.value = controls[name] ?? usual;
+      label.textContent = `${text}: ${Number((controls[name] ?? usual).toPrecision(3))}`;
+    };
+    input.addEventListener("input", () => { change({ [name]: Number(input.value) }); show({ [name]: Number(input.value) }); });
+    bar.append(make("label", {}, label, input));
+    show(first);
+    inputs.push({ show, input, name });
+  }
+  for (const { input, name } of inputs) input.dataset.control = name;
+  const acts = {
+    c: ["copy code", async (button) => {
+      const text = code(cameras, model.get("controls"), model.get("defaults"), model.get("answer").x);
+      try { await navigator.clipboard.writeText(text); button.textContent = "copied"; } catch { button.textContent = text; }
+    }],
+    s: ["save as SVG", () => download("fields.svg", svg(cameras, model.get("answer")), "image/svg+xml")],
+    g: ["save the moved rig", () => download("rig_moved.yaml", model.get("answer").rig, "text/yaml")],
+    r: ["reset", () => {
+      const usual = { ...model.get("defaults"), ...first, x: model.get("answer").x ?? first.x };
+      change(usual);
+      inputs.forEach(({ show }) => show(usual));
+    }],
+    d: ["light or dark", () => {
+      const dark = getComputedStyle(root).colorScheme === "light dark"
+        ? matchMedia("(prefers-color-scheme: dark)").matches : root.style.colorScheme === "dark";
+      root.style.colorScheme = dark ? "light" : "dark";
+      draw();
+    }],
+  };
+  const buttons = Object.entries(acts).map(([key, [text, act]]) => {
+    const button = make("button", { textContent: text, title: `key ${key}` });
+    button.dataset.key = key;
+    button.addEventListener("click", () => act(button));
+    return button;
+  });
+  bar.append(make("div", { className: "buttons" }, ...buttons, make("kbd", { textContent: "arrows move the pixel" })));
+  root.addEventListener("keydown", (event) => {
+    if (event.target.matches("input, select") || event.ctrlKey || event.metaKey || event.altKey) return;
+    const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+    const [x, y] = model.get("answer").x ?? first.x, size = event.shiftKey ? 10 : 1;
+    if (step) change({ x: [x + size * step[0], y + size * step[1]] });
+    else if (event.key in acts) buttons.find((button) => button.dataset.key === event.key).click();
+    else return;
+    event.preventDefault();
+    event.stopPropagation();
+  });
+  root.append(make("div", { className: "below" }, top, bar));
+  el.append(root);
+  const showRig = () => { buttons[2].disabled = !model.get("answer").rig; };
+  model.on("change:answer", () => { draw(); showRig(); });
   draw();
+  showRig();
 }
 
 export default { render };

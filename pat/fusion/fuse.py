@@ -157,7 +157,7 @@ def fuse(
         if luminance != "alpha":
             frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
         del inputs, fused, matches  # the segments and matches of a large frame: what follows needs memory, too
-        frame = low_light.corrected(found.undone(frame), done.found, steps, keep_alpha=keep_alpha)
+        frame = low_light.corrected(found.undone(frame), done.found, steps, found.response, keep_alpha=keep_alpha)
         LOG.info("back to the pixels of %s", alpha)
         for back in undo:
             frame = back(frame)

@@ -20,6 +20,7 @@ from arraygeom.chunks import chunked
 from arraygeom.pixels import HW
 from arraygeom.threads import torch_in_all_threads
 
+from ..matching.radiometry import Response
 from ..media.colour import luminance
 from ..networks.collaborative import luma_refined, without_noise
 from ..networks.denoiser import LowLightNetwork, NoisyView, over_flips
@@ -96,12 +97,19 @@ class LowLight:
         return found + sum({part.data_ptr(): part.nbytes for part in (*images, *parts)}.values())
 
     def corrected(
-        self, frame: Frame, found: Float[Tensor, "n 3 h w"], steps: Sequence[FusionStep], *, keep_alpha: bool = False
+        self,
+        frame: Frame,
+        found: Float[Tensor, "n 3 h w"],
+        steps: Sequence[FusionStep],
+        response: Response,
+        *,
+        keep_alpha: bool = False,
     ) -> Frame:
         """A frame fused from the denoised views, corrected by what all of them recorded.
 
         `found` is where its pixels are in each beta, x and y, and the confidence of that. `steps` were taken before it
-        was fused and are not undone yet. With `keep_alpha`, or if alpha has no noise, the luma is alpha's as recorded.
+        was fused and are not undone yet; `response` says what brings betas to alpha's exposure. With `keep_alpha`, or
+        if alpha has no noise, the luma is alpha's as recorded.
         Betas that are not all RGB are denoised one by one alone.
         """
         if not self.noisy:
@@ -112,7 +120,7 @@ class LowLight:
         own = views.pop(alpha)
         betas = list(views.values())
         if all(view.recorded.shape[1] == 3 for view in betas):
-            image = jointly_denoised(image, own, betas, found)
+            image = jointly_denoised(image, own, [exposed(view, response) for view in betas], found)
             if keep_alpha or alpha not in self.noisy:
                 image = image - luminance(image - frame.image)
         return frame._replace(image=image if given is None else image + given - own.denoised[0])
@@ -187,6 +195,14 @@ def noisy_view(image: Float[Tensor, "c h w"], level: NoiseLevel) -> NoisyView | 
         return None
     recorded = level.unbiased(image[None])
     return NoisyView(recorded, denoised(recorded, deviation), deviation)
+
+
+def exposed(view: NoisyView, response: Response) -> NoisyView:
+    """A beta at alpha's exposure; its deviation by the difference that one deviation makes."""
+    if response.is_rec601:
+        return view
+    more, less = (response.exposed(view.denoised + sign * view.deviation) for sign in (1, -1))
+    return NoisyView(response.exposed(view.recorded), response.exposed(view.denoised), (more - less) / 2)
 
 
 @torch_in_all_threads()

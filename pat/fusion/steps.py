@@ -258,12 +258,21 @@ def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens:
 
 def _resized(views: Views, name: str) -> Views:
     """Beta resized so that its pixels are about the size of alpha's where the views meet."""
-    scale, (h, w) = resolution_ratio(views.pair(name)), views.rig[name].hw
-    if 0.8 < scale < 1.25:
+    image = at_alphas_resolution(views.images[name], views.pair(name))
+    if image is views.images[name]:
         return views
+    h, w = image.shape[-2:]
+    return views.replace({name: image}, rig=views.rig.resize(name, (h, w)))
+
+
+def at_alphas_resolution(image: Float[Tensor, "c h w"], pair: Pair) -> Float[Tensor, "c h2 w2"]:
+    """Beta's image with pixels of about the size of alpha's where the views meet; as it is where they nearly are."""
+    scale, (h, w) = resolution_ratio(pair), pair.beta.hw
+    if 0.8 < scale < 1.25:
+        return image
     hw = (max(round(h / scale), 16), max(round(w / scale), 16))
-    image = interpolate(views.images[name][None], size=hw, mode="bicubic", align_corners=False, antialias=True)
-    return views.replace({name: image[0].clamp(0, 1)}, rig=views.rig.resize(name, hw))
+    resized = interpolate(image[None], size=hw, mode="bicubic", align_corners=False, antialias=True)
+    return resized[0].clamp(0, 1)
 
 
 def resolution_ratio(pair: Pair) -> float:

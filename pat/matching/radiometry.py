@@ -169,9 +169,13 @@ class Response(NamedTuple):
 
     def of_beta(self, beta: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h w"]:
         """Beta at alpha's exposure, sheared along grey so that its Rec. 601 luma is what alpha sees."""
-        even = beta * self._brightening(beta) if self.shading else beta
-        scaled = self.gain * (even if self.gamma == 1 else even.clamp(min=0) ** self.gamma)
+        scaled = self.exposed(beta)
         return scaled + self._shear(scaled)
+
+    def exposed(self, beta: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h w"]:
+        """Beta at alpha's exposure, in its own colours."""
+        even = beta * self._brightening(beta) if self.shading else beta
+        return self.gain * (even if self.gamma == 1 else even.clamp(min=0) ** self.gamma)
 
     def _brightening(self, beta: Tensor) -> Float[Tensor, "h w"]:
         h, w = beta.shape[-2:]

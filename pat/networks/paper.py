@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -26,6 +27,13 @@ from .protocol import FusionOutput, JoinsBands
 
 SURROUNDINGS, FLOOR = 9, 0.01
 """Side of the windows that `normalised` takes means over, pixels, and the contrast below which it adds none."""
+
+
+class QueryAndKey(NamedTuple):
+    """What attention compares of an image: the query (B, D, H, W) of an alpha, the key of a beta."""
+
+    query: Tensor
+    key: Tensor
 
 
 class PAT(nn.Module):
@@ -78,6 +86,11 @@ class PAT(nn.Module):
             image = image + self._enlarged(inputs.alpha)
         position, deviation, confidence = (list(part) for part in list(zip(*attended))[1:])
         return FusionOutput(image, position, deviation, confidence), compared
+
+    def query_and_key(self, image: Float[Tensor, "b c h w"], beta: int = 0) -> QueryAndKey:
+        """The image's query if it is alpha's, and its key if it is that of the `beta`-th beta."""
+        after = self.engine.before(self.features(self._channels(image)))
+        return QueryAndKey(self.engine.query(after), self.engine.key[beta](after))
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
         """Features of all views, measured."""

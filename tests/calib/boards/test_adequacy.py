@@ -29,11 +29,37 @@ def test_projections_are_off_by_what_is_said(found):
     x, deviation = uncertainty(known, 1.5)
     X = known.camera.unproject(torch.from_numpy(x), torch.full((len(x),), 1.5, dtype=torch.float64))
     true = TRUE.replace(cam_from_world=Pose.identity())
-    off = (true.project_local(X).x.numpy() - x).ravel()
-    pose = camera_jacobian(known.camera, X.numpy())[..., :6].reshape(len(off), 6)
-    off = np.linalg.norm((off - pose @ np.linalg.lstsq(pose, off, rcond=None)[0]).reshape(-1, 2), axis=1)
+    parts = []
+    for points in (torch.from_numpy(known.seen), X):
+        off = true.project_local(points).x - known.camera.project_local(points).x
+        parts.append((off.numpy().ravel(), camera_jacobian(known.camera, points.numpy())[..., :6].reshape(-1, 6)))
+    (at_boards, pose), (off, by_pose) = parts
+    off = off - by_pose @ np.linalg.lstsq(pose, at_boards, rcond=None)[0]
+    off = np.linalg.norm(off.reshape(-1, 2), axis=1)
     assert 0.1 < np.median(off / deviation) < 2.5
     assert deviation[0] > np.median(deviation)
+
+
+def test_points_far_beyond_the_boards_are_less_certain(found):
+    """Boards are at 0.9 to 2.4 m: a change of the focal length that they absorb shows at other depths."""
+    known = intrinsics_of(found.fit, "cam")
+    near, far = (np.median(uncertainty(known, depth)[1]) for depth in (1.5, 15.0))
+    assert far > 1.1 * near
+
+
+def test_halves_are_compared_only_where_boards_were_seen():
+    """Boards in the middle of the image: nothing is said of its corners, where the lens is extrapolated."""
+    fit = calibrate(see(Rig({"cam": TRUE}), board_poses(10, spread=0.05, depth=(1.6, 2.4)), noise=0.2), BOARD).fit
+    x, _ = half_difference(fit, 1.5)["cam"]
+    seen = fit.problem.seen["cam"].x
+    assert 20 < len(x) < 200
+    assert max(np.linalg.norm(seen - each, axis=1).min() for each in x) < 32
+
+
+def test_fisheyes_by_the_omnidirectional_model():
+    true = camera(240.0, (480, 640), lens=(0.02, -0.01, 0.003, -0.001), model="kannala-brandt")
+    views = see(Rig({"a": true}), board_poses(10, depth=(0.4, 0.9), spread=0.7), noise=0.05)
+    assert calibrate(views, BOARD, lens="omni").rms < 0.12
 
 
 def test_halves_differ_by_no_more_than_their_uncertainty(found):

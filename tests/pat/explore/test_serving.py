@@ -13,7 +13,6 @@ import pytest
 from pat.cli.main import main
 from pat.data.sample_array import SAMPLE
 
-pytest.importorskip("panel", reason="the extra 'explore' is not installed")
 ROOT = Path(__file__).parents[3]
 IMAGES = [a for n in ("mono", "colour") for a in ("--image", f"{n}={SAMPLE / n}.png")]
 EXPLORE = ["explore", str(SAMPLE / "rig.yaml"), *IMAGES, "--no-browser"]
@@ -28,8 +27,8 @@ def server():
     process.communicate()
 
 
-def status(port, path, **headers) -> int:
-    request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", headers=headers)
+def status(port, path, data=None, **headers) -> int:
+    request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", data, headers=headers)
     try:
         with urllib.request.urlopen(request, timeout=300) as answer:
             return answer.status
@@ -39,14 +38,17 @@ def status(port, path, **headers) -> int:
 
 def test_foreign_hosts_are_refused_whatever_their_origin_and_ctrl_c_is_quiet(server):
     process, port = server
-    upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
-    upgrade["Sec-WebSocket-Key"] = "AAAAAAAAAAAAAAAAAAAAAA=="
     for host in (f"localhost:{port}", f"127.0.0.1:{port}"):
         assert status(port, "/", Host=host) == 200
     for host in (f"evil.example:{port}", "evil.example", f"localhost.evil.example:{port}", f"xlocalhost:{port}"):
-        for path in ("/", "/autoload.js", "/static/js/bokeh.min.js"):
+        for path in ("/", "/answer", "/elsewhere"):
             assert status(port, path, Host=host) == 403
-        assert status(port, "/ws", Host=host, Origin=f"http://{host}", **upgrade) == 403
+        assert status(port, "/answer", b"{}", Host=host, Origin=f"http://{host}") == 403
+    own = f"localhost:{port}"
+    assert status(port, "/answer", b"{}", Host=own, Origin="http://evil.example") == 403
+    assert status(port, "/answer", b"{}", Host=own, Origin=f"http://{own}") == 200
+    assert status(port, "/answer", b"[1", Host=own) == 400
+    assert status(port, "/elsewhere", Host=own) == 404
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=300)
     assert process.returncode == 0

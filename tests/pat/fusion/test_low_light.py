@@ -237,3 +237,16 @@ def test_positions_are_those_of_the_matched_colours(network):
     monkey.undo()
     high = (seen["confidence"] > 0.8).expand_as(seen["image"])
     assert float((seen["beta"].denoised - seen["image"])[high].abs().mean()) < 0.02
+
+
+def test_a_darker_beta_keeps_its_colours(network):
+    """The joint correction saw a beta at its own exposure, and pulled colours towards its darker ones."""
+    sample, _, _ = in_low_light(200, middle=True)
+    level = NoiseLevel.of_electrons(200, 2)
+    saturations = []
+    for exposure in (1.0, 0.5):
+        images = {**sample.images, BETA: exposure * sample.images[BETA]}
+        images = {n: level.recorded(i[None], generator_for(0, n))[0] for n, i in images.items()}
+        image = fuse(network, sample.rig, images, alpha=ALPHA, noise=dict.fromkeys(images, level)).image
+        saturations.append(float((image.amax(0) - image.amin(0)).mean()))
+    assert saturations[1] == pytest.approx(saturations[0], rel=0.1)

@@ -1,0 +1,166 @@
+// Who answers the widget of a page: a server, a grid of answers, or the page itself for calibrated pinholes.
+
+// A model as a notebook's: one question at a time, the latest next.
+function modelOf(values, ask) {
+  let drawAgain = () => {}, busy = false, again = false;
+  async function answer() {
+    if (busy) { again = true; return; }
+    busy = true;
+    try { values.answer = await ask(values.controls, values); } catch (error) { values.answer = { error: String(error) }; }
+    busy = false;
+    drawAgain();
+    if (again) { again = false; answer(); }
+  }
+  return {
+    get: (name) => values[name], set: (name, value) => { values[name] = value; },
+    on: (_, call) => { drawAgain = call; }, save_changes: answer,
+  };
+}
+
+const asksServer = () => async (controls) => {
+  const headers = { "Content-Type": "application/json" };
+  let reply;
+  try { reply = await fetch("/answer", { method: "POST", headers, body: JSON.stringify(controls) }); }
+  catch { throw "the server has ended: start `pat explore` again"; }
+  return reply.json();
+};
+
+const asksGrid = ({ columns, rows, answers }) => async (controls, { cameras, answer }) => {
+  if (controls.clicked) return answer; // the grid is alpha's
+  const [h, w] = cameras[0].hw, [x, y] = controls.x;
+  const cell = (v, n, size) => Math.min(n - 1, Math.max(0, Math.floor(((v + 0.5) / size) * n)));
+  return answers[`${cell(x, columns, w)},${cell(y, rows, h)}`];
+};
+
+const dot = (a, b) => a.reduce((sum, v, i) => sum + v * b[i], 0);
+const times = (M, v) => M.map((row) => dot(row, v));
+const product = (A, B) => A.map((row) => B[0].map((_, j) => dot(row, B.map((r) => r[j]))));
+const transposed = (M) => M[0].map((_, j) => M.map((row) => row[j]));
+const inverse = ([[a, b, c], [d, e, f], [g, h, i]]) => {
+  const cofactors = [[e * i - f * h, c * h - b * i, b * f - c * e], [f * g - d * i, a * i - c * g, c * d - a * f],
+    [d * h - e * g, b * g - a * h, a * e - b * d]];
+  const det = a * cofactors[0][0] + b * cofactors[1][0] + c * cofactors[2][0];
+  return cofactors.map((row) => row.map((v) => v / det));
+};
+const RADIUS = 5, SHARPNESS = 30, FLAT = 1e-4; // as in pixel.py
+
+// The same numbers as pixel.py gives for the field of `pat fuse` and weights by windows, of the images as shown.
+function asksPinholes(rig) {
+  const guides = {};
+  async function guide({ name, src, hw }) {
+    if (guides[name]) return guides[name];
+    const image = new Image();
+    image.src = src;
+    await image.decode();
+    const [width, height] = [image.naturalWidth, image.naturalHeight];
+    const canvas = Object.assign(document.createElement("canvas"), { width, height }), context = canvas.getContext("2d");
+    context.drawImage(image, 0, 0);
+    const { data } = context.getImageData(0, 0, width, height), luma = new Float32Array(width * height);
+    for (let i = 0; i < luma.length; i++)
+      luma[i] = (0.299 * data[4 * i] + 0.587 * data[4 * i + 1] + 0.114 * data[4 * i + 2]) / 255;
+    return (guides[name] = { luma, width, height, scale: width / hw[1] });
+  }
+  function value({ luma, width, height, scale }, [x, y]) { // bilinear; beyond the border its nearest value
+    const u = Math.min(width - 1, Math.max(0, (x + 0.5) * scale - 0.5));
+    const v = Math.min(height - 1, Math.max(0, (y + 0.5) * scale - 0.5));
+    const i = Math.min(width - 2, Math.floor(u)), j = Math.min(height - 2, Math.floor(v)), a = u - i, b = v - j;
+    const at = (row, column) => luma[row * width + column];
+    return (1 - b) * ((1 - a) * at(j, i) + a * at(j, i + 1)) + b * ((1 - a) * at(j + 1, i) + a * at(j + 1, i + 1));
+  }
+  function feature(image, [x, y], J) {
+    const found = [];
+    for (let v = -RADIUS; v <= RADIUS; v++)
+      for (let u = -RADIUS; u <= RADIUS; u++)
+        found.push(value(image, [x + J[0][0] * u + J[0][1] * v, y + J[1][0] * u + J[1][1] * v]));
+    const mean = found.reduce((a, b) => a + b) / found.length, centred = found.map((f) => f - mean);
+    const length = Math.sqrt(dot(centred, centred));
+    return length > FLAT ? centred.map((f) => f / length) : centred.map(() => 0);
+  }
+  function moved(controls) {
+    const own = rig.cameras[rig.alpha], angle = controls.rotation * Math.PI / 180, found = {};
+    const turn = [[Math.cos(angle), 0, Math.sin(angle)], [0, 1, 0], [-Math.sin(angle), 0, Math.cos(angle)]];
+    for (const [name, camera] of Object.entries(rig.cameras)) {
+      if (name === rig.alpha) { found[name] = camera; continue; }
+      const [right, forward] = controls.moved[name] ?? [0, 0], step = times(transposed(own.R), [right, 0, forward]);
+      const centre = own.centre.map((c, i) => c + controls.baseline * (camera.centre[i] - c) + step[i]);
+      const K = camera.K.map((row, i) => row.map((v, j) => (i < 2 && j < 2 ? v * controls.focal : v)));
+      found[name] = { ...camera, K, R: product(turn, camera.R), centre };
+    }
+    return found;
+  }
+  function pairOf(a, b) { // a pixel x of a at depth z is at M x + p / z of b, homogeneous
+    const R = product(b.R, transposed(a.R)), Ki = inverse(a.K);
+    const p = times(b.K, times(b.R, a.centre.map((c, i) => c - b.centre[i])));
+    return { M: product(b.K, product(R, Ki)), p };
+  }
+  const transfer = ({ M, p }, [x, y], w) => times(M, [x, y, 1]).map((v, i) => v + w * p[i]);
+  const flat = ([x, y, z]) => [x / z, y / z];
+
+  // Segment between the depths, its part in the image, a sample a pixel; Liang and Barsky's clipping.
+  function samplesOf(pair, x, [near, far], [h, w]) {
+    const ends = [1 / near, 1 / far].map((inverse) => transfer(pair, x, inverse));
+    if (ends.some((end) => end[2] <= 0)) return [];
+    const [a, b] = ends.map(flat), d = [b[0] - a[0], b[1] - a[1]];
+    let [from, to] = [0, 1];
+    for (const [start, step, high] of [[a[0], d[0], w - 0.5], [a[1], d[1], h - 0.5]]) {
+      if (step === 0) { if (start < -0.5 || start > high) return []; continue; }
+      const cuts = [(-0.5 - start) / step, (high - start) / step].sort((p, q) => p - q);
+      [from, to] = [Math.max(from, cuts[0]), Math.min(to, cuts[1])];
+    }
+    if (from > to) return [];
+    const count = Math.ceil((to - from) * Math.hypot(...d)) + 1;
+    return Array.from({ length: count }, (_, i) => {
+      const s = count === 1 ? from : from + (to - from) * i / (count - 1);
+      return [a[0] + s * d[0], a[1] + s * d[1]];
+    });
+  }
+  function depthOf({ M, p }, x, [u, v]) { // least squares of (M x + w p) cross (u, v, 1)
+    const m = times(M, [...x, 1]), lines = [[m[0] - u * m[2], p[0] - u * p[2]], [m[1] - v * m[2], p[1] - v * p[2]]];
+    const w = -lines.reduce((s, [c, q]) => s + c * q, 0) / lines.reduce((s, [, q]) => s + q * q, 0);
+    return w > 0 ? Number((1 / w).toPrecision(4)) : null;
+  }
+  async function report(camera, alpha, pair, x, depths) {
+    const samples = samplesOf(pair, x, depths, camera.hw);
+    if (!samples.length)
+      return { problem: "no part of the segment lies in this image: the views do not overlap here" };
+    const middle = (1 / depths[0] + 1 / depths[1]) / 2, at = (dx, dy) => flat(transfer(pair, [x[0] + dx, x[1] + dy], middle));
+    const [r, l, d, u] = [at(0.5, 0), at(-0.5, 0), at(0, 0.5), at(0, -0.5)];
+    const J = [[r[0] - l[0], d[0] - u[0]], [r[1] - l[1], d[1] - u[1]]];
+    const own = feature(await guide(alpha), x, [[1, 0], [0, 1]]), image = await guide(camera);
+    const scores = samples.map((sample) => SHARPNESS * dot(own, feature(image, sample, J)));
+    const top = Math.max(...scores), powers = scores.map((s) => Math.exp(s - top)), total = powers.reduce((a, b) => a + b);
+    const weights = powers.map((p) => p / total), best = weights.indexOf(Math.max(...weights));
+    const known = samples.map((sample) => depthOf(pair, x, sample));
+    return { samples, weights, depths: known, match: samples[best], depth: known[best], peak: weights[best] };
+  }
+  async function inspect(cameras, shown, alpha, x, depths) {
+    const betas = {}, own = shown.find(({ name }) => name === alpha);
+    for (const camera of shown)
+      if (camera.name !== alpha)
+        betas[camera.name] = await report(camera, own, pairOf(cameras[alpha], cameras[camera.name]), x, depths);
+    return betas;
+  }
+  return async (controls, { cameras: shown }) => {
+    const cameras = moved(controls), own = cameras[rig.alpha], depths = [controls.near ?? rig.near, controls.far ?? rig.far];
+    if (!(depths[0] > 0 && depths[0] < depths[1])) return { error: `near must be less than far, got ${depths.join(" and ")}` };
+    const rounded = (v, size) => Math.min(size - 1, Math.max(0, Math.round(v)));
+    const inside = ([x, y], [h, w]) => [rounded(x, w), rounded(y, h)];
+    let x = inside(controls.x, own.hw), backwards = [];
+    if (controls.clicked) {
+      const [name, ...at] = controls.clicked;
+      const pair = [name, rig.alpha].map((n) => shown.find((camera) => camera.name === n));
+      const back = (await inspect(cameras, pair, name, inside(at, cameras[name].hw), depths))[rig.alpha];
+      if (back.problem) return { error: `no pixel of ${rig.alpha} can match this one of ${name}` };
+      [x, backwards] = [inside(back.match, own.hw), back.samples];
+    }
+    const betas = await inspect(cameras, shown, rig.alpha, x, depths);
+    let [sum, inverse] = [0, 0];
+    for (const { problem, weights, depths: known, peak } of Object.values(betas))
+      if (!problem) weights.forEach((w, i) => { if (known[i] != null) { sum += peak * w; inverse += peak * w / known[i]; } });
+    const top = Object.entries(cameras).map(([name, { centre, R }]) => {
+      const at = times(own.R, centre.map((c, i) => c - own.centre[i])), ahead = times(own.R, R[2]);
+      return { name, at: [at[0], at[2]], ahead: [ahead[0], ahead[2]] };
+    });
+    return { x, depth: inverse > 0 ? Number((sum / inverse).toPrecision(4)) : null, betas, backwards, top, rig: "" };
+  };
+}
