@@ -311,10 +311,10 @@ def markdown(rows: Sequence[AblationRow]) -> str:
     scenes = len({row.scene for row in rows})
     note = (
         f"{scenes} scenes; the focal ratio is alpha's focal length over beta's. PSNR in dB, behind it a 95% interval.\n"
-        "Rectified, warped: both images are rectified by the calibration, and the result is warped back. The rectified\n"
-        "assumption takes lines of the images as they are for rows, and both images for the same field of view; 'rows\n"
-        "around H x' is given position and scale, and takes only the lines for rows. Off: mean error in beta of points\n"
-        "at the depth found.\n\n"
+        "Rectified, warped: both images are rectified by the calibration, and the result is warped back. The\n"
+        "rectified assumption takes lines of the images as they are for rows, and both images for the same field of\n"
+        "view; 'rows around H x' is given position and scale, and takes only the lines for rows. Off: mean error in\n"
+        "beta of points at the depth found.\n\n"
     )
     return note + markdown_table(columns, lines, align="l" + "r" * (len(columns) - 2) + "l")
 
