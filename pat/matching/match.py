@@ -20,7 +20,7 @@ from .inputs import Beta, Inputs
 from .matches import BetaMatches, Comparison, Matches, combined_bands
 from .multiview import agreed
 from .semi_global import FINE, matched_at_half_size
-from .subpixel import matched_at_full_size, precise
+from .subpixel import matched_at_full_size, precise, with_gradients
 
 LOG = logging.getLogger(__name__)
 
@@ -45,12 +45,24 @@ class Matcher(Protocol):
 
 
 def match(inputs: Inputs) -> Matches:
-    """Match alpha with every beta, and transfer the betas' bands to alpha's view.
+    """Match alpha with every beta, and transfer the betas' bands to alpha's view; with gradients as `transferred`, and
+    of the positions.
 
     Raises ValueError for a beta whose field is not of straight segments.
     """
     found = located(inputs)
+    if torch.is_grad_enabled():
+        found = Matches(tuple(_following(inputs.alpha, *one) for one in zip(inputs.betas, found.betas)))
     return transferred(inputs, found)
+
+
+def _following(alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaMatches:
+    """The matches, which follow images and segments that have gradients."""
+    segments, comparison = beta.field.straight, found.comparison
+    if not any(x.requires_grad for x in (alpha, beta.image, segments.start, segments.end)):
+        return found
+    views = comparison.normalisations.whole.views(alpha, comparison.combined(beta.image))
+    return replace(found, disparity=with_gradients(views, segments, found.disparity))
 
 
 @torch.no_grad()
