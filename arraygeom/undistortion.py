@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .camera import AnyLensView, Camera, LensView
-from .pixels import coarse_grid, pixel_grid, product
+from .camera import AnyLensView, Camera, LensView, View
+from .pixels import coarse_grid, map_homogeneous, pixel_grid, product
+from .rig import Rig
 from .sampling import Interpolation, Sampled, sample
 from .tracing import needs_numbers
 
@@ -49,6 +50,41 @@ def pixels_between(source: LensView, target: LensView) -> tuple[Float[Tensor, "h
         rays = rays @ (source.R @ target.R.mT).mT
     found = source.project_local(rays)
     return found.x, valid & found.valid & source.contains(found.x)
+
+
+def recorded_pixels(
+    x: Float[Tensor, "*n 2"], now: View, recorded: LensView
+) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    """Pixels of a view without its lens, cropped, resized or rotated, in the image as recorded; which it can show.
+
+    K of both views says how pixels were changed: x ~ K_now K_recorded^-1 x_recorded but for the lens.
+    """
+    x = map_homogeneous(_between(recorded, now)[:2], x)
+    return recorded.to(torch.float64).distort(x)
+
+
+def straight_pixels(
+    x: Float[Tensor, "*n 2"], now: View, recorded: LensView
+) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    """The inverse of `recorded_pixels`: pixels of the image as recorded in the view as it is now."""
+    x, valid = recorded.to(torch.float64).undistort(x)
+    return map_homogeneous(torch.linalg.inv(_between(recorded, now))[:2], x), valid
+
+
+def _between(recorded: LensView, now: View) -> Float[Tensor, "3 3"]:
+    """K_recorded K_now^-1."""
+    if not isinstance(now, LensView):
+        raise ValueError("which pixels were recorded views without K do not say: give them one (`with_pixels`)")
+    return product(recorded.K.double(), torch.linalg.inv(now.K.double()))
+
+
+def with_pixels(rig: Rig) -> Rig:
+    """The rig whose views all have a K, the identity if they are not calibrated: it follows every change of pixels."""
+    for name, view in rig.cameras.items():
+        if not isinstance(view, LensView):
+            eye = torch.eye(3, dtype=torch.float64)
+            rig = rig.with_camera(name, LensView(hw=view.hw, sensor=view.sensor, K=eye))
+    return rig
 
 
 def resampled(

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from . import options
+from .known import Known
 from .one_frame import fuse_with_progress
 from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Numbers, Out, Weights, optional, say
 
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Fuse:
+class Fuse(Known):
     """Fuse the images of an array into one image at alpha's view: a frame, many frames, or a sequence.
 
     Without a rig: pat fuse mono.png colour.png
@@ -170,7 +171,7 @@ class Fuse:
                     compared.result()
             if several:
                 return self._many(rig, found, alpha)
-            self._one(views.developed, views, alpha, before_writing=compared.result)
+            self._one(views.developed, views, alpha, views.files, before_writing=compared.result)
 
     def _without_rig(self) -> None:
         from ..fusion.batch import find_images
@@ -214,7 +215,7 @@ class Fuse:
         self.normalise_radiometry |= array.match_levels
         self.exposure = self.exposure or "auto"
         if max(map(len, files.values())) == 1:
-            return self._one(array.rig, array.images, array.alpha, found=array.notes)
+            return self._one(array.rig, array.images, array.alpha, first, found=array.notes)
         rig = array.rig
         for name, rate in rates.items():
             if name in rig.names:
@@ -272,6 +273,7 @@ class Fuse:
         rig: Rig,
         images: Mapping[str, Tensor],
         alpha: str,
+        files: Mapping[str, str | Path],
         *,
         found: tuple[str, ...] | None = None,
         before_writing: Callable[[], None] = lambda: None,
@@ -292,7 +294,8 @@ class Fuse:
             if not self.resume:
                 shutil.rmtree(store, ignore_errors=True)
             further = {**self._options(), "explain": self._note, "store": store, "device": self.device}
-            frame = fuse_with_progress(rig=rig, images=images, alpha=alpha, **further)
+            known, further["field"] = self.with_known(rig, alpha, files, further["field"])
+            frame = fuse_with_progress(rig=known, images=images, alpha=alpha, **further)
             before_writing()
             frame, gain = self._exposed(frame)
             if found is None and not frame.depth.isfinite().any():
@@ -372,6 +375,7 @@ class Fuse:
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 
+        self.refuse_several()
         single = {"--points": self.points, "--classical": self.classical, "--device cuda": self.device == "cuda"}
         if named := [option for option, given in single.items() if given]:
             raise ValueError(f"{', '.join(named)}: of a single frame alone: leave it out for many")

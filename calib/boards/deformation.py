@@ -25,7 +25,7 @@ STEP = 1e-5
 
 
 @dataclass(frozen=True)
-class BoardShape:
+class BoardDeformation:
     """The shapes of some boards.
 
     values: stretch (y / x - 1) and curvatures xx, xy, yy (1/m, positive: the middle lies in front) of each board.
@@ -37,7 +37,9 @@ class BoardShape:
     part: Int[np.ndarray, " b"]
 
     @classmethod
-    def flat(cls, points: Float[np.ndarray, "n 3"], of_point: Int[np.ndarray, " n"], part: np.ndarray) -> BoardShape:
+    def flat(
+        cls, points: Float[np.ndarray, "n 3"], of_point: Int[np.ndarray, " n"], part: np.ndarray
+    ) -> BoardDeformation:
         """Flat boards of given points and the board of each; `part` is the board of each block."""
         ends = [points[of_point == k, :2] for k in range(int(of_point.max()) + 1)]
         middle = np.stack([(p.min(0) + p.max(0)) / 2 for p in ends])
@@ -59,11 +61,11 @@ class BoardShape:
             found[rows, :, part, i] = (ahead - behind) / (2 * STEP)
         return found.reshape(len(p), 3, -1)
 
-    def stepped(self, change: Float[np.ndarray, " s"]) -> BoardShape:
+    def stepped(self, change: Float[np.ndarray, " s"]) -> BoardDeformation:
         """The shapes after a change of all values."""
         return replace(self, values=self.values + change.reshape(self.values.shape))
 
-    def of_blocks(self, part: Int[np.ndarray, " b"]) -> BoardShape:
+    def of_blocks(self, part: Int[np.ndarray, " b"]) -> BoardDeformation:
         """The same shapes for other blocks."""
         return replace(self, part=part)
 
@@ -71,6 +73,10 @@ class BoardShape:
     def information(self) -> Float[np.ndarray, " s"]:
         """Inverse variances of the values before any measurement."""
         return np.tile(DEVIATIONS**-2.0, len(self.values))
+
+    def loss(self) -> float:
+        """Half the squared Mahalanobis distance from flat boards."""
+        return float(self.information @ self.values.ravel() ** 2) / 2
 
     def main_curvature(self, board: int, extent: tuple[float, float]) -> Curvature:
         """The board's main curvature over a board of some width and height (metres)."""
@@ -114,7 +120,9 @@ def is_significant(values: Float[np.ndarray, " s"], covariance: Float[np.ndarray
     return bool(f_distribution.sf(ratio, count, frames - count) < SIGNIFICANCE)
 
 
-def described(shape: BoardShape, deviations: Float[np.ndarray, "k 4"], extents: list[tuple[float, float]]) -> list[str]:
+def described(
+    shape: BoardDeformation, deviations: Float[np.ndarray, "k 4"], extents: list[tuple[float, float]]
+) -> list[str]:
     """Sentences on boards whose shapes were estimated, with standard deviations."""
     found = []
     for k, (extent, deviation) in enumerate(zip(extents, deviations)):
