@@ -51,7 +51,7 @@ def fuse(
     max_memory: float | str | None = None,
     match_levels: bool = False,
     response: Given = "fit",
-    align: bool = True,
+    align: bool | None = None,
     corrections: Corrections | None = None,
     explain: Callable[[str], None] | None = None,
     noise: Noise | None = None,
@@ -88,7 +88,8 @@ def fuse(
         response: how alpha weighs red, green and blue of its one colour beta. "fit" fits it to matches, with a gain and
             a gamma, and leaves it at Rec. 601 luma ("rec601") where that explains the images as well; three numbers
             state it. The result has alpha as this combination of its colours.
-        align: find how far the betas lie across their search segments, and put that right.
+        align: find how far the betas lie across their search segments, and put that right; by default unless
+            `differentiable`, where a rig that is put right has no gradient of being off.
         corrections: what is known of both from another frame of the same cameras (`corrections_of`), instead.
         explain: called with a line for each thing that was found and put right.
         noise: the noise level of each camera that has some, or "estimate": views are denoised before they are matched,
@@ -100,9 +101,8 @@ def fuse(
         store: a folder for finished tiles of a frame of several, so that one that was stopped goes on;
             tiles of other images, rigs or weights are not taken. Whoever gave it removes it afterwards.
         differentiable: keep gradients with respect to the numbers of the rig, the images and the network's weights
-            (which `requires_grad_(True)` frees). What semi-global matching finds, such as the position along each
-            segment, is a constant: gradients go through the segments and attention around that position. So are
-            `align` and `response`: without `align=False` a rig that is off is put right, and has hardly a gradient.
+            (which `requires_grad_(True)` frees). A match moves along its segment as images and rig move the best
+            agreement around it; which match is the best, `align` and `response` are constants.
             Else the frame is detached, whatever requires gradients.
         matcher: what finds the matches of a network that uses some: `pat.matching.match.match`, or your own.
         announce: called with the plan before the work begins; the time of a large frame is estimated by fusing a piece.
@@ -117,6 +117,7 @@ def fuse(
     """
     network, rig, images, alpha, grey_world = _with_rig(network, rig, images, alpha, explain)
     match_levels |= grey_world
+    align = not differentiable if align is None else align
     if differentiable and not (max_memory is None and store is None):
         raise ValueError("a differentiable fusion is of the whole frame: leave out max_memory and store")
     check_luminance(network, luminance, noisy=noise is not None)

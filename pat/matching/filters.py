@@ -23,6 +23,11 @@ def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[T
     def one(image: Tensor, blur: float) -> Tensor:
         if not blur:
             return image
+        if image.requires_grad:
+            from kornia.filters import gaussian_blur2d
+
+            side = round(8 * blur + 1) | 1  # as OpenCV chooses it
+            return gaussian_blur2d(image[None, None], side, (blur, blur))[0, 0]
         plane = np.ascontiguousarray(image.detach().cpu().numpy(), np.float32)
         return torch.from_numpy(cv2.GaussianBlur(plane, (0, 0), blur)).to(image)
 

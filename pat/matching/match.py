@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -16,14 +16,14 @@ from arraygeom import Segments
 
 from ..support.settings import size
 from .colour_transfer import transferred
-from .inputs import Inputs
+from .inputs import Beta, Inputs
 from .matches import BetaMatches, Matches, is_consistent
 from .multiview import agreed
 from .normalisation import Comparison
 from .positions import FINE, at_matches, reduced
 from .radiometry import SpectralMix
 from .semi_global import HalfSizeMatches, matched_at_half_size
-from .subpixel import matched_at_full_size
+from .subpixel import matched_at_full_size, with_gradients
 
 LOG = logging.getLogger(__name__)
 
@@ -42,12 +42,24 @@ Matcher = Callable[[Inputs], Matches]
 
 
 def match(inputs: Inputs) -> Matches:
-    """Match alpha with every beta, and transfer the betas' bands to alpha's view.
+    """Match alpha with every beta, and transfer the betas' bands to alpha's view; with gradients as `transferred`, and
+    of the positions.
 
     Raises ValueError for a beta whose field is not of straight segments.
     """
     found = located(inputs)
+    if torch.is_grad_enabled():
+        found = Matches(tuple(_following(inputs.alpha, *one) for one in zip(inputs.betas, found.betas)))
     return transferred(inputs, found)
+
+
+def _following(alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaMatches:
+    """The matches, which follow images and segments that have gradients."""
+    segments, comparison = beta.field.straight, found.comparison
+    if not any(x.requires_grad for x in (alpha, beta.image, segments.start, segments.end)):
+        return found
+    views = comparison.views(alpha, beta.image)
+    return replace(found, disparity=with_gradients(views, segments, found.disparity))
 
 
 @torch.no_grad()

@@ -24,7 +24,7 @@ from arraygeom import Segments
 from ..support.settings import size, tuned
 from .filters import box_mean, filled, numpy_of
 from .normalisation import ComparedViews
-from .positions import FINE, Extent, at_matches
+from .positions import FINE, Extent, at_matches, matches
 from .semi_global import CONSISTENT, SemiGlobalSettings, Windows, geometry_of, matched_by_labels
 
 FULL_SIZE = SemiGlobalSettings(
@@ -43,6 +43,7 @@ class SubpixelSettings:
     neighbourhood: int = size(5, "Side of the neighbourhood at half the size, pixels")
     same: float = tuned(0.7, "Middlebury: nearer matches at both sizes are of one surface, pixels")
     step_radius: int = size(3, "Window of the step to a fraction of a pixel")
+    gradient_radius: int = size(6, "Window around a pixel whose brightness moves its match, in gradients")
     step_floor: float = tuned(2e-5, "Source not recorded: regulariser (variance of brightness) of that step")
     most_step: float = tuned(0.25, "Source not recorded: the most pixels of that step")
     flat: float = tuned(
@@ -83,19 +84,51 @@ def _precise(
     own, other, guides = views
     near = consistent & ((disparity - rough).abs() < SETTINGS.same)
     start = torch.where(near, (disparity + rough) / 2, disparity)
-    across, down = (torch.gradient(other, dim=side)[0] for side in (3, 2))
-    extent = Extent.of(segments)
-    seen, across, down = at_matches(torch.cat([other, across, down], 1), segments, start, extent)[0].split(1, 1)
-    towards = extent.towards.movedim(-1, 1).to(other)
-    mean = partial(box_mean, radius=2 * SETTINGS.step_radius)
-    rise, rest = across * towards[:, :1] + down * towards[:, 1:], own - seen
-    rise, rest = rise - mean(rise), rest - mean(rest)
+    rise, rest = _compared(own, other, segments, start)
     common, slope = box_mean(torch.cat([rise * rest, rise.square()], 1), SETTINGS.step_radius).split(1, 1)
     step = (common / (slope + SETTINGS.step_floor)).clamp(-SETTINGS.most_step, SETTINGS.most_step)
     weight = torch.where(consistent, slope / (slope + SETTINGS.flat) + SETTINGS.least_weight, 0.0) + 1e-5
     planes = zip(numpy_of(torch.where(near, start + step, start)), numpy_of(weight[:, 0]), guides)
     smooth = np.stack([filled(d, w, _surfaces(d[0], brightness), SETTINGS.surface) for d, w, brightness in planes])
     return torch.from_numpy(smooth).to(disparity)
+
+
+def with_gradients(
+    views: ComparedViews, segments: Segments, disparity: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, "b 1 h w"]:
+    """The same disparity, with the gradients of where brightness along the segments agrees best around each pixel.
+
+    By the implicit function theorem: there the least squares' step is zero, and stays so if the match moves by as
+    much as images and segments move the step.
+    """
+    step = _step(views, segments, disparity)
+    return disparity + (step - step.detach())
+
+
+def _step(views: ComparedViews, segments: Segments, disparity: Tensor) -> Float[Tensor, "b 1 h w"]:
+    """One step towards the best agreement, pixels; its gradients hold where it is zero."""
+    rise, rest = _compared(views.alpha, views.beta, segments, disparity)
+    rise = rise.detach()
+    common, slope = box_mean(torch.cat([rise * rest, rise.square()], 1), SETTINGS.gradient_radius).split(1, 1)
+    return common / (slope.detach() + SETTINGS.flat)
+
+
+def _compared(
+    own: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"], segments: Segments, disparity: Tensor
+) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"]]:
+    """Of each pixel, both less their mean around it: how much brighter beta is a pixel farther along its segment than
+    at its match, and how much brighter alpha is than beta there."""
+    across, down = (torch.gradient(other, dim=side)[0] for side in (3, 2))
+    still, extent = Segments(segments.start.detach(), segments.end.detach(), segments.valid), Extent.of(segments)
+    seen, across, down = at_matches(torch.cat([other, across, down], 1), still, disparity)[0].split(1, 1)
+    if segments.end.requires_grad or segments.start.requires_grad:
+        # Along these slopes: those of bicubic sampling itself are half as much again at whole pixels.
+        x, y = matches(segments, disparity, extent=extent).to(other)[:, None].unbind(-1)
+        seen = seen + across.detach() * (x - x.detach()) + down.detach() * (y - y.detach())
+    towards = extent.towards.movedim(-1, 1).to(other).detach()
+    mean = partial(box_mean, radius=2 * SETTINGS.step_radius)
+    rise, rest = across * towards[:, :1] + down * towards[:, 1:], own - seen
+    return rise - mean(rise), rest - mean(rest)
 
 
 def _surfaces(disparity: NDArray[np.float32], brightness: NDArray[np.uint8]) -> NDArray[np.uint8]:

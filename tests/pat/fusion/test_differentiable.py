@@ -5,8 +5,10 @@ import math
 import pytest
 import torch
 
-from arraygeom import Rig
+from arraygeom import Pair, Rig
+from arraygeom.multiview import warp
 from pat import fuse, load_weights
+from pat.media.colour import luminance
 from tests.pat.layered_array import load_sample
 
 HW = (192, 256)
@@ -38,6 +40,45 @@ def test_a_rotation_is_recovered_through_the_fused_image(cropped):
         (frame.image - ground_truth).square().mean().backward()
         optimiser.step()
     assert abs(math.degrees(angle.item())) < 0.02
+
+
+def test_a_rotation_is_recovered_from_images_alone(cropped):
+    """What alpha sees is in the colour image where the depth found says, in the rig as it should be."""
+    rig, images, _ = cropped
+    network = load_weights("mono-colour")
+    angle = torch.tensor(math.radians(0.3), dtype=torch.float64, requires_grad=True)
+    optimiser = torch.optim.Rprop([angle], lr=math.radians(0.13), etas=(0.3, 1.01))
+    colour = luminance(images["colour"])[None].double()
+    for _ in range(8):
+        optimiser.zero_grad()
+        moved = rotated(rig, angle)
+        frame = fuse(network, moved, images, alpha="mono", differentiable=True)
+        pair = Pair(moved["mono"], moved["colour"])
+        seen, valid = warp(pair, colour, frame.depth[None].double(), interpolation="bicubic")
+        likely = valid[0] & (frame.confidence > 0.5)
+        (seen[0] - images["mono"])[:, likely].square().mean().backward()
+        optimiser.step()
+    assert abs(math.degrees(angle.item())) < 0.03
+
+
+def test_depths_follow_a_rotation_along_the_segments(cropped):
+    """Colour turned about its y axis: matches stay where they are in its image, depths change. A constant position
+    along the segment would move the match instead."""
+    rig, images, _ = cropped
+    network = load_weights("mono-colour")
+
+    def fused(angle: torch.Tensor, **options):
+        turned = rig.perturbed({"colour.rotation": angle * torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)})
+        return fuse(network, turned, images, alpha="mono", align=False, **options)
+
+    step = math.radians(0.1)
+    before, after = (fused(torch.tensor(s, dtype=torch.float64)) for s in (-step, step))
+    angle = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    frame = fused(angle, differentiable=True)
+    change = (1 / after.depth - 1 / before.depth) / (2 * step)
+    likely = (torch.stack([f.confidence.detach() for f in (frame, before, after)]) > 0.7).all(0)
+    (slope,) = torch.autograd.grad((1 / frame.depth)[likely].mean(), angle)
+    assert slope.item() == pytest.approx(change[likely].median().item(), rel=0.15)
 
 
 def test_gradients_reach_rig_images_and_weights(cropped):
