@@ -22,7 +22,7 @@ from arraygeom import Band, LensView, ReceptiveField, Rig, Segments, View, pixel
 from arraygeom.chunks import chunked
 from arraygeom.pixels import map_homogeneous
 from arraygeom.sampling import Interpolation, on_image
-from arraygeom.undistortion import pixels_between, sampled_between
+from arraygeom.undistortion import pixels_between
 
 from ..matching.inputs import Beta
 from ..matching.match import Matcher, match
@@ -296,7 +296,7 @@ def _at_pixels(
         return plane
     assert isinstance(pinhole, LensView)
     assert isinstance(recorded, LensView)
-    return sampled_between(plane, pinhole, pixels_between(pinhole, recorded), interpolation).values[0]
+    return resampled(plane, pinhole, recorded, interpolation=interpolation).values[0]
 
 
 def _has_lens(view: View) -> bool:
