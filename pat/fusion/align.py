@@ -22,7 +22,7 @@ from arraygeom import Band, LensView, ReceptiveField, Rig, Segments, View, pixel
 from arraygeom.chunks import chunked
 from arraygeom.pixels import map_homogeneous
 from arraygeom.sampling import Interpolation, on_image
-from arraygeom.undistortion import pixels_between
+from arraygeom.undistortion import pixels_between, resampled
 
 from ..matching.inputs import Beta
 from ..matching.match import Matcher, match

@@ -172,8 +172,8 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
     factors = {
         name: min(lengths[alpha] / length * min(MATCHED / longest, 1.0), 1.0) for name, length in lengths.items()
     }
-    reduced = {name: _scaled(image, factors[name]) for name, image in pinhole.items()}
-    masks = {name: _scaled(mask, factors[name])[0] > 0.99 for name, mask in shown.items()}
+    reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
+    masks = {name: scaled(mask, factors[name])[0] > 0.99 for name, mask in shown.items()}
     found, facts = centres_found(_resized(straight, reduced), reduced, masks, alpha=alpha)
     for name, (points, distance) in facts.items():
         note(f"{name}: {points} points, {distance:.2f} px from their lines, intrinsics kept")
@@ -194,7 +194,7 @@ def found_rig(
     Calibrated, up to a scale, where points matched between alpha and a beta have parallax; else known by F alone.
     """
     factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in images.items()}
-    reduced = {name: _scaled(image, factors[name]) for name, image in images.items()}
+    reduced = {name: scaled(image, factors[name]) for name, image in images.items()}
     lengths = {name: length * factors[name] for name, length in focal.items()}
     with part(0, LINES):
         found = rig_from_images(reduced, focal=lengths, alpha=alpha)
@@ -269,7 +269,7 @@ def _refined(
     """The pair refined by the matches of a fusion at reduced size, unless it has one of these links; and that."""
     alpha, beta = pair.rig.names
     factor = min(COARSE / max(images[alpha].shape[-2:]), 1.0)
-    small = {name: _scaled(images[name], factor) for name in (alpha, beta)}
+    small = {name: scaled(images[name], factor) for name in (alpha, beta)}
     link = links.get((alpha, beta))
     rig = _resized(pair.rig if link is None else pair.rig.replace(links={(alpha, beta): link}), small)
     with warnings.catch_warnings():
@@ -310,7 +310,8 @@ def _resized(rig: Rig, images: Images) -> Rig:
     return rig
 
 
-def _scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 w2"]:
+def scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 w2"]:
+    """The image reduced by this factor; of 1 or more, as it is."""
     if factor >= 1:
         return image
     hw = [max(round(n * factor), 16) for n in image.shape[-2:]]
