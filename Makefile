@@ -43,7 +43,7 @@ demo: $(READY)
 
 showcase: $(READY)
 	@echo "== fusing the images in $(DATA) into out/showcase"
-	@$(BIN)/pat showcase --data $(DATA) --out out/showcase
+	@$(BIN)/python -m experiments showcase --data $(DATA) --out out/showcase
 
 readme: demo showcase
 	@echo "== bringing docs/results.md and docs/demo.jpg up to date"

@@ -17,6 +17,7 @@ from torch import Tensor
 from .batching import Batched
 from .pixels import HW, pixel_grid
 from .text import share_text
+from .tracing import followed
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,6 +54,8 @@ class Segments(Batched):
         """Length in pixels. Differentiable, also at zero length (where the gradient is zero)."""
         x, y = (self.end - self.start).unbind(-1)  # a sum over an axis of two takes four times as long
         squared = x * x + y * y
+        if not (squared.requires_grad or followed()):
+            return squared.sqrt_()
         positive = squared > 0
         return torch.where(positive, torch.where(positive, squared, 1.0).sqrt(), 0.0)
 

@@ -10,9 +10,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .camera import AnyLensView, Camera, LensView
+from .camera import AnyLensView, Camera, LensView, View
 from .chunks import chunked
-from .pixels import HW, coarse_grid, pixel_coordinates, product
+from .pixels import HW, coarse_grid, map_homogeneous, pixel_coordinates, product
+from .rig import Rig
 from .sampling import Interpolation, Sampled, sample
 from .tracing import needs_numbers
 
@@ -66,6 +67,41 @@ def _by_rows(function: Callable[[Tensor], Any], hw: HW, *, axis: int) -> Any:
     x, y = pixel_coordinates(hw, dtype=torch.float64)
     rows = max(AT_ONCE // hw[1], 1)
     return chunked(lambda x, y: function(torch.stack([x, y], -1)), x, y, rows=rows, axis=axis)
+
+
+def recorded_pixels(
+    x: Float[Tensor, "*n 2"], now: View, recorded: LensView
+) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    """Pixels of a view without its lens, cropped, resized or rotated, in the image as recorded; which it can show.
+
+    K of both views says how pixels were changed: x ~ K_now K_recorded^-1 x_recorded but for the lens.
+    """
+    x = map_homogeneous(_between(recorded, now)[:2], x)
+    return recorded.to(torch.float64).distort(x)
+
+
+def straight_pixels(
+    x: Float[Tensor, "*n 2"], now: View, recorded: LensView
+) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    """The inverse of `recorded_pixels`: pixels of the image as recorded in the view as it is now."""
+    x, valid = recorded.to(torch.float64).undistort(x)
+    return map_homogeneous(torch.linalg.inv(_between(recorded, now))[:2], x), valid
+
+
+def _between(recorded: LensView, now: View) -> Float[Tensor, "3 3"]:
+    """K_recorded K_now^-1."""
+    if not isinstance(now, LensView):
+        raise ValueError("which pixels were recorded views without K do not say: give them one (`with_pixels`)")
+    return product(recorded.K.double(), torch.linalg.inv(now.K.double()))
+
+
+def with_pixels(rig: Rig) -> Rig:
+    """The rig whose views all have a K, the identity if they are not calibrated: it follows every change of pixels."""
+    for name, view in rig.cameras.items():
+        if not isinstance(view, LensView):
+            eye = torch.eye(3, dtype=torch.float64)
+            rig = rig.with_camera(name, LensView(hw=view.hw, sensor=view.sensor, K=eye))
+    return rig
 
 
 def resampled(

@@ -120,7 +120,9 @@ def imported_modules(path: Path) -> set[str]:
         ("pat/matching", r"pat\.(networks|fusion|cli)\b"),
         ("pat/fusion", r"pat\.networks\.(paper|guided|bandwise)\b|pat\.cli\b"),
         ("pat/networks", r"pat\.matching\.\w+_numba\b|pat\.(fusion|cli)\b"),
-        ("calib", r"pat\b"),
+        ("calib", r"pat\b|experiments\b"),
+        ("pat", r"experiments\b"),
+        ("arraygeom", r"experiments\b"),
     ],
 )
 def test_rooms_import_only_what_is_below_them(room, forbidden):

@@ -12,6 +12,7 @@ A rig whose numbers have batch axes *b takes pixels (*b, ..., 2), or with axes o
 """
 
 from .approximation import approximated, placement_error
+from .around import AroundDepth, AroundMatches
 from .curved import Curved, ThroughLenses
 from .default import FIELDS, default_field, named_field, recorded_field
 from .explicit import Dense, Local, NearestVoxels
@@ -23,6 +24,8 @@ from .widened import Widened
 
 __all__ = [
     "FIELDS",
+    "AroundDepth",
+    "AroundMatches",
     "Curved",
     "Dense",
     "Epipolar",

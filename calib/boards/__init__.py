@@ -1,10 +1,9 @@
 """Calibration from images of a board: from its specification to a rig with covariance and report.
 
-`board`, `known_points`, `target`, `printing` (boards) -> `photos`, `detect`, `corners`, `collect` (detections) ->
-`intrinsics` (one camera) -> `poses`, `start` (initial rig) -> `camera_parameters`, `bundle`, `jackknife`,
-`observability`, `shape` (adjustment) -> `rig` (calibration) -> `validation`, `lens_comparison`, `coverage`,
-`covariance`, `adequacy`, `report`. `run` does all of it from files to files, `watch` guides while images are taken,
-`simulation` renders the images that a planned rig would take.
+`board`, `target` (boards, from text and to print) -> `photos`, `corners`, `detect` (detections) -> `parameters`,
+`deformation`, `bundle`, `solve` (adjustment) -> `intrinsics` (one camera) -> `poses` (initial rig) -> `rig`
+(calibration) -> `validation`, `uncertainty`, `adequacy`, `figures`, `report`. `run` does all of it from files to files,
+`watch` guides while images are taken, `simulation` renders the images that a planned rig would take.
 """
 
 from .. import _lazy
@@ -16,9 +15,9 @@ __getattr__ = _lazy(
     {
         "calibrate": "rig",
         "calibrate_photos": "run",
-        "collect_folder": "collect",
+        "collect_folder": "detect",
         "parse_board": "target",
         "simulate_photos": "simulation",
-        "write_board": "run",
+        "write_board": "target",
     },
 )

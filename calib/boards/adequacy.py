@@ -1,8 +1,4 @@
-"""Whether a camera's model is adequate and its images enough: uncertainty of projection, halves of the frames compared.
-
-A camera's pose and its lens can stand for one another: what is compared are the pixels of points at a distance, after
-the small motion of the camera that fits them best (as in mrcal's projection uncertainty and difference).
-"""
+"""Whether a camera's images are enough: what boards cover, and which views would help most."""
 
 from __future__ import annotations
 
@@ -11,18 +7,23 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from arraygeom import Camera, Pose, rotation_from_vector
 
 from .board import Board
-from .bundle import BundleResult, readjusted
-from .camera_parameters import camera_jacobian, parameter_names
-from .validation import without_blocks
+from .detect import BoardViews
+from .parameters import camera_jacobian
+from .photos import FrameKey
+from .rig import Calibration
+from .uncertainty import Intrinsics, intrinsics_of, moved_pixels
 
-GRID = 15, 20
-"""Rows and columns of the pixels at which projections are compared."""
-FEWEST_TO_HALVE = 8
+CELLS = 6, 8
+"""Rows and columns of the coverage grid."""
+WIDE_ENOUGH = 0.6
+DEEP_ENOUGH = 1.5
+TILTED_ENOUGH = 20.0
+POSITIONS = ("top left", "top", "top right"), ("left", "middle", "right"), ("bottom left", "bottom", "bottom right")
 TILT = 30.0
 """Degrees by which a proposed board is tilted."""
 FILLS = 0.35, 0.7
@@ -33,72 +34,62 @@ TILTS = {(0, 1): "right edge nearer", (0, -1): "left edge nearer", (1, 0): "uppe
 TILTS |= {(-1, 0): "lower edge nearer"}
 
 
-class Intrinsics(NamedTuple):
-    """A camera in its own frame, the covariance of its free intrinsics, which they are, and its noise in pixels."""
+class Coverage(NamedTuple):
+    """Coverage of one camera by its boards.
 
-    camera: Camera
-    covariance: Float[np.ndarray, "f f"]
-    free: Float[np.ndarray, " p"]
-    sigma: float
-
-
-def intrinsics_of(fit: BundleResult, name: str) -> Intrinsics:
-    """One camera of a fit that has a covariance."""
-    assert fit.covariance is not None
-    camera = fit.problem.cameras[name].replace(cam_from_world=Pose.identity())
-    entries = [f"{name}.{entry}" for entry in parameter_names(camera)]
-    free = np.array([i >= 6 and entry in fit.names for i, entry in enumerate(entries)])
-    index = [fit.names.index(entry) for entry, is_free in zip(entries, free) if is_free]
-    return Intrinsics(camera, fit.covariance[np.ix_(index, index)], free, fit.sigma[name])
-
-
-def grid_points(camera: Camera, depth: float) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"]]:
-    """Pixels over the image, and their points at a depth in the camera's frame, where the lens has a ray."""
-    rows, columns = GRID
-    h, w = camera.hw
-    x = np.stack(np.meshgrid(np.linspace(0, w - 1, columns), np.linspace(0, h - 1, rows)), -1).reshape(-1, 2)
-    X = camera.unproject(torch.from_numpy(x), torch.full((len(x),), depth, dtype=torch.float64)).numpy()
-    usable = np.isfinite(X).all(1)
-    return x[usable], X[usable]
-
-
-def uncertainty(known: Intrinsics, depth: float) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Standard deviations (pixels, worst direction) of the projection of points at a depth (metres), over the image."""
-    x, change = _changes(known, depth)
-    return x, np.sqrt(np.linalg.eigvalsh(change @ known.covariance @ change.swapaxes(-1, -2))[:, -1])
-
-
-def _changes(known: Intrinsics, depth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels, and how they move with the free intrinsics, after the best motion of the camera: (n, 2), (n, 2, f)."""
-    x, X = grid_points(known.camera, depth)
-    J = camera_jacobian(known.camera, X)
-    moved, pose = J[..., known.free].reshape(2 * len(x), -1), J[..., :6].reshape(2 * len(x), 6)
-    left = moved - pose @ np.linalg.lstsq(pose, moved, rcond=None)[0]
-    return x, left.reshape(len(x), 2, -1)
-
-
-def half_difference(fit: BundleResult, depth: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """By camera: pixels (n, 2), and how far (n, 2) projections differ between fits to every other frame.
-
-    Empty if there are too few frames.
+    cells: points in each cell of the image. depths: (nearest, furthest) point, metres. tilts: (least, most)
+    angle between the board's normal and the optical axis, degrees. missing: advice, one sentence each.
     """
-    count = len(fit.problem.structure)
-    if count < FEWEST_TO_HALVE:
-        return {}
-    even = np.arange(count) % 2 == 0
-    try:
-        halves = [readjusted(without_blocks(fit.problem, kept), fit.free(), fit.sigma) for kept in (even, ~even)]
-    except np.linalg.LinAlgError:
-        return {}
-    found = {}
-    for name in fit.problem.cameras:
-        a, b = (half.cameras[name].replace(cam_from_world=Pose.identity()) for half in halves)
-        x, X = grid_points(a, depth)
-        off = b.project_local(torch.from_numpy(X)).x.numpy() - x
-        pose = camera_jacobian(a, X)[..., :6].reshape(2 * len(x), 6)
-        off = off.ravel() - pose @ np.linalg.lstsq(pose, off.ravel(), rcond=None)[0]
-        found[name] = x, off.reshape(-1, 2)
-    return found
+
+    cells: Int[np.ndarray, "r c"]
+    depths: tuple[float, float]
+    tilts: tuple[float, float]
+    missing: tuple[str, ...]
+
+    @property
+    def share(self) -> float:
+        """The share of cells with a point."""
+        return float((self.cells > 0).mean())
+
+
+def coverage(views: BoardViews, cam_from_board: Mapping[FrameKey, Pose], board: Board) -> Coverage:
+    """Coverage of a camera by its boards, from their poses in it."""
+    h, w = views.hw
+    x = np.concatenate([d.x for d in views.seen.values()])
+    rows, columns = CELLS
+    cells, _, _ = np.histogram2d(x[:, 1], x[:, 0], bins=(rows, columns), range=((-0.5, h - 0.5), (-0.5, w - 0.5)))
+    poses = {key: cam_from_board[key] for key in views.seen}
+    depths = [board.points[d.ids] @ poses[k].R[2].numpy() + float(poses[k].t[2]) for k, d in views.seen.items()]
+    tilts = np.degrees([np.arccos(min(1.0, abs(float(pose.R[2, 2])))) for pose in poses.values()])
+    found = Coverage(cells.astype(np.int64), _range(np.concatenate(depths)), _range(tilts), ())
+    return found._replace(missing=tuple(_missing(found)))
+
+
+def _range(values: np.ndarray) -> tuple[float, float]:
+    return float(values.min()), float(values.max())
+
+
+def _missing(found: Coverage) -> list[str]:
+    missing = []
+    thirds = found.cells.reshape(3, CELLS[0] // 3, CELLS[1])
+    empty = [
+        POSITIONS[i][j]
+        for i, band in enumerate(thirds)
+        for j, part in enumerate(np.array_split(band, 3, axis=1))
+        if not part.any()
+    ]
+    if empty:
+        missing.append(f"no points at the {', '.join(empty)} of the image: the lens model is extrapolated there")
+    elif found.share < WIDE_ENOUGH:
+        missing.append(f"points in only {found.share:.0%} of the image: fill it, corners too")
+    if found.depths[1] < DEEP_ENOUGH * found.depths[0]:
+        near, far = found.depths
+        missing.append(
+            f"boards at one depth only ({near:.3g} to {far:.3g} m): bring it closer in some, further in others"
+        )
+    if found.tilts[1] < TILTED_ENOUGH:
+        missing.append(f"boards tilted by {found.tilts[1]:.0f} degrees at most: tilt it by 20 to 40")
+    return missing
 
 
 class NextView(NamedTuple):
@@ -111,7 +102,7 @@ class NextView(NamedTuple):
 
 def next_views(known: Intrinsics, board: Board, depth: float, *, count: int = 2) -> list[NextView]:
     """The views that lower a camera's uncertainty of projection most, one after the other."""
-    _, change = _changes(known, depth)
+    _, change = moved_pixels(known, depth)
     gains = {text: _gain(known, X) for text, X in proposed_views(known.camera, board.members[0]).items()}
     candidates = {text: gain for text, gain in gains.items() if gain is not None}
     information, found = np.linalg.inv(known.covariance), []
@@ -155,3 +146,30 @@ def _gain(known: Intrinsics, X: np.ndarray) -> np.ndarray | None:
     pose, own = J[..., :6].reshape(-1, 6), J[..., known.free].reshape(2 * int(inside.sum()), -1)
     left = own - pose @ np.linalg.lstsq(pose, own, rcond=None)[0]
     return np.asarray(left.T @ left)
+
+
+def coverages(calibration: Calibration) -> dict[str, Coverage]:
+    """Coverage of every camera."""
+    problem = calibration.fit.problem
+    boards = problem.board_poses
+    found = {}
+    for name, views in calibration.views.items():
+        poses = {key: problem.cameras[name].cam_from_world @ boards[key] for key in views.seen}
+        found[name] = coverage(views, poses, calibration.board)
+    return found
+
+
+def coverage_advice(calibration: Calibration, covers: Mapping[str, Coverage]) -> list[str]:
+    """What each camera's images lack, and, where that is something, which views would help most."""
+    found = []
+    for name, covered in covers.items():
+        found += [f"{name}: {text}" for text in covered.missing]
+        if not covered.missing or calibration.fit.covariance is None:
+            continue
+        known = intrinsics_of(calibration.fit, name)
+        if len(known.covariance):
+            views = next_views(known, calibration.board, float(np.mean(covered.depths)))
+            listed = "; then ".join(view.text for view in views)
+            gain = f"uncertainty from {views[0].before:.2g} to {views[-1].after:.2g} px"
+            found.append(f"{name}: two more views would help most: {listed} ({gain})")
+    return found

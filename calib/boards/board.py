@@ -1,4 +1,7 @@
-"""What all boards have in common, and the markers that identify the points of some."""
+"""Calibration boards: their points, the markers that identify some, how they are drawn.
+
+Points are (x, y, 0) in metres: x along the rows, y down the columns, z into the board, the first point at the origin.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,10 @@ from typing import Any, ClassVar
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
+from matplotlib.patches import Circle, Rectangle
+
+FLAT = 0.03
+"""Relief below which points of known position count as lying in a plane, as a share of their extent."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +105,242 @@ class MarkedBoard(Board):
         """The numbers of its markers."""
 
 
+@dataclass(frozen=True)
+class Chessboard(Board):
+    """`columns` x `rows` inner corners."""
+
+    def __str__(self) -> str:
+        return f"chessboard:{self.columns}x{self.rows}:{millimetres(self.spacing)}"
+
+    def _draw(self, axes: Any) -> None:
+        side = 1e3 * self.spacing
+        for row in range(self.rows + 1):
+            for column in range(row % 2, self.columns + 1, 2):
+                axes.add_patch(_black(column * side, row * side, side, side))
+
+
+@dataclass(frozen=True)
+class Charuco(MarkedBoard):
+    """A chessboard with markers in its white squares; `columns` x `rows` counts its inner corners."""
+
+    marker: float
+    legacy: bool = False
+
+    @property
+    def markers(self) -> range:
+        """The numbers of its markers."""
+        return range(self.first, self.first + (self.columns + 1) * (self.rows + 1) // 2)
+
+    @cached_property
+    def opencv(self) -> cv2.aruco.CharucoBoard:
+        """OpenCV's board, lengths in metres."""
+        size = self.columns + 1, self.rows + 1
+        ids = np.array(self.markers)
+        board = cv2.aruco.CharucoBoard(size, self.spacing, self.marker, marker_dictionary(self.dictionary), ids)
+        board.setLegacyPattern(self.legacy)
+        return board
+
+    def __str__(self) -> str:
+        squares = f"{self.columns + 1}x{self.rows + 1}"
+        tail = (":legacy" if self.legacy else "") + (f":from{self.first}" if self.first else "")
+        lengths = f"{millimetres(self.spacing)}:{millimetres(self.marker)}"
+        return f"charuco:{squares}:{lengths}:{self.dictionary.lower()}{tail}"
+
+    def _draw(self, axes: Any) -> None:
+        side, marker = 1e3 * self.spacing, 1e3 * self.marker
+        white = set()
+        for corners, number in zip(np.array(self.opencv.getObjPoints()), np.array(self.opencv.getIds()).reshape(-1)):
+            left, top = (1e3 * float(v) for v in corners[:, :2].min(0))
+            white.add((int(left // side), int(top // side)))
+            _draw_marker(axes, self.dictionary, int(number), left, top, marker)
+        for column, row in np.ndindex(self.columns + 1, self.rows + 1):
+            if (column, row) not in white:
+                axes.add_patch(_black(column * side, row * side, side, side))
+
+
+@dataclass(frozen=True)
+class AprilGrid(MarkedBoard):
+    """Kalibr's grid of AprilTags; `columns` x `rows` counts the corners of all tags, `spacing` is twice the gap.
+
+    tag: side of a tag, metres; border: black bits around its code. Tags are numbered row by row from below.
+    """
+
+    tag: float
+    border: int = 2
+
+    @property
+    def gap(self) -> float:
+        """The space between two tags, metres."""
+        return self.spacing / 2
+
+    @property
+    def markers(self) -> range:
+        """The numbers of its tags."""
+        return range(self.first, self.first + self.columns * self.rows // 4)
+
+    @cached_property
+    def points(self) -> Float[np.ndarray, "n 3"]:
+        """Positions of the tags' corners on the board, metres, row by row."""
+        grid = unit_grid(self.columns, self.rows)
+        return (grid // 2) * (self.tag + self.gap) + (grid % 2) * self.tag
+
+    @cached_property
+    def corners(self) -> Int[np.ndarray, "m 4"]:
+        """The points at the upper left, upper right, lower right and lower left corner of each tag."""
+        index = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)
+        a, b = index[::2][::-1], index[1::2][::-1]
+        return np.stack([a[:, ::2], a[:, 1::2], b[:, 1::2], b[:, ::2]], -1).reshape(-1, 4)
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Width and height of the print without its margin, metres: the small squares at the tags' corners."""
+        width, height = (float(v) + 2 * self.gap for v in self.points[:, :2].max(0))
+        return width, height
+
+    @property
+    def offset(self) -> float:
+        """The gap, metres."""
+        return self.gap
+
+    def __str__(self) -> str:
+        tail = (":border1" if self.border == 1 else "") + (f":from{self.first}" if self.first else "")
+        return f"aprilgrid:{self.columns // 2}x{self.rows // 2}:{millimetres(self.tag)}:{self.gap / self.tag:.6g}{tail}"
+
+    def _draw(self, axes: Any) -> None:
+        tag, gap = 1e3 * self.tag, 1e3 * self.gap
+        for number, corners in zip(self.markers, self.corners):
+            left, top = 1e3 * self.points[corners[0], :2] + gap
+            _draw_marker(axes, self.dictionary, number, left, top, tag, border=self.border, quarter_turns=2)
+        for column, row in np.ndindex(self.columns // 2 + 1, self.rows // 2 + 1):
+            axes.add_patch(_black(column * (tag + gap), row * (tag + gap), gap, gap))
+
+
+@dataclass(frozen=True)
+class Boards(Board):
+    """Several boards seen at once, each with poses of its own; their points in one list."""
+
+    boards: tuple[Board, ...] = ()
+    identified: ClassVar[bool] = True
+
+    @property
+    def members(self) -> tuple[Board, ...]:
+        """The boards."""
+        return self.boards
+
+    @cached_property
+    def points(self) -> Float[np.ndarray, "n 3"]:
+        """The points of all boards, each in its own frame, metres."""
+        return np.concatenate([b.points for b in self.boards])
+
+    @cached_property
+    def part(self) -> Int[np.ndarray, " n"]:
+        """The board that each point is on."""
+        return np.repeat(np.arange(len(self.boards)), [len(b.points) for b in self.boards])
+
+    @property
+    def extents(self) -> list[tuple[float, float]]:
+        """`extent` of each board."""
+        return [b.extent for b in self.boards]
+
+    def __str__(self) -> str:
+        return " and ".join(map(str, self.boards))
+
+    def _draw(self, axes: Any) -> None:
+        raise ValueError("several boards are printed one by one")
+
+
+@dataclass(frozen=True)
+class Circles(Board):
+    """Black circles on white, in rows; in an asymmetric grid every other row is shifted by half their distance."""
+
+    asymmetric: bool = False
+
+    def __str__(self) -> str:
+        name = "acircles" if self.asymmetric else "circles"
+        return f"{name}:{self.columns}x{self.rows}:{millimetres(self.spacing)}"
+
+    @cached_property
+    def points(self) -> Float[np.ndarray, "n 3"]:
+        """Positions of the centres on the board, metres, row by row."""
+        grid = unit_grid(self.columns, self.rows)
+        if self.asymmetric:
+            grid[:, 0] = 2 * grid[:, 0] + grid[:, 1] % 2
+        return grid * self.spacing
+
+    @property
+    def radius(self) -> float:
+        """Radius of the printed circles, metres."""
+        return 0.3 * self.spacing * (2**0.5 if self.asymmetric else 1)
+
+    @property
+    def offset(self) -> float:
+        """A circle's radius, metres."""
+        return self.radius
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Width and height of the print without its margin, metres."""
+        width, height = (float(v) + 2 * self.radius for v in self.points[:, :2].max(0))
+        return width, height
+
+    def _draw(self, axes: Any) -> None:
+        radius = 1e3 * self.radius
+        for x, y in (1e3 * self.points[:, :2] + radius).tolist():
+            axes.add_patch(Circle((x, y), radius, facecolor="black", edgecolor="none"))
+
+
+@dataclass(frozen=True)
+class KnownPoints(MarkedBoard):
+    """Points at known positions: the centres of markers, or corners of them.
+
+    ids: (marker, corner) of each point, corners clockwise from the marker's upper left, -1 for its centre.
+    positions: (x, y, z) of each, metres, in any frame.
+    """
+
+    file: str
+    ids: tuple[tuple[int, int], ...]
+    positions: tuple[tuple[float, float, float], ...]
+
+    @cached_property
+    def points(self) -> Float[np.ndarray, "n 3"]:
+        """Their positions about their mean, metres; in their own plane, x and y, if they lie in one."""
+        points = np.array(self.positions, dtype=np.float64)
+        points -= points.mean(0)
+        if self.relief >= FLAT:
+            return points
+        axes = np.linalg.svd(points)[2]
+        return np.asarray(points @ (axes * np.array([1, 1, np.linalg.det(axes)])[:, None]).T)
+
+    @cached_property
+    def relief(self) -> float:
+        """How far the points are from lying in a plane, as a share of their extent."""
+        points = np.array(self.positions, dtype=np.float64)
+        first, *_, third = np.linalg.svd(points - points.mean(0), compute_uv=False)
+        return float(third / first)
+
+    @property
+    def flat(self) -> bool:
+        """Whether they are so nearly in a plane that cameras need several views of them."""
+        return self.relief < FLAT
+
+    @property
+    def markers(self) -> Sequence[int]:
+        """The numbers of the markers."""
+        return sorted({marker for marker, _ in self.ids})
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Width and height, metres."""
+        width, height, _ = np.ptp(self.points, axis=0).tolist()
+        return width, height
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.dictionary}"
+
+    def _draw(self, axes: Any) -> None:
+        raise ValueError(f"{self.file}: points of known position are no board to print")
+
+
 def unit_grid(columns: int, rows: int) -> Float[np.ndarray, "n 3"]:
     """The points (x, y, 0) of a grid of spacing 1, row by row."""
     grid = np.zeros((rows, columns, 3))
@@ -110,13 +353,32 @@ def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name.upper()}"))
 
 
-def smallest_dictionary(text: str, name: str, markers: int) -> str:
-    """The smallest dictionary of a kind that has enough markers; larger ones begin with the same markers.
+def millimetres(length: float) -> str:
+    """A length in metres as text, such as "30mm"."""
+    return f"{1e3 * length:.6g}mm"
 
-    `text` names the target in the ValueError where there is none.
-    """
-    names = [name.upper()] if "_" in name else [f"{name.upper()}_{n}" for n in (50, 100, 250, 1000)]
-    for full in names:
-        if hasattr(cv2.aruco, f"DICT_{full}") and len(marker_dictionary(full).bytesList) >= markers:
-            return full.lower()
-    raise ValueError(f"board '{text}': no dictionary '{name}' of OpenCV has the {markers} markers it needs; try 4x4")
+
+def _draw_marker(
+    axes: Any,
+    dictionary: str,
+    number: int,
+    left: float,
+    top: float,
+    side: float,
+    *,
+    border: int = 1,
+    quarter_turns: int = 0,
+) -> None:
+    """Runs of black bits as one rectangle each: no hairlines between bits."""
+    known = marker_dictionary(dictionary)
+    bits = known.markerSize + 2 * border
+    black = np.rot90(cv2.aruco.generateImageMarker(known, number, bits, borderBits=border) == 0, quarter_turns)
+    step = side / bits
+    for row, line in enumerate(black):
+        edges: np.ndarray = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
+        for begin, end in edges.reshape(-1, 2).tolist():
+            axes.add_patch(_black(left + begin * step, top + row * step, (end - begin) * step, step))
+
+
+def _black(x: float, y: float, width: float, height: float) -> Rectangle:
+    return Rectangle((x, y), width, height, facecolor="black", edgecolor="none", snap=False)

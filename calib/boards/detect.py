@@ -1,4 +1,4 @@
-"""Detection of a board's points in an image, to a fraction of a pixel.
+"""Detection of a board's points in images, to a fraction of a pixel, with likely reasons where it fails.
 
 OpenCV 4.10 and newer, and 5. Images that are dim, flat or inverted (near infrared, narrow bands) are stretched,
 equalised and inverted in turn until the board is found.
@@ -7,19 +7,21 @@ equalised and inverted in turn until the board is found.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
-from .board import Board, MarkedBoard, marker_dictionary
+from arraygeom.pixels import HW
+
+from .board import AprilGrid, Board, Charuco, Chessboard, Circles, KnownPoints, MarkedBoard, marker_dictionary
 from .corners import monomials, refine_corners
-from .known_points import KnownPoints
-from .target import AprilGrid, Charuco, Chessboard, Circles
-
-Grey = UInt8[np.ndarray, "h w"]
+from .photos import FrameKey, Grey, Photo, Photos, find_photos
 
 FEWEST = 8
 """Points that a detection must have: a pose needs 4, a check of it more."""
@@ -32,6 +34,12 @@ LARGEST_MISFIT = 0.35
 SMALL = 640
 """Width to which images are reduced to identify the board they show."""
 OTHER_DICTIONARIES = ("4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000", "aruco_original", "apriltag_36h11")
+EXPLAINED_IMAGES = 4
+"""Images without a board that are analysed for the reason."""
+NAMED = 6
+"""Images named in a message."""
+
+Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
 
 class Detection(NamedTuple):
@@ -39,6 +47,23 @@ class Detection(NamedTuple):
 
     ids: Int[np.ndarray, " n"]
     x: Float[np.ndarray, "n 2"]
+
+
+@dataclass(frozen=True)
+class BoardViews:
+    """One camera's image size and, by moment, the board points detected."""
+
+    hw: HW
+    seen: Mapping[FrameKey, Detection]
+
+    @property
+    def count(self) -> int:
+        """The number of points."""
+        return sum(len(d.ids) for d in self.seen.values())
+
+    def only(self, keys: Collection[FrameKey]) -> BoardViews:
+        """The views at some moments."""
+        return BoardViews(self.hw, {key: d for key, d in self.seen.items() if key in keys})
 
 
 def detect(grey: Grey, board: Board) -> Detection | None:
@@ -49,16 +74,6 @@ def detect(grey: Grey, board: Board) -> Detection | None:
             refined = _refined(grey, found, board)
             return refined if _plausible(refined, board) else found
     return None
-
-
-def to_grey(image: np.ndarray) -> Grey:
-    """An image (H, W) or (H, W, 3) in grey, 8 bits; one that is dim or of 16 bits is stretched to all of them."""
-    grey = image if image.ndim == 2 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
-    low, high = np.percentile(grey[::4, ::4], (0.5, 99.5))
-    if grey.dtype == np.uint8 and high - low > 100:
-        return grey
-    scaled = (grey.astype(np.float32) - low) * (255 / max(high - low, 1.0))
-    return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
 
 
 def explain(images: Iterable[Grey], board: Board) -> str:
@@ -298,3 +313,97 @@ def _grid_size(grey: Grey) -> tuple[int, int] | None:
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
     done, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
     return (meta.shape[1], meta.shape[0]) if done else None
+
+
+# All images ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CollectedViews:
+    """Detections of each camera, its images, and notes on failed ones."""
+
+    views: dict[str, BoardViews]
+    photos: Photos
+    notes: tuple[str, ...]
+
+
+def collect(photos: Photos, board: Board, *, progress: Progress | None = None) -> CollectedViews:
+    """Detect the board in all images of all cameras.
+
+    Raises ValueError, naming images and cause, if a camera's images differ in size, if the board is found in
+    none of them, or if they show a board of another size.
+    """
+    jobs = [(name, key, photo) for name, moments in photos.items() for key, photo in moments.items()]
+    with ThreadPoolExecutor(2) as pool:
+        results = pool.map(lambda job: detected(job[2], job[1], board), jobs)
+        found = list(progress(results, len(jobs)) if progress else results)
+    by_camera = {name: [(k, r) for (n, k, _), r in zip(jobs, found) if n == name] for name in photos}
+    views, notes = {}, []
+    for name, moments in photos.items():
+        sizes = {key: hw for key, (hw, _) in by_camera[name]}
+        _check_sizes(name, moments, sizes)
+        seen = {key: boards for key, (_, boards) in by_camera[name] if boards}
+        _check_board(name, moments, seen, board)
+        by_board = {key: d for boards in seen.values() for key, d in boards.items()}
+        views[name] = BoardViews(next(iter(sizes.values())), by_board)
+        notes += _missing(name, moments, seen, board)
+    return CollectedViews(views, photos, tuple(notes))
+
+
+def collect_folder(
+    folder: str | Path, board: Board, *, patterns: Mapping[str, str] | None = None, progress: Progress | None = None
+) -> CollectedViews:
+    """`collect` for the images of a folder (see `find_photos`)."""
+    return collect(find_photos(Path(folder), patterns=patterns), board, progress=progress)
+
+
+def detected(photo: Photo, key: FrameKey, board: Board) -> tuple[HW, dict[FrameKey, Detection]]:
+    """An image's size and the points of each board in it, numbered as those of all boards.
+
+    Each board has poses of its own, hence a key of its own; that of the first one is the image's. Raises ValueError if
+    the image cannot be read.
+    """
+    grey, found, before = photo.read(), dict[FrameKey, Detection](), 0
+    for index, member in enumerate(board.members):
+        if (seen := detect(grey, member)) is not None:
+            found[f"{key} board {index + 1}" if index else key] = Detection(seen.ids + before, seen.x)
+        before += len(member.points)
+    return (grey.shape[0], grey.shape[1]), found
+
+
+def _check_sizes(name: str, moments: Mapping[FrameKey, Photo], sizes: Mapping[FrameKey, tuple[int, int]]) -> None:
+    counts = Counter(sizes.values())
+    if len(counts) == 1:
+        return
+    shown = [f"{w}x{h} ({_named([moments[k].label for k in sizes if sizes[k] == (h, w)], 2)})" for h, w in counts]
+    raise ValueError(f"{name}: its images differ in size: {'; '.join(shown)}; keep those of one camera at one setting")
+
+
+def _check_board(name: str, moments: Mapping[FrameKey, Photo], seen: Collection[FrameKey], board: Board) -> None:
+    """Raises ValueError if no image shows the board, or if most of some show a larger one."""
+    if not seen:
+        why = explain(_greys(list(moments.values())), board.members[0])
+        labels = _named([p.label for p in moments.values()], NAMED)
+        raise ValueError(f"{name}: the board {board} is found in none of {len(moments)} images ({labels}): {why}")
+    if other := other_size(_greys([moments[key] for key in seen]), board, larger=True):
+        raise ValueError(
+            f"{name}: the images show a chessboard with {other} inner corners and the board given is {board}: "
+            "count the corners between squares, not the squares"
+        )
+
+
+def _missing(name: str, moments: Mapping[FrameKey, Photo], seen: Collection[FrameKey], board: Board) -> list[str]:
+    missing = [photo for key, photo in moments.items() if key not in seen]
+    if not missing:
+        return []
+    labels, why = _named([p.label for p in missing], NAMED), explain(_greys(missing), board.members[0])
+    return [f"{name}: no board in {len(missing)} of {len(moments)} images ({labels}): {why}"]
+
+
+def _greys(photos: list[Photo]) -> Iterable[Grey]:
+    step = max(1, len(photos) // EXPLAINED_IMAGES)
+    return (photo.read() for photo in photos[::step][:EXPLAINED_IMAGES])
+
+
+def _named(labels: list[str], most: int) -> str:
+    return ", ".join(labels[:most]) + (f" and {len(labels) - most} more" if len(labels) > most else "")

@@ -1,26 +1,37 @@
-"""Initial calibration of one camera from its images of a board: Zhang's method, by OpenCV."""
+"""One camera from its own images: Zhang's method by OpenCV, then all observable parameters; lens models compared."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.optimize import least_squares
 
 from arraygeom import Camera, Distortion, Pose, intrinsics
 from arraygeom.pixels import HW
 
 from .board import Board
-from .detect import Detection
+from .bundle import POSE, BundleProblem, Observations, Solved, readjusted
+from .detect import BoardViews, Detection
 from .photos import FrameKey
+from .solve import board_problem, flat_boards, solve
 
-Lens = Literal["brown-conrady", "rational", "thin-prism", "tilted", "kannala-brandt", "none"]
-COEFFICIENTS: dict[Lens, int] = {"brown-conrady": 5, "rational": 8, "thin-prism": 12, "tilted": 14}
-"""Coefficients of the lens models of Brown and Conrady, each with all terms of the former."""
+Lens = Literal["brown-conrady", "rational", "thin-prism", "tilted", "kannala-brandt", "double-sphere", "omni", "none"]
+LENSES: dict[Lens, tuple[str, int]] = {
+    "brown-conrady": ("brown-conrady", 5),
+    "rational": ("brown-conrady", 8),
+    "thin-prism": ("brown-conrady", 12),
+    "tilted": ("brown-conrady", 14),
+    "kannala-brandt": ("kannala-brandt", 4),
+    "double-sphere": ("double-sphere", 2),
+    "omni": ("unified", 5),
+}
+"""Model and number of coefficients; those of Brown and Conrady have all terms of the former."""
 FEWEST_IMAGES = 3
 FEWEST_POINTS = 6
 """Points of an image below which none is left out."""
@@ -32,30 +43,83 @@ MEDIAN_TO_DEVIATION = 1 / 1.17741
 """The standard deviation of a coordinate is this share of the median distance."""
 FEWEST_TILT = 8.0
 """Boards whose normals differ by less than this many degrees count as parallel."""
+ROUNDS = 3
+"""Times that outliers may change."""
+COMPARED: tuple[Lens, ...] = (
+    "none",
+    "double-sphere",
+    "kannala-brandt",
+    "brown-conrady",
+    "rational",
+    "thin-prism",
+    "tilted",
+)
+"""Models that are compared, by number of coefficients."""
+FOLDS = 4
+FEWEST_FRAMES = 8
+EQUAL = 0.01
+"""Held-out errors that differ by less than this share are equal."""
+
+Points = Float[np.ndarray, "n 3"]
+OpenCVSolution = tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]
+"""K, coefficients, rotations, translations."""
 
 
 @dataclass(frozen=True)
-class BoardViews:
-    """One camera's image size and, by moment, the board points detected."""
+class CalibratedViews:
+    """A calibrated camera at the origin with its views, and the board's pose in it by moment."""
 
-    hw: HW
-    seen: Mapping[FrameKey, Detection]
-
-
-Points = Float[np.ndarray, "n 3"]
-Solved = tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]
-
-
-class InitialCamera(NamedTuple):
-    """A camera at the origin, the board's pose in it by moment, and each image's reprojection error in pixels."""
-
+    name: str
     camera: Camera
-    cam_from_board: dict[FrameKey, Pose]
-    rms: dict[FrameKey, float]
+    views: BoardViews
+    poses: Mapping[FrameKey, Pose]
 
 
-def calibrate_camera(name: str, views: BoardViews, board: Board, *, lens: Lens = "brown-conrady") -> InitialCamera:
-    """A camera's intrinsics, lens and board poses from its own images.
+class SingleCalibration(NamedTuple):
+    """One camera calibrated by itself, with the images used."""
+
+    solved: Solved
+    seen: CalibratedViews
+
+    @property
+    def camera(self) -> Camera:
+        """The camera, at the origin."""
+        return self.seen.camera
+
+    @property
+    def rms(self) -> float:
+        """Its reprojection error, pixels."""
+        return self.solved.problem.rms()
+
+
+def calibrate_single(
+    name: str, views: BoardViews, board: Board, *, lens: Lens = "brown-conrady", final: bool = True
+) -> SingleCalibration:
+    """One camera's intrinsics and lens from its own images. Raises ValueError, with advice, where they do not suffice.
+
+    Unless `final`, a poorly constrained focal length is accepted, as other cameras will add constraints.
+    """
+    initial = initial_camera(name, views, board, lens)
+    kept = _without_bad_images(views, initial, board)
+    if len(kept.seen) < len(views.seen):
+        initial = initial_camera(name, kept, board, lens)
+    camera, poses, deformation = initial.camera, initial.poses, None
+    used = without_outliers(kept, camera, poses, board.points)
+    flat = flat_boards(board, poses, {name: kept})
+    for _ in range(ROUNDS):
+        problem = board_problem({name: camera}, poses, {name: used}, board)
+        solved = solve(replace(problem, deformation=deformation), flat, final=final)
+        camera, poses = solved.problem.cameras[name], solved.problem.board_poses
+        deformation = solved.problem.deformation
+        before, used = used, near_fit(solved, name, kept, board)
+        if used.count == before.count:
+            break
+    check_tilts(name, poses, board)
+    return SingleCalibration(solved, CalibratedViews(name, camera, before, poses))
+
+
+def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> CalibratedViews:
+    """A camera's intrinsics, lens and board poses from its own images, without outliers.
 
     Raises ValueError if there are fewer than three images with a board (one, with points that are not in a plane), or
     if the board was never tilted.
@@ -72,8 +136,25 @@ def calibrate_camera(name: str, views: BoardViews, board: Board, *, lens: Lens =
         plausible = without_outliers(views, camera, poses, board.points)
         camera, poses = _solved(name, plausible, board, lens)
     check_tilts(name, poses, board)
-    distances = {key: _distances(camera, pose, plausible.seen[key], board.points) for key, pose in poses.items()}
-    return InitialCamera(camera, poses, {key: float(np.sqrt((d**2).mean())) for key, d in distances.items()})
+    return CalibratedViews(name, camera, plausible, poses)
+
+
+def _without_bad_images(views: BoardViews, initial: CalibratedViews, board: Board) -> BoardViews:
+    """The views without images whose reprojection error is far above the others'."""
+    rms = {}
+    for key, pose in initial.poses.items():
+        distances = _distances(initial.camera, pose, initial.views.seen[key], board.points)
+        rms[key] = float(np.sqrt((distances**2).mean()))
+    limit = max(2.0, 10 * float(np.median(list(rms.values()))))
+    return views.only([key for key in views.seen if rms[key] < limit])
+
+
+def near_fit(solved: Solved, name: str, views: BoardViews, board: Board) -> BoardViews:
+    """A camera's views without the points that a solution shows to be outliers."""
+    camera, boards, deformation = solved.problem.cameras[name], solved.problem.board_poses, solved.problem.deformation
+    poses = {key: camera.cam_from_world @ boards[key] for key in views.seen}
+    points = board.points if deformation is None else deformation.deformed(board.points, board.part)
+    return without_outliers(views, camera, poses, points, sigma=solved.sigma[name])
 
 
 def near_homography(found: Detection, board: Board) -> Detection:
@@ -118,17 +199,38 @@ def _only(found: Detection, mask: np.ndarray) -> Detection:
 
 
 def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Camera, dict[FrameKey, Pose]]:
-    pinhole = lens in COEFFICIENTS or lens == "none"
+    model, count = LENSES.get(lens, ("none", 0))
+    pinhole = model in ("brown-conrady", "none")
     try:
-        K, coefficients, rotations, translations = _pinhole(views, board, lens) if pinhole else _fisheye(views, board)
+        K, coefficients, rotations, translations = _pinhole(views, board, count) if pinhole else _fisheye(views, board)
     except cv2.error as error:
         raise ValueError(
             f"{name}: OpenCV finds no camera that fits these boards ({error.err}): do all show the same board?"
         ) from None
-    model = "brown-conrady" if lens in COEFFICIENTS else "kannala-brandt"
-    distortion = None if lens == "none" else Distortion(model, torch.tensor(coefficients))
+    distortion = Distortion(model if pinhole else "kannala-brandt", torch.tensor(coefficients)) if count else None
     camera = Camera(K=torch.tensor(K), cam_from_world=Pose.identity(), hw=views.hw, distortion=distortion)
+    if not pinhole and model != "kannala-brandt":
+        camera = _with_model(camera, model, count)
     return camera, {key: _pose(r, t) for key, r, t in zip(views.seen, rotations, translations)}
+
+
+def _with_model(camera: Camera, model: str, count: int) -> Camera:
+    """A fisheye's camera with another lens model of nearly the same rays: its focal length and two terms are fitted."""
+    h, w = camera.hw
+    grid = np.stack(np.meshgrid(np.linspace(0, w - 1, 16), np.linspace(0, h - 1, 12)), -1).reshape(-1, 2)
+    rays, valid = camera.rays(torch.from_numpy(grid))
+    rays, x = rays[valid], torch.from_numpy(grid)[valid]
+
+    def changed(values: np.ndarray) -> Camera:
+        K = camera.K.clone()
+        K[:2, :2] *= float(np.exp(values[0]))
+        coefficients = torch.zeros(count, dtype=torch.float64)
+        coefficients[:2] = torch.from_numpy(values[1:])
+        return camera.replace(K=K, distortion=Distortion(model, coefficients))
+
+    first = np.array([0.0, 0.0, 0.5] if model == "double-sphere" else [np.log(2.0), 1.0, 0.0])
+    found = least_squares(lambda v: (changed(v).project_local(rays).x - x).numpy().ravel(), first, loss="soft_l1")
+    return changed(found.x)
 
 
 def check_tilts(name: str, poses: Mapping[FrameKey, Pose], board: Board) -> None:
@@ -166,21 +268,21 @@ def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:
     return _pose(r, t)
 
 
-def _pinhole(views: BoardViews, board: Board, lens: Lens) -> Solved:
+def _pinhole(views: BoardViews, board: Board, count: int) -> OpenCVSolution:
     """Two radial terms suffice initially: (K, coefficients, rotations, translations)."""
     initial = board.points * (1, 1, 0) if board.flat else board.points
     points = [initial[d.ids].astype(np.float32) for d in views.seen.values()]
     pixels = [d.x.astype(np.float32)[:, None] for d in views.seen.values()]
     h, w = views.hw
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    if lens == "none":
+    if not count:
         flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
     K: np.ndarray = np.eye(3)
     if not board.flat:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
         K = _linear_intrinsics(max(zip(points, pixels), key=lambda view: len(view[0])), views.hw)
     _, K, c, rotations, translations = cv2.calibrateCamera(points, pixels, (w, h), K, np.zeros(5), flags=flags)
-    coefficients = np.zeros(COEFFICIENTS.get(lens, 5))
+    coefficients = np.zeros(max(count, 2))
     coefficients[:2] = c.reshape(-1)[:2]
     return K, coefficients, list(rotations), list(translations)
 
@@ -200,7 +302,7 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
     return np.array(intrinsics(float(np.clip(focal, 0.3 * max(hw), 30 * max(hw))), hw))
 
 
-def _fisheye(views: BoardViews, board: Board) -> Solved:
+def _fisheye(views: BoardViews, board: Board) -> OpenCVSolution:
     if not board.flat:
         raise ValueError("fisheyes need a flat board to start from: points of known position give pinhole cameras")
     points = [board.points[d.ids][:, None] for d in views.seen.values()]
@@ -219,3 +321,72 @@ def _distances(camera: Camera, pose: Pose, found: Detection, points: Points) -> 
 
 def _pose(r: np.ndarray, t: np.ndarray) -> Pose:
     return Pose(torch.from_numpy(cv2.Rodrigues(r)[0]), torch.from_numpy(t.reshape(3).astype(np.float64)))
+
+
+# Lens models --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LensComparison:
+    """Mean square errors of a coordinate (pixels^2) of each frame by each model that can be fitted without it."""
+
+    errors: Mapping[Lens, Float[np.ndarray, " f"]]
+
+    def rms(self, lens: Lens) -> float:
+        """The held-out error along x or y, pixels."""
+        return float(np.sqrt(self.errors[lens].mean()))
+
+    @property
+    def advised(self) -> Lens:
+        """The model with fewest coefficients that predicts as well as the best, to a standard error or one percent."""
+        if not self.errors:
+            return "brown-conrady"
+        best = min(self.errors, key=self.rms)
+        return next(lens for lens in COMPARED if lens in self.errors and self._equal(lens, best))
+
+    def _equal(self, lens: Lens, best: Lens) -> bool:
+        worse = self.errors[lens] - self.errors[best]
+        error = float(worse.std(ddof=1)) / len(worse) ** 0.5
+        return float(worse.mean()) <= max(error, 2 * EQUAL * float(self.errors[best].mean()))
+
+    @property
+    def advice(self) -> str:
+        """The advised model and all errors, in a sentence."""
+        if not self.errors:
+            return f"too few frames to compare lens models ({FEWEST_FRAMES} are needed): brown-conrady is used"
+        listed = ", ".join(f"{lens} {self.rms(lens):.3f}" for lens in COMPARED if lens in self.errors)
+        return f"the images support the lens model {self.advised} (error on held-out frames, px: {listed})"
+
+
+def compare_lenses(views: Mapping[str, BoardViews], board: Board) -> dict[str, LensComparison]:
+    """The lens models of each camera, judged on frames that they were not fitted to."""
+    return {name: _compared(name, v, board) for name, v in views.items()}
+
+
+def _compared(name: str, views: BoardViews, board: Board) -> LensComparison:
+    if len(views.seen) < FEWEST_FRAMES:
+        return LensComparison({})
+    kept = calibrate_single(name, views, board, final=False).seen.views
+    found: dict[Lens, np.ndarray] = {}
+    for lens in COMPARED:
+        try:
+            problem = calibrate_single(name, kept, board, lens=lens, final=False).solved.problem
+        except ValueError:
+            continue  # it does not fit at all, as a fisheye's model of a long lens may
+        index = np.arange(len(problem.frames))
+        found[lens] = np.concatenate([_held_out(problem, index % FOLDS == fold) for fold in range(FOLDS)])
+    return LensComparison(found)
+
+
+def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"]:
+    """Mean squares of the frames held `out` by a camera fitted to the others, their boards' poses fitted to them."""
+    fitted, judged = readjusted(problem.of_boards(~out)), problem.of_boards(out)
+    (name,) = fitted.cameras
+    if fitted.deformation is not None and judged.deformation is not None:
+        judged = replace(judged, deformation=fitted.deformation.of_blocks(judged.deformation.part))
+    seen = Observations(judged.seen[name].block, judged.on_board(name), judged.seen[name].x)
+    fixed = {name: np.zeros(len(judged.free[name]), dtype=bool)}
+    posed = replace(judged, cameras=fitted.cameras, seen={name: seen}, free=fixed, priors={}, deformation=None)
+    squares = (readjusted(posed).residuals()[name] ** 2).sum(-1)
+    count = np.bincount(seen.block)
+    return np.asarray(np.bincount(seen.block, squares) / np.maximum(2 * count - POSE, 1))

@@ -16,11 +16,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from arraygeom.image_bytes import decodable
 
-from .detect import Grey, to_grey
+Grey = UInt8[np.ndarray, "h w"]
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"}
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"}
@@ -48,6 +49,16 @@ class Photo:
 
 Photos = Mapping[str, Mapping[FrameKey, Photo]]
 """By camera, then by moment."""
+
+
+def to_grey(image: np.ndarray) -> Grey:
+    """An image (H, W) or (H, W, 3) in grey, 8 bits; one that is dim or of 16 bits is stretched to all of them."""
+    grey = image if image.ndim == 2 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
+    low, high = np.percentile(grey[::4, ::4], (0.5, 99.5))
+    if grey.dtype == np.uint8 and high - low > 100:
+        return grey
+    scaled = (grey.astype(np.float32) - low) * (255 / max(high - low, 1.0))
+    return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
 
 
 def find_photos(folder: Path, *, patterns: Mapping[str, str] | None = None) -> Photos:

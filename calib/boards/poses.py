@@ -1,20 +1,22 @@
-"""Initial poses of the cameras: relative poses of pairs by vote, joined along a maximum spanning tree."""
+"""Initial poses of the cameras and boards.
+
+Relative poses of pairs by vote, joined along a maximum spanning tree; or those of a rig that is known roughly.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from arraygeom import Camera, Pose
+from arraygeom import Camera, Distortion, Pose, Rig
 
 from .board import Board
-from .detect import Detection
-from .intrinsics import BoardViews, board_pose
+from .detect import BoardViews, Detection
+from .intrinsics import LENSES, CalibratedViews, Lens, board_pose
 from .photos import FrameKey
 
 TOLERANCE = 0.03
@@ -39,51 +41,78 @@ class RelativePose(NamedTuple):
         return len(self.shared) < FEWEST_TO_JUDGE or len(self.agreeing) > max(1, len(self.shared) // 2)
 
 
-@dataclass(frozen=True)
-class CalibratedViews:
-    """A calibrated camera with its views and the board poses from them."""
-
-    name: str
-    camera: Camera
-    views: BoardViews
-    poses: Mapping[FrameKey, Pose]
-
-    @property
-    def tolerance(self) -> float:
-        """Largest error of a prediction that agrees, pixels."""
-        return TOLERANCE * self.views.hw[1]
-
-
 class InitialRig(NamedTuple):
-    """`cam_from_world` of each camera (the first is the world), `world_from_board` of each moment, renumbered views.
+    """The cameras, `world_from_board` of each moment, and the views, numbered consistently.
 
     left_out: images that disagree with the others, (camera, moment).
     """
 
-    cam_from_world: dict[str, Pose]
-    world_from_board: dict[FrameKey, Pose]
+    cameras: dict[str, Camera]
+    boards: dict[FrameKey, Pose]
     views: dict[str, BoardViews]
     left_out: list[tuple[str, FrameKey]]
 
     def without(self, images: Collection[tuple[str, FrameKey]]) -> InitialRig:
         """Without these images too."""
-        views = {
-            name: BoardViews(v.hw, {key: d for key, d in v.seen.items() if (name, key) not in images})
-            for name, v in self.views.items()
-        }
-        boards = {k: p for k, p in self.world_from_board.items() if any(k in v.seen for v in views.values())}
-        return InitialRig(self.cam_from_world, boards, views, [*self.left_out, *images])
+        views = {name: v.only([key for key in v.seen if (name, key) not in images]) for name, v in self.views.items()}
+        boards = {key: pose for key, pose in self.boards.items() if any(key in v.seen for v in views.values())}
+        return InitialRig(self.cameras, boards, views, [*self.left_out, *images])
 
 
 def initial_rig(cameras: Sequence[CalibratedViews], board: Board) -> InitialRig:
-    """Poses of all cameras and boards from pairs, along the tree whose edges have most corners.
+    """Poses of all cameras and boards from pairs, along the tree whose edges have most corners; the first is the world.
 
     Raises ValueError if cameras are not connected by shared frames, or if the frames of a pair contradict
     each other: images that are mirrored, or not of the same moments.
     """
     pairs = {(a.name, b.name): found for a, b in combinations(cameras, 2) if (found := pair_pose(a, b, board))}
-    poses = _along_tree(cameras, pairs, board)
-    return consistent_boards(cameras, poses, board)
+    return consistent_boards(cameras, _along_tree(cameras, pairs, board), board)
+
+
+def start_cameras(start: Rig, views: Mapping[str, BoardViews], lens: Mapping[str, Lens]) -> dict[str, Camera]:
+    """The cameras of a start that have images, with a lens. Raises ValueError if one is missing or differs in size."""
+    found = {}
+    for name, v in views.items():
+        camera = start.cameras.get(name)
+        if not isinstance(camera, Camera):
+            raise ValueError(
+                f"{name}: the start has no camera of this name with K and pose; it has {list(start.names)}"
+            )
+        if camera.hw != v.hw:
+            (h, w), (rows, columns) = camera.hw, v.hw
+            raise ValueError(f"{name}: its images are {columns}x{rows} and the start states {w}x{h}")
+        if camera.distortion is None and lens[name] != "none":
+            model, count = LENSES[lens[name]]
+            camera = camera.replace(distortion=Distortion(model, torch.zeros(count, dtype=torch.float64)))
+        found[name] = camera.to(torch.float64)
+    return found
+
+
+def rig_near_start(cameras: Mapping[str, Camera], views: Mapping[str, BoardViews], board: Board) -> InitialRig:
+    """Cameras at the start's positions, rotated so that they agree on the boards, and the boards in the start's world.
+
+    The camera with most images keeps its orientation. Raises ValueError if a camera shares no moment with another.
+    """
+    for name, v in views.items():
+        if len(views) > 1 and not any(v.seen.keys() & other.seen.keys() for n, other in views.items() if n != name):
+            raise ValueError(f"{name}: never sees the board in the same frame as another camera: check the numbers")
+    seen = [
+        CalibratedViews(name, c, views[name], {key: board_pose(c, d, board) for key, d in views[name].seen.items()})
+        for name, c in cameras.items()
+    ]
+    anchor = max(seen, key=lambda v: len(v.poses))
+    poses = {v.name: _aligned(anchor, v, board) for v in seen}
+    return consistent_boards(seen, poses, board)
+
+
+def _aligned(a: CalibratedViews, b: CalibratedViews, board: Board) -> Pose:
+    """`cam_from_world` of camera b with the orientation by the frames that it shares with a."""
+    shared = [key for key in b.poses if key in a.poses]
+    if not shared or a is b:
+        return b.camera.cam_from_world
+    nominal, symmetries = a.camera.cam_from_world @ b.camera.cam_from_world.inverse(), symmetry_poses(board)
+    a_from_b = average_pose([nearest_pose(nominal, a.poses[key], b.poses[key], symmetries) for key in shared])
+    return Pose.from_centre(a_from_b.R.T @ a.camera.R, b.camera.centre)
 
 
 def pair_pose(a: CalibratedViews, b: CalibratedViews, board: Board) -> RelativePose | None:
@@ -112,7 +141,7 @@ class _Candidate(NamedTuple):
 def _vote(a: CalibratedViews, b: CalibratedViews, a_from_b: Pose, keys: Sequence[FrameKey], board: Board) -> _Candidate:
     """The frames that agree with a relative pose; the score is their number, then minus their total error."""
     errors = _prediction_errors(a, b, a_from_b, keys, board)
-    agree = errors < a.tolerance
+    agree = errors < _tolerance(a)
     frames = tuple(key for key, good in zip(keys, agree) if good)
     return _Candidate(a_from_b, frames, (len(frames), -float(errors[agree].sum())))
 
@@ -159,6 +188,11 @@ def _prediction_errors(
     return np.min(errors, axis=0)
 
 
+def _tolerance(seen: CalibratedViews) -> float:
+    """Largest error of a prediction that agrees, pixels."""
+    return TOLERANCE * seen.views.hw[1]
+
+
 def _along_tree(
     cameras: Sequence[CalibratedViews], pairs: Mapping[tuple[str, str], RelativePose], board: Board
 ) -> dict[str, Pose]:
@@ -188,12 +222,12 @@ def consistent_boards(cameras: Sequence[CalibratedViews], poses: dict[str, Pose]
         boards[key] = poses[anchor.name].inverse() @ anchor.poses[key]
         for camera in views:
             error, numbered = _numbered(camera, key, poses[camera.name] @ boards[key], board)
-            if camera is anchor or error < 3 * camera.tolerance:
+            if camera is anchor or error < 3 * _tolerance(camera):
                 seen[camera.name][key] = numbered
             else:
                 left_out.append((camera.name, key))
-    views_by_name = {c.name: BoardViews(c.views.hw, seen[c.name]) for c in cameras}
-    return InitialRig({c.name: poses[c.name] for c in cameras}, boards, views_by_name, left_out)
+    placed = {c.name: c.camera.replace(cam_from_world=poses[c.name]) for c in cameras}
+    return InitialRig(placed, boards, {c.name: BoardViews(c.views.hw, seen[c.name]) for c in cameras}, left_out)
 
 
 def _agreement(
@@ -202,7 +236,7 @@ def _agreement(
     """How many cameras agree with one camera's board pose."""
     world_from_board = poses[anchor.name].inverse() @ anchor.poses[key]
     errors = [(c, _numbered(c, key, poses[c.name] @ world_from_board, board)[0]) for c in views]
-    return sum(error < c.tolerance for c, error in errors)
+    return sum(error < _tolerance(c) for c, error in errors)
 
 
 def _numbered(camera: CalibratedViews, key: FrameKey, cam_from_board: Pose, board: Board) -> tuple[float, Detection]:

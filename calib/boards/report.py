@@ -2,34 +2,30 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
-from io import BytesIO
-from itertools import cycle
-from typing import Any
 
 import numpy as np
-import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
-from torch import Tensor
 
-from arraygeom import Camera, Rig
+from arraygeom import Camera
 from arraygeom.text import angle
-from arraygeom.viz import COLOURS, draw_rig, show_image
 
-from .adequacy import intrinsics_of, next_views
-from .adequacy_figures import draw_adequacy, draw_worst_images, escaped
-from .covariance import RigCovariance, baseline_deviation, beta_covariance
-from .coverage import CELLS, Coverage, coverage
-from .intrinsics import BoardViews
-from .observability import LENS_TERMS
+from .adequacy import Coverage, coverage_advice, coverages
+from .detect import BoardViews
+from .figures import (
+    draw_adequacy,
+    draw_by_image,
+    draw_camera,
+    draw_scene,
+    draw_uncertainty,
+    draw_worst_images,
+    image,
+)
+from .parameters import LENS_TERMS
 from .photos import Photos
 from .rig import Calibration
-from .validation import frame_rms
+from .uncertainty import baseline_deviation, rig_covariance
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 1080px; margin: 2em auto; padding: 0 1em; color: #222 }
@@ -124,33 +120,6 @@ def summary(calibration: Calibration) -> str:
     return text
 
 
-def coverages(calibration: Calibration) -> dict[str, Coverage]:
-    """Coverage of every camera."""
-    problem = calibration.fit.problem
-    boards = problem.board_poses(calibration.frames)
-    found = {}
-    for name, views in calibration.views.items():
-        poses = {key: problem.cameras[name].cam_from_world @ boards[key] for key in views.seen}
-        found[name] = coverage(views, poses, calibration.board)
-    return found
-
-
-def coverage_advice(calibration: Calibration, covers: Mapping[str, Coverage]) -> list[str]:
-    """What each camera's images lack, and, where that is something, which views would help most."""
-    found = []
-    for name, covered in covers.items():
-        found += [f"{name}: {text}" for text in covered.missing]
-        if not covered.missing or calibration.fit.covariance is None:
-            continue
-        known = intrinsics_of(calibration.fit, name)
-        if len(known.covariance):
-            views = next_views(known, calibration.board, float(np.mean(covered.depths)))
-            listed = "; then ".join(view.text for view in views)
-            gain = f"uncertainty from {views[0].before:.2g} to {views[-1].after:.2g} px"
-            found.append(f"{name}: two more views would help most: {listed} ({gain})")
-    return found
-
-
 def depths(covers: Iterable[Coverage]) -> tuple[float, float]:
     """Depths of the nearest and the furthest board point, metres."""
     near, far = zip(*(c.depths for c in covers))
@@ -186,7 +155,7 @@ def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> st
 
 def pair_table(calibration: Calibration) -> str:
     """One row per pair: baseline, relative rotation and epipolar errors."""
-    covariance = rig_covariance(calibration)
+    covariance = rig_covariance(calibration.fit)
     cameras = calibration.fit.problem.cameras
     rows = []
     for (a, b), errors in calibration.epipolar.items():
@@ -209,14 +178,8 @@ def _mean_and_quantile(errors: np.ndarray, between: str = ", ") -> str:
     return f"{errors.mean():.3f}{between}{np.quantile(errors, 0.95):.3f}"
 
 
-def rig_covariance(calibration: Calibration) -> RigCovariance | None:
-    """The covariance of the calibration's free parameters, if they are observable."""
-    matrix = calibration.fit.covariance
-    return None if matrix is None else RigCovariance(calibration.fit.names, matrix)
-
-
 def _with_deviations(calibration: Calibration, name: str, camera: Camera, kind: str) -> str:
-    covariance = rig_covariance(calibration)
+    covariance = rig_covariance(calibration.fit)
     lens = camera.distortion
     values = {
         "focal": camera.K.diagonal()[:2],
@@ -243,128 +206,3 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     top = "".join(f"<th>{escape(h)}</th>" for h in head)
     lines = ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
     return f"<table><tr>{top}</tr>{''.join(lines)}</table>"
-
-
-# Figures ------------------------------------------------------------------------------------------------------
-
-
-def draw_scene(calibration: Calibration) -> Figure:
-    """The rig alone, and the rig with the boards from above."""
-    figure = draw_rig(Rig({escaped(n): c for n, c in calibration.rig.cameras.items()}))
-    figure.set_size_inches(10.4, 4.6)
-    axes: Any = figure.axes[0]
-    axes.set_position((0.0, 0.02, 0.46, 0.94))
-    figure.set_layout_engine("none")
-    above = figure.add_axes((0.55, 0.12, 0.43, 0.8))
-    corners = _outline(calibration)
-    for pose in calibration.fit.problem.board_poses(calibration.frames).values():
-        X = pose.apply(corners).numpy()
-        above.plot(X[:, 0], X[:, 2], color="0.75", lw=0.8)
-    for colour, (name, camera) in zip(cycle(COLOURS), calibration.fit.problem.cameras.items()):
-        x, _, z = camera.centre.tolist()
-        dx, _, dz = camera.R[2].tolist()
-        above.plot(x, z, "o", ms=4, color=colour)
-        above.annotate(
-            escaped(name), (x, z), (0, -4), textcoords="offset points", fontsize=8, color=colour, va="top", ha="center"
-        )
-        above.quiver(x, z, dx, dz, color=colour, width=0.004, scale=12)
-    above.set(aspect="equal", xlabel="x (m)", ylabel="z (m)")
-    above.set_title("from above, with the boards", fontsize=9)
-    above.spines[["top", "right"]].set_visible(False)
-    return figure
-
-
-def draw_by_image(calibration: Calibration) -> Figure:
-    """The root mean square residual of every image of every camera, by frame."""
-    frames = calibration.frames
-    figure = Figure(figsize=(10.4, 2.8), layout="constrained")
-    axes = figure.subplots()
-    for colour, (name, rms) in zip(cycle(COLOURS), frame_rms(calibration.fit.problem).items()):
-        axes.plot(list(rms), list(rms.values()), "o", ms=4, color=colour, label=escaped(name))
-    step = max(1, len(frames) // 30)
-    axes.set_xticks(range(0, len(frames), step), [escaped(str(f)) for f in frames[::step]], fontsize=7, rotation=60)
-    axes.set(ylim=(0, None), xlabel="frame", ylabel="RMS residual (px)")
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(fontsize=8, frameon=False, loc="outside right upper")
-    return figure
-
-
-def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figure:
-    """One camera: observed points; the median residual of each part of the image, magnified; their scatter."""
-    seen, r = calibration.fit.problem.seen[name], calibration.fit.problem.residuals()[name]
-    hw = calibration.views[name].hw
-    figure = Figure(figsize=(10.4, 10.4 / 3.4 * min(1.6, max(0.8, 1.33 * hw[0] / hw[1])) + 0.5), layout="compressed")
-    left, middle, right = figure.subplots(1, 3)
-    show_image(left, hw)
-    left.imshow(np.where(covered.cells, np.nan, 1.0), extent=_extent(hw), cmap="Reds", vmin=0, vmax=4, aspect="equal")
-    left.plot(*seen.x.T, ".", ms=1.5, color=COLOURS[0])
-    left.set_title(f"points observed (red: none), {covered.share:.0%} covered", fontsize=9)
-    show_image(middle, hw)
-    _draw_field(middle, seen.x, r, hw)
-    limit = max(4 * calibration.fit.sigma[name], 1e-3)
-    right.plot(*np.clip(r, -limit, limit).T, ".", ms=1.5, color=COLOURS[0])
-    right.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", xlabel="x (px)", ylabel="y (px)")
-    right.set_title(f"residuals, noise {calibration.fit.sigma[name]:.3f} px", fontsize=9)
-    right.spines[["top", "right"]].set_visible(False)
-    return figure
-
-
-def _draw_field(axes: Any, x: np.ndarray, r: np.ndarray, hw: tuple[int, int]) -> None:
-    """The median residual in each cell as an arrow, magnified so that the longest nearly fills a cell."""
-    rows, columns = 2 * CELLS[0], 2 * CELLS[1]
-    row = np.clip(((x[:, 1] + 0.5) / hw[0] * rows).astype(int), 0, rows - 1)
-    column = np.clip(((x[:, 0] + 0.5) / hw[1] * columns).astype(int), 0, columns - 1)
-    cell = row * columns + column
-    filled = [c for c in np.unique(cell) if (cell == c).sum() >= 3]
-    if not filled:
-        return
-    at = np.array([x[cell == c].mean(0) for c in filled])
-    arrows = np.array([np.median(r[cell == c], axis=0) for c in filled])
-    longest = float(np.linalg.norm(arrows, axis=1).max())
-    magnify = 1.2 * hw[1] / columns / max(longest, 1e-9)
-    axes.quiver(*at.T, *(magnify * arrows).T, angles="xy", scale_units="xy", scale=1, width=0.004, color=COLOURS[1])
-    axes.set_title(f"median residuals, longest {longest:.3f} px", fontsize=9)
-
-
-def draw_uncertainty(calibration: Calibration, at: tuple[float, float]) -> Figure:
-    """By beta (rows) and depth (columns): the deviation of the predicted pixel, over the first camera's image."""
-    covariance = rig_covariance(calibration)
-    assert covariance is not None
-    alpha, *betas = calibration.views
-    h, w = calibration.views[alpha].hw
-    xs, ys = np.linspace(0, w - 1, 25), np.linspace(0, h - 1, 19)
-    x = np.stack(np.meshgrid(xs, ys), -1).reshape(-1, 2)
-    figure = Figure(figsize=(8.4, 2.6 * len(betas) + 0.3), layout="constrained")
-    grid = figure.subplots(len(betas), len(at), squeeze=False)
-    for row, beta in zip(grid, betas):
-        for axes, depth in zip(row, at):
-            pixels = beta_covariance(calibration.rig, covariance, alpha, beta, x, depth)
-            usable = np.isfinite(pixels).all((1, 2))
-            deviation = np.full(len(x), np.nan)
-            deviation[usable] = np.sqrt(np.linalg.eigvalsh(pixels[usable])[:, -1])
-            shown = axes.imshow(
-                deviation.reshape(len(ys), len(xs)), extent=_extent((h, w)), cmap="viridis", norm=LogNorm()
-            )
-            axes.set(xticks=[], yticks=[])
-            median = float(np.median(deviation[usable])) if usable.any() else float("nan")
-            axes.set_title(f"{escaped(beta)} of {escaped(alpha)}, {depth:.3g} m: median {median:.2f} px", fontsize=9)
-            figure.colorbar(shown, ax=axes, shrink=0.9)
-    return figure
-
-
-def image(figure: Figure) -> str:
-    """A figure as an embedded HTML image."""
-    FigureCanvasAgg(figure)
-    data = BytesIO()
-    figure.savefig(data, format="png", dpi=110)
-    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
-
-
-def _outline(calibration: Calibration) -> Tensor:
-    (left, top, _), (right, bottom, _) = calibration.board.points.min(0), calibration.board.points.max(0)
-    corners = [[left, top], [right, top], [right, bottom], [left, bottom], [left, top]]
-    return torch.tensor([[*corner, 0.0] for corner in corners], dtype=torch.float64)
-
-
-def _extent(hw: tuple[int, int]) -> tuple[float, float, float, float]:
-    return (-0.5, hw[1] - 0.5, hw[0] - 0.5, -0.5)

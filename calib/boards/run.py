@@ -1,4 +1,4 @@
-"""Calibration of a folder of images to files, and files of boards to print."""
+"""Calibration of a folder of images to files."""
 
 from __future__ import annotations
 
@@ -7,20 +7,18 @@ from glob import escape
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from matplotlib import rc_context
-
 from arraygeom import Rig
-from arraygeom.atomic import sweep, write_atomically, write_text, write_together
+from arraygeom.atomic import sweep, write_text, write_together
 from arraygeom.rig import depth_range
 
-from .collect import Progress, collect_folder
-from .intrinsics import Lens
-from .lens_comparison import compare_lenses
-from .printing import draw_board
-from .report import by_cameras, coverage_advice, coverages, report_html, rig_covariance, summary
+from .adequacy import coverage_advice, coverages
+from .detect import Progress, collect_folder
+from .intrinsics import Lens, compare_lenses
+from .parameters import StartDeviations
+from .report import by_cameras, report_html, summary
 from .rig import calibrate
-from .start import StartDeviations
-from .target import parse_board, parse_boards
+from .target import parse_boards
+from .uncertainty import rig_covariance
 
 
 class CalibrationOutput(NamedTuple):
@@ -73,7 +71,7 @@ def calibrate_photos(
         detected=found.views,
         photos=found.photos,
     )
-    covariance = rig_covariance(calibration)
+    covariance = rig_covariance(calibration.fit)
     sweep(out.parent, out.stem)
     with write_together(out.parent, last=out.name, stale=[path.name for path in written[:2]]) as folder:
         write_text(folder / written[0].name, report)
@@ -89,16 +87,3 @@ def _named_like(folder: Path, rig: Rig) -> dict[str, str] | None:
     """A pattern for each camera if the folder holds a file called like each."""
     patterns = {name: f"{escape(name)}.*" for name in rig.names}
     return patterns if all(any(folder.glob(pattern)) for pattern in patterns.values()) else None
-
-
-def write_board(board: str, out: Path, *, paper: str | None = None) -> Path:
-    """Write a board as a PDF or SVG of its true size, on a sheet of paper if given.
-
-    Raises ValueError for another ending, and if the board does not fit on the sheet.
-    """
-    if out.suffix.lower() not in (".pdf", ".svg"):
-        raise ValueError(f"{out}: a board is written as .pdf or .svg, which keep its true size")
-    figure = draw_board(parse_board(board), paper=paper)
-    with write_atomically(out) as temporary, rc_context({"svg.fonttype": "path"}):
-        figure.savefig(temporary)
-    return out

@@ -22,8 +22,8 @@ from arraygeom.atomic import write_atomically
 from arraygeom.viz import calibrated
 
 from .board import Board
-from .printing import draw_board
-from .shape import BoardShape
+from .deformation import BoardDeformation
+from .target import draw_board
 
 FILLS = (0.35, 0.9)
 """Least and largest width of the board, as a share of the narrowest view."""
@@ -91,20 +91,20 @@ def photograph(
     *,
     dpi: float | None = None,
     rays: Rays | None = None,
-    shape: BoardShape | None = None,
+    deformation: BoardDeformation | None = None,
 ) -> UInt8[np.ndarray, "h w"]:
     """The image of a printed board by a camera, through its lens: the mean of four samples per pixel.
 
     The print is drawn at `dpi`, by default such that its pixels match the distance of the samples. `rays` are
-    `fine_rays(camera)`, if precomputed. The board is flat, or bent and stretched as `shape` says.
+    `fine_rays(camera)`, if precomputed. The board is flat, or bent and stretched as `deformation` says.
     """
     directions, valid = rays or fine_rays(camera)
     R, t = cam_from_board.R, cam_from_board.t
     distance = (R[:, 2] @ t) / (directions @ R[:, 2])
     on_board = (directions * distance[:, None] - t) @ R
     flat = on_board[:, :2].numpy()
-    if shape is not None:
-        flat = _on_shape(shape, (directions @ R).numpy(), (-t @ R).numpy(), max(board.extent))
+    if deformation is not None:
+        flat = _on_deformed(deformation, (directions @ R).numpy(), (-t @ R).numpy(), max(board.extent))
     resolution = dpi or _resolution(camera, cam_from_board, board)
     print_, per_metre, origin = printed(board, resolution)
     hw = 2 * camera.hw[0], 2 * camera.hw[1]
@@ -115,19 +115,21 @@ def photograph(
     return np.asarray(cv2.resize(image, camera.hw[::-1], interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _on_shape(shape: BoardShape, along: np.ndarray, centre: np.ndarray, size: float) -> np.ndarray:
+def _on_deformed(deformation: BoardDeformation, along: np.ndarray, centre: np.ndarray, size: float) -> np.ndarray:
     """Where rays from a centre meet a shaped board: positions (n, 2) on it as if it were flat, by iteration.
 
     Rays that pass its plane farther than `size` (metres) from its middle are not followed.
     """
     found = (centre - along * (centre[2] / along[:, 2])[:, None])[:, :2]
-    near = np.flatnonzero(np.abs(found - shape.middle[0]).max(1) < size)
+    near = np.flatnonzero(np.abs(found - deformation.middle[0]).max(1) < size)
     flat, part = np.zeros((len(near), 3)), np.zeros(len(near), dtype=int)
     flat[:, :2] = found[near]
     for _ in range(ITERATIONS):
-        deformed = shape.deformed(flat, part)
+        deformed = deformation.deformed(flat, part)
         hit = centre + along[near] * ((deformed[:, 2] - centre[2]) / along[near, 2])[:, None]
-        flat[:, :2] = shape.middle[0] + np.clip(flat[:, :2] + (hit - deformed)[:, :2] - shape.middle[0], -size, size)
+        flat[:, :2] = deformation.middle[0] + np.clip(
+            flat[:, :2] + (hit - deformed)[:, :2] - deformation.middle[0], -size, size
+        )
     found[near] = flat[:, :2]
     return found
 

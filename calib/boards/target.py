@@ -1,4 +1,4 @@
-"""Calibration boards: their specification as text, their points, and how to print them.
+"""Calibration boards from text, and their printing.
 
 A board is specified by a short text:
 
@@ -10,32 +10,41 @@ A board is specified by a short text:
 - ``aprilgrid:6x6:88mm:0.3``: tags across x down, side of a tag, space between tags as a share of it (Kalibr's layout,
   tag family 36h11; ``border1`` for tags with one black bit around them instead of two); or Kalibr's own target file.
 
-- ``targets.csv:4x4``: markers at known positions (see `known_points`).
+- ``targets.csv:4x4``: markers at known positions, on a wall, in a frame, in a room (columns id, x, y, z or id,
+  corner, x, y, z, in metres).
 
 ``from24`` at the end of a board with markers: its first marker has this number, so that several boards differ.
-
-Points are (x, y, 0) in metres: x along the rows, y down the columns, z into the board, the first point at the origin.
 """
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import cv2
 import numpy as np
 import yaml
-from jaxtyping import Float, Int
-from matplotlib.patches import Circle, Rectangle
+from matplotlib import rc_context
+from matplotlib.figure import Figure
 
+from arraygeom.atomic import write_atomically
 from arraygeom.safe_yaml import load_yaml
 
-from .board import Board, MarkedBoard, marker_dictionary, smallest_dictionary, unit_grid
-from .known_points import known_points
+from .board import (
+    AprilGrid,
+    Board,
+    Boards,
+    Charuco,
+    Chessboard,
+    Circles,
+    KnownPoints,
+    MarkedBoard,
+    marker_dictionary,
+    millimetres,
+)
 
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 FORMS = (
@@ -44,192 +53,21 @@ FORMS = (
 )
 LARGEST = 100
 APRIL_TAGS = "apriltag_36h11"
-
-
-@dataclass(frozen=True)
-class Chessboard(Board):
-    """`columns` x `rows` inner corners."""
-
-    def __str__(self) -> str:
-        return f"chessboard:{self.columns}x{self.rows}:{_millimetres(self.spacing)}"
-
-    def _draw(self, axes: Any) -> None:
-        side = 1e3 * self.spacing
-        for row in range(self.rows + 1):
-            for column in range(row % 2, self.columns + 1, 2):
-                axes.add_patch(_black(column * side, row * side, side, side))
-
-
-@dataclass(frozen=True)
-class Charuco(MarkedBoard):
-    """A chessboard with markers in its white squares; `columns` x `rows` counts its inner corners."""
-
-    marker: float
-    legacy: bool = False
-
-    @property
-    def markers(self) -> range:
-        """The numbers of its markers."""
-        return range(self.first, self.first + (self.columns + 1) * (self.rows + 1) // 2)
-
-    @cached_property
-    def opencv(self) -> cv2.aruco.CharucoBoard:
-        """OpenCV's board, lengths in metres."""
-        size = self.columns + 1, self.rows + 1
-        ids = np.array(self.markers)
-        board = cv2.aruco.CharucoBoard(size, self.spacing, self.marker, marker_dictionary(self.dictionary), ids)
-        board.setLegacyPattern(self.legacy)
-        return board
-
-    def __str__(self) -> str:
-        squares = f"{self.columns + 1}x{self.rows + 1}"
-        tail = (":legacy" if self.legacy else "") + (f":from{self.first}" if self.first else "")
-        lengths = f"{_millimetres(self.spacing)}:{_millimetres(self.marker)}"
-        return f"charuco:{squares}:{lengths}:{self.dictionary.lower()}{tail}"
-
-    def _draw(self, axes: Any) -> None:
-        side, marker = 1e3 * self.spacing, 1e3 * self.marker
-        white = set()
-        for corners, number in zip(np.array(self.opencv.getObjPoints()), np.array(self.opencv.getIds()).reshape(-1)):
-            left, top = (1e3 * float(v) for v in corners[:, :2].min(0))
-            white.add((int(left // side), int(top // side)))
-            _draw_marker(axes, self.dictionary, int(number), left, top, marker)
-        for column, row in np.ndindex(self.columns + 1, self.rows + 1):
-            if (column, row) not in white:
-                axes.add_patch(_black(column * side, row * side, side, side))
-
-
-@dataclass(frozen=True)
-class AprilGrid(MarkedBoard):
-    """Kalibr's grid of AprilTags; `columns` x `rows` counts the corners of all tags, `spacing` is twice the gap.
-
-    tag: side of a tag, metres; border: black bits around its code. Tags are numbered row by row from below.
-    """
-
-    tag: float
-    border: int = 2
-
-    @property
-    def gap(self) -> float:
-        """The space between two tags, metres."""
-        return self.spacing / 2
-
-    @property
-    def markers(self) -> range:
-        """The numbers of its tags."""
-        return range(self.first, self.first + self.columns * self.rows // 4)
-
-    @cached_property
-    def points(self) -> Float[np.ndarray, "n 3"]:
-        """Positions of the tags' corners on the board, metres, row by row."""
-        grid = unit_grid(self.columns, self.rows)
-        return (grid // 2) * (self.tag + self.gap) + (grid % 2) * self.tag
-
-    @cached_property
-    def corners(self) -> Int[np.ndarray, "m 4"]:
-        """The points at the upper left, upper right, lower right and lower left corner of each tag."""
-        index = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)
-        a, b = index[::2][::-1], index[1::2][::-1]
-        return np.stack([a[:, ::2], a[:, 1::2], b[:, 1::2], b[:, ::2]], -1).reshape(-1, 4)
-
-    @property
-    def extent(self) -> tuple[float, float]:
-        """Width and height of the print without its margin, metres: the small squares at the tags' corners."""
-        width, height = (float(v) + 2 * self.gap for v in self.points[:, :2].max(0))
-        return width, height
-
-    @property
-    def offset(self) -> float:
-        """The gap, metres."""
-        return self.gap
-
-    def __str__(self) -> str:
-        tail = (":border1" if self.border == 1 else "") + (f":from{self.first}" if self.first else "")
-        return (
-            f"aprilgrid:{self.columns // 2}x{self.rows // 2}:{_millimetres(self.tag)}:{self.gap / self.tag:.6g}{tail}"
-        )
-
-    def _draw(self, axes: Any) -> None:
-        tag, gap = 1e3 * self.tag, 1e3 * self.gap
-        for number, corners in zip(self.markers, self.corners):
-            left, top = 1e3 * self.points[corners[0], :2] + gap
-            _draw_marker(axes, self.dictionary, number, left, top, tag, border=self.border, quarter_turns=2)
-        for column, row in np.ndindex(self.columns // 2 + 1, self.rows // 2 + 1):
-            axes.add_patch(_black(column * (tag + gap), row * (tag + gap), gap, gap))
-
-
-@dataclass(frozen=True)
-class Boards(Board):
-    """Several boards seen at once, each with poses of its own; their points in one list."""
-
-    boards: tuple[Board, ...] = ()
-    identified: ClassVar[bool] = True
-
-    @property
-    def members(self) -> tuple[Board, ...]:
-        """The boards."""
-        return self.boards
-
-    @cached_property
-    def points(self) -> Float[np.ndarray, "n 3"]:
-        """The points of all boards, each in its own frame, metres."""
-        return np.concatenate([b.points for b in self.boards])
-
-    @cached_property
-    def part(self) -> Int[np.ndarray, " n"]:
-        """The board that each point is on."""
-        return np.repeat(np.arange(len(self.boards)), [len(b.points) for b in self.boards])
-
-    @property
-    def extents(self) -> list[tuple[float, float]]:
-        """`extent` of each board."""
-        return [b.extent for b in self.boards]
-
-    def __str__(self) -> str:
-        return " and ".join(map(str, self.boards))
-
-    def _draw(self, axes: Any) -> None:
-        raise ValueError("several boards are printed one by one")
-
-
-@dataclass(frozen=True)
-class Circles(Board):
-    """Black circles on white, in rows; in an asymmetric grid every other row is shifted by half their distance."""
-
-    asymmetric: bool = False
-
-    def __str__(self) -> str:
-        name = "acircles" if self.asymmetric else "circles"
-        return f"{name}:{self.columns}x{self.rows}:{_millimetres(self.spacing)}"
-
-    @cached_property
-    def points(self) -> Float[np.ndarray, "n 3"]:
-        """Positions of the centres on the board, metres, row by row."""
-        grid = unit_grid(self.columns, self.rows)
-        if self.asymmetric:
-            grid[:, 0] = 2 * grid[:, 0] + grid[:, 1] % 2
-        return grid * self.spacing
-
-    @property
-    def radius(self) -> float:
-        """Radius of the printed circles, metres."""
-        return 0.3 * self.spacing * (2**0.5 if self.asymmetric else 1)
-
-    @property
-    def offset(self) -> float:
-        """A circle's radius, metres."""
-        return self.radius
-
-    @property
-    def extent(self) -> tuple[float, float]:
-        """Width and height of the print without its margin, metres."""
-        width, height = (float(v) + 2 * self.radius for v in self.points[:, :2].max(0))
-        return width, height
-
-    def _draw(self, axes: Any) -> None:
-        radius = 1e3 * self.radius
-        for x, y in (1e3 * self.points[:, :2] + radius).tolist():
-            axes.add_patch(Circle((x, y), radius, facecolor="black", edgecolor="none"))
+COLUMNS = ("id", "x", "y", "z"), ("id", "corner", "x", "y", "z")
+"""Of a file of points."""
+FEWEST_POINTS = 6
+"""Points that a target of known points needs."""
+PAPERS = {
+    "A4": (210, 297),
+    "letter": (216, 279),
+    "A3": (297, 420),
+    "A2": (420, 594),
+    "A1": (594, 841),
+    "A0": (841, 1189),
+}
+"""Sheets of printers, millimetres."""
+BELOW = 14.0
+"""Millimetres below a board, for its ruler and name."""
 
 
 def parse_board(text: str) -> Board:
@@ -240,7 +78,7 @@ def parse_board(text: str) -> Board:
     if text.lower().endswith((".yaml", ".yml")):
         text = _kalibr_target(Path(text))
     if ".csv" in text:
-        return known_points(text)
+        return _known_points(text)
     kind, _, rest = text.strip().lower().partition(":")
     parts = rest.split(":")
     if kind not in ("chessboard", "charuco", "circles", "acircles", "aprilgrid") or len(parts) < 2:
@@ -278,32 +116,6 @@ def parse_boards(texts: Sequence[str]) -> Board:
     return Boards(first.columns, first.rows, first.spacing, tuple(boards))
 
 
-def _draw_marker(
-    axes: Any,
-    dictionary: str,
-    number: int,
-    left: float,
-    top: float,
-    side: float,
-    *,
-    border: int = 1,
-    quarter_turns: int = 0,
-) -> None:
-    """Runs of black bits as one rectangle each: no hairlines between bits."""
-    known = marker_dictionary(dictionary)
-    bits = known.markerSize + 2 * border
-    black = np.rot90(cv2.aruco.generateImageMarker(known, number, bits, borderBits=border) == 0, quarter_turns)
-    step = side / bits
-    for row, line in enumerate(black):
-        edges: np.ndarray = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
-        for begin, end in edges.reshape(-1, 2).tolist():
-            axes.add_patch(_black(left + begin * step, top + row * step, (end - begin) * step, step))
-
-
-def _black(x: float, y: float, width: float, height: float) -> Rectangle:
-    return Rectangle((x, y), width, height, facecolor="black", edgecolor="none", snap=False)
-
-
 def _charuco(text: str, columns: int, rows: int, spacing: float, options: list[str]) -> Charuco:
     lengths = [o for o in options if re.fullmatch(r"[\d.]+ *[a-z]+", o)]
     names = [o for o in options if re.fullmatch(r"\d+x\d+(_\d+)?", o) or o.startswith("aruco") or o.startswith("april")]
@@ -313,10 +125,8 @@ def _charuco(text: str, columns: int, rows: int, spacing: float, options: list[s
         raise ValueError(f"board '{text}': '{rest[0]}' is not recognised; write it like charuco:8x6:30mm:22mm:4x4_50")
     marker = _length(text, lengths[0]) if lengths else 0.75 * spacing
     if not marker < spacing:
-        raise ValueError(
-            f"board '{text}': markers of {_millimetres(marker)} do not fit into squares that are no larger"
-        )
-    name = smallest_dictionary(text, names[0] if names else "4x4", first + (columns * rows + 1) // 2)
+        raise ValueError(f"board '{text}': markers of {millimetres(marker)} do not fit into squares that are no larger")
+    name = _smallest_dictionary(text, names[0] if names else "4x4", first + (columns * rows + 1) // 2)
     return Charuco(columns - 1, rows - 1, spacing, name, first, marker=marker, legacy="legacy" in options)
 
 
@@ -373,5 +183,141 @@ def _length(text: str, part: str) -> float:
     return float(match[1]) * UNITS[match[2]]
 
 
-def _millimetres(length: float) -> str:
-    return f"{1e3 * length:.6g}mm"
+def _smallest_dictionary(text: str, name: str, markers: int) -> str:
+    """The smallest dictionary of a kind that has enough markers; larger ones begin with the same markers.
+
+    `text` names the target in the ValueError where there is none.
+    """
+    names = [name.upper()] if "_" in name else [f"{name.upper()}_{n}" for n in (50, 100, 250, 1000)]
+    for full in names:
+        if hasattr(cv2.aruco, f"DICT_{full}") and len(marker_dictionary(full).bytesList) >= markers:
+            return full.lower()
+    raise ValueError(f"board '{text}': no dictionary '{name}' of OpenCV has the {markers} markers it needs; try 4x4")
+
+
+def _known_points(text: str) -> KnownPoints:
+    """The points of a CSV file `targets.csv`, or `targets.csv:5x5_100` with its markers' dictionary (4x4 by default).
+
+    Columns id, x, y, z (metres) for markers' centres, or id, corner (0 to 3), x, y, z. Raises ValueError.
+    """
+    file, _, dictionary = text.partition(".csv")
+    path = Path(f"{file}.csv")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file of points")
+    with path.open(encoding="utf-8", newline="") as lines:
+        table = csv.DictReader(lines, skipinitialspace=True)
+        head = tuple(name.strip().lower() for name in table.fieldnames or ())
+        if head not in COLUMNS:
+            raise ValueError(f"{path}: its first line is '{','.join(head)[:60]}': write id,x,y,z or id,corner,x,y,z")
+        rows = [_point(path, number, row, head) for number, row in enumerate(table, 2)]
+    ids = tuple(marker for marker, _ in rows)
+    _check_points(path, ids)
+    positions = tuple(position for _, position in rows)
+    name = _smallest_dictionary(text, dictionary.removeprefix(":").lower() or "4x4", max(ids)[0] + 1)
+    apart = np.linalg.norm(np.array(positions)[:, None] - np.array(positions), axis=-1)
+    spacing = float(np.median(np.sort(apart, axis=1)[:, 1]))
+    return KnownPoints(len(ids), 1, spacing, name, 0, file=str(path), ids=ids, positions=positions)
+
+
+Row = tuple[tuple[int, int], tuple[float, float, float]]
+
+
+def _point(path: Path, number: int, row: dict[str, str], head: tuple[str, ...]) -> Row:
+    try:
+        values = dict(zip(head, row.values()))
+        x, y, z = (float(values[axis]) for axis in "xyz")
+        marker, corner = int(values["id"]), int(values.get("corner", -1))
+    except (TypeError, ValueError):
+        marker, corner, x, y, z = -1, 0, 0.0, 0.0, 0.0
+    if marker < 0 or not -1 <= corner <= 3 or not np.isfinite([x, y, z]).all():
+        raise ValueError(f"{path}, line {number}: wanted {','.join(head)}, numbers in metres, corners 0 to 3")
+    return (marker, corner), (x, y, z)
+
+
+def _check_points(path: Path, ids: Sequence[tuple[int, int]]) -> None:
+    if len(ids) < FEWEST_POINTS:
+        raise ValueError(f"{path}: has {len(ids)} points and {FEWEST_POINTS} is the least")
+    if twice := [marker for marker in ids if ids.count(marker) > 1]:
+        raise ValueError(f"{path}: marker {twice[0][0]} is there twice")
+
+
+# Printing -----------------------------------------------------------------------------------------------------
+
+
+def page_of(board: Board, *, margin: float = 0.012) -> tuple[float, float]:
+    """Width and height of the page that a board is drawn on, with margins and ruler, millimetres."""
+    width, height = (1e3 * (v + 2 * margin) for v in board.extent)
+    return width, height + BELOW
+
+
+def smallest_paper(page: tuple[float, float]) -> str | None:
+    """The smallest sheet that a page (millimetres) fits on, upright or across; None if none is large enough."""
+    fitting = [name for name, paper in PAPERS.items() if all(a <= b for a, b in zip(sorted(page), paper))]
+    return fitting[0] if fitting else None
+
+
+def page_note(board: Board) -> str:
+    """What to print a board on."""
+    page = page_of(board)
+    size = f"the page is {page[0]:.0f} x {page[1]:.0f} mm"
+    if (paper := smallest_paper(page)) is None:
+        return f"{size}, larger than A0: have it plotted, or use smaller squares"
+    return f"{size}: print it on {paper} or larger at 100 %, not fitted to the page, then measure its ruler"
+
+
+def draw_board(board: Board, *, margin: float = 0.012, paper: str | None = None) -> Figure:
+    """The board as a figure whose size in inches is its true size, with a white margin (metres) and a ruler below.
+
+    Saved as PDF or SVG it prints at true size; the ruler serves to check it. On a sheet of `paper` ("A4") it is in the
+    middle. Raises ValueError if it does not fit there.
+    """
+    width, height = (1e3 * v for v in board.extent)
+    page = page_of(board, margin=margin)
+    total = page if paper is None else _sheet(paper, page)
+    left, top = ((whole - part) / 2 + 1e3 * margin for whole, part in zip(total, page))
+    figure = Figure(figsize=(total[0] / 25.4, total[1] / 25.4), facecolor="white")
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set(xlim=(-left, total[0] - left), ylim=(total[1] - top, -top))
+    axes.set_axis_off()
+    board._draw(axes)
+    _draw_ruler(axes, str(board), width, height + 1e3 * margin + 2)
+    return figure
+
+
+def _sheet(paper: str, page: tuple[float, float]) -> tuple[float, float]:
+    """Width and height of a sheet that a page fits on, upright or across, millimetres."""
+    sizes = {name.lower(): size for name, size in PAPERS.items()}
+    if paper.lower() not in sizes:
+        raise ValueError(f"paper '{paper}' is not known: use one of {', '.join(PAPERS)}")
+    short, long = sizes[paper.lower()]
+    for sheet in ((short, long), (long, short)):
+        if page[0] <= sheet[0] and page[1] <= sheet[1]:
+            return sheet
+    larger = smallest_paper(page)
+    raise ValueError(
+        f"the board needs {page[0]:.0f} x {page[1]:.0f} mm with its margin and {paper} has {short} x {long}: use "
+        f"{f'{larger}, ' if larger else ''}smaller squares or fewer of them"
+    )
+
+
+def _draw_ruler(axes: Any, text: str, width: float, y: float) -> None:
+    """A line of a whole number of centimetres with a tick at each, and the board's name."""
+    length = max(10.0, 10 * (min(width, 100.0) // 10))
+    axes.plot([0, length], [y, y], color="0.4", lw=0.6)
+    for x in np.arange(0, length + 1, 10):
+        axes.plot([x, x], [y, y + 2], color="0.4", lw=0.6)
+    note = f"{length:g} mm; print at 100 %, glue it flat, then measure this line.  {text}"
+    axes.text(0, y + 4, note, fontsize=min(7.0, 0.045 * width), color="0.4", va="top", family="sans-serif")
+
+
+def write_board(board: str, out: Path, *, paper: str | None = None) -> Path:
+    """Write a board as a PDF or SVG of its true size, on a sheet of paper if given.
+
+    Raises ValueError for another ending, and if the board does not fit on the sheet.
+    """
+    if out.suffix.lower() not in (".pdf", ".svg"):
+        raise ValueError(f"{out}: a board is written as .pdf or .svg, which keep its true size")
+    figure = draw_board(parse_board(board), paper=paper)
+    with write_atomically(out) as temporary, rc_context({"svg.fonttype": "path"}):
+        figure.savefig(temporary)
+    return out

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from arraygeom import Rig, epipolar_distance
 
-from .bundle import BoardPoses, BundleProblem, BundleResult, readjusted
-from .intrinsics import LEAST_SIGMA, BoardViews
+from .bundle import BundleProblem, Solved, readjusted
+from .detect import BoardViews
+from .intrinsics import LEAST_SIGMA
 from .photos import FrameKey
 
 FEWEST_TO_HOLD_OUT = 8
@@ -30,36 +30,23 @@ CONSPICUOUS = 1.8
 LISTED = 5
 
 
-def without_blocks(problem: BundleProblem, kept: Bool[np.ndarray, " b"]) -> BundleProblem:
-    """The problem with some of its boards only."""
-    assert isinstance(problem.structure, BoardPoses)
-    index, boards = np.cumsum(kept) - 1, problem.structure.world_from_board
-    seen = {}
-    for name, s in problem.seen.items():
-        mine = kept[s.block]
-        seen[name] = s._replace(block=index[s.block[mine]], p=s.p[mine], x=s.x[mine])
-    shape = problem.shape and problem.shape.of_blocks(problem.shape.part[kept])
-    return replace(problem, structure=BoardPoses(boards[torch.from_numpy(kept)]), seen=seen, shape=shape)
-
-
-def held_out_errors(
-    fit: BundleResult, frames: Sequence[FrameKey], views: Mapping[str, BoardViews]
-) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
+def held_out_errors(fit: Solved, views: Mapping[str, BoardViews]) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
     """Epipolar errors of all frames, each by a rig calibrated without it; empty if there are too few.
 
-    Frames are held out in five parts. `frames` are those of the fit's blocks.
+    Frames are held out in five parts.
     """
+    frames = fit.problem.frames
     shared = [key for key in frames if sum(key in v.seen for v in views.values()) > 1]
     if len(shared) < FEWEST_TO_HOLD_OUT:
         return {}
-    free, found = fit.free(), dict[tuple[str, str], list[np.ndarray]]()
+    found = dict[tuple[str, str], list[np.ndarray]]()
     for fold in range(FOLDS):
         out = set(shared[fold::FOLDS])
         if any(len(v.seen.keys() - out) < FEWEST_LEFT for v in views.values()):
             return {}
-        used = without_blocks(fit.problem, np.array([key not in out for key in frames]))
-        kept = {name: BoardViews(v.hw, {k: d for k, d in v.seen.items() if k in out}) for name, v in views.items()}
-        for names, errors in epipolar_errors(Rig(readjusted(used, free, fit.sigma).cameras), kept).items():
+        used = readjusted(fit.problem.of_boards(np.array([key not in out for key in frames])))
+        judged = {name: v.only(out) for name, v in views.items()}
+        for names, errors in epipolar_errors(Rig(used.cameras), judged).items():
             found.setdefault(names, []).append(errors)
     return {names: np.concatenate(errors) for names, errors in found.items()}
 
@@ -68,37 +55,37 @@ class FrameMisfit(NamedTuple):
     """A frame that a camera does not fit: its residuals, and those of the camera's median frame (RMS, pixels)."""
 
     camera: str
-    block: int
+    frame: FrameKey
     rms: float
     typical: float
 
 
-def frame_rms(problem: BundleProblem) -> dict[str, dict[int, float]]:
-    """By camera and block: root mean square residual, pixels."""
+def frame_rms(problem: BundleProblem) -> dict[str, dict[FrameKey, float]]:
+    """By camera and frame: root mean square residual, pixels."""
     found = {}
     for name, r in problem.residuals().items():
         block = problem.seen[name].block
         squared, count = np.bincount(block, (r**2).sum(-1)), np.bincount(block)
-        found[name] = {int(b): float(np.sqrt(squared[b] / count[b])) for b in np.flatnonzero(count)}
+        found[name] = {problem.frames[b]: float(np.sqrt(squared[b] / count[b])) for b in np.flatnonzero(count)}
     return found
 
 
-def misfits(fit: BundleResult) -> list[FrameMisfit]:
+def misfits(fit: Solved) -> list[FrameMisfit]:
     """Frames whose residuals stand out, worst first."""
     found = []
-    for name, by_block in frame_rms(fit.problem).items():
-        typical = float(np.median(list(by_block.values())))
+    for name, by_frame in frame_rms(fit.problem).items():
+        typical = float(np.median(list(by_frame.values())))
         limit = max(MISFIT * typical, CONSPICUOUS * 2**0.5 * max(fit.sigma[name], LEAST_SIGMA))
-        found += [FrameMisfit(name, block, rms, typical) for block, rms in by_block.items() if rms > limit]
+        found += [FrameMisfit(name, frame, rms, typical) for frame, rms in by_frame.items() if rms > limit]
     return sorted(found, key=lambda m: -m.rms / m.typical)
 
 
-def misfit_notes(fit: BundleResult, frames: Sequence[FrameKey]) -> list[str]:
+def misfit_notes(fit: Solved) -> list[str]:
     """One note per camera on its frames that do not fit."""
     notes = []
     for name in fit.problem.cameras:
         if mine := [m for m in misfits(fit) if m.camera == name]:
-            listed = ", ".join(f"{frames[m.block]} ({m.rms:.2f} px)" for m in mine[:LISTED])
+            listed = ", ".join(f"{m.frame} ({m.rms:.2f} px)" for m in mine[:LISTED])
             more = f" and {len(mine) - LISTED} more" if len(mine) > LISTED else ""
             notes.append(
                 f"{name}: frames that do not fit: {listed}{more}, others {mine[0].typical:.2f} px: "

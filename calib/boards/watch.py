@@ -14,14 +14,14 @@ import numpy as np
 
 from arraygeom.atomic import write_text
 
-from .adequacy import intrinsics_of, next_views
+from .adequacy import coverages, next_views
 from .board import Board
-from .collect import detected
-from .detect import Detection
-from .intrinsics import BoardViews, Lens
+from .detect import BoardViews, Detection, detected
+from .intrinsics import Lens
 from .photos import FrameKey, Photos, find_photos
-from .report import STYLE, coverages
+from .report import STYLE
 from .rig import Calibration, calibrate
+from .uncertainty import intrinsics_of
 
 WIDTH = 420
 """Of the images shown, pixels."""

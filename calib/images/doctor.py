@@ -22,7 +22,7 @@ from arraygeom.robust import cauchy, least_squares, robust_least_squares
 from arraygeom.threads import torch_in_one_thread
 
 from .held_out import image_parts, trimmed_square
-from .matches import Images, Pairs, PointMatches, match_cameras
+from .matches import Images, Pairs, PointMatches, agreeing_pairs, match_cameras
 from .plausibility import DriftEvidence, plausible
 from .remedies import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
 from .residuals import lines_basis, related, residuals_and_depths, stack_key, stacked
@@ -169,8 +169,10 @@ def _rounded(figures: FitStatistics) -> dict[str, float | None]:
 
 
 @torch_in_one_thread()
-def diagnose(rig: Rig, images: Images) -> Diagnosis:
+def diagnose(rig: Rig, images: Images, matches: Pairs | None = None) -> Diagnosis:
     """Find the usual mistake, if any, in a rig, by one image (C, H, W) of two or more of its cameras.
+
+    `matches` are taken in place of those that would be found.
 
     Raises ValueError, one line, for a camera that the rig lacks, fewer than two images, equal ones, and images in
     which too few points match; and for a rig that does not relate its cameras.
@@ -178,7 +180,7 @@ def diagnose(rig: Rig, images: Images) -> Diagnosis:
     for name in images:
         rig.require(name)
     sizes = {name: (int(image.shape[1]), int(image.shape[2])) for name, image in images.items()}
-    return diagnose_matches(rig, sizes, match_cameras(images))
+    return diagnose_matches(rig, sizes, match_cameras(images) if matches is None else agreeing_pairs(matches))
 
 
 def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnosis:

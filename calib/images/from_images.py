@@ -21,7 +21,9 @@ from .held_out import median_off, split
 from .lenses import describe_lenses
 from .matches import (
     AGREE,
+    Pairs,
     PointMatches,
+    agreeing_pairs,
     fit_fundamental,
     fit_link,
     line_distance,
@@ -64,16 +66,20 @@ class UncalibratedRig(NamedTuple):
 @torch_in_one_thread()
 @stage()
 def rig_from_images(
-    images: Mapping[str, Float[Tensor, "_ _ _"]], *, focal: Mapping[str, float] | None = None, alpha: str | None = None
+    images: Mapping[str, Float[Tensor, "_ _ _"]],
+    *,
+    focal: Mapping[str, float] | None = None,
+    alpha: str | None = None,
+    matches: Pairs | None = None,
 ) -> UncalibratedRig:
     """An uncalibrated rig of the cameras that took these images (C, H, W), good enough to fuse with.
 
     F of every two cameras with a common field of view (of `alpha` and each other one, if it is given) by MAGSAC++
     (Barath et al. 2020), and a rough map. With rough focal lengths, in pixels, of both cameras an essential matrix is
     fitted too, with five degrees of freedom instead of seven: it is used where it fits held-out points better. All F
-    are then fitted jointly, with lenses, and accepted on the same condition. Raises ValueError, one line: fewer than
-    two images, equal ones, too few points, a focal
-    length of no camera.
+    are then fitted jointly, with lenses, and accepted on the same condition. `matches` of pairs of images are taken in
+    place of those that would be found. Raises ValueError, one line: fewer than two images, equal ones, too few points,
+    a focal length of no camera.
     """
     focal = dict(focal or {})
     for name, length in focal.items():
@@ -84,12 +90,12 @@ def rig_from_images(
     pairs = math.comb(len(images), 2) if alpha is None else len(images) - 1
     matched_at = (matching := matching_time(images, pairs)) / (matching + JOINED * pairs)
     with part(0, matched_at):
-        matched = match_cameras(images, alpha=alpha)
+        matched = match_cameras(images, alpha=alpha) if matches is None else agreeing_pairs(matches)
     found = UncalibratedRig(Rig({name: View(hw=hw) for name, hw in sizes.items()}), {}, {}, {}, {}, matched)
     links = {}
-    for names, matches in matched.items():
-        F, distance, by_focal = _fundamental(matches, *(K.get(name) for name in names))
-        links[names] = fit_link(matches, F, within=AGREE).link
+    for names, points in matched.items():
+        F, distance, by_focal = _fundamental(points, *(K.get(name) for name in names))
+        links[names] = fit_link(points, F, within=AGREE).link
         found.distance[names], found.by_focal[names] = distance, by_focal
     rig = found.rig.replace(links=links)
     with part(matched_at, 1):
@@ -98,8 +104,8 @@ def rig_from_images(
         rig = refined.rig
         _, held_out = split([matched])
         found.distance.update({names: median_off(rig, {names: m}) for names, m in held_out.items()})
-    for names, matches in matched.items():
-        fit = with_map(rig.pair(*names), matches)
+    for names, points in matched.items():
+        fit = with_map(rig.pair(*names), points)
         links[names] = fit.link
         found.points[names], found.displacement[names] = len(fit.matches.alpha), fit.displacement
     return found._replace(rig=rig.replace(links=links))

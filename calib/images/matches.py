@@ -193,6 +193,18 @@ def agreeing(matches: PointMatches) -> PointMatches:
     return matches.only(torch.zeros(len(matches.alpha), dtype=torch.bool))
 
 
+def agreeing_pairs(given: Pairs) -> dict[tuple[str, str], PointMatches]:
+    """The consistent matches of pairs that have enough, of matches from elsewhere. Raises ValueError if none has."""
+    found = {names: agreeing(matches) for names, matches in given.items()}
+    kept = {names: matches for names, matches in found.items() if len(matches.alpha) >= ENOUGH}
+    if not kept:
+        most = max((len(matches.alpha) for matches in found.values()), default=0)
+        raise ValueError(
+            f"only {most} of the given matches agree with any rig, {ENOUGH} are needed: are they of these images?"
+        )
+    return kept
+
+
 def near_lines(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float) -> PointMatches:
     """The matches within some pixels of their epipolar line in beta."""
     return matches.only(line_distance(matches, F) <= within)

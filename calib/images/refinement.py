@@ -33,7 +33,7 @@ from .depth_change import LARGE_CHANGE, NEGLIGIBLE, DepthChange, depth_modes, lo
 from .held_out import PARTS, held_out_pixels, image_parts, line_distances, line_statistics, median_off, nearer, split
 from .least_squares import JoinedResiduals, Residuals, Solution, jacobian, left_out, most_probable, noise_scale, solve
 from .lenses import with_lenses
-from .matches import ENOUGH, Images, Pairs, match_cameras, matching_time, with_map
+from .matches import ENOUGH, Images, Pairs, agreeing_pairs, match_cameras, matching_time, with_map
 from .parameters import FreeParameter, apply_change, considered_parameters, free_parameters
 from .photometric import Attend, PhotometricFrame, photometric_errors, with_depths
 from .refined import LineStatistics, ParameterChange, PhotometricResult, Refinement
@@ -72,8 +72,9 @@ def refine(
     sigma: Mapping[str, float] | None = None,
     attend: Attend | None = None,
     force: bool = False,
+    matches: Sequence[Pairs] | None = None,
 ) -> Refinement:
-    """Refine a rig by points matched in frames, each with an image of every camera.
+    """Refine a rig by points matched in frames, each with an image of every camera; or by given `matches` of them.
 
     The first camera that has images keeps its pose. `free` and `sigma` are those of `parameters.free_parameters`; F of
     links is always free, and views known by F alone are given lenses if held-out points improve. With two frames or
@@ -90,7 +91,7 @@ def refine(
         pairs = []
         for i, frame in enumerate(frames):
             with part(matched_at * i / len(frames), matched_at * (i + 1) / len(frames)):
-                pairs.append(match_cameras(frame))
+                pairs.append(match_cameras(frame) if matches is None else agreeing_pairs(matches[i]))
         with part(matched_at, 1):
             fit, solution = fitted(rig, pairs, free=free, sigma=sigma)
     refined = fit.report(solution, force=force)

@@ -13,6 +13,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from . import options
 from .fusing import files_by_camera, named_images
+from .known import Known
 from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Out, optional, say
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Align:
+class Align(Known):
     """Align the images of an array: every camera's own values at the pixels of one, with masks; no fused image.
 
     Without a rig: pat align IMG_0000_*.TIF
@@ -140,14 +141,18 @@ class Align:
         options.say_when_compiling()
         with folder_lock(self.out), warnings.catch_warnings():
             warnings.showwarning = noted
+            if frame.name:
+                self.refuse_several()
+            field = options.field_named(self.field)
+            rig, known = self.with_known(frame.rig, frame.alpha, frame.files, field)
             with options.working(f"aligning {frame.name}".strip()):
                 aligned = align(
-                    frame.rig,
+                    rig,
                     frame.images,
                     alpha=frame.alpha,
                     recorded=RecordedFiles(frame.recorded, frame.files),
                     network=None if self.weights is None else load_weights(self.weights),
-                    field=options.field_named(self.field),
+                    field=known,
                     interpolation=self.interpolation,
                     min_confidence=self.confidence,
                     fill=self.fill,

@@ -1,4 +1,4 @@
-"""Commands for the development of networks: evaluate, ablate, systems, showcase, data, render, train."""
+"""Commands for the development of networks: evaluate, ablate, data, render, train, settings."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tyro.conf import Fixed, Positional, arg
 
 from . import options
-from .options import FieldName, MaybeOut, MaybePath, Memory, Out, Weights, optional, say, writable
+from .options import FieldName, MaybePath, Out, Weights, optional, say, writable
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from ..evaluation.protocols import StereoMethod
-    from ..networks.protocol import FusionNetwork
+    from ..networks.protocol import Comparing, FusionNetwork
     from ..networks.weights import Network
 
 RenderedFolder = Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder written by `pat render`.")]
@@ -43,6 +43,9 @@ class Evaluate:
     """Factors by which beta is reduced."""
     protocol: Literal["table1", "table2"] = "table1"
     """The paper's: mono + colour (table1), or mono + three bands (table2)."""
+    as_authors: bool = False
+    """As the paper's code tests: images of half the size (its "x2" and its "x4"), rows of 80 pixels without the pixel
+    itself. Give --rates 2."""
     controls: bool = False
     """Also fuse without beta, with another scene's, and with shuffled fields: the fusion must get worse."""
     without_rig: bool = False
@@ -51,6 +54,8 @@ class Evaluate:
     """Instead: other responses, exposures, noise, misalignment; by region, with depth. Also conditions.png."""
     only: tuple[str, ...] = ()
     """Of these conditions, by name."""
+    outside: bool = False
+    """Instead: fuse with disparities from elsewhere: OpenCV's SGBM, the true ones, a prior. Writes outside.md."""
     half: Literal["tune", "report", "all"] = "all"
     """The pairs on which settings may be chosen, or those that are reported."""
     out: Out = Path("out/evaluate")
@@ -74,13 +79,18 @@ class Evaluate:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
         writable(self.out, folder=True)
         network, bands = load_weights(self.weights), protocols.PROTOCOLS[self.protocol]
+        if self.outside:
+            return self._from_outside(network, folders)
         if self.conditions or self.only:
             return self._under_conditions(network, folders)
         wrong = protocols.controls(network, bands=bands) if self.controls else {}
-        methods = {**protocols.BASELINES, "fusion": protocols.rectified_fusion(network, bands=bands), **wrong}
+        field = protocols.AuthorsRows() if self.as_authors else None
+        fusion = protocols.rectified_fusion(network, bands=bands, field=field)
+        methods = {**protocols.BASELINES, "fusion": fusion, **wrong}
         if self.without_rig:
             methods[RIG_FOUND] = with_found_rig(network)
-        rows = stereo.evaluate_sets(folders, methods, self.rates, out=self.out, half=self.half)
+        change = {"change": protocols.halved} if self.as_authors else {}
+        rows = stereo.evaluate_sets(folders, methods, self.rates, out=self.out, half=self.half, **change)
         every = [row for found in rows.values() for row in found]
         text = stereo.sets_markdown(rows, protocol=self.protocol)
         compared = (*wrong, *[RIG_FOUND] * self.without_rig)
@@ -89,6 +99,24 @@ class Evaluate:
         write_csv(self.out / "scores.csv", stereo.StereoRow._fields, every)
         print(text, end="")
         say(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, images in {self.out}")
+
+    def _from_outside(self, network: FusionNetwork, folders: dict[str, Path]) -> None:
+        from arraygeom.atomic import write_text
+
+        from ..evaluation import stereo
+        from ..evaluation.halves import of_half
+        from ..evaluation.outside import evaluate_outside, outside_markdown
+
+        sets = [stereo.DATA_SETS[name](folder) for name, folder in folders.items()]
+        pairs = [pair for found in sets for pair in of_half(found, self.half) if pair.disparity is not None]
+        if not pairs:
+            raise ValueError(f"--half {self.half}: of none of its pairs the true disparity is known")
+        with options.working("evaluating") as retitle:
+            rows = evaluate_outside(pairs, network, each=lambda row: retitle(f"{row.pair}: {row.source}"))
+        text = outside_markdown(rows)
+        write_text(self.out / "outside.md", text)
+        print(text, end="")
+        say(f"written: {self.out / 'outside.md'}")
 
     def _under_conditions(self, network: FusionNetwork, folders: dict[str, Path]) -> None:
         from arraygeom.atomic import write_text
@@ -141,6 +169,11 @@ class Ablate:
     """Of rotation, "principal point", baseline, "focal ratio" and ahead; all by default."""
     without: tuple[str, ...] = ()
     """Fields to leave out, such as dense, which takes most of the time."""
+    every_field: bool = False
+    """Instead: a table of every field of the toolkit, with time and memory: unrectified scenes and, with --middlebury,
+    rectified pairs and the same with F alone."""
+    middlebury: MaybePath = None
+    """Folder of Middlebury's pairs with true disparity, for --every-field; those of the report half."""
     families: bool = False
     """Instead: a table of families of fields, on unrectified rigs with focal lengths 1 to 3 times beta's."""
     photos: tuple[Path, ...] = ()
@@ -165,12 +198,43 @@ class Ablate:
             raise ValueError(f"--scenes: {self.scenes}: give at least 1")
         writable(self.out, folder=True)
         network = load_weights(self.weights)
-        if self.families or self.rendered is not None:
+        if self.every_field:
+            self._every_field(network)
+        elif self.families or self.rendered is not None:
             self._families(network)
         else:
             self._sweeps(network)
         print((self.out / "ablation.md").read_text(encoding="utf-8"), end="")
         say(f"written: {self.out / 'ablation.md'}, and its figures and numbers beside it")
+
+    def _every_field(self, network: Network) -> None:
+        from arraygeom.atomic import write_text
+
+        from ..data.pairs import middlebury_pairs
+        from ..evaluation import field_table
+        from ..evaluation.ablation import sample_photographs
+        from ..evaluation.halves import of_half
+        from ..evaluation.tables import write_csv
+        from ..synthesis.photos import PhotoBank
+
+        bank = PhotoBank.load(*self.photos) if self.photos else sample_photographs()
+        cases = list(field_table.layered_cases(bank, self.scenes))
+        if self.middlebury is not None:
+            for linked in (True, False):
+                pairs = of_half(middlebury_pairs(self.middlebury), "report")
+                cases += field_table.rectified_cases(pairs, linked=linked)
+        shown = options.progress("fusing")(cases, len(cases))
+        rows = field_table.evaluate_fields(self._comparing(network), shown)
+        write_text(self.out / "ablation.md", field_table.fields_markdown(rows))
+        write_csv(self.out / "ablation.csv", field_table.FieldRow._fields, rows)
+
+    def _comparing(self, network: Network) -> Comparing:
+        """The network, if its attention alone finds the points. Raises ValueError for another."""
+        from ..networks.protocol import Comparing
+
+        if not isinstance(network, Comparing):
+            raise ValueError(f"--weights {self.weights}: its matches are not of its attention alone: add --families")
+        return network
 
     def _families(self, network: Network) -> None:
         from ..evaluation.ablation import FieldFamily, ablate, families, layered_cases, rendered_cases
@@ -187,11 +251,9 @@ class Ablate:
     def _sweeps(self, network: Network) -> None:
         from ..evaluation.sweep_report import write_report
         from ..evaluation.sweeps import FIELDS, SIZE, SWEEPS, ablate, points
-        from ..networks.protocol import Comparing
         from ..synthesis.photos import PhotoBank
 
-        if not isinstance(network, Comparing):
-            raise ValueError(f"--weights {self.weights}: its matches are not of its attention alone: add --families")
+        comparing = self._comparing(network)
         unknown = [name for name in self.without if name not in FIELDS]
         if unknown:
             raise ValueError(f"--without: no field '{unknown[0]}': there are {', '.join(FIELDS)}")
@@ -199,85 +261,7 @@ class Ablate:
         rigs = list(points(self.sweeps or tuple(SWEEPS), hw=self.hw or SIZE))
         bank = PhotoBank.load(*self.photos) if self.photos else None
         shown = options.progress("ablating")(rigs, len(rigs))
-        write_report(ablate(network, shown, fields, scenes=self.scenes, photos=bank, seed=self.seed), self.out)
-
-
-@dataclass
-class Showcase:
-    """Fuse real images: stereo pairs, calibrated pairs that are not rectified, the paper's fast + slow array."""
-
-    data: Path
-    """Folder with kitti, middlebury, flickr1024, syntim and hfr_lfr."""
-    out: Out = Path("out/showcase")
-    """Folder for showcase.md, the figures and the rig files."""
-    weights: Weights = "mono-colour"
-
-    def run(self) -> None:
-        from ..systems.showcase import showcase
-
-        writable(self.out, folder=True)
-        print(showcase(self.data, self.out, self.weights), end="")
-        say(f"written: {self.out / 'showcase.md'}, and its figures and rig files")
-
-
-@dataclass
-class SystemsList:
-    """List the paper's four arrays."""
-
-    def run(self) -> None:
-        from ..systems import NAMES, load_system
-
-        for name in NAMES:
-            print(f"{name:12s} {load_system(name).title}")
-
-
-@dataclass
-class SystemsRun:
-    """Render a scene for an array, record it, fuse it, compare with the ground truth: PSNR, SSIM and images.
-
-    Example: pat systems run fast-slow --out out/fast-slow
-    """
-
-    name: Positional[str]
-    """One of the names that `pat systems list` prints."""
-    full: bool = False
-    """At the full size of the paper's cameras; by default reduced, minutes on two cores."""
-    scene: Literal["layered", "rendered"] = "layered"
-    """Photographs on planes; or a still life (a landscape for visible-nir) rendered with Blender, as one sees it."""
-    photos: MaybePath = None
-    """Folder of photographs for the layers' surfaces; by default patterns and images that scikit-image ships."""
-    recording: MaybePath = None
-    """For fast-slow: the paper's own frames in place of a rendered scene, a folder with pillow_1 and the matrices."""
-    out: MaybeOut = None
-    """Folder for the results; by default out/systems/NAME."""
-    weights: Weights = "mono-colour"
-    max_memory: Memory = None
-    """Memory limit of fusing, such as 4GiB; a single frame is then fused in a process of its own, measured."""
-
-    def run(self) -> None:
-        """Print the scores, and the expected ones where they are of the same settings."""
-        from ..systems import load_system, run_system
-        from ..systems.fast_slow.recorded import run_recorded
-
-        out = writable(self.out or Path("out/systems") / self.name, folder=True)
-        if self.recording is None:
-            same = ("full", "scene", "photos", "weights", "max_memory")
-            result = run_system(self.name, out, say=say, **{name: getattr(self, name) for name in same})
-        elif self.name == "fast-slow":
-            result = run_recorded(self.recording, out, weights=self.weights, say=say)
-        else:
-            raise ValueError(f"--recording is of fast-slow, not of '{self.name}'")
-        print(result.table, end="")
-        expected = load_system(self.name).expected
-        if expected and self.recording is None and self.scene == "layered" and not self.full:
-            say(f"\nexpected:\n{expected}")
-        say(f"written: {', '.join(map(str, result.written))}")
-
-
-class Systems:
-    """Run the paper's four arrays, each from a rendered scene to figures."""
-
-    commands: ClassVar[Mapping[str, Any]] = {"list": SystemsList, "run": SystemsRun}
+        write_report(ablate(comparing, shown, fields, scenes=self.scenes, photos=bank, seed=self.seed), self.out)
 
 
 @dataclass

@@ -12,7 +12,7 @@ from . import options
 from .options import Depth, Out, say
 
 if TYPE_CHECKING:
-    from calib.boards.start import StartDeviations
+    from calib.boards.parameters import StartDeviations
 
 BOARDS = (
     "charuco:8x6:30mm (squares), chessboard:9x6:25mm (inner corners), circles:7x5:20mm, acircles:4x11:20mm, "
@@ -77,7 +77,7 @@ class Calibrate:
         say(f"written: {', '.join(map(str, found.written))}")
 
     def _deviations(self) -> StartDeviations:
-        from calib.boards.start import StartDeviations
+        from calib.boards.parameters import StartDeviations
 
         if self.deviation and self.start is None:
             raise ValueError("--deviation is of a --start: give the rig too")
@@ -112,9 +112,7 @@ class PrintBoard:
     """Sheet to centre the board on; without it the page is as large as the board with its margin."""
 
     def run(self) -> None:
-        from calib.boards.printing import page_note
-        from calib.boards.run import write_board
-        from calib.boards.target import parse_board
+        from calib.boards.target import page_note, parse_board, write_board
 
         say(f"written: {write_board(self.board, options.writable(self.out), paper=self.paper)}")
         say(page_note(parse_board(self.board)))

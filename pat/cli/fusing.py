@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from . import options
+from .known import Known
 from .one_frame import fuse_with_progress
 from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Numbers, Out, Weights, optional, say
 
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Fuse:
+class Fuse(Known):
     """Fuse the images of an array into one image at alpha's view: a frame, many frames, or a sequence.
 
     Without a rig: pat fuse mono.png colour.png
@@ -173,7 +174,7 @@ class Fuse:
             if several:
                 return self._many(rig, found, alpha)
             fused = views.developed if rig is views.rig else rig
-            self._one(fused, views, alpha, healing=compared.result)
+            self._one(fused, views, alpha, views.files, healing=compared.result)
 
     def _without_rig(self) -> None:
         from ..fusion.batch import find_images
@@ -217,7 +218,7 @@ class Fuse:
         self.normalise_radiometry |= array.match_levels
         self.exposure = self.exposure or "auto"
         if max(map(len, files.values())) == 1:
-            return self._one(array.rig, array.images, array.alpha, found=array.notes)
+            return self._one(array.rig, array.images, array.alpha, first, found=array.notes)
         rig = array.rig
         for name, rate in rates.items():
             if name in rig.names:
@@ -275,6 +276,7 @@ class Fuse:
         rig: Rig,
         images: Mapping[str, Tensor],
         alpha: str,
+        files: Mapping[str, str | Path],
         *,
         found: tuple[str, ...] | None = None,
         healing: Callable[[], Healed | None] = lambda: None,
@@ -296,10 +298,13 @@ class Fuse:
             if not self.resume:
                 shutil.rmtree(store, ignore_errors=True)
             further = {**self._options(), "explain": self._note, "store": store, "device": self.device}
-            frame = fuse_with_progress(rig=rig, images=images, alpha=alpha, **further)
+            own = further["field"]
+            known, further["field"] = self.with_known(rig, alpha, files, own)
+            frame = fuse_with_progress(rig=known, images=images, alpha=alpha, **further)
             if (healed := healing()) is not None and healed.text not in self._notes:
                 rig = self._healed(rig, healed)
-                frame = fuse_with_progress(rig=rig, images=images, alpha=alpha, **further)
+                known, further["field"] = self.with_known(rig, alpha, files, own)
+                frame = fuse_with_progress(rig=known, images=images, alpha=alpha, **further)
             frame, gain = self._exposed(frame)
             if found is None and not frame.depth.isfinite().any():
                 self._note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
@@ -394,6 +399,7 @@ class Fuse:
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 
+        self.refuse_several()
         single = {"--points": self.points, "--classical": self.classical, "--device cuda": self.device == "cuda"}
         if named := [option for option, given in single.items() if given]:
             raise ValueError(f"{', '.join(named)}: of a single frame alone: leave it out for many")
@@ -439,8 +445,8 @@ class Demo:
 
         from ..data.sample_array import ALPHA, BETA, load_sample
         from ..evaluation.baseline import classical
+        from ..evaluation.demo import save_demo_figure
         from ..fusion.results import save_frame
-        from ..systems.demo import save_demo_figure
 
         options.writable(self.out, folder=True)
         sample = load_sample()

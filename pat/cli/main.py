@@ -35,8 +35,6 @@ class Pat:
     authors: ClassVar[Mapping[str, Any]] = {
         "evaluate": authors.Evaluate,
         "ablate": authors.Ablate,
-        "systems": authors.Systems,
-        "showcase": authors.Showcase,
         "data": authors.Data,
         "render": authors.Render,
         "train": authors.Train,
@@ -53,12 +51,12 @@ def command_paths(group: Any = Pat, before: tuple[str, ...] = ()) -> Iterator[tu
         yield from command_paths(command, (*before, name)) if inner else [(*before, name)]
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Run `pat`. Errors in what was given are one line on standard error, and exit status 2."""
+def main(arguments: list[str] | None = None, *, group: Any = Pat, prog: str = "pat") -> None:
+    """Run `pat`, or another group. Errors in what was given are one line on standard error, and exit status 2."""
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
         try:
-            _run([a for a in arguments if a != "--debug"], debug="--debug" in arguments)
+            _run([a for a in arguments if a != "--debug"], group, prog, debug="--debug" in arguments)
         finally:
             sys.stdout.flush()
     except BrokenPipeError:
@@ -66,11 +64,11 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(141)
 
 
-def _run(arguments: list[str], *, debug: bool) -> None:
+def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
-            command = _command(arguments)
+            command = _command(arguments, group, prog)
             if isinstance(rig := getattr(command, "rig", None), Path):
                 refuse_missing_rig(rig)
             command.run()
@@ -101,16 +99,16 @@ def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
     say(f"pat: warning: {message}", style="yellow")
 
 
-def _command(arguments: list[str]) -> Any:
+def _command(arguments: list[str], group: Any, prog: str) -> Any:
     """The command that arguments name, its options parsed. Raises ValueError for a command that does not exist."""
     if "--tyro-print-completion" in arguments or "--tyro-write-completion" in arguments:
-        return tyro.cli(_union(Pat), prog="pat", args=arguments)
+        return tyro.cli(_union(group), prog=prog, args=arguments)
     if "--version" in arguments:
         from importlib.metadata import version
 
         print(f"arraygeom-pat {version('arraygeom-pat')}")
         sys.exit(0)
-    path, command = "pat", Pat
+    path, command = prog, group
     while hasattr(command, "commands"):
         word = arguments[0] if arguments else "--help"
         if word in ("--help", "-h"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,12 +14,14 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from tyro.conf import Positional, arg
 
 from . import options
+from .known import MatchesFile
 from .options import FIRST, LAST, Depth, FieldName, Images, MaybeOut, Numbers, Out, RigFile, load_rig, optional, say
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from arraygeom import Rig
+    from calib.images.matches import Pairs
 
 
 @dataclass
@@ -80,6 +82,18 @@ def matched_points(rig: Rig, alpha: str, images: Mapping[str, Tensor]) -> dict[s
                 pair = related(rig, match_cameras({alpha: images[alpha], name: images[name]}))
                 found[name] = pair[alpha, name].alpha, pair[alpha, name].beta
     return found
+
+
+def given_matches(path: Path | None, texts: Sequence[str], images: Mapping[str, Tensor]) -> Pairs | None:
+    """The matches of a file between images of cameras, which `--image NAME=FILE` gives; None without a file."""
+    if path is None:
+        return None
+    from arraygeom.io.point_matches import read_matches
+    from calib.images.matches import PointMatches
+
+    files = options.files_by_name(texts)
+    sizes = {name: (image.shape[1], image.shape[2]) for name, image in images.items()}
+    return {names: PointMatches(*points) for names, points in read_matches(path, files, sizes).items()}
 
 
 def _twelve_pixels(hw: tuple[int, int]) -> Tensor:
@@ -210,6 +224,7 @@ class Doctor:
     rig: RigFile
     image: Images
     """An image of each of two or more cameras."""
+    matches: MatchesFile = None
     out: MaybeOut = None
     """Rig file to write if a mistake is found: the repaired rig. Also: --fix. A former file is kept as NAME.old."""
     json: bool = False
@@ -223,7 +238,8 @@ class Doctor:
             options.writable(self.out)
         rig = load_rig(self.rig)
         with options.working("matching features and trying mistakes"):
-            found = diagnose(rig, options.read_images(rig, self.image, sized=False))
+            images = options.read_images(rig, self.image, sized=False)
+            found = diagnose(rig, images, given_matches(self.matches, self.image, images))
         if self.json:
             options.print_json(json.loads(found.as_json()))
         else:
@@ -261,6 +277,7 @@ class Refine:
     """Once for each camera and frame: the first files of all cameras are one frame, and so on."""
     out: Out
     """Rig file to write."""
+    matches: MatchesFile = None
     free: tuple[str, ...] = ("rotation", "centre")
     """Free parameters: rotation, translation, focal, centre (principal_point), distortion; or CAMERA.rotation. By
     default, focal and translation too if that brings held-out points nearer."""
@@ -282,10 +299,15 @@ class Refine:
         rig = load_rig(self.rig)
         deviations = options.numbers_by_name(self.sigma, "--sigma")
         options.say_when_compiling()
+        frames = options.read_frames(rig, self.image)
+        if self.matches is not None and len(frames) > 1:
+            raise ValueError(f"--matches: are of one frame, and images of {len(frames)} are given: give one")
+        matches = given_matches(self.matches, self.image, frames[0])
         with options.working("matching features and refining"):
             found = refine(
                 rig,
-                options.read_frames(rig, self.image),
+                frames,
+                matches=None if matches is None else [matches],
                 free=[kind for text in self.free for kind in text.split(",")],
                 sigma={kind: math.radians(s) if kind == "rotation" else s for kind, s in deviations.items()},
                 attend=attend_with_statistics if self.photometric else None,
@@ -321,6 +343,7 @@ class RigFromImages:
     """Rig file to write."""
     focal: Numbers = ()
     """Rough focal lengths in pixels, if known; used where they help."""
+    matches: MatchesFile = None
 
     def run(self) -> None:
         from calib.images.from_images import rig_from_images
@@ -330,7 +353,8 @@ class RigFromImages:
         options.writable(self.out)
         images = {name: read_image(path, name=name) for name, path in options.files_by_name(self.image).items()}
         with options.working("matching features and fitting lines"):
-            found = rig_from_images(images, focal=options.numbers_by_name(self.focal, "--focal"))
+            focal = options.numbers_by_name(self.focal, "--focal")
+            found = rig_from_images(images, focal=focal, matches=given_matches(self.matches, self.image, images))
         print(found.as_text())
         found.rig.save(self.out)
         say(f"written: {self.out}")

@@ -224,16 +224,24 @@ def _correspondence(
     soft: Image, other: Image, guide: NDArray[np.uint8], inside: Image, max_disparity: float
 ) -> _Correspondence:
     """`other` is luminance normalised to mono's, `inside` is 1 where it has content."""
-    ours = _disparity(to_bytes(soft), to_bytes(other), max_disparity)
-    # Seen from beta, alpha's points lie to the right: mirrored, to the left again.
-    theirs = _disparity(to_bytes(other[:, ::-1]), to_bytes(soft[:, ::-1]), max_disparity)[:, ::-1]
     columns, rows = _grid(soft.shape)
-    back = _sampled(np.ascontiguousarray(theirs), columns - ours, rows, how=cv2.INTER_NEAREST)
-    consistent = (np.abs(back - ours) <= CHECK) & (ours >= 0) & (columns - ours >= -0.5)
+    ours, consistent = checked_disparity(to_bytes(soft), to_bytes(other), max_disparity)
     filled = _diffused(ours, consistent.astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
     columns = columns - np.where(consistent, ours, filled)
     seen = _sampled(inside, columns, rows) * (columns >= -0.5)
     return _Correspondence(columns, rows, seen, np.maximum(consistent, INCONSISTENT) * seen)
+
+
+def checked_disparity(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float
+) -> tuple[Image, NDArray[np.bool_]]:
+    """Disparity of left (h, w) by OpenCV's semi-global matching, and where the left-right check holds."""
+    ours = _disparity(left, right, max_disparity)
+    # Seen from beta, alpha's points lie to the right: mirrored, to the left again.
+    theirs = _disparity(right[:, ::-1], left[:, ::-1], max_disparity)[:, ::-1]
+    columns, rows = _grid(left.shape)
+    back = _sampled(np.ascontiguousarray(theirs), columns - ours, rows, how=cv2.INTER_NEAREST)
+    return ours, (np.abs(back - ours) <= CHECK) & (ours >= 0) & (columns - ours >= -0.5)
 
 
 def _warped_chroma(mono: Image, colours: Image, inside: Image, max_disparity: float, sharpness: float) -> Image:

@@ -19,7 +19,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 from arraygeom import Camera, Pair, Pose, Positions, ReceptiveField, Rectified, Rig, Segments, intrinsics
 from arraygeom.pixels import HW
 
-from ..data.pairs import StereoPair
+from ..data.pairs import Disparity, StereoPair
 from ..data.sample_array import BETA, SAMPLE
 from ..fusion.fuse import fuse
 from ..media.colour import luminance
@@ -115,24 +115,62 @@ def rectified_fusion(
     bands: bool = False,
     beta: Callable[[Tensor], Tensor] = lambda beta: beta,
     shuffled: bool = False,
+    field: ReceptiveField | None = None,
     **options: Any,
 ) -> StereoMethod:
     """`fuse` with a network as a method, alpha on the left: segments are rows, `max_disparity` pixels long.
 
     With `bands` each channel of beta is a camera. For controls: `beta` is applied to beta before the network gets it,
-    and `shuffled` gives each pixel the segment of another one, drawn at random. Other options go to `fuse`.
+    and `shuffled` gives each pixel the segment of another one, drawn at random. `field` is another field than rows of
+    that length. Other options go to `fuse`.
     """
 
     def fused(alpha: Tensor, given: Tensor, max_disparity: float) -> StereoResult:
         image = beta(given)
         betas = dict(zip("rgb", image.split(1))) if bands else {"beta": image}
         rig = rectified_rig(hw_of(alpha), {name: hw_of(band) for name, band in betas.items()}, max_disparity)
-        field = rectified_field(max_disparity)
-        field = ShuffledField(field) if shuffled else field
-        frame = fuse(network, rig, {"alpha": alpha, **betas}, alpha="alpha", field=field, **options)
+        looked_at = field or rectified_field(max_disparity)
+        looked_at = ShuffledField(looked_at) if shuffled else looked_at
+        frame = fuse(network, rig, {"alpha": alpha, **betas}, alpha="alpha", field=looked_at, **options)
         return StereoResult(frame.image, alpha.shape[-1] / frame.depth)
 
     return fused
+
+
+def halved(pair: StereoPair) -> StereoPair:
+    """The pair at half the size (cubic, as MATLAB's), as the paper's code tests: its "x2" and its "x4"."""
+    hw = pair.left.shape[-2] // 2, pair.left.shape[-1] // 2
+    disparity = None
+    if pair.disparity is not None:
+        value, valid = (t[: 2 * hw[0] : 2, : 2 * hw[1] : 2] for t in pair.disparity)
+        disparity = Disparity(value / 2, valid)
+
+    def smaller(image: Tensor) -> Tensor:
+        cut = _cut_to_multiple(image, 2)[None]
+        return interpolate(cut, hw, mode="bicubic", antialias=True, align_corners=False)[0].clamp(0, 1)
+
+    return StereoPair(pair.name, smaller(pair.left), smaller(pair.right), pair.max_disparity, disparity)
+
+
+@dataclass(frozen=True)
+class AuthorsRows:
+    """The rows of the paper's test loader: `arange(j - 80, j)` in column j, and columns 0 to 79 in the first 80.
+
+    The pixel itself, zero disparity, is not among them.
+    """
+
+    length: int = 80
+
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Positions:
+        """Integer positions in beta's pixels. Raises ValueError for views of unequal sizes."""
+        if pair.alpha.hw != pair.beta.hw:
+            sizes = f"alpha is {pair.alpha.hw}, beta {pair.beta.hw}"
+            raise ValueError(f"the authors' rows need views of one size, and {sizes}: resize beta")
+        column = x[..., :1].round()
+        first = (column - self.length).clamp(min=0)
+        columns = first + torch.arange(self.length, dtype=x.dtype, device=x.device)
+        found = torch.stack([columns, x[..., 1:].round().expand_as(columns)], -1)
+        return Positions(found, columns < pair.beta.hw[1])
 
 
 def rectified_field(max_disparity: float) -> ReceptiveField:

@@ -63,13 +63,14 @@ def evaluate_sets(
     *,
     out: Path,
     half: Half = "all",
+    change: Callable[[StereoPair], StereoPair] = lambda pair: pair,
 ) -> dict[str, list[StereoRow]]:
     """`evaluate_pairs` on data sets by name (see `DATA_SETS`): rows by set, a strip of images a pair in out/set.
-    Of the pairs of one half, or all.
+    Of the pairs of one half, or all, each after `change`.
 
     All folders are opened before the work begins: a missing one raises FileNotFoundError or ValueError.
     """
-    pairs = {name: of_half(DATA_SETS[name](folder), half) for name, folder in folders.items()}
+    pairs = {name: map(change, of_half(DATA_SETS[name](folder), half)) for name, folder in folders.items()}
     return {name: evaluate_pairs(found, methods, rates, images=out / name) for name, found in pairs.items()}
 
 

@@ -20,9 +20,8 @@ from torch import Tensor
 
 from arraygeom import Band, LensView, ReceptiveField, Rig, Segments, View, pixel_grid, sample
 from arraygeom.chunks import chunked
-from arraygeom.pixels import map_homogeneous
 from arraygeom.sampling import Interpolation, on_image
-from arraygeom.undistortion import pixels_between, resampled
+from arraygeom.undistortion import pixels_between, recorded_pixels, resampled, with_pixels
 
 from ..matching.inputs import Beta
 from ..matching.match import Matcher, match
@@ -178,7 +177,7 @@ def align(
             f"interpolation is nearest, bilinear or cubic, and fill none or propagate; got {interpolation}, {fill}"
         )
     limit = None if max_memory is None else parse_bytes(max_memory)
-    rig = _with_pixels(rig if depth is None else rig.replace(depth=depth))
+    rig = with_pixels(rig if depth is None else rig.replace(depth=depth))
     views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, field=field), noise)
     betas = views.betas
     network = network or _default_network([len(views.images[name]) for name in betas])
@@ -225,15 +224,6 @@ def _steps(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:
     """Those of a fusion that change where pixels are, and the radiometry that matching sees."""
     resize = [EqualResolution(network)] if network.equal_resolution else []
     return [Undistort(), Upright(), *resize, *([Radiometry()] if normalise else [])]
-
-
-def _with_pixels(rig: Rig) -> Rig:
-    """The rig whose views all have a K, the identity if they are not calibrated: it follows every change of pixels."""
-    for name, view in rig.cameras.items():
-        if not isinstance(view, LensView):
-            eye = torch.eye(3, dtype=torch.float64)
-            rig = rig.with_camera(name, LensView(hw=view.hw, sensor=view.sensor, K=eye))
-    return rig
 
 
 class _Located(NamedTuple):
@@ -301,21 +291,6 @@ def _at_pixels(
 
 def _has_lens(view: View) -> bool:
     return isinstance(view, LensView) and view.distortion is not None
-
-
-def recorded_pixels(
-    x: Float[Tensor, "*n 2"], now: LensView, recorded: LensView
-) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-    """Pixels of a view without its lens, cropped, resized or rotated, in the image as recorded; which it can show.
-
-    K of both views says how pixels were changed: x ~ K_now K_recorded^-1 x_recorded but for the lens.
-    """
-    normalised = map_homogeneous(torch.linalg.inv(now.K.double())[:2], x)
-    if recorded.distortion is None:
-        valid = torch.ones_like(x[..., 0], dtype=torch.bool)
-    else:
-        normalised, valid = recorded.to(torch.float64).distortion.distort(normalised)  # type: ignore[union-attr]
-    return map_homogeneous(recorded.K.double()[:2], normalised), valid
 
 
 def _aligned_view(

@@ -24,14 +24,16 @@ from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.sampling import sample
 
-from ..matching.epipolar_offset import Misalignment, fit_misalignment, normals
+from ..matching.epipolar_offset import Misalignment, fit_misalignment
+from ..matching.filters import blurred
 from ..matching.inputs import Beta, Inputs
 from ..matching.match import located
-from ..matching.matches import BetaMatches, combined_bands
+from ..matching.matches import BetaMatches
 from ..matching.normalisation import SETTINGS as NORMALISATION
-from ..matching.normalisation import Normalisation, blurred, moments
+from ..matching.normalisation import Normalisation, combined_bands, moments
+from ..matching.positions import enlarged, normals, reduced
 from ..matching.radiometry import Given, Response, fit, stated_response
-from ..matching.semi_global import CONSISTENT, enlarged, reduced
+from ..matching.semi_global import CONSISTENT
 from ..networks.protocol import FusionNetwork
 from ..support.settings import size, tuned
 from .inputs import FrameInputs, padded

@@ -96,8 +96,10 @@ def background_filled(
 
     What a beta does not see is occluded: farther away than what is beside it. Along rows, or along columns if the betas
     are above or below alpha. What is unknown stays NaN. Betas on several sides see what is occluded in one of them:
-    depth is then as it is.
+    depth is then as it is; so it is where it is known from elsewhere.
     """
+    if any(beta.around for beta in inputs.betas):
+        return depth
     steps = [beta.field.pixels for beta in inputs.betas if beta.field.pixels is not None]
     if not steps:
         return depth

@@ -14,13 +14,13 @@ from torch.nn.functional import pad
 
 from arraygeom import Curved, Moved, Pair, ReceptiveField, Widened, depth_of
 from arraygeom.epipolar import Depth, Track
-from arraygeom.fields import default_field, pinhole_track
+from arraygeom.fields import AroundDepth, AroundMatches, default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
 from arraygeom.fields.ray_depth import ray_depth
 from arraygeom.pixels import HW
 
 from ..matching.inputs import Beta, Inputs
-from ..matching.matches import combined_bands
+from ..matching.normalisation import combined_bands
 from ..matching.tangents import along_tangents
 from ..networks.protocol import FusionNetwork
 from .steps import FusionStep, Undo
@@ -131,7 +131,8 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
         if network.uses_matches and on_grid.pixels is None:
             on_grid = along_tangents(alpha, combined_bands(image), on_grid, name)
         place = Placement(pair, field.points if isinstance(field, Moved) else lambda x: x, bounds_of(field))
-        betas.append(Beta(image, on_grid, track=place.track if place.has_track else None))
+        around = isinstance(innermost(field), AroundDepth | AroundMatches)
+        betas.append(Beta(image, on_grid, track=place.track if place.has_track else None, around=around))
         if not on_grid.any_valid(pair.alpha.hw):
             bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} m"
             raise ValueError(f"alpha's and '{name}'s views do not overlap{bounds}: check the poses and the depth range")
@@ -141,9 +142,15 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
 
 def bounds_of(field: ReceptiveField) -> Literal["depth", "distance"]:
     """What a field's depth range is of."""
+    field = innermost(field)
+    return field.bounds if isinstance(field, Curved) else "depth"
+
+
+def innermost(field: ReceptiveField) -> ReceptiveField:
+    """The field that is widened or moved, if it is."""
     while isinstance(field, Widened | Moved):
         field = field.field
-    return field.bounds if isinstance(field, Curved) else "depth"
+    return field
 
 
 def padded(image: Tensor, multiple: int) -> Tensor:

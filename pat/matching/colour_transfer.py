@@ -3,28 +3,31 @@ they are not seen."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments
-from arraygeom.sampling import on_image, sample
 from arraygeom.threads import in_parallel
 
 from ..media.colour import to_bytes
 from ..support.settings import size, tuned
 from . import semi_global_numba as kernels
+from .filters import LocalMoments, box_mean, numpy_of, smoothed
+from .inputs import Beta, Inputs
+from .matches import BetaMatches, Matches, is_consistent
 from .normalisation import SETTINGS as NORMALISATION
-from .normalisation import LocalMoments, Normalisation, Normalisations, box_mean, explained_share, normalised
+from .normalisation import Normalisation, combined_bands, explained_share, normalised
+from .positions import at_matches
 from .radiometry import SpectralMix
-from .semi_global import CONSISTENT, Extent, enlarged, matched_at_half_size, matches, numpy_of, reduced, smoothed
 
 FILLS = 2
 """Size: ways in which colour is diffused, along its regression on brightness, and as it is."""
@@ -76,6 +79,51 @@ class ColourTransferSettings:
 SETTINGS = ColourTransferSettings()
 
 
+def transferred(inputs: Inputs, found: Matches) -> Matches:
+    """The matches with beta's bands at them; those of matches from elsewhere, too.
+
+    Of betas that agree on depth, those that have all of the result's bands share the colour that is diffused; any other
+    has its own. With gradients if images or fields have some and gradients are recorded. Raises ValueError for matches
+    of another size or number of betas.
+    """
+    found.check(inputs.hw, len(inputs.betas))
+    agree, large = inputs.can_agree, len(inputs.pieces) > 1
+    sharing = [agree and inputs.shows_all_bands(beta) for beta in inputs.betas]
+
+    def of(piece: Inputs, there: Matches) -> list[Tensor]:
+        parts = _transferred_piece(piece, there, sharing)
+        return [part if part.requires_grad or not large else part.half() for part in parts]
+
+    parts = inputs.in_pieces(of, found)
+    bands, diffused = parts[-len(sharing) :], iter(parts[: -len(sharing)])
+    shared = next(diffused) if any(sharing) else None
+    made = zip(found.betas, bands, sharing)
+    return Matches(tuple(replace(m, bands=b, diffused=shared if s else next(diffused)) for m, b, s in made))
+
+
+def _transferred_piece(piece: Inputs, found: Matches, sharing: Sequence[bool]) -> list[Tensor]:
+    """The diffused colour that betas share, if any do, that of each other beta, and each beta's bands minus alpha."""
+    alpha = piece.alpha
+    alone = [transferred_bands(alpha, *one) for one in zip(piece.betas, found.betas)]
+    shared = []
+    if any(sharing):
+        counting = [(c, w, m.prior) for (c, w), m, counts in zip(alone, found.betas, sharing) if counts]
+        weights = [weight * math.exp(prior) for _, weight, prior in counting]
+        mixed = sum(w * colour for w, (colour, _, _) in zip(weights, counting)) / torch.stack(weights).sum(0)
+        shared = [diffused_from(mixed, alpha, torch.stack([weight for _, weight, _ in counting]).amax(0))]
+    own = [diffused_from(colour, alpha, weight) for (colour, weight), counts in zip(alone, sharing) if not counts]
+    return [*shared, *own, *(colour for colour, _ in alone)]
+
+
+def transferred_bands(alpha: Tensor, beta: Beta, found: BetaMatches) -> tuple[Tensor, Tensor]:
+    """A beta's bands minus alpha at its matches (B, C, H, W), and their weight (B, 1, H, W), 0 to 1."""
+    mix, level = found.comparison.mix, found.comparison.whole
+    if mix is not None:
+        return _colours_of_bands(alpha, beta, found, mix)
+    where = beta.field.straight, found.disparity, found.facts
+    return matched_colours(alpha, combined_bands(beta.image), beta.image, *where, level)
+
+
 def matched_colours(
     alpha: Float[Tensor, "b 1 h w"],
     guide: Float[Tensor, "b 1 hb wb"],
@@ -107,79 +155,28 @@ def matched_colours(
 
 
 @torch.no_grad()
-def coarse_mix(
-    alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b c hb wb"], segments: Segments, blocks: Segments, factor: int
-) -> SpectralMix:
-    """The combination of beta's bands that is most like alpha, found on images reduced by `factor`.
-
-    `segments` (B or 1, h / factor, w / factor) and `blocks` (half as many) are of the centres of blocks of
-    alpha's pixels, in pixels of the whole beta.
-    """
-    if beta.shape[1] == 1:
-        return SpectralMix.equal(beta)
-    own, bands = avg_pool2d(alpha, factor), avg_pool2d(beta, factor)
-    guide = SpectralMix.equal(bands).of(bands)
-    normalisations = Normalisations.of(own, guide)
-    disparity, facts = matched_at_half_size(own, guide, reduced(blocks, factor), normalisations.half)
-    values, valid = at_matches(bands, reduced(segments, factor), disparity)
-    return SpectralMix.fitted(values, normalisations.whole.softened(own), valid * is_consistent(facts))
-
-
-@torch.no_grad()
-def colours_of_bands(
-    alpha: Float[Tensor, "b 1 h w"],
-    beta: Float[Tensor, "b c hb wb"],
-    segments: Segments,
-    disparity: Float[Tensor, "b 1 h w"],
-    facts: Float[Tensor, "b 3 h2 w2"],
-    mix: SpectralMix,
-    normalisation: Normalisation,
-) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
-    """The bands minus alpha at matches that the mix has found, and their weight, 0 to 1."""
-    values, valid = at_matches(beta, segments, disparity)
-    colours, unlike = _matched(values, alpha, mix, normalisation)
-    return colours, match_weight(unlike, is_consistent(facts), valid)
-
-
-def _matched(values: Tensor, alpha: Tensor, mix: SpectralMix, normalisation: Normalisation) -> tuple[Tensor, Tensor]:
-    """Bands minus alpha, with the detail that alpha has and they have not; how unlike alpha they are."""
-    brightness, soft = mix.of(values), normalisation.softened(alpha)
+def _colours_of_bands(alpha: Tensor, beta: Beta, found: BetaMatches, mix: SpectralMix) -> tuple[Tensor, Tensor]:
+    """The bands minus alpha at matches that the mix has found, with the detail that alpha has and they have not; their
+    weight, 0 to 1."""
+    values, valid = at_matches(beta.image, beta.field.straight, found.disparity)
+    brightness, soft = mix.of(values), found.comparison.whole.softened(alpha)
     gain = mix.gain[:, None, None, None].to(alpha)
     beyond = (alpha - soft) + gain * (soft - brightness)
     rises = mix.rises(values)
     slope = rises + local_slope(values - rises * brightness, brightness)
-    return values + slope * SETTINGS.detail(beyond) - alpha, brightness - soft
+    colours = values + slope * SETTINGS.detail(beyond) - alpha
+    return colours, match_weight(brightness - soft, is_consistent(found.facts), valid)
 
 
 def _scaled_to_alpha(colour: Tensor, brightness: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Colour differences (B, C, H, W) and brightness of beta, larger where alpha is brighter around a pixel.
 
-    What a lens or the light makes brighter keeps its saturation, a reflection does not: the power is in
-        between.
+    What a lens or the light makes brighter keeps its saturation, a reflection does not: the power is in between.
     """
     least, most = 1e-3, SETTINGS.most_brighter
     own, other = (box_mean(image * weight, SETTINGS.surroundings) + least for image in (alpha, brightness))
     ratio = (own / other.clamp(min=least)).clamp(1 / most, most)
     return colour * ratio**SETTINGS.saturation, brightness * ratio
-
-
-def at_matches(
-    beta: Float[Tensor, "b c hb wb"],
-    segments: Segments,
-    disparity: Float[Tensor, "b 1 _ _"],
-    extent: Extent | None = None,
-) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
-    """What beta shows at the matches, at its edge where these are beyond it, and where they are not."""
-    hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, disparity, extent=extent).to(beta)
-    position = middle.reshape(len(beta), -1, 2)
-    inside = position.clamp(min=0).minimum(position.new_tensor([hw[1] - 1, hw[0] - 1]))
-    values = sample(beta, inside, interpolation="bicubic").values
-    return values.reshape(*beta.shape[:2], *middle.shape[1:3]), on_image(middle, hw)[:, None]
-
-
-def is_consistent(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]:
-    """1 where the match is consistent."""
-    return enlarged((facts[:, :1] < CONSISTENT).to(facts))
 
 
 def match_weight(unlike: Float[Tensor, "b 1 h w"], consistent: Tensor, valid: Tensor) -> Float[Tensor, "b 1 h w"]:

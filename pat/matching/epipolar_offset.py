@@ -18,13 +18,12 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arraygeom import Segments
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.robust import cauchy, normal_deviation, robust_least_squares
 
 from ..support.settings import size, tuned
-from .semi_global import along
+from .positions import normals
 
 Image = NDArray[Any]
 
@@ -82,12 +81,6 @@ class Misalignment:
         if self == Misalignment() or field.pixels is None:
             return field
         return field.displaced(lambda found, x: self.at(x, hw)[..., None] * normals(found))
-
-
-def normals(segments: Segments) -> Float[Tensor, "*n 2"]:
-    """Unit vectors across the segments; zero where a segment is a point."""
-    direction = along(segments)
-    return torch.stack([-direction[..., 1], direction[..., 0]], -1)
 
 
 @torch.no_grad()

@@ -36,13 +36,15 @@ class Beta:
     """One beta's image (B, C, H, W) and the field of alpha's pixels in it.
 
     `offset` is the (x, y) of its first pixel in the whole image, other than (0, 0) for a part of an image.
-    `track` gives the tracks of alpha's pixels (*n, 2) in the image of a calibrated beta.
+    `track` gives the tracks of alpha's pixels (*n, 2) in the image of a calibrated beta. With `around` each segment is
+    around what is known of its own pixel: positions along the segments of two pixels are not to be compared.
     """
 
     image: Float[Tensor, "b c h w"]
     field: FieldOnGrid
     offset: tuple[int, int] = (0, 0)
     track: Callable[[Tensor], Track] | None = None
+    around: bool = False
 
 
 @dataclass(frozen=True)
@@ -86,20 +88,23 @@ class Inputs:
         sides = sides_by_work(self.hw, SETTINGS.halo, self.multiple, SETTINGS.at_once)
         return list(tiles_of(self.hw, sides[0], SETTINGS.halo))
 
-    def in_pieces(self, make: Callable[[Box], Any]) -> Any:
-        """Planes (..., h, w), or several, put together from what is made of each piece, by its box."""
-        return assembled(self.hw, ((piece, make(piece.outer)) for piece in self.pieces))
-
-    def part(self, box: Box) -> Inputs:
-        """A part of alpha as `cut` gives it; of the whole, these inputs."""
-        return self if box == whole(self.hw).outer else self.cut(box)
+    def in_pieces(self, make: Callable[..., Any], *more: Any) -> Any:
+        """Planes (..., h, w), or several, put together from what is made of each piece of these inputs, and of what
+        is given besides, cut alike."""
+        pieces = self.pieces
+        if len(pieces) == 1:
+            return make(self, *more)
+        made = (make(*(one.cut(piece.outer) for one in (self, *more))) for piece in pieces)
+        return assembled(self.hw, zip(pieces, made))
 
     @property
     def can_agree(self) -> bool:
-        """Whether there are several betas, all calibrated and with straight fields, of one frame."""
+        """Whether all betas, of which there are several or one `around` what is known, are calibrated and have straight
+        fields, of one frame."""
         fields = [beta.field.pixels for beta in self.betas]
         one = len(self.alpha) == 1 and all(field is not None and len(field.valid) == 1 for field in fields)
-        return len(fields) > 1 and one and all(beta.track is not None for beta in self.betas)
+        several = len(fields) > 1 or any(beta.around for beta in self.betas)
+        return several and one and all(beta.track is not None for beta in self.betas)
 
     def shows_all_bands(self, beta: Beta) -> bool:
         """Whether the beta is one of several of which some show all bands of the result, and shows them."""
@@ -125,7 +130,8 @@ class Inputs:
         y0, y1, x0, x1 = self.touched(beta, box)
         offset = (beta.offset[0] + x0, beta.offset[1] + y0)
         track = beta.track and _part_of(beta.track, (box[2], box[0]), (x0, y0))
-        return Beta(beta.image[..., y0:y1, x0:x1], beta.field.cut(box, (x0, y0)), offset, track)
+        image = beta.image[..., y0:y1, x0:x1]
+        return Beta(image, beta.field.cut(box, (x0, y0)), offset, track, beta.around)
 
 
 def _part_of(

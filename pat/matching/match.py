@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate
+from torch.nn.functional import avg_pool2d
 
-from arraygeom.chunks import Box
+from arraygeom import Segments
 
 from ..support.settings import size
-from .colour_transfer import coarse_mix, colours_of_bands, diffused_from, matched_colours
-from .inputs import Beta, Inputs
-from .matches import BetaMatches, Comparison, Matches, combined_bands
+from .colour_transfer import transferred
+from .inputs import Inputs
+from .matches import BetaMatches, Matches, is_consistent
 from .multiview import agreed
-from .semi_global import FINE, matched_at_half_size
-from .subpixel import matched_at_full_size, precise
+from .normalisation import Comparison
+from .positions import FINE, at_matches, reduced
+from .radiometry import SpectralMix
+from .semi_global import HalfSizeMatches, matched_at_half_size
+from .subpixel import matched_at_full_size
 
 LOG = logging.getLogger(__name__)
 
@@ -34,14 +37,8 @@ class MatchSettings:
 
 SETTINGS = MatchSettings()
 
-
-@runtime_checkable
-class Matcher(Protocol):
-    """What `fuse` asks for matches: `match`, or another function of the inputs."""
-
-    def __call__(self, inputs: Inputs) -> Matches:
-        """The matches of inputs whose sides are whole multiples of `inputs.multiple`."""
-        ...
+Matcher = Callable[[Inputs], Matches]
+"""What `fuse` asks for matches of inputs whose sides are whole multiples of `inputs.multiple`: `match`, or your own."""
 
 
 def match(inputs: Inputs) -> Matches:
@@ -56,82 +53,54 @@ def match(inputs: Inputs) -> Matches:
 @torch.no_grad()
 def located(inputs: Inputs) -> Matches:
     """Where alpha's pixels are in each beta, without colours; of several calibrated betas, where all agree."""
-    alone = Matches(tuple(_located_in_one(inputs.of_beta(i)) for i in range(len(inputs.betas))))
+    alone = Matches(tuple(located_in_one(inputs.of_beta(i)) for i in range(len(inputs.betas))))
     return agreed(inputs, alone) if inputs.can_agree else alone
 
 
-def _located_in_one(inputs: Inputs) -> BetaMatches:
+def located_in_one(inputs: Inputs) -> BetaMatches:
     """The matches in the one beta: at half the size for the whole frame, then at full size around those."""
     LOG.info("matching a beta")
-    alpha, (beta,) = inputs.alpha, inputs.betas
-    comparison = compared(inputs)
-    level, combined = comparison.normalisations, comparison.combined(beta.image)
-    half = matched_at_half_size(alpha, combined, beta.field.of_blocks(FINE), level.half)
+    comparison = Comparison.of(inputs.alpha, inputs.betas[0].image, seen_mix(inputs))
+    halves = comparison.half_views(inputs.alpha, inputs.betas[0].image)
+    half = matched_at_half_size(halves, inputs.betas[0].field.of_blocks(FINE))
 
-    def closer(box: Box) -> list[Tensor]:
-        piece, rough = inputs.part(box), half.cut(box).disparity
-        (part,), near = piece.betas, interpolate(rough, scale_factor=FINE, mode="bilinear")
-        views, segments = level.whole.views(piece.alpha, comparison.combined(part.image)), part.field.straight
-        disparity, unlike = matched_at_full_size(views, segments, rough)
-        return [precise(views, segments, disparity, unlike, near), avg_pool2d(unlike, FINE)]
+    def closer(piece: Inputs, rough: HalfSizeMatches) -> tuple[Tensor, Tensor]:
+        (beta,) = piece.betas
+        views = comparison.views(piece.alpha, beta.image)
+        return matched_at_full_size(views, beta.field.straight, rough.disparity)
 
-    disparity, unlike = inputs.in_pieces(closer)
+    disparity, unlike = inputs.in_pieces(closer, half)
     return BetaMatches(disparity, torch.cat([unlike, half.facts[:, 1:]], 1), comparison)
 
 
-def compared(inputs: Inputs) -> Comparison:
-    """What of the one beta's bands is compared with alpha: the combination that is most like alpha where betas may have
-    any bands, else luma."""
+def seen_mix(inputs: Inputs) -> SpectralMix | None:
+    """The combination of the one beta's bands that is most like alpha, on reduced images; None, for luma, where the
+    result's bands are known or there is one alone."""
     alpha, (beta,) = inputs.alpha, inputs.betas
     if inputs.bands is not None or beta.image.shape[1] == 1:
-        return Comparison.of(alpha, beta.image, None)
+        return None
     factor = FINE
     while factor < inputs.multiple // FINE and math.prod(inputs.hw) > SETTINGS.coarsely * factor**2:
         factor *= 2
     segments, blocks = (beta.field.of_blocks(side) for side in (factor, FINE * factor))
-    return Comparison.of(alpha, beta.image, coarse_mix(alpha, beta.image, segments, blocks, factor))
+    return coarse_mix(alpha, beta.image, segments, blocks, factor)
 
 
-def transferred(inputs: Inputs, found: Matches) -> Matches:
-    """The matches with beta's bands at them; those of matches from elsewhere, too.
+@torch.no_grad()
+def coarse_mix(
+    alpha: Float[Tensor, "b 1 h w"],
+    beta: Float[Tensor, "b c hb wb"],
+    segments: Segments,
+    blocks: Segments,
+    factor: int,
+) -> SpectralMix:
+    """The combination of beta's bands that is most like alpha, found on images reduced by `factor`.
 
-    Of betas that agree on depth, those that have all of the result's bands share the colour that is diffused; any other
-    has its own. With gradients if images or fields have some and gradients are recorded. Raises ValueError for matches
-    of another size or number of betas.
+    `segments` (B or 1, h / factor, w / factor) and `blocks` (half as many) are of the centres of blocks of
+    alpha's pixels, in pixels of the whole beta.
     """
-    found.check(inputs.hw, len(inputs.betas))
-    agree, large = inputs.can_agree, len(inputs.pieces) > 1
-    sharing = [agree and inputs.shows_all_bands(beta) for beta in inputs.betas]
-
-    def of(box: Box) -> list[Tensor]:
-        parts = _transferred_piece(inputs.part(box), found.cut(box), sharing)
-        return [part if part.requires_grad or not large else part.half() for part in parts]
-
-    parts = inputs.in_pieces(of)
-    bands, diffused = parts[-len(sharing) :], iter(parts[: -len(sharing)])
-    shared = next(diffused) if any(sharing) else None
-    made = zip(found.betas, bands, sharing)
-    return Matches(tuple(replace(m, bands=b, diffused=shared if s else next(diffused)) for m, b, s in made))
-
-
-def _transferred_piece(piece: Inputs, found: Matches, sharing: Sequence[bool]) -> list[Tensor]:
-    """The diffused colour that betas share, if any do, that of each other beta, and each beta's bands minus alpha."""
-    alpha = piece.alpha
-    alone = [transferred_bands(alpha, *one) for one in zip(piece.betas, found.betas)]
-    shared = []
-    if any(sharing):
-        counting = [(c, w, m.prior) for (c, w), m, counts in zip(alone, found.betas, sharing) if counts]
-        weights = [weight * math.exp(prior) for _, weight, prior in counting]
-        mixed = sum(w * colour for w, (colour, _, _) in zip(weights, counting)) / torch.stack(weights).sum(0)
-        shared = [diffused_from(mixed, alpha, torch.stack([weight for _, weight, _ in counting]).amax(0))]
-    own = [diffused_from(colour, alpha, weight) for (colour, weight), counts in zip(alone, sharing) if not counts]
-    return [*shared, *own, *(colour for colour, _ in alone)]
-
-
-def transferred_bands(alpha: Tensor, beta: Beta, found: BetaMatches) -> tuple[Tensor, Tensor]:
-    """A beta's bands minus alpha at its matches (B, C, H, W), and their weight (B, 1, H, W), 0 to 1."""
-    where, mix = (beta.field.straight, found.disparity, found.facts), found.comparison.mix
-    level = found.comparison.normalisations.whole
-    if mix is None:
-        return matched_colours(alpha, combined_bands(beta.image), beta.image, *where, level)
-    return colours_of_bands(alpha, beta.image, *where, mix, level)
+    own, bands = avg_pool2d(alpha, factor), avg_pool2d(beta, factor)
+    comparison = Comparison.of(own, bands, SpectralMix.equal(bands))
+    half = matched_at_half_size(comparison.half_views(own, bands), reduced(blocks, factor))
+    values, valid = at_matches(bands, reduced(segments, factor), half.disparity)
+    return SpectralMix.fitted(values, comparison.whole.softened(own), valid * is_consistent(half.facts))

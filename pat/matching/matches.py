@@ -12,40 +12,14 @@ from arraygeom.chunks import Box
 from arraygeom.pixels import HW
 from arraygeom.sampling import on_image
 
-from ..media.colour import luminance
-from .normalisation import Normalisations
-from .radiometry import SpectralMix
-from .semi_global import FINE, matches
+from .normalisation import Comparison
+from .positions import FINE, enlarged, matches
+from .semi_global import CONSISTENT
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """What of a beta's bands is compared with alpha, and how that is brought to alpha's level and sharpness.
-
-    mix: the combination of bands that alpha sees; None: Rec. 601 luma of three bands, the mean of others.
-    normalisations: of the combination, for whole images.
-    """
-
-    mix: SpectralMix | None
-    normalisations: Normalisations
-
-    @classmethod
-    def of(
-        cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b c hb wb"], mix: SpectralMix | None
-    ) -> Comparison:
-        """That of whole images of even sides, by this mix."""
-        return cls(mix, Normalisations.of(alpha, combined_bands(beta, mix)))
-
-    def combined(self, beta: Float[Tensor, "b c hb wb"]) -> Float[Tensor, "b 1 hb wb"]:
-        """The combination of beta's bands, or of a part of it."""
-        return combined_bands(beta, self.mix)
-
-
-def combined_bands(beta: Float[Tensor, "b c h w"], mix: SpectralMix | None = None) -> Float[Tensor, "b 1 h w"]:
-    """The bands as this mix combines them; without one Rec. 601 luma of three bands, the mean of others."""
-    if mix is not None:
-        return mix.of(beta)
-    return luminance(beta) if beta.shape[1] == 3 else beta.mean(1, keepdim=True)
+def is_consistent(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]:
+    """1 where the match is consistent."""
+    return enlarged((facts[:, :1] < CONSISTENT).to(facts))
 
 
 @dataclass(frozen=True)

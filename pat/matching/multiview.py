@@ -21,21 +21,16 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, depth_from_track, pixel_grid
-from arraygeom.chunks import Box, spans
+from arraygeom.chunks import Tile, assembled, spans
 from arraygeom.epipolar import FRONT, Track
 
 from ..media.colour import to_bytes
 from ..support.settings import size, tuned
+from .filters import filled
 from .inputs import Beta, Inputs
 from .matches import BetaMatches, Matches
-from .semi_global import (
-    CONSISTENT,
-    DISPARITY_FILL,
-    FINE,
-    Extent,
-    enlarged,
-    filled,
-)
+from .positions import FINE, Extent, enlarged
+from .semi_global import CONSISTENT, DISPARITY_FILL
 
 
 @dataclass(frozen=True)
@@ -169,7 +164,8 @@ class MatchedBeta:
     def hidden(self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
         """By how many pixels the nearest point seen at the same pixel of beta differs; infinite outside the image."""
         index = self._index(inverse_depth)
-        apart = self.disparity_of(buffer[index]) - self.disparity_of(inverse_depth)
+        (x, y), (u, v) = self._seen(buffer[index]), self._seen(inverse_depth)
+        apart = torch.hypot(x - u, y - v)  # not along the segments: around a known depth they may be points
         return torch.where(index < len(buffer) - 1, apart, torch.inf)
 
     def _index(self, inverse_depth: Tensor) -> Tensor:
@@ -306,15 +302,17 @@ def _agree(terms: Tensor, own: Tensor, rise: Tensor, solutions: Float[Tensor, "k
 def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
     """Inverse depth diffused to where no match is consistent, and without outliers."""
 
-    def of(box: Box) -> Tensor:
-        part = (..., slice(box[0], box[1]), slice(box[2], box[3]))
-        plane, known = (x[part].cpu().numpy() for x in (agreement.inverse_depth, agreement.known))
-        guide = to_bytes(inputs.alpha[0, 0][part])
+    def of(tile: Tile) -> Tensor:
+        top, bottom, left, right = tile.outer
+        planes = agreement.inverse_depth, agreement.known, inputs.alpha[0]
+        plane, known, alpha = (x[:, top:bottom, left:right].cpu().numpy() for x in planes)
+        guide = to_bytes(alpha[0])
         smooth = filled(plane, known[0].astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
         median = cv2.medianBlur(np.where(known, plane, smooth)[0], 5)
         return torch.from_numpy(median)[None].to(inputs.alpha)
 
-    return agreement._replace(inverse_depth=inputs.in_pieces(of))
+    dense = assembled(inputs.hw, ((tile, of(tile)) for tile in inputs.pieces))
+    return agreement._replace(inverse_depth=dense)
 
 
 def _of_beta(

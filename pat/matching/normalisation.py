@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -16,10 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from arraygeom.fields.protocol import compilable
-
-from ..media.colour import to_bytes
+from ..media.colour import luminance, to_bytes
 from ..support.settings import size, tuned
+from .filters import blurred
+from .radiometry import SpectralMix
 
 LEAST_WEIGHT = 1e-6
 """Size: added to weights, so that there are moments where all are 0."""
@@ -147,18 +145,6 @@ class Normalisation(NamedTuple):
         return ComparedViews(*self.equally_sharp(alpha, self.normalised(beta)), to_bytes(alpha[:, 0]))
 
 
-class Normalisations(NamedTuple):
-    """Those of images, and of the same at half the size."""
-
-    whole: Normalisation
-    half: Normalisation
-
-    @classmethod
-    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisations:
-        """Of alpha and beta's brightness; all sides are even."""
-        return cls(Normalisation.of(alpha, beta), Normalisation.of(avg_pool2d(alpha, 2), avg_pool2d(beta, 2)))
-
-
 def _levelled(image: Tensor, level: Tensor) -> Tensor:
     mean, factor, middle = level.to(image)
     return (image - mean) * factor + middle
@@ -184,64 +170,45 @@ def _least_blur(image: Tensor, contrast: float) -> float:
     return SETTINGS.blurs[-1]
 
 
-def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[Tensor, "b 1 h w"]:
-    """Each blurred with its standard deviation in pixels; 0: as it is."""
-
-    def one(image: Tensor, blur: float) -> Tensor:
-        if not blur:
-            return image
-        plane = np.ascontiguousarray(image.detach().cpu().numpy(), np.float32)
-        return torch.from_numpy(cv2.GaussianBlur(plane, (0, 0), blur)).to(image)
-
-    return torch.stack([one(p[0], blur) for p, blur in zip(images, blurs)])[:, None]
-
-
 def _contrast(image: Float[Tensor, "1 h w"]) -> Tensor:
     return image.diff(dim=-1).abs().mean() + image.diff(dim=-2).abs().mean()
 
 
-class LocalMoments(NamedTuple):
-    """Moments of bands (B, C, H, W) and an image (B, 1, H, W) within squares around each pixel.
+class Comparison(NamedTuple):
+    """What of a beta's bands is compared with alpha, and how that is brought to alpha's level and sharpness.
 
-    `bands` and `image` are the means.
+    mix: the combination of bands that alpha sees; None: Rec. 601 luma of three bands, the mean of others.
+    whole, half: how the combination is normalised, and the same at half the size.
     """
 
-    bands: Tensor
-    image: Tensor
-    variance_of_bands: Tensor
-    variance_of_image: Tensor
-    covariance: Tensor
+    mix: SpectralMix | None
+    whole: Normalisation
+    half: Normalisation
 
     @classmethod
-    def within(cls, radius: int, bands: Float[Tensor, "b c h w"], image: Float[Tensor, "b 1 h w"]) -> LocalMoments:
-        """Those within squares of so many pixels to either side."""
-        mean = partial(box_mean, radius=radius)
-        centre, middle = mean(bands), mean(image)
-        variation = (mean(bands.square()) - centre.square()).clamp(min=0)
-        variance = (mean(image.square()) - middle.square()).clamp(min=0)
-        return cls(centre, middle, variation, variance, mean(bands * image) - centre * middle)
+    def of(
+        cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b c hb wb"], mix: SpectralMix | None = None
+    ) -> Comparison:
+        """That of whole images of even sides, by this mix."""
+        other = combined_bands(beta, mix)
+        half = Normalisation.of(avg_pool2d(alpha, 2), avg_pool2d(other, 2))
+        return cls(mix, Normalisation.of(alpha, other), half)
 
-    def slope(self, floor: float) -> Float[Tensor, "b c h w"]:
-        """The slope of the bands' regression on the image, whose variance is regularised by the floor."""
-        return self.covariance / (self.variance_of_image + floor)
+    def combined(self, beta: Float[Tensor, "b c hb wb"]) -> Float[Tensor, "b 1 hb wb"]:
+        """The combination of beta's bands, or of a part of it."""
+        return combined_bands(beta, self.mix)
+
+    def views(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b c hb wb"]) -> ComparedViews:
+        """Alpha and the combination of beta's bands, or parts of them, as they are compared."""
+        return self.whole.views(alpha, self.combined(beta))
+
+    def half_views(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b c hb wb"]) -> ComparedViews:
+        """The same at half the size."""
+        return self.half.views(avg_pool2d(alpha, 2), avg_pool2d(self.combined(beta), 2))
 
 
-def box_mean(x: Tensor, radius: int) -> Tensor:
-    """Over squares around each pixel, as far as these are on the image."""
-    side = 2 * radius + 1
-    if compilable(x) and not x.requires_grad:
-        return _box_mean_of_numbers(x, radius)
-    rows = avg_pool2d(x, (side, 1), 1, (radius, 0), count_include_pad=False)
-    return avg_pool2d(rows, (1, side), 1, (0, radius), count_include_pad=False)
-
-
-def _box_mean_of_numbers(x: Tensor, radius: int) -> Tensor:
-    """The same by OpenCV's running sums: a third of the time."""
-    planes = x.detach().contiguous().flatten(0, -3).numpy()
-    counts = [np.minimum(np.arange(n), radius) + np.minimum(np.arange(n)[::-1], radius) + 1 for n in planes.shape[1:]]
-    share = (1 / (counts[0][:, None] * counts[1])).astype(planes.dtype)
-    out = np.empty_like(planes)
-    for plane, target in zip(planes, out):
-        sums = cv2.boxFilter(plane, -1, (2 * radius + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        np.multiply(sums, share, out=target)
-    return torch.from_numpy(out).view(x.shape)
+def combined_bands(beta: Float[Tensor, "b c h w"], mix: SpectralMix | None = None) -> Float[Tensor, "b 1 h w"]:
+    """The bands as this mix combines them; without one Rec. 601 luma of three bands, the mean of others."""
+    if mix is not None:
+        return mix.of(beta)
+    return luminance(beta) if beta.shape[1] == 3 else beta.mean(1, keepdim=True)

@@ -27,7 +27,7 @@ from arraygeom.robust import RobustFit, cauchy, gaussian, least_squares, normal_
 
 from ..media.colour import REC601
 from ..support.settings import physics, size, tuned
-from .normalisation import box_mean
+from .filters import box_mean
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,9 @@ import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Segments
 from arraygeom.chunks import Box
-from arraygeom.fields.protocol import compilable
 from arraygeom.sampling import on_image
 from arraygeom.threads import in_parallel
 
@@ -33,10 +31,9 @@ from ..support.memory import how_many_fit
 from ..support.settings import size, tuned
 from . import semi_global_numba as kernels
 from .cost import planes_of
-from .normalisation import ComparedViews, Normalisation
-
-FINE = 2
-"""Matching is done on images this many times smaller."""
+from .filters import filled, numpy_of
+from .normalisation import ComparedViews
+from .positions import FINE, Extent
 
 
 @dataclass(frozen=True)
@@ -113,18 +110,13 @@ class _Geometry(NamedTuple):
     cut: NDArray[np.float32]
 
 
-def matched_at_half_size(
-    alpha: Float[Tensor, "b 1 h w"],
-    guide: Float[Tensor, "b 1 hb wb"],
-    blocks: Segments,
-    normalisation: Normalisation,
-) -> HalfSizeMatches:
-    """Matches of images at half the size; `normalisation` is that of half the size."""
-    views = normalisation.views(avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE))
-    geometry = geometry_of(blocks, len(alpha), (guide.shape[-2], guide.shape[-1]))
-    del guide, blocks
+def matched_at_half_size(views: ComparedViews, blocks: Segments) -> HalfSizeMatches:
+    """Matches of views at half the size; `blocks` are the segments of their pixels, in those of the whole beta."""
+    own, other = views.alpha, views.beta
+    geometry = geometry_of(blocks, len(own), (FINE * other.shape[-2], FINE * other.shape[-1]))
+    del blocks
     disparity, facts = matched_by_labels(views, geometry, Windows.all(geometry), HALF_SIZE)
-    return HalfSizeMatches(FINE * disparity[:, None].to(alpha), facts.movedim(-1, 1).to(alpha))
+    return HalfSizeMatches(FINE * disparity[:, None].to(own), facts.movedim(-1, 1).to(own))
 
 
 def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int = FINE) -> _Geometry:
@@ -133,9 +125,9 @@ def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int
 
     Segments that start within a pixel of beta's edge may have been cut there.
     """
-    length = length_of(segments)
+    length, towards = Extent.of(segments)
     cut = segments.valid & ~on_image(segments.start - 0.5, (hw[0] - 1, hw[1] - 1))
-    end, towards = (segments.end + 0.5) / factor - 0.5, along(segments, length)
+    end = (segments.end + 0.5) / factor - 0.5
     length = torch.where(segments.valid, length / factor, -1.0)
     planes = (numpy_of(x.expand(batch, *x.shape[1:])) for x in (end, towards, length, cut))
     return _Geometry(*planes)
@@ -262,88 +254,3 @@ def _block(image: _Image, box: tuple, windows: Windows, settings: SemiGlobalSett
     image.claims.append(claims)
     for plane, part in zip(image.found, parts):
         plane[inner] = part
-
-
-def matches(
-    segments: Segments,
-    disparity: Float[Tensor, "b 1 _ _"],
-    *,
-    beyond_edge: bool = False,
-    extent: Extent | None = None,
-) -> Float[Tensor, "b h w 2"]:
-    """Where the alpha pixels of segments (B or 1, H, W) have their matches `disparity` from the ends, beta's
-    pixels.
-
-    Disparity may be at half the size. Not beyond the segments' near ends, unless `beyond_edge`. `extent` is
-    the segments', if it is known.
-    """
-    length, towards = extent or Extent.of(segments)
-    if disparity.shape[-2:] != length.shape[-2:]:
-        disparity = interpolate(disparity, scale_factor=FINE, mode="bilinear")
-    far = disparity[:, 0].to(length).clamp(min=0)
-    return segments.end + (far if beyond_edge else far.minimum(length))[..., None] * towards
-
-
-class Extent(NamedTuple):
-    r"""Lengths of segments (\*n), and unit vectors from end to start (\*n, 2)."""
-
-    length: Tensor
-    towards: Tensor
-
-    @classmethod
-    def of(cls, segments: Segments) -> Extent:
-        """That of segments."""
-        length = length_of(segments)
-        return cls(length, along(segments, length))
-
-
-def length_of(segments: Segments) -> Float[Tensor, "*n"]:
-    """The segments' lengths in pixels; of plain numbers in half the time of `Segments.length`, which is the
-    same."""
-    step = segments.end - segments.start
-    if step.requires_grad or not compilable(step):
-        return segments.length
-    x, y = step.unbind(-1)
-    return (x * x).add_(y * y).sqrt_()
-
-
-def along(segments: Segments, length: Tensor | None = None) -> Float[Tensor, "*n 2"]:
-    """Unit vectors from end to start; zero where a segment is a point. `length` is the segments', if it is
-    known."""
-    length = length_of(segments) if length is None else length
-    step, divisor = segments.start - segments.end, torch.where(length > 0, length, 1.0)
-    if step.requires_grad or not compilable(step):
-        return step / divisor[..., None]
-    for part in step.unbind(-1):
-        part.div_(divisor)
-    return step
-
-
-def reduced(segments: Segments, factor: int) -> Segments:
-    """The same segments in pixels of a beta that is `factor` times smaller."""
-    start, end = ((x + 0.5) / factor - 0.5 for x in (segments.start, segments.end))
-    return Segments(start, end, segments.valid)
-
-
-def enlarged(x: Tensor) -> Tensor:
-    """From half the size, each value four times."""
-    return x.repeat_interleave(FINE, -1).repeat_interleave(FINE, -2)
-
-
-def filled(planes: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, float]) -> NDArray:
-    """The weighted mean of planes (c, h, w) over what is connected in the guide. Weights are positive."""
-
-    total, *sums = smoothed([weight, *(plane * weight for plane in planes)], guide, how)
-    return np.stack([plane / total for plane in sums])
-
-
-def smoothed(planes: Sequence[NDArray], guide: NDArray[np.uint8], how: tuple[float, float]) -> list[NDArray]:
-    """Planes smoothed where the guide shows no edge. One after the other: the smoother is not for several
-    threads, but has its own."""
-    smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, *how)
-    return [smoother.filter(np.ascontiguousarray(plane, np.float32)) for plane in planes]
-
-
-def numpy_of(x: Tensor) -> NDArray[np.float32]:
-    """A float32 copy on the CPU, in one piece."""
-    return np.ascontiguousarray(x.detach().cpu().numpy(), np.float32)

@@ -424,6 +424,21 @@ def regression(brightness, total, first, second, colour, product, floor, along, 
             along[y, x], mean_colour[y, x] = middle + slope * beyond, middle
 
 
-for _entry in (costs, aggregate, winners, regression):
+@compiled(nogil=True, cache=True)
+def costs_at(own, other, places, out):
+    """Cost of alpha's pixel and beta's at each of its places, pixels of beta counted row by row (-1: none): out (h, w,
+    1, lanes), of which those after the last place have no label. `own` and `other` are flat planes of `cost`."""
+    height, width, labels = places.shape
+    for y in range(height):
+        for x in range(width):
+            pixel, costs = pixel_of(own, y * width + x), out[y, x, 0]
+            costs[labels:] = NO_LABEL
+            for label in range(labels):
+                at = places[y, x, label]
+                cost = dissimilarity(pixel, pixel_of(other, max(at, 0)))
+                costs[label] = cost if at >= 0 else NOWHERE
+
+
+for _entry in (costs, aggregate, winners, regression, costs_at):
     renew_with(_entry, [Path(__file__), Path(__file__).with_name("cost.py"), *SOURCES])
     separate_cache(_entry)

@@ -17,23 +17,15 @@ import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Segments
 
 from ..support.settings import size, tuned
-from .colour_transfer import at_matches, box_mean
+from .filters import box_mean, filled, numpy_of
 from .normalisation import ComparedViews
-from .semi_global import (
-    CONSISTENT,
-    FINE,
-    Extent,
-    SemiGlobalSettings,
-    Windows,
-    filled,
-    geometry_of,
-    matched_by_labels,
-    numpy_of,
-)
+from .positions import FINE, Extent, at_matches
+from .semi_global import CONSISTENT, SemiGlobalSettings, Windows, geometry_of, matched_by_labels
 
 FULL_SIZE = SemiGlobalSettings(
     step=20.0,
@@ -69,31 +61,26 @@ SETTINGS = SubpixelSettings()
 
 
 def matched_at_full_size(
-    views: ComparedViews, segments: Segments, disparity: Float[Tensor, "b 1 h2 w2"]
-) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"]]:
-    """Disparity from that at half the size, and how far matching back from beta disagrees, 0 to 1.
-
-    Where it disagrees, disparity is diffused from where it does not.
-    """
+    views: ComparedViews, segments: Segments, half: Float[Tensor, "b 1 h2 w2"]
+) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h2 w2"]]:
+    """Disparity to a fraction of a pixel from that at half the size, and how far matching back from beta disagrees, 0
+    to 1, at half the size. Where it disagrees, disparity is diffused from where it does not."""
     own, other = views.alpha, views.beta
     geometry = geometry_of(segments, len(own), (other.shape[-2], other.shape[-1]), factor=1)
-    windows = Windows(np.stack([_runs(half) for half in numpy_of(disparity[:, 0])]), SETTINGS.run)
-    found, unlike = matched_by_labels(views, geometry, windows, FULL_SIZE, facts=1)
-    return found[:, None].to(own), unlike.movedim(-1, 1).to(own)
+    windows = Windows(np.stack([_runs(plane) for plane in numpy_of(half[:, 0])]), SETTINGS.run)
+    found, measured = matched_by_labels(views, geometry, windows, FULL_SIZE, facts=1)
+    disparity, unlike = found[:, None].to(own), measured.movedim(-1, 1).to(own)
+    near = interpolate(half, scale_factor=FINE, mode="bilinear")
+    return _precise(views, segments, disparity, unlike < CONSISTENT, near), avg_pool2d(unlike, FINE)
 
 
-def precise(
-    views: ComparedViews,
-    segments: Segments,
-    disparity: Float[Tensor, "b 1 h w"],
-    unlike: Float[Tensor, "b 1 h w"],
-    rough: Float[Tensor, "b 1 h w"],
+def _precise(
+    views: ComparedViews, segments: Segments, disparity: Tensor, consistent: Tensor, rough: Tensor
 ) -> Float[Tensor, "b 1 h w"]:
-    """Disparity to a fraction of a pixel: where that of half the size (`rough`) is near, the mean of both;
-    from there a step of least squares of the brightness around each pixel (Lucas and Kanade 1981); and the
-    result smoothed within surfaces, where brightness says little of the position more than elsewhere."""
+    """Disparity to a fraction of a pixel: where that of half the size (`rough`) is near, the mean of both; from there a
+    step of least squares of the brightness around each pixel (Lucas and Kanade 1981); and the result smoothed within
+    surfaces, where brightness says little of the position more than elsewhere."""
     own, other, guides = views
-    consistent = unlike < CONSISTENT
     near = consistent & ((disparity - rough).abs() < SETTINGS.same)
     start = torch.where(near, (disparity + rough) / 2, disparity)
     across, down = (torch.gradient(other, dim=side)[0] for side in (3, 2))

@@ -30,16 +30,10 @@ from arraygeom.pixels import HW, pixel_grid
 from ..media.colour import to_bytes
 from . import semi_global_numba as kernels
 from .cost import planes_of
-from .positions_numba import costs_at
-from .semi_global import (
-    DISPARITY_FILL,
-    FINE,
-    HALF_SIZE,
-    Normalisation,
-    filled,
-    inner_and_outer,
-    numpy_of,
-)
+from .filters import filled, numpy_of
+from .normalisation import Normalisation
+from .positions import FINE
+from .semi_global import DISPARITY_FILL, HALF_SIZE, inner_and_outer
 
 ORDERED = 0.95
 """Share of pixels none of whose steps from one position to the next goes back, from which positions are a curve: those
@@ -151,7 +145,7 @@ def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool)
         lanes = -(-places.shape[-1] // kernels.LANES) * kernels.LANES
         cost = np.empty((*places.shape[:2], 1, lanes), np.uint8)
         parts = [np.ascontiguousarray(p[outer]) for p in planes]
-        costs_at(_flat(parts), other_planes, places, cost)
+        kernels.costs_at(_flat(parts), other_planes, places, cost)
         total = cost.astype(np.int16)
         if ordered:
             first = np.zeros((*places.shape[:2], 1), np.int32)

@@ -23,11 +23,7 @@ from ..attention import attend, attend_with_statistics
 from ..matching.colour_transfer import FILLS, likeness
 from ..matching.inputs import Beta, Inputs
 from ..matching.matches import BetaMatches, Matches
-from ..matching.semi_global import (
-    FINE,
-    Extent,
-    matches,
-)
+from ..matching.positions import FINE, Extent, matches
 from ..media.colour import luminance
 from ..support.settings import size, tuned
 from .blocks import ResidualBlock, channels_last, conv, enlarge, stacked

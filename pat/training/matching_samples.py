@@ -26,7 +26,7 @@ from pat.data.pairs import StereoPair, middlebury_pairs
 from pat.evaluation.conditions import regions_of
 from pat.evaluation.halves import of_half
 from pat.matching.normalisation import Normalisation
-from pat.matching.semi_global import Extent
+from pat.matching.positions import Extent
 from pat.media.colour import REC601
 from pat.sensors import GaussianBlur, NoiseLevel, generator_for, record
 from pat.synthesis.layered import ArrayBatch, LayeredScenes

@@ -9,7 +9,7 @@ from torch.autograd import gradcheck, gradgradcheck
 
 from arraygeom import Camera, Curved, Pose, Rig, intrinsics, unchecked
 from arraygeom.distortion import COEFFICIENT_COUNTS, Distortion
-from calib.boards.observability import LENS_TERMS, TYPICAL_COEFFICIENTS
+from calib.boards.parameters import LENS_TERMS, TYPICAL_COEFFICIENTS
 from tests.oracles import Oracle
 
 cv2 = Oracle("cv2")

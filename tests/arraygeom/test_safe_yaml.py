@@ -69,7 +69,7 @@ def test_repeated_keys_are_refused_with_both_lines(text, key, lines):
 def test_what_people_write_is_read():
     text = "a: &x {b: 1, c: [1, 2]}\nd: {<<: *x, b: 2}\ne: [*x, *x]\n"
     assert load_yaml(text) == yaml.safe_load(text)
-    for path in [*ROOT.glob("pat/training/recipes/*.yaml"), *ROOT.glob("pat/systems/*/*.yaml")]:
+    for path in [*ROOT.glob("pat/training/recipes/*.yaml"), *ROOT.glob("experiments/*/*.yaml")]:
         assert load_yaml(path.read_text()) == yaml.safe_load(path.read_text())
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,9 +21,11 @@ from arraygeom import Camera, Rig
 from arraygeom.atomic import write_text
 from arraygeom.io import read_rig
 from calib.boards.bundle import adjust
-from calib.boards.collect import collect_folder
-from calib.boards.rig import Calibration, calibrate, calibrate_single, epipolar_errors
+from calib.boards.detect import collect_folder
+from calib.boards.intrinsics import calibrate_single
+from calib.boards.rig import Calibration, calibrate
 from calib.boards.target import parse_board
+from calib.boards.validation import epipolar_errors
 from pat.evaluation.tables import markdown_header, markdown_row
 from tests.calib.board_scenes import errors_of, pose_errors
 from tests.calib.rendered import BOARD
@@ -33,7 +36,6 @@ from tests.calib.tracks import (
     caliscope,
     caliscope_views,
     fifteen_cameras,
-    free_of,
     rms_and_mean,
 )
 
@@ -88,18 +90,18 @@ def action_cameras(data: Path) -> Iterator[Figure]:
         found = collect_folder(folder, board, patterns={"cam": f"int_cam{number:02d}_img/*.jpg"})
         alone = calibrate_single("cam", found.views["cam"], board)
         off = float(alone.camera.K[0, 0]) / published - 1
-        rms = alone.fit.problem.rms()
+        rms = alone.solved.problem.rms()
         yield Figure(f"action camera {number}: f", f"{100 * off:+.2f} % (RMS {rms:.3f} px)", "to 1.5 %")
 
 
 def tracks(data: Path) -> Iterator[Figure]:
     problem, start = fifteen_cameras(data).problem, time.perf_counter()
-    found = adjust(problem, free_of(problem))
+    found = adjust(problem)
     rms, seconds = rms_and_mean(found.problem)[0], time.perf_counter() - start
     yield Figure("15 cameras, free points: RMS", f"{rms:.4f} px in {seconds:.0f} s", f"at most {FIFTEEN_RMS:.4f}, 60 s")
     problem, start = caliscope(data).problem, time.perf_counter()
     posed = {name: np.arange(15) < (6 if i else 0) for i, name in enumerate(problem.cameras)}
-    rms = rms_and_mean(adjust(problem, posed, rounds=0).problem)[0]
+    rms = rms_and_mean(adjust(replace(problem, free=posed), rounds=0).problem)[0]
     seconds = time.perf_counter() - start
     yield Figure(
         "caliscope, free points, its intrinsics: RMS",

@@ -3,8 +3,9 @@
 The array "wide field - narrow field" at a part of its size, with smooth random images: seconds of the matching and of
 the network, what part of the latter convolutions take, and at what rate, beside the rate of this machine's matrix
 products with as many threads in the same run. `--full-runs` instead fuses the rendered frame of 4024x3036 under caps
-(`--caps 4GiB 8GiB 2GiB`; `pat systems run wide-narrow --full --max-memory ...`), in 4 to 6 minutes of a core each on
-a machine that does nothing else, and compares what comes out. Prints figures and puts them into
+(`--caps 4GiB 8GiB 2GiB`; `python -m experiments systems run wide-narrow --full --max-memory ...`), in 4 to 6
+minutes of a core each on a machine that does nothing else, and compares what comes out. Prints figures and puts them
+into
 tests/benchmarks/RESULTS_fuse.md, each in its section, beside those that were there.
 """
 
@@ -26,6 +27,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from arraygeom import Rig
 from arraygeom.atomic import write_text
 from arraygeom.chunks import Tile
+from experiments import load_system, run_system
 from pat.evaluation.tables import markdown_table
 from pat.fusion.fuse import fuse
 from pat.fusion.inputs import frame_inputs
@@ -35,7 +37,6 @@ from pat.fusion.views import Views
 from pat.media.images import read_image
 from pat.networks.protocol import matched_for
 from pat.networks.weights import load_weights
-from pat.systems import load_system, run_system
 
 SIDE = 2048
 CAPS = ("4GiB", "8GiB", "2GiB")

@@ -26,6 +26,7 @@ from calib.images.from_images import rig_from_images
 from calib.images.held_out import line_distances, line_statistics, split
 from calib.images.matches import PointMatches, fit_fundamental, line_distance, match_cameras
 from calib.images.refinement import FREE, LineStatistics, RefinementProblem, polish, refine, refine_matches
+from experiments.showcase import FAST, FAST_FRAME, SCENE, SLOW, SLOW_FRAME, published_matrices
 from pat.attention import attend_with_statistics
 from pat.data.sample_array import load_sample
 from pat.evaluation.ablation import AblationCase, rendered_cases
@@ -34,7 +35,6 @@ from pat.evaluation.tables import markdown_header, markdown_row
 from pat.fusion.fuse import fuse
 from pat.media.images import read_image
 from pat.networks.weights import load_weights
-from pat.systems.showcase import FAST, FAST_FRAME, SCENE, SLOW, SLOW_FRAME, published_matrices
 from tests.benchmarks.printed import print_tables
 from tests.calib.real import bumblebee, syntim
 from tests.calib.scenes import uninformed

@@ -20,8 +20,7 @@ import torch
 from tqdm import tqdm
 
 from arraygeom import Rig
-from calib.boards.detect import Detection
-from calib.boards.intrinsics import BoardViews
+from calib.boards.detect import BoardViews, Detection
 from calib.boards.rig import Calibration, calibrate
 from pat.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.printed import print_tables

@@ -14,12 +14,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from calib.boards.bundle import BundleProblem, BundleResult, readjusted
-from calib.boards.camera_parameters import intrinsic_values
-from calib.boards.collect import collect_folder
+from calib.boards.bundle import BundleProblem, Solved, readjusted
+from calib.boards.detect import collect_folder
+from calib.boards.parameters import intrinsic_values
 from calib.boards.rig import Calibration, calibrate
 from calib.boards.target import parse_board
-from calib.boards.validation import without_blocks
 from pat.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.printed import data_and_out, print_tables
 
@@ -37,21 +36,21 @@ def sets(data: Path) -> Iterator[tuple[str, Calibration]]:
         yield f"pose2sim camera {i}", calibrate(views, known)
 
 
-def jackknifed(fit: BundleResult) -> np.ndarray:
+def jackknifed(fit: Solved) -> np.ndarray:
     """The jackknife's standard deviations of the free parameters."""
-    free, count = fit.free(), len(fit.problem.structure)
+    count = len(fit.problem.frames)
     values = []
     for left_out in range(count):
-        again = readjusted(without_blocks(fit.problem, np.arange(count) != left_out), free, fit.sigma)
-        values.append(difference(again, fit.problem, free))
+        again = readjusted(fit.problem.of_boards(np.arange(count) != left_out))
+        values.append(difference(again, fit.problem))
     found = np.array(values)
     return np.sqrt((count - 1) / count * ((found - found.mean(0)) ** 2).sum(0))
 
 
-def difference(a: BundleProblem, b: BundleProblem, free: dict[str, np.ndarray]) -> np.ndarray:
+def difference(a: BundleProblem, b: BundleProblem) -> np.ndarray:
     """Of all free parameters, in the order of the fit's names; rotations to first order."""
     parts = []
-    for name, mask in free.items():
+    for name, mask in b.free.items():
         change = intrinsic_values(a.cameras[name]) - intrinsic_values(b.cameras[name])
         R = (a.cameras[name].R @ b.cameras[name].R.T).numpy()
         change[:3] = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
@@ -73,7 +72,7 @@ def rows(data: Path) -> Iterator[str]:
         others = ", ".join(f"{n} {r:.2f}" for r, n in zip(ratio[~near], np.array(found.fit.names)[~near]))
         notes.append(f"- {name}: {others or 'none'}")
         cells = f"{np.median(ratio):.2f}", f"{np.mean(near):.0%}", f"{np.mean(focal):.2f}"
-        count = len(found.fit.problem.structure)
+        count = len(found.fit.problem.frames)
         yield markdown_row(
             [name, count, f"{found.rms:.3f}", len(ratio), *cells, f"{found.raised:.1f}", shape or "flat"]
         )

@@ -20,12 +20,11 @@ import numpy as np
 import torch
 
 from arraygeom import Camera, Pose, Rig, intrinsics
-from calib.boards.collect import collect_folder
-from calib.boards.covariance import baseline_deviation
-from calib.boards.report import rig_covariance
+from calib.boards.detect import collect_folder
+from calib.boards.parameters import StartDeviations
 from calib.boards.rig import Calibration, calibrate
-from calib.boards.start import StartDeviations
 from calib.boards.target import parse_board
+from calib.boards.uncertainty import baseline_deviation, rig_covariance
 from calib.images.held_out import line_distances
 from calib.images.matches import PointMatches, match_cameras
 from pat.evaluation.tables import markdown_header, markdown_row
@@ -81,7 +80,7 @@ def rows(folder: Path) -> Iterator[str]:
 
 
 def _cells(found: Calibration, matches: Mapping[tuple[str, str], PointMatches]) -> Iterator[str]:
-    covariance, rig = rig_covariance(found), found.rig
+    covariance, rig = rig_covariance(found.fit), found.rig
     assert covariance is not None
     off = [float((rig[b].centre - rig[a].centre).norm()) - GRID for a, b in neighbours()]
     deviations = [baseline_deviation(found.fit.problem.cameras, a, b, covariance) for a, b in neighbours()]

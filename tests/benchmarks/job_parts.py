@@ -21,7 +21,7 @@ STAGES = {
     "field": ["arraygeom.fields.grid.FieldOnGrid.of"],
     "plan": ["pat.fusion.fuse.plan_frame"],
     "pre-pass": ["pat.fusion.corrections.find_corrections"],
-    "matching": ["pat.matching.match.located", "pat.matching.match.transferred"],
+    "matching": ["pat.matching.match.located", "pat.matching.colour_transfer.transferred"],
     "attention": ["pat.attention.attend._attend"],
     "network": ["pat.networks.guided.GuidedPAT.forward"],
     "depth": ["pat.fusion.tiles.depth_and_confidence", "pat.fusion.fuse.background_filled"],

@@ -4,10 +4,9 @@ import numpy as np
 import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_vector
-from calib.boards.bundle import BoardPoses, BundleProblem, Observations
-from calib.boards.camera_parameters import parameter_names
-from calib.boards.detect import Detection
-from calib.boards.intrinsics import BoardViews
+from calib.boards.bundle import BundleProblem, Observations
+from calib.boards.detect import BoardViews, Detection
+from calib.boards.parameters import parameter_names
 from calib.boards.target import Board, parse_board
 
 BOARD = parse_board("charuco:9x7:60mm")
@@ -71,13 +70,23 @@ def see(rig, boards, board: Board = BOARD, *, noise=0.0, seed=1) -> dict[str, Bo
     return views
 
 
+def all_free(cameras, *, lens: int = 5) -> dict[str, np.ndarray]:
+    """All numbers but the first camera's pose and the lens's later terms."""
+    free = {}
+    for index, (name, c) in enumerate(cameras.items()):
+        free[name] = np.ones(len(parameter_names(c)), dtype=bool)
+        free[name][:6] = index > 0
+        free[name][10 + lens :] = False
+    return free
+
+
 def scene_of(rig, boards, views, board: Board = BOARD) -> BundleProblem:
     """The ground truth as a problem to adjust."""
     seen = {}
     for name, v in views.items():
         parts = [(np.full(len(d.ids), frame), board.points[d.ids], d.x) for frame, d in v.seen.items()]
         seen[name] = Observations(*(np.concatenate(part) for part in zip(*parts)))
-    return BundleProblem(dict(rig.cameras), BoardPoses(boards), seen)
+    return BundleProblem(dict(rig.cameras), boards, seen, tuple(range(len(boards.t))), all_free(rig.cameras))
 
 
 def errors_of(fit, rig):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from arraygeom import Rig
-from calib.boards.collect import collect_folder
+from calib.boards.detect import collect_folder
 from calib.boards.rig import calibrate
 from calib.boards.target import parse_board
 from calib.images.doctor import diagnose, diagnose_matches

@@ -5,47 +5,28 @@ from __future__ import annotations
 import bz2
 import csv
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
-from arraygeom import Rig, triangulate
+from arraygeom import Pose, Rig, triangulate
 from arraygeom.io import read_rig
 from calib.boards.bundle import BundleProblem, Observations
-from calib.boards.camera_parameters import parameter_names
-from calib.boards.detect import Detection
-from calib.boards.intrinsics import BoardViews
+from calib.boards.detect import BoardViews, Detection
+from tests.calib.board_scenes import all_free
 
 CALISCOPE_BOARD = "charuco:4x5:54mm"
 CALISCOPE_RMS, FIFTEEN_RMS = 1.6625, 0.8070
 """The published rigs' own reprojection errors (root mean square, pixels) on the published corners."""
 
 
-@dataclass(frozen=True)
-class FreePoints:
-    """Independent points in the world, metres: the `Structure` of tracks without a board."""
-
-    X: Float[np.ndarray, "b 3"]
-    width: ClassVar[int] = 3
-
-    def __len__(self) -> int:
-        return len(self.X)
-
-    def world(self, seen: Observations) -> Float[np.ndarray, "n 3"]:
-        """The observed points in the world, metres."""
-        return self.X[seen.block]
-
-    def jacobian(self, seen: Observations) -> Float[np.ndarray, "n 3 3"]:
-        """The identity."""
-        return np.broadcast_to(np.eye(3), (len(seen.block), 3, 3))
-
-    def stepped(self, change: Float[np.ndarray, "b 3"]) -> FreePoints:
-        """The points after a change."""
-        return FreePoints(self.X + change)
+def free_points(cameras, X, seen) -> BundleProblem:
+    """Independent points in the world (n, 3), metres: each is the origin of a board of its own."""
+    eye = torch.eye(3, dtype=torch.float64).expand(len(X), 3, 3)
+    frames = tuple(range(len(X)))
+    return BundleProblem(dict(cameras), Pose(eye, torch.from_numpy(X)), seen, frames, all_free(cameras))
 
 
 class Tracks(NamedTuple):
@@ -71,7 +52,7 @@ def fifteen_cameras(data: Path) -> Tracks:
     observations = {
         name: Observations(np.flatnonzero(s), np.zeros((s.sum(), 3)), p[s]) for name, s, p in zip(rig.names, seen, x)
     }
-    return Tracks(rig, BundleProblem(dict(rig.cameras), FreePoints(points), observations))
+    return Tracks(rig, free_points(rig.cameras, points, observations))
 
 
 def caliscope(data: Path) -> Tracks:
@@ -90,7 +71,7 @@ def caliscope(data: Path) -> Tracks:
         name: Observations(np.array([i for i, _, _ in s]), np.zeros((len(s), 3)), np.array([[x, y] for _, x, y in s]))
         for name, s in seen.items()
     }
-    return Tracks(rig, BundleProblem(dict(rig.cameras), FreePoints(np.array(list(corners.values()))), observations))
+    return Tracks(rig, free_points(rig.cameras, np.array(list(corners.values())), observations))
 
 
 def caliscope_views(data: Path) -> dict[str, BoardViews]:
@@ -103,16 +84,6 @@ def caliscope_views(data: Path) -> dict[str, BoardViews]:
         name: BoardViews((720, 1280), {k: _detection(corners) for k, corners in frames.items() if len(corners) >= 6})
         for name, frames in sorted(found.items())
     }
-
-
-def free_of(problem: BundleProblem, *, lens: int = 5) -> dict[str, np.ndarray]:
-    """All numbers but the first camera's pose and the lens's later terms."""
-    free = {}
-    for index, (name, c) in enumerate(problem.cameras.items()):
-        free[name] = np.ones(len(parameter_names(c)), dtype=bool)
-        free[name][:6] = index > 0
-        free[name][10 + lens :] = False
-    return free
 
 
 def rms_and_mean(problem: BundleProblem) -> tuple[float, float]:

@@ -20,7 +20,7 @@ from torch import nn
 
 from arraygeom import Distortion, Rig
 from arraygeom.io import read_rig, write_rig
-from calib.boards.covariance import RigCovariance
+from calib.boards.uncertainty import RigCovariance
 from pat.cli.main import main
 from pat.media.images import read_image, write_image
 from pat.media.video import read_video

@@ -16,7 +16,7 @@ import torch
 
 from arraygeom import Rig
 from arraygeom.io import RigFileError
-from calib.boards.covariance import RigCovariance
+from calib.boards.uncertainty import RigCovariance
 from pat.networks.weights import load_weights, save_weights
 from pat.support.memory import keep_freed
 from pat.support.tensor_files import write_tensors

@@ -5,20 +5,14 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig
-from calib.boards.adequacy import (
-    half_difference,
-    intrinsics_of,
-    next_views,
-    proposed_views,
-    uncertainty,
-)
-from calib.boards.camera_parameters import camera_jacobian, parameter_names
-from calib.boards.intrinsics import board_pose
-from calib.boards.lens_comparison import LensComparison, compare_lenses
+from calib.boards.adequacy import next_views, proposed_views
+from calib.boards.intrinsics import LensComparison, board_pose, compare_lenses
+from calib.boards.parameters import camera_jacobian, parameter_names
 from calib.boards.report import by_cameras
 from calib.boards.rig import calibrate
 from calib.boards.simulation import simulate_photos
 from calib.boards.target import parse_board
+from calib.boards.uncertainty import half_difference, intrinsics_of, uncertainty
 from calib.boards.watch import watch
 from tests.calib.board_scenes import BOARD, board_poses, camera, see
 

@@ -9,12 +9,10 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from arraygeom import Pose, Rig
-from calib.boards.collect import collect_folder
-from calib.boards.detect import detect, explain
-from calib.boards.printing import draw_board, page_note
+from calib.boards.detect import collect_folder, detect, explain
 from calib.boards.rig import calibrate
 from calib.boards.simulation import photograph
-from calib.boards.target import parse_board, parse_boards
+from calib.boards.target import draw_board, page_note, parse_board, parse_boards
 from tests.calib.board_scenes import board_poses, camera, tensor
 
 GRID = parse_board("aprilgrid:5x4:50mm:0.3")

@@ -9,20 +9,29 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from arraygeom import Pose, Rig
-from calib.boards.bundle import BoardPoses, BundleProblem, Observations, adjust, normal_equations
-from calib.boards.camera_parameters import CameraPrior, camera_jacobian, changed, intrinsic_values, parameter_names
+from calib.boards.bundle import Observations, adjust, linearised, normal_equations
+from calib.boards.parameters import CameraPrior, camera_jacobian, changed, intrinsic_values, parameter_names
 from calib.boards.rig import calibrate
 from calib.boards.target import parse_board
-from tests.calib.board_scenes import board_poses, camera, errors_of, four_cameras, pose_errors, scene_of, see, tensor
+from tests.calib.board_scenes import (
+    all_free,
+    board_poses,
+    camera,
+    errors_of,
+    four_cameras,
+    pose_errors,
+    scene_of,
+    see,
+    tensor,
+)
 from tests.calib.tracks import (
     CALISCOPE_BOARD,
     CALISCOPE_RMS,
     FIFTEEN_RMS,
-    FreePoints,
     caliscope,
     caliscope_views,
     fifteen_cameras,
-    free_of,
+    free_points,
     rms_and_mean,
 )
 
@@ -31,11 +40,12 @@ def shaken(problem, size, seed=0):
     """The problem with all that is free moved: by `size` times 0.01 rad, 0.01 m, 5 px, 0.02 of a coefficient."""
     random = np.random.default_rng(seed)
     cameras = {}
-    for (name, c), mask in zip(problem.cameras.items(), free_of(problem, lens=2).values()):
+    for (name, c), mask in zip(problem.cameras.items(), all_free(problem.cameras, lens=2).values()):
         scale = np.array([0.01] * 6 + [5.0] * 4 + [0.02] * (len(mask) - 10))
         cameras[name] = changed(c, torch.from_numpy(size * mask * scale * random.normal(size=len(mask))))
-    change = size * 0.01 * random.normal(size=(len(problem.structure), 6))
-    return BundleProblem(cameras, problem.structure.stepped(change), problem.seen)
+    change = size * 0.01 * random.normal(size=(len(problem.frames), 6))
+    still = np.zeros(len(problem.names))
+    return replace(problem.stepped(still, change), cameras=cameras)
 
 
 @pytest.fixture(scope="module")
@@ -67,23 +77,22 @@ def test_derivatives_are_those_of_finite_differences(lens, model):
         assert np.abs((ends[0] - ends[1]) / 2e-6 - found[..., i]).max() < 1e-5 * (1 + np.abs(found[..., i]).max()), name
 
 
-@pytest.mark.parametrize("kind", ["boards", "points"])
-def test_derivatives_of_blocks(kind):
-    random = np.random.default_rng(0)
-    seen = Observations(np.array([0, 1, 1, 2]), random.normal(size=(4, 3)), np.zeros((4, 2)))
-    structure = BoardPoses(board_poses(3)) if kind == "boards" else FreePoints(random.normal(size=(3, 3)))
-    found = structure.jacobian(seen)
-    for i in range(structure.width):
-        step = np.zeros((3, structure.width))
+def test_derivatives_of_boards(small):
+    """Of the pixels, by the poses of the boards."""
+    _, _, problem = small
+    problem = replace(problem, sigma={"mono": 1.0, "colour": 1.0})
+    found, still = linearised(problem)["colour"].by_board, np.zeros(len(problem.names))
+    for i in range(6):
+        step = np.zeros((8, 6))
         step[:, i] = 1e-6
-        numeric = (structure.stepped(step).world(seen) - structure.stepped(-step).world(seen)) / 2e-6
-        assert np.abs(numeric - found[..., i]).max() < 1e-8
+        ahead, behind = (problem.stepped(still, sign * step).residuals()["colour"] for sign in (1, -1))
+        assert np.abs((behind - ahead) / 2e-6 - found[..., i]).max() < 1e-5 * (1 + np.abs(found).max())
 
 
 def test_perfect_corners_recover_the_ground_truth():
     rig, boards = four_cameras(), board_poses(10)
     ground_truth = scene_of(rig, boards, see(rig, boards))
-    fit = adjust(shaken(ground_truth, 1.0), free_of(ground_truth))
+    fit = adjust(shaken(ground_truth, 1.0))
     assert fit.converged
     assert fit.problem.rms() < 1e-6
     for name, c in fit.problem.cameras.items():
@@ -94,41 +103,30 @@ def test_perfect_corners_recover_the_ground_truth():
 def test_the_least_squares_are_scipys(small):
     """The same minimum and the same covariance as a general solver finds without Schur complement or autodiff."""
     _, _, problem = small
-    free = free_of(problem)
-    fit = adjust(problem, free)
-    counts = [int(mask.sum()) for mask in free.values()]
-
-    def moved(change):
-        cameras = {}
-        for (name, c), mask, part in zip(
-            fit.problem.cameras.items(), free.values(), np.split(change, np.cumsum(counts))
-        ):
-            full = np.zeros(len(mask))
-            full[mask] = part
-            cameras[name] = changed(c, torch.from_numpy(full))
-        return BundleProblem(cameras, fit.problem.structure.stepped(change[sum(counts) :].reshape(-1, 6)), problem.seen)
+    fit = adjust(problem)
+    count = len(fit.names)
 
     def residuals(change):
-        return np.concatenate([(r / fit.sigma[n]).ravel() for n, r in moved(change).residuals().items()])
+        moved = fit.problem.stepped(change[:count], change[count:].reshape(-1, 6))
+        return np.concatenate([(r / fit.sigma[n]).ravel() for n, r in moved.residuals().items()])
 
-    theirs = least_squares(residuals, np.zeros(sum(counts) + 48), x_scale="jac", max_nfev=4)
-    assert 2 * theirs.cost == pytest.approx(float((residuals(np.zeros(sum(counts) + 48)) ** 2).sum()), rel=2e-3)
-    deviations = np.sqrt(np.linalg.inv(theirs.jac.T @ theirs.jac).diagonal()[: sum(counts)])
+    theirs = least_squares(residuals, np.zeros(count + 48), x_scale="jac", max_nfev=4)
+    assert 2 * theirs.cost == pytest.approx(float((residuals(np.zeros(count + 48)) ** 2).sum()), rel=2e-3)
+    deviations = np.sqrt(np.linalg.inv(theirs.jac.T @ theirs.jac).diagonal()[:count])
     assert np.sqrt(fit.covariance.diagonal()) == pytest.approx(deviations, rel=0.05)
 
 
 def test_a_prior_has_its_stated_weight(small):
     """The fit with a prior is the weighted mean of the fit without and the prior."""
     _, _, problem = small
-    free = free_of(problem)
-    alone = adjust(problem, free)
+    alone = adjust(problem)
     at = list(alone.names).index("mono.focal.0")
     deviation = float(np.sqrt(alone.covariance[at, at]))
     mean = intrinsic_values(alone.problem.cameras["mono"])
     mean[6] += 2 * deviation
     information = np.zeros((len(mean), len(mean)))
     information[6, 6] = deviation**-2
-    held = adjust(replace(alone.problem, priors={"mono": CameraPrior(mean, information)}), free)
+    held = adjust(replace(alone.problem, priors={"mono": CameraPrior(mean, information)}))
     moved = float(held.problem.cameras["mono"].K[0, 0] - alone.problem.cameras["mono"].K[0, 0])
     assert moved == pytest.approx(deviation, rel=0.05)
     assert held.covariance[at, at] == pytest.approx(deviation**2 / 2, rel=0.05)
@@ -136,13 +134,10 @@ def test_a_prior_has_its_stated_weight(small):
 
 def test_outliers_have_no_influence(small):
     _, _, problem = small
-    clean = adjust(problem, free_of(problem))
+    clean = adjust(problem)
     x = problem.seen["mono"].x.copy()
     x[::40] += np.random.default_rng(1).uniform(20, 60, x[::40].shape)
-    spoilt = BundleProblem(
-        problem.cameras, problem.structure, {**problem.seen, "mono": problem.seen["mono"]._replace(x=x)}
-    )
-    fit = adjust(spoilt, free_of(problem))
+    fit = adjust(replace(problem, seen={**problem.seen, "mono": problem.seen["mono"]._replace(x=x)}))
     deviations = np.sqrt(clean.covariance.diagonal())
     for i, name in enumerate(clean.names):
         camera_name, kind, index = name.split(".")
@@ -154,23 +149,23 @@ def test_outliers_have_no_influence(small):
 
 def test_an_unobservable_scale_has_no_covariance(small):
     _, _, problem = small
-    points = FreePoints(problem.structure.world(problem.seen["mono"])[:60])
-    seen = {}
+    X, seen = problem.world("mono")[:60], {}
     for name, c in problem.cameras.items():
-        x, _, valid = c.project(torch.from_numpy(points.X))
+        x, _, valid = c.project(torch.from_numpy(X))
         index = np.flatnonzero(valid.numpy())
         seen[name] = Observations(index, np.zeros((len(index), 3)), x.numpy()[index])
     poses = {name: np.arange(len(parameter_names(c))) < 6 for name, c in problem.cameras.items()}
     poses["mono"][:] = False
-    assert adjust(BundleProblem(problem.cameras, points, seen), poses, rounds=1).covariance is None
+    points = replace(free_points(problem.cameras, X, seen), free=poses)
+    assert adjust(points, rounds=1).covariance is None
 
 
 def test_fixed_numbers_stay_bit_identical(small):
     _, _, problem = small
-    free = free_of(problem, lens=0)
+    free = all_free(problem.cameras, lens=0)
     free["colour"][6:8] = False
-    fit = adjust(shaken(problem, 0.1), free, rounds=1)
-    started = shaken(problem, 0.1).cameras
+    started = replace(shaken(problem, 0.1), free=free)
+    fit, started = adjust(started, rounds=1), started.cameras
     assert torch.equal(fit.problem.cameras["mono"].R, started["mono"].R)
     assert torch.equal(fit.problem.cameras["colour"].K.diagonal(), started["colour"].K.diagonal())
     assert torch.equal(fit.problem.cameras["colour"].distortion.coefficients, started["colour"].distortion.coefficients)
@@ -183,7 +178,7 @@ def test_the_covariance_is_true():
     squares, relative, worst = [], [], []
     for draw in range(30):
         ground_truth = scene_of(rig, boards, see(rig, boards, noise=0.15, seed=draw))
-        fit = adjust(ground_truth, free_of(ground_truth))
+        fit = adjust(ground_truth)
         error = errors_of(fit, rig)
         squares.append(error @ np.linalg.solve(fit.covariance, error))
         relative.append(error / np.sqrt(fit.covariance.diagonal()))
@@ -201,7 +196,7 @@ def test_the_covariance_is_true():
 @pytest.mark.slow
 def test_fifteen_cameras_fit_better_than_published(shared_data):
     problem = fifteen_cameras(shared_data).problem
-    rms, mean = rms_and_mean(adjust(problem, free_of(problem)).problem)
+    rms, mean = rms_and_mean(adjust(problem).problem)
     print("rms", rms, "mean", mean)
     assert rms < FIFTEEN_RMS
     assert mean < 0.6
@@ -215,7 +210,7 @@ def test_caliscopes_tracks_fit_better_than_published(shared_data):
     """
     published = caliscope(shared_data).problem
     free = {name: np.arange(15) < (6 if i else 0) for i, name in enumerate(published.cameras)}
-    squares, robust = (adjust(published, free, rounds=rounds) for rounds in (0, 4))
+    squares, robust = (adjust(replace(published, free=free), rounds=rounds) for rounds in (0, 4))
     before, after = rms_and_mean(published), rms_and_mean(squares.problem)
     print("before", before, "least squares", after, "robust", rms_and_mean(robust.problem))
     assert before[0] == pytest.approx(CALISCOPE_RMS, abs=1e-3)
@@ -232,17 +227,18 @@ def test_caliscopes_corners_through_all_of_calibrate(shared_data):
     assert any("taken at the same moments" in note for note in found.notes)
 
 
-def test_world_points_of_boards_are_their_poses():
-    boards = board_poses(3)
-    seen = Observations(np.array([2]), np.array([[0.1, 0.2, 0.0]]), np.zeros((1, 2)))
+def test_world_points_of_boards_are_their_poses(small):
+    _, boards, problem = small
+    seen = {"mono": Observations(np.array([2]), np.array([[0.1, 0.2, 0.0]]), np.zeros((1, 2)))}
     expected = Pose(boards.R[2], boards.t[2]).apply(tensor(0.1, 0.2, 0.0)[None])
-    assert np.abs(BoardPoses(boards).world(seen) - expected.numpy()).max() < 1e-15
+    assert np.abs(replace(problem, seen=seen).world("mono") - expected.numpy()).max() < 1e-15
 
 
 def test_the_step_solves_the_whole_system(small):
     """Schur's complement against the full matrix."""
     _, _, problem = small
-    equations = normal_equations(problem, free_of(problem), {"mono": 0.1, "colour": 0.1})
+    problem = replace(problem, sigma={"mono": 0.1, "colour": 0.1})
+    equations = normal_equations(problem, linearised(problem))
     c, (b, d) = len(equations.g), equations.h.shape
     full = np.zeros((c + b * d, c + b * d))
     full[:c, :c] = equations.H

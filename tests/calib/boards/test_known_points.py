@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig
+from calib.boards.board import marker_dictionary
 from calib.boards.detect import detect
-from calib.boards.known_points import known_points
 from calib.boards.rig import calibrate
-from calib.boards.target import marker_dictionary, parse_board
+from calib.boards.target import parse_board
 from tests.calib.board_scenes import errors_of, four_cameras, see
 
 
@@ -93,7 +93,7 @@ def test_centres_and_corners_of_markers_are_found(tmp_path):
         assert np.abs(x - squares[number].mean(0)).max() > 1
     path = tmp_path / "corners.csv"
     path.write_text("id,corner,x,y,z\n" + "".join(f"{n},{n % 4},{n},{n * n},{n % 3}\n" for n in range(6)))
-    found = detect(image, known_points(str(path)))
+    found = detect(image, parse_board(str(path)))
     assert np.abs(found.x - [squares[n][n % 4] for n in range(6)]).max() < 1
 
 

@@ -7,17 +7,16 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig
-from calib.boards.bundle import normal_equations
-from calib.boards.camera_parameters import parameter_names
-from calib.boards.covariance import RigCovariance, beta_covariance
-from calib.boards.coverage import coverage
-from calib.boards.detect import Detection
-from calib.boards.intrinsics import BoardViews
-from calib.boards.jackknife import jackknife
+from calib.boards.adequacy import coverage
+from calib.boards.bundle import jackknife
+from calib.boards.detect import BoardViews, Detection
+from calib.boards.intrinsics import calibrate_single
 from calib.boards.poses import symmetry_poses
-from calib.boards.report import report_html, rig_covariance
-from calib.boards.rig import calibrate, calibrate_single, many_wrong
+from calib.boards.report import report_html
+from calib.boards.rig import calibrate, many_wrong
+from calib.boards.solve import with_disagreement
 from calib.boards.target import parse_board
+from calib.boards.uncertainty import RigCovariance, beta_covariance, rig_covariance
 from tests.benchmarks.bench_robust import drawn
 from tests.calib.board_scenes import BOARD, board_poses, camera, errors_of, four_cameras, see, tensor
 
@@ -63,7 +62,7 @@ def test_a_pair_is_found_within_its_uncertainty(pair, found):
 
 def test_the_covariance_says_how_far_predictions_are_off(pair, found):
     """A point of alpha at 2 m, predicted in beta, by the true rig and by the calibration."""
-    rig, covariance = pair[0], rig_covariance(found)
+    rig, covariance = pair[0], rig_covariance(found.fit)
     x = np.stack(np.meshgrid(np.linspace(200, 760, 5), np.linspace(150, 570, 4)), -1).reshape(-1, 2)
     both = []
     for r in (rig, found.rig):
@@ -83,7 +82,7 @@ def test_held_out_frames_are_no_worse(found):
 
 
 def test_the_covariance_is_kept_in_a_file(found, tmp_path):
-    covariance = rig_covariance(found)
+    covariance = rig_covariance(found.fit)
     covariance.save(tmp_path / "c.json")
     again = RigCovariance.load(tmp_path / "c.json")
     assert again.names == covariance.names
@@ -192,7 +191,7 @@ def test_boards_that_move_between_the_exposures_do_not_distort_the_lenses(pair):
     result = calibrate(views, BOARD)
     assert any("taken at the same moments" in note for note in result.notes)
     alone = calibrate_single("colour", views["colour"], BOARD)
-    deviations = dict(zip(alone.fit.names, np.sqrt(alone.fit.covariance.diagonal())))
+    deviations = dict(zip(alone.solved.names, np.sqrt(alone.solved.covariance.diagonal())))
     for i in range(2):
         change = abs(float(result.rig["colour"].K[i, i] - alone.camera.K[i, i]))
         assert change < deviations[f"colour.focal.{i}"]
@@ -296,21 +295,14 @@ def test_a_board_that_bends_raises_the_deviations():
     assert any("is the board flat" in note for note in bent.notes)
 
 
-def test_frames_that_disagree_about_the_focal_lengths_raise_those_alone(pair, found, monkeypatch):
+def test_frames_that_disagree_about_the_focal_lengths_raise_those_alone(found, monkeypatch):
     """By the jackknife their deviations are five times as large, the others' the same."""
-
-    def disagreeing(problem, free, sigma):
-        given = jackknife(problem, free, sigma)
-        plain = np.linalg.inv(normal_equations(problem, free, sigma).information())
-        names = [f"{n}.{e}" for n, c in problem.cameras.items() for e in np.array(parameter_names(c))[free[n]]]
-        factor = np.array([5.0 if "focal" in name else 1.0 for name in names])
-        raised = plain * factor[:, None] * factor
-        return given._replace(covariance=raised, left_out=raised)
-
-    plain = found.deviations()
+    factor = np.array([5.0 if "focal" in name else 1.0 for name in found.fit.names])
+    disagreeing = found.fit.covariance * factor[:, None] * factor
+    given = jackknife(found.fit.problem)._replace(covariance=disagreeing, left_out=disagreeing)
     assert found.raised == 1.0
-    monkeypatch.setattr("calib.boards.rig.jackknife", disagreeing)
-    raised = calibrate(pair[2], BOARD).deviations()
-    for name in plain:
-        expected = np.sqrt((1 + 25) / 2) if "focal" in name else 1.0
-        assert raised[name] == pytest.approx(expected * plain[name], rel=0.02)
+    monkeypatch.setattr("calib.boards.solve.jackknife", lambda _: given)
+    raised = with_disagreement(found.fit, BOARD.extents)
+    ratio = np.sqrt(raised.covariance.diagonal() / found.fit.covariance.diagonal())
+    assert ratio == pytest.approx(np.where(factor > 1, np.sqrt((1 + 25) / 2), 1.0))
+    assert raised.raised == pytest.approx(np.sqrt(13))

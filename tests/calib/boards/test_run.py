@@ -8,8 +8,9 @@ import pytest
 
 from arraygeom import Pose, Rig
 from arraygeom.io import read_rig
-from calib.boards.collect import collect_folder
-from calib.boards.rig import calibrate, calibrate_single
+from calib.boards.detect import collect_folder
+from calib.boards.intrinsics import calibrate_single
+from calib.boards.rig import calibrate
 from calib.boards.simulation import fine_rays, photograph
 from calib.boards.target import parse_board
 from pat.cli.main import main
@@ -219,5 +220,12 @@ def test_action_cameras(camera_name, focal, shared_data):
     board = parse_board("chessboard:4x7:60mm")
     found = collect_folder(folder, board, patterns={"cam": f"{camera_name}/*.jpg"})
     alone = calibrate_single("cam", found.views["cam"], board)
-    print(camera_name, alone.camera.K, alone.fit.problem.rms(), len(found.views["cam"].seen), found.notes, alone.notes)
+    print(
+        camera_name,
+        alone.camera.K,
+        alone.solved.problem.rms(),
+        len(found.views["cam"].seen),
+        found.notes,
+        alone.solved.notes,
+    )
     assert float(alone.camera.K[0, 0]) == pytest.approx(focal, rel=0.015)

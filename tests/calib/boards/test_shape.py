@@ -9,14 +9,12 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig
-from calib.boards.detect import Detection, detect
-from calib.boards.intrinsics import BoardViews
-from calib.boards.jackknife import jackknife
+from calib.boards.bundle import jackknife
+from calib.boards.deformation import BoardDeformation
+from calib.boards.detect import BoardViews, Detection, detect
 from calib.boards.rig import calibrate
-from calib.boards.shape import BoardShape
 from calib.boards.simulation import photograph
 from calib.boards.target import parse_board
-from calib.boards.validation import without_blocks
 from tests.calib.board_scenes import BOARD, board_poses, camera, errors_of, four_cameras, see
 
 CYLINDER = (0.0, 0.5, 0.0, 0.0)
@@ -24,7 +22,7 @@ CYLINDER = (0.0, 0.5, 0.0, 0.0)
 
 
 def shaped(values, board=BOARD):
-    flat = BoardShape.flat(board.points, board.part, np.zeros(1, dtype=int))
+    flat = BoardDeformation.flat(board.points, board.part, np.zeros(1, dtype=int))
     return replace(flat, values=np.array([values]))
 
 
@@ -71,7 +69,7 @@ def test_a_cylinder_keeps_the_lengths_on_it():
 )
 def test_shapes_are_found_modelled_and_said(values, said):
     found = calibrated(values)
-    estimate = found.fit.problem.shape.values[0]
+    estimate = found.fit.problem.deformation.values[0]
     assert np.abs(estimate - values)[0] < 0.001
     assert np.abs(estimate - values)[1:].max() < 0.02
     assert any(re.search(said, note) for note in found.notes), found.notes
@@ -82,14 +80,14 @@ def test_shapes_are_found_modelled_and_said(values, said):
 
 def test_six_frames_of_a_board_with_oblong_squares():
     found = calibrate(seen_of([0.05, 0.0, 0.0, 0.0], count=6), BOARD)
-    assert found.fit.problem.shape.values[0, 0] == pytest.approx(0.05, abs=1e-3)
+    assert found.fit.problem.deformation.values[0, 0] == pytest.approx(0.05, abs=1e-3)
     assert found.rms < 0.15
-    assert calibrate(seen_of(FLAT, count=6), BOARD).fit.problem.shape is None
+    assert calibrate(seen_of(FLAT, count=6), BOARD).fit.problem.deformation is None
 
 
 def test_flat_boards_stay_flat():
     found = calibrated(FLAT)
-    assert found.fit.problem.shape is None
+    assert found.fit.problem.deformation is None
     assert not any("board is" in note for note in found.notes)
 
 
@@ -97,7 +95,7 @@ def test_a_rendered_cylinder_projects_where_it_should():
     board, c = parse_board("charuco:9x7:40mm"), camera(700.0, (480, 640), lens=(-0.2, 0.05, 0, 0, 0))
     pose = Pose(torch.eye(3, dtype=torch.float64), torch.tensor([-0.16, -0.12, 0.6], dtype=torch.float64))
     shape = shaped([0.003, 0.3, 0.2, 0.1], board)
-    found = detect(photograph(c, pose, board, shape=shape), board)
+    found = detect(photograph(c, pose, board, deformation=shape), board)
     X = torch.from_numpy(shape.deformed(board.points, board.part)[found.ids])
     assert len(found.ids) > 40
     assert np.abs(c.project_local(pose.apply(X)).x.numpy() - found.x).max() < 0.1
@@ -124,7 +122,7 @@ def test_the_covariance_over_frames_is_that_of_the_noise_where_nothing_else_is()
     """A plain jackknife is too large by a fifth and more; the stated one is corrected for it."""
     factors, plain = [], []
     for fit in (calibrated(FLAT).fit, *(calibrated(FLAT, seed=seed).fit for seed in range(3))):
-        found = jackknife(fit.problem, fit.free(), fit.sigma)
+        found = jackknife(fit.problem)
         for part, into in ((found.covariance, factors), (found.left_out, plain)):
             into.append(np.sqrt(np.trace(np.linalg.solve(fit.covariance, part)) / len(part)))
     assert 0.8 < np.mean(factors) < 1.15 < np.mean(plain)
@@ -132,9 +130,9 @@ def test_the_covariance_over_frames_is_that_of_the_noise_where_nothing_else_is()
 
 def test_leaving_a_frame_out_keeps_the_others():
     problem = calibrated(CYLINDER).fit.problem
-    kept = np.arange(len(problem.structure)) != 3
-    part = without_blocks(problem, kept)
-    assert len(part.structure) == len(problem.structure) - 1 == len(part.shape.part)
+    kept = np.arange(len(problem.frames)) != 3
+    part = problem.of_boards(kept)
+    assert len(part.frames) == len(problem.frames) - 1 == len(part.deformation.part)
     before, after = problem.residuals()["mono"], part.residuals()["mono"]
     assert np.allclose(before[problem.seen["mono"].block != 3], after)
 
@@ -147,7 +145,7 @@ def test_a_rendered_cylinder_is_recovered():
     for i in range(14):
         middle = poses.R[i] @ torch.from_numpy(board.points.mean(0) - BOARD.points.mean(0))
         pose = Pose(poses.R[i], poses.t[i] - middle)
-        seen[i] = detect(photograph(c, pose, board, shape=shape), board)
+        seen[i] = detect(photograph(c, pose, board, deformation=shape), board)
     found = calibrate({"c": BoardViews(c.hw, {i: d for i, d in seen.items() if d is not None})}, board)
-    assert np.abs(found.fit.problem.shape.values[0] - [0.003, 0.5, 0.0, 0.0]).max() < 0.03
+    assert np.abs(found.fit.problem.deformation.values[0] - [0.003, 0.5, 0.0, 0.0]).max() < 0.03
     assert float(found.rig["c"].K[0, 0]) == pytest.approx(700, rel=0.005)

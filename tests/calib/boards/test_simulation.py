@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig
-from calib.boards.collect import collect_folder
+from calib.boards.detect import collect_folder
 from calib.boards.rig import calibrate
 from calib.boards.simulation import board_poses, photograph, simulate_photos
 from calib.boards.target import parse_board

@@ -9,10 +9,9 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig
-from calib.boards.camera_parameters import CameraPrior, intrinsic_values, parameter_sizes
+from calib.boards.parameters import CameraPrior, StartDeviations, intrinsic_values, parameter_sizes, start_prior
 from calib.boards.rig import calibrate
 from calib.boards.simulation import photograph
-from calib.boards.start import StartDeviations, start_prior
 from calib.boards.target import parse_board
 from calib.images.held_out import line_distances
 from calib.images.matches import match_cameras

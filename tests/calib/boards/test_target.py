@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from calib.boards.detect import detect
-from calib.boards.printing import draw_board
-from calib.boards.run import write_board
 from calib.boards.simulation import printed
-from calib.boards.target import Charuco, parse_board
+from calib.boards.target import Charuco, draw_board, parse_board, write_board
 
 
 @pytest.mark.parametrize(

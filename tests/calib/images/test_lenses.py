@@ -24,10 +24,10 @@ from calib.images.lenses import largest_distortion, with_lenses
 from calib.images.matches import PointMatches, fit_fundamental, match_cameras, undistort_matches
 from calib.images.photometric import PhotometricFrame, photometric_errors
 from calib.images.refinement import Refinement, refine_matches
+from experiments.showcase import FAST, FAST_FRAME, SCENE, SLOW_FRAME, published_matrices
 from pat.attention import attend_with_statistics
 from pat.cli.main import main
 from pat.media.images import read_image
-from pat.systems.showcase import FAST, FAST_FRAME, SCENE, SLOW_FRAME, published_matrices
 from tests.calib.scenes import rectified_images, rectified_pair, seen_points, vector
 
 HW = (480, 640)

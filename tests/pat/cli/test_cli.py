@@ -276,7 +276,7 @@ def test_images_stand_anywhere_among_the_options_of_fuse():
 
 def test_writers_take_o_and_out():
     """Every command with an option --out takes -o; all but those that write nothing have it."""
-    nothing = {("explore",), ("settings",), ("rig", "info"), ("systems", "list"), ("data", "info"), ("warm-up",)}
+    nothing = {("explore",), ("settings",), ("rig", "info"), ("data", "info"), ("warm-up",)}
     for path in command_paths():
         command = functools.reduce(lambda group, word: group.commands[word], path, Pat)
         spellings = getattr(command, "spellings", {})
@@ -396,8 +396,6 @@ def test_a_bad_out_is_found_before_the_fusion(small, capsys, monkeypatch):
         (["rig", "show", "rig.yaml"], "file", "is a file: name a folder"),
         (["demo"], "file", "is a file: name a folder"),
         (["ablate", "--scenes", "1"], "file", "is a file: name a folder"),
-        (["showcase", "--data", "data"], "file", "is a file: name a folder"),
-        (["systems", "run", "exposures"], "file/x", "file is a file, so"),
         (["board", "charuco:8x6:30mm"], "folder", "is a folder: name a file"),
     ],
 )

@@ -6,8 +6,9 @@ import tifffile
 import torch
 
 from arraygeom import Band, Camera, Distortion, Pose, Rig, Sensor, View, intrinsics, sample
+from arraygeom.undistortion import recorded_pixels, straight_pixels
 from pat import align
-from pat.fusion.align import OUTSIDE, SEEN, filled, recorded_pixels
+from pat.fusion.align import OUTSIDE, SEEN, filled
 from pat.fusion.aligned_files import RecordedFiles, save_aligned, write_bands
 from pat.fusion.aligned_page import ndvi, write_aligned_page
 from pat.fusion.report import Facts
@@ -103,6 +104,9 @@ def test_recorded_pixels_undo_all_that_was_done_to_a_view():
     found, valid = recorded_pixels(now.project(X).x, now, rig["nir"])
     assert valid.all()
     assert torch.allclose(found, rig["nir"].project(X).x, atol=1e-6)
+    back, valid = straight_pixels(found, now, rig["nir"])
+    assert valid.all()
+    assert torch.allclose(back, now.project(X).x, atol=1e-6)
 
 
 def test_views_without_calibration():

@@ -5,10 +5,10 @@ import torch
 
 from arraygeom import Pair, Rectified, Segments, View, lazily, pixel_grid
 from pat.matching.colour_transfer import diffused_from, matched_colours
-from pat.matching.matches import BetaMatches, Comparison
-from pat.matching.normalisation import Normalisations
-from pat.matching.semi_global import FINE, matched_at_half_size
-from pat.matching.subpixel import matched_at_full_size, precise
+from pat.matching.matches import BetaMatches
+from pat.matching.normalisation import Comparison
+from pat.matching.semi_global import matched_at_half_size
+from pat.matching.subpixel import matched_at_full_size
 
 
 def blurred(image: torch.Tensor, blur: float) -> torch.Tensor:
@@ -37,14 +37,11 @@ def faint(seed: int, *, contrast: float, blur: float) -> torch.Tensor:
     return (0.5 + contrast * (soft - soft.mean()) / soft.std()).clamp(0, 1)
 
 
-def matched(alpha, guide, segments, blocks, normalisations, half=None):
+def matched(alpha, guide, segments, blocks, comparison, half=None):
     """Disparity and facts of one beta whose brightness is `guide`; without `half` both sizes are matched."""
-    rough, facts = half or matched_at_half_size(alpha, guide, blocks, normalisations.half)
-    views = normalisations.whole.views(alpha, guide)
-    disparity, unlike = matched_at_full_size(views, segments, rough)
-    near = torch.nn.functional.interpolate(rough, scale_factor=FINE, mode="bilinear")
-    found = precise(views, segments, disparity, unlike, near)
-    return found, torch.cat([torch.nn.functional.avg_pool2d(unlike, FINE), facts[:, 1:]], 1)
+    rough, facts = half or matched_at_half_size(comparison.half_views(alpha, guide), blocks)
+    found, unlike = matched_at_full_size(comparison.views(alpha, guide), segments, rough)
+    return found, torch.cat([unlike, facts[:, 1:]], 1)
 
 
 def semi_global_matching(
@@ -53,11 +50,11 @@ def semi_global_matching(
     beta: torch.Tensor,
     segments: Segments,
     blocks: Segments | None,
-    normalisations: Normalisations | None = None,
+    comparison: Comparison | None = None,
 ) -> BetaMatches:
     """Matches of one beta, whose brightness is `guide`, and its colours by them, as `match` has."""
-    normalisations = normalisations or Normalisations.of(alpha, guide)
-    disparity, facts = matched(alpha, guide, segments, blocks, normalisations)
-    colours, weight = matched_colours(alpha, guide, beta, segments, disparity, facts, normalisations.whole)
+    comparison = comparison or Comparison.of(alpha, guide)
+    disparity, facts = matched(alpha, guide, segments, blocks, comparison)
+    colours, weight = matched_colours(alpha, guide, beta, segments, disparity, facts, comparison.whole)
     diffused = diffused_from(colours, alpha, weight)
-    return BetaMatches(disparity, facts, Comparison(None, normalisations), colours, diffused)
+    return BetaMatches(disparity, facts, comparison, colours, diffused)

@@ -9,7 +9,8 @@ from arraygeom import Camera, Pose, Rig, intrinsics
 from pat.fusion.fuse import fuse
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.views import Views
-from pat.matching.match import located, match, transferred
+from pat.matching.colour_transfer import transferred
+from pat.matching.match import located, match
 from pat.matching.matches import Matches
 from pat.media.colour import luminance
 from pat.networks.protocol import FusionOutput

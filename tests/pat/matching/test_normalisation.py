@@ -3,7 +3,8 @@
 import numpy as np
 import torch
 
-from pat.matching.normalisation import LocalMoments, Moments, box_mean, mean_moments, moments, normalised
+from pat.matching.filters import LocalMoments, box_mean
+from pat.matching.normalisation import Moments, mean_moments, moments, normalised
 
 
 def image(seed: int, bands: int = 1) -> torch.Tensor:

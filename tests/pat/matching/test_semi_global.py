@@ -21,13 +21,10 @@ from arraygeom import (
     pixel_grid,
     rotation_from_vector,
 )
-from pat.matching.matches import BetaMatches, Comparison
-from pat.matching.normalisation import Normalisation, Normalisations, equalising_blurs
-from pat.matching.semi_global import (
-    length_of,
-    matched_at_half_size,
-    matches,
-)
+from pat.matching.matches import BetaMatches
+from pat.matching.normalisation import Comparison, Normalisation, equalising_blurs
+from pat.matching.positions import matches
+from pat.matching.semi_global import matched_at_half_size
 from pat.support.memory import limited
 from tests.pat.matching.matched_scenes import beside, blurred, faint, semi_global_matching
 
@@ -36,13 +33,14 @@ HW = (64, 96)
 PARTS = ("disparity", "facts", "bands", "diffused")
 
 
-def test_lengths_of_plain_numbers_are_those_of_the_segments():
+def test_lengths_of_plain_numbers_are_those_with_gradients():
     start, end = 100 * torch.rand(2, 1, 50, 60, 2, generator=torch.Generator().manual_seed(0))
     end[0, 0] = start[0, 0]
     segments = Segments(start, end, torch.ones(1, 50, 60, dtype=torch.bool))
-    assert torch.equal(length_of(segments), segments.length)
+    plain = segments.length
     freed = Segments(start.requires_grad_(), end, segments.valid)
-    (gradient,) = torch.autograd.grad(length_of(freed).sum(), start)
+    assert torch.equal(plain, freed.length.detach())
+    (gradient,) = torch.autograd.grad(freed.length.sum(), start)
     assert bool(gradient.isfinite().all())
 
 
@@ -145,12 +143,12 @@ def test_no_more_blocks_at_once_than_memory_holds(monkeypatch, limit, at_once):
 
     pair = pair_of(0.1)
     alpha, beta, _ = plane_seen(pair, 2.0)
-    normalisation = Normalisation.of(alpha, beta)
+    views = Comparison.of(alpha, beta).half_views(alpha, beta)
     monkeypatch.setattr(pat.matching.semi_global, "_block", block)
     in_blocks_of(monkeypatch, block=8, long_block=8)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 4)
     with limited(limit):
-        matched_at_half_size(alpha, beta, sampled_at(pair, 2), normalisation)
+        matched_at_half_size(views, sampled_at(pair, 2))
     assert max(most) in at_once
     assert len(most) == 4 * 6
 
@@ -160,7 +158,7 @@ def test_blocks_know_what_others_claim(monkeypatch, threads):
     """Blocks whose margins hold the whole image find what a single one does."""
     pair = pair_of(0.1)
     alpha, beta, _ = plane_seen(pair, 2.0)
-    given = alpha, beta, sampled_at(pair, 2), Normalisation.of(alpha, beta)
+    given = Comparison.of(alpha, beta).half_views(alpha, beta), sampled_at(pair, 2)
     whole = matched_at_half_size(*given)
     in_blocks_of(monkeypatch, block=12, long_block=20, margin=1000)
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
@@ -191,9 +189,7 @@ def test_no_segment_is_nothing_found():
 
 def test_a_cut_is_where_it_says():
     half, whole = torch.arange(48.0).view(1, 1, 6, 8), torch.arange(192.0).view(1, 1, 12, 16)
-    cut = BetaMatches(whole - 1, half, Comparison(None, Normalisations.of(whole, whole)), whole + 1, whole).cut(
-        (4, 10, 2, 16)
-    )
+    cut = BetaMatches(whole - 1, half, Comparison.of(whole, whole), whole + 1, whole).cut((4, 10, 2, 16))
     assert torch.equal(cut.disparity, whole[..., 4:10, 2:16] - 1)
     assert torch.equal(cut.facts, half[..., 2:5, 1:8])
     assert torch.equal(cut.diffused, whole[..., 4:10, 2:16])

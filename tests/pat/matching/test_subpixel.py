@@ -6,7 +6,7 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, pixel_grid
-from pat.matching.normalisation import Normalisations
+from pat.matching.normalisation import Comparison
 from pat.matching.semi_global import matched_at_half_size
 from pat.matching.subpixel import SETTINGS, _runs, _surfaces
 from tests.pat.matching.matched_scenes import beside, blurred, matched
@@ -47,9 +47,9 @@ def scene() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, Segments, Segment
 
 def test_an_edge_is_found_to_the_pixel():
     alpha, beta, disparity, segments, blocks = scene()
-    normalisations = Normalisations.of(alpha, beta)
-    half, _ = matched_at_half_size(alpha, beta, blocks, normalisations.half)
-    found, facts = matched(alpha, beta, segments, blocks, normalisations)
+    comparison = Comparison.of(alpha, beta)
+    half, _ = matched_at_half_size(comparison.half_views(alpha, beta), blocks)
+    found, facts = matched(alpha, beta, segments, blocks, comparison)
     near_edge = torch.zeros(H, W, dtype=torch.bool)
     near_edge[BOX[0].start : BOX[0].stop, BOX[1].stop - 4 : BOX[1].stop + 4] = True
     doubled = half[0, 0].repeat_interleave(2, 0).repeat_interleave(2, 1)
@@ -68,7 +68,7 @@ def test_a_match_is_found_to_a_tenth_of_a_pixel(disparity):
     shift = round(8 * disparity)
     alpha, beta = (avg_pool2d(scene[..., x : x + 8 * 160], 8) for x in (0, shift))
     _, _, segments = beside(alpha, 0, 160)
-    found, _ = matched(alpha, beta, *segments, Normalisations.of(alpha, beta))
+    found, _ = matched(alpha, beta, *segments, Comparison.of(alpha, beta))
     error = (found - shift / 8)[..., 8:-8, 40:-8]
     assert abs(float(error.mean())) < 0.05
     assert float(error.abs().mean()) < 0.1
@@ -87,7 +87,7 @@ def test_a_slope_with_little_texture_is_found_to_a_fraction_of_a_pixel_in_noise(
     alpha = scene[0, 0][rows, (64 + 8 * (x - disparity)).round().long().clamp(min=0)]
     images = [p[None, None] + 0.01 * torch.randn(1, 1, 96, 160, generator=g) for p in (alpha, beta)]
     _, _, segments = beside(images[0], 0, 160)
-    found, _ = matched(*images, *segments, Normalisations.of(*images))
+    found, _ = matched(*images, *segments, Comparison.of(*images))
     assert float((found[0, 0] - disparity).abs()[8:-8, 24:-8].mean()) < 0.2
 
 

@@ -13,7 +13,6 @@ from pat.evaluation.metrics import score
 from pat.matching import cost
 from pat.matching import semi_global_numba as kernels
 from pat.matching.cost import planes_of
-from pat.matching.positions_numba import costs_at
 from pat.matching.tangents import along_tangents
 from tests.pat.layered_array import ALPHA, load_sample
 
@@ -73,7 +72,7 @@ def test_costs_of_positions_are_those_of_labels():
     (a, a_bits), (b, b_bits) = planes_of(own), planes_of(other)
     places = rng.integers(-1, b.size, (6, 9, 5)).astype(np.int32)
     found = np.empty((6, 9, 1, 16), np.uint8)
-    costs_at((a.ravel(), a_bits.ravel()), (b.ravel(), b_bits.ravel()), places, found)
+    kernels.costs_at((a.ravel(), a_bits.ravel()), (b.ravel(), b_bits.ravel()), places, found)
     assert (found[..., 5:] == kernels.NO_LABEL).all()
     for y, x, label in np.ndindex(places.shape):
         at = divmod(int(places[y, x, label]), 9)

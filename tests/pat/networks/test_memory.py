@@ -14,9 +14,9 @@ from arraygeom.chunks import Tile
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.tiles import fuse_tile, working_memory
 from pat.fusion.views import Views
-from pat.matching.match import compared
 from pat.matching.matches import BetaMatches, Matches
 from pat.matching.multiview import agreed
+from pat.matching.normalisation import Comparison
 from pat.networks.weights import load_weights
 from pat.support.memory import give_back, limited, peak_memory, resident
 
@@ -47,7 +47,7 @@ def found_in(inputs):
         BetaMatches(
             5 * torch.rand(1, 1, h, w),
             torch.rand(1, 3, h // 2, w // 2),
-            compared(inputs.of_beta(i)),
+            Comparison.of(inputs.alpha, inputs.betas[i].image),
             torch.rand(1, 3, h, w),
             fills,
         )

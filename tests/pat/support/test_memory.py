@@ -7,7 +7,17 @@ import threading
 import numpy as np
 import pytest
 
-from pat.support.memory import ROOM, give_back, how_many_fit, limited, parse_bytes, peak_memory, resident, watch_peak
+from pat.support.memory import (
+    ROOM,
+    give_back,
+    how_many_fit,
+    limited,
+    parse_bytes,
+    peak_memory,
+    resident,
+    watch_peak,
+    with_peak,
+)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -19,6 +29,16 @@ def test_freed_memory_is_given_back():
     give_back()
     assert before - resident() > 0.8 * 2000 * 2**16
     assert all(block[0] == 1 for block in blocks)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_the_peak_of_work_is_what_it_held_at_most():
+    """100 MiB held and let go, whatever was held before."""
+    held = np.ones(2**25)
+    del held
+    value, grown = with_peak(lambda: float(np.ones(100 * 2**17).sum()))
+    assert value == 100 * 2**17
+    assert 95 * 2**20 < grown < 115 * 2**20
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")

@@ -1,0 +1,123 @@
+"""Matched points of pairs of images, from a CSV file or a COLMAP database.
+
+CSV: x0 y0 x1 y1 a line, in the order of two images given, first pixel's centre at 0; a header may name the columns.
+COLMAP: verified matches where there are any; the first pixel's centre is at 0.5 (shift -0.5); images by file name.
+"""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..pixels import HW
+
+MAX_IMAGES = 2**31 - 1
+"""COLMAP numbers the pair of images a < b as a * MAX_IMAGES + b (its documentation of the database)."""
+SQLITE = b"SQLite format 3\0"
+
+PointPairs = dict[tuple[str, str], tuple[Tensor, Tensor]]
+"""Points (n, 2) of two cameras, by their names, float64."""
+
+
+def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mapping[str, HW]) -> PointPairs:
+    """The matches of a file between the images of cameras, whose sizes are given too.
+
+    Raises FileNotFoundError, and ValueError for files of another kind, for more or fewer than two images with a CSV
+    file, for a database without these images, and for points outside the images.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file of matches: check the path")
+    with path.open("rb") as file:
+        database = file.read(len(SQLITE)) == SQLITE
+    named = {name: Path(file) for name, file in files.items()}
+    found = _database(path, named) if database else _csv(path, named)
+    for names, points in found.items():
+        for name, x in zip(names, points):
+            h, w = sizes[name]
+            outside = ((x < -0.5) | (x > x.new_tensor([w, h]) - 0.5)).any(-1)
+            if outside.any():
+                raise ValueError(
+                    f"{path}: {int(outside.sum())} of {len(x)} points are outside the image of '{name}', {w}x{h}: "
+                    "are they of this image, at this size?"
+                )
+    return found
+
+
+def _csv(path: Path, files: Mapping[str, Path]) -> PointPairs:
+    if len(files) != 2:
+        raise ValueError(f"{path}: x0 y0 x1 y1 are of two images, and {len(files)} are given: give two, or a database")
+    try:
+        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: neither CSV nor a COLMAP database: give x0,y0,x1,y1 a line") from None
+    lines = lines if lines and _numbers(lines[0]) else lines[1:]
+    parsed = [_numbers(line) for line in lines]
+    wrong = next((line for line, row in zip(lines, parsed) if row is None), None)
+    if wrong is not None or not parsed:
+        what = "an empty file" if wrong is None else f"line '{wrong}'"
+        raise ValueError(f"{path}: {what} is not four numbers: give x0,y0,x1,y1 a line")
+    points = torch.tensor([row[:4] for row in parsed if row], dtype=torch.float64)
+    if not points.isfinite().all():
+        raise ValueError(f"{path}: has points that are not finite: leave those lines out")
+    a, b = files
+    return {(a, b): (points[:, :2], points[:, 2:])}
+
+
+def _numbers(line: str) -> list[float] | None:
+    """The four numbers or more of a line; None if they are none."""
+    try:
+        numbers = [float(word) for word in re.split(r"[,;\s]+", line.strip())]
+    except ValueError:
+        return None
+    return numbers if len(numbers) >= 4 else None
+
+
+def _database(path: Path, files: Mapping[str, Path]) -> PointPairs:
+    try:
+        with closing(sqlite3.connect(f"file:{path.resolve()}?mode=ro", uri=True)) as database:
+            return _colmap(database, path, files)
+    except sqlite3.Error as error:
+        raise ValueError(f"{path}: not a COLMAP database ({error}): give COLMAP's database.db, or CSV") from None
+
+
+def _colmap(database: sqlite3.Connection, path: Path, files: Mapping[str, Path]) -> PointPairs:
+    ids = {Path(name).name: number for number, name in database.execute("SELECT image_id, name FROM images")}
+    if missing := [file.name for file in files.values() if file.name not in ids]:
+        known = ", ".join(list(ids)[:5])
+        raise ValueError(f"{path}: has no image {missing[0]} (it has {known}, ...): give the images it was made of")
+    names = {ids[file.name]: name for name, file in files.items()}
+    found: PointPairs = {}
+    for table in ("two_view_geometries", "matches"):
+        for (a, b), pairs in _matches(database, table, names):
+            points = (_keypoints(database, number)[pairs[:, side]] for side, number in enumerate((a, b)))
+            found.setdefault((names[a], names[b]), tuple(points))  # type: ignore[arg-type]
+    if not found:
+        raise ValueError(f"{path}: has no matches between {', '.join(files)}: match these images first")
+    return found
+
+
+def _matches(
+    database: sqlite3.Connection, table: str, names: Mapping[int, str]
+) -> Iterator[tuple[tuple[int, int], NDArray[np.int64]]]:
+    """Pairs of image numbers, and the numbers of their matched keypoints (n, 2)."""
+    for pair, rows, data in database.execute(f"SELECT pair_id, rows, data FROM {table} WHERE rows > 0"):
+        a, b = pair // MAX_IMAGES, pair % MAX_IMAGES
+        if a in names and b in names:
+            yield (a, b), np.frombuffer(data, np.uint32).reshape(rows, -1)[:, :2].astype(np.int64)
+
+
+def _keypoints(database: sqlite3.Connection, image: int) -> Tensor:
+    """The keypoints of an image (n, 2)."""
+    query = "SELECT rows, cols, data FROM keypoints WHERE image_id = ?"
+    rows, columns, data = database.execute(query, (image,)).fetchone() or (0, 2, b"")
+    points = np.frombuffer(data, np.float32).reshape(rows, columns)[:, :2]
+    return torch.from_numpy(points.astype(np.float64)) - 0.5

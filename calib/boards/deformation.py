@@ -1,0 +1,144 @@
+"""Boards that are neither flat nor printed true to size: their shape as unknowns of the bundle adjustment.
+
+A print may be longer along one axis, and a sheet be curved. To third order a bent sheet keeps the lengths on it: with
+the symmetric curvature C (1/m) about the board's middle, the point q moves to q - C q (q^T C q) / 6, and out of the
+plane by q^T C q / 2 - (q^T C q) (q^T C^2 q) / 24; exact to that order for cylinders of any axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+PARAMETERS = 4
+"""Per board: stretch of y against x, curvatures xx, xy, yy (1/m)."""
+DEVIATIONS = np.array([0.05, 0.5, 0.5, 0.5])
+"""Standard deviations of a board's shape before any measurement."""
+SIGNIFICANCE = 1e-3
+"""Chance at which frames agree on a shape that is not there (Hotelling's test), and"""
+LEAST_GAIN = 20.0
+"""by how much the loss must fall (half a chi-square)."""
+STEP = 1e-5
+
+
+@dataclass(frozen=True)
+class BoardDeformation:
+    """The shapes of some boards.
+
+    values: stretch (y / x - 1) and curvatures xx, xy, yy (1/m, positive: the middle lies in front) of each board.
+    middle: the board's middle, metres. part: the board of each block.
+    """
+
+    values: Float[np.ndarray, "k 4"]
+    middle: Float[np.ndarray, "k 2"]
+    part: Int[np.ndarray, " b"]
+
+    @classmethod
+    def flat(
+        cls, points: Float[np.ndarray, "n 3"], of_point: Int[np.ndarray, " n"], part: np.ndarray
+    ) -> BoardDeformation:
+        """Flat boards of given points and the board of each; `part` is the board of each block."""
+        ends = [points[of_point == k, :2] for k in range(int(of_point.max()) + 1)]
+        middle = np.stack([(p.min(0) + p.max(0)) / 2 for p in ends])
+        return cls(np.zeros((len(middle), PARAMETERS)), middle, part)
+
+    def __len__(self) -> int:
+        return self.values.size
+
+    def deformed(self, p: Float[np.ndarray, "n 3"], part: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+        """Flat points of some boards on the boards as they are, metres."""
+        return _deformed(p, self.middle[part], self.values[part])
+
+    def jacobian(self, p: Float[np.ndarray, "n 3"], part: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3 s"]:
+        """Derivatives of the deformed points with respect to all values, by central differences."""
+        found = np.zeros((len(p), 3, *self.values.shape))
+        rows, middle, values = np.arange(len(p)), self.middle[part], self.values[part]
+        for i, step in enumerate(STEP * np.eye(PARAMETERS)):
+            ahead, behind = (_deformed(p, middle, values + sign * step) for sign in (1, -1))
+            found[rows, :, part, i] = (ahead - behind) / (2 * STEP)
+        return found.reshape(len(p), 3, -1)
+
+    def stepped(self, change: Float[np.ndarray, " s"]) -> BoardDeformation:
+        """The shapes after a change of all values."""
+        return replace(self, values=self.values + change.reshape(self.values.shape))
+
+    def of_blocks(self, part: Int[np.ndarray, " b"]) -> BoardDeformation:
+        """The same shapes for other blocks."""
+        return replace(self, part=part)
+
+    @property
+    def information(self) -> Float[np.ndarray, " s"]:
+        """Inverse variances of the values before any measurement."""
+        return np.tile(DEVIATIONS**-2.0, len(self.values))
+
+    def loss(self) -> float:
+        """Half the squared Mahalanobis distance from flat boards."""
+        return float(self.information @ self.values.ravel() ** 2) / 2
+
+    def main_curvature(self, board: int, extent: tuple[float, float]) -> Curvature:
+        """The board's main curvature over a board of some width and height (metres)."""
+        _, a, b, c = self.values[board]
+        curvatures, axes = np.linalg.eigh(np.array([[a, b], [b, c]]))
+        main = int(np.abs(curvatures).argmax())
+        length = float(np.abs(axes[:, main]) @ np.array(extent))
+        curvature = float(curvatures[main])
+        return Curvature(abs(curvature) * length**2 / 8, 1 / max(abs(curvature), 1e-9), curvature > 0)
+
+
+class Curvature(NamedTuple):
+    """How far the middle lies off the plane of two opposite edges, metres; radius, metres; towards the cameras."""
+
+    depth: float
+    radius: float
+    towards: bool
+
+
+def _deformed(p: np.ndarray, middle: np.ndarray, values: np.ndarray) -> np.ndarray:
+    stretch, a, b, c = values.T
+    u, v = p[:, 0] - middle[:, 0], (p[:, 1] - middle[:, 1]) * (1 + stretch)
+    cu, cv = a * u + b * v, b * u + c * v
+    first, second = cu * u + cv * v, cu**2 + cv**2
+    x, y = u - cu * first / 6, v - cv * first / 6
+    return np.stack([middle[:, 0] + x, middle[:, 1] + y, p[:, 2] + first / 2 - first * second / 24], -1)
+
+
+def fewest_frames(count: int) -> int:
+    """The least number of frames whose agreement on so many values means something."""
+    return 2 * count + 2
+
+
+def is_significant(values: Float[np.ndarray, " s"], covariance: Float[np.ndarray, "s s"], frames: int) -> bool:
+    """Whether shapes differ from flat ones by more than the jackknife over frames explains (Hotelling's test)."""
+    from scipy.stats import f as f_distribution  # here, as it takes half a second to import
+
+    count = len(values)
+    squared = float(values @ np.linalg.solve(covariance, values))
+    ratio = squared * (frames - count) / (count * (frames - 1))
+    return bool(f_distribution.sf(ratio, count, frames - count) < SIGNIFICANCE)
+
+
+def described(
+    shape: BoardDeformation, deviations: Float[np.ndarray, "k 4"], extents: list[tuple[float, float]]
+) -> list[str]:
+    """Sentences on boards whose shapes were estimated, with standard deviations."""
+    found = []
+    for k, (extent, deviation) in enumerate(zip(extents, deviations)):
+        name = f"board {k + 1}" if len(extents) > 1 else "the board"
+        stretch, curved = shape.values[k, 0], shape.main_curvature(k, extent)
+        if abs(stretch) > 3 * deviation[0]:
+            found.append(
+                f"{name} is stretched: squares are {100 * abs(stretch):.2f} ± {100 * deviation[0]:.2g} % "
+                f"{'longer' if stretch > 0 else 'shorter'} down than across; this is modelled, with the size across as "
+                "specified: measure both"
+            )
+        relative = float(np.max(np.abs(shape.values[k, 1:]) / deviation[1:]))
+        if relative > 3:
+            found.append(
+                f"{name} is bent: its middle lies {1e3 * curved.depth:.2f} ± {1e3 * curved.depth / relative:.2g} mm "
+                f"{'in front of' if curved.towards else 'behind'} its edges (radius {curved.radius:.2f} m); this "
+                "is modelled: glue it to something stiff and flat"
+            )
+    return found

@@ -1,0 +1,103 @@
+"""`python -m experiments COMMAND ...`: the paper's four arrays, and fusion of real images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from tyro.conf import Positional
+
+from pat.cli.main import main
+from pat.cli.options import MaybeOut, MaybePath, Memory, Out, Weights, say, writable
+
+
+@dataclass
+class Showcase:
+    """Fuse real images: stereo pairs, calibrated pairs that are not rectified, the paper's fast + slow array."""
+
+    data: Path
+    """Folder with kitti, middlebury, flickr1024, syntim and hfr_lfr."""
+    out: Out = Path("out/showcase")
+    """Folder for showcase.md, the figures and the rig files."""
+    weights: Weights = "mono-colour"
+
+    def run(self) -> None:
+        """Write and print the tables. Raises ValueError or FileNotFoundError naming what is missing."""
+        from .showcase import showcase
+
+        writable(self.out, folder=True)
+        print(showcase(self.data, self.out, self.weights), end="")
+        say(f"written: {self.out / 'showcase.md'}, and its figures and rig files")
+
+
+@dataclass
+class SystemsList:
+    """List the paper's four arrays."""
+
+    def run(self) -> None:
+        """Print a line for each."""
+        from .system import NAMES, load_system
+
+        for name in NAMES:
+            print(f"{name:12s} {load_system(name).title}")
+
+
+@dataclass
+class SystemsRun:
+    """Render a scene for an array, record it, fuse it, compare with the ground truth: PSNR, SSIM and images.
+
+    Example: python -m experiments systems run fast-slow --out out/fast-slow
+    """
+
+    name: Positional[str]
+    """One of the names that `python -m experiments systems list` prints."""
+    full: bool = False
+    """At the full size of the paper's cameras; by default reduced, minutes on two cores."""
+    scene: Literal["layered", "rendered"] = "layered"
+    """Photographs on planes; or a still life (a landscape for visible-nir) rendered with Blender, as one sees it."""
+    photos: MaybePath = None
+    """Folder of photographs for the layers' surfaces; by default patterns and images that scikit-image ships."""
+    recording: MaybePath = None
+    """For fast-slow: the paper's own frames in place of a rendered scene, a folder with pillow_1 and the matrices."""
+    out: MaybeOut = None
+    """Folder for the results; by default out/systems/NAME."""
+    weights: Weights = "mono-colour"
+    max_memory: Memory = None
+    """Memory limit of fusing, such as 4GiB; a single frame is then fused in a process of its own, measured."""
+
+    def run(self) -> None:
+        """Print the scores, and the expected ones where they are of the same settings."""
+        from .fast_slow.recorded import run_recorded
+        from .system import load_system, run_system
+
+        out = writable(self.out or Path("out/systems") / self.name, folder=True)
+        if self.recording is None:
+            same = ("full", "scene", "photos", "weights", "max_memory")
+            result = run_system(self.name, out, say=say, **{name: getattr(self, name) for name in same})
+        elif self.name == "fast-slow":
+            result = run_recorded(self.recording, out, weights=self.weights, say=say)
+        else:
+            raise ValueError(f"--recording is of fast-slow, not of '{self.name}'")
+        print(result.table, end="")
+        expected = load_system(self.name).expected
+        if expected and self.recording is None and self.scene == "layered" and not self.full:
+            say(f"\nexpected:\n{expected}")
+        say(f"written: {', '.join(map(str, result.written))}")
+
+
+class Systems:
+    """Run the paper's four arrays, each from a rendered scene to figures."""
+
+    commands: ClassVar[Mapping[str, Any]] = {"list": SystemsList, "run": SystemsRun}
+
+
+class Experiments:
+    """Run the paper's arrays, and fuse real images."""
+
+    commands: ClassVar[Mapping[str, Any]] = {"systems": Systems, "showcase": Showcase}
+
+
+if __name__ == "__main__":
+    main(group=Experiments, prog="python -m experiments")

@@ -1,0 +1,65 @@
+"""Short exposure - long exposure: four mono cameras, three of them behind filters, each exposed for its own time.
+
+Alpha has no filter. The filters pass 80 nm about 450, 550 and 600 nm: less than a third of alpha's light, which longer
+exposures make up for. The scene's surfaces are lit from very dark to very bright.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from arraygeom import Band
+from experiments.rendered import RenderedScene
+from experiments.stage import SystemScene
+from experiments.system import SystemRecording
+from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
+from pat.media.raw import light_of
+from pat.sensors import Clip, Noise, Spectral, record
+
+TITLE = "four mono cameras, three filters, four exposures: more range than any one of them has"
+REDUCED = 2 / 5
+DEPTHS, LAYERS, SEED = (2.2, 11.0), 10, 13
+ELECTRONS, READ = 10_500, 4
+"""Of the sensors: electrons at white, and noise of reading in electrons."""
+DARKEST = 0.004
+"""Light on the darkest surface, as part of that on the brightest."""
+OVER = 3.0
+"""How far above alpha's white the brightest surface is."""
+GENERATOR = "still-life"
+GAIN = 1.5
+"""Light of the rendered scene: the lamp is above alpha's white then."""
+
+
+def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
+    """One frame. The ground truth is in alpha's exposure, not clipped at white."""
+    rig, alpha = stage.rig, stage.alpha
+    raw, bands, lights = {}, {}, {}
+    for name in rig.names:
+        lit = light(stage, name)
+        sensor = rig[name].sensor
+        own = luminance(lit) if name == alpha else banded(lit, sensor.response)
+        seen = own * light_of(sensor, rig[alpha].sensor)
+        lights[name] = own[0]
+        raw[name] = [record(seen, (Noise(ELECTRONS, READ), Clip()), stage.generator(name)).image[0]]
+        if name != alpha:
+            bands[name] = banded(light(stage, alpha), sensor.response)[0]
+    return SystemRecording(raw, [srgb_from_linear(torch.cat([bands[name] for name in rig.betas(alpha)]))], lights)
+
+
+def light(stage: SystemScene | RenderedScene, name: str) -> Tensor:
+    """Linear colours of what a camera sees, 1 being alpha's white."""
+    if isinstance(stage, RenderedScene):
+        return GAIN * stage.light(name)
+    count, g = stage.scene.present.shape[1], stage.generator("light")
+    lit = DARKEST ** torch.rand(count, generator=g)
+    lit[1], lit[2] = 1.0, DARKEST
+    strength = stage.seen(name, stage.painted(lit.sqrt().tolist()))[0].square()
+    return linear_from_srgb(stage.seen(name)[0]) * strength * OVER
+
+
+def banded(linear: Tensor, response: object) -> Tensor:
+    """What passes a filter, white staying white."""
+    if not isinstance(response, Band):
+        raise ValueError("the betas of this system have filters: give each a band as its response")
+    return record(linear, (Spectral(response),), torch.Generator()).image

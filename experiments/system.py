@@ -1,0 +1,379 @@
+"""Runs a system: a scene is rendered for its rig, recorded to files, fused from them and compared."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal, NamedTuple
+
+import torch
+from jaxtyping import Float
+from safetensors import safe_open
+from tifffile import imread
+from torch import Tensor
+
+from arraygeom import Rig
+from arraygeom.atomic import write_text
+from arraygeom.io.native import write as rig_text
+from experiments.hdr import merged, missed, tone_curve, usable_range
+from pat.evaluation.baseline import classical_baseline
+from pat.evaluation.metrics import score
+from pat.evaluation.tables import markdown_table
+from pat.fusion.frames import ImageFiles
+from pat.fusion.fuse import fuse
+from pat.fusion.results import Frame, save_frame, view_of
+from pat.fusion.sequence import SequenceFusion, flicker
+from pat.fusion.views import read_views
+from pat.media.colour import linear_from_srgb, luminance, to_luma_chroma
+from pat.media.figures import colour_depth, save_panels
+from pat.media.images import read_image, write_image
+from pat.media.raw import as_bright
+from pat.media.video import write_video
+from pat.networks.protocol import FusionNetwork
+from pat.networks.weights import load_weights
+from pat.support.memory import watch_peak
+from pat.support.tensor_files import write_tensors
+
+SceneKind = Literal["layered", "rendered"]
+NAMES = ("wide-narrow", "visible-nir", "exposures", "fast-slow")
+
+
+@dataclass(frozen=True)
+class SystemRecording:
+    """Raw values 0..1 by camera, frame by frame, and the ground truth: alpha's view (sRGB).
+
+    `light` is the linear light that each camera received, on alpha's scale, for systems that need it.
+    """
+
+    raw: Mapping[str, list[Float[Tensor, "_ _ _"]]]
+    ground_truth: list[Float[Tensor, "3 h w"]]
+    light: Mapping[str, Float[Tensor, "1 _ _"]] = field(default_factory=dict)
+
+    @property
+    def reference(self) -> dict[str, Tensor]:
+        """All but the raw images, by name."""
+        ground_truth = {f"ground truth/{i:03d}": image.contiguous() for i, image in enumerate(self.ground_truth)}
+        return ground_truth | {f"light/{name}": image.contiguous() for name, image in self.light.items()}
+
+    @classmethod
+    def of(cls, reference: Mapping[str, Tensor]) -> SystemRecording:
+        """The recording of a `reference`, without the raw images."""
+        kinds = {name.partition("/")[::2]: tensor for name, tensor in reference.items()}
+        ground_truth = [kinds[key] for key in sorted(kinds) if key[0] == "ground truth"]
+        return cls({}, ground_truth, {name: tensor for (kind, name), tensor in kinds.items() if kind == "light"})
+
+
+@dataclass(frozen=True)
+class ArraySystem:
+    """One of the paper's arrays: its rig at full size, and the module that renders and records it."""
+
+    name: str
+    rig: Rig
+    module: ModuleType
+
+    @property
+    def title(self) -> str:
+        """A line of description."""
+        return str(self.module.TITLE)
+
+    @property
+    def alpha(self) -> str:
+        """The first camera."""
+        return self.rig.names[0]
+
+    @property
+    def expected(self) -> str:
+        """The table that `run_system` gave at reduced size when it was last recorded."""
+        file = Path(self.module.__file__ or "").with_name("expected.md")
+        return file.read_text(encoding="utf-8") if file.is_file() else ""
+
+    def sized(self, full: bool, *, scale: float = 1.0) -> Rig:
+        """The rig at full size, or at `scale` times the reduced one; raw images keep even sides."""
+        rig = self.rig
+        for name in rig.names if not full else ():
+            h, w = (max(round(n * scale * self.module.REDUCED / 2) * 2, 16) for n in rig[name].hw)
+            rig = rig.resize(name, (h, w))
+        return rig
+
+
+class SystemResult(NamedTuple):
+    """The table that was written, and the files."""
+
+    table: str
+    written: list[Path]
+
+
+def load_system(name: str) -> ArraySystem:
+    """A system by name. Raises ValueError listing the names."""
+    if name not in NAMES:
+        raise ValueError(f"no system '{name}': there are {', '.join(NAMES)}")
+    module = importlib.import_module(f"experiments.{name.replace('-', '_')}")
+    return ArraySystem(name, Rig.load(Path(module.__file__ or "").with_name("rig.yaml")), module)
+
+
+def run_system(
+    name: str,
+    out: Path,
+    *,
+    full: bool = False,
+    scale: float = 1.0,
+    scene: SceneKind = "layered",
+    photos: Path | None = None,
+    weights: str = "mono-colour",
+    max_memory: str | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> SystemResult:
+    """Render, record, fuse and compare; inputs, images, figure.png and scores.md go to `out`.
+
+    At `full` size, or at `scale` times the reduced one, which is minutes on two cores; half of it is seconds.
+    `scene` is layered photographs, or a believable one rendered with Blender. `photos` is a folder of images for the
+    layers' textures; without, patterns and scikit-image's images are used.
+    """
+    system = load_system(name)
+    rig = system.sized(full, scale=scale)
+    recording, files = recorded(system, rig, out / "inputs", scene=scene, photos=photos, say=say)
+    say("fusing")
+    run = _sequence if len(recording.ground_truth) > 1 else _still
+    lines, panels = run(SystemRun(system, rig, files, recording, out, weights, max_memory, say))
+    save_panels(panels, out / "figure.png", columns=4)
+    table = "\n".join(lines) + "\n"
+    write_text(out / "scores.md", table)
+    return SystemResult(table, sorted(p for p in out.iterdir() if p.is_file()))
+
+
+class SystemRun(NamedTuple):
+    """A recorded system, and how it is fused: folder, weights, memory limit, progress callback."""
+
+    system: ArraySystem
+    rig: Rig
+    files: Mapping[str, list[Path]]
+    recording: SystemRecording
+    out: Path
+    weights: str
+    max_memory: str | None
+    say: Callable[[str], None]
+
+
+def recorded(
+    system: ArraySystem,
+    rig: Rig,
+    out: Path,
+    *,
+    scene: SceneKind = "layered",
+    photos: Path | None,
+    say: Callable[[str], None],
+) -> tuple[SystemRecording, dict[str, list[Path]]]:
+    """The recording of the system's scene, and its files; rendered unless it was before with the same settings."""
+    module, cache = system.module, out / "recorded.safetensors"
+    key = f"{system.name}, {scene}, seed {module.SEED}, textures {photos or 'our own'}\n{rig_text(rig)}"
+    if cache.is_file():
+        with safe_open(cache, "pt") as file:
+            if file.metadata()["key"] == key:
+                say(f"using the recording in {out}")
+                counts = json.loads(file.metadata()["counts"])
+                return SystemRecording.of({name: file.get_tensor(name) for name in file.keys()}), _files(out, counts)  # noqa: SIM118
+    say(f"rendering and recording {', '.join(f'{n} {rig[n].hw[1]}x{rig[n].hw[0]}' for n in rig.names)}")
+    cache.unlink(missing_ok=True)
+    recording = module.record_scene(_stage(system, rig, scene, photos))
+    write_recording(recording, rig, out)
+    counts = {name: len(images) for name, images in recording.raw.items()}
+    write_tensors(cache, recording.reference, {"key": key, "counts": json.dumps(counts)})
+    return recording, _files(out, counts)
+
+
+def _stage(system: ArraySystem, rig: Rig, scene: SceneKind, photos: Path | None) -> Any:
+    """The scene before the cameras, with what a system's module asks of it."""
+    from .rendered import RenderedScene
+    from .stage import SystemScene
+
+    module = system.module
+    if scene == "layered":
+        depths, layers = module.DEPTHS, module.LAYERS
+        return SystemScene(rig, system.alpha, depths=depths, layers=layers, photos=photos, seed=module.SEED)
+    frames, rate = getattr(module, "FRAMES", 1), rig[system.alpha].sensor.frame_rate or 1.0
+    duration = 0.0 if frames == 1 else frames / rate
+    moving, infrared = getattr(module, "MOVING", 0.0), "nir" in rig.names
+    return RenderedScene(rig, module.GENERATOR, module.SEED, infrared=infrared, moving=moving, duration=duration)
+
+
+def _files(out: Path, counts: Mapping[str, int]) -> dict[str, list[Path]]:
+    return {name: [out / f"{name}_{i:03d}.png" for i in range(count)] for name, count in counts.items()}
+
+
+def write_recording(recording: SystemRecording, rig: Rig, out: Path) -> None:
+    """The raw images as 16-bit files with the rig's counts, the ground truth, and the rig."""
+    out.mkdir(parents=True, exist_ok=True)
+    rig.save(out / "rig.yaml")
+    for name, images in recording.raw.items():
+        white = 2 ** (rig[name].sensor.bits or 16) - 1
+        for i, image in enumerate(images):
+            counts = (image.clamp(0, 1) * white).round()
+            write_image(out / f"{name}_{i:03d}.png", counts / 65535, bits=16)
+    for i, image in enumerate(recording.ground_truth):
+        write_image(out / f"ground_truth_{i:03d}.png", image, bits=16)
+
+
+Panels = dict[str, Tensor]
+
+
+def _still(job: SystemRun) -> tuple[list[str], Panels]:
+    rig, recording, out = job.rig, job.recording, job.out
+    alpha, ground_truth = job.system.alpha, recording.ground_truth[0]
+    first = {name: paths[0] for name, paths in job.files.items()}
+    memory: list[str] = []
+    if job.max_memory is not None:
+        frame, memory = fused_apart(job, first)
+    read, images = read_views(rig, first, alpha=alpha)
+    if job.max_memory is None:
+        frame = fuse(load_weights(job.weights), read, images, alpha=alpha)
+        save_frame(frame, out, bits=16, view=view_of(read, alpha, bits=16))
+    baseline = classical_baseline(read, images, alpha)
+    if len(images) == 2:
+        baseline = as_bright(baseline, images[alpha], read[alpha].sensor)
+    rows = {"alpha alone": images[alpha].expand(3, -1, -1), "classical": baseline, "fusion": frame.image}
+    extra: list[str] = []
+    if recording.light:
+        merged_frame = merged(frame, rig, images, alpha)
+        rows["fusion, exposures merged"] = merged_frame.image
+        extra = [
+            *_ranges(rig, recording, images, frame, merged_frame),
+            *_permuted(load_weights(job.weights), read, images, alpha, frame),
+        ]
+        write_image(out / "merged.tif", linear_from_srgb(merged_frame.image.clamp(min=0)), bits=32)
+    white = 1.0 if not recording.light else float(ground_truth.max())
+    panels = {f"{n}{' (alpha)' if n == alpha else ''}": images[n] for n in rig.names}
+    panels |= {
+        f"{n}: clipped red, noisy blue": missed(images[n], recording.light[n]) for n in rig.names if recording.light
+    }
+    compared = {"ground truth": ground_truth, **{n: p for n, p in rows.items() if n != "alpha alone"}}
+    shown = tone_curve(ground_truth) if recording.light else torch.Tensor.clone
+    panels |= {name: shown(image) for name, image in compared.items()}
+    panels |= {"depth (red is near)": colour_depth(frame.depth), "confidence": frame.confidence[None]}
+    return [*_table(rows, ground_truth, white), *_confidence_line(frame, ground_truth), *extra, *memory], panels
+
+
+def fused_apart(job: SystemRun, files: Mapping[str, Path]) -> tuple[Frame, list[str]]:
+    """A frame fused by `pat fuse` in a process of its own, and its memory and time, as lines of text."""
+    images = [text for name, path in files.items() for text in ("--image", f"{name}={path}")]
+    out, rig = job.out, job.out / "inputs" / "rig.yaml"
+    command = [sys.executable, "-m", "pat", "fuse", "--rig", str(rig), "--alpha", job.system.alpha, *images]
+    command += ["--out", str(out), "--bits", "16", "--weights", job.weights, "--max-memory", str(job.max_memory)]
+    begin, planned = time.monotonic(), ""
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    most = watch_peak(process.pid)
+    for line in process.stderr or ():
+        planned = line.strip() if line.startswith("plan:") else planned
+        if line.strip():
+            job.say(line.rstrip())
+    _, status, used = os.wait4(process.pid, 0)
+    if status:
+        raise ValueError(f"fusing in a process of its own failed (wait status {status})")
+    took = f"{time.monotonic() - begin:.0f} s, {used.ru_utime + used.ru_stime:.0f} s of a core"
+    peak = f"allowed {job.max_memory}, at most {most() / 2**30:.2f} GiB resident"
+    depth = torch.from_numpy(imread(out / "depth.tif")) if (out / "depth.tif").is_file() else None
+    image, confidence = read_image(out / "fused.png"), read_image(out / "confidence.png")[0]
+    depth = torch.full_like(confidence, torch.nan) if depth is None else depth
+    return Frame(image, depth, confidence), ["", f"{planned}. Memory: {peak}. Time: {took}."]
+
+
+def _sequence(job: SystemRun) -> tuple[list[str], Panels]:
+    alpha, rig, out, ground_truth = job.system.alpha, job.rig, job.out, job.recording.ground_truth
+    frames = {name: ImageFiles(paths, rig, name, alpha=alpha) for name, paths in job.files.items()}
+    fusion = SequenceFusion(load_weights(job.weights), rig, frames, alpha, options={"max_memory": job.max_memory})
+    keys = fusion.timeline.key_frames()
+    colours = {key.alpha: fusion.colour(key) for key in keys}
+    fused = [fusion.frame(i, keys, lambda key: colours[key.alpha]) for i in range(len(ground_truth))]
+    alone = [fusion.alone(i) for i in range(len(fused))]
+    for i, frame in enumerate(fused):
+        save_frame(frame, out / "frames", name=f"{i:03d}", view=view_of(rig, alpha, bits=8))
+    write_video(out / "fused.mp4", [f.image for f in fused], rate=10)
+    greys = [fusion.grey(i) for i in range(len(fused))]
+    base = [classical_baseline(rig, _images(fusion, i), alpha) for i in range(len(fused))]
+    methods = {
+        "alpha alone": [g.expand(3, -1, -1) for g in greys],
+        "classical": base,
+        "fusion, each frame alone": [f.image for f in alone],
+        "fusion": [f.image for f in fused],
+    }
+    lines = [*_sequence_table(methods, ground_truth, greys), *_confidence_line(fused[2], ground_truth[2])]
+    i = next(i for i in range(len(fused)) if i not in colours)
+    first = next(name for name in rig.betas(alpha))
+    panels = {f"alpha, frame {i}": greys[i], f"beta {first}": frames[first][0], "ground truth": ground_truth[i]}
+    panels |= {n: p[i] for n, p in methods.items() if n != "alpha alone"}
+    panels |= {"confidence": fused[i].confidence[None], "confidence, frame alone": alone[i].confidence[None]}
+    return lines, panels
+
+
+def _images(fusion: SequenceFusion, i: int) -> dict[str, Tensor]:
+    return {fusion.alpha: fusion.grey(i), **{n: fusion.frames[n][j] for n, j in fusion.timeline.at(i).items()}}
+
+
+def _table(rows: Mapping[str, Tensor], ground_truth: Tensor, white: float) -> list[str]:
+    scores = {name: score((image / white).clamp(0, 1), ground_truth / white) for name, image in rows.items()}
+    cells = [(name, f"{found.psnr:.2f}", f"{found.ssim:.4f}") for name, found in scores.items()]
+    return markdown_table(["", "PSNR, dB", "SSIM"], cells).splitlines()
+
+
+def _sequence_table(methods: Mapping[str, list[Tensor]], ground_truth: list[Tensor], greys: list[Tensor]) -> list[str]:
+    rows = []
+    for name, images in methods.items():
+        scores = [score(p.clamp(0, 1), t) for p, t in zip(images, ground_truth)]
+        psnr, ssim = ([getattr(s, kind) for s in scores] for kind in ("psnr", "ssim"))
+        figures = (f"{sum(psnr) / len(psnr):.2f}", f"{min(psnr):.2f}", f"{sum(ssim) / len(ssim):.4f}")
+        rows.append((name, *figures, f"{1000 * flicker(images, greys):.2f}"))
+    rows.append(("ground truth", "", "", "", f"{1000 * flicker(ground_truth, greys):.2f}"))
+    table = markdown_table(["", "PSNR, dB", "lowest", "SSIM", "flicker x 1000"], rows)
+    return [
+        "Means over the frames; flicker is the mean change of chroma from frame to frame where nothing moves.",
+        "",
+        *table.splitlines(),
+    ]
+
+
+WRONG = 0.1
+"""Chroma farther off than this counts as a wrong colour."""
+
+
+def _confidence_line(frame: Frame, ground_truth: Tensor) -> list[str]:
+    """Shares of wrong colours among the quarters of the pixels with the highest and the lowest confidence."""
+    off = (to_luma_chroma(frame.image)[1] - to_luma_chroma(ground_truth)[1]).abs().amax(0).flatten()
+    order = frame.confidence.flatten().argsort()
+    quarter = len(order) // 4
+    high, low = (float((off[part] > WRONG).float().mean()) for part in (order[-quarter:], order[:quarter]))
+    return ["", f"Wrong colours: {high:.1%} of the quarter where confidence is highest, {low:.1%} where lowest."]
+
+
+def _ranges(
+    rig: Rig, recording: SystemRecording, images: Mapping[str, Tensor], frame: Frame, joint: Frame
+) -> list[str]:
+    """A table of the range of light that each image measures with an error of at most a quarter."""
+    measured = {name: (linear_from_srgb(images[name])[0], recording.light[name][0]) for name in rig.names}
+    ground_truth = linear_from_srgb(recording.ground_truth[0])
+    for name, image in {"fusion": frame.image, "fusion, exposures merged": joint.image}.items():
+        measured[name] = (luminance(linear_from_srgb(image.clamp(min=0)))[0], luminance(ground_truth)[0])
+    ranges = {name: usable_range(value, light) for name, (value, light) in measured.items()}
+    rows = [(name, f"{r.low:.4f}", f"{r.high:.3f}", f"{r.stops:.1f}") for name, r in ranges.items()]
+    columns = ["light measured to a quarter", "darkest", "brightest", "stops"]
+    return ["", *markdown_table(columns, rows).splitlines()]
+
+
+def _permuted(network: FusionNetwork, rig: Rig, images: Mapping[str, Tensor], alpha: str, frame: Frame) -> list[str]:
+    """How far a fusion with the betas in another order differs from the same fusion with its bands reordered."""
+    betas = rig.betas(alpha)
+    order = [2, 0, 1]
+    permuted = rig.replace(cameras={n: rig[n] for n in (alpha, *(betas[i] for i in order))})
+    other = fuse(network, permuted, images, alpha=alpha).image
+    same = score(other.clamp(0, 1), frame.image[order].clamp(0, 1)).psnr
+    before = score(other.clamp(0, 1), frame.image.clamp(0, 1)).psnr
+    return [
+        "",
+        f"Betas in another order: the bands follow to {same:.1f} dB (against the former order: {before:.1f} dB).",
+    ]

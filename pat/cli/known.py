@@ -1,0 +1,97 @@
+"""Options for what is known from elsewhere: a depth map of alpha, and matched points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import arg
+
+if TYPE_CHECKING:
+    from arraygeom import ReceptiveField, Rig
+
+MATCHES_HELP = "Matched points to use: CSV (x0,y0,x1,y1 a line, of two images in order) or a COLMAP database."
+MatchesFile = Annotated[Path | None, arg(metavar="FILE", help=MATCHES_HELP, help_behavior_hint="")]
+
+OUT_OF_RANGE = 0.9
+"""Share of a depth map outside the rig's depth range from which its unit must be wrong."""
+
+
+@dataclass
+class Known:
+    """What `pat fuse` and `pat align` may be given of the scene."""
+
+    depth_map: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Depth of alpha's pixels, of a single frame: PFM, TIFF or PNG of 16 bits; matches are searched around it."""
+    depth_scale: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
+    """Metres of one unit of --depth-map; by default 1 of floats, and .001 of whole numbers."""
+    depth_tolerance: float = 0.05
+    """By what share --depth-map may be off; 0 takes it as it is."""
+    matches: MatchesFile = None
+
+    def with_known(
+        self, rig: Rig, alpha: str, files: Mapping[str, str | Path], field: ReceptiveField | None
+    ) -> tuple[Rig, ReceptiveField | Mapping[str, ReceptiveField | None] | None]:
+        """The rig, and the field around what is known, by beta; `field` if nothing is.
+
+        Raises ValueError for options that do not go together, and for what is not of these cameras.
+        """
+        from arraygeom.undistortion import with_pixels
+
+        if self.depth_map is None and self.matches is None:
+            return rig, field
+        if self.depth_map is None:
+            rig = with_pixels(rig)
+            return rig, self._around_matches(rig, alpha, files, field)
+        if self.matches is not None or field is not None:
+            raise ValueError("--depth-map: goes with neither --matches nor --field: give one of them")
+        return rig, self._around_depth(rig, alpha)
+
+    def refuse_several(self) -> None:
+        """Raise ValueError if something is known, which is of a single frame."""
+        if self.depth_map is not None or self.matches is not None:
+            raise ValueError("--depth-map, --matches: are of a single frame: give the images of one")
+
+    def _around_depth(self, rig: Rig, alpha: str) -> ReceptiveField:
+        import torch
+
+        from arraygeom import Camera
+        from arraygeom.fields import AroundDepth
+
+        from ..media.depth_maps import read_depth
+
+        view = rig[alpha]
+        if not isinstance(view, Camera) or rig.depth is None:
+            raise ValueError("--depth-map: needs a calibrated rig: give --rig RIG and --depth NEAR FAR")
+        assert self.depth_map is not None
+        depth = read_depth(self.depth_map, hw=view.hw, scale=self.depth_scale)
+        near, far = (float(bound) for bound in rig.depth)
+        known = depth[depth.isfinite()]
+        if float(((known < near) | (known > far)).float().mean()) > OUT_OF_RANGE:
+            low, high = known.quantile(torch.tensor([0.05, 0.95])).tolist()
+            raise ValueError(
+                f"{self.depth_map}: is of {low:.3g} to {high:.3g} m, the rig's depths are {near:g} to {far:g} m: "
+                "state its unit by --depth-scale, or give --depth"
+            )
+        return AroundDepth(depth, self.depth_tolerance, view)
+
+    def _around_matches(
+        self, rig: Rig, alpha: str, files: Mapping[str, str | Path], field: ReceptiveField | None
+    ) -> Mapping[str, ReceptiveField | None]:
+        from arraygeom import LensView
+        from arraygeom.fields import AroundMatches
+        from arraygeom.io.point_matches import read_matches
+
+        assert self.matches is not None
+        fields = dict.fromkeys(rig.betas(alpha), field)
+        for names, points in read_matches(self.matches, files, {name: rig[name].hw for name in files}).items():
+            if alpha not in names:
+                continue
+            (a, b) = (names, points) if names[0] == alpha else (names[::-1], points[::-1])
+            own, beta = rig[a[0]], rig[a[1]]
+            assert isinstance(own, LensView)
+            assert isinstance(beta, LensView)
+            fields[a[1]] = AroundMatches.from_points(*b, own.hw, views=(own, beta), field=field)
+        return fields

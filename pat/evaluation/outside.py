@@ -1,0 +1,131 @@
+"""Disparities from elsewhere through the same fusion: those of OpenCV's SGBM, the true ones, and a rough prior."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from arraygeom import ReceptiveField
+from arraygeom.fields import AroundDepth
+
+from ..data.pairs import PAPER_DISPARITY, StereoPair
+from ..fusion.fuse import fuse
+from ..media.colour import luminance, to_bytes
+from ..networks.protocol import FusionNetwork
+from .baseline import checked_disparity
+from .metrics import score
+from .protocols import MonoColourTask, hw_of, mono_colour_task, rectified_rig
+from .stereo import disparity_errors
+from .tables import distinct, markdown_table
+
+PRIOR = 0.05
+"""Share by which the depths of the prior are off at most."""
+BUMP = 64
+"""Pixels between the values from which the prior's error is interpolated."""
+
+
+class OutsideRow(NamedTuple):
+    """One source of disparities on one pair; seconds of the fusion, and of SGBM where it is one."""
+
+    pair: str
+    source: str
+    psnr: float
+    end_point_error: float
+    within_one: float
+    seconds: float
+
+
+def evaluate_outside(
+    pairs: Iterable[StereoPair],
+    network: FusionNetwork,
+    *,
+    rate: int = 2,
+    each: Callable[[OutsideRow], None] = lambda row: None,
+) -> list[OutsideRow]:
+    """Every source on every pair with true disparity, beta reduced `rate` times."""
+    rows = []
+    for pair in pairs:
+        if pair.disparity is None:
+            continue
+        task = mono_colour_task(pair, rate)
+        for source, field_of in SOURCES.items():
+            rows.append(_row(pair, task, network, source, field_of))
+            each(rows[-1])
+    return rows
+
+
+def outside_markdown(rows: Sequence[OutsideRow]) -> str:
+    """A line for each source: means over the pairs."""
+    lines = []
+    for source in distinct(row.source for row in rows):
+        own = [row for row in rows if row.source == source]
+        psnr, error, within, seconds = np.mean([row[2:] for row in own], 0)
+        lines.append([source, f"{psnr:.2f}", f"{error:.2f}", f"{within:.1%}", f"{seconds:.1f}"])
+    count = len(distinct(row.pair for row in rows))
+    columns = [f"disparity, {count} pairs", "dB", "mean error, px", "within 1 px", "seconds"]
+    return markdown_table(columns, lines)
+
+
+FieldOf = Callable[[StereoPair, MonoColourTask], ReceptiveField | None]
+
+
+def _row(pair: StereoPair, task: MonoColourTask, network: FusionNetwork, source: str, field_of: FieldOf) -> OutsideRow:
+    hw = hw_of(task.alpha)
+    rig = rectified_rig(hw, {"beta": hw_of(task.beta)}, PAPER_DISPARITY)
+    began = time.perf_counter()
+    field = field_of(pair, task)
+    frame = fuse(network, rig, {"alpha": task.alpha, "beta": task.beta}, alpha="alpha", field=field)
+    seconds = time.perf_counter() - began
+    assert pair.disparity is not None
+    error, within = disparity_errors(hw[1] / frame.depth, pair.disparity)
+    assert error is not None
+    assert within is not None
+    psnr = score(frame.image.clamp(0, 1), task.ground_truth).psnr
+    return OutsideRow(pair.name, source, psnr, error, within, seconds)
+
+
+def _around(disparity: Float[Tensor, "h w"], known: Tensor, tolerance: float) -> AroundDepth:
+    """The field around a disparity of a `rectified_rig`."""
+    depth = disparity.shape[1] / torch.where(known & (disparity > 0), disparity, torch.nan)
+    return AroundDepth(depth, tolerance)
+
+
+def _sgbm(pair: StereoPair, task: MonoColourTask) -> ReceptiveField:
+    hw = hw_of(task.alpha)
+    beta = interpolate(luminance(task.beta)[None], hw, mode="bicubic", align_corners=False)[0].clamp(0, 1)
+    disparity, consistent = checked_disparity(to_bytes(task.alpha[0]), to_bytes(beta[0]), round(PAPER_DISPARITY))
+    return _around(torch.from_numpy(disparity), torch.from_numpy(consistent), 0.0)
+
+
+def _true(pair: StereoPair, task: MonoColourTask) -> ReceptiveField:
+    return _around(*_truth(pair, task), 0.0)
+
+
+def _prior(pair: StereoPair, task: MonoColourTask) -> ReceptiveField:
+    disparity, known = _truth(pair, task)
+    h, w = disparity.shape
+    coarse = torch.rand(1, 1, h // BUMP + 2, w // BUMP + 2, generator=torch.Generator().manual_seed(0))
+    error = interpolate(coarse, (h, w), mode="bilinear", align_corners=True)[0, 0]
+    return _around(disparity * (1 + PRIOR * (2 * error - 1)), known, PRIOR)
+
+
+def _truth(pair: StereoPair, task: MonoColourTask) -> tuple[Tensor, Tensor]:
+    assert pair.disparity is not None
+    h, w = hw_of(task.alpha)
+    return pair.disparity.value[:h, :w].float(), pair.disparity.valid[:h, :w]
+
+
+SOURCES: dict[str, FieldOf] = {
+    "own matches": lambda pair, task: None,
+    "OpenCV's SGBM, own where it has none": _sgbm,
+    "true disparities": _true,
+    "true depth to 5 %, as a prior": _prior,
+}
+"""The field of each source; None: the default."""

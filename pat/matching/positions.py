@@ -1,0 +1,82 @@
+"""Where matches are: positions along search segments, from their far ends, and what beta shows there."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from arraygeom import Segments
+from arraygeom.sampling import on_image, sample
+
+FINE = 2
+"""Matching is done on images this many times smaller."""
+
+
+class Extent(NamedTuple):
+    r"""Lengths of segments (\*n), and unit vectors from end to start (\*n, 2)."""
+
+    length: Tensor
+    towards: Tensor
+
+    @classmethod
+    def of(cls, segments: Segments) -> Extent:
+        """That of segments; the vector is zero where one is a point."""
+        length = segments.length
+        divisor = torch.where(length > 0, length, 1.0)
+        x, y = (segments.start - segments.end).unbind(-1)
+        return cls(length, torch.stack([x / divisor, y / divisor], -1))
+
+
+def reduced(segments: Segments, factor: int) -> Segments:
+    """The same segments in pixels of a beta that is `factor` times smaller."""
+    start, end = ((x + 0.5) / factor - 0.5 for x in (segments.start, segments.end))
+    return Segments(start, end, segments.valid)
+
+
+def matches(
+    segments: Segments,
+    disparity: Float[Tensor, "b 1 _ _"],
+    *,
+    beyond_edge: bool = False,
+    extent: Extent | None = None,
+) -> Float[Tensor, "b h w 2"]:
+    """Where the alpha pixels of segments (B or 1, H, W) have their matches `disparity` from the ends, beta's
+    pixels.
+
+    Disparity may be at half the size. Not beyond the segments' near ends, unless `beyond_edge`. `extent` is
+    the segments', if it is known.
+    """
+    length, towards = extent or Extent.of(segments)
+    if disparity.shape[-2:] != length.shape[-2:]:
+        disparity = interpolate(disparity, scale_factor=FINE, mode="bilinear")
+    far = disparity[:, 0].to(length).clamp(min=0)
+    return segments.end + (far if beyond_edge else far.minimum(length))[..., None] * towards
+
+
+def at_matches(
+    beta: Float[Tensor, "b c hb wb"],
+    segments: Segments,
+    disparity: Float[Tensor, "b 1 _ _"],
+    extent: Extent | None = None,
+) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
+    """What beta shows at the matches, at its edge where these are beyond it, and where they are not."""
+    hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, disparity, extent=extent).to(beta)
+    position = middle.reshape(len(beta), -1, 2)
+    inside = position.clamp(min=0).minimum(position.new_tensor([hw[1] - 1, hw[0] - 1]))
+    values = sample(beta, inside, interpolation="bicubic").values
+    return values.reshape(*beta.shape[:2], *middle.shape[1:3]), on_image(middle, hw)[:, None]
+
+
+def normals(segments: Segments) -> Float[Tensor, "*n 2"]:
+    """Unit vectors across the segments; zero where a segment is a point."""
+    direction = Extent.of(segments).towards
+    return torch.stack([-direction[..., 1], direction[..., 0]], -1)
+
+
+def enlarged(x: Tensor) -> Tensor:
+    """From half the size, each value four times."""
+    return x.repeat_interleave(FINE, -1).repeat_interleave(FINE, -2)

@@ -1,0 +1,70 @@
+"""Depth maps from files: PFM, TIFF, and PNG of 16 bits."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from .headers import HW
+from .images import read_recorded
+
+MILLIMETRE = 0.001
+"""Metres of a count in maps of whole numbers: depth cameras (RealSense, ZED, Kinect) count millimetres."""
+
+
+def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = None) -> Float[Tensor, "h w"]:
+    """Depth z in metres (H, W), float32; NaN where it is not positive and finite.
+
+    `scale` is metres of one unit of the file: by default 1 of float files, and of whole numbers what a depth_16.png
+    from `pat fuse` states, else `MILLIMETRE`. Raises FileNotFoundError, and ValueError for what is no depth map, or has
+    another size than `hw`.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such depth map: check the path")
+    if path.suffix.lower() == ".pfm":
+        values = _pfm(path)
+    else:
+        planes = read_recorded(path)
+        if len(planes) != 1:
+            raise ValueError(f"{path}: has {len(planes)} channels, a depth map has one: give depth, not its picture")
+        values = planes[0]
+    if hw is not None and values.shape != tuple(hw):
+        (h, w), (height, width) = values.shape, hw
+        raise ValueError(f"{path}: is {w}x{h}, alpha's image is {width}x{height}: give the depth of alpha's pixels")
+    if values.dtype == np.uint8:
+        raise ValueError(f"{path}: has 8 bits, too few for depth: give PFM, float TIFF, or PNG of 16 bits")
+    if scale is None:
+        scale = 1.0 if np.issubdtype(values.dtype, np.floating) else _stated_scale(path) or MILLIMETRE
+    depth = torch.from_numpy(values.astype(np.float32)) * scale
+    known = depth.isfinite() & (depth > 0)
+    if not known.any():
+        raise ValueError(f"{path}: no pixel has a positive depth: is it a depth map?")
+    return torch.where(known, depth, torch.nan)
+
+
+def _pfm(path: Path) -> NDArray[np.float32]:
+    """A grey PFM file: text "Pf", width and height, scale (negative: little-endian), then rows from the bottom up."""
+    content = path.read_bytes()
+    head = re.match(rb"Pf\s+(\d+)\s+(\d+)\s+(-?[0-9.eE+-]+)\s", content)
+    if head is None:
+        raise ValueError(f"{path}: not a grey PFM file: give one that begins with 'Pf', or float TIFF")
+    w, h, scale = int(head[1]), int(head[2]), float(head[3])
+    values = np.frombuffer(content, "<f4" if scale < 0 else ">f4", offset=head.end())
+    if values.size != h * w:
+        raise ValueError(f"{path}: has {values.size} values, {w}x{h} are {h * w}: the file is not whole")
+    return values.reshape(h, w)[::-1].astype(np.float32)
+
+
+def _stated_scale(path: Path) -> float | None:
+    """Metres of a count as `write_depth` states them in a PNG file; None in other files."""
+    with Image.open(path) as image:
+        said = re.match(r"depth: ([0-9.e+-]+) counts a metre", str(image.info.get("Description", "")))
+    return None if said is None else 1 / float(said[1])

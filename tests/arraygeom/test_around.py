@@ -1,0 +1,114 @@
+"""Fields around a known depth or known matches: where the segments are, also as views change before fusion."""
+
+import math
+
+import pytest
+import torch
+
+from arraygeom import Camera, Distortion, Link, Pair, Pose, Rectified, Rig, View, intrinsics, pinhole_view, pixel_grid
+from arraygeom.fields import AroundDepth, AroundMatches, Epipolar
+
+HW = (60, 90)
+LENS = Distortion("brown-conrady", torch.tensor([-0.15, 0.02, 1e-3, 0.0], dtype=torch.float64))
+
+
+def rig_of(lens: Distortion | None = None) -> Rig:
+    alpha = Camera(K=intrinsics(80.0, HW), cam_from_world=Pose.identity(), hw=HW, distortion=lens)
+    beside = alpha.replace(cam_from_world=Pose(alpha.R, alpha.t.new_tensor([-0.2, 0.01, 0.0])))
+    return Rig({"a": alpha, "b": beside}, depth=(1.0, 50.0))
+
+
+def straightened(rig: Rig, turns: int = 0) -> Rig:
+    """Pinhole views in place of lenses, and the second one rotated, as before a fusion."""
+    for name in rig.names:
+        view = pinhole_view(rig[name])
+        rig = rig.with_camera(name, view)
+    return rig.rot90("b", turns)
+
+
+def sloping(hw=HW) -> torch.Tensor:
+    return 2 + 0.05 * pixel_grid(hw)[..., 0] + 0.02 * pixel_grid(hw)[..., 1]
+
+
+def test_segments_are_between_the_bounds_of_each_pixels_depth():
+    pair, depth = rig_of().pair("a", "b"), sloping()
+    x = pixel_grid(HW, dtype=torch.float64)[5:50, 40:80]
+    found = AroundDepth(depth, 0.1)(pair, x)
+    z = depth[5:50, 40:80].double()
+    alpha, beta = pair.cameras
+    for end, bound in ((found.start, z / 1.1), (found.end, z * 1.1)):
+        expected = beta.project(alpha.unproject(x, bound)).x
+        assert found.valid.all()
+        assert torch.allclose(end, expected, atol=1e-6)
+    point = AroundDepth(depth, 0.0)(pair, x)
+    assert float(point.length.max()) < 1e-6
+
+
+def test_where_depth_is_not_known_the_whole_range_is_searched():
+    pair, depth = rig_of().pair("a", "b"), sloping()
+    depth[10, 60], depth[11, 60], depth[12, 60] = math.nan, 0.0, math.inf
+    x = torch.tensor([[60.0, 10.0], [60.0, 11.0], [60.0, 12.0]], dtype=torch.float64)
+    found, whole = AroundDepth(depth)(pair, x), Epipolar()(pair, x)
+    assert torch.allclose(found.start, whole.start)
+    assert torch.allclose(found.end, whole.end)
+
+
+def test_depth_is_of_the_pixels_as_recorded():
+    """A map of the image with its lens serves the pinhole view that fusion makes of it."""
+    rig, depth = rig_of(LENS), sloping()
+    now = straightened(rig)
+    lens, pinhole = rig["a"], now["a"]
+    recorded = torch.tensor([[30.0, 12.0], [70.0, 50.0]], dtype=torch.float64)
+    x = pinhole.project(lens.unproject(recorded, torch.ones(2).double())).x
+    found = AroundDepth(depth, 0.0, lens)(now.pair("a", "b"), x)
+    z = torch.stack([depth[12, 30], depth[50, 70]]).double()
+    expected = now["b"].project(lens.unproject(recorded, z)).x
+    assert torch.allclose(found.start, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("turns", [0, 1])
+def test_matches_are_of_the_pixels_as_recorded(turns):
+    rig = rig_of(LENS)
+    now = straightened(rig, turns)
+    recorded = torch.tensor([[30.0, 12.0], [70.0, 50.0]], dtype=torch.float64)
+    X = rig["a"].unproject(recorded, torch.tensor([2.5, 4.0]).double())
+    field = AroundMatches.from_points(recorded, rig["b"].project(X).x, HW, 0.5, (rig["a"], rig["b"]))
+    found = field(now.pair("a", "b"), now["a"].project(X).x)
+    expected = now["b"].project(X).x
+    assert found.valid.all()
+    assert float((found.at(torch.full((2,), 0.5)) - expected).norm(dim=-1).max()) < 0.02
+    assert torch.allclose(found.length, torch.ones(2).double(), atol=1e-3)
+
+
+def test_matches_off_their_lines_do_not_count():
+    pair = rig_of().pair("a", "b")
+    x = torch.tensor([[30.0, 12.0], [70.0, 50.0]], dtype=torch.float64)
+    whole = Epipolar()(pair, x)
+    there = whole.at(torch.full((2,), 0.4)) + torch.tensor([[0.0, 1.5], [0.0, 4.0]])
+    found = AroundMatches.from_points(x, there, HW, 1.0)(pair, x)
+    assert found.length[0] < 2.1
+    assert torch.equal(found.start[1], whole.start[1])
+
+
+def test_disparities_of_a_rectified_pair_without_calibration():
+    pair = Pair(View(hw=HW), View(hw=HW))
+    disparity = torch.full(HW, 6.0)
+    disparity[20, 50] = math.nan
+    x = torch.tensor([[40.0, 20.0], [50.0, 20.0]], dtype=torch.float64)
+    found = AroundMatches(AroundMatches.from_disparity(disparity).positions, 2.0, field=Rectified(20.0))(pair, x)
+    assert found.start[0].tolist() == pytest.approx([32.0, 20.0])
+    assert found.end[0].tolist() == pytest.approx([36.0, 20.0])
+    assert found.length[1] == 20
+
+
+def test_wrong_uses_are_refused():
+    rig = rig_of()
+    with pytest.raises(ValueError, match="is of 90x59 pixels, alpha has 90x60"):
+        AroundDepth(torch.ones(59, 90), 0.1, rig["a"])
+    with pytest.raises(ValueError, match="tolerance is -1"):
+        AroundDepth(torch.ones(HW), -1.0)
+    F = rig.pair("a", "b").fundamental
+    linked = Pair(View(hw=HW), View(hw=HW), link=Link(F, torch.eye(3, dtype=torch.float64)))
+    field = AroundMatches(torch.zeros(*HW, 2), 1.0, (rig["a"], rig["b"]))
+    with pytest.raises(ValueError, match="without K"):
+        field(linked, torch.zeros(1, 2))

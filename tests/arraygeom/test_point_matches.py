@@ -1,0 +1,83 @@
+"""Matched points from CSV files and COLMAP databases, and what is refused."""
+
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from arraygeom.io.point_matches import MAX_IMAGES, read_matches
+
+FILES = {"mono": Path("photos/a.png"), "colour": Path("photos/b.png")}
+SIZES = {"mono": (60, 80), "colour": (50, 70)}
+POINTS = np.array([[1.0, 2.0], [30.5, 40.25], [79.0, 59.0]]), np.array([[3.0, 4.0], [20.0, 21.0], [69.0, 49.0]])
+
+
+def database(path, *, verified=True, first="a.png"):
+    """A COLMAP database (its documentation's tables): pixels from .5, numbers of keypoints in another order."""
+    with sqlite3.connect(path) as file:
+        file.execute("CREATE TABLE images (image_id INTEGER, name TEXT)")
+        file.execute("CREATE TABLE keypoints (image_id INTEGER, rows INTEGER, cols INTEGER, data BLOB)")
+        for table in ("matches", "two_view_geometries"):
+            file.execute(f"CREATE TABLE {table} (pair_id INTEGER, rows INTEGER, cols INTEGER, data BLOB)")
+        for number, (name, points) in enumerate(((f"set/{first}", POINTS[0]), ("set/b.png", POINTS[1][::-1])), 1):
+            six = np.concatenate([points + 0.5, np.zeros((len(points), 4))], 1).astype(np.float32)
+            file.execute("INSERT INTO images VALUES (?, ?)", (number, name))
+            file.execute("INSERT INTO keypoints VALUES (?, ?, 6, ?)", (number, len(points), six.tobytes()))
+        pairs = np.array([[0, 2], [1, 1], [2, 0]], np.uint32)
+        table = "two_view_geometries" if verified else "matches"
+        file.execute(f"INSERT INTO {table} VALUES (?, 3, 2, ?)", (MAX_IMAGES + 2, pairs.tobytes()))
+
+
+@pytest.mark.parametrize("text", ["x0,y0,x1,y1\n{}", "{}", "# alpha beta\n{}"])
+@pytest.mark.parametrize("between", [",", " ", "\t", ";"])
+def test_csv(tmp_path, text, between):
+    rows = "\n".join(between.join(map(str, row)) for row in np.hstack(POINTS))
+    (tmp_path / "m.csv").write_text(text.format(rows))
+    found = read_matches(tmp_path / "m.csv", FILES, SIZES)["mono", "colour"]
+    for one, points in zip(found, POINTS):
+        assert np.array_equal(one.numpy(), points)
+
+
+@pytest.mark.parametrize("verified", [True, False])
+def test_colmap(tmp_path, verified):
+    database(tmp_path / "database.db", verified=verified)
+    found = read_matches(tmp_path / "database.db", FILES, SIZES)["mono", "colour"]
+    for one, points in zip(found, POINTS):
+        assert torch.allclose(one, torch.from_numpy(points))
+
+
+def test_colmap_pairs_are_of_the_cameras_whatever_their_order(tmp_path):
+    database(tmp_path / "database.db")
+    turned = dict(reversed(FILES.items()))
+    assert list(read_matches(tmp_path / "database.db", turned, SIZES)) == [("mono", "colour")]
+
+
+def test_what_is_refused(tmp_path):
+    path = tmp_path / "m.csv"
+    path.write_text("1,2,3,4\n1,2,300,4\n")
+    with pytest.raises(ValueError, match="1 of 2 points are outside the image of 'colour', 70x50"):
+        read_matches(path, FILES, SIZES)
+    path.write_text("1,2,3,4\n1,2,3\n")
+    with pytest.raises(ValueError, match=r"line '1,2,3' is not four numbers"):
+        read_matches(path, FILES, SIZES)
+    path.write_text("1,2,nan,4\n")
+    with pytest.raises(ValueError, match="not finite"):
+        read_matches(path, FILES, SIZES)
+    path.write_text("")
+    with pytest.raises(ValueError, match="an empty file is not four numbers"):
+        read_matches(path, FILES, SIZES)
+    with pytest.raises(ValueError, match="3 are given"):
+        read_matches(path, {**FILES, "nir": Path("c.png")}, SIZES)
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ValueError, match="neither CSV nor"):
+        read_matches(path, FILES, SIZES)
+    path.write_bytes(b"SQLite format 3\0" + bytes(100))
+    with pytest.raises(ValueError, match="not a COLMAP database"):
+        read_matches(path, FILES, SIZES)
+    with pytest.raises(FileNotFoundError, match="no such file of matches"):
+        read_matches(tmp_path / "none.csv", FILES, SIZES)
+    database(tmp_path / "other.db", first="c.png")
+    with pytest.raises(ValueError, match=r"has no image a.png \(it has c.png, b.png"):
+        read_matches(tmp_path / "other.db", FILES, SIZES)

@@ -1,0 +1,114 @@
+"""`--depth-map` and `--matches` of fuse, align and the rig commands, on a wall with a post before it."""
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+import torch
+from torch.nn.functional import interpolate
+
+from arraygeom import Camera, Pose, Rig, intrinsics
+from pat.cli.main import main
+from pat.fusion.align import OCCLUDED
+from pat.fusion.align import align as aligned
+from pat.media.images import read_image, write_image
+
+H, W = 96, 160
+WALL, POST, BASELINE = 4.0, 2.0, 0.25
+FAR, NEAR = 10, 20
+"""Disparities of wall and post, pixels."""
+ON_POST = slice(70, 90)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Rig, images and what is known of them; beta's image has nothing to do with alpha's in `blind.png`."""
+    folder = tmp_path_factory.mktemp("known")
+    camera = Camera(K=intrinsics(float(W), (H, W)), cam_from_world=Pose.identity(), hw=(H, W))
+    beside = camera.replace(cam_from_world=Pose(camera.R, camera.t.new_tensor([-BASELINE, 0.0, 0.0])))
+    Rig({"mono": camera, "colour": beside}, depth=(1.0, 50.0)).save(folder / "rig.yaml")
+    noise = torch.rand(2, 3, H // 2, W // 2 + 10, generator=torch.Generator().manual_seed(0))
+    wall, post = interpolate(noise, size=(H, W + 20), mode="bicubic", align_corners=False).clamp(0, 1)
+    mono, colour, depth = wall[..., :W].clone(), wall[..., FAR : FAR + W].clone(), torch.full((H, W), WALL)
+    mono[..., ON_POST] = post[..., ON_POST]
+    colour[..., ON_POST.start - NEAR : ON_POST.stop - NEAR] = post[..., ON_POST]
+    depth[:, ON_POST] = POST
+    write_image(folder / "mono.png", mono.mean(0, keepdim=True))
+    write_image(folder / "colour.png", colour)
+    write_image(folder / "blind.png", noise[1, :, :48, :80].repeat(1, 2, 2).rot90(2, (1, 2)))
+    tifffile.imwrite(folder / "depth.tif", depth.numpy())
+    cv2.imwrite(str(folder / "depth.png"), (depth.numpy() * 5000).astype(np.uint16))
+    y, x = np.mgrid[4:H:8, 24:W:8]
+    d = np.where(depth.numpy()[y, x] == WALL, FAR, NEAR)
+    np.savetxt(folder / "matches.csv", np.stack([x, y, x - d, y], -1).reshape(-1, 4), delimiter=",")
+    return folder
+
+
+def run(folder, command, *options, colour="colour.png"):
+    images = ["--image", f"mono={folder / 'mono.png'}", "--image", f"colour={folder / colour}"]
+    main([command, str(folder / "rig.yaml"), "--alpha", "mono", *images, "-o", str(folder / "out"), *options])
+
+
+def depth_of(folder):
+    return tifffile.imread(folder / "out" / "depth.tif")[:, 40:]
+
+
+@pytest.mark.parametrize("file", [["depth.tif"], ["depth.png", "--depth-scale", "0.0002"]])
+def test_a_depth_map_is_taken_as_it_is(folder, file):
+    """Whatever the images show: beta's is of something else."""
+    name, *scale = file
+    known = ["--depth-map", str(folder / name), *scale, "--depth-tolerance", "0", "--no-align"]
+    run(folder, "fuse", *known, "--response", "rec601", colour="blind.png")
+    found, true = depth_of(folder), tifffile.imread(folder / "depth.tif")[:, 40:]
+    known = np.isfinite(found)
+    assert known.mean() > 0.8
+    assert np.abs(found - true)[known].max() < 1e-2
+
+
+def test_what_the_post_hides_is_occluded(folder):
+    from arraygeom.fields import AroundDepth
+
+    rig = Rig.load(folder / "rig.yaml")
+    images = {name: read_image(folder / f"{name}.png") for name in rig.names}
+    depth = torch.from_numpy(tifffile.imread(folder / "depth.tif"))
+    view = aligned(rig, images, alpha="mono", correct=False, field=AroundDepth(depth, 0.02, rig["mono"]))["colour"]
+    hidden = slice(ON_POST.start - (NEAR - FAR), ON_POST.start)
+    assert (view.visibility[:, hidden][:, 2:-2] == OCCLUDED).mean() > 0.9
+    assert view.valid[:, ON_POST].mean() > 0.9
+    assert view.valid[:, ON_POST.stop + 4 : -4].mean() > 0.9
+
+
+def test_matches_guide_the_search(folder):
+    run(folder, "align", "--matches", str(folder / "matches.csv"))
+    inner = depth_of(folder)
+    assert np.nanmedian(np.abs(inner - tifffile.imread(folder / "depth.tif")[:, 40:])) < 0.05
+
+
+def test_rig_commands_take_matches(folder, capsys):
+    images = ["--image", f"mono={folder / 'mono.png'}", "--image", f"colour={folder / 'colour.png'}"]
+    matches = ["--matches", str(folder / "matches.csv")]
+    main(["rig", "doctor", str(folder / "rig.yaml"), *images, *matches])
+    assert "204 points" in capsys.readouterr().out
+    main(["rig", "start", *images, *matches, "-o", str(folder / "started.yaml")])
+    assert "points" in capsys.readouterr().out
+    assert Rig.load(folder / "started.yaml").links
+    out = ["-o", str(folder / "refined.yaml"), "--no-photometric"]
+    main(["rig", "refine", str(folder / "rig.yaml"), *images, *matches, *out])
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--depth-map", "{}/depth.tif", "--matches", "{}/matches.csv"], "goes with neither"),
+        (["--depth-map", "{}/depth.png", "--depth-scale", "1"], "is of 1e+04 to 2e+04 m, the rig's"),
+        (["--depth-map", "{}/mono.png"], "8 bits, too few"),
+        (["--depth-map", "{}/none.png"], "no such depth map"),
+        (["--matches", "{}/mono.png"], "neither CSV nor a COLMAP database"),
+        (["--depth-map", "{}/depth.tif", "--depth-tolerance", "-1"], "tolerance is -1.0"),
+    ],
+)
+def test_bad_input_is_one_line(folder, options, expected, capsys):
+    with pytest.raises(SystemExit) as stop:
+        run(folder, "fuse", *(word.format(folder) for word in options))
+    assert stop.value.code == 2
+    assert expected in capsys.readouterr().err.splitlines()[-1]
