@@ -1,7 +1,8 @@
-"""Means over pixels whose surroundings are alike: non-local means (Buades et al. 2005) guided by another image.
+"""Means over pixels whose surroundings are alike: non-local means (Buades et al. 2005) guided by another
+image.
 
-What a network makes of noisy views still has some of their noise. Pixels that are alike in its image are averaged in
-it, and then what betas recorded there.
+What a network makes of noisy views still has some of their noise. Pixels that are alike in its image are
+averaged in it, and then what betas recorded there.
 """
 
 from __future__ import annotations
@@ -46,10 +47,11 @@ OWN, RECORDED, ROWS = SETTINGS.own, SETTINGS.recorded, SETTINGS.rows
 def averaged_with_alike(
     image: Float[Tensor, "3 h w"], beta: Float[Tensor, "3 h w"], confidence: Float[Tensor, "1 h w"], deviation: float
 ) -> Float[Tensor, "3 h w"]:
-    """An image with the mean colour of what is alike near each pixel: of its own, and of that recorded by beta.
+    """An image with the mean colour of what is alike near each pixel: of its own, and of that recorded by
+    beta.
 
-    Luma stays. `beta` are its values at alpha's pixels, to be used as far as `confidence` says, with noise of this
-    standard deviation in the mean.
+    Luma stays. `beta` are its values at alpha's pixels, to be used as far as `confidence` says, with noise of
+    this standard deviation in the mean.
     """
     luma, counts, root = luminance(image), confidence.square(), deviation**0.5
     colour = (image - luma)[[0, 2]]
@@ -69,9 +71,10 @@ def sums_of_alike(
 ) -> tuple[Float[Tensor, "k h w"], Float[Tensor, "1 h w"]]:
     """For each pixel the weighted sums of the values at pixels around it, and of the weights.
 
-    The weight is about exp(-d / scale^2), where d is the mean square difference of the guide's 3 x 3 patches around
-    both. The pixels are those at most `radius` rows and columns away, every `step`-th of them; beyond the edges images
-    are mirrored. All in float32 on the CPU, on as many threads as torch may use; back on the values' device.
+    The weight is about exp(-d / scale^2), where d is the mean square difference of the guide's 3 x 3 patches
+    around both. The pixels are those at most `radius` rows and columns away, every `step`-th of them; beyond
+    the edges images are mirrored. All in float32 on the CPU, on as many threads as torch may use; back on the
+    values' device.
     """
     h, w = guide.shape[-2:]
     around = radius + 1

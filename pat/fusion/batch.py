@@ -1,9 +1,10 @@
-"""Many frames, and sequences, from folders to a folder: what `pat fuse` does with more than one image a camera.
+"""Many frames, and sequences, from folders to a folder: what `pat fuse` does with more than one image a
+camera.
 
-Every frame is a task of its own that leaves its image last; `settings.yaml` beside the images says what they were
-made with, and a job is resumed with the same settings only; `inputs.json` says from which images, and frames whose
-images have changed are made again. One command at a time writes to a folder. The colours of a sequence's key frames
-wait in `.keys` until all frames are there.
+Every frame is a task of its own that leaves its image last; `settings.yaml` beside the images says what they
+were made with, and a job is resumed with the same settings only; `inputs.json` says from which images, and
+frames whose images have changed are made again. One command at a time writes to a folder. The colours of a
+sequence's key frames wait in `.keys` until all frames are there.
 """
 
 from __future__ import annotations
@@ -61,8 +62,9 @@ FIELD_CLASSES = {kind.__name__: kind for kind in (*FIELDS.values(), ThroughLense
 class Batch:
     """What is to be fused and how: `files` by camera, the frames in order; `out`, the folder of the results.
 
-    Options are as of `fuse` and `save_frame`. A `sequence` is fused as `fuse_sequence` does, else the first frame with
-    the first of every other camera, the second with the second and so on (`frame_matching` finds which these are).
+    Options are as of `fuse` and `save_frame`. A `sequence` is fused as `fuse_sequence` does, else the first
+    frame with the first of every other camera, the second with the second and so on (`frame_matching` finds
+    which these are).
     """
 
     rig: Rig
@@ -134,7 +136,8 @@ class Batch:
 
     @property
     def inputs(self) -> dict[str, str]:
-        """A digest of the names, sizes and times of the images each frame is made from: all of them in a sequence."""
+        """A digest of the names, sizes and times of the images each frame is made from: all of them in a
+        sequence."""
         stamps = {name: [_stamp(file) for file in files] for name, files in self.files.items()}
         if self.sequence:
             return dict.fromkeys(self.names, _digest(stamps))
@@ -155,8 +158,8 @@ class Batch:
     ) -> JobReport:
         """Fuse all frames. With `video`, its frames a second, fused.mp4 is written when all are there.
 
-        Raises JobError if a frame fails and the job is to stop, ValueError to resume with other settings, and for a
-        folder that another command is writing to, or that cannot be written to.
+        Raises JobError if a frame fails and the job is to stop, ValueError to resume with other settings, and
+        for a folder that another command is writing to, or that cannot be written to.
         """
         with folder_lock(self.out):
             return self._run(workers, resume, on_error, video, console)
@@ -183,7 +186,8 @@ class Batch:
         return report
 
     def _begin(self, resume: bool) -> None:
-        """Write the settings and what the frames are made from; or, to resume, compare them with those of before.
+        """Write the settings and what the frames are made from; or, to resume, compare them with those of
+        before.
 
         Frames whose images are not those of before are removed.
         """
@@ -203,7 +207,8 @@ class Batch:
         write_text(self.out / KEYS / PLAN, self.to_json())
 
     def to_json(self) -> str:
-        """The batch as text for the processes that fuse its frames. Raises ValueError for a field of one's own."""
+        """The batch as text for the processes that fuse its frames. Raises ValueError for a field of one's
+        own."""
         entries = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
         entries["rig"] = rig_text(self.rig)
         entries["files"] = {name: [str(file) for file in files] for name, files in self.files.items()}
@@ -297,7 +302,8 @@ def noise_document(noise: Noise | None) -> str | dict[str, Any] | None:
 
 
 def field_document(field: ReceptiveField | None) -> dict[str, Any] | None:
-    """A field as its class's name and entries. Raises ValueError for other fields than the families of arraygeom."""
+    """A field as its class's name and entries. Raises ValueError for other fields than the families of
+    arraygeom."""
     if field is None:
         return None
     if FIELD_CLASSES.get(type(field).__name__) is not type(field):
@@ -358,7 +364,8 @@ def _network(weights: str, precision: Precision) -> Network:
 
 
 def find_images(text: str | Path, *, name: str = "") -> list[Path]:
-    """The images of a folder, of a pattern such as "a/mono_*.png", or one file; numbers in names count as numbers.
+    """The images of a folder, of a pattern such as "a/mono_*.png", or one file; numbers in names count as
+    numbers.
 
     Raises FileNotFoundError if there is none.
     """

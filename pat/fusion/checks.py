@@ -14,11 +14,12 @@ from .results import Frame
 
 LOW_CONFIDENCE = 0.3
 UNFIT_CONFIDENCE = 0.21
-"""Mean confidences, where all views overlap, below which one is warned, and below which a rig is taken for wrong.
+"""Mean confidences, where all views overlap, below which one is warned, and below which a rig is taken for
+wrong.
 
-Measured with the shipped weights: 34 pairs with the sign of the baseline changed had .04 to .38, 29 of them below .3
-and 19 below .21; the same with the right rig .35 to .79, two without texture or with strong noise .22 and .23, and
-three bands at three positions .26 to .33.
+Measured with the shipped weights: 34 pairs with the sign of the baseline changed had .04 to .38, 29 of them
+below .3 and 19 below .21; the same with the right rig .35 to .79, two without texture or with strong noise
+.22 and .23, and three bands at three positions .26 to .33.
 """
 
 
@@ -31,7 +32,8 @@ class LowConfidenceWarning(UserWarning):
 def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs) -> None:
     """Warn if the mean confidence is low where the segments of all betas are valid.
 
-    Below `UNFIT_CONFIDENCE` by a `LowConfidenceWarning`. Only for networks whose confidence is a trained probability.
+    Below `UNFIT_CONFIDENCE` by a `LowConfidenceWarning`. Only for networks whose confidence is a trained
+    probability.
     """
     if not network.uses_matches:
         return

@@ -1,7 +1,8 @@
 """A second process that compiles the kernels of the fusion while this one begins with its work.
 
-numba compiles one function at a time in a process. The two meet in its cache: the second begins with the kernels that
-are needed last, neither compiles what the other does (`arraygeom.compiled`), and the first loads what it finds there.
+numba compiles one function at a time in a process. The two meet in its cache: the second begins with the
+kernels that are needed last, neither compiles what the other does (`arraygeom.compiled`), and the first loads
+what it finds there.
 """
 
 from __future__ import annotations
@@ -19,14 +20,15 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 WITHOUT_TORCH = "arraygeom", "pat.attention"
-"""Packages whose modules of kernels are imported without their `__init__`, which imports torch: two seconds."""
+"""Packages whose modules of kernels are imported without their `__init__`, which imports torch: two
+seconds."""
 
 _FIRST = Lock()
 
 
 def seems_compiled() -> bool:
-    """Whether numba's cache has code of attention for this version of Python, of whatever age; numba is not imported
-    for it."""
+    """Whether numba's cache has code of attention for this version of Python, of whatever age; numba is not
+    imported for it."""
     cache_home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folders = [
         ROOT / "pat" / "attention" / "kernels" / "__pycache__",
@@ -84,8 +86,8 @@ def _end_with_parent() -> None:
 
 
 def kernels() -> Iterator[tuple[Any, tuple[Any, ...]]]:
-    """The kernels that a frame of two cameras is fused by, in the order of their use, and the types of what they are
-    given."""
+    """The kernels that a frame of two cameras is fused by, in the order of their use, and the types of what
+    they are given."""
     from numba import float32, float64, int16, int32, int64, types, uint8, uint64
 
     from ..attention.kernels import attend_rows

@@ -1,4 +1,5 @@
-"""Which image files of several cameras are of one frame: by their names, their numbers or times in these, or in order.
+"""Which image files of several cameras are of one frame: by their names, their numbers or times in these, or
+in order.
 
 A camera that missed a frame would else shift all that follow.
 """
@@ -29,8 +30,8 @@ class MissingFramesWarning(UserWarning):
 def matched_frames(files: Files) -> dict[str, list[Path]]:
     """The files of the frames that every camera has, in order.
 
-    Warns of frames that some camera lacks, and where nothing but their order relates files. Raises ValueError if
-    nothing relates them and their numbers differ. A camera of one file is left as it is.
+    Warns of frames that some camera lacks, and where nothing but their order relates files. Raises ValueError
+    if nothing relates them and their numbers differ. A camera of one file is left as it is.
     """
     given = {name: list(paths) for name, paths in files.items()}
     if min(map(len, given.values())) < 2:
@@ -101,7 +102,8 @@ def _endings(files: Files) -> Keys | None:
 
 
 def _numbers(files: Files) -> Keys | None:
-    """The numbers in names that differ between a camera's files; of one number, times that are nearly equal are equal.
+    """The numbers in names that differ between a camera's files; of one number, times that are nearly equal
+    are equal.
 
     None where two files of a camera have the same, or some have other numbers of numbers.
     """

@@ -1,6 +1,7 @@
 """Whose brightness the fused image has: alpha's, or a colour beta's in alpha's detail.
 
-Where no combination of beta's bands is what alpha sees, as with near infrared, alpha's brightness in beta's colours is
+Where no combination of beta's bands is what alpha sees, as with near infrared, alpha's brightness in beta's
+colours is
 of neither camera: leaves are pale, skin is flat.
 """
 

@@ -1,10 +1,11 @@
 """Sequences: every frame of alpha in the colours of betas with clocks of their own.
 
-Colour is fused at key frames, those of alpha nearest in time to what a beta recorded, where each beta is searched
-where the points of alpha were at its own time (`Moved`), with a margin for the uncertainty of that (`Widened`). From
-the key frames before and after, it is warped to each frame along the motion between alpha's own frames, and mixed
-by time, confidence, and the weight of the motion. So colour does not flicker from frame to frame as single fusions do,
-and a frame depends on nothing but images: any one can be made alone, in any order, with the same result.
+Colour is fused at key frames, those of alpha nearest in time to what a beta recorded, where each beta is
+searched where the points of alpha were at its own time (`Moved`), with a margin for the uncertainty of that
+(`Widened`). From the key frames before and after, it is warped to each frame along the motion between alpha's
+own frames, and mixed by time, confidence, and the weight of the motion. So colour does not flicker from frame
+to frame as single fusions do, and a frame depends on nothing but images: any one can be made alone, in any
+order, with the same result.
 """
 
 from __future__ import annotations
@@ -65,7 +66,8 @@ SETTINGS = SequenceSettings()
 
 
 class KeyColour(NamedTuple):
-    """What fusion adds to alpha at a key frame (C, H, W), with confidence and inverse depth (0: unknown), (H, W)."""
+    """What fusion adds to alpha at a key frame (C, H, W), with confidence and inverse depth (0: unknown), (H,
+    W)."""
 
     added: Float[Tensor, "c h w"]
     confidence: Float[Tensor, "h w"]
@@ -114,7 +116,8 @@ class SequenceFusion:
         return self.recorded(i) if self.keep_alpha else self.grey(i)
 
     def alone(self, i: int) -> Frame:
-        """The frame fused by itself with the betas nearest in time, motion or not: what warping is compared with."""
+        """The frame fused by itself with the betas nearest in time, motion or not: what warping is compared
+        with."""
         return self._fused(i, self.timeline.at(i), {}, alone=True)
 
     def colour(self, key: KeyFrame) -> KeyColour:
@@ -130,7 +133,8 @@ class SequenceFusion:
     def frame(self, i: int, keys: Sequence[KeyFrame], fetch: Callable[[KeyFrame], KeyColour | None]) -> Frame:
         """Any frame, its colour warped from the key frames around it.
 
-        `fetch` gives a key frame's colour, or None for one that could not be fused. Raises ValueError if none could.
+        `fetch` gives a key frame's colour, or None for one that could not be fused. Raises ValueError if none
+        could.
         """
         own = self.grey(i)
         sources = [self._warped(i, own, key, colour) for key in self._around(i, keys) if (colour := fetch(key))]
@@ -186,8 +190,8 @@ class SequenceFusion:
     def _fused(
         self, i: int, betas: Mapping[str, int], fields: Mapping[str, ReceptiveField], *, alone: bool = False
     ) -> Frame:
-        """Alpha's frame with those of betas. Levels are matched over several frames, or in this one if it is alone or
-        its noise, which is of images as recorded, is to be removed."""
+        """Alpha's frame with those of betas. Levels are matched over several frames, or in this one if it is
+        alone or its noise, which is of images as recorded, is to be removed."""
         images = {name: self.frames[name][j] for name, j in betas.items()}
         alone = alone or self.noise is not None
         if self.match_levels and not alone:
@@ -217,7 +221,8 @@ class SequenceFusion:
 
     @cached_property
     def _noise(self) -> Mapping[str, NoiseLevel] | None:
-        """The noise of each camera, stated or estimated once, near the middle; None if views are not denoised."""
+        """The noise of each camera, stated or estimated once, near the middle; None if views are not
+        denoised."""
         if not isinstance(self.noise, str):
             return self.noise
         nothing: Mapping[str, NoiseLevel] = {}
@@ -230,8 +235,8 @@ class SequenceFusion:
         return frames if level is None else CachedFrames(DenoisedFrames(frames, level))
 
     def _at_middle(self, find: Callable[[KeyFrame], T], otherwise: T) -> T:
-        """What is found at the key frame nearest to the middle whose images can be read: what cannot is reported when
-        it is fused."""
+        """What is found at the key frame nearest to the middle whose images can be read: what cannot is
+        reported when it is fused."""
         keys = self.timeline.key_frames()
         for key in sorted(keys, key=lambda key: abs(key.alpha - keys[len(keys) // 2].alpha)):
             try:
@@ -261,7 +266,8 @@ class SequenceFusion:
         )
 
     def _normalised(self, name: str, image: Tensor, i: int) -> Tensor:
-        """Beta's image with alpha's mean and deviation over several key frames, so that it does not flicker."""
+        """Beta's image with alpha's mean and deviation over several key frames, so that it does not
+        flicker."""
         keys = self.timeline.key_frames()
         nearest = min(range(len(keys)), key=lambda k: abs(keys[k].alpha - i))
         around = keys[max(nearest - SETTINGS.neighbours, 0) : nearest + SETTINGS.neighbours + 1]
@@ -270,7 +276,8 @@ class SequenceFusion:
 
 
 class KeyContribution(NamedTuple):
-    """One key frame's contribution to a frame: how near it is in time (0 to 1), and its colour warped there."""
+    """One key frame's contribution to a frame: how near it is in time (0 to 1), and its colour warped
+    there."""
 
     nearness: float
     added: Tensor
@@ -281,7 +288,8 @@ class KeyContribution(NamedTuple):
 def mixed(own: Float[Tensor, "1 h w"], sources: Sequence[KeyContribution]) -> Frame:
     """Alpha's frame with the sources' colours, weighted by nearness in time and confidence.
 
-    Confidence is the sources' own weighted mean, lowered where sources that are weighed about the same disagree.
+    Confidence is the sources' own weighted mean, lowered where sources that are weighed about the same
+    disagree.
     """
     weights = torch.stack([s.nearness * (s.confidence + SETTINGS.floor) for s in sources])
     share = (weights / weights.sum(0))[:, None]
@@ -313,15 +321,13 @@ def fuse_sequence(
 ) -> Iterator[Frame]:
     """Fuse every frame of alpha, in order, as they are asked for.
 
-    Args:
-        network: as of `fuse`, and so are `field`, `match_levels`, `response`, `align` (both found once, at the key
-            frame in the middle), `noise` (estimated there too), `keep_alpha` and other options (`depth`, `max_memory`,
-            `luminance`).
-        rig: cameras with `frame_rate` (a second) and `time_offset` (seconds after a common clock).
-        frames: by camera name, in the order of time. Cameras without are left out.
-        alpha: the camera whose frames are wanted.
-        speed: how fast things move at most, pixels of alpha a second, for the room that fields leave where a beta did
-            not record at a key frame's time. By default a quarter of the motion seen between alpha's frames.
+    Args: network: as of `fuse`, and so are `field`, `match_levels`, `response`, `align` (both found once, at
+        the key frame in the middle), `noise` (estimated there too), `keep_alpha` and other options (`depth`,
+        `max_memory`, `luminance`). rig: cameras with `frame_rate` (a second) and `time_offset` (seconds after
+        a common clock). frames: by camera name, in the order of time. Cameras without are left out. alpha:
+        the camera whose frames are wanted. speed: how fast things move at most, pixels of alpha a second, for
+        the room that fields leave where a beta did not record at a key frame's time. By default a quarter of
+        the motion seen between alpha's frames.
 
     Raises ValueError for frame rates that are not known and for recordings that do not overlap in time.
     """

@@ -10,7 +10,8 @@ from arraygeom import Rig
 
 
 class KeyFrame(NamedTuple):
-    """A frame of alpha that gets colour from betas: its number, and for each beta that of the frame nearest in time."""
+    """A frame of alpha that gets colour from betas: its number, and for each beta that of the frame nearest
+    in time."""
 
     alpha: int
     betas: dict[str, int]
@@ -18,7 +19,8 @@ class KeyFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class Timeline:
-    """When the frames of a sequence were recorded: camera `name`'s frame i at time_offset + i / frame_rate, seconds.
+    """When the frames of a sequence were recorded: camera `name`'s frame i at time_offset + i / frame_rate,
+    seconds.
 
     Raises ValueError for a camera without a frame rate, or without frames.
     """
@@ -62,7 +64,8 @@ class Timeline:
         return 1 / min(max(self.rate(name) for name in self.betas), self.rate(self.alpha))
 
     def key_frames(self) -> list[KeyFrame]:
-        """The key frames: for each frame of the fastest beta the nearest of alpha, if that is within half an interval.
+        """The key frames: for each frame of the fastest beta the nearest of alpha, if that is within half an
+        interval.
 
         Raises ValueError if there is none: then the recordings do not overlap.
         """

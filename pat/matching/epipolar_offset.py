@@ -30,7 +30,8 @@ Image = NDArray[Any]
 
 @dataclass(frozen=True)
 class AlignmentSettings:
-    """Lengths are in pixels of the images that are given, brightness is 0 to 1. Middlebury is its tune half."""
+    """Lengths are in pixels of the images that are given, brightness is 0 to 1. Middlebury is its tune
+    half."""
 
     blur: float = tuned(1.5, "Middlebury: standard deviation of the blur before gradients")
     radius: int = tuned(7, "Middlebury: of the windows, to either side")

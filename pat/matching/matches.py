@@ -26,13 +26,13 @@ def is_consistent(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]
 class BetaMatches:
     """The matches of alpha's H x W pixels in one beta.
 
-    disparity: (B, 1, H, W), how far along its segment, from the end, the match is, pixels of beta; where no match is
-        consistent, diffused from where one is.
-    facts: (B, 3, H / 2, W / 2), how far matching back from beta disagrees, by how much the match is better than
-        others, and its cost; each 0 to 1.
+    disparity: (B, 1, H, W), how far along its segment, from the end, the match is, pixels of beta; where no
+        match is consistent, diffused from where one is.
+    facts: (B, 3, H / 2, W / 2), how far matching back from beta disagrees, by how much the match is better
+        than others, and its cost; each 0 to 1.
     comparison: what of beta was compared with alpha.
-    bands: (B, C, H, W), beta's bands minus alpha at the match, with the detail that alpha has and beta has not; None
-        before they are transferred.
+    bands: (B, C, H, W), beta's bands minus alpha at the match, with the detail that alpha has and beta has
+        not; None before they are transferred.
     diffused: (B, fills, C, H, W), the same diffused from pixels of high weight to the others.
     prior: how much more, as a logit, its colours count than another beta's.
     """
@@ -52,7 +52,8 @@ class BetaMatches:
         return self.bands, self.diffused
 
     def positions(self, segments: Segments, hw: HW) -> tuple[Float[Tensor, "b h w 2"], Bool[Tensor, "b h w"]]:
-        """The matches in a beta of this size (x, y), by the segments of alpha's pixels; whether they are on it."""
+        """The matches in a beta of this size (x, y), by the segments of alpha's pixels; whether they are on
+        it."""
         where = matches(segments, self.disparity, beyond_edge=True)
         return where, segments.valid & on_image(where, hw)
 

@@ -1,8 +1,8 @@
 """Several betas of one scene: their matches agree on one inverse depth for each pixel of alpha.
 
-What one beta cannot see another can. Each beta is matched alone; of the inverse depths that they propose for a pixel,
-the one that most others support is taken, and where no match is consistent it is diffused. From it follow where the
-pixel is in every beta, and, by a depth buffer, which betas see it.
+What one beta cannot see another can. Each beta is matched alone; of the inverse depths that they propose for
+a pixel, the one that most others support is taken, and where no match is consistent it is diffused. From it
+follow where the pixel is in every beta, and, by a depth buffer, which betas see it.
 """
 
 from __future__ import annotations
@@ -70,14 +70,16 @@ SETTINGS = MultiviewSettings()
 
 
 STRIP = 1 << 16
-"""Alpha's pixels that are compared at a time, in rows: what is computed on the way stays in a core's cache."""
+"""Alpha's pixels that are compared at a time, in rows: what is computed on the way stays in a core's
+cache."""
 
 
 class Ambiguity(NamedTuple):
-    """What may be between inverse depths that two betas give to alpha's pixels: own = scale other + plane (x, y, 1).
+    """What may be between inverse depths that two betas give to alpha's pixels: own = scale other + plane (x,
+    y, 1).
 
-    As far as it is known from the images alone, the geometry of two views is known up to this (Hartley, Zisserman 2004,
-    chapter 10). Cameras that were found by pairs do not agree on depth but by it.
+    As far as it is known from the images alone, the geometry of two views is known up to this (Hartley,
+    Zisserman 2004, chapter 10). Cameras that were found by pairs do not agree on depth but by it.
     """
 
     scale: float
@@ -106,7 +108,8 @@ class MatchedBeta:
     def of(
         cls, beta: Beta, found: BetaMatches, rows: tuple[int, int], ambiguity: Ambiguity = NO_AMBIGUITY
     ) -> MatchedBeta:
-        """Of a beta with a track and its own matches, at some of alpha's rows: from an even one to an even one."""
+        """Of a beta with a track and its own matches, at some of alpha's rows: from an even one to an even
+        one."""
         top, bottom = rows
         pixels, disparity = beta.field.straight, found.disparity[0, 0, top:bottom]
         start, end = (x[0, top:bottom].double() for x in (pixels.start, pixels.end))
@@ -153,8 +156,8 @@ class MatchedBeta:
         return (self.disparity_of(inverse_depth) - self.disparity).abs()
 
     def depth_buffer(self) -> Float[Tensor, "n"]:
-        """The nearest inverse depth at each pixel of half of beta's size (alpha's pixels leave no holes in it), row by
-        row, and one more for what is outside: all empty."""
+        """The nearest inverse depth at each pixel of half of beta's size (alpha's pixels leave no holes in
+        it), row by row, and one more for what is outside: all empty."""
         return self.disparity.new_zeros(math.prod(-(-n // FINE) for n in self.hw) + 1)
 
     def enter(self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, "n"]) -> None:
@@ -162,7 +165,8 @@ class MatchedBeta:
         buffer.scatter_reduce_(0, self._index(inverse_depth).flatten(), inverse_depth.flatten(), "amax")
 
     def hidden(self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
-        """By how many pixels the nearest point seen at the same pixel of beta differs; infinite outside the image."""
+        """By how many pixels the nearest point seen at the same pixel of beta differs; infinite outside the
+        image."""
         index = self._index(inverse_depth)
         (x, y), (u, v) = self._seen(buffer[index]), self._seen(inverse_depth)
         apart = torch.hypot(x - u, y - v)  # not along the segments: around a known depth they may be points
@@ -185,8 +189,8 @@ def _priors(inputs: Inputs) -> tuple[float, ...]:
 class Agreement(NamedTuple):
     """What the matches of all betas agree on, at alpha's pixels.
 
-    inverse_depth: (1, h, w); known: (1, h, w), whether any match is consistent; facts: (2, h / 2, w / 2), margin and
-    cost of the matches that were taken.
+    inverse_depth: (1, h, w); known: (1, h, w), whether any match is consistent; facts: (2, h / 2, w / 2),
+    margin and cost of the matches that were taken.
     """
 
     inverse_depth: Tensor
@@ -229,7 +233,8 @@ def agreed(inputs: Inputs, matches: Matches) -> Matches:
 
 
 def ambiguities(inputs: Inputs, found: Sequence[BetaMatches]) -> list[Ambiguity]:
-    """Of each beta against the one whose matches tell most: none, unless clearly more pixels agree with one."""
+    """Of each beta against the one whose matches tell most: none, unless clearly more pixels agree with
+    one."""
     step = max(inputs.hw[0] // SETTINGS.sampled_rows // FINE, 1) * FINE
     rows = [(top, top + FINE) for top in range(0, inputs.hw[0], step)]
     sampled = [_Sampled.of(inputs.betas[i], found[i], rows) for i in range(len(found))]
@@ -242,8 +247,8 @@ def ambiguities(inputs: Inputs, found: Sequence[BetaMatches]) -> list[Ambiguity]
 
 
 class _Sampled(NamedTuple):
-    """The inverse depths of a beta's matches at some of alpha's pixels, where they are known, and by how many of its
-    pixels a point moves if its inverse depth rises by one."""
+    """The inverse depths of a beta's matches at some of alpha's pixels, where they are known, and by how many
+    of its pixels a point moves if its inverse depth rises by one."""
 
     w: Tensor
     known: Tensor

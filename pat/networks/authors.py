@@ -1,7 +1,8 @@
 """Checkpoints of the paper's authors: their names, shapes and options, as those of PAT here.
 
-Their repository, github.com/djbradyAtOpticalSciencesArizona/physicsAwareTransformer, trains under DataParallel and
-saves a dict with `epoch`, `psnr` and `state_dict`, whose names begin with `module.`. The files are read with
+Their repository, github.com/djbradyAtOpticalSciencesArizona/physicsAwareTransformer, trains under
+DataParallel and saves a dict with `epoch`, `psnr` and `state_dict`, whose names begin with `module.`. The
+files are read with
 `weights_only`: tensors and plain numbers, nothing that runs.
 """
 
@@ -37,8 +38,8 @@ class Authors(NamedTuple):
 def read_authors(path: str | Path) -> Authors:
     """A checkpoint of theirs, of any number of inputs and any upscale factor.
 
-    Raises FileNotFoundError for no file; ValueError for one that would run code, is cut short, or holds another
-    network, naming the first weight that does not fit.
+    Raises FileNotFoundError for no file; ValueError for one that would run code, is cut short, or holds
+    another network, naming the first weight that does not fit.
     """
     content = _loaded(Path(path))
     given = content.get("state_dict", content) if isinstance(content, Mapping) else None

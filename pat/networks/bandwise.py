@@ -1,9 +1,9 @@
 """BandwisePAT: any number of bands, each treated alike, so that the order of the betas cannot matter.
 
 GuidedPAT mixes its bands in the order in which they come. Here the bands of a beta are matched and judged
-together, by the combination of them that is most like alpha (`pat.matching.radiometry`); then one GuidedPAT of a
-single band finishes each with the same weights. Permuting bands or betas permutes the output's bands and does
-nothing else.
+together, by the combination of them that is most like alpha (`pat.matching.radiometry`); then one GuidedPAT
+of a single band finishes each with the same weights. Permuting bands or betas permutes the output's bands and
+does nothing else.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ class BandwisePAT(nn.Module):
     def _of_beta(self, own: Encoded, alpha: Tensor, estimate: BetaEstimate, found: BetaMatches) -> Tensor:
         """One beta's bands at alpha's view.
 
-        The network's result for each is counted from its local regression on alpha: where a band is unlike alpha,
-        its difference from alpha differs even between similar pixels.
+        The network's result for each is counted from its local regression on alpha: where a band is unlike
+        alpha, its difference from alpha differs even between similar pixels.
         """
         base, mix = found.colours[1][:, 0].to(alpha), found.comparison.mix
         bands = [

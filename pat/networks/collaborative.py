@@ -1,8 +1,10 @@
-"""Noise taken out of groups of alike blocks, as by BM3D (Dabov et al. 2007), beginning with a network's estimate.
+"""Noise taken out of groups of alike blocks, as by BM3D (Dabov et al. 2007), beginning with a network's
+estimate.
 
-Blocks of 8 x 8 pixels are stacked with those most alike near them. A cosine transform of each and a Hadamard transform
-over the stack gather what they have in common in few coefficients, and noise spreads over all of them. Coefficients
-are kept if they are large (first pass), or weighted by how strong they are in an earlier estimate (Wiener's filter).
+Blocks of 8 x 8 pixels are stacked with those most alike near them. A cosine transform of each and a Hadamard
+transform over the stack gather what they have in common in few coefficients, and noise spreads over all of
+them. Coefficients are kept if they are large (first pass), or weighted by how strong they are in an earlier
+estimate (Wiener's filter).
 """
 
 from __future__ import annotations
@@ -66,8 +68,8 @@ def refined(
 ) -> Float[Tensor, "b c h w"]:
     """A network's estimate of an image of one band or of three (RGB), from what was recorded with noise.
 
-    The noise is white and of this standard deviation. Brightness is the mean of the network's and the filtered one;
-    colour is filtered three times.
+    The noise is white and of this standard deviation. Brightness is the mean of the network's and the
+    filtered one; colour is filtered three times.
     """
     whole = [_refined(*parts) for parts in zip(estimate, recorded, deviation)]
     return torch.stack(whole)
@@ -94,7 +96,8 @@ def _filtered(estimate: Tensor, recorded: Tensor, deviation: Tensor, guide: Tens
 def luma_refined(
     image: Float[Tensor, "3 h w"], alpha: Float[Tensor, "1 h w"], deviation: Float[Tensor, "1 h w"]
 ) -> Float[Tensor, "3 h w"]:
-    """An RGB image whose luma is corrected by alpha as it was recorded, with noise of this standard deviation."""
+    """An RGB image whose luma is corrected by alpha as it was recorded, with noise of this standard
+    deviation."""
     luma = luminance(image)
     found = wiener_filtered(alpha, luma, deviation, _guide(luma, alpha))
     return image + (1 - KEPT) * (found - luma)
@@ -110,7 +113,8 @@ def wiener_filtered(
     deviation: Float[Tensor, "c h w"],
     guide: Float[Tensor, "g h w"],
 ) -> Float[Tensor, "c h w"]:
-    """An image without white noise of this standard deviation; `expected` is an estimate of what it is without it."""
+    """An image without white noise of this standard deviation; `expected` is an estimate of what it is
+    without it."""
     return collaboratively_filtered(image, expected, guide, deviation, threshold=0.0)
 
 
@@ -124,8 +128,8 @@ def collaboratively_filtered(
 ) -> Float[Tensor, "c h w"]:
     """An image without white noise of this standard deviation, each band by itself.
 
-    Blocks are alike where `guide` is. With a threshold `expected` is not used. Beyond the edges images are mirrored.
-    Computed in float32 on the CPU, on as many threads as torch may use; back on the image's device.
+    Blocks are alike where `guide` is. With a threshold `expected` is not used. Beyond the edges images are
+    mirrored. Computed in float32 on the CPU, on as many threads as torch may use; back on the image's device.
     """
     h, w = image.shape[-2:]
     margin = SIDE - STEP
@@ -164,7 +168,8 @@ WINDOW = np.outer(np.kaiser(SIDE, 2.0), np.kaiser(SIDE, 2.0)).astype(np.float32)
 
 @compiled(nogil=True, cache=True, fastmath=True)
 def find_alike(guide, top, found):
-    """Fill `found` (rows, columns, ALIKE, 2) with the displacements (y, x) of the blocks most alike each block.
+    """Fill `found` (rows, columns, ALIKE, 2) with the displacements (y, x) of the blocks most alike each
+    block.
 
     Block (r, k) begins at pixel (STEP (top + r), STEP k), RADIUS pixels inside; the first found is itself.
     """
@@ -236,7 +241,8 @@ def group_transform(blocks):
 
 @compiled(nogil=True, cache=True, fastmath=True)
 def filter_groups(image, expected, variance, top, found, cosines, window, threshold, out):
-    """Add to `out` (2, c, rows, w), from the first row of blocks: every filtered block, weighted, and the weights."""
+    """Add to `out` (2, c, rows, w), from the first row of blocks: every filtered block, weighted, and the
+    weights."""
     rows, columns = found.shape[:2]
     seen = np.empty((SIDE * SIDE, ALIKE), np.float32)
     known = np.empty((SIDE * SIDE, ALIKE), np.float32)

@@ -14,10 +14,11 @@ class PATConfig:
     width D, `scale` the enlargement s by pixel shuffle. `residual` adds the network's answer to alpha instead
     of replacing it, so that alpha's own detail cannot be lost. `interpolation` is how beta is sampled.
 
-    Where the authors' code has another layout: `block_bias` of residual blocks, `fusion_bias` of the 1x1 fusion, and
-    `values_after_block`, values made of the features that keys are made of. `normalised` gives the features one more
-    channel of every image, its luminance with the mean and the contrast of its surroundings taken away: what a grey
-    and a colour camera see alike. `equal_resolution` has betas resized to about alpha's angular resolution first.
+    Where the authors' code has another layout: `block_bias` of residual blocks, `fusion_bias` of the 1x1
+    fusion, and `values_after_block`, values made of the features that keys are made of. `normalised` gives
+    the features one more channel of every image, its luminance with the mean and the contrast of its
+    surroundings taken away: what a grey and a colour camera see alike. `equal_resolution` has betas resized
+    to about alpha's angular resolution first.
     """
 
     betas: int = 1
@@ -39,9 +40,9 @@ class GuidedPATConfig:
     """Widths of the features at 1/2, 1/4, 1/8 and 1/16 of the size, of the keys, and of the judgement.
 
     Attention reaches `window` pixels to either side of the match, with `taps` samples. Colour is propagated
-    within alpha in one round for each of `propagation_steps`, the spacing of 7 x 7 pixels at 1/4. Without `head_dim`
-    (0) nothing is added to what was matched and propagated. `keep_luminance` lets the network add colour to alpha, and
-    never luminance.
+    within alpha in one round for each of `propagation_steps`, the spacing of 7 x 7 pixels at 1/4. Without
+    `head_dim` (0) nothing is added to what was matched and propagated. `keep_luminance` lets the network add
+    colour to alpha, and never luminance.
     """
 
     widths: tuple[int, int, int, int] = (16, 32, 40, 48)

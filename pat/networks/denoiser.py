@@ -1,4 +1,5 @@
-"""Networks that remove noise of a known level: from one image, and from a fused image with the help of every view."""
+"""Networks that remove noise of a known level: from one image, and from a fused image with the help of every
+view."""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ OPPONENT = ((3**-0.5, 3**-0.5, 3**-0.5), (2**-0.5, 0.0, -(2**-0.5)), (6**-0.5, -
 
 @dataclass(frozen=True)
 class DenoiserConfig:
-    """Widths at 1/2, 1/4 and 1/8 of the size: of the network for one band, for three, and for the fused image."""
+    """Widths at 1/2, 1/4 and 1/8 of the size: of the network for one band, for three, and for the fused
+    image."""
 
     band: tuple[int, int, int] = (24, 32, 32)
     colour: tuple[int, int, int] = (32, 32, 32)
@@ -59,7 +61,8 @@ class NoisyView(NamedTuple):
 
 
 class Denoising(nn.Module):
-    """An image minus its noise, estimated in units of a standard deviation: where that is 0 it stays as it is."""
+    """An image minus its noise, estimated in units of a standard deviation: where that is 0 it stays as it
+    is."""
 
     def __init__(self, bands: int, widths: tuple[int, int, int], *, further: int = 0) -> None:
         super().__init__()
@@ -80,9 +83,9 @@ class Denoising(nn.Module):
 class ColourDenoising(nn.Module):
     """A colour image minus its noise, by brightness and two colour differences, on orthogonal axes.
 
-    Brightness loses noise that the network estimates, as in `Denoising`. Colour differences are first blurred, the more
-    the noisier they are, and the network adds what that took: most of it is known from brightness, and a network
-    this small need not hold the noise of every band.
+    Brightness loses noise that the network estimates, as in `Denoising`. Colour differences are first
+    blurred, the more the noisier they are, and the network adds what that took: most of it is known from
+    brightness, and a network this small need not hold the noise of every band.
     """
 
     def __init__(self, widths: tuple[int, int, int]) -> None:
@@ -145,7 +148,8 @@ class LowLightNetwork(nn.Module):
 
 
 def over_flips(network: Callable[..., Tensor], *images: Float[Tensor, "b _ h w"]) -> Tensor:
-    """The mean of a network's results on the images as they are and flipped: its own errors differ, and average out."""
+    """The mean of a network's results on the images as they are and flipped: its own errors differ, and
+    average out."""
     total: Tensor | float = 0.0
     for axes in ((), (-1,), (-2,), (-2, -1)):
         total = total + network(*(image.flip(axes) for image in images)).flip(axes)

@@ -66,11 +66,12 @@ class FusionNetwork(Protocol):
     equal_resolution: bool
     """Whether betas are to be resized to about alpha's angular resolution."""
     joins_bands: JoinsBands
-    """Which co-located betas are to come as one of several bands: none, those that follow each other (where the order
-    of the bands matters), or all."""
+    """Which co-located betas are to come as one of several bands: none, those that follow each other (where
+    the order of the bands matters), or all."""
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
-        """Memory that fusing so many pixels of alpha with so many of each beta takes, beside the inputs, measured."""
+        """Memory that fusing so many pixels of alpha with so many of each beta takes, beside the inputs,
+        measured."""
         ...
 
     def __call__(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
@@ -89,7 +90,8 @@ class Explaining(Protocol):
 
 @runtime_checkable
 class Comparing(Protocol):
-    """A network with C3 attention over the segments of its inputs, which training can supervise by geometry."""
+    """A network with C3 attention over the segments of its inputs, which training can supervise by
+    geometry."""
 
     def compare(self, inputs: Inputs) -> tuple[FusionOutput, list[Compared]]:
         """Fuse, and what attention compares in each beta."""

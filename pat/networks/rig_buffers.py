@@ -16,7 +16,8 @@ from arraygeom.pixels import floating
 class RigBuffers(nn.Module):
     """Holds a rig, camera or pair, whose numbers become buffers: `.to` moves them and `state_dict` has them.
 
-    Called, it gives the rig. `.half()` and `.bfloat16()` leave its numbers in float32: they hold no pixel position.
+    Called, it gives the rig. `.half()` and `.bfloat16()` leave its numbers in float32: they hold no pixel
+    position.
     """
 
     def __init__(self, rig: Batched) -> None:

@@ -60,12 +60,12 @@ def save_weights(
 def load_weights(name: str | Path, *, precision: Precision = "float32") -> Network:
     """The network of a weights file, or of a name that ships with the package, ready for use.
 
-    With `precision` "bfloat16" its convolutions are in that (attention and matching never are): they take less than
-    half the time on processors that multiply it (AVX-512 BF16, AMX), and the image's PSNR changes by .003 dB. Then
-    parts of a frame are equal to the whole to 1e-3 only.
+    With `precision` "bfloat16" its convolutions are in that (attention and matching never are): they take
+    less than half the time on processors that multiply it (AVX-512 BF16, AMX), and the image's PSNR changes
+    by .003 dB. Then parts of a frame are equal to the whole to 1e-3 only.
 
-    Raises FileNotFoundError for neither, ValueError for a file that is not of this format or does not fit, and for a
-    processor that has no bfloat16.
+    Raises FileNotFoundError for neither, ValueError for a file that is not of this format or does not fit,
+    and for a processor that has no bfloat16.
     """
     network: Network = _load(find_weights(name), NETWORKS)
     if precision == "bfloat16":
@@ -83,7 +83,8 @@ def convolutions(network: nn.Module) -> list[nn.Module]:
 
 
 def load_denoiser(path: str | Path = DENOISER) -> LowLightNetwork:
-    """The network that removes noise: the shipped one, or that of a weights file. Raises as `load_weights`."""
+    """The network that removes noise: the shipped one, or that of a weights file. Raises as
+    `load_weights`."""
     return _load(Path(path), DENOISERS)
 
 
@@ -124,7 +125,8 @@ def renamed(key: str) -> str:
 
 
 def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
-    """The first tensor that is missing, too many, or of another shape than the network's; empty if all fit."""
+    """The first tensor that is missing, too many, or of another shape than the network's; empty if all
+    fit."""
     return _misfit(network, {k: tuple(v.shape) for k, v in state.items()})
 
 
