@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .camera import AnyLensView, Camera, LensView, View
-from .pixels import coarse_grid, map_homogeneous, pixel_grid, product
+from .chunks import chunked
+from .pixels import HW, coarse_grid, map_homogeneous, pixel_coordinates, product
 from .rig import Rig
 from .sampling import Interpolation, Sampled, sample
 from .tracing import needs_numbers
 
 WIDEST = math.radians(62)
 """How far off axis a pinhole view reaches: there it stretches outwards 4.5 times what it does in its middle."""
+AT_ONCE = 1 << 18
+"""Pixels that are resampled at once."""
 
 
 def pinhole_view(camera: AnyLensView, *, widest: float = WIDEST) -> AnyLensView:
@@ -42,14 +47,26 @@ def pinhole_view(camera: AnyLensView, *, widest: float = WIDEST) -> AnyLensView:
     return camera.replace(K=K, hw=(h, w), distortion=None)
 
 
-def pixels_between(source: LensView, target: LensView) -> tuple[Float[Tensor, "h w 2"], Tensor]:
-    """For each pixel of `target` its position in the co-located `source`, and whether `source` sees it. Float64."""
+def pixels_between(
+    source: LensView, target: LensView, x: Float[Tensor, "h w 2"] | None = None
+) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
+    """For pixels x of `target`, by default all, their positions in the co-located `source`, and whether `source` sees
+    them. Float64."""
+    if x is None:
+        return _by_rows(lambda x: pixels_between(source, target, x), target.hw, axis=0)
     source, target = source.to(torch.float64), target.to(torch.float64)
-    rays, valid = target.rays(pixel_grid(target.hw, dtype=torch.float64))
+    rays, valid = target.rays(x)
     if isinstance(source, Camera) and isinstance(target, Camera):
         rays = rays @ (source.R @ target.R.mT).mT
     found = source.project_local(rays)
     return found.x, valid & found.valid & source.contains(found.x)
+
+
+def _by_rows(function: Callable[[Tensor], Any], hw: HW, *, axis: int) -> Any:
+    """What a function makes of an image's pixels (h, w, 2), some rows at a time: it takes some 300 bytes a pixel."""
+    x, y = pixel_coordinates(hw, dtype=torch.float64)
+    rows = max(AT_ONCE // hw[1], 1)
+    return chunked(lambda x, y: function(torch.stack([x, y], -1)), x, y, rows=rows, axis=axis)
 
 
 def recorded_pixels(
@@ -100,7 +117,11 @@ def resampled(
     Where `source` sees nothing values are 0, or if `extended` those of its nearest pixel; they are not valid. The
     baseline between the two is ignored; uncalibrated views count as having the same orientation.
     """
-    return sampled_between(image, source, pixels_between(source, target), interpolation, extended=extended)
+
+    def part(x: Tensor) -> Sampled:
+        return sampled_between(image, source, pixels_between(source, target, x), interpolation, extended=extended)
+
+    return Sampled(*_by_rows(part, target.hw, axis=-2))
 
 
 def sampled_between(

@@ -31,6 +31,15 @@ def with_lenses(rig: Rig, names: Iterable[str]) -> Rig:
     return rig
 
 
+def with_lens_of(camera: Camera, view: LensView) -> Camera:
+    """A pinhole camera with the lens of a view of the same centre, whose terms are in units of another length."""
+    assert isinstance(view.distortion, Distortion)
+    factor = float(camera.K[0, 0] / view.K[0, 0])
+    powers = factor ** view.distortion.coefficients.new_tensor([2, 4, 1, 1])
+    lens = Distortion(view.distortion.model, view.distortion.coefficients * powers)
+    return camera.replace(distortion=lens)
+
+
 def describe_lenses(rig: Rig) -> str:
     """A sentence on the lenses of uncalibrated views; empty if there are none."""
     distorted = [

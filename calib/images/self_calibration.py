@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -17,12 +17,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import Camera, Link, Pair, Pose, Rig, View, intrinsics, rotation_from_vector, triangulate
+from arraygeom import Camera, LensView, Link, Pair, Pose, Rig, View, intrinsics, rotation_from_vector, triangulate
 from arraygeom.pixels import map_homogeneous
 from arraygeom.text import angle
 from arraygeom.threads import torch_in_one_thread
 
 from .held_out import median_off
+from .lenses import with_lens_of
 from .matches import ENOUGH, LOCALISED, Images, PointMatches, contrast_equalised, line_distance, near_lines
 from .patch_matching import refine_points
 from .refinement import refine_matches
@@ -62,24 +63,29 @@ WELL_LOCALISED = 0.3
 class RefinedPair(NamedTuple):
     """A calibrated pair as a rig of two cameras, with the depth range of the points that determine it.
 
-    points: their number. distance: their median distance from their lines, pixels of beta.
+    points: their number. distance: their median distance from their lines, pixels of beta. exact: whether these lines
+    fit as well as those of F alone; if not, the rig is good for rough depths, and the lines are to be F's.
     """
 
     rig: Rig
     points: int
     distance: float
+    exact: bool = True
 
 
 @torch_in_one_thread()
 def self_calibrated(
     views: Mapping[str, View], link: Link, matches: PointMatches, *, focal: Mapping[str, float]
 ) -> RefinedPair | None:
-    """Two cameras (alpha, beta) whose epipolar lines are those of `link`; None where points do not determine them.
+    """Two cameras (alpha, beta) whose epipolar lines are those of `link`, as nearly as can be; None for points without
+    parallax.
 
     Alpha is at the origin with the principal point in the middle, and the baseline is 1. `focal` has focal lengths in
-    pixels, by camera; others are assumed.
+    pixels, by camera; others are assumed. Cameras have the lenses of their views; the pair then is not `exact`.
     """
     alpha, beta = views
+    lenses = {name: view for name, view in views.items() if isinstance(view, LensView) and view.distortion is not None}
+    matches = _without_lenses(list(views.values()), matches)
     K = {name: intrinsics(length, views[name].hw) for name, length in _focal_lengths(views, link, focal).items()}
     near = near_lines(matches, link.F, within=NEAR_LINE)
     best = AS_GOOD * float(line_distance(near, link.F).median()) + SLACK
@@ -88,14 +94,29 @@ def self_calibrated(
     for pose in (*_lateral_poses(near, upright, K[alpha], K[beta]), *_poses(near, link.F, K[alpha], K[beta])):
         cameras = {alpha: _camera(views[alpha], K[alpha], Pose.identity()), beta: _camera(views[beta], K[beta], pose)}
         LOG.info("calibrating %s and %s, pose %d", alpha, beta, len(trials) + 1)
-        trial = _refined_pair(Rig(cameras), matches, near)
-        if trial is not None and trial.distance <= best:
+        trial = _refined_pair(Rig(cameras), matches, near, fixed=("centre",) if lenses else ())
+        if trial is not None:
             trials.append(trial)
     if not trials:
         return None
     least = min(trial.distance for trial in trials)
     fitting = [t for t in trials if t.distance <= (1 + ALIKE / math.sqrt(t.points)) * least + ALIKE_SLACK]
-    return min(fitting, key=lambda trial: float(angle(_pair(trial.rig).beta_from_alpha.R.T @ upright)))
+    found = min(fitting, key=lambda trial: float(angle(_pair(trial.rig).beta_from_alpha.R.T @ upright)))
+    rig = found.rig
+    for name, view in lenses.items():
+        rig = rig.with_camera(name, with_lens_of(_pair(rig).cameras[rig.names.index(name)], view))
+    return found._replace(rig=rig, exact=found.distance <= best and not lenses)
+
+
+def _without_lenses(views: Sequence[View], matches: PointMatches) -> PointMatches:
+    """The points where pinhole views would have them; those that a lens does not show are left out."""
+    there, shown = [], torch.ones(len(matches.alpha), dtype=torch.bool)
+    for view, x in zip(views, matches):
+        if isinstance(view, LensView) and view.distortion is not None:
+            x, valid = view.to(torch.float64).undistort(x.double())
+            shown = shown & valid
+        there.append(x)
+    return PointMatches(*there).only(shown)
 
 
 @torch_in_one_thread()
@@ -224,10 +245,12 @@ def _camera(view: View, K: Tensor, pose: Pose) -> Camera:
     return Camera(hw=view.hw, sensor=view.sensor, K=K, cam_from_world=pose)
 
 
-def _refined_pair(rig: Rig, matches: PointMatches, near: PointMatches) -> RefinedPair | None:
+def _refined_pair(
+    rig: Rig, matches: PointMatches, near: PointMatches, *, fixed: Sequence[str] = ()
+) -> RefinedPair | None:
     """The pair refined by matches, its distance and depths those of `near`; None without parallax."""
     alpha, beta = rig.names
-    free = [f"{beta}.{kind}" for kind in (*SIGMA, "centre")]
+    free = [f"{beta}.{kind}" for kind in (*SIGMA, "centre") if kind not in fixed]
     sigma = {**SIGMA, "centre": CENTRE_SHARE * max(rig[beta].hw)}
     refined = refine_matches(rig, [{(alpha, beta): matches}], free=free, sigma=sigma, keep_depth=False).rig
     refined = _unit_baseline(refined)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from . import options
-from .fusing import files_by_camera, named_images, warn_of_wrong_rig
+from .fusing import files_by_camera, named_images
 from .known import Known
 from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Out, optional, say
 
@@ -91,6 +91,7 @@ class Align(Known):
                 self._align(frame)
 
     def _frames_with_rig(self, image: tuple[str, ...]) -> Iterator[_Frame]:
+        from ..fusion.healing import checked_rig
         from ..fusion.views import ViewFiles
 
         rig = options.load_rig(self.given[0], self.depth)
@@ -98,7 +99,7 @@ class Align(Known):
         for i, one in enumerate(_in_order(files)):
             views = ViewFiles(rig, one, alpha=alpha)
             if i == 0:
-                warn_of_wrong_rig(views)
+                checked_rig(views, heal=False)
             yield _Frame(views.developed, rig, views, one, alpha, name=_name_of(files, alpha, one))
 
     def _frames_without(self) -> Iterator[_Frame]:

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
     from arraygeom import Rig
 
+    from ..fusion.healing import Healed
     from ..fusion.report import Facts
     from ..fusion.results import Frame
-    from ..fusion.views import ViewFiles
 
 
 @dataclass
@@ -151,6 +151,7 @@ class Fuse(Known):
     def _with_rig(self) -> None:
         from arraygeom.compiled import numba_loaded
 
+        from ..fusion.healing import checked_rig
         from ..fusion.views import ViewFiles
 
         if self.focal:
@@ -163,14 +164,16 @@ class Fuse(Known):
             return self._many(rig, found, alpha)
         with ThreadPoolExecutor(2) as beside:
             beside.submit(numba_loaded)
-            compared = beside.submit(warn_of_wrong_rig, views)
+            compared = beside.submit(checked_rig, views, heal=self.align)
             several = max(map(len, found.values())) > 1
             if several or self.strict or self.max_memory is not None:
                 with options.working("comparing the rig with the images"):
-                    compared.result()
+                    healed = compared.result()
+                rig = self._healed(rig, healed)
             if several:
                 return self._many(rig, found, alpha)
-            self._one(views.developed, views, alpha, views.files, before_writing=compared.result)
+            fused = views.developed if rig is views.rig else rig
+            self._one(fused, views, alpha, views.files, healing=compared.result)
 
     def _without_rig(self) -> None:
         from ..fusion.batch import find_images
@@ -275,9 +278,10 @@ class Fuse(Known):
         files: Mapping[str, str | Path],
         *,
         found: tuple[str, ...] | None = None,
-        before_writing: Callable[[], None] = lambda: None,
+        healing: Callable[[], Healed | None] = lambda: None,
     ) -> None:
-        """Fuse one frame. `found` is what was found out about the rig, if it was found from the images."""
+        """Fuse one frame. `found` is what was found out about the rig, if it was found from the images; `healing` gives
+        the rig healed by them, with which a frame is fused again."""
         from arraygeom import Camera
         from arraygeom.atomic import sweep
 
@@ -293,9 +297,13 @@ class Fuse(Known):
             if not self.resume:
                 shutil.rmtree(store, ignore_errors=True)
             further = {**self._options(), "explain": self._note, "store": store, "device": self.device}
-            known, further["field"] = self.with_known(rig, alpha, files, further["field"])
+            own = further["field"]
+            known, further["field"] = self.with_known(rig, alpha, files, own)
             frame = fuse_with_progress(rig=known, images=images, alpha=alpha, **further)
-            before_writing()
+            if (healed := healing()) is not None and healed.text not in self._notes:
+                rig = self._healed(rig, healed)
+                known, further["field"] = self.with_known(rig, alpha, files, own)
+                frame = fuse_with_progress(rig=known, images=images, alpha=alpha, **further)
             frame, gain = self._exposed(frame)
             if found is None and not frame.depth.isfinite().any():
                 self._note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
@@ -320,6 +328,22 @@ class Fuse(Known):
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
         if self.report:
             say(f"to see the result, open {self.out / 'index.html'} in a browser")
+
+    def _healed(self, rig: Rig, healed: Healed | None) -> Rig:
+        """The rig, or the one that its images healed, which is written beside the results."""
+        from ..fusion.results import HEALED_RIG
+
+        if healed is None:
+            return rig
+        self._note(healed.text)
+        path = self.out / HEALED_RIG
+        if path.resolve() == self.given[0].resolve():
+            self._note(f"the healed rig is not written: {path} is the one that was given: give another --out")
+        else:
+            self.out.mkdir(parents=True, exist_ok=True)
+            healed.rig.save(path)
+            self._note(f"the healed rig: {path}")
+        return healed.rig
 
     def _options(self) -> dict[str, Any]:
         """What a frame and many frames have in common."""
@@ -458,22 +482,3 @@ def refuse_equal_files(files: Mapping[str, Path]) -> None:
     for (a, first), (b, second) in combinations(files.items(), 2):
         if first.is_file() and second.is_file() and filecmp.cmp(first, second, shallow=False):
             raise ValueError(f"the images of '{a}' and '{b}' are the same image, {second}: give each camera its own")
-
-
-def warn_of_wrong_rig(views: ViewFiles) -> None:
-    """Warn if a rig fits its images badly, with the doctor's verdict.
-
-    By a `LowConfidenceWarning` if it is wrong: mistaken by that verdict, or points are where nothing is seen. One that
-    has drifted is aligned anyway.
-    """
-    from calib.images.misfit import OUTSIDE, find_misfit
-
-    from ..fusion.checks import LowConfidenceWarning
-
-    try:
-        found = find_misfit(views.developed, dict(views))
-    except (ValueError, OSError):  # of a file or an image: the fusion says so
-        return
-    if found is not None:
-        wrong = found.mistaken or found.outside > OUTSIDE
-        warnings.warn(found.text, LowConfidenceWarning if wrong else UserWarning, stacklevel=2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -266,6 +267,12 @@ class Doctor:
         say(f"written: {self.out} ({found.named.words}: undone{kept})")
 
 
+REFUSED = 4
+"""The exit status of a refinement that is refused though the rig does not fit."""
+NEARER = 4.0
+"""How many times nearer to their lines points come then."""
+
+
 @dataclass
 class Refine:
     """Refine a rig by ordinary images of its cameras: matched points first, then the fusion's own error.
@@ -318,7 +325,16 @@ class Refine:
             )
         print(found.as_text())
         if not found.accepted:
-            return say("no rig written" + (": --force writes it all the same" if found.objections else ""))
+            refused = found.held_out[1].median < found.held_out[0].median / NEARER
+            if not refused:
+                return say("no rig written" + (": --force writes it all the same" if found.objections else ""))
+            files = " ".join({text.partition("=")[0]: text.partition("=")[2] for text in self.image[::-1]}.values())
+            say(
+                "no rig written, though points come far nearer to their lines: --force writes it all the same; or fuse "
+                f"without a rig: `pat fuse {files}`",
+                style="yellow",
+            )
+            sys.exit(REFUSED)
         notes = "".join(f"# {line}\n" for line in ["pat rig refine:", *found.as_text().splitlines()])
         write_text(self.out, write(found.rig) + notes)
         say(f"written: {self.out}")

@@ -21,7 +21,7 @@ from torch import Tensor
 from arraygeom import Band, LensView, ReceptiveField, Rig, Segments, View, pixel_grid, sample
 from arraygeom.chunks import chunked
 from arraygeom.sampling import Interpolation, on_image
-from arraygeom.undistortion import pixels_between, recorded_pixels, sampled_between, with_pixels
+from arraygeom.undistortion import pixels_between, recorded_pixels, resampled, with_pixels
 
 from ..matching.inputs import Beta
 from ..matching.match import Matcher, match
@@ -286,7 +286,7 @@ def _at_pixels(
         return plane
     assert isinstance(pinhole, LensView)
     assert isinstance(recorded, LensView)
-    return sampled_between(plane, pinhole, pixels_between(pinhole, recorded), interpolation).values[0]
+    return resampled(plane, pinhole, recorded, interpolation=interpolation).values[0]
 
 
 def _has_lens(view: View) -> bool:

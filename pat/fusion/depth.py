@@ -76,6 +76,9 @@ def depth_and_confidence(
                 moved = _within(where.reshape(-1, 2)[beyond], beta.field.pixels, beyond.view(h, w))
                 there = depth_from_track(Track(*(v.expand_as(track.a)[beyond] for v in track)), moved + offset)
                 found = Depth(*(t.masked_scatter(beyond, part) for t, part in zip(found, there)))
+        elif pair.link is not None and pair.depth is not None:
+            near, far = (bound.to(found.depth) for bound in pair.depth)
+            found = found._replace(depth=found.depth.clamp(near, far))
         valid = found.valid.reshape(h, w)
         weight = torch.where(valid & (confidence[0, :h, :w] > SETTINGS.unseen), confidence[0, :h, :w], 0.0)
         total = total + weight / torch.where(found.valid, found.depth, 1.0).reshape(h, w)

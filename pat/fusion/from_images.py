@@ -14,12 +14,13 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from arraygeom import Rig
+from arraygeom import Link, Rig
 from arraygeom.io.xmp import named_by_band, rig_of_images, states_cameras
 from arraygeom.progress import log_step, part, stage
 from arraygeom.undistortion import pixels_between
 from calib.images.from_images import UncalibratedRig, rig_from_images
 from calib.images.known_intrinsics import centres_found
+from calib.images.lenses import describe_lenses
 from calib.images.self_calibration import UNSCALED, RefinedPair, joined, refined_by_depth, self_calibrated
 
 from ..media.exif import focal_length
@@ -171,8 +172,8 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
     factors = {
         name: min(lengths[alpha] / length * min(MATCHED / longest, 1.0), 1.0) for name, length in lengths.items()
     }
-    reduced = {name: _scaled(image, factors[name]) for name, image in pinhole.items()}
-    masks = {name: _scaled(mask, factors[name])[0] > 0.99 for name, mask in shown.items()}
+    reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
+    masks = {name: scaled(mask, factors[name])[0] > 0.99 for name, mask in shown.items()}
     found, facts = centres_found(_resized(straight, reduced), reduced, masks, alpha=alpha)
     for name, (points, distance) in facts.items():
         note(f"{name}: {points} points, {distance:.2f} px from their lines, intrinsics kept")
@@ -190,10 +191,10 @@ def found_rig(
 ) -> tuple[Rig, list[str]]:
     """The rig of the cameras of images, and which of them it relates to alpha; alpha comes first in both.
 
-    Calibrated, up to a scale, where points matched between alpha and every beta allow it; else known by F alone.
+    Calibrated, up to a scale, where points matched between alpha and a beta have parallax; else known by F alone.
     """
     factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in images.items()}
-    reduced = {name: _scaled(image, factors[name]) for name, image in images.items()}
+    reduced = {name: scaled(image, factors[name]) for name, image in images.items()}
     lengths = {name: length * factors[name] for name, length in focal.items()}
     with part(0, LINES):
         found = rig_from_images(reduced, focal=lengths, alpha=alpha)
@@ -202,10 +203,7 @@ def found_rig(
         raise ValueError(f"no image shows enough of what '{alpha}' shows: choose another alpha with --alpha NAME")
     for name in images.keys() - {alpha, *betas}:
         note(f"{name}: left out, too little in common with {alpha}")
-    rig = _calibrated(found, reduced, alpha, betas, focal, network, note)
-    if rig is None:
-        note("\n".join(line for line in found.as_text().splitlines() if line.startswith((f"{alpha} >", "F "))))
-        rig = _without(found.rig, images.keys() - {alpha, *betas})
+    rig = _calibrated(found, reduced, alpha, betas, lengths, network, note)
     return _resized(rig, images), [alpha, *betas]
 
 
@@ -217,46 +215,70 @@ def _calibrated(
     focal: Mapping[str, float],
     network: Network,
     note: Say,
-) -> Rig | None:
-    """The calibrated rig, each pair refined by what a coarse fusion of it matches; None if one cannot be calibrated."""
+) -> Rig:
+    """The rig of alpha and these betas: calibrated, each pair refined by what a coarse fusion of it matches.
+
+    A pair whose lines no poses fit as well as F alone keeps F's, with the nearest poses for rough depths; one without
+    parallax has F alone. Each is said in a line.
+    """
     pairs: dict[str, RefinedPair] = {}
     depths: dict[str, Frame] = {}
+    links: dict[tuple[str, str], Link] = {}
     for i, name in enumerate(betas):
         log_step(LOG, LINES + (1 - LINES) * i / len(betas), "calibrating %s and %s", alpha, name)
-        link, matches = found.rig.links[alpha, name], found.matches[alpha, name]
+        link = found.rig.links[alpha, name]
         views = {n: found.rig[n] for n in (alpha, name)}
-        if _distorted(found.rig):
-            note("no depth: the lens bends lines, and images do not tell its focal length: `pat calibrate` finds both")
-            return None
-        pair = self_calibrated(views, link, matches, focal=focal)
+        pair = self_calibrated(views, link, found.matches[alpha, name], focal=focal)
+        if pair is None or not pair.exact:
+            links[alpha, name] = link
+            note(next(line for line in found.as_text().splitlines() if line.startswith(f"{alpha} > {name}")))
         if pair is None:
-            note(f"no depth: no position of {name} beside {alpha} fits their points as well as lines alone do")
-            return None
-        note(f"{alpha} > {name}: {pair.points} points, {pair.distance:.2f} px from their lines; refining")
-        pairs[name], depths[name] = _refined(pair, images, network)
+            note(f"no depth by {name}: its points show no parallax, beside {alpha} it is too near or its scene too far")
+            continue
+        if pair.exact:
+            note(f"{alpha} > {name}: {pair.points} points, {pair.distance:.2f} px from their lines; refining")
+        else:
+            note(f"{alpha} > {name}: lines by F; depths are rough, by poses whose lines are {pair.distance:.2f} px off")
+        pairs[name] = pair
+        if pair.exact or len(betas) > 1:
+            pairs[name], depths[name] = _refined(pair, images, network, links)
         if pairs[name] is not pair:
             note(f"{alpha} > {name}: {pairs[name].points} points, {pairs[name].distance:.2f} px from their lines")
-    assumed = [name for name in (alpha, *betas) if name not in focal]
+    if _distorted(found.rig):
+        note(describe_lenses(found.rig))
+    if not pairs:
+        return _without(found.rig, found.rig.cameras.keys() - {alpha, *betas})
+    first = next(iter(pairs))
+    assumed = [name for name in (alpha, *pairs) if name not in focal]
     note(
         "depths are multiples of the baseline"
-        + (f" {alpha} to {betas[0]}" if len(betas) > 1 else "")
+        + (f" {alpha} to {first}" if len(betas) > 1 else "")
         + (f"; focal lengths assumed of {', '.join(assumed)}: depths are only proportional" if assumed else "")
     )
-    scales = {name: _relative_scale(depths[betas[0]], depths[name]) for name in betas}
-    return joined(pairs, scales)
+    scales = {name: _relative_scale(depths[first], depths[name]) if name in depths else 1.0 for name in pairs}
+    rig = joined(pairs, scales)
+    for name in betas:
+        if name not in pairs:
+            rig = rig.with_camera(name, found.rig[name])
+    return rig.replace(cameras={name: rig[name] for name in (alpha, *betas)}, links=links)
 
 
-def _refined(pair: RefinedPair, images: Images, network: Network) -> tuple[RefinedPair, Frame]:
-    """The pair refined by the matches of a fusion at reduced size, and that."""
+def _refined(
+    pair: RefinedPair, images: Images, network: Network, links: Mapping[tuple[str, str], Link]
+) -> tuple[RefinedPair, Frame]:
+    """The pair refined by the matches of a fusion at reduced size, unless it has one of these links; and that."""
     alpha, beta = pair.rig.names
     factor = min(COARSE / max(images[alpha].shape[-2:]), 1.0)
-    small = {name: _scaled(images[name], factor) for name in (alpha, beta)}
-    rig = _resized(pair.rig, small)
+    small = {name: scaled(images[name], factor) for name in (alpha, beta)}
+    link = links.get((alpha, beta))
+    rig = _resized(pair.rig if link is None else pair.rig.replace(links={(alpha, beta): link}), small)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         network = _for_bands(network, len(small[beta]))
         LOG.info("coarse fusion of %s and %s", alpha, beta)
         frame = fuse(network, rig, small, alpha=alpha, align=False, response="rec601")
+    if link is not None:
+        return pair, frame
     refined = refined_by_depth(pair._replace(rig=rig), small, frame.depth, frame.confidence)
     if refined.rig is rig:
         return pair, frame
@@ -288,7 +310,8 @@ def _resized(rig: Rig, images: Images) -> Rig:
     return rig
 
 
-def _scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 w2"]:
+def scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 w2"]:
+    """The image reduced by this factor; of 1 or more, as it is."""
     if factor >= 1:
         return image
     hw = [max(round(n * factor), 16) for n in image.shape[-2:]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +16,12 @@ from arraygeom import ReceptiveField, Rig
 from arraygeom.chunks import Tile
 from arraygeom.threads import torch_in_one_thread
 
+from ..matching.inputs import Inputs
 from ..matching.match import Matcher, match
 from ..matching.radiometry import Given
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
-from ..support.memory import limited, parse_bytes
+from ..support.memory import limited, parse_bytes, planned
 from .checks import warn_of_confidence
 from .corrections import Corrections, corrections_for, expected_work
 from .depth import background_filled
@@ -28,7 +30,7 @@ from .low_light import Noise, denoised_views
 from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail
 from .results import Frame
 from .steps import steps_for
-from .tiles import Plan, fused_in_tiles, plan_frame
+from .tiles import ESTIMATED, Plan, fused_in_tiles, plan_frame
 from .views import Views
 
 LOG = logging.getLogger(__name__)
@@ -126,6 +128,7 @@ def fuse(
     check_bands(network, views)
     betas, steps = views.betas, steps_for(network, normalise=match_levels)
     inputs, undo = prepared(network, views, steps)
+    held = _bytes_beside(inputs.inputs, [views.own, *(images.values() if isinstance(images, dict) else ())])
     del views  # whose images are there again, padded
     LOG.info("planning")
     plan = plan_frame(
@@ -136,7 +139,7 @@ def fuse(
         stored=store is not None,
         before=0.0 if corrections else expected_work(inputs, response, align=align),
         after=low_light.seconds_left,
-        kept=low_light.kept(inputs.hw, len(betas)),
+        kept=held + low_light.kept(inputs.hw, len(betas)),
     )
     if announce:
         announce(plan)
@@ -146,7 +149,7 @@ def fuse(
             explain(line)
     fused = replace(found.applied(inputs.inputs, inputs.hw), luminance=SHARES[luminance])
     inputs = inputs._replace(inputs=fused)
-    with limited(limit):
+    with limited(planned(limit, plan.memory, large=math.prod(inputs.hw) > ESTIMATED)):
         with torch.set_grad_enabled(differentiable):
             matches = matcher(inputs.inputs) if network.uses_matches else None
             LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
@@ -163,6 +166,13 @@ def fuse(
         for back in undo:
             frame = back(frame)
         return frame if differentiable else Frame(*(part.detach() for part in frame))
+
+
+def _bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:
+    """Memory of images whose pixels are not those of the inputs: the caller's."""
+    own = {part.untyped_storage().data_ptr() for part in (inputs.alpha, *(beta.image for beta in inputs.betas))}
+    parts = {part.untyped_storage().data_ptr(): part.nbytes for part in images}
+    return float(sum(nbytes for place, nbytes in parts.items() if place not in own))
 
 
 def _with_rig(

@@ -41,13 +41,13 @@ class Placement(NamedTuple):
 
     @property
     def has_depth(self) -> bool:
-        """Whether positions in beta give depth."""
-        return self.pair.link is None and self.pair.calibrated
+        """Whether positions in beta give depth: also along the lines of a link, if roughly."""
+        return self.pair.calibrated
 
     @property
     def has_track(self) -> bool:
-        """Whether they do by a straight track."""
-        return self.has_depth and not self.pair.has_lens
+        """Whether they do by a straight track that is the search segment's line."""
+        return self.has_depth and self.pair.link is None and not self.pair.has_lens
 
     def track(self, x: Float[Tensor, "*n 2"]) -> Track:
         """The tracks in beta of alpha's pixels, of pinholes."""

@@ -41,6 +41,10 @@ FOUND_RIG = "found_rig.yaml"
 """The rig that was found from images. Not rig.yaml, which may be one that somebody wrote."""
 
 
+HEALED_RIG = "healed_rig.yaml"
+"""A given rig as its images have it."""
+
+
 def save_frame(
     frame: Frame,
     out: Path,

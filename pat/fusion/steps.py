@@ -35,7 +35,7 @@ from arraygeom import (
 from arraygeom.fields.default import default_field
 from arraygeom.fields.ray_depth import rough_transfer
 from arraygeom.pixels import coarse_grid, map_homogeneous, shift_matrix
-from arraygeom.undistortion import pixels_between, sampled_between
+from arraygeom.undistortion import pixels_between
 
 from ..matching.inputs import box_around, ends_of
 from ..matching.normalisation import normalised
@@ -248,11 +248,11 @@ def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens:
     """The frame at the pixels of alpha's own image."""
     if not (isinstance(pinhole, LensView) and isinstance(lens, LensView) and lens.distortion is not None):
         return frame
-    added = frame.image - straight
-    inverse = (1 / frame.depth).nan_to_num(0.0)
-    where = pixels_between(pinhole, lens)
-    back = sampled_between(torch.cat([added, frame.confidence[None]]), pinhole, where, "bilinear").values[0]
-    depth = 1 / sampled_between(inverse[None], pinhole, where, "nearest").values[0, 0]
+    shown = torch.cat([frame.image - straight, frame.confidence[None]])
+    inverse = (1 / frame.depth).nan_to_num(0.0)[None]
+    back = resampled(shown, pinhole, lens, interpolation="bilinear").values[0]
+    del shown
+    depth = 1 / resampled(inverse, pinhole, lens, interpolation="nearest").values[0, 0]
     return Frame(own + back[:-1], torch.where(depth.isfinite(), depth, torch.nan), back[-1])
 
 

@@ -38,6 +38,8 @@ MATCHING_BYTES = 330.0
 """Working memory of matching for each pixel of alpha, measured."""
 FRAME_BYTES = 20.0
 """A fused frame's for each pixel: three colours, depth and confidence."""
+WRITING_BYTES = 65.0
+"""What taking a fused frame back to alpha's pixels and writing it takes for each pixel, measured."""
 PROBE = (192, 512)
 """Least and greatest side of the piece of alpha that is fused to estimate the time, pixels."""
 ESTIMATED = 4_000_000
@@ -94,8 +96,9 @@ def plan_frame(
     matching = MATCHING_BYTES * max(area(tile.outer) for tile in pieces) if network.uses_matches else 0.0
     tiles = tiles_within(network, frame, limit, held, matching)
     work = max(matching, *(working_memory(network, frame.inputs, tile) for tile in tiles))
+    held = max(held + work, LIBRARIES + kept + math.prod(frame.hw) * (FRAME_BYTES + WRITING_BYTES))
     seconds = (1 + before) * probe.seconds(pieces, tiles) + after if probe else None
-    return Plan(tiles, SLACK * (held + work), seconds, len(pieces))
+    return Plan(tiles, SLACK * held, seconds, len(pieces))
 
 
 def tiles_within(

@@ -127,7 +127,7 @@ class ViewFiles(Mapping[str, Tensor]):
     """
 
     def __init__(self, rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> None:
-        self.rig, self.files, self.like = rig, files, rig[alpha].sensor
+        self.rig, self.files, self.alpha, self.like = rig, files, alpha, rig[alpha].sensor
         self._kept: dict[str, Tensor] = {}
 
     def __iter__(self) -> Iterator[str]:

@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from arraygeom import Rig
+from arraygeom import Distortion, LensView, Rig, intrinsics
+from arraygeom.pixels import coarse_grid
 from calib.images.held_out import line_distances
 from calib.images.matches import PointMatches, with_map
 from calib.images.self_calibration import RefinedPair, dense_matches, joined, refined_by_depth, self_calibrated
@@ -42,10 +43,29 @@ def test_pose_and_bounds_are_found_with_the_focal_lengths():
     assert far > 6.0 / 0.2
 
 
-def test_focal_lengths_that_the_points_contradict_give_no_calibration():
+def test_focal_lengths_that_the_points_contradict_give_rough_depths_alone():
     rig = unlike_pair()
     (matches,) = seen_points(rig, noise=0.05, near=1.6, far=7.0).values()
-    assert calibrated_from(rig, matches, first=3000.0, second=60.0) is None
+    found = calibrated_from(rig, matches, first=3000.0, second=60.0)
+    assert found is None or not found.exact
+
+
+def test_cameras_have_the_lenses_of_their_views():
+    """Views with lenses were taken for pinholes, whose lines do not fit: there was no depth."""
+    rig = rectified_pair()
+    (matches,) = seen_points(rig, noise=0.1, near=2.0, far=6.0).values()
+    lens = Distortion("brown-conrady", torch.tensor([-0.08, 0.01, 0.002, -0.001], dtype=torch.float64))
+    views = {n: LensView(hw=HW, K=intrinsics(max(HW) / 2, HW), distortion=lens) for n in rig.names}
+    link = with_map(rig.pair(*rig.names), matches).link
+    seen = PointMatches(*(view.distort(x)[0] for view, x in zip(views.values(), matches)))
+    found = self_calibrated(views, link, seen, focal=dict.fromkeys(rig.names, 300.0))
+    assert not found.exact
+    x = coarse_grid(HW).reshape(-1, 2)
+    for name, view in views.items():
+        there, same = found.rig[name].distort(x)[0], view.distort(x)[0]
+        assert float((there - same).abs().max()) < 1e-6
+    pose = found.rig.pair(*rig.names).beta_from_alpha
+    assert pose.t.tolist() == pytest.approx([-1, 0, 0], abs=0.1)
 
 
 def test_dense_matches_follow_from_a_depth_map():

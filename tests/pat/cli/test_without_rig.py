@@ -259,4 +259,31 @@ def test_why_there_is_no_depth_is_said(halved, monkeypatch):
     lines = []
     rig, _ = found_rig(halved[1], "mono", {}, load_weights("mono-colour"), lines.append)
     assert not isinstance(rig["mono"], Camera)
-    assert any(line.startswith("no depth: no position of colour beside mono") for line in lines)
+    assert any(line.startswith("no depth by colour: its points show no parallax") for line in lines)
+
+
+def test_depth_is_rough_where_no_poses_fit_as_well_as_lines_alone(halved, monkeypatch):
+    """There was none."""
+    monkeypatch.setattr("pat.fusion.from_images.MATCHED", 300)
+    monkeypatch.setattr("calib.images.self_calibration.AS_GOOD", 0.0)
+    monkeypatch.setattr("calib.images.self_calibration.SLACK", 0.0)
+    known, images, _ = halved
+    focal, lines = {name: float(known[name].K[0, 0]) for name in known.names}, []
+    rig, _ = found_rig(images, "mono", focal, load_weights("mono-colour"), lines.append)
+    assert rig.links
+    assert any("lines by F; depths are rough" in line for line in lines)
+    network = load_weights("mono-colour")
+    frames = [fuse(network, r, images, alpha="mono", align=False) for r in (rig, known)]
+    sure = (frames[0].confidence > 0.7) & (frames[1].confidence > 0.7)
+    ratio = (frames[0].depth / frames[1].depth)[sure]
+    assert ratio.isfinite().double().mean() > 0.95
+    assert float((ratio / ratio.nanmedian() - 1).abs().nanmedian()) < 0.1
+
+
+def test_focal_lengths_are_of_the_images_as_given(halved, monkeypatch):
+    """Of images that were reduced to find their rig they were taken for those of the reduced ones."""
+    monkeypatch.setattr("pat.fusion.from_images.MATCHED", 160)
+    known, images, _ = halved
+    focal = {name: float(known[name].K[0, 0]) for name in known.names}
+    rig, _ = found_rig(images, "mono", focal, load_weights("mono-colour"), lambda line: None)
+    assert float(rig["mono"].K[0, 0]) == pytest.approx(focal["mono"], rel=1e-3)

@@ -1,0 +1,101 @@
+"""A rig that its images contradict: said, and healed for them where they determine it far better than the file does."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from torch import Tensor
+
+from arraygeom import Rig
+from calib.images.matches import Pairs, match_cameras
+from calib.images.misfit import OUTSIDE, find_misfit, share_outside
+from calib.images.refinement import refine_matches
+from calib.images.residuals import own_distance, related
+from calib.images.self_calibration import depth_bounds
+
+from ..support.settings import size
+from .checks import LowConfidenceWarning
+from .from_images import MATCHED, scaled
+from .views import ViewFiles
+
+
+@dataclass(frozen=True)
+class HealingSettings:
+    """Of a frame that heals its own rig."""
+
+    nearer: float = size(4.0, "How many times nearer to their lines held-out points must come")
+    of_own: float = size(2.0, "How many times as far from them as from those of an F of their own they may be then")
+    slack: float = size(0.25, "And so many pixels of the matched images more")
+
+
+SETTINGS = HealingSettings()
+
+
+class Healed(NamedTuple):
+    """A rig as its images have it, and what was changed, in a line."""
+
+    rig: Rig
+    text: str
+
+
+def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
+    """The rig healed by its images, where they say clearly more; else None, and a warning if it fits them badly.
+
+    By a `LowConfidenceWarning` if it is wrong: mistaken by the doctor's verdict, or points are where nothing is seen.
+    """
+    try:
+        images = dict(views)
+        misfit = find_misfit(views.developed, images)
+    except (ValueError, OSError):  # of a file or an image: the fusion says so
+        return None
+    if misfit is None:
+        return None
+    wrong = misfit.mistaken or misfit.outside > OUTSIDE
+    if heal and not misfit.outside > OUTSIDE and (healed := healed_rig(views.developed, images, views.alpha)):
+        return healed._replace(text=f"{healed.text}; {misfit.text}") if misfit.mistaken else healed
+    warnings.warn(misfit.text, LowConfidenceWarning if wrong else UserWarning, stacklevel=2)
+    return None
+
+
+def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | None:
+    """The rig refined by points matched between alpha and the betas, whatever its deviations; None unless held-out
+    points then lie about as near to their lines as to those of an F of their own, and far nearer than before."""
+    small = {name: scaled(image, min(MATCHED / max(image.shape[-2:]), 1.0)) for name, image in images.items()}
+    reduced = Rig({name: rig[name] for name in (alpha, *small)}, depth=rig.depth, links=rig.links, name=rig.name)
+    for name, image in small.items():
+        reduced = reduced.resize(name, (image.shape[-2], image.shape[-1]))
+    try:
+        pairs = related(reduced, match_cameras(small, alpha=alpha))
+        found = refine_matches(reduced, [pairs], force=True)
+    except ValueError:  # too few points, nothing to refine
+        return None
+    before, after = (statistics.median for statistics in found.held_out)
+    best = SETTINGS.of_own * own_distance(reduced, pairs) + SETTINGS.slack
+    if not found.accepted or after > best or after * SETTINGS.nearer > before:
+        return None
+    if share_outside(found.rig, pairs) > OUTSIDE:
+        return None
+    cameras = dict(rig.cameras)
+    for name in small:
+        cameras[name] = found.rig.resize(name, rig[name].hw)[name].replace(sensor=rig[name].sensor)
+    changed = "" if found.depth is None else f"; depth changes by {found.depth.change:.0%} (median), and is rough"
+    text = (
+        f"the rig is healed by these images: points lay {before:.1f} px from their lines, {after:.2f} px now{changed} "
+        "(--no-align leaves the rig as it is)"
+    )
+    depth = _depth_range(found.rig, pairs)
+    return Healed(rig.replace(cameras=cameras, depth=depth), text)
+
+
+def _depth_range(rig: Rig, pairs: Pairs) -> tuple[float, float] | None:
+    """The rig's depth range, extended to that of the matched points: a rotation that images correct moves all depths
+    along the segments."""
+    found = [depth_bounds(Rig({n: rig[n] for n in names}), matches) for names, matches in pairs.items()]
+    ranges = [bounds for bounds in found if bounds is not None]
+    if rig.depth is None or not ranges:
+        return rig.depth
+    given = [float(bound) for bound in rig.depth]
+    return min(given[0], *(near for near, _ in ranges)), max(given[1], *(far for _, far in ranges))
