@@ -16,6 +16,8 @@ from .options import FieldName, MaybePath, Out, Weights, optional, say, writable
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from arraygeom import ReceptiveField
+
     from ..evaluation.protocols import StereoMethod
     from ..networks.protocol import Comparing, FusionNetwork
     from ..networks.weights import Network
@@ -223,8 +225,14 @@ class Ablate:
             for linked in (True, False):
                 pairs = of_half(middlebury_pairs(self.middlebury), "report")
                 cases += field_table.rectified_cases(pairs, linked=linked)
+
+        def chosen(max_displacement: float) -> dict[str, ReceptiveField]:
+            every = field_table.fields_of(max_displacement)
+            return {name: field for name, field in every.items() if name not in self.without}
+
+        self._known(field_table.fields_of(1.0))
         shown = options.progress("fusing")(cases, len(cases))
-        rows = field_table.evaluate_fields(self._comparing(network), shown)
+        rows = field_table.evaluate_fields(self._comparing(network), shown, fields=chosen)
         write_text(self.out / "ablation.md", field_table.fields_markdown(rows))
         write_csv(self.out / "ablation.csv", field_table.FieldRow._fields, rows)
 
@@ -235,6 +243,12 @@ class Ablate:
         if not isinstance(network, Comparing):
             raise ValueError(f"--weights {self.weights}: its matches are not of its attention alone: add --families")
         return network
+
+    def _known(self, fields: Mapping[str, object]) -> None:
+        """Raise ValueError for a field to leave out that there is not."""
+        unknown = [name for name in self.without if name not in fields]
+        if unknown:
+            raise ValueError(f"--without: no field '{unknown[0]}': there are {', '.join(fields)}")
 
     def _families(self, network: Network) -> None:
         from ..evaluation.ablation import FieldFamily, ablate, families, layered_cases, rendered_cases
@@ -254,9 +268,7 @@ class Ablate:
         from ..synthesis.photos import PhotoBank
 
         comparing = self._comparing(network)
-        unknown = [name for name in self.without if name not in FIELDS]
-        if unknown:
-            raise ValueError(f"--without: no field '{unknown[0]}': there are {', '.join(FIELDS)}")
+        self._known(FIELDS)
         fields = {name: field for name, field in FIELDS.items() if name not in self.without}
         rigs = list(points(self.sweeps or tuple(SWEEPS), hw=self.hw or SIZE))
         bank = PhotoBank.load(*self.photos) if self.photos else None
