@@ -1,4 +1,4 @@
-"""Training of features for matching: `python -m pat.training.matching_features RECIPE --photos DIR --stereo
+"""Training of features for matching: `python -m experiments.learned_matching.training RECIPE --photos DIR --stereo
 DIR`."""
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ import tyro
 from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from pat.matching.features import FeatureConfig, MatchingEncoder, load_features, save_features
 from pat.sensors import generator_for
 from pat.support.locks import folder_lock
 from pat.support.schema import from_document, read_yaml
 from pat.synthesis.photos import PhotoBank
+from pat.training.checkpoints import collect, newest_checkpoint, restore, write_checkpoint
 
-from .checkpoints import collect, newest_checkpoint, restore, write_checkpoint
-from .matching_loss import Precision, matching_loss
-from .matching_samples import MatchingRecording, MatchingSample, MatchingScenes, recorded_sample, tune_stereo
+from .features import FeatureConfig, MatchingEncoder, load_features, save_features
+from .loss import Precision, matching_loss
+from .samples import MatchingRecording, MatchingSample, MatchingScenes, recorded_sample, tune_stereo
 
-RECIPES = Path(__file__).parent / "recipes" / "matching"
+RECIPES = Path(__file__).parent
 WEIGHTS, LOG = "features.safetensors", "log.csv"
 KEPT = 24
 """Samples for validation."""

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from pat.matching.cost import census
-from pat.matching.features import (
+from experiments.learned_matching.features import (
     BITS,
     FeatureConfig,
     MatchingEncoder,
@@ -16,6 +15,7 @@ from pat.matching.features import (
     save_features,
     words,
 )
+from pat.matching.cost import census
 
 SHARP = torch.zeros(1)
 

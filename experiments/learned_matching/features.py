@@ -21,8 +21,8 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pad, relu
 
-from ..support.schema import from_document
-from ..support.tensor_files import undamaged, write_tensors
+from pat.support.schema import from_document
+from pat.support.tensor_files import undamaged, write_tensors
 
 FORMAT = "pat-features 1"
 BITS = 64

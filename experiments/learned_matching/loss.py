@@ -11,9 +11,9 @@ from torch.nn.functional import max_pool2d
 
 from pat.matching.cost import BRIGHTNESS as LEVELS
 from pat.matching.cost import TRUNCATED
-from pat.matching.features import BITS, MatchingEncoder, Size
 
-from .matching_samples import MatchingSample, TrueMatches
+from .features import BITS, MatchingEncoder, Size
+from .samples import MatchingSample, TrueMatches
 
 QUERIES = 256
 """Pixels of a view that a step asks for, at either size."""

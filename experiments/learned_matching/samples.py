@@ -32,9 +32,8 @@ from pat.sensors import GaussianBlur, NoiseLevel, generator_for, record
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rigs import below, one_of, uniform
-
-from .config import GENERAL, RECTIFIED
-from .samples import pair_of, transfer
+from pat.training.config import GENERAL, RECTIFIED
+from pat.training.samples import pair_of, transfer
 
 REUSED = 3
 """How many times a scene is recorded on average."""

@@ -9,12 +9,8 @@ from safetensors.torch import load_file
 from torch import Generator
 
 from arraygeom import sample
-from pat.data.pairs import Disparity, StereoPair
-from pat.matching.features import BITS, FeatureConfig, MatchingEncoder
-from pat.media.images import write_image
-from pat.synthesis.photos import PhotoBank
-from pat.training.matching_features import FeatureTraining, command_line, train_features
-from pat.training.matching_loss import (
+from experiments.learned_matching.features import BITS, FeatureConfig, MatchingEncoder
+from experiments.learned_matching.loss import (
     Queries,
     drawn_queries,
     matching_loss,
@@ -23,13 +19,17 @@ from pat.training.matching_loss import (
     unlike_bits,
     unlike_brightness,
 )
-from pat.training.matching_samples import (
+from experiments.learned_matching.samples import (
     ColourPair,
     MatchingRecording,
     MatchingScenes,
     recorded_sample,
     window_of,
 )
+from experiments.learned_matching.training import FeatureTraining, command_line, train_features
+from pat.data.pairs import Disparity, StereoPair
+from pat.media.images import write_image
+from pat.synthesis.photos import PhotoBank
 
 
 def smooth(hw, seed, bands=3):
@@ -185,16 +185,16 @@ def short(folder, **changes):
 @pytest.mark.slow  # failed once of three beside other work: the weights of one layer differed
 def test_a_run_that_stopped_continues_exactly(tmp_path, monkeypatch):
     whole = load_file(train_features(short(tmp_path, out=tmp_path / "whole")))
-    from pat.training import matching_features
+    from experiments.learned_matching import training
 
-    advance = matching_features._advance
+    advance = training._advance
 
     def stopped(config, step, *rest):
         if step == 3:
             raise KeyboardInterrupt
         return advance(config, step, *rest)
 
-    monkeypatch.setattr(matching_features, "_advance", stopped)
+    monkeypatch.setattr(training, "_advance", stopped)
     with pytest.raises(KeyboardInterrupt):
         train_features(short(tmp_path))
     monkeypatch.undo()

@@ -1,0 +1,1 @@
+"""Learned features for matching, trained but not better than census in the same pipeline: docs/matching.md."""
