@@ -29,14 +29,14 @@ class Demo:
         from arraygeom.atomic import write_text
 
         from ..data.sample_array import ALPHA, load_motorcycle, load_sample
-        from ..evaluation.demo import Recording, classical_methods, save_demo_figure
+        from ..evaluation.demo import DemoRecording, classical_methods, save_demo_figure
         from ..evaluation.metrics import score
         from ..fusion.results import save_frame
         from ..networks.weights import load_weights
 
         options.writable(self.out, folder=True)
         network = load_weights(self.weights)
-        photograph, sample = Recording(load_motorcycle()), Recording(load_sample())
+        photograph, sample = DemoRecording(load_motorcycle()), DemoRecording(load_sample())
         recordings = {
             "photograph": photograph.as_real_cameras(),
             "rendered": sample.as_real_cameras(),

@@ -29,21 +29,21 @@ CROP = 4
 """Enlargement of the figure's lower row."""
 
 
-class Recording(NamedTuple):
+class DemoRecording(NamedTuple):
     """An array with its images as recorded, and their noise levels by camera if there is noise."""
 
     array: SampleArray
     noise: Mapping[str, NoiseLevel] | None = None
 
-    def as_real_cameras(self) -> Recording:
+    def as_real_cameras(self) -> DemoRecording:
         """The same array with cameras of another response and exposure, in low light."""
         generator = Generator().manual_seed(0)
         ideal = {ALPHA: luminance(self.array.ground_truth, RESPONSE), BETA: EXPOSURE * self.array.images[BETA]}
         images = {name: NOISE.recorded(image[None], generator)[0] for name, image in ideal.items()}
-        return Recording(self.array._replace(images=images), dict.fromkeys(images, NOISE))
+        return DemoRecording(self.array._replace(images=images), dict.fromkeys(images, NOISE))
 
 
-def classical_methods(network: FusionNetwork, recording: Recording) -> dict[str, Tensor]:
+def classical_methods(network: FusionNetwork, recording: DemoRecording) -> dict[str, Tensor]:
     """The classical fusion: plain; with alpha's response corrected; denoised first; and both.
 
     The response is what our fusion finds in the denoised images; these are by non-local means that know the noise.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import sys
 import threading
 import webbrowser
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -15,6 +16,13 @@ LARGEST = 1 << 16
 """Bytes of a question."""
 OWN_NAMES = ("localhost", "127.0.0.1")
 """Host names of this machine."""
+
+
+class _Server(ThreadingHTTPServer):
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A browser that leaves before it has its answer is no error."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
 
 
 def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
@@ -68,7 +76,7 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
         def log_message(self, format: str, *args: Any) -> None:
             """Say nothing of each request."""
 
-    server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+    server = _Server(("127.0.0.1", port), Handler)
     address = f"http://localhost:{server.server_port}"
     print(f"the explorer is at {address} (Ctrl+C ends it)", flush=True)
     if browser:

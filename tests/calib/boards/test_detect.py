@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from arraygeom import Pose, rotation_from_vector
-from calib.boards.detect import detect, explain, other_size, to_grey
+from calib.boards.detect import detect, explain, other_size
+from calib.boards.photos import to_grey
 from calib.boards.simulation import fine_rays, photograph
 from calib.boards.target import parse_board
 from tests.calib.board_scenes import camera, tensor

@@ -207,7 +207,7 @@ def test_an_interruption_is_one_line_and_status_130(monkeypatch, capsys):
 
 def test_explore_says_what_is_missing(small, capsys):
     told = fails(["explore", str(small / "rig.yaml"), "--image", f"mono={small / 'mono.png'}", "--no-browser"], capsys)
-    assert "two cameras or more" in told
+    assert "at least one beta" in told
 
 
 def test_warnings_are_one_line(small, capsys):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pat.cli.fusing import Demo
+from pat.cli.demo import Demo
 from pat.cli.main import Pat, command_paths, main
 from pat.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named
 from tests.pat.cli.test_cli import fails

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,9 @@ EXPLORE = ["explore", str(SAMPLE / "rig.yaml"), *IMAGES, "--no-browser"]
 @pytest.fixture
 def server():
     command = [sys.executable, "-m", "pat", *EXPLORE]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    heard = partial(signal.signal, signal.SIGINT, signal.default_int_handler)  # also if the tests run in the background
+    process = subprocess.Popen(command, cwd=ROOT, preexec_fn=heard, **pipes)
     yield process, re.search(r"http://localhost:(\d+)", process.stdout.readline())[1]
     process.kill()
     process.communicate()
