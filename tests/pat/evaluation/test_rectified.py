@@ -28,7 +28,7 @@ def test_the_canvas_holds_all_of_alpha_at_its_scale(sweep, value):
 
 
 def test_the_depth_of_a_slanted_plane_comes_back():
-    rig = point("focal ratio", 1.5, hw=HW).rig
+    rig = point("ahead", 30, hw=HW).rig
     normal = torch.tensor([0.2, -0.1, 1.0], dtype=torch.float64)
 
     def depth(camera):
