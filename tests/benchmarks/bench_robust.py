@@ -17,7 +17,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from tqdm import tqdm
+from rich.progress import track
 
 from arraygeom import Rig
 from calib.boards.detect import BoardViews, Detection
@@ -73,7 +73,7 @@ def rows(draws: range, shares: Sequence[float]) -> Iterator[str]:
     notes = []
     for share in shares:
         found: dict[int, Draw] = {}
-        for draw in tqdm(draws, desc=f"{share:.0%}"):
+        for draw in track(draws, description=f"{share:.0%}"):
             try:
                 found[draw] = judged(share, draw)
             except ValueError as error:
