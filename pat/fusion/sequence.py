@@ -151,8 +151,8 @@ class SequenceFusion:
     def _around(self, i: int, keys: Sequence[KeyFrame]) -> list[KeyFrame]:
         """The key frames within reach, or the nearest one."""
         gaps = {k.alpha: abs(self._time(k.alpha) - self._time(i)) for k in keys}
-        disparity = max(SETTINGS.intervals * self.timeline.interval * (1 - 1e-9), min(gaps.values()))
-        return [k for k in keys if gaps[k.alpha] <= disparity]
+        longest = max(SETTINGS.intervals * self.timeline.interval * (1 - 1e-9), min(gaps.values()))
+        return [k for k in keys if gaps[k.alpha] <= longest]
 
     def _warped(self, i: int, own: Tensor, key: KeyFrame, colour: KeyColour) -> KeyContribution:
         gap = abs(self._time(key.alpha) - self._time(i))
