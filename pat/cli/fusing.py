@@ -299,7 +299,7 @@ class Fuse(Known):
         from arraygeom.atomic import sweep
 
         from ..fusion.report import write_report
-        from ..fusion.results import band_names, save_frame, view_of
+        from ..fusion.results import band_names, describe_bands, save_frame, view_of
         from ..support.locks import folder_lock
 
         if self.points and not isinstance(rig[alpha], Camera):
@@ -329,12 +329,8 @@ class Fuse(Known):
                 frame, self.out, bits=bits, kind=self.kind, view=view, rig=found_rig, points=points, bands=bands
             )
             shutil.rmtree(store, ignore_errors=True)
-            if bands:
-                listed = ", ".join(f"fused_{name}.{self.kind}" for name in bands)
-                picture = "the three as a picture" if len(bands) == 3 else "their mean"
-                self._note(f"bands at alpha's view: {listed}; fused.{self.kind} is {picture}")
-            elif len(frame.image) not in (1, 3):
-                self._note(f"bands at alpha's view: fused_1.{self.kind} and so on; fused.{self.kind} is their mean")
+            if said := describe_bands(frame, bands, self.kind):
+                self._note(said)
             if self.points:
                 self._note("points.ply: the pixels of known depth, in alpha's frame")
             if self.report:

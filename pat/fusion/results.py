@@ -111,6 +111,15 @@ def band_names(frame: Frame, betas: Iterable[str]) -> list[str]:
     return names if frame.by_band is not None and len(names) == len(frame.by_band) else []
 
 
+def describe_bands(frame: Frame, names: Sequence[str], kind: ImageFormat) -> str:
+    """Which files have a frame's bands, in a line; empty for an ordinary image."""
+    if not names and len(frame.image) in (1, 3):
+        return ""
+    listed = ", ".join(f"fused_{name}.{kind}" for name in names) or f"fused_1.{kind} and so on"
+    picture = "the three as a picture" if len(frame.image) == 3 else "their mean"
+    return f"bands at alpha's view: {listed}; fused.{kind} is {picture}"
+
+
 def depth_scale(near: float) -> float:
     """Counts a metre in a depth image of 16 bits: the power of ten with which `near` is at most a twentieth of them."""
     return 10.0 ** math.floor(math.log10(MOST / 20 / near))

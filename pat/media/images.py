@@ -151,7 +151,7 @@ def has_many_bits(path: Path) -> bool:
     """Whether an image file has more than 8 bits a value."""
     if path.suffix.lower() in RAW_SUFFIXES:
         return True
-    header = image_header(path.read_bytes())
+    header = image_header(path.read_bytes()) if path.is_file() else None
     return header is not None and header.bits > 8
 
 

@@ -15,7 +15,7 @@ from arraygeom import Pose, Rig
 from pat.cli.fusing import Fuse
 from pat.cli.main import Pat, command_paths, main
 from pat.cli.options import respelled
-from pat.data.sample_array import SAMPLE, load_sample
+from pat.data.sample_array import SAMPLE, load_motorcycle, load_sample
 from pat.evaluation.metrics import score
 from pat.media.images import read_image, write_image
 
