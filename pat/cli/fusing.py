@@ -87,8 +87,9 @@ class Fuse(Known):
     """With --noise, leave alpha's values as recorded; always so if alpha has hardly any noise."""
     luminance: Literal["alpha", "mix", "beta"] = "alpha"
     """Whose brightness the fused image has: beta's, in alpha's detail, suits a near infrared alpha."""
-    bits: Literal[8, 16, 32] = 8
-    """Bits a channel of the fused image: 8 or 16 sRGB-encoded, or 32 for linear light as floats (tif, exr)."""
+    bits: Annotated[Literal[8, 16, 32] | None, optional("{8,16,32}")] = None
+    """Bits a channel of the fused image: 8 or 16 sRGB-encoded, or 32 for linear light as floats (tif, exr). By default
+    16 if an image has more than 8, else 8; 32 of exr."""
     kind: Literal["png", "tif", "exr"] = "png"
     """Format of the fused image."""
     sequence: bool = False
@@ -128,7 +129,7 @@ class Fuse(Known):
 
     def run(self) -> None:
         """Check the options that can be checked at once, and fuse, with the rig that is given or one that is found."""
-        if self.bits not in {"png": (8, 16), "tif": (8, 16, 32), "exr": (32,)}[self.kind]:
+        if self.bits not in {"png": (None, 8, 16), "tif": (None, 8, 16, 32), "exr": (None, 32)}[self.kind]:
             raise ValueError(f"--bits {self.bits} --kind {self.kind}: png holds 8 or 16 bits, exr 32, tif any")
         if self.kind == "exr":
             from ..media.images import exr_writer
@@ -159,6 +160,7 @@ class Fuse(Known):
         rig = self._rig()
         alpha, found = files_by_camera(rig, self.alpha, self.given, self.image)
         found = self._frames(found)
+        self._choose_bits(found)
         views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=alpha)
         if self.sequence:
             return self._many(rig, found, alpha)
@@ -205,9 +207,11 @@ class Fuse(Known):
         """Find the rig from the first image of each camera and fuse; `rates` are frames a second, of videos."""
         from ..fusion.from_images import array_from_images
         from ..fusion.results import FOUND_RIG
+        from ..networks.weights import load_weights
 
         self.sequence |= bool(rates)
         files = self._frames(files)
+        self._choose_bits(files)
         first = {name: paths[0] for name, paths in files.items()}
         focal = options.numbers_by_name(self.focal, "--focal")
         options.say_when_compiling()
@@ -215,7 +219,8 @@ class Fuse(Known):
             array = array_from_images(first, alpha=self.alpha, weights=self.weights, focal=focal, say=say)
         self.weights = array.weights
         self.normalise_radiometry |= array.match_levels
-        self.exposure = self.exposure or "auto"
+        measured = load_weights(array.weights).bands is None
+        self.exposure = self.exposure or ("keep" if measured else "auto")
         if max(map(len, files.values())) == 1:
             return self._one(array.rig, array.images, array.alpha, first, found=array.notes)
         rig = array.rig
@@ -226,6 +231,14 @@ class Fuse(Known):
         self._many(rig, {name: files[name] for name in rig.names}, array.alpha)
         rig.save(self.out / FOUND_RIG)
         say(f"the rig that was found: {self.out / FOUND_RIG}")
+
+    def _choose_bits(self, files: Mapping[str, Sequence[Path]]) -> None:
+        """As many bits as the images have, unless asked otherwise."""
+        from ..media.images import has_many_bits
+
+        if self.bits is None:
+            deep = any(has_many_bits(paths[0]) for paths in files.values())
+            self.bits = 32 if self.kind == "exr" else 16 if deep else 8
 
     def _frames(self, files: dict[str, list[Path]]) -> dict[str, list[Path]]:
         """The files of the frames that every camera has; all of them, of a sequence."""
@@ -286,7 +299,7 @@ class Fuse(Known):
         from arraygeom.atomic import sweep
 
         from ..fusion.report import write_report
-        from ..fusion.results import save_frame, view_of
+        from ..fusion.results import band_names, describe_bands, save_frame, view_of
         from ..support.locks import folder_lock
 
         if self.points and not isinstance(rig[alpha], Camera):
@@ -307,17 +320,17 @@ class Fuse(Known):
             frame, gain = self._exposed(frame)
             if found is None and not frame.depth.isfinite().any():
                 self._note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
-            view = view_of(rig, alpha, bits=self.bits, bands=len(frame.image))
+            bits = self.bits or 8
+            view = view_of(rig, alpha, bits=bits, bands=len(frame.image))
             found_rig = rig if found is not None else None
             points = rig[alpha] if self.points else None
+            bands = band_names(frame, (name for name in rig.betas(alpha) if name in images))
             written = save_frame(
-                frame, self.out, bits=self.bits, kind=self.kind, view=view, rig=found_rig, points=points
+                frame, self.out, bits=bits, kind=self.kind, view=view, rig=found_rig, points=points, bands=bands
             )
             shutil.rmtree(store, ignore_errors=True)
-            if len(frame.image) not in (1, 3):
-                bands = [name for name in rig.betas(alpha) if name in images for _ in images[name]]
-                listed = ", ".join(f"fused_{i}.{self.kind} {name}" for i, name in enumerate(bands, 1))
-                self._note(f"bands at alpha's view: {listed}; fused.{self.kind} is their mean")
+            if said := describe_bands(frame, bands, self.kind):
+                self._note(said)
             if self.points:
                 self._note("points.ply: the pixels of known depth, in alpha's frame")
             if self.report:
@@ -409,7 +422,7 @@ class Fuse(Known):
             self.out,
             sequence=self.sequence,
             speed=self.speed,
-            bits=self.bits,
+            bits=self.bits or 8,
             kind=self.kind,
             alone=not self.propagate,
             strict=self.strict,
