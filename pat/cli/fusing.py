@@ -143,7 +143,7 @@ class Fuse(Known):
         options.noise_of(self.noise)
         options.device_of(self.device)
         if self.classical and not self.report:
-            raise ValueError("--classical is shown on the page: leave out --no-report")
+            raise ValueError("--classical needs the page: leave out --no-report")
         self._notes: list[str] = []
         options.compile_at_once()
         with limited(limit), self._judged() as self._warnings:
@@ -303,7 +303,7 @@ class Fuse(Known):
         from ..support.locks import folder_lock
 
         if self.points and not isinstance(rig[alpha], Camera):
-            raise ValueError("--points: needs a calibrated alpha, and the rig knows it by F alone: leave it out")
+            raise ValueError("--points needs a calibrated alpha, and the rig has only F for it: leave out --points")
         begin, store = time.monotonic(), self.out / ".tiles"
         with folder_lock(self.out):
             sweep(self.out)
@@ -414,7 +414,7 @@ class Fuse(Known):
         self.refuse_several()
         single = {"--points": self.points, "--classical": self.classical, "--device cuda": self.device == "cuda"}
         if named := [option for option, given in single.items() if given]:
-            raise ValueError(f"{', '.join(named)}: of a single frame alone: leave it out for many")
+            raise ValueError(f"{', '.join(named)}: for a single frame only: leave out for several")
         batch = Batch(
             rig,
             files,

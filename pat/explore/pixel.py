@@ -289,7 +289,7 @@ MOST_SAMPLES = 96
 """Samples on the line, around that of the largest weight, from which it is sought."""
 CLEAR = 0.7
 """Least correlation of a clear match."""
-BETTER = 0.05
+BETTER = 0.03
 """By how much a match beside the line must correlate better than the best one on it."""
 
 

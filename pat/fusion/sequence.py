@@ -351,7 +351,7 @@ def flicker(images: Sequence[Float[Tensor, "3 h w"]], greys: Sequence[Float[Tens
     `greys` are alpha's frames, which show what moves. Raises ValueError for fewer than two frames.
     """
     if len(images) < 2:
-        raise ValueError("flicker is of two frames or more")
+        raise ValueError("flicker needs two frames or more")
     changes = []
     for (a, b), (grey_a, grey_b) in zip(pairwise(images), pairwise(greys)):
         change = (to_luma_chroma(b)[1] - to_luma_chroma(a)[1]).abs().mean(0)
