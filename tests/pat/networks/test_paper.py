@@ -83,7 +83,7 @@ def test_four_inputs_a_band_each_give_the_colours():
     window = (slice(None), slice(104, 296), slice(192, 448))
     rig = sample.rig.crop("mono", 104, 192, (192, 256))
     depth = tuple(float(d) for d in rig.pair("mono", "colour").depth_range)
-    four = Rig({"mono": rig["mono"]} | {band: rig["colour"] for band in "rgb"}, depth=depth)
+    four = Rig({"mono": rig["mono"]} | dict.fromkeys("rgb", rig["colour"]), depth=depth)
     mono, truth = sample.images["mono"][window], sample.ground_truth[window]
 
     def psnr(bands: str) -> float:
