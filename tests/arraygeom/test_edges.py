@@ -21,6 +21,7 @@ from arraygeom import (
     Segments,
     ThroughLenses,
     View,
+    default_field,
     depth_of,
     epipolar_lines,
     epipoles,
@@ -28,6 +29,7 @@ from arraygeom import (
     pixel_grid,
     rectify,
     sample,
+    sampling_locations,
     triangulate,
 )
 from arraygeom.distortion import COEFFICIENT_COUNTS
@@ -216,3 +218,38 @@ def test_a_number_of_samples_by_the_longest_segment_cannot_be_traced():
     with pytest.raises(NotImplementedError, match=r"the longest segment \(give `samples`\) depends on numbers"):
         torch.vmap(attended)(starts)
     torch.testing.assert_close(torch.vmap(lambda s: attended(s, 5))(starts)[0], attended(starts[0], 5))
+
+
+FAR_ORIGIN = torch.tensor([500_000.0, 5_000_000.0, 300.0], dtype=F64)
+"""As of UTM coordinates, metres."""
+
+
+def in_utm(rig: Rig) -> Rig:
+    moved = {}
+    for name, camera in rig.cameras.items():
+        pose = camera.cam_from_world
+        moved[name] = camera.replace(cam_from_world=Pose(pose.R, pose.t - pose.R @ FAR_ORIGIN))
+    return Rig(moved, depth=rig.depth)
+
+
+@pytest.mark.parametrize("rig", [pinholes(), bent()], ids=["pinholes", "lenses"])
+def test_rigs_in_map_coordinates_are_right_or_refused(rig):
+    """To a hundredth of a pixel in float64, whatever the pixels' type; float32 would hold the poses to half a metre."""
+    here, there = (r.pair("alpha", "beta") for r in (rig, in_utm(rig)))
+    for dtype in (F64, torch.float32):
+        x = torch.tensor([[20.0, 12.0], [31.0, 25.0]], dtype=dtype)
+        for field in (default_field(here), EpipolarLine() if not here.has_lens else Curved(8)):
+            one, other = (sampling_locations(field, pair, x) for pair in (here, there))
+            assert torch.equal(one.mask, other.mask)
+            assert float((one.xy - other.xy).abs().max()) < 0.01
+        assert x.dtype == one.xy.dtype
+    X = torch.tensor([[0.1, 0.2, 4.0]], dtype=F64)
+    pixels = [torch.stack([c.project(X + FAR_ORIGIN).x for c in there.cameras]).to(t) for t in (F64, torch.float32)]
+    for x in pixels:
+        assert float((triangulate(there.cameras, x).X - FAR_ORIGIN - X).abs().max()) < 1e-3
+    single = in_utm(rig).to(torch.float32).pair("alpha", "beta")
+    with pytest.raises(ValueError, match=r"m from the origin, which float32 holds to 0\.[3-6] m: give float64"):
+        default_field(single)(single, torch.tensor([[20.0, 12.0]]))
+    camera = there.cameras[0]
+    with pytest.raises(ValueError, match="put the origin near the cameras"):
+        Camera(K=camera.K.float(), cam_from_world=Pose(camera.R.float(), camera.t.float()), hw=camera.hw)
