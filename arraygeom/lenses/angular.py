@@ -48,7 +48,11 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
         radius = torch.where(off, torch.where(off, squared, 1.0).sqrt(), 0.0)
         with torch.no_grad():
             limit = beside_points(self._limit(), xy)
-            valid = finite & (radius <= limit * self._radius_over_angle(limit)[0])
+            outermost = limit * self._radius_over_angle(limit)[0]
+            valid = finite & (radius <= outermost)
+            pull = torch.where(valid, 1.0, outermost / torch.where(valid, 1.0, radius))
+        xy, radius = xy * pull[..., None], radius * pull
+        with torch.no_grad():
             theta = invert_increasing(self._radius, radius, limit.expand_as(radius), ITERATIONS)
         for _ in range(2):
             scale, slope = self._radius_over_angle(theta)

@@ -36,6 +36,7 @@ from arraygeom.distortion import COEFFICIENT_COUNTS
 from arraygeom.fields.straight import covering_displacement
 from pat.attention import attend
 from tests.arraygeom.rigs import random_rig
+from tests.arraygeom.test_camera_models import MODELS
 from tests.arraygeom.test_precision import FIELDS, WHOLE
 
 F64 = torch.float64
@@ -65,10 +66,14 @@ def test_the_nearest_pixel_of_halves_is_the_same_everywhere(width):
     assert attend(query, torch.ones_like(image), image, where, interpolation="nearest").flatten().equal(found)
 
 
-@pytest.mark.parametrize("model", COEFFICIENT_COUNTS)
+LENSES = {name: Distortion(name, torch.full((counts[0],), 0.01)) for name, counts in COEFFICIENT_COUNTS.items()}
+LENSES |= {name: model.to(torch.float32) for name, (model, _) in MODELS.items() if model.central and name != "own"}
+
+
+@pytest.mark.parametrize("model", LENSES)
 @pytest.mark.parametrize("size", [1e18, 1e20, 3e38])
 def test_lenses_are_finite_at_huge_points_in_float32(model, size):
-    lens = Distortion(model, torch.full((COEFFICIENT_COUNTS[model][0],), 0.01))
+    lens = LENSES[model]
     X = torch.tensor([[size, 0, 1], [size, size, size], [0, 0, size], [size, -size, -size], [1, 1, 1 / size]])
     X.requires_grad_()
     for value, _ in (lens.project(X), *(f(X[:, :2]) for f in (lens.distort, lens.undistort, lens.unproject))):
@@ -77,6 +82,17 @@ def test_lenses_are_finite_at_huge_points_in_float32(model, size):
     (large, valid), (small, expected) = lens.project(X), lens.project(X.detach() / size)
     assert valid[1:4].equal(expected[1:4])
     torch.testing.assert_close(large[1:4][valid[1:4]], small[1:4][valid[1:4]], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("model", [name for name, (model, _) in MODELS.items() if not model.central])
+def test_cameras_whose_rays_do_not_meet_are_finite_at_huge_points(model):
+    """As far away as they are followed; their values are those of float64 there."""
+    X = torch.tensor([[1e9, 0, 1], [1e18, 1e18, 1e18], [0, 0, 3e38], [1e20, -1e20, -1e20], [1, 1, 1e-20]])
+    X.requires_grad_()
+    lens = MODELS[model][0].to(torch.float32)
+    for value in (lens.project(X)[0], lens.unproject(X[:, :2])[0]):
+        assert value.isfinite().all()
+        assert not value.requires_grad or torch.autograd.grad(value.sum(), X)[0].isfinite().all()
 
 
 @pytest.mark.parametrize("near", [1e-38, 1e-30, 1e-20])
@@ -239,7 +255,8 @@ def test_rigs_in_map_coordinates_are_right_or_refused(rig):
     for dtype in (F64, torch.float32):
         x = torch.tensor([[20.0, 12.0], [31.0, 25.0]], dtype=dtype)
         for field in (default_field(here), EpipolarLine() if not here.has_lens else Curved(8)):
-            one, other = (sampling_locations(field, pair, x) for pair in (here, there))
+            found = [sampling_locations(field, pair, x) for pair in (here, there)]
+            one, other = (f if isinstance(f, Positions) else f.positions(5) for f in found)
             assert torch.equal(one.mask, other.mask)
             assert float((one.xy - other.xy).abs().max()) < 0.01
         assert x.dtype == one.xy.dtype

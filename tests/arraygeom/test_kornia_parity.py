@@ -294,7 +294,7 @@ def test_lenses_that_kornia_lacks_are_named():
     prism = torch.cat([LENS, torch.full((4,), 0.01, dtype=F64)])
     for lens, what in (
         (Distortion("double-sphere", LENS[:2]), "kornia has no double-sphere model: it has pinholes"),
-        (Distortion("brown-conrady", prism), "and this lens more"),
+        (Distortion("brown-conrady", prism), "this lens also prism or tilt terms"),
     ):
         with pytest.raises(ValueError, match=what):
             ALPHA.replace(distortion=lens).to_kornia()

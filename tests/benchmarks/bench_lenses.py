@@ -1,6 +1,6 @@
 """Every lens model beside OpenCV, kornia and pycolmap: wrong answers, error, derivatives, vmap, time; docs/lenses.md.
 
-    python -m tests.benchmarks.bench_lenses [--lenses 1000] [--write]
+    python -m tests.benchmarks.bench_lenses [--lenses 1000] [--models NAME ...] [--write]
 
 1,000 random lenses of each model, 100 directions each, f = 1000 px, float64. The truth is the model's formula, written
 here in numpy, along the path from the axis to the direction: a lens is followed until its image folds (its Jacobian no
@@ -17,7 +17,7 @@ import argparse
 import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -411,10 +411,10 @@ HEAD = (
 )
 
 
-def rows(lenses: int) -> list[list[str]]:
+def rows(names: Sequence[str], lenses: int) -> list[list[str]]:
     """One row a model and library."""
     made = []
-    for name in FAMILIES:
+    for name in names:
         points = drawn(name, lenses)
         for library, of in LIBRARIES.items():
             chosen = of(name)
@@ -429,10 +429,13 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--lenses", type=int, default=1000)
     parser.add_argument("--write", action="store_true", help="put the table into docs/lenses.md")
+    parser.add_argument("--models", nargs="*", default=list(FAMILIES), help="some of them; the others' rows stay")
     given = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    table = [list(HEAD), ["---"] * len(HEAD), *rows(given.lenses)]
-    text = "\n".join(f"| {' | '.join(row)} |" for row in table)
+    made = ["| " + " | ".join(row) + " |" for row in (HEAD, ["---"] * len(HEAD), *rows(given.models, given.lenses))]
     if given.write:
-        PAGE.write_text(with_block(PAGE.read_text(), "lenses", text))
+        page = PAGE.read_text()
+        block = page[page.index("<!-- lenses:begin -->") : page.index("<!-- lenses:end -->")]
+        kept = [line for line in block.splitlines() if line[2:].split(" ")[0] in set(FAMILIES) - set(given.models)]
+        PAGE.write_text(with_block(page, "lenses", "\n".join([*made[:2], *sorted([*made[2:], *kept])])))
