@@ -248,7 +248,7 @@ def adjustment() -> Iterator[Row]:
         return least_squares(cost, np.concatenate([np.zeros(sum(sizes)), points.flatten().numpy()]), method="trf")
 
     ours = bundle_adjusted(rig, points, x, free=free)
-    value = f"cost, relative {abs(float(ours.cost[-1]) / (2 * theirs().cost) - 1):.0e}"
+    value = f"cost, relative {float(ours.cost[-1]) / (2 * theirs().cost) - 1:+.0e}"
     slope = gradient_error(lambda v: bundle_adjusted(rig, points, v.reshape(3, 100, 2), free=free).X, x.flatten())
     times = ratio(lambda: bundle_adjusted(rig, points, x, free=free), theirs, 1)
     yield Row("bundle adjustment, 309 numbers", "SciPy", value, f"{slope:.0e}", "none", times)
@@ -265,7 +265,7 @@ def adjustment() -> Iterator[Row]:
         "projection through a lens", "OpenCV", apart(camera.project(X).x, projected()), f"{slope:.0e}", "none", times
     )
     rays = world_rays(camera, camera.project(X).x)
-    away = torch.linalg.cross(rays.direction, X).sub(rays.plucker[:, 3:]).norm(dim=-1).max()
+    away = torch.linalg.cross(X, rays.direction).sub(rays.plucker[:, 3:]).norm(dim=-1).max()
     yield Row(
         "rays, Pluecker coordinates", "no other", f"true points off their rays by {float(away):.0e} m", "", "", ""
     )
