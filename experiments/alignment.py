@@ -1,7 +1,8 @@
 """How well bands are aligned: beside a homography, on stereo pairs as bands and on real multispectral cameras.
 
-A patch counts if it can be located: a corner of alpha's image all of whose pixels the beta sees, whose best match
-within some pixels of where the alignment puts it is like it. It is well aligned if that match is within half a pixel.
+A patch counts around a corner of alpha's image that the alignment says the beta sees (with true disparity: and whose
+patch it does see), if it can be located: its best match within some pixels of where the alignment, or the homography,
+puts it is like it. It is well aligned if that match is within half a pixel.
 The homography is OpenCV's ECC on gradients, coarse to fine, of images without their lenses, as the makers of
 multispectral cameras align their bands.
 """
@@ -56,9 +57,9 @@ WIDEST = 0.15
 
 
 class AlignmentRow(NamedTuple):
-    """One beta of one scene. Shares of: corners that the beta sees; of those, patches that can be located; of those,
-    patches within half a pixel of their best match, by the alignment and by the homography; with the truth, visible
-    patches within half a pixel of it, and occluded pixels wrongly filled.
+    """One beta of one scene. Shares of: corners (truly visible ones) that the alignment sees; of those, patches that
+    can be located; of those, patches within half a pixel of their best match, by the alignment and by the homography; with
+    the truth, seen patches within half a pixel of it, and occluded pixels wrongly filled.
 
     off: largest difference of the values, in their own units, from samples of the recorded image, rounded as they are.
     """
@@ -126,14 +127,15 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
     rows = []
     for name in scene.rig.betas(scene.alpha):
         view, values = aligned[name], np.asarray(scene.recorded[name])
-        visible = view.visibility == SEEN
+        visible = np.ones((h, w), bool)
         occluded = None
         if scene.truth is not None:
             occluded = occluded_pixels(scene.truth)
             inside = pixel_grid((h, w)).numpy()[..., 0] - scene.truth.value.numpy() >= 0
             visible = scene.truth.valid.numpy() & inside & ~occluded
-        seen = patch_mean(visible.astype(float), corners) > 1 - 1e-6
-        x = corners[seen]
+        candidates = corners[patch_mean(visible.astype(float), corners) > 1 - 1e-6]
+        seen = view.valid[candidates[:, 1], candidates[:, 0]]
+        x = candidates[seen]
         warped = shown_band(resampled_values(values, np.nan_to_num(view.positions), "bilinear"))
         plane = by_homography(scene, name, straight, pinhole)
         rigid = shown_band(resampled_values(values, plane, "bilinear"))

@@ -1,6 +1,7 @@
 """`pat rig diff`: simulated recalibrations of a rig that moved and of one that did not, and what is refused."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -43,7 +44,7 @@ def compared(one, other):
 def shares(rig, count):
     """Of so many recalibrations of a rig that did not move and of one that did, what share is said to be so."""
     fits = [recalibrated(rig, seed) for seed in range(count + 1)]
-    same = [not compared(*pair).significance.moved for pair in zip(fits, fits[1:])]
+    same = [not compared(*pair).significance.moved for pair in pairwise(fits)]
     moved = [compared(fits[i], recalibrated(turned(rig, i), 10_000 + i)).significance for i in range(count)]
     return np.mean(same), np.mean([found.moved for found in moved])
 
