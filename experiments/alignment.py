@@ -58,8 +58,8 @@ WIDEST = 0.15
 
 class AlignmentRow(NamedTuple):
     """One beta of one scene. Shares of: corners (truly visible ones) that the alignment sees; of those, patches that
-    can be located; of those, patches within half a pixel of their best match, by the alignment and by the homography; with
-    the truth, seen patches within half a pixel of it, and occluded pixels wrongly filled.
+    can be located; of those, patches within half a pixel of their best match by the alignment, and by the homography;
+    with the truth, seen patches within half a pixel of it, and occluded pixels wrongly filled.
 
     off: largest difference of the values, in their own units, from samples of the recorded image, rounded as they are.
     """
