@@ -173,7 +173,7 @@ class Ablate:
     """Fields to leave out, such as dense, which takes most of the time."""
     every_field: bool = False
     """Instead: a table of every field of the toolkit, with time and memory: unrectified scenes and, with --middlebury,
-    rectified pairs and the same with F alone."""
+    rectified pairs and the same with F alone. Also peaks.png: where attention is largest, in three pictures."""
     middlebury: MaybePath = None
     """Folder of Middlebury's pairs with true disparity, for --every-field; those of the report half."""
     families: bool = False
@@ -217,6 +217,7 @@ class Ablate:
         from ..evaluation.ablation import sample_photographs
         from ..evaluation.halves import of_half
         from ..evaluation.tables import write_csv
+        from ..media.figures import save_panels
         from ..synthesis.photos import PhotoBank
 
         bank = PhotoBank.load(*self.photos) if self.photos else sample_photographs()
@@ -233,6 +234,9 @@ class Ablate:
         self._known(field_table.fields_of(1.0))
         shown = options.progress("fusing")(cases, len(cases))
         rows = field_table.evaluate_fields(self._comparing(network), shown, fields=chosen)
+        looked_at = [case for case in cases if case.kind != "F alone"]
+        panels = field_table.drawn_peaks(self._comparing(network), looked_at[:: -(-len(looked_at) // 3)])
+        save_panels(panels, self.out / "peaks.png", columns=4)
         write_text(self.out / "ablation.md", field_table.fields_markdown(rows))
         write_csv(self.out / "ablation.csv", field_table.FieldRow._fields, rows)
 
