@@ -59,7 +59,8 @@ WIDEST = 0.15
 class AlignmentRow(NamedTuple):
     """One beta of one scene. Shares of: corners (truly visible ones) that the alignment sees; of those, patches that
     can be located; of those, patches within half a pixel of their best match by the alignment, and by the homography;
-    with the truth, seen patches within half a pixel of it, and occluded pixels wrongly filled.
+    with the truth, patches within half a pixel of their best match if aligned by it, seen patches within half a pixel
+    of it, and occluded pixels wrongly filled.
 
     off: largest difference of the values, in their own units, from samples of the recorded image, rounded as they are.
     """
@@ -70,6 +71,7 @@ class AlignmentRow(NamedTuple):
     located: float
     aligned: float
     homography: float
+    by_truth: float | None
     true: float | None
     filled: float | None
     off: float
@@ -136,19 +138,20 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
         candidates = corners[patch_mean(visible.astype(float), corners) > 1 - 1e-6]
         seen = view.valid[candidates[:, 1], candidates[:, 0]]
         x = candidates[seen]
-        warped = shown_band(resampled_values(values, np.nan_to_num(view.positions), "bilinear"))
-        plane = by_homography(scene, name, straight, pinhole)
-        rigid = shown_band(resampled_values(values, plane, "bilinear"))
-        offsets, like = zip(*(local_offsets(own, other, x) for other in (warped, rigid)))
-        located = np.maximum(*like) >= ALIKE
-        near = [float((off[located] <= HALF_PIXEL).mean()) for off in offsets]
+        planes = [np.nan_to_num(view.positions), by_homography(scene, name, straight, pinhole)]
         true, filled = None, None
         if scene.truth is not None and occluded is not None:
             expected = pixel_grid((h, w)).numpy().copy()
             expected[..., 0] -= scene.truth.value.numpy()
+            planes.append(expected)
             error = np.linalg.norm(view.positions - expected, axis=-1)[x[:, 1], x[:, 0]]
             true = float((error <= HALF_PIXEL).mean())
             filled = float((view.visibility[occluded] == SEEN).mean())
+        others = [shown_band(resampled_values(values, plane, "bilinear")) for plane in planes]
+        offsets, like = zip(*(local_offsets(own, other, x) for other in others))
+        located = np.maximum(*like[:2]) >= ALIKE
+        near: list[float | None] = [float((off[located] <= HALF_PIXEL).mean()) for off in offsets]
+        near += [None] * (3 - len(near))
         share = float(seen.mean()), float(located.mean())
         kind = str(view.values.dtype)
         rows.append(AlignmentRow(scene.name, name, *share, *near, true, filled, sampling_error(view, values), kind))
@@ -259,16 +262,16 @@ def alignment_markdown(rows: Sequence[AlignmentRow]) -> str:
     lines = [_line(row) for row in rows if row.true is None]
     for name in dict.fromkeys(row.beta for row in known):
         mine = [row for row in known if row.beta == name]
-        means = [float(np.mean([row[i] for row in mine])) for i in range(2, 8)]
+        means = [float(np.mean([row[i] for row in mine])) for i in range(2, 9)]
         off = max(row.off for row in mine)
         scene = f"Middlebury, {len(mine)} pairs"
         lines.append(_line(AlignmentRow(scene, name, *means, off, mine[0].dtype)))
-    columns = ["scene", "beta", "corners seen", "located", "within .5 px", "homography", "of the truth"]
+    columns = ["scene", "beta", "corners seen", "located", "within .5 px", "homography", "by the truth", "of the truth"]
     return markdown_table([*columns, "occluded, filled", "values off", "type"], lines)
 
 
 def _line(row: AlignmentRow) -> list[str]:
-    shares = ["" if share is None else f"{share:.1%}" for share in row[2:8]]
+    shares = ["" if share is None else f"{share:.1%}" for share in row[2:9]]
     return [row.scene, row.beta, *shares, f"{row.off:.1g}", row.dtype]
 
 
@@ -297,7 +300,7 @@ def capture(name: str, pattern: str) -> Callable[[Path], Iterator[AlignmentScene
         files = camera_names(sorted((data / "multispectral" / name).glob(pattern)))
         array = array_from_images(files)
         files = {camera: files[camera] for camera in array.rig.names}
-        recorded = RecordedFiles(array.rig, files)
+        recorded = RecordedFiles(array.recorded, files)
         yield AlignmentScene(name, array.rig, array.images, recorded, array.alpha, array.match_levels)
 
     return scenes
