@@ -78,6 +78,9 @@ class AlignmentRow(NamedTuple):
     dtype: str
 
 
+SHARES = "seen", "located", "aligned", "homography", "by_truth", "true", "filled"
+
+
 class AlignmentScene(NamedTuple):
     """What is aligned: a rig, developed images, recorded values, alpha, and alpha's true disparity if it is known."""
 
@@ -150,11 +153,22 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
         others = [shown_band(resampled_values(values, plane, "bilinear")) for plane in planes]
         offsets, like = zip(*(local_offsets(own, other, x) for other in others))
         located = np.maximum(*like[:2]) >= ALIKE
-        near: list[float | None] = [float((off[located] <= HALF_PIXEL).mean()) for off in offsets]
-        near += [None] * (3 - len(near))
-        share = float(seen.mean()), float(located.mean())
-        kind = str(view.values.dtype)
-        rows.append(AlignmentRow(scene.name, name, *share, *near, true, filled, sampling_error(view, values), kind))
+        near = [float((off[located] <= HALF_PIXEL).mean()) for off in offsets]
+        rows.append(
+            AlignmentRow(
+                scene.name,
+                name,
+                seen=float(seen.mean()),
+                located=float(located.mean()),
+                aligned=near[0],
+                homography=near[1],
+                by_truth=near[2] if len(near) > 2 else None,
+                true=true,
+                filled=filled,
+                off=sampling_error(view, values),
+                dtype=str(view.values.dtype),
+            )
+        )
     return rows
 
 
@@ -172,7 +186,7 @@ def local_offsets(
         found = np.square(np.nan_to_num(cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED)))
         best = np.unravel_index(int(found.argmax()), found.shape)
         like[i] = found[best]
-        offsets[i] = np.hypot(*(_peak(found, best, axis) - SEARCH for axis in (0, 1)))
+        offsets[i] = np.hypot(_peak(found, best, 0) - SEARCH, _peak(found, best, 1) - SEARCH)
     return offsets, like
 
 
@@ -200,6 +214,7 @@ def by_homography(
 def ecc_homography(own: NDArray[np.uint8], other: NDArray[np.uint8]) -> Float[np.ndarray, "3 3"]:
     """The homography from `own` to `other` by enhanced correlation (Evangelidis and Psarakis 2008) of gradients."""
     H = np.eye(3, dtype=np.float32)
+    ecc: Any = cv2.findTransformECC
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
     for level in range(LEVELS, -1, -1):
         a, b = (_gradients(image, 0.5**level) for image in (own, other))
@@ -210,7 +225,7 @@ def ecc_homography(own: NDArray[np.uint8], other: NDArray[np.uint8]) -> Float[np
             H[:2, 2] *= 2
             H[2, :2] /= 2
         try:
-            _, H = cv2.findTransformECC(a, b, H, cv2.MOTION_HOMOGRAPHY, criteria, None, 5)
+            _, H = ecc(a, b, H, cv2.MOTION_HOMOGRAPHY, criteria, None, 5)
         except cv2.error:  # it does not converge on this level
             continue
     return np.asarray(H, np.float64)
@@ -262,16 +277,16 @@ def alignment_markdown(rows: Sequence[AlignmentRow]) -> str:
     lines = [_line(row) for row in rows if row.true is None]
     for name in dict.fromkeys(row.beta for row in known):
         mine = [row for row in known if row.beta == name]
-        means = [float(np.mean([row[i] for row in mine])) for i in range(2, 9)]
-        off = max(row.off for row in mine)
-        scene = f"Middlebury, {len(mine)} pairs"
-        lines.append(_line(AlignmentRow(scene, name, *means, off, mine[0].dtype)))
+        means: dict[str, Any] = {share: float(np.mean([getattr(row, share) for row in mine])) for share in SHARES}
+        scene, off = f"Middlebury, {len(mine)} pairs", max(row.off for row in mine)
+        lines.append(_line(mine[0]._replace(scene=scene, off=off, **means)))
     columns = ["scene", "beta", "corners seen", "located", "within .5 px", "homography", "by the truth", "of the truth"]
     return markdown_table([*columns, "occluded, filled", "values off", "type"], lines)
 
 
 def _line(row: AlignmentRow) -> list[str]:
-    shares = ["" if share is None else f"{share:.1%}" for share in row[2:9]]
+    found = [getattr(row, share) for share in SHARES]
+    shares = ["" if share is None else f"{share:.1%}" for share in found]
     return [row.scene, row.beta, *shares, f"{row.off:.1g}", row.dtype]
 
 

@@ -278,9 +278,9 @@ def _check_one_capture(images: Mapping[str, _Image]) -> None:
                 raise image.source.fail(
                     None, f"is of another {kind} than the image of '{name}' ({two}, {one}): give images of one capture"
                 )
-        places = _place(first.tags), _place(image.tags)
-        if places[0] and places[1] and math.dist(*places) > SAME_PLACE:
-            here, there = (f"{north:.4f}, {east:.4f}" for north, east in places[::-1])
+        place, other = _place(first.tags), _place(image.tags)
+        if place and other and math.dist(place, other) > SAME_PLACE:
+            here, there = (f"{north:.4f}, {east:.4f}" for north, east in (other, place))
             raise image.source.fail(
                 None,
                 f"is of another place by GPS than the image of '{name}' ({here}; {there}): give images of one capture",

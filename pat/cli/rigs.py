@@ -432,15 +432,14 @@ class RigDiff:
         images = options.read_images(a, self.image)
         with options.working("matching points of the images"):
             pairs = given_matches(self.matches, self.image, images) or match_cameras(images)
-        off = [line_distances(rig, pairs) for rig in (a, b)]
-        medians = [float(distance.abs().median()) for distance in off]
-        text = (
-            f"on the images: {len(off[0])} points, {medians[0]:.2f} px from A's lines and {medians[1]:.2f} px from B's"
-        )
-        for name, before, after in (("B", *off), ("A", *off[::-1])):
-            if nearer(before, after):
-                share = float((after.abs() < before.abs()).float().mean())
-                return f"{text}: {name} fits better, at {share:.0%} of them"
+        of_a, of_b = line_distances(a, pairs), line_distances(b, pairs)
+        medians = float(of_a.abs().median()), float(of_b.abs().median())
+        text = f"on the images: {len(of_a)} points, {medians[0]:.2f} px from A's lines and {medians[1]:.2f} px from B's"
+        closer = float((of_a.abs() < of_b.abs()).float().mean())
+        if nearer(of_b, of_a):
+            return f"{text}: A fits better, at {closer:.0%} of them"
+        if nearer(of_a, of_b):
+            return f"{text}: B fits better, at {1 - closer:.0%} of them"
         return f"{text}: neither fits significantly better"
 
 

@@ -129,10 +129,10 @@ def test_captures_that_do_not_go_together(capture, tmp_path, capsys, options, me
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--depth-map", "{}/small.tif"], "the depth map is 80x48"),
-        (["--depth-map", "{}/depth.png", "--depth-scale", "1"], "state its unit by --depth-scale"),
+        (["--depth-map", "{}/small.tif"], "small.tif: is 80x48, alpha's image is 160x96"),
+        (["--depth-map", "{}/depth.png", "--depth-scale", "1"], "state its unit with --depth-scale"),
         (["--matches", "{}/far.csv"], "outside"),
-        (["--confidence", "2"], "confidence"),
+        (["--confidence", "2"], "the least confidence is 2: give a number from 0 to 1"),
         (["--alpha", "nir"], "no camera 'nir'"),
     ],
 )
