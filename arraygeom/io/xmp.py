@@ -24,7 +24,8 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..distortion import Distortion
-from ..lenses.central import POLYNOMIAL_FISHEYE
+from ..lenses import PolynomialFisheye
+from ..lenses.model import LensModel
 from ..pose import Pose
 from ..rig import Rig
 from ..sensor import Band, Sensor
@@ -179,7 +180,7 @@ class _Image(NamedTuple):
             raise self.source.fail("Orientation", f"is {orientation}, a mirrored image: save it as the camera did")
         return QUARTER_TURNS[orientation]
 
-    def _pix4d(self) -> tuple[Tensor, Distortion | None]:
+    def _pix4d(self) -> tuple[Tensor, LensModel | None]:
         kind, centre = self.text("ModelType"), self.needed("PrincipalPoint", 2)
         if "pixel" not in (self.text("PrincipalPointUnits") or "mm"):
             centre = centre * self.per_mm
@@ -202,9 +203,8 @@ class _Image(NamedTuple):
             )
         scale = 2 / math.pi
         K[:2, :2] = self.needed("FisheyeAffineMatrix", 4).reshape(2, 2) * float(p[1]) * scale
-        powers = torch.nn.functional.pad(p[2:] / p[1], (0, 5 - len(p)))
-        bends = powers * scale ** torch.arange(1, 4, dtype=torch.float64)
-        return self._intrinsics(K), self.source.lens(POLYNOMIAL_FISHEYE, bends, "FisheyePolynomial")
+        bends = p[2:] / p[1] * scale ** torch.arange(1, len(p) - 1, dtype=torch.float64)
+        return self._intrinsics(K), PolynomialFisheye(bends)
 
     def _dji(self) -> tuple[Tensor, Distortion | None]:
         (h, w), text = self.tags.hw, self.tags.text(DJI, "DewarpData") or ""

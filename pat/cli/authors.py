@@ -76,7 +76,7 @@ class Evaluate:
         if not folders:
             raise ValueError(f"no images: give at least one of --{', --'.join(stereo.DATA_SETS)}")
         if self.without_rig and (self.protocol != "table1" or self.conditions or self.only):
-            raise ValueError("--without-rig: is of --protocol table1, without --conditions")
+            raise ValueError("--without-rig needs --protocol table1, and no --conditions")
         if not self.rates or min(self.rates) < 1:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
         writable(self.out, folder=True)
@@ -112,7 +112,7 @@ class Evaluate:
         sets = [stereo.DATA_SETS[name](folder) for name, folder in folders.items()]
         pairs = [pair for found in sets for pair in of_half(found, self.half) if pair.disparity is not None]
         if not pairs:
-            raise ValueError(f"--half {self.half}: of none of its pairs the true disparity is known")
+            raise ValueError(f"--half {self.half}: none of its pairs has a true disparity: give the other half")
         with options.working("evaluating") as retitle:
             rows = evaluate_outside(pairs, network, each=lambda row: retitle(f"{row.pair}: {row.source}"))
         text = outside_markdown(rows)
@@ -133,7 +133,7 @@ class Evaluate:
         sets = [stereo.DATA_SETS[name](folder) for name, folder in folders.items()]
         pairs = [pair for found in sets for pair in of_half(found, self.half)]
         if not pairs:
-            raise ValueError(f"--half {self.half}: none of the pairs is of that half")
+            raise ValueError(f"--half {self.half}: no pair belongs to that half: give more pairs, or the other half")
         rows = conditions.evaluate_conditions(pairs, network, names, progress=options.progress("evaluating"))
         text = conditions.conditions_markdown(rows)
         write_text(self.out / "conditions.md", text)
@@ -245,7 +245,10 @@ class Ablate:
         from ..networks.protocol import Comparing
 
         if not isinstance(network, Comparing):
-            raise ValueError(f"--weights {self.weights}: its matches are not of its attention alone: add --families")
+            raise ValueError(f"--weights {self.weights} needs --families: this network matches without attention, too")
+        if network.betas not in (1, 3):
+            wanted = "give some for one beta in colour, or for three with a band each"
+            raise ValueError(f"--weights {self.weights}: they are for {network.betas} betas: {wanted}")
         return network
 
     def _known(self, fields: Mapping[str, object]) -> None:

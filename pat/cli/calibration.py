@@ -88,7 +88,7 @@ class Calibrate:
         from calib.boards.parameters import StartDeviations
 
         if self.deviation and self.start is None:
-            raise ValueError("--deviation is of a --start: give the rig too")
+            raise ValueError("--deviation needs --start: give the rig whose positions it is about")
         return StartDeviations.of(options.numbers_by_name(self.deviation, "--deviation"))
 
     def _watch(self, patterns: dict[str, str]) -> None:

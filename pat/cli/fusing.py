@@ -143,7 +143,7 @@ class Fuse(Known):
         options.noise_of(self.noise)
         options.device_of(self.device)
         if self.classical and not self.report:
-            raise ValueError("--classical is shown on the page: leave out --no-report")
+            raise ValueError("--classical needs the page: leave out --no-report")
         self._notes: list[str] = []
         options.compile_at_once()
         with limited(limit), self._judged() as self._warnings:
@@ -276,7 +276,7 @@ class Fuse(Known):
             sys.exit(LowConfidenceWarning.exit_status)
 
     def _rig(self) -> Rig:
-        rig = options.load_rig(self.given[0], self.depth)
+        rig = load_rig_or_say_no_image(self.given[0], self.depth)
         for name, rate in options.numbers_by_name(self.frame_rate, "--frame-rate").items():
             rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate)))
         for name, offset in options.numbers_by_name(self.time_offset, "--time-offset").items():
@@ -303,7 +303,7 @@ class Fuse(Known):
         from ..support.locks import folder_lock
 
         if self.points and not isinstance(rig[alpha], Camera):
-            raise ValueError("--points: needs a calibrated alpha, and the rig knows it by F alone: leave it out")
+            raise ValueError("--points needs a calibrated alpha, and the rig has only F for it: leave out --points")
         begin, store = time.monotonic(), self.out / ".tiles"
         with folder_lock(self.out):
             sweep(self.out)
@@ -414,7 +414,7 @@ class Fuse(Known):
         self.refuse_several()
         single = {"--points": self.points, "--classical": self.classical, "--device cuda": self.device == "cuda"}
         if named := [option for option, given in single.items() if given]:
-            raise ValueError(f"{', '.join(named)}: of a single frame alone: leave it out for many")
+            raise ValueError(f"{', '.join(named)}: for a single frame only: leave out for several")
         batch = Batch(
             rig,
             files,
@@ -451,7 +451,7 @@ def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> t
     if given and (image or is_rig_file(given[0])):
         named = (*image, *(f"{path.stem}={path}" for path in given[1:]))
         if not named:
-            raise ValueError(f"with the rig {given[0]}, give --image NAME=FILE for each camera")
+            raise ValueError(f"{given[0]}: {NO_IMAGE}; if it is a rig, give --image NAME=FILE for each camera")
         options.files_by_name(named)
         options.refuse_missing_rig(given[0])
         return named, True
@@ -482,6 +482,19 @@ def files_by_camera(
     found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
     refuse_equal_files({name: paths[0] for name, paths in found.items()})
     return rig.require(alpha), found
+
+
+NO_IMAGE = "is no image: images end in .png, .tif, .jpg and the like"
+
+
+def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> Rig:
+    """The rig of the first argument, which might have been meant as an image; with other depth bounds if given."""
+    from arraygeom.io.source import UnknownRigFormat
+
+    try:
+        return options.load_rig(path, depth)
+    except UnknownRigFormat:
+        raise ValueError(f"{path}: {NO_IMAGE}; nor is it a rig file (`pat rig convert --help` names formats)") from None
 
 
 def is_rig_file(path: Path) -> bool:

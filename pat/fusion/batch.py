@@ -193,7 +193,9 @@ class Batch:
         """
         text, file = self.settings, self.out / SETTINGS
         if resume and file.is_file() and file.read_text(encoding="utf-8") != text:
-            raise ValueError(f"{file}: the frames there were made with other settings: give those, or another folder")
+            raise ValueError(
+                f"{file}: the frames there were made with other settings: give the same ones, or another --out"
+            )
         now, before = self.inputs, _read_inputs(self.out / INPUTS) if resume else {}
         other = [i for i, name in enumerate(self.names) if before.get(name) != now[name]]
         if not resume or (self.sequence and other):

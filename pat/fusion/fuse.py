@@ -122,7 +122,7 @@ def fuse(
     match_levels |= grey_world
     align = not differentiable if align is None else align
     if differentiable and not (max_memory is None and store is None):
-        raise ValueError("a differentiable fusion is of the whole frame: leave out max_memory and store")
+        raise ValueError("differentiable=True fuses the whole frame at once: leave out max_memory and store")
     check_luminance(network, luminance, noisy=noise is not None)
     limit = None if max_memory is None else parse_bytes(max_memory)
     views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
