@@ -62,6 +62,7 @@ class AlignmentRow(NamedTuple):
     with the truth, patches within half a pixel of their best match if aligned by it, seen patches within half a pixel
     of it, and occluded pixels wrongly filled.
 
+    median, median_homography: of the distances of patches from their best match, pixels (searched 5 along x and y).
     off: largest difference of the values, in their own units, from samples of the recorded image, rounded as they are.
     """
 
@@ -71,6 +72,8 @@ class AlignmentRow(NamedTuple):
     located: float
     aligned: float
     homography: float
+    median: float
+    median_homography: float
     by_truth: float | None
     true: float | None
     filled: float | None
@@ -79,6 +82,7 @@ class AlignmentRow(NamedTuple):
 
 
 SHARES = "seen", "located", "aligned", "homography", "by_truth", "true", "filled"
+MEDIANS = "median", "median_homography"
 
 
 class AlignmentScene(NamedTuple):
@@ -162,6 +166,8 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
                 located=float(located.mean()),
                 aligned=near[0],
                 homography=near[1],
+                median=float(np.median(offsets[0][located])),
+                median_homography=float(np.median(offsets[1][located])),
                 by_truth=near[2] if len(near) > 2 else None,
                 true=true,
                 filled=filled,
@@ -277,17 +283,20 @@ def alignment_markdown(rows: Sequence[AlignmentRow]) -> str:
     lines = [_line(row) for row in rows if row.true is None]
     for name in dict.fromkeys(row.beta for row in known):
         mine = [row for row in known if row.beta == name]
-        means: dict[str, Any] = {share: float(np.mean([getattr(row, share) for row in mine])) for share in SHARES}
+        means: dict[str, Any] = {
+            share: float(np.mean([getattr(row, share) for row in mine])) for share in SHARES + MEDIANS
+        }
         scene, off = f"Middlebury, {len(mine)} pairs", max(row.off for row in mine)
         lines.append(_line(mine[0]._replace(scene=scene, off=off, **means)))
     columns = ["scene", "beta", "corners seen", "located", "within .5 px", "homography", "by the truth", "of the truth"]
-    return markdown_table([*columns, "occluded, filled", "values off", "type"], lines)
+    return markdown_table([*columns, "occluded, filled", "median px, both", "values off", "type"], lines)
 
 
 def _line(row: AlignmentRow) -> list[str]:
     found = [getattr(row, share) for share in SHARES]
     shares = ["" if share is None else f"{share:.1%}" for share in found]
-    return [row.scene, row.beta, *shares, f"{row.off:.1g}", row.dtype]
+    medians = f"{row.median:.2f} / {row.median_homography:.2f}"
+    return [row.scene, row.beta, *shares, medians, f"{row.off:.1g}", row.dtype]
 
 
 # Scenes -------------------------------------------------------------------------------------------------------
@@ -343,9 +352,10 @@ def nine_band_calibration(folder: Path, deviations: StartDeviations) -> Calibrat
 
 
 def nine_band_scene(data: Path) -> Iterator[AlignmentScene]:
-    """The array of nine bands, calibrated by its board; its middle camera is alpha."""
+    """The array of nine bands, calibrated by its board: the middle camera is alpha, the four beside it the betas."""
     folder, alpha = data / "nine_band_array", "Cam-4"
     rig = nine_band_calibration(folder, StartDeviations()).rig
+    rig = Rig({name: rig[name] for name in (alpha, "Cam-1", "Cam-3", "Cam-5", "Cam-7")})
     files = {name: folder / "scene" / f"{name}.png" for name in rig.names}
     views = ViewFiles(rig, files, alpha=alpha)
     images = {name: views[name] for name in rig.names}
