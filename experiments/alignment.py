@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
+from skimage.data import stereo_motorcycle
 from torch import Tensor
 
 from arraygeom import Camera, Pose, Rig, apply_homography, intrinsics, sample
@@ -35,7 +36,7 @@ from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair, middlebury_pa
 from pat.evaluation.halves import of_half
 from pat.evaluation.protocols import rectified_rig
 from pat.evaluation.tables import markdown_table
-from pat.fusion.align import SEEN, Aligned, align, resampled_values
+from pat.fusion.align import LEAST_CONFIDENCE, SEEN, Aligned, align, resampled_values
 from pat.fusion.aligned_files import RecordedFiles
 from pat.fusion.aligned_page import shown_layers
 from pat.fusion.from_images import array_from_images, camera_names
@@ -94,11 +95,17 @@ class AlignmentScene(NamedTuple):
     recorded: Mapping[str, Any]
     alpha: str
     match_levels: bool
+    recorded_rig: Rig | None = None
     truth: Disparity | None = None
 
 
 def evaluate_alignment(
-    data: Path, out: Path, names: Sequence[str], each: Callable[[str], None] = lambda line: None
+    data: Path,
+    out: Path,
+    names: Sequence[str],
+    *,
+    min_confidence: float = LEAST_CONFIDENCE,
+    each: Callable[[str], None] = lambda line: None,
 ) -> str:
     """Align the scenes of these names (see `SCENES`) below `data`; write alignment.md and figures. Returns the text.
 
@@ -111,18 +118,26 @@ def evaluate_alignment(
     for name in names:
         for scene in SCENES[name](data):
             each(scene.name)
-            aligned = aligned_scene(scene)
+            aligned = aligned_scene(scene, min_confidence)
             rows += alignment_rows(scene, aligned)
-            if scene.truth is None:
-                save_panels(shown_layers(aligned), out / f"{scene.name}.png", columns=3)
+            layers = {} if scene.truth is not None else shown_layers(aligned, scene.recorded_rig)
+            name = f"{scene.name.replace('/', '-')}.png"
+            save_panels({**composites(scene, aligned), **layers}, out / name, columns=2)
     text = alignment_markdown(rows)
     write_text(out / "alignment.md", text)
     return text
 
 
-def aligned_scene(scene: AlignmentScene) -> Aligned:
+def aligned_scene(scene: AlignmentScene, min_confidence: float = LEAST_CONFIDENCE) -> Aligned:
     """Its bands at the pixels of alpha."""
-    return align(scene.rig, scene.images, alpha=scene.alpha, recorded=scene.recorded, match_levels=scene.match_levels)
+    return align(
+        scene.rig,
+        scene.images,
+        alpha=scene.alpha,
+        recorded=scene.recorded,
+        match_levels=scene.match_levels,
+        min_confidence=min_confidence,
+    )
 
 
 def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow]:
@@ -176,6 +191,29 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
             )
         )
     return rows
+
+
+def composites(scene: AlignmentScene, aligned: Aligned) -> dict[str, Float[Tensor, "3 h w"]]:
+    """The first two betas as red and blue and alpha as green: by the homography, and aligned."""
+    straight, pinhole = without_lenses(scene.rig, scene.images)
+    names = scene.rig.betas(scene.alpha)[:2]
+    found: dict[str, list[NDArray[Any]]] = {"by a homography": [], "by pat align, white where not seen": []}
+    for name in names:
+        values, view = np.asarray(scene.recorded[name]), aligned[name]
+        rigid = by_homography(scene, name, straight, pinhole)
+        planes = [resampled_values(values, plane, "bilinear")[0] for plane in (rigid, np.nan_to_num(view.positions))]
+        scale = 0.95 / np.percentile(values[0], 99)
+        found["by a homography"].append(planes[0] * scale)
+        found["by pat align, white where not seen"].append(np.where(view.valid, planes[1] * scale, 1.0))
+    own = aligned[scene.alpha].values[0]
+    green = own * (0.95 / np.percentile(own, 99))
+    unseen = np.any([~aligned[name].valid for name in names], 0)
+    panels = {}
+    for title, (red, *further) in found.items():
+        middle = green if "homography" in title else np.where(unseen, 1.0, green)
+        bands = [red, middle, (further or [red])[0]]
+        panels[title] = torch.from_numpy(np.stack(bands).clip(0, 1).astype(np.float32))
+    return panels
 
 
 def local_offsets(
@@ -286,7 +324,7 @@ def alignment_markdown(rows: Sequence[AlignmentRow]) -> str:
         means: dict[str, Any] = {
             share: float(np.mean([getattr(row, share) for row in mine])) for share in SHARES + MEDIANS
         }
-        scene, off = f"Middlebury, {len(mine)} pairs", max(row.off for row in mine)
+        scene, off = f"{len(mine)} stereo pairs", max(row.off for row in mine)
         lines.append(_line(mine[0]._replace(scene=scene, off=off, **means)))
     columns = ["scene", "beta", "corners seen", "located", "within .5 px", "homography", "by the truth", "of the truth"]
     return markdown_table([*columns, "occluded, filled", "median px, both", "values off", "type"], lines)
@@ -314,7 +352,15 @@ def _as_bands(pair: StereoPair, truth: Disparity) -> AlignmentScene:
     rig = rectified_rig(hw, {"red": hw, "blue": hw}, PAPER_DISPARITY)
     images = {"alpha": pair.left[1:2], "red": pair.right[0:1], "blue": pair.right[2:3]}
     recorded = {name: np.rint(image.numpy() * 255).astype(np.uint8) for name, image in images.items()}
-    return AlignmentScene(pair.name, rig, images, recorded, "alpha", True, truth)
+    return AlignmentScene(pair.name, rig, images, recorded, "alpha", True, truth=truth)
+
+
+def motorcycle_scene(data: Path) -> Iterator[AlignmentScene]:
+    """Middlebury's motorcycle of 2014, as scikit-image ships it, as bands; `data` is not needed."""
+    left, right, disparity = (torch.from_numpy(np.array(photo)) for photo in stereo_motorcycle())
+    left, right = (photo.movedim(-1, 0) / 255 for photo in (left, right))
+    truth = Disparity(disparity.nan_to_num(0.0, 0.0, 0.0).float(), disparity.isfinite() & (disparity > 0))
+    yield _as_bands(StereoPair("motorcycle", left, right, PAPER_DISPARITY, truth), truth)
 
 
 def capture(name: str, pattern: str) -> Callable[[Path], Iterator[AlignmentScene]]:
@@ -325,7 +371,7 @@ def capture(name: str, pattern: str) -> Callable[[Path], Iterator[AlignmentScene
         array = array_from_images(files)
         files = {camera: files[camera] for camera in array.rig.names}
         recorded = RecordedFiles(array.recorded, files)
-        yield AlignmentScene(name, array.rig, array.images, recorded, array.alpha, array.match_levels)
+        yield AlignmentScene(name, array.rig, array.images, recorded, array.alpha, array.match_levels, array.recorded)
 
     return scenes
 
@@ -375,6 +421,7 @@ def _depths_seen(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) 
 
 
 SCENES: Mapping[str, Callable[[Path], Iterator[AlignmentScene]]] = {
+    "motorcycle": motorcycle_scene,
     "middlebury": middlebury_scenes,
     "rededge": capture("rededge", "IMG*.tif"),
     "sequoia": capture("sequoia", "IMG*.TIF"),
