@@ -51,6 +51,7 @@ POINTS, SPACING = 3000, 8
 """Corners of alpha at most, and their least distance, pixels."""
 LEVELS = 4
 """Halvings of the images in which the homography is searched, coarse to fine."""
+SCALE = np.diag([2.0, 2.0, 1.0])
 BOARD = "chessboard:11x8:30mm"
 CAMERAS = 9
 WIDEST = 0.15
@@ -256,23 +257,33 @@ def by_homography(
 
 
 def ecc_homography(own: NDArray[np.uint8], other: NDArray[np.uint8]) -> Float[np.ndarray, "3 3"]:
-    """The homography from `own` to `other` by enhanced correlation (Evangelidis and Psarakis 2008) of gradients."""
-    H = np.eye(3, dtype=np.float32)
+    """The homography from `own` to `other` by enhanced correlation (Evangelidis and Psarakis 2008) of gradients.
+
+    It starts from a translation by phase correlation, or from none; no level may lower the correlation.
+    """
+    a, b = (_gradients(image, 0.5**LEVELS) for image in (own, other))
+    b = cv2.resize(b, a.shape[::-1])
+    shifted = np.eye(3)
+    shifted[:2, 2] = cv2.phaseCorrelate(a, b, cv2.createHanningWindow(a.shape[::-1], cv2.CV_32F))[0]
+    H: NDArray[Any] = max([np.eye(3), shifted], key=lambda H: _correlation(a, b, H))
     ecc: Any = cv2.findTransformECC
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
     for level in range(LEVELS, -1, -1):
         a, b = (_gradients(image, 0.5**level) for image in (own, other))
-        if level == LEVELS:
-            window = cv2.createHanningWindow(a.shape[::-1], cv2.CV_32F)
-            H[:2, 2] = cv2.phaseCorrelate(a, cv2.resize(b, a.shape[::-1]), window)[0]
-        else:
-            H[:2, 2] *= 2
-            H[2, :2] /= 2
+        if level < LEVELS:
+            H = SCALE @ H @ np.linalg.inv(SCALE)
         try:
-            _, H = ecc(a, b, H, cv2.MOTION_HOMOGRAPHY, criteria, None, 5)
+            _, found = ecc(a, b, H.astype(np.float32), cv2.MOTION_HOMOGRAPHY, criteria, None, 5)
         except cv2.error:  # it does not converge on this level
             continue
+        H = max([H, found], key=lambda H: _correlation(a, b, H))
     return np.asarray(H, np.float64)
+
+
+def _correlation(a: NDArray[Any], b: NDArray[Any], H: NDArray[Any]) -> float:
+    """Of gradients and those of the other image, brought to them by a homography."""
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return float(cv2.computeECC(a, cv2.warpPerspective(b, H.astype(np.float64), a.shape[::-1], flags=flags)))
 
 
 def _gradients(image: NDArray[np.uint8], factor: float) -> NDArray[np.float32]:
