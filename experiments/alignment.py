@@ -169,7 +169,7 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
             planes.append(expected)
             error = np.linalg.norm(view.positions - expected, axis=-1)[x[:, 1], x[:, 0]]
             true = float((error <= HALF_PIXEL).mean())
-            filled = float((view.visibility[occluded] == SEEN).mean())
+            filled = float((view.visibility[occluded] == SEEN).mean()) if occluded.any() else 0.0
         others = [shown_band(resampled_values(values, plane, "bilinear")) for plane in planes]
         offsets, like = zip(*(local_offsets(own, other, x) for other in others))
         located = np.maximum(*like[:2]) >= ALIKE
@@ -262,7 +262,7 @@ def ecc_homography(own: NDArray[np.uint8], other: NDArray[np.uint8]) -> Float[np
     It starts from a translation by phase correlation, or from none; no level may lower the correlation.
     """
     a, b = (_gradients(image, 0.5**LEVELS) for image in (own, other))
-    b = cv2.resize(b, a.shape[::-1])
+    b = np.asarray(cv2.resize(b, a.shape[::-1]), np.float32)
     shifted = np.eye(3)
     shifted[:2, 2] = cv2.phaseCorrelate(a, b, cv2.createHanningWindow(a.shape[::-1], cv2.CV_32F))[0]
     H: NDArray[Any] = max([np.eye(3), shifted], key=lambda H: _correlation(a, b, H))

@@ -66,7 +66,7 @@ def test_a_post_occludes_what_is_beside_it():
 def test_a_shifted_band_is_aligned_and_measured():
     wide = texture((HW[0], HW[1] + 12))
     left, right = wide[:, : HW[1]], wide[:, 12:]
-    recorded = {"alpha": left[None], "red": 255 - right[None] // 2}
+    recorded = {"alpha": left[None], "red": right[None] // 2 + 20}
     images = {name: torch.from_numpy(values.astype(np.float32) / 255) for name, values in recorded.items()}
     truth = Disparity(torch.full(HW, 12.0), torch.ones(HW, dtype=torch.bool))
     rig = rectified_rig(HW, {"red": HW}, 40.0)
