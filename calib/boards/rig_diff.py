@@ -27,7 +27,7 @@ DEPTHS = 3
 """Depths at which projections are compared, at even steps of inverse depth."""
 FARTHEST = 50.0
 """The far bound as a multiple of the near one, at most: farther away pixels hardly change."""
-LEVEL = 0.01
+LEVEL = 0.001
 """Probability with which a rig that has not moved is said to have moved."""
 LEAST = 1e-3
 """Combinations of parameters that change pixels by less (RMS, pixels) are not tested."""
