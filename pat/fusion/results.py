@@ -141,12 +141,22 @@ class Frame(NamedTuple):
 
     image: (C, H, W), in alpha's coding, not cut to 0..1.
     depth: (H, W), metres along alpha's axis; NaN where no calibrated beta sees the point.
-    confidence: (H, W), 0 to 1: that every band's beta sees the point and its position is right.
+    confidence: (H, W), the probability that every band's beta sees the point and its position is right to a pixel.
+    half_width: (H, W), 1/metres: in 9 of 10 pixels the true inverse depth is within it of 1 / depth; NaN where depth is.
     """
 
     image: Float[Tensor, "c h w"]
     depth: Float[Tensor, "h w"]
     confidence: Float[Tensor, "h w"]
+    half_width: Float[Tensor, "h w"]
+
+    @property
+    def depth_interval(self) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+        """The nearest and the farthest depth (metres; infinite too) between which the true one is in 9 of 10 pixels."""
+        inverse = 1 / self.depth
+        farthest = inverse - self.half_width
+        beyond = farthest <= 0
+        return 1 / (inverse + self.half_width), torch.where(beyond, torch.inf, 1 / torch.where(beyond, 1.0, farthest))
 
     def __repr__(self) -> str:
         """Sizes, the range of depth and the mean confidence, in a line."""

@@ -249,11 +249,13 @@ def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens:
     if not (isinstance(pinhole, LensView) and isinstance(lens, LensView) and lens.distortion is not None):
         return frame
     shown = torch.cat([frame.image - straight, frame.confidence[None]])
-    inverse = (1 / frame.depth).nan_to_num(0.0)[None]
+    inverse = torch.stack([(1 / frame.depth).nan_to_num(0.0), frame.half_width.nan_to_num(0.0)])
     back = resampled(shown, pinhole, lens, interpolation="bilinear").values[0]
     del shown
-    depth = 1 / resampled(inverse, pinhole, lens, interpolation="nearest").values[0, 0]
-    return Frame(own + back[:-1], torch.where(depth.isfinite(), depth, torch.nan), back[-1])
+    inverse_depth, half_width = resampled(inverse, pinhole, lens, interpolation="nearest").values[0]
+    known = inverse_depth != 0
+    depth = torch.where(known, 1 / torch.where(known, inverse_depth, 1.0), torch.nan)
+    return Frame(own + back[:-1], depth, back[-1], torch.where(known, half_width, torch.nan))
 
 
 def _resized(views: Views, name: str) -> Views:
