@@ -32,7 +32,8 @@ help:
 	@echo "make notebooks  run the notebooks and keep what they put out"
 	@echo "make docs       the documentation as a site, in out/site"
 	@echo "make drawings   the documentation's drawings"
-	@echo "make wheel      build the wheel, install it into an empty environment, run 'pat demo' from there"
+	@echo "make wheel      build sdist and wheels, install them into empty environments and use them there;"
+	@echo "                PYTHONS='python3.11 python3.12' ARGS=--lowest: more of them"
 	@echo "make env        only the environment, in $(VENV)"
 
 env: $(READY)
@@ -115,13 +116,8 @@ docs: $(READY)
 drawings: $(READY)
 	@$(BIN)/python docs/drawings.py
 
-wheel: $(READY)
-	@rm -rf out/wheel build
-	@$(BIN)/python -m pip wheel -qq --no-deps --wheel-dir out/wheel .
-	@$(PYTHON) -m venv out/wheel/venv
-	@echo "== installing it and what it needs into out/wheel/venv"
-	@out/wheel/venv/bin/python -m pip install -qq --disable-pip-version-check --constraint constraints.txt torch "$$(ls out/wheel/*.whl)[plots]"
-	@cd out/wheel && venv/bin/pat demo --out demo
+wheel:
+	@$(PYTHON) tests/wheel/run.py --python $(or $(PYTHONS),$(PYTHON)) $(ARGS)
 
 train: $(READY)
 	@$(BIN)/pat train $(ARGS)

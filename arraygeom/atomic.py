@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -95,22 +94,12 @@ def write_text(path: str | Path, text: str) -> None:
 def alone(lock: Path, longest: float) -> Iterator[None]:
     """A block that one process is in at a time, or one that has waited so many seconds for the others, or that cannot
     lock the file. The system unlocks what a process that ended had locked."""
-    try:
-        import fcntl
+    from filelock import FileLock
 
-        file = lock.open("a")
-    except (ImportError, OSError):
+    lock_file = FileLock(lock, timeout=longest)
+    with suppress(OSError):  # waited long, or no locks on this drive
+        lock_file.acquire(poll_interval=0.01)
+    try:
         yield
-        return
-    with file:
-        end = time.monotonic() + longest
-        while time.monotonic() < end:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                time.sleep(0.01)
-                continue
-            except OSError:  # not on every network's drive
-                pass
-            break
-        yield
+    finally:
+        lock_file.release()

@@ -129,7 +129,9 @@ def _check_size(plane: Tensor, view: LensView | None) -> None:
     """Raise ValueError for a plane of another size than its view."""
     if view is not None and tuple(plane.shape[:2]) != tuple(view.hw):
         (h, w), (height, width) = plane.shape[:2], view.hw
-        raise ValueError(f"what is known is of {w}x{h} pixels, alpha has {width}x{height}: give it of alpha's image")
+        raise ValueError(
+            f"the known depth or matches have {w}x{h} pixels, alpha has {width}x{height}: give them at alpha's pixels"
+        )
 
 
 def _at_nearest(plane: Tensor, x: Float[Tensor, "*n 2"], now: View, recorded: LensView | None) -> Tensor:

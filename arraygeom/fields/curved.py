@@ -60,7 +60,7 @@ class Curved:
         near, far = Epipolar(self.near, self.far).bounds(pair)
         x = floating(x)
         curve = RayCurve.of(pair, near, far, x, self.bounds)
-        if curve.compilable:
+        if curve.compilable and curve.valid.numel() > FEW:
             return curve.positions(self.nodes, self.samples)
         even = torch.linspace(0, 1, self.nodes, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], -1)
         nodes, seen = curve.at(even)
@@ -69,6 +69,10 @@ class Curved:
         xy, inside = _onto_edge(xy, pair.beta.hw, EDGE)
         mask = inside & seen & (pieces.length.sum(-1, keepdim=True) > 0)
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
+
+
+FEW = 16
+"""Pixels for which the formulas do: to compile the loop, once on a machine, takes half a minute."""
 
 
 @dataclass(frozen=True)

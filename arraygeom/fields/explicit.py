@@ -63,8 +63,8 @@ class NearestVoxels:
             return self._choose(self._window(centre), line, centre, pair)[:2]
         beside = 2 + self.count // (2 * self.window + 1)
         xy, mask, distance = self._choose(self._candidates(line, centre, beside), line, centre, pair)
-        disparity = (beside + 0.5) * line[:, :2].abs().amax(-1)
-        unsure = (distance.amax(-1) > disparity - TIE).nonzero()[:, 0]
+        searched = (beside + 0.5) * line[:, :2].abs().amax(-1)
+        unsure = (distance.amax(-1) > searched - TIE).nonzero()[:, 0]
 
         def in_window(line: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
             return self._choose(self._window(centre), line, centre, pair)[:2]

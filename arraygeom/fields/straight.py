@@ -107,12 +107,12 @@ class HomographyDisplacement:
         require_straight(pair)
         F, H, hw = pair.fundamental, pair.homography, pair.beta.hw
         x, given = floating(x), self.displacement
-        disparity = (covering_displacement(pair) if given is None else torch.tensor(given)).to(x)
-        disparity = disparity[(..., *[None] * (x.ndim - 1 - disparity.ndim))] if disparity.ndim else disparity
+        reach = (covering_displacement(pair) if given is None else torch.tensor(given)).to(x)
+        reach = reach[(..., *[None] * (x.ndim - 1 - reach.ndim))] if reach.ndim else reach
 
         def around(x: Tensor) -> Segments:
             centre, placed = apply_homography(H, x)
-            piece = line_piece(epipolar_lines(F, x), centre, disparity, hw)
+            piece = line_piece(epipolar_lines(F, x), centre, reach, hw)
             return Segments(piece.start, piece.end, piece.valid & placed)
 
         return segments_by_rows(around, pair, x)
@@ -156,8 +156,8 @@ def _searched_widest(pair: Pair) -> Tensor:
     grid = all_pixels(pair)
     with torch.no_grad():
         rows = CHUNK // grid.shape[-2] + 1
-        disparity = chunked(partial(_squared_reach, pair), grid, rows=rows, axis=len(pair.batch_shape))
-    index = disparity.flatten(-2).argmax(-1)
+        squared_reach = chunked(partial(_squared_reach, pair), grid, rows=rows, axis=len(pair.batch_shape))
+    index = squared_reach.flatten(-2).argmax(-1)
     chosen = grid.reshape(-1, 2).index_select(0, index.reshape(-1)).reshape(*index.shape, 1, 2)
     return chosen.to(pair.cameras[0].K)
 
@@ -231,14 +231,14 @@ def foot_on_line(line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"]) ->
 
 
 def line_piece(
-    line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"], disparity: Float[Tensor, "*#d"], hw: HW
+    line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"], reach: Float[Tensor, "*#d"], hw: HW
 ) -> Segments:
-    """The piece of each line within `disparity` of the foot of `point`, clipped to the image.
+    """The piece of each line within `reach` pixels of the foot of `point`, clipped to the image.
 
     It runs along (l1, -l0), which for a calibrated F is from near to far. Without a line: the point itself.
     """
     foot = foot_on_line(line, point)
-    along = disparity[..., None] * torch.stack([-line[..., 1], line[..., 0]], -1)
+    along = reach[..., None] * torch.stack([-line[..., 1], line[..., 0]], -1)
     return clip_to_image(foot + along, foot - along, hw)
 
 

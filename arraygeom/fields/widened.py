@@ -81,8 +81,8 @@ class Widened:
         return Segments(s.start - more, s.end + more, s.valid)
 
     def _stretched(self, p: Positions) -> Positions:
-        disparity = torch.linspace(-self.along, self.along, p.xy.shape[-2], dtype=p.xy.dtype, device=p.xy.device)
-        return Positions(p.xy + disparity[:, None] * tangents(p), p.mask)
+        steps = torch.linspace(-self.along, self.along, p.xy.shape[-2], dtype=p.xy.dtype, device=p.xy.device)
+        return Positions(p.xy + steps[:, None] * tangents(p), p.mask)
 
     def _band(self, p: Positions, hw: HW) -> Positions:
         tangent = tangents(p)

@@ -42,7 +42,7 @@ from . import (
     syntim,
     xmp,
 )
-from .source import RigFileError, RigFileWarning, RigSource
+from .source import RigFileError, RigFileWarning, RigSource, UnknownRigFormat
 
 # In the order in which they are asked whether they recognise a file.
 READERS: dict[str, Any] = {
@@ -139,7 +139,8 @@ def recognise(path: str | Path) -> str:
     for name, reader in READERS.items():
         if reader.recognises(path, head):
             return name
-    raise RigFileError(path, None, f"is not a rig file of a known format ({', '.join(READERS)}); or name its format")
+    known = ", ".join(READERS)
+    raise UnknownRigFormat(path, None, f"is not a rig file of a known format ({known}); or name its format")
 
 
 def convention(format: str) -> str:

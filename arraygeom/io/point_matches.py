@@ -54,7 +54,7 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
 
 def _csv(path: Path, files: Mapping[str, Path]) -> PointPairs:
     if len(files) != 2:
-        raise ValueError(f"{path}: x0 y0 x1 y1 are of two images, and {len(files)} are given: give two, or a database")
+        raise ValueError(f"{path}: x0 y0 x1 y1 relate two images, and {len(files)} are given: give two, or a database")
     try:
         lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
     except UnicodeDecodeError:

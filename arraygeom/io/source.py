@@ -34,6 +34,10 @@ class RigFileError(ValueError):
         self.path, self.entry = Path(path), entry
 
 
+class UnknownRigFormat(RigFileError):
+    """A file that no reader of rig files recognises."""
+
+
 class RigFileWarning(UserWarning):
     """A rig file that was read but has suspicious values."""
 

@@ -76,7 +76,7 @@ class Evaluate:
         if not folders:
             raise ValueError(f"no images: give at least one of --{', --'.join(stereo.DATA_SETS)}")
         if self.without_rig and (self.protocol != "table1" or self.conditions or self.only):
-            raise ValueError("--without-rig: is of --protocol table1, without --conditions")
+            raise ValueError("--without-rig needs --protocol table1, and no --conditions")
         if not self.rates or min(self.rates) < 1:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
         writable(self.out, folder=True)
@@ -112,7 +112,7 @@ class Evaluate:
         sets = [stereo.DATA_SETS[name](folder) for name, folder in folders.items()]
         pairs = [pair for found in sets for pair in of_half(found, self.half) if pair.disparity is not None]
         if not pairs:
-            raise ValueError(f"--half {self.half}: of none of its pairs the true disparity is known")
+            raise ValueError(f"--half {self.half}: none of its pairs has a true disparity: give the other half")
         with options.working("evaluating") as retitle:
             rows = evaluate_outside(pairs, network, each=lambda row: retitle(f"{row.pair}: {row.source}"))
         text = outside_markdown(rows)
@@ -133,7 +133,7 @@ class Evaluate:
         sets = [stereo.DATA_SETS[name](folder) for name, folder in folders.items()]
         pairs = [pair for found in sets for pair in of_half(found, self.half)]
         if not pairs:
-            raise ValueError(f"--half {self.half}: none of the pairs is of that half")
+            raise ValueError(f"--half {self.half}: no pair belongs to that half: give more pairs, or the other half")
         rows = conditions.evaluate_conditions(pairs, network, names, progress=options.progress("evaluating"))
         text = conditions.conditions_markdown(rows)
         write_text(self.out / "conditions.md", text)
@@ -173,7 +173,7 @@ class Ablate:
     """Fields to leave out, such as dense, which takes most of the time."""
     every_field: bool = False
     """Instead: a table of every field of the toolkit, with time and memory: unrectified scenes and, with --middlebury,
-    rectified pairs and the same with F alone."""
+    rectified pairs and the same with F alone. Also peaks.png: where attention is largest, in three pictures."""
     middlebury: MaybePath = None
     """Folder of Middlebury's pairs with true disparity, for --every-field; those of the report half."""
     families: bool = False
@@ -217,6 +217,7 @@ class Ablate:
         from ..evaluation.ablation import sample_photographs
         from ..evaluation.halves import of_half
         from ..evaluation.tables import write_csv
+        from ..media.figures import save_panels
         from ..synthesis.photos import PhotoBank
 
         bank = PhotoBank.load(*self.photos) if self.photos else sample_photographs()
@@ -233,6 +234,9 @@ class Ablate:
         self._known(field_table.fields_of(1.0))
         shown = options.progress("fusing")(cases, len(cases))
         rows = field_table.evaluate_fields(self._comparing(network), shown, fields=chosen)
+        looked_at = [case for case in cases if case.kind != "F alone"]
+        panels = field_table.drawn_peaks(self._comparing(network), looked_at[:: -(-len(looked_at) // 3)])
+        save_panels(panels, self.out / "peaks.png", columns=4)
         write_text(self.out / "ablation.md", field_table.fields_markdown(rows))
         write_csv(self.out / "ablation.csv", field_table.FieldRow._fields, rows)
 
@@ -241,7 +245,7 @@ class Ablate:
         from ..networks.protocol import Comparing
 
         if not isinstance(network, Comparing):
-            raise ValueError(f"--weights {self.weights}: its matches are not of its attention alone: add --families")
+            raise ValueError(f"--weights {self.weights} needs --families: this network matches without attention, too")
         return network
 
     def _known(self, fields: Mapping[str, object]) -> None:

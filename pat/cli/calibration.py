@@ -46,6 +46,7 @@ class Calibrate:
         "tilted",
         "kannala-brandt",
         "omni",
+        "double-sphere",
         "none",
     ] = "brown-conrady"
     """Lens model; kannala-brandt or omni for fisheyes. auto compares them on held-out frames and takes the best
@@ -88,7 +89,7 @@ class Calibrate:
         from calib.boards.parameters import StartDeviations
 
         if self.deviation and self.start is None:
-            raise ValueError("--deviation is of a --start: give the rig too")
+            raise ValueError("--deviation needs --start: give the rig whose positions it is about")
         return StartDeviations.of(options.numbers_by_name(self.deviation, "--deviation"))
 
     def _watch(self, patterns: dict[str, str]) -> None:

@@ -87,8 +87,9 @@ class Fuse(Known):
     """With --noise, leave alpha's values as recorded; always so if alpha has hardly any noise."""
     luminance: Literal["alpha", "mix", "beta"] = "alpha"
     """Whose brightness the fused image has: beta's, in alpha's detail, suits a near infrared alpha."""
-    bits: Literal[8, 16, 32] = 8
-    """Bits a channel of the fused image: 8 or 16 sRGB-encoded, or 32 for linear light as floats (tif, exr)."""
+    bits: Annotated[Literal[8, 16, 32] | None, optional("{8,16,32}")] = None
+    """Bits a channel of the fused image: 8 or 16 sRGB-encoded, or 32 for linear light as floats (tif, exr). By default
+    16 if an image has more than 8, else 8; 32 of exr."""
     kind: Literal["png", "tif", "exr"] = "png"
     """Format of the fused image."""
     sequence: bool = False
@@ -128,7 +129,7 @@ class Fuse(Known):
 
     def run(self) -> None:
         """Check the options that can be checked at once, and fuse, with the rig that is given or one that is found."""
-        if self.bits not in {"png": (8, 16), "tif": (8, 16, 32), "exr": (32,)}[self.kind]:
+        if self.bits not in {"png": (None, 8, 16), "tif": (None, 8, 16, 32), "exr": (None, 32)}[self.kind]:
             raise ValueError(f"--bits {self.bits} --kind {self.kind}: png holds 8 or 16 bits, exr 32, tif any")
         if self.kind == "exr":
             from ..media.images import exr_writer
@@ -142,7 +143,7 @@ class Fuse(Known):
         options.noise_of(self.noise)
         options.device_of(self.device)
         if self.classical and not self.report:
-            raise ValueError("--classical is shown on the page: leave out --no-report")
+            raise ValueError("--classical needs the page: leave out --no-report")
         self._notes: list[str] = []
         options.compile_at_once()
         with limited(limit), self._judged() as self._warnings:
@@ -159,6 +160,7 @@ class Fuse(Known):
         rig = self._rig()
         alpha, found = files_by_camera(rig, self.alpha, self.given, self.image)
         found = self._frames(found)
+        self._choose_bits(found)
         views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=alpha)
         if self.sequence:
             return self._many(rig, found, alpha)
@@ -205,9 +207,11 @@ class Fuse(Known):
         """Find the rig from the first image of each camera and fuse; `rates` are frames a second, of videos."""
         from ..fusion.from_images import array_from_images
         from ..fusion.results import FOUND_RIG
+        from ..networks.weights import load_weights
 
         self.sequence |= bool(rates)
         files = self._frames(files)
+        self._choose_bits(files)
         first = {name: paths[0] for name, paths in files.items()}
         focal = options.numbers_by_name(self.focal, "--focal")
         options.say_when_compiling()
@@ -215,7 +219,8 @@ class Fuse(Known):
             array = array_from_images(first, alpha=self.alpha, weights=self.weights, focal=focal, say=say)
         self.weights = array.weights
         self.normalise_radiometry |= array.match_levels
-        self.exposure = self.exposure or "auto"
+        measured = load_weights(array.weights).bands is None
+        self.exposure = self.exposure or ("keep" if measured else "auto")
         if max(map(len, files.values())) == 1:
             return self._one(array.rig, array.images, array.alpha, first, found=array.notes)
         rig = array.rig
@@ -226,6 +231,14 @@ class Fuse(Known):
         self._many(rig, {name: files[name] for name in rig.names}, array.alpha)
         rig.save(self.out / FOUND_RIG)
         say(f"the rig that was found: {self.out / FOUND_RIG}")
+
+    def _choose_bits(self, files: Mapping[str, Sequence[Path]]) -> None:
+        """As many bits as the images have, unless asked otherwise."""
+        from ..media.images import has_many_bits
+
+        if self.bits is None:
+            deep = any(has_many_bits(paths[0]) for paths in files.values())
+            self.bits = 32 if self.kind == "exr" else 16 if deep else 8
 
     def _frames(self, files: dict[str, list[Path]]) -> dict[str, list[Path]]:
         """The files of the frames that every camera has; all of them, of a sequence."""
@@ -263,7 +276,7 @@ class Fuse(Known):
             sys.exit(LowConfidenceWarning.exit_status)
 
     def _rig(self) -> Rig:
-        rig = options.load_rig(self.given[0], self.depth)
+        rig = load_rig_or_say_no_image(self.given[0], self.depth)
         for name, rate in options.numbers_by_name(self.frame_rate, "--frame-rate").items():
             rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate)))
         for name, offset in options.numbers_by_name(self.time_offset, "--time-offset").items():
@@ -286,11 +299,11 @@ class Fuse(Known):
         from arraygeom.atomic import sweep
 
         from ..fusion.report import write_report
-        from ..fusion.results import save_frame, view_of
+        from ..fusion.results import band_names, describe_bands, save_frame, view_of
         from ..support.locks import folder_lock
 
         if self.points and not isinstance(rig[alpha], Camera):
-            raise ValueError("--points: needs a calibrated alpha, and the rig knows it by F alone: leave it out")
+            raise ValueError("--points needs a calibrated alpha, and the rig has only F for it: leave out --points")
         begin, store = time.monotonic(), self.out / ".tiles"
         with folder_lock(self.out):
             sweep(self.out)
@@ -307,17 +320,17 @@ class Fuse(Known):
             frame, gain = self._exposed(frame)
             if found is None and not frame.depth.isfinite().any():
                 self._note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
-            view = view_of(rig, alpha, bits=self.bits, bands=len(frame.image))
+            bits = self.bits or 8
+            view = view_of(rig, alpha, bits=bits, bands=len(frame.image))
             found_rig = rig if found is not None else None
             points = rig[alpha] if self.points else None
+            bands = band_names(frame, (name for name in rig.betas(alpha) if name in images))
             written = save_frame(
-                frame, self.out, bits=self.bits, kind=self.kind, view=view, rig=found_rig, points=points
+                frame, self.out, bits=bits, kind=self.kind, view=view, rig=found_rig, points=points, bands=bands
             )
             shutil.rmtree(store, ignore_errors=True)
-            if len(frame.image) not in (1, 3):
-                bands = [name for name in rig.betas(alpha) if name in images for _ in images[name]]
-                listed = ", ".join(f"fused_{i}.{self.kind} {name}" for i, name in enumerate(bands, 1))
-                self._note(f"bands at alpha's view: {listed}; fused.{self.kind} is their mean")
+            if said := describe_bands(frame, bands, self.kind):
+                self._note(said)
             if self.points:
                 self._note("points.ply: the pixels of known depth, in alpha's frame")
             if self.report:
@@ -401,7 +414,7 @@ class Fuse(Known):
         self.refuse_several()
         single = {"--points": self.points, "--classical": self.classical, "--device cuda": self.device == "cuda"}
         if named := [option for option, given in single.items() if given]:
-            raise ValueError(f"{', '.join(named)}: of a single frame alone: leave it out for many")
+            raise ValueError(f"{', '.join(named)}: for a single frame only: leave out for several")
         batch = Batch(
             rig,
             files,
@@ -409,7 +422,7 @@ class Fuse(Known):
             self.out,
             sequence=self.sequence,
             speed=self.speed,
-            bits=self.bits,
+            bits=self.bits or 8,
             kind=self.kind,
             alone=not self.propagate,
             strict=self.strict,
@@ -438,7 +451,7 @@ def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> t
     if given and (image or is_rig_file(given[0])):
         named = (*image, *(f"{path.stem}={path}" for path in given[1:]))
         if not named:
-            raise ValueError(f"with the rig {given[0]}, give --image NAME=FILE for each camera")
+            raise ValueError(f"{given[0]}: {NO_IMAGE}; if it is a rig, give --image NAME=FILE for each camera")
         options.files_by_name(named)
         options.refuse_missing_rig(given[0])
         return named, True
@@ -469,6 +482,19 @@ def files_by_camera(
     found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
     refuse_equal_files({name: paths[0] for name, paths in found.items()})
     return rig.require(alpha), found
+
+
+NO_IMAGE = "is no image: images end in .png, .tif, .jpg and the like"
+
+
+def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> Rig:
+    """The rig of the first argument, which might have been meant as an image; with other depth bounds if given."""
+    from arraygeom.io.source import UnknownRigFormat
+
+    try:
+        return options.load_rig(path, depth)
+    except UnknownRigFormat:
+        raise ValueError(f"{path}: {NO_IMAGE}; nor is it a rig file (`pat rig convert --help` names formats)") from None
 
 
 def is_rig_file(path: Path) -> bool:

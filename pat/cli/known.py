@@ -46,13 +46,13 @@ class Known:
             rig = with_pixels(rig)
             return rig, self._around_matches(rig, alpha, files, field)
         if self.matches is not None or field is not None:
-            raise ValueError("--depth-map: goes with neither --matches nor --field: give one of them")
+            raise ValueError("--depth-map, --matches, --field: each excludes the others: give one of them")
         return rig, self._around_depth(rig, alpha)
 
     def refuse_several(self) -> None:
         """Raise ValueError if something is known, which is of a single frame."""
         if self.depth_map is not None or self.matches is not None:
-            raise ValueError("--depth-map, --matches: are of a single frame: give the images of one")
+            raise ValueError("--depth-map, --matches: for a single frame only: give one image of each camera")
 
     def _around_depth(self, rig: Rig, alpha: str) -> ReceptiveField:
         import torch
@@ -72,8 +72,8 @@ class Known:
         if float(((known < near) | (known > far)).float().mean()) > OUT_OF_RANGE:
             low, high = known.quantile(torch.tensor([0.05, 0.95])).tolist()
             raise ValueError(
-                f"{self.depth_map}: is of {low:.3g} to {high:.3g} m, the rig's depths are {near:g} to {far:g} m: "
-                "state its unit by --depth-scale, or give --depth"
+                f"{self.depth_map}: holds {low:.3g} to {high:.3g} m, the rig's depth range is {near:g} to {far:g} m: "
+                "state its unit with --depth-scale, or another range with --depth"
             )
         return AroundDepth(depth, self.depth_tolerance, view)
 

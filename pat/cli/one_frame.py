@@ -32,7 +32,6 @@ def fuse_with_progress(
 ) -> Frame:
     """`fuse` with weights by name, the plan and a bar on the terminal. The frame is on the CPU."""
     from ..fusion.fuse import fuse
-    from ..fusion.results import Frame
     from ..networks.weights import load_weights
 
     where = options.device_of(device)
@@ -47,7 +46,7 @@ def fuse_with_progress(
             retitle("fusing" if plan.seconds is None else f"fusing, about {plan.duration} in all")
 
         frame = fuse(network, rig, images, progress=_numbered, announce=announce, **further)
-    return Frame(*(part.cpu() for part in frame))
+    return frame.mapped(lambda part: part.cpu())
 
 
 def _numbered(tiles: Iterable[Tile], count: int) -> Iterator[Tile]:

@@ -157,7 +157,7 @@ def writable(out: Path, *, folder: bool = False) -> Path:
         raise ValueError(f"--out: {above} is a file, so {out} cannot be made: give another path")
     for place in {above, above if above.is_dir() else above.absolute().parent}:
         if not os.access(place, os.W_OK):
-            raise ValueError(f"--out: {place} is not to be written to: give another path, or permission")
+            raise ValueError(f"--out: {place} cannot be written to: give another path, or permission")
     return out
 
 

@@ -311,7 +311,9 @@ class Refine:
         options.say_when_compiling()
         frames = options.read_frames(rig, self.image)
         if self.matches is not None and len(frames) > 1:
-            raise ValueError(f"--matches: are of one frame, and images of {len(frames)} are given: give one")
+            raise ValueError(
+                f"--matches needs a single frame, and {len(frames)} are given: give one image of each camera"
+            )
         matches = given_matches(self.matches, self.image, frames[0])
         with options.working("matching features and refining"):
             found = refine(

@@ -84,10 +84,16 @@ class RecordedScene(NamedTuple):
 
 
 class Result(NamedTuple):
-    """The fused image (3, H, W), and where attention is largest in beta as recorded (h, w, 2)."""
+    """The fused image (3, H, W), and where attention is largest in beta as recorded, of each of its bands if the
+    network takes them one by one (bands, h, w, 2)."""
 
     image: Tensor
     peak: Tensor
+
+    def peaks(self, scene: RecordedScene) -> float:
+        """The share of the pixels that beta sees whose largest weight is within a pixel of the true position."""
+        off = (self.peak - scene.position).norm(dim=-1)
+        return float((off[:, scene.visible] <= 1).double().mean())
 
 
 class Row(NamedTuple):
@@ -156,8 +162,8 @@ class Resampled:
         level = rectified(rig, images)
         alpha, beta = (level.images[name] for name in (ALPHA, BETA))
         result = fused(network, level.rectification.pair, alpha, beta, self.field)
-        peaks = level.back(result.peak.movedim(-1, 0), interpolation="nearest").movedim(0, -1)
-        there = apply_homography(torch.linalg.inv(level.rectification.H_beta), peaks.double()).x
+        peaks = [level.back(one.movedim(-1, 0), interpolation="nearest").movedim(0, -1) for one in result.peak]
+        there = apply_homography(torch.linalg.inv(level.rectification.H_beta), torch.stack(peaks).double()).x
         return Result(level.back(result.image), there)
 
 
@@ -229,17 +235,17 @@ def _row(
         return Row(point.sweep, point.value, name, number, note=f"{error}".partition(":")[0])
     seconds = time.perf_counter() - began
     psnr, ssim = score(result.image.clamp(0, 1), scene.ground_truth)
-    off = (result.peak - scene.position).norm(dim=-1)
-    peaks = float((off[scene.visible] <= 1).double().mean())
-    return Row(point.sweep, point.value, name, number, psnr, ssim, peaks, seconds)
+    return Row(point.sweep, point.value, name, number, psnr, ssim, result.peaks(scene), seconds)
 
 
 @torch.no_grad()
 def fused(network: Comparing, pair: Pair, alpha: Tensor, beta: Tensor, field: ReceptiveField) -> Result:
-    """The network on two images (C, H, W), whole."""
-    inputs = Inputs.of(alpha[None], [beta[None]], [FieldOnGrid.of(field, pair, blocks=False)])
-    output, compared = network.compare(inputs)
-    return Result(output.image[0], peak_position(compared[0])[0].movedim(0, -1).double())
+    """The network on two images (C, H, W), whole; beta's bands are cameras of their own to one of several betas."""
+    betas = [beta[None]] if network.betas == 1 else list(beta[None].split(1, dim=1))
+    on_grid = FieldOnGrid.of(field, pair, blocks=False)
+    output, compared = network.compare(Inputs.of(alpha[None], betas, [on_grid] * len(betas)))
+    peaks = [peak_position(one)[0].movedim(0, -1).double() for one in compared]
+    return Result(output.image[0], torch.stack(peaks))
 
 
 def two(rig: Rig) -> Rig:

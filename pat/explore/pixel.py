@@ -289,6 +289,8 @@ MOST_SAMPLES = 96
 """Samples on the line, around that of the largest weight, from which it is sought."""
 CLEAR = 0.7
 """Least correlation of a clear match."""
+BETTER = 0.03
+"""By how much a match beside the line must correlate better than the best one on it."""
 
 
 def match_offset(
@@ -300,7 +302,7 @@ def match_offset(
 ) -> MatchOffset | None:
     """The images' own match near the segment, by the correlation of windows around both pixels.
 
-    Unlike the samples it may lie beside the line, and does if the rig is off.
+    Unlike the samples it may lie beside the line, and does if the rig is off. None where nothing matches clearly.
     """
     xy, weight = samples
     if ends is None or not bool((weight > 0).any()) or float((ends[1] - ends[0]).norm()) < 1e-6:
@@ -308,18 +310,22 @@ def match_offset(
     along = torch.nn.functional.normalize(ends[1] - ends[0], dim=0)
     across = torch.stack([-along[1], along[0]])
     first = max(int(weight.argmax()) - MOST_SAMPLES // 2, 0)
-    best, score = xy[first], -1.0
-    fine = torch.arange(-1, 1 + STEP / 2, STEP)
-    stages: tuple[tuple[Tensor | None, Tensor, Tensor], ...]
-    stages = (xy[first : first + MOST_SAMPLES], torch.arange(-ACROSS, ACROSS + 1), torch.zeros(1)), (None, fine, fine)
-    for start, u, v in stages:
-        begin = best[None] if start is None else start
-        near = begin[:, None, None] + u.to(xy)[:, None, None] * across + v.to(xy)[:, None] * along
-        scores = correlations(*guides, pair, x, near.reshape(-1, 2))
-        best, score = near.reshape(-1, 2)[scores.argmax()], float(scores.max())
-    if score < CLEAR:
+    line = xy[first : first + MOST_SAMPLES]
+    fine = torch.arange(-1, 1 + STEP / 2, STEP).to(xy)[:, None]
+
+    def best(points: Float[Tensor, "*n 2"]) -> tuple[Tensor, float]:
+        points = points.reshape(-1, 2)
+        scores = correlations(*guides, pair, x, points)
+        return points[scores.argmax()], float(scores.max())
+
+    on_line, own = best(best(line)[0] + fine * along)
+    beside = best(line[:, None] + torch.arange(-ACROSS, ACROSS + 1).to(xy)[:, None] * across)[0]
+    beside, other = best(beside + fine[:, None] * across + fine * along)
+    if max(own, other) < CLEAR:
         return None
-    return MatchOffset(best, abs(float((best - ends[0]) @ across)), score)
+    if other < own + BETTER:
+        return MatchOffset(on_line, 0.0, own)
+    return MatchOffset(beside, abs(float((beside - ends[0]) @ across)), other)
 
 
 def ends_of(found: Segments | Positions) -> Float[Tensor, "2 2"] | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
 import shutil
@@ -99,15 +98,19 @@ class JobFolder:
     @contextmanager
     def locked(self, tag: str) -> Iterator[None]:
         """Only one run of a shard at a time on this machine. Raises ValueError if there is one."""
+        from filelock import FileLock, Timeout
+
         self.work.mkdir(parents=True, exist_ok=True)
-        with (self.work / f"lock-{tag}").open("w") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                raise ValueError(
-                    f"{self.root}: another run is rendering into it: wait for it, or use --shard"
-                ) from None
+        lock = FileLock(self.work / f"lock-{tag}", timeout=0)
+        try:
+            lock.acquire()
+        except Timeout:
+            message = f"{self.root}: another run is rendering into it: wait for it, or use --shard"
+            raise ValueError(message) from None
+        try:
             yield
+        finally:
+            lock.release()
 
     def journal(self, event: str, index: int, **facts: Any) -> None:
         """Note that something happened to a scene, in a file of this process alone."""
@@ -154,7 +157,9 @@ def publish(partial: Path, final: Path) -> bool:
 
 
 def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
+    if os.name == "nt" and path.is_dir():  # Windows opens no folders
+        return
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(handle)
     finally:

@@ -186,7 +186,7 @@ class Workshop(AbstractContextManager["Workshop"]):
         assert self._process is not None
         code = self._process.wait()
         self._end()
-        if code == -signal.SIGKILL:
+        if code == -9:
             return {"answer": "killed", "reason": "the worker was killed (SIGKILL; out of memory?)"}
         cause = signal.Signals(-code).name if code < 0 else f"exit status {code}"
         last = [line for line in self._log_end().splitlines() if line.strip()][-1:]

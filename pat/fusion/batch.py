@@ -46,7 +46,7 @@ from .frames import ImageFiles
 from .fuse import fuse
 from .low_light import Noise
 from .luminance import Luminance
-from .results import Frame, ImageFormat, save_frame, view_of
+from .results import Frame, ImageFormat, band_names, save_frame, view_of
 from .sequence import KeyColour, SequenceFusion
 from .timeline import KeyFrame
 from .views import ViewFiles
@@ -193,7 +193,9 @@ class Batch:
         """
         text, file = self.settings, self.out / SETTINGS
         if resume and file.is_file() and file.read_text(encoding="utf-8") != text:
-            raise ValueError(f"{file}: the frames there were made with other settings: give those, or another folder")
+            raise ValueError(
+                f"{file}: the frames there were made with other settings: give the same ones, or another --out"
+            )
         now, before = self.inputs, _read_inputs(self.out / INPUTS) if resume else {}
         other = [i for i, name in enumerate(self.names) if before.get(name) != now[name]]
         if not resume or (self.sequence and other):
@@ -279,7 +281,8 @@ class Batch:
             with confidence_checked(strict=self.strict):
                 frame = self._frame(i)
             view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
-            save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i])
+            bands = band_names(frame, (name for name in self.rig.betas(self.alpha) if name in self.files))
+            save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i], bands=bands)
 
     def _frame(self, i: int) -> Frame:
         if not self.sequence:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import statistics
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
 
+from ..matching.inputs import Inputs
 from ..networks.protocol import FusionNetwork
+from ..sensors import NoiseLevel
 from .inputs import FrameInputs
 from .results import Frame
 
@@ -23,6 +26,12 @@ below .3 and 19 below .21; the same with the right rig .35 to .79, two without t
 """
 
 
+MIDDLE = 1024
+"""Side of the part of an image in which noise is looked for, pixels."""
+PLAIN_NOISE = 4 / 255
+"""The standard deviation from which noise is named as a reason."""
+
+
 class LowConfidenceWarning(UserWarning):
     """The images hardly match along the rig's search segments; commands end with `exit_status`."""
 
@@ -32,20 +41,36 @@ class LowConfidenceWarning(UserWarning):
 def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs) -> None:
     """Warn if the mean confidence is low where the segments of all betas are valid.
 
-    Below `UNFIT_CONFIDENCE` by a `LowConfidenceWarning`. Only for networks whose confidence is a trained
+    Below `UNFIT_CONFIDENCE` by a `LowConfidenceWarning`. Of bands that are each another beta's, by that of the median
+    band: some bands of nine are unlike alpha whatever the rig. Only for networks whose confidence is a trained
     probability.
     """
     if not network.uses_matches:
         return
-    mean = overlap_confidence(frame, inputs)
+    mean = statistics.median(overlap_confidences(frame, inputs))
     if not mean < LOW_CONFIDENCE:
         return
-    found = f"mean confidence {mean:.2f} where the views overlap"
+    several = " of the median band" if frame.by_band is not None else ""
+    found = f"mean confidence {mean:.2f}{several} where the views overlap"
+    advice = noise_advice(inputs.inputs)
     if mean < UNFIT_CONFIDENCE:
         text = f"{found}: the rig does not fit the images, or they hardly match: check it with `pat rig doctor`"
-        warnings.warn(text, LowConfidenceWarning, stacklevel=3)
+        warnings.warn(text + advice, LowConfidenceWarning, stacklevel=3)
     else:
-        warnings.warn(f"{found}: little texture, noise, or a rig that `pat rig doctor` finds wrong", stacklevel=3)
+        text = f"{found}: little texture, noise, or a rig that `pat rig doctor` finds wrong"
+        warnings.warn(text + advice, stacklevel=3)
+
+
+def noise_advice(inputs: Inputs) -> str:
+    """What to do about noise that the middle of an image shows plainly; empty if there is hardly any."""
+    found = 0.0
+    for image in (inputs.alpha, *(beta.image for beta in inputs.betas)):
+        top, left = (max(n - MIDDLE, 0) // 2 for n in image.shape[-2:])
+        part = image[:1, :, top : top + MIDDLE, left : left + MIDDLE].detach().clamp(0, 1)
+        found = max(found, float(NoiseLevel.estimated(part).deviation(part).mean()))
+    if found < PLAIN_NOISE:
+        return ""
+    return f"; noise of {255 * found:.0f}/255 shows: try `--noise estimate` first"
 
 
 @contextmanager
@@ -57,11 +82,12 @@ def confidence_checked(*, strict: bool) -> Iterator[None]:
         yield
 
 
-def overlap_confidence(frame: Frame, inputs: FrameInputs) -> float:
-    """The mean confidence where the segments of all betas are valid; NaN if that is nowhere."""
+def overlap_confidences(frame: Frame, inputs: FrameInputs) -> list[float]:
+    """The mean confidence, or that of each band, where the segments of all betas are valid; NaN if that is nowhere."""
     h, w = inputs.hw
     overlap = torch.ones(inputs.hw, dtype=torch.bool, device=frame.confidence.device)
     for beta in inputs.inputs.betas:
         if beta.field.pixels is not None:
             overlap &= beta.field.pixels.valid.reshape(beta.field.pixels.valid.shape[-2:])[:h, :w]
-    return float((frame.confidence.detach() * overlap).sum(dtype=torch.float64) / overlap.sum())
+    maps = [frame.confidence] if frame.by_band is None else frame.by_band
+    return [float((one.detach() * overlap).sum(dtype=torch.float64) / overlap.sum()) for one in maps]

@@ -144,7 +144,7 @@ def _given(response: Given, inputs: Inputs) -> Response:
     if isinstance(response, str):
         return Response.rec601()
     if not any(map(_is_rgb, inputs.betas)):
-        raise ValueError("a response is of RGB betas: leave it out for bands of another kind")
+        raise ValueError("a response needs betas in red, green and blue: leave it out for other bands")
     return stated_response(response)
 
 

@@ -44,9 +44,12 @@ LINES = 0.45
 """The share of the time to find a rig that epipolar lines take; the rest is calibration."""
 EVEN = 0.004
 """The standard deviation below which an image is of one colour: a count of 8 bits."""
-WAVELENGTHS = {"red": 620, "green": 540, "blue": 460}
+WAVELENGTHS = {"edge": 720, "red": 620, "green": 540, "blue": 460}
+"""Nanometres; a red edge is no red."""
+COLOURS = ((570, 700), (500, 580), (400, 500))
+"""Nanometres between which three bands are shown as red, green and blue."""
 LONGEST_VISIBLE = 760
-"""Nanometres; bands beyond are not taken for a colour."""
+"""Nanometres; bands beyond are not put in order."""
 
 Images = Mapping[str, Float[Tensor, "_ h w"]]
 Say = Callable[[str], None]
@@ -105,7 +108,7 @@ def array_from_images(
         images = {name: read_view(tagged, name, files[name], like=tagged[alpha].sensor) for name in images}
     names = _ordered_betas(images, alpha, note)
     bands = [len(images[name]) for name in names]
-    weights = weights or ("mono-colour" if 3 in (*bands, sum(bands)) else "mono-spectral")
+    weights = weights or ("mono-colour" if 3 in bands or show_colour(names, bands) else "mono-spectral")
     images = {name: images[name] for name in (alpha, *names)}
     if tagged is None:
         by_tags = {n: by_exif for n in images if n in files and (by_exif := focal_length(files[n]))}
@@ -332,7 +335,7 @@ def _read(name: str, path: Path, note: Say) -> Float[Tensor, "c h w"]:
 def _textured(label: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "_ h w"]:
     """The image, one band of it where all are equal. Raises ValueError for an image of one colour."""
     if float(image.flatten(1).std(-1).amax()) < EVEN:
-        raise ValueError(f"{label}: is of one colour: there is nothing to match or to fuse")
+        raise ValueError(f"{label}: is of one colour, with nothing to match: give another image")
     return image[:1] if len(image) == 3 and equal_bands(image) else image
 
 
@@ -358,15 +361,17 @@ def _ordered_betas(images: Images, alpha: str, note: Say) -> list[str]:
     if any(len(images[name]) == 3 for name in betas):
         return betas
     waves = {name: _wavelength(name) for name in betas}
-    known = all(waves.values())
-    if known:
+    if all(waves.values()):
         betas = sorted(betas, key=lambda name: -waves[name])
-    if len(betas) == 3:
-        said = "by their names" if known else "in the order given, which is a guess: give them in that order"
-        note(f"bands: {', '.join(betas)} are shown as red, green, blue, {said}")
-    else:
-        note(f"bands: {', '.join(betas)}, each at alpha's view")
+    shown = ", shown as red, green, blue by their names" if show_colour(betas, [1] * len(betas)) else ""
+    note(f"bands: {', '.join(betas)}, each at alpha's view{shown}")
     return betas
+
+
+def show_colour(names: Sequence[str], bands: Sequence[int]) -> bool:
+    """Whether cameras of a band each record, by their names, red, green and blue, in this order."""
+    waves = [_wavelength(name) for name in names]
+    return set(bands) == {1} and len(waves) == 3 and all(low <= w <= high for w, (low, high) in zip(waves, COLOURS))
 
 
 def _wavelength(name: str) -> float:

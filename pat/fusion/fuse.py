@@ -28,9 +28,10 @@ from .depth import background_filled
 from .inputs import check_bands, prepared
 from .low_light import Noise, denoised_views
 from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail
+from .own_colour import with_own_colours
 from .results import Frame
 from .steps import steps_for
-from .tiles import ESTIMATED, Plan, fused_in_tiles, plan_frame
+from .tiles import LARGE, Plan, fused_in_tiles, plan_frame
 from .views import Views
 
 LOG = logging.getLogger(__name__)
@@ -121,12 +122,13 @@ def fuse(
     match_levels |= grey_world
     align = not differentiable if align is None else align
     if differentiable and not (max_memory is None and store is None):
-        raise ValueError("a differentiable fusion is of the whole frame: leave out max_memory and store")
+        raise ValueError("differentiable=True fuses the whole frame at once: leave out max_memory and store")
     check_luminance(network, luminance, noisy=noise is not None)
     limit = None if max_memory is None else parse_bytes(max_memory)
     views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
     check_bands(network, views)
-    betas, steps = views.betas, steps_for(network, normalise=match_levels)
+    betas, in_colour = views.betas, views.alpha_in_colour
+    steps = steps_for(network, normalise=match_levels)
     inputs, undo = prepared(network, views, steps)
     held = _bytes_beside(inputs.inputs, [views.own, *(images.values() if isinstance(images, dict) else ())])
     del views  # whose images are there again, padded
@@ -149,7 +151,7 @@ def fuse(
             explain(line)
     fused = replace(found.applied(inputs.inputs, inputs.hw), luminance=SHARES[luminance])
     inputs = inputs._replace(inputs=fused)
-    with limited(planned(limit, plan.memory, large=math.prod(inputs.hw) > ESTIMATED)):
+    with limited(planned(limit, plan.memory, large=math.prod(inputs.hw) > LARGE)):
         with torch.set_grad_enabled(differentiable):
             matches = matcher(inputs.inputs) if network.uses_matches else None
             LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
@@ -165,7 +167,9 @@ def fuse(
         LOG.info("back to the pixels of %s", alpha)
         for back in undo:
             frame = back(frame)
-        return frame if differentiable else Frame(*(part.detach() for part in frame))
+        if in_colour and len(frame.image) == 3 and frame.by_band is None and not noisy:
+            frame = with_own_colours(frame, images[alpha])
+        return frame if differentiable else frame.mapped(Tensor.detach)
 
 
 def _bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:

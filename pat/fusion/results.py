@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -55,6 +55,7 @@ def save_frame(
     rig: Rig | None = None,
     points: Camera | None = None,
     name: str = "",
+    bands: Sequence[str] = (),
 ) -> list[Path]:
     """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown), depth_16.png (`write_depth`) and
     depth.png (red is near).
@@ -63,9 +64,11 @@ def save_frame(
     rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to found_rig.yaml; with
     `points`, the camera of alpha, the pixels of known depth go to points.ply. With a `name` the files are
     name_fused.png and so on.
-    Without any known depth there are no depth files. Bands that are not one or three go to fused_1.png, fused_2.png
-    and so on, their mean to fused.png. The image comes last: where it is, the others are of the same frame, and
-    points.ply and the page index.html of a former one are gone. After an error all former files are as they were.
+    Without any known depth there are no depth files. With `bands`, the names of bands that cameras record one by one,
+    each goes to fused_NAME.png and confidence_NAME.png too; bands without names that are not one or three go to
+    fused_1.png and so on. Of other numbers than one and three fused.png is the mean. The image comes last: where it is,
+    the others are of the same frame, and points.ply and the page index.html of a former one are gone. After an error
+    all former files are as they were.
     Returns what was written.
     """
     prefix = f"{name}_" if name else ""
@@ -88,14 +91,33 @@ def save_frame(
         if points is not None:
             write_points(folder / "points.ply", points, frame.depth, frame.image)
         image = linear_from_srgb(frame.image) if bits == 32 else frame.image
+        bands = bands or ([] if len(image) in (1, 3) else [str(i + 1) for i in range(len(image))])
+        for band, values in zip(bands, image):
+            write_image(folder / f"{prefix}fused_{band}.{kind}", values[None], bits=bits)
+        for band, confidence in zip(bands, () if frame.by_band is None else frame.by_band):
+            write_image(folder / f"{prefix}confidence_{band}.png", confidence[None].float())
         if len(image) not in (1, 3):
-            for i, band in enumerate(image, 1):
-                write_image(folder / f"{prefix}fused_{i}.{kind}", band[None], bits=bits)
             image = image.mean(0, keepdim=True)
         tasks.insert(0, partial(write_image, folder / last, image, bits=bits, profile=bits != 32))
         in_parallel(tasks, most=how_many_fit(4 * image.nbytes))
         names = {file.name for file in folder.iterdir()} - {last}
     return [out / last, *(out / file for file in sorted(names, key=lambda name: ("fused" not in name, name)))]
+
+
+def band_names(frame: Frame, betas: Iterable[str]) -> list[str]:
+    """The cameras that record a frame's bands one by one, in order; none if its bands are those of colour cameras, or
+    if cameras have several bands each."""
+    names = list(betas)
+    return names if frame.by_band is not None and len(names) == len(frame.by_band) else []
+
+
+def describe_bands(frame: Frame, names: Sequence[str], kind: ImageFormat) -> str:
+    """Which files have a frame's bands, in a line; empty for an ordinary image."""
+    if not names and len(frame.image) in (1, 3):
+        return ""
+    listed = ", ".join(f"fused_{name}.{kind}" for name in names) or f"fused_1.{kind} and so on"
+    picture = "the three as a picture" if len(frame.image) == 3 else "their mean"
+    return f"bands at alpha's view: {listed}; fused.{kind} is {picture}"
 
 
 def depth_scale(near: float) -> float:
@@ -143,12 +165,14 @@ class Frame(NamedTuple):
     depth: (H, W), metres along alpha's axis; NaN where no calibrated beta sees the point.
     confidence: (H, W), the probability that every band's beta sees the point and its position is right to a pixel.
     half_width: (H, W), 1/metres: in 9 of 10 pixels the true inverse depth is within it of 1 / depth; NaN where depth is.
+    by_band: (C, H, W), the confidence of each band alone, where each is another beta's; else None.
     """
 
     image: Float[Tensor, "c h w"]
     depth: Float[Tensor, "h w"]
     confidence: Float[Tensor, "h w"]
     half_width: Float[Tensor, "h w"]
+    by_band: Float[Tensor, "c h w"] | None = None
 
     @property
     def depth_interval(self) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
@@ -157,6 +181,11 @@ class Frame(NamedTuple):
         farthest = inverse - self.half_width
         beyond = farthest <= 0
         return 1 / (inverse + self.half_width), torch.where(beyond, torch.inf, 1 / torch.where(beyond, 1.0, farthest))
+
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> Frame:
+        """The frame whose every part is changed, such as moved to another device."""
+        by_band = None if self.by_band is None else change(self.by_band)
+        return Frame(*(change(part) for part in self[:-1]), by_band)
 
     def __repr__(self) -> str:
         """Sizes, the range of depth and the mean confidence, in a line."""

@@ -151,8 +151,8 @@ class SequenceFusion:
     def _around(self, i: int, keys: Sequence[KeyFrame]) -> list[KeyFrame]:
         """The key frames within reach, or the nearest one."""
         gaps = {k.alpha: abs(self._time(k.alpha) - self._time(i)) for k in keys}
-        disparity = max(SETTINGS.intervals * self.timeline.interval * (1 - 1e-9), min(gaps.values()))
-        return [k for k in keys if gaps[k.alpha] <= disparity]
+        longest = max(SETTINGS.intervals * self.timeline.interval * (1 - 1e-9), min(gaps.values()))
+        return [k for k in keys if gaps[k.alpha] <= longest]
 
     def _warped(self, i: int, own: Tensor, key: KeyFrame, colour: KeyColour) -> KeyContribution:
         gap = abs(self._time(key.alpha) - self._time(i))
@@ -353,7 +353,7 @@ def flicker(images: Sequence[Float[Tensor, "3 h w"]], greys: Sequence[Float[Tens
     `greys` are alpha's frames, which show what moves. Raises ValueError for fewer than two frames.
     """
     if len(images) < 2:
-        raise ValueError("flicker is of two frames or more")
+        raise ValueError("flicker needs two frames or more")
     changes = []
     for (a, b), (grey_a, grey_b) in zip(pairwise(images), pairwise(greys)):
         change = (to_luma_chroma(b)[1] - to_luma_chroma(a)[1]).abs().mean(0)

@@ -38,7 +38,7 @@ from arraygeom.pixels import coarse_grid, map_homogeneous, shift_matrix
 from arraygeom.undistortion import pixels_between
 
 from ..matching.inputs import box_around, ends_of
-from ..matching.normalisation import normalised
+from ..matching.normalisation import moments, normalised
 from ..media.images import Images
 from ..media.raw import LIGHT, as_bright
 from ..networks.protocol import FusionNetwork, JoinsBands
@@ -67,7 +67,7 @@ class FusionStep(Protocol):
 def steps_for(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:
     """The steps that a network needs, in order."""
     resize = [EqualResolution(network)] if network.equal_resolution else []
-    radiometry = [Radiometry()] if normalise else []
+    radiometry = [Radiometry(undone=not network.keeps_luminance)] if normalise else []
     return [Undistort(), LinearLuminance(), Upright(), *resize, *radiometry, JoinBands(network.joins_bands)]
 
 
@@ -156,11 +156,28 @@ class EqualResolution:
 
 @dataclass(frozen=True)
 class Radiometry:
-    """Each beta with alpha's mean and standard deviation: for cameras of other exposures or filters."""
+    """Each beta with alpha's mean and standard deviation: for cameras of other exposures or filters.
+
+    `undone`: bands have their own scale in the result, as measurements need it; else that is as bright as alpha.
+    """
+
+    undone: bool = False
 
     def do(self, views: Views) -> Done:
         """Normalise the betas."""
-        return Done(views.replace({n: normalised(views.images[n], views.own) for n in views.betas}), _as_it_is)
+        done = views.replace({n: normalised(views.images[n], views.own) for n in views.betas})
+        if not self.undone:
+            return Done(done, _as_it_is)
+        own = moments(views.own)
+        scales = [(moments(views.images[name]), len(views.images[name])) for name in views.betas]
+
+        def back(frame: Frame) -> Frame:
+            parts = frame.image.split([bands for _, bands in scales])
+            return frame._replace(
+                image=torch.cat([own.matched(part, scale) for part, (scale, _) in zip(parts, scales)])
+            )
+
+        return Done(done, back)
 
 
 @dataclass(frozen=True)
@@ -178,7 +195,12 @@ class JoinBands:
         order = _band_order(names, groups, bands)
         joined = {group[0]: torch.cat([views.images[name] for name in group]) for group in groups}
         done = Views(views.rig, {views.alpha: views.own, **joined}, views.alpha, views.fields)
-        return Done(done, lambda frame: frame._replace(image=frame.image[order]))
+        return Done(done, lambda frame: _reordered(frame, order))
+
+
+def _reordered(frame: Frame, order: list[int]) -> Frame:
+    by_band = frame.confidence.expand(len(order), -1, -1) if frame.by_band is None else frame.by_band
+    return frame._replace(image=frame.image[order], by_band=by_band[order])
 
 
 def co_located(rig: Rig, names: Sequence[str], fields: Fields, which: JoinsBands) -> list[list[str]]:
@@ -255,7 +277,12 @@ def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens:
     inverse_depth, half_width = resampled(inverse, pinhole, lens, interpolation="nearest").values[0]
     known = inverse_depth != 0
     depth = torch.where(known, 1 / torch.where(known, inverse_depth, 1.0), torch.nan)
-    return Frame(own + back[:-1], depth, back[-1], torch.where(known, half_width, torch.nan))
+    half_width = torch.where(known, half_width, torch.nan)
+    by_band = frame.by_band
+    if by_band is not None:
+        bands = [resampled(b[None].float(), pinhole, lens, interpolation="bilinear").values[0, 0] for b in by_band]
+        by_band = torch.stack([band.to(by_band) for band in bands])
+    return Frame(own + back[:-1], depth, back[-1], half_width, by_band)
 
 
 def _resized(views: Views, name: str) -> Views:

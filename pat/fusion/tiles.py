@@ -36,14 +36,18 @@ SLACK = 1.05
 """What a process may take over what is counted here: freed blocks smaller than a page cannot be returned."""
 MATCHING_BYTES = 330.0
 """Working memory of matching for each pixel of alpha, measured."""
-FRAME_BYTES = 24.0
-"""A fused frame's for each pixel: three colours, depth, confidence and half-width."""
+FRAME_BYTES = 12.0
+"""A fused frame's for each pixel: depth, confidence and half-width."""
+BAND_BYTES = (4.0, 2.0)
+"""And for each of its bands; its confidence, of several."""
 WRITING_BYTES = 65.0
 """What taking a fused frame back to alpha's pixels and writing it takes for each pixel, measured."""
 PROBE = (192, 512)
 """Least and greatest side of the piece of alpha that is fused to estimate the time, pixels."""
 ESTIMATED = 4_000_000
 """Alpha's pixels from which the time is estimated: smaller frames take seconds, and so does estimating."""
+LARGE = 16 * PROBE[0] ** 2
+"""Alpha's pixels from which a piece is fused to know the memory of matches, and the planned memory is kept to."""
 PROBED = 1 / 40
 """The part of alpha that the piece is between these."""
 
@@ -89,14 +93,14 @@ def plan_frame(
     Raises ValueError as `tiles_within`.
     """
     pieces = frame.inputs.pieces
-    large = math.prod(frame.hw) > 16 * PROBE[0] ** 2
+    large = math.prod(frame.hw) > LARGE
     slow = math.prod(frame.hw) > ESTIMATED
     probe = Probe.of(network, frame) if (large and limit) or (slow and estimate) else None
     held = kept + held_memory(frame, probe.matches if probe else 0.0, whole_frame=not stored)
     matching = MATCHING_BYTES * max(area(tile.outer) for tile in pieces) if network.uses_matches else 0.0
     tiles = tiles_within(network, frame, limit, held, matching)
     work = max(matching, *(working_memory(network, frame.inputs, tile) for tile in tiles))
-    held = max(held + work, LIBRARIES + kept + math.prod(frame.hw) * (FRAME_BYTES + WRITING_BYTES))
+    held = max(held + work, LIBRARIES + kept + math.prod(frame.hw) * (frame_bytes(frame.inputs) + WRITING_BYTES))
     seconds = (1 + before) * probe.seconds(pieces, tiles) + after if probe else None
     return Plan(tiles, SLACK * held, seconds, len(pieces))
 
@@ -139,7 +143,14 @@ def held_memory(frame: FrameInputs, matches: float, *, whole_frame: bool) -> flo
     """Bytes of the process that do not depend on the tiles: libraries, images, fields, `matches` for each pixel, and
     the fused frame if it is kept in memory."""
     pixels = math.prod(frame.hw)
-    return LIBRARIES + frame.inputs.nbytes + pixels * (matches + (FRAME_BYTES if whole_frame else 0.0))
+    return LIBRARIES + frame.inputs.nbytes + pixels * (matches + (frame_bytes(frame.inputs) if whole_frame else 0.0))
+
+
+def frame_bytes(inputs: Inputs) -> float:
+    """Bytes of a fused frame for each pixel."""
+    bands = inputs.bands or sum(beta.image.shape[1] for beta in inputs.betas)
+    values, confidence = BAND_BYTES
+    return FRAME_BYTES + bands * (values + (confidence if len(inputs.betas) > 1 else 0.0))
 
 
 class Probe(NamedTuple):
@@ -187,18 +198,21 @@ def _to_multiple(box: Box, multiple: int) -> Box:
 
 class FusedTile(NamedTuple):
     """The inner part of a tile: image (C, h, w), depth, confidence and half-width (h, w) as of `Frame`, and where its
-    pixels were found in each whole beta, (betas, 3, h, w): x, y and the confidence of that."""
+    pixels were found in each whole beta, (betas, 3, h, w): x, y and the confidence of that; `by_band` as of `Frame`, or
+    empty."""
 
     image: Tensor
     depth: Tensor
     confidence: Tensor
     half_width: Tensor
     found: Tensor
+    by_band: Tensor
 
     @property
     def frame(self) -> Frame:
         """The same of a whole frame, as its result."""
-        return Frame(self.image, self.depth, self.confidence, self.half_width)
+        by_band = self.by_band if len(self.by_band) else None
+        return Frame(self.image, self.depth, self.confidence, self.half_width, by_band)
 
 
 def fuse_tile(network: FusionNetwork, frame: FrameInputs, matches: Matches | None, tile: Tile) -> FusedTile:
@@ -217,7 +231,15 @@ def _fused(
     part = replace(inputs, betas=tuple(replace(beta, field=beta.field.cut(box)) for beta in inputs.betas))
     hw = bottom - top, right - left
     depth, half_width, confidence = measured_depth(output, part, frame.placements, hw, (left, top))
-    return FusedTile(output.image[0], depth, confidence, half_width, _found(output, part))
+    return FusedTile(output.image[0], depth, confidence, half_width, _found(output, part), _by_band(output, part))
+
+
+def _by_band(output: FusionOutput, part: Inputs) -> Tensor:
+    """The confidence of each band (C, h, w) as float16, where each is another beta's; else none, (0, h, w)."""
+    bands = [beta.image.shape[1] for beta in part.betas]
+    if len(bands) == 1 or sum(bands) != output.image.shape[1]:
+        return output.image[0, :0].half()
+    return torch.cat([c.expand(n, -1, -1) for c, n in zip(output.confidence, bands)]).half()
 
 
 def _found(output: FusionOutput, part: Inputs) -> Tensor:
@@ -267,7 +289,7 @@ class TileStore(NamedTuple):
     @classmethod
     def of(cls, folder: Path, network: FusionNetwork, inputs: Inputs) -> TileStore:
         """The store for one frame's tiles."""
-        digest = hashlib.sha256(type(network).__name__.encode())
+        digest = hashlib.sha256(f"{type(network).__name__} {FusedTile._fields}".encode())
         parameters = network.state_dict().values() if isinstance(network, nn.Module) else ()
         fields = [tensor for beta in inputs.betas for tensor in _sparse(beta.field, inputs.hw)]
         for tensor in (*parameters, inputs.alpha, *(b.image for b in inputs.betas), *fields):

@@ -32,6 +32,8 @@ class Views:
     images: Mapping[str, Tensor]
     alpha: str
     fields: Fields = dataclasses.field(default_factory=dict)
+    alpha_in_colour: bool = False
+    """Whether alpha's image was, before it was made grey."""
 
     @classmethod
     def of(
@@ -58,7 +60,8 @@ class Views:
         checked = {name: _checked(rig, images, name) for name in (alpha, *names)}
         fields = field if isinstance(field, Mapping) else dict.fromkeys(names, field)
         rig = rig if depth is None else rig.replace(depth=depth)
-        return cls(rig, {**checked, alpha: grey_alpha(alpha, checked[alpha])}, alpha, fields)
+        own = grey_alpha(alpha, checked[alpha])
+        return cls(rig, {**checked, alpha: own}, alpha, fields, is_in_colour(checked[alpha]))
 
     @property
     def own(self) -> Float[Tensor, "1 h w"]:
@@ -83,11 +86,16 @@ LARGEST_VALUE = 32.0
 """Of an image in 0..1: developed ones of a short exposure exceed 1, and those of 8 bits have values to 255."""
 
 
+def is_in_colour(image: Float[Tensor, "c h w"]) -> bool:
+    """Whether an image has three bands that are not all equal."""
+    return len(image) == 3 and not (torch.equal(image[0], image[1]) and torch.equal(image[0], image[2]))
+
+
 def grey_alpha(name: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "1 h w"]:
     """Alpha's image in grey. Warns if it was in colour."""
-    if len(image) == 3 and not (torch.equal(image[0], image[1]) and torch.equal(image[0], image[2])):
-        text = f"the image of alpha, '{name}', is in colour: only its luminance is used, colours come from the betas"
-        warnings.warn(text, stacklevel=2)
+    if is_in_colour(image):
+        text = "is in colour: colours come from the betas, its own only where they do not see"
+        warnings.warn(f"the image of alpha, '{name}', {text}", stacklevel=2)
     return grey(image)
 
 

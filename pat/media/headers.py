@@ -14,7 +14,8 @@ _WIDTH, _HEIGHT, _BITS, _ORIENTATION = 256, 257, 258, 274
 
 
 class ImageHeader(NamedTuple):
-    """(height, width) as stored, the orientation tag (1 to 8; 1 without one), and the bits a value of a TIFF file.
+    """(height, width) as stored, the orientation tag (1 to 8; 1 without one), and the bits a value of a TIFF, PNG or
+    PNM file (else 0).
 
     `tag` is where a TIFF file has its orientation: byte offset and struct format; None without one, and in other files.
     """
@@ -52,7 +53,7 @@ def _png(content: bytes) -> ImageHeader:
     for kind, start, end in png_chunks(content):
         if kind == b"eXIf":
             orientation = _exif_orientation(content[start + 8 : end - 4])
-    return ImageHeader((height, width), orientation)
+    return ImageHeader((height, width), orientation, content[24])
 
 
 def _jpeg(content: bytes) -> ImageHeader | None:
@@ -98,8 +99,8 @@ def _bmp(content: bytes) -> ImageHeader:
 
 def _pnm(content: bytes) -> ImageHeader | None:
     gap = rb"(?:\s|#[^\n]*\n)+"
-    found = re.match(rb"P[1-6]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})\s", content[:4096])
-    return ImageHeader((int(found[2]), int(found[1]))) if found else None
+    found = re.match(rb"P[1-6]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})\s(?:\s*(\d{1,5})\s)?", content[:4096])
+    return ImageHeader((int(found[2]), int(found[1])), bits=16 if int(found[3] or 0) > 255 else 8) if found else None
 
 
 def _tiff(content: bytes) -> ImageHeader:

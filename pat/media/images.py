@@ -147,6 +147,14 @@ def write_image(
         temporary.write_bytes(content)
 
 
+def has_many_bits(path: Path) -> bool:
+    """Whether an image file has more than 8 bits a value."""
+    if path.suffix.lower() in RAW_SUFFIXES:
+        return True
+    header = image_header(path.read_bytes()) if path.is_file() else None
+    return header is not None and header.bits > 8
+
+
 def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
     """The image of a HEIC or HEIF file, upright, as a PNG file; its size is compared before it is decoded."""
     try:

@@ -40,7 +40,7 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, r
                 stream.height, stream.width = pixels.shape[:2]
                 stream.pix_fmt, stream.options = "yuv420p", {"crf": "16", "preset": "medium"}
             if pixels.shape[:2] != (stream.height, stream.width):
-                raise ValueError(f"{path}: the frames of a video are of one size")
+                raise ValueError(f"{path}: all frames of a video must have the size of the first")
             file.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
         if stream is None:
             raise ValueError(f"{path}: a video needs at least one frame")

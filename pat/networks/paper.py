@@ -54,6 +54,7 @@ class PAT(nn.Module):
     def __init__(self, config: PATConfig = PATConfig()) -> None:
         super().__init__()
         self.config, self.equal_resolution = config, config.equal_resolution
+        self.betas = config.betas
         self.features = Features(config)
         self.engine = AttentionEngine(config)
         self.post = PostFusion(config)

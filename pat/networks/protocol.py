@@ -93,6 +93,9 @@ class Comparing(Protocol):
     """A network with C3 attention over the segments of its inputs, which training can supervise by
     geometry."""
 
+    betas: int
+    """The number it is made for: one in all bands, or several with a band each."""
+
     def compare(self, inputs: Inputs) -> tuple[FusionOutput, list[Compared]]:
         """Fuse, and what attention compares in each beta."""
         ...

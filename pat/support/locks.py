@@ -2,33 +2,39 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from errno import ENOENT
 from pathlib import Path
-from typing import IO
+
+from filelock import BaseFileLock, FileLock, Timeout
 
 LOCK = ".lock"
+OWNER = ".lock.json"
+"""Who holds it: a locked file cannot be read on every system."""
 
 
 @contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
     """Make the folder, and keep other commands out of it until the block ends; one left empty is removed again.
 
-    The lock is a file of process and host, locked by the system: that of a process of this host which is gone counts
-    for nothing. Raises ValueError for a folder that another command holds, or that cannot be written to.
+    The lock is a file locked by the system, and process and host are in another beside it: that of a process of this
+    host which is gone counts for nothing. Raises ValueError for a folder that another command holds, or that cannot
+    be written to.
     """
     made = _make(folder)
     try:
-        file = _locked(folder)
+        lock = _locked(folder)
         try:
             yield
         finally:
-            (folder / LOCK).unlink(missing_ok=True)
-            file.close()
+            (folder / OWNER).unlink(missing_ok=True)
+            with suppress(OSError):  # Windows removes it when it is released
+                (folder / LOCK).unlink()
+            lock.release()
     finally:
         for empty in made:
             try:
@@ -47,43 +53,34 @@ def _make(folder: Path) -> list[Path]:
     return missing
 
 
-def _locked(folder: Path) -> IO[str]:
-    """The lock file, open and locked, with this process in it."""
-    path = folder / LOCK
-    while True:
-        try:
-            file = path.open("a+", encoding="utf-8")
-        except OSError as error:
-            raise _unusable(folder, error) from None
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            owner = _owner(file)
-            file.close()
-            raise _in_use(folder, owner, "wait for it") from None
-        if not path.exists() or os.fstat(file.fileno()).st_ino != path.stat().st_ino:
-            file.close()  # its owner ended, and removed it, between the two calls above
-            continue
-        owner = _owner(file)
-        if owner.get("host", socket.gethostname()) != socket.gethostname():
-            file.close()
-            raise _in_use(folder, owner, f"wait for it, or remove {path} if it has ended")
-        try:
-            file.truncate(0)
-            file.write(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}))
-            file.flush()
-        except OSError as error:
-            file.close()
-            raise _unusable(folder, error) from None
-        return file
-
-
-def _owner(file: IO[str]) -> dict[str, object]:
-    """What a lock file says; nothing for a file that is empty or damaged."""
-    file.seek(0)
+def _locked(folder: Path) -> BaseFileLock:
+    """The folder's lock, held, with this process in the file of its owner."""
+    lock, owner_file = FileLock(folder / LOCK, timeout=0), folder / OWNER
     try:
-        owner = json.load(file)
-    except ValueError:
+        lock.acquire()
+    except Timeout:
+        if not (folder / LOCK).exists():
+            raise _unusable(folder, FileNotFoundError(ENOENT, os.strerror(ENOENT), str(folder))) from None
+        raise _in_use(folder, _owner(owner_file), "wait for it") from None
+    except OSError as error:
+        raise _unusable(folder, error) from None
+    owner = _owner(owner_file)
+    if owner.get("host", socket.gethostname()) != socket.gethostname():
+        lock.release()
+        raise _in_use(folder, owner, f"wait for it, or remove {owner_file} if it has ended")
+    try:
+        owner_file.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}), encoding="utf-8")
+    except OSError as error:
+        lock.release()
+        raise _unusable(folder, error) from None
+    return lock
+
+
+def _owner(file: Path) -> dict[str, object]:
+    """What the file of the owner says; nothing where it is missing, empty or damaged."""
+    try:
+        owner = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
         return {}
     return owner if isinstance(owner, dict) else {}
 
@@ -96,5 +93,5 @@ def _in_use(folder: Path, owner: dict[str, object], advice: str) -> ValueError:
 def _unusable(folder: Path, error: OSError) -> ValueError:
     at = Path(error.filename) if error.filename else folder
     blocked = next((path for path in (folder, *folder.parents) if path.exists() and not path.is_dir()), None)
-    reason = f"{blocked} is a file" if blocked else f"{at.parent if at.name == LOCK else at}: {error.strerror}"
+    reason = f"{blocked} is a file" if blocked else f"{at.parent if at.name in (LOCK, OWNER) else at}: {error.strerror}"
     return ValueError(f"{folder}: cannot write there ({reason}): give another folder")

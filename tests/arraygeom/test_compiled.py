@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from arraygeom import compiled as module
 from arraygeom import linked
@@ -63,43 +64,35 @@ def test_called_from_python_such_a_function_raises(entry):
 
 
 def test_one_process_compiles_and_others_wait_for_it(entry):
-    fcntl = pytest.importorskip("fcntl")
     lock = Path(module.cache_file(entry)._index_path).with_suffix(".lock")
-    with lock.open("a") as file, ThreadPoolExecutor() as beside:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    with ThreadPoolExecutor() as beside, FileLock(lock) as held:
         waiting = beside.submit(entry, 4.0)
         time.sleep(0.3)
         assert not waiting.done()
         assert not [*lock.parent.glob("*.nbc")]
-        fcntl.flock(file, fcntl.LOCK_UN)
+        held.release()
         assert waiting.result() == 4.5
 
 
 def test_a_process_that_has_waited_long_compiles_itself(entry, monkeypatch):
-    fcntl = pytest.importorskip("fcntl")
     monkeypatch.setattr(module, "LONGEST", 0.1)
-    with Path(module.cache_file(entry)._index_path).with_suffix(".lock").open("a") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    with FileLock(Path(module.cache_file(entry)._index_path).with_suffix(".lock")):
         assert entry(4.0) == 4.5
 
 
 def test_where_files_cannot_be_locked_each_process_compiles(entry, monkeypatch):
-    fcntl = pytest.importorskip("fcntl")
-
     def refused(*_):
         raise OSError(errno.ENOLCK, "no locks")
 
-    monkeypatch.setattr(fcntl, "flock", refused)
+    monkeypatch.setattr(FileLock, "_acquire", refused)
     assert entry(4.0) == 4.5
 
 
 def test_what_is_kept_is_loaded_without_waiting(entry):
-    fcntl = pytest.importorskip("fcntl")
     entry(4.0)
     assert module.is_kept(entry, entry.signatures[0])
     again = module.compiled(sum_of_halves, cache=True)
-    with Path(module.cache_file(entry)._index_path).with_suffix(".lock").open("a") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    with FileLock(Path(module.cache_file(entry)._index_path).with_suffix(".lock")):
         begin = time.monotonic()
         assert again(4.0) == 4.5
         assert time.monotonic() - begin < 10

@@ -3,7 +3,8 @@
     python -m tests.benchmarks.bench_python [--busy 3] [--frames 4] [--against FOLDER]
 
 A notebook imports torch first, without `OMP_WAIT_POLICY`; the command sets it to PASSIVE. `--against` measures another
-checkout in turn with this one. Other processes are loops of Python's, as many as `--busy`.
+checkout in turn with this one. Other processes are loops of Python's, as many as `--busy`. The table goes to
+tests/benchmarks/RESULTS_python.md.
 """
 
 from __future__ import annotations
@@ -26,12 +27,27 @@ from pat import fuse, load_weights
 from pat.data.sample_array import load_sample
 warnings.simplefilter("ignore")
 sample, network = load_sample(), load_weights("mono-colour")
+rig, images = sample.rig, {{}}
+for name, image in sample.images.items():
+    images[name] = torch.nn.functional.interpolate(image[None], scale_factor={scale}, mode="bicubic")[0].clamp(0, 1)
+    rig = rig.resize(name, tuple(images[name].shape[1:]))
 for i in range({frames} + 1):
     begin = time.monotonic()
-    fuse(network, sample.rig, sample.images, alpha="mono")
+    fuse(network, rig, images, alpha="mono")
     print(time.monotonic() - begin, flush=True)
 """
+SIZES = {"640x400": 1, "1280x800": 2}
+RESULTS = Path(__file__).with_name("RESULTS_python.md")
 POLICIES = {"import torch; from pat import fuse": {}, "as the command": {"OMP_WAIT_POLICY": "PASSIVE"}}
+
+
+COLUMNS = [
+    "two threads",
+    "processes beside",
+    "load before",
+    *(f"{name}, seconds a frame" for name in POLICIES),
+    "ratio",
+]
 
 
 @dataclass
@@ -43,25 +59,29 @@ class Bench:
     against: Path | None = None
 
     def run(self) -> None:
-        """The medians after the first frame, in turn."""
+        """The medians after the first frame, in turn, and their ratio."""
         checkouts = {"": Path.cwd()} | ({"before: ": self.against} if self.against else {})
         rows = []
         for busy in (0, self.busy):
             others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(busy)]
             try:
-                for label, folder in checkouts.items():
-                    for name, policy in POLICIES.items():
-                        rows.append([label + name, str(busy), f"{self.seconds(folder, policy):.2f}"])
+                for size, scale in SIZES.items():
+                    for label, folder in checkouts.items():
+                        load = f"{os.getloadavg()[0]:.0f}"
+                        took = [self.seconds(folder, policy, scale) for policy in POLICIES.values()]
+                        cells = [label + size, str(busy), load, *(f"{t:.2f}" for t in took), f"{took[0] / took[1]:.2f}"]
+                        rows.append(cells)
+                        print(markdown_table(COLUMNS, [cells]).splitlines()[-1], flush=True)
             finally:
                 for process in others:
                     process.kill()
-        print(markdown_table(["640x400, two threads", "other processes", "seconds a frame"], rows))
+        RESULTS.write_text(markdown_table(COLUMNS, rows))
 
-    def seconds(self, folder: Path, policy: dict[str, str]) -> float:
+    def seconds(self, folder: Path, policy: dict[str, str], scale: int) -> float:
         """The median of a process's frames, the first left out."""
         plain = {k: v for k, v in os.environ.items() if not k.startswith("OMP_")}
         environment = {**plain, **policy, "PYTHONPATH": str(folder)}
-        command = [sys.executable, "-c", FRAME.format(frames=self.frames)]
+        command = [sys.executable, "-c", FRAME.format(frames=self.frames, scale=scale)]
         done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True)
         return median(map(float, done.stdout.split()[1:]))
 

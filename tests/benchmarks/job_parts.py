@@ -1,7 +1,8 @@
 """What `bench_job` starts, each part in a process of its own: `python -m tests.benchmarks.job_parts PART ...`.
 
-`scene`: the sample array enlarged to any size, with several copies of the colour camera. `classical`, `opencv`: other
-ways to the same image, from files to a file. `stages`: `pat fuse` with the time of its parts printed as JSON.
+`scene`: the sample array enlarged to any size, with several copies of the colour camera, through lenses or not.
+`classical`, `opencv`: other ways to the same image, from files to a file. `stages`: `pat fuse` with the time of its
+parts printed as JSON.
 """
 
 from __future__ import annotations
@@ -30,11 +31,15 @@ STAGES = {
 """What is counted as each part, without the parts within it."""
 
 
-def scene(folder: Path, width: int, height: int, betas: int) -> None:
-    """Rig and images: the sample array's, enlarged; `betas` copies of its colour camera, which differ by a pixel."""
-    import cv2
+def scene(folder: Path, width: int, height: int, betas: int, k1: float = 0.0) -> None:
+    """Rig and images: the sample array's, enlarged; `betas` copies of its colour camera, which differ by a pixel.
 
-    from arraygeom import Rig
+    With `k1`, as through lenses of that first radial coefficient.
+    """
+    import cv2
+    import torch
+
+    from arraygeom import Distortion, Rig, resampled
     from pat.data.sample_array import ALPHA, BETA, SAMPLE
 
     rig = Rig.load(SAMPLE / "rig.yaml")
@@ -44,10 +49,16 @@ def scene(folder: Path, width: int, height: int, betas: int) -> None:
         h, w = rig[name].hw
         hw = round(h * height / rig[ALPHA].hw[0]), round(w * width / rig[ALPHA].hw[1])
         image = cv2.resize(cv2.imread(str(SAMPLE / f"{name}.png")), hw[::-1], interpolation=cv2.INTER_CUBIC)
+        camera = rig[name].resize(hw)
+        if k1:
+            straight, values = camera, torch.from_numpy(image).movedim(-1, 0).float()
+            camera = straight.replace(distortion=Distortion("brown-conrady", torch.tensor([k1, 0, 0, 0]).double()))
+            seen = resampled(values, straight, camera, extended=True).values[0]
+            image = seen.clamp(0, 255).round().byte().movedim(0, -1).numpy().copy()
         for i, copy in enumerate([name] if name == ALPHA else [f"{name}{i + 1}" for i in range(betas)]):
             image[0, 0] = i
             cv2.imwrite(str(folder / f"{copy}.png"), image[..., 0] if name == ALPHA else image)
-            cameras[copy] = rig[name].resize(hw)
+            cameras[copy] = camera
     Rig(cameras, depth=rig.depth, name="benchmark").save(folder / "rig.yaml")
 
 
@@ -174,7 +185,7 @@ def _owner(name: str, load: Callable[[str], Any]) -> tuple[Any, str]:
 if __name__ == "__main__":
     part, *given = sys.argv[1:]
     if part == "scene":
-        scene(Path(given[0]), *map(int, given[1:]))
+        scene(Path(given[0]), *map(int, given[1:4]), *map(float, given[4:]))
     elif part == "stages":
         stages(given)
     else:

@@ -15,7 +15,7 @@ from arraygeom import Pose, Rig
 from pat.cli.fusing import Fuse
 from pat.cli.main import Pat, command_paths, main
 from pat.cli.options import respelled
-from pat.data.sample_array import SAMPLE, load_sample
+from pat.data.sample_array import SAMPLE, load_motorcycle, load_sample
 from pat.evaluation.metrics import score
 from pat.media.images import read_image, write_image
 
@@ -353,10 +353,11 @@ def test_bands_are_listed_with_their_files(small, capsys):
     rest = ["--alpha", "mono", "--weights", "mono-spectral", "--no-report", "-o", str(small / "out")]
     main(["fuse", str(small / "rig.yaml"), *given, *rest])
     said = " ".join(capsys.readouterr().err.split())
-    assert "bands at alpha's view: fused_1.png nir, fused_2.png red; fused.png is their mean" in said
-    for name, file in (("nir", "fused_1.png"), ("red", "fused_2.png")):
-        other = {"nir": "red", "red": "nir"}[name]
-        fused, own, wrong = (read_image(small / path) for path in (f"out/{file}", f"{name}.png", f"{other}.png"))
+    assert "bands at alpha's view: fused_nir.png, fused_red.png; fused.png is their mean" in said
+    for name, other in (("nir", "red"), ("red", "nir")):
+        files = f"out/fused_{name}.png", f"{name}.png", f"{other}.png"
+        fused, own, wrong = (read_image(small / path) for path in files)
+        assert (small / "out" / f"confidence_{name}.png").is_file()
         assert (fused.mean() - own.mean()).abs() < (fused.mean() - wrong.mean()).abs()
 
 
@@ -374,7 +375,7 @@ def test_an_alpha_in_colour_and_a_beta_without_are_said(small, capsys):
     with contextlib.suppress(SystemExit):
         main(arguments(small))
     text = " ".join(capsys.readouterr().err.split())
-    assert "warning: the image of alpha, 'mono', is in colour: only its luminance is used" in text
+    assert "warning: the image of alpha, 'mono', is in colour: colours come from the betas, its own only" in text
     assert "warning: the image of 'colour' has three equal bands" in text
 
 

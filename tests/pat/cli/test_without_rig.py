@@ -177,7 +177,7 @@ def test_what_does_not_go_with_a_rig_or_with_many_frames_is_refused(folder, tmp_
     rig = folder / "out" / "found_rig.yaml"
     stray = [rig, "--alpha", "mono", tmp_path / "mono" / "0.png", folder / "colour.png", "-o", tmp_path / "out"]
     assert "0.png: no camera of the rig has its name: give --image NAME=" in fails(stray, capsys)
-    assert "--points, --classical: of a single frame alone" in fails([*given, "--points", "--classical"], capsys)
+    assert "--points, --classical: for a single frame only" in fails([*given, "--points", "--classical"], capsys)
     assert not (tmp_path / "out").exists()
 
 

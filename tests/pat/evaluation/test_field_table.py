@@ -6,10 +6,13 @@ import pytest
 import torch
 
 from arraygeom import Dense, Epipolar, EpipolarLine, Rectified, sample
+from arraygeom.fields.grid import FieldOnGrid
+from pat.attention.scores import peak_position
 from pat.data.pairs import Disparity, StereoPair
 from pat.evaluation.ablation import sample_photographs
 from pat.evaluation.field_table import (
     FieldRow,
+    drawn_peaks,
     evaluate_fields,
     fields_markdown,
     fields_of,
@@ -17,7 +20,8 @@ from pat.evaluation.field_table import (
     rectified_cases,
     row_link,
 )
-from pat.evaluation.sweeps import ALPHA, BETA
+from pat.evaluation.sweeps import ALPHA, BETA, fused
+from pat.matching.inputs import Inputs
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
 
@@ -84,3 +88,34 @@ def test_what_cannot_serve_is_named(network, pair):
         scene=case.scene._replace(images={ALPHA: torch.rand(1, 200, 200), BETA: torch.rand(3, 200, 200)})
     )
     assert "left out" in evaluate_fields(network, [large], fields=lambda max_displacement: {"dense": Dense()})[0].note
+
+
+def test_a_network_of_several_betas_gets_a_band_each(pair):
+    torch.manual_seed(0)
+    four = PAT(PATConfig(betas=3, in_channels=1, dim=8)).eval().requires_grad_(False)
+    case = next(rectified_cases([pair]))
+    alpha, beta = case.scene.images[ALPHA], case.scene.images[BETA]
+    found = fused(four, case.pair, alpha, beta, Epipolar())
+    on_grid = FieldOnGrid.of(Epipolar(), case.pair)
+    wanted, compared = four.compare(Inputs.of(alpha[None], [band[None, None] for band in beta], [on_grid] * 3))
+    torch.testing.assert_close(found.image, wanted.image[0])
+    assert found.peak.shape == (3, *HW, 2)
+    for band, one in enumerate(compared):
+        torch.testing.assert_close(found.peak[band].float(), peak_position(one)[0].movedim(0, -1))
+    two = PAT(PATConfig(betas=2, in_channels=1, dim=8))
+    rows = evaluate_fields(two, [case], fields=lambda max_displacement: {"epipolar": Epipolar()})
+    assert rows[0].note == "this PAT is made for 2 betas, got 3"
+
+
+def test_drawn_peaks_are_red_where_the_table_counts_them_wrong(network, pair):
+    case = next(rectified_cases([pair]))
+    row = evaluate_fields(network, [case], fields=lambda max_displacement: {"epipolar": Epipolar()})[0]
+    alpha, true, found, off = drawn_peaks(network, [case]).values()
+    red = (off == torch.tensor([1.0, 0, 0])[:, None, None]).all(0)
+    known = case.scene.visible
+    assert int(red.sum()) == round((1 - row.peaks) * int(known.sum()))
+    assert (off[:, ~red] == alpha.expand(3, -1, -1)[:, ~red]).all()
+    assert (true[:, ~known] == 0).all()
+    drawn = true[:, known]
+    assert (drawn == drawn[:, :1]).all()  # the parallax is 5 pixels everywhere
+    assert found.std() > 0.1

@@ -8,7 +8,19 @@ from functools import cache
 import pytest
 import torch
 
-from arraygeom import Camera, Curved, Epipolar, EpipolarLine, Pair, Pose, intrinsics, rotation_from_vector
+from arraygeom import (
+    Camera,
+    Curved,
+    Epipolar,
+    EpipolarLine,
+    HomographyDisplacement,
+    Local,
+    Pair,
+    Pose,
+    Widened,
+    intrinsics,
+    rotation_from_vector,
+)
 from arraygeom.distortion import Distortion
 from arraygeom.fields.grid import FieldOnGrid
 from pat import fuse, load_weights
@@ -18,7 +30,14 @@ from pat.networks.paper import PAT
 from tests.pat.layered_array import load_sample
 
 HW = (7, 9)
-FIELDS = {"epipolar": Epipolar(), "line": EpipolarLine(), "curved": Curved(5, nodes=8)}
+FIELDS = {
+    "epipolar": Epipolar(),
+    "line": EpipolarLine(),
+    "homography + displacement": HomographyDisplacement(2.5),
+    "local": Local(3),
+    "widened": Widened(Epipolar(), across=0.7),
+    "curved": Curved(5, nodes=8),
+}
 
 
 @cache

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from pat.support.locks import LOCK, folder_lock
+from pat.support.locks import LOCK, OWNER, folder_lock
 
 ROOT = Path(__file__).parents[3]
 HOLD = """
@@ -44,20 +44,21 @@ def test_a_folder_is_one_commands_until_that_is_gone(holder, tmp_path):
     assert (out / LOCK).is_file()
     holder.send_signal(signal.SIGKILL)
     holder.wait()
-    assert json.loads((out / LOCK).read_text())["pid"] == holder.pid
+    assert json.loads((out / OWNER).read_text())["pid"] == holder.pid
     with folder_lock(out):
-        assert json.loads((out / LOCK).read_text())["pid"] == os.getpid()
+        assert json.loads((out / OWNER).read_text())["pid"] == os.getpid()
     assert not (out / LOCK).exists()
+    assert not (out / OWNER).exists()
 
 
 def test_a_lock_of_another_machine_is_not_taken(tmp_path):
-    (tmp_path / LOCK).write_text('{"pid": 7, "host": "far.example"}')
+    (tmp_path / OWNER).write_text('{"pid": 7, "host": "far.example"}')
     with (
         pytest.raises(ValueError, match=r"process 7 on far.example\): wait for it, or remove .*\.lock"),
         folder_lock(tmp_path),
     ):
         pass
-    (tmp_path / LOCK).write_text("damaged")
+    (tmp_path / OWNER).write_text("damaged")
     with folder_lock(tmp_path):
         pass
 

@@ -1,0 +1,101 @@
+"""Sixty kinds of input of `pat fuse`: `python -m tests.benchmarks.bench_inputs [--data ../shared/data] [--only WORD]`.
+
+Of each its exit status, whether there is depth, the mean confidence and the memory by which the process grew at most.
+Lines are printed as they are measured, and put into the table of tests/benchmarks/RESULTS_inputs.md. Exit status 1 if
+one is not as is expected.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import sys
+import tempfile
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import tyro
+
+from pat.cli.main import main
+from pat.evaluation.tables import markdown_table
+from pat.support.memory import with_peak
+
+from .input_kinds import Kind, kinds
+
+RESULTS = Path(__file__).with_name("RESULTS_inputs.md")
+COLUMNS = ["input", "status", "depth", "confidence", "peak, MiB"]
+
+
+class Came(NamedTuple):
+    """What came of a kind of input; the last line that was said."""
+
+    status: int
+    depth: bool
+    confidence: float
+    peak: float
+    said: str
+
+    def as_wanted(self, kind: Kind) -> bool:
+        """Whether it is as is expected; a refusal is one line."""
+        refused = self.status != 2 or self.said.startswith("pat: ")
+        return (self.status, self.depth) == (kind.status, kind.depth) and refused
+
+    def row(self, kind: Kind) -> list[str]:
+        """Of the table."""
+        confidence = "" if self.status == 2 else f"{self.confidence:.2f}"
+        wanted = "" if self.as_wanted(kind) else f" (expected: {kind.status}, {'depth' if kind.depth else 'no depth'})"
+        return [kind.name + wanted, str(self.status), "yes" if self.depth else "no", confidence, f"{self.peak:.0f}"]
+
+
+def what_came(kind: Kind, folder: Path) -> Came:
+    """Fuse an input of this kind in a folder."""
+    words = [*map(str, kind.make(folder)), "--out", str(folder / "out")]
+    said = io.StringIO()
+
+    def fused() -> int:
+        try:
+            main(["fuse", *words])
+        except SystemExit as ended:
+            return int(ended.code or 0)
+        return 0
+
+    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said), warnings.catch_warnings():
+        status, peak = with_peak(fused)
+    maps = [cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in sorted((folder / "out").glob("*confidence.png"))]
+    confidence = float(maps[0].mean() / 255) if maps else 0.0
+    depth = any((folder / "out").glob("*depth.tif"))
+    lines = said.getvalue().strip().splitlines() or [""]
+    return Came(status, depth, confidence, (peak or 0) / 2**20, lines[-1])
+
+
+@dataclass
+class Bench:
+    """Measure and print the table."""
+
+    data: Path = Path("../shared/data")
+    only: str = ""
+    """Kinds whose name has this in it."""
+
+    def run(self) -> int:
+        """All kinds, in turn; 1 if one is not as expected."""
+        known = {}
+        if RESULTS.exists():
+            known = {line.split(" | ")[0]: line for line in RESULTS.read_text().splitlines()[2:]}
+        wrong = 0
+        for kind in (kind for kind in kinds(self.data.resolve()) if self.only in kind.name):
+            with tempfile.TemporaryDirectory() as folder:
+                came = what_came(kind, Path(folder))
+            wrong += not came.as_wanted(kind)
+            line = markdown_table(COLUMNS, [came.row(kind)]).splitlines()[-1]
+            print(line if came.as_wanted(kind) else f"{line}\n{came.said}", flush=True)
+            known = {key: text for key, text in known.items() if not key.startswith(f"| {kind.name} (expected")}
+            known[f"| {kind.name}"] = line
+            RESULTS.write_text("\n".join([*markdown_table(COLUMNS, []).splitlines()[:2], *known.values()]) + "\n")
+        return int(wrong > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(Bench).run())

@@ -1,0 +1,124 @@
+"""Bands that cameras record one by one: their names, their values, their confidences; and noise."""
+
+import warnings
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arraygeom import Rig
+from pat.cli.main import main
+from pat.data.sample_array import load_sample
+from pat.fusion.checks import LowConfidenceWarning, noise_advice, warn_of_confidence
+from pat.fusion.from_images import _ordered_betas, show_colour
+from pat.fusion.fuse import fuse
+from pat.fusion.inputs import FrameInputs
+from pat.fusion.results import Frame, band_names, save_frame
+from pat.matching.inputs import Inputs
+from pat.networks.weights import load_weights
+from pat.sensors import NoiseLevel
+
+
+def sample_of_bands(scales: dict[str, float]) -> tuple[Rig, dict[str, torch.Tensor]]:
+    """The sample array reduced, its colour camera's bands as cameras of a band each, a pixel apart."""
+    sample = load_sample()
+    rig, cameras = sample.rig, {"mono": sample.rig["mono"].resize((200, 320))}
+    images = {"mono": torch.nn.functional.avg_pool2d(sample.images["mono"], 2)}
+    half = torch.nn.functional.avg_pool2d(sample.images["colour"], 2)
+    for i, (name, scale) in enumerate(scales.items()):
+        camera = rig["colour"].resize((180, 280))
+        pose = camera.cam_from_world
+        cameras[name] = camera.replace(cam_from_world=type(pose)(pose.R, pose.t * (1 + 0.01 * i)))
+        images[name] = half[i : i + 1] * scale
+    return Rig(cameras, depth=rig.depth), images
+
+
+@pytest.mark.parametrize(
+    ("names", "colour"),
+    [
+        (("red", "green", "blue"), True),
+        (("cam1_600nm", "cam2_550nm", "cam3_450nm"), True),
+        (("red_edge", "red", "green"), False),
+        (("green", "red", "blue"), False),
+        (("a", "b", "c"), False),
+        (("red", "green"), False),
+    ],
+)
+def test_three_bands_are_colours_only_if_their_names_say_so(names, colour):
+    """A red edge, red and green were shown as red, green and blue, and any three in the order given."""
+    assert show_colour(names, [1] * len(names)) == colour
+    assert not show_colour(names, [3] * len(names))
+
+
+def test_a_red_edge_is_ordered_before_red():
+    images = {name: torch.rand(1, 4, 4) for name in ("nir", "green", "red", "red_edge")}
+    said = []
+    assert _ordered_betas(images, "nir", said.append) == ["red_edge", "red", "green"]
+    assert said == ["bands: red_edge, red, green, each at alpha's view"]
+
+
+def test_bands_keep_their_own_values_where_levels_are_matched():
+    """They were scaled to alpha's mean and contrast."""
+    rig, images = sample_of_bands({"a": 1.0, "b": 0.25})
+    frame = fuse(load_weights("mono-spectral"), rig, images, alpha="mono", match_levels=True, align=False)
+    truth = load_sample().ground_truth[:2].flatten(1).mean(1)
+    for mean, wanted in zip(frame.image.flatten(1).mean(1), (float(truth[0]), 0.25 * float(truth[1]))):
+        assert float(mean) == pytest.approx(wanted, rel=0.1)
+    assert frame.by_band.shape == frame.image.shape
+    assert band_names(frame, ["a", "b"]) == ["a", "b"]
+    assert torch.allclose(frame.by_band.amin(0).float(), frame.confidence, atol=2e-3)
+
+
+def test_bands_are_files_by_name_with_their_confidences(tmp_path):
+    frame = Frame(torch.rand(3, 6, 8), torch.full((6, 8), torch.nan), torch.rand(6, 8), torch.rand(3, 6, 8).half())
+    written = save_frame(frame, tmp_path, bands=["red", "nir", "edge"])
+    assert {path.name for path in written} == {"fused.png", "confidence.png"} | {
+        f"{kind}_{name}.png" for kind in ("fused", "confidence") for name in ("red", "nir", "edge")
+    }
+    assert cv2.imread(str(tmp_path / "fused.png"), cv2.IMREAD_UNCHANGED).shape == (6, 8, 3)
+    read = cv2.imread(str(tmp_path / "confidence_nir.png"), cv2.IMREAD_UNCHANGED) / 255
+    assert np.allclose(read, frame.by_band[1].numpy(), atol=3e-3)
+
+
+def confidence_warning(by_band: list[float] | None) -> list[warnings.WarningMessage]:
+    least = 0.04 if by_band is None else min(by_band)
+    maps = None if by_band is None else torch.tensor(by_band)[:, None, None].expand(-1, 8, 8)
+    frame = Frame(torch.rand(9, 8, 8), torch.ones(8, 8), torch.full((8, 8), least), maps)
+    inputs = FrameInputs(Inputs(torch.full((1, 1, 8, 8), 0.5), ()), [], (8, 8))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        warn_of_confidence(load_weights("mono-spectral"), frame, inputs)
+    return caught
+
+
+def test_one_band_that_matches_badly_is_no_wrong_rig():
+    """Nine bands right to the eye ended with status 3: the least of their confidences was .04."""
+    assert confidence_warning([0.04, 0.1, *[0.6] * 7]) == []
+    (none,), (most,) = confidence_warning(None), confidence_warning([0.04] * 7 + [0.6] * 2)
+    assert none.category is LowConfidenceWarning
+    assert most.category is LowConfidenceWarning
+    assert "of the median band" in str(most.message)
+
+
+def test_plain_noise_names_the_option_that_it_needs():
+    image = torch.nn.functional.interpolate(torch.rand(1, 1, 16, 16), size=(200, 200), mode="bicubic").clamp(0, 1)
+    noisy = NoiseLevel.of_electrons(60, 2).recorded(image, torch.Generator().manual_seed(0))
+    assert noise_advice(Inputs(image, ())) == ""
+    assert "try `--noise estimate`" in noise_advice(Inputs(noisy, ()))
+
+
+def test_sixteen_bits_are_written_for_sixteen(tmp_path):
+    """They were written as 8 bits unless asked otherwise."""
+    rig, images = sample_of_bands({"a": 1.0, "b": 0.25})
+    rig.save(tmp_path / "rig.yaml")
+    for name, image in images.items():
+        deep = name == "a"
+        values = (image[0].numpy() * (65535 if deep else 255)).round().astype(np.uint16 if deep else np.uint8)
+        cv2.imwrite(str(tmp_path / f"{name}.png"), values)
+    given = [str(tmp_path / "rig.yaml"), *(str(tmp_path / f"{name}.png") for name in images), "--alpha", "mono"]
+    for extra, kind in (([], np.uint16), (["--bits", "8"], np.uint8)):
+        rest = ["--weights", "mono-spectral", "--no-report", "--no-align", "-o", str(tmp_path / "out"), *extra]
+        main(["fuse", *given, *rest])
+        for name in ("fused", "fused_a", "fused_b"):
+            assert cv2.imread(str(tmp_path / "out" / f"{name}.png"), cv2.IMREAD_UNCHANGED).dtype == kind

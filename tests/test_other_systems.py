@@ -1,0 +1,40 @@
+"""What Windows has not (fcntl, resource, a process's pwd) is not needed to import the packages or to fuse images."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+WITHOUT = """
+import sys, warnings
+sys.modules |= dict.fromkeys(("fcntl", "resource", "pwd", "grp", "termios"))
+warnings.filterwarnings("ignore", "only soft file lock")
+"""
+IMPORT_ALL = """
+import importlib, pkgutil
+import arraygeom, calib, pat
+for package in (arraygeom, calib, pat):
+    for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        if not module.name.startswith(("pat.synthesis.blender", "pat.attention.gpu")):
+            importlib.import_module(module.name)
+"""
+FUSE = "from pat.cli.main import main; main(sys.argv[1:])"
+
+
+def run(code, *words):
+    command = [sys.executable, "-c", WITHOUT + code, *map(str, words)]
+    done = subprocess.run(command, cwd=ROOT, env=os.environ, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def test_every_module_is_imported_without_what_only_posix_has():
+    run(IMPORT_ALL)
+
+
+def test_images_are_fused_without_what_only_posix_has(tmp_path):
+    sample = ROOT / "pat/data/sample"
+    images = [word for name in ("mono", "colour") for word in ("--image", f"{name}={sample / name}.png")]
+    run(FUSE, "fuse", "--rig", sample / "rig.yaml", "--alpha", "mono", *images, "--out", tmp_path / "out")
+    assert (tmp_path / "out" / "fused.png").is_file()
+    assert not [*(tmp_path / "out").glob(".lock*")]
