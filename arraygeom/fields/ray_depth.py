@@ -53,7 +53,11 @@ def ray_depth(
         inverse = curve.inverse_depth(there)[:, 0]
         valid = curve.valid & apart.gather(-1, best)[:, 0].isfinite() & (inverse > 0)
         depth = torch.where(valid, 1 / torch.where(valid, inverse, 1.0), 0.0)
-        return depth, torch.where(valid, deviation * _inverse_depth_per_pixel(curve, there), 0.0) * depth.square(), valid
+        return (
+            depth,
+            torch.where(valid, deviation * _inverse_depth_per_pixel(curve, there), 0.0) * depth.square(),
+            valid,
+        )
 
     x = floating(x)
     sigma = torch.zeros_like(x[:, 0]) if deviation is None else deviation.to(x)

@@ -146,7 +146,7 @@ def fitted(found: Sequence[Judged], seed: int = 0) -> CertaintyNetwork:
             loss.backward()
             optimizer.step()
             schedule.step()
-    first = network[0]
+    first = network.first
     with torch.no_grad():  # of numbers as they are
         first.weight /= spread
         first.bias -= first.weight @ middle

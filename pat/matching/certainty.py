@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -50,6 +51,11 @@ class CertaintyNetwork(nn.Sequential):
         width = SETTINGS.width
         first, middle, last = nn.Linear(MEASURED, width), nn.Linear(width, width), nn.Linear(width, 2)
         super().__init__(first, nn.SiLU(), middle, nn.SiLU(), last)
+
+    @property
+    def first(self) -> nn.Linear:
+        """The layer that takes the numbers."""
+        return cast(nn.Linear, self[0])
 
 
 @cache
