@@ -11,11 +11,12 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .batching import Batched
-from .checks import check_batches, check_hw, check_K, checking
+from .checks import check_batches, check_hw, check_K, check_origin, checking
 from .distortion import Distortion
 from .lenses.model import LensModel
 from .pixels import (
     HW,
+    coarse_grid,
     floating,
     map_homogeneous,
     product,
@@ -28,9 +29,11 @@ from .pixels import (
 from .pose import Pose
 from .sensor import Sensor
 from .text import view_facts
+from .tracing import traced
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
+    from kornia.sensors.camera import CameraModel
 
 
 class Projected(NamedTuple):
@@ -158,8 +161,13 @@ class LensView(View):
 
     @property
     def has_pinhole_view(self) -> bool:
-        """Whether the camera is a pinhole or has a lens: rays of other models may not meet, or be at any angle."""
-        return isinstance(self.distortion, Distortion | None)
+        """Whether it is a pinhole, has a `Distortion` or a model whose rays meet, all within 75 degrees of the axis."""
+        if isinstance(self.distortion, Distortion | None):
+            return True
+        if not self.distortion.central or traced():
+            return False
+        rays, seen = self.rays(coarse_grid(self.hw).to(self.K).reshape(*[1] * len(self.batch_shape), -1, 2))
+        return bool((seen & (rays[..., 2] > NARROW * rays.norm(dim=-1))).all())
 
     @property
     def central(self) -> bool:
@@ -193,6 +201,8 @@ class LensView(View):
         return map_homogeneous(self.K[..., :2, :], normalised), valid
 
 
+NARROW = 0.259
+"""The cosine of 75 degrees."""
 AnyLensView = TypeVar("AnyLensView", bound=LensView)
 ThroughLens = Callable[[Any, Tensor], tuple[Tensor, Tensor]]
 
@@ -219,6 +229,7 @@ class Camera(LensView):
             if not isinstance(self.cam_from_world, Pose):
                 raise TypeError(f"cam_from_world is a {type(self.cam_from_world).__name__}: give a Pose(R, t)")
             check_batches("K and cam_from_world", self.K.shape[:-2], self.cam_from_world.batch_shape)
+            check_origin(self.cam_from_world.t)
 
     @property
     def R(self) -> Float[Tensor, "*b 3 3"]:
@@ -254,15 +265,19 @@ class Camera(LensView):
         X = torch.where(valid[..., None], X, torch.nan)
         return self.cam_from_world.inverse().apply(X)
 
-    def to_kornia(self) -> PinholeCamera:
-        """The same pinhole as a kornia camera, batched (B, 4, 4). Raises ValueError if there is a lens.
+    def to_kornia(self) -> PinholeCamera | CameraModel:
+        """The same camera in kornia: a `PinholeCamera`, batched (B, 4, 4), or with a lens a `CameraModel`.
 
-        Pixels and axes are alike in both. `PinholeCamera.scale` moves the principal point otherwise: `resize` before.
+        Kornia's camera models (`kornia.sensors.camera`) have no pose: keep `cam_from_world`. Pixels and axes are alike.
+        `PinholeCamera.scale` moves the principal point otherwise: `resize` before. Raises ValueError for a lens that
+        kornia does not have.
         """
         from kornia.geometry.camera import PinholeCamera
 
+        from .kornia_models import to_kornia_model
+
         if self.distortion is not None and not self.distortion.harmless:
-            raise ValueError("kornia's PinholeCamera has no lens model: undistort first, or drop `distortion`")
+            return to_kornia_model(self)
         R, t, K = self.R.reshape(-1, 3, 3), self.t.reshape(-1, 3), self.K.reshape(-1, 3, 3)
         row = K.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(K), 1, 4)
         intrinsics = torch.cat([torch.cat([K, K.new_zeros(len(K), 3, 1)], -1), row], -2)
@@ -271,11 +286,20 @@ class Camera(LensView):
         return PinholeCamera(intrinsics, extrinsics, h, w)
 
     @classmethod
-    def from_kornia(cls, camera: PinholeCamera, *, batched: bool = False) -> Camera:
+    def from_kornia(
+        cls, camera: PinholeCamera | CameraModel, *, batched: bool = False, cam_from_world: Pose | None = None
+    ) -> Camera:
         """The camera of a kornia pinhole; a batch of one becomes a single camera unless `batched`.
 
-        Raises ValueError if the images of a batch differ in size.
+        Of a `CameraModel`, which has no pose, at `cam_from_world`. Raises ValueError if the images of a batch differ in
+        size.
         """
+        from kornia.geometry.camera import PinholeCamera
+
+        from .kornia_models import from_kornia_model
+
+        if not isinstance(camera, PinholeCamera):
+            return from_kornia_model(camera, cam_from_world)
         sizes = sorted({(int(h), int(w)) for h, w in zip(camera.height.reshape(-1), camera.width.reshape(-1))})
         if len(sizes) > 1:
             found = " and ".join(f"{w}x{h}" for h, w in sizes)

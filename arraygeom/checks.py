@@ -65,6 +65,23 @@ def check_numbers(value: Any, shape: tuple[int, ...], what: str) -> Tensor:
     return value
 
 
+def check_origin(t: Tensor) -> None:
+    """Raises ValueError for float32 translations (\\*b, 3) of which a millimetre is lost to rounding."""
+    if t.dtype != torch.float32 or t.is_meta:
+        return
+    largest = float(t.detach().abs().max()) if t.numel() else 0.0
+    rounding = largest * torch.finfo(t.dtype).eps
+    if rounding > LOST:
+        raise ValueError(
+            f"a camera is {largest:,.0f} m from the origin, which float32 holds to {rounding:.1g} m: "
+            "give float64, or put the origin near the cameras"
+        )
+
+
+LOST = 1e-3
+"""Metres."""
+
+
 def check_rotation(R: Any) -> None:
     """Raises ValueError unless R (\\*b, 3, 3) is a rotation but for rounding."""
     R = check_numbers(R, (3, 3), "R")

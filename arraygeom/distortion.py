@@ -12,8 +12,6 @@ Models, with their coefficients:
   theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (Kannala and Brandt 2006; OpenCV's ``fisheye``,
   Kalibr's ``equidistant``, COLMAP's ``OPENCV_FISHEYE``).
 - ``thin-prism-fisheye``: k1 k2 p1 p2 k3 k4 sx sy, the same angle, then Brown-Conrady's polynomials (COLMAP).
-- ``pix4d-fisheye``: k2 k3 k4, the angle theta goes to the radius theta (1 + k2 theta + k3 theta^2 + k4 theta^3)
-  (Pix4D's fisheye).
 - ``double-sphere``: xi alpha (Usenko, Demmel and Cremers 2018; Kalibr's ``ds``).
 - ``extended-unified``: alpha beta (Khomutenko, Garcia and Martinet 2016; Kalibr's ``eucm``).
 - ``unified``: xi k1 k2 p1 p2 (Mei and Rives 2007; Kalibr's ``omni``, OpenCV's ``omnidir``).

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from .batching import Batched, map_tensors
 from .camera import Camera, LensView, View
-from .checks import check_numbers, checking, derived
+from .checks import check_numbers, check_origin, checking, derived
 from .epipolar import fundamental_matrix
 from .homography import plane_homography
 from .pixels import HW, product, resize_matrix, rot90_matrix, shift_matrix
@@ -99,6 +99,9 @@ class Pair(Batched):
     def beta_from_alpha(self) -> Pose:
         """X_beta = R X_alpha + t."""
         alpha, beta = self.cameras
+        if checking():
+            check_origin(alpha.t)
+            check_origin(beta.t)
         return beta.cam_from_world.__matmul__(alpha.cam_from_world.inverse())  # torch.compile cannot trace @ of these
 
     @property
@@ -242,6 +245,12 @@ class Rig(Batched):
         if views:
             raise ValueError(f"kornia has no camera without a calibration: {', '.join(views)} of this rig are such")
         shape = self.batch_shape
+        lenses = [(name, camera.distortion) for name, camera in self.cameras.items()]
+        if bent := [name for name, lens in lenses if lens is not None and not lens.harmless]:
+            raise ValueError(
+                f"kornia's cameras with a lens have no pose ({', '.join(bent)}): give each as camera.to_kornia() and "
+                "keep its cam_from_world"
+            )
         return {name: _expanded(camera, shape).to_kornia() for name, camera in self.cameras.items()}
 
     def __getitem__(self, name: Any) -> Any:

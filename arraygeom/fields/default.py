@@ -12,6 +12,7 @@ from ..checks import check_field
 from ..epipolar import FRONT
 from ..pixels import coarse_grid
 from ..rig import Pair
+from ..tracing import traced
 from .curved import Curved, ThroughLenses
 from .explicit import Dense, Local, NearestVoxels
 from .protocol import ReceptiveField
@@ -70,7 +71,7 @@ def default_field(pair: Pair) -> ReceptiveField:
     images. A calibrated one has `Epipolar`, which raises ValueError if the pair has no depth range: a search of the
     whole line is ambiguous and has to be asked for (`EpipolarLine`). A pair of which only the sizes are known counts as
     rectified, with alpha on either side. With lenses these are `Curved`, or `ThroughLenses` of the field without them.
-    Of cameras without a pinhole view (`View.has_pinhole_view`) it is `Curved`, its bounds by `natural_bounds`.
+    The bounds of `Curved` are those of `natural_bounds`.
     """
     return _through_lenses(straight_field(pair), pair)
 
@@ -89,12 +90,14 @@ def _through_lenses(field: ReceptiveField, pair: Pair, samples: int = 96, nodes:
         return field
     if not isinstance(field, Epipolar) and all(view.has_pinhole_view for view in (pair.alpha, pair.beta)):
         return ThroughLenses(field, samples)
-    return Curved(samples, nodes=nodes, bounds="depth" if pair.alpha.has_pinhole_view else natural_bounds(pair))
+    return Curved(samples, nodes=nodes, bounds=natural_bounds(pair))
 
 
 def natural_bounds(pair: Pair) -> Literal["depth", "distance"]:
     """Of what the depth range of a pair is: the distance along the ray where alpha sees 90 degrees off axis."""
     alpha = pair.cameras[0]
+    if alpha.distortion is None or not alpha.distortion.sees_behind or traced():
+        return "depth"
     rays, seen = alpha.rays(coarse_grid(alpha.hw).to(alpha.K).reshape(*[1] * len(alpha.batch_shape), -1, 2))
     return "distance" if bool((seen & (rays[..., 2] <= FRONT * rays.norm(dim=-1))).any()) else "depth"
 

@@ -10,13 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .common import angle_over_radius, cosine_and_sinc, finite_points
+from ..roots import first_root, invert_increasing
+from .common import MARGIN, angle_over_radius, cosine_and_sinc, finite_points
 from .model import CameraModel, beside_points
-
-BISECTIONS, NEWTON = 28, 3
-"""Halvings of a solution's bounds, after which so many steps of Newton's leave rounding, in float64."""
-STEPS = 512
-"""Angles at which a polynomial is checked to increase."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -41,29 +37,33 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
             off, ratio * torch.where(off, squared, 1.0).sqrt(), torch.where(X[..., 2] < 0, math.pi, 0.0)
         )
         scale, _ = self._radius_over_angle(theta)
-        valid = finite & (theta <= self._limit(X)) & (X != 0).any(-1)
+        valid = finite & (theta <= beside_points(self._limit(), X)) & (X != 0).any(-1)
         return X[..., :2] * (ratio * scale)[..., None], valid
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Unit directions: the inverse of `project`, by bisection and a step of Newton's, which has the gradient."""
+        """Unit directions: the inverse of `project`."""
         xy, finite = finite_points(xy)
         squared = xy.square().sum(-1)
         off = squared > 0
         radius = torch.where(off, torch.where(off, squared, 1.0).sqrt(), 0.0)
         with torch.no_grad():
-            low, high = torch.zeros_like(radius), self._limit(xy).expand_as(radius).clone()
-            valid = finite & (radius <= high * self._radius_over_angle(high)[0])
-            for _ in range(BISECTIONS):
-                middle = 0.5 * (low + high)
-                beyond = middle * self._radius_over_angle(middle)[0] > radius
-                low, high = torch.where(beyond, low, middle), torch.where(beyond, middle, high)
-            theta = 0.5 * (low + high)
-        for _ in range(NEWTON):
+            limit = beside_points(self._limit(), xy)
+            outermost = limit * self._radius_over_angle(limit)[0]
+            valid = finite & (radius <= outermost)
+            pull = torch.where(valid, 1.0, outermost / torch.where(valid, 1.0, radius))
+        xy, radius = xy * pull[..., None], radius * pull
+        with torch.no_grad():
+            theta = invert_increasing(self._radius, radius, limit.expand_as(radius), ITERATIONS)
+        for _ in range(2):
             scale, slope = self._radius_over_angle(theta)
             theta = theta + (radius - theta * scale) / torch.where(valid & (slope > 0), slope, 1.0)
         cosine, sinc = cosine_and_sinc(theta.square())
         share = torch.where(off, theta / torch.where(off, radius, 1.0), 1.0)
         return torch.cat([xy * (sinc * share)[..., None], cosine[..., None]], -1), valid
+
+    def _radius(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        ratio, slope = self._radius_over_angle(theta)
+        return theta * ratio, slope
 
     def _radius_over_angle(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """radius / theta, and the derivative of the radius."""
@@ -75,14 +75,19 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
         return ratio, slope
 
     @torch.no_grad()
-    def _limit(self, points: Tensor) -> Tensor:
-        """The widest angle, beside points (*b, ..., k)."""
-        widest = self.widest.to(points.dtype).clamp(max=math.pi)
-        batch = torch.broadcast_shapes(widest.shape, self.k.shape[:-1])
-        theta = widest[..., None].expand(*batch, 1) * torch.linspace(0, 1, STEPS).to(widest)
-        increases = (self._radius_over_angle(theta)[1] > 0).long().cumprod(-1)
-        last = (increases.sum(-1, keepdim=True) - 1).clamp(min=0)
-        return beside_points(theta.gather(-1, last)[..., 0], points)
+    def _limit(self) -> Tensor:
+        """The widest angle (*b): float64 on the CPU."""
+        k, widest = (t.detach().to("cpu", torch.float64) for t in (self.k, self.widest))
+        widest = widest.clamp(max=math.pi)
+        if not k.shape[-1]:
+            return widest
+        powers = torch.arange(2, k.shape[-1] + 2).to(k)
+        slope = torch.cat([torch.ones_like(k[..., :1]), k * powers], -1)
+        return torch.minimum(first_root(slope) * (1 - MARGIN), widest)
+
+
+ITERATIONS = 40
+"""Of the search for an angle, at most; most take five."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

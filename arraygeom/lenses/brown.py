@@ -102,7 +102,34 @@ def brown_limit(lens: Brown) -> Tensor:
     falling = polynomial_product((one, k1, k2, k3, *k7), (0 * one, 2 * k4, 4 * k5, 6 * k6))
     turn = first_root(torch.stack([a - b for a, b in zip(rising, falling)], -1))
     pole = first_root(torch.stack([one, k4, k5, k6], -1))
-    return torch.minimum(torch.minimum(turn * (1 - MARGIN), pole * POLE), one * WIDEST**2)
+    limit = torch.minimum(torch.minimum(turn * (1 - MARGIN), pole * POLE), one * WIDEST**2)
+    if not traced() and not any(bool(v.any()) for v in (*lens.p, *lens.s)):
+        return limit
+    return _before_dip(lens, limit)
+
+
+def _before_dip(lens: Brown, limit: Tensor) -> Tensor:
+    """The squared radius at which the radial slope is least, if tangential and prism terms may fold the image there and
+    the slope rises again after it: past such a fold points look right, and are another's; else the limit.
+
+    The terms' Jacobian is at most 7 |p| r and 2 |s| r (4 |s| r^3): where the slope is larger there is no fold.
+    """
+    parts = (*lens.k, *lens.p, *lens.s, lens.k[0] * 0 if lens.eighth is None else lens.eighth)
+    *k, p1, p2, s1, s2, s3, s4, k7 = (v.detach().to("cpu", torch.float64)[..., None] for v in parts)
+    angles = torch.linspace(1 / RADII, 1, RADII, dtype=torch.float64)
+    r = (limit.sqrt().atan()[..., None] * angles).tan()
+    g, dg = _radial_factor(Brown(tuple(k), (p1, p2), (s1, s2, s3, s4), None, k7), r.square())
+    slope = g + 2 * r.square() * dg
+    bound = r * (7 * torch.hypot(p1, p2) + 2 * torch.hypot(s1, s3)) + 4 * r**3 * torch.hypot(s2, s4)
+    folds = slope <= bound
+    ends = folds & ((~folds).flip(-1).cumsum(-1).flip(-1) > 0)  # the slope is larger again further out
+    first = ends & ((ends.cumsum(-1) > 0) & ~folds).cumsum(-1).eq(0)
+    least = torch.where(first, slope, torch.inf).argmin(-1, keepdim=True)
+    return torch.where(first.any(-1), r.gather(-1, least)[..., 0].square(), limit)
+
+
+RADII = 256
+"""Radii, evenly spaced in angle, at which a dip of the slope is sought."""
 
 
 def _brown_start(lens: Brown, target: Tensor, limit: Tensor) -> Tensor:

@@ -15,7 +15,6 @@ from torch import Tensor
 from ..roots import first_root, invert_increasing
 from .brown import brown_distort, brown_undistort
 from .common import MARGIN, TINY, WIDEST, angle_over_radius, cosine_and_sinc, unit
-from .fisheye import polynomial_limit, polynomial_project, polynomial_unproject
 
 DOUBLE_SPHERE = "double-sphere"
 EXTENDED_UNIFIED = "extended-unified"
@@ -23,7 +22,6 @@ UNIFIED = "unified"
 FOV = "fov"
 SCARAMUZZA = "scaramuzza"
 THIN_PRISM_FISHEYE = "thin-prism-fisheye"
-POLYNOMIAL_FISHEYE = "pix4d-fisheye"
 
 
 class _Model(NamedTuple):
@@ -268,9 +266,6 @@ MODELS: dict[str, _Model] = {
         (1.0,),
     ),
     SCARAMUZZA: _Model(_scaramuzza, _scaramuzza_inverse, _scaramuzza_limit, lambda c: c[..., 0].isfinite(), (0.0,) * 3),
-    POLYNOMIAL_FISHEYE: _Model(
-        polynomial_project, polynomial_unproject, polynomial_limit, lambda c: c[..., 0].isfinite(), (0.0,) * 3
-    ),
     THIN_PRISM_FISHEYE: _Model(
         _equidistant,
         _equidistant_inverse,

@@ -1,4 +1,4 @@
-"""Polynomials of the angle from the optical axis, and their inverses: Kannala-Brandt's of odd powers; of all powers."""
+"""The odd polynomial of the angle from the optical axis (Kannala and Brandt), and its inverse."""
 
 from __future__ import annotations
 
@@ -79,70 +79,3 @@ def fisheye_limit(c: Tensor) -> Tensor:
     odd = torch.tensor([3.0, 5.0, 7.0, 9.0], dtype=torch.float64)
     slope = torch.cat([torch.ones_like(c[..., :1]).to(odd), c.detach().to(odd) * odd], -1)
     return first_root(slope).clamp_max(pi**2) * (1 - MARGIN)
-
-
-def polynomial_project(c: Tensor, X: Tensor) -> Tensor:
-    """Directions at the radius theta (1 + k2 theta + k3 theta^2 + k4 theta^3)."""
-    u = X[..., :2].square().sum(-1)
-    ratio = angle_over_radius(u, X[..., 2])
-    factor, _ = _polynomial_factor(c, ratio * _root(u))
-    return X[..., :2] * (ratio * factor)[..., None]
-
-
-def polynomial_unproject(c: Tensor, xy: Tensor) -> Tensor:
-    """The inverse, within the limit."""
-    r = _root(xy.square().sum(-1))
-    start = _traced_polynomial_angle if torch.compiler.is_compiling() else _polynomial_angle
-    theta = start(c.detach(), r.detach())
-    for _ in range(2):
-        factor, slope = _polynomial_factor(c, theta)
-        theta = theta - (theta * factor - r) / slope
-    factor, _ = _polynomial_factor(c, theta)
-    cosine, sinc = cosine_and_sinc(theta.square())
-    return torch.cat([xy * (sinc / factor)[..., None], cosine[..., None]], -1)
-
-
-def polynomial_limit(c: Tensor) -> Tensor:
-    """The squared radius at the angle up to which the radius rises, at most pi."""
-    theta = _polynomial_widest(c)
-    factor, _ = _polynomial_factor(c.detach().to(theta), theta)
-    return (theta * factor).square()
-
-
-def _polynomial_widest(c: Tensor) -> Tensor:
-    """The angle up to which the radius rises: float64 on the CPU."""
-    powers = torch.tensor([2.0, 3.0, 4.0], dtype=torch.float64)
-    c = c.detach().to(powers)
-    return first_root(torch.cat([torch.ones_like(c[..., :1]), c * powers], -1)).clamp_max(pi) * (1 - MARGIN)
-
-
-def _polynomial_factor(c: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
-    """Radius over angle, and the slope of the radius."""
-    k2, k3, k4 = c.unbind(-1)
-    return 1 + theta * (k2 + theta * (k3 + theta * k4)), 1 + theta * (2 * k2 + theta * (3 * k3 + theta * 4 * k4))
-
-
-@torch.no_grad()
-def _polynomial_angle(c: Tensor, r: Tensor) -> Tensor:
-    def radius(theta: Tensor) -> tuple[Tensor, Tensor]:
-        factor, slope = _polynomial_factor(c, theta)
-        return theta * factor, slope
-
-    return invert_increasing(radius, r, _polynomial_widest(c).to(r).expand_as(r))
-
-
-@torch.library.custom_op("arraygeom::polynomial_angle", mutates_args=(), schema="(Tensor c, Tensor r) -> Tensor")
-def _traced_polynomial_angle(c: Tensor, r: Tensor) -> Tensor:
-    """The same for torch.compile, which cannot follow iterations that numbers end."""
-    return _polynomial_angle(c, r).contiguous()
-
-
-@_traced_polynomial_angle.register_fake
-def _(c: Tensor, r: Tensor) -> Tensor:
-    return torch.empty_like(r, memory_format=torch.contiguous_format)
-
-
-def _root(u: Tensor) -> Tensor:
-    """The square root, with a gradient of 0 at 0."""
-    positive = u > 0
-    return torch.where(positive, torch.where(positive, u, 1.0).sqrt(), 0.0)

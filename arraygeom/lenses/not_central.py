@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import factorial
 from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..checks import checking
 from ..pixels import to_homogeneous
 from ..tracing import followed
-from .angular import BISECTIONS, NEWTON
-from .common import finite_points, unit
+from .common import cosine_and_sinc, finite_points, unit
 from .model import CameraModel, LensModel, beside_points
 
-ITERATIONS = 16
-"""Of the row at which a point is seen; each takes its error times the motion while a row's height is read."""
+ROWS, ANGLES = 12, 24
+"""Steps, at most, to the row at which a point is seen, and to the angle at which a pane is looked through."""
+FOLLOWED = 2
+"""Further steps, which first and second derivatives go through."""
+SETTLED = 64
+"""A solution is found where a step is this many roundings."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -94,21 +99,36 @@ class RollingShutter(BehindModel, name="rolling-shutter"):
     readout: Float[Tensor, "*b"]
 
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the row that sees a point is read, iterated; not valid where that does not converge."""
+        """Where the row that sees a point is read, by the secant method; not valid where that finds none."""
         X, finite = finite_points(X)
-        xy, valid = self._through(X)
-        for _ in range(ITERATIONS):
-            before = xy
-            xy, valid = self._through(self._at_rest(X, xy[..., 1]))
-            settled = (xy - before).abs().amax(-1) <= 64 * torch.finfo(xy.dtype).eps * (1 + xy.abs().amax(-1))
-            if not followed() and bool(settled.all()):
-                break
+        with torch.no_grad():
+            row, slope = self._row(X)
+        for _ in range(FOLLOWED if torch.is_grad_enabled() else 0):
+            row = row + (self._through(self._at_rest(X, row))[0][..., 1] - row) / (1 - slope)
+        xy, valid = self._through(self._at_rest(X, row))
+        settled = (xy[..., 1] - row).abs() <= SETTLED * torch.finfo(xy.dtype).eps * (1 + xy.abs().amax(-1))
         return xy, valid & finite & settled
+
+    def _row(self, X: Tensor) -> tuple[Tensor, Tensor]:
+        """The row that sees a point when it is read, and how far it moves while a row is read, in rows."""
+        before = self._through(X)[0][..., 1]
+        row, slope = before, torch.zeros_like(before)
+        last, rounding = torch.zeros_like(before), torch.finfo(before.dtype).eps
+        for _ in range(ROWS):
+            seen = self._through(self._at_rest(X, row))[0][..., 1]
+            step = row - last
+            moved = step.abs() > rounding**0.5
+            slope = torch.where(moved, (seen - before) / torch.where(moved, step, 1.0), slope).clamp(max=STEEPEST)
+            last, before = row, seen
+            row = row + (seen - row) / (1 - slope)
+            if not followed() and bool(((row - last).abs() <= SETTLED * rounding * (1 + row.abs())).all()):
+                break
+        return row, slope
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
         """Unit directions, in the frame of time 0."""
         ray, valid = self._ray(xy)
-        return _rotated(ray, self._turn(ray, xy[..., 1])), valid
+        return _rotated(ray, self.rotation, self._time(ray, xy[..., 1])), valid
 
     def origins(self, xy: Tensor) -> Tensor:
         """Where the camera is when the row is read."""
@@ -118,24 +138,43 @@ class RollingShutter(BehindModel, name="rolling-shutter"):
     def _time(self, points: Tensor, row: Tensor) -> Tensor:
         return beside_points(self.readout, points) * row
 
-    def _turn(self, points: Tensor, row: Tensor) -> Tensor:
-        return self._time(points, row)[..., None] * beside_points(self.rotation, points, 1)
-
     def _at_rest(self, X: Tensor, row: Tensor) -> Tensor:
         """Points in the frame of the camera when it reads a row."""
-        moved = X - self._time(X, row)[..., None] * beside_points(self.velocity, X, 1)
-        return _rotated(moved, -self._turn(X, row))
+        time = self._time(X, row)
+        return _rotated(X - time[..., None] * beside_points(self.velocity, X, 1), self.rotation, -time)
 
 
-def _rotated(v: Tensor, w: Tensor) -> Tensor:
-    """Vectors rotated by rotation vectors (Rodrigues), smooth at angle 0."""
-    squared = w.square().sum(-1, keepdim=True)
-    small = squared < 1e-6
-    angle = torch.where(small, 1.0, squared).sqrt()
-    sinc = torch.where(small, 1 - squared / 6, angle.sin() / angle)
-    versed = torch.where(small, 0.5 - squared / 24, (1 - angle.cos()) / angle.square())
-    once = torch.linalg.cross(w, v)
-    return v + sinc * once + versed * torch.linalg.cross(w, once)
+STEEPEST = 0.9
+"""The largest slope that a step is made by."""
+
+
+def _rotated(v: Tensor, rotation: Tensor, time: Tensor) -> Tensor:
+    """Vectors (*b, ..., 3) after a time at angular velocities (*b, 3) (Rodrigues), smooth at angle 0."""
+    w = beside_points(rotation, v, 1)
+    sinc, versed = _sinc_and_versed(time.square() * w.square().sum(-1))
+    once = _cross(w, v)
+    return v + (time * sinc)[..., None] * once + (time.square() * versed)[..., None] * _cross(w, once)
+
+
+def _sinc_and_versed(squared: Tensor) -> tuple[Tensor, Tensor]:
+    """sin(t) / t and (1 - cos(t)) / t^2 of squared angles t^2; by their series alone where all are small."""
+    if followed() or bool((squared > SMALL).any()):
+        sinc, half = cosine_and_sinc(squared)[1], cosine_and_sinc(squared / 4)[1]
+        return sinc, 0.5 * half.square()
+    sinc, versed = torch.zeros_like(squared), torch.zeros_like(squared)
+    for k in reversed(range(7)):
+        sinc, versed = 1 / factorial(2 * k + 1) - squared * sinc, 1 / factorial(2 * k + 2) - squared * versed
+    return sinc, versed
+
+
+SMALL = 0.1
+"""Squared angles up to which the eighth term of their series is below rounding."""
+
+
+def _cross(w: Tensor, v: Tensor) -> Tensor:
+    """Cross products by their parts: `torch.linalg.cross` of a broadcast vector takes three times as long."""
+    (wx, wy, wz), (x, y, z) = w.unbind(-1), v.unbind(-1)
+    return torch.stack([wy * z - wz * y, wz * x - wx * z, wx * y - wy * x], -1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -143,7 +182,7 @@ class FlatPort(BehindModel, name="flat-port"):
     """A camera in air that looks into water through a flat pane of glass, which is at right angles to its axis.
 
     distance: from the camera's centre to the pane, metres. thickness: of the pane, metres. glass, water: their
-    refractive indices (Treibitz, Schechner, Kunz and Singh 2012).
+    refractive indices, at least 1 (Treibitz, Schechner, Kunz and Singh 2012).
     """
 
     central: ClassVar[bool] = False
@@ -152,29 +191,35 @@ class FlatPort(BehindModel, name="flat-port"):
     glass: Float[Tensor, "*b"]
     water: Float[Tensor, "*b"]
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if checking() and not all(bool((n >= 1).all()) for n in (self.glass, self.water)):
+            raise ValueError("glass and water are refractive indices, at least 1, as 1.52 and 1.333")
+
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Points in the water, by the angle in air whose ray reaches them: bisection, and steps of Newton's."""
+        """Points in the water, by the tangent in air of the ray that reaches them.
+
+        By Newton's method on the tangent over the radius, from its value on the axis: how far off axis a ray gets is
+        concave in its tangent, so that no step goes too far.
+        """
         X, finite = finite_points(X)
-        layers = self._layers(X)
+        distance, thickness = self._layers(X)
+        valid = finite & (X[..., 2] > distance + thickness)
+        depths = thickness, torch.where(valid, X[..., 2] - distance - thickness, 1.0)
         squared = X[..., :2].square().sum(-1)
-        off = squared > 0
-        radius = torch.where(off, torch.where(off, squared, 1.0).sqrt(), 0.0)
-        valid = finite & (X[..., 2] > layers[0] + layers[1])
-        depths = layers[0], layers[1], torch.where(valid, X[..., 2] - layers[0] - layers[1], 1.0)
         with torch.no_grad():
-            low, high = torch.zeros_like(radius), torch.ones_like(radius)
-            for _ in range(BISECTIONS):
-                middle = 0.5 * (low + high)
-                beyond = self._reached(middle, depths)[0] > radius
-                low, high = torch.where(beyond, low, middle), torch.where(beyond, middle, high)
-            sine = low
-        for _ in range(NEWTON):
-            found, slope = self._reached(sine, depths)
-            sine = (sine - (found - radius) / slope).clamp(0, 1)
-        share = torch.where(off, sine / torch.where(off, radius, 1.0), 1 / self._reached(0 * sine, depths)[1])
-        cosine = (1 - sine.square()).clamp(min=1e-12).sqrt()
-        xy, seen = self._through(torch.cat([X[..., :2] * share[..., None], cosine[..., None]], -1))
-        return xy, valid & seen
+            share, settled = torch.zeros_like(squared), valid
+            for _ in range(ANGLES):
+                step = self._step(share, squared, depths)
+                share = share + step
+                settled = step.abs() <= SETTLED * torch.finfo(share.dtype).eps * share
+                if not followed() and bool((settled | ~valid).all()):
+                    break
+        share = torch.where(settled, share, 0.0)
+        for _ in range(FOLLOWED if torch.is_grad_enabled() else 0):
+            share = share + self._step(share, squared, depths)
+        xy, seen = self._through(to_homogeneous(X[..., :2] * share[..., None]))
+        return xy, valid & settled & seen
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
         """Unit directions in the water, by Snell's law."""
@@ -196,12 +241,12 @@ class FlatPort(BehindModel, name="flat-port"):
     def _layers(self, points: Tensor) -> tuple[Tensor, Tensor]:
         return beside_points(self.distance, points), beside_points(self.thickness, points)
 
-    def _reached(self, sine: Tensor, depths: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """How far off axis the ray of a sine in air gets through layers of air, glass and water; the derivative."""
-        indices = (torch.ones_like(sine), *(beside_points(n, sine[..., None]) for n in (self.glass, self.water)))
-        radius, slope = torch.zeros_like(sine), torch.zeros_like(sine)
-        for depth, index in zip(depths, indices):
-            squared = (index.square() - sine.square()).clamp(min=1e-12)
-            radius = radius + depth * sine / squared.sqrt()
-            slope = slope + depth * index.square() / squared**1.5
-        return radius, slope
+    def _step(self, share: Tensor, squared: Tensor, depths: tuple[Tensor, Tensor]) -> Tensor:
+        """Newton's, to the tangent in air over the radius whose ray gets as far as the (squared) radius."""
+        across = squared * share.square()
+        reached = slope = self._layers(share[..., None])[0]
+        for depth, number in zip(depths, (self.glass, self.water)):
+            index = beside_points(number, share[..., None]).square()
+            bent = (index + (index - 1) * across).rsqrt()
+            reached, slope = reached + depth * bent, slope + depth * index * bent**3
+        return (1 - share * reached) / slope

@@ -11,13 +11,13 @@ import torch
 from jaxtyping import Float
 
 from arraygeom import Camera, Pose, Rig
+from arraygeom.lenses.model import LensModel
 from arraygeom.pose import cross_matrix, rotation_vector
 
 TYPICAL_COEFFICIENTS = {
     "brown-conrady": (1.0, 1.0, 0.02, 0.02, 1.0, 1.0, 1.0, 1.0, 0.02, 0.02, 0.02, 0.02, 0.1, 0.1),
     "kannala-brandt": (0.3, 0.3, 0.3, 0.3),
     "thin-prism-fisheye": (0.3, 0.3, 0.02, 0.02, 0.3, 0.3, 0.02, 0.02),
-    "pix4d-fisheye": (0.1, 0.1, 0.1),
     "double-sphere": (0.3, 0.3),
     "extended-unified": (0.3, 0.5),
     "unified": (1.0, 1.0, 1.0, 0.02, 0.02),
@@ -29,7 +29,6 @@ LENS_TERMS = {
     "brown-conrady": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty"),
     "kannala-brandt": ("k1", "k2", "k3", "k4"),
     "thin-prism-fisheye": ("k1", "k2", "p1", "p2", "k3", "k4", "sx", "sy"),
-    "pix4d-fisheye": ("k2", "k3", "k4"),
     "double-sphere": ("xi", "alpha"),
     "extended-unified": ("alpha", "beta"),
     "unified": ("xi", "k1", "k2", "p1", "p2"),
@@ -37,6 +36,19 @@ LENS_TERMS = {
     "scaramuzza": ("b2", "b3", "b4"),
 }
 """Names of the coefficients, in order."""
+
+
+def typical_coefficients(lens: LensModel) -> tuple[float, ...]:
+    """Usual sizes of a lens's numbers; 1 for those of a camera model."""
+    count = lens.coefficients.shape[-1]
+    return TYPICAL_COEFFICIENTS.get(lens.model, (1.0,) * count)[:count]
+
+
+def term(lens: LensModel, index: int) -> str:
+    """The name of a lens's number."""
+    return LENS_TERMS[lens.model][index] if lens.model in LENS_TERMS else f"number {index + 1}"
+
+
 TYPICAL_FOCAL_ERROR, TYPICAL_CENTRE_ERROR = 0.1, 0.1
 """Likewise of the error of a guessed focal length, as a share of it, and of the principal point, of the width."""
 CENTRE_DEVIATION, ASPECT_DEVIATION = 0.03, 0.01
@@ -110,7 +122,7 @@ def described_default(camera: Camera, entry: str) -> str:
     if kind == "centre":
         return f"the principal point's {'xy'[int(index)]} is fixed at the image's centre"
     assert camera.distortion is not None
-    return f"the lens's {LENS_TERMS[camera.distortion.model][int(index)]} is fixed at 0"
+    return f"the lens's {term(camera.distortion, int(index))} is fixed at 0"
 
 
 # Priors -------------------------------------------------------------------------------------------------------
@@ -153,7 +165,7 @@ def typical_sizes(camera: Camera) -> Float[np.ndarray, " p"]:
     """Typical errors of a camera's parameters before any measurement, in the order of `parameter_names`."""
     focal = TYPICAL_FOCAL_ERROR * _mean_focal(camera)
     lens = camera.distortion
-    coefficients = () if lens is None else TYPICAL_COEFFICIENTS[lens.model][: len(lens.coefficients)]
+    coefficients = () if lens is None else typical_coefficients(lens)
     return np.array([3.0] * 3 + [100.0] * 3 + [focal] * 2 + [TYPICAL_CENTRE_ERROR * camera.hw[1]] * 2 + [*coefficients])
 
 

@@ -22,7 +22,7 @@ from .figures import (
     draw_worst_images,
     image,
 )
-from .parameters import LENS_TERMS
+from .parameters import term
 from .photos import Photos
 from .rig import Calibration
 from .uncertainty import baseline_deviation, rig_covariance
@@ -188,7 +188,7 @@ def _with_deviations(calibration: Calibration, name: str, camera: Camera, kind: 
     }[kind].tolist()
     texts = []
     for i, value in enumerate(values):
-        label = "" if kind != "distortion" or lens is None else f"{LENS_TERMS[lens.model][i]} "
+        label = "" if kind != "distortion" or lens is None else f"{term(lens, i)} "
         if f"{name}.{kind}.{i}" not in calibration.fit.names:
             texts.append(f"{label}{value:.4g} (fixed)" if value or kind != "distortion" else "")
             continue

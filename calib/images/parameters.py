@@ -15,11 +15,11 @@ from torch import Tensor
 from arraygeom import Camera, LensView, Link, Rig, rotation_from_vector
 from arraygeom.pixels import HW
 
-from ..boards.parameters import TYPICAL_COEFFICIENTS
+from ..boards.parameters import typical_coefficients
 
 SIGMA = {"rotation": math.radians(0.5), "translation": 0.01, "focal": 0.01, "centre": 5.0, "distortion": 0.02}
 """Default standard deviations: radians, a share of the longest baseline, a share of the focal length, pixels of the
-principal point, and a share of `TYPICAL_COEFFICIENTS`."""
+principal point, and a share of `typical_coefficients`."""
 UNCERTAIN = ("rotation", "translation", "focal", "centre")
 """Kinds of parameters that are uncertain even where they are not free."""
 ALIASES = {"principal_point": "centre", "focal_length": "focal"}
@@ -145,7 +145,7 @@ def _free_parameter(rig: Rig, name: str, like: Tensor, sigma: Mapping[str, float
     if kind == "focal" and isinstance(view, Camera):
         size = size * view.K[:2, :2].abs().amax(0)
     if kind == "distortion" and isinstance(view, LensView) and view.distortion is not None:
-        natural = torch.tensor(TYPICAL_COEFFICIENTS[view.distortion.model][: len(size)], dtype=torch.float64)
+        natural = torch.tensor(typical_coefficients(view.distortion), dtype=torch.float64)
         size = natural * (sigma[kind] if isinstance(view, Camera) else LENS_SIGMA)
     if kind == "translation":
         size = size * _longest_baseline(rig)

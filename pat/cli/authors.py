@@ -246,6 +246,9 @@ class Ablate:
 
         if not isinstance(network, Comparing):
             raise ValueError(f"--weights {self.weights} needs --families: this network matches without attention, too")
+        if network.betas not in (1, 3):
+            wanted = "give some for one beta in colour, or for three with a band each"
+            raise ValueError(f"--weights {self.weights}: they are for {network.betas} betas: {wanted}")
         return network
 
     def _known(self, fields: Mapping[str, object]) -> None:

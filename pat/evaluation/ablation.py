@@ -24,6 +24,7 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom import (
     Camera,
+    Curved,
     Dense,
     Epipolar,
     HomographyDisplacement,
@@ -38,10 +39,12 @@ from arraygeom import (
     apply_homography,
     pixel_grid,
     rotation_from_vector,
+    world_rays,
 )
 from arraygeom.atomic import write_text
+from arraygeom.fields.default import natural_bounds
 from arraygeom.fields.straight import covering_displacement
-from arraygeom.pixels import HW
+from arraygeom.pixels import HW, coarse_grid
 from arraygeom.segments import clip_to_image
 
 from ..fusion.fuse import fuse
@@ -98,7 +101,7 @@ class FieldFamily:
     If `warped`, both images are rectified by that rig before, and the result is warped back.
     """
 
-    field: Callable[[float], ReceptiveField]
+    field: Callable[[float], ReceptiveField | None]
     assumed: Callable[[Rig, Generator], Rig] = lambda rig, g: rig
     warped: bool = False
 
@@ -149,7 +152,7 @@ class HorizontalDisplacement:
 def families() -> dict[str, FieldFamily]:
     """Every family by name, `calibrated` first."""
     exact = {
-        "calibrated": FieldFamily(lambda disparity: Epipolar()),
+        "calibrated": FieldFamily(lambda disparity: None),  # the default
         "rectified, warped": FieldFamily(lambda disparity: Epipolar(), warped=True),
         "rectified assumption": FieldFamily(lambda disparity: Rectified(2 * disparity, alpha_is="either")),
         "rows around H x": FieldFamily(HorizontalDisplacement),
@@ -165,6 +168,10 @@ def families() -> dict[str, FieldFamily]:
 
 def disparity(network: FusionNetwork, pair: Pair) -> float:
     """The largest displacement of a point from H x, pixels of beta as the network gets it."""
+    if pair.has_lens:
+        found = Curved(bounds=natural_bounds(pair))(pair, coarse_grid(pair.alpha.hw).reshape(-1, 2).double())
+        reached = (found.xy - found.xy[:, :1]).norm(dim=-1)[found.mask & found.mask[:, :1]]
+        return float(reached.amax()) if len(reached) else 1.0
     scale = resolution_ratio(pair)
     resized = network.equal_resolution and not 0.8 < scale < 1.25
     return max(float(covering_displacement(pair)) / (scale if resized else 1.0), 1.0)
@@ -283,7 +290,8 @@ def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float
     """
     alpha, beta = case.rig.pair(ALPHA, BETA).cameras
     x = pixel_grid(alpha.hw, dtype=torch.float64).reshape(-1, 2)
-    ours, theirs = (beta.project(alpha.unproject(x, d.reshape(-1).double())) for d in (depth, case.depth))
+    unproject = _at_distance if natural_bounds(case.rig.pair(ALPHA, BETA)) == "distance" else Camera.unproject
+    ours, theirs = (beta.project(unproject(alpha, x, d.reshape(-1).double())) for d in (depth, case.depth))
     known = theirs.valid & theirs.x.isfinite().all(-1)
     compared = known & ours.valid & ours.x.isfinite().all(-1)
     if not compared.any():
@@ -292,7 +300,12 @@ def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float
     return float(error.mean()), float((error <= 1).sum() / known.sum())
 
 
-def unsupported(network: FusionNetwork, field: ReceptiveField, rig: Rig) -> str:
+def _at_distance(camera: Camera, x: Tensor, distance: Tensor) -> Tensor:
+    rays = world_rays(camera, x)
+    return torch.where(rays.valid[..., None], rays.origin + distance[..., None] * rays.direction, torch.nan)
+
+
+def unsupported(network: FusionNetwork, field: ReceptiveField | None, rig: Rig) -> str:
     """Why a network cannot use a field; empty if it can."""
     pair = rig.pair(ALPHA, BETA)
     if isinstance(field, Dense):

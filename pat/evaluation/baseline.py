@@ -109,8 +109,10 @@ def classical_calibrated(
 
     Both are rectified to one image plane with about alpha's resolution and matched there for depths near to far; the
     colour differences (for one band: what beta has more than alpha) are warped back to alpha. Values 0..1. Raises
-    ValueError if 0 < near < far does not hold, and for cameras that look along the line between them.
+    ValueError if 0 < near < far does not hold, for lenses, and for cameras that look along the line between them.
     """
+    if pair.has_lens:
+        raise ValueError("the classical baseline needs pinhole cameras: undistort the images first")
     near, far = (float(d) for d in pair.depth_range)
     if not 0 < near < far:
         raise ValueError(f"depth must be 0 < near < far, got {near} to {far}")

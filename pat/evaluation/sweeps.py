@@ -252,6 +252,13 @@ def two(rig: Rig) -> Rig:
     """The first two cameras, as alpha and beta. Raises ValueError unless they are calibrated, with a depth range."""
     first, second = rig.names[:2]
     cameras = rig.pair(first, second).cameras
+    for name, camera in zip((first, second), cameras):
+        if camera.distortion is not None:
+            model = camera.distortion.model
+            raise ValueError(
+                f"these scenes are made for pinholes and '{name}' has a lens ({model}): give scenes of your own to "
+                "pat.evaluation.ablation.ablate"
+            )
     return Rig(dict(zip((ALPHA, BETA), cameras)), depth=tuple(float(d) for d in rig.pair(first, second).depth_range))
 
 

@@ -77,7 +77,8 @@ class PAT(nn.Module):
     def compare(self, inputs: Inputs) -> tuple[FusionOutput, list[Compared]]:
         """The fused image, and what attention compares in each beta. Raises as `forward`."""
         if len(inputs.betas) != self.config.betas:
-            raise ValueError(f"this PAT is made for {self.config.betas} betas, got {len(inputs.betas)}")
+            asked = f"this PAT is made for {self.config.betas} betas, got {len(inputs.betas)}"
+            raise ValueError(f"{asked}: give as many cameras beside alpha, or other --weights")
         own = self.features(self._channels(inputs.alpha))
         others = [self.features(self._channels(beta.image)) for beta in inputs.betas]
         compared = self.engine.compare(own, others, [beta.field for beta in inputs.betas])

@@ -21,6 +21,7 @@ from arraygeom import (
     Segments,
     ThroughLenses,
     View,
+    default_field,
     depth_of,
     epipolar_lines,
     epipoles,
@@ -28,12 +29,14 @@ from arraygeom import (
     pixel_grid,
     rectify,
     sample,
+    sampling_locations,
     triangulate,
 )
 from arraygeom.distortion import COEFFICIENT_COUNTS
 from arraygeom.fields.straight import covering_displacement
 from pat.attention import attend
 from tests.arraygeom.rigs import random_rig
+from tests.arraygeom.test_camera_models import MODELS
 from tests.arraygeom.test_precision import FIELDS, WHOLE
 
 F64 = torch.float64
@@ -63,10 +66,14 @@ def test_the_nearest_pixel_of_halves_is_the_same_everywhere(width):
     assert attend(query, torch.ones_like(image), image, where, interpolation="nearest").flatten().equal(found)
 
 
-@pytest.mark.parametrize("model", COEFFICIENT_COUNTS)
+LENSES = {name: Distortion(name, torch.full((counts[0],), 0.01)) for name, counts in COEFFICIENT_COUNTS.items()}
+LENSES |= {name: model.to(torch.float32) for name, (model, _) in MODELS.items() if model.central and name != "own"}
+
+
+@pytest.mark.parametrize("model", LENSES)
 @pytest.mark.parametrize("size", [1e18, 1e20, 3e38])
 def test_lenses_are_finite_at_huge_points_in_float32(model, size):
-    lens = Distortion(model, torch.full((COEFFICIENT_COUNTS[model][0],), 0.01))
+    lens = LENSES[model]
     X = torch.tensor([[size, 0, 1], [size, size, size], [0, 0, size], [size, -size, -size], [1, 1, 1 / size]])
     X.requires_grad_()
     for value, _ in (lens.project(X), *(f(X[:, :2]) for f in (lens.distort, lens.undistort, lens.unproject))):
@@ -75,6 +82,17 @@ def test_lenses_are_finite_at_huge_points_in_float32(model, size):
     (large, valid), (small, expected) = lens.project(X), lens.project(X.detach() / size)
     assert valid[1:4].equal(expected[1:4])
     torch.testing.assert_close(large[1:4][valid[1:4]], small[1:4][valid[1:4]], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("model", [name for name, (model, _) in MODELS.items() if not model.central])
+def test_cameras_whose_rays_do_not_meet_are_finite_at_huge_points(model):
+    """As far away as they are followed; their values are those of float64 there."""
+    X = torch.tensor([[1e9, 0, 1], [1e18, 1e18, 1e18], [0, 0, 3e38], [1e20, -1e20, -1e20], [1, 1, 1e-20]])
+    X.requires_grad_()
+    lens = MODELS[model][0].to(torch.float32)
+    for value in (lens.project(X)[0], lens.unproject(X[:, :2])[0]):
+        assert value.isfinite().all()
+        assert not value.requires_grad or torch.autograd.grad(value.sum(), X)[0].isfinite().all()
 
 
 @pytest.mark.parametrize("near", [1e-38, 1e-30, 1e-20])
@@ -216,3 +234,39 @@ def test_a_number_of_samples_by_the_longest_segment_cannot_be_traced():
     with pytest.raises(NotImplementedError, match=r"the longest segment \(give `samples`\) depends on numbers"):
         torch.vmap(attended)(starts)
     torch.testing.assert_close(torch.vmap(lambda s: attended(s, 5))(starts)[0], attended(starts[0], 5))
+
+
+FAR_ORIGIN = torch.tensor([500_000.0, 5_000_000.0, 300.0], dtype=F64)
+"""As of UTM coordinates, metres."""
+
+
+def in_utm(rig: Rig) -> Rig:
+    moved = {}
+    for name, camera in rig.cameras.items():
+        pose = camera.cam_from_world
+        moved[name] = camera.replace(cam_from_world=Pose(pose.R, pose.t - pose.R @ FAR_ORIGIN))
+    return Rig(moved, depth=rig.depth)
+
+
+@pytest.mark.parametrize("rig", [pinholes(), bent()], ids=["pinholes", "lenses"])
+def test_rigs_in_map_coordinates_are_right_or_refused(rig):
+    """To a hundredth of a pixel in float64, whatever the pixels' type; float32 would hold the poses to half a metre."""
+    here, there = (r.pair("alpha", "beta") for r in (rig, in_utm(rig)))
+    for dtype in (F64, torch.float32):
+        x = torch.tensor([[20.0, 12.0], [31.0, 25.0]], dtype=dtype)
+        for field in (default_field(here), EpipolarLine() if not here.has_lens else Curved(8)):
+            found = [sampling_locations(field, pair, x) for pair in (here, there)]
+            one, other = (f if isinstance(f, Positions) else f.positions(5) for f in found)
+            assert torch.equal(one.mask, other.mask)
+            assert float((one.xy - other.xy).abs().max()) < 0.01
+        assert x.dtype == one.xy.dtype
+    X = torch.tensor([[0.1, 0.2, 4.0]], dtype=F64)
+    pixels = [torch.stack([c.project(X + FAR_ORIGIN).x for c in there.cameras]).to(t) for t in (F64, torch.float32)]
+    for x in pixels:
+        assert float((triangulate(there.cameras, x).X - FAR_ORIGIN - X).abs().max()) < 1e-3
+    single = in_utm(rig).to(torch.float32).pair("alpha", "beta")
+    with pytest.raises(ValueError, match=r"m from the origin, which float32 holds to 0\.[3-6] m: give float64"):
+        default_field(single)(single, torch.tensor([[20.0, 12.0]]))
+    camera = there.cameras[0]
+    with pytest.raises(ValueError, match="put the origin near the cameras"):
+        Camera(K=camera.K.float(), cam_from_world=Pose(camera.R.float(), camera.t.float()), hw=camera.hw)

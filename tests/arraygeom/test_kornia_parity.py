@@ -10,6 +10,10 @@ from kornia.geometry.camera import PinholeCamera, project_points, unproject_poin
 from kornia.geometry.liegroup import Se3, So3
 from kornia.geometry.linalg import inverse_transformation, transform_points
 from kornia.geometry.transform import remap
+from kornia.geometry.vector import Vector2, Vector3
+from kornia.image import ImageSize
+from kornia.sensors.camera import CameraModel as KorniaModel
+from kornia.sensors.camera import CameraModelType
 from torch import Tensor
 
 from arraygeom import (
@@ -29,6 +33,8 @@ from arraygeom import (
     stack,
     triangulate,
 )
+from arraygeom.kornia_models import from_kornia_model, to_kornia_model
+from arraygeom.lenses import Orthographic
 from arraygeom.pose import cross_matrix, rotation_vector
 from tests.arraygeom.rigs import random_rig, scene_points
 
@@ -239,7 +245,58 @@ def test_unequal_batches_and_lenses_are_refused():
     with pytest.raises(ValueError, match=r"batches of one length, got {'a': 2, 'b': 3}"):
         Rig.from_kornia({"a": pinhole(2), "b": pinhole(3)})
     bent = RIG.with_camera("beta", BETA.replace(distortion=Distortion("brown-conrady", LENS)))
-    with pytest.raises(ValueError, match="no lens model"):
+    with pytest.raises(ValueError, match=r"have no pose \(beta\)"):
         bent.to_kornia()
     with pytest.raises(ValueError, match="kornia has no camera without a calibration: b"):
         Rig({"a": ALPHA, "b": LensView(hw=(4, 4), K=ALPHA.K)}).to_kornia()
+
+
+MODELS = {
+    "pinhole": (None, ALPHA),
+    "brown": (Distortion("brown-conrady", LENS), ALPHA),
+    "four": (Distortion("brown-conrady", LENS[:4]), ALPHA),
+    "fisheye": (Distortion("kannala-brandt", torch.tensor([0.05, -0.01, 0.002, -1e-3], dtype=F64)), ALPHA),
+    "parallel": (Orthographic(), ALPHA.replace(K=intrinsics(20.0, ALPHA.hw))),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_lenses_are_kornias_camera_models(name):
+    """Values and gradients in the numbers, there; the same camera, back."""
+    lens, camera = MODELS[name]
+    camera = camera.replace(distortion=lens)
+    theirs = to_kornia_model(camera)
+    X = torch.rand(40, 3, dtype=F64, generator=torch.Generator().manual_seed(0)) - 0.5 + torch.tensor([0, 0, 2.0])
+    back = Camera.from_kornia(theirs, cam_from_world=camera.cam_from_world)
+    params = theirs.params.clone().requires_grad_()
+    kinds = {4: "ORTHOGRAPHIC" if name == "parallel" else "PINHOLE", 8: "KANNALA_BRANDT_K3", 12: "BROWN_CONRADY"}
+    free = KorniaModel(ImageSize(*camera.hw), CameraModelType[kinds[len(params)]], params)
+    expected = free.project(Vector3(X)).data
+    found = from_kornia_model(free, camera.cam_from_world).project_local(X)
+    assert bool(found.valid.all())
+    torch.testing.assert_close(found.x, expected, rtol=0, atol=1e-9)
+    slopes = [torch.autograd.grad(x.square().sum(), params, retain_graph=True)[0] for x in (found.x, expected)]
+    torch.testing.assert_close(*slopes, rtol=1e-9, atol=1e-6)
+    rays, _ = back.rays(found.x.detach())
+    if name != "parallel":
+        near = theirs.unproject(Vector2(found.x.detach()), torch.ones(40, dtype=F64)).data
+        torch.testing.assert_close(rays / rays[:, 2:], near, rtol=0, atol=1e-3)  # theirs stops after 5 or 10 steps
+        torch.testing.assert_close(rays / rays[:, 2:], X / X[:, 2:], rtol=0, atol=1e-9)
+    if name != "four":
+        assert back == camera
+    assert type(camera.to_kornia()).__name__ == ("PinholeCamera" if lens is None else "CameraModel")
+    both = from_kornia_model(to_kornia_model(stack([camera, camera])))
+    assert both.batch_shape == (2,)
+    torch.testing.assert_close(both.project_local(X.expand(2, 40, 3)).x[1], found.x.detach())
+
+
+def test_lenses_that_kornia_lacks_are_named():
+    prism = torch.cat([LENS, torch.full((4,), 0.01, dtype=F64)])
+    for lens, what in (
+        (Distortion("double-sphere", LENS[:2]), "kornia has no double-sphere model: it has pinholes"),
+        (Distortion("brown-conrady", prism), "this lens also prism or tilt terms"),
+    ):
+        with pytest.raises(ValueError, match=what):
+            ALPHA.replace(distortion=lens).to_kornia()
+    with pytest.raises(ValueError, match="skewed or rotated"):
+        ALPHA.replace(distortion=Distortion("brown-conrady", LENS)).rot90(1).to_kornia()

@@ -35,7 +35,7 @@ SLOW = [pytest.param(n, marks=pytest.mark.slow) for n in ("fisheye", "equirectan
 def test_a_camera_of_any_model_is_fused(name):
     model, focal = MODELS[name]
     R = rotation_from_vector(number(0.0, 0.12 if name == "orthographic" else -0.01, 0.0))
-    t = number(0.0, 0.0, 2.5) - R @ number(0.0, 0.0, 2.5) if name == "orthographic" else number(-0.15, 0.01, 0.0)
+    t = number(0.0, 0.0, 2.5) - R @ number(0.0, 0.0, 2.5) if name == "orthographic" else number(-0.25, 0.01, 0.0)
     poses = Pose.identity(), Pose(R, t)
     cameras = [Camera(K=intrinsics(focal, HW), cam_from_world=p, hw=HW, distortion=model) for p in poses]
     wide = name in ("fisheye", "equirectangular")
@@ -45,7 +45,7 @@ def test_a_camera_of_any_model_is_fused(name):
         warnings.simplefilter("error")
         frame = fuse(load_weights("mono-colour"), rig, images, alpha="alpha")
     alone, fused = (score(i.clamp(0, 1), truth).psnr for i in (images["alpha"].expand(3, -1, -1), frame.image))
-    assert fused > alone + 5
+    assert fused > alone + 4
     X, distance = hit(cameras[0], pixel_grid(HW, dtype=torch.float64))
     wanted = distance if wide else X[..., 2]
     assert float(((frame.depth - wanted) / wanted).abs().nanmedian()) < 0.1
