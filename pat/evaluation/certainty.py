@@ -19,6 +19,8 @@ from rich.progress import track
 from torch import Generator, Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
+from arraygeom.atomic import write_text
+
 from ..data.pairs import PAPER_DISPARITY, StereoPair, middlebury_pairs
 from ..fusion.fuse import fuse
 from ..matching.certainty import SETTINGS, CertaintyNetwork, fitted_network, measured, typical_facts
@@ -220,8 +222,8 @@ class CertaintyRun:
     """The network that fuses."""
     fit: Path | None = None
     """Fit to these pairs, and write that here."""
-    figure: Path | None = None
-    """Write the reliability diagram here."""
+    out: Path | None = None
+    """Folder for certainty.md, the tables, and reliability.png."""
 
 
 def main(run: CertaintyRun) -> str:
@@ -231,9 +233,11 @@ def main(run: CertaintyRun) -> str:
     if run.fit:
         write_tensors(run.fit, fitted(found).state_dict())
     shown = held(found, by_thirds(found) if run.fit else lambda one: Stated.by(fitted_network(), one.numbers))
-    if run.figure:
-        save_reliability(shown, run.figure)
-    return held_markdown(shown)
+    text = held_markdown(shown)
+    if run.out:
+        save_reliability(shown, run.out / "reliability.png")
+        write_text(run.out / "certainty.md", text)
+    return text
 
 
 if __name__ == "__main__":
