@@ -53,8 +53,10 @@ def cell_parts(cell: dict[str, Any]) -> list[str]:
 
 
 def shown(output: dict[str, Any]) -> str:
-    """An image, or text."""
+    """An image, a table, or text."""
     data = output.get("data", {})
+    if "text/markdown" in data:
+        return "".join(data["text/markdown"])
     for kind in ("image/jpeg", "image/png"):
         if kind in data:
             return f"![](data:{kind};base64,{''.join(data[kind]).replace(chr(10), '')})"

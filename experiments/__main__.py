@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal
 from tyro.conf import Positional
 
 from pat.cli.main import main
-from pat.cli.options import MaybeOut, MaybePath, Memory, Out, Weights, say, writable
+from pat.cli.options import MaybeOut, MaybePath, Memory, Out, Weights, say, working, writable
 
 
 @dataclass
@@ -30,6 +30,30 @@ class Showcase:
         writable(self.out, folder=True)
         print(showcase(self.data, self.out, self.weights), end="")
         say(f"written: {self.out / 'showcase.md'}, and its figures and rig files")
+
+
+@dataclass
+class Alignment:
+    """Measure how well bands are aligned, beside a homography: stereo pairs as bands, multispectral cameras."""
+
+    data: Path = Path("data")
+    """Folder with middlebury, multispectral and nine_band_array."""
+    scenes: tuple[str, ...] = ("middlebury", "rededge", "sequoia", "nine-band")
+    """Some of these, or motorcycle, which needs no data."""
+    out: Out = Path("out/alignment")
+    """Folder for alignment.md and a figure of each scene."""
+    confidence: float = 0.5
+    """As of `pat align`: from which confidence on a camera counts as seeing a point."""
+
+    def run(self) -> None:
+        """Write and print the table. Raises ValueError or FileNotFoundError naming what is missing."""
+        from .alignment import evaluate_alignment
+
+        writable(self.out, folder=True)
+        with working("aligning") as retitle:
+            text = evaluate_alignment(self.data, self.out, self.scenes, min_confidence=self.confidence, each=retitle)
+        print(text, end="")
+        say(f"written: {self.out / 'alignment.md'}, and figures")
 
 
 @dataclass
@@ -96,7 +120,7 @@ class Systems:
 class Experiments:
     """Run the paper's arrays, and fuse real images."""
 
-    commands: ClassVar[Mapping[str, Any]] = {"systems": Systems, "showcase": Showcase}
+    commands: ClassVar[Mapping[str, Any]] = {"systems": Systems, "showcase": Showcase, "alignment": Alignment}
 
 
 if __name__ == "__main__":

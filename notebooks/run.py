@@ -18,6 +18,7 @@ def execute(notebook: nbformat.NotebookNode, folder: Path) -> nbformat.NotebookN
     patience = {"timeout": 1800, "startup_timeout": 600, "iopub_timeout": 120}  # seconds, for machines with other work
     client = NotebookClient(notebook, kernel_name="python3", resources={"metadata": {"path": str(folder)}}, **patience)
     client.execute(env={**os.environ, "PYTHONPATH": str(HERE.parent)})
+    notebook.metadata.pop("widgets", None)  # the state of the explorer: images again, of no use without a kernel
     for cell in notebook.cells:
         cell.metadata.pop("execution", None)
         for output in cell.get("outputs", []):

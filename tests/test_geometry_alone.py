@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from importlib.metadata import distribution
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
-NEEDED = ("torch", "kornia", "numpy", "PyYAML", "jaxtyping", "pytest", "pytest-timeout", "hypothesis")
+NEEDED = ("torch", "kornia", "numpy", "PyYAML", "jaxtyping", "filelock", "pytest", "pytest-timeout", "hypothesis")
 
 
 def with_requirements(names):
@@ -33,6 +34,15 @@ def link_packages(folder):
         for top in {file.parts[0] for file in one.files or ()} - {"..", "__pycache__"}:
             if not (folder / top).exists():
                 (folder / top).symlink_to(one.locate_file(top))
+
+
+def test_its_own_distribution_agrees_with_that_of_the_whole():
+    """Version, bounds of what it needs, and packages: `make wheel` installs it alone."""
+    own, whole = (tomllib.loads((ROOT / path).read_text()) for path in ("arraygeom/pyproject.toml", "pyproject.toml"))
+    assert own["project"]["version"] == whole["project"]["version"]
+    assert set(own["project"]["dependencies"]) <= set(whole["project"]["dependencies"])
+    packages = {".".join(path.parent.relative_to(ROOT).parts) for path in (ROOT / "arraygeom").rglob("__init__.py")}
+    assert set(own["tool"]["setuptools"]["packages"]) == packages
 
 
 @pytest.mark.slow

@@ -272,7 +272,7 @@ class _Bytes:
     """A binary file read from front to back."""
 
     def __init__(self, source: RigSource) -> None:
-        self.source, self.data, self.at = source, source.path.read_bytes(), 0
+        self.source, self.data, self.at = source, source.content(), 0
 
     def take(self, layout: str) -> tuple[Any, ...]:
         """The next values."""

@@ -11,7 +11,7 @@ from ..pixels import HW
 
 PIX4D, DJI, MICASENSE = "pix4d.com", "drone-dji", "micasense.com/MicaSense"
 """Parts of the names of XMP's namespaces; those of Pix4D's `Camera:` differ between makers."""
-EXIF, WIDTH, HEIGHT = 0x8769, 256, 257
+EXIF, GPS, WIDTH, HEIGHT = 0x8769, 0x8825, 256, 257
 """Tags of TIFF (6.0) and EXIF (2.32)."""
 LARGEST_XMP = 1 << 20
 """Bytes of an XMP packet, at most: those of cameras have some tens of thousands."""
@@ -62,11 +62,12 @@ def _jpeg(content: bytes, xmp: dict[tuple[str, str], str]) -> ImageTags | None:
 
 
 def _fields(content: bytes) -> dict[int, tuple[Any, ...]]:
-    """Numbers and texts of the first directory of a TIFF file and of its EXIF directory."""
+    """Numbers and texts of the first directory of a TIFF file, and of its EXIF and GPS directories."""
     order = "<" if content.startswith(b"II") else ">"
     fields = _directory(content, order, struct.unpack_from(order + "I", content, 4)[0])
-    if EXIF in fields:
-        fields |= _directory(content, order, int(fields[EXIF][0]))
+    for inner in (EXIF, GPS):
+        if inner in fields:
+            fields |= _directory(content, order, int(fields[inner][0]))
     return fields
 
 

@@ -34,10 +34,7 @@ class _Element(NamedTuple):
 
 def load_variables(source: RigSource) -> dict[str, Any]:
     """The variables of a .mat file that consist of structs, cells, text and numbers, by name. Raises RigFileError."""
-    try:
-        data = source.path.read_bytes()
-    except OSError as error:
-        raise source.fail(None, f"cannot be read: {error.strerror}") from None
+    data = source.content()
     if not data:
         raise source.fail(None, "is empty")
     if data.startswith(b"MATLAB 7.3"):

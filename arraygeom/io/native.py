@@ -50,7 +50,7 @@ import yaml
 from torch import Tensor
 
 from ..camera import Camera, LensView, View, intrinsics
-from ..distortion import Distortion
+from ..distortion import COEFFICIENT_COUNTS, Distortion
 from ..epipolar import shift_origin
 from ..lenses.model import CAMERA_MODELS, CameraModel, LensModel
 from ..pixels import shift_matrix
@@ -212,6 +212,12 @@ class _Document(RigSource):
         kind = CAMERA_MODELS.get(str(value.get("model"))) if isinstance(value, dict) else None
         if kind is not None:
             return self.model(entry, kind, value)
+        if isinstance(value, dict) and "model" in value and value["model"] not in COEFFICIENT_COUNTS:
+            known = ", ".join([*COEFFICIENT_COUNTS, *CAMERA_MODELS])
+            raise self.fail(
+                f"{entry}.model",
+                f"is '{value['model']}', not one of {known}: import the module that defines a model of your own first",
+            )
         self.keys(value, ("model", "coefficients"), entry)
         coefficients = self.numbers(value.get("coefficients"), None, f"{entry}.coefficients")
         return self.made(entry, Distortion, str(value.get("model")), coefficients)

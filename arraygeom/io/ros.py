@@ -36,7 +36,7 @@ def read(source: RigSource) -> Rig:
 
 
 def _yaml_files(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.iterdir() if file.suffix in {".yaml", ".yml"})
+    return sorted(file for file in folder.iterdir() if file.suffix in {".yaml", ".yml"} and file.is_file())
 
 
 def _is_camera_info(text: str) -> bool:

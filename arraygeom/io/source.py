@@ -59,14 +59,21 @@ class RigSource:
         """Warn about the file as a whole."""
         warnings.warn(f"{self.path}: {message}", RigFileWarning, stacklevel=2)
 
+    def content(self) -> bytes:
+        """The file's bytes; reading a pipe would wait for ever."""
+        try:
+            if not self.path.is_file() and self.path.exists():
+                raise self.fail(None, "is not a file: put the rig's own file there")
+            return self.path.read_bytes()
+        except OSError as error:
+            raise self.fail(None, f"cannot be read: {error.strerror}") from None
+
     def text(self, most: int | None = None) -> str:
         """The file's text, of at most so many characters."""
         try:
-            text = self.path.read_bytes().decode("utf-8-sig")
+            text = self.content().decode("utf-8-sig")
         except UnicodeDecodeError:
             raise self.fail(None, "is not a text file") from None
-        except OSError as error:
-            raise self.fail(None, f"cannot be read: {error.strerror}") from None
         if not text.strip():
             raise self.fail(None, "is empty")
         if most is not None and len(text) > most:

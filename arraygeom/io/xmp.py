@@ -35,11 +35,16 @@ from .source import RigSource
 CONVENTION = "first pixel's centre at 0 (no shift); millimetres by the sensor's resolution; RigRelatives camera->rig"
 
 SUFFIXES = (".tif", ".tiff", ".jpg", ".jpeg")
+VIGNETTING = "VignettingPolynomial", "VignettingPolynomial2D"
 IN_PIXELS = 100.0
 """A focal length above is in pixels: no lens of these cameras has so many millimetres, and no image so few pixels."""
 LONGEST_TRANSLATION = 1.0
 """Metres between cameras of one body; what is longer is in another unit."""
 BLACK_LEVEL, EXPOSURE, ISO, ISO_SPEED, TAKEN, SERIAL = 50714, 0x829A, 0x8827, 0x8833, 0x9003, 0xA431
+NORTH, LATITUDE, EAST, LONGITUDE = 1, 2, 3, 4
+"""GPS tags: the hemispheres' letters, and degrees, minutes and seconds."""
+SAME_PLACE = 1e-3
+"""Degrees of latitude or longitude, some 100 m, by which images of one capture may differ: receivers wander."""
 RESOLUTION_X, RESOLUTION_Y, RESOLUTION_UNIT = 0xA20E, 0xA20F, 0xA210
 ORIENTATION, QUARTER_TURNS = 274, {1: 0, 3: 2, 6: 3, 8: 1}
 """EXIF's orientations, and the quarter turns counter-clockwise that put them upright."""
@@ -100,6 +105,8 @@ def rig_of_images(files: Mapping[str, Path]) -> Rig:
     rig = first.rig(cameras)
     if unrotated := [name for name, image in images.items() if image.rotation is None][1:]:
         first.warn(f"RigRelatives are not stated of {', '.join(unrotated)}: parallel axes are assumed")
+    if any(image.text(name) for image in images.values() for name in VIGNETTING):
+        first.warn("vignetting polynomials are stated, and not applied: values are as recorded")
     if len(cameras) > 1 and not any(bool(image.centre.any()) for image in images.values()):
         first.warn("RigTranslations are not stated: all cameras are at one point; state the translations, in metres")
     return rig
@@ -271,6 +278,25 @@ def _check_one_capture(images: Mapping[str, _Image]) -> None:
                 raise image.source.fail(
                     None, f"is of another {kind} than the image of '{name}' ({two}, {one}): give images of one capture"
                 )
+        place, other = _place(first.tags), _place(image.tags)
+        if place and other and math.dist(place, other) > SAME_PLACE:
+            here, there = (f"{north:.4f}, {east:.4f}" for north, east in (other, place))
+            raise image.source.fail(
+                None,
+                f"is of another place by GPS than the image of '{name}' ({here}; {there}): give images of one capture",
+            )
+
+
+def _place(tags: ImageTags) -> tuple[float, float] | None:
+    """Latitude and longitude, degrees; None if they are not stated."""
+    degrees = []
+    for letter, number in ((NORTH, LATITUDE), (EAST, LONGITUDE)):
+        parts = tags.fields.get(number, ())
+        if len(parts) != 3:
+            return None
+        value = sum(float(part) / 60**i for i, part in enumerate(parts))
+        degrees.append(-value if tags.fields.get(letter, ("",))[0] in ("S", "W") else value)
+    return degrees[0], degrees[1]
 
 
 def _rotation(degrees: Tensor) -> Tensor:

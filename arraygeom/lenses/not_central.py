@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import factorial
 from typing import ClassVar, Literal
 
 import torch
@@ -150,10 +151,24 @@ STEEPEST = 0.9
 def _rotated(v: Tensor, rotation: Tensor, time: Tensor) -> Tensor:
     """Vectors (*b, ..., 3) after a time at angular velocities (*b, 3) (Rodrigues), smooth at angle 0."""
     w = beside_points(rotation, v, 1)
-    squared = time.square() * w.square().sum(-1)
-    sinc, half = cosine_and_sinc(squared)[1], cosine_and_sinc(squared / 4)[1]
+    sinc, versed = _sinc_and_versed(time.square() * w.square().sum(-1))
     once = _cross(w, v)
-    return v + (time * sinc)[..., None] * once + (0.5 * (time * half).square())[..., None] * _cross(w, once)
+    return v + (time * sinc)[..., None] * once + (time.square() * versed)[..., None] * _cross(w, once)
+
+
+def _sinc_and_versed(squared: Tensor) -> tuple[Tensor, Tensor]:
+    """sin(t) / t and (1 - cos(t)) / t^2 of squared angles t^2; by their series alone where all are small."""
+    if followed() or bool((squared > SMALL).any()):
+        sinc, half = cosine_and_sinc(squared)[1], cosine_and_sinc(squared / 4)[1]
+        return sinc, 0.5 * half.square()
+    sinc, versed = torch.zeros_like(squared), torch.zeros_like(squared)
+    for k in reversed(range(7)):
+        sinc, versed = 1 / factorial(2 * k + 1) - squared * sinc, 1 / factorial(2 * k + 2) - squared * versed
+    return sinc, versed
+
+
+SMALL = 0.1
+"""Squared angles up to which the eighth term of their series is below rounding."""
 
 
 def _cross(w: Tensor, v: Tensor) -> Tensor:

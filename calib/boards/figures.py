@@ -24,6 +24,7 @@ from .adequacy import CELLS, Coverage
 from .detect import BoardViews
 from .photos import FrameKey, Photos
 from .rig import Calibration
+from .rig_diff import RigDifference
 from .uncertainty import GRID, beta_covariance, half_difference, intrinsics_of, rig_covariance, uncertainty
 from .validation import frame_rms, misfits
 
@@ -249,3 +250,37 @@ def _photo(photos: Mapping[FrameKey, Any], key: FrameKey) -> Any | None:
 def escaped(text: str) -> str:
     """Text that matplotlib does not parse as formulas."""
     return text.replace("$", r"\$")
+
+
+def draw_difference(found: RigDifference) -> Figure:
+    """How far two rigs' pixels differ, at the nearest and the farthest depth, and depths by each pair, in percent."""
+    panels = []
+    for name, camera in found.cameras.items():
+        for depth in (camera.depth.min(), camera.depth.max()):
+            at = camera.depth == depth
+            panels.append((f"{name}, {depth:.3g} m: pixels", camera.x[at], np.linalg.norm(camera.change[at], axis=1)))
+    for name, by_pair in found.depths.items():
+        for depth in (by_pair.depth.min(), by_pair.depth.max()):
+            at = by_pair.depth == depth
+            panels.append(
+                (f"depth by {found.alpha} and {name}, {depth:.3g} m: %", by_pair.x[at], 100 * by_pair.change[at])
+            )
+    figure = Figure(figsize=(9, 2.7 * len(panels) / 2), layout="constrained")
+    for i, (title, x, values) in enumerate(panels, 1):
+        axes: Any = figure.add_subplot(len(panels) // 2, 2, i)
+        signed = "%" in title
+        most = float(np.nanquantile(np.abs(values), 0.98)) if len(values) else 1.0
+        shown = axes.scatter(
+            *x.T,
+            c=values,
+            s=22,
+            marker="s",
+            cmap="RdBu" if signed else "viridis",
+            vmin=-most if signed else 0,
+            vmax=most,
+        )
+        figure.colorbar(shown, ax=axes)
+        axes.set_title(escaped(title), fontsize=9)
+        axes.set(aspect="equal", xticks=[], yticks=[])
+        axes.invert_yaxis()
+    return figure

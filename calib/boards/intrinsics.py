@@ -21,7 +21,7 @@ from .detect import BoardViews, Detection
 from .photos import FrameKey
 from .solve import board_problem, flat_boards, solve
 
-Lens = Literal["brown-conrady", "rational", "thin-prism", "tilted", "kannala-brandt", "omni", "double-sphere", "none"]
+Lens = Literal["brown-conrady", "rational", "thin-prism", "tilted", "kannala-brandt", "omni", "none"]
 LENSES: dict[Lens, tuple[str, int]] = {
     "brown-conrady": ("brown-conrady", 5),
     "rational": ("brown-conrady", 8),
@@ -29,12 +29,8 @@ LENSES: dict[Lens, tuple[str, int]] = {
     "tilted": ("brown-conrady", 14),
     "kannala-brandt": ("kannala-brandt", 4),
     "omni": ("unified", 5),
-    "double-sphere": ("double-sphere", 2),
 }
 """Model and number of coefficients; those of Brown and Conrady have all terms of the former."""
-FIRST = {"unified": (np.log(2.0), 1.0, 0.0), "double-sphere": (0.0, 0.0, 0.55)}
-"""Where the fit of a model to a fisheye's rays begins: the logarithm of its focal length over the fisheye's, and the
-model's first two coefficients, as of wide lenses."""
 FEWEST_IMAGES = 3
 FEWEST_POINTS = 6
 """Points of an image below which none is left out."""
@@ -230,7 +226,7 @@ def _with_model(camera: Camera, model: str, count: int) -> Camera:
         coefficients[:2] = torch.from_numpy(values[1:])
         return camera.replace(K=K, distortion=Distortion(model, coefficients))
 
-    first = np.array(FIRST[model])
+    first = np.array([np.log(2.0), 1.0, 0.0])
     found = least_squares(lambda v: (changed(v).project_local(rays).x - x).numpy().ravel(), first, loss="soft_l1")
     return changed(found.x)
 

@@ -115,7 +115,7 @@ def _finished(
     solved: Solved, views: Mapping[str, BoardViews], board: Board, alone: Mapping[str, SingleCalibration]
 ) -> Calibration:
     """The calibration by a fit of all cameras, with its errors."""
-    solved = with_disagreement(solved, board.extents)
+    solved = with_disagreement(solved, board.extents, unchecked=bool(alone) and board.flat)
     rig, single = Rig(solved.problem.cameras), {name: a.rms for name, a in alone.items()}
     notes = (*solved.notes, *misfit_notes(solved))
     return Calibration(rig, board, solved, views, single, epipolar_errors(rig, views), notes)

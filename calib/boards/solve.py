@@ -28,6 +28,9 @@ UNOBSERVABLE = 0.5
 ROUNDS = 3
 """Times that parameters may return."""
 FEWEST_TO_JACKKNIFE = 6
+UNCHECKED = 3.0
+"""The factor by which standard deviations are raised of fewer frames, which cannot be checked: real sets
+of six frames and more are raised by 1.0 to 4.8 (tests/benchmarks/RESULTS_sigma.md)."""
 CONSIDERABLE = 1.3
 """Standard deviations are raised if the jackknife's are larger by this."""
 
@@ -149,8 +152,10 @@ def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
     return deformed if gain > (max(left, LEAST_GAIN) if few else LEAST_GAIN) else solved
 
 
-def with_disagreement(solved: Solved, extents: list[tuple[float, float]]) -> Solved:
+def with_disagreement(solved: Solved, extents: list[tuple[float, float]], *, unchecked: bool = False) -> Solved:
     """The solution with its covariance raised if frames disagree considerably; with notes on that and on the boards.
+
+    Where frames are too few to tell, it is raised by `UNCHECKED` if it is of such frames alone (`unchecked`).
 
     `extents` are the boards' sizes, metres. The raised covariance is the mean of the jackknife's, which few frames make
     noisy, and of that of the points' noise, scaled to the jackknife's level: the median over the parameters, as frames
@@ -158,13 +163,19 @@ def with_disagreement(solved: Solved, extents: list[tuple[float, float]]) -> Sol
     """
     problem, covariance, notes = solved.problem, solved.covariance, list[str]()
     enough = len(problem.names) > 0 and len(problem.frames) >= FEWEST_TO_JACKKNIFE
+    raised = 1.0
+    if covariance is not None and unchecked and len(problem.frames) < FEWEST_TO_JACKKNIFE:
+        covariance, raised = UNCHECKED**2 * covariance, UNCHECKED
+        notes.append(
+            f"{len(problem.frames)} frames are too few to check standard deviations: they are raised by "
+            f"{UNCHECKED:.0f}, as more frames do of real boards; take {FEWEST_TO_JACKKNIFE} or more"
+        )
     if problem.deformation is None and (covariance is None or not enough):
-        return solved
+        return replace(solved, covariance=covariance, raised=raised, notes=(*solved.notes, *notes))
     found = jackknife(problem)
     if problem.deformation is not None:
         deviations = np.sqrt(found.deformations.diagonal()).reshape(problem.deformation.values.shape)
         notes += described(problem.deformation, deviations, extents)
-    raised = 1.0
     if enough and covariance is not None and _excess(found.covariance, covariance) > CONSIDERABLE:
         level = max(1.0, float(np.median(_ratio(found.left_out, covariance))))
         before, covariance = covariance, (level**2 * covariance + found.left_out) / 2

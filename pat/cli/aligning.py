@@ -119,9 +119,9 @@ class Align(Known):
         files = {name: files[name] for name in array.rig.names}
         for one in _in_order(files):
             first = one == {name: paths[0] for name, paths in files.items()}
-            images = array.images if first else ViewFiles(array.rig, one, alpha=array.alpha)
+            images = array.images if first else ViewFiles(array.recorded, one, alpha=array.alpha)
             name = _name_of(files, array.alpha, one)
-            yield _Frame(array.rig, array.rig, images, one, array.alpha, array.notes, name, found=True)
+            yield _Frame(array.rig, array.recorded, images, one, array.alpha, array.notes, name, found=True)
 
     def _align(self, frame: _Frame) -> None:
         from ..fusion.align import align
@@ -164,11 +164,11 @@ class Align(Known):
                 )
             written = save_aligned(aligned, self.out, separate=self.separate, positions=self.positions, name=frame.name)
             if frame.found:
-                frame.rig.save(self.out / "rig.yaml")
+                frame.recorded.save(self.out / "rig.yaml")
                 written.append(self.out / "rig.yaml")
             if self.report and not frame.name:
                 facts = Facts(frame.notes, texts, time.monotonic() - begin)
-                written.append(write_aligned_page(self.out / "index.html", aligned, frame.rig, facts))
+                written.append(write_aligned_page(self.out / "index.html", aligned, frame.recorded, facts))
         print(
             (self.out / f"{frame.name}_visibility.txt" if frame.name else self.out / "visibility.txt").read_text(),
             end="",

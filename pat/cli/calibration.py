@@ -46,7 +46,6 @@ class Calibrate:
         "tilted",
         "kannala-brandt",
         "omni",
-        "double-sphere",
         "none",
     ] = "brown-conrady"
     """Lens model; kannala-brandt or omni for fisheyes. auto compares them on held-out frames and takes the best

@@ -223,7 +223,7 @@ class Fuse(Known):
         self.exposure = self.exposure or ("keep" if measured else "auto")
         if max(map(len, files.values())) == 1:
             return self._one(array.rig, array.images, array.alpha, first, found=array.notes)
-        rig = array.rig
+        rig = array.recorded
         for name, rate in rates.items():
             if name in rig.names:
                 rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate)))

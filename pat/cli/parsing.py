@@ -4,18 +4,31 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable
 from contextlib import redirect_stderr
 from typing import Any
 
 import tyro
 
-REWORDED = (
+
+def _choices(given: str, option: str, choices: str) -> str:
+    """What an option can be, without the None of one that may be left out, numbers in order."""
+    named = [choice for choice in choices.split(", ") if choice != "'None'"]
+    if all(choice.strip("'").isdecimal() for choice in named):
+        named.sort(key=lambda choice: int(choice.strip("'")))
+    return f"{option}: {given} is not one of {', '.join(named)}"
+
+
+REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"^Error parsing (\S+): ", r"\1: "),
     (r"no type matching (?:\{None\}\|)?\{(.+?)\} could be instantiated from \[(.*?)\].*", r"wanted \1, got \2"),
     (r"Could not find valid parse for arguments: \[(.*?)\].*", r"\1 does not fit"),
     (r"invalid literal for int\(\) with base 10: (.+)", r"\1 is not a whole number"),
     (r"could not convert string to float: (.+)", r"\1 is not a number"),
-    (r"^invalid choice (.+) for argument '(\S+)'\. Expected one of \((.*?),?\)\.", r"\2: \1 is not one of \3"),
+    (
+        r"^invalid choice (.+) for argument '(\S+)'\. Expected one of \((.*?),?\)\.",
+        lambda found: _choices(*found.groups()),
+    ),
     (r"^Missing value for argument '(\S+)'.*", r"\1: give a value"),
     (r"^Missing from .+?: (\S+) (.+?) \(required\)", r"\1 is missing: \2"),
     (r"^Unrecognized options: ", r"unknown here: "),

@@ -372,8 +372,79 @@ class RigFromImages:
         say(f"written: {self.out}")
 
 
+@dataclass
+class RigDiff:
+    """Say whether a rig has moved: two calibrations of it compared by the pixels and depths that they say.
+
+    A motion of the whole rig is no difference. What is more than both calibrations' errors follows from the covariance
+    files that `pat calibrate` writes beside its rigs.
+    Example: pat rig diff may.yaml october.yaml --out diff.png
+    """
+
+    first: Annotated[Positional[Path], arg(metavar="A")]
+    """Rig file."""
+    second: Annotated[Positional[Path], arg(metavar="B")]
+    """Rig file of the same cameras."""
+    depth: Depth = None
+    """Near and far bounds in metres between which rigs are compared, instead of the first one's."""
+    image: Images = ()
+    """An image of each camera: which rig fits them better, by points matched in them."""
+    matches: MatchesFile = None
+    out: MaybeOut = None
+    """Picture to write: how far pixels and depths differ, over the images."""
+
+    def run(self) -> None:
+        from calib.boards.figures import draw_difference
+        from calib.boards.rig_diff import rig_difference
+        from calib.boards.uncertainty import RigCovariance
+
+        from ..media.figures import save_figure
+
+        if self.out is not None:
+            options.writable(self.out)
+        a, b = load_rig(self.first), load_rig(self.second)
+        depth = self.depth or (a.depth or b.depth)
+        if depth is None:
+            raise ValueError("--depth: neither rig states between which depths it is used: give NEAR FAR in metres")
+        near, far = (float(bound) for bound in depth)
+        beside = [path.with_suffix(".covariance.json") for path in (self.first, self.second)]
+        covariances = [RigCovariance.load(path) if path.is_file() else None for path in beside]
+        found = rig_difference(a, b, covariances=(covariances[0], covariances[1]), depth=(near, far))
+        for path, covariance in zip(beside, covariances):
+            if covariance is None and any(covariances):
+                say(
+                    f"pat: warning: {path}: not there: that rig counts as calibrated as well as the other",
+                    style="yellow",
+                )
+        if not any(covariances):
+            say("pat: warning: no covariance file beside the rigs: calibrate with `pat calibrate`", style="yellow")
+        print(found.as_text())
+        if self.image:
+            print(self._on_images(a, b))
+        if self.out is not None:
+            save_figure(draw_difference(found), self.out)
+            say(f"written: {self.out}")
+
+    def _on_images(self, a: Rig, b: Rig) -> str:
+        from calib.images.held_out import line_distances, nearer
+        from calib.images.matches import match_cameras
+
+        images = options.read_images(a, self.image)
+        with options.working("matching points of the images"):
+            pairs = given_matches(self.matches, self.image, images) or match_cameras(images)
+        of_a, of_b = line_distances(a, pairs), line_distances(b, pairs)
+        medians = float(of_a.abs().median()), float(of_b.abs().median())
+        text = f"on the images: {len(of_a)} points, {medians[0]:.2f} px from A's lines and {medians[1]:.2f} px from B's"
+        closer = float((of_a.abs() < of_b.abs()).float().mean())
+        if nearer(of_b, of_a):
+            return f"{text}: A fits better, at {closer:.0%} of them"
+        if nearer(of_a, of_b):
+            return f"{text}: B fits better, at {1 - closer:.0%} of them"
+        return f"{text}: neither fits significantly better"
+
+
 class RigCommands:
-    """Inspect, convert, draw, check and refine rig files."""
+    """Inspect, convert, draw, check, refine and compare rig files."""
 
     commands: ClassVar[Mapping[str, Any]] = {
         "info": Info,
@@ -382,4 +453,5 @@ class RigCommands:
         "doctor": Doctor,
         "refine": Refine,
         "start": RigFromImages,
+        "diff": RigDiff,
     }

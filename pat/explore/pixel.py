@@ -287,7 +287,7 @@ ACROSS, STEP = 8, 0.25
 """How far from the line the images' own match is sought, and to which step, pixels."""
 MOST_SAMPLES = 96
 """Samples on the line, around that of the largest weight, from which it is sought."""
-CLEAR = 0.7
+CLEAR = 0.8
 """Least correlation of a clear match."""
 BETTER = 0.03
 """By how much a match beside the line must correlate better than the best one on it."""

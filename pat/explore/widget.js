@@ -98,7 +98,7 @@ function drawProfile(canvas, beta) {
 
 function betaText(beta) {
   if (beta.problem) return beta.problem;
-  const off = beta.off === undefined ? "" : beta.off == null ? ", the views are too unlike here to judge the rig" : `, ${beta.off} px off the line`;
+  const off = beta.off == null ? "" : `, ${beta.off} px off the line`;
   const second = beta.second && (beta.second.problem ?? `${beta.second.samples.length} samples`);
   return `match (${beta.match.map((v) => v.toFixed(1)).join(", ")}), ${metres(beta.depth)}, ` +
     `${beta.samples.length} samples${off}` + (second ? `; compared: ${second}` : "");

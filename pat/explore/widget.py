@@ -36,6 +36,9 @@ class FieldWidget(anywidget.AnyWidget):
         super().__init__(**explorer.values())
         self.observe(self._respond, "controls")
 
+    def __repr__(self) -> str:
+        return "the explorer, which a kernel answers: run this cell"
+
     def save(self, path: str | Path, columns: int = GRID) -> None:
         """Write a page of one file that needs no kernel; see `Explorer.save`."""
         self.explorer.controls = self.controls

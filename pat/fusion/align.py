@@ -176,6 +176,8 @@ def align(
         raise ValueError(
             f"interpolation is nearest, bilinear or cubic, and fill none or propagate; got {interpolation}, {fill}"
         )
+    if not 0 <= min_confidence <= 1:
+        raise ValueError(f"the least confidence is {min_confidence:g}: give a number from 0 to 1")
     limit = None if max_memory is None else parse_bytes(max_memory)
     rig = with_pixels(rig if depth is None else rig.replace(depth=depth))
     views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, field=field), noise)

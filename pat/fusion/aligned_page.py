@@ -30,7 +30,7 @@ RED, NEAR_INFRARED = 660.0, 840.0
 
 def write_aligned_page(path: Path, aligned: Aligned, rig: Rig, facts: Facts) -> Path:
     """Write the page atomically; it needs no other file and no network. Returns the path."""
-    layers = {name: data_url(reduced(image, LONGEST)) for name, image in shown_layers(aligned).items()}
+    layers = {name: data_url(reduced(image, LONGEST)) for name, image in shown_layers(aligned, rig).items()}
     overlays = {
         f"not seen by {name}": shares_layer(torch.from_numpy(view.valid.astype(np.float32)))
         for name, view in aligned.items()
@@ -54,8 +54,8 @@ def write_aligned_page(path: Path, aligned: Aligned, rig: Rig, facts: Facts) -> 
     return path
 
 
-def shown_layers(aligned: Aligned) -> dict[str, Float[Tensor, "_ h w"]]:
-    """Each camera's bands, stretched; composites and NDVI where wavelengths allow them; depth if known."""
+def shown_layers(aligned: Aligned, rig: Rig | None = None) -> dict[str, Float[Tensor, "_ h w"]]:
+    """Each camera's bands, stretched; composites and NDVI (see `ndvi`) where wavelengths allow them; depth if known."""
     layers = {}
     for name, view in aligned.items():
         bands = [_stretched(band, view.valid) for band in view.values]
@@ -66,32 +66,43 @@ def shown_layers(aligned: Aligned) -> dict[str, Float[Tensor, "_ h w"]]:
         chosen = [_band_near(aligned, wave) for wave in waves]
         if all(chosen) and len({band.name for band in chosen if band}) == len(waves):
             layers[name] = torch.stack([_stretched(band.values, band.valid) for band in chosen if band])
-    if (index := ndvi(aligned)) is not None:
+    if (index := ndvi(aligned, rig)) is not None:
         layers["NDVI"] = _index_colours(index)
     if np.isfinite(aligned.depth).any():
         layers["depth"] = colour_depth(torch.from_numpy(aligned.depth))
     return layers
 
 
-def ndvi(aligned: Aligned) -> NDArray[np.float32] | None:
-    """(near infrared - red) / their sum (H, W), of values as they are; NaN where a camera does not see the point.
+def ndvi(aligned: Aligned, rig: Rig | None = None) -> NDArray[np.float32] | None:
+    """(near infrared - red) / their sum (H, W); NaN where a camera does not see the point.
 
-    None without bands near 840 and 660 nm. Only of values that are proportional to reflectance is it the index of the
-    literature (Tucker 1979).
+    Of light: of values without the black level, by exposure and gain, as the sensors of `rig` state them for the
+    recorded files; without a rig, of values as they are. None without bands near 840 and 660 nm. Only of reflectance,
+    which a panel of known reflectance gives, is it the index of the literature (Tucker 1979).
     """
     nir, red = (_band_near(aligned, wave) for wave in (NEAR_INFRARED, RED))
     if nir is None or red is None or nir.name == red.name:
         return None
-    one, other = (band.values.astype(np.float32) for band in (nir, red))
+    one, other = (_light(band, rig) for band in (nir, red))
     total = one + other
     with np.errstate(all="ignore"):
         index = (one - other) / total
     return np.where(nir.valid & red.valid & (total > 0), index, np.float32(np.nan))
 
 
+def _light(band: _ShownBand, rig: Rig | None) -> NDArray[np.float32]:
+    values = band.values.astype(np.float32)
+    if rig is None:
+        return values
+    sensor = rig[band.camera].sensor
+    gain = sensor.gain if isinstance(sensor.gain, float | int) else 1.0
+    return np.maximum(values - sensor.black_level, 0) / np.float32((sensor.exposure or 1.0) * gain)
+
+
 class _ShownBand(NamedTuple):
     """A band of an alignment, and where its camera sees the point."""
 
+    camera: str
     name: str
     values: NDArray[Any]
     valid: NDArray[np.bool_]
@@ -100,8 +111,8 @@ class _ShownBand(NamedTuple):
 def _band_near(aligned: Aligned, wave: float) -> _ShownBand | None:
     """The band whose centre is nearest to a wavelength; None if none is near."""
     found = {
-        abs(centre - wave): _ShownBand(name, values, view.valid)
-        for view in aligned.values()
+        abs(centre - wave): _ShownBand(camera, name, values, view.valid)
+        for camera, view in aligned.items()
         for name, centre, values in zip(view.bands, view.wavelengths, view.values)
         if centre is not None and abs(centre - wave) <= NEAREST
     }

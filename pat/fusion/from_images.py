@@ -59,10 +59,12 @@ Say = Callable[[str], None]
 class ImageArray:
     """What images of an array say of it: the rig, which camera is alpha, with which weights to fuse, and how.
 
+    rig: of the images as they were developed. recorded: of the files, with their sensors' coding and black level.
     images: alpha's and those of the betas that are fused. notes: what was found, a line each.
     """
 
     rig: Rig
+    recorded: Rig
     images: dict[str, Tensor]
     alpha: str
     weights: str
@@ -122,7 +124,10 @@ def array_from_images(
     several = len(names) > 2 and all(len(images[name]) == 1 for name in names[1:])
     if several:
         note("radiometry: each band is brought to alpha's mean and contrast, as for a grey world")
-    return ImageArray(rig, images, alpha, weights, several, tuple(notes))
+    recorded = rig
+    if tagged is not None:
+        recorded = rig.replace(cameras={n: rig[n].replace(sensor=tagged[n].sensor) for n in rig.names})
+    return ImageArray(rig, recorded, images, alpha, weights, several, tuple(notes))
 
 
 def camera_names(paths: Sequence[Path]) -> dict[str, Path]:

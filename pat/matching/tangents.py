@@ -36,8 +36,10 @@ from .positions import FINE
 from .semi_global import DISPARITY_FILL, HALF_SIZE, inner_and_outer
 
 ORDERED = 0.95
-"""Share of pixels none of whose steps from one position to the next goes back, from which positions are a curve: those
-of a window and of a whole image go back at the end of each row."""
+"""Share of pixels whose steps from one position to the next hardly ever go back, from which positions are a curve:
+those of a window and of a whole image go back at the end of each row."""
+SEAM = 2
+"""How often those of a curve go back: onto the other side of a whole sphere's image, and on from there."""
 LEAST_MARGIN = 0.02
 """Margin of a match to the second best, as of `BetaMatches.facts`, up to which it is filled from its neighbours.
 *size*: what follows matches again, around it."""
@@ -104,10 +106,10 @@ class _BlockCentres:
         if found.xy.shape[-2] < 3:
             return False
         steps = found.xy.detach().diff(dim=-2)
-        on = (steps[..., 1:, :] * steps[..., :-1, :]).sum(-1) >= 0
+        back = (steps[..., 1:, :] * steps[..., :-1, :]).sum(-1) < 0
         counts = found.mask[..., 2:] & found.mask[..., 1:-1] & found.mask[..., :-2]
         some = counts.any(-1)
-        return bool(some.any()) and float((on | ~counts).all(-1)[some].double().mean()) >= ORDERED
+        return bool(some.any()) and float(((back & counts).sum(-1) <= SEAM)[some].double().mean()) >= ORDERED
 
     def tangents(self, labels: Tensor) -> Segments:
         """The lines through the labels' positions along the curves, as long as these."""

@@ -109,6 +109,8 @@ def newest_checkpoint(folder: Path) -> Checkpoint | None:
 
 def read_checkpoint(path: Path) -> Checkpoint | None:
     """A checkpoint, or None for a file that is damaged or is none."""
+    if not path.is_file():
+        return None
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

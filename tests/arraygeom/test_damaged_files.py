@@ -1,8 +1,10 @@
 """Files that crash the parsers underneath (OpenCV's, scipy's): refused before these see them."""
 
+import contextlib
 import json
 import os
 import random
+import shutil
 import time
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from arraygeom import Rig
 from arraygeom.io import RigFileError, read_rig
 from arraygeom.io.matfile import readable_variables
 
+FIXTURES = Path(__file__).parent / "fixtures"
 DEEP = 100_000
 YAML = "%YAML:1.0\n---\na: "
 XML = '<?xml version="1.0"?>\n<opencv_storage>'
@@ -149,3 +152,19 @@ def test_a_pipe_is_no_rig(tmp_path):
     os.mkfifo(tmp_path / "rig.yaml")
     with pytest.raises(RigFileError, match="neither a file nor a folder"):
         read_rig(tmp_path / "rig.yaml", format="native")
+
+
+PARTS = [path for path in sorted(FIXTURES.rglob("*")) if path.is_file() and path.parent != FIXTURES]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes in folders")
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("part", PARTS, ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_a_pipe_in_place_of_a_part_is_read_by_no_reader(part, tmp_path):
+    """`extrinsics.yml` as a pipe was waited for. What a format can do without is not looked at."""
+    home = tmp_path / "rig"
+    shutil.copytree(part.parent, home)
+    (home / part.name).unlink()
+    os.mkfifo(home / part.name)
+    with contextlib.suppress(RigFileError, FileNotFoundError):
+        read_rig(home)

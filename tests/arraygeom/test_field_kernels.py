@@ -46,6 +46,13 @@ def test_curved_positions_are_those_of_the_formulas(name, monkeypatch):
     assert (compiled.xy - expected.xy).abs().max() < 1e-9
 
 
+def test_few_pixels_wait_for_no_compiler(monkeypatch):
+    """The explorer asks for one, and waited half a minute for the first through a lens."""
+    pair = pair_with("radial")
+    monkeypatch.setattr("arraygeom.fields.curved.RayCurve.positions", None)
+    assert Curved(40)(pair, torch.tensor([[300.0, 200.0]])).xy.shape == (1, 40, 2)
+
+
 @pytest.mark.parametrize("field", [Curved(40, nodes=24), NearestVoxels(24, 12)], ids=repr)
 def test_without_numba_the_formulas_are_used(field, monkeypatch):
     pair = pair_with("none")

@@ -9,6 +9,7 @@ import torch
 
 from arraygeom import Band, Rig
 from arraygeom.io import RigFileError, RigFileWarning, recognise
+from arraygeom.io.image_tags import image_tags
 from arraygeom.io.xmp import named_by_band
 
 tifffile = pytest.importorskip("tifffile")
@@ -32,7 +33,9 @@ PERSPECTIVE = {
 PER_MM = 266.666667
 
 
-def image_of(path: Path, tags, *, dji=None, orientation=1, serial="A1", hw=(960, 1280)) -> Path:
+def image_of(
+    path: Path, tags, *, dji=None, orientation=1, serial="A1", hw=(960, 1280), taken="2018:04:13 08:06:58"
+) -> Path:
     """A TIFF file of zeros with these Camera: tags, half of them as elements."""
     parts = [f'Camera:{k}="{v}"' for k, v in list(tags.items())[::2]]
     parts += [f'drone-dji:{k}="{v}"' for k, v in (dji or {}).items()]
@@ -53,6 +56,7 @@ def image_of(path: Path, tags, *, dji=None, orientation=1, serial="A1", hw=(960,
         (0xA20F, "2I", 1, (266666667, 1000000), True),
         (0xA210, "H", 1, 4, True),
         (0xA431, "s", 0, serial, True),
+        (0x9003, "s", 0, taken, True),
         (0x829A, "2I", 1, (3, 1000), True),
         (50714, "H", 4, (4000, 4002, 4000, 4002), True),
     ]
@@ -127,6 +131,7 @@ def test_dewarp_data(tmp_path):
         ({"RigTranslations": "12.5,0,0"}, {}, "RigTranslations: is .*metres are wanted"),
         ({}, {"serial": "B2"}, "another serial number"),
         ({"CaptureUUID": "two"}, {}, "another capture"),
+        ({}, {"taken": "2018:04:13 08:07:01"}, "another time than the image of 'green'"),
         ({}, {"orientation": 2}, "a mirrored image"),
         ({}, {"hw": (300, 400)}, "was it cropped or resized"),
     ],
@@ -137,6 +142,28 @@ def test_mistakes_are_named(tmp_path, changed, options, message):
     with pytest.raises(RigFileError, match=message) as refused:
         Rig.load(path)
     assert "\n" not in str(refused.value)
+
+
+def test_images_of_two_places_are_named(tmp_path, monkeypatch):
+    """The GPS directory by its tags: 48 degrees 30' north, and the same south."""
+    path = pair(tmp_path, FISHEYE)
+    places = {"IMG_1.tif": "N", "IMG_2.tif": "S"}
+
+    def tags(path):
+        found = image_tags(path)
+        gps = {1: (places[path.name],), 2: (48.0, 30.0, 0.0), 3: ("E",), 4: (2.0, 0.0, 0.0)}
+        return found._replace(fields=found.fields | gps)
+
+    monkeypatch.setattr("arraygeom.io.xmp.image_tags", tags)
+    with pytest.raises(RigFileError, match=r"another place by GPS than the image of 'green' \(-48.5000, 2.0000; 48"):
+        Rig.load(path)
+    places["IMG_2.tif"] = "N"
+    assert len(Rig.load(path).names) == 2
+
+
+def test_stated_vignetting_is_said_to_be_left(tmp_path):
+    with pytest.warns(RigFileWarning, match="vignetting polynomials are stated, and not applied"):
+        Rig.load(pair(tmp_path, {**FISHEYE, "VignettingPolynomial": "1e-5,2e-7"}))
 
 
 @pytest.mark.parametrize(("folder", "bands"), [("sequoia", 5), ("rededge", 5)])

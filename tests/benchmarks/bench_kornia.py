@@ -1,6 +1,6 @@
 """arraygeom beside kornia, for what both have: values, gradients, low precision, and the ratio of times.
 
-Run as `python -m tests.benchmarks.bench_kornia`; it writes its tables into docs/kornia.md.
+Run as `python -m tests.benchmarks.bench_kornia [table] [calls]`; it writes both, or one, into docs/kornia.md.
 
 The value's difference is the largest over all entries, float64, relative to the largest entry. The gradient's error is
 each library's own, of a random cotangent, against central differences of its own values; second derivatives have to be
@@ -25,7 +25,7 @@ import kornia.geometry
 import torch
 from torch import Tensor
 
-from arraygeom import Pose, Rig, relative_pose
+from arraygeom import Camera, Distortion, Pose, Rig, relative_pose
 from pat.fusion.fuse import fuse
 from pat.networks.guided import GuidedPAT
 from tests.arraygeom.rigs import random_rig
@@ -148,6 +148,9 @@ def convert() -> None:
     rig = random_rig(1)
     pose = rig["alpha"].cam_from_world
     Rig.from_kornia(rig.to_kornia())
+    for model in ("brown-conrady", "kannala-brandt"):
+        lens = Distortion(model, torch.full((4,), 0.01, dtype=torch.float64))
+        Camera.from_kornia(rig["alpha"].replace(distortion=lens).to_kornia(), cam_from_world=pose)
     Pose.from_kornia(pose.to_kornia())
     Pose.from_quaternion(pose.quaternion, pose.t)
     pair = rig.pair("alpha", "beta")
@@ -170,7 +173,8 @@ def write_page(what: str, text: str) -> None:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    for what, make in (("table", table), ("calls", counts)):
-        made = make()
+    tables = {"table": table, "calls": counts}
+    for what in sys.argv[1:] or tables:
+        made = tables[what]()
         print(made)
         write_page(what, made)

@@ -396,6 +396,12 @@ def _kornia_maps(name: str, x: Tensor, c: Tensor) -> Tensor:
     return maps.undistort(params, Vector2(x)).data + maps.distort(params, Vector2(x)).data
 
 
+def _place(line: str) -> tuple[int, int]:
+    """Where a row goes: models and libraries in their order."""
+    model, library = (cell.strip() for cell in line.split("|")[1:3])
+    return list(FAMILIES).index(model), list(LIBRARIES).index(library)
+
+
 HEAD = (
     "lens",
     "library",
@@ -438,4 +444,4 @@ if __name__ == "__main__":
         page = PAGE.read_text()
         block = page[page.index("<!-- lenses:begin -->") : page.index("<!-- lenses:end -->")]
         kept = [line for line in block.splitlines() if line[2:].split(" ")[0] in set(FAMILIES) - set(given.models)]
-        PAGE.write_text(with_block(page, "lenses", "\n".join([*made[:2], *sorted([*made[2:], *kept])])))
+        PAGE.write_text(with_block(page, "lenses", "\n".join([*made[:2], *sorted([*made[2:], *kept], key=_place)])))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import os
 import random
 import shutil
 import warnings
@@ -44,6 +45,9 @@ class Seed(NamedTuple):
     whole_folder: bool = False
 
 
+NO_FILE = 0.03
+"""The share of cases in which something else is in the file's place: a pipe, links in a circle, a folder."""
+
 Check = Callable[[Path, random.Random], str]
 
 
@@ -58,8 +62,18 @@ def damaged(seed: Seed, number: int, folder: Path) -> Path:
         home.mkdir(parents=True)
     text = seed.file.suffix not in (".bin", ".mat", ".safetensors", ".npz") and seed.kind not in ("image", "video")
     path = home / seed.file.name
+    if source.random() < NO_FILE:
+        path.unlink(missing_ok=True)
+        source.choice((os.mkfifo, _linked_in_a_circle, os.mkdir))(path)
+        return home if seed.whole_folder and seed.kind == "rig" else path
     path.write_bytes(mutated(seed.file.read_bytes(), source, text=text, suffix=seed.file.suffix))
     return home if seed.whole_folder and seed.kind == "rig" else path
+
+
+def _linked_in_a_circle(path: Path) -> None:
+    """A link to a folder that leads back to the one it is in, and a link to itself in place of the file."""
+    (path.parent / "round").symlink_to(path.parent)
+    path.symlink_to(path)
 
 
 # Rigs -------------------------------------------------------------------------------------------------------
@@ -209,7 +223,7 @@ def read_and_write(path: Path, source: random.Random) -> str:
     """`read_image`, what it gives written again, and the bank of photographs of a folder that holds it."""
     try:
         image = read_image(path, hw=source.choice([None, None, (60, 80)]))
-    except ValueError as error:
+    except (ValueError, FileNotFoundError) as error:
         return "refused" if "\n" not in str(error) and str(path) in str(error) else f"message: {error}"
     if not (image.isfinite().all() and image.min() >= 0 and image.max() <= 1):
         return "values outside 0..1"
@@ -244,7 +258,7 @@ def watch_video(path: Path, _: random.Random) -> str:
     """All frames of `read_video`."""
     try:
         video = read_video(path)
-    except ValueError as error:
+    except (ValueError, FileNotFoundError) as error:
         return "refused" if "\n" not in str(error) and str(path) in str(error) else f"message: {error}"
     whole = all(frame.isfinite().all() for frame in itertools.islice(video.frames, 100))
     return "read" if whole and 0 < video.rate < float("inf") else f"{video.rate} frames a second"
@@ -309,7 +323,7 @@ def covariance_seeds(folder: Path) -> Iterator[Seed]:
 def use_covariance(path: Path, _: random.Random) -> str:
     try:
         found = RigCovariance.load(path)
-    except ValueError as error:
+    except (ValueError, FileNotFoundError) as error:
         return "refused" if "\n" not in str(error) and str(path) in str(error) else f"message: {error}"
     whole = np.isfinite(found.matrix).all() and all(isinstance(name, str) for name in found.names)
     return "read" if whole else f"{found.names} {found.matrix}"

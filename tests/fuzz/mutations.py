@@ -92,11 +92,28 @@ def mutated(content: bytes, source: random.Random, *, text: bool, suffix: str = 
         kinds += [lambda s, c: structure(s, c, suffix)] * len(kinds)
     if suffix == ".json":
         kinds += [repeat_keys, half_character]
+    if suffix == ".safetensors":
+        kinds += [absurd_header] * len(kinds)
     if suffix in PIECES:
         kinds += [lambda s, c: rearranged(s, c, suffix)] * len(kinds)
     for _ in range(source.choice([1, 1, 1, 2, 4])):
         content = source.choice(kinds)(source, content)
     return content
+
+
+def absurd_header(source: random.Random, content: bytes) -> bytes:
+    """Weights whose header claims a length, a shape, offsets or a type that no file has."""
+    length = struct.unpack_from("<Q", content)[0] if len(content) > 8 else 0
+    header = content[8 : 8 + length]
+    if source.randrange(3) == 0 or not NUMBER.search(header):
+        claimed = source.choice((0, 1, 2**31, 2**40, 2**63, 2**64 - 1, len(content)))
+        return struct.pack("<Q", claimed) + content[8:]
+    found = source.choice(list(NUMBER.finditer(header)))
+    number = source.choice(
+        (b"0", b"-1", b"4294967296", b"18446744073709551615", b"1e30", b"true", b'"F99"', b"[2,[3]]")
+    )
+    changed = header[: found.start()] + number + header[found.end() :]
+    return struct.pack("<Q", len(changed)) + changed + content[8 + length :]
 
 
 def truncate(source: random.Random, content: bytes) -> bytes:

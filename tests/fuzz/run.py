@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import random
 import shutil
 import sys
@@ -106,8 +107,12 @@ def keep(case: Case, home: Path, log: Path) -> None:
     seed = case.seed
     name = f"{seed.kind}-{seed.format}-{seed.file.name}-{case.number}".replace(" ", "_").replace("/", "_")
     print(f"fault: {name}: {case.outcome.verdict}: {case.outcome.message[:200]}", file=sys.stderr)
-    shutil.copytree(home, FAULTS / name, dirs_exist_ok=True)
+    shutil.copytree(home, FAULTS / name, symlinks=True, ignore=_no_files, dirs_exist_ok=True)
     shutil.copy(log, FAULTS / name / "log.txt")
+
+
+def _no_files(folder: str, names: list[str]) -> list[str]:
+    return [name for name in names if not os.path.isfile(os.path.join(folder, name))]
 
 
 def table_rows(kind: str, cases: list[Case]) -> list[str]:

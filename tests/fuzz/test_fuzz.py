@@ -139,6 +139,15 @@ def test_checkpoints_with_wrong_facts_are_damaged(wrong, tmp_path):
         newest_checkpoint(tmp_path)
 
 
+@pytest.mark.timeout(60)
+def test_a_pipe_in_place_of_a_checkpoint_is_not_waited_for(tmp_path):
+    path = write_checkpoint(tmp_path, collect(*cases.training(), FACTS))
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(ValueError, match="no checkpoint there can be read"):
+        newest_checkpoint(tmp_path)
+
+
 def test_a_bit_that_changed_in_a_checkpoint_or_in_weights_is_seen(tmp_path):
     """The file is still a valid one, of other numbers."""
     path = write_checkpoint(tmp_path, collect(*cases.training(), FACTS))

@@ -183,6 +183,11 @@ def test_what_cannot_serve_says_what_is_missing(name, tmp_path):
         write_rig(rig, tmp_path / "transforms.json", format="nerfstudio")
     with pytest.raises(ValueError, match=r"a lens .own-.*: give scenes of your own"):
         ablate_rigs(load_weights("pat-supervised"), {"own": rig}, scenes=1)
+    rig.save(tmp_path / "rig.yaml")
+    text = (tmp_path / "rig.yaml").read_text().replace("own-", "unknown-")
+    (tmp_path / "rig.yaml").write_text(text)
+    with pytest.raises(ValueError, match=r"model: is 'unknown-.*: import the module that defines a model of your own"):
+        Rig.load(tmp_path / "rig.yaml")
     if not pair.cameras[0].central:
         with pytest.raises(ValueError, match="do not meet in a point"):
             depth_of(pair, x, x)

@@ -295,6 +295,14 @@ def test_a_board_that_bends_raises_the_deviations():
     assert any("is the board flat" in note for note in bent.notes)
 
 
+@pytest.mark.parametrize(("frames", "raised"), [(4, 3.0), (7, 1.0)])
+def test_deviations_that_few_frames_cannot_check_are_raised(frames, raised):
+    """Of a real pair, baselines from three frames were up to 6.8 stated deviations off, and nothing said so."""
+    found = calibrate(see(pair_rig(), board_poses(frames, spread=0.2), noise=0.05), BOARD)
+    assert found.raised == raised
+    assert any("too few to check standard deviations" in note for note in found.notes) == (raised > 1)
+
+
 def test_frames_that_disagree_about_the_focal_lengths_raise_those_alone(found, monkeypatch):
     """By the jackknife their deviations are five times as large, the others' the same."""
     factor = np.array([5.0 if "focal" in name else 1.0 for name in found.fit.names])

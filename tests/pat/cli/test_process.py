@@ -124,6 +124,14 @@ def test_an_image_without_a_camera_is_explained(capsys):
     assert "--image mono.png: which camera is it of? Give NAME=FILE, such as mono=mono.png" in said
 
 
+@pytest.mark.parametrize("command", ["fuse", "align"])
+@pytest.mark.parametrize("others", [(), ("mono.png",)], ids=["alone", "with an image"])
+def test_a_first_file_that_is_no_image_is_said_to_be_none(command, others, capsys):
+    sample = ROOT / "pat" / "data" / "sample"
+    said = fails([command, str(ROOT / "README.md"), *(str(sample / name) for name in others)], capsys)
+    assert f"{ROOT / 'README.md'}: is no image: images end in .png, .tif, .jpg" in said
+
+
 def test_commands_that_do_not_exist(capsys):
     assert fails(["fues"], capsys) == "pat: no command 'pat fues'; did you mean 'fuse'?"
     assert fails(["rig", "docter"], capsys) == "pat: no command 'pat rig docter'; did you mean 'doctor'?"

@@ -170,7 +170,7 @@ def test_sweeps_that_there_are_not_are_named():
         (["--scenes", "0"], "give at least 1"),
         (["--sweeps", "zoom"], "no sweep 'zoom'"),
         (["--without", "all"], "no field 'all'"),
-        (["--weights", "mono-colour"], "add --families"),
+        (["--weights", "mono-colour"], "needs --families"),
     ],
 )
 def test_the_command_refuses_in_a_line(arguments, words, tmp_path, capsys):

@@ -160,6 +160,18 @@ def test_an_answer_for_images_of_megapixels_takes_milliseconds(sample):
     assert min(times) < 0.1
 
 
+def test_of_an_exact_rig_hardly_any_match_is_said_to_be_off_the_line():
+    sample, draw = load_sample(), torch.Generator().manual_seed(5)
+    scene, (h, w) = ExplorerScene(sample.rig, sample.images), sample.rig["mono"].hw
+    off = []
+    for u, v in torch.rand(60, 2, generator=draw).tolist():
+        x = (round(10 + u * (w - 20)), round(10 + v * (h - 20)))
+        offset = inspect_pixel(scene, ExplorerState("mono", x)).betas["colour"].offset
+        off += [] if offset is None else [offset.distance]
+    assert len(off) > 30
+    assert sum(distance > 1 for distance in off) < 0.2 * len(off)
+
+
 def test_a_moved_rig_puts_the_match_off_the_line_by_as_much_as_it_says():
     sample = load_sample()
     scene, state = ExplorerScene(sample.rig, sample.images), ExplorerState("mono", (334.0, 133.0))

@@ -1,0 +1,152 @@
+"""`pat rig diff`: simulated recalibrations of a rig that moved and of one that did not, and what is refused."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from arraygeom import Pose, Rig, View, rotation_from_vector
+from calib.boards.bundle import adjust
+from calib.boards.rig_diff import rig_difference
+from calib.boards.uncertainty import rig_covariance
+from pat.cli.main import main
+from tests.calib.board_scenes import board_poses, four_cameras, scene_of, see
+
+DEPTH = (1.0, 4.0)
+TURN = math.radians(0.05)
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return Rig({name: four_cameras()[name] for name in ("mono", "nir")})
+
+
+def recalibrated(rig, seed, *, frames=12):
+    """The rig and its covariance from new images of a board, with .2 px of noise."""
+    boards = board_poses(frames, seed=seed)
+    fit = adjust(scene_of(rig, boards, see(rig, boards, noise=0.2, seed=seed + 5000)))
+    return Rig(fit.problem.cameras, depth=DEPTH), rig_covariance(fit)
+
+
+def turned(rig, seed):
+    """The rig with one camera rotated by .05 degrees about a random axis."""
+    axis = torch.from_numpy(np.random.default_rng(seed).normal(size=3))
+    pose = rig["nir"].cam_from_world.perturbed(TURN * axis / axis.norm(), torch.zeros(3, dtype=torch.float64))
+    return rig.with_camera("nir", rig["nir"].replace(cam_from_world=pose))
+
+
+def compared(one, other):
+    return rig_difference(one[0], other[0], covariances=(one[1], other[1]), depth=DEPTH)
+
+
+def shares(rig, count):
+    """Of so many recalibrations of a rig that did not move and of one that did, what share is said to be so."""
+    fits = [recalibrated(rig, seed) for seed in range(count + 1)]
+    same = [not compared(*pair).significance.moved for pair in pairwise(fits)]
+    moved = [compared(fits[i], recalibrated(turned(rig, i), 10_000 + i)).significance for i in range(count)]
+    return np.mean(same), np.mean([found.moved for found in moved])
+
+
+def test_a_few_recalibrations(rig):
+    assert shares(rig, 3) == (1.0, 1.0)
+
+
+@pytest.mark.slow
+def test_two_hundred_recalibrations(rig, capsys):
+    same, moved = shares(rig, 200)
+    with capsys.disabled():
+        print(f"\nunchanged rigs said to be the same: {same:.1%}; rotated by .05 degrees said to be moved: {moved:.1%}")
+    assert same >= 0.95
+    assert moved >= 0.95
+
+
+def test_a_motion_of_the_whole_rig_is_no_difference(rig):
+    world = Pose(rotation_from_vector(torch.tensor([0.3, -0.2, 0.5]).double()), torch.tensor([1.0, 2.0, -0.5]).double())
+    cameras = {n: c.replace(cam_from_world=c.cam_from_world @ world.inverse()) for n, c in rig.cameras.items()}
+    found = rig_difference(rig, Rig(cameras), depth=DEPTH)
+    assert max(np.abs(camera.change).max() for camera in found.cameras.values()) < 1e-6
+    assert torch.allclose(found.motion.matrix, world.matrix, atol=1e-8)
+    assert np.abs(found.depths["nir"].change).max() < 1e-8
+
+
+def test_differences_are_those_of_the_motion(rig):
+    """One camera of many rotated: its own pixels move by f tan(angle), depths as the disparity does."""
+    cameras = {
+        f"c{i}": rig["mono"].replace(cam_from_world=Pose.from_centre(torch.eye(3).double(), c.double()))
+        for i, c in enumerate(torch.tensor([[0.0, 0, 0], [0.2, 0, 0], [0.4, 0, 0], [0, 0.2, 0], [0.2, 0.2, 0]]))
+    }
+    rig = Rig(cameras)
+    last = rig["c4"].cam_from_world.perturbed(torch.tensor([0, TURN, 0]).double(), torch.zeros(3).double())
+    found = rig_difference(rig, rig.with_camera("c4", rig["c4"].replace(cam_from_world=last)), depth=DEPTH)
+    off = {name: np.median(np.linalg.norm(camera.change, axis=1)) for name, camera in found.cameras.items()}
+    assert off["c4"] == pytest.approx(1150 * TURN, rel=0.3)
+    assert max(off[name] for name in off if name != "c4") < off["c4"] / 2
+    at = found.depths["c4"].depth == DEPTH[1]
+    relative = 1150 * TURN * DEPTH[1] / (1150 * 0.2)
+    assert np.median(np.abs(found.depths["c4"].change[at])) == pytest.approx(relative, rel=0.5)
+
+
+def test_the_depths_deviation_is_that_of_recalibrations(rig):
+    fits = [recalibrated(rig, seed) for seed in range(8)]
+    found = [compared(*pair).depths["nir"] for pair in zip(fits[::2], fits[1::2])]
+    ratio = np.concatenate([depth.change / depth.sigma for depth in found])
+    assert 0.5 < np.sqrt(np.square(ratio).mean()) < 1.6
+
+
+@pytest.fixture(scope="module")
+def files(rig, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rigs")
+    for name, seed, one in (("a", 0, rig), ("b", 1, rig), ("turned", 2, turned(rig, 0))):
+        made, covariance = recalibrated(one, seed)
+        made.save(folder / f"{name}.yaml")
+        covariance.save(folder / f"{name}.covariance.json")
+    bare = Rig.load(folder / "a.yaml")
+    bare.save(folder / "bare.yaml")
+    bare.replace(depth=None).save(folder / "no_depth.yaml")
+    bare.resize("nir", (240, 320)).save(folder / "small.yaml")
+    Rig({"mono": bare["mono"], "red": bare["nir"]}, depth=DEPTH).save(folder / "other.yaml")
+    Rig({"mono": bare["mono"], "nir": View(hw=bare["nir"].hw)}, depth=DEPTH).save(folder / "view.yaml")
+    return folder
+
+
+def diff(folder, one, other, *options):
+    main(["rig", "diff", str(folder / f"{one}.yaml"), str(folder / f"{other}.yaml"), *options])
+
+
+def test_the_verdict(files, capsys):
+    diff(files, "a", "b", "--out", str(files / "diff.png"))
+    assert "verdict: the same" in capsys.readouterr().out
+    assert (files / "diff.png").stat().st_size > 10_000
+    diff(files, "a", "turned")
+    assert "verdict: moved" in capsys.readouterr().out
+
+
+def test_without_deviations_there_is_no_verdict(files, capsys):
+    diff(files, "bare", "bare")
+    said = capsys.readouterr()
+    assert "verdict: none" in said.out
+    assert "no covariance file" in said.err
+    diff(files, "a", "bare")
+    said = capsys.readouterr()
+    assert "verdict: the same" in said.out
+    assert "bare.covariance.json: not there: that rig counts as calibrated as well" in said.err
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "message"),
+    [
+        ("a", "other", "the rigs are of other cameras (mono, nir; and mono, red)"),
+        ("a", "small", "'nir' has 640x480 pixels in one rig and 320x240 in the other"),
+        ("a", "view", "'nir' is not calibrated in both rigs"),
+        ("no_depth", "no_depth", "--depth: neither rig states"),
+        ("a", "missing", "missing.yaml"),
+    ],
+)
+def test_mistakes_are_named(files, capsys, one, other, message):
+    with pytest.raises(SystemExit):
+        diff(files, one, other)
+    said = capsys.readouterr().err.strip()
+    assert message in said
+    assert "\n" not in said

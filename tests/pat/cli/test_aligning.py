@@ -1,0 +1,155 @@
+"""`pat align`: its files and options on a wall with a post before it, and what is refused, one line each."""
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+import torch
+
+from arraygeom import Rig
+from pat.cli.main import main
+from tests.arraygeom.test_xmp import FISHEYE, PERSPECTIVE, image_of
+from tests.pat.cli.test_known import FAR, NEAR, ON_POST, H, W, folder  # noqa: F401
+
+HIDDEN = slice(ON_POST.start - (NEAR - FAR), ON_POST.start)
+"""Columns of the wall that the post hides from the second camera."""
+
+
+@pytest.fixture
+def counts(folder, tmp_path):  # noqa: F811
+    """The images as counts of 16 bits."""
+    for name in ("mono", "colour"):
+        image = cv2.imread(str(folder / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(tmp_path / f"{name}.png"), image.astype(np.uint16) * 201 + 1000)
+    return tmp_path
+
+
+def align(folder, images, *options, alpha="mono"):  # noqa: F811
+    files = [word for name in ("mono", "colour") for word in ("--image", f"{name}={images / f'{name}.png'}")]
+    main(["align", str(folder / "rig.yaml"), "--to", alpha, *files, "-o", str(images / "out"), *options])
+    return images / "out"
+
+
+def test_files(folder, counts, capsys):  # noqa: F811
+    out = align(folder, counts, "--no-correct", "--response", "rec601")
+    bands = tifffile.imread(out / "aligned.tif")
+    assert bands.shape == (4, H, W)
+    assert bands.dtype == np.uint16
+    recorded = cv2.imread(str(counts / "mono.png"), cv2.IMREAD_UNCHANGED)
+    assert (bands[0] == recorded).all()
+    visibility = cv2.imread(str(out / "colour_visibility.png"), cv2.IMREAD_UNCHANGED)
+    seen = visibility == 255
+    assert (bands[1:, ~seen] == 0).all()
+    assert (bands[1:, seen] >= 1000).all()
+    assert (visibility[4:-4, HIDDEN] == 128).mean() > 0.8
+    assert (visibility[:, : FAR - 2] == 0).mean() > 0.8
+    positions = np.load(out / "colour_positions.npy")
+    assert positions.dtype == np.float32
+    assert abs(np.nanmedian(positions[:, 100:, 0] - np.arange(100, W)) + FAR) < 0.1
+    expected = {"aligned.tif", "colour_confidence.png", "depth.tif", "visibility.txt", "index.html"}
+    assert expected <= {path.name for path in out.iterdir()}
+    assert "colour: sees " in capsys.readouterr().out
+
+
+def test_options(folder, counts):  # noqa: F811
+    """Filled, nearest, a file of each camera, positions as TIFF; no page."""
+    options = ["--fill", "propagate", "--interpolation", "nearest", "--separate", "--positions", "tif", "--no-report"]
+    out = align(folder, counts, *options, "--no-correct", "--response", "rec601")
+    values = tifffile.imread(out / "colour.tif")
+    recorded = cv2.imread(str(counts / "colour.png"), cv2.IMREAD_UNCHANGED)[..., ::-1].transpose(2, 0, 1)
+    for band, own in zip(values, recorded):
+        assert np.isin(band, own).all()
+    assert values.min() >= 1000
+    assert tifffile.imread(out / "colour_positions.tif").shape == (2, H, W)
+    assert not (out / "aligned.tif").exists()
+    assert not (out / "index.html").exists()
+
+
+def test_to_the_other_camera(folder, counts):  # noqa: F811
+    out = align(folder, counts, "--no-correct", alpha="colour")
+    bands = tifffile.imread(out / "aligned.tif")
+    recorded = cv2.imread(str(counts / "colour.png"), cv2.IMREAD_UNCHANGED)
+    assert (bands[:3].transpose(1, 2, 0) == recorded[..., ::-1]).all()
+    positions = np.load(out / "mono_positions.npy")
+    on_post = slice(ON_POST.start - NEAR + 3, ON_POST.stop - NEAR - 3)
+    assert abs(np.nanmedian(positions[:, on_post, 0] - np.arange(W)[on_post]) - NEAR) < 0.2
+
+
+def test_confidence_decides_what_is_seen(folder, counts):  # noqa: F811
+    shares = []
+    for confidence in ("0", "0.5", "1"):
+        out = align(folder, counts, "--confidence", confidence, "--no-report", "--no-correct")
+        shares.append(float((cv2.imread(str(out / "colour_visibility.png"), 0) == 255).mean()))
+    assert shares[0] > shares[1] > shares[2]
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """Two images of a capture with tags of their cameras, and what they show."""
+    texture = torch.rand(1, 1, 60, 80, generator=torch.Generator().manual_seed(0))
+    image = (torch.nn.functional.interpolate(texture, (960, 1280), mode="bicubic")[0, 0] * 40000).numpy()
+
+    def made(*, second=FISHEYE, **options):
+        for name, tags, more in (("1", {**FISHEYE, "BandName": "Green"}, {}), ("2", second, options)):
+            path = image_of(tmp_path / f"IMG_{name}.tif", tags, **more)
+            if path.is_file() and options.get("hw") is None:
+                with tifffile.TiffFile(path) as file:
+                    offset = file.pages[0].dataoffsets[0]
+                with path.open("r+b") as file:
+                    file.seek(offset)
+                    file.write(image.clip(0, 65535).astype("<u2").tobytes())
+        return [str(tmp_path / f"IMG_{name}.tif") for name in ("1", "2")]
+
+    return made
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"serial": "B2"},
+            "is of another serial number than the image of 'green' (B2, A1): give images of one capture",
+        ),
+        ({"taken": "2018:04:13 09:00:00"}, "is of another time than the image of 'green'"),
+        ({"second": {**FISHEYE, "RigTranslations": "12.5,0,0"}}, "RigTranslations: is [12.5, 0.0, 0.0], and metres"),
+        ({"second": {**PERSPECTIVE, "PrincipalPoint": "24,18"}}, "was it cropped or resized?"),
+        ({"hw": (300, 400)}, "was it cropped or resized?"),
+        ({"second": {k: v for k, v in FISHEYE.items() if k != "FisheyeAffineMatrix"}}, "FisheyeAffineMatrix: is not"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::arraygeom.io.RigFileWarning")
+def test_captures_that_do_not_go_together(capture, tmp_path, capsys, options, message):
+    with pytest.raises(SystemExit) as stop:
+        main(["align", *capture(**options), "-o", str(tmp_path / "out")])
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "out" / "aligned.tif").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--depth-map", "{}/small.tif"], "small.tif: is 80x48, alpha's image is 160x96"),
+        (["--depth-map", "{}/depth.png", "--depth-scale", "1"], "state its unit with --depth-scale"),
+        (["--matches", "{}/far.csv"], "outside"),
+        (["--confidence", "2"], "the least confidence is 2: give a number from 0 to 1"),
+        (["--alpha", "nir"], "no camera 'nir'"),
+    ],
+)
+def test_bad_input_is_one_line(folder, tmp_path, capsys, options, message):  # noqa: F811
+    tifffile.imwrite(folder / "small.tif", np.full((48, 80), 4, np.float32))
+    np.savetxt(folder / "far.csv", np.array([[900.0, 20, 890, 20]] * 30), delimiter=",")
+    files = [word for name in ("mono", "colour") for word in ("--image", f"{name}={folder / f'{name}.png'}")]
+    words = [word.format(folder) for word in options]
+    words += [] if "--alpha" in words else ["--alpha", "mono"]
+    with pytest.raises(SystemExit) as stop:
+        main(["align", str(folder / "rig.yaml"), *files, "-o", str(tmp_path / "out"), *words])
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_without_a_rig_the_files_rig_is_written(folder, counts):  # noqa: F811
+    """Its sensors are those of the files: it serves for the next frame."""
+    out = counts / "found"
+    main(["align", str(counts / "mono.png"), str(counts / "colour.png"), "-o", str(out), "--no-report"])
+    assert set(Rig.load(out / "rig.yaml").names) == {"mono", "colour"}
