@@ -36,12 +36,14 @@ class Showcase:
 class Alignment:
     """Measure how well bands are aligned, beside a homography: stereo pairs as bands, multispectral cameras."""
 
-    data: Path
+    data: Path = Path("data")
     """Folder with middlebury, multispectral and nine_band_array."""
     scenes: tuple[str, ...] = ("middlebury", "rededge", "sequoia", "nine-band")
-    """Some of these."""
+    """Some of these, or motorcycle, which needs no data."""
     out: Out = Path("out/alignment")
-    """Folder for alignment.md and a figure of each multispectral scene."""
+    """Folder for alignment.md and a figure of each scene."""
+    confidence: float = 0.5
+    """As of `pat align`: from which confidence on a camera counts as seeing a point."""
 
     def run(self) -> None:
         """Write and print the table. Raises ValueError or FileNotFoundError naming what is missing."""
@@ -49,7 +51,7 @@ class Alignment:
 
         writable(self.out, folder=True)
         with working("aligning") as retitle:
-            text = evaluate_alignment(self.data, self.out, self.scenes, retitle)
+            text = evaluate_alignment(self.data, self.out, self.scenes, min_confidence=self.confidence, each=retitle)
         print(text, end="")
         say(f"written: {self.out / 'alignment.md'}, and figures")
 

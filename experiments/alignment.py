@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
+from skimage.data import stereo_motorcycle
 from torch import Tensor
 
 from arraygeom import Camera, Pose, Rig, apply_homography, intrinsics, sample
@@ -35,7 +36,7 @@ from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair, middlebury_pa
 from pat.evaluation.halves import of_half
 from pat.evaluation.protocols import rectified_rig
 from pat.evaluation.tables import markdown_table
-from pat.fusion.align import SEEN, Aligned, align, resampled_values
+from pat.fusion.align import LEAST_CONFIDENCE, SEEN, Aligned, align, resampled_values
 from pat.fusion.aligned_files import RecordedFiles
 from pat.fusion.aligned_page import shown_layers
 from pat.fusion.from_images import array_from_images, camera_names
@@ -50,6 +51,7 @@ POINTS, SPACING = 3000, 8
 """Corners of alpha at most, and their least distance, pixels."""
 LEVELS = 4
 """Halvings of the images in which the homography is searched, coarse to fine."""
+SCALE = np.diag([2.0, 2.0, 1.0])
 BOARD = "chessboard:11x8:30mm"
 CAMERAS = 9
 WIDEST = 0.15
@@ -62,6 +64,7 @@ class AlignmentRow(NamedTuple):
     with the truth, patches within half a pixel of their best match if aligned by it, seen patches within half a pixel
     of it, and occluded pixels wrongly filled.
 
+    median, median_homography: of the distances of patches from their best match, pixels (searched 5 along x and y).
     off: largest difference of the values, in their own units, from samples of the recorded image, rounded as they are.
     """
 
@@ -71,6 +74,8 @@ class AlignmentRow(NamedTuple):
     located: float
     aligned: float
     homography: float
+    median: float
+    median_homography: float
     by_truth: float | None
     true: float | None
     filled: float | None
@@ -79,6 +84,7 @@ class AlignmentRow(NamedTuple):
 
 
 SHARES = "seen", "located", "aligned", "homography", "by_truth", "true", "filled"
+MEDIANS = "median", "median_homography"
 
 
 class AlignmentScene(NamedTuple):
@@ -90,11 +96,17 @@ class AlignmentScene(NamedTuple):
     recorded: Mapping[str, Any]
     alpha: str
     match_levels: bool
+    recorded_rig: Rig | None = None
     truth: Disparity | None = None
 
 
 def evaluate_alignment(
-    data: Path, out: Path, names: Sequence[str], each: Callable[[str], None] = lambda line: None
+    data: Path,
+    out: Path,
+    names: Sequence[str],
+    *,
+    min_confidence: float = LEAST_CONFIDENCE,
+    each: Callable[[str], None] = lambda line: None,
 ) -> str:
     """Align the scenes of these names (see `SCENES`) below `data`; write alignment.md and figures. Returns the text.
 
@@ -107,18 +119,26 @@ def evaluate_alignment(
     for name in names:
         for scene in SCENES[name](data):
             each(scene.name)
-            aligned = aligned_scene(scene)
+            aligned = aligned_scene(scene, min_confidence)
             rows += alignment_rows(scene, aligned)
-            if scene.truth is None:
-                save_panels(shown_layers(aligned), out / f"{scene.name}.png", columns=3)
+            layers = {} if scene.truth is not None else shown_layers(aligned, scene.recorded_rig)
+            name = f"{scene.name.replace('/', '-')}.png"
+            save_panels({**composites(scene, aligned), **layers}, out / name, columns=2)
     text = alignment_markdown(rows)
     write_text(out / "alignment.md", text)
     return text
 
 
-def aligned_scene(scene: AlignmentScene) -> Aligned:
+def aligned_scene(scene: AlignmentScene, min_confidence: float = LEAST_CONFIDENCE) -> Aligned:
     """Its bands at the pixels of alpha."""
-    return align(scene.rig, scene.images, alpha=scene.alpha, recorded=scene.recorded, match_levels=scene.match_levels)
+    return align(
+        scene.rig,
+        scene.images,
+        alpha=scene.alpha,
+        recorded=scene.recorded,
+        match_levels=scene.match_levels,
+        min_confidence=min_confidence,
+    )
 
 
 def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow]:
@@ -149,7 +169,7 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
             planes.append(expected)
             error = np.linalg.norm(view.positions - expected, axis=-1)[x[:, 1], x[:, 0]]
             true = float((error <= HALF_PIXEL).mean())
-            filled = float((view.visibility[occluded] == SEEN).mean())
+            filled = float((view.visibility[occluded] == SEEN).mean()) if occluded.any() else 0.0
         others = [shown_band(resampled_values(values, plane, "bilinear")) for plane in planes]
         offsets, like = zip(*(local_offsets(own, other, x) for other in others))
         located = np.maximum(*like[:2]) >= ALIKE
@@ -162,6 +182,8 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
                 located=float(located.mean()),
                 aligned=near[0],
                 homography=near[1],
+                median=float(np.median(offsets[0][located])),
+                median_homography=float(np.median(offsets[1][located])),
                 by_truth=near[2] if len(near) > 2 else None,
                 true=true,
                 filled=filled,
@@ -170,6 +192,29 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
             )
         )
     return rows
+
+
+def composites(scene: AlignmentScene, aligned: Aligned) -> dict[str, Float[Tensor, "3 h w"]]:
+    """The first two betas as red and blue and alpha as green: by the homography, and aligned."""
+    straight, pinhole = without_lenses(scene.rig, scene.images)
+    names = scene.rig.betas(scene.alpha)[:2]
+    found: dict[str, list[NDArray[Any]]] = {"by a homography": [], "by pat align, white where not seen": []}
+    for name in names:
+        values, view = np.asarray(scene.recorded[name]), aligned[name]
+        rigid = by_homography(scene, name, straight, pinhole)
+        planes = [resampled_values(values, plane, "bilinear")[0] for plane in (rigid, np.nan_to_num(view.positions))]
+        scale = 0.95 / np.percentile(values[0], 99)
+        found["by a homography"].append(planes[0] * scale)
+        found["by pat align, white where not seen"].append(np.where(view.valid, planes[1] * scale, 1.0))
+    own = aligned[scene.alpha].values[0]
+    green = own * (0.95 / np.percentile(own, 99))
+    unseen = np.any([~aligned[name].valid for name in names], 0)
+    panels = {}
+    for title, (red, *further) in found.items():
+        middle = green if "homography" in title else np.where(unseen, 1.0, green)
+        bands = [red, middle, (further or [red])[0]]
+        panels[title] = torch.from_numpy(np.stack(bands).clip(0, 1).astype(np.float32))
+    return panels
 
 
 def local_offsets(
@@ -212,23 +257,33 @@ def by_homography(
 
 
 def ecc_homography(own: NDArray[np.uint8], other: NDArray[np.uint8]) -> Float[np.ndarray, "3 3"]:
-    """The homography from `own` to `other` by enhanced correlation (Evangelidis and Psarakis 2008) of gradients."""
-    H = np.eye(3, dtype=np.float32)
+    """The homography from `own` to `other` by enhanced correlation (Evangelidis and Psarakis 2008) of gradients.
+
+    It starts from a translation by phase correlation, or from none; no level may lower the correlation.
+    """
+    a, b = (_gradients(image, 0.5**LEVELS) for image in (own, other))
+    b = np.asarray(cv2.resize(b, a.shape[::-1]), np.float32)
+    shifted = np.eye(3)
+    shifted[:2, 2] = cv2.phaseCorrelate(a, b, cv2.createHanningWindow(a.shape[::-1], cv2.CV_32F))[0]
+    H: NDArray[Any] = max([np.eye(3), shifted], key=lambda H: _correlation(a, b, H))
     ecc: Any = cv2.findTransformECC
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
     for level in range(LEVELS, -1, -1):
         a, b = (_gradients(image, 0.5**level) for image in (own, other))
-        if level == LEVELS:
-            window = cv2.createHanningWindow(a.shape[::-1], cv2.CV_32F)
-            H[:2, 2] = cv2.phaseCorrelate(a, cv2.resize(b, a.shape[::-1]), window)[0]
-        else:
-            H[:2, 2] *= 2
-            H[2, :2] /= 2
+        if level < LEVELS:
+            H = SCALE @ H @ np.linalg.inv(SCALE)
         try:
-            _, H = ecc(a, b, H, cv2.MOTION_HOMOGRAPHY, criteria, None, 5)
+            _, found = ecc(a, b, H.astype(np.float32), cv2.MOTION_HOMOGRAPHY, criteria, None, 5)
         except cv2.error:  # it does not converge on this level
             continue
+        H = max([H, found], key=lambda H: _correlation(a, b, H))
     return np.asarray(H, np.float64)
+
+
+def _correlation(a: NDArray[Any], b: NDArray[Any], H: NDArray[Any]) -> float:
+    """Of gradients and those of the other image, brought to them by a homography."""
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return float(cv2.computeECC(a, cv2.warpPerspective(b, H.astype(np.float64), a.shape[::-1], flags=flags)))
 
 
 def _gradients(image: NDArray[np.uint8], factor: float) -> NDArray[np.float32]:
@@ -277,17 +332,20 @@ def alignment_markdown(rows: Sequence[AlignmentRow]) -> str:
     lines = [_line(row) for row in rows if row.true is None]
     for name in dict.fromkeys(row.beta for row in known):
         mine = [row for row in known if row.beta == name]
-        means: dict[str, Any] = {share: float(np.mean([getattr(row, share) for row in mine])) for share in SHARES}
-        scene, off = f"Middlebury, {len(mine)} pairs", max(row.off for row in mine)
+        means: dict[str, Any] = {
+            share: float(np.mean([getattr(row, share) for row in mine])) for share in SHARES + MEDIANS
+        }
+        scene, off = f"{len(mine)} stereo pairs", max(row.off for row in mine)
         lines.append(_line(mine[0]._replace(scene=scene, off=off, **means)))
     columns = ["scene", "beta", "corners seen", "located", "within .5 px", "homography", "by the truth", "of the truth"]
-    return markdown_table([*columns, "occluded, filled", "values off", "type"], lines)
+    return markdown_table([*columns, "occluded, filled", "median px, both", "values off", "type"], lines)
 
 
 def _line(row: AlignmentRow) -> list[str]:
     found = [getattr(row, share) for share in SHARES]
     shares = ["" if share is None else f"{share:.1%}" for share in found]
-    return [row.scene, row.beta, *shares, f"{row.off:.1g}", row.dtype]
+    medians = f"{row.median:.2f} / {row.median_homography:.2f}"
+    return [row.scene, row.beta, *shares, medians, f"{row.off:.1g}", row.dtype]
 
 
 # Scenes -------------------------------------------------------------------------------------------------------
@@ -305,7 +363,15 @@ def _as_bands(pair: StereoPair, truth: Disparity) -> AlignmentScene:
     rig = rectified_rig(hw, {"red": hw, "blue": hw}, PAPER_DISPARITY)
     images = {"alpha": pair.left[1:2], "red": pair.right[0:1], "blue": pair.right[2:3]}
     recorded = {name: np.rint(image.numpy() * 255).astype(np.uint8) for name, image in images.items()}
-    return AlignmentScene(pair.name, rig, images, recorded, "alpha", True, truth)
+    return AlignmentScene(pair.name, rig, images, recorded, "alpha", True, truth=truth)
+
+
+def motorcycle_scene(data: Path) -> Iterator[AlignmentScene]:
+    """Middlebury's motorcycle of 2014, as scikit-image ships it, as bands; `data` is not needed."""
+    left, right, disparity = (torch.from_numpy(np.array(photo)) for photo in stereo_motorcycle())
+    left, right = (photo.movedim(-1, 0) / 255 for photo in (left, right))
+    truth = Disparity(disparity.nan_to_num(0.0, 0.0, 0.0).float(), disparity.isfinite() & (disparity > 0))
+    yield _as_bands(StereoPair("motorcycle", left, right, PAPER_DISPARITY, truth), truth)
 
 
 def capture(name: str, pattern: str) -> Callable[[Path], Iterator[AlignmentScene]]:
@@ -316,7 +382,7 @@ def capture(name: str, pattern: str) -> Callable[[Path], Iterator[AlignmentScene
         array = array_from_images(files)
         files = {camera: files[camera] for camera in array.rig.names}
         recorded = RecordedFiles(array.recorded, files)
-        yield AlignmentScene(name, array.rig, array.images, recorded, array.alpha, array.match_levels)
+        yield AlignmentScene(name, array.rig, array.images, recorded, array.alpha, array.match_levels, array.recorded)
 
     return scenes
 
@@ -343,9 +409,10 @@ def nine_band_calibration(folder: Path, deviations: StartDeviations) -> Calibrat
 
 
 def nine_band_scene(data: Path) -> Iterator[AlignmentScene]:
-    """The array of nine bands, calibrated by its board; its middle camera is alpha."""
+    """The array of nine bands, calibrated by its board: the middle camera is alpha, the four beside it the betas."""
     folder, alpha = data / "nine_band_array", "Cam-4"
     rig = nine_band_calibration(folder, StartDeviations()).rig
+    rig = Rig({name: rig[name] for name in (alpha, "Cam-1", "Cam-3", "Cam-5", "Cam-7")})
     files = {name: folder / "scene" / f"{name}.png" for name in rig.names}
     views = ViewFiles(rig, files, alpha=alpha)
     images = {name: views[name] for name in rig.names}
@@ -365,6 +432,7 @@ def _depths_seen(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) 
 
 
 SCENES: Mapping[str, Callable[[Path], Iterator[AlignmentScene]]] = {
+    "motorcycle": motorcycle_scene,
     "middlebury": middlebury_scenes,
     "rededge": capture("rededge", "IMG*.tif"),
     "sequoia": capture("sequoia", "IMG*.TIF"),

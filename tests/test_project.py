@@ -152,6 +152,7 @@ def imported_at_once(path: Path) -> set[str]:
 
 GEOMETRY_NEEDS = {"torch", "kornia", "numpy", "yaml", "jaxtyping", *sys.stdlib_module_names}
 GEOMETRY_MAY_USE = {
+    "atomic.py": {"filelock"},
     "compiled.py": {"numba"},
     "linked.py": {"numba"},
     "opencv.py": {"cv2"},

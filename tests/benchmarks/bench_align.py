@@ -37,9 +37,10 @@ def measured(command: str, folder: Path, limit: str | None) -> list[str]:
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the table, of all cases or of those whose titles begin with a word that is given."""
     rows = []
-    for title, (width, height, betas, limit) in CASES.items():
+    chosen = {title: case for title, case in CASES.items() if title.startswith(tuple(sys.argv[1:] or [""]))}
+    for title, (width, height, betas, limit) in chosen.items():
         with TemporaryDirectory() as folder:
             scene(Path(folder), width, height, betas)
             for command in ("fuse", "align"):
