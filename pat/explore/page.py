@@ -112,7 +112,8 @@ def page(values: Mapping[str, Any], asks: str) -> str:
 
 
 PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Receptive fields</title>
-<style>body { margin: 0; background: light-dark(#f6f7f9, #14171a); color-scheme: light dark }</style>
+<style>body { margin: 0; background: light-dark(#f6f7f9, #14171a); color-scheme: light dark }
+body > .pat { min-height: 100vh; box-sizing: border-box }</style>
 <body><script type="module">
 MODULES
 const values = DATA;

@@ -117,9 +117,10 @@ def geometry_alone(folder: Path, wheel: Path, python: str, torch: str | None, ke
         call(here, "pip", "install", *words, wheel)
         shutil.copy(ROOT / "pat" / "data" / "sample" / "rig.yaml", folder)
         seconds = timed(here, ["python", "-c", GEOMETRY], folder)
-        packages = call(here, "pip", "list", "--format=freeze").split()
+        packages = call(here, "python", "-m", "pip", "list", "--format=freeze").split()
         print(f"\narraygeom alone: {seconds:.1f} s, with {len(packages)} packages: {' '.join(packages)}", flush=True)
-        return not [name for name in packages if re.match("(opencv|scipy|numba|pillow|arraygeom-pat)", name)]
+        more = [name for name in packages if re.match("(opencv|scipy|numba|pillow|arraygeom-pat)", name)]
+        return bool(packages) and not more
     except subprocess.CalledProcessError as error:
         print(f"\narraygeom alone failed: {error.cmd}\n{error.output[-3000:]}", flush=True)
         return False
