@@ -210,14 +210,25 @@ class _Part(NamedTuple):
 
 
 def _projections(a: Rig, b: Rig, motion: Pose, name: str, X: np.ndarray) -> _Part:
-    moved = motion.apply(torch.from_numpy(X))
-    pixels = [camera.project(points).x for camera, points in ((a[name], torch.from_numpy(X)), (b[name], moved))]
-    J_a, J_b = camera_jacobian(a[name], X), camera_jacobian(b[name], moved.numpy())
-    along = J_b[..., 3:6] @ b[name].R.numpy()
-    rotated = moved - motion.t
-    by_motion = np.concatenate([-along @ cross_matrix(rotated).numpy(), along], -1)
-    change = (pixels[1] - pixels[0]).numpy()
-    return _Part(name, (a[name], b[name]), change, by_motion.reshape(-1, 6), (J_a, J_b))
+    one, other, points = a[name], b[name], torch.from_numpy(X)
+    moved = other.replace(cam_from_world=other.cam_from_world @ motion)
+    J_a, J_b = camera_jacobian(one, X), camera_jacobian(moved, X)
+    if _same_lens(one, other):  # the mean of both: the difference is linear in the parameters to third order
+        J_a = J_b = (J_a + J_b) / 2
+    along = J_b[..., 3:6] @ other.R.numpy()
+    by_motion = np.concatenate([-along @ cross_matrix(points @ motion.R.T).numpy(), along], -1)
+    # a rotation of the camera in its own world moves its translation in the first rig's
+    lever = J_b[..., 3:6] @ cross_matrix(other.R @ motion.t).numpy()
+    J_b = np.concatenate([J_b[..., :3] - lever, J_b[..., 3:]], -1)
+    change = (moved.project(points).x - one.project(points).x).numpy()
+    return _Part(name, (one, other), change, by_motion.reshape(-1, 6), (J_a, J_b))
+
+
+def _same_lens(a: Camera, b: Camera) -> bool:
+    if a.distortion is None or b.distortion is None:
+        return a.distortion is b.distortion
+    same = a.distortion.model == b.distortion.model
+    return same and a.distortion.coefficients.shape == b.distortion.coefficients.shape
 
 
 def _best_motion(a: Rig, b: Rig, grids: Mapping[str, Grid]) -> Pose:

@@ -9,7 +9,8 @@ import torch
 
 from arraygeom import Pose, Rig, View, rotation_from_vector
 from calib.boards.bundle import adjust
-from calib.boards.rig_diff import rig_difference
+from calib.boards.parameters import changed, parameter_names
+from calib.boards.rig_diff import _projections, rig_difference
 from calib.boards.uncertainty import rig_covariance
 from pat.cli.main import main
 from tests.calib.board_scenes import board_poses, four_cameras, scene_of, see
@@ -150,3 +151,24 @@ def test_mistakes_are_named(files, capsys, one, other, message):
     said = capsys.readouterr().err.strip()
     assert message in said
     assert "\n" not in said
+
+
+def test_derivatives_are_those_of_the_difference(rig):
+    """Of the second rig's parameters in its own world, which is turned and shifted, by differences."""
+    world = Pose(rotation_from_vector(torch.tensor([0.3, -0.2, 0.5]).double()), torch.tensor([1.0, 2.0, -0.5]).double())
+    other = Rig({n: c.replace(cam_from_world=c.cam_from_world @ world.inverse()) for n, c in rig.cameras.items()})
+    X = rig["nir"].unproject(torch.tensor([[100.0, 80], [500, 400]]).double(), torch.tensor([1.5, 3.0]).double())
+    part = _projections(rig, other, world, "nir", X.numpy())
+    for i, entry in enumerate(parameter_names(other["nir"])):
+        step = torch.zeros(len(parameter_names(other["nir"])), dtype=torch.float64)
+        step[i] = 1e-6
+        moved = other.with_camera("nir", changed(other["nir"], step))
+        by_step = (_projections(rig, moved, world, "nir", X.numpy()).change - part.change) / 1e-6
+        assert np.allclose(part.jacobians[1][..., i], by_step, rtol=1e-3, atol=1e-3 * abs(by_step).max()), entry
+    for i in range(6):
+        step = torch.zeros(6, dtype=torch.float64)
+        step[i] = 1e-6
+        by_step = (
+            _projections(rig, other, world.perturbed(*step.split(3)), "nir", X.numpy()).change - part.change
+        ) / 1e-6
+        assert np.allclose(part.by_motion[:, i], by_step.ravel(), rtol=1e-3, atol=1e-3 * abs(by_step).max())
