@@ -8,13 +8,14 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme conditions without-rig paper-network test test-long check format bench bench-job train notebooks docs drawings wheel fuzz kills transformations
+.PHONY: help env synthesis demo showcase readme conditions certainty without-rig paper-network test test-long check format bench bench-job train notebooks docs drawings wheel fuzz kills transformations
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
 	@echo "make showcase   fuse real images from DATA=$(DATA) into out/showcase"
 	@echo "make readme     run both and put what they print into docs/results.md"
 	@echo "make conditions measure other responses, low light and misalignment into docs/results.md; half an hour"
+	@echo "make certainty  measure how well stated confidence holds into docs/weights.md; ten minutes"
 	@echo "make paper-network  measure the paper's network, narrow and briefly trained, into docs/results.md"
 	@echo "make without-rig  fuse with rigs found from the images, against known ones, into docs/results.md"
 	@echo "make test       the tests"
@@ -55,6 +56,11 @@ conditions: $(READY)
 	@$(BIN)/pat evaluate --middlebury $(DATA)/middlebury --conditions --half report --out out/conditions
 	@$(BIN)/python -m docs.update_readme --document docs/results.md --block conditions=out/conditions/conditions.md \
 		--image out/conditions/conditions.png docs/conditions.jpg
+
+certainty: $(READY)
+	@$(BIN)/python -m pat.evaluation.certainty --middlebury $(DATA)/middlebury --out out/certainty
+	@$(BIN)/python -m docs.update_readme --document docs/weights.md --block reliability=out/certainty/certainty.md \
+		--image out/certainty/reliability.png docs/reliability.jpg
 
 without-rig: $(READY)
 	@$(BIN)/pat evaluate --middlebury $(DATA)/middlebury --without-rig --rates 2 --half report --out out/without-rig

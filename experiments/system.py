@@ -281,7 +281,10 @@ def fused_apart(job: SystemRun, files: Mapping[str, Path]) -> tuple[Frame, list[
     depth = torch.from_numpy(imread(out / "depth.tif")) if (out / "depth.tif").is_file() else None
     image, confidence = read_image(out / "fused.png"), read_image(out / "confidence.png")[0]
     depth = torch.full_like(confidence, torch.nan) if depth is None else depth
-    return Frame(image, depth, confidence), ["", f"{planned}. Memory: {peak}. Time: {took}."]
+    return Frame(image, depth, confidence, torch.full_like(depth, torch.nan)), [
+        "",
+        f"{planned}. Memory: {peak}. Time: {took}.",
+    ]
 
 
 def _sequence(job: SystemRun) -> tuple[list[str], Panels]:

@@ -20,6 +20,8 @@ ROWS = 1 << 12
 """Pixels that are searched at once."""
 NODES, FINER = 65, 17
 """Points at which the curve is followed, and then again between the neighbours of the nearest."""
+PART = 0.005
+"""Of the curve, to either side, over which differences are taken."""
 
 
 def ray_depth(
@@ -27,16 +29,19 @@ def ray_depth(
     x: Real[Tensor, "n 2"],
     x_beta: Real[Tensor, "n 2"],
     bounds: Literal["depth", "distance"] = "depth",
+    *,
+    deviation: Float[Tensor, " n"] | None = None,
 ) -> Depth:
     """Depth of what alpha's pixels see at beta's, or distance along the ray, within the pair's depth range.
 
-    That of the nearest point of the curve on which beta sees the ray; its deviation is 0, as none is given. Raises
-    ValueError for pairs that are not calibrated or have no depth range.
+    That of the nearest point of the curve on which beta sees the ray. `deviation` is the standard deviation of x_beta
+    along the curve in pixels (default 0); that of the depth is propagated to first order. Raises ValueError for pairs
+    that are not calibrated or have no depth range.
     """
     pair.cameras  # noqa: B018  (raises for an uncalibrated pair)
     near, far = pair.depth_range
 
-    def of(x: Tensor, x_beta: Tensor) -> tuple[Tensor, ...]:
+    def of(x: Tensor, x_beta: Tensor, deviation: Tensor) -> tuple[Tensor, ...]:
         curve = RayCurve.of(pair, near, far, x, bounds)
         low, high = torch.zeros_like(x[:, :1]), torch.ones_like(x[:, :1])
         for count in (NODES, FINER, FINER, FINER):
@@ -44,12 +49,27 @@ def ray_depth(
             apart = _apart(curve, fraction, x_beta)
             best = apart.argmin(-1, keepdim=True)
             low, high = (fraction.gather(-1, (best + step).clamp(0, count - 1)) for step in (-1, 1))
-        inverse = curve.inverse_depth(fraction.gather(-1, best))[:, 0]
+        there = fraction.gather(-1, best)
+        inverse = curve.inverse_depth(there)[:, 0]
         valid = curve.valid & apart.gather(-1, best)[:, 0].isfinite() & (inverse > 0)
         depth = torch.where(valid, 1 / torch.where(valid, inverse, 1.0), 0.0)
-        return depth, torch.zeros_like(depth), valid
+        return (
+            depth,
+            torch.where(valid, deviation * _inverse_depth_per_pixel(curve, there), 0.0) * depth.square(),
+            valid,
+        )
 
-    return Depth(*chunked(of, floating(x), floating(x_beta), rows=ROWS, axis=0))
+    x = floating(x)
+    sigma = torch.zeros_like(x[:, 0]) if deviation is None else deviation.to(x)
+    return Depth(*chunked(of, x, floating(x_beta), sigma, rows=ROWS, axis=0))
+
+
+def _inverse_depth_per_pixel(curve: RayCurve, fraction: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:
+    """How much inverse depth a pixel of beta along the curve is worth, by differences over a part of the curve."""
+    ends = torch.cat([(fraction + step).clamp(0, 1) for step in (-PART, PART)], -1)
+    xy, _ = curve.at(ends)
+    pixels = (xy[:, 1] - xy[:, 0]).norm(dim=-1)
+    return curve.inverse_depth(ends).diff(dim=-1)[:, 0].abs() / pixels.clamp(min=1e-6)
 
 
 def rough_transfer(pair: Pair, x: Real[Tensor, "n 2"]) -> TransformedPoints:

@@ -66,8 +66,9 @@ class Fuse(Known):
     focal: Numbers = ()
     """Without a rig: the focal length in pixels of a camera whose file does not state it."""
     out: Out = Path("out")
-    """Folder for fused.png, confidence.png, depth.tif, depth_16.png (16 bits; 0 is unknown), depth.png, index.html
-    (a page that shows them) and view.yaml (the rig of the fused view)."""
+    """Folder for fused.png, confidence.png, depth.tif, depth_16.png (16 bits; 0 is unknown), depth.png,
+    depth_nearest.tif and depth_farthest.tif (the true depth is between them in 9 of 10 pixels), index.html (a page
+    that shows them) and view.yaml (the rig of the fused view)."""
     weights: Annotated[str | None, arg(metavar="NAME|FILE", help=WEIGHTS_HELP, help_behavior_hint="")] = None
     field: FieldName = "auto"
     max_memory: Memory = None

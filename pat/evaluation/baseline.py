@@ -77,7 +77,7 @@ def classical_view(rig: Rig, images: Mapping[str, Tensor], alpha: str, *, longes
         rig = rig.resize(name, (h, w))
     views, back = Undistort().do(Views.of(rig, small, alpha=alpha))
     image = classical_baseline(views.rig, views.images, alpha)
-    return back(Frame(image, *torch.zeros(2, *image.shape[-2:]))).image
+    return back(Frame(image, *torch.zeros(3, *image.shape[-2:]))).image
 
 
 def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> Float[Tensor, "_ h w"]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from arraygeom import Segments, depth_from_track, pixel_grid
 from arraygeom.chunks import chunked
@@ -14,6 +16,8 @@ from arraygeom.epipolar import Depth, Track
 from arraygeom.pixels import HW
 
 from ..matching.inputs import Inputs
+from ..matching.matches import Matches
+from ..matching.positions import FINE
 from ..networks.protocol import FusionOutput
 from ..support.settings import physics, size, tuned
 from .inputs import Placement
@@ -34,6 +38,8 @@ class DepthSettings:
 
 
 SETTINGS = DepthSettings()
+DEVIATIONS = 1.645
+"""Physics: so many standard deviations to either side of a normal distribution's mean are 9 of 10 cases."""
 
 
 def _within(where: Float[Tensor, "n 2"], segments: Segments, which: Bool[Tensor, "h w"]) -> Float[Tensor, "n 2"]:
@@ -49,10 +55,33 @@ def _within(where: Float[Tensor, "n 2"], segments: Segments, which: Bool[Tensor,
     return torch.where(beyond[..., None], moved, where)
 
 
-def depth_and_confidence(
+class Measured(NamedTuple):
+    """Depth (h, w), NaN where unknown, the half-width of the interval of inverse depth as of `Frame`, and the image's
+    confidence."""
+
+    depth: Tensor
+    half_width: Tensor
+    confidence: Tensor
+
+
+def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> FusionOutput:
+    """A network's result with the certainty of the matches it was given, where that is known, for its own."""
+    if matches is None:
+        return output
+    confidence, deviation = list(output.confidence), list(output.deviation)
+    for i, (found, beta) in enumerate(zip(matches.betas, inputs.betas)):
+        if found.certainty is not None:
+            whole = interpolate(found.certainty.float(), scale_factor=FINE, mode="bilinear").to(confidence[i])
+            confidence[i] = torch.where(beta.field.straight.valid & (output.confidence[i] > 0), whole[:, 0], 0.0)
+            deviation[i] = whole[:, 1] / DEVIATIONS
+    overall = output.overall if output.overall is None else torch.stack(confidence).amax(0)
+    return output._replace(confidence=confidence, deviation=deviation, overall=overall)
+
+
+def measured_depth(
     output: FusionOutput, part: Inputs, placements: list[Placement], hw: HW, corner: tuple[int, int]
-) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Depth from the calibrated betas, weighted by confidence in inverse depth (NaN: unknown); the image's confidence.
+) -> Measured:
+    """Depth from the calibrated betas, weighted by confidence in inverse depth, with its interval.
 
     A position whose depth is beyond the bounds that were searched counts as the end of its segment: a pixel beyond the
     far end may otherwise stand for any distance.
@@ -61,32 +90,38 @@ def depth_and_confidence(
     h, w = hw
     like = output.position[0]
     x = (pixel_grid(hw, dtype=like.dtype, device=like.device) + like.new_tensor(corner)).reshape(-1, 2)
-    total, weights = like.new_zeros(2, h, w)
-    for beta, place, position, confidence in zip(part.betas, placements, output.position, output.confidence):
+    total, widths, weights = like.new_zeros(3, h, w)
+    found_in_betas = zip(output.position, output.deviation, output.confidence)
+    for beta, place, (position, deviation, confidence) in zip(part.betas, placements, found_in_betas):
         if not place.has_depth:
             continue
         pair, offset = place.pair, like.new_tensor(beta.offset)
         where = position[0, :, :h, :w].movedim(0, -1)
-        found = place.depth(x, (where + offset).reshape(-1, 2))
+        half_width = DEVIATIONS * deviation[0, :h, :w].reshape(-1)
+        found = place.depth(x, (where + offset).reshape(-1, 2), half_width)
         if beta.field.pixels is not None and pair.depth is not None and place.has_track:
             track = place.track(x)
             near, far = (bound.to(found.depth) for bound in pair.depth)
             beyond = ~(found.valid & (found.depth >= near) & (found.depth <= far))
             if bool(beyond.any()):
                 moved = _within(where.reshape(-1, 2)[beyond], beta.field.pixels, beyond.view(h, w))
-                there = depth_from_track(Track(*(v.expand_as(track.a)[beyond] for v in track)), moved + offset)
+                some = Track(*(v.expand_as(track.a)[beyond] for v in track))
+                there = depth_from_track(some, moved + offset, half_width[beyond])
                 found = Depth(*(t.masked_scatter(beyond, part) for t, part in zip(found, there)))
         elif pair.link is not None and pair.depth is not None:
             near, far = (bound.to(found.depth) for bound in pair.depth)
             found = found._replace(depth=found.depth.clamp(near, far))
         valid = found.valid.reshape(h, w)
         weight = torch.where(valid & (confidence[0, :h, :w] > SETTINGS.unseen), confidence[0, :h, :w], 0.0)
-        total = total + weight / torch.where(found.valid, found.depth, 1.0).reshape(h, w)
+        inverse = (1 / torch.where(found.valid, found.depth, 1.0)).reshape(h, w)
+        total = total + weight * inverse
+        widths = widths + weight * found.deviation.reshape(h, w) * inverse.square()
         weights = weights + weight
     known = weights > 0
     depth = torch.where(known, weights / torch.where(known, total, 1.0), torch.nan)
     overall = torch.stack(output.confidence).amin(0) if output.overall is None else output.overall
-    return depth.to(output.image), overall[0, :h, :w]
+    half_width = torch.where(known, widths / torch.where(known, weights, 1.0), torch.nan)
+    return Measured(depth.to(output.image), half_width.to(output.image), overall[0, :h, :w])
 
 
 def background_filled(

@@ -53,11 +53,11 @@ class Placement(NamedTuple):
         """The tracks in beta of alpha's pixels, of pinholes."""
         return pinhole_track(self.pair, self.points(x))
 
-    def depth(self, x: Float[Tensor, "*n 2"], x_beta: Float[Tensor, "*n 2"]) -> Depth:
+    def depth(self, x: Float[Tensor, "n 2"], x_beta: Float[Tensor, "n 2"], deviation: Float[Tensor, " n"]) -> Depth:
         """The depth of what alpha's pixels see at beta's pixels, or its distance if `bounds` are of that."""
         if self.pair.alpha.has_pinhole_view and self.pair.beta.has_pinhole_view and self.bounds == "depth":
-            return depth_of(self.pair, self.points(x), x_beta)
-        return ray_depth(self.pair, self.points(x), x_beta, self.bounds)
+            return depth_of(self.pair, self.points(x), x_beta, deviation)
+        return ray_depth(self.pair, self.points(x), x_beta, self.bounds, deviation=deviation)
 
 
 class FrameInputs(NamedTuple):

@@ -57,8 +57,8 @@ def save_frame(
     name: str = "",
     bands: Sequence[str] = (),
 ) -> list[Path]:
-    """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown), depth_16.png (`write_depth`) and
-    depth.png (red is near).
+    """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown), depth_16.png (`write_depth`),
+    depth.png (red is near), depth_nearest.tif and depth_farthest.tif (the true depth is between in 9 of 10 pixels).
 
     8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With `view`, the
     rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to found_rig.yaml; with
@@ -73,14 +73,16 @@ def save_frame(
     """
     prefix = f"{name}_" if name else ""
     last = f"{prefix}fused.{kind}"
-    depths = {f"{prefix}depth{part}" for part in (".tif", ".png", "_16.png")}
+    depths = {f"{prefix}depth{part}" for part in (".tif", ".png", "_16.png", "_nearest.tif", "_farthest.tif")}
     stale = depths | (set() if name else {"points.ply", "index.html"})
     with write_together(out, last=last, stale=stale) as folder:
         tasks: list[Callable[[], object]] = [
             partial(write_image, folder / f"{prefix}confidence.png", frame.confidence[None])
         ]
         if frame.depth.isfinite().any():
-            tasks.append(partial(write_image, folder / f"{prefix}depth.tif", frame.depth[None], bits=32, unknown=True))
+            for part, depth in zip(("", "_nearest", "_farthest"), (frame.depth, *frame.depth_interval)):
+                path = folder / f"{prefix}depth{part}.tif"
+                tasks.append(partial(write_image, path, depth[None], bits=32, unknown=True))
             near = view.depth[0] if view is not None and view.depth else None
             tasks.append(partial(write_depth, folder / f"{prefix}depth_16.png", frame.depth, near=near and float(near)))
             tasks.append(lambda: write_image(folder / f"{prefix}depth.png", colour_depth(frame.depth)))
@@ -163,19 +165,30 @@ class Frame(NamedTuple):
 
     image: (C, H, W), in alpha's coding, not cut to 0..1.
     depth: (H, W), metres along alpha's axis; NaN where no calibrated beta sees the point.
-    confidence: (H, W), 0 to 1: that every band's beta sees the point and its position is right.
-    by_band: (C, H, W), the same of each band alone, where each is another beta's; else None.
+    confidence: (H, W), the probability that every band's beta sees the point and its position is right to a pixel.
+    half_width: (H, W), 1/metres: in 9 of 10 pixels the true inverse depth is within it of 1 / depth; NaN where that is.
+    by_band: (C, H, W), the confidence of each band alone, where each is another beta's; else None.
     """
 
     image: Float[Tensor, "c h w"]
     depth: Float[Tensor, "h w"]
     confidence: Float[Tensor, "h w"]
+    half_width: Float[Tensor, "h w"]
     by_band: Float[Tensor, "c h w"] | None = None
+
+    @property
+    def depth_interval(self) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+        """The nearest and the farthest depth (metres; infinite too) between which the true one is in 9 of 10 pixels."""
+        inverse = 1 / self.depth
+        farthest = inverse - self.half_width
+        beyond = farthest <= 0
+        return 1 / (inverse + self.half_width), torch.where(beyond, torch.inf, 1 / torch.where(beyond, 1.0, farthest))
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Frame:
         """The frame whose every part is changed, such as moved to another device."""
         by_band = None if self.by_band is None else change(self.by_band)
-        return Frame(change(self.image), change(self.depth), change(self.confidence), by_band)
+        planes = change(self.depth), change(self.confidence), change(self.half_width)
+        return Frame(change(self.image), *planes, by_band)
 
     def __repr__(self) -> str:
         """Sizes, the range of depth and the mean confidence, in a line."""

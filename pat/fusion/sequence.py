@@ -66,12 +66,12 @@ SETTINGS = SequenceSettings()
 
 
 class KeyColour(NamedTuple):
-    """What fusion adds to alpha at a key frame (C, H, W), with confidence and inverse depth (0: unknown), (H,
-    W)."""
+    """What fusion adds to alpha at a key frame (C, H, W), with confidence (H, W), and inverse depth (0: unknown) with
+    its half-width as of `Frame` (2, H, W)."""
 
     added: Float[Tensor, "c h w"]
     confidence: Float[Tensor, "h w"]
-    inverse_depth: Float[Tensor, "h w"]
+    inverse_depth: Float[Tensor, "2 h w"]
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class SequenceFusion:
             fields[name], certain = self._field(name, key.alpha, self.timeline.time(name, i))
             weight = torch.minimum(weight, certain)
         frame = self._fused(key.alpha, key.betas, fields)
-        inverse = (1 / frame.depth).nan_to_num(0.0)
+        inverse = torch.stack([1 / frame.depth, frame.half_width]).nan_to_num(0.0)
         return KeyColour(frame.image - self.base(key.alpha), frame.confidence * weight, inverse)
 
     def frame(self, i: int, keys: Sequence[KeyFrame], fetch: Callable[[KeyFrame], KeyColour | None]) -> Frame:
@@ -161,8 +161,8 @@ class SequenceFusion:
             return KeyContribution(nearness, *colour)
         LOG.info("motion of frame %d", i)
         flow = flow_between(own, self.grey(key.alpha))
-        moved = warped(torch.cat([colour.added, colour.confidence[None], colour.inverse_depth[None]]), flow.step)
-        return KeyContribution(nearness, moved[:-2], moved[-2] * flow.weight, moved[-1])
+        moved = warped(torch.cat([colour.added, colour.confidence[None], colour.inverse_depth]), flow.step)
+        return KeyContribution(nearness, moved[:-3], moved[-3] * flow.weight, moved[-2:])
 
     def _time(self, i: int) -> float:
         return self.timeline.time(self.alpha, i)
@@ -297,11 +297,13 @@ def mixed(own: Float[Tensor, "1 h w"], sources: Sequence[KeyContribution]) -> Fr
     colour = (share * added).sum(0)
     apart = (share * (added - colour).square()).sum((0, 1))
     confidence = (share[:, 0] * torch.stack([s.confidence for s in sources])).sum(0)
-    known = torch.stack([s.inverse_depth > 0 for s in sources])
-    weights = torch.where(known, weights, 0.0)
-    inverse = (weights * torch.stack([s.inverse_depth for s in sources])).sum(0) / weights.sum(0).clamp(min=1e-12)
-    depth = torch.where(known.any(0), 1 / torch.where(known.any(0), inverse, 1.0), torch.nan)
-    return Frame(own + colour, depth, confidence * torch.exp(-apart / SETTINGS.disagreement**2))
+    found = torch.stack([s.inverse_depth for s in sources])
+    weights = torch.where(found[:, 0] > 0, weights, 0.0)
+    known = weights.sum(0) > 0
+    inverse, half_width = (weights[:, None] * found).sum(0) / weights.sum(0).clamp(min=1e-12)
+    depth = torch.where(known, 1 / torch.where(known, inverse, 1.0), torch.nan)
+    agreeing = torch.exp(-apart / SETTINGS.disagreement**2)
+    return Frame(own + colour, depth, confidence * agreeing, torch.where(known, half_width, torch.nan))
 
 
 def fuse_sequence(

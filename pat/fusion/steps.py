@@ -271,15 +271,18 @@ def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens:
     if not (isinstance(pinhole, LensView) and isinstance(lens, LensView) and lens.distortion is not None):
         return frame
     shown = torch.cat([frame.image - straight, frame.confidence[None]])
-    inverse = (1 / frame.depth).nan_to_num(0.0)[None]
+    inverse = torch.stack([(1 / frame.depth).nan_to_num(0.0), frame.half_width.nan_to_num(0.0)])
     back = resampled(shown, pinhole, lens, interpolation="bilinear").values[0]
     del shown
-    depth = 1 / resampled(inverse, pinhole, lens, interpolation="nearest").values[0, 0]
+    inverse_depth, half_width = resampled(inverse, pinhole, lens, interpolation="nearest").values[0]
+    known = inverse_depth != 0
+    depth = torch.where(known, 1 / torch.where(known, inverse_depth, 1.0), torch.nan)
+    half_width = torch.where(known, half_width, torch.nan)
     by_band = frame.by_band
     if by_band is not None:
         bands = [resampled(b[None].float(), pinhole, lens, interpolation="bilinear").values[0, 0] for b in by_band]
         by_band = torch.stack([band.to(by_band) for band in bands])
-    return Frame(own + back[:-1], torch.where(depth.isfinite(), depth, torch.nan), back[-1], by_band)
+    return Frame(own + back[:-1], depth, back[-1], half_width, by_band)
 
 
 def _resized(views: Views, name: str) -> Views:

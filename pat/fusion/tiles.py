@@ -23,7 +23,7 @@ from ..matching.inputs import Inputs
 from ..matching.matches import Matches
 from ..networks.protocol import FusionNetwork, FusionOutput, matched_for
 from ..support.tensor_files import write_tensors
-from .depth import depth_and_confidence
+from .depth import certain, measured_depth
 from .inputs import FrameInputs
 from .results import Frame
 
@@ -36,8 +36,8 @@ SLACK = 1.05
 """What a process may take over what is counted here: freed blocks smaller than a page cannot be returned."""
 MATCHING_BYTES = 330.0
 """Working memory of matching for each pixel of alpha, measured."""
-FRAME_BYTES = 8.0
-"""A fused frame's for each pixel: depth and confidence."""
+FRAME_BYTES = 12.0
+"""A fused frame's for each pixel: depth, confidence and half-width."""
 BAND_BYTES = (4.0, 2.0)
 """And for each of its bands; its confidence, of several."""
 WRITING_BYTES = 65.0
@@ -197,19 +197,22 @@ def _to_multiple(box: Box, multiple: int) -> Box:
 
 
 class FusedTile(NamedTuple):
-    """The inner part of a tile: image (C, h, w), depth and confidence (h, w) as of `Frame`, and where its pixels were
-    found in each whole beta, (betas, 3, h, w): x, y and the confidence of that; `by_band` as of `Frame`, or empty."""
+    """The inner part of a tile: image (C, h, w), depth, confidence and half-width (h, w) as of `Frame`, and where its
+    pixels were found in each whole beta, (betas, 3, h, w): x, y and the confidence of that; `by_band` as of `Frame`, or
+    empty."""
 
     image: Tensor
     depth: Tensor
     confidence: Tensor
+    half_width: Tensor
     found: Tensor
     by_band: Tensor
 
     @property
     def frame(self) -> Frame:
         """The same of a whole frame, as its result."""
-        return Frame(self.image, self.depth, self.confidence, self.by_band if len(self.by_band) else None)
+        by_band = self.by_band if len(self.by_band) else None
+        return Frame(self.image, self.depth, self.confidence, self.half_width, by_band)
 
 
 def fuse_tile(network: FusionNetwork, frame: FrameInputs, matches: Matches | None, tile: Tile) -> FusedTile:
@@ -224,11 +227,11 @@ def _fused(
     top, bottom, left, right = tile.inner
     box = (top - tile.outer[0], bottom - tile.outer[0], left - tile.outer[2], right - tile.outer[2])
     with torch_in_all_threads():
-        output = network(inputs, matches).cut(box)
+        output = certain(network(inputs, matches), matches, inputs).cut(box)
     part = replace(inputs, betas=tuple(replace(beta, field=beta.field.cut(box)) for beta in inputs.betas))
     hw = bottom - top, right - left
-    depth, confidence = depth_and_confidence(output, part, frame.placements, hw, (left, top))
-    return FusedTile(output.image[0], depth, confidence, _found(output, part), _by_band(output, part))
+    depth, half_width, confidence = measured_depth(output, part, frame.placements, hw, (left, top))
+    return FusedTile(output.image[0], depth, confidence, half_width, _found(output, part), _by_band(output, part))
 
 
 def _by_band(output: FusionOutput, part: Inputs) -> Tensor:

@@ -15,6 +15,7 @@ from torch.nn.functional import avg_pool2d
 from arraygeom import Segments
 
 from ..support.settings import size
+from .certainty import with_certainty
 from .colour_transfer import transferred
 from .inputs import Beta, Inputs
 from .matches import BetaMatches, Matches, is_consistent
@@ -42,15 +43,15 @@ Matcher = Callable[[Inputs], Matches]
 
 
 def match(inputs: Inputs) -> Matches:
-    """Match alpha with every beta, and transfer the betas' bands to alpha's view; with gradients as `transferred`, and
-    of the positions.
+    """Match alpha with every beta, say how certain each match is, and transfer the betas' bands to alpha's view; with
+    gradients as `transferred`, and of the positions.
 
     Raises ValueError for a beta whose field is not of straight segments.
     """
     found = located(inputs)
     if torch.is_grad_enabled():
         found = Matches(tuple(_following(inputs.alpha, *one) for one in zip(inputs.betas, found.betas)))
-    return transferred(inputs, found)
+    return transferred(inputs, with_certainty(inputs, found))
 
 
 def _following(alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaMatches:

@@ -25,7 +25,7 @@ STAGES = {
     "matching": ["pat.matching.match.located", "pat.matching.colour_transfer.transferred"],
     "attention": ["pat.attention.attend._attend"],
     "network": ["pat.networks.guided.GuidedPAT.forward"],
-    "depth": ["pat.fusion.tiles.depth_and_confidence", "pat.fusion.fuse.background_filled"],
+    "depth": ["pat.fusion.tiles.measured_depth", "pat.fusion.fuse.background_filled"],
     "write": ["pat.fusion.results.save_frame", "pat.fusion.report.write_report"],
 }
 """What is counted as each part, without the parts within it."""

@@ -164,7 +164,7 @@ def test_merged_exposures_have_more_range_than_alpha(tiny):
         rig = rig.with_camera(name, rig["alpha"].replace(cam_from_world=one_place, sensor=rig[name].sensor))
     limit = {"alpha": 1.0, "red": 1 / 0.9, "green": 1 / 0.54, "blue": 1 / 1.44}
     images = {name: srgb_from_linear(light.clamp(max=limit[name])) for name in rig.names}
-    frame = Frame(images["alpha"].expand(3, -1, -1), torch.full((h, w), 5.0), torch.ones(h, w))
+    frame = Frame(images["alpha"].expand(3, -1, -1), torch.full((h, w), 5.0), *torch.ones(2, h, w))
     measured = linear_from_srgb(merged(frame, rig, images, "alpha").image)[1]
     off = ((measured - light[0]) / light[0]).abs()
     assert off[:, light[0, 0] < 1.7].max() < 0.02

@@ -56,6 +56,8 @@ def test_fuse_writes_everything(small):
         "depth.png",
         "depth.tif",
         "depth_16.png",
+        "depth_farthest.tif",
+        "depth_nearest.tif",
         "fused.png",
         "index.html",
         "view.yaml",

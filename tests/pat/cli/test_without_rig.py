@@ -23,7 +23,15 @@ from pat.fusion.results import Frame, save_frame
 from pat.media.images import read_image, write_image
 from pat.media.video import read_video, write_video
 
-ALL = [*(f"{n}.png" for n in ("confidence", "depth")), "depth.tif", "depth_16.png", "fused.png", "index.html"]
+ALL = [
+    *(f"{n}.png" for n in ("confidence", "depth")),
+    "depth.tif",
+    "depth_16.png",
+    "depth_farthest.tif",
+    "depth_nearest.tif",
+    "fused.png",
+    "index.html",
+]
 ALL = sorted([*ALL, "found_rig.yaml", "view.yaml"])
 
 
@@ -108,7 +116,7 @@ def test_the_rig_that_was_found_serves_the_next_command(folder):
 def test_a_rig_of_ones_own_beside_the_result_is_kept(folder, tmp_path):
     """It was overwritten by the one that was found."""
     (tmp_path / "rig.yaml").write_text("my own")
-    frame = Frame(torch.rand(3, 8, 8), torch.full((8, 8), 2.0), torch.ones(8, 8))
+    frame = Frame(torch.rand(3, 8, 8), torch.full((8, 8), 2.0), *torch.ones(2, 8, 8))
     save_frame(frame, tmp_path, rig=Rig.load(folder / "out" / "found_rig.yaml"))
     assert (tmp_path / "rig.yaml").read_text() == "my own"
     assert (tmp_path / "found_rig.yaml").is_file()

@@ -71,7 +71,7 @@ def test_bands_keep_their_own_values_where_levels_are_matched():
 
 
 def test_bands_are_files_by_name_with_their_confidences(tmp_path):
-    frame = Frame(torch.rand(3, 6, 8), torch.full((6, 8), torch.nan), torch.rand(6, 8), torch.rand(3, 6, 8).half())
+    frame = Frame(torch.rand(3, 6, 8), torch.full((6, 8), torch.nan), *torch.rand(2, 6, 8), torch.rand(3, 6, 8).half())
     written = save_frame(frame, tmp_path, bands=["red", "nir", "edge"])
     assert {path.name for path in written} == {"fused.png", "confidence.png"} | {
         f"{kind}_{name}.png" for kind in ("fused", "confidence") for name in ("red", "nir", "edge")
@@ -84,7 +84,7 @@ def test_bands_are_files_by_name_with_their_confidences(tmp_path):
 def confidence_warning(by_band: list[float] | None) -> list[warnings.WarningMessage]:
     least = 0.04 if by_band is None else min(by_band)
     maps = None if by_band is None else torch.tensor(by_band)[:, None, None].expand(-1, 8, 8)
-    frame = Frame(torch.rand(9, 8, 8), torch.ones(8, 8), torch.full((8, 8), least), maps)
+    frame = Frame(torch.rand(9, 8, 8), torch.ones(8, 8), torch.full((8, 8), least), torch.ones(8, 8), maps)
     inputs = FrameInputs(Inputs(torch.full((1, 1, 8, 8), 0.5), ()), [], (8, 8))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -285,7 +285,7 @@ def test_options_reach_the_fusion_of_frames_and_of_sequences(material, tmp_path,
 
     def fuse(*_, **further):
         given.update(further)
-        return Frame(torch.zeros(3, 1, 1), torch.zeros(1, 1), torch.zeros(1, 1))
+        return Frame(torch.zeros(3, 1, 1), *torch.zeros(3, 1, 1))
 
     monkeypatch.setattr("pat.fusion.batch.fuse", fuse)
     batch(material, tmp_path, **options)._frame(0)

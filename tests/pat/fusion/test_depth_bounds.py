@@ -5,7 +5,7 @@ import torch
 
 from arraygeom import Camera, Epipolar, Pose, Rig, Segments, intrinsics
 from arraygeom.fields.grid import FieldOnGrid
-from pat.fusion.depth import background_filled, depth_and_confidence
+from pat.fusion.depth import background_filled, measured_depth
 from pat.fusion.inputs import Placement
 from pat.matching.inputs import Beta, Inputs
 from pat.networks.protocol import FusionOutput
@@ -33,7 +33,7 @@ def test_positions_beyond_a_segment_are_its_ends(share):
         position = (found.start + share * (found.end - found.start)).movedim(-1, 1).float()
         ones = torch.ones(1, *hw)
         output = FusionOutput(torch.zeros(1, 3, *hw), [position], [ones], [ones])
-        depth, _ = depth_and_confidence(output, part, [Placement(p, lambda x: x)], hw, (box[2], box[0]))
+        depth, *_ = measured_depth(output, part, [Placement(p, lambda x: x)], hw, (box[2], box[0]))
         seen = found.valid[0]
         assert seen.any()
         assert depth[seen].isfinite().all()

@@ -20,10 +20,10 @@ def test_chroma_is_alphas_own_as_the_betas_show_it_and_luminance_stays():
     confidence[:, 30:] = 0.0
     wrong = rendered.clone()
     wrong[:, :, 30:] = from_luma_chroma(luma, -chroma)[:, :, 30:]
-    mended = with_own_colours(Frame(wrong, torch.ones(40, 60), confidence), truth).image
+    mended = with_own_colours(Frame(wrong, torch.ones(40, 60), confidence, torch.ones(40, 60)), truth).image
     assert torch.allclose(mended, rendered, atol=1e-2)
     assert torch.allclose(luminance(mended), luma, atol=1e-5)
-    grey = with_own_colours(Frame(wrong, torch.ones(40, 60), torch.zeros(40, 60)), truth).image
+    grey = with_own_colours(Frame(wrong, *torch.ones(1, 40, 60), *torch.zeros(2, 40, 60)), truth).image
     assert torch.allclose(grey, truth, atol=1e-4)
 
 

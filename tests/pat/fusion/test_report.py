@@ -24,7 +24,7 @@ def page(tmp_path_factory):
     h, w = sample.rig["mono"].hw
     depth = torch.linspace(2, 9, w).expand(h, w).clone()
     depth[:, :40] = torch.nan
-    frame = Frame(sample.ground_truth, depth, torch.linspace(0, 1, h)[:, None].expand(h, w))
+    frame = Frame(sample.ground_truth, depth, torch.linspace(0, 1, h)[:, None].expand(h, w), 0.1 / depth)
     baseline = classical_view(sample.rig, sample.images, "mono", longest=h)
     facts = Facts(("weights: <mono> & more",), ("the rig may be wrong: check it",), 12.0, 2.0**30, classical=baseline)
     path = tmp_path_factory.mktemp("report") / "index.html"
@@ -45,7 +45,7 @@ def test_the_page_needs_no_other_file(page):
 
 
 def test_without_depth_poses_and_warnings_there_is_nothing_of_them(page):
-    frame = Frame(torch.rand(3, 20, 30), torch.full((20, 30), torch.nan), torch.rand(20, 30))
+    frame = Frame(torch.rand(3, 20, 30), torch.full((20, 30), torch.nan), *torch.rand(2, 20, 30))
     sample = load_sample()
     views = {name: sample.rig[name].resize((20, 30)) for name in sample.rig.names}
     rig = Rig(views)

@@ -14,7 +14,7 @@ from pat.media.images import read_image
 
 
 def frame_of(bands: int) -> Frame:
-    return Frame(torch.rand(bands, 6, 8), torch.full((6, 8), torch.nan), torch.rand(6, 8))
+    return Frame(torch.rand(bands, 6, 8), torch.full((6, 8), torch.nan), *torch.rand(2, 6, 8))
 
 
 @pytest.mark.parametrize("bands", [1, 3])
@@ -40,16 +40,14 @@ def test_other_bands_are_written_one_by_one_and_their_mean(bands, tmp_path):
 
 def test_a_full_disk_leaves_the_former_files_all_of_one_frame(tmp_path):
     """The depth fits and the fused image does not, as on a full disk."""
-    former = Frame(torch.full((3, 60, 80), 0.5), torch.ones(60, 80), torch.ones(60, 80))
+    former = Frame(torch.full((3, 60, 80), 0.5), *torch.ones(3, 60, 80))
     save_frame(former, tmp_path, kind="tif", bits=16)
     before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (25_000, limits[1]))
     try:
         with pytest.raises(OSError, match=r"too large: '.*/fused\.tif'$") as caught:
-            save_frame(
-                Frame(torch.rand(3, 60, 80), torch.rand(60, 80), torch.rand(60, 80)), tmp_path, kind="tif", bits=16
-            )
+            save_frame(Frame(torch.rand(3, 60, 80), *torch.rand(3, 60, 80)), tmp_path, kind="tif", bits=16)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert caught.value.filename == str(tmp_path / "fused.tif")
@@ -73,13 +71,13 @@ def test_fused_images_say_that_they_are_srgb(tmp_path):
 
 
 def test_depth_of_a_former_frame_does_not_stay_beside_one_without(tmp_path):
-    save_frame(Frame(torch.rand(3, 6, 8), torch.ones(6, 8), torch.rand(6, 8)), tmp_path)
+    save_frame(Frame(torch.rand(3, 6, 8), torch.ones(6, 8), *torch.rand(2, 6, 8)), tmp_path)
     save_frame(frame_of(3), tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["confidence.png", "fused.png"]
 
 
 def test_unknown_depth_is_nan_in_the_file_as_in_memory(tmp_path):
     depth = torch.tensor([[1.5, torch.nan, 3.0], [torch.nan, 2.0, 0.5]])
-    frame = Frame(torch.rand(3, 2, 3), depth, torch.rand(2, 3))
+    frame = Frame(torch.rand(3, 2, 3), depth, *torch.rand(2, 2, 3))
     assert tmp_path / "depth.tif" in save_frame(frame, tmp_path)
     torch.testing.assert_close(torch.from_numpy(tifffile.imread(tmp_path / "depth.tif")), depth, equal_nan=True)

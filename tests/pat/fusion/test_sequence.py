@@ -77,14 +77,15 @@ def test_colours_mix_by_confidence_which_disagreement_lowers():
     red, blue = (torch.tensor(c)[:, None, None].expand(3, 1, 2) for c in ((0.2, 0.0, 0.0), (0.0, 0.0, 0.2)))
     sure = torch.tensor([[0.9, 0.9]])
     sources = [
-        KeyContribution(1.0, red, sure, sure),
-        KeyContribution(1.0, blue, torch.tensor([[0.9, 0.0]]), torch.zeros(1, 2)),
+        KeyContribution(1.0, red, sure, torch.stack([sure, 0.1 * sure])),
+        KeyContribution(1.0, blue, torch.tensor([[0.9, 0.0]]), torch.zeros(2, 1, 2)),
     ]
     frame = mixed(own, sources)
     torch.testing.assert_close(frame.image[:, 0, 1], torch.tensor([0.7, 0.5, 0.5]), atol=1e-3, rtol=0)
     torch.testing.assert_close(frame.image[:, 0, 0], torch.tensor([0.6, 0.5, 0.6]), atol=1e-3, rtol=0)
     assert frame.confidence[0, 0] < 0.5 * frame.confidence[0, 1]
     torch.testing.assert_close(frame.depth, 1 / sure)
+    torch.testing.assert_close(frame.half_width, 0.1 * sure)
 
 
 @pytest.fixture(scope="module")

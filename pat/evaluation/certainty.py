@@ -1,0 +1,244 @@
+"""How well stated certainty holds, and the fit of it: `python -m pat.evaluation.certainty --middlebury DIR`.
+
+Pairs with true disparity are fused under many conditions: how often are matches right that are stated to be so with
+some probability, and how many true positions lie in the interval of 9 of 10? With `--fit FILE` a network is fitted to
+these pairs and written; the tables are then of three fits, each judged by the third of the pairs that it did not see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+import tyro
+from jaxtyping import Bool, Float
+from rich.progress import track
+from torch import Generator, Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
+
+from arraygeom.atomic import write_text
+
+from ..data.pairs import PAPER_DISPARITY, StereoPair, middlebury_pairs
+from ..fusion.fuse import fuse
+from ..matching.certainty import SETTINGS, CertaintyNetwork, fitted_network, measured, typical_facts
+from ..matching.inputs import Inputs
+from ..matching.match import match
+from ..matching.matches import BetaMatches, Matches
+from ..matching.positions import FINE
+from ..media.figures import save_curves
+from ..networks.protocol import FusionNetwork
+from ..networks.weights import load_weights
+from ..support.tensor_files import write_tensors
+from .conditions import CONDITIONS, regions_of
+from .halves import Half, of_half
+from .protocols import hw_of, rectified_field, rectified_rig
+from .tables import distinct, markdown_table
+
+PIXELS = 6000
+"""Of a pair under a condition that take part, drawn evenly: every pair counts the same."""
+BINS = 15
+"""Bins of probability by which the calibration error is measured, as is usual (Guo et al. 2017)."""
+FITTED_ON = (
+    "ideal", "x1", "x4", "x8", "alpha = .6/.3/.1", "alpha random", "beta x .6",
+    "1000 electrons", "200 electrons", "50 electrons",
+)  # fmt: skip
+STEPS, BATCH, RATE, DECAY = 2000, 4096, 1e-2, 5e-2
+
+
+class Judged(NamedTuple):
+    """Some pixels (n) of a pair under a condition: what certainty is read off, whether the match is right, and the
+    error of depth in pixels."""
+
+    pair: str
+    condition: str
+    numbers: Float[Tensor, "n k"]
+    right: Bool[Tensor, " n"]
+    error: Float[Tensor, " n"]
+
+
+class Stated(NamedTuple):
+    """What is stated of pixels (n): the probability that the match is right, the half-width of the interval."""
+
+    probability: Float[Tensor, " n"]
+    half_width: Float[Tensor, " n"]
+
+    @classmethod
+    def by(cls, network: CertaintyNetwork, numbers: Float[Tensor, "n k"]) -> Stated:
+        """By a network."""
+        with torch.no_grad():
+            logit, width = network(numbers).unbind(-1)
+        return cls(logit.sigmoid(), width.exp())
+
+
+class Reliability(NamedTuple):
+    """By bins of stated probability: its mean, the share that is right, the share of matches in the bin."""
+
+    stated: Float[Tensor, " bins"]
+    right: Float[Tensor, " bins"]
+    share: Float[Tensor, " bins"]
+
+    @classmethod
+    def of(cls, probability: Float[Tensor, " n"], right: Bool[Tensor, " n"], bins: int = BINS) -> Reliability:
+        """How often matches are right, by the probability stated for them."""
+        which = (probability * bins).long().clamp(0, bins - 1)
+        count = torch.bincount(which, minlength=bins).double()
+        stated, fulfilled = (torch.bincount(which, x.double(), minlength=bins) for x in (probability, right))
+        some = count.clamp(min=1)
+        return cls(stated / some, fulfilled / some, count / count.sum())
+
+    @property
+    def error(self) -> float:
+        """The expected calibration error: the mean difference of what is stated and what is right."""
+        return float(((self.stated - self.right).abs() * self.share).sum())
+
+
+def judged(network: FusionNetwork, pairs: Iterable[StereoPair], conditions: Sequence[str]) -> Iterator[Judged]:
+    """Every pair with true disparity under every condition, fused as `fuse` does."""
+    for pair in pairs:
+        if pair.disparity is not None:
+            yield from (judged_pair(network, pair, name) for name in conditions)
+
+
+def judged_pair(network: FusionNetwork, pair: StereoPair, condition: str) -> Judged:
+    """One of them. A match is right if beta sees the point and it is within a pixel."""
+    assert pair.disparity is not None
+    (alpha, beta, _), noise = CONDITIONS[condition].recorded(pair)
+    h, w = hw_of(alpha)
+    rig = rectified_rig((h, w), {"beta": hw_of(beta)}, PAPER_DISPARITY)
+    stated = None if noise is None else {"alpha": noise, "beta": noise}
+    kept: list[BetaMatches] = []
+
+    def matcher(inputs: Inputs) -> Matches:
+        found = match(inputs)
+        kept.extend(found.betas)
+        return found
+
+    images, field = {"alpha": alpha, "beta": beta}, rectified_field(PAPER_DISPARITY)
+    frame = fuse(network, rig, images, alpha="alpha", field=field, noise=stated, matcher=matcher)
+    value, known = (x[:h, :w] for x in pair.disparity)
+    places = known.nonzero()
+    y, x = places[torch.randperm(len(places), generator=Generator().manual_seed(0))[:PIXELS]].unbind(-1)
+    (found,) = kept
+    numbers = measured(found, typical_facts(found))[0, :, y // FINE, x // FINE].T
+    right = regions_of(pair, (h, w))["seen"] & ((found.disparity[0, 0, :h, :w] - value).abs() <= 1)
+    error = (w / frame.depth - value).abs().nan_to_num(float(w))
+    return Judged(pair.name, condition, numbers, right[y, x], error[y, x])
+
+
+def fitted(found: Sequence[Judged], seed: int = 0) -> CertaintyNetwork:
+    """The network that states of all of these together what they ask for."""
+    numbers, right, error = (torch.cat([getattr(j, name) for j in found]) for name in ("numbers", "right", "error"))
+    middle, spread = numbers.mean(0), numbers.std(0) + 1e-6
+    farness = error.clamp(min=0.02).log()
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        network = CertaintyNetwork()
+        optimizer = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, STEPS)
+        for _ in range(STEPS):
+            some = torch.randint(len(numbers), (BATCH,))
+            logit, width = network((numbers[some] - middle) / spread).unbind(-1)
+            beyond = farness[some] - width
+            interval = torch.maximum(SETTINGS.covered * beyond, (SETTINGS.covered - 1) * beyond).mean()
+            loss = binary_cross_entropy_with_logits(logit, right[some].float()) + interval
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+    first = network.first
+    with torch.no_grad():  # of numbers as they are
+        first.weight /= spread
+        first.bias -= first.weight @ middle
+    return network.eval().requires_grad_(False)
+
+
+def by_thirds(found: Sequence[Judged]) -> Callable[[Judged], Stated]:
+    """What fits to two thirds of the pairs state of the others."""
+    pairs = distinct(j.pair for j in found)
+    networks = [fitted([j for j in found if j.pair not in pairs[k::3]]) for k in range(3)]
+    return lambda one: Stated.by(networks[pairs.index(one.pair) % 3], one.numbers)
+
+
+class Held(NamedTuple):
+    """How it held under a condition: the stated probability, and the share of true positions in the intervals."""
+
+    stated: Reliability
+    covered: float
+
+
+def held(found: Sequence[Judged], stating: Callable[[Judged], Stated]) -> dict[str, Held]:
+    """By condition, and over "all"."""
+    stated = [stating(j) for j in found]
+
+    def of(some: Sequence[int]) -> Held:
+        right, error = (torch.cat([getattr(found[i], name) for i in some]) for name in ("right", "error"))
+        probability, width = (torch.cat(planes) for planes in zip(*(stated[i] for i in some)))
+        covered = float((error <= width).float().mean())
+        return Held(Reliability.of(probability, right), covered)
+
+    names = distinct(j.condition for j in found)
+    return {n: of([i for i, j in enumerate(found) if n in (j.condition, "all")]) for n in [*names, "all"]}
+
+
+def held_markdown(held: dict[str, Held]) -> str:
+    """Calibration errors and coverage by condition, and the reliability over all."""
+    columns = ["condition", "right", "stated", "calibration error", "true position in the 90 % interval"]
+    lines = []
+    for name, one in held.items():
+        stated, right = (float((part * one.stated.share).sum()) for part in one.stated[:2])
+        lines.append([name, f"{right:.1%}", f"{stated:.1%}", f"{one.stated.error:.3f}", f"{one.covered:.1%}"])
+    bins = [
+        [f"{float(stated):.2f}", f"{float(right):.2f}", f"{float(share):.1%}"]
+        for stated, right, share in zip(*held["all"].stated)
+        if share > 0
+    ]
+    reliable = markdown_table(["probability stated", "share that is right", "of the pixels"], bins)
+    return markdown_table(columns, lines) + "\n" + reliable
+
+
+def save_reliability(held: dict[str, Held], path: Path) -> None:
+    """The reliability diagram: a curve for each condition, and the diagonal."""
+    curves = {"as stated": [(0.0, 0.0), (1.0, 1.0)]}
+    for name, one in held.items():
+        enough = one.stated.share > 1 / 200
+        points = torch.stack(one.stated[:2], 1)[enough].tolist()
+        curves[name] = [(float(x), float(y)) for x, y in points]
+    save_curves({"probability stated": curves}, path, ylabel="share of matches that are right")
+
+
+@dataclass(frozen=True)
+class CertaintyRun:
+    """What is measured."""
+
+    middlebury: Path
+    """Folder of Middlebury's scenes."""
+    half: Half = "report"
+    """Pairs that take part: it is fitted to tune."""
+    conditions: tuple[str, ...] = FITTED_ON
+    weights: str = "mono-colour"
+    """The network that fuses."""
+    fit: Path | None = None
+    """Fit to these pairs, and write that here."""
+    out: Path | None = None
+    """Folder for certainty.md, the tables, and reliability.png."""
+
+
+def main(run: CertaintyRun) -> str:
+    """The tables."""
+    pairs = list(of_half(middlebury_pairs(run.middlebury), run.half))
+    found = list(judged(load_weights(run.weights), track(pairs, "fusing"), run.conditions))
+    if run.fit:
+        write_tensors(run.fit, fitted(found).state_dict())
+    shown = held(found, by_thirds(found) if run.fit else lambda one: Stated.by(fitted_network(), one.numbers))
+    text = held_markdown(shown)
+    if run.out:
+        save_reliability(shown, run.out / "reliability.png")
+        write_text(run.out / "certainty.md", text)
+    return text
+
+
+if __name__ == "__main__":
+    print(main(tyro.cli(CertaintyRun, prog="python -m pat.evaluation.certainty")))

@@ -1,0 +1,109 @@
+"""How certain matches are: the probability of each, and how far from it the true position may be.
+
+Both are read off what matching found: its facts at a pixel and around it, how much disparities differ there, by
+how much one image had to be blurred to be compared, and what facts the pair's consistent matches have. A small
+network does it, which was fitted to pairs with true disparity (`python -m pat.evaluation.certainty`). It knows
+nothing of the image, so it holds for any network that uses the matches.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import cast
+
+import torch
+from jaxtyping import Float
+from safetensors.torch import load_file
+from torch import Tensor, nn
+from torch.nn.functional import max_pool2d
+
+from ..support.settings import size
+from .filters import box_mean
+from .inputs import Inputs
+from .matches import BetaMatches, Matches
+from .positions import FINE
+from .semi_global import CONSISTENT
+
+FITTED = Path(__file__).with_name("certainty.safetensors")
+
+
+@dataclass(frozen=True)
+class CertaintySettings:
+    """What certainty is read off."""
+
+    around: tuple[int, int] = size((2, 6), "Radii, at half the size, around a pixel in which facts are averaged")
+    apart: tuple[int, int] = size((1, 4), "Radii, at full size, in which disparities are compared")
+    width: int = size(16, "Numbers in each of the two hidden layers")
+    covered: float = size(0.9, "The share of true positions that an interval is to cover")
+
+
+SETTINGS = CertaintySettings()
+MEASURED = 3 * (1 + len(SETTINGS.around)) + len(SETTINGS.apart) + 4
+"""How many numbers of a pixel certainty is read off."""
+
+
+class CertaintyNetwork(nn.Sequential):
+    """Of each pixel's numbers the logit of the probability, and the logarithm of the half-width."""
+
+    def __init__(self) -> None:
+        width = SETTINGS.width
+        first, middle, last = nn.Linear(MEASURED, width), nn.Linear(width, width), nn.Linear(width, 2)
+        super().__init__(first, nn.SiLU(), middle, nn.SiLU(), last)
+
+    @property
+    def first(self) -> nn.Linear:
+        """The layer that takes the numbers."""
+        return cast(nn.Linear, self[0])
+
+
+@cache
+def fitted_network() -> CertaintyNetwork:
+    """The one that ships."""
+    network = CertaintyNetwork()
+    network.load_state_dict(load_file(FITTED))
+    return network.eval().requires_grad_(False)
+
+
+@torch.no_grad()
+def with_certainty(inputs: Inputs, matches: Matches) -> Matches:
+    """The matches, with the certainty of each."""
+    return Matches(tuple(_judged(inputs, found) for found in matches.betas))
+
+
+def _judged(inputs: Inputs, found: BetaMatches) -> BetaMatches:
+    typical = typical_facts(found)
+
+    def of(_: Inputs, part: BetaMatches) -> Tensor:
+        numbers = measured(part, typical).movedim(1, -1)
+        logit, half_width = fitted_network().to(numbers)(numbers).unbind(-1)
+        return torch.stack([logit.sigmoid(), half_width.exp()], 1)
+
+    return replace(found, certainty=inputs.in_pieces(of, replace(found, bands=None, diffused=None)))
+
+
+def typical_facts(found: BetaMatches) -> Float[Tensor, "b 2"]:
+    """By how much the pair's consistent matches are better than others, and their cost, in the mean."""
+    consistent = (found.facts[:, :1] < CONSISTENT).to(found.facts)
+    some = consistent.mean((-2, -1)).clamp(min=1e-3)
+    return (found.facts[:, 1:] * consistent).mean((-2, -1)) / some
+
+
+def measured(found: BetaMatches, typical: Float[Tensor, "b 2"]) -> Float[Tensor, "b n h2 w2"]:
+    """The `MEASURED` numbers of each pixel, at half the size; `typical` is of the whole frame."""
+    facts = [found.facts, *(box_mean(found.facts, radius) for radius in SETTINGS.around)]
+    apart = [_logarithm(max_pool2d(_range(found.disparity, radius), FINE), 0.1) for radius in SETTINGS.apart]
+    blurs = torch.tensor(found.comparison.whole.blurs).T  # of alpha and of beta, of each of the batch
+    same = torch.cat([blurs.to(typical), typical], 1)[..., None, None]
+    return torch.cat([*facts, *apart, same.expand(*same.shape[:2], *found.facts.shape[-2:])], 1)
+
+
+def _range(x: Tensor, radius: int) -> Tensor:
+    """The greatest less the least value within squares around each pixel."""
+    side = 2 * radius + 1
+    return max_pool2d(x, side, 1, radius) + max_pool2d(-x, side, 1, radius)
+
+
+def _logarithm(x: Tensor, least: float) -> Tensor:
+    return (x.clamp(min=0) + least).log()

@@ -1,0 +1,124 @@
+"""Certainty of matches: what it is read off, the same in pieces as at once, any network's, and depth's interval."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from skimage.data import stereo_motorcycle
+
+from pat.data.sample_array import load_motorcycle, load_sample
+from pat.evaluation.certainty import Reliability
+from pat.fusion.fuse import fuse
+from pat.fusion.results import Frame
+from pat.matching import inputs as pieces
+from pat.matching.certainty import MEASURED, measured, typical_facts, with_certainty
+from pat.matching.match import match
+from pat.matching.matches import BetaMatches
+from pat.matching.normalisation import Comparison, Normalisation
+from pat.networks.weights import load_weights
+
+
+def a_match(facts, disparity=None, blurs=((0.6,), (0.0,))):
+    """Matches of one image of 8 x 8 pixels with these facts everywhere."""
+    planes = torch.tensor(facts)[None, :, None, None].expand(1, 3, 4, 4).clone()
+    disparity = torch.full((1, 1, 8, 8), 5.0) if disparity is None else disparity
+    normalisation = Normalisation(torch.zeros(3, 1, 1, 1, 1), tuple(map(list, blurs)))
+    return BetaMatches(disparity, planes, Comparison(None, normalisation, normalisation))
+
+
+def test_what_certainty_is_read_off():
+    disparity = torch.full((1, 1, 8, 8), 5.0)
+    disparity[..., 6:] = 9.0
+    found = a_match([0.0, 0.5, 0.25], disparity)
+    numbers = measured(found, typical_facts(found))[0]
+    assert numbers.shape == (MEASURED, 4, 4)
+    near, far = numbers[9, 0], numbers[10, 0]
+    torch.testing.assert_close(near.exp() - 0.1, torch.tensor([0.0, 0.0, 4.0, 4.0]))
+    torch.testing.assert_close(far.exp() - 0.1, torch.tensor([0.0, 4.0, 4.0, 4.0]))
+    assert numbers[11:, 0, 0].tolist() == pytest.approx([0.6, 0.0, 0.5, 0.25])
+
+
+def test_typical_facts_are_of_consistent_matches():
+    found = a_match([0.0, 0.5, 0.25])
+    found.facts[:, :, :, :2] = torch.tensor([1.0, 0.0, 1.0])[None, :, None, None]
+    assert typical_facts(found).tolist() == [pytest.approx([0.5, 0.25])]
+
+
+@pytest.fixture(scope="module")
+def kept():
+    """The sample's inputs with one colour beta, their matches, and the frame."""
+    sample, found = load_sample(), []
+
+    def matcher(inputs):
+        found.append((inputs, match(inputs)))
+        return found[-1][1]
+
+    images = {name: sample.images[name] for name in ("mono", "colour")}
+    frame = fuse(load_weights("mono-colour-small"), sample.rig, images, alpha="mono", matcher=matcher)
+    return (*found[-1], frame, sample)
+
+
+def test_pieces_are_as_certain_as_the_whole(kept, monkeypatch):
+    inputs, found, *_ = kept
+    monkeypatch.setattr(pieces, "SETTINGS", replace(pieces.SETTINGS, at_once=60_000, halo=64))
+    assert len(inputs.pieces) > 3
+    again = with_certainty(inputs, found)
+    torch.testing.assert_close(again.betas[0].certainty, found.betas[0].certainty, atol=1e-5, rtol=1e-4)
+
+
+def test_matches_that_do_not_come_back_are_less_certain(kept):
+    _, found, *_ = kept
+    (beta,) = found.betas
+    probability = beta.certainty[:, 0]
+    assert probability.min() >= 0
+    assert probability.max() <= 1
+    assert probability[beta.facts[:, 0] < 0.05].mean() > 0.6
+    assert probability[beta.facts[:, 0] > 0.9].mean() < 0.2
+
+
+def test_confidence_is_the_matches_whatever_the_network(kept):
+    """The same for other weights: where matches lie is the same."""
+    *_, frame, sample = kept
+    images = {name: sample.images[name] for name in ("mono", "colour")}
+    other = fuse(load_weights("mono-colour"), sample.rig, images, alpha="mono")
+    assert (frame.confidence - other.confidence).abs().mean() < 1e-4
+
+
+@pytest.fixture(scope="module")
+def motorcycle():
+    """The frame of a real pair, and its true depth, NaN where that is not known."""
+    array = load_motorcycle()
+    frame = fuse(load_weights("mono-colour-small"), array.rig, array.images, alpha="mono")
+    disparity = torch.from_numpy(stereo_motorcycle()[2][:, :740].copy())
+    pair = array.rig.pair("mono", "colour")
+    baseline = float(pair.beta_from_alpha.t.norm())
+    depth = 994.978 * baseline / (disparity + 31.086)
+    return frame, torch.where(disparity.isfinite() & (disparity > 0), depth, torch.nan)
+
+
+def test_true_depths_are_in_the_interval(motorcycle):
+    """9 of 10, of a pair that it was not fitted to."""
+    frame, depth = motorcycle
+    near, far = frame.depth_interval
+    known = depth.isfinite() & frame.depth.isfinite()
+    inside = ((depth >= near) & (depth <= far))[known].float().mean()
+    assert 0.85 < inside < 0.96
+
+
+def test_confidence_is_the_share_of_depths_that_are_right(motorcycle):
+    """Right is within a pixel of disparity; hidden points may be so by what was put there, so some more are right."""
+    frame, depth = motorcycle
+    known = depth.isfinite() & frame.depth.isfinite()
+    pixel = 1 / (994.978 * 0.193001)
+    right = ((1 / frame.depth - 1 / depth).abs() <= pixel)[known]
+    found = Reliability.of(frame.confidence[known], right)
+    assert found.error < 0.08
+
+
+def test_interval_is_of_the_pixels_that_it_says():
+    """A focal length of 500 px and a baseline of .1 m: at 5 m disparity is 10 px, a pixel more is 4.545 m."""
+    one = torch.ones(1, 1)
+    near, far = Frame(torch.ones(1, 1, 1), 5 * one, one, 1 / 50 * one).depth_interval
+    assert near.item() == pytest.approx(50 / 11)
+    assert far.item() == pytest.approx(50 / 9)
+    assert Frame(torch.ones(1, 1, 1), 5 * one, one, one).depth_interval[1].item() == torch.inf
