@@ -321,11 +321,12 @@ def match_offset(
     on_line, own = best(best(line)[0] + fine * along)
     beside = best(line[:, None] + torch.arange(-ACROSS, ACROSS + 1).to(xy)[:, None] * across)[0]
     beside, other = best(beside + fine[:, None] * across + fine * along)
+    distance = abs(float((beside - ends[0]) @ across))
     if max(own, other) < CLEAR:
         return None
     if other < own + BETTER:
         return MatchOffset(on_line, 0.0, own)
-    return MatchOffset(beside, abs(float((beside - ends[0]) @ across)), other)
+    return MatchOffset(beside, distance, other) if distance < ACROSS else None  # at the edge it would be better beyond
 
 
 def ends_of(found: Segments | Positions) -> Float[Tensor, "2 2"] | None:

@@ -127,6 +127,7 @@ FACTS = {"step": 3, "best": 1.0, "minutes": 0.5, "done": False, "recipe": "steps
         {"best": None},
         {"best": float("nan")},
         {"minutes": -1},
+        {"minutes": 2**64 - 1},
         {"done": 0},
         {"recipe": {}},
     ],
