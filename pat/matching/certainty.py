@@ -57,6 +57,11 @@ class CertaintyNetwork(nn.Sequential):
         """The layer that takes the numbers."""
         return cast(nn.Linear, self[0])
 
+    @property
+    def last(self) -> nn.Linear:
+        """The layer that gives logit and logarithm."""
+        return cast(nn.Linear, self[-1])
+
 
 @cache
 def fitted_network() -> CertaintyNetwork:
