@@ -50,7 +50,8 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
             limit = beside_points(self._limit(), xy)
             outermost = limit * self._radius_over_angle(limit)[0]
             valid = finite & (radius <= outermost)
-            pull = torch.where(valid, 1.0, outermost / torch.where(valid, 1.0, radius))
+            beyond = finite & (radius > outermost)
+            pull = torch.where(beyond, outermost / torch.where(beyond, radius, 1.0), 1.0)
         xy, radius = xy * pull[..., None], radius * pull
         with torch.no_grad():
             theta = invert_increasing(self._radius, radius, limit.expand_as(radius), ITERATIONS)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from . import options
-from .fusing import files_by_camera, load_rig_or_say_no_image, named_images
+from .fusing import files_by_camera, named_images
 from .known import Known
 from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Out, optional, say
 
@@ -94,7 +94,7 @@ class Align(Known):
         from ..fusion.healing import checked_rig
         from ..fusion.views import ViewFiles
 
-        rig = load_rig_or_say_no_image(self.given[0], self.depth)
+        rig = options.load_rig_or_say_no_image(self.given[0], self.depth)
         alpha, files = files_by_camera(rig, self.alpha, self.given, image)
         for i, one in enumerate(_in_order(files)):
             views = ViewFiles(rig, one, alpha=alpha)

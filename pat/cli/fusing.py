@@ -277,7 +277,7 @@ class Fuse(Known):
             sys.exit(LowConfidenceWarning.exit_status)
 
     def _rig(self) -> Rig:
-        rig = load_rig_or_say_no_image(self.given[0], self.depth)
+        rig = options.load_rig_or_say_no_image(self.given[0], self.depth)
         for name, rate in options.numbers_by_name(self.frame_rate, "--frame-rate").items():
             rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate)))
         for name, offset in options.numbers_by_name(self.time_offset, "--time-offset").items():
@@ -452,7 +452,7 @@ def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> t
     if given and (image or is_rig_file(given[0])):
         named = (*image, *(f"{path.stem}={path}" for path in given[1:]))
         if not named:
-            raise ValueError(f"{given[0]}: {NO_IMAGE}; if it is a rig, give --image NAME=FILE for each camera")
+            raise ValueError(f"{given[0]}: {options.NO_IMAGE}; if it is a rig, give --image NAME=FILE for each camera")
         options.files_by_name(named)
         options.refuse_missing_rig(given[0])
         return named, True
@@ -483,19 +483,6 @@ def files_by_camera(
     found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
     refuse_equal_files({name: paths[0] for name, paths in found.items()})
     return rig.require(alpha), found
-
-
-NO_IMAGE = "is no image: images end in .png, .tif, .jpg and the like"
-
-
-def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> Rig:
-    """The rig of the first argument, which might have been meant as an image; with other depth bounds if given."""
-    from arraygeom.io.source import UnknownRigFormat
-
-    try:
-        return options.load_rig(path, depth)
-    except UnknownRigFormat:
-        raise ValueError(f"{path}: {NO_IMAGE}; nor is it a rig file (`pat rig convert --help` names formats)") from None
 
 
 def is_rig_file(path: Path) -> bool:

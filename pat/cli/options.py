@@ -193,6 +193,19 @@ def load_rig(path: Path, depth: tuple[float, float] | None = None) -> Rig:
     return rig if depth is None else rig.replace(depth=depth)
 
 
+NO_IMAGE = "is no image: images end in .png, .tif, .jpg and the like"
+
+
+def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> Rig:
+    """The rig of the first argument, which might have been meant as an image; with other depth bounds if given."""
+    from arraygeom.io.source import UnknownRigFormat
+
+    try:
+        return load_rig(path, depth)
+    except UnknownRigFormat:
+        raise ValueError(f"{path}: {NO_IMAGE}; nor is it a rig file (`pat rig convert --help` names formats)") from None
+
+
 def refuse_missing_rig(path: Path) -> None:
     """Raise FileNotFoundError for a rig file that does not exist, before torch is imported to read it."""
     if not path.exists():

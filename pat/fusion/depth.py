@@ -55,7 +55,7 @@ def _within(where: Float[Tensor, "n 2"], segments: Segments, which: Bool[Tensor,
     return torch.where(beyond[..., None], moved, where)
 
 
-class Measured(NamedTuple):
+class FoundDepth(NamedTuple):
     """Depth (h, w), NaN where unknown, the half-width of the interval of inverse depth as of `Frame`, and the image's
     confidence."""
 
@@ -80,7 +80,7 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
 
 def measured_depth(
     output: FusionOutput, part: Inputs, placements: list[Placement], hw: HW, corner: tuple[int, int]
-) -> Measured:
+) -> FoundDepth:
     """Depth from the calibrated betas, weighted by confidence in inverse depth, with its interval.
 
     A position whose depth is beyond the bounds that were searched counts as the end of its segment: a pixel beyond the
@@ -121,7 +121,7 @@ def measured_depth(
     depth = torch.where(known, weights / torch.where(known, total, 1.0), torch.nan)
     overall = torch.stack(output.confidence).amin(0) if output.overall is None else output.overall
     half_width = torch.where(known, widths / torch.where(known, weights, 1.0), torch.nan)
-    return Measured(depth.to(output.image), half_width.to(output.image), overall[0, :h, :w])
+    return FoundDepth(depth.to(output.image), half_width.to(output.image), overall[0, :h, :w])
 
 
 def background_filled(

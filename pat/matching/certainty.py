@@ -57,6 +57,11 @@ class CertaintyNetwork(nn.Sequential):
         """The layer that takes the numbers."""
         return cast(nn.Linear, self[0])
 
+    @property
+    def last(self) -> nn.Linear:
+        """The layer that gives logit and logarithm."""
+        return cast(nn.Linear, self[-1])
+
 
 @cache
 def fitted_network() -> CertaintyNetwork:
@@ -68,7 +73,11 @@ def fitted_network() -> CertaintyNetwork:
 
 @torch.no_grad()
 def with_certainty(inputs: Inputs, matches: Matches) -> Matches:
-    """The matches, with the certainty of each."""
+    """The matches, with the certainty of each.
+
+    Of matches on which several betas agree, whose certainty alone was known before: a beta sees a point only if both
+    say so.
+    """
     return Matches(tuple(_judged(inputs, found) for found in matches.betas))
 
 
@@ -80,7 +89,10 @@ def _judged(inputs: Inputs, found: BetaMatches) -> BetaMatches:
         logit, half_width = fitted_network().to(numbers)(numbers).unbind(-1)
         return torch.stack([logit.sigmoid(), half_width.exp()], 1)
 
-    return replace(found, certainty=inputs.in_pieces(of, replace(found, bands=None, diffused=None)))
+    certainty = inputs.in_pieces(of, replace(found, bands=None, diffused=None, certainty=None))
+    if found.certainty is not None:
+        certainty[:, :1] = certainty[:, :1].minimum(found.certainty[:, :1])
+    return replace(found, certainty=certainty)
 
 
 def typical_facts(found: BetaMatches) -> Float[Tensor, "b 2"]:

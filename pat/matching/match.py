@@ -67,7 +67,7 @@ def _following(alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaMatches:
 def located(inputs: Inputs) -> Matches:
     """Where alpha's pixels are in each beta, without colours; of several calibrated betas, where all agree."""
     alone = Matches(tuple(located_in_one(inputs.of_beta(i)) for i in range(len(inputs.betas))))
-    return agreed(inputs, alone) if inputs.can_agree else alone
+    return agreed(inputs, with_certainty(inputs, alone)) if inputs.can_agree else alone
 
 
 def located_in_one(inputs: Inputs) -> BetaMatches:

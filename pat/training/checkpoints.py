@@ -28,6 +28,8 @@ FACTS: Mapping[str, tuple[type, ...]] = {
     "recipe": (str,),
 }
 """What a checkpoint says beside its tensors, and the types of it."""
+LONGEST = 1e7
+"""Minutes that a run takes at most: 19 years."""
 
 
 class Checkpoint(NamedTuple):
@@ -125,7 +127,7 @@ def read_checkpoint(path: Path) -> Checkpoint | None:
 def _are_facts(facts: object) -> bool:
     if not isinstance(facts, dict) or not all(type(facts.get(name)) in kinds for name, kinds in FACTS.items()):
         return False
-    return facts["step"] >= 0 and 0 <= facts["minutes"] < math.inf and not math.isnan(facts["best"])
+    return facts["step"] >= 0 and 0 <= facts["minutes"] < LONGEST and not math.isnan(facts["best"])
 
 
 def _files(folder: Path) -> list[Path]:

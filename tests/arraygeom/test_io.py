@@ -381,7 +381,8 @@ def test_a_lens_without_focal_length_states_its_scale(tmp_path):
     with pytest.raises(RigFileError, match=r"distortion\.scale: is -3; a scale is positive"):
         Rig.load(path)
     path.write_text(
-        text.replace("640, 400]", "640, 400]\n    focal: 500") + "{model: x, coefficients: [0], scale: 3}\n"
+        text.replace("640, 400]", "640, 400]\n    focal: 500")
+        + "{model: brown-conrady, coefficients: [0, 0, 0, 0], scale: 3}\n"
     )
     with pytest.raises(RigFileError, match=r"distortion\.scale: unknown key"):
         Rig.load(path)

@@ -19,6 +19,7 @@ from PIL import Image
 from arraygeom import Camera, Pose, Rig, intrinsics
 from arraygeom.io import read_rig
 from arraygeom.pose import rotation_from_vector
+from experiments.showcase import syntim_scene
 from pat.media.video import write_video
 
 SIDE = 320
@@ -108,7 +109,7 @@ def kinds(data: Path) -> Iterator[Kind]:
     yield Kind("no rig, same picture twice", partial(pair, table, table), 2, False)
     yield Kind("no rig, near infrared of one view", partial(same_view, data), depth=False)
     yield Kind("no rig, other scenes", partial(pair, table, cloth), 2, False)
-    for name in ("Color", "Poly", "Lego"):
+    for name in ("Color", "Poly", "Serfaty"):
         yield Kind(f"rig, syntim {name}", partial(syntim, data, name))
     yield Kind("rig, lenses (bumblebee)", partial(with_lenses, data))
     yield Kind("rig, street (KITTI)", partial(kitti, data, 0.0, 1.0))
@@ -227,10 +228,9 @@ def with_rig(rig: Rig, images: dict[str, Path], alpha: str, folder: Path) -> lis
 
 
 def syntim(data: Path, name: str, folder: Path) -> list:
-    """An unrectified pair with its published rig."""
-    wanted = {"Lego": "OG1"}.get(name, "OG0")
-    rig = read_rig(data / f"syntim/cam_{name}_g", data / f"syntim/cam_{name}_d")
-    return _two(rig, [data / f"syntim/{name}{i}_{wanted}.png" for i in (0, 1)], folder)
+    """An unrectified pair with its published rig, its depths those of matched points."""
+    rig = syntim_scene(data / "syntim", name).rig
+    return _two(rig, [next((data / "syntim").glob(f"{name}{i}_OG*.png")) for i in (0, 1)], folder)
 
 
 def _two(rig: Rig, files: Sequence[Path], folder: Path, depth: tuple[float, float] | None = None) -> list:
@@ -241,14 +241,14 @@ def _two(rig: Rig, files: Sequence[Path], folder: Path, depth: tuple[float, floa
 
 def with_lenses(data: Path, folder: Path) -> list:
     """A rig with lens distortion."""
-    rig = read_rig(data / "bumblebee2_scenes/stereo.yaml")
+    rig = read_rig(data / "bumblebee2_scenes/stereo.yaml", scale=1e-3)
     files = [data / f"bumblebee2_scenes/chair01_{side}.jpg" for side in ("left", "right")]
     return _two(rig, files, folder, (0.4, 10.0))
 
 
 def kitti_rig(degrees: float, sign: float) -> Rig:
     """The published rig of the two colour cameras, turned by so much, its baseline times a sign."""
-    K = intrinsics(721.5377, 721.5377, 609.5593, 172.854)
+    K = intrinsics(721.5377, (375, 1242), (609.5593, 172.854))
     turn = rotation_from_vector(torch.tensor([0.3, 1.0, 0.3], dtype=torch.float64) * degrees * np.pi / 180)
     one = Camera(K=K, cam_from_world=Pose.identity(), hw=(375, 1242))
     other = Camera(K=K, cam_from_world=Pose(turn, torch.tensor([-0.5327 * sign, 0, 0]).double()), hw=(375, 1242))
@@ -270,7 +270,7 @@ def light_field(data: Path, more: Sequence[str], folder: Path) -> list:
             t = torch.tensor([-0.01 * (column - 4), -0.01 * (row - 4), 0]).double()
             name = f"row{row}_col{column}"
             cameras[name] = Camera(
-                K=intrinsics(500, 500, 255.5, 255.5), cam_from_world=Pose(Pose.identity().R, t), hw=(512, 512)
+                K=intrinsics(500, (512, 512)), cam_from_world=Pose(Pose.identity().R, t), hw=(512, 512)
             )
             images[name] = small(source / f"{name}.png", folder / f"{name}.png", grey=name == "row4_col4", side=256)
     return [*with_rig(Rig(cameras, depth=(1.2, 60.0)), images, "row4_col4", folder), *more]

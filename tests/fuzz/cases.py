@@ -310,7 +310,9 @@ def use_checkpoint(path: Path, _: random.Random) -> str:
     except ValueError as error:
         return "refused" if "\n" not in str(error) else f"message: {error}"
     facts = found.facts
-    whole = isinstance(facts["step"], int) and isinstance(facts["minutes"], float) and isinstance(facts["done"], bool)
+    whole = (
+        isinstance(facts["step"], int) and isinstance(facts["minutes"], float | int) and isinstance(facts["done"], bool)
+    )
     return "read" if whole else f"facts of other types: {facts}"
 
 

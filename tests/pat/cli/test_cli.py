@@ -23,14 +23,18 @@ from pat.media.images import read_image, write_image
 @pytest.fixture
 def small(tmp_path):
     """The sample array, its rig and images cut small so that fusing takes a moment."""
+    return cut_sample(tmp_path, (96, 128))
+
+
+def cut_sample(folder, hw):
+    """The folder, with the upper left part of the sample array of so many rows and columns."""
     sample = load_sample()
     rig = sample.rig
     for name in rig.names:
-        image = sample.images[name][:, :96, :128]
-        rig = rig.crop(name, 0, 0, (96, 128))
-        write_image(tmp_path / f"{name}.png", image)
-    rig.save(tmp_path / "rig.yaml")
-    return tmp_path
+        rig = rig.crop(name, 0, 0, hw)
+        write_image(folder / f"{name}.png", sample.images[name][:, : hw[0], : hw[1]])
+    rig.save(folder / "rig.yaml")
+    return folder
 
 
 def arguments(folder, **changes):
@@ -323,7 +327,8 @@ def wrong(small) -> None:
     rig.with_camera("colour", rig["colour"].replace(cam_from_world=Pose(pose.R, -pose.t))).save(small / "rig.yaml")
 
 
-def test_a_rig_that_does_not_fit_ends_with_status_3_and_strict_writes_nothing(small, capsys):
+def test_a_rig_that_does_not_fit_ends_with_status_3_and_strict_writes_nothing(tmp_path, capsys):
+    small = cut_sample(tmp_path, (240, 320))
     wrong(small)
     for extra, written in ((["--no-report"], True), (["--strict"], False)):
         shutil.rmtree(small / "out", ignore_errors=True)
@@ -331,7 +336,8 @@ def test_a_rig_that_does_not_fit_ends_with_status_3_and_strict_writes_nothing(sm
             main(arguments(small, extra=extra))
         assert stop.value.code == 3
         text = " ".join(capsys.readouterr().err.split())
-        assert re.search(r"pat: .*mean confidence 0\.[01]\d where the views overlap: .*`pat rig doctor`", text)
+        assert "`pat rig doctor` says: likely mistake: translation of all cameras with the wrong sign" in text
+        assert written == bool(re.search(r"mean confidence 0\.[01]\d where the views overlap", text))
         assert (small / "out" / "fused.png").exists() == written
         assert not (small / "out" / "index.html").exists()
     assert not (small / "out").exists()

@@ -100,7 +100,7 @@ def test_rig_commands_take_matches(folder, capsys):
     ("options", "expected"),
     [
         (["--depth-map", "{}/depth.tif", "--matches", "{}/matches.csv"], "each excludes the others"),
-        (["--depth-map", "{}/depth.png", "--depth-scale", "1"], "is of 1e+04 to 2e+04 m, the rig's"),
+        (["--depth-map", "{}/depth.png", "--depth-scale", "1"], "holds 1e+04 to 2e+04 m, the rig's"),
         (["--depth-map", "{}/mono.png"], "8 bits, too few"),
         (["--depth-map", "{}/none.png"], "no such depth map"),
         (["--matches", "{}/mono.png"], "neither CSV nor a COLMAP database"),

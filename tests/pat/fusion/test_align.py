@@ -170,3 +170,22 @@ def test_mistakes_are_named(tmp_path):
 def test_one_band_and_packed_values(tmp_path):
     write_bands(tmp_path / "one.tif", np.ones((1, 8, 9), np.float32), ["x"], [None])
     assert read_image(tmp_path / "one.tif").shape == (1, 8, 9)
+
+
+def test_ndvi_is_of_light_where_the_sensors_are_stated():
+    """Counts above the black level, by exposure and gain: as if both bands had been exposed alike."""
+    rig, images = array()
+    facts = {"mono": (Band(660.0, 40.0), 100.0, 0.01, 2.0), "nir": (Band(840.0, 40.0), 300.0, 0.04, 1.0)}
+    cameras, counts = {}, {}
+    for name, (band, black, exposure, gain) in facts.items():
+        sensor = Sensor(response=band, coding="linear", bits=16, black_level=black, exposure=exposure, gain=gain)
+        cameras[name] = rig[name].replace(sensor=sensor)
+        counts[name] = np.rint(black + images[name].numpy() * 1e6 * exposure * gain).astype(np.uint16)
+    stated = rig.replace(cameras=cameras)
+    found = align(stated, images, alpha="mono", recorded=counts, correct=False, interpolation="nearest")
+    index, nir = ndvi(found, stated), found["nir"]
+    where = np.rint(np.nan_to_num(nir.positions)).astype(int)
+    seen = nir.valid
+    light = images["nir"][0].numpy()[where[..., 1], where[..., 0]], images["mono"][0].numpy()
+    expected = (light[0] - light[1]) / (light[0] + light[1])
+    assert np.nanmedian(np.abs(index - expected)[seen]) < 1e-3

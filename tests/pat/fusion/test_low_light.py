@@ -236,7 +236,7 @@ def test_positions_are_those_of_the_matched_colours(network):
     fuse(network, sample.rig, images, alpha=ALPHA, noise=noise)
     monkey.undo()
     high = (seen["confidence"] > 0.8).expand_as(seen["image"])
-    assert float((seen["beta"].denoised - seen["image"])[high].abs().mean()) < 0.02
+    assert float((seen["beta"].denoised - seen["image"])[high].abs().mean()) < 0.025
 
 
 def test_a_darker_beta_keeps_its_colours(network):

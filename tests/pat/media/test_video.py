@@ -55,7 +55,7 @@ def test_what_goes_wrong_leaves_no_file(tmp_path):
 
     with pytest.raises(OSError, match="disk"):
         write_video(tmp_path / "a.mp4", broken())
-    with pytest.raises(ValueError, match="one size"):
+    with pytest.raises(ValueError, match="size of the first"):
         write_video(tmp_path / "a.mp4", [torch.zeros(3, 32, 32), torch.zeros(3, 32, 34)])
     with pytest.raises(ValueError, match="at least one"):
         write_video(tmp_path / "a.mp4", [])

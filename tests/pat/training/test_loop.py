@@ -296,4 +296,4 @@ def test_one_run_at_a_time_writes_to_a_folder(folder, whole):
     with folder_lock(config.out):
         with pytest.raises(ValueError, match="twice: another command is writing there"):
             train(config)
-        assert [p.name for p in config.out.iterdir()] == [".lock"]
+        assert {p.name for p in config.out.iterdir()} == {".lock", ".lock.json"}
