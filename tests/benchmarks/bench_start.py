@@ -10,7 +10,6 @@ the pairs with most points (median and worst pair).
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -19,44 +18,19 @@ import cv2
 import numpy as np
 import torch
 
-from arraygeom import Camera, Pose, Rig, intrinsics
-from calib.boards.detect import collect_folder
 from calib.boards.parameters import StartDeviations
-from calib.boards.rig import Calibration, calibrate
-from calib.boards.target import parse_board
 from calib.boards.uncertainty import baseline_deviation, rig_covariance
 from calib.images.held_out import line_distances
 from calib.images.matches import PointMatches, match_cameras
+from experiments.alignment import nine_band_calibration
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.media.images import read_image
 from tests.benchmarks.printed import data_and_out, print_tables
 
-BOARD = "chessboard:11x8:30mm"
 ROWS = ((0, 1, 2), (3, 4, 5), (6, 7, 8))
 GRID = 0.04
 ENOUGH = 150
 """Points of a pair whose distances are reported."""
-
-
-def start_rig(folder: Path) -> Rig:
-    """The array as its makers state it: X to the right, Y up, parallel cameras."""
-    stated = json.loads((folder / "camera_array.json").read_text())
-    cameras = {}
-    for i in range(9):
-        c = stated[f"Camera {i}"]
-        hw = c["image_height"], c["image_width"]
-        centre = torch.tensor([c["X"], -c["Y"], 0.0], dtype=torch.float64) * 1e-3
-        pose = Pose.from_centre(torch.eye(3, dtype=torch.float64), centre)
-        focal = c["focal_length"] / c["sensor_width"] * c["image_width"]
-        cameras[f"Cam-{i}"] = Camera(K=intrinsics(focal, hw), cam_from_world=pose, hw=hw)
-    return Rig(cameras)
-
-
-def calibrated(folder: Path, deviations: StartDeviations) -> Calibration:
-    """The array from its boards."""
-    start, board = start_rig(folder), parse_board(BOARD)
-    views = collect_folder(folder / "calibration", board, patterns={name: f"{name}.png" for name in start.names}).views
-    return calibrate(views, board, start=start, deviations=deviations)
 
 
 def neighbours() -> Iterator[tuple[str, str]]:
@@ -75,7 +49,7 @@ def rows(folder: Path) -> Iterator[str]:
     yield markdown_header(list(head))
     matches = scene_matches(folder)
     for position in (5e-4, 5e-3):
-        found = calibrated(folder, StartDeviations(position=position))
+        found = nine_band_calibration(folder, StartDeviations(position=position))
         yield markdown_row([f"± {1e3 * position:g} mm", f"{found.rms:.3f}", *_cells(found, matches)])
 
 

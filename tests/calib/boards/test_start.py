@@ -15,9 +15,10 @@ from calib.boards.simulation import photograph
 from calib.boards.target import parse_board
 from calib.images.held_out import line_distances
 from calib.images.matches import match_cameras
+from experiments.alignment import nine_band_calibration
 from pat.cli.main import main
 from pat.media.images import read_image
-from tests.benchmarks.bench_start import GRID, calibrated, neighbours
+from tests.benchmarks.bench_start import GRID, neighbours
 from tests.calib.board_scenes import BOARD, board_poses, camera, errors_of, see
 
 STATED = StartDeviations(position=1e-3, rotation=1.0, focal=0.02, centre=0.01)
@@ -167,7 +168,7 @@ def test_mistakes_with_a_start(options, message, photos, capsys):
 @pytest.mark.slow
 def test_the_nine_band_array(shared_data):
     """Baselines of 40 mm, and a scene whose points lie near their lines though no image of it was used."""
-    found = calibrated(shared_data / "nine_band_array", StartDeviations())
+    found = nine_band_calibration(shared_data / "nine_band_array", StartDeviations())
     off = [float((found.rig[b].centre - found.rig[a].centre).norm()) - GRID for a, b in neighbours()]
     assert np.abs(off).max() < 5e-4
     assert found.rms < 0.11
