@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import zipfile
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
@@ -99,6 +100,10 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
             _check_shapes(path, network, config, shapes)
             stored = {key: file.get_tensor(key) for key in keys.values()}
     except (SafetensorError, OSError) as error:
+        if zipfile.is_zipfile(path):
+            raise ValueError(
+                f"{path}: a checkpoint of PyTorch's: `pat weights import` makes weights of one of the paper's authors"
+            ) from None
         raise ValueError(f"{path}: not a safetensors file ({error}); was it copied whole?") from None
     if not undamaged(stored, metadata):
         raise ValueError(f"{path}: its numbers are not those that were written: copy it again")
