@@ -13,6 +13,7 @@ from calib.boards.parameters import changed, parameter_names
 from calib.boards.rig_diff import _projections, rig_difference
 from calib.boards.uncertainty import rig_covariance
 from pat.cli.main import main
+from pat.data.sample_array import SAMPLE
 from tests.calib.board_scenes import board_poses, four_cameras, scene_of, see
 
 DEPTH = (1.0, 4.0)
@@ -95,10 +96,10 @@ def test_differences_are_those_of_the_motion(rig, name):
 
 
 def test_the_depths_deviation_is_that_of_recalibrations(rig):
-    fits = [recalibrated(rig, seed) for seed in range(8)]
+    fits = [recalibrated(rig, seed) for seed in range(24)]
     found = [compared(*pair).depths["nir"] for pair in zip(fits[::2], fits[1::2])]
     ratio = np.concatenate([depth.change / depth.sigma for depth in found])
-    assert 0.5 < np.sqrt(np.square(ratio).mean()) < 1.6
+    assert 0.6 < np.sqrt(np.square(ratio).mean()) < 1.3
 
 
 @pytest.fixture(scope="module")
@@ -138,6 +139,22 @@ def test_without_deviations_there_is_no_verdict(files, capsys):
     said = capsys.readouterr()
     assert "verdict: the same" in said.out
     assert "bare.covariance.json: not there: that rig counts as calibrated as well" in said.err
+
+
+def test_images_say_which_rig_fits(tmp_path, capsys):
+    """The sample's images fit its rig, not one with a camera turned by .3 degrees, whichever is given first."""
+    rig = Rig.load(SAMPLE / "rig.yaml")
+    pose = rig["colour"].cam_from_world.perturbed(
+        6 * TURN * torch.tensor([1.0, 0, 0]).double(), torch.zeros(3).double()
+    )
+    rig.with_camera("colour", rig["colour"].replace(cam_from_world=pose)).save(tmp_path / "turned.yaml")
+    images = [word for name in rig.names for word in ("--image", f"{name}={SAMPLE / name}.png")]
+    main(["rig", "diff", str(SAMPLE / "rig.yaml"), str(tmp_path / "turned.yaml"), *images])
+    assert "A fits better" in capsys.readouterr().out
+    main(["rig", "diff", str(tmp_path / "turned.yaml"), str(SAMPLE / "rig.yaml"), *images])
+    assert "B fits better" in capsys.readouterr().out
+    main(["rig", "diff", str(SAMPLE / "rig.yaml"), str(SAMPLE / "rig.yaml"), *images])
+    assert "neither fits significantly better" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
