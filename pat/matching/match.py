@@ -51,7 +51,8 @@ def match(inputs: Inputs) -> Matches:
     found = located(inputs)
     if torch.is_grad_enabled():
         found = Matches(tuple(_following(inputs.alpha, *one) for one in zip(inputs.betas, found.betas)))
-    return transferred(inputs, with_certainty(inputs, found))
+    found = with_certainty(inputs, found)
+    return transferred(inputs, found)
 
 
 def _following(alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaMatches:
@@ -67,7 +68,10 @@ def _following(alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaMatches:
 def located(inputs: Inputs) -> Matches:
     """Where alpha's pixels are in each beta, without colours; of several calibrated betas, where all agree."""
     alone = Matches(tuple(located_in_one(inputs.of_beta(i)) for i in range(len(inputs.betas))))
-    return agreed(inputs, with_certainty(inputs, alone)) if inputs.can_agree else alone
+    if not inputs.can_agree:
+        return alone
+    alone = with_certainty(inputs, alone)
+    return agreed(inputs, alone)
 
 
 def located_in_one(inputs: Inputs) -> BetaMatches:

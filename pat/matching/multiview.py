@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, depth_from_track, pixel_grid
-from arraygeom.chunks import Tile, assembled, spans
+from arraygeom.chunks import Box, spans
 from arraygeom.epipolar import FRONT, Track
 
 from ..media.colour import to_bytes
@@ -215,6 +215,12 @@ class Agreement(NamedTuple):
         facts = avg_pool2d(torch.stack([margin, cost]), FINE)
         return cls(inverse_depth[None].to(like), taken.any(0)[None], facts.to(like))
 
+    def cut(self, box: Box) -> Agreement:
+        """The part at alpha's (top, bottom, left, right), of inverse depth; facts are whole."""
+        top, bottom, left, right = box
+        planes = (plane[:, top:bottom, left:right] for plane in (self.inverse_depth, self.known))
+        return Agreement(*planes, self.facts)
+
 
 def agreed(inputs: Inputs, matches: Matches) -> Matches:
     """The matches of each beta, with `disparity` and `facts` from the inverse depths on which all agree."""
@@ -224,7 +230,8 @@ def agreed(inputs: Inputs, matches: Matches) -> Matches:
     def at(i: int, rows: tuple[int, int]) -> MatchedBeta:
         return MatchedBeta.of(inputs.betas[i], found[i], rows, between[i])
 
-    betas, strips = range(len(found)), spans(inputs.hw[0], max(STRIP // inputs.hw[1] // FINE, 1) * FINE)
+    (height, width), betas = matches.hw, range(len(found))
+    strips = spans(height, max(STRIP // width // FINE, 1) * FINE)
     parts = [Agreement.of([at(i, rows) for i in betas], inputs.alpha) for rows in strips]
     agreement = _dense(Agreement(*(torch.cat(planes, 1) for planes in zip(*parts))), inputs)
     del parts
@@ -307,17 +314,13 @@ def _agree(terms: Tensor, own: Tensor, rise: Tensor, solutions: Float[Tensor, "k
 def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
     """Inverse depth diffused to where no match is consistent, and without outliers."""
 
-    def of(tile: Tile) -> Tensor:
-        top, bottom, left, right = tile.outer
-        planes = agreement.inverse_depth, agreement.known, inputs.alpha[0]
-        plane, known, alpha = (x[:, top:bottom, left:right].cpu().numpy() for x in planes)
-        guide = to_bytes(alpha[0])
-        smooth = filled(plane, known[0].astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
+    def of(piece: Inputs, part: Agreement) -> Tensor:
+        plane, known = part.inverse_depth.cpu().numpy(), part.known.cpu().numpy()
+        smooth = filled(plane, known[0].astype(np.float32) + 1e-5, to_bytes(piece.alpha[0, 0]), DISPARITY_FILL)
         median = cv2.medianBlur(np.where(known, plane, smooth)[0], 5)
-        return torch.from_numpy(median)[None].to(inputs.alpha)
+        return torch.from_numpy(median)[None].to(piece.alpha)
 
-    dense = assembled(inputs.hw, ((tile, of(tile)) for tile in inputs.pieces))
-    return agreement._replace(inverse_depth=dense)
+    return agreement._replace(inverse_depth=inputs.in_pieces(of, agreement))
 
 
 def _of_beta(

@@ -210,32 +210,31 @@ def fit(
     bands: Float[Tensor, "3 n"],
     alpha: Float[Tensor, " n"],
     where: Float[Tensor, "n 2"] | None = None,
-    settings: ResponseSettings = SETTINGS,
 ) -> Response:
     """The response by robust least squares over points: the most plausible of those that explain alpha.
 
     `where` are the points in beta, in its width and height, from its middle: with them vignetting is found
     too. Rec. 601's where there are too few points, or where a combination of bands does not explain alpha.
     """
-    most, fewest = settings.points
+    most, fewest = SETTINGS.points
     step = max(alpha.numel() // most, 1)
     x, y = bands[:, ::step].double().cpu(), alpha[::step].double().cpu()
     unclipped = (y > 0.02) & (y < 0.98) & (x > 0.01).all(0) & (x < 0.98).all(0)
     x, y = x[:, unclipped], y[unclipped]
     if len(y) < fewest:
         return Response.rec601()
-    gamma, found = _best_gamma(x, y, settings)
+    gamma, found = _best_gamma(x, y)
     shading: tuple[float, ...] = ()
     if where is not None:
         terms = _shading_terms(where[::step].double().cpu()[unclipped])
-        slopes = _shading(x, y, terms, settings)
+        slopes = _shading(x, y, terms)
         even = x * (slopes @ terms).exp()
-        other_gamma, other = _best_gamma(even, y, settings)
-        if other.error < settings.better * found.error and _plausible(slopes, terms, settings):
+        other_gamma, other = _best_gamma(even, y)
+        if other.error < SETTINGS.better * found.error and _plausible(slopes, terms):
             x, gamma, found, shading = even, other_gamma, other, tuple(slopes.tolist())
-    if found.explained < settings.explained:
+    if found.explained < SETTINGS.explained:
         return Response.rec601()
-    return _decided(x**gamma, y, gamma, found, settings)[1]._replace(shading=shading)
+    return _decided(x**gamma, y, gamma, found)[1]._replace(shading=shading)
 
 
 class _Fit(NamedTuple):
@@ -248,17 +247,17 @@ class _Fit(NamedTuple):
     explained: float
 
 
-def _best_gamma(x: Tensor, y: Tensor, settings: ResponseSettings) -> tuple[float, _Fit]:
+def _best_gamma(x: Tensor, y: Tensor) -> tuple[float, _Fit]:
     """1, or the gamma that explains alpha clearly better; of several the one with the most plausible
     response."""
-    trials = {gamma: _weighted_fit(x**gamma, y, settings) for gamma in settings.gammas}
+    trials = {gamma: _weighted_fit(x**gamma, y) for gamma in SETTINGS.gammas}
     least = min(trial.error for trial in trials.values())
-    if least > settings.better * trials[1.0].error:
+    if least > SETTINGS.better * trials[1.0].error:
         return 1.0, trials[1.0]
-    equal = {gamma: trial for gamma, trial in trials.items() if trial.error <= settings.equal * least}
+    equal = {gamma: trial for gamma, trial in trials.items() if trial.error <= SETTINGS.equal * least}
     linear, most = trials[1.0], max(float(trial.counts.sum()) for trial in equal.values())
     equal[1.0] = linear._replace(counts=linear.counts * (most / linear.counts.sum()))
-    gamma = min(equal, key=lambda g: _decided(x**g, y, g, equal[g], settings)[0])
+    gamma = min(equal, key=lambda g: _decided(x**g, y, g, equal[g])[0])
     return gamma, trials[gamma]
 
 
@@ -268,22 +267,22 @@ def _shading_terms(where: Float[Tensor, "n 2"]) -> Float[Tensor, "5 n"]:
     return torch.stack([u, v, u * u, u * v, v * v])
 
 
-def _plausible(slopes: Tensor, terms: Tensor, settings: ResponseSettings) -> bool:
+def _plausible(slopes: Tensor, terms: Tensor) -> bool:
     """Whether a lens may shade its image so: noticeably at the points, not absurdly in the corners."""
     corners = _shading_terms(torch.tensor([[u, v] for u in (-0.5, 0.5) for v in (-0.5, 0.5)]).to(terms))
     seen, extreme = (float((slopes @ t).abs().max()) for t in (terms, corners))
-    least, most = settings.shading
+    least, most = SETTINGS.shading
     return seen > least and extreme < most
 
 
-def _shading(x: Tensor, y: Tensor, terms: Tensor, settings: ResponseSettings) -> Float[Tensor, "5"]:
+def _shading(x: Tensor, y: Tensor, terms: Tensor) -> Float[Tensor, "5"]:
     """Coefficients of the logarithm of alpha over what explains it, by least squares with the fit's
     weights."""
     slopes = terms.new_zeros(len(terms))
     design = torch.cat([terms, torch.ones_like(terms[:1])])
     for _ in range(3):
         even = x * (slopes @ terms).exp()
-        found = _weighted_fit(even, y, settings)
+        found = _weighted_fit(even, y)
         ratio = (y / (found.weights @ even).clamp(min=0.01)).log()
         counts = found.counts * y.square()
         ridge = 1e-4 * counts.sum() * torch.eye(len(design)).to(y)
@@ -295,19 +294,19 @@ CHANGES = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]], dtype=torch.float
 """What weights may change by while their sum stays."""
 
 
-def _weighted_fit(x: Tensor, y: Tensor, settings: ResponseSettings) -> _Fit:
+def _weighted_fit(x: Tensor, y: Tensor) -> _Fit:
     """Weights s (usual ones + d), d's sum 0, robustly. Nothing is assumed of s; d is drawn to 0."""
-    usual = x.new_tensor(settings.usual)
+    usual = x.new_tensor(SETTINGS.usual)
     terms = torch.stack([usual @ x, *(CHANGES.T @ x)])
     start = x.new_tensor([float(y.median() / terms[0].median()), 0.0, 0.0])
 
     def weigh(rest: Tensor) -> Tensor:
-        deviation = normal_deviation(rest, settings.error / 3)
-        share = cauchy(rest, settings.outlier * deviation)
-        return share * (settings.independent / share.sum() / max(deviation, settings.error) ** 2)
+        deviation = normal_deviation(rest, SETTINGS.error / 3)
+        share = cauchy(rest, SETTINGS.outlier * deviation)
+        return share * (SETTINGS.independent / share.sum() / max(deviation, SETTINGS.error) ** 2)
 
     def precision(found: Tensor) -> Tensor:
-        return torch.block_diag(x.new_zeros(1, 1), CHANGES.T @ CHANGES / (settings.prior * float(found[0])) ** 2)
+        return torch.block_diag(x.new_zeros(1, 1), CHANGES.T @ CHANGES / (SETTINGS.prior * float(found[0])) ** 2)
 
     (scale, *change), rest, counts = robust_least_squares(terms, y, start, weigh, precision=precision)
     centred = y - counts @ y / counts.sum()
@@ -328,21 +327,17 @@ class _Points(NamedTuple):
         found = least_squares(terms, rest, self.counts, precision)
         return float(self.counts @ (rest - found @ terms).square() + found @ precision @ found), found
 
-    def misfit(self, shade: Tensor) -> float:
-        """That of alpha explained as it is."""
-        return float(self.counts @ (self.y - shade).square())
 
-
-def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: ResponseSettings) -> tuple[float, Response]:
+def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit) -> tuple[float, Response]:
     """The most plausible of four explanations of alpha, and its misfit.
 
     They are luma as it is, another gain, other weights of sum 1, or both. In a scene of one hue several fit,
     and what each must gain to be taken decides.
     """
     points, rec601 = _Points(x, y, found.counts), Response.rec601().weights
-    usual = x.new_tensor(settings.usual)
+    usual = x.new_tensor(SETTINGS.usual)
     grey, hues, free = usual @ x, CHANGES.T @ x, x.new_zeros(1, 1)
-    precision = CHANGES.T @ CHANGES / settings.prior**2
+    precision = CHANGES.T @ CHANGES / SETTINGS.prior**2
     scale = float(found.weights.sum())
     only_gain, (gain,) = points.explained(y, (rec601 @ x)[None], free)
     only_weights, change = points.explained(y - grey, hues, precision)
@@ -350,42 +345,40 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
     both, (total, *rest) = points.explained(y, torch.stack([grey, *hues]), scaled)
     weights, further = usual + CHANGES @ change, usual + CHANGES @ torch.stack(rest) / total
     trials = [
-        (only_gain + settings.unlikely[0], rec601, float(gain)),
-        (both + settings.unlikely[2] + _negative(further, settings), further, float(total)),
+        (only_gain + SETTINGS.unlikely[0], rec601, float(gain)),
+        (both + SETTINGS.unlikely[2] + _negative(further), further, float(total)),
     ]
     if gamma == 1:
-        trials.append((only_weights + settings.unlikely[1] + _negative(weights, settings), weights, 1.0))
-        trials.append((points.misfit(rec601 @ x), rec601, 1.0))
+        trials.append((only_weights + SETTINGS.unlikely[1] + _negative(weights), weights, 1.0))
+        trials.append((float(points.counts @ (y - rec601 @ x).square()), rec601, 1.0))
     misfit, chosen, exposure = min(trials, key=lambda trial: trial[0])
-    as_well = only_gain < only_weights + settings.alike
-    unchanged = float(((chosen - rec601) @ x).square().mean().sqrt()) < settings.least_change
-    if exposure == 1 and (unchanged or _is_light(points, float(gain), as_well, (weights, further), settings)):
+    as_well = only_gain < only_weights + SETTINGS.alike
+    unchanged = float(((chosen - rec601) @ x).square().mean().sqrt()) < SETTINGS.least_change
+    if exposure == 1 and (unchanged or _is_light(points, float(gain), as_well, (weights, further))):
         chosen = rec601
     elif chosen is not rec601:
-        chosen, exposure = _or_equal(points, chosen, exposure, settings)
+        chosen, exposure = _or_equal(points, chosen, exposure)
     return misfit, Response(chosen, exposure, gamma, found.explained)
 
 
-def _is_light(
-    points: _Points, gain: float, as_well: bool, weights: Sequence[Tensor], settings: ResponseSettings
-) -> bool:
+def _is_light(points: _Points, gain: float, as_well: bool, weights: Sequence[Tensor]) -> bool:
     """Whether light that differs between the views may be why other weights explain alpha better: a small
     gain explains it as well, or no sensor has such weights."""
-    rec601, sensor = Response.rec601().weights, points.x.new_tensor(settings.sensor)
+    rec601, sensor = Response.rec601().weights, points.x.new_tensor(SETTINGS.sensor)
     unlike_sensors = (gain - 1) * float(((sensor - rec601) @ points.x) @ points.counts) < 0
-    no_sensor = any(bool((w[1] > settings.greenest) & (w[2] < rec601[2])) for w in weights)
-    small = as_well and abs(math.log(gain)) < settings.light[unlike_sensors]
+    no_sensor = any(bool((w[1] > SETTINGS.greenest) & (w[2] < rec601[2])) for w in weights)
+    small = as_well and abs(math.log(gain)) < SETTINGS.light[unlike_sensors]
     return small or (unlike_sensors and no_sensor)
 
 
-def _negative(weights: Tensor, settings: ResponseSettings) -> float:
+def _negative(weights: Tensor) -> float:
     """How unlikely negative weights are, as a misfit."""
-    return float((weights.clamp(max=0) / settings.negative).square().sum())
+    return float((weights.clamp(max=0) / SETTINGS.negative).square().sum())
 
 
-def _or_equal(points: _Points, weights: Tensor, gain: float, settings: ResponseSettings) -> tuple[Tensor, float]:
+def _or_equal(points: _Points, weights: Tensor, gain: float) -> tuple[Tensor, float]:
     """1/3 of each band if they explain alpha about as well, with the gain that fits best unless that is 1."""
-    more, deviation = settings.equal_weights
+    more, deviation = SETTINGS.equal_weights
     precision = points.x.new_full((1, 1), deviation**-2 if gain == 1 else 0.0)
     equal = torch.full_like(weights, 1 / 3)
     shades = [gain * (w @ points.x) for w in (weights, equal)]
@@ -450,7 +443,8 @@ def _mix(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, 
     unexplained = weight.flatten() @ rest.square() / (weight.flatten() @ y[0].square()).clamp(min=1e-12)
     explained = (1 - unexplained).clamp(min=0)
     weights = weights / explained.clamp(min=MIX_SETTINGS.diluted).sqrt()
-    detail = _detail(bands[order]).flatten(1)
+    # What pixels have beyond the mean of those around: how materials differ does not count.
+    detail = (bands[order] - _mean_around(bands[order], 1)).flatten(1)
     combined = weights @ detail
     slopes = explained * (detail @ (share * combined)) / (share @ combined.square()).clamp(min=1e-12)
     misfit = _smooth_misfit(rest.view_as(alpha), share.view_as(alpha))
@@ -487,18 +481,14 @@ def _beyond_local_mean(planes: Tensor, weight: Tensor) -> Tensor:
     return planes - (box_mean((planes * weight)[None], radius) / box_mean(weight[None], radius))[0]
 
 
-def _detail(planes: Tensor) -> Tensor:
-    """What pixels of (c, h, w) have beyond the mean of those around: how materials differ does not count."""
-    return planes - avg_pool2d(planes[None], 3, 1, 1, count_include_pad=False)[0]
+def _mean_around(planes: Tensor, radius: int) -> Tensor:
+    """Of planes (c, h, w), within squares around each pixel."""
+    return avg_pool2d(planes[None], 2 * radius + 1, 1, radius, count_include_pad=False)[0]
 
 
 def _smooth_misfit(rest: Tensor, share: Tensor) -> Tensor:
     """Root mean square of the rest (1, h, w) averaged around each pixel: errors of matches, at edges, average
     out."""
-    radius = MIX_SETTINGS.smooth
-
-    def mean(plane: Tensor) -> Tensor:
-        return avg_pool2d(plane[None], 2 * radius + 1, 1, radius, count_include_pad=False)[0]
-
-    smooth = mean(share * rest) / mean(share).clamp(min=1e-12)
+    total = _mean_around(share, MIX_SETTINGS.smooth).clamp(min=1e-12)
+    smooth = _mean_around(share * rest, MIX_SETTINGS.smooth) / total
     return (share * smooth.square()).sum().sqrt()

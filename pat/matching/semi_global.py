@@ -24,7 +24,7 @@ from torch import Tensor
 
 from arraygeom import Segments
 from arraygeom.chunks import Box
-from arraygeom.sampling import on_image
+from arraygeom.sampling import SLACK
 from arraygeom.threads import in_parallel
 
 from ..support.memory import how_many_fit
@@ -123,10 +123,12 @@ def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int
     """In pixels of a beta that is so many times smaller. An invalid segment's length is negative: it has no
     pixel.
 
-    Segments that start within a pixel of beta's edge may have been cut there.
+    Segments that start beyond the centres of beta's outermost pixels may have been cut there.
     """
     length, towards = Extent.of(segments)
-    cut = segments.valid & ~on_image(segments.start - 0.5, (hw[0] - 1, hw[1] - 1))
+    last = segments.start.new_tensor([hw[1] - 1, hw[0] - 1])
+    at_edge = (segments.start < -SLACK) | (segments.start > last + SLACK)
+    cut = segments.valid & at_edge.any(-1)
     end = (segments.end + 0.5) / factor - 0.5
     length = torch.where(segments.valid, length / factor, -1.0)
     planes = (numpy_of(x.expand(batch, *x.shape[1:])) for x in (end, towards, length, cut))
@@ -186,7 +188,7 @@ def _matched_blocks(
     images, tasks, nbytes = [], [], 1.0
     for i, (mine, its) in enumerate(zip(planes[: len(own)], planes[len(own) :])):
         views = own[i], windows.first[i], *(g[i] for g in geometry), *mine
-        images.append(_Image(views, _flat(its), (rows, columns), (disparity[i], measured[i], place[i]), []))
+        images.append(_Image(views, flat(its), (rows, columns), (disparity[i], measured[i], place[i]), []))
         boxes = _boxes(hw, geometry.along[i], windows.first.shape[-1] * windows.labels, settings)
         tasks += [partial(_block, images[-1], box, windows, settings) for box in boxes]
         largest = max(_pixels_in(outer, hw) for _, outer in boxes)
@@ -203,7 +205,7 @@ def _prepare(planes: list[tuple[NDArray, ...]], i: int, image: NDArray) -> None:
     planes[i] = planes_of(image)
 
 
-def _flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
+def flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
     """Planes (h, w, ...) as lists of pixels."""
     return tuple(plane.reshape(-1, *plane.shape[2:]) for plane in planes)
 
@@ -240,7 +242,7 @@ def _block(image: _Image, box: tuple, windows: Windows, settings: SemiGlobalSett
     guide, first, end, along, length, cut, *own = (np.ascontiguousarray(x[outer]) for x in image.views)
     labels, segments = (first, windows.labels), (end, along, length, cut)
     cost = np.empty((*length.shape, *windows.lanes), np.uint8)
-    kernels.costs(_flat(own), image.other, *labels, *segments, *image.hw, cost)
+    kernels.costs(flat(own), image.other, *labels, *segments, *image.hw, cost)
     total = np.empty(cost.shape, np.int16)
     step, jump = np.float32(settings.step), np.float32(settings.jump)
     kernels.aggregate(cost, guide, *labels, step, jump, total)

@@ -9,7 +9,6 @@ then is the pixel's search segment, in pixels of arc from its last position, and
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -33,7 +32,7 @@ from .cost import planes_of
 from .filters import filled, numpy_of
 from .normalisation import Normalisation
 from .positions import FINE
-from .semi_global import DISPARITY_FILL, HALF_SIZE, inner_and_outer
+from .semi_global import DISPARITY_FILL, HALF_SIZE, flat, inner_and_outer
 
 ORDERED = 0.95
 """Share of pixels whose steps from one position to the next hardly ever go back, from which positions are a curve:
@@ -138,7 +137,7 @@ def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool)
     own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
     level = Normalisation.of(own, other)
     a, b = (numpy_of(p[0, 0]) for p in level.equally_sharp(own, level.normalised(other)))
-    planes, other_planes = planes_of(a), _flat(planes_of(b))
+    planes, other_planes = planes_of(a), flat(planes_of(b))
     label, margin = np.zeros((2, *a.shape), np.float32)
     rows = [(rows, slice(0, a.shape[1])) for rows in grid.by_rows()]
     sides = (HALF_SIZE.margin, HALF_SIZE.block, HALF_SIZE.block)
@@ -147,7 +146,7 @@ def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool)
         lanes = -(-places.shape[-1] // kernels.LANES) * kernels.LANES
         cost = np.empty((*places.shape[:2], 1, lanes), np.uint8)
         parts = [np.ascontiguousarray(p[outer]) for p in planes]
-        kernels.costs_at(_flat(parts), other_planes, places, cost)
+        kernels.costs_at(flat(parts), other_planes, places, cost)
         total = cost.astype(np.int16)
         if ordered:
             first = np.zeros((*places.shape[:2], 1), np.int32)
@@ -161,11 +160,6 @@ def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool)
     weight = np.minimum(margin / scale, 1)
     dense = filled(label[None], weight + np.float32(1e-5), to_bytes(own[:, 0])[0], DISPARITY_FILL)[0]
     return cv2.medianBlur(np.where(weight > LEAST_MARGIN, label, dense).astype(np.float32), 5)
-
-
-def _flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
-    """Planes (h, w) as lists of pixels."""
-    return tuple(plane.ravel() for plane in planes)
 
 
 def _places(grid: _BlockCentres, box: tuple[slice, ...], hw: tuple[int, ...]) -> NDArray[np.int32]:
