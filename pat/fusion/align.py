@@ -35,8 +35,7 @@ from .corrections import corrections_for, expected_work
 from .fuse import Progress
 from .inputs import FrameInputs, Placement, check_bands, prepared
 from .low_light import Noise, denoised_views
-from .results import Frame
-from .steps import EqualResolution, FusionStep, Radiometry, Undistort, Undo, Upright
+from .steps import EqualResolution, FusionStep, Radiometry, Undistort, Upright, has_lens, undone
 from .tiles import fused_in_tiles, plan_frame
 from .views import Views
 
@@ -200,7 +199,7 @@ def align(
         matches = matcher(inputs.inputs)
         done = fused_in_tiles(network, inputs, matches, plan.tiles, progress=progress)
         warn_of_confidence(network, done.frame, inputs)
-        depths = _at_alpha(done.frame, undo).depth
+        depths = undone(done.frame, undo).depth
         own = recorded if recorded is not None else images
         aligned = {alpha: _of_alpha(rig, alpha, own)}
         for i, name in enumerate(betas):
@@ -239,7 +238,7 @@ def _located(inputs: FrameInputs, i: int, found: BetaMatches, recorded: View) ->
     h, w = inputs.hw
     beta = inputs.inputs.betas[i]
     hw = (beta.image.shape[-2], beta.image.shape[-1])
-    if not _has_lens(recorded):
+    if not has_lens(recorded):
         where, inside = found.positions(beta.field.straight, hw)
         return _Located(where[0, :h, :w], inside[0, :h, :w])
     pinhole = inputs.placements[i].pair.alpha
@@ -272,26 +271,15 @@ def _between_pixels(disparity: Float[Tensor, "1 h w"], x: Float[Tensor, "h2 w2 2
     return torch.where((smooth - nearest).abs() < SMOOTH, smooth, nearest)
 
 
-def _at_alpha(frame: Frame, undo: Sequence[Undo]) -> Frame:
-    """The frame at alpha's recorded pixels."""
-    for back in undo:
-        frame = back(frame)
-    return frame
-
-
 def _at_pixels(
     plane: Float[Tensor, "1 h w"], pinhole: View, recorded: View, interpolation: Interpolation
 ) -> Float[Tensor, "1 h2 w2"]:
     """A plane at alpha's recorded pixels; 0 where its pinhole view has none."""
-    if not _has_lens(recorded):
+    if not has_lens(recorded):
         return plane
     assert isinstance(pinhole, LensView)
     assert isinstance(recorded, LensView)
     return resampled(plane, pinhole, recorded, interpolation=interpolation).values[0]
-
-
-def _has_lens(view: View) -> bool:
-    return isinstance(view, LensView) and view.distortion is not None
 
 
 def _aligned_view(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ from arraygeom.atomic import write_text
 
 from ..media.figures import colour_depth, reduced
 from .align import Aligned
-from .report import LONGEST, Facts, data_url, filled_page, listed, rig_drawing, shares_layer
+from .report import LONGEST, Facts, data_url, filled_page, rig_drawing, shares_layer
 
 STRETCH = (1.0, 99.0)
 """Percentiles of a band's values that are shown black and white."""
@@ -45,9 +44,8 @@ def write_aligned_page(path: Path, aligned: Aligned, rig: Rig, facts: Facts) -> 
         (h, w),
         layers,
         overlays,
-        FACTS="\n".join(f"<tr><th>{escape(key)}<td>{escape(value)}" for key, value in figures.items()),
-        NOTES=listed("What was found", facts.notes),
-        WARNINGS=listed("Warnings", facts.warnings, kind="warnings"),
+        figures,
+        facts,
         RIG=rig_drawing(rig, aligned.alpha),
     )
     write_text(path, page)

@@ -110,29 +110,14 @@ class Batch:
     def settings(self) -> str:
         """What the results depend on, as text."""
         digest = hashlib.sha256(find_weights(self.weights).read_bytes()).hexdigest()
-        facts: dict[str, Any] = {
-            "alpha": self.alpha,
-            "weights": f"{self.weights} (SHA-256 {digest[:16]})",
-            "sequence": self.sequence,
-            "speed": self.speed,
-            "field": repr(self.field),
-            "match_levels": self.match_levels,
-            "response": self.response if isinstance(self.response, str) else list(self.response),
-            "align": self.align,
-            "alone": self.alone,
-            "bits": self.bits,
-            "kind": self.kind,
-            "frames": {name: len(files) for name, files in self.files.items()},
-            "first": {name: str(files[0]) for name, files in self.files.items()},
-            "rig": rig_text(self.rig),
-        }
-        if self.precision != "float32":
-            facts["precision"] = self.precision
-        if self.noise is not None:
-            facts |= {"noise": noise_document(self.noise), "keep_alpha": self.keep_alpha}
-        if self.luminance != "alpha":
-            facts["luminance"] = self.luminance
-        return yaml.safe_dump(facts, sort_keys=False)
+        entries = json.loads(self.to_json())
+        files = entries.pop("files")
+        for name in ("format", "out", "max_memory", "strict"):
+            del entries[name]
+        entries["weights"] = f"{self.weights} (SHA-256 {digest[:16]})"
+        entries["frames"] = {name: len(paths) for name, paths in files.items()}
+        entries["first"] = {name: paths[0] for name, paths in files.items()}
+        return yaml.safe_dump(entries, sort_keys=False)
 
     @property
     def inputs(self) -> dict[str, str]:

@@ -125,7 +125,7 @@ def find_corrections(frame: FrameInputs, response: Given, *, align: bool) -> Cor
         LOG.info("pre-pass %d of at most %d", i + 1, SETTINGS.passes)
         matches = _matches(small, found)
         response_now = _fitted(small, matches) if fits else found.response
-        steps = [_misaligned(m) for m in matches] if align else [Misalignment()] * len(matches)
+        steps = [m.misalignment if align else Misalignment() for m in matches]
         moves = tuple(before + step for before, step in zip(found.misalignments, steps))
         found = Corrections(response_now, moves)
         if all(step.largest(small.hw) <= SETTINGS.settled for step in steps):
@@ -209,6 +209,11 @@ class _Matches(NamedTuple):
         """The matches in beta's width and height, from its middle."""
         return (self.position + 0.5) / self.position.new_tensor([self.luma.shape[1], self.luma.shape[0]]) - 0.5
 
+    @property
+    def misalignment(self) -> Misalignment:
+        """How far beta is across its segments."""
+        return fit_misalignment(self.alpha, self.luma, self.position, self.normal, self.weight)
+
 
 def _matches(frame: FrameInputs, found: Corrections) -> list[_Matches]:
     """Matches of each beta with what has been found put right."""
@@ -231,7 +236,7 @@ def _of_beta(alpha: Tensor, before: Beta, beta: Beta, found: BetaMatches, hw: HW
     seen_there, wanted = (moments(image, weight[None, None]) for image in (values[-1:][None], own))
     bright = seen_there.matched(luma, wanted, NORMALISATION.largest_gain)
     soft = blurred(values[:-1][:, None], [SETTINGS.blur] * (len(values) - 1))[:, 0]
-    normal = normals(Segments(*(t[0, :h, :w] for t in _parts(beta.field.straight))))
+    normal = normals(beta.field.straight)[0, :h, :w]
     return _Matches(soft, own[0, 0], bright[0, 0], where, normal.to(where), weight)
 
 
@@ -241,10 +246,6 @@ def _reliable(found: BetaMatches) -> Bool[Tensor, "b 1 h w"]:
     return enlarged(((unlike < CONSISTENT) & (margin > SETTINGS.margin)).to(margin)) > 0
 
 
-def _parts(found: Segments) -> tuple[Tensor, Tensor, Tensor]:
-    return found.start, found.end, found.valid
-
-
 def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
     h, w = frame.hw
     own = blurred(frame.inputs.alpha[:, :, :h, :w], [SETTINGS.blur])[0, 0]
@@ -252,7 +253,3 @@ def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
     points = [found.before[:, counts] for found, counts in colour]
     places = [found.place[counts] for found, counts in colour]
     return fit(torch.cat(points, 1), torch.cat([own[counts] for _, counts in colour]), torch.cat(places))
-
-
-def _misaligned(found: _Matches) -> Misalignment:
-    return fit_misalignment(found.alpha, found.luma, found.position, found.normal, found.weight)

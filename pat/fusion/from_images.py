@@ -29,10 +29,9 @@ from ..media.raw import developed_rig
 from ..media.video import read_video
 from ..networks.weights import Network, load_weights
 from .fuse import ImageSources, fuse
-from .inputs import equal_bands
 from .results import Frame
 from .steps import without_lenses
-from .views import read_view
+from .views import is_in_colour, read_view
 
 LOG = logging.getLogger(__name__)
 
@@ -341,7 +340,7 @@ def _textured(label: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "_ h w
     """The image, one band of it where all are equal. Raises ValueError for an image of one colour."""
     if float(image.flatten(1).std(-1).amax()) < EVEN:
         raise ValueError(f"{label}: is of one colour, with nothing to match: give another image")
-    return image[:1] if len(image) == 3 and equal_bands(image) else image
+    return image[:1] if len(image) == 3 and not is_in_colour(image) else image
 
 
 def _chosen_alpha(images: Images, alpha: str | None, note: Say) -> str:

@@ -25,13 +25,12 @@ from ..support.memory import limited, parse_bytes, planned
 from .checks import warn_of_confidence
 from .corrections import Corrections, corrections_for, expected_work
 from .depth import background_filled
-from .inputs import check_bands, prepared
+from .inputs import FrameInputs, check_bands, prepared
 from .low_light import Noise, denoised_views
-from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail
-from .own_colour import with_own_colours
+from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail, with_own_colours
 from .results import Frame
-from .steps import steps_for
-from .tiles import LARGE, Plan, fused_in_tiles, plan_frame
+from .steps import steps_for, undone
+from .tiles import LARGE, FusedTile, Plan, fused_in_tiles, plan_frame
 from .views import Views
 
 LOG = logging.getLogger(__name__)
@@ -119,7 +118,6 @@ def fuse(
             `warnings.simplefilter("error", LowConfidenceWarning)`.
     """
     network, rig, images, alpha, grey_world = _with_rig(network, rig, images, alpha, explain)
-    match_levels |= grey_world
     align = not differentiable if align is None else align
     if differentiable and not (max_memory is None and store is None):
         raise ValueError("differentiable=True fuses the whole frame at once: leave out max_memory and store")
@@ -127,8 +125,8 @@ def fuse(
     limit = None if max_memory is None else parse_bytes(max_memory)
     views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
     check_bands(network, views)
-    betas, in_colour = views.betas, views.alpha_in_colour
-    steps = steps_for(network, normalise=match_levels)
+    betas, in_colour, noisy = views.betas, views.alpha_in_colour, bool(low_light.noisy)
+    steps = steps_for(network, normalise=match_levels or grey_world)
     inputs, undo = prepared(network, views, steps)
     held = _bytes_beside(inputs.inputs, [views.own, *(images.values() if isinstance(images, dict) else ())])
     del views  # whose images are there again, padded
@@ -146,30 +144,39 @@ def fuse(
     if announce:
         announce(plan)
     found = corrections or corrections_for(network, inputs, response, align=align)
-    if explain:
-        for line in found.described(betas, inputs.hw):
-            explain(line)
-    fused = replace(found.applied(inputs.inputs, inputs.hw), luminance=SHARES[luminance])
-    inputs = inputs._replace(inputs=fused)
+    for line in found.described(betas, inputs.hw) if explain else ():
+        explain(line)
+    right = replace(found.applied(inputs.inputs, inputs.hw), luminance=SHARES[luminance])
+    inputs = inputs._replace(inputs=right)
     with limited(planned(limit, plan.memory, large=math.prod(inputs.hw) > LARGE)):
         with torch.set_grad_enabled(differentiable):
-            matches = matcher(inputs.inputs) if network.uses_matches else None
-            LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
-            noisy = bool(low_light.noisy)
-            done = fused_in_tiles(network, inputs, matches, plan.tiles, found=noisy, progress=progress, store=store)
-        frame = done.frame
-        warn_of_confidence(network, frame, inputs)
-        frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
-        if luminance != "alpha":
-            frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
-        del inputs, fused, matches  # the segments and matches of a large frame: what follows needs memory, too
+            done = _matched_and_fused(network, inputs, matcher, plan, found=noisy, progress=progress, store=store)
+        warn_of_confidence(network, done.frame, inputs)
+        frame = _completed(done.frame, inputs, luminance)
+        del inputs, right  # the segments of a large frame: what follows needs memory, too
         frame = low_light.corrected(found.undone(frame), done.found, steps, found.response, keep_alpha=keep_alpha)
         LOG.info("back to the pixels of %s", alpha)
-        for back in undo:
-            frame = back(frame)
+        frame = undone(frame, undo)
         if in_colour and len(frame.image) == 3 and frame.by_band is None and not noisy:
             frame = with_own_colours(frame, images[alpha])
         return frame if differentiable else frame.mapped(Tensor.detach)
+
+
+def _matched_and_fused(
+    network: FusionNetwork, inputs: FrameInputs, matcher: Matcher, plan: Plan, **options: Any
+) -> FusedTile:
+    """The whole frame from its tiles; options are those of `fused_in_tiles`."""
+    matches = matcher(inputs.inputs) if network.uses_matches else None
+    LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
+    return fused_in_tiles(network, inputs, matches, plan.tiles, **options)
+
+
+def _completed(frame: Frame, inputs: FrameInputs, luminance: Luminance) -> Frame:
+    """The fused frame with depth where betas are occluded, and alpha's detail in beta's luminance."""
+    frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
+    if luminance == "alpha":
+        return frame
+    return with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
 
 
 def _bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:

@@ -7,12 +7,11 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from arraygeom import Curved, Moved, Pair, ReceptiveField, Widened, depth_of
+from arraygeom import Curved, Moved, Pair, ReceptiveField, depth_of
 from arraygeom.epipolar import Depth, Track
 from arraygeom.fields import AroundDepth, AroundMatches, default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
@@ -23,8 +22,8 @@ from ..matching.inputs import Beta, Inputs
 from ..matching.normalisation import combined_bands
 from ..matching.tangents import along_tangents
 from ..networks.protocol import FusionNetwork
-from .steps import FusionStep, Undo
-from .views import Views
+from .steps import FusionStep, Undo, innermost
+from .views import Views, is_in_colour
 
 LOG = logging.getLogger(__name__)
 
@@ -76,7 +75,7 @@ def check_bands(network: FusionNetwork, views: Views) -> None:
     _refuse_bands(network, views)
     for name in views.betas:
         image = views.images[name]
-        if len(image) == 3 and equal_bands(image):
+        if len(image) == 3 and not is_in_colour(image):
             warnings.warn(f"the image of '{name}' has three equal bands: it is grey, and gives no colour", stacklevel=3)
 
 
@@ -96,11 +95,6 @@ def _refuse_bands(network: FusionNetwork, views: Views) -> None:
         f"the betas have {total} band{'s' if total > 1 else ''} in all ({listed}), these weights make {wanted}: "
         f"{advice}take the weights mono-spectral, which fuse any number of bands"
     )
-
-
-def equal_bands(image: Float[Tensor, "c h w"]) -> bool:
-    """Whether all bands are the same."""
-    return all(torch.equal(image[0], band) for band in image[1:])
 
 
 def prepared(network: FusionNetwork, views: Views, steps: Sequence[FusionStep]) -> tuple[FrameInputs, list[Undo]]:
@@ -142,15 +136,8 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
 
 def bounds_of(field: ReceptiveField) -> Literal["depth", "distance"]:
     """What a field's depth range is of."""
-    field = innermost(field)
-    return field.bounds if isinstance(field, Curved) else "depth"
-
-
-def innermost(field: ReceptiveField) -> ReceptiveField:
-    """The field that is widened or moved, if it is."""
-    while isinstance(field, Widened | Moved):
-        field = field.field
-    return field
+    inner = innermost(field)
+    return inner.bounds if isinstance(inner, Curved) else "depth"
 
 
 def padded(image: Tensor, multiple: int) -> Tensor:

@@ -80,20 +80,29 @@ def report_page(frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig:
         frame.depth.shape,
         {name: urls[name] for name in layers},
         {name: urls[name] for name in overlays},
-        FACTS="\n".join(f"<tr><th>{k}<td>{html.escape(v)}" for k, v in _figures(frame, known, facts).items()),
-        NOTES=listed("What was found", facts.notes),
-        WARNINGS=listed("Warnings", facts.warnings, kind="warnings"),
+        _figures(frame, known, facts),
+        facts,
         RIG=rig_drawing(rig, alpha),
         LEGEND=_depth_legend(known, facts.unit),
     )
 
 
 def filled_page(
-    title: str, hw: Sequence[int], layers: Mapping[str, str], overlays: Mapping[str, str], **parts: str
+    title: str,
+    hw: Sequence[int],
+    layers: Mapping[str, str],
+    overlays: Mapping[str, str],
+    figures: Mapping[str, str],
+    facts: Facts,
+    **parts: str,
 ) -> str:
     """The page with layers to compare and overlays to switch, URLs by name, and its further parts as HTML."""
     h, w = hw
     parts = {"LEGEND": "", **parts, "TITLE": html.escape(title), "RATIO": f"{w} / {h}"}
+    rows = [f"<tr><th>{html.escape(key)}<td>{html.escape(value)}" for key, value in figures.items()]
+    parts["FACTS"] = "\n".join(rows)
+    parts["NOTES"] = _listed("What was found", facts.notes)
+    parts["WARNINGS"] = _listed("Warnings", facts.warnings, kind="warnings")
     parts["LAYERS"] = "\n".join(_layer(name, url) for name, url in layers.items())
     named = {name: html.escape(name) for name in overlays}
     parts["OVERLAYS"] = "\n".join(
@@ -206,7 +215,7 @@ def _switch(name: str) -> str:
     return f'<label><input type="checkbox" data-overlay="{name}"> {said}</label>'
 
 
-def listed(title: str, lines: Iterable[str], *, kind: str = "notes") -> str:
+def _listed(title: str, lines: Iterable[str], *, kind: str = "notes") -> str:
     """A section of the page with a list; empty without lines."""
     items = "".join(f"<li>{html.escape(line)}" for line in lines)
     return f'<section class="{kind}"><h2>{title}</h2><ul>{items}</ul></section>' if items else ""

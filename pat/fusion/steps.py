@@ -87,8 +87,10 @@ class Undistort:
     def do(self, views: Views) -> Done:
         """Resample every image with a lens."""
         cameras = [views.rig[name] for name in views.images]
-        as_recorded = any(map(_through_lenses, views.fields.values())) or not all(c.has_pinhole_view for c in cameras)
-        if as_recorded or not any(map(_has_lens, cameras)):
+        as_recorded = any(isinstance(innermost(f), Curved | ThroughLenses) for f in views.fields.values()) or not all(
+            c.has_pinhole_view for c in cameras
+        )
+        if as_recorded or not any(map(has_lens, cameras)):
             return Done(views, _as_it_is)
         rig, images = without_lenses(views.rig, views.images)
         lens, pinhole = views.rig[views.alpha], rig[views.alpha]
@@ -242,14 +244,23 @@ def without_lenses(rig: Rig, images: Images) -> tuple[Rig, dict[str, Tensor]]:
     return rig, straight
 
 
-def _has_lens(view: View) -> bool:
+def has_lens(view: View) -> bool:
+    """Whether a camera's pixels are not those of a pinhole."""
     return isinstance(view, LensView) and view.distortion is not None
 
 
-def _through_lenses(field: ReceptiveField | None) -> bool:
+def innermost(field: ReceptiveField | None) -> ReceptiveField | None:
+    """The field that is widened or moved, if it is."""
     while isinstance(field, Widened | Moved):
         field = field.field
-    return isinstance(field, Curved | ThroughLenses)
+    return field
+
+
+def undone(frame: Frame, undo: Sequence[Undo]) -> Frame:
+    """A frame taken back to what it was before the steps."""
+    for back in undo:
+        frame = back(frame)
+    return frame
 
 
 def _for_pinhole(field: ReceptiveField | None, lens: View, pinhole: View) -> ReceptiveField | None:

@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -88,7 +87,7 @@ LARGEST_VALUE = 32.0
 
 def is_in_colour(image: Float[Tensor, "c h w"]) -> bool:
     """Whether an image has three bands that are not all equal."""
-    return len(image) == 3 and not (torch.equal(image[0], image[1]) and torch.equal(image[0], image[2]))
+    return len(image) == 3 and not all(torch.equal(image[0], band) for band in image[1:])
 
 
 def grey_alpha(name: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "1 h w"]:
@@ -117,13 +116,6 @@ def _checked(rig: Rig, images: Images, name: str) -> Tensor:
     return image
 
 
-class DevelopedImages(NamedTuple):
-    """Images ready to fuse, and the rig that describes them."""
-
-    rig: Rig
-    images: dict[str, Tensor]
-
-
 KEPT = 4_000_000
 """Values of an image up to which it is kept: reading it again takes longer than the memory is worth."""
 
@@ -131,7 +123,7 @@ KEPT = 4_000_000
 class ViewFiles(Mapping[str, Tensor]):
     """An image file of each camera, read and developed when asked for; kept if it is small (`KEPT`).
 
-    Asking raises as `read_views` does.
+    Asking raises as `read_view` does.
     """
 
     def __init__(self, rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> None:
@@ -173,9 +165,3 @@ def read_view(rig: Rig, name: str, path: str | Path, *, like: Sensor) -> Float[T
     if view.sensor.bayer and image.shape[0] != 1:
         raise ValueError(f"{name}: {path}: is in colour, and the rig says raw {view.sensor.bayer}: drop 'bayer'")
     return develop(image, view.sensor, like=like)
-
-
-def read_views(rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> DevelopedImages:
-    """Read one image of each camera and develop it; raises as `read_view` does."""
-    views = ViewFiles(rig, files, alpha=alpha)
-    return DevelopedImages(views.developed, dict(views))

@@ -93,16 +93,14 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            keys = {renamed(key): key for key in file.keys()}  # noqa: SIM118
             network, config = _described(path, metadata, networks)
-            shapes = {name: tuple(file.get_slice(key).get_shape()) for name, key in keys.items()}
-            _check_shapes(path, network, config, shapes)
-            stored = {key: file.get_tensor(key) for key in keys.values()}
+            names = list(file.keys())
+            _check_shapes(path, network, config, {name: tuple(file.get_slice(name).get_shape()) for name in names})
+            state = {name: file.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:
         raise ValueError(f"{path}: not a safetensors file ({error}); was it copied whole?") from None
-    if not undamaged(stored, metadata):
+    if not undamaged(state, metadata):
         raise ValueError(f"{path}: its numbers are not those that were written: copy it again")
-    state = {name: stored[key] for name, key in keys.items()}
     for name, tensor in state.items():
         if not tensor.is_floating_point() or not tensor.float().isfinite().all():
             raise ValueError(
@@ -111,17 +109,6 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
     made = network(config)
     made.load_state_dict(state)
     return made.eval().requires_grad_(False)
-
-
-_OLD_NAMES = {"trust": "confidence", "carry": "propagation"}
-"""First words of parts and options of networks in files of earlier versions."""
-
-
-def renamed(key: str) -> str:
-    """The name, in this version, of a tensor or an option in a file of any version."""
-    first, separator, rest = key.removeprefix("single.").partition("_" if "." not in key else ".")
-    single = "single." if key.startswith("single.") else ""
-    return single + _OLD_NAMES.get(first, first) + separator + rest
 
 
 def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
@@ -162,9 +149,7 @@ def _described(
         raise ValueError(f"{path}: not weights of this package ('{FORMAT}' is wanted in the file's metadata, {found})")
     network, kind = networks[metadata["network"]]
     try:
-        values = json.loads(metadata["config"])
-        document = {renamed(key): value for key, value in values.items()} if isinstance(values, dict) else values
-        config: Any = from_document(kind, document)  # type: ignore[arg-type]
+        config: Any = from_document(kind, json.loads(metadata["config"]))  # type: ignore[arg-type]
         for name, value in dataclasses.asdict(config).items():
             _check_numbers(name, value)
     except (KeyError, RecursionError, TypeError, ValueError) as error:
