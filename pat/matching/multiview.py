@@ -218,8 +218,8 @@ class Agreement(NamedTuple):
     def cut(self, box: Box) -> Agreement:
         """The part at alpha's (top, bottom, left, right), of inverse depth; facts are whole."""
         top, bottom, left, right = box
-        planes = (plane[:, top:bottom, left:right] for plane in (self.inverse_depth, self.known))
-        return Agreement(*planes, self.facts)
+        part = (slice(None), slice(top, bottom), slice(left, right))
+        return self._replace(inverse_depth=self.inverse_depth[part], known=self.known[part])
 
 
 def agreed(inputs: Inputs, matches: Matches) -> Matches:
