@@ -7,7 +7,7 @@ of a network is in them.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -29,6 +29,7 @@ from ..matching.matches import BetaMatches
 from ..matching.radiometry import Given
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
+from ..networks.weights import load_weights, weights_for
 from ..support.memory import limited, parse_bytes
 from .checks import warn_of_confidence
 from .corrections import corrections_for, expected_work
@@ -180,7 +181,7 @@ def align(
     rig = with_pixels(rig if depth is None else rig.replace(depth=depth))
     views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, field=field), noise)
     betas = views.betas
-    network = network or _default_network([len(views.images[name]) for name in betas])
+    network = network or load_weights(weights_for([len(views.images[name]) for name in betas]))
     check_bands(network, views)
     inputs, undo = prepared(network, views, _steps(network, normalise=match_levels))
     del views
@@ -212,12 +213,6 @@ def align(
                 rig[name], name, place, located, confidence, seen, own[name], interpolation, fill
             )
     return Aligned(alpha, aligned, depths.numpy())
-
-
-def _default_network(bands: Sequence[int]) -> FusionNetwork:
-    from ..networks.weights import load_weights
-
-    return load_weights("mono-colour" if all(count == 3 for count in bands) else "mono-spectral")
 
 
 def _steps(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:

@@ -19,14 +19,13 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments
-from arraygeom.epipolar import Track
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.sampling import sample
 
 from ..matching.epipolar_offset import Misalignment, fit_misalignment
 from ..matching.filters import blurred
-from ..matching.inputs import Beta, Inputs
+from ..matching.inputs import Beta, Inputs, track_in
 from ..matching.match import located
 from ..matching.matches import BetaMatches
 from ..matching.normalisation import SETTINGS as NORMALISATION
@@ -162,33 +161,29 @@ def _reduced_frame(frame: FrameInputs) -> FrameInputs:
         return frame
     hw = (frame.hw[0] // factor, frame.hw[1] // factor)
     alpha = padded(avg_pool2d(inputs.alpha, factor), inputs.multiple)
+    offset = (0.5 / factor - 0.5,) * 2
+
+    def whole(x: Tensor) -> Tensor:
+        return (x + 0.5) * factor - 0.5
+
     betas = tuple(
         Beta(
             padded(avg_pool2d(beta.image, factor), inputs.multiple),
-            _reduced_field(beta.field, alpha, factor),
-            track=beta.track and _reduced_track(beta.track, factor),
+            _reduced_field(beta.field, alpha, whole, factor),
+            track=beta.track and track_in(beta.track, whole, 1 / factor, offset),
         )
         for beta in inputs.betas
     )
     return frame._replace(inputs=replace(inputs, alpha=alpha, betas=betas), hw=hw)
 
 
-def _reduced_field(field: FieldOnGrid, alpha: Tensor, factor: int) -> FieldOnGrid:
+def _reduced_field(field: FieldOnGrid, alpha: Tensor, whole: Callable[[Tensor], Tensor], factor: int) -> FieldOnGrid:
     def at(x: Tensor) -> Segments:
-        found = field.at((x + 0.5) * factor - 0.5)
+        found = field.at(whole(x))
         assert isinstance(found, Segments)
         return reduced(found, factor)
 
     return FieldOnGrid.evaluated(at, (alpha.shape[-2], alpha.shape[-1]), field.samples // factor + 2)
-
-
-def _reduced_track(track: Callable[[Tensor], Track], factor: int) -> Callable[[Tensor], Track]:
-    offset = 0.5 / factor - 0.5
-
-    def in_pixels(v: Tensor) -> Tensor:
-        return torch.cat([v[..., :2] / factor + offset * v[..., 2:], v[..., 2:]], -1)
-
-    return lambda x: Track(*map(in_pixels, track((x + 0.5) * factor - 0.5)))
 
 
 class _Matches(NamedTuple):

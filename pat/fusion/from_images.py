@@ -27,7 +27,7 @@ from ..media.exif import focal_length
 from ..media.images import read_image, write_image
 from ..media.raw import developed_rig
 from ..media.video import read_video
-from ..networks.weights import Network, load_weights
+from ..networks.weights import Network, load_weights, weights_for
 from .fuse import ImageSources, fuse
 from .results import Frame
 from .steps import without_lenses
@@ -181,7 +181,7 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
     }
     reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
     masks = {name: scaled(mask, factors[name])[0] > 0.99 for name, mask in shown.items()}
-    found, facts = centres_found(_resized(straight, reduced), reduced, masks, alpha=alpha)
+    found, facts = centres_found(resized_rig(straight, reduced), reduced, masks, alpha=alpha)
     for name, (points, distance) in facts.items():
         note(f"{name}: {points} points, {distance:.2f} px from their lines, intrinsics kept")
     for name in images.keys() - {*found.names}:
@@ -211,7 +211,7 @@ def found_rig(
     for name in images.keys() - {alpha, *betas}:
         note(f"{name}: left out, too little in common with {alpha}")
     rig = _calibrated(found, reduced, alpha, betas, lengths, network, note)
-    return _resized(rig, images), [alpha, *betas]
+    return resized_rig(rig, images), [alpha, *betas]
 
 
 def _calibrated(
@@ -277,11 +277,12 @@ def _refined(
     alpha, beta = pair.rig.names
     factor = min(COARSE / max(images[alpha].shape[-2:]), 1.0)
     small = {name: scaled(images[name], factor) for name in (alpha, beta)}
+    bands = len(small[beta])
     link = links.get((alpha, beta))
-    rig = _resized(pair.rig if link is None else pair.rig.replace(links={(alpha, beta): link}), small)
+    rig = resized_rig(pair.rig if link is None else pair.rig.replace(links={(alpha, beta): link}), small)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        network = _for_bands(network, len(small[beta]))
+        network = network if network.bands in (None, bands) else load_weights(weights_for([bands]))
         LOG.info("coarse fusion of %s and %s", alpha, beta)
         frame = fuse(network, rig, small, alpha=alpha, align=False, response="rec601")
     if link is not None:
@@ -289,11 +290,7 @@ def _refined(
     refined = refined_by_depth(pair._replace(rig=rig), small, frame.depth, frame.confidence)
     if refined.rig is rig:
         return pair, frame
-    return refined._replace(rig=_resized(refined.rig, images), distance=refined.distance / factor), frame
-
-
-def _for_bands(network: Network, bands: int) -> Network:
-    return network if network.bands in (None, bands) else load_weights("mono-colour" if bands == 3 else "mono-spectral")
+    return refined._replace(rig=resized_rig(refined.rig, images), distance=refined.distance / factor), frame
 
 
 def _relative_scale(first: Frame, other: Frame) -> float:
@@ -311,7 +308,8 @@ def _without(rig: Rig, names: set[str]) -> Rig:
     return rig.replace(cameras=cameras, links={pair: v for pair, v in rig.links.items() if not names & {*pair}})
 
 
-def _resized(rig: Rig, images: Images) -> Rig:
+def resized_rig(rig: Rig, images: Images) -> Rig:
+    """The rig whose cameras are of the images' sizes."""
     for name in rig.names:
         rig = rig.resize(name, (int(images[name].shape[-2]), int(images[name].shape[-1])))
     return rig

@@ -18,7 +18,7 @@ from calib.images.self_calibration import depth_bounds
 
 from ..support.settings import size
 from .checks import LowConfidenceWarning
-from .from_images import MATCHED, scaled
+from .from_images import MATCHED, resized_rig, scaled
 from .views import ViewFiles
 
 
@@ -65,8 +65,7 @@ def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | N
     points then lie about as near to their lines as to those of an F of their own, and far nearer than before."""
     small = {name: scaled(image, min(MATCHED / max(image.shape[-2:]), 1.0)) for name, image in images.items()}
     reduced = Rig({name: rig[name] for name in (alpha, *small)}, depth=rig.depth, links=rig.links, name=rig.name)
-    for name, image in small.items():
-        reduced = reduced.resize(name, (image.shape[-2], image.shape[-1]))
+    reduced = resized_rig(reduced, small)
     try:
         pairs = related(reduced, match_cameras(small, alpha=alpha))
         found = refine_matches(reduced, [pairs], force=True)

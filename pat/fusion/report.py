@@ -23,7 +23,7 @@ from arraygeom.viz import COLOURS, frustum, frustum_size
 from ..media.colour import to_bytes
 from ..media.figures import colour_depth, reduced
 from ..support.memory import how_many_fit
-from .results import Frame
+from .results import Frame, picture_of
 
 LONGEST = 1600
 """Images in the page have at most this many pixels along their longer side."""
@@ -67,13 +67,15 @@ def report_page(frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig:
     shown = {f"alpha: {alpha}": images[alpha]}
     shown |= {f"beta: {name}": images[name] for name in rig.betas(alpha) if name in images}
     if facts.classical is not None:
-        shown["classical"] = _shown(facts.classical)
-    shown["fused"] = _shown(frame.image)
+        shown["classical"] = picture_of(facts.classical)
+    shown["fused"] = picture_of(frame.image)
     overlays = {"confidence": lambda: shares_layer(frame.confidence)}
     known = frame.depth[frame.depth.isfinite()]
     if len(known):
         overlays["depth"] = lambda: data_url(reduced(colour_depth(frame.depth), LONGEST))
-    layers = {name: partial(lambda image: data_url(reduced(_shown(image), LONGEST)), x) for name, x in shown.items()}
+    layers = {
+        name: partial(lambda image: data_url(reduced(picture_of(image), LONGEST)), x) for name, x in shown.items()
+    }
     urls = _all_of({**layers, **overlays})
     return filled_page(
         f"{' + '.join(name for name in rig.names if name in images)}, fused",
@@ -182,11 +184,6 @@ def _depth_legend(known: Float[Tensor, " n"], unit: str) -> str:
     return (
         f'<p class="legend" hidden>depth: near, {near:.3g} {unit} <i></i> far, {far:.3g} {unit}; unknown is black</p>'
     )
-
-
-def _shown(image: Float[Tensor, "c h w"]) -> Float[Tensor, "d h w"]:
-    """An image of one channel or three: the mean of any other number of bands."""
-    return image if len(image) in (1, 3) else image.mean(0, keepdim=True)
 
 
 def data_url(image: Float[Tensor, "c h w"]) -> str:

@@ -98,8 +98,7 @@ def save_frame(
             write_image(folder / f"{prefix}fused_{band}.{kind}", values[None], bits=bits)
         for band, confidence in zip(bands, () if frame.by_band is None else frame.by_band):
             write_image(folder / f"{prefix}confidence_{band}.png", confidence[None].float())
-        if len(image) not in (1, 3):
-            image = image.mean(0, keepdim=True)
+        image = picture_of(image)
         tasks.insert(0, partial(write_image, folder / last, image, bits=bits, profile=bits != 32))
         in_parallel(tasks, most=how_many_fit(4 * image.nbytes))
         names = {file.name for file in folder.iterdir()} - {last}
@@ -120,6 +119,11 @@ def describe_bands(frame: Frame, names: Sequence[str], kind: ImageFormat) -> str
     listed = ", ".join(f"fused_{name}.{kind}" for name in names) or f"fused_1.{kind} and so on"
     picture = "the three as a picture" if len(frame.image) == 3 else "their mean"
     return f"bands at alpha's view: {listed}; fused.{kind} is {picture}"
+
+
+def picture_of(image: Float[Tensor, "c h w"]) -> Float[Tensor, "d h w"]:
+    """An image of one channel or three: the mean of any other number of bands."""
+    return image if len(image) in (1, 3) else image.mean(0, keepdim=True)
 
 
 def depth_scale(near: float) -> float:
@@ -199,9 +203,9 @@ class Frame(NamedTuple):
 
     def _repr_png_(self) -> bytes:
         """For notebooks: the image and, beside it, depth (red is near) and confidence, as a PNG file."""
-        colours = self.image if len(self.image) == 3 else self.image.mean(0, keepdim=True)
         confidence = self.confidence[None].expand(3, -1, -1)
-        shown = [shrunk(part) for part in (colours.expand(3, -1, -1), colour_depth(self.depth), confidence)]
+        parts = picture_of(self.image).expand(3, -1, -1), colour_depth(self.depth), confidence
+        shown = [shrunk(part) for part in parts]
         values = (torch.cat(shown, -1).clamp(0, 1) * 255).round().to(torch.uint8)
         file = BytesIO()
         Image.fromarray(values.permute(1, 2, 0).numpy()).save(file, format="PNG")

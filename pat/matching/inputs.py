@@ -129,20 +129,24 @@ class Inputs:
     def _cut(self, beta: Beta, box: Box) -> Beta:
         y0, y1, x0, x1 = self.touched(beta, box)
         offset = (beta.offset[0] + x0, beta.offset[1] + y0)
-        track = beta.track and _part_of(beta.track, (box[2], box[0]), (x0, y0))
+        top, _, left, _ = box
+        track = beta.track and track_in(beta.track, lambda x: x + x.new_tensor((left, top)), 1.0, (-x0, -y0))
         image = beta.image[..., y0:y1, x0:x1]
         return Beta(image, beta.field.cut(box, (x0, y0)), offset, track, beta.around)
 
 
-def _part_of(
-    track: Callable[[Tensor], Track], own: tuple[int, int], other: tuple[int, int]
+def track_in(
+    track: Callable[[Tensor], Track],
+    whole: Callable[[Tensor], Tensor],
+    scale: float,
+    offset: tuple[float, float],
 ) -> Callable[[Tensor], Track]:
-    """The tracks of a part of alpha in a part of beta, which begin at these pixels (x, y)."""
+    """The tracks of pixels that are those of `whole(x)` in alpha, in pixels of beta times a scale, plus an offset."""
 
-    def shifted(v: Tensor) -> Tensor:
-        return torch.cat([v[..., :2] - v.new_tensor(other) * v[..., 2:], v[..., 2:]], -1)
+    def changed(v: Tensor) -> Tensor:
+        return torch.cat([scale * v[..., :2] + v.new_tensor(offset) * v[..., 2:], v[..., 2:]], -1)
 
-    return lambda x: Track(*map(shifted, track(x + x.new_tensor(own))))
+    return lambda x: Track(*map(changed, track(whole(x))))
 
 
 def ends_of(found: Segments | Positions) -> Float[Tensor, "n 2"]:

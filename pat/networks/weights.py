@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Union
@@ -74,6 +74,11 @@ def load_weights(name: str | Path, *, precision: Precision = "float32") -> Netwo
         for part in convolutions(network):
             in_bfloat16(part)
     return network
+
+
+def weights_for(bands: Sequence[int]) -> str:
+    """The name of the shipped weights for betas of these numbers of bands."""
+    return "mono-colour" if all(count == 3 for count in bands) else "mono-spectral"
 
 
 def convolutions(network: nn.Module) -> list[nn.Module]:
