@@ -32,6 +32,7 @@ from calib.boards.rig import Calibration, calibrate
 from calib.boards.target import parse_board
 from calib.images.guided_matches import ALIKE, guided_matches
 from calib.images.matches import seen_depths
+from calib.images.refinement import refine
 from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair, middlebury_pairs
 from pat.evaluation.halves import of_half
 from pat.evaluation.protocols import rectified_rig
@@ -409,7 +410,8 @@ def nine_band_calibration(folder: Path, deviations: StartDeviations) -> Calibrat
 
 
 def nine_band_scene(data: Path) -> Iterator[AlignmentScene]:
-    """The array of nine bands, calibrated by its board: the middle camera is alpha, the four beside it the betas."""
+    """The array of nine bands, calibrated by its one board, refined by the scene, as `pat rig refine` does it: the
+    middle camera is alpha, the four beside it the betas."""
     folder, alpha = data / "nine_band_array", "Cam-4"
     rig = nine_band_calibration(folder, StartDeviations()).rig
     rig = Rig({name: rig[name] for name in (alpha, "Cam-1", "Cam-3", "Cam-5", "Cam-7")})
@@ -418,8 +420,8 @@ def nine_band_scene(data: Path) -> Iterator[AlignmentScene]:
     images = {name: views[name] for name in rig.names}
     depths = [_depths_seen(rig, images, alpha, name) for name in ("Cam-3", "Cam-5")]
     bounds = min(near for near, _ in depths), max(far for _, far in depths)
-    recorded = RecordedFiles(rig, files)
-    yield AlignmentScene("nine-band", views.developed.replace(depth=bounds), images, recorded, alpha, True)
+    refined = refine(views.developed.replace(depth=bounds), [images]).rig
+    yield AlignmentScene("nine-band", refined, images, RecordedFiles(rig, files), alpha, True)
 
 
 def _depths_seen(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""The most probable parameters given residuals and a normal prior: Gauss-Newton, reweighted for Cauchy's loss.
+"""The most probable parameters given residuals and a normal prior: damped Gauss-Newton, reweighted for Cauchy's loss.
 
 Parameters are in units of their prior standard deviations, so that the prior's covariance is 1. The first ones are
 free; the rest are considered: uncertain, so that they explain what they may, but they never change the rig.
@@ -27,6 +27,8 @@ FURTHER_STEPS = 6
 """About so many follow, wherever a fit is: they are fewer than `STEPS` in most."""
 CONVERGED = 5e-3
 """Iteration ends at a step of this many prior deviations."""
+DAMPING = 1e-3, 1e9
+"""Of the first step, as a share of the information; and where no step lowers the cost any more."""
 LEAST_NOISE = 0.03
 """Lower bound of the noise of matched points, pixels."""
 
@@ -106,27 +108,31 @@ def left_out(residuals: Residuals, solution: Solution, groups: Int[Tensor, " m"]
 def most_probable(
     residuals: Residuals, z: Float[Tensor, " k"], basis: Float[Tensor, "k m"], *, steps: int = STEPS
 ) -> Float[Tensor, " k"]:
-    """The most probable parameters z + basis y, from z on."""
+    """The most probable parameters z + basis y, from z on, by Levenberg and Marquardt.
+
+    Undamped steps shortened until the cost falls would stop short where some parameters are hardly observable, as poses
+    by a flat scene are.
+    """
+    damping = DAMPING[0]
     for i in range(steps):
         log_step(LOG, i / (i + FURTHER_STEPS), "step %d of the fit", i + 1)
         r, J = jacobian(residuals, z)
         information, slope = _normal_equations(r, J, z)
-        step = basis @ torch.linalg.solve(basis.T @ information @ basis, basis.T @ slope)
-        z, moved = _shorten(residuals, z, step, r)
-        if moved < CONVERGED:
+        information, slope = basis.T @ information @ basis, basis.T @ slope
+        scale = noise_scale(r)
+        before = _cost(r, z, scale)
+        while damping < DAMPING[1]:
+            damped = information + damping * information.diagonal().diag()
+            step = basis @ torch.linalg.solve(damped, slope)
+            if _cost(residuals(z + step).detach(), z + step, scale) <= before:
+                break
+            damping *= 10
+        else:
+            break
+        z, damping = z + step, max(damping / 10, 1e-9)
+        if float(step.abs().max()) < CONVERGED:
             break
     return z
-
-
-def _shorten(residuals: Residuals, z: Tensor, step: Tensor, r: Tensor) -> tuple[Tensor, float]:
-    """A step along `step` from residuals r that lowers the cost, halved until it does; and its largest entry."""
-    scale = noise_scale(r)
-    before = _cost(r, z, scale)
-    for _ in range(8):
-        if _cost(residuals(z + step).detach(), z + step, scale) <= before:
-            return z + step, float(step.abs().max())
-        step = step / 2
-    return z, 0.0
 
 
 def _cost(r: Tensor, z: Tensor, scale: float) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
@@ -103,6 +104,10 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
             _check_shapes(path, network, config, {name: tuple(file.get_slice(name).get_shape()) for name in names})
             state = {name: file.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:
+        if zipfile.is_zipfile(path):
+            raise ValueError(
+                f"{path}: a checkpoint of PyTorch's: `pat weights import` makes weights of one of the paper's authors"
+            ) from None
         raise ValueError(f"{path}: not a safetensors file ({error}); was it copied whole?") from None
     if not undamaged(state, metadata):
         raise ValueError(f"{path}: its numbers are not those that were written: copy it again")

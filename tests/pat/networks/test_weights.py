@@ -51,6 +51,12 @@ def test_what_is_not_weights_is_named(tmp_path):
         load_weights(other)
 
 
+def test_a_checkpoint_of_pytorch_is_said_to_be_one(tmp_path):
+    torch.save({"state_dict": {}}, tmp_path / "best.pth.tar")
+    with pytest.raises(ValueError, match=r"best.pth.tar: a checkpoint of PyTorch's: `pat weights import`"):
+        load_weights(tmp_path / "best.pth.tar")
+
+
 def test_weights_of_another_architecture_are_refused(tmp_path):
     path = tmp_path / "w.safetensors"
     network = PAT(PATConfig(dim=8))
