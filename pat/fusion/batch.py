@@ -98,7 +98,9 @@ class Batch:
             raise ValueError(f"no image of alpha, '{self.alpha}'")
         if not self.sequence and len({len(files) for files in self.files.values()}) > 1:
             counts = ", ".join(f"{len(files)} of '{name}'" for name, files in self.files.items())
-            raise ValueError(f"frames need as many images of each camera, got {counts}; or is it a --sequence?")
+            raise ValueError(
+                f"frames need as many images of each camera, got {counts}; or is it a --sequence?"
+            )
 
     @cached_property
     def names(self) -> list[str]:
@@ -126,7 +128,9 @@ class Batch:
         stamps = {name: [_stamp(file) for file in files] for name, files in self.files.items()}
         if self.sequence:
             return dict.fromkeys(self.names, _digest(stamps))
-        return {name: _digest({n: found[i] for n, found in stamps.items()}) for i, name in enumerate(self.names)}
+        return {
+            name: _digest({n: found[i] for n, found in stamps.items()}) for i, name in enumerate(self.names)
+        }
 
     def fused_file(self, i: int) -> Path:
         """The file of a fused frame."""
@@ -154,7 +158,12 @@ class Batch:
     ) -> JobReport:
         self._begin(resume)
         plan, many = self.out / KEYS / PLAN, range(len(self.names))
-        options: dict[str, Any] = {"workers": workers, "resume": resume, "on_error": on_error, "console": console}
+        options: dict[str, Any] = {
+            "workers": workers,
+            "resume": resume,
+            "on_error": on_error,
+            "console": console,
+        }
         if self.sequence and not self.alone:
             missing = [i for i in many if not (resume and self.fused_file(i).exists())]
             keys = self.fusion.keys_of(missing)
@@ -179,7 +188,8 @@ class Batch:
         text, file = self.settings, self.out / SETTINGS
         if resume and file.is_file() and file.read_text(encoding="utf-8") != text:
             raise ValueError(
-                f"{file}: the frames there were made with other settings: give the same ones, or another --out"
+                f"{file}: the frames there were made with other settings: give the same ones, or "
+                "another --out"
             )
         now, before = self.inputs, _read_inputs(self.out / INPUTS) if resume else {}
         other = [i for i, name in enumerate(self.names) if before.get(name) != now[name]]
@@ -212,7 +222,9 @@ class Batch:
             if entries.pop("format") != PLAN_FORMAT:
                 raise ValueError("another version's")
             entries["rig"] = rig_of_text(entries["rig"], source)
-            entries["files"] = {name: [Path(file) for file in files] for name, files in entries["files"].items()}
+            entries["files"] = {
+                name: [Path(file) for file in files] for name, files in entries["files"].items()
+            }
             entries["out"] = Path(entries["out"])
             entries["field"] = field_of(entries["field"])
             if isinstance(entries["noise"], dict):
@@ -267,7 +279,9 @@ class Batch:
                 frame = self._frame(i)
             view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
             bands = band_names(frame, (name for name in self.rig.betas(self.alpha) if name in self.files))
-            save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i], bands=bands)
+            save_frame(
+                frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i], bands=bands
+            )
 
     def _frame(self, i: int) -> Frame:
         if not self.sequence:
@@ -296,8 +310,11 @@ def field_document(field: ReceptiveField | None) -> dict[str, Any] | None:
         return None
     if FIELD_CLASSES.get(type(field).__name__) is not type(field):
         known = ", ".join(FIELD_CLASSES)
-        raise ValueError(f"a batch's field is written to a file, which {field!r} cannot be: give one of {known}")
-    entries = {entry.name: getattr(field, entry.name) for entry in dataclasses.fields(field)}  # type: ignore[arg-type]
+        raise ValueError(
+            f"a batch's field is written to a file, which {field!r} cannot be: give one of {known}"
+        )
+    names = [entry.name for entry in dataclasses.fields(field)]  # type: ignore[arg-type]
+    entries = {name: getattr(field, name) for name in names}
     inner = {"field": field_document(entries["field"])} if "field" in entries else {}
     return {"kind": type(field).__name__, **entries, **inner}
 
@@ -360,7 +377,9 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
     path = Path(text)
     label = f"{name}: " if name else ""
     if path.is_dir():
-        found = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
+        found = [
+            p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")
+        ]
     elif any(c in path.name for c in "*?["):
         found = list(path.parent.glob(path.name))
     else:

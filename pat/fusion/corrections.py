@@ -1,7 +1,7 @@
 """What cameras and rig are off by, found once a frame from a fusion of reduced images.
 
-A pre-pass matches the images at half the size or less, without a network. Where its matches are reliable, alpha's
-response is fitted (`pat.matching.radiometry`), and how far beta lies across its search segments
+A pre-pass matches the images at half the size or less, without a network. Where its matches are reliable,
+alpha's response is fitted (`pat.matching.radiometry`), and how far beta lies across its search segments
 (`pat.matching.epipolar_offset`). Both are put right before the frame is fused.
 """
 
@@ -76,12 +76,16 @@ class Corrections:
     def applied(self, inputs: Inputs, hw: HW) -> Inputs:
         """The inputs put right; `hw` is alpha's size without padding."""
         if not self.response.is_rec601:
-            betas = tuple(replace(b, image=self.response.of_beta(b.image)) if _is_rgb(b) else b for b in inputs.betas)
+            betas = tuple(
+                replace(b, image=self.response.of_beta(b.image)) if _is_rgb(b) else b for b in inputs.betas
+            )
             inputs = replace(inputs, alpha=self.response.of_alpha(inputs.alpha), betas=betas)
         moves = self.misalignments or (Misalignment(),) * len(inputs.betas)
         return replace(
             inputs,
-            betas=tuple(replace(b, field=m.applied(b.field, hw)) for b, m in zip(inputs.betas, moves, strict=True)),
+            betas=tuple(
+                replace(b, field=m.applied(b.field, hw)) for b, m in zip(inputs.betas, moves, strict=True)
+            ),
         )
 
     def described(self, betas: Sequence[str], hw: HW) -> list[str]:
@@ -98,7 +102,9 @@ class Corrections:
         return frame if self.response.is_rec601 else frame._replace(image=self.response.undone(frame.image))
 
 
-def corrections_for(network: FusionNetwork, frame: FrameInputs, response: Given, *, align: bool) -> Corrections:
+def corrections_for(
+    network: FusionNetwork, frame: FrameInputs, response: Given, *, align: bool
+) -> Corrections:
     """What is to be put right for a network: for one without matches nothing is looked for. Raises as
     `find_corrections`."""
     if network.uses_matches:
@@ -110,8 +116,8 @@ def corrections_for(network: FusionNetwork, frame: FrameInputs, response: Given,
 def find_corrections(frame: FrameInputs, response: Given, *, align: bool) -> Corrections:
     """Alpha's response if it is to be fitted, and the betas' misalignments if these are asked for.
 
-    A response is fitted for RGB betas. Raises ValueError for a stated response that is not three weights, none
-    negative, or where there is no RGB beta.
+    A response is fitted for RGB betas. Raises ValueError for a stated response that is not three weights,
+    none negative, or where there is no RGB beta.
     """
     found = Corrections(_given(response, frame.inputs))
     fits = response == "fit" and any(map(_is_rgb, frame.inputs.betas))
@@ -177,7 +183,9 @@ def _reduced_frame(frame: FrameInputs) -> FrameInputs:
     return frame._replace(inputs=replace(inputs, alpha=alpha, betas=betas), hw=hw)
 
 
-def _reduced_field(field: FieldOnGrid, alpha: Tensor, whole: Callable[[Tensor], Tensor], factor: int) -> FieldOnGrid:
+def _reduced_field(
+    field: FieldOnGrid, alpha: Tensor, whole: Callable[[Tensor], Tensor], factor: int
+) -> FieldOnGrid:
     def at(x: Tensor) -> Segments:
         found = field.at(whole(x))
         assert isinstance(found, Segments)
@@ -189,7 +197,8 @@ def _reduced_field(field: FieldOnGrid, alpha: Tensor, whole: Callable[[Tensor], 
 class _Matches(NamedTuple):
     """What one beta shows at its matches: all (h, w) or (c, h, w), at the size of the pre-pass.
 
-    `before` are beta's own bands, blurred; `luma` is that of the corrected beta, as bright and sharp as `alpha`.
+    `before` are beta's own bands, blurred; `luma` is that of the corrected beta, as bright and sharp as
+    `alpha`.
     """
 
     before: Float[Tensor, "c h w"]
@@ -202,7 +211,9 @@ class _Matches(NamedTuple):
     @property
     def place(self) -> Float[Tensor, "h w 2"]:
         """The matches in beta's width and height, from its middle."""
-        return (self.position + 0.5) / self.position.new_tensor([self.luma.shape[1], self.luma.shape[0]]) - 0.5
+        return (self.position + 0.5) / self.position.new_tensor(
+            [self.luma.shape[1], self.luma.shape[0]]
+        ) - 0.5
 
     @property
     def misalignment(self) -> Misalignment:

@@ -58,7 +58,8 @@ Say = Callable[[str], None]
 class ImageArray:
     """What images of an array say of it: the rig, which camera is alpha, with which weights to fuse, and how.
 
-    rig: of the images as they were developed. recorded: of the files, with their sensors' coding and black level.
+    rig: of the images as they were developed. recorded: of the files, with their sensors' coding and black
+        level.
     images: alpha's and those of the betas that are fused. notes: what was found, a line each.
     """
 
@@ -81,8 +82,9 @@ def array_from_images(
 ) -> ImageArray:
     """The array of one image a camera. `say` is called with each line of what is found, as it is found.
 
-    `focal`: focal lengths in pixels by camera, instead of those in the files' tags. Raises ValueError, one line:
-    fewer than two images, an image of one colour, images that do not show the same things, a focal length of no camera.
+    `focal`: focal lengths in pixels by camera, instead of those in the files' tags. Raises ValueError, one
+    line: fewer than two images, an image of one colour, images that do not show the same things, a focal
+    length of no camera.
     """
     if not isinstance(sources, Mapping):
         sources = camera_names([Path(path) for path in sources])
@@ -92,7 +94,9 @@ def array_from_images(
     files = {name: Path(path) for name, path in sources.items() if not isinstance(path, Tensor)}
     for name, length in (focal or {}).items():
         if name not in sources or not 0 < length < math.inf:
-            raise ValueError(f"focal {name}={length:g}: no camera of {', '.join(sources)}, or not positive: mend it")
+            raise ValueError(
+                f"focal {name}={length:g}: no camera of {', '.join(sources)}, or not positive: mend it"
+            )
     notes: list[str] = []
 
     def note(line: str) -> None:
@@ -103,7 +107,9 @@ def array_from_images(
     if tagged is not None and focal:
         raise ValueError("focal: the images' tags state the focal lengths: leave it out")
     images = {name: images[name] if name in images else _read(name, files[name], note) for name in sources}
-    images = {name: _textured(f"{name}: {files.get(name, 'the image')}", image) for name, image in images.items()}
+    images = {
+        name: _textured(f"{name}: {files.get(name, 'the image')}", image) for name, image in images.items()
+    }
     alpha = _chosen_alpha(images, alpha, note)
     if tagged is not None:
         images = {name: read_view(tagged, name, files[name], like=tagged[alpha].sensor) for name in images}
@@ -115,7 +121,10 @@ def array_from_images(
         by_tags = {n: by_exif for n in images if n in files and (by_exif := focal_length(files[n]))}
         lengths = {n: length for n, length in (by_tags | dict(focal or {})).items() if n in images}
         for name, length in lengths.items():
-            note(f"{name}: focal length {length:.0f} pixels, {'as given' if name in (focal or {}) else 'by EXIF'}")
+            note(
+                f"{name}: focal length {length:.0f} pixels, "
+                f"{'as given' if name in (focal or {}) else 'by EXIF'}"
+            )
         rig, names = found_rig(images, alpha, lengths, load_weights(weights), note)
     else:
         rig, names = _translated_rig(tagged, images, alpha, note)
@@ -130,8 +139,8 @@ def array_from_images(
 
 
 def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
-    """Names of cameras for their files: the bands' that their tags state, the files' own without suffix, or the
-    folders', or numbers."""
+    """Names of cameras for their files: the bands' that their tags state, the files' own without suffix, or
+    the folders', or numbers."""
     if states_cameras(paths):
         return named_by_band(paths)
     for names in ([p.stem for p in paths], [p.resolve().parent.name for p in paths]):
@@ -141,7 +150,9 @@ def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
     return {f"camera{i}": path for i, path in enumerate(paths, 1)}
 
 
-def frames_of_videos(videos: Mapping[str, Path], folder: Path) -> tuple[dict[str, list[Path]], dict[str, float]]:
+def frames_of_videos(
+    videos: Mapping[str, Path], folder: Path
+) -> tuple[dict[str, list[Path]], dict[str, float]]:
     """The frames of videos as image files in a folder, and the frames a second, by camera."""
     files: dict[str, list[Path]] = {}
     rates: dict[str, float] = {}
@@ -171,13 +182,15 @@ def _tagged_rig(files: Mapping[str, Path], note: Say) -> Rig | None:
 
 @stage()
 def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple[Rig, list[str]]:
-    """The rig of tags with translations and depths by the images, and the cameras that match; alpha comes first."""
+    """The rig of tags with translations and depths by the images, and the cameras that match; alpha comes
+    first."""
     straight, pinhole = without_lenses(Rig({name: tagged[name] for name in images}), images)
     shown = {name: pixels_between(tagged[name], straight[name])[1][None].float() for name in images}
     lengths = {name: float(straight[name].K[0, 0]) for name in images}
     longest = max(images[alpha].shape[-2:])
     factors = {
-        name: min(lengths[alpha] / length * min(MATCHED / longest, 1.0), 1.0) for name, length in lengths.items()
+        name: min(lengths[alpha] / length * min(MATCHED / longest, 1.0), 1.0)
+        for name, length in lengths.items()
     }
     reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
     masks = {name: scaled(mask, factors[name])[0] > 0.99 for name, mask in shown.items()}
@@ -188,7 +201,9 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
         note(f"{name}: left out, too little in common with the others")
     note(f"depths are multiples of the baseline {alpha} to {found.betas(alpha)[0]}")
     rig = developed_rig(tagged, images)
-    cameras = {n: rig[n].replace(cam_from_world=found[n].cam_from_world) for n in (alpha, *found.betas(alpha))}
+    cameras = {
+        n: rig[n].replace(cam_from_world=found[n].cam_from_world) for n in (alpha, *found.betas(alpha))
+    }
     return Rig(cameras, depth=found.depth, name=UNSCALED), list(cameras)
 
 
@@ -198,7 +213,8 @@ def found_rig(
 ) -> tuple[Rig, list[str]]:
     """The rig of the cameras of images, and which of them it relates to alpha; alpha comes first in both.
 
-    Calibrated, up to a scale, where points matched between alpha and a beta have parallax; else known by F alone.
+    Calibrated, up to a scale, where points matched between alpha and a beta have parallax; else known by F
+    alone.
     """
     factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in images.items()}
     reduced = {name: scaled(image, factors[name]) for name, image in images.items()}
@@ -207,7 +223,9 @@ def found_rig(
         found = rig_from_images(reduced, focal=lengths, alpha=alpha)
     betas = [name for name in images if (alpha, name) in found.rig.links]
     if not betas:
-        raise ValueError(f"no image shows enough of what '{alpha}' shows: choose another alpha with --alpha NAME")
+        raise ValueError(
+            f"no image shows enough of what '{alpha}' shows: choose another alpha with --alpha NAME"
+        )
     for name in images.keys() - {alpha, *betas}:
         note(f"{name}: left out, too little in common with {alpha}")
     rig = _calibrated(found, reduced, alpha, betas, lengths, network, note)
@@ -225,8 +243,8 @@ def _calibrated(
 ) -> Rig:
     """The rig of alpha and these betas: calibrated, each pair refined by what a coarse fusion of it matches.
 
-    A pair whose lines no poses fit as well as F alone keeps F's, with the nearest poses for rough depths; one without
-    parallax has F alone. Each is said in a line.
+    A pair whose lines no poses fit as well as F alone keeps F's, with the nearest poses for rough depths; one
+    without parallax has F alone. Each is said in a line.
     """
     pairs: dict[str, RefinedPair] = {}
     depths: dict[str, Frame] = {}
@@ -240,17 +258,26 @@ def _calibrated(
             links[alpha, name] = link
             note(next(line for line in found.as_text().splitlines() if line.startswith(f"{alpha} > {name}")))
         if pair is None:
-            note(f"no depth by {name}: its points show no parallax, beside {alpha} it is too near or its scene too far")
+            note(
+                f"no depth by {name}: its points show no parallax, beside {alpha} it is too near or "
+                "its scene too far"
+            )
             continue
         if pair.exact:
             note(f"{alpha} > {name}: {pair.points} points, {pair.distance:.2f} px from their lines; refining")
         else:
-            note(f"{alpha} > {name}: lines by F; depths are rough, by poses whose lines are {pair.distance:.2f} px off")
+            note(
+                f"{alpha} > {name}: lines by F; depths are rough, by poses whose lines are "
+                f"{pair.distance:.2f} px off"
+            )
         pairs[name] = pair
         if pair.exact or len(betas) > 1:
             pairs[name], depths[name] = _refined(pair, images, network, links)
         if pairs[name] is not pair:
-            note(f"{alpha} > {name}: {pairs[name].points} points, {pairs[name].distance:.2f} px from their lines")
+            note(
+                f"{alpha} > {name}: {pairs[name].points} points, {pairs[name].distance:.2f} px from "
+                "their lines"
+            )
     if _distorted(found.rig):
         note(describe_lenses(found.rig))
     if not pairs:
@@ -260,7 +287,11 @@ def _calibrated(
     note(
         "depths are multiples of the baseline"
         + (f" {alpha} to {first}" if len(betas) > 1 else "")
-        + (f"; focal lengths assumed of {', '.join(assumed)}: depths are only proportional" if assumed else "")
+        + (
+            f"; focal lengths assumed of {', '.join(assumed)}: depths are only proportional"
+            if assumed
+            else ""
+        )
     )
     scales = {name: _relative_scale(depths[first], depths[name]) if name in depths else 1.0 for name in pairs}
     rig = joined(pairs, scales)
@@ -273,7 +304,8 @@ def _calibrated(
 def _refined(
     pair: RefinedPair, images: Images, network: Network, links: Mapping[tuple[str, str], Link]
 ) -> tuple[RefinedPair, Frame]:
-    """The pair refined by the matches of a fusion at reduced size, unless it has one of these links; and that."""
+    """The pair refined by the matches of a fusion at reduced size, unless it has one of these links; and
+    that."""
     alpha, beta = pair.rig.names
     factor = min(COARSE / max(images[alpha].shape[-2:]), 1.0)
     small = {name: scaled(images[name], factor) for name in (alpha, beta)}
@@ -295,7 +327,9 @@ def _refined(
 
 def _relative_scale(first: Frame, other: Frame) -> float:
     """The factor that brings another pair's depths to those of the first."""
-    both = (first.confidence > 0.5) & (other.confidence > 0.5) & first.depth.isfinite() & other.depth.isfinite()
+    both = (
+        (first.confidence > 0.5) & (other.confidence > 0.5) & first.depth.isfinite() & other.depth.isfinite()
+    )
     return float((first.depth[both] / other.depth[both]).median()) if both.any() else 1.0
 
 
@@ -305,7 +339,9 @@ def _distorted(rig: Rig) -> bool:
 
 def _without(rig: Rig, names: set[str]) -> Rig:
     cameras = {name: view for name, view in rig.cameras.items() if name not in names}
-    return rig.replace(cameras=cameras, links={pair: v for pair, v in rig.links.items() if not names & {*pair}})
+    return rig.replace(
+        cameras=cameras, links={pair: v for pair, v in rig.links.items() if not names & {*pair}}
+    )
 
 
 def resized_rig(rig: Rig, images: Images) -> Rig:
@@ -320,7 +356,9 @@ def scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 
     if factor >= 1:
         return image
     hw = [max(round(n * factor), 16) for n in image.shape[-2:]]
-    return interpolate(image[None], size=hw, mode="bicubic", antialias=True, align_corners=False)[0].clamp(0, 1)
+    return interpolate(image[None], size=hw, mode="bicubic", antialias=True, align_corners=False)[0].clamp(
+        0, 1
+    )
 
 
 def _read(name: str, path: Path, note: Say) -> Float[Tensor, "c h w"]:
@@ -350,10 +388,14 @@ def _chosen_alpha(images: Images, alpha: str | None, note: Say) -> str:
     grey = [name for name, image in images.items() if len(image) == 1]
     chosen = max(grey or images, key=lambda name: math.prod(images[name].shape[-2:]))
     h, w = images[chosen].shape[-2:]
-    why = "the only grey image" if len(grey) == 1 else "the largest grey image" if grey else "the largest image"
+    why = (
+        "the only grey image" if len(grey) == 1 else "the largest grey image" if grey else "the largest image"
+    )
     equal = [name for name in grey or images if images[name].shape[-2:] == (h, w)]
     why = "the first of images of one size" if len(equal) > 1 else why
-    note(f"alpha, whose view and detail the result has: {chosen} ({w}x{h}, {why}; --alpha NAME takes another)")
+    note(
+        f"alpha, whose view and detail the result has: {chosen} ({w}x{h}, {why}; --alpha NAME takes another)"
+    )
     return chosen
 
 
@@ -373,7 +415,11 @@ def _ordered_betas(images: Images, alpha: str, note: Say) -> list[str]:
 def show_colour(names: Sequence[str], bands: Sequence[int]) -> bool:
     """Whether cameras of a band each record, by their names, red, green and blue, in this order."""
     waves = [_wavelength(name) for name in names]
-    return set(bands) == {1} and len(waves) == 3 and all(low <= w <= high for w, (low, high) in zip(waves, COLOURS))
+    return (
+        set(bands) == {1}
+        and len(waves) == 3
+        and all(low <= w <= high for w, (low, high) in zip(waves, COLOURS))
+    )
 
 
 def _wavelength(name: str) -> float:

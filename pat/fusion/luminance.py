@@ -1,7 +1,8 @@
 """Whose luminance the fused image has, alpha's or a colour beta's in alpha's detail, and whose chroma.
 
-Where no combination of beta's bands is what alpha sees, as with near infrared, alpha's brightness in beta's colours
-is of neither camera: leaves are pale, skin is flat. An alpha in colour has its own chroma where betas do not see.
+Where no combination of beta's bands is what alpha sees, as with near infrared, alpha's brightness in beta's
+colours is of neither camera: leaves are pale, skin is flat. An alpha in colour has its own chroma where betas
+do not see.
 """
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ def check_luminance(network: FusionNetwork, kept: Luminance, *, noisy: bool) -> 
     if kept == "alpha":
         return
     if not network.keeps_luminance:
-        raise ValueError(f"luminance={kept!r} needs weights for RGB betas, such as mono-colour: leave it at 'alpha'")
+        raise ValueError(
+            f"luminance={kept!r} needs weights for RGB betas, such as mono-colour: leave it at 'alpha'"
+        )
     if noisy:
         raise ValueError(
             f"luminance={kept!r} with noise: denoising is towards alpha's luminance; leave one of them out"
@@ -67,14 +70,17 @@ def with_alpha_detail(frame: Frame, alpha: Float[Tensor, "1 h w"]) -> Frame:
 
 
 def with_own_colours(frame: Frame, own: Float[Tensor, "3 h w"]) -> Frame:
-    """A fused frame whose chroma is alpha's own where confidence is low, as the betas' cameras show such colours.
+    """A fused frame whose chroma is alpha's own where confidence is low, as the betas' cameras show such
+    colours.
 
     Luminance stays. How the betas show alpha's colours is found where they see the same points.
     """
     own = own.to(frame.image)
     step = max(int((frame.confidence.numel() / OWN_COLOUR.pixels) ** 0.5), 1)
     some = (..., slice(None, None, step), slice(None, None, step))
-    terms, values = (to_luma_chroma(image[some])[1].flatten(1).detach().double() for image in (own, frame.image))
+    terms, values = (
+        to_luma_chroma(image[some])[1].flatten(1).detach().double() for image in (own, frame.image)
+    )
     weight = (frame.confidence[some].flatten().detach() > OWN_COLOUR.seen).double()
     same = torch.eye(2, dtype=torch.float64, device=own.device)
     change = same + least_squares(terms, (values - terms).T, weight, OWN_COLOUR.prior * same)

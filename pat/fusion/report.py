@@ -62,7 +62,9 @@ def write_report(
     return path
 
 
-def report_page(frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig: Rig, alpha: str, facts: Facts) -> str:
+def report_page(
+    frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig: Rig, alpha: str, facts: Facts
+) -> str:
     """The page as text."""
     shown = {f"alpha: {alpha}": images[alpha]}
     shown |= {f"beta: {name}": images[name] for name in rig.betas(alpha) if name in images}
@@ -74,7 +76,8 @@ def report_page(frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig:
     if len(known):
         overlays["depth"] = lambda: data_url(reduced(colour_depth(frame.depth), LONGEST))
     layers = {
-        name: partial(lambda image: data_url(reduced(picture_of(image), LONGEST)), x) for name, x in shown.items()
+        name: partial(lambda image: data_url(reduced(picture_of(image), LONGEST)), x)
+        for name, x in shown.items()
     }
     urls = _all_of({**layers, **overlays})
     return filled_page(
@@ -136,7 +139,10 @@ def rig_drawing(rig: Rig, alpha: str) -> str:
     if not cameras:
         return ""
     size = frustum_size(cameras)
-    lines = {name: [line[:, [0, 2]] * (1, -1) for line in frustum(camera, size)] for name, camera in cameras.items()}
+    lines = {
+        name: [line[:, [0, 2]] * (1, -1) for line in frustum(camera, size)]
+        for name, camera in cameras.items()
+    }
     points = np.concatenate([line for some in lines.values() for line in some])
     low, extent = points.min(0), float(np.ptp(points, axis=0).max()) or 1.0
     drawn = []
@@ -145,10 +151,13 @@ def rig_drawing(rig: Rig, alpha: str) -> str:
         drawn += [_polyline((line - low) / extent * 300 + 30, colour) for line in lines[name]]
         x, y = (lines[name][0][0] - low) / extent * 300 + 30
         label = html.escape(name) + (" (alpha)" if name == alpha else "")
-        drawn.append(f'<text x="{x:.1f}" y="{y + 18:.1f}" fill="{colour}" text-anchor="middle">{label}</text>')
+        drawn.append(
+            f'<text x="{x:.1f}" y="{y + 18:.1f}" fill="{colour}" text-anchor="middle">{label}</text>'
+        )
     wide, high = np.ptp(points, axis=0) / extent * 300 + 60
     return (
-        f'<svg viewBox="0 0 {wide:.0f} {high:.0f}" role="img" aria-label="the rig from above">{"".join(drawn)}</svg>'
+        f'<svg viewBox="0 0 {wide:.0f} {high:.0f}" role="img" aria-label="the rig from '
+        f'above">{"".join(drawn)}</svg>'
         "<p>The cameras from above, each with the field of view that it has.</p>"
     )
 
@@ -182,7 +191,8 @@ def _depth_legend(known: Float[Tensor, " n"], unit: str) -> str:
         return ""
     near, far = _range(known)
     return (
-        f'<p class="legend" hidden>depth: near, {near:.3g} {unit} <i></i> far, {far:.3g} {unit}; unknown is black</p>'
+        f'<p class="legend" hidden>depth: near, {near:.3g} {unit} <i></i> far, {far:.3g} {unit}; unknown '
+        "is black</p>"
     )
 
 

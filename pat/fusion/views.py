@@ -25,7 +25,8 @@ Fields = Mapping[str, ReceptiveField | None]
 
 @dataclass(frozen=True)
 class Views:
-    """What is fused: images (C, H, W) by camera, the rig that describes them, the camera alpha, the betas' fields."""
+    """What is fused: images (C, H, W) by camera, the rig that describes them, the camera alpha, the betas'
+    fields."""
 
     rig: Rig
     images: Mapping[str, Tensor]
@@ -46,8 +47,9 @@ class Views:
     ) -> Views:
         """Check names and images; each is asked for once, and alpha made grey.
 
-        Raises ValueError for a camera that the rig lacks, no image of alpha or of any beta, an image of another size
-        than the rig says, of another type, or with values that are not finite or far outside 0..1.
+        Raises ValueError for a camera that the rig lacks, no image of alpha or of any beta, an image of
+        another size than the rig says, of another type, or with values that are not finite or far outside
+        0..1.
         """
         for name in (alpha, *images):
             rig.require(name)
@@ -55,7 +57,9 @@ class Views:
             raise ValueError(f"no image of alpha, '{alpha}'")
         names = [name for name in rig.betas(alpha) if name in images]
         if not names:
-            raise ValueError(f"no image of any other camera than alpha, '{alpha}': fusion needs at least one beta")
+            raise ValueError(
+                f"no image of any other camera than alpha, '{alpha}': fusion needs at least one beta"
+            )
         checked = {name: _checked(rig, images, name) for name in (alpha, *names)}
         fields = field if isinstance(field, Mapping) else dict.fromkeys(names, field)
         rig = rig if depth is None else rig.replace(depth=depth)
@@ -82,7 +86,8 @@ class Views:
 
 
 LARGEST_VALUE = 32.0
-"""Of an image in 0..1: developed ones of a short exposure exceed 1, and those of 8 bits have values to 255."""
+"""Of an image in 0..1: developed ones of a short exposure exceed 1, and those of 8 bits have values to
+255."""
 
 
 def is_in_colour(image: Float[Tensor, "c h w"]) -> bool:
@@ -112,7 +117,9 @@ def _checked(rig: Rig, images: Images, name: str) -> Tensor:
     if not math.isfinite(largest):
         raise ValueError(f"the image of '{name}' has NaN or infinite values")
     if largest > LARGEST_VALUE:
-        raise ValueError(f"the image of '{name}' has values up to {largest:g}: divide them, images are in 0..1")
+        raise ValueError(
+            f"the image of '{name}' has values up to {largest:g}: divide them, images are in 0..1"
+        )
     return image
 
 
@@ -156,12 +163,16 @@ class ViewFiles(Mapping[str, Tensor]):
 def read_view(rig: Rig, name: str, path: str | Path, *, like: Sensor) -> Float[Tensor, "c h w"]:
     """Read and develop the image of one camera, on the scale of light of the sensor `like`.
 
-    Raises ValueError or FileNotFoundError naming the camera and the file for what cannot be read, has another size
-    than the rig says, or is in colour where the rig says raw.
+    Raises ValueError or FileNotFoundError naming the camera and the file for what cannot be read, has another
+    size than the rig says, or is in colour where the rig says raw.
     """
     view = rig[name]
     raw = view.sensor.bayer is not None
-    image = read_image(path, name=name, bits=view.sensor.bits, hw=view.hw, orientation="ignore" if raw else "apply")
+    image = read_image(
+        path, name=name, bits=view.sensor.bits, hw=view.hw, orientation="ignore" if raw else "apply"
+    )
     if view.sensor.bayer and image.shape[0] != 1:
-        raise ValueError(f"{name}: {path}: is in colour, and the rig says raw {view.sensor.bayer}: drop 'bayer'")
+        raise ValueError(
+            f"{name}: {path}: is in colour, and the rig says raw {view.sensor.bayer}: drop 'bayer'"
+        )
     return develop(image, view.sensor, like=like)

@@ -39,8 +39,12 @@ class AlignmentSettings:
     finest: float = size(5e-3, "A step below this ends them")
     contrast: float = tuned(2e-5, "Middlebury: mean squared gradient of a window that counts half")
     farthest: float = size(2.0, "A window's displacement in one step is at most this")
-    deviation: float = size(0.05, "The standard deviation of windows' displacements about the plane, at least")
-    least: float = tuned(0.2, "Middlebury: largest displacement of a pixel below which the rig is taken to be right")
+    deviation: float = size(
+        0.05, "The standard deviation of windows' displacements about the plane, at least"
+    )
+    least: float = tuned(
+        0.2, "Middlebury: largest displacement of a pixel below which the rig is taken to be right"
+    )
     better: float = tuned(
         0.98, "Middlebury: residual with the displacement over that without, up to which it is accepted"
     )
@@ -145,7 +149,9 @@ class _Windows(NamedTuple):
         height, width = self.beta.shape
         inside = (columns > 2) & (rows > 2) & (columns < width - 3) & (rows < height - 3)
         planes = (self.beta, *self.gradients)
-        value, gx, gy = (cv2.remap(p, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for p in planes)
+        value, gx, gy = (
+            cv2.remap(p, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for p in planes
+        )
         return value, gx, gy, self.weight * inside.astype(np.float32)
 
     def _mean(self, plane: Image, weight: Image) -> Image:

@@ -23,7 +23,14 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import pixel_grid
-from arraygeom.robust import RobustFit, cauchy, gaussian, least_squares, normal_deviation, robust_least_squares
+from arraygeom.robust import (
+    RobustFit,
+    cauchy,
+    gaussian,
+    least_squares,
+    normal_deviation,
+    robust_least_squares,
+)
 
 from ..media.colour import REC601
 from ..support.settings import physics, size, tuned
@@ -42,8 +49,12 @@ class ResponseSettings:
         (0.32, 0.48, 0.20), "Middlebury: weights of a usual sensor that is not Rec. 601's: it sees more blue"
     )
     prior: float = tuned(0.2, "Middlebury: standard deviation of weights about these")
-    independent: float = tuned(20.0, "Middlebury: as how many independent observations, or materials, all points count")
-    error: float = tuned(0.012, "Middlebury: standard deviation of one of those, at least: light differs between views")
+    independent: float = tuned(
+        20.0, "Middlebury: as how many independent observations, or materials, all points count"
+    )
+    error: float = tuned(
+        0.012, "Middlebury: standard deviation of one of those, at least: light differs between views"
+    )
     outlier: float = tuned(2.0, "Middlebury: residuals of this many robust deviations count half")
     points: tuple[int, int] = size((6000, 300), "Pixels used at most, and the fewest that are enough")
     gammas: tuple[float, ...] = size(
@@ -74,13 +85,16 @@ class ResponseSettings:
     )
     equal_weights: tuple[float, float] = tuned(
         (8.0, 0.006),
-        "Middlebury: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other weights, to be taken "
+        "Middlebury: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other "
+        "weights, to be taken "
         "in their place: a sensor without filters; light may differ by a gain of this standard deviation",
     )
     least_change: float = physics(
         0.01, "Root mean square change of luma up to which the weights are left at Rec. 601's"
     )
-    equal: float = tuned(1.1, "Middlebury: the error over the least one up to which a gamma explains alpha as well")
+    equal: float = tuned(
+        1.1, "Middlebury: the error over the least one up to which a gamma explains alpha as well"
+    )
     better: float = tuned(
         0.8,
         "Middlebury: the error with another gamma than 1, or with vignetting, over that without, to be taken",
@@ -202,7 +216,9 @@ def stated_response(weights: Sequence[float]) -> Response:
     negative."""
     values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
     if values.shape != (3,) or not bool((values >= 0).all() & (values.sum() > 0) & values.isfinite().all()):
-        raise ValueError(f"a response is three weights, of red, green and blue, none negative; got {tuple(weights)}")
+        raise ValueError(
+            f"a response is three weights, of red, green and blue, none negative; got {tuple(weights)}"
+        )
     return Response(values / values.sum(), gain=float(values.sum()))
 
 
@@ -306,7 +322,9 @@ def _weighted_fit(x: Tensor, y: Tensor) -> _Fit:
         return share * (SETTINGS.independent / share.sum() / max(deviation, SETTINGS.error) ** 2)
 
     def precision(found: Tensor) -> Tensor:
-        return torch.block_diag(x.new_zeros(1, 1), CHANGES.T @ CHANGES / (SETTINGS.prior * float(found[0])) ** 2)
+        return torch.block_diag(
+            x.new_zeros(1, 1), CHANGES.T @ CHANGES / (SETTINGS.prior * float(found[0])) ** 2
+        )
 
     (scale, *change), rest, counts = robust_least_squares(terms, y, start, weigh, precision=precision)
     centred = y - counts @ y / counts.sum()
@@ -411,7 +429,10 @@ class SpectralMix(NamedTuple):
 
     @classmethod
     def fitted(
-        cls, bands: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
+        cls,
+        bands: Float[Tensor, "b c h w"],
+        alpha: Float[Tensor, "b 1 h w"],
+        weight: Float[Tensor, "b 1 h w"],
     ) -> SpectralMix:
         """The one most like alpha by weighted least squares, around each pixel's surroundings; twice, the
         second time without outliers."""
@@ -428,7 +449,9 @@ class SpectralMix(NamedTuple):
         """The slopes."""
         return self.slopes[:, :, None, None].to(like)
 
-    def reconciled(self, bands: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b c h w"]:
+    def reconciled(
+        self, bands: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"]
+    ) -> Float[Tensor, "b c h w"]:
         """The bands corrected so that their combination is nearer to alpha, by as much as it is reliable."""
         step = self.gain[:, None, None, None].to(bands) * self.rises(bands)
         return bands + step * (alpha - self.of(bands))

@@ -43,7 +43,9 @@ class SemiGlobalSettings:
     step: float = tuned(
         12.0, "Source not recorded: penalty of neighbours whose labels differ by one, in the unit of `cost`"
     )
-    jump: float = tuned(100.0, "Source not recorded: penalty of those that differ by more, where alpha shows no edge")
+    jump: float = tuned(
+        100.0, "Source not recorded: penalty of those that differ by more, where alpha shows no edge"
+    )
     margin: int = size(64, "What is matched around a block, pixels")
     block: int = size(320, "Sides of a block, pixels")
     long_block: int = size(640, "The longer side of the blocks of large images, along the segments")
@@ -67,7 +69,8 @@ CONSISTENT, DISPARITY_FILL = HALF_SIZE.consistent, HALF_SIZE.fill
 
 
 class HalfSizeMatches(NamedTuple):
-    """Matches at half the size: `disparity` (B, 1, H / 2, W / 2) in pixels of beta; facts as of `BetaMatches`."""
+    """Matches at half the size: `disparity` (B, 1, H / 2, W / 2) in pixels of beta; facts as of
+    `BetaMatches`."""
 
     disparity: Tensor
     facts: Tensor
@@ -111,7 +114,8 @@ class _Geometry(NamedTuple):
 
 
 def matched_at_half_size(views: ComparedViews, blocks: Segments) -> HalfSizeMatches:
-    """Matches of views at half the size; `blocks` are the segments of their pixels, in those of the whole beta."""
+    """Matches of views at half the size; `blocks` are the segments of their pixels, in those of the whole
+    beta."""
     own, other = views.alpha, views.beta
     geometry = geometry_of(blocks, len(own), (FINE * other.shape[-2], FINE * other.shape[-1]))
     del blocks
@@ -151,7 +155,9 @@ def matched_by_labels(
     own, other = (numpy_of(image[:, 0]) for image in (views.alpha, views.beta))
     found, measured = _matched_blocks(own, other, geometry, windows, settings, facts)
     consistent = (measured[..., 0] < settings.consistent).astype(np.float32)
-    dense = (filled(d[None], c + 1e-5, g, settings.fill)[0] for d, c, g in zip(found, consistent, views.guides))
+    dense = (
+        filled(d[None], c + 1e-5, g, settings.fill)[0] for d, c, g in zip(found, consistent, views.guides)
+    )
     smooth = [cv2.medianBlur(np.where(c > 0, d, fill), 5) for d, c, fill in zip(found, consistent, dense)]
     return torch.from_numpy(np.stack(smooth)), torch.from_numpy(measured)
 
@@ -192,7 +198,9 @@ def _matched_blocks(
         boxes = _boxes(hw, geometry.along[i], windows.first.shape[-1] * windows.labels, settings)
         tasks += [partial(_block, images[-1], box, windows, settings) for box in boxes]
         largest = max(_pixels_in(outer, hw) for _, outer in boxes)
-        nbytes = max(nbytes, largest * (settings.pixel_bytes + settings.label_bytes * math.prod(windows.lanes)))
+        nbytes = max(
+            nbytes, largest * (settings.pixel_bytes + settings.label_bytes * math.prod(windows.lanes))
+        )
     in_parallel(tasks, most=how_many_fit(nbytes))
     for image, fact, its in zip(images, measured[..., 0], place):
         label = (reduce(np.minimum, image.claims)[its] & 0xFFFF).astype(np.float32)

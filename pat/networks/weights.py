@@ -27,7 +27,8 @@ SHIPPED = Path(__file__).parent / "shipped"
 DENOISER = Path(__file__).parent / "denoisers" / "low-light.safetensors"
 FORMAT = "pat-weights 1"
 NETWORKS: Mapping[str, tuple[Any, Any]] = {
-    name: (getattr(import_module(f"pat.networks.{MODULES[name]}"), name), kind) for name, kind in CONFIGS.items()
+    name: (getattr(import_module(f"pat.networks.{MODULES[name]}"), name), kind)
+    for name, kind in CONFIGS.items()
 }
 DENOISERS = {"LowLightNetwork": (LowLightNetwork, DenoiserConfig)}
 
@@ -101,12 +102,15 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
             metadata = file.metadata() or {}
             network, config = _described(path, metadata, networks)
             names = list(file.keys())
-            _check_shapes(path, network, config, {name: tuple(file.get_slice(name).get_shape()) for name in names})
+            _check_shapes(
+                path, network, config, {name: tuple(file.get_slice(name).get_shape()) for name in names}
+            )
             state = {name: file.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:
         if zipfile.is_zipfile(path):
             raise ValueError(
-                f"{path}: a checkpoint of PyTorch's: `pat weights import` makes weights of one of the paper's authors"
+                f"{path}: a checkpoint of PyTorch's: `pat weights import` makes weights of one of "
+                "the paper's authors"
             ) from None
         raise ValueError(f"{path}: not a safetensors file ({error}); was it copied whole?") from None
     if not undamaged(state, metadata):
@@ -153,10 +157,18 @@ def _described(
 ) -> tuple[Callable[..., nn.Module], Any]:
     """The class of the network that a file describes, and its configuration, of plausible numbers."""
     if metadata.get("format", "").startswith("pat-checkpoint"):
-        raise ValueError(f"{path}: a checkpoint of training: the weights are in best.safetensors, a folder above")
+        raise ValueError(
+            f"{path}: a checkpoint of training: the weights are in best.safetensors, a folder above"
+        )
     if metadata.get("format") != FORMAT or metadata.get("network") not in networks:
-        found = f"it is '{metadata.get('format')}' of a {metadata.get('network')}" if metadata else "it says nothing"
-        raise ValueError(f"{path}: not weights of this package ('{FORMAT}' is wanted in the file's metadata, {found})")
+        found = (
+            f"it is '{metadata.get('format')}' of a {metadata.get('network')}"
+            if metadata
+            else "it says nothing"
+        )
+        raise ValueError(
+            f"{path}: not weights of this package ('{FORMAT}' is wanted in the file's metadata, {found})"
+        )
     network, kind = networks[metadata["network"]]
     try:
         config: Any = from_document(kind, json.loads(metadata["config"]))  # type: ignore[arg-type]
@@ -173,7 +185,11 @@ def _check_numbers(name: str, value: object) -> None:
         raise ValueError(f"{name} has {len(values)} entries; at most {MOST_ENTRIES} are read")
     least = 0 if name in MAY_BE_ZERO else 1
     for number in values:
-        if isinstance(number, int | float) and not isinstance(number, bool) and not least <= number <= LARGEST:
+        if (
+            isinstance(number, int | float)
+            and not isinstance(number, bool)
+            and not least <= number <= LARGEST
+        ):
             raise ValueError(f"{name} is {number}; wanted {least} to {LARGEST}")
 
 
@@ -186,6 +202,10 @@ def _check_shapes(
             made = network(config)
             wrong = _misfit(made, shapes)
     except Exception as error:  # whatever a constructor runs into, the cause is the configuration
-        raise ValueError(f"{path}: its configuration makes no network ({' '.join(str(error).split())[:200]})") from None
+        raise ValueError(
+            f"{path}: its configuration makes no network ({' '.join(str(error).split())[:200]})"
+        ) from None
     if wrong:
-        raise ValueError(f"{path}: the weights do not fit the {type(made).__name__} that the file describes: {wrong}")
+        raise ValueError(
+            f"{path}: the weights do not fit the {type(made).__name__} that the file describes: {wrong}"
+        )
