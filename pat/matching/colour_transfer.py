@@ -27,7 +27,7 @@ from .matches import BetaMatches, Matches, is_consistent
 from .normalisation import SETTINGS as NORMALISATION
 from .normalisation import Normalisation, combined_bands, explained_share, normalised
 from .positions import at_matches
-from .radiometry import SpectralMix
+from .spectral_mix import SpectralMix
 
 FILLS = 2
 """Size: ways in which colour is diffused, along its regression on brightness, and as it is."""

@@ -23,8 +23,8 @@ from .matches import BetaMatches, Matches, is_consistent
 from .multiview import agreed
 from .normalisation import Comparison
 from .positions import FINE, at_matches, reduced
-from .radiometry import SpectralMix
 from .semi_global import HalfSizeMatches, matched_at_half_size
+from .spectral_mix import SpectralMix
 from .subpixel import matched_at_full_size, with_gradients
 
 LOG = logging.getLogger(__name__)

@@ -2,8 +2,7 @@
 
 Their repository, github.com/djbradyAtOpticalSciencesArizona/physicsAwareTransformer, trains under
 DataParallel and saves a dict with `epoch`, `psnr` and `state_dict`, whose names begin with `module.`. The
-files are read with
-`weights_only`: tensors and plain numbers, nothing that runs.
+files are read with `weights_only`: tensors and plain numbers, nothing that runs.
 """
 
 from __future__ import annotations
