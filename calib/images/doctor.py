@@ -21,7 +21,8 @@ from arraygeom.rig import Depths
 from arraygeom.robust import cauchy, least_squares, robust_least_squares
 from arraygeom.threads import torch_in_one_thread
 
-from .held_out import image_parts, trimmed_square
+from .depth_change import relative_change
+from .held_out import image_parts, line_distances, trimmed_square
 from .matches import Images, Pairs, PointMatches, agreeing_pairs, match_cameras
 from .plausibility import DriftEvidence, plausible
 from .remedies import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
@@ -49,6 +50,8 @@ MARGIN = 12.0
 EXPLAINED, ROUGHLY = (HEALTHY_MISFIT, 0.06), 0.9
 """A mistake explains the points if no more than so many pixels, or that share of the misfit, are left; pixels of those
 whose remedy is approximate."""
+SAME_DEPTH, SAME_DISTANCE = 1e-3, 1e-3
+"""Rigs are the same in which depths (relative) and distances from lines (pixels) differ by less, in the median."""
 LEAST_NOISE = 0.05
 """Lower bound of the points' noise, pixels."""
 FEW = 10
@@ -102,7 +105,8 @@ class Diagnosis:
     named: the mistake, or `NOTHING`: no mistake explains the images clearly better than a drift of the cameras does.
     equal: other kinds of mistake that explain the images as well.
     before, after: statistics of the given rig and of the repaired one. tried: all explanations, best first.
-    matches: number of points used. healthy: the given rig fits the images.
+    matches: number of points used. healthy: the given rig fits the images. certain: all explanations that are as good
+    as the one named are undone by the same rig.
     """
 
     named: Remedy
@@ -113,6 +117,7 @@ class Diagnosis:
     matches: int
     healthy: bool
     repaired: Rig
+    certain: bool
 
     @property
     def outside_depth_range(self) -> bool:
@@ -201,13 +206,26 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     LOG.info("comparing the mistake found with a drift")
     if best and fits and not _clearly_better(rig, tried[best], (figures[0], figures[best]), pairs, inliers, noise):
         best = 0
-    equal = {tried[i].kind: tried[i] for i in reversed(order) if figures[i].penalised_misfit <= least and candidate}
+    as_good = [i for i in order if figures[i].penalised_misfit <= least and candidate]
+    equal = {tried[i].kind: tried[i] for i in reversed(as_good)}
     equal.pop("nothing", None)
     equal.pop(tried[best].kind, None)
     table = tuple((tried[i], figures[i]) for i in order)
     count = sum(len(matches.alpha) for matches in pairs.values())
     repaired = tried[best].repair(rig)
-    return Diagnosis(tried[best], tuple(equal.values()), figures[0], figures[best], table, count, healthy, repaired)
+    certain = best > 0 and all(_same_rig(repaired, tried[i].repair(rig), pairs) for i in as_good if i != best)
+    return Diagnosis(
+        tried[best], tuple(equal.values()), figures[0], figures[best], table, count, healthy, repaired, certain
+    )
+
+
+def _same_rig(rig: Rig, other: Rig, pairs: Pairs) -> bool:
+    """Whether no point tells two rigs apart: by its depth or, if they are not calibrated, by its line."""
+    change = relative_change(rig, other, pairs)
+    if not math.isnan(change):
+        return change < SAME_DEPTH
+    off = [line_distances(each, pairs).abs() for each in (rig, other)]
+    return bool((off[0] - off[1]).abs().median() < SAME_DISTANCE)
 
 
 def _clearly_better(

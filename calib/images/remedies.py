@@ -15,11 +15,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import Camera, Distortion, Pose, Rig, View, resize_matrix
+from arraygeom import Camera, Distortion, Pose, Rig, View, resize_matrix, rotation_from_vector
 from arraygeom.pixels import HW, rot90_matrix, shift_matrix
+from arraygeom.pose import rotation_vector
 
 KINDS = (
     *("nothing", "resized", "rotated or mirrored", "cameras swapped", "pose inverted", "R transposed", "sign of t"),
+    *("centre as t", "OpenGL axes", "order of quaternions", "degrees and radians"),
     *("x and y exchanged", "units", "distortion", "half-pixel shift", "one-pixel shift"),
 )
 RESIZED = (0.5, 2.0, 0.25, 4.0, 1 / 3, 3.0, 2 / 3, 1.5, 0.75, 4 / 3)
@@ -157,13 +159,37 @@ def _swapped(rig: Rig, names: list[str], sizes: Mapping[str, HW]) -> Iterator[Re
             yield Remedy("cameras swapped", f"images of '{a}' and '{b}' swapped", partial(swap, a=a, b=b))
 
 
+def _of_other_axes(pose: Pose) -> Pose:
+    """The same camera where y was upwards and z backwards, as in OpenGL and Blender."""
+    D = torch.diag(pose.t.new_tensor([1, -1, -1]))
+    return Pose(D @ pose.R, D @ pose.t)
+
+
+def _reordered(pose: Pose, order: list[int]) -> Pose:
+    return Pose.from_quaternion(pose.quaternion[..., order], pose.t)
+
+
+POSES: dict[tuple[str, str], Callable[[Pose], Pose]] = {
+    ("pose inverted", "pose of {} inverted (world from camera)"): Pose.inverse,
+    ("sign of t", "translation of {} with the wrong sign"): lambda pose: Pose(pose.R, -pose.t),
+    ("R transposed", "R of {} transposed"): lambda pose: Pose(pose.R.mT, pose.t),
+    ("centre as t", "t of {} is the camera's centre"): lambda pose: Pose.from_centre(pose.R, pose.t),
+    ("OpenGL axes", "axes of {} are OpenGL's (y upwards, z backwards)"): _of_other_axes,
+    ("order of quaternions", "quaternion of {} is w, x, y, z and was read as x, y, z, w"): partial(
+        _reordered, order=[1, 2, 3, 0]
+    ),
+    ("order of quaternions", "quaternion of {} is x, y, z, w and was read as w, x, y, z"): partial(
+        _reordered, order=[3, 0, 1, 2]
+    ),
+    ("degrees and radians", "rotation of {} in radians, taken for degrees"): lambda pose: Pose(
+        rotation_from_vector(torch.rad2deg(rotation_vector(pose.R))), pose.t
+    ),
+}
+"""Mistakes in a pose, and what undoes them."""
+
+
 def _poses(rig: Rig, names: list[str]) -> Iterator[Remedy]:
-    changes: dict[tuple[str, str], Callable[[Pose], Pose]] = {
-        ("pose inverted", "pose of {} inverted (world from camera)"): Pose.inverse,
-        ("sign of t", "translation of {} with the wrong sign"): lambda pose: Pose(pose.R, -pose.t),
-        ("R transposed", "R of {} transposed"): lambda pose: Pose(pose.R.transpose(-1, -2), pose.t),
-    }
-    for (kind, words), change in changes.items():
+    for (kind, words), change in POSES.items():
         for group, label in _groups(_calibrated(rig, names)):
             yield Remedy(kind, words.format(label), partial(_with_poses, names=group, change=change))
 

@@ -224,8 +224,9 @@ class Convert:
 class Doctor:
     """Find the usual mistakes in a rig, by features matched between one image of each camera.
 
-    Half-pixel and one-pixel shifts, R transposed, pose inverted, units, cameras swapped, images resized, cropped,
-    rotated or mirrored without the rig, x and y exchanged, distortion ignored, applied twice or with the wrong sign.
+    Half-pixel and one-pixel shifts, R transposed, pose inverted, the centre given as t, OpenGL axes, order of
+    quaternions, radians taken for degrees, units, cameras swapped, images resized, cropped, rotated or mirrored
+    without the rig, x and y exchanged, distortion ignored, applied twice or with the wrong sign.
     Example: pat rig doctor rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
     """
 
@@ -236,7 +237,8 @@ class Doctor:
     """An image of each of two or more cameras."""
     matches: MatchesFile = None
     out: MaybeOut = None
-    """Rig file to write if a mistake is found: the repaired rig. Also: --fix. A former file is kept as NAME.old."""
+    """Rig file to write if a mistake is found: the repaired rig. Also: --fix. A former file is kept as NAME.old. Exit
+    status 4, and nothing is written, if several mistakes with different repairs explain the images as well."""
     json: bool = False
     """Print JSON instead of text."""
 
@@ -258,6 +260,9 @@ class Doctor:
             return
         if found.named.kind == "nothing":
             return say("no rig written: no mistake was found")
+        if not found.certain:
+            say("no rig written: several mistakes explain these images as well: correct the rig file by hand")
+            raise SystemExit(REFUSED)
         kept = ""
         if self.out.exists():
             former = self.out.with_name(f"{self.out.name}.old")

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Link, Pose, Rig, View
+from arraygeom import Link, Pose, Rig, View, rotation_from_vector
+from arraygeom.pose import rotation_vector
 from calib.images.doctor import diagnose, diagnose_matches
 from calib.images.least_squares import most_probable
 from calib.images.parameters import UNCERTAIN, apply_change, free_parameters
@@ -41,12 +42,17 @@ def moved(d):
     return lambda c: c.replace(K=c.K + torch.nn.functional.pad(vector([d], [d]), (2, 0, 0, 1)))
 
 
+OPENGL = torch.diag(vector(1, -1, -1))
 MISTAKES = {
     "sign of t": one(posed(lambda p: Pose(p.R, -p.t))),
     "half-pixel shift": one(moved(0.5)),
     "one-pixel shift": one(moved(-1.0)),
     "R transposed": each(posed(lambda p: Pose(p.R.T, p.t))),
     "pose inverted": each(posed(Pose.inverse)),
+    "centre as t": each(posed(lambda p: Pose(p.R, -p.R.T @ p.t))),
+    "OpenGL axes": one(posed(lambda p: Pose(OPENGL @ p.R, OPENGL @ p.t))),
+    "order of quaternions": each(posed(lambda p: Pose.from_quaternion(p.quaternion[[3, 0, 1, 2]], p.t))),
+    "degrees and radians": each(posed(lambda p: Pose(rotation_from_vector(rotation_vector(p.R).deg2rad()), p.t))),
     "cameras swapped": lambda rig: swap(rig, *rig.names),
     "units": each(posed(lambda p: Pose(p.R, 1000 * p.t))),
     "x and y exchanged": each(lambda c: c.replace(K=TRANSPOSE @ c.K @ TRANSPOSE)),
@@ -168,6 +174,15 @@ def test_what_cannot_be_distinguished_is_said():
     assert {"pose inverted", "cameras swapped"} <= kinds
     assert found.before.front < 0.1
     assert found.after.front > 0.9
+    assert found.certain
+
+
+def test_nothing_is_certain_where_repairs_of_equal_lines_give_other_depths():
+    """The right camera sees 3 px to one side: an inverted pose is not quite the same as images swapped."""
+    rig = rectified_pair().perturbed({"right.centre": vector(3, 0)})
+    found = diagnose_matches(each(posed(Pose.inverse))(rig), sizes(rig), seen_points(rig))
+    assert {"pose inverted", "cameras swapped"} <= {found.named.kind, *(remedy.kind for remedy in found.equal)}
+    assert not found.certain
 
 
 def test_an_f_of_which_one_side_counts_from_one():
@@ -231,4 +246,8 @@ def test_command_line(tmp_path, capsys):
     captured = capsys.readouterr()
     assert json.loads(captured.out)["healthy"]
     assert "no rig written" in captured.err
+    assert not (tmp_path / "none.yaml").exists()
+    each(posed(Pose.inverse))(rig.perturbed({"right.centre": vector(3, 0)})).save(tmp_path / "other.yaml")
+    with pytest.raises(SystemExit, match="4"):
+        main(["rig", "doctor", str(tmp_path / "other.yaml"), *files, "--fix", str(tmp_path / "none.yaml")])
     assert not (tmp_path / "none.yaml").exists()
