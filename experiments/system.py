@@ -31,7 +31,7 @@ from pat.fusion.frames import ImageFiles
 from pat.fusion.fuse import fuse
 from pat.fusion.results import Frame, save_frame, view_of
 from pat.fusion.sequence import SequenceFusion, flicker
-from pat.fusion.views import read_views
+from pat.fusion.views import ViewFiles
 from pat.media.colour import linear_from_srgb, luminance, to_luma_chroma
 from pat.media.figures import colour_depth, save_panels
 from pat.media.images import read_image, write_image
@@ -231,7 +231,8 @@ def _still(job: SystemRun) -> tuple[list[str], Panels]:
     memory: list[str] = []
     if job.max_memory is not None:
         frame, memory = fused_apart(job, first)
-    read, images = read_views(rig, first, alpha=alpha)
+    files = ViewFiles(rig, first, alpha=alpha)
+    read, images = files.developed, dict(files)
     if job.max_memory is None:
         frame = fuse(load_weights(job.weights), read, images, alpha=alpha)
         save_frame(frame, out, bits=16, view=view_of(read, alpha, bits=16))

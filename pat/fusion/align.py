@@ -1,13 +1,14 @@
-"""Each beta's own values at alpha's pixels, with where they are seen: what fusion finds on its way, and no fused image.
+"""Each beta's own values at alpha's pixels, with where they are seen: what fusion finds on its way, and no
+fused image.
 
-Values are those that the cameras recorded, resampled once, at sub-pixel positions: no luminance of alpha and no colour
-of a network is in them.
+Values are those that the cameras recorded, resampled once, at sub-pixel positions: no luminance of alpha and
+no colour of a network is in them.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -29,14 +30,14 @@ from ..matching.matches import BetaMatches
 from ..matching.radiometry import Given
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
+from ..networks.weights import load_weights, weights_for
 from ..support.memory import limited, parse_bytes
 from .checks import warn_of_confidence
 from .corrections import corrections_for, expected_work
 from .fuse import Progress
 from .inputs import FrameInputs, Placement, check_bands, prepared
 from .low_light import Noise, denoised_views
-from .results import Frame
-from .steps import EqualResolution, FusionStep, Radiometry, Undistort, Undo, Upright
+from .steps import EqualResolution, FusionStep, Radiometry, Undistort, Upright, has_lens, undone
 from .tiles import fused_in_tiles, plan_frame
 from .views import Views
 
@@ -47,15 +48,16 @@ Fill = Literal["none", "propagate"]
 INTERPOLATIONS: dict[str, Interpolation] = {"nearest": "nearest", "bilinear": "bilinear", "cubic": "bicubic"}
 
 OUTSIDE, OCCLUDED, SEEN = 0, 1, 2
-"""Visibility of alpha's pixels in a beta: beyond its edge; occluded, or without a match of enough confidence; seen."""
+"""Visibility of alpha's pixels in a beta: beyond its edge; occluded, or without a match of enough confidence;
+seen."""
 
 LEAST_CONFIDENCE = 0.5
-"""Confidence from which a point counts as seen: that it is, and at this position, is likelier than not. As bands, 36 %
-of the motorcycle pair's occluded pixels exceed it (docs/results.md)."""
+"""Confidence from which a point counts as seen: that it is, and at this position, is likelier than not. As
+bands, 36 % of the motorcycle pair's occluded pixels exceed it (docs/results.md)."""
 
 SMOOTH = 1.0
-"""Pixels by which a disparity between alpha's may differ from the nearest one's, at most: beyond is a depth edge, where
-a mean is of neither surface."""
+"""Pixels by which a disparity between alpha's may differ from the nearest one's, at most: beyond is a depth
+edge, where a mean is of neither surface."""
 
 Recorded = Mapping[str, Any]
 """Values (C, H, W) by camera, as recorded: NumPy arrays of any type, or tensors."""
@@ -65,7 +67,8 @@ Recorded = Mapping[str, Any]
 class AlignedView:
     """One camera's values at alpha's H x W pixels; `numpy.asarray` gives the values.
 
-    values: (C, H, W), in the recorded type; 0, of floats NaN, where the camera does not see the point, unless filled.
+    values: (C, H, W), in the recorded type; 0, of floats NaN, where the camera does not see the point, unless
+        filled.
     positions: (H, W, 2), float32, where alpha's pixels are in the recorded image (x, y); NaN beyond its edge.
     visibility: (H, W), `OUTSIDE`, `OCCLUDED` or `SEEN`.
     confidence: (H, W), float32, 0 to 1: that this camera sees the point, and at this position.
@@ -96,7 +99,8 @@ class AlignedView:
 
 @dataclass(frozen=True)
 class Aligned(Mapping[str, AlignedView]):
-    """All cameras' own values at the pixels of one of them: a mapping of names to views, that of `alpha` first.
+    """All cameras' own values at the pixels of one of them: a mapping of names to views, that of `alpha`
+    first.
 
     depth: (H, W), float32, metres along alpha's axis; NaN where no calibrated beta sees the point.
     """
@@ -158,22 +162,26 @@ def align(
 ) -> Aligned:
     """Every camera's own values at the pixels of camera `alpha`.
 
-    `rig`, `images`, `depth`, `field`, `max_memory`, `match_levels`, `response`, `noise`, `progress` and `matcher` are
-    as of `fuse`, and `correct` is its `align`; they serve to find where alpha's pixels are in each beta. A pixel
-    counts as occluded where the confidence that beta sees its point, and there, is low.
+    `rig`, `images`, `depth`, `field`, `max_memory`, `match_levels`, `response`, `noise`, `progress` and
+    `matcher` are as of `fuse`, and `correct` is its `align`; they serve to find where alpha's pixels are in
+    each beta. A pixel counts as occluded where the confidence that beta sees its point, and there, is low.
 
     Args:
-        recorded: the values to align, by camera, (C, H, W) of any type, as large as the images; by default the images.
+        recorded: the values to align, by camera, (C, H, W) of any type, as large as the images; by default
+            the images.
         network: the one whose confidence is taken; by default the shipped weights for bands as the betas'.
-        interpolation: "nearest" keeps recorded values, "bilinear" and "cubic" are between them; of integers rounded.
+        interpolation: "nearest" keeps recorded values, "bilinear" and "cubic" are between them; of integers
+            rounded.
         min_confidence: from which confidence on a camera counts as seeing a point, 0 to 1.
-        fill: "none" invents no values; "propagate" gives pixels that a camera does not see its nearest seen value.
+        fill: "none" invents no values; "propagate" gives pixels that a camera does not see its nearest seen
+            value.
 
     Raises ValueError as `fuse`, and for recorded values of another size than the rig says.
     """
     if interpolation not in INTERPOLATIONS or fill not in ("none", "propagate"):
         raise ValueError(
-            f"interpolation is nearest, bilinear or cubic, and fill none or propagate; got {interpolation}, {fill}"
+            "interpolation is nearest, bilinear or cubic, and fill none or propagate; got "
+            f"{interpolation}, {fill}"
         )
     if not 0 <= min_confidence <= 1:
         raise ValueError(f"the least confidence is {min_confidence:g}: give a number from 0 to 1")
@@ -181,7 +189,7 @@ def align(
     rig = with_pixels(rig if depth is None else rig.replace(depth=depth))
     views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, field=field), noise)
     betas = views.betas
-    network = network or _default_network([len(views.images[name]) for name in betas])
+    network = network or load_weights(weights_for([len(views.images[name]) for name in betas]))
     check_bands(network, views)
     inputs, undo = prepared(network, views, _steps(network, normalise=match_levels))
     del views
@@ -200,7 +208,7 @@ def align(
         matches = matcher(inputs.inputs)
         done = fused_in_tiles(network, inputs, matches, plan.tiles, progress=progress)
         warn_of_confidence(network, done.frame, inputs)
-        depths = _at_alpha(done.frame, undo).depth
+        depths = undone(done.frame, undo).depth
         own = recorded if recorded is not None else images
         aligned = {alpha: _of_alpha(rig, alpha, own)}
         for i, name in enumerate(betas):
@@ -213,12 +221,6 @@ def align(
                 rig[name], name, place, located, confidence, seen, own[name], interpolation, fill
             )
     return Aligned(alpha, aligned, depths.numpy())
-
-
-def _default_network(bands: Sequence[int]) -> FusionNetwork:
-    from ..networks.weights import load_weights
-
-    return load_weights("mono-colour" if all(count == 3 for count in bands) else "mono-spectral")
 
 
 def _steps(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:
@@ -239,7 +241,7 @@ def _located(inputs: FrameInputs, i: int, found: BetaMatches, recorded: View) ->
     h, w = inputs.hw
     beta = inputs.inputs.betas[i]
     hw = (beta.image.shape[-2], beta.image.shape[-1])
-    if not _has_lens(recorded):
+    if not has_lens(recorded):
         where, inside = found.positions(beta.field.straight, hw)
         return _Located(where[0, :h, :w], inside[0, :h, :w])
     pinhole = inputs.placements[i].pair.alpha
@@ -247,18 +249,26 @@ def _located(inputs: FrameInputs, i: int, found: BetaMatches, recorded: View) ->
     assert isinstance(recorded, LensView)
     x, seen = pixels_between(pinhole, recorded)
     disparity = _between_pixels(found.disparity[0, :, :h, :w], x)
-    where, inside = chunked(lambda x, disparity: _at_points(beta, found, x, disparity, hw), x, disparity, axis=0)
+    where, inside = chunked(
+        lambda x, disparity: _at_points(beta, found, x, disparity, hw), x, disparity, axis=0
+    )
     return _Located(where, inside & seen)
 
 
 def _at_points(
-    beta: Beta, found: BetaMatches, x: Float[Tensor, "h w 2"], disparity: Float[Tensor, "h w"], hw: tuple[int, int]
+    beta: Beta,
+    found: BetaMatches,
+    x: Float[Tensor, "h w 2"],
+    disparity: Float[Tensor, "h w"],
+    hw: tuple[int, int],
 ) -> tuple[Tensor, Tensor]:
     """Positions in beta of some points between alpha's pixels, by their disparities."""
     segments = beta.field.at(x.reshape(-1, 2))
     assert isinstance(segments, Segments)
     h, w = x.shape[:2]
-    parts = (part.reshape(1, h, w, *part.shape[1:]) for part in (segments.start, segments.end, segments.valid))
+    parts = (
+        part.reshape(1, h, w, *part.shape[1:]) for part in (segments.start, segments.end, segments.valid)
+    )
     where, inside = replace(found, disparity=disparity[None, None]).positions(Segments(*parts), hw)
     return where[0], inside[0]
 
@@ -272,26 +282,15 @@ def _between_pixels(disparity: Float[Tensor, "1 h w"], x: Float[Tensor, "h2 w2 2
     return torch.where((smooth - nearest).abs() < SMOOTH, smooth, nearest)
 
 
-def _at_alpha(frame: Frame, undo: Sequence[Undo]) -> Frame:
-    """The frame at alpha's recorded pixels."""
-    for back in undo:
-        frame = back(frame)
-    return frame
-
-
 def _at_pixels(
     plane: Float[Tensor, "1 h w"], pinhole: View, recorded: View, interpolation: Interpolation
 ) -> Float[Tensor, "1 h2 w2"]:
     """A plane at alpha's recorded pixels; 0 where its pinhole view has none."""
-    if not _has_lens(recorded):
+    if not has_lens(recorded):
         return plane
     assert isinstance(pinhole, LensView)
     assert isinstance(recorded, LensView)
     return resampled(plane, pinhole, recorded, interpolation=interpolation).values[0]
-
-
-def _has_lens(view: View) -> bool:
-    return isinstance(view, LensView) and view.distortion is not None
 
 
 def _aligned_view(
@@ -328,7 +327,9 @@ def _of_alpha(rig: Rig, name: str, recorded: Recorded) -> AlignedView:
     values = _as_array(recorded[name], name, hw)
     grid, ones = pixel_grid(hw).numpy(), np.ones(hw, np.float32)
     visibility = np.full(hw, SEEN, np.uint8)
-    return AlignedView(values, grid, visibility, ones, _band_names(name, len(values)), rig[name].sensor.response)
+    return AlignedView(
+        values, grid, visibility, ones, _band_names(name, len(values)), rig[name].sensor.response
+    )
 
 
 def _as_array(values: Any, name: str, hw: tuple[int, int]) -> NDArray[Any]:
@@ -336,7 +337,9 @@ def _as_array(values: Any, name: str, hw: tuple[int, int]) -> NDArray[Any]:
     array = values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
     if array.ndim != 3 or array.shape[1:] != tuple(hw):
         (h, w), got = hw, "x".join(map(str, array.shape))
-        raise ValueError(f"the recorded values of '{name}' are {got}, the rig says (C, {h}, {w}): give the whole image")
+        raise ValueError(
+            f"the recorded values of '{name}' are {got}, the rig says (C, {h}, {w}): give the whole image"
+        )
     return array
 
 
@@ -346,17 +349,22 @@ def _band_names(name: str, count: int) -> tuple[str, ...]:
     return tuple(f"{name}.{band}" for band in ("red", "green", "blue") * (count == 3) or range(1, count + 1))
 
 
-def resampled_values(values: NDArray[Any], positions: NDArray[np.float32], interpolation: Resampling) -> NDArray[Any]:
+def resampled_values(
+    values: NDArray[Any], positions: NDArray[np.float32], interpolation: Resampling
+) -> NDArray[Any]:
     """Recorded values (C, H, W) at positions (h, w, 2), in their own type: (C, h, w). Of integers rounded.
 
-    In float64: float32 would round positions by 1e-4 pixels in an image of 4000. Beyond the edge values are 0.
+    In float64: float32 would round positions by 1e-4 pixels in an image of 4000. Beyond the edge values are
+    0.
     """
     kind = INTERPOLATIONS[interpolation]
     where = torch.from_numpy(positions)
 
     def band(plane: NDArray[Any]) -> NDArray[Any]:
         image = torch.from_numpy(plane.astype(np.float64))[None, None]
-        taken = chunked(lambda x: sample(image, x[None].double(), interpolation=kind).values[0, 0], where, axis=0)
+        taken = chunked(
+            lambda x: sample(image, x[None].double(), interpolation=kind).values[0, 0], where, axis=0
+        )
         return _in_type(taken.numpy(), values.dtype)
 
     return np.stack([band(plane) for plane in values])
@@ -370,7 +378,8 @@ def _in_type(values: NDArray[np.float64], dtype: Any) -> NDArray[Any]:
 
 
 def filled(values: NDArray[Any], valid: NDArray[np.bool_], fill: Fill) -> NDArray[Any]:
-    """Values (C, H, W) with 0, of floats NaN, where they are not valid; or with those of the nearest valid pixel."""
+    """Values (C, H, W) with 0, of floats NaN, where they are not valid; or with those of the nearest valid
+    pixel."""
     if fill == "none" or not valid.any():
         nothing = np.nan if np.issubdtype(values.dtype, np.floating) else 0
         return np.where(valid, values, np.asarray(nothing, values.dtype))

@@ -23,8 +23,8 @@ PositionFormat = Literal["npy", "tif", "none"]
 GREY = {0: 0, 1: 128, 2: 255}
 """Of visibility in its image: beyond the edge, occluded, seen."""
 GDAL_METADATA, GDAL_NODATA = 42112, 42113
-"""TIFF tags in which GDAL, QGIS and others read the bands' names and wavelengths, and the value of pixels without one
-(GDAL's documentation of GeoTIFF)."""
+"""TIFF tags in which GDAL, QGIS and others read the bands' names and wavelengths, and the value of pixels
+without one (GDAL's documentation of GeoTIFF)."""
 LARGEST_TIFF = 2**32 - 2**25
 """Bytes up to which a TIFF file has offsets of 32 bits; tifffile's own limit."""
 
@@ -32,7 +32,8 @@ LARGEST_TIFF = 2**32 - 2**25
 class RecordedFiles(Mapping[str, NDArray[Any]]):
     """The values of an image file of each camera, read when asked for: counts, linear of raw ones.
 
-    Those behind a colour filter pattern are demosaiced: red, green and blue counts. Asking raises as `read_recorded`.
+    Those behind a colour filter pattern are demosaiced: red, green and blue counts. Asking raises as
+    `read_recorded`.
     """
 
     def __init__(self, rig: Rig, files: Mapping[str, str | Path]) -> None:
@@ -66,11 +67,11 @@ def save_aligned(
     name: str = "",
 ) -> list[Path]:
     """Write aligned.tif (all bands, alpha's first, with their names and wavelengths), and of each camera
-    NAME_visibility.png (0 beyond its edge, 128 occluded, 255 seen), NAME_confidence.png and NAME_positions.npy (or
-    .tif: x, y); depth.tif (metres) if any is known.
+    NAME_visibility.png (0 beyond its edge, 128 occluded, 255 seen), NAME_confidence.png and
+    NAME_positions.npy (or .tif: x, y); depth.tif (metres) if any is known.
 
-    One file a camera, NAME.tif, if `separate`, or if their types differ: values keep theirs. With a `name` the files
-    are name_aligned.tif and so on. All are written, or none. Returns what was written.
+    One file a camera, NAME.tif, if `separate`, or if their types differ: values keep theirs. With a `name`
+    the files are name_aligned.tif and so on. All are written, or none. Returns what was written.
     """
     prefix = f"{name}_" if name else ""
     unlike = len({view.values.dtype for view in aligned.values()}) > 1
@@ -98,7 +99,9 @@ def _write_view(folder: Path, stem: str, view: AlignedView, positions: PositionF
     if positions == "npy":
         np.save(folder / f"{stem}_positions.npy", view.positions)
     elif positions == "tif":
-        write_bands(folder / f"{stem}_positions.tif", view.positions.transpose(2, 0, 1), ("x", "y"), (None, None))
+        write_bands(
+            folder / f"{stem}_positions.tif", view.positions.transpose(2, 0, 1), ("x", "y"), (None, None)
+        )
 
 
 def _shares(aligned: Aligned) -> str:
@@ -107,19 +110,26 @@ def _shares(aligned: Aligned) -> str:
     for camera, view in aligned.items():
         if camera != aligned.alpha:
             outside, occluded, seen = np.bincount(view.visibility.ravel(), minlength=3) / view.visibility.size
-            lines.append(f"{camera}: sees {seen:.1%} of {aligned.alpha}, {occluded:.1%} occluded or unmatched, ")
+            lines.append(
+                f"{camera}: sees {seen:.1%} of {aligned.alpha}, {occluded:.1%} occluded or unmatched, "
+            )
             lines[-1] += f"{outside:.1%} beyond its edge\n"
     return "".join(lines)
 
 
-def write_bands(path: Path, values: NDArray[Any], bands: Sequence[str], wavelengths: Sequence[float | None]) -> None:
-    """Write bands (C, H, W) as one TIFF file in their own type, with names and wavelengths (nanometres) for GIS."""
+def write_bands(
+    path: Path, values: NDArray[Any], bands: Sequence[str], wavelengths: Sequence[float | None]
+) -> None:
+    """Write bands (C, H, W) as one TIFF file in their own type, with names and wavelengths (nanometres) for
+    GIS."""
     items = []
     for i, (band, wave) in enumerate(zip(bands, wavelengths, strict=True)):
         items.append(f'<Item name="DESCRIPTION" sample="{i}" role="description">{escape(band)}</Item>')
         if wave is not None:
             micrometres = f"{wave / 1000:g}"
-            items.append(f'<Item name="CENTRAL_WAVELENGTH_UM" domain="IMAGERY" sample="{i}">{micrometres}</Item>')
+            items.append(
+                f'<Item name="CENTRAL_WAVELENGTH_UM" domain="IMAGERY" sample="{i}">{micrometres}</Item>'
+            )
     described = f"<GDALMetadata>{''.join(items)}</GDALMetadata>"
     nothing = "nan" if np.issubdtype(values.dtype, np.floating) else "0"
     tifffile.imwrite(

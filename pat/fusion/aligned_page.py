@@ -1,8 +1,8 @@
-"""A page that shows aligned bands: any two under a slider, composites of them, and what a camera does not see."""
+"""A page that shows aligned bands: any two under a slider, composites of them, and what a camera does not
+see."""
 
 from __future__ import annotations
 
-from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from arraygeom.atomic import write_text
 
 from ..media.figures import colour_depth, reduced
 from .align import Aligned
-from .report import LONGEST, Facts, data_url, filled_page, listed, rig_drawing, shares_layer
+from .report import LONGEST, Facts, data_url, filled_page, rig_drawing, shares_layer
 
 STRETCH = (1.0, 99.0)
 """Percentiles of a band's values that are shown black and white."""
@@ -45,9 +45,8 @@ def write_aligned_page(path: Path, aligned: Aligned, rig: Rig, facts: Facts) -> 
         (h, w),
         layers,
         overlays,
-        FACTS="\n".join(f"<tr><th>{escape(key)}<td>{escape(value)}" for key, value in figures.items()),
-        NOTES=listed("What was found", facts.notes),
-        WARNINGS=listed("Warnings", facts.warnings, kind="warnings"),
+        figures,
+        facts,
         RIG=rig_drawing(rig, aligned.alpha),
     )
     write_text(path, page)
@@ -55,7 +54,8 @@ def write_aligned_page(path: Path, aligned: Aligned, rig: Rig, facts: Facts) -> 
 
 
 def shown_layers(aligned: Aligned, rig: Rig | None = None) -> dict[str, Float[Tensor, "_ h w"]]:
-    """Each camera's bands, stretched; composites and NDVI (see `ndvi`) where wavelengths allow them; depth if known."""
+    """Each camera's bands, stretched; composites and NDVI (see `ndvi`) where wavelengths allow them; depth if
+    known."""
     layers = {}
     for name, view in aligned.items():
         bands = [_stretched(band, view.valid) for band in view.values]
@@ -76,9 +76,9 @@ def shown_layers(aligned: Aligned, rig: Rig | None = None) -> dict[str, Float[Te
 def ndvi(aligned: Aligned, rig: Rig | None = None) -> NDArray[np.float32] | None:
     """(near infrared - red) / their sum (H, W); NaN where a camera does not see the point.
 
-    Of light: of values without the black level, by exposure and gain, as the sensors of `rig` state them for the
-    recorded files; without a rig, of values as they are. None without bands near 840 and 660 nm. Only of reflectance,
-    which a panel of known reflectance gives, is it the index of the literature (Tucker 1979).
+    Of light: of values without the black level, by exposure and gain, as the sensors of `rig` state them for
+    the recorded files; without a rig, of values as they are. None without bands near 840 and 660 nm. Only of
+    reflectance, which a panel of known reflectance gives, is it the index of the literature (Tucker 1979).
     """
     nir, red = (_band_near(aligned, wave) for wave in (NEAR_INFRARED, RED))
     if nir is None or red is None or nir.name == red.name:
@@ -133,6 +133,8 @@ def _index_colours(index: NDArray[np.float32]) -> Float[Tensor, "3 h w"]:
     """-1 brown, 0 pale, 1 green; black where unknown."""
     stops = torch.tensor([[0.55, 0.32, 0.04], [0.96, 0.96, 0.86], [0.0, 0.41, 0.22]])
     value = torch.from_numpy(np.nan_to_num(index)).clamp(-1, 1)[..., None]
-    colour = torch.where(value < 0, torch.lerp(stops[1], stops[0], -value), torch.lerp(stops[1], stops[2], value))
+    colour = torch.where(
+        value < 0, torch.lerp(stops[1], stops[0], -value), torch.lerp(stops[1], stops[2], value)
+    )
     known = torch.from_numpy(np.isfinite(index))[..., None]
     return torch.where(known, colour, 0.0).movedim(-1, 0)

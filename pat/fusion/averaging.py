@@ -29,12 +29,15 @@ class AveragingSettings:
 
     own: tuple[float, int, float] = tuned(
         (0.22, 6, 2.0),
-        "Middlebury, tune half: colour is averaged by itself first: the scale of unlikeness over the root of the "
-        "noise's standard deviation, how far away pixels are, and how much more luma counts than a colour difference",
+        "Middlebury, tune half: colour is averaged by itself first: the scale of unlikeness over "
+        "the root of the "
+        "noise's standard deviation, how far away pixels are, and how much more luma counts than a "
+        "colour difference",
     )
     recorded: tuple[float, int, float, float] = tuned(
         (0.11, 16, 1.25, 0.75),
-        "Middlebury, tune half: colour is averaged as beta recorded it then: the same, and how much of it is taken "
+        "Middlebury, tune half: colour is averaged as beta recorded it then: the same, and how much "
+        "of it is taken "
         "where enough is alike",
     )
     rows: int = size(16, "Rows that a thread works on at once: what it sums stays in its cache")
@@ -45,7 +48,10 @@ OWN, RECORDED, ROWS = SETTINGS.own, SETTINGS.recorded, SETTINGS.rows
 
 
 def averaged_with_alike(
-    image: Float[Tensor, "3 h w"], beta: Float[Tensor, "3 h w"], confidence: Float[Tensor, "1 h w"], deviation: float
+    image: Float[Tensor, "3 h w"],
+    beta: Float[Tensor, "3 h w"],
+    confidence: Float[Tensor, "1 h w"],
+    deviation: float,
 ) -> Float[Tensor, "3 h w"]:
     """An image with the mean colour of what is alike near each pixel: of its own, and of that recorded by
     beta.
@@ -79,7 +85,9 @@ def sums_of_alike(
     h, w = guide.shape[-2:]
     around = radius + 1
     mirrored = [(0, 0), (around, around), (around, around)]
-    planes = [np.pad(image.detach().float().cpu().numpy(), mirrored, mode="reflect") for image in (guide, values)]
+    planes = [
+        np.pad(image.detach().float().cpu().numpy(), mirrored, mode="reflect") for image in (guide, values)
+    ]
     out = np.zeros((len(values) + 1, h, w), np.float32)
     sharpness = np.float32(1 / (8 * 9 * len(guide) * scale**2))
 
@@ -116,7 +124,17 @@ def add_alike(guide, values, around, radius, step, sharpness, top, out):
                     continue
                 a, b, c0 = difference[0], difference[1], difference[2]
                 for x in range(width):
-                    d = a[x] + a[x + 1] + a[x + 2] + b[x] + b[x + 1] + b[x + 2] + c0[x] + c0[x + 1] + c0[x + 2]
+                    d = (
+                        a[x]
+                        + a[x + 1]
+                        + a[x + 2]
+                        + b[x]
+                        + b[x + 1]
+                        + b[x + 2]
+                        + c0[x]
+                        + c0[x + 1]
+                        + c0[x + 2]
+                    )
                     t = max(np.float32(1) - d * sharpness, np.float32(0))
                     t *= t
                     t *= t

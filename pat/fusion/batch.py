@@ -98,7 +98,9 @@ class Batch:
             raise ValueError(f"no image of alpha, '{self.alpha}'")
         if not self.sequence and len({len(files) for files in self.files.values()}) > 1:
             counts = ", ".join(f"{len(files)} of '{name}'" for name, files in self.files.items())
-            raise ValueError(f"frames need as many images of each camera, got {counts}; or is it a --sequence?")
+            raise ValueError(
+                f"frames need as many images of each camera, got {counts}; or is it a --sequence?"
+            )
 
     @cached_property
     def names(self) -> list[str]:
@@ -110,29 +112,14 @@ class Batch:
     def settings(self) -> str:
         """What the results depend on, as text."""
         digest = hashlib.sha256(find_weights(self.weights).read_bytes()).hexdigest()
-        facts: dict[str, Any] = {
-            "alpha": self.alpha,
-            "weights": f"{self.weights} (SHA-256 {digest[:16]})",
-            "sequence": self.sequence,
-            "speed": self.speed,
-            "field": repr(self.field),
-            "match_levels": self.match_levels,
-            "response": self.response if isinstance(self.response, str) else list(self.response),
-            "align": self.align,
-            "alone": self.alone,
-            "bits": self.bits,
-            "kind": self.kind,
-            "frames": {name: len(files) for name, files in self.files.items()},
-            "first": {name: str(files[0]) for name, files in self.files.items()},
-            "rig": rig_text(self.rig),
-        }
-        if self.precision != "float32":
-            facts["precision"] = self.precision
-        if self.noise is not None:
-            facts |= {"noise": noise_document(self.noise), "keep_alpha": self.keep_alpha}
-        if self.luminance != "alpha":
-            facts["luminance"] = self.luminance
-        return yaml.safe_dump(facts, sort_keys=False)
+        entries = json.loads(self.to_json())
+        files = entries.pop("files")
+        for name in ("format", "out", "max_memory", "strict"):
+            del entries[name]
+        entries["weights"] = f"{self.weights} (SHA-256 {digest[:16]})"
+        entries["frames"] = {name: len(paths) for name, paths in files.items()}
+        entries["first"] = {name: paths[0] for name, paths in files.items()}
+        return yaml.safe_dump(entries, sort_keys=False)
 
     @property
     def inputs(self) -> dict[str, str]:
@@ -141,7 +128,9 @@ class Batch:
         stamps = {name: [_stamp(file) for file in files] for name, files in self.files.items()}
         if self.sequence:
             return dict.fromkeys(self.names, _digest(stamps))
-        return {name: _digest({n: found[i] for n, found in stamps.items()}) for i, name in enumerate(self.names)}
+        return {
+            name: _digest({n: found[i] for n, found in stamps.items()}) for i, name in enumerate(self.names)
+        }
 
     def fused_file(self, i: int) -> Path:
         """The file of a fused frame."""
@@ -169,7 +158,12 @@ class Batch:
     ) -> JobReport:
         self._begin(resume)
         plan, many = self.out / KEYS / PLAN, range(len(self.names))
-        options: dict[str, Any] = {"workers": workers, "resume": resume, "on_error": on_error, "console": console}
+        options: dict[str, Any] = {
+            "workers": workers,
+            "resume": resume,
+            "on_error": on_error,
+            "console": console,
+        }
         if self.sequence and not self.alone:
             missing = [i for i in many if not (resume and self.fused_file(i).exists())]
             keys = self.fusion.keys_of(missing)
@@ -194,7 +188,8 @@ class Batch:
         text, file = self.settings, self.out / SETTINGS
         if resume and file.is_file() and file.read_text(encoding="utf-8") != text:
             raise ValueError(
-                f"{file}: the frames there were made with other settings: give the same ones, or another --out"
+                f"{file}: the frames there were made with other settings: give the same ones, or "
+                "another --out"
             )
         now, before = self.inputs, _read_inputs(self.out / INPUTS) if resume else {}
         other = [i for i, name in enumerate(self.names) if before.get(name) != now[name]]
@@ -227,7 +222,9 @@ class Batch:
             if entries.pop("format") != PLAN_FORMAT:
                 raise ValueError("another version's")
             entries["rig"] = rig_of_text(entries["rig"], source)
-            entries["files"] = {name: [Path(file) for file in files] for name, files in entries["files"].items()}
+            entries["files"] = {
+                name: [Path(file) for file in files] for name, files in entries["files"].items()
+            }
             entries["out"] = Path(entries["out"])
             entries["field"] = field_of(entries["field"])
             if isinstance(entries["noise"], dict):
@@ -282,7 +279,9 @@ class Batch:
                 frame = self._frame(i)
             view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
             bands = band_names(frame, (name for name in self.rig.betas(self.alpha) if name in self.files))
-            save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i], bands=bands)
+            save_frame(
+                frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i], bands=bands
+            )
 
     def _frame(self, i: int) -> Frame:
         if not self.sequence:
@@ -311,8 +310,11 @@ def field_document(field: ReceptiveField | None) -> dict[str, Any] | None:
         return None
     if FIELD_CLASSES.get(type(field).__name__) is not type(field):
         known = ", ".join(FIELD_CLASSES)
-        raise ValueError(f"a batch's field is written to a file, which {field!r} cannot be: give one of {known}")
-    entries = {entry.name: getattr(field, entry.name) for entry in dataclasses.fields(field)}  # type: ignore[arg-type]
+        raise ValueError(
+            f"a batch's field is written to a file, which {field!r} cannot be: give one of {known}"
+        )
+    names = [entry.name for entry in dataclasses.fields(field)]  # type: ignore[arg-type]
+    entries = {name: getattr(field, name) for name in names}
     inner = {"field": field_document(entries["field"])} if "field" in entries else {}
     return {"kind": type(field).__name__, **entries, **inner}
 
@@ -375,7 +377,9 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
     path = Path(text)
     label = f"{name}: " if name else ""
     if path.is_dir():
-        found = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
+        found = [
+            p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")
+        ]
     elif any(c in path.name for c in "*?["):
         found = list(path.parent.glob(path.name))
     else:

@@ -20,9 +20,9 @@ UNFIT_CONFIDENCE = 0.16
 """Mean confidences, where all views overlap, below which one is warned, and below which a rig is taken for
 wrong.
 
-Measured on Middlebury's tune half: with the sign of the baseline changed, or beta turned upside down, 36 pairs had
-.05 to .24, 32 of them below .16; the same with the right rig .61 to .88, with beta reduced eight times .27 to .55, and
-with 50 electrons from .23.
+Measured on Middlebury's tune half: with the sign of the baseline changed, or beta turned upside down, 36
+pairs had .05 to .24, 32 of them below .16; the same with the right rig .61 to .88, with beta reduced eight
+times .27 to .55, and with 50 electrons from .23.
 """
 
 
@@ -41,9 +41,10 @@ class LowConfidenceWarning(UserWarning):
 def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs) -> None:
     """Warn if the mean confidence is low where the segments of all betas are valid.
 
-    Below `UNFIT_CONFIDENCE` by a `LowConfidenceWarning`. Of bands that are each another beta's, by that of the median
-    band: some bands of nine are unlike alpha whatever the rig. Only for networks whose confidence is a trained
-    probability.
+    Below `UNFIT_CONFIDENCE` by a `LowConfidenceWarning`. Of bands that are each another beta's, by that of
+    the median
+    band: some bands of nine are unlike alpha whatever the rig. Only for networks whose confidence is a
+        trained probability.
     """
     if not network.uses_matches:
         return
@@ -54,7 +55,9 @@ def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs
     found = f"mean confidence {mean:.2f}{several} where the views overlap"
     advice = noise_advice(inputs.inputs)
     if mean < UNFIT_CONFIDENCE:
-        text = f"{found}: the rig does not fit the images, or they hardly match: check it with `pat rig doctor`"
+        text = (
+            f"{found}: the rig does not fit the images, or they hardly match: check it with `pat rig doctor`"
+        )
         warnings.warn(text + advice, LowConfidenceWarning, stacklevel=3)
     else:
         text = f"{found}: little texture, noise, or a rig that `pat rig doctor` finds wrong"
@@ -83,7 +86,8 @@ def confidence_checked(*, strict: bool) -> Iterator[None]:
 
 
 def overlap_confidences(frame: Frame, inputs: FrameInputs) -> list[float]:
-    """The mean confidence, or that of each band, where the segments of all betas are valid; NaN if that is nowhere."""
+    """The mean confidence, or that of each band, where the segments of all betas are valid; NaN if that is
+    nowhere."""
     h, w = inputs.hw
     overlap = torch.ones(inputs.hw, dtype=torch.bool, device=frame.confidence.device)
     for beta in inputs.inputs.betas:

@@ -48,7 +48,9 @@ def compile_beside() -> None:
         return
     code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
     quiet = subprocess.DEVNULL
-    process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=quiet, stderr=quiet)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=quiet, stderr=quiet
+    )
     atexit.register(_end, process)
 
 

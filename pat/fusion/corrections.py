@@ -1,7 +1,7 @@
 """What cameras and rig are off by, found once a frame from a fusion of reduced images.
 
-A pre-pass matches the images at half the size or less, without a network. Where its matches are reliable, alpha's
-response is fitted (`pat.matching.radiometry`), and how far beta lies across its search segments
+A pre-pass matches the images at half the size or less, without a network. Where its matches are reliable,
+alpha's response is fitted (`pat.matching.radiometry`), and how far beta lies across its search segments
 (`pat.matching.epipolar_offset`). Both are put right before the frame is fused.
 """
 
@@ -19,14 +19,13 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments
-from arraygeom.epipolar import Track
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.sampling import sample
 
 from ..matching.epipolar_offset import Misalignment, fit_misalignment
 from ..matching.filters import blurred
-from ..matching.inputs import Beta, Inputs
+from ..matching.inputs import Beta, Inputs, track_in
 from ..matching.match import located
 from ..matching.matches import BetaMatches
 from ..matching.normalisation import SETTINGS as NORMALISATION
@@ -77,12 +76,16 @@ class Corrections:
     def applied(self, inputs: Inputs, hw: HW) -> Inputs:
         """The inputs put right; `hw` is alpha's size without padding."""
         if not self.response.is_rec601:
-            betas = tuple(replace(b, image=self.response.of_beta(b.image)) if _is_rgb(b) else b for b in inputs.betas)
+            betas = tuple(
+                replace(b, image=self.response.of_beta(b.image)) if _is_rgb(b) else b for b in inputs.betas
+            )
             inputs = replace(inputs, alpha=self.response.of_alpha(inputs.alpha), betas=betas)
         moves = self.misalignments or (Misalignment(),) * len(inputs.betas)
         return replace(
             inputs,
-            betas=tuple(replace(b, field=m.applied(b.field, hw)) for b, m in zip(inputs.betas, moves, strict=True)),
+            betas=tuple(
+                replace(b, field=m.applied(b.field, hw)) for b, m in zip(inputs.betas, moves, strict=True)
+            ),
         )
 
     def described(self, betas: Sequence[str], hw: HW) -> list[str]:
@@ -99,7 +102,9 @@ class Corrections:
         return frame if self.response.is_rec601 else frame._replace(image=self.response.undone(frame.image))
 
 
-def corrections_for(network: FusionNetwork, frame: FrameInputs, response: Given, *, align: bool) -> Corrections:
+def corrections_for(
+    network: FusionNetwork, frame: FrameInputs, response: Given, *, align: bool
+) -> Corrections:
     """What is to be put right for a network: for one without matches nothing is looked for. Raises as
     `find_corrections`."""
     if network.uses_matches:
@@ -111,8 +116,8 @@ def corrections_for(network: FusionNetwork, frame: FrameInputs, response: Given,
 def find_corrections(frame: FrameInputs, response: Given, *, align: bool) -> Corrections:
     """Alpha's response if it is to be fitted, and the betas' misalignments if these are asked for.
 
-    A response is fitted for RGB betas. Raises ValueError for a stated response that is not three weights, none
-    negative, or where there is no RGB beta.
+    A response is fitted for RGB betas. Raises ValueError for a stated response that is not three weights,
+    none negative, or where there is no RGB beta.
     """
     found = Corrections(_given(response, frame.inputs))
     fits = response == "fit" and any(map(_is_rgb, frame.inputs.betas))
@@ -125,7 +130,7 @@ def find_corrections(frame: FrameInputs, response: Given, *, align: bool) -> Cor
         LOG.info("pre-pass %d of at most %d", i + 1, SETTINGS.passes)
         matches = _matches(small, found)
         response_now = _fitted(small, matches) if fits else found.response
-        steps = [_misaligned(m) for m in matches] if align else [Misalignment()] * len(matches)
+        steps = [m.misalignment if align else Misalignment() for m in matches]
         moves = tuple(before + step for before, step in zip(found.misalignments, steps))
         found = Corrections(response_now, moves)
         if all(step.largest(small.hw) <= SETTINGS.settled for step in steps):
@@ -162,39 +167,38 @@ def _reduced_frame(frame: FrameInputs) -> FrameInputs:
         return frame
     hw = (frame.hw[0] // factor, frame.hw[1] // factor)
     alpha = padded(avg_pool2d(inputs.alpha, factor), inputs.multiple)
+    offset = (0.5 / factor - 0.5,) * 2
+
+    def whole(x: Tensor) -> Tensor:
+        return (x + 0.5) * factor - 0.5
+
     betas = tuple(
         Beta(
             padded(avg_pool2d(beta.image, factor), inputs.multiple),
-            _reduced_field(beta.field, alpha, factor),
-            track=beta.track and _reduced_track(beta.track, factor),
+            _reduced_field(beta.field, alpha, whole, factor),
+            track=beta.track and track_in(beta.track, whole, 1 / factor, offset),
         )
         for beta in inputs.betas
     )
     return frame._replace(inputs=replace(inputs, alpha=alpha, betas=betas), hw=hw)
 
 
-def _reduced_field(field: FieldOnGrid, alpha: Tensor, factor: int) -> FieldOnGrid:
+def _reduced_field(
+    field: FieldOnGrid, alpha: Tensor, whole: Callable[[Tensor], Tensor], factor: int
+) -> FieldOnGrid:
     def at(x: Tensor) -> Segments:
-        found = field.at((x + 0.5) * factor - 0.5)
+        found = field.at(whole(x))
         assert isinstance(found, Segments)
         return reduced(found, factor)
 
     return FieldOnGrid.evaluated(at, (alpha.shape[-2], alpha.shape[-1]), field.samples // factor + 2)
 
 
-def _reduced_track(track: Callable[[Tensor], Track], factor: int) -> Callable[[Tensor], Track]:
-    offset = 0.5 / factor - 0.5
-
-    def in_pixels(v: Tensor) -> Tensor:
-        return torch.cat([v[..., :2] / factor + offset * v[..., 2:], v[..., 2:]], -1)
-
-    return lambda x: Track(*map(in_pixels, track((x + 0.5) * factor - 0.5)))
-
-
 class _Matches(NamedTuple):
     """What one beta shows at its matches: all (h, w) or (c, h, w), at the size of the pre-pass.
 
-    `before` are beta's own bands, blurred; `luma` is that of the corrected beta, as bright and sharp as `alpha`.
+    `before` are beta's own bands, blurred; `luma` is that of the corrected beta, as bright and sharp as
+    `alpha`.
     """
 
     before: Float[Tensor, "c h w"]
@@ -207,7 +211,14 @@ class _Matches(NamedTuple):
     @property
     def place(self) -> Float[Tensor, "h w 2"]:
         """The matches in beta's width and height, from its middle."""
-        return (self.position + 0.5) / self.position.new_tensor([self.luma.shape[1], self.luma.shape[0]]) - 0.5
+        return (self.position + 0.5) / self.position.new_tensor(
+            [self.luma.shape[1], self.luma.shape[0]]
+        ) - 0.5
+
+    @property
+    def misalignment(self) -> Misalignment:
+        """How far beta is across its segments."""
+        return fit_misalignment(self.alpha, self.luma, self.position, self.normal, self.weight)
 
 
 def _matches(frame: FrameInputs, found: Corrections) -> list[_Matches]:
@@ -231,7 +242,7 @@ def _of_beta(alpha: Tensor, before: Beta, beta: Beta, found: BetaMatches, hw: HW
     seen_there, wanted = (moments(image, weight[None, None]) for image in (values[-1:][None], own))
     bright = seen_there.matched(luma, wanted, NORMALISATION.largest_gain)
     soft = blurred(values[:-1][:, None], [SETTINGS.blur] * (len(values) - 1))[:, 0]
-    normal = normals(Segments(*(t[0, :h, :w] for t in _parts(beta.field.straight))))
+    normal = normals(beta.field.straight)[0, :h, :w]
     return _Matches(soft, own[0, 0], bright[0, 0], where, normal.to(where), weight)
 
 
@@ -241,10 +252,6 @@ def _reliable(found: BetaMatches) -> Bool[Tensor, "b 1 h w"]:
     return enlarged(((unlike < CONSISTENT) & (margin > SETTINGS.margin)).to(margin)) > 0
 
 
-def _parts(found: Segments) -> tuple[Tensor, Tensor, Tensor]:
-    return found.start, found.end, found.valid
-
-
 def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
     h, w = frame.hw
     own = blurred(frame.inputs.alpha[:, :, :h, :w], [SETTINGS.blur])[0, 0]
@@ -252,7 +259,3 @@ def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
     points = [found.before[:, counts] for found, counts in colour]
     places = [found.place[counts] for found, counts in colour]
     return fit(torch.cat(points, 1), torch.cat([own[counts] for _, counts in colour]), torch.cat(places))
-
-
-def _misaligned(found: _Matches) -> Misalignment:
-    return fit_misalignment(found.alpha, found.luma, found.position, found.normal, found.weight)

@@ -30,10 +30,13 @@ class DepthSettings:
     unseen: float = size(
         1e-4, "At confidences up to this beta does not see the point: then its position gives no depth"
     )
-    lost: float = tuned(0.3, "Middlebury, tune half: confidence below which a pixel's depth is taken from beside it")
+    lost: float = tuned(
+        0.3, "Middlebury, tune half: confidence below which a pixel's depth is taken from beside it"
+    )
     one_side: float = physics(
         0.9,
-        "Length of the sum of all betas' segments, over the sum of their lengths, from which all count as on one side",
+        "Length of the sum of all betas' segments, over the sum of their lengths, from which all "
+        "count as on one side",
     )
 
 
@@ -42,8 +45,11 @@ DEVIATIONS = 1.645
 """Physics: so many standard deviations to either side of a normal distribution's mean are 9 of 10 cases."""
 
 
-def _within(where: Float[Tensor, "n 2"], segments: Segments, which: Bool[Tensor, "h w"]) -> Float[Tensor, "n 2"]:
-    """Positions of some of alpha's pixels, those beyond an end of their segment moved along it to that end."""
+def _within(
+    where: Float[Tensor, "n 2"], segments: Segments, which: Bool[Tensor, "h w"]
+) -> Float[Tensor, "n 2"]:
+    """Positions of some of alpha's pixels, those beyond an end of their segment moved along it to that
+    end."""
     h, w = which.shape
     start, end, valid = (t[0, :h, :w][which] for t in (segments.start, segments.end, segments.valid))
     start, end = start.to(where), end.to(where)
@@ -56,8 +62,8 @@ def _within(where: Float[Tensor, "n 2"], segments: Segments, which: Bool[Tensor,
 
 
 class FoundDepth(NamedTuple):
-    """Depth (h, w), NaN where unknown, the half-width of the interval of inverse depth as of `Frame`, and the image's
-    confidence."""
+    """Depth (h, w), NaN where unknown, the half-width of the interval of inverse depth as of `Frame`, and the
+    image's confidence."""
 
     depth: Tensor
     half_width: Tensor
@@ -72,7 +78,9 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
     for i, (found, beta) in enumerate(zip(matches.betas, inputs.betas)):
         if found.certainty is not None:
             whole = interpolate(found.certainty.float(), scale_factor=FINE, mode="bilinear").to(confidence[i])
-            confidence[i] = torch.where(beta.field.straight.valid & (output.confidence[i] > 0), whole[:, 0], 0.0)
+            confidence[i] = torch.where(
+                beta.field.straight.valid & (output.confidence[i] > 0), whole[:, 0], 0.0
+            )
             deviation[i] = whole[:, 1] / DEVIATIONS
     overall = output.overall if output.overall is None else torch.stack(confidence).amax(0)
     return output._replace(confidence=confidence, deviation=deviation, overall=overall)
@@ -83,9 +91,9 @@ def measured_depth(
 ) -> FoundDepth:
     """Depth from the calibrated betas, weighted by confidence in inverse depth, with its interval.
 
-    A position whose depth is beyond the bounds that were searched counts as the end of its segment: a pixel beyond the
-    far end may otherwise stand for any distance.
-    `corner` is the (x, y) of the part's first pixel in alpha; `hw` the size of the part without padding.
+    A position whose depth is beyond the bounds that were searched counts as the end of its segment: a pixel
+    beyond the far end may otherwise stand for any distance. `corner` is the (x, y) of the part's first pixel
+    in alpha; `hw` the size of the part without padding.
     """
     h, w = hw
     like = output.position[0]
@@ -129,9 +137,9 @@ def background_filled(
 ) -> Float[Tensor, "h w"]:
     """Depth whose values of low confidence are the farther of the nearest confident ones to either side.
 
-    What a beta does not see is occluded: farther away than what is beside it. Along rows, or along columns if the betas
-    are above or below alpha. What is unknown stays NaN. Betas on several sides see what is occluded in one of them:
-    depth is then as it is; so it is where it is known from elsewhere.
+    What a beta does not see is occluded: farther away than what is beside it. Along rows, or along columns if
+    the betas are above or below alpha. What is unknown stays NaN. Betas on several sides see what is occluded
+    in one of them: depth is then as it is; so it is where it is known from elsewhere.
     """
     if any(beta.around for beta in inputs.betas):
         return depth

@@ -46,7 +46,9 @@ def matched_frames(files: Files) -> dict[str, list[Path]]:
     if len({len(paths) for paths in given.values()}) > 1:
         counts = ", ".join(f"{len(paths)} of '{name}'" for name, paths in given.items())
         raise ValueError(f"frames need as many images of each camera, got {counts}; or is it a --sequence?")
-    warnings.warn(f"no name or number relates the frames ({spans}): taken in order", MissingFramesWarning, stacklevel=2)
+    warnings.warn(
+        f"no name or number relates the frames ({spans}): taken in order", MissingFramesWarning, stacklevel=2
+    )
     return given
 
 
@@ -58,7 +60,10 @@ def warn_of_gaps(files: Files) -> None:
         gaps = [i for i, step in enumerate(steps) if step > 1.5 * median(steps)]
         if gaps:
             before, after = files[name][gaps[0]].name, files[name][gaps[0] + 1].name
-            text = f"'{name}' has no frame between {before} and {after}: those after it count as recorded earlier"
+            text = (
+                f"'{name}' has no frame between {before} and {after}: those after it count as recorded "
+                "earlier"
+            )
             warnings.warn(f"{text} than they were; give all frames", MissingFramesWarning, stacklevel=2)
 
 

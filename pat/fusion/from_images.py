@@ -27,12 +27,11 @@ from ..media.exif import focal_length
 from ..media.images import read_image, write_image
 from ..media.raw import developed_rig
 from ..media.video import read_video
-from ..networks.weights import Network, load_weights
+from ..networks.weights import Network, load_weights, weights_for
 from .fuse import ImageSources, fuse
-from .inputs import equal_bands
 from .results import Frame
 from .steps import without_lenses
-from .views import read_view
+from .views import is_in_colour, read_view
 
 LOG = logging.getLogger(__name__)
 
@@ -59,7 +58,8 @@ Say = Callable[[str], None]
 class ImageArray:
     """What images of an array say of it: the rig, which camera is alpha, with which weights to fuse, and how.
 
-    rig: of the images as they were developed. recorded: of the files, with their sensors' coding and black level.
+    rig: of the images as they were developed. recorded: of the files, with their sensors' coding and black
+        level.
     images: alpha's and those of the betas that are fused. notes: what was found, a line each.
     """
 
@@ -82,8 +82,9 @@ def array_from_images(
 ) -> ImageArray:
     """The array of one image a camera. `say` is called with each line of what is found, as it is found.
 
-    `focal`: focal lengths in pixels by camera, instead of those in the files' tags. Raises ValueError, one line:
-    fewer than two images, an image of one colour, images that do not show the same things, a focal length of no camera.
+    `focal`: focal lengths in pixels by camera, instead of those in the files' tags. Raises ValueError, one
+    line: fewer than two images, an image of one colour, images that do not show the same things, a focal
+    length of no camera.
     """
     if not isinstance(sources, Mapping):
         sources = camera_names([Path(path) for path in sources])
@@ -93,7 +94,9 @@ def array_from_images(
     files = {name: Path(path) for name, path in sources.items() if not isinstance(path, Tensor)}
     for name, length in (focal or {}).items():
         if name not in sources or not 0 < length < math.inf:
-            raise ValueError(f"focal {name}={length:g}: no camera of {', '.join(sources)}, or not positive: mend it")
+            raise ValueError(
+                f"focal {name}={length:g}: no camera of {', '.join(sources)}, or not positive: mend it"
+            )
     notes: list[str] = []
 
     def note(line: str) -> None:
@@ -104,7 +107,9 @@ def array_from_images(
     if tagged is not None and focal:
         raise ValueError("focal: the images' tags state the focal lengths: leave it out")
     images = {name: images[name] if name in images else _read(name, files[name], note) for name in sources}
-    images = {name: _textured(f"{name}: {files.get(name, 'the image')}", image) for name, image in images.items()}
+    images = {
+        name: _textured(f"{name}: {files.get(name, 'the image')}", image) for name, image in images.items()
+    }
     alpha = _chosen_alpha(images, alpha, note)
     if tagged is not None:
         images = {name: read_view(tagged, name, files[name], like=tagged[alpha].sensor) for name in images}
@@ -116,7 +121,10 @@ def array_from_images(
         by_tags = {n: by_exif for n in images if n in files and (by_exif := focal_length(files[n]))}
         lengths = {n: length for n, length in (by_tags | dict(focal or {})).items() if n in images}
         for name, length in lengths.items():
-            note(f"{name}: focal length {length:.0f} pixels, {'as given' if name in (focal or {}) else 'by EXIF'}")
+            note(
+                f"{name}: focal length {length:.0f} pixels, "
+                f"{'as given' if name in (focal or {}) else 'by EXIF'}"
+            )
         rig, names = found_rig(images, alpha, lengths, load_weights(weights), note)
     else:
         rig, names = _translated_rig(tagged, images, alpha, note)
@@ -131,8 +139,8 @@ def array_from_images(
 
 
 def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
-    """Names of cameras for their files: the bands' that their tags state, the files' own without suffix, or the
-    folders', or numbers."""
+    """Names of cameras for their files: the bands' that their tags state, the files' own without suffix, or
+    the folders', or numbers."""
     if states_cameras(paths):
         return named_by_band(paths)
     for names in ([p.stem for p in paths], [p.resolve().parent.name for p in paths]):
@@ -142,7 +150,9 @@ def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
     return {f"camera{i}": path for i, path in enumerate(paths, 1)}
 
 
-def frames_of_videos(videos: Mapping[str, Path], folder: Path) -> tuple[dict[str, list[Path]], dict[str, float]]:
+def frames_of_videos(
+    videos: Mapping[str, Path], folder: Path
+) -> tuple[dict[str, list[Path]], dict[str, float]]:
     """The frames of videos as image files in a folder, and the frames a second, by camera."""
     files: dict[str, list[Path]] = {}
     rates: dict[str, float] = {}
@@ -172,24 +182,28 @@ def _tagged_rig(files: Mapping[str, Path], note: Say) -> Rig | None:
 
 @stage()
 def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple[Rig, list[str]]:
-    """The rig of tags with translations and depths by the images, and the cameras that match; alpha comes first."""
+    """The rig of tags with translations and depths by the images, and the cameras that match; alpha comes
+    first."""
     straight, pinhole = without_lenses(Rig({name: tagged[name] for name in images}), images)
     shown = {name: pixels_between(tagged[name], straight[name])[1][None].float() for name in images}
     lengths = {name: float(straight[name].K[0, 0]) for name in images}
     longest = max(images[alpha].shape[-2:])
     factors = {
-        name: min(lengths[alpha] / length * min(MATCHED / longest, 1.0), 1.0) for name, length in lengths.items()
+        name: min(lengths[alpha] / length * min(MATCHED / longest, 1.0), 1.0)
+        for name, length in lengths.items()
     }
     reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
     masks = {name: scaled(mask, factors[name])[0] > 0.99 for name, mask in shown.items()}
-    found, facts = centres_found(_resized(straight, reduced), reduced, masks, alpha=alpha)
+    found, facts = centres_found(resized_rig(straight, reduced), reduced, masks, alpha=alpha)
     for name, (points, distance) in facts.items():
         note(f"{name}: {points} points, {distance:.2f} px from their lines, intrinsics kept")
     for name in images.keys() - {*found.names}:
         note(f"{name}: left out, too little in common with the others")
     note(f"depths are multiples of the baseline {alpha} to {found.betas(alpha)[0]}")
     rig = developed_rig(tagged, images)
-    cameras = {n: rig[n].replace(cam_from_world=found[n].cam_from_world) for n in (alpha, *found.betas(alpha))}
+    cameras = {
+        n: rig[n].replace(cam_from_world=found[n].cam_from_world) for n in (alpha, *found.betas(alpha))
+    }
     return Rig(cameras, depth=found.depth, name=UNSCALED), list(cameras)
 
 
@@ -199,7 +213,8 @@ def found_rig(
 ) -> tuple[Rig, list[str]]:
     """The rig of the cameras of images, and which of them it relates to alpha; alpha comes first in both.
 
-    Calibrated, up to a scale, where points matched between alpha and a beta have parallax; else known by F alone.
+    Calibrated, up to a scale, where points matched between alpha and a beta have parallax; else known by F
+    alone.
     """
     factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in images.items()}
     reduced = {name: scaled(image, factors[name]) for name, image in images.items()}
@@ -208,11 +223,13 @@ def found_rig(
         found = rig_from_images(reduced, focal=lengths, alpha=alpha)
     betas = [name for name in images if (alpha, name) in found.rig.links]
     if not betas:
-        raise ValueError(f"no image shows enough of what '{alpha}' shows: choose another alpha with --alpha NAME")
+        raise ValueError(
+            f"no image shows enough of what '{alpha}' shows: choose another alpha with --alpha NAME"
+        )
     for name in images.keys() - {alpha, *betas}:
         note(f"{name}: left out, too little in common with {alpha}")
     rig = _calibrated(found, reduced, alpha, betas, lengths, network, note)
-    return _resized(rig, images), [alpha, *betas]
+    return resized_rig(rig, images), [alpha, *betas]
 
 
 def _calibrated(
@@ -226,8 +243,8 @@ def _calibrated(
 ) -> Rig:
     """The rig of alpha and these betas: calibrated, each pair refined by what a coarse fusion of it matches.
 
-    A pair whose lines no poses fit as well as F alone keeps F's, with the nearest poses for rough depths; one without
-    parallax has F alone. Each is said in a line.
+    A pair whose lines no poses fit as well as F alone keeps F's, with the nearest poses for rough depths; one
+    without parallax has F alone. Each is said in a line.
     """
     pairs: dict[str, RefinedPair] = {}
     depths: dict[str, Frame] = {}
@@ -241,17 +258,26 @@ def _calibrated(
             links[alpha, name] = link
             note(next(line for line in found.as_text().splitlines() if line.startswith(f"{alpha} > {name}")))
         if pair is None:
-            note(f"no depth by {name}: its points show no parallax, beside {alpha} it is too near or its scene too far")
+            note(
+                f"no depth by {name}: its points show no parallax, beside {alpha} it is too near or "
+                "its scene too far"
+            )
             continue
         if pair.exact:
             note(f"{alpha} > {name}: {pair.points} points, {pair.distance:.2f} px from their lines; refining")
         else:
-            note(f"{alpha} > {name}: lines by F; depths are rough, by poses whose lines are {pair.distance:.2f} px off")
+            note(
+                f"{alpha} > {name}: lines by F; depths are rough, by poses whose lines are "
+                f"{pair.distance:.2f} px off"
+            )
         pairs[name] = pair
         if pair.exact or len(betas) > 1:
             pairs[name], depths[name] = _refined(pair, images, network, links)
         if pairs[name] is not pair:
-            note(f"{alpha} > {name}: {pairs[name].points} points, {pairs[name].distance:.2f} px from their lines")
+            note(
+                f"{alpha} > {name}: {pairs[name].points} points, {pairs[name].distance:.2f} px from "
+                "their lines"
+            )
     if _distorted(found.rig):
         note(describe_lenses(found.rig))
     if not pairs:
@@ -261,7 +287,11 @@ def _calibrated(
     note(
         "depths are multiples of the baseline"
         + (f" {alpha} to {first}" if len(betas) > 1 else "")
-        + (f"; focal lengths assumed of {', '.join(assumed)}: depths are only proportional" if assumed else "")
+        + (
+            f"; focal lengths assumed of {', '.join(assumed)}: depths are only proportional"
+            if assumed
+            else ""
+        )
     )
     scales = {name: _relative_scale(depths[first], depths[name]) if name in depths else 1.0 for name in pairs}
     rig = joined(pairs, scales)
@@ -274,15 +304,17 @@ def _calibrated(
 def _refined(
     pair: RefinedPair, images: Images, network: Network, links: Mapping[tuple[str, str], Link]
 ) -> tuple[RefinedPair, Frame]:
-    """The pair refined by the matches of a fusion at reduced size, unless it has one of these links; and that."""
+    """The pair refined by the matches of a fusion at reduced size, unless it has one of these links; and
+    that."""
     alpha, beta = pair.rig.names
     factor = min(COARSE / max(images[alpha].shape[-2:]), 1.0)
     small = {name: scaled(images[name], factor) for name in (alpha, beta)}
+    bands = len(small[beta])
     link = links.get((alpha, beta))
-    rig = _resized(pair.rig if link is None else pair.rig.replace(links={(alpha, beta): link}), small)
+    rig = resized_rig(pair.rig if link is None else pair.rig.replace(links={(alpha, beta): link}), small)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        network = _for_bands(network, len(small[beta]))
+        network = network if network.bands in (None, bands) else load_weights(weights_for([bands]))
         LOG.info("coarse fusion of %s and %s", alpha, beta)
         frame = fuse(network, rig, small, alpha=alpha, align=False, response="rec601")
     if link is not None:
@@ -290,16 +322,14 @@ def _refined(
     refined = refined_by_depth(pair._replace(rig=rig), small, frame.depth, frame.confidence)
     if refined.rig is rig:
         return pair, frame
-    return refined._replace(rig=_resized(refined.rig, images), distance=refined.distance / factor), frame
-
-
-def _for_bands(network: Network, bands: int) -> Network:
-    return network if network.bands in (None, bands) else load_weights("mono-colour" if bands == 3 else "mono-spectral")
+    return refined._replace(rig=resized_rig(refined.rig, images), distance=refined.distance / factor), frame
 
 
 def _relative_scale(first: Frame, other: Frame) -> float:
     """The factor that brings another pair's depths to those of the first."""
-    both = (first.confidence > 0.5) & (other.confidence > 0.5) & first.depth.isfinite() & other.depth.isfinite()
+    both = (
+        (first.confidence > 0.5) & (other.confidence > 0.5) & first.depth.isfinite() & other.depth.isfinite()
+    )
     return float((first.depth[both] / other.depth[both]).median()) if both.any() else 1.0
 
 
@@ -309,10 +339,13 @@ def _distorted(rig: Rig) -> bool:
 
 def _without(rig: Rig, names: set[str]) -> Rig:
     cameras = {name: view for name, view in rig.cameras.items() if name not in names}
-    return rig.replace(cameras=cameras, links={pair: v for pair, v in rig.links.items() if not names & {*pair}})
+    return rig.replace(
+        cameras=cameras, links={pair: v for pair, v in rig.links.items() if not names & {*pair}}
+    )
 
 
-def _resized(rig: Rig, images: Images) -> Rig:
+def resized_rig(rig: Rig, images: Images) -> Rig:
+    """The rig whose cameras are of the images' sizes."""
     for name in rig.names:
         rig = rig.resize(name, (int(images[name].shape[-2]), int(images[name].shape[-1])))
     return rig
@@ -323,7 +356,9 @@ def scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 
     if factor >= 1:
         return image
     hw = [max(round(n * factor), 16) for n in image.shape[-2:]]
-    return interpolate(image[None], size=hw, mode="bicubic", antialias=True, align_corners=False)[0].clamp(0, 1)
+    return interpolate(image[None], size=hw, mode="bicubic", antialias=True, align_corners=False)[0].clamp(
+        0, 1
+    )
 
 
 def _read(name: str, path: Path, note: Say) -> Float[Tensor, "c h w"]:
@@ -341,7 +376,7 @@ def _textured(label: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "_ h w
     """The image, one band of it where all are equal. Raises ValueError for an image of one colour."""
     if float(image.flatten(1).std(-1).amax()) < EVEN:
         raise ValueError(f"{label}: is of one colour, with nothing to match: give another image")
-    return image[:1] if len(image) == 3 and equal_bands(image) else image
+    return image[:1] if len(image) == 3 and not is_in_colour(image) else image
 
 
 def _chosen_alpha(images: Images, alpha: str | None, note: Say) -> str:
@@ -353,10 +388,14 @@ def _chosen_alpha(images: Images, alpha: str | None, note: Say) -> str:
     grey = [name for name, image in images.items() if len(image) == 1]
     chosen = max(grey or images, key=lambda name: math.prod(images[name].shape[-2:]))
     h, w = images[chosen].shape[-2:]
-    why = "the only grey image" if len(grey) == 1 else "the largest grey image" if grey else "the largest image"
+    why = (
+        "the only grey image" if len(grey) == 1 else "the largest grey image" if grey else "the largest image"
+    )
     equal = [name for name in grey or images if images[name].shape[-2:] == (h, w)]
     why = "the first of images of one size" if len(equal) > 1 else why
-    note(f"alpha, whose view and detail the result has: {chosen} ({w}x{h}, {why}; --alpha NAME takes another)")
+    note(
+        f"alpha, whose view and detail the result has: {chosen} ({w}x{h}, {why}; --alpha NAME takes another)"
+    )
     return chosen
 
 
@@ -376,7 +415,11 @@ def _ordered_betas(images: Images, alpha: str, note: Say) -> list[str]:
 def show_colour(names: Sequence[str], bands: Sequence[int]) -> bool:
     """Whether cameras of a band each record, by their names, red, green and blue, in this order."""
     waves = [_wavelength(name) for name in names]
-    return set(bands) == {1} and len(waves) == 3 and all(low <= w <= high for w, (low, high) in zip(waves, COLOURS))
+    return (
+        set(bands) == {1}
+        and len(waves) == 3
+        and all(low <= w <= high for w, (low, high) in zip(waves, COLOURS))
+    )
 
 
 def _wavelength(name: str) -> float:

@@ -25,19 +25,19 @@ from ..support.memory import limited, parse_bytes, planned
 from .checks import warn_of_confidence
 from .corrections import Corrections, corrections_for, expected_work
 from .depth import background_filled
-from .inputs import check_bands, prepared
+from .inputs import FrameInputs, check_bands, prepared
 from .low_light import Noise, denoised_views
-from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail
-from .own_colour import with_own_colours
+from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail, with_own_colours
 from .results import Frame
-from .steps import steps_for
-from .tiles import LARGE, Plan, fused_in_tiles, plan_frame
+from .steps import steps_for, undone
+from .tiles import LARGE, FusedTile, Plan, fused_in_tiles, plan_frame
 from .views import Views
 
 LOG = logging.getLogger(__name__)
 
 ImageSources = Mapping[str, str | Path | Tensor] | Sequence[str | Path]
-"""An image file, or a tensor (C, H, W) in 0..1, of each camera by name; or files alone, which name their cameras."""
+"""An image file, or a tensor (C, H, W) in 0..1, of each camera by name; or files alone, which name their
+cameras."""
 Progress = Callable[[Iterable[Tile], int], Iterable[Tile]]
 """Wraps the tiles (and their number) to show how far the work is, as `rich.progress.track` does."""
 
@@ -66,60 +66,64 @@ def fuse(
     differentiable: bool = False,
     matcher: Matcher = match,
 ) -> Frame:
-    """Fuse one frame at the view of camera `alpha`: `fuse(network, rig, images, alpha=...)`, or `fuse(images)`.
+    """Fuse one frame at the view of camera `alpha`: `fuse(network, rig, images, alpha=...)`, or
+    `fuse(images)`.
 
-    Images alone are files, or files or tensors by camera; their rig and the weights are found as by `pat fuse`
-    (`pat.fusion.from_images.array_from_images`, which also gives them), and depths are multiples of the baseline.
-    Frames too large for the memory allowed are fused in tiles of alpha, each with the part of every beta that its
-    segments touch, and a halo: equal to the whole to 1e-4. Distorted images are first resampled to pinhole views
-    (`pat.fusion.steps.Undistort`), rotated betas made upright, and betas resized to alpha's angular resolution; the
-    result is at alpha's own pixels all the same. Where alpha is known to measure the luminance of linear light and one
-    beta the colours, the result is as bright in that sense (`pat.media.raw.as_bright`).
+    Images alone are files, or files or tensors by camera; their rig and the weights are found as by `pat
+    fuse` (`pat.fusion.from_images.array_from_images`, which also gives them), and depths are multiples of the
+    baseline. Frames too large for the memory allowed are fused in tiles of alpha, each with the part of every
+    beta that its segments touch, and a halo: equal to the whole to 1e-4. Distorted images are first resampled
+    to pinhole views (`pat.fusion.steps.Undistort`), rotated betas made upright, and betas resized to alpha's
+    angular resolution; the result is at alpha's own pixels all the same. Where alpha is known to measure the
+    luminance of linear light and one beta the colours, the result is as bright in that sense
+    (`pat.media.raw.as_bright`).
 
     Args:
         network: for instance `load_weights("mono-colour")`; or, without rig, the images.
         rig: the cameras. Those without an image in `images` are left out.
-        images: tensors by camera name, (C, H, W) in 0..1, each of the size that the rig states. A mapping that reads
-            them when asked saves memory (`pat.fusion.views.ViewFiles`).
+        images: tensors by camera name, (C, H, W) in 0..1, each of the size that the rig states. A mapping
+            that reads them when asked saves memory (`pat.fusion.views.ViewFiles`).
         alpha: the camera whose view is wanted; without a rig by default the largest grey image.
         depth: (near, far) in metres, instead of the rig's.
-        field: the receptive field, or one for each of some betas, by name; by default `arraygeom`'s `default_field`.
-        max_memory: bytes, or like "4GiB": what the process may take in all, libraries and images included, if there
-            is nothing else in it. Default: no limit.
-        match_levels: bring each beta to alpha's mean and standard deviation first, for cameras whose exposures or
-            filters differ and which are not radiometrically calibrated.
-        response: how alpha weighs red, green and blue of its one colour beta. "fit" fits it to matches, with a gain and
-            a gamma, and leaves it at Rec. 601 luma ("rec601") where that explains the images as well; three numbers
-            state it. The result has alpha as this combination of its colours.
+        field: the receptive field, or one for each of some betas, by name; by default `arraygeom`'s
+            `default_field`.
+        max_memory: bytes, or like "4GiB": what the process may take in all, libraries and images included, if
+            there is nothing else in it. Default: no limit.
+        match_levels: bring each beta to alpha's mean and standard deviation first, for cameras whose
+            exposures or filters differ and which are not radiometrically calibrated.
+        response: how alpha weighs red, green and blue of its one colour beta. "fit" fits it to matches, with
+            a gain and a gamma, and leaves it at Rec. 601 luma ("rec601") where that explains the images as
+            well; three numbers state it. The result has alpha as this combination of its colours.
         align: find how far the betas lie across their search segments, and put that right; by default unless
             `differentiable`, where a rig that is put right has no gradient of being off.
         corrections: what is known of both from another frame of the same cameras (`corrections_of`), instead.
         explain: called with a line for each thing that was found and put right.
-        noise: the noise level of each camera that has some, or "estimate": views are denoised before they are matched,
-            and jointly once they are fused.
-        keep_alpha: leave alpha's values as recorded, noise included; otherwise so if alpha has no noise to speak of.
-        luminance: the image's: "alpha", which the network keeps exactly, that of "beta" in alpha's detail, where alpha
-            sees another part of the spectrum, or their "mix".
+        noise: the noise level of each camera that has some, or "estimate": views are denoised before they are
+            matched, and jointly once they are fused.
+        keep_alpha: leave alpha's values as recorded, noise included; otherwise so if alpha has no noise to
+            speak of.
+        luminance: the image's: "alpha", which the network keeps exactly, that of "beta" in alpha's detail,
+            where alpha sees another part of the spectrum, or their "mix".
         progress: shows the tiles as they are done.
         store: a folder for finished tiles of a frame of several, so that one that was stopped goes on;
             tiles of other images, rigs or weights are not taken. Whoever gave it removes it afterwards.
-        differentiable: keep gradients with respect to the numbers of the rig, the images and the network's weights
-            (which `requires_grad_(True)` frees). A match moves along its segment as images and rig move the best
-            agreement around it; which match is the best, `align` and `response` are constants.
+        differentiable: keep gradients with respect to the numbers of the rig, the images and the network's
+            weights (which `requires_grad_(True)` frees). A match moves along its segment as images and rig
+            move the best agreement around it; which match is the best, `align` and `response` are constants.
             Else the frame is detached, whatever requires gradients.
         matcher: what finds the matches of a network that uses some: `pat.matching.match.match`, or your own.
-        announce: called with the plan before the work begins; the time of a large frame is estimated by fusing a piece.
+        announce: called with the plan before the work begins; the time of a large frame is estimated by
+            fusing a piece.
 
     Raises:
-        ValueError: a camera that the rig lacks, an image of another size, a rig whose views do not overlap, bands that
-            the network does not make, `differentiable` with `max_memory` or `store`.
+        ValueError: a camera that the rig lacks, an image of another size, a rig whose views do not overlap,
+            bands that the network does not make, `differentiable` with `max_memory` or `store`.
 
     Warns:
-        LowConfidenceWarning: the images hardly match: the rig is probably wrong. A filter makes it an error, as
-            `warnings.simplefilter("error", LowConfidenceWarning)`.
+        LowConfidenceWarning: the images hardly match: the rig is probably wrong. A filter makes it an error,
+            as `warnings.simplefilter("error", LowConfidenceWarning)`.
     """
     network, rig, images, alpha, grey_world = _with_rig(network, rig, images, alpha, explain)
-    match_levels |= grey_world
     align = not differentiable if align is None else align
     if differentiable and not (max_memory is None and store is None):
         raise ValueError("differentiable=True fuses the whole frame at once: leave out max_memory and store")
@@ -127,8 +131,8 @@ def fuse(
     limit = None if max_memory is None else parse_bytes(max_memory)
     views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
     check_bands(network, views)
-    betas, in_colour = views.betas, views.alpha_in_colour
-    steps = steps_for(network, normalise=match_levels)
+    betas, in_colour, noisy = views.betas, views.alpha_in_colour, bool(low_light.noisy)
+    steps = steps_for(network, normalise=match_levels or grey_world)
     inputs, undo = prepared(network, views, steps)
     held = _bytes_beside(inputs.inputs, [views.own, *(images.values() if isinstance(images, dict) else ())])
     del views  # whose images are there again, padded
@@ -146,47 +150,68 @@ def fuse(
     if announce:
         announce(plan)
     found = corrections or corrections_for(network, inputs, response, align=align)
-    if explain:
-        for line in found.described(betas, inputs.hw):
-            explain(line)
-    fused = replace(found.applied(inputs.inputs, inputs.hw), luminance=SHARES[luminance])
-    inputs = inputs._replace(inputs=fused)
+    for line in found.described(betas, inputs.hw) if explain else ():
+        explain(line)
+    right = replace(found.applied(inputs.inputs, inputs.hw), luminance=SHARES[luminance])
+    inputs = inputs._replace(inputs=right)
     with limited(planned(limit, plan.memory, large=math.prod(inputs.hw) > LARGE)):
         with torch.set_grad_enabled(differentiable):
-            matches = matcher(inputs.inputs) if network.uses_matches else None
-            LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
-            noisy = bool(low_light.noisy)
-            done = fused_in_tiles(network, inputs, matches, plan.tiles, found=noisy, progress=progress, store=store)
-        frame = done.frame
-        warn_of_confidence(network, frame, inputs)
-        frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
-        if luminance != "alpha":
-            frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
-        del inputs, fused, matches  # the segments and matches of a large frame: what follows needs memory, too
-        frame = low_light.corrected(found.undone(frame), done.found, steps, found.response, keep_alpha=keep_alpha)
+            done = _matched_and_fused(
+                network, inputs, matcher, plan, found=noisy, progress=progress, store=store
+            )
+        warn_of_confidence(network, done.frame, inputs)
+        frame = _completed(done.frame, inputs, luminance)
+        del inputs, right  # the segments of a large frame: what follows needs memory, too
+        frame = low_light.corrected(
+            found.undone(frame), done.found, steps, found.response, keep_alpha=keep_alpha
+        )
         LOG.info("back to the pixels of %s", alpha)
-        for back in undo:
-            frame = back(frame)
+        frame = undone(frame, undo)
         if in_colour and len(frame.image) == 3 and frame.by_band is None and not noisy:
             frame = with_own_colours(frame, images[alpha])
         return frame if differentiable else frame.mapped(Tensor.detach)
 
 
+def _matched_and_fused(
+    network: FusionNetwork, inputs: FrameInputs, matcher: Matcher, plan: Plan, **options: Any
+) -> FusedTile:
+    """The whole frame from its tiles; options are those of `fused_in_tiles`."""
+    matches = matcher(inputs.inputs) if network.uses_matches else None
+    LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
+    return fused_in_tiles(network, inputs, matches, plan.tiles, **options)
+
+
+def _completed(frame: Frame, inputs: FrameInputs, luminance: Luminance) -> Frame:
+    """The fused frame with depth where betas are occluded, and alpha's detail in beta's luminance."""
+    frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
+    if luminance == "alpha":
+        return frame
+    return with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
+
+
 def _bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:
     """Memory of images whose pixels are not those of the inputs: the caller's."""
-    own = {part.untyped_storage().data_ptr() for part in (inputs.alpha, *(beta.image for beta in inputs.betas))}
+    own = {
+        part.untyped_storage().data_ptr() for part in (inputs.alpha, *(beta.image for beta in inputs.betas))
+    }
     parts = {part.untyped_storage().data_ptr(): part.nbytes for part in images}
     return float(sum(nbytes for place, nbytes in parts.items() if place not in own))
 
 
 def _with_rig(
-    network: Any, rig: Rig | None, images: Images | None, alpha: str | None, explain: Callable[[str], None] | None
+    network: Any,
+    rig: Rig | None,
+    images: Images | None,
+    alpha: str | None,
+    explain: Callable[[str], None] | None,
 ) -> tuple[FusionNetwork, Rig, Images, str, bool]:
     """Network, rig, images, alpha, and whether to match levels; all found where the first is images alone."""
     if rig is not None and images is not None and alpha is not None:
         return network, rig, images, alpha, False
     if rig is not None or images is not None or not isinstance(network, Mapping | Sequence):
-        raise TypeError("fuse takes a network, a rig, images and alpha=NAME; or images alone, to find the rig")
+        raise TypeError(
+            "fuse takes a network, a rig, images and alpha=NAME; or images alone, to find the rig"
+        )
     from ..networks.weights import load_weights
     from .from_images import array_from_images
 
@@ -208,7 +233,8 @@ def corrections_of(
     align: bool = True,
     noise: Noise | None = None,
 ) -> Corrections:
-    """What `fuse` finds and puts right before it fuses; give it to `fuse` for other frames of the same cameras.
+    """What `fuse` finds and puts right before it fuses; give it to `fuse` for other frames of the same
+    cameras.
 
     Arguments and errors are as of `fuse`.
     """

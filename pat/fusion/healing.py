@@ -1,4 +1,5 @@
-"""A rig that its images contradict: said, and healed for them where they determine it far better than the file does."""
+"""A rig that its images contradict: said, and healed for them where they determine it far better than the
+file does."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ from calib.images.self_calibration import depth_bounds
 
 from ..support.settings import size
 from .checks import LowConfidenceWarning
-from .from_images import MATCHED, scaled
+from .from_images import MATCHED, resized_rig, scaled
 from .views import ViewFiles
 
 
@@ -27,7 +28,9 @@ class HealingSettings:
     """Of a frame that heals its own rig."""
 
     nearer: float = size(4.0, "How many times nearer to their lines held-out points must come")
-    of_own: float = size(2.0, "How many times as far from them as from those of an F of their own they may be then")
+    of_own: float = size(
+        2.0, "How many times as far from them as from those of an F of their own they may be then"
+    )
     slack: float = size(0.25, "And so many pixels of the matched images more")
 
 
@@ -42,9 +45,11 @@ class Healed(NamedTuple):
 
 
 def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
-    """The rig healed by its images, where they say clearly more; else None, and a warning if it fits them badly.
+    """The rig healed by its images, where they say clearly more; else None, and a warning if it fits them
+    badly.
 
-    By a `LowConfidenceWarning` if it is wrong: mistaken by the doctor's verdict, or points are where nothing is seen.
+    By a `LowConfidenceWarning` if it is wrong: mistaken by the doctor's verdict, or points are where nothing
+    is seen.
     """
     try:
         images = dict(views)
@@ -61,12 +66,14 @@ def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
 
 
 def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | None:
-    """The rig refined by points matched between alpha and the betas, whatever its deviations; None unless held-out
-    points then lie about as near to their lines as to those of an F of their own, and far nearer than before."""
+    """The rig refined by points matched between alpha and the betas, whatever its deviations; None unless
+    held-out points then lie about as near to their lines as to those of an F of their own, and far nearer
+    than before."""
     small = {name: scaled(image, min(MATCHED / max(image.shape[-2:]), 1.0)) for name, image in images.items()}
-    reduced = Rig({name: rig[name] for name in (alpha, *small)}, depth=rig.depth, links=rig.links, name=rig.name)
-    for name, image in small.items():
-        reduced = reduced.resize(name, (image.shape[-2], image.shape[-1]))
+    reduced = Rig(
+        {name: rig[name] for name in (alpha, *small)}, depth=rig.depth, links=rig.links, name=rig.name
+    )
+    reduced = resized_rig(reduced, small)
     try:
         pairs = related(reduced, match_cameras(small, alpha=alpha))
         found = refine_matches(reduced, [pairs], force=True)
@@ -81,9 +88,12 @@ def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | N
     cameras = dict(rig.cameras)
     for name in small:
         cameras[name] = found.rig.resize(name, rig[name].hw)[name].replace(sensor=rig[name].sensor)
-    changed = "" if found.depth is None else f"; depth changes by {found.depth.change:.0%} (median), and is rough"
+    changed = (
+        "" if found.depth is None else f"; depth changes by {found.depth.change:.0%} (median), and is rough"
+    )
     text = (
-        f"the rig is healed by these images: points lay {before:.1f} px from their lines, {after:.2f} px now{changed} "
+        f"the rig is healed by these images: points lay {before:.1f} px from their lines, "
+        f"{after:.2f} px now{changed} "
         "(--no-align leaves the rig as it is)"
     )
     depth = _depth_range(found.rig, pairs)
@@ -91,8 +101,8 @@ def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | N
 
 
 def _depth_range(rig: Rig, pairs: Pairs) -> tuple[float, float] | None:
-    """The rig's depth range, extended to that of the matched points: a rotation that images correct moves all depths
-    along the segments."""
+    """The rig's depth range, extended to that of the matched points: a rotation that images correct moves all
+    depths along the segments."""
     found = [depth_bounds(Rig({n: rig[n] for n in names}), matches) for names, matches in pairs.items()]
     ranges = [bounds for bounds in found if bounds is not None]
     if rig.depth is None or not ranges:

@@ -1,4 +1,5 @@
-"""From views to what a network is given: padded images, and each field evaluated once for every pixel of alpha."""
+"""From views to what a network is given: padded images, and each field evaluated once for every pixel of
+alpha."""
 
 from __future__ import annotations
 
@@ -7,12 +8,11 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from arraygeom import Curved, Moved, Pair, ReceptiveField, Widened, depth_of
+from arraygeom import Curved, Moved, Pair, ReceptiveField, depth_of
 from arraygeom.epipolar import Depth, Track
 from arraygeom.fields import AroundDepth, AroundMatches, default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
@@ -23,8 +23,8 @@ from ..matching.inputs import Beta, Inputs
 from ..matching.normalisation import combined_bands
 from ..matching.tangents import along_tangents
 from ..networks.protocol import FusionNetwork
-from .steps import FusionStep, Undo
-from .views import Views
+from .steps import FusionStep, Undo, innermost
+from .views import Views, is_in_colour
 
 LOG = logging.getLogger(__name__)
 
@@ -53,7 +53,9 @@ class Placement(NamedTuple):
         """The tracks in beta of alpha's pixels, of pinholes."""
         return pinhole_track(self.pair, self.points(x))
 
-    def depth(self, x: Float[Tensor, "n 2"], x_beta: Float[Tensor, "n 2"], deviation: Float[Tensor, " n"]) -> Depth:
+    def depth(
+        self, x: Float[Tensor, "n 2"], x_beta: Float[Tensor, "n 2"], deviation: Float[Tensor, " n"]
+    ) -> Depth:
         """The depth of what alpha's pixels see at beta's pixels, or its distance if `bounds` are of that."""
         if self.pair.alpha.has_pinhole_view and self.pair.beta.has_pinhole_view and self.bounds == "depth":
             return depth_of(self.pair, self.points(x), x_beta, deviation)
@@ -61,7 +63,8 @@ class Placement(NamedTuple):
 
 
 class FrameInputs(NamedTuple):
-    """A network's inputs, padded to whole multiples; how each beta is placed; alpha's size without padding."""
+    """A network's inputs, padded to whole multiples; how each beta is placed; alpha's size without
+    padding."""
 
     inputs: Inputs
     placements: list[Placement]
@@ -69,15 +72,18 @@ class FrameInputs(NamedTuple):
 
 
 def check_bands(network: FusionNetwork, views: Views) -> None:
-    """Refuse betas whose bands are not those that the network makes; warn of those whose three bands are equal.
+    """Refuse betas whose bands are not those that the network makes; warn of those whose three bands are
+    equal.
 
     Raises ValueError that says which weights to take.
     """
     _refuse_bands(network, views)
     for name in views.betas:
         image = views.images[name]
-        if len(image) == 3 and equal_bands(image):
-            warnings.warn(f"the image of '{name}' has three equal bands: it is grey, and gives no colour", stacklevel=3)
+        if len(image) == 3 and not is_in_colour(image):
+            warnings.warn(
+                f"the image of '{name}' has three equal bands: it is grey, and gives no colour", stacklevel=3
+            )
 
 
 def _refuse_bands(network: FusionNetwork, views: Views) -> None:
@@ -93,18 +99,17 @@ def _refuse_bands(network: FusionNetwork, views: Views) -> None:
         said = ", and the rig says that it is in colour" if sensor.response == "rgb" else ""
         advice = f"its image is grey{said}: give one in colour, or "
     raise ValueError(
-        f"the betas have {total} band{'s' if total > 1 else ''} in all ({listed}), these weights make {wanted}: "
+        f"the betas have {total} band{'s' if total > 1 else ''} in all ({listed}), these weights "
+        f"make {wanted}: "
         f"{advice}take the weights mono-spectral, which fuse any number of bands"
     )
 
 
-def equal_bands(image: Float[Tensor, "c h w"]) -> bool:
-    """Whether all bands are the same."""
-    return all(torch.equal(image[0], band) for band in image[1:])
-
-
-def prepared(network: FusionNetwork, views: Views, steps: Sequence[FusionStep]) -> tuple[FrameInputs, list[Undo]]:
-    """The network's inputs after these steps, and how the frame is taken back to the views, the last step first.
+def prepared(
+    network: FusionNetwork, views: Views, steps: Sequence[FusionStep]
+) -> tuple[FrameInputs, list[Undo]]:
+    """The network's inputs after these steps, and how the frame is taken back to the views, the last step
+    first.
 
     Raises ValueError as `frame_inputs`.
     """
@@ -135,22 +140,17 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
         betas.append(Beta(image, on_grid, track=place.track if place.has_track else None, around=around))
         if not on_grid.any_valid(pair.alpha.hw):
             bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} m"
-            raise ValueError(f"alpha's and '{name}'s views do not overlap{bounds}: check the poses and the depth range")
+            raise ValueError(
+                f"alpha's and '{name}'s views do not overlap{bounds}: check the poses and the depth range"
+            )
         placements.append(place)
     return FrameInputs(Inputs(alpha, tuple(betas), m, network.beta_halo, bands=network.bands), placements, hw)
 
 
 def bounds_of(field: ReceptiveField) -> Literal["depth", "distance"]:
     """What a field's depth range is of."""
-    field = innermost(field)
-    return field.bounds if isinstance(field, Curved) else "depth"
-
-
-def innermost(field: ReceptiveField) -> ReceptiveField:
-    """The field that is widened or moved, if it is."""
-    while isinstance(field, Widened | Moved):
-        field = field.field
-    return field
+    inner = innermost(field)
+    return inner.bounds if isinstance(inner, Curved) else "depth"
 
 
 def padded(image: Tensor, multiple: int) -> Tensor:

@@ -53,7 +53,8 @@ class LowLightSettings:
     found_bytes: float = size(12.0, "Of a position in a beta and its confidence")
     jointly: float = size(
         0.5,
-        "The time of the joint correction over that of denoising the views before, about (.45 to .47 were measured)",
+        "The time of the joint correction over that of denoising the views before, about (.45 to "
+        ".47 were measured)",
     )
 
 
@@ -71,9 +72,11 @@ def shipped_denoiser() -> LowLightNetwork:
 
 @dataclass(frozen=True)
 class LowLight:
-    """Views as given, without noise, and those that had some: (1, C, H, W) by camera, as recorded but unbiased.
+    """Views as given, without noise, and those that had some: (1, C, H, W) by camera, as recorded but
+    unbiased.
 
-    If no view had noise, nothing is asked of them, and they are without images. `seconds` is what denoising took.
+    If no view had noise, nothing is asked of them, and they are without images. `seconds` is what denoising
+    took.
     """
 
     given: Views
@@ -87,8 +90,8 @@ class LowLight:
         return SETTINGS.jointly * self.seconds if self.noisy else 0.0
 
     def kept(self, hw: HW, betas: int) -> float:
-        """Bytes that are held until the frame of this size is corrected: the views, and where its pixels are in each
-        beta."""
+        """Bytes that are held until the frame of this size is corrected: the views, and where its pixels are
+        in each beta."""
         if not self.noisy:
             return 0.0
         images = [*self.given.images.values(), *self.views.images.values()]
@@ -107,10 +110,10 @@ class LowLight:
     ) -> Frame:
         """A frame fused from the denoised views, corrected by what all of them recorded.
 
-        `found` is where its pixels are in each beta, x and y, and the confidence of that. `steps` were taken before it
-        was fused and are not undone yet; `response` says what brings betas to alpha's exposure. With `keep_alpha`, or
-        if alpha has no noise, the luma is alpha's as recorded.
-        Betas that are not all RGB are denoised one by one alone.
+        `found` is where its pixels are in each beta, x and y, and the confidence of that. `steps` were taken
+        before it was fused and are not undone yet; `response` says what brings betas to alpha's exposure.
+        With `keep_alpha`, or if alpha has no noise, the luma is alpha's as recorded. Betas that are not all
+        RGB are denoised one by one alone.
         """
         if not self.noisy:
             return frame
@@ -163,7 +166,9 @@ def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:
     if not noisy:
         without = replace(views, images={})
         return views, LowLight(without, without, {})
-    denoised = replace(views, images={**views.images, **{name: view.denoised[0] for name, view in noisy.items()}})
+    denoised = replace(
+        views, images={**views.images, **{name: view.denoised[0] for name, view in noisy.items()}}
+    )
     return denoised, LowLight(views, denoised, noisy, time.perf_counter() - begin)
 
 
@@ -172,10 +177,13 @@ def warn_of_noise(name: str, image: Float[Tensor, "c h w"], view: NoisyView) -> 
     shown = NoiseLevel.estimated(image[None])
     if shown == NoiseLevel():
         return
-    stated, found = (255 * float(deviation.mean()) for deviation in (view.deviation, shown.deviation(image[None])))
+    stated, found = (
+        255 * float(deviation.mean()) for deviation in (view.deviation, shown.deviation(image[None]))
+    )
     if stated > SETTINGS.far_more * max(found, 255 * SETTINGS.least_deviation):
         warnings.warn(
-            f"noise of '{name}': a standard deviation of {stated:.0f}/255 is stated, its image shows {found:.1f}/255: "
+            f"noise of '{name}': a standard deviation of {stated:.0f}/255 is stated, its image shows "
+            f"{found:.1f}/255: "
             "detail will be lost; state electrons at white, or have the noise estimated",
             stacklevel=3,
         )
@@ -207,7 +215,9 @@ def exposed(view: NoisyView, response: Response) -> NoisyView:
 
 @torch_in_all_threads()
 @torch.no_grad()
-def denoised(image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+def denoised(
+    image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"]
+) -> Float[Tensor, "b c h w"]:
     """An image without noise of this standard deviation; bands other than three are denoised one by one."""
     network = shipped_denoiser()
     if image.shape[1] == 3:
@@ -219,7 +229,10 @@ def denoised(image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"
 @torch_in_all_threads()
 @torch.no_grad()
 def jointly_denoised(
-    image: Float[Tensor, "3 h w"], alpha: NoisyView, betas: Sequence[NoisyView], found: Float[Tensor, "n 3 h w"]
+    image: Float[Tensor, "3 h w"],
+    alpha: NoisyView,
+    betas: Sequence[NoisyView],
+    found: Float[Tensor, "n 3 h w"],
 ) -> Float[Tensor, "3 h w"]:
     """The image fused from denoised views, corrected by alpha and the RGB betas as they were recorded."""
     beta, confidence = warped(betas, found)
@@ -239,7 +252,9 @@ def jointly_denoised(
     return in_tiles(averaged, fused, beta.recorded, confidence, alpha.recorded, alpha.deviation)[0]
 
 
-def warped(betas: Sequence[NoisyView], found: Float[Tensor, "n 3 h w"]) -> tuple[NoisyView, Float[Tensor, "1 1 h w"]]:
+def warped(
+    betas: Sequence[NoisyView], found: Float[Tensor, "n 3 h w"]
+) -> tuple[NoisyView, Float[Tensor, "1 1 h w"]]:
     """All betas at alpha's pixels, mixed by their confidences; and the confidence of the mixture."""
     positions, confidence = found[:, :2].movedim(1, -1), found[:, 2]
     images = [torch.cat([sample(part, x[None]).values for part in beta]) for beta, x in zip(betas, positions)]

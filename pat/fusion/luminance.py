@@ -1,27 +1,46 @@
-"""Whose brightness the fused image has: alpha's, or a colour beta's in alpha's detail.
+"""Whose luminance the fused image has, alpha's or a colour beta's in alpha's detail, and whose chroma.
 
 Where no combination of beta's bands is what alpha sees, as with near infrared, alpha's brightness in beta's
-colours is
-of neither camera: leaves are pale, skin is flat.
+colours is of neither camera: leaves are pale, skin is flat. An alpha in colour has its own chroma where betas
+do not see.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from arraygeom.chunks import chunked
+from arraygeom.robust import least_squares
+
 from ..matching.colour_transfer import SETTINGS, local_slope
 from ..matching.normalisation import Normalisation
-from ..media.colour import luminance
+from ..media.colour import from_luma_chroma, luminance, to_luma_chroma
 from ..networks.protocol import FusionNetwork
+from ..support.settings import size
 from .results import Frame
 
 Luminance = Literal["alpha", "mix", "beta"]
 SHARES: dict[Luminance, float] = {"alpha": 1.0, "mix": 0.5, "beta": 0.0}
 """Alpha's share of the luminance."""
+
+
+@dataclass(frozen=True)
+class OwnColourSettings:
+    """Of a fused image whose alpha was recorded in colour."""
+
+    unseen: float = size(0.2, "Confidence up to which alpha's own colours are taken")
+    seen: float = size(0.5, "And from which the betas'")
+    pixels: int = size(100_000, "About so many pixels say how the betas' colours differ from alpha's")
+    prior: float = size(1.0, "Squared chroma in all that weighs as much against any difference")
+
+
+OWN_COLOUR = OwnColourSettings()
 
 
 def check_luminance(network: FusionNetwork, kept: Luminance, *, noisy: bool) -> None:
@@ -31,7 +50,9 @@ def check_luminance(network: FusionNetwork, kept: Luminance, *, noisy: bool) -> 
     if kept == "alpha":
         return
     if not network.keeps_luminance:
-        raise ValueError(f"luminance={kept!r} needs weights for RGB betas, such as mono-colour: leave it at 'alpha'")
+        raise ValueError(
+            f"luminance={kept!r} needs weights for RGB betas, such as mono-colour: leave it at 'alpha'"
+        )
     if noisy:
         raise ValueError(
             f"luminance={kept!r} with noise: denoising is towards alpha's luminance; leave one of them out"
@@ -46,3 +67,34 @@ def with_alpha_detail(frame: Frame, alpha: Float[Tensor, "1 h w"]) -> Frame:
     soft = normalisation.softened(own)
     detail = local_slope(other, soft) * SETTINGS.detail(own - soft)
     return frame._replace(image=frame.image + detail[0])
+
+
+def with_own_colours(frame: Frame, own: Float[Tensor, "3 h w"]) -> Frame:
+    """A fused frame whose chroma is alpha's own where confidence is low, as the betas' cameras show such
+    colours.
+
+    Luminance stays. How the betas show alpha's colours is found where they see the same points.
+    """
+    own = own.to(frame.image)
+    step = max(int((frame.confidence.numel() / OWN_COLOUR.pixels) ** 0.5), 1)
+    some = (..., slice(None, None, step), slice(None, None, step))
+    terms, values = (
+        to_luma_chroma(image[some])[1].flatten(1).detach().double() for image in (own, frame.image)
+    )
+    weight = (frame.confidence[some].flatten().detach() > OWN_COLOUR.seen).double()
+    same = torch.eye(2, dtype=torch.float64, device=own.device)
+    change = same + least_squares(terms, (values - terms).T, weight, OWN_COLOUR.prior * same)
+    mix = partial(_mixed, change.T.to(own))
+    return frame._replace(image=chunked(mix, frame.image, own, frame.confidence[None]))
+
+
+def _mixed(
+    change: Float[Tensor, "2 2"],
+    image: Float[Tensor, "3 h w"],
+    own: Float[Tensor, "3 h w"],
+    confidence: Float[Tensor, "1 h w"],
+) -> Float[Tensor, "3 h w"]:
+    share = ((confidence - OWN_COLOUR.unseen) / (OWN_COLOUR.seen - OWN_COLOUR.unseen)).clamp(0, 1)
+    luma, chroma = to_luma_chroma(image)
+    there = torch.einsum("ij,jhw->ihw", change, to_luma_chroma(own)[1])
+    return from_luma_chroma(luma, share * chroma + (1 - share) * there)

@@ -23,7 +23,7 @@ from arraygeom.viz import COLOURS, frustum, frustum_size
 from ..media.colour import to_bytes
 from ..media.figures import colour_depth, reduced
 from ..support.memory import how_many_fit
-from .results import Frame
+from .results import Frame, picture_of
 
 LONGEST = 1600
 """Images in the page have at most this many pixels along their longer side."""
@@ -62,38 +62,52 @@ def write_report(
     return path
 
 
-def report_page(frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig: Rig, alpha: str, facts: Facts) -> str:
+def report_page(
+    frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig: Rig, alpha: str, facts: Facts
+) -> str:
     """The page as text."""
     shown = {f"alpha: {alpha}": images[alpha]}
     shown |= {f"beta: {name}": images[name] for name in rig.betas(alpha) if name in images}
     if facts.classical is not None:
-        shown["classical"] = _shown(facts.classical)
-    shown["fused"] = _shown(frame.image)
+        shown["classical"] = picture_of(facts.classical)
+    shown["fused"] = picture_of(frame.image)
     overlays = {"confidence": lambda: shares_layer(frame.confidence)}
     known = frame.depth[frame.depth.isfinite()]
     if len(known):
         overlays["depth"] = lambda: data_url(reduced(colour_depth(frame.depth), LONGEST))
-    layers = {name: partial(lambda image: data_url(reduced(_shown(image), LONGEST)), x) for name, x in shown.items()}
+    layers = {
+        name: partial(lambda image: data_url(reduced(picture_of(image), LONGEST)), x)
+        for name, x in shown.items()
+    }
     urls = _all_of({**layers, **overlays})
     return filled_page(
         f"{' + '.join(name for name in rig.names if name in images)}, fused",
         frame.depth.shape,
         {name: urls[name] for name in layers},
         {name: urls[name] for name in overlays},
-        FACTS="\n".join(f"<tr><th>{k}<td>{html.escape(v)}" for k, v in _figures(frame, known, facts).items()),
-        NOTES=listed("What was found", facts.notes),
-        WARNINGS=listed("Warnings", facts.warnings, kind="warnings"),
+        _figures(frame, known, facts),
+        facts,
         RIG=rig_drawing(rig, alpha),
         LEGEND=_depth_legend(known, facts.unit),
     )
 
 
 def filled_page(
-    title: str, hw: Sequence[int], layers: Mapping[str, str], overlays: Mapping[str, str], **parts: str
+    title: str,
+    hw: Sequence[int],
+    layers: Mapping[str, str],
+    overlays: Mapping[str, str],
+    figures: Mapping[str, str],
+    facts: Facts,
+    **parts: str,
 ) -> str:
     """The page with layers to compare and overlays to switch, URLs by name, and its further parts as HTML."""
     h, w = hw
     parts = {"LEGEND": "", **parts, "TITLE": html.escape(title), "RATIO": f"{w} / {h}"}
+    rows = [f"<tr><th>{html.escape(key)}<td>{html.escape(value)}" for key, value in figures.items()]
+    parts["FACTS"] = "\n".join(rows)
+    parts["NOTES"] = _listed("What was found", facts.notes)
+    parts["WARNINGS"] = _listed("Warnings", facts.warnings, kind="warnings")
     parts["LAYERS"] = "\n".join(_layer(name, url) for name, url in layers.items())
     named = {name: html.escape(name) for name in overlays}
     parts["OVERLAYS"] = "\n".join(
@@ -125,7 +139,10 @@ def rig_drawing(rig: Rig, alpha: str) -> str:
     if not cameras:
         return ""
     size = frustum_size(cameras)
-    lines = {name: [line[:, [0, 2]] * (1, -1) for line in frustum(camera, size)] for name, camera in cameras.items()}
+    lines = {
+        name: [line[:, [0, 2]] * (1, -1) for line in frustum(camera, size)]
+        for name, camera in cameras.items()
+    }
     points = np.concatenate([line for some in lines.values() for line in some])
     low, extent = points.min(0), float(np.ptp(points, axis=0).max()) or 1.0
     drawn = []
@@ -134,10 +151,13 @@ def rig_drawing(rig: Rig, alpha: str) -> str:
         drawn += [_polyline((line - low) / extent * 300 + 30, colour) for line in lines[name]]
         x, y = (lines[name][0][0] - low) / extent * 300 + 30
         label = html.escape(name) + (" (alpha)" if name == alpha else "")
-        drawn.append(f'<text x="{x:.1f}" y="{y + 18:.1f}" fill="{colour}" text-anchor="middle">{label}</text>')
+        drawn.append(
+            f'<text x="{x:.1f}" y="{y + 18:.1f}" fill="{colour}" text-anchor="middle">{label}</text>'
+        )
     wide, high = np.ptp(points, axis=0) / extent * 300 + 60
     return (
-        f'<svg viewBox="0 0 {wide:.0f} {high:.0f}" role="img" aria-label="the rig from above">{"".join(drawn)}</svg>'
+        f'<svg viewBox="0 0 {wide:.0f} {high:.0f}" role="img" aria-label="the rig from '
+        f'above">{"".join(drawn)}</svg>'
         "<p>The cameras from above, each with the field of view that it has.</p>"
     )
 
@@ -171,13 +191,9 @@ def _depth_legend(known: Float[Tensor, " n"], unit: str) -> str:
         return ""
     near, far = _range(known)
     return (
-        f'<p class="legend" hidden>depth: near, {near:.3g} {unit} <i></i> far, {far:.3g} {unit}; unknown is black</p>'
+        f'<p class="legend" hidden>depth: near, {near:.3g} {unit} <i></i> far, {far:.3g} {unit}; unknown '
+        "is black</p>"
     )
-
-
-def _shown(image: Float[Tensor, "c h w"]) -> Float[Tensor, "d h w"]:
-    """An image of one channel or three: the mean of any other number of bands."""
-    return image if len(image) in (1, 3) else image.mean(0, keepdim=True)
 
 
 def data_url(image: Float[Tensor, "c h w"]) -> str:
@@ -206,7 +222,7 @@ def _switch(name: str) -> str:
     return f'<label><input type="checkbox" data-overlay="{name}"> {said}</label>'
 
 
-def listed(title: str, lines: Iterable[str], *, kind: str = "notes") -> str:
+def _listed(title: str, lines: Iterable[str], *, kind: str = "notes") -> str:
     """A section of the page with a list; empty without lines."""
     items = "".join(f"<li>{html.escape(line)}" for line in lines)
     return f'<section class="{kind}"><h2>{title}</h2><ul>{items}</ul></section>' if items else ""

@@ -57,18 +57,19 @@ def save_frame(
     name: str = "",
     bands: Sequence[str] = (),
 ) -> list[Path]:
-    """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown), depth_16.png (`write_depth`),
-    depth.png (red is near), depth_nearest.tif and depth_farthest.tif (the true depth is between in 9 of 10 pixels).
+    """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown), depth_16.png
+    (`write_depth`), depth.png (red is near), depth_nearest.tif and depth_farthest.tif (the true depth is
+    between in 9 of 10 pixels).
 
-    8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With `view`, the
-    rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to found_rig.yaml; with
-    `points`, the camera of alpha, the pixels of known depth go to points.ply. With a `name` the files are
-    name_fused.png and so on.
-    Without any known depth there are no depth files. With `bands`, the names of bands that cameras record one by one,
-    each goes to fused_NAME.png and confidence_NAME.png too; bands without names that are not one or three go to
-    fused_1.png and so on. Of other numbers than one and three fused.png is the mean. The image comes last: where it is,
-    the others are of the same frame, and points.ply and the page index.html of a former one are gone. After an error
-    all former files are as they were.
+    8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With
+    `view`, the rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to
+    found_rig.yaml; with `points`, the camera of alpha, the pixels of known depth go to points.ply. With a
+    `name` the files are name_fused.png and so on. Without any known depth there are no depth files. With
+    `bands`, the names of bands that cameras record one by one, each goes to fused_NAME.png and
+    confidence_NAME.png too; bands without names that are not one or three go to fused_1.png and so on. Of
+    other numbers than one and three fused.png is the mean. The image comes last: where it is, the others are
+    of the same frame, and points.ply and the page index.html of a former one are gone. After an error all
+    former files are as they were.
     Returns what was written.
     """
     prefix = f"{name}_" if name else ""
@@ -84,7 +85,9 @@ def save_frame(
                 path = folder / f"{prefix}depth{part}.tif"
                 tasks.append(partial(write_image, path, depth[None], bits=32, unknown=True))
             near = view.depth[0] if view is not None and view.depth else None
-            tasks.append(partial(write_depth, folder / f"{prefix}depth_16.png", frame.depth, near=near and float(near)))
+            tasks.append(
+                partial(write_depth, folder / f"{prefix}depth_16.png", frame.depth, near=near and float(near))
+            )
             tasks.append(lambda: write_image(folder / f"{prefix}depth.png", colour_depth(frame.depth)))
         if view is not None:
             view.save(folder / "view.yaml")
@@ -98,8 +101,7 @@ def save_frame(
             write_image(folder / f"{prefix}fused_{band}.{kind}", values[None], bits=bits)
         for band, confidence in zip(bands, () if frame.by_band is None else frame.by_band):
             write_image(folder / f"{prefix}confidence_{band}.png", confidence[None].float())
-        if len(image) not in (1, 3):
-            image = image.mean(0, keepdim=True)
+        image = picture_of(image)
         tasks.insert(0, partial(write_image, folder / last, image, bits=bits, profile=bits != 32))
         in_parallel(tasks, most=how_many_fit(4 * image.nbytes))
         names = {file.name for file in folder.iterdir()} - {last}
@@ -107,8 +109,8 @@ def save_frame(
 
 
 def band_names(frame: Frame, betas: Iterable[str]) -> list[str]:
-    """The cameras that record a frame's bands one by one, in order; none if its bands are those of colour cameras, or
-    if cameras have several bands each."""
+    """The cameras that record a frame's bands one by one, in order; none if its bands are those of colour
+    cameras, or if cameras have several bands each."""
     names = list(betas)
     return names if frame.by_band is not None and len(names) == len(frame.by_band) else []
 
@@ -122,13 +124,20 @@ def describe_bands(frame: Frame, names: Sequence[str], kind: ImageFormat) -> str
     return f"bands at alpha's view: {listed}; fused.{kind} is {picture}"
 
 
+def picture_of(image: Float[Tensor, "c h w"]) -> Float[Tensor, "d h w"]:
+    """An image of one channel or three: the mean of any other number of bands."""
+    return image if len(image) in (1, 3) else image.mean(0, keepdim=True)
+
+
 def depth_scale(near: float) -> float:
-    """Counts a metre in a depth image of 16 bits: the power of ten with which `near` is at most a twentieth of them."""
+    """Counts a metre in a depth image of 16 bits: the power of ten with which `near` is at most a twentieth
+    of them."""
     return 10.0 ** math.floor(math.log10(MOST / 20 / near))
 
 
 def write_depth(path: Path, depth: Float[Tensor, "h w"], *, near: float | None = None) -> float:
-    """Write depth as a PNG file of 16 bits; returns its counts a metre, by `near` (metres; else the nearest depth).
+    """Write depth as a PNG file of 16 bits; returns its counts a metre, by `near` (metres; else the nearest
+    depth).
 
     The scale is in the file's text chunk "Description". 0 is unknown, 65535 that far or farther.
     """
@@ -165,8 +174,10 @@ class Frame(NamedTuple):
 
     image: (C, H, W), in alpha's coding, not cut to 0..1.
     depth: (H, W), metres along alpha's axis; NaN where no calibrated beta sees the point.
-    confidence: (H, W), the probability that every band's beta sees the point and its position is right to a pixel.
-    half_width: (H, W), 1/metres: in 9 of 10 pixels the true inverse depth is within it of 1 / depth; NaN where that is.
+    confidence: (H, W), the probability that every band's beta sees the point and its position is right to a
+        pixel.
+    half_width: (H, W), 1/metres: in 9 of 10 pixels the true inverse depth is within it of 1 / depth; NaN
+        where that is.
     by_band: (C, H, W), the confidence of each band alone, where each is another beta's; else None.
     """
 
@@ -178,11 +189,14 @@ class Frame(NamedTuple):
 
     @property
     def depth_interval(self) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-        """The nearest and the farthest depth (metres; infinite too) between which the true one is in 9 of 10 pixels."""
+        """The nearest and the farthest depth (metres; infinite too) between which the true one is in 9 of 10
+        pixels."""
         inverse = 1 / self.depth
         farthest = inverse - self.half_width
         beyond = farthest <= 0
-        return 1 / (inverse + self.half_width), torch.where(beyond, torch.inf, 1 / torch.where(beyond, 1.0, farthest))
+        return 1 / (inverse + self.half_width), torch.where(
+            beyond, torch.inf, 1 / torch.where(beyond, 1.0, farthest)
+        )
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Frame:
         """The frame whose every part is changed, such as moved to another device."""
@@ -199,9 +213,9 @@ class Frame(NamedTuple):
 
     def _repr_png_(self) -> bytes:
         """For notebooks: the image and, beside it, depth (red is near) and confidence, as a PNG file."""
-        colours = self.image if len(self.image) == 3 else self.image.mean(0, keepdim=True)
         confidence = self.confidence[None].expand(3, -1, -1)
-        shown = [shrunk(part) for part in (colours.expand(3, -1, -1), colour_depth(self.depth), confidence)]
+        parts = picture_of(self.image).expand(3, -1, -1), colour_depth(self.depth), confidence
+        shown = [shrunk(part) for part in parts]
         values = (torch.cat(shown, -1).clamp(0, 1) * 255).round().to(torch.uint8)
         file = BytesIO()
         Image.fromarray(values.permute(1, 2, 0).numpy()).save(file, format="PNG")

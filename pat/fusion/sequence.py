@@ -66,8 +66,8 @@ SETTINGS = SequenceSettings()
 
 
 class KeyColour(NamedTuple):
-    """What fusion adds to alpha at a key frame (C, H, W), with confidence (H, W), and inverse depth (0: unknown) with
-    its half-width as of `Frame` (2, H, W)."""
+    """What fusion adds to alpha at a key frame (C, H, W), with confidence (H, W), and inverse depth (0:
+    unknown) with its half-width as of `Frame` (2, H, W)."""
 
     added: Float[Tensor, "c h w"]
     confidence: Float[Tensor, "h w"]
@@ -137,7 +137,9 @@ class SequenceFusion:
         could.
         """
         own = self.grey(i)
-        sources = [self._warped(i, own, key, colour) for key in self._around(i, keys) if (colour := fetch(key))]
+        sources = [
+            self._warped(i, own, key, colour) for key in self._around(i, keys) if (colour := fetch(key))
+        ]
         if not sources:
             raise ValueError(f"frame {i}: none of the key frames around it could be fused")
         return mixed(self.base(i), sources)
@@ -247,7 +249,10 @@ class SequenceFusion:
 
     def _images_at(self, key: KeyFrame) -> dict[str, Tensor]:
         """Alpha's image and those of the betas, as recorded."""
-        return {self.alpha: self.recorded(key.alpha), **{name: self.frames[name][j] for name, j in key.betas.items()}}
+        return {
+            self.alpha: self.recorded(key.alpha),
+            **{name: self.frames[name][j] for name, j in key.betas.items()},
+        }
 
     def _found_at(self, key: KeyFrame) -> Corrections:
         gaps = (self._time(key.alpha) - self.timeline.time(name, j) for name, j in key.betas.items())

@@ -77,18 +77,20 @@ def _as_it_is(frame: Frame) -> Frame:
 
 @dataclass(frozen=True)
 class Undistort:
-    """Pinhole views in place of views with lenses (up to 62 degrees off axis), unless a field goes through lenses, or
-    a camera has no pinhole view.
+    """Pinhole views in place of views with lenses (up to 62 degrees off axis), unless a field goes through
+    lenses, or a camera has no pinhole view.
 
-    Undone, the frame is at alpha's own pixels: the fusion's difference from alpha is resampled and added to alpha's
-    own image, and what the pinhole view leaves out has confidence 0.
+    Undone, the frame is at alpha's own pixels: the fusion's difference from alpha is resampled and added to
+    alpha's own image, and what the pinhole view leaves out has confidence 0.
     """
 
     def do(self, views: Views) -> Done:
         """Resample every image with a lens."""
         cameras = [views.rig[name] for name in views.images]
-        as_recorded = any(map(_through_lenses, views.fields.values())) or not all(c.has_pinhole_view for c in cameras)
-        if as_recorded or not any(map(_has_lens, cameras)):
+        as_recorded = any(
+            isinstance(innermost(f), Curved | ThroughLenses) for f in views.fields.values()
+        ) or not all(c.has_pinhole_view for c in cameras)
+        if as_recorded or not any(map(has_lens, cameras)):
             return Done(views, _as_it_is)
         rig, images = without_lenses(views.rig, views.images)
         lens, pinhole = views.rig[views.alpha], rig[views.alpha]
@@ -100,10 +102,12 @@ class Undistort:
 
 @dataclass(frozen=True)
 class LinearLuminance:
-    """The result as bright as alpha's camera saw it, if that measured the luminance of light (`as_bright`)."""
+    """The result as bright as alpha's camera saw it, if that measured the luminance of light
+    (`as_bright`)."""
 
     def do(self, views: Views) -> Done:
-        """Leave the views as they are; undone, a frame in the colours of RGB betas is made as bright as alpha."""
+        """Leave the views as they are; undone, a frame in the colours of RGB betas is made as bright as
+        alpha."""
         own, sensor = views.own, views.rig[views.alpha].sensor
         if sensor.response != LIGHT or 3 not in [views.images[name].shape[0] for name in views.betas]:
             return Done(views, _as_it_is)
@@ -126,7 +130,8 @@ class Upright:
 
 @dataclass(frozen=True)
 class EqualResolution:
-    """Betas at about alpha's angular resolution where the views meet, without large parts that alpha cannot see."""
+    """Betas at about alpha's angular resolution where the views meet, without large parts that alpha cannot
+    see."""
 
     network: FusionNetwork
 
@@ -137,7 +142,8 @@ class EqualResolution:
         return Done(views, _as_it_is)
 
     def _cropped(self, views: Views, name: str) -> Views:
-        """A calibrated beta without what no search segment touches, if that is much: it would be enlarged for nothing.
+        """A calibrated beta without what no search segment touches, if that is much: it would be enlarged for
+        nothing.
 
         Not where the field may depend on the images' sizes.
         """
@@ -147,7 +153,9 @@ class EqualResolution:
         if not follows or pair.link is not None or not pair.calibrated or resolution_ratio(pair) > 0.8:
             return views
         found = (field or default_field(pair))(pair, coarse_grid(pair.alpha.hw).reshape(-1, 2))
-        top, bottom, left, right = box_around(ends_of(found), (h, w), self.network.beta_halo, self.network.multiple)
+        top, bottom, left, right = box_around(
+            ends_of(found), (h, w), self.network.beta_halo, self.network.multiple
+        )
         if (bottom - top) * (right - left) > 0.75 * h * w:
             return views
         rig = views.rig.transformed(name, shift_matrix(left, top), (bottom - top, right - left))
@@ -158,7 +166,8 @@ class EqualResolution:
 class Radiometry:
     """Each beta with alpha's mean and standard deviation: for cameras of other exposures or filters.
 
-    `undone`: bands have their own scale in the result, as measurements need it; else that is as bright as alpha.
+    `undone`: bands have their own scale in the result, as measurements need it; else that is as bright as
+    alpha.
     """
 
     undone: bool = False
@@ -182,7 +191,8 @@ class Radiometry:
 
 @dataclass(frozen=True)
 class JoinBands:
-    """Betas that differ at most in their sensors as one of several bands; undone, bands are in the rig's order."""
+    """Betas that differ at most in their sensors as one of several bands; undone, bands are in the rig's
+    order."""
 
     which: JoinsBands
 
@@ -231,7 +241,8 @@ def _band_order(names: Sequence[str], groups: Sequence[Sequence[str]], bands: Ma
 
 
 def without_lenses(rig: Rig, images: Images) -> tuple[Rig, dict[str, Tensor]]:
-    """The rig and its images with pinhole views in place of cameras with lenses; see `arraygeom.pinhole_view`."""
+    """The rig and its images with pinhole views in place of cameras with lenses; see
+    `arraygeom.pinhole_view`."""
     straight = dict(images)
     for name, image in images.items():
         camera = rig[name]
@@ -242,14 +253,23 @@ def without_lenses(rig: Rig, images: Images) -> tuple[Rig, dict[str, Tensor]]:
     return rig, straight
 
 
-def _has_lens(view: View) -> bool:
+def has_lens(view: View) -> bool:
+    """Whether a camera's pixels are not those of a pinhole."""
     return isinstance(view, LensView) and view.distortion is not None
 
 
-def _through_lenses(field: ReceptiveField | None) -> bool:
+def innermost(field: ReceptiveField | None) -> ReceptiveField | None:
+    """The field that is widened or moved, if it is."""
     while isinstance(field, Widened | Moved):
         field = field.field
-    return isinstance(field, Curved | ThroughLenses)
+    return field
+
+
+def undone(frame: Frame, undo: Sequence[Undo]) -> Frame:
+    """A frame taken back to what it was before the steps."""
+    for back in undo:
+        frame = back(frame)
+    return frame
 
 
 def _for_pinhole(field: ReceptiveField | None, lens: View, pinhole: View) -> ReceptiveField | None:
@@ -280,7 +300,9 @@ def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens:
     half_width = torch.where(known, half_width, torch.nan)
     by_band = frame.by_band
     if by_band is not None:
-        bands = [resampled(b[None].float(), pinhole, lens, interpolation="bilinear").values[0, 0] for b in by_band]
+        bands = [
+            resampled(b[None].float(), pinhole, lens, interpolation="bilinear").values[0, 0] for b in by_band
+        ]
         by_band = torch.stack([band.to(by_band) for band in bands])
     return Frame(own + back[:-1], depth, back[-1], half_width, by_band)
 
@@ -295,7 +317,8 @@ def _resized(views: Views, name: str) -> Views:
 
 
 def at_alphas_resolution(image: Float[Tensor, "c h w"], pair: Pair) -> Float[Tensor, "c h2 w2"]:
-    """Beta's image with pixels of about the size of alpha's where the views meet; as it is where they nearly are."""
+    """Beta's image with pixels of about the size of alpha's where the views meet; as it is where they nearly
+    are."""
     scale, (h, w) = resolution_ratio(pair), pair.beta.hw
     if 0.8 < scale < 1.25:
         return image
@@ -305,7 +328,8 @@ def at_alphas_resolution(image: Float[Tensor, "c h w"], pair: Pair) -> Float[Ten
 
 
 def resolution_ratio(pair: Pair) -> float:
-    """Pixels of beta to a pixel of alpha, by the pair's rough homography at the middle of alpha; 1 if undefined."""
+    """Pixels of beta to a pixel of alpha, by the pair's rough homography at the middle of alpha; 1 if
+    undefined."""
     steps = _steps_in_beta(pair)
     area = 0.0 if steps is None else abs(float(torch.linalg.det(steps)))
     return math.sqrt(area) if area > 0 else 1.0
@@ -321,7 +345,8 @@ def quarter_turns(pair: Pair) -> int:
 
 
 def _steps_in_beta(pair: Pair) -> Float[Tensor, "2 2"] | None:
-    """What a pixel to the right and one down from the middle of alpha are in beta, by the pair's rough homography."""
+    """What a pixel to the right and one down from the middle of alpha are in beta, by the pair's rough
+    homography."""
     h, w = pair.alpha.hw
     middle = torch.tensor([[(w - 1) / 2, (h - 1) / 2]], dtype=torch.float64)
     steps = torch.cat([middle, middle + torch.tensor([[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)])

@@ -28,8 +28,8 @@ from .inputs import FrameInputs
 from .results import Frame
 
 MAX_HALO = 224
-"""The widest halo, pixels: what is farther off changes images by at most 2.2e-6 with trained weights (at 192 pixels
-3e-5, at 160 2e-4; measured on three scenes), however far their convolutions reach."""
+"""The widest halo, pixels: what is farther off changes images by at most 2.2e-6 with trained weights (at 192
+pixels 3e-5, at 160 2e-4; measured on three scenes), however far their convolutions reach."""
 LIBRARIES = 0.46 * 2**30
 """What Python, torch and the compiled loops take, bytes (430 MiB were measured)."""
 SLACK = 1.05
@@ -47,14 +47,15 @@ PROBE = (192, 512)
 ESTIMATED = 4_000_000
 """Alpha's pixels from which the time is estimated: smaller frames take seconds, and so does estimating."""
 LARGE = 16 * PROBE[0] ** 2
-"""Alpha's pixels from which a piece is fused to know the memory of matches, and the planned memory is kept to."""
+"""Alpha's pixels from which a piece is fused to know the memory of matches, and the planned memory is kept
+to."""
 PROBED = 1 / 40
 """The part of alpha that the piece is between these."""
 
 
 class Plan(NamedTuple):
-    """How a frame will be fused: tiles, memory of the process at most (bytes), time, if estimated (seconds), and in
-    how many pieces it is matched first."""
+    """How a frame will be fused: tiles, memory of the process at most (bytes), time, if estimated (seconds),
+    and in how many pieces it is matched first."""
 
     tiles: list[Tile]
     memory: float
@@ -85,11 +86,12 @@ def plan_frame(
     after: float = 0.0,
     kept: float = 0.0,
 ) -> Plan:
-    """The tiles under a limit of memory (bytes); with `estimate`, the time of a large frame by fusing a piece.
+    """The tiles under a limit of memory (bytes); with `estimate`, the time of a large frame by fusing a
+    piece.
 
-    `before` is the share of the frame's work that is done beforehand, by which the time is longer, and `after` are
-    seconds that follow. `stored` says that finished tiles are stored on disk until all are there. `kept` are bytes that
-    the caller holds beside the frame.
+    `before` is the share of the frame's work that is done beforehand, by which the time is longer, and
+    `after` are seconds that follow. `stored` says that finished tiles are stored on disk until all are there.
+    `kept` are bytes that the caller holds beside the frame.
     Raises ValueError as `tiles_within`.
     """
     pieces = frame.inputs.pieces
@@ -100,7 +102,9 @@ def plan_frame(
     matching = MATCHING_BYTES * max(area(tile.outer) for tile in pieces) if network.uses_matches else 0.0
     tiles = tiles_within(network, frame, limit, held, matching)
     work = max(matching, *(working_memory(network, frame.inputs, tile) for tile in tiles))
-    held = max(held + work, LIBRARIES + kept + math.prod(frame.hw) * (frame_bytes(frame.inputs) + WRITING_BYTES))
+    held = max(
+        held + work, LIBRARIES + kept + math.prod(frame.hw) * (frame_bytes(frame.inputs) + WRITING_BYTES)
+    )
     seconds = (1 + before) * probe.seconds(pieces, tiles) + after if probe else None
     return Plan(tiles, SLACK * held, seconds, len(pieces))
 
@@ -108,10 +112,11 @@ def plan_frame(
 def tiles_within(
     network: FusionNetwork, frame: FrameInputs, limit: float | None, held: float = 0.0, matching: float = 0.0
 ) -> list[Tile]:
-    """The tiles with the least work (their halos overlap) of which none takes more than `limit` without `held` bytes.
+    """The tiles with the least work (their halos overlap) of which none takes more than `limit` without
+    `held` bytes.
 
-    One tile if the whole frame does not. Raises ValueError if not even tiles of 64 pixels fit, or matching, which
-    takes `matching` bytes, does not.
+    One tile if the whole frame does not. Raises ValueError if not even tiles of 64 pixels fit, or matching,
+    which takes `matching` bytes, does not.
     """
     one = whole(frame.hw)
     if limit is None:
@@ -130,20 +135,27 @@ def tiles_within(
             return tiles
     least = max(map(memory, tiles_of(frame.hw, 64, halo)))
     needed = SLACK * (held + max(least, matching)) / 2**20
-    raise ValueError(f"max_memory is {limit / 2**20:.0f} MiB; this frame and network need at least {needed:.0f} MiB")
+    raise ValueError(
+        f"max_memory is {limit / 2**20:.0f} MiB; this frame and network need at least {needed:.0f} MiB"
+    )
 
 
 def working_memory(network: FusionNetwork, inputs: Inputs, tile: Tile) -> float:
-    """Bytes that a tile takes: those for its part of alpha and for the part of each beta that its segments touch."""
+    """Bytes that a tile takes: those for its part of alpha and for the part of each beta that its segments
+    touch."""
     betas = [area(inputs.touched(beta, tile.outer, 16)) for beta in inputs.betas]
     return network.working_bytes(area(tile.outer), betas)
 
 
 def held_memory(frame: FrameInputs, matches: float, *, whole_frame: bool) -> float:
-    """Bytes of the process that do not depend on the tiles: libraries, images, fields, `matches` for each pixel, and
-    the fused frame if it is kept in memory."""
+    """Bytes of the process that do not depend on the tiles: libraries, images, fields, `matches` for each
+    pixel, and the fused frame if it is kept in memory."""
     pixels = math.prod(frame.hw)
-    return LIBRARIES + frame.inputs.nbytes + pixels * (matches + (frame_bytes(frame.inputs) if whole_frame else 0.0))
+    return (
+        LIBRARIES
+        + frame.inputs.nbytes
+        + pixels * (matches + (frame_bytes(frame.inputs) if whole_frame else 0.0))
+    )
 
 
 def frame_bytes(inputs: Inputs) -> float:
@@ -154,8 +166,8 @@ def frame_bytes(inputs: Inputs) -> float:
 
 
 class Probe(NamedTuple):
-    """What a piece from the middle of alpha took, for each of its pixels: bytes of its matches, seconds of matching and
-    of fusing."""
+    """What a piece from the middle of alpha took, for each of its pixels: bytes of its matches, seconds of
+    matching and of fusing."""
 
     matches: float
     matching: float
@@ -197,9 +209,9 @@ def _to_multiple(box: Box, multiple: int) -> Box:
 
 
 class FusedTile(NamedTuple):
-    """The inner part of a tile: image (C, h, w), depth, confidence and half-width (h, w) as of `Frame`, and where its
-    pixels were found in each whole beta, (betas, 3, h, w): x, y and the confidence of that; `by_band` as of `Frame`, or
-    empty."""
+    """The inner part of a tile: image (C, h, w), depth, confidence and half-width (h, w) as of `Frame`, and
+    where its pixels were found in each whole beta, (betas, 3, h, w): x, y and the confidence of that;
+    `by_band` as of `Frame`, or empty."""
 
     image: Tensor
     depth: Tensor
@@ -231,11 +243,14 @@ def _fused(
     part = replace(inputs, betas=tuple(replace(beta, field=beta.field.cut(box)) for beta in inputs.betas))
     hw = bottom - top, right - left
     depth, half_width, confidence = measured_depth(output, part, frame.placements, hw, (left, top))
-    return FusedTile(output.image[0], depth, confidence, half_width, _found(output, part), _by_band(output, part))
+    return FusedTile(
+        output.image[0], depth, confidence, half_width, _found(output, part), _by_band(output, part)
+    )
 
 
 def _by_band(output: FusionOutput, part: Inputs) -> Tensor:
-    """The confidence of each band (C, h, w) as float16, where each is another beta's; else none, (0, h, w)."""
+    """The confidence of each band (C, h, w) as float16, where each is another beta's; else none, (0, h,
+    w)."""
     bands = [beta.image.shape[1] for beta in part.betas]
     if len(bands) == 1 or sum(bands) != output.image.shape[1]:
         return output.image[0, :0].half()
@@ -259,8 +274,8 @@ def fused_in_tiles(
     progress: Callable[[Iterable[Tile], int], Iterable[Tile]] | None = None,
     store: Path | None = None,
 ) -> FusedTile:
-    """The frame put together from its tiles, or from a folder where finished tiles are; without what was `found` in the
-    betas (it takes 12 bytes a pixel and beta) if that is not asked for."""
+    """The frame put together from its tiles, or from a folder where finished tiles are; without what was
+    `found` in the betas (it takes 12 bytes a pixel and beta) if that is not asked for."""
 
     def make(tile: Tile) -> FusedTile:
         made = fuse_tile(network, frame, matches, tile)

@@ -32,7 +32,9 @@ class Timeline:
     def __post_init__(self) -> None:
         for name, count in self.counts.items():
             if self.rig[name].sensor.frame_rate is None:
-                raise ValueError(f"the frame rate of '{name}' is not known: add 'frame_rate' to it in the rig")
+                raise ValueError(
+                    f"the frame rate of '{name}' is not known: add 'frame_rate' to it in the rig"
+                )
             if count < 1:
                 raise ValueError(f"no frames of '{name}'")
         if self.alpha not in self.counts:
@@ -78,7 +80,9 @@ class Timeline:
             if gap <= 0.5 * self.interval + 1e-9:
                 found[index] = min(gap, found.get(index, gap))
         if not found:
-            raise ValueError("no frame of a beta is near one of alpha in time: check 'frame_rate' and 'time_offset'")
+            raise ValueError(
+                "no frame of a beta is near one of alpha in time: check 'frame_rate' and 'time_offset'"
+            )
         return [KeyFrame(i, self.at(i)) for i in sorted(found)]
 
     def at(self, index: int) -> dict[str, int]:

@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -26,7 +25,8 @@ Fields = Mapping[str, ReceptiveField | None]
 
 @dataclass(frozen=True)
 class Views:
-    """What is fused: images (C, H, W) by camera, the rig that describes them, the camera alpha, the betas' fields."""
+    """What is fused: images (C, H, W) by camera, the rig that describes them, the camera alpha, the betas'
+    fields."""
 
     rig: Rig
     images: Mapping[str, Tensor]
@@ -47,8 +47,9 @@ class Views:
     ) -> Views:
         """Check names and images; each is asked for once, and alpha made grey.
 
-        Raises ValueError for a camera that the rig lacks, no image of alpha or of any beta, an image of another size
-        than the rig says, of another type, or with values that are not finite or far outside 0..1.
+        Raises ValueError for a camera that the rig lacks, no image of alpha or of any beta, an image of
+        another size than the rig says, of another type, or with values that are not finite or far outside
+        0..1.
         """
         for name in (alpha, *images):
             rig.require(name)
@@ -56,7 +57,9 @@ class Views:
             raise ValueError(f"no image of alpha, '{alpha}'")
         names = [name for name in rig.betas(alpha) if name in images]
         if not names:
-            raise ValueError(f"no image of any other camera than alpha, '{alpha}': fusion needs at least one beta")
+            raise ValueError(
+                f"no image of any other camera than alpha, '{alpha}': fusion needs at least one beta"
+            )
         checked = {name: _checked(rig, images, name) for name in (alpha, *names)}
         fields = field if isinstance(field, Mapping) else dict.fromkeys(names, field)
         rig = rig if depth is None else rig.replace(depth=depth)
@@ -83,12 +86,13 @@ class Views:
 
 
 LARGEST_VALUE = 32.0
-"""Of an image in 0..1: developed ones of a short exposure exceed 1, and those of 8 bits have values to 255."""
+"""Of an image in 0..1: developed ones of a short exposure exceed 1, and those of 8 bits have values to
+255."""
 
 
 def is_in_colour(image: Float[Tensor, "c h w"]) -> bool:
     """Whether an image has three bands that are not all equal."""
-    return len(image) == 3 and not (torch.equal(image[0], image[1]) and torch.equal(image[0], image[2]))
+    return len(image) == 3 and not all(torch.equal(image[0], band) for band in image[1:])
 
 
 def grey_alpha(name: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "1 h w"]:
@@ -113,15 +117,10 @@ def _checked(rig: Rig, images: Images, name: str) -> Tensor:
     if not math.isfinite(largest):
         raise ValueError(f"the image of '{name}' has NaN or infinite values")
     if largest > LARGEST_VALUE:
-        raise ValueError(f"the image of '{name}' has values up to {largest:g}: divide them, images are in 0..1")
+        raise ValueError(
+            f"the image of '{name}' has values up to {largest:g}: divide them, images are in 0..1"
+        )
     return image
-
-
-class DevelopedImages(NamedTuple):
-    """Images ready to fuse, and the rig that describes them."""
-
-    rig: Rig
-    images: dict[str, Tensor]
 
 
 KEPT = 4_000_000
@@ -131,7 +130,7 @@ KEPT = 4_000_000
 class ViewFiles(Mapping[str, Tensor]):
     """An image file of each camera, read and developed when asked for; kept if it is small (`KEPT`).
 
-    Asking raises as `read_views` does.
+    Asking raises as `read_view` does.
     """
 
     def __init__(self, rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> None:
@@ -164,18 +163,16 @@ class ViewFiles(Mapping[str, Tensor]):
 def read_view(rig: Rig, name: str, path: str | Path, *, like: Sensor) -> Float[Tensor, "c h w"]:
     """Read and develop the image of one camera, on the scale of light of the sensor `like`.
 
-    Raises ValueError or FileNotFoundError naming the camera and the file for what cannot be read, has another size
-    than the rig says, or is in colour where the rig says raw.
+    Raises ValueError or FileNotFoundError naming the camera and the file for what cannot be read, has another
+    size than the rig says, or is in colour where the rig says raw.
     """
     view = rig[name]
     raw = view.sensor.bayer is not None
-    image = read_image(path, name=name, bits=view.sensor.bits, hw=view.hw, orientation="ignore" if raw else "apply")
+    image = read_image(
+        path, name=name, bits=view.sensor.bits, hw=view.hw, orientation="ignore" if raw else "apply"
+    )
     if view.sensor.bayer and image.shape[0] != 1:
-        raise ValueError(f"{name}: {path}: is in colour, and the rig says raw {view.sensor.bayer}: drop 'bayer'")
+        raise ValueError(
+            f"{name}: {path}: is in colour, and the rig says raw {view.sensor.bayer}: drop 'bayer'"
+        )
     return develop(image, view.sensor, like=like)
-
-
-def read_views(rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> DevelopedImages:
-    """Read one image of each camera and develop it; raises as `read_view` does."""
-    views = ViewFiles(rig, files, alpha=alpha)
-    return DevelopedImages(views.developed, dict(views))

@@ -1,9 +1,9 @@
 """How certain matches are: the probability of each, and how far from it the true position may be.
 
-Both are read off what matching found: its facts at a pixel and around it, how much disparities differ there, by
-how much one image had to be blurred to be compared, and what facts the pair's consistent matches have. A small
-network does it, which was fitted to pairs with true disparity (`python -m pat.evaluation.certainty`). It knows
-nothing of the image, so it holds for any network that uses the matches.
+Both are read off what matching found: its facts at a pixel and around it, how much disparities differ there,
+by how much one image had to be blurred to be compared, and what facts the pair's consistent matches have. A
+small network does it, which was fitted to pairs with true disparity (`python -m pat.evaluation.certainty`).
+It knows nothing of the image, so it holds for any network that uses the matches.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ FITTED = Path(__file__).with_name("certainty.safetensors")
 class CertaintySettings:
     """What certainty is read off."""
 
-    around: tuple[int, int] = size((2, 6), "Radii, at half the size, around a pixel in which facts are averaged")
+    around: tuple[int, int] = size(
+        (2, 6), "Radii, at half the size, around a pixel in which facts are averaged"
+    )
     apart: tuple[int, int] = size((1, 4), "Radii, at full size, in which disparities are compared")
     width: int = size(16, "Numbers in each of the two hidden layers")
     covered: float = size(0.9, "The share of true positions that an interval is to cover")
@@ -75,8 +77,8 @@ def fitted_network() -> CertaintyNetwork:
 def with_certainty(inputs: Inputs, matches: Matches) -> Matches:
     """The matches, with the certainty of each.
 
-    Of matches on which several betas agree, whose certainty alone was known before: a beta sees a point only if both
-    say so.
+    Of matches on which several betas agree, whose certainty alone was known before: a beta sees a point only
+    if both say so.
     """
     return Matches(tuple(_judged(inputs, found) for found in matches.betas))
 

@@ -27,7 +27,7 @@ from .matches import BetaMatches, Matches, is_consistent
 from .normalisation import SETTINGS as NORMALISATION
 from .normalisation import Normalisation, combined_bands, explained_share, normalised
 from .positions import at_matches
-from .radiometry import SpectralMix
+from .spectral_mix import SpectralMix
 
 FILLS = 2
 """Size: ways in which colour is diffused, along its regression on brightness, and as it is."""
@@ -37,14 +37,20 @@ FILLS = 2
 class ColourTransferSettings:
     """Brightness is 0 to 1. Middlebury and SYNTIM are the pairs of their tune halves."""
 
-    likeness: float = tuned(0.08, "Middlebury: difference of brightness at which the weight of a match falls to 1 / e")
-    inconsistent: float = tuned(0.25, "Middlebury: weight of a match that is not consistent, before the likeness")
+    likeness: float = tuned(
+        0.08, "Middlebury: difference of brightness at which the weight of a match falls to 1 / e"
+    )
+    inconsistent: float = tuned(
+        0.25, "Middlebury: weight of a match that is not consistent, before the likeness"
+    )
     fill: tuple[float, float] = tuned(
         (300.0, 3.0),
         "Source not recorded: strength, and 8-bit difference that counts as an edge, of the smoothing that "
         "diffuses colour",
     )
-    surroundings: int = tuned(24, "Middlebury: within how many pixels the brightness of both views is compared")
+    surroundings: int = tuned(
+        24, "Middlebury: within how many pixels the brightness of both views is compared"
+    )
     saturation: float = tuned(0.6, "Middlebury: the power of its ratio by which colour grows")
     most_brighter: float = size(
         2.0, "Matched surroundings whose brightness differs by a larger factor are of different things"
@@ -52,7 +58,9 @@ class ColourTransferSettings:
     detail_radius: int = tuned(
         2, "Source not recorded: window of the regression that gives matched colour the detail that beta lost"
     )
-    floor: float = tuned(1e-4, "Middlebury: regulariser of colour's regressions on brightness, a variance of that")
+    floor: float = tuned(
+        1e-4, "Middlebury: regulariser of colour's regressions on brightness, a variance of that"
+    )
     radius_of_blur: float = tuned(
         1.5,
         "Middlebury, reduced 4 and 8 times: the window's radius for each pixel of standard deviation by "
@@ -64,10 +72,13 @@ class ColourTransferSettings:
         "brightness differs by",
     )
     texture_share: float = tuned(0.6, "SYNTIM and Middlebury: texture's share that is taken off that")
-    lowest: float = tuned(0.1, "SYNTIM and Middlebury: the quantile of either that is taken for where there is least")
+    lowest: float = tuned(
+        0.1, "SYNTIM and Middlebury: the quantile of either that is taken for where there is least"
+    )
     least_noise: float = size(
         2e-5,
-        "Less variance than this, two thirds of a level of 8 bits in each band, is left; taking it out takes time",
+        "Less variance than this, two thirds of a level of 8 bits in each band, is left; taking it "
+        "out takes time",
     )
     most_detail: float = size(0.2, "Differences of brightness beyond this are no detail that beta lost")
 
@@ -82,9 +93,9 @@ SETTINGS = ColourTransferSettings()
 def transferred(inputs: Inputs, found: Matches) -> Matches:
     """The matches with beta's bands at them; those of matches from elsewhere, too.
 
-    Of betas that agree on depth, those that have all of the result's bands share the colour that is diffused; any other
-    has its own. With gradients if images or fields have some and gradients are recorded. Raises ValueError for matches
-    of another size or number of betas.
+    Of betas that agree on depth, those that have all of the result's bands share the colour that is diffused;
+    any other has its own. With gradients if images or fields have some and gradients are recorded. Raises
+    ValueError for matches of another size or number of betas.
     """
     found.check(inputs.hw, len(inputs.betas))
     agree, large = inputs.can_agree, len(inputs.pieces) > 1
@@ -102,7 +113,8 @@ def transferred(inputs: Inputs, found: Matches) -> Matches:
 
 
 def _transferred_piece(piece: Inputs, found: Matches, sharing: Sequence[bool]) -> list[Tensor]:
-    """The diffused colour that betas share, if any do, that of each other beta, and each beta's bands minus alpha."""
+    """The diffused colour that betas share, if any do, that of each other beta, and each beta's bands minus
+    alpha."""
     alpha = piece.alpha
     alone = [transferred_bands(alpha, *one) for one in zip(piece.betas, found.betas)]
     shared = []
@@ -111,7 +123,9 @@ def _transferred_piece(piece: Inputs, found: Matches, sharing: Sequence[bool]) -
         weights = [weight * math.exp(prior) for _, weight, prior in counting]
         mixed = sum(w * colour for w, (colour, _, _) in zip(weights, counting)) / torch.stack(weights).sum(0)
         shared = [diffused_from(mixed, alpha, torch.stack([weight for _, weight, _ in counting]).amax(0))]
-    own = [diffused_from(colour, alpha, weight) for (colour, weight), counts in zip(alone, sharing) if not counts]
+    own = [
+        diffused_from(colour, alpha, weight) for (colour, weight), counts in zip(alone, sharing) if not counts
+    ]
     return [*shared, *own, *(colour for colour, _ in alone)]
 
 
@@ -136,7 +150,9 @@ def matched_colours(
     """Beta's bands minus alpha at the matches, colour as in alpha's light, with the detail that alpha has and
     beta has not; their weight, 0 to 1."""
     bands = beta.shape[1]
-    seen, valid = at_matches(torch.cat([beta, guide, normalisation.normalised(guide)], 1), segments, disparity)
+    seen, valid = at_matches(
+        torch.cat([beta, guide, normalisation.normalised(guide)], 1), segments, disparity
+    )
     values, own, brightness = seen.split([bands, 1, 1], 1)
     consistent = is_consistent(facts)
     brightness = normalised(brightness, alpha, valid * consistent, largest_gain=NORMALISATION.largest_gain)
@@ -145,8 +161,13 @@ def matched_colours(
     if bands > 1:
         colour, bright = _scaled_to_alpha(values - own, own, alpha, weight)
         noise = colour_noise(brightness - soft, soft, weight * consistent)
-        colour = _without_noise(colour, bright, noise) if float(noise.amax()) > SETTINGS.least_noise else colour
-        radii = [max(SETTINGS.detail_radius, round(SETTINGS.radius_of_blur * blur)) for blur in normalisation.blurs[0]]
+        colour = (
+            _without_noise(colour, bright, noise) if float(noise.amax()) > SETTINGS.least_noise else colour
+        )
+        radii = [
+            max(SETTINGS.detail_radius, round(SETTINGS.radius_of_blur * blur))
+            for blur in normalisation.blurs[0]
+        ]
         detailed = _each_detailed(colour, bright, alpha, radii)
         matched = torch.lerp(colour, detailed, explained_share(own, soft, valid * consistent)) + own - alpha
     else:
@@ -155,9 +176,11 @@ def matched_colours(
 
 
 @torch.no_grad()
-def _colours_of_bands(alpha: Tensor, beta: Beta, found: BetaMatches, mix: SpectralMix) -> tuple[Tensor, Tensor]:
-    """The bands minus alpha at matches that the mix has found, with the detail that alpha has and they have not; their
-    weight, 0 to 1."""
+def _colours_of_bands(
+    alpha: Tensor, beta: Beta, found: BetaMatches, mix: SpectralMix
+) -> tuple[Tensor, Tensor]:
+    """The bands minus alpha at matches that the mix has found, with the detail that alpha has and they have
+    not; their weight, 0 to 1."""
     values, valid = at_matches(beta.image, beta.field.straight, found.disparity)
     brightness, soft = mix.of(values), found.comparison.whole.softened(alpha)
     gain = mix.gain[:, None, None, None].to(alpha)
@@ -168,10 +191,13 @@ def _colours_of_bands(alpha: Tensor, beta: Beta, found: BetaMatches, mix: Spectr
     return colours, match_weight(brightness - soft, is_consistent(found.facts), valid)
 
 
-def _scaled_to_alpha(colour: Tensor, brightness: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+def _scaled_to_alpha(
+    colour: Tensor, brightness: Tensor, alpha: Tensor, weight: Tensor
+) -> tuple[Tensor, Tensor]:
     """Colour differences (B, C, H, W) and brightness of beta, larger where alpha is brighter around a pixel.
 
-    What a lens or the light makes brighter keeps its saturation, a reflection does not: the power is in between.
+    What a lens or the light makes brighter keeps its saturation, a reflection does not: the power is in
+    between.
     """
     least, most = 1e-3, SETTINGS.most_brighter
     own, other = (box_mean(image * weight, SETTINGS.surroundings) + least for image in (alpha, brightness))
@@ -179,7 +205,9 @@ def _scaled_to_alpha(colour: Tensor, brightness: Tensor, alpha: Tensor, weight: 
     return colour * ratio**SETTINGS.saturation, brightness * ratio
 
 
-def match_weight(unlike: Float[Tensor, "b 1 h w"], consistent: Tensor, valid: Tensor) -> Float[Tensor, "b 1 h w"]:
+def match_weight(
+    unlike: Float[Tensor, "b 1 h w"], consistent: Tensor, valid: Tensor
+) -> Float[Tensor, "b 1 h w"]:
     """The weight of a match whose brightness differs from alpha's by `unlike`; always more than 0."""
     least = SETTINGS.inconsistent
     return (least + (1 - least) * consistent) * valid * likeness(unlike, SETTINGS.likeness) + 1e-4
@@ -210,7 +238,9 @@ def colour_noise(
     fine = box_mean((parts - box_mean(parts, radius)).square(), radius)
     fine = torch.where(weight > 0.5, fine, torch.nan)[..., ::4, ::4].flatten(2)
     least, of_texture = fine.nanquantile(SETTINGS.lowest, 2).nan_to_num(0.0).split(1, 1)
-    return (SETTINGS.noise_share * (least - SETTINGS.texture_share * of_texture)).clamp(min=0)[..., None, None]
+    return (SETTINGS.noise_share * (least - SETTINGS.texture_share * of_texture)).clamp(min=0)[
+        ..., None, None
+    ]
 
 
 def _without_noise(colour: Tensor, brightness: Tensor, noise: Tensor) -> Tensor:
@@ -230,7 +260,9 @@ def _each_detailed(colour: Tensor, brightness: Tensor, alpha: Tensor, radii: Seq
     return torch.cat([_detailed(c, b, a, radius) for c, b, a, radius in parts])
 
 
-def _detailed(colour: Tensor, brightness: Tensor, alpha: Tensor, radius: int = SETTINGS.detail_radius) -> Tensor:
+def _detailed(
+    colour: Tensor, brightness: Tensor, alpha: Tensor, radius: int = SETTINGS.detail_radius
+) -> Tensor:
     """Colour (B, C, H, W) moved along its local regression on brightness by what alpha's brightness has
     beyond it."""
     return colour + local_slope(colour, brightness, radius) * SETTINGS.detail(alpha - brightness)
@@ -243,9 +275,9 @@ def local_slope(
 ) -> Float[Tensor, "b c h w"]:
     """The slope of the regression of colour on brightness around each pixel.
 
-    The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its resolution.
-    The less of colour's variance the regression explains, the flatter it is: few of a window's pixels are
-    independent, so that even noise seems to be explained in part.
+    The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its
+    resolution. The less of colour's variance the regression explains, the flatter it is: few of a window's
+    pixels are independent, so that even noise seems to be explained in part.
     """
     local = LocalMoments.within(radius, colour, brightness)
     variances = (local.variance_of_image + 1e-6) * (local.variance_of_bands + 1e-6)
@@ -271,5 +303,7 @@ def _diffused(
     out = np.empty((FILLS, *colour.shape), np.float32)
     planes = zip(totals[3:], products, *out)
     floor = SETTINGS.floor
-    in_parallel([partial(kernels.regression, brightness, *totals[:3], c, p, floor, *o) for c, p, *o in planes])
+    in_parallel(
+        [partial(kernels.regression, brightness, *totals[:3], c, p, floor, *o) for c, p, *o in planes]
+    )
     return out

@@ -39,8 +39,12 @@ class AlignmentSettings:
     finest: float = size(5e-3, "A step below this ends them")
     contrast: float = tuned(2e-5, "Middlebury: mean squared gradient of a window that counts half")
     farthest: float = size(2.0, "A window's displacement in one step is at most this")
-    deviation: float = size(0.05, "The standard deviation of windows' displacements about the plane, at least")
-    least: float = tuned(0.2, "Middlebury: largest displacement of a pixel below which the rig is taken to be right")
+    deviation: float = size(
+        0.05, "The standard deviation of windows' displacements about the plane, at least"
+    )
+    least: float = tuned(
+        0.2, "Middlebury: largest displacement of a pixel below which the rig is taken to be right"
+    )
     better: float = tuned(
         0.98, "Middlebury: residual with the displacement over that without, up to which it is accepted"
     )
@@ -91,7 +95,6 @@ def fit_misalignment(
     position: Float[Tensor, "h w 2"],
     normal: Float[Tensor, "h w 2"],
     weight: Float[Tensor, "h w"],
-    settings: AlignmentSettings = SETTINGS,
 ) -> Misalignment:
     """How far across its segments beta is, from matches; none if that explains the images hardly better.
 
@@ -101,20 +104,20 @@ def fit_misalignment(
     own, other, where, across, counts = (
         t.detach().cpu().float().numpy() for t in (alpha, beta, position, normal, weight)
     )
-    views = _Windows.of(own, other, where, across, counts, settings)
+    views = _Windows.of(own, other, where, across, counts)
     height, width = alpha.shape
     coefficients = np.zeros(3)
-    for _ in range(settings.steps):
+    for _ in range(SETTINGS.steps):
         step = views.step(coefficients)
         if step is None:
             return Misalignment()
         coefficients = coefficients + step
-        if np.abs(step).max() < settings.finest:
+        if np.abs(step).max() < SETTINGS.finest:
             break
     found = Misalignment(*(float(c) / width for c in coefficients))
-    if found.largest((height, width)) < settings.least:
+    if found.largest((height, width)) < SETTINGS.least:
         return Misalignment()
-    accepted = views.residual(coefficients) < settings.better * views.residual(np.zeros(3))
+    accepted = views.residual(coefficients) < SETTINGS.better * views.residual(np.zeros(3))
     return found if accepted else Misalignment()
 
 
@@ -128,19 +131,16 @@ class _Windows(NamedTuple):
     normal: Image
     weight: Image
     design: Image
-    settings: AlignmentSettings
 
     @classmethod
-    def of(
-        cls, alpha: Image, beta: Image, position: Image, normal: Image, weight: Image, settings: AlignmentSettings
-    ) -> _Windows:
+    def of(cls, alpha: Image, beta: Image, position: Image, normal: Image, weight: Image) -> _Windows:
         height, width = alpha.shape
         y, x = np.mgrid[:height, :width].astype(np.float32)
         design = np.stack([np.ones_like(x), (x + 0.5) / width - 0.5, (y + 0.5 - height / 2) / width])
-        own, other = (cv2.GaussianBlur(p, (0, 0), settings.blur) for p in (alpha, beta))
+        own, other = (cv2.GaussianBlur(p, (0, 0), SETTINGS.blur) for p in (alpha, beta))
         horizontal = cv2.Sobel(other, cv2.CV_32F, 1, 0, ksize=3) / 8
         vertical = cv2.Sobel(other, cv2.CV_32F, 0, 1, ksize=3) / 8
-        return cls(own, other, (horizontal, vertical), position, normal, weight, design, settings)
+        return cls(own, other, (horizontal, vertical), position, normal, weight, design)
 
     def _sampled(self, coefficients: NDArray[np.float64]) -> tuple[Image, Image, Image, Image]:
         """Beta and its gradients at the displaced matches, and the weight of those inside beta."""
@@ -149,11 +149,13 @@ class _Windows(NamedTuple):
         height, width = self.beta.shape
         inside = (columns > 2) & (rows > 2) & (columns < width - 3) & (rows < height - 3)
         planes = (self.beta, *self.gradients)
-        value, gx, gy = (cv2.remap(p, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for p in planes)
+        value, gx, gy = (
+            cv2.remap(p, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for p in planes
+        )
         return value, gx, gy, self.weight * inside.astype(np.float32)
 
     def _mean(self, plane: Image, weight: Image) -> Image:
-        side = (2 * self.settings.radius + 1,) * 2
+        side = (2 * SETTINGS.radius + 1,) * 2
         product: Image = weight * plane
         return cv2.blur(product, side) / (cv2.blur(weight, side) + 1e-6)
 
@@ -178,14 +180,14 @@ class _Windows(NamedTuple):
         strength = strength - mixed**2 / (other + 1e-6)
         towards = towards - mixed * aside / (other + 1e-6)
         some = (slice(None, None, 4), slice(None, None, 4))
-        useful = (strength[some] > self.settings.contrast / 10) & (weight[some] > 0.3)
-        if useful.sum() < self.settings.windows:
+        useful = (strength[some] > SETTINGS.contrast / 10) & (weight[some] > 0.3)
+        if useful.sum() < SETTINGS.windows:
             return None
-        found = towards[some][useful] / (strength[some][useful] + self.settings.contrast / 10)
-        counts = strength[some][useful] / (strength[some][useful] + self.settings.contrast)
-        limit = self.settings.farthest
+        found = towards[some][useful] / (strength[some][useful] + SETTINGS.contrast / 10)
+        counts = strength[some][useful] / (strength[some][useful] + SETTINGS.contrast)
+        limit = SETTINGS.farthest
         return _robust_plane(
-            self.design[:, ::4, ::4][:, useful], np.clip(found, -limit, limit), counts, self.settings.deviation
+            self.design[:, ::4, ::4][:, useful], np.clip(found, -limit, limit), counts, SETTINGS.deviation
         )
 
 

@@ -46,11 +46,16 @@ def box_mean(x: Tensor, radius: int) -> Tensor:
 def _box_mean_of_numbers(x: Tensor, radius: int) -> Tensor:
     """The same by OpenCV's running sums: a third of the time."""
     planes = x.detach().contiguous().flatten(0, -3).numpy()
-    counts = [np.minimum(np.arange(n), radius) + np.minimum(np.arange(n)[::-1], radius) + 1 for n in planes.shape[1:]]
+    counts = [
+        np.minimum(np.arange(n), radius) + np.minimum(np.arange(n)[::-1], radius) + 1
+        for n in planes.shape[1:]
+    ]
     share = (1 / (counts[0][:, None] * counts[1])).astype(planes.dtype)
     out = np.empty_like(planes)
     for plane, target in zip(planes, out):
-        sums = cv2.boxFilter(plane, -1, (2 * radius + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        sums = cv2.boxFilter(
+            plane, -1, (2 * radius + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT
+        )
         np.multiply(sums, share, out=target)
     return torch.from_numpy(out).view(x.shape)
 
@@ -68,7 +73,9 @@ class LocalMoments(NamedTuple):
     covariance: Tensor
 
     @classmethod
-    def within(cls, radius: int, bands: Float[Tensor, "b c h w"], image: Float[Tensor, "b 1 h w"]) -> LocalMoments:
+    def within(
+        cls, radius: int, bands: Float[Tensor, "b c h w"], image: Float[Tensor, "b 1 h w"]
+    ) -> LocalMoments:
         """Those within squares of so many pixels to either side."""
         mean = partial(box_mean, radius=radius)
         centre, middle = mean(bands), mean(image)

@@ -1,4 +1,5 @@
-"""What is matched and fused: alpha's image, and for each beta its image and the field of alpha's pixels in it."""
+"""What is matched and fused: alpha's image, and for each beta its image and the field of alpha's pixels in
+it."""
 
 from __future__ import annotations
 
@@ -36,8 +37,9 @@ class Beta:
     """One beta's image (B, C, H, W) and the field of alpha's pixels in it.
 
     `offset` is the (x, y) of its first pixel in the whole image, other than (0, 0) for a part of an image.
-    `track` gives the tracks of alpha's pixels (*n, 2) in the image of a calibrated beta. With `around` each segment is
-    around what is known of its own pixel: positions along the segments of two pixels are not to be compared.
+    `track` gives the tracks of alpha's pixels (*n, 2) in the image of a calibrated beta. With `around` each
+    segment is around what is known of its own pixel: positions along the segments of two pixels are not to be
+    compared.
     """
 
     image: Float[Tensor, "b c h w"]
@@ -51,10 +53,10 @@ class Beta:
 class Inputs:
     """Alpha's image (B, C, H, W) and the betas, which may be of any sizes.
 
-    Parts of betas are cut at whole multiples of `multiple` pixels, `beta_halo` pixels around the segments. `luminance`
-    is alpha's share of the result's, for networks that keep it; the rest is beta's. `bands` are those of the result: so
-    many, whose luminance (the mean, if they are not three) is what alpha sees, or None: those of all betas, of which
-    alpha may see any combination.
+    Parts of betas are cut at whole multiples of `multiple` pixels, `beta_halo` pixels around the segments.
+    `luminance` is alpha's share of the result's, for networks that keep it; the rest is beta's. `bands` are
+    those of the result: so many, whose luminance (the mean, if they are not three) is what alpha sees, or
+    None: those of all betas, of which alpha may see any combination.
     """
 
     alpha: Float[Tensor, "b c h w"]
@@ -81,16 +83,16 @@ class Inputs:
 
     @property
     def pieces(self) -> list[Tile]:
-        """The pieces in which a frame is matched: one, or those with the least work of a size that fits into memory
-        (`InputsSettings`)."""
+        """The pieces in which a frame is matched: one, or those with the least work of a size that fits into
+        memory (`InputsSettings`)."""
         if math.prod(self.hw) <= SETTINGS.at_once:
             return [whole(self.hw)]
         sides = sides_by_work(self.hw, SETTINGS.halo, self.multiple, SETTINGS.at_once)
         return list(tiles_of(self.hw, sides[0], SETTINGS.halo))
 
     def in_pieces(self, make: Callable[..., Any], *more: Any) -> Any:
-        """Planes (..., h, w), or several, put together from what is made of each piece of these inputs, and of what
-        is given besides, cut alike."""
+        """Planes (..., h, w), or several, put together from what is made of each piece of these inputs, and
+        of what is given besides, cut alike."""
         pieces = self.pieces
         if len(pieces) == 1:
             return make(self, *more)
@@ -99,8 +101,8 @@ class Inputs:
 
     @property
     def can_agree(self) -> bool:
-        """Whether all betas, of which there are several or one `around` what is known, are calibrated and have straight
-        fields, of one frame."""
+        """Whether all betas, of which there are several or one `around` what is known, are calibrated and
+        have straight fields, of one frame."""
         fields = [beta.field.pixels for beta in self.betas]
         one = len(self.alpha) == 1 and all(field is not None and len(field.valid) == 1 for field in fields)
         several = len(fields) > 1 or any(beta.around for beta in self.betas)
@@ -118,31 +120,39 @@ class Inputs:
         """A part of alpha, (top, bottom, left, right), with the part of each beta that its segments touch."""
         top, bottom, left, right = box
         return replace(
-            self, alpha=self.alpha[..., top:bottom, left:right], betas=tuple(self._cut(b, box) for b in self.betas)
+            self,
+            alpha=self.alpha[..., top:bottom, left:right],
+            betas=tuple(self._cut(b, box) for b in self.betas),
         )
 
     def touched(self, beta: Beta, box: Box, step: int = 2) -> Box:
-        """The part of a beta that the segments of every `step`-th pixel of a box of alpha touch, with the halo."""
+        """The part of a beta that the segments of every `step`-th pixel of a box of alpha touch, with the
+        halo."""
         hw = beta.image.shape[-2], beta.image.shape[-1]
         return box_around(_ends_in(beta.field, box, step), hw, self.beta_halo, self.multiple)
 
     def _cut(self, beta: Beta, box: Box) -> Beta:
         y0, y1, x0, x1 = self.touched(beta, box)
         offset = (beta.offset[0] + x0, beta.offset[1] + y0)
-        track = beta.track and _part_of(beta.track, (box[2], box[0]), (x0, y0))
+        top, _, left, _ = box
+        track = beta.track and track_in(beta.track, lambda x: x + x.new_tensor((left, top)), 1.0, (-x0, -y0))
         image = beta.image[..., y0:y1, x0:x1]
         return Beta(image, beta.field.cut(box, (x0, y0)), offset, track, beta.around)
 
 
-def _part_of(
-    track: Callable[[Tensor], Track], own: tuple[int, int], other: tuple[int, int]
+def track_in(
+    track: Callable[[Tensor], Track],
+    whole: Callable[[Tensor], Tensor],
+    scale: float,
+    offset: tuple[float, float],
 ) -> Callable[[Tensor], Track]:
-    """The tracks of a part of alpha in a part of beta, which begin at these pixels (x, y)."""
+    """The tracks of pixels that are those of `whole(x)` in alpha, in pixels of beta times a scale, plus an
+    offset."""
 
-    def shifted(v: Tensor) -> Tensor:
-        return torch.cat([v[..., :2] - v.new_tensor(other) * v[..., 2:], v[..., 2:]], -1)
+    def changed(v: Tensor) -> Tensor:
+        return torch.cat([scale * v[..., :2] + v.new_tensor(offset) * v[..., 2:], v[..., 2:]], -1)
 
-    return lambda x: Track(*map(shifted, track(x + x.new_tensor(own))))
+    return lambda x: Track(*map(changed, track(whole(x))))
 
 
 def ends_of(found: Segments | Positions) -> Float[Tensor, "n 2"]:
@@ -153,7 +163,8 @@ def ends_of(found: Segments | Positions) -> Float[Tensor, "n 2"]:
 
 
 def box_around(points: Float[Tensor, "n 2"], hw: HW, halo: int, multiple: int) -> Box:
-    """The part of an image around points (x, y), with a halo, its corners at whole multiples or the image's end."""
+    """The part of an image around points (x, y), with a halo, its corners at whole multiples or the image's
+    end."""
     if not len(points):
         return 0, multiple, 0, multiple
     low, high = points.amin(0) - halo, points.amax(0) + halo

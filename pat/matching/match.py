@@ -1,4 +1,5 @@
-"""The door of this room: `match` says where the pixels of alpha are in each beta, and what the betas show there."""
+"""The door of this room: `match` says where the pixels of alpha are in each beta, and what the betas show
+there."""
 
 from __future__ import annotations
 
@@ -22,8 +23,8 @@ from .matches import BetaMatches, Matches, is_consistent
 from .multiview import agreed
 from .normalisation import Comparison
 from .positions import FINE, at_matches, reduced
-from .radiometry import SpectralMix
 from .semi_global import HalfSizeMatches, matched_at_half_size
+from .spectral_mix import SpectralMix
 from .subpixel import matched_at_full_size, with_gradients
 
 LOG = logging.getLogger(__name__)
@@ -33,25 +34,29 @@ LOG = logging.getLogger(__name__)
 class MatchSettings:
     """Of matching as a whole."""
 
-    coarsely: int = size(400_000, "Pixels of alpha at most on which the combination of bands that it sees is found")
+    coarsely: int = size(
+        400_000, "Pixels of alpha at most on which the combination of bands that it sees is found"
+    )
 
 
 SETTINGS = MatchSettings()
 
 Matcher = Callable[[Inputs], Matches]
-"""What `fuse` asks for matches of inputs whose sides are whole multiples of `inputs.multiple`: `match`, or your own."""
+"""What `fuse` asks for matches of inputs whose sides are whole multiples of `inputs.multiple`: `match`, or
+your own."""
 
 
 def match(inputs: Inputs) -> Matches:
-    """Match alpha with every beta, say how certain each match is, and transfer the betas' bands to alpha's view; with
-    gradients as `transferred`, and of the positions.
+    """Match alpha with every beta, say how certain each match is, and transfer the betas' bands to alpha's
+    view; with gradients as `transferred`, and of the positions.
 
     Raises ValueError for a beta whose field is not of straight segments.
     """
     found = located(inputs)
     if torch.is_grad_enabled():
         found = Matches(tuple(_following(inputs.alpha, *one) for one in zip(inputs.betas, found.betas)))
-    return transferred(inputs, with_certainty(inputs, found))
+    found = with_certainty(inputs, found)
+    return transferred(inputs, found)
 
 
 def _following(alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaMatches:
@@ -65,9 +70,13 @@ def _following(alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaMatches:
 
 @torch.no_grad()
 def located(inputs: Inputs) -> Matches:
-    """Where alpha's pixels are in each beta, without colours; of several calibrated betas, where all agree."""
+    """Where alpha's pixels are in each beta, without colours; of several calibrated betas, where all
+    agree."""
     alone = Matches(tuple(located_in_one(inputs.of_beta(i)) for i in range(len(inputs.betas))))
-    return agreed(inputs, with_certainty(inputs, alone)) if inputs.can_agree else alone
+    if not inputs.can_agree:
+        return alone
+    alone = with_certainty(inputs, alone)
+    return agreed(inputs, alone)
 
 
 def located_in_one(inputs: Inputs) -> BetaMatches:
@@ -87,8 +96,8 @@ def located_in_one(inputs: Inputs) -> BetaMatches:
 
 
 def seen_mix(inputs: Inputs) -> SpectralMix | None:
-    """The combination of the one beta's bands that is most like alpha, on reduced images; None, for luma, where the
-    result's bands are known or there is one alone."""
+    """The combination of the one beta's bands that is most like alpha, on reduced images; None, for luma,
+    where the result's bands are known or there is one alone."""
     alpha, (beta,) = inputs.alpha, inputs.betas
     if inputs.bands is not None or beta.image.shape[1] == 1:
         return None

@@ -35,9 +35,9 @@ class BetaMatches:
         not; None before they are transferred.
     diffused: (B, fills, C, H, W), the same diffused from pixels of high weight to the others.
     prior: how much more, as a logit, its colours count than another beta's.
-    certainty: (B, 2, H / 2, W / 2), the probability that beta sees the point and the match is within a pixel of
-        it, and the half-width, in pixels of beta, of the interval around the match in which the true position
-        is in 9 of 10 cases; None where it is not known.
+    certainty: (B, 2, H / 2, W / 2), the probability that beta sees the point and the match is within a pixel
+        of it, and the half-width, in pixels of beta, of the interval around the match in which the true
+        position is in 9 of 10 cases; None where it is not known.
     """
 
     disparity: Tensor
@@ -52,7 +52,9 @@ class BetaMatches:
     def colours(self) -> tuple[Tensor, Tensor]:
         """`bands` and `diffused`. Raises ValueError before they are transferred."""
         if self.bands is None or self.diffused is None:
-            raise ValueError("these matches have no colours: give them those of their images by `transferred`")
+            raise ValueError(
+                "these matches have no colours: give them those of their images by `transferred`"
+            )
         return self.bands, self.diffused
 
     def positions(self, segments: Segments, hw: HW) -> tuple[Float[Tensor, "b h w 2"], Bool[Tensor, "b h w"]]:
@@ -70,7 +72,9 @@ class BetaMatches:
         certainty = self.certainty if self.certainty is None else self.certainty[half]
         facts = self.facts[half]
         disparity = self.disparity[whole]
-        return replace(self, disparity=disparity, facts=facts, bands=bands, diffused=diffused, certainty=certainty)
+        return replace(
+            self, disparity=disparity, facts=facts, bands=bands, diffused=diffused, certainty=certainty
+        )
 
     def stored(self) -> BetaMatches:
         """The same with colours as float16; differences from alpha are rounded by 1e-4 at most."""
@@ -109,6 +113,7 @@ class Matches:
         if self.hw != hw or len(self.betas) != betas:
             (h, w), (height, width) = self.hw, hw
             raise ValueError(
-                f"these matches are of {w}x{h} pixels in {len(self.betas)} betas, the images are {width}x{height} "
+                f"these matches are of {w}x{h} pixels in {len(self.betas)} betas, the images are "
+                f"{width}x{height} "
                 f"with {betas}: match these images"
             )

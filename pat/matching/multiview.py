@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, depth_from_track, pixel_grid
-from arraygeom.chunks import Tile, assembled, spans
+from arraygeom.chunks import Box, spans
 from arraygeom.epipolar import FRONT, Track
 
 from ..media.colour import to_bytes
@@ -44,13 +44,15 @@ class MultiviewSettings:
     )
     farthest: float = size(
         8.0,
-        "A difference of disparities of this many half-size pixels is 1 in the facts, as in semi-global matching",
+        "A difference of disparities of this many half-size pixels is 1 in the facts, as in "
+        "semi-global matching",
     )
     sampled_rows: int = size(64, "In how many pairs of alpha's rows the depths of betas are compared")
     sampled_columns: int = size(4, "Every how many columns the depths of betas are compared")
     trials: int = size(
         400,
-        "Fits to four pixels each, of which that is taken with which most others agree (Fischler, Bolles 1981)",
+        "Fits to four pixels each, of which that is taken with which most others agree (Fischler, "
+        "Bolles 1981)",
     )
     more: float = tuned(
         0.1,
@@ -136,13 +138,18 @@ class MatchedBeta:
     @property
     def inverse_depth(self) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
         """Of the matches, and where these are consistent and have one."""
-        found = depth_from_track(self.track, self.segments.end + self.disparity[..., None] * self.extent.towards)
+        found = depth_from_track(
+            self.track, self.segments.end + self.disparity[..., None] * self.extent.towards
+        )
         known = found.valid & self.segments.valid & (self.facts[0] < CONSISTENT)
         return torch.where(known, 1 / torch.where(known, found.depth, 1.0), 0.0), known
 
     def _seen(self, inverse_depth: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
         """Beta's pixels as by `Track.at`, x and y apart, which takes a fraction of the time."""
-        x, y, z = (torch.addcmul(p, inverse_depth, d) for p, d in zip(self.track.a.unbind(-1), self.track.b.unbind(-1)))
+        x, y, z = (
+            torch.addcmul(p, inverse_depth, d)
+            for p, d in zip(self.track.a.unbind(-1), self.track.b.unbind(-1))
+        )
         z = torch.where(z > FRONT, z, 1.0)
         return x / z, y / z
 
@@ -215,6 +222,12 @@ class Agreement(NamedTuple):
         facts = avg_pool2d(torch.stack([margin, cost]), FINE)
         return cls(inverse_depth[None].to(like), taken.any(0)[None], facts.to(like))
 
+    def cut(self, box: Box) -> Agreement:
+        """The part at alpha's (top, bottom, left, right), of inverse depth; facts are whole."""
+        top, bottom, left, right = box
+        part = (slice(None), slice(top, bottom), slice(left, right))
+        return self._replace(inverse_depth=self.inverse_depth[part], known=self.known[part])
+
 
 def agreed(inputs: Inputs, matches: Matches) -> Matches:
     """The matches of each beta, with `disparity` and `facts` from the inverse depths on which all agree."""
@@ -224,7 +237,8 @@ def agreed(inputs: Inputs, matches: Matches) -> Matches:
     def at(i: int, rows: tuple[int, int]) -> MatchedBeta:
         return MatchedBeta.of(inputs.betas[i], found[i], rows, between[i])
 
-    betas, strips = range(len(found)), spans(inputs.hw[0], max(STRIP // inputs.hw[1] // FINE, 1) * FINE)
+    (height, width), betas = matches.hw, range(len(found))
+    strips = spans(height, max(STRIP // width // FINE, 1) * FINE)
     parts = [Agreement.of([at(i, rows) for i in betas], inputs.alpha) for rows in strips]
     agreement = _dense(Agreement(*(torch.cat(planes, 1) for planes in zip(*parts))), inputs)
     del parts
@@ -307,17 +321,15 @@ def _agree(terms: Tensor, own: Tensor, rise: Tensor, solutions: Float[Tensor, "k
 def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
     """Inverse depth diffused to where no match is consistent, and without outliers."""
 
-    def of(tile: Tile) -> Tensor:
-        top, bottom, left, right = tile.outer
-        planes = agreement.inverse_depth, agreement.known, inputs.alpha[0]
-        plane, known, alpha = (x[:, top:bottom, left:right].cpu().numpy() for x in planes)
-        guide = to_bytes(alpha[0])
-        smooth = filled(plane, known[0].astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
+    def of(piece: Inputs, part: Agreement) -> Tensor:
+        plane, known = part.inverse_depth.cpu().numpy(), part.known.cpu().numpy()
+        smooth = filled(
+            plane, known[0].astype(np.float32) + 1e-5, to_bytes(piece.alpha[0, 0]), DISPARITY_FILL
+        )
         median = cv2.medianBlur(np.where(known, plane, smooth)[0], 5)
-        return torch.from_numpy(median)[None].to(inputs.alpha)
+        return torch.from_numpy(median)[None].to(piece.alpha)
 
-    dense = assembled(inputs.hw, ((tile, of(tile)) for tile in inputs.pieces))
-    return agreement._replace(inverse_depth=dense)
+    return agreement._replace(inverse_depth=inputs.in_pieces(of, agreement))
 
 
 def _of_beta(
@@ -334,7 +346,9 @@ def _of_beta(
     for top, bottom in strips:
         view, half = at((top, bottom)), slice(top // FINE, bottom // FINE)
         inverse_depth = agreement.inverse_depth[0, top:bottom].to(buffer)
-        disparity[0, 0, top:bottom] = view.disparity_of(inverse_depth).clamp(min=0).minimum(view.extent.length)
+        disparity[0, 0, top:bottom] = (
+            view.disparity_of(inverse_depth).clamp(min=0).minimum(view.extent.length)
+        )
         unlike = (view.hidden(inverse_depth, buffer) / (FINE * SETTINGS.farthest)).clamp(0, 1)
         unlike = torch.where(agreement.known[0, top:bottom], unlike, 1.0)
         facts[0, :1, half] = avg_pool2d(unlike[None], FINE)
@@ -342,6 +356,10 @@ def _of_beta(
     return replace(own, disparity=disparity, facts=facts)
 
 
-def _supported(views: Sequence[MatchedBeta], weights: Tensor, inverse_depth: Tensor) -> Float[Tensor, "betas h w"]:
+def _supported(
+    views: Sequence[MatchedBeta], weights: Tensor, inverse_depth: Tensor
+) -> Float[Tensor, "betas h w"]:
     """The weights of the betas whose matches are near a proposed inverse depth."""
-    return torch.stack([w * (view.differs(inverse_depth) < SETTINGS.support) for view, w in zip(views, weights)])
+    return torch.stack(
+        [w * (view.differs(inverse_depth) < SETTINGS.support) for view, w in zip(views, weights)]
+    )

@@ -17,7 +17,7 @@ from torch.nn.functional import avg_pool2d
 from ..media.colour import luminance, to_bytes
 from ..support.settings import size, tuned
 from .filters import blurred
-from .radiometry import SpectralMix
+from .spectral_mix import SpectralMix
 
 LEAST_WEIGHT = 1e-6
 """Size: added to weights, so that there are moments where all are 0."""
@@ -32,9 +32,12 @@ class NormalisationSettings:
     )
     blurs: tuple[float, ...] = size(
         (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0),
-        "Standard deviations, in pixels, with which the sharper image is tried until it is as sharp as the other",
+        "Standard deviations, in pixels, with which the sharper image is tried until it is as sharp "
+        "as the other",
     )
-    sharper: float = tuned(1.05, "Source not recorded: contrast over the other's up to which an image is no sharper")
+    sharper: float = tuned(
+        1.05, "Source not recorded: contrast over the other's up to which an image is no sharper"
+    )
 
 
 SETTINGS = NormalisationSettings()
@@ -103,7 +106,8 @@ def _weighted_mean(image: Tensor, weight: Tensor) -> Float[Tensor, "*b 1 1 1"]:
 
 
 class ComparedViews(NamedTuple):
-    """Alpha and what of beta is compared with it, (B, 1, ., .), equally bright and sharp; alpha in 8 bits (B, h, w)."""
+    """Alpha and what of beta is compared with it, (B, 1, ., .), equally bright and sharp; alpha in 8 bits (B,
+    h, w)."""
 
     alpha: Tensor
     beta: Tensor
@@ -155,8 +159,8 @@ def equalising_blurs(
 ) -> tuple[list[float], list[float]]:
     """Standard deviations to blur either with until it is no sharper.
 
-    Detail that only one has cannot be matched. Sharpness is the mean difference of neighbouring pixels; 0 for an
-    image that has hardly more than the other.
+    Detail that only one has cannot be matched. Sharpness is the mean difference of neighbouring pixels; 0 for
+    an image that has hardly more than the other.
     """
     own, its = ([float(_contrast(p)) for p in images] for images in (image, other))
     return [_least_blur(p, c) for p, c in zip(image, its)], [_least_blur(p, c) for p, c in zip(other, own)]
@@ -207,7 +211,9 @@ class Comparison(NamedTuple):
         return self.half.views(avg_pool2d(alpha, 2), avg_pool2d(self.combined(beta), 2))
 
 
-def combined_bands(beta: Float[Tensor, "b c h w"], mix: SpectralMix | None = None) -> Float[Tensor, "b 1 h w"]:
+def combined_bands(
+    beta: Float[Tensor, "b c h w"], mix: SpectralMix | None = None
+) -> Float[Tensor, "b 1 h w"]:
     """The bands as this mix combines them; without one Rec. 601 luma of three bands, the mean of others."""
     if mix is not None:
         return mix.of(beta)

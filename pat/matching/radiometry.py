@@ -1,13 +1,10 @@
-"""Which combination of beta's bands alpha sees: of RGB (`Response`), and of any bands (`SpectralMix`).
+"""Which combination of an RGB beta's bands alpha sees; of any bands: `spectral_mix`.
 
 The network compares alpha with Rec. 601 luma of an RGB beta and keeps alpha as the result's luma. A real mono
 sensor weighs red, green and blue otherwise, and another exposure or tone curve makes beta darker or flatter.
 There alpha is explained as weights . (gain * beta^gamma) over points that match, and beta is mapped so that
 its luma is that: scaled, raised to the power, and sheared along grey, so that neutral stays neutral. The
 fused image is sheared back.
-
-Of other bands alpha is explained as offset + weights . beta around each pixel, and how alpha's detail adds to
-each is found too. All sums over such bands are of sorted summands, so that their order cannot matter at all.
 """
 
 from __future__ import annotations
@@ -20,14 +17,17 @@ from typing import Literal, NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from arraygeom import pixel_grid
-from arraygeom.robust import RobustFit, cauchy, gaussian, least_squares, normal_deviation, robust_least_squares
+from arraygeom.robust import (
+    cauchy,
+    least_squares,
+    normal_deviation,
+    robust_least_squares,
+)
 
 from ..media.colour import REC601
 from ..support.settings import physics, size, tuned
-from .filters import box_mean
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,12 @@ class ResponseSettings:
         (0.32, 0.48, 0.20), "Middlebury: weights of a usual sensor that is not Rec. 601's: it sees more blue"
     )
     prior: float = tuned(0.2, "Middlebury: standard deviation of weights about these")
-    independent: float = tuned(20.0, "Middlebury: as how many independent observations, or materials, all points count")
-    error: float = tuned(0.012, "Middlebury: standard deviation of one of those, at least: light differs between views")
+    independent: float = tuned(
+        20.0, "Middlebury: as how many independent observations, or materials, all points count"
+    )
+    error: float = tuned(
+        0.012, "Middlebury: standard deviation of one of those, at least: light differs between views"
+    )
     outlier: float = tuned(2.0, "Middlebury: residuals of this many robust deviations count half")
     points: tuple[int, int] = size((6000, 300), "Pixels used at most, and the fewest that are enough")
     gammas: tuple[float, ...] = size(
@@ -74,13 +78,16 @@ class ResponseSettings:
     )
     equal_weights: tuple[float, float] = tuned(
         (8.0, 0.006),
-        "Middlebury: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other weights, to be taken "
+        "Middlebury: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other "
+        "weights, to be taken "
         "in their place: a sensor without filters; light may differ by a gain of this standard deviation",
     )
     least_change: float = physics(
         0.01, "Root mean square change of luma up to which the weights are left at Rec. 601's"
     )
-    equal: float = tuned(1.1, "Middlebury: the error over the least one up to which a gamma explains alpha as well")
+    equal: float = tuned(
+        1.1, "Middlebury: the error over the least one up to which a gamma explains alpha as well"
+    )
     better: float = tuned(
         0.8,
         "Middlebury: the error with another gamma than 1, or with vignetting, over that without, to be taken",
@@ -93,41 +100,7 @@ class ResponseSettings:
     explained: float = tuned(0.5, "Middlebury: share of alpha's variance that must be explained")
 
 
-@dataclass(frozen=True)
-class MixSettings:
-    """Brightness is 0 to 1."""
-
-    outlier: float = tuned(
-        0.06,
-        "Source not recorded: difference from alpha at which a match counts 1 / e in the second of two fits",
-    )
-    equal: float = size(
-        1e-4, "How strongly the combination is drawn to one of equal parts: share of the bands' mean variance"
-    )
-    misfit: float = tuned(
-        0.016,
-        "Source not recorded: difference from alpha, averaged over `smooth` pixels to either side, at which "
-        "the combination counts half",
-    )
-    smooth: int = size(4, "See `misfit`")
-    alike: float = tuned(
-        0.08,
-        "Source not recorded: where the combination's black and white are so near to alpha's, black is "
-        "taken for black and white for white, and the difference for that of two exposures",
-    )
-    diluted: float = tuned(
-        0.8,
-        "Source not recorded: wrong matches make least squares' weights too small; they are enlarged until "
-        "the combination varies as much as alpha, as if no less than this share of alpha's variance were "
-        "explained",
-    )
-    wide: int = size(
-        4, "Bands are compared with alpha within squares whose radius is the image's longer side over this"
-    )
-
-
 SETTINGS = ResponseSettings()
-MIX_SETTINGS = MixSettings()
 
 
 class Response(NamedTuple):
@@ -202,7 +175,9 @@ def stated_response(weights: Sequence[float]) -> Response:
     negative."""
     values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
     if values.shape != (3,) or not bool((values >= 0).all() & (values.sum() > 0) & values.isfinite().all()):
-        raise ValueError(f"a response is three weights, of red, green and blue, none negative; got {tuple(weights)}")
+        raise ValueError(
+            f"a response is three weights, of red, green and blue, none negative; got {tuple(weights)}"
+        )
     return Response(values / values.sum(), gain=float(values.sum()))
 
 
@@ -210,32 +185,31 @@ def fit(
     bands: Float[Tensor, "3 n"],
     alpha: Float[Tensor, " n"],
     where: Float[Tensor, "n 2"] | None = None,
-    settings: ResponseSettings = SETTINGS,
 ) -> Response:
     """The response by robust least squares over points: the most plausible of those that explain alpha.
 
     `where` are the points in beta, in its width and height, from its middle: with them vignetting is found
     too. Rec. 601's where there are too few points, or where a combination of bands does not explain alpha.
     """
-    most, fewest = settings.points
+    most, fewest = SETTINGS.points
     step = max(alpha.numel() // most, 1)
     x, y = bands[:, ::step].double().cpu(), alpha[::step].double().cpu()
     unclipped = (y > 0.02) & (y < 0.98) & (x > 0.01).all(0) & (x < 0.98).all(0)
     x, y = x[:, unclipped], y[unclipped]
     if len(y) < fewest:
         return Response.rec601()
-    gamma, found = _best_gamma(x, y, settings)
+    gamma, found = _best_gamma(x, y)
     shading: tuple[float, ...] = ()
     if where is not None:
         terms = _shading_terms(where[::step].double().cpu()[unclipped])
-        slopes = _shading(x, y, terms, settings)
+        slopes = _shading(x, y, terms)
         even = x * (slopes @ terms).exp()
-        other_gamma, other = _best_gamma(even, y, settings)
-        if other.error < settings.better * found.error and _plausible(slopes, terms, settings):
+        other_gamma, other = _best_gamma(even, y)
+        if other.error < SETTINGS.better * found.error and _plausible(slopes, terms):
             x, gamma, found, shading = even, other_gamma, other, tuple(slopes.tolist())
-    if found.explained < settings.explained:
+    if found.explained < SETTINGS.explained:
         return Response.rec601()
-    return _decided(x**gamma, y, gamma, found, settings)[1]._replace(shading=shading)
+    return _decided(x**gamma, y, gamma, found)[1]._replace(shading=shading)
 
 
 class _Fit(NamedTuple):
@@ -248,17 +222,17 @@ class _Fit(NamedTuple):
     explained: float
 
 
-def _best_gamma(x: Tensor, y: Tensor, settings: ResponseSettings) -> tuple[float, _Fit]:
+def _best_gamma(x: Tensor, y: Tensor) -> tuple[float, _Fit]:
     """1, or the gamma that explains alpha clearly better; of several the one with the most plausible
     response."""
-    trials = {gamma: _weighted_fit(x**gamma, y, settings) for gamma in settings.gammas}
+    trials = {gamma: _weighted_fit(x**gamma, y) for gamma in SETTINGS.gammas}
     least = min(trial.error for trial in trials.values())
-    if least > settings.better * trials[1.0].error:
+    if least > SETTINGS.better * trials[1.0].error:
         return 1.0, trials[1.0]
-    equal = {gamma: trial for gamma, trial in trials.items() if trial.error <= settings.equal * least}
+    equal = {gamma: trial for gamma, trial in trials.items() if trial.error <= SETTINGS.equal * least}
     linear, most = trials[1.0], max(float(trial.counts.sum()) for trial in equal.values())
     equal[1.0] = linear._replace(counts=linear.counts * (most / linear.counts.sum()))
-    gamma = min(equal, key=lambda g: _decided(x**g, y, g, equal[g], settings)[0])
+    gamma = min(equal, key=lambda g: _decided(x**g, y, g, equal[g])[0])
     return gamma, trials[gamma]
 
 
@@ -268,22 +242,22 @@ def _shading_terms(where: Float[Tensor, "n 2"]) -> Float[Tensor, "5 n"]:
     return torch.stack([u, v, u * u, u * v, v * v])
 
 
-def _plausible(slopes: Tensor, terms: Tensor, settings: ResponseSettings) -> bool:
+def _plausible(slopes: Tensor, terms: Tensor) -> bool:
     """Whether a lens may shade its image so: noticeably at the points, not absurdly in the corners."""
     corners = _shading_terms(torch.tensor([[u, v] for u in (-0.5, 0.5) for v in (-0.5, 0.5)]).to(terms))
     seen, extreme = (float((slopes @ t).abs().max()) for t in (terms, corners))
-    least, most = settings.shading
+    least, most = SETTINGS.shading
     return seen > least and extreme < most
 
 
-def _shading(x: Tensor, y: Tensor, terms: Tensor, settings: ResponseSettings) -> Float[Tensor, "5"]:
+def _shading(x: Tensor, y: Tensor, terms: Tensor) -> Float[Tensor, "5"]:
     """Coefficients of the logarithm of alpha over what explains it, by least squares with the fit's
     weights."""
     slopes = terms.new_zeros(len(terms))
     design = torch.cat([terms, torch.ones_like(terms[:1])])
     for _ in range(3):
         even = x * (slopes @ terms).exp()
-        found = _weighted_fit(even, y, settings)
+        found = _weighted_fit(even, y)
         ratio = (y / (found.weights @ even).clamp(min=0.01)).log()
         counts = found.counts * y.square()
         ridge = 1e-4 * counts.sum() * torch.eye(len(design)).to(y)
@@ -295,19 +269,21 @@ CHANGES = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]], dtype=torch.float
 """What weights may change by while their sum stays."""
 
 
-def _weighted_fit(x: Tensor, y: Tensor, settings: ResponseSettings) -> _Fit:
+def _weighted_fit(x: Tensor, y: Tensor) -> _Fit:
     """Weights s (usual ones + d), d's sum 0, robustly. Nothing is assumed of s; d is drawn to 0."""
-    usual = x.new_tensor(settings.usual)
+    usual = x.new_tensor(SETTINGS.usual)
     terms = torch.stack([usual @ x, *(CHANGES.T @ x)])
     start = x.new_tensor([float(y.median() / terms[0].median()), 0.0, 0.0])
 
     def weigh(rest: Tensor) -> Tensor:
-        deviation = normal_deviation(rest, settings.error / 3)
-        share = cauchy(rest, settings.outlier * deviation)
-        return share * (settings.independent / share.sum() / max(deviation, settings.error) ** 2)
+        deviation = normal_deviation(rest, SETTINGS.error / 3)
+        share = cauchy(rest, SETTINGS.outlier * deviation)
+        return share * (SETTINGS.independent / share.sum() / max(deviation, SETTINGS.error) ** 2)
 
     def precision(found: Tensor) -> Tensor:
-        return torch.block_diag(x.new_zeros(1, 1), CHANGES.T @ CHANGES / (settings.prior * float(found[0])) ** 2)
+        return torch.block_diag(
+            x.new_zeros(1, 1), CHANGES.T @ CHANGES / (SETTINGS.prior * float(found[0])) ** 2
+        )
 
     (scale, *change), rest, counts = robust_least_squares(terms, y, start, weigh, precision=precision)
     centred = y - counts @ y / counts.sum()
@@ -328,21 +304,17 @@ class _Points(NamedTuple):
         found = least_squares(terms, rest, self.counts, precision)
         return float(self.counts @ (rest - found @ terms).square() + found @ precision @ found), found
 
-    def misfit(self, shade: Tensor) -> float:
-        """That of alpha explained as it is."""
-        return float(self.counts @ (self.y - shade).square())
 
-
-def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: ResponseSettings) -> tuple[float, Response]:
+def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit) -> tuple[float, Response]:
     """The most plausible of four explanations of alpha, and its misfit.
 
     They are luma as it is, another gain, other weights of sum 1, or both. In a scene of one hue several fit,
     and what each must gain to be taken decides.
     """
     points, rec601 = _Points(x, y, found.counts), Response.rec601().weights
-    usual = x.new_tensor(settings.usual)
+    usual = x.new_tensor(SETTINGS.usual)
     grey, hues, free = usual @ x, CHANGES.T @ x, x.new_zeros(1, 1)
-    precision = CHANGES.T @ CHANGES / settings.prior**2
+    precision = CHANGES.T @ CHANGES / SETTINGS.prior**2
     scale = float(found.weights.sum())
     only_gain, (gain,) = points.explained(y, (rec601 @ x)[None], free)
     only_weights, change = points.explained(y - grey, hues, precision)
@@ -350,42 +322,40 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
     both, (total, *rest) = points.explained(y, torch.stack([grey, *hues]), scaled)
     weights, further = usual + CHANGES @ change, usual + CHANGES @ torch.stack(rest) / total
     trials = [
-        (only_gain + settings.unlikely[0], rec601, float(gain)),
-        (both + settings.unlikely[2] + _negative(further, settings), further, float(total)),
+        (only_gain + SETTINGS.unlikely[0], rec601, float(gain)),
+        (both + SETTINGS.unlikely[2] + _negative(further), further, float(total)),
     ]
     if gamma == 1:
-        trials.append((only_weights + settings.unlikely[1] + _negative(weights, settings), weights, 1.0))
-        trials.append((points.misfit(rec601 @ x), rec601, 1.0))
+        trials.append((only_weights + SETTINGS.unlikely[1] + _negative(weights), weights, 1.0))
+        trials.append((float(points.counts @ (y - rec601 @ x).square()), rec601, 1.0))
     misfit, chosen, exposure = min(trials, key=lambda trial: trial[0])
-    as_well = only_gain < only_weights + settings.alike
-    unchanged = float(((chosen - rec601) @ x).square().mean().sqrt()) < settings.least_change
-    if exposure == 1 and (unchanged or _is_light(points, float(gain), as_well, (weights, further), settings)):
+    as_well = only_gain < only_weights + SETTINGS.alike
+    unchanged = float(((chosen - rec601) @ x).square().mean().sqrt()) < SETTINGS.least_change
+    if exposure == 1 and (unchanged or _is_light(points, float(gain), as_well, (weights, further))):
         chosen = rec601
     elif chosen is not rec601:
-        chosen, exposure = _or_equal(points, chosen, exposure, settings)
+        chosen, exposure = _or_equal(points, chosen, exposure)
     return misfit, Response(chosen, exposure, gamma, found.explained)
 
 
-def _is_light(
-    points: _Points, gain: float, as_well: bool, weights: Sequence[Tensor], settings: ResponseSettings
-) -> bool:
+def _is_light(points: _Points, gain: float, as_well: bool, weights: Sequence[Tensor]) -> bool:
     """Whether light that differs between the views may be why other weights explain alpha better: a small
     gain explains it as well, or no sensor has such weights."""
-    rec601, sensor = Response.rec601().weights, points.x.new_tensor(settings.sensor)
+    rec601, sensor = Response.rec601().weights, points.x.new_tensor(SETTINGS.sensor)
     unlike_sensors = (gain - 1) * float(((sensor - rec601) @ points.x) @ points.counts) < 0
-    no_sensor = any(bool((w[1] > settings.greenest) & (w[2] < rec601[2])) for w in weights)
-    small = as_well and abs(math.log(gain)) < settings.light[unlike_sensors]
+    no_sensor = any(bool((w[1] > SETTINGS.greenest) & (w[2] < rec601[2])) for w in weights)
+    small = as_well and abs(math.log(gain)) < SETTINGS.light[unlike_sensors]
     return small or (unlike_sensors and no_sensor)
 
 
-def _negative(weights: Tensor, settings: ResponseSettings) -> float:
+def _negative(weights: Tensor) -> float:
     """How unlikely negative weights are, as a misfit."""
-    return float((weights.clamp(max=0) / settings.negative).square().sum())
+    return float((weights.clamp(max=0) / SETTINGS.negative).square().sum())
 
 
-def _or_equal(points: _Points, weights: Tensor, gain: float, settings: ResponseSettings) -> tuple[Tensor, float]:
+def _or_equal(points: _Points, weights: Tensor, gain: float) -> tuple[Tensor, float]:
     """1/3 of each band if they explain alpha about as well, with the gain that fits best unless that is 1."""
-    more, deviation = settings.equal_weights
+    more, deviation = SETTINGS.equal_weights
     precision = points.x.new_full((1, 1), deviation**-2 if gain == 1 else 0.0)
     equal = torch.full_like(weights, 1 / 3)
     shades = [gain * (w @ points.x) for w in (weights, equal)]
@@ -393,112 +363,3 @@ def _or_equal(points: _Points, weights: Tensor, gain: float, settings: ResponseS
     if of_equal > misfit + more:
         return weights, gain
     return equal, gain if gain == 1 else gain * (1 + float(light))
-
-
-class SpectralMix(NamedTuple):
-    """The combination of C bands that is most like alpha, for each of a batch: offset + sum of weights times
-    bands.
-
-    slopes: (B, C), by how much each band rises where the combination rises by 1 from one pixel to the next;
-        less if that explains alpha badly.
-    gain: (B), 0 to 1: how far what alpha has beyond the combination is the bands' error, and not another
-        spectrum. 0 for one band, where that cannot be known.
-    """
-
-    weights: Float[Tensor, "b c"]
-    offset: Float[Tensor, " b"]
-    slopes: Float[Tensor, "b c"]
-    gain: Float[Tensor, " b"]
-
-    @classmethod
-    def equal(cls, bands: Float[Tensor, "b c _ _"]) -> SpectralMix:
-        """The mean of the bands."""
-        ones = torch.ones(bands.shape[:2], dtype=torch.float64, device=bands.device)
-        return cls(ones / bands.shape[1], 0 * ones[:, 0], ones, 0 * ones[:, 0])
-
-    @classmethod
-    def fitted(
-        cls, bands: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
-    ) -> SpectralMix:
-        """The one most like alpha by weighted least squares, around each pixel's surroundings; twice, the
-        second time without outliers."""
-        parts = [_mix(*part) for part in zip(bands.double(), alpha.double(), weight.double())]
-        return cls(*(torch.stack(part) for part in zip(*parts)))
-
-    def of(self, bands: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 h w"]:
-        """The combination of these bands."""
-        products = self.weights[:, :, None, None] * bands.double()
-        total = products.sort(1).values.sum(1, keepdim=True) + self.offset[:, None, None, None]
-        return total.to(bands)
-
-    def rises(self, like: Tensor) -> Float[Tensor, "b c 1 1"]:
-        """The slopes."""
-        return self.slopes[:, :, None, None].to(like)
-
-    def reconciled(self, bands: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b c h w"]:
-        """The bands corrected so that their combination is nearer to alpha, by as much as it is reliable."""
-        step = self.gain[:, None, None, None].to(bands) * self.rises(bands)
-        return bands + step * (alpha - self.of(bands))
-
-
-def _mix(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Weights, offset, slopes and gain for bands (C, h, w) and alpha (1, h, w)."""
-    order = bands.flatten(1).sum(1).argsort()
-    weight = weight + 1e-6
-    x, y = (_beyond_local_mean(planes, weight).flatten(1) for planes in (bands[order], alpha))
-    weights, rest, share = _combination(x, y[0], weight.flatten())
-    unexplained = weight.flatten() @ rest.square() / (weight.flatten() @ y[0].square()).clamp(min=1e-12)
-    explained = (1 - unexplained).clamp(min=0)
-    weights = weights / explained.clamp(min=MIX_SETTINGS.diluted).sqrt()
-    detail = _detail(bands[order]).flatten(1)
-    combined = weights @ detail
-    slopes = explained * (detail @ (share * combined)) / (share @ combined.square()).clamp(min=1e-12)
-    misfit = _smooth_misfit(rest.view_as(alpha), share.view_as(alpha))
-    gain = explained / (1 + (misfit / MIX_SETTINGS.misfit) ** 6)
-    offset = share @ (alpha.flatten() - weights @ bands[order].flatten(1))
-    if max(abs(weights.sum() + offset - 1), abs(offset)) < MIX_SETTINGS.alike:
-        weights, offset, slopes = weights / weights.sum(), 0 * offset, slopes * weights.sum()
-    back = order.argsort()
-    return weights[back], offset, slopes[back], gain
-
-
-def _combination(x: Tensor, y: Tensor, weight: Tensor) -> RobustFit:
-    """Weights (C) with which bands x (C, n) make y (n), both about 0; drawn to equal ones. The second time
-    without outliers."""
-    share, mean = weight / weight.sum(), x.mean(0)
-    scale = (share @ y.square()).sqrt() / (share @ mean.square()).sqrt().clamp(min=1e-3)
-    equal = scale.expand(len(x)) / len(x)
-    ridge = MIX_SETTINGS.equal * (share @ x.square().mean(0)) + 1e-12
-    precision, beyond = ridge * torch.eye(len(x)).to(x), y - equal @ x
-
-    def weigh(rest: Tensor) -> Tensor:
-        robust = weight * gaussian(rest, MIX_SETTINGS.outlier)
-        return robust / robust.sum()
-
-    start = least_squares(x, beyond, share, precision)
-    found = robust_least_squares(x, beyond, start, weigh, precision=precision, steps=1)
-    return found._replace(coefficients=equal + found.coefficients)
-
-
-def _beyond_local_mean(planes: Tensor, weight: Tensor) -> Tensor:
-    """Planes (c, h, w) less their weighted mean in wide squares: light and lenses differ between views,
-    slowly."""
-    radius = max(planes.shape[-2:]) // MIX_SETTINGS.wide
-    return planes - (box_mean((planes * weight)[None], radius) / box_mean(weight[None], radius))[0]
-
-
-def _detail(planes: Tensor) -> Tensor:
-    """What pixels of (c, h, w) have beyond the mean of those around: how materials differ does not count."""
-    return planes - avg_pool2d(planes[None], 3, 1, 1, count_include_pad=False)[0]
-
-
-def _smooth_misfit(rest: Tensor, share: Tensor) -> Tensor:
-    """Root mean square of the rest (1, h, w) averaged around each pixel: errors of matches, at edges, average
-    out."""
-    radius = MIX_SETTINGS.smooth
-
-    def mean(plane: Tensor) -> Tensor:
-        return avg_pool2d(plane[None], 2 * radius + 1, 1, radius, count_include_pad=False)[0]
-
-    smooth = mean(share * rest) / mean(share).clamp(min=1e-12)
-    return (share * smooth.square()).sum().sqrt()

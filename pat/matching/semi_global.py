@@ -24,7 +24,7 @@ from torch import Tensor
 
 from arraygeom import Segments
 from arraygeom.chunks import Box
-from arraygeom.sampling import on_image
+from arraygeom.sampling import SLACK
 from arraygeom.threads import in_parallel
 
 from ..support.memory import how_many_fit
@@ -43,7 +43,9 @@ class SemiGlobalSettings:
     step: float = tuned(
         12.0, "Source not recorded: penalty of neighbours whose labels differ by one, in the unit of `cost`"
     )
-    jump: float = tuned(100.0, "Source not recorded: penalty of those that differ by more, where alpha shows no edge")
+    jump: float = tuned(
+        100.0, "Source not recorded: penalty of those that differ by more, where alpha shows no edge"
+    )
     margin: int = size(64, "What is matched around a block, pixels")
     block: int = size(320, "Sides of a block, pixels")
     long_block: int = size(640, "The longer side of the blocks of large images, along the segments")
@@ -67,7 +69,8 @@ CONSISTENT, DISPARITY_FILL = HALF_SIZE.consistent, HALF_SIZE.fill
 
 
 class HalfSizeMatches(NamedTuple):
-    """Matches at half the size: `disparity` (B, 1, H / 2, W / 2) in pixels of beta; facts as of `BetaMatches`."""
+    """Matches at half the size: `disparity` (B, 1, H / 2, W / 2) in pixels of beta; facts as of
+    `BetaMatches`."""
 
     disparity: Tensor
     facts: Tensor
@@ -111,7 +114,8 @@ class _Geometry(NamedTuple):
 
 
 def matched_at_half_size(views: ComparedViews, blocks: Segments) -> HalfSizeMatches:
-    """Matches of views at half the size; `blocks` are the segments of their pixels, in those of the whole beta."""
+    """Matches of views at half the size; `blocks` are the segments of their pixels, in those of the whole
+    beta."""
     own, other = views.alpha, views.beta
     geometry = geometry_of(blocks, len(own), (FINE * other.shape[-2], FINE * other.shape[-1]))
     del blocks
@@ -123,10 +127,12 @@ def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int
     """In pixels of a beta that is so many times smaller. An invalid segment's length is negative: it has no
     pixel.
 
-    Segments that start within a pixel of beta's edge may have been cut there.
+    Segments that start beyond the centres of beta's outermost pixels may have been cut there.
     """
     length, towards = Extent.of(segments)
-    cut = segments.valid & ~on_image(segments.start - 0.5, (hw[0] - 1, hw[1] - 1))
+    last = segments.start.new_tensor([hw[1] - 1, hw[0] - 1])
+    at_edge = (segments.start < -SLACK) | (segments.start > last + SLACK)
+    cut = segments.valid & at_edge.any(-1)
     end = (segments.end + 0.5) / factor - 0.5
     length = torch.where(segments.valid, length / factor, -1.0)
     planes = (numpy_of(x.expand(batch, *x.shape[1:])) for x in (end, towards, length, cut))
@@ -149,7 +155,9 @@ def matched_by_labels(
     own, other = (numpy_of(image[:, 0]) for image in (views.alpha, views.beta))
     found, measured = _matched_blocks(own, other, geometry, windows, settings, facts)
     consistent = (measured[..., 0] < settings.consistent).astype(np.float32)
-    dense = (filled(d[None], c + 1e-5, g, settings.fill)[0] for d, c, g in zip(found, consistent, views.guides))
+    dense = (
+        filled(d[None], c + 1e-5, g, settings.fill)[0] for d, c, g in zip(found, consistent, views.guides)
+    )
     smooth = [cv2.medianBlur(np.where(c > 0, d, fill), 5) for d, c, fill in zip(found, consistent, dense)]
     return torch.from_numpy(np.stack(smooth)), torch.from_numpy(measured)
 
@@ -186,11 +194,13 @@ def _matched_blocks(
     images, tasks, nbytes = [], [], 1.0
     for i, (mine, its) in enumerate(zip(planes[: len(own)], planes[len(own) :])):
         views = own[i], windows.first[i], *(g[i] for g in geometry), *mine
-        images.append(_Image(views, _flat(its), (rows, columns), (disparity[i], measured[i], place[i]), []))
+        images.append(_Image(views, flat(its), (rows, columns), (disparity[i], measured[i], place[i]), []))
         boxes = _boxes(hw, geometry.along[i], windows.first.shape[-1] * windows.labels, settings)
         tasks += [partial(_block, images[-1], box, windows, settings) for box in boxes]
         largest = max(_pixels_in(outer, hw) for _, outer in boxes)
-        nbytes = max(nbytes, largest * (settings.pixel_bytes + settings.label_bytes * math.prod(windows.lanes)))
+        nbytes = max(
+            nbytes, largest * (settings.pixel_bytes + settings.label_bytes * math.prod(windows.lanes))
+        )
     in_parallel(tasks, most=how_many_fit(nbytes))
     for image, fact, its in zip(images, measured[..., 0], place):
         label = (reduce(np.minimum, image.claims)[its] & 0xFFFF).astype(np.float32)
@@ -203,7 +213,7 @@ def _prepare(planes: list[tuple[NDArray, ...]], i: int, image: NDArray) -> None:
     planes[i] = planes_of(image)
 
 
-def _flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
+def flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
     """Planes (h, w, ...) as lists of pixels."""
     return tuple(plane.reshape(-1, *plane.shape[2:]) for plane in planes)
 
@@ -240,7 +250,7 @@ def _block(image: _Image, box: tuple, windows: Windows, settings: SemiGlobalSett
     guide, first, end, along, length, cut, *own = (np.ascontiguousarray(x[outer]) for x in image.views)
     labels, segments = (first, windows.labels), (end, along, length, cut)
     cost = np.empty((*length.shape, *windows.lanes), np.uint8)
-    kernels.costs(_flat(own), image.other, *labels, *segments, *image.hw, cost)
+    kernels.costs(flat(own), image.other, *labels, *segments, *image.hw, cost)
     total = np.empty(cost.shape, np.int16)
     step, jump = np.float32(settings.step), np.float32(settings.jump)
     kernels.aggregate(cost, guide, *labels, step, jump, total)

@@ -204,7 +204,8 @@ def aggregate(cost, guide, first, count, small, large, total):
     height, width, runs, lanes = cost.shape
     reach = count + 1
     pad = (reach + NARROW) // NARROW * NARROW
-    # Three rows of paths that the next row reads, two along the row, and one of zeros, from which the first go on.
+    # Three rows of paths that the next row reads, two along the row, and one of zeros, from which the first
+    # go on.
     slots, stride = 3 * width + 4 * height + 7, runs * (lanes + pad)
     paths, fewest = np.full(slots * stride + lanes + 2 * pad, WALL, np.int16), np.zeros(slots, np.int16)
     for run in range(runs):
@@ -225,7 +226,9 @@ def _sweep(way, shape, planes, guide, reach, pad, small, large, paths, fewest, j
     """
     height, width, runs, lanes = shape
     cost, first, total = pointers(planes)
-    paths, fewest, ahead, above, behind, beside = pointers((paths, fewest, jumps[0], jumps[1], jumps[2], jumps[3]))
+    paths, fewest, ahead, above, behind, beside = pointers(
+        (paths, fewest, jumps[0], jumps[1], jumps[2], jumps[3])
+    )
     known = cost, first, total, paths, fewest, runs, lanes, pad, reach, _repeat(np.int16(small * PARTS))
     side, none = 3 * width + 4 * height + 4, 3 * width + 4 * height + 6
     step = 1 - 2 * way
@@ -394,7 +397,8 @@ def _lowest(costs, first, last):
 
 @compiled(inline="always")
 def _rounding(end, along, label):
-    """How far along its segment a label's pixel of beta, to which its position is rounded, is from that position."""
+    """How far along its segment a label's pixel of beta, to which its position is rounded, is from that
+    position."""
     x, y = end[0] + label * along[0], end[1] + label * along[1]
     return (np.floor(x + HALF) - x) * along[0] + (np.floor(y + HALF) - y) * along[1]
 
@@ -426,8 +430,9 @@ def regression(brightness, total, first, second, colour, product, floor, along, 
 
 @compiled(nogil=True, cache=True)
 def costs_at(own, other, places, out):
-    """Cost of alpha's pixel and beta's at each of its places, pixels of beta counted row by row (-1: none): out (h, w,
-    1, lanes), of which those after the last place have no label. `own` and `other` are flat planes of `cost`."""
+    """Cost of alpha's pixel and beta's at each of its places, pixels of beta counted row by row (-1: none):
+    out (h, w, 1, lanes), of which those after the last place have no label. `own` and `other` are flat planes
+    of `cost`."""
     height, width, labels = places.shape
     for y in range(height):
         for x in range(width):

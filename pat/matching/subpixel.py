@@ -32,7 +32,8 @@ FULL_SIZE = SemiGlobalSettings(
     jump=80.0,
     margin=48,
 )
-"""Penalties chosen on Middlebury's pairs of the tune half; half the size, where a label is two pixels, has others."""
+"""Penalties chosen on Middlebury's pairs of the tune half; half the size, where a label is two pixels, has
+others."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,8 @@ SETTINGS = SubpixelSettings()
 def matched_at_full_size(
     views: ComparedViews, segments: Segments, half: Float[Tensor, "b 1 h2 w2"]
 ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h2 w2"]]:
-    """Disparity to a fraction of a pixel from that at half the size, and how far matching back from beta disagrees, 0
-    to 1, at half the size. Where it disagrees, disparity is diffused from where it does not."""
+    """Disparity to a fraction of a pixel from that at half the size, and how far matching back from beta
+    disagrees, 0 to 1, at half the size. Where it disagrees, disparity is diffused from where it does not."""
     own, other = views.alpha, views.beta
     geometry = geometry_of(segments, len(own), (other.shape[-2], other.shape[-1]), factor=1)
     windows = Windows(np.stack([_runs(plane) for plane in numpy_of(half[:, 0])]), SETTINGS.run)
@@ -78,9 +79,9 @@ def matched_at_full_size(
 def _precise(
     views: ComparedViews, segments: Segments, disparity: Tensor, consistent: Tensor, rough: Tensor
 ) -> Float[Tensor, "b 1 h w"]:
-    """Disparity to a fraction of a pixel: where that of half the size (`rough`) is near, the mean of both; from there a
-    step of least squares of the brightness around each pixel (Lucas and Kanade 1981); and the result smoothed within
-    surfaces, where brightness says little of the position more than elsewhere."""
+    """Disparity to a fraction of a pixel: where that of half the size (`rough`) is near, the mean of both;
+    from there a step of least squares of the brightness around each pixel (Lucas and Kanade 1981); and the
+    result smoothed within surfaces, where brightness says little of the position more than elsewhere."""
     own, other, guides = views
     near = consistent & ((disparity - rough).abs() < SETTINGS.same)
     start = torch.where(near, (disparity + rough) / 2, disparity)
@@ -89,17 +90,20 @@ def _precise(
     step = (common / (slope + SETTINGS.step_floor)).clamp(-SETTINGS.most_step, SETTINGS.most_step)
     weight = torch.where(consistent, slope / (slope + SETTINGS.flat) + SETTINGS.least_weight, 0.0) + 1e-5
     planes = zip(numpy_of(torch.where(near, start + step, start)), numpy_of(weight[:, 0]), guides)
-    smooth = np.stack([filled(d, w, _surfaces(d[0], brightness), SETTINGS.surface) for d, w, brightness in planes])
+    smooth = np.stack(
+        [filled(d, w, _surfaces(d[0], brightness), SETTINGS.surface) for d, w, brightness in planes]
+    )
     return torch.from_numpy(smooth).to(disparity)
 
 
 def with_gradients(
     views: ComparedViews, segments: Segments, disparity: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 h w"]:
-    """The same disparity, with the gradients of where brightness along the segments agrees best around each pixel.
+    """The same disparity, with the gradients of where brightness along the segments agrees best around each
+    pixel.
 
-    By the implicit function theorem: there the least squares' step is zero, and stays so if the match moves by as
-    much as images and segments move the step.
+    By the implicit function theorem: there the least squares' step is zero, and stays so if the match moves
+    by as much as images and segments move the step.
     """
     step = _step(views, segments, disparity)
     return disparity + (step - step.detach())
@@ -116,10 +120,13 @@ def _step(views: ComparedViews, segments: Segments, disparity: Tensor) -> Float[
 def _compared(
     own: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"], segments: Segments, disparity: Tensor
 ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"]]:
-    """Of each pixel, both less their mean around it: how much brighter beta is a pixel farther along its segment than
-    at its match, and how much brighter alpha is than beta there."""
+    """Of each pixel, both less their mean around it: how much brighter beta is a pixel farther along its
+    segment than at its match, and how much brighter alpha is than beta there."""
     across, down = (torch.gradient(other, dim=side)[0] for side in (3, 2))
-    still, extent = Segments(segments.start.detach(), segments.end.detach(), segments.valid), Extent.of(segments)
+    still, extent = (
+        Segments(segments.start.detach(), segments.end.detach(), segments.valid),
+        Extent.of(segments),
+    )
     seen, across, down = at_matches(torch.cat([other, across, down], 1), still, disparity)[0].split(1, 1)
     if segments.end.requires_grad or segments.start.requires_grad:
         # Along these slopes: those of bicubic sampling itself are half as much again at whole pixels.
@@ -143,7 +150,9 @@ def _runs(half: NDArray[np.float32]) -> NDArray[np.int32]:
     """First labels (h, w, 2) of both runs at full size, from disparity at half the size: around the least of
     its neighbourhood and around the greatest, or, where these are near each other, one beside the other."""
     window, run = np.ones((SETTINGS.neighbourhood,) * 2, np.uint8), SETTINGS.run
-    low, high = (np.rint(_doubled(f(half, window))).astype(np.int32) - run // 2 for f in (cv2.erode, cv2.dilate))
+    low, high = (
+        np.rint(_doubled(f(half, window))).astype(np.int32) - run // 2 for f in (cv2.erode, cv2.dilate)
+    )
     low = np.maximum(np.where(high < low + run, (low + high) // 2 - run // 2, low), 0)
     return np.stack([low, np.maximum(high, low + run)], -1)
 

@@ -1,15 +1,16 @@
-"""Fields of explicit positions for networks that sample segments: the tangents of their curves at a first match.
+"""Fields of explicit positions for networks that sample segments: the tangents of their curves at a first
+match.
 
-Where a pixel's positions follow each other along a curve they are labels like those of a segment: semi-global matching
-at half the size finds one, among neighbours that agree. Positions without an order (a window, the nearest pixels, all)
-have no neighbours to agree with: the best one of each pixel is taken alone. The line through the match along the curve
-then is the pixel's search segment, in pixels of arc from its last position, and what follows is as for any segment.
+Where a pixel's positions follow each other along a curve they are labels like those of a segment: semi-global
+matching at half the size finds one, among neighbours that agree. Positions without an order (a window, the
+nearest pixels, all) have no neighbours to agree with: the best one of each pixel is taken alone. The line
+through the match along the curve then is the pixel's search segment, in pixels of arc from its last position,
+and what follows is as for any segment.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -33,16 +34,16 @@ from .cost import planes_of
 from .filters import filled, numpy_of
 from .normalisation import Normalisation
 from .positions import FINE
-from .semi_global import DISPARITY_FILL, HALF_SIZE, inner_and_outer
+from .semi_global import DISPARITY_FILL, HALF_SIZE, flat, inner_and_outer
 
 ORDERED = 0.95
-"""Share of pixels whose steps from one position to the next hardly ever go back, from which positions are a curve:
-those of a window and of a whole image go back at the end of each row."""
+"""Share of pixels whose steps from one position to the next hardly ever go back, from which positions are a
+curve: those of a window and of a whole image go back at the end of each row."""
 SEAM = 2
 """How often those of a curve go back: onto the other side of a whole sphere's image, and on from there."""
 LEAST_MARGIN = 0.02
-"""Margin of a match to the second best, as of `BetaMatches.facts`, up to which it is filled from its neighbours.
-*size*: what follows matches again, around it."""
+"""Margin of a match to the second best, as of `BetaMatches.facts`, up to which it is filled from its
+neighbours. *size*: what follows matches again, around it."""
 HALF_WINDOW = 8.0
 """Of a match in a set of positions: how far its segment goes to either side, pixels. *size*"""
 AT_ONCE = 1 << 21
@@ -52,15 +53,18 @@ AT_ONCE = 1 << 21
 def along_tangents(
     alpha: Float[Tensor, "1 1 h w"], guide: Float[Tensor, "1 1 hb wb"], field: FieldOnGrid, name: str = "beta"
 ) -> FieldOnGrid:
-    """A field of positions of one rig as segments through its matches in the one beta; sides of images are even.
+    """A field of positions of one rig as segments through its matches in the one beta; sides of images are
+    even.
 
-    Warns of positions that have no order. The label of each pixel is a constant; positions keep their gradients.
+    Warns of positions that have no order. The label of each pixel is a constant; positions keep their
+    gradients.
     """
     grid = _BlockCentres(field, (alpha.shape[-2] // FINE, alpha.shape[-1] // FINE))
     ordered = grid.ordered()
     if not ordered:
         warnings.warn(
-            f"the field in '{name}' is a set of positions without an order: each pixel is matched alone", stacklevel=2
+            f"the field in '{name}' is a set of positions without an order: each pixel is matched alone",
+            stacklevel=2,
         )
     with torch.no_grad():
         labels = torch.from_numpy(_labels(alpha, guide, grid, ordered=ordered))
@@ -90,7 +94,9 @@ class _BlockCentres:
         grid = (pixel_grid((h, w), dtype=torch.float64)[rows, columns] + 0.5) * FINE - 0.5
         found = self.field.at(grid.reshape(-1, 2))
         if not isinstance(found, Positions):
-            raise TypeError("this field gives segments for some pixels and positions for others: give one kind")
+            raise TypeError(
+                "this field gives segments for some pixels and positions for others: give one kind"
+            )
         return Positions(
             *(t.reshape(*grid.shape[:2], *t.shape[t.ndim - n :]) for t, n in ((found.xy, 2), (found.mask, 1)))
         )
@@ -138,7 +144,7 @@ def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool)
     own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
     level = Normalisation.of(own, other)
     a, b = (numpy_of(p[0, 0]) for p in level.equally_sharp(own, level.normalised(other)))
-    planes, other_planes = planes_of(a), _flat(planes_of(b))
+    planes, other_planes = planes_of(a), flat(planes_of(b))
     label, margin = np.zeros((2, *a.shape), np.float32)
     rows = [(rows, slice(0, a.shape[1])) for rows in grid.by_rows()]
     sides = (HALF_SIZE.margin, HALF_SIZE.block, HALF_SIZE.block)
@@ -147,7 +153,7 @@ def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool)
         lanes = -(-places.shape[-1] // kernels.LANES) * kernels.LANES
         cost = np.empty((*places.shape[:2], 1, lanes), np.uint8)
         parts = [np.ascontiguousarray(p[outer]) for p in planes]
-        kernels.costs_at(_flat(parts), other_planes, places, cost)
+        kernels.costs_at(flat(parts), other_planes, places, cost)
         total = cost.astype(np.int16)
         if ordered:
             first = np.zeros((*places.shape[:2], 1), np.int32)
@@ -163,16 +169,13 @@ def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool)
     return cv2.medianBlur(np.where(weight > LEAST_MARGIN, label, dense).astype(np.float32), 5)
 
 
-def _flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
-    """Planes (h, w) as lists of pixels."""
-    return tuple(plane.ravel() for plane in planes)
-
-
 def _places(grid: _BlockCentres, box: tuple[slice, ...], hw: tuple[int, ...]) -> NDArray[np.int32]:
     """Where positions are in the reduced beta, pixels counted row by row; -1 for those that do not count."""
     (h, w), (rows, columns) = hw, box
     parts = []
-    for top, bottom in spans(min(rows.stop, grid.hw[0]) - rows.start, max(1, AT_ONCE // (w * grid.field.samples))):
+    for top, bottom in spans(
+        min(rows.stop, grid.hw[0]) - rows.start, max(1, AT_ONCE // (w * grid.field.samples))
+    ):
         found = grid.at(slice(rows.start + top, rows.start + bottom), columns)
         x, y = ((found.xy + 0.5) / FINE - 0.5).round().int().unbind(-1)
         inside = found.mask & (x >= 0) & (y >= 0) & (x < w) & (y < h)
@@ -216,7 +219,8 @@ def _tangents(found: Positions, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]
 
 
 def _around(found: Chosen, guide: NDArray[np.uint8]) -> Segments:
-    """Segments along x around positions that were chosen alone, which a median makes agree with their neighbours."""
+    """Segments along x around positions that were chosen alone, which a median makes agree with their
+    neighbours."""
     xy = found.xy.detach().float().numpy()
     smooth = np.stack([cv2.medianBlur(np.ascontiguousarray(xy[..., i]), 5) for i in range(2)], -1)
     middle = torch.from_numpy(smooth).to(found.xy)

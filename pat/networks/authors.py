@@ -2,8 +2,7 @@
 
 Their repository, github.com/djbradyAtOpticalSciencesArizona/physicsAwareTransformer, trains under
 DataParallel and saves a dict with `epoch`, `psnr` and `state_dict`, whose names begin with `module.`. The
-files are read with
-`weights_only`: tensors and plain numbers, nothing that runs.
+files are read with `weights_only`: tensors and plain numbers, nothing that runs.
 """
 
 from __future__ import annotations
@@ -62,7 +61,13 @@ def config_of(given: Mapping[str, Tensor]) -> PATConfig:
     dim, in_channels = given["init_feature.0.weight"].shape[:2]
     scale = round((len(given["upscale.4.weight"]) / max(dim, 1)) ** 0.5)
     out_channels = len(given["upscale.7.weight"])
-    sizes = {"betas": betas, "in_channels": in_channels, "out_channels": out_channels, "dim": dim, "scale": scale}
+    sizes = {
+        "betas": betas,
+        "in_channels": in_channels,
+        "out_channels": out_channels,
+        "dim": dim,
+        "scale": scale,
+    }
     if min(sizes.values()) < 1 or max(sizes.values()) > 1024:
         raise ValueError(f"it has {', '.join(f'{name} {n}' for name, n in sizes.items())}")
     layout: dict[str, Any] = {"block_bias": False, "fusion_bias": True, "values_after_block": True}
@@ -138,7 +143,9 @@ def _loaded(path: Path) -> Any:
     scalar = import_module("numpy.core.multiarray").scalar
     number = [(scalar, f"{core}.multiarray.scalar") for core in ("numpy.core", "numpy._core")]
     try:
-        with torch.serialization.safe_globals([*number, np.dtype, type(np.dtype(np.float64)), type(np.dtype("f4"))]):
+        with torch.serialization.safe_globals(
+            [*number, np.dtype, type(np.dtype(np.float64)), type(np.dtype("f4"))]
+        ):
             return torch.load(path, map_location="cpu", weights_only=True)
     except UnpicklingError as error:
         what = re.search(r"GLOBAL (\S+)", str(error))

@@ -1,7 +1,7 @@
 """BandwisePAT: any number of bands, each treated alike, so that the order of the betas cannot matter.
 
 GuidedPAT mixes its bands in the order in which they come. Here the bands of a beta are matched and judged
-together, by the combination of them that is most like alpha (`pat.matching.radiometry`); then one GuidedPAT
+together, by the combination of them that is most like alpha (`pat.matching.spectral_mix`); then one GuidedPAT
 of a single band finishes each with the same weights. Permuting bands or betas permutes the output's bands and
 does nothing else.
 """

@@ -54,7 +54,9 @@ class ResidualASPP(nn.Module):
 
 def conv(inputs: int, outputs: int, *, stride: int = 1) -> nn.Sequential:
     """A 3x3 convolution and its activation."""
-    return nn.Sequential(nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1), nn.LeakyReLU(0.1, inplace=True))
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1), nn.LeakyReLU(0.1, inplace=True)
+    )
 
 
 def channels_last(x: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d h w"]:

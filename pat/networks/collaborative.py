@@ -37,11 +37,13 @@ class CollaborativeSettings:
     rows: int = size(16, "Rows of blocks that a thread works on at once")
     threshold: float = tuned(
         2.9,
-        "Middlebury, tune half: coefficients of so many standard deviations of the noise are kept in the first pass",
+        "Middlebury, tune half: coefficients of so many standard deviations of the noise are kept "
+        "in the first pass",
     )
     as_recorded: float = tuned(
         0.5,
-        "Middlebury, tune half: later passes look for alike blocks in an estimate with so much of the noise left: "
+        "Middlebury, tune half: later passes look for alike blocks in an estimate with so much of "
+        "the noise left: "
         "where an image is flat the noise makes blocks alike that lie apart, as is needed",
     )
     kept: float = tuned(
@@ -64,7 +66,9 @@ def without_noise(
 
 
 def refined(
-    estimate: Float[Tensor, "b c h w"], recorded: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"]
+    estimate: Float[Tensor, "b c h w"],
+    recorded: Float[Tensor, "b c h w"],
+    deviation: Float[Tensor, "b c h w"],
 ) -> Float[Tensor, "b c h w"]:
     """A network's estimate of an image of one band or of three (RGB), from what was recorded with noise.
 
@@ -135,7 +139,10 @@ def collaboratively_filtered(
     margin = SIDE - STEP
     across, down = (-(-(size + margin) // STEP) for size in (w, h))
     first = RADIUS + margin
-    padding = [(0, 0), *((first, STEP * count + RADIUS + margin - size) for count, size in ((down, h), (across, w)))]
+    padding = [
+        (0, 0),
+        *((first, STEP * count + RADIUS + margin - size) for count, size in ((down, h), (across, w))),
+    ]
     planes = [
         np.pad(x.detach().float().cpu().numpy(), padding, mode="symmetric")
         for x in (image, expected, deviation.square(), guide)
@@ -160,7 +167,9 @@ def collaboratively_filtered(
 
 
 _PHASES = np.outer(np.arange(SIDE), 2 * np.arange(SIDE) + 1) * np.pi / (2 * SIDE)
-COSINES = (np.cos(_PHASES) * np.where(np.arange(SIDE) > 0, 2, 1)[:, None] ** 0.5 / SIDE**0.5).astype(np.float32)
+COSINES = (np.cos(_PHASES) * np.where(np.arange(SIDE) > 0, 2, 1)[:, None] ** 0.5 / SIDE**0.5).astype(
+    np.float32
+)
 """The cosine transform (DCT-II) as an orthogonal matrix. By scipy it would add to the time of every start."""
 WINDOW = np.outer(np.kaiser(SIDE, 2.0), np.kaiser(SIDE, 2.0)).astype(np.float32)
 """What a block's pixels count when blocks are put together."""

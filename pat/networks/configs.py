@@ -67,7 +67,9 @@ class BandwisePATConfig(GuidedPATConfig):
 
     def __post_init__(self) -> None:
         if self.bands != 1 or self.keep_luminance:
-            raise ValueError("BandwisePAT fuses one band at a time: leave bands at 1 and keep_luminance at false")
+            raise ValueError(
+                "BandwisePAT fuses one band at a time: leave bands at 1 and keep_luminance at false"
+            )
 
 
 CONFIGS = {"PAT": PATConfig, "GuidedPAT": GuidedPATConfig, "BandwisePAT": BandwisePATConfig}

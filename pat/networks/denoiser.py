@@ -27,7 +27,9 @@ class DenoiserSettings:
         "about as large as values",
     )
     blur: int = tuned(2, "Source not recorded: radius of the blur of colour differences, pixels")
-    colour_noise: float = tuned(0.02, "Source not recorded: the deviation at which half of that blur is taken")
+    colour_noise: float = tuned(
+        0.02, "Source not recorded: the deviation at which half of that blur is taken"
+    )
 
 
 SETTINGS = DenoiserSettings()
@@ -70,7 +72,10 @@ class Denoising(nn.Module):
         nn.init.zeros_(self.network.last.weight)
 
     def forward(
-        self, image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"], *further: Float[Tensor, "b _ h w"]
+        self,
+        image: Float[Tensor, "b c h w"],
+        deviation: Float[Tensor, "b c h w"],
+        *further: Float[Tensor, "b _ h w"],
     ) -> Float[Tensor, "b c h w"]:
         """Of any size; `further` are other images of the same pixels."""
         h, w = image.shape[-2:]
@@ -93,7 +98,9 @@ class ColourDenoising(nn.Module):
         self.network = UNet(4 * 3 + 3 + 2, widths, 4 * 3)
         nn.init.zeros_(self.network.last.weight)
 
-    def forward(self, image: Float[Tensor, "b 3 h w"], deviation: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+    def forward(
+        self, image: Float[Tensor, "b 3 h w"], deviation: Float[Tensor, "b 3 h w"]
+    ) -> Float[Tensor, "b 3 h w"]:
         """Of any size."""
         h, w = image.shape[-2:]
         enough = (0, -w % SETTINGS.multiple, 0, -h % SETTINGS.multiple)
@@ -103,7 +110,11 @@ class ColourDenoising(nn.Module):
         share = noise.square() / (noise.square() + SETTINGS.colour_noise**2)
         share = torch.cat([torch.zeros_like(share[:, :1]), share[:, 1:]], 1)
         base = torch.lerp(bands, blurred, share)
-        given = [pixel_unshuffle(bands, 2), SETTINGS.scale * avg_pool2d(noise, 2), avg_pool2d(bands[:, 1:], 2)]
+        given = [
+            pixel_unshuffle(bands, 2),
+            SETTINGS.scale * avg_pool2d(noise, 2),
+            avg_pool2d(bands[:, 1:], 2),
+        ]
         found = pixel_shuffle(self.network(torch.cat(given, 1)).float(), 2)
         return 0.5 + rgb_of_opponent(base - noise * found)[..., :h, :w]
 
@@ -134,7 +145,11 @@ class LowLightNetwork(nn.Module):
         self.fused = Denoising(3, config.fused, further=9)
 
     def forward(
-        self, image: Float[Tensor, "b 3 h w"], alpha: NoisyView, beta: NoisyView, confidence: Float[Tensor, "b 1 h w"]
+        self,
+        image: Float[Tensor, "b 3 h w"],
+        alpha: NoisyView,
+        beta: NoisyView,
+        confidence: Float[Tensor, "b 1 h w"],
     ) -> Float[Tensor, "b 3 h w"]:
         """The image fused from denoised views, corrected by both views as they were recorded.
 

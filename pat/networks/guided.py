@@ -1,9 +1,9 @@
 """GuidedPAT: C3 attention from coarse to fine, colour guided by alpha.
 
-Our own network, for one alpha whose detail is to be preserved and betas that have colour. Matching (`pat.matching`)
-has found each pixel's position along its segment; attention samples a short window around it at full size. The network
-estimates the confidence that the match is the point that alpha sees, propagates colour from pixels of high confidence
-to the others, and adds it to alpha.
+Our own network, for one alpha whose detail is to be preserved and betas that have colour. Matching
+(`pat.matching`) has found each pixel's position along its segment; attention samples a short window around it
+at full size. The network estimates the confidence that the match is the point that alpha sees, propagates
+colour from pixels of high confidence to the others, and adds it to alpha.
 """
 
 from __future__ import annotations
@@ -53,7 +53,9 @@ class GuidedSettings:
         "Middlebury, tune half: goes with the next training: how much of what the head adds is "
         "added: it was trained to mend more than is left to be mended",
     )
-    likeness: float = tuned(0.06, "Source not recorded: difference of brightness at which likeness falls to 1 / e")
+    likeness: float = tuned(
+        0.06, "Source not recorded: difference of brightness at which likeness falls to 1 / e"
+    )
     likest: float = tuned(
         3.0,
         "Source not recorded: how much more a beta's colour counts, as a logit, where it is as "
@@ -72,8 +74,10 @@ class BetaEstimate(NamedTuple):
     colour: (B, C, H, W), its bands minus alpha, attended and matched, mixed.
     diffused: (B, fills, C, H, W), the same diffused within alpha from pixels of high weight.
     logit: (B, 1, H, W), of the confidence that `colour` is of the point that alpha sees.
-    choice: (B, 1 + fills, H, W), logits of the alternatives where it is not: propagated, or each of `diffused`.
-    position: (B, 2, H, W), the semi-global match in beta, pixels; beyond beta's edge where the segment is cut there.
+    choice: (B, 1 + fills, H, W), logits of the alternatives where it is not: propagated, or each of
+        `diffused`.
+    position: (B, 2, H, W), the semi-global match in beta, pixels; beyond beta's edge where the segment is cut
+        there.
     likeness: (B, 1, H, W), of alpha's brightness and that attended in beta, 0 to 1.
     prior: how much more its colour counts than another beta's, as a logit.
     """
@@ -91,8 +95,8 @@ class BetaEstimate(NamedTuple):
 
     @property
     def confidence(self) -> Float[Tensor, "b h w"]:
-        """That `colour` is of the point that alpha sees, 0 to 1. Over [1 2 1] pixels: the four pixels that are made of
-        one at half the size differ by some .02."""
+        """That `colour` is of the point that alpha sees, 0 to 1. Over [1 2 1] pixels: the four pixels that
+        are made of one at half the size differ by some .02."""
         found = pad(self.logit.sigmoid(), (1, 1, 1, 1), mode="replicate")
         return avg_pool2d(avg_pool2d(found, 2, 1), 2, 1)[:, 0] * (self.peak > 0)
 
@@ -103,9 +107,12 @@ class BetaEstimate(NamedTuple):
         return (self.logit + unlike + (alike - unlike) * self.likeness).sigmoid()
 
     def beyond(self, base: Float[Tensor, "b c h w"], band: int) -> BetaEstimate:
-        """One band alone, counted from a base instead of from alpha; `base` (B, C, H, W) is bands minus alpha."""
+        """One band alone, counted from a base instead of from alpha; `base` (B, C, H, W) is bands minus
+        alpha."""
         of = slice(band, band + 1)
-        return self._replace(colour=(self.colour - base)[:, of], diffused=(self.diffused - base[:, None])[:, :, of])
+        return self._replace(
+            colour=(self.colour - base)[:, of], diffused=(self.diffused - base[:, None])[:, :, of]
+        )
 
 
 class Encoded(NamedTuple):
@@ -116,7 +123,8 @@ class Encoded(NamedTuple):
 
 
 class GuidedPAT(nn.Module):
-    """Betas whose bands, in order, are the output's: three cameras with filters, or any number of RGB cameras.
+    """Betas whose bands, in order, are the output's: three cameras with filters, or any number of RGB
+    cameras.
 
     Other betas beside those with all bands help to find depth.
 
@@ -142,19 +150,25 @@ class GuidedPAT(nn.Module):
         self.fine_key = nn.Conv2d(w2, 4 * c.fine_dim, 1)
         self.judge = UNet(w4 + 9, c.widths[1:], c.judge_dim)
         self.confidence = ConfidenceHead(c.judge_dim + w2 + 4 + 12, c.confidence_dim)
-        self.propagation = nn.ModuleList(Propagation(w4, c.propagation_dim, spacing) for spacing in c.propagation_steps)
+        self.propagation = nn.ModuleList(
+            Propagation(w4, c.propagation_dim, spacing) for spacing in c.propagation_steps
+        )
         if c.head_dim:
             self.propagate = UNet(w4 + 2 * c.bands, c.widths[1:], w2)
             self.head = Head(4 * (1 + 3 * c.bands) + 2 * w2, c.head_dim, c.bands)
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
-        """In the head; or around attention, which comes for one beta after the other; and the estimates of others."""
+        """In the head; or around attention, which comes for one beta after the other; and the estimates of
+        others."""
         most = max(betas, default=0)
         return max(350.0 * alpha, 145.0 * alpha + 100.0 * most) + 130.0 * alpha * max(len(betas) - 1, 0)
 
     def _in_parts(self, inputs: Inputs) -> bool:
-        """Whether each beta has some of the bands, in order; else those with all of them show the same colours."""
-        return all(beta.image.shape[1] != self.config.bands for beta in inputs.betas) or len(inputs.betas) == 1
+        """Whether each beta has some of the bands, in order; else those with all of them show the same
+        colours."""
+        return (
+            all(beta.image.shape[1] != self.config.bands for beta in inputs.betas) or len(inputs.betas) == 1
+        )
 
     def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
         """Fuse alpha (B, 1, H, W) with the betas. The image has the betas' bands.
@@ -171,7 +185,11 @@ class GuidedPAT(nn.Module):
             raise ValueError(f"the betas have {bands} bands in all, this network makes {self.config.bands}")
         alpha, own = inputs.alpha, self.encoder(inputs.alpha)
         estimates = [self.estimate(own, alpha, *one) for one in zip(inputs.betas, matches.betas)]
-        used = estimates if parts else [combined([e for e in estimates if e.colour.shape[1] == self.config.bands])]
+        used = (
+            estimates
+            if parts
+            else [combined([e for e in estimates if e.colour.shape[1] == self.config.bands])]
+        )
         residual = self.blended(own, alpha, used)
         if self.config.keep_luminance:
             residual = residual - inputs.luminance * luminance(residual)
@@ -189,11 +207,13 @@ class GuidedPAT(nn.Module):
             return blend
         rough = avg_pool2d(torch.cat([colour * confidence, confidence], 1), SETTINGS.coarse)
         context = self.propagate(stacked(own.quarter, rough))
-        return blend + SETTINGS.head_share * self.head(alpha, blend, colour, confidence, own.half, enlarge(context))
+        return blend + SETTINGS.head_share * self.head(
+            alpha, blend, colour, confidence, own.half, enlarge(context)
+        )
 
     def _unseen(self, own: Encoded, estimate: BetaEstimate) -> Tensor:
-        """Colour for where beta does not see the point: propagated at 1/4 of the size to pixels that are similar in
-        alpha, or diffused."""
+        """Colour for where beta does not see the point: propagated at 1/4 of the size to pixels that are
+        similar in alpha, or diffused."""
         confidence = estimate.logit.sigmoid()
         weight = avg_pool2d(confidence, SETTINGS.coarse)
         colour = avg_pool2d(estimate.colour * confidence, SETTINGS.coarse) / (weight + SETTINGS.least_weight)
@@ -222,7 +242,9 @@ class GuidedPAT(nn.Module):
         logit = torch.where(peak[:, None] > 0, logit, SETTINGS.nowhere)
         colour = torch.lerp(value - alpha, bands.to(value), (exact + SETTINGS.exact_offset).sigmoid())
         alike = likeness(facts[0], SETTINGS.likeness)
-        return BetaEstimate(attended, deviation, peak, colour, diffused, logit, choice, position, alike, found.prior)
+        return BetaEstimate(
+            attended, deviation, peak, colour, diffused, logit, choice, position, alike, found.prior
+        )
 
     def _judged(self, own: Encoded, found: BetaMatches, facts: Tensor, valid: Tensor) -> Tensor:
         """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the semi-global match."""
@@ -233,8 +255,11 @@ class GuidedPAT(nn.Module):
         return self.confidence(stacked(enlarge(context), own.half, matched, facts))
 
     def _key(self, features: Encoded) -> Tensor:
-        """What queries and keys are at full size; the channels are beside each other, as attention wants them."""
-        weight, bias = (p.unflatten(0, (-1, 2, 2)).movedim(0, 2).flatten(0, 2) for p in self.fine_key.parameters())
+        """What queries and keys are at full size; the channels are beside each other, as attention wants
+        them."""
+        weight, bias = (
+            p.unflatten(0, (-1, 2, 2)).movedim(0, 2).flatten(0, 2) for p in self.fine_key.parameters()
+        )
         x = conv2d(features.half, weight, bias).movedim(1, -1)
         b, h, w, c = x.shape
         pixels = x.unflatten(-1, (2, c // 2)).movedim(3, 2)
@@ -256,9 +281,11 @@ def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]
 
 
 def combined(estimates: Sequence[BetaEstimate]) -> BetaEstimate:
-    """The estimate of several betas with the same bands: what each shows, weighted by its odds of being right.
+    """The estimate of several betas with the same bands: what each shows, weighted by its odds of being
+    right.
 
-    Beside depth's edges one beta may show another surface and be as confident as the others: its brightness tells.
+    Beside depth's edges one beta may show another surface and be as confident as the others: its brightness
+    tells.
     """
     if len(estimates) == 1:
         return estimates[0]
@@ -296,10 +323,11 @@ class ConfidenceHead(nn.Sequential):
 
 
 class Propagation(nn.Module):
-    """C3 attention of alpha to itself: each pixel takes colour from similar pixels of high weight in 7 x 7 around it.
+    """C3 attention of alpha to itself: each pixel takes colour from similar pixels of high weight in 7 x 7
+    around it.
 
-    The logarithm of the weight is added to the scores as one more channel of the keys. Without training all pixels are
-    equally similar, and this is a normalised convolution.
+    The logarithm of the weight is added to the scores as one more channel of the keys. Without training all
+    pixels are equally similar, and this is a normalised convolution.
     """
 
     def __init__(self, width: int, dim: int, step: int) -> None:
@@ -309,7 +337,10 @@ class Propagation(nn.Module):
         nn.init.zeros_(self.query.weight)
 
     def forward(
-        self, features: Float[Tensor, "b d h w"], colour: Float[Tensor, "b c h w"], weight: Float[Tensor, "b 1 h w"]
+        self,
+        features: Float[Tensor, "b d h w"],
+        colour: Float[Tensor, "b c h w"],
+        weight: Float[Tensor, "b 1 h w"],
     ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
         """Colour and weight after one round."""
         query = torch.cat([self.query(features), torch.ones_like(weight)], 1)
@@ -322,7 +353,8 @@ class Propagation(nn.Module):
 def window_around(
     disparity: Float[Tensor, "b 1 h w"], segments: Segments, window: float, extent: Extent | None = None
 ) -> Segments:
-    """The parts of segments (B or 1, 2 h, 2 w) up to `window` pixels from the match at `disparity` from their end."""
+    """The parts of segments (B or 1, 2 h, 2 w) up to `window` pixels from the match at `disparity` from their
+    end."""
     extent = extent or Extent.of(segments)
     middle, step = matches(segments, disparity, extent=extent), window * extent.towards
     return Segments(middle + step, middle - step, segments.valid.expand(middle.shape[:-1]))
@@ -341,7 +373,9 @@ class Encoder(nn.Module):
         w2, w4, w8, _ = widths
         self.at_half = nn.Sequential(conv(4, w2), ResidualBlock(w2))
         self.at_quarter = nn.Sequential(conv(w2, w4, stride=2), ResidualBlock(w4))
-        self.at_eighth = nn.Sequential(conv(w4, w8, stride=2), ResidualBlock(w8), ResidualBlock(w8, dilation=3))
+        self.at_eighth = nn.Sequential(
+            conv(w4, w8, stride=2), ResidualBlock(w8), ResidualBlock(w8, dilation=3)
+        )
         self.up = nn.Conv2d(w8, w4, 1)
         self.merge = ResidualBlock(w4)
 

@@ -26,7 +26,8 @@ from .configs import PATConfig
 from .protocol import FusionOutput, JoinsBands
 
 SURROUNDINGS, FLOOR = 9, 0.01
-"""Side of the windows that `normalised` takes means over, pixels, and the contrast below which it adds none."""
+"""Side of the windows that `normalised` takes means over, pixels, and the contrast below which it adds
+none."""
 
 
 class QueryAndKey(NamedTuple):
@@ -61,7 +62,8 @@ class PAT(nn.Module):
 
     @classmethod
     def from_authors(cls, path: str | Path) -> PAT:
-        """The network of one of the authors' checkpoints (best.pth.tar), ready for use; see `read_authors`."""
+        """The network of one of the authors' checkpoints (best.pth.tar), ready for use; see
+        `read_authors`."""
         read = read_authors(path)
         network = cls(read.config)
         network.load_state_dict(read.state)
@@ -101,19 +103,28 @@ class PAT(nn.Module):
     def _channels(self, image: Tensor) -> Tensor:
         wanted = self.config.in_channels
         if image.shape[1] not in (1, wanted):
-            raise ValueError(f"images must have 1 or {wanted} channels for this network, got {image.shape[1]}")
+            raise ValueError(
+                f"images must have 1 or {wanted} channels for this network, got {image.shape[1]}"
+            )
         image = image.expand(-1, wanted, -1, -1)
-        return torch.cat([image, normalised(image.mean(1, keepdim=True))], 1) if self.config.normalised else image
+        return (
+            torch.cat([image, normalised(image.mean(1, keepdim=True))], 1)
+            if self.config.normalised
+            else image
+        )
 
     def _enlarged(self, alpha: Tensor) -> Tensor:
         alpha = alpha.expand(-1, self.config.out_channels, -1, -1)
         if self.config.scale == 1:
             return alpha
-        return nn.functional.interpolate(alpha, scale_factor=self.config.scale, mode="bicubic", align_corners=False)
+        return nn.functional.interpolate(
+            alpha, scale_factor=self.config.scale, mode="bicubic", align_corners=False
+        )
 
 
 def normalised(image: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
-    """The image less its mean in windows of 9x9 pixels, over its standard deviation there, with a floor of .01."""
+    """The image less its mean in windows of 9x9 pixels, over its standard deviation there, with a floor of
+    .01."""
     mean, squares = (
         nn.functional.avg_pool2d(x, SURROUNDINGS, 1, SURROUNDINGS // 2, count_include_pad=False)
         for x in (image, image * image)
@@ -149,7 +160,8 @@ class AttentionEngine(nn.Module):
         self.key = nn.ModuleList(nn.Conv2d(dim, dim, 1) for _ in range(betas))
         self.value = nn.ModuleList(nn.Conv2d(dim, dim, 1) for _ in range(betas))
         for key in self.key:
-            # Equal features score high from the first step on: drawn apart, keys and queries have to find each other.
+            # Equal features score high from the first step on: drawn apart, keys and queries have to find
+            # each other.
             key.load_state_dict(self.query.state_dict())
 
     def compare(self, own: Tensor, others: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> list[Compared]:

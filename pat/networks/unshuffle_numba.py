@@ -10,8 +10,8 @@ COLUMNS = 32
 
 @compiled(nogil=True, cache=True)
 def unshuffle(upper, lower, out):
-    """The 2x2 pixels of images, of their even and odd rows (c, h, 2 w), as channels of `out` (h, w, 4 c), a few columns
-    at a time."""
+    """The 2x2 pixels of images, of their even and odd rows (c, h, 2 w), as channels of `out` (h, w, 4 c), a
+    few columns at a time."""
     channels, (height, width) = len(upper), out.shape[:2]
     for y in range(height):
         for left in range(0, width, COLUMNS):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Union
@@ -27,7 +27,8 @@ SHIPPED = Path(__file__).parent / "shipped"
 DENOISER = Path(__file__).parent / "denoisers" / "low-light.safetensors"
 FORMAT = "pat-weights 1"
 NETWORKS: Mapping[str, tuple[Any, Any]] = {
-    name: (getattr(import_module(f"pat.networks.{MODULES[name]}"), name), kind) for name, kind in CONFIGS.items()
+    name: (getattr(import_module(f"pat.networks.{MODULES[name]}"), name), kind)
+    for name, kind in CONFIGS.items()
 }
 DENOISERS = {"LowLightNetwork": (LowLightNetwork, DenoiserConfig)}
 
@@ -77,6 +78,11 @@ def load_weights(name: str | Path, *, precision: Precision = "float32") -> Netwo
     return network
 
 
+def weights_for(bands: Sequence[int]) -> str:
+    """The name of the shipped weights for betas of these numbers of bands."""
+    return "mono-colour" if all(count == 3 for count in bands) else "mono-spectral"
+
+
 def convolutions(network: nn.Module) -> list[nn.Module]:
     """The parts without attention, whose search segments are functions that torch.compile would break at."""
     inner = network.single if isinstance(network, BandwisePAT) else network
@@ -94,20 +100,21 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            keys = {renamed(key): key for key in file.keys()}  # noqa: SIM118
             network, config = _described(path, metadata, networks)
-            shapes = {name: tuple(file.get_slice(key).get_shape()) for name, key in keys.items()}
-            _check_shapes(path, network, config, shapes)
-            stored = {key: file.get_tensor(key) for key in keys.values()}
+            names = list(file.keys())
+            _check_shapes(
+                path, network, config, {name: tuple(file.get_slice(name).get_shape()) for name in names}
+            )
+            state = {name: file.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:
         if zipfile.is_zipfile(path):
             raise ValueError(
-                f"{path}: a checkpoint of PyTorch's: `pat weights import` makes weights of one of the paper's authors"
+                f"{path}: a checkpoint of PyTorch's: `pat weights import` makes weights of one of "
+                "the paper's authors"
             ) from None
         raise ValueError(f"{path}: not a safetensors file ({error}); was it copied whole?") from None
-    if not undamaged(stored, metadata):
+    if not undamaged(state, metadata):
         raise ValueError(f"{path}: its numbers are not those that were written: copy it again")
-    state = {name: stored[key] for name, key in keys.items()}
     for name, tensor in state.items():
         if not tensor.is_floating_point() or not tensor.float().isfinite().all():
             raise ValueError(
@@ -116,17 +123,6 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
     made = network(config)
     made.load_state_dict(state)
     return made.eval().requires_grad_(False)
-
-
-_OLD_NAMES = {"trust": "confidence", "carry": "propagation"}
-"""First words of parts and options of networks in files of earlier versions."""
-
-
-def renamed(key: str) -> str:
-    """The name, in this version, of a tensor or an option in a file of any version."""
-    first, separator, rest = key.removeprefix("single.").partition("_" if "." not in key else ".")
-    single = "single." if key.startswith("single.") else ""
-    return single + _OLD_NAMES.get(first, first) + separator + rest
 
 
 def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
@@ -161,15 +157,21 @@ def _described(
 ) -> tuple[Callable[..., nn.Module], Any]:
     """The class of the network that a file describes, and its configuration, of plausible numbers."""
     if metadata.get("format", "").startswith("pat-checkpoint"):
-        raise ValueError(f"{path}: a checkpoint of training: the weights are in best.safetensors, a folder above")
+        raise ValueError(
+            f"{path}: a checkpoint of training: the weights are in best.safetensors, a folder above"
+        )
     if metadata.get("format") != FORMAT or metadata.get("network") not in networks:
-        found = f"it is '{metadata.get('format')}' of a {metadata.get('network')}" if metadata else "it says nothing"
-        raise ValueError(f"{path}: not weights of this package ('{FORMAT}' is wanted in the file's metadata, {found})")
+        found = (
+            f"it is '{metadata.get('format')}' of a {metadata.get('network')}"
+            if metadata
+            else "it says nothing"
+        )
+        raise ValueError(
+            f"{path}: not weights of this package ('{FORMAT}' is wanted in the file's metadata, {found})"
+        )
     network, kind = networks[metadata["network"]]
     try:
-        values = json.loads(metadata["config"])
-        document = {renamed(key): value for key, value in values.items()} if isinstance(values, dict) else values
-        config: Any = from_document(kind, document)  # type: ignore[arg-type]
+        config: Any = from_document(kind, json.loads(metadata["config"]))  # type: ignore[arg-type]
         for name, value in dataclasses.asdict(config).items():
             _check_numbers(name, value)
     except (KeyError, RecursionError, TypeError, ValueError) as error:
@@ -183,7 +185,11 @@ def _check_numbers(name: str, value: object) -> None:
         raise ValueError(f"{name} has {len(values)} entries; at most {MOST_ENTRIES} are read")
     least = 0 if name in MAY_BE_ZERO else 1
     for number in values:
-        if isinstance(number, int | float) and not isinstance(number, bool) and not least <= number <= LARGEST:
+        if (
+            isinstance(number, int | float)
+            and not isinstance(number, bool)
+            and not least <= number <= LARGEST
+        ):
             raise ValueError(f"{name} is {number}; wanted {least} to {LARGEST}")
 
 
@@ -196,6 +202,10 @@ def _check_shapes(
             made = network(config)
             wrong = _misfit(made, shapes)
     except Exception as error:  # whatever a constructor runs into, the cause is the configuration
-        raise ValueError(f"{path}: its configuration makes no network ({' '.join(str(error).split())[:200]})") from None
+        raise ValueError(
+            f"{path}: its configuration makes no network ({' '.join(str(error).split())[:200]})"
+        ) from None
     if wrong:
-        raise ValueError(f"{path}: the weights do not fit the {type(made).__name__} that the file describes: {wrong}")
+        raise ValueError(
+            f"{path}: the weights do not fit the {type(made).__name__} that the file describes: {wrong}"
+        )

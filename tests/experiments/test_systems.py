@@ -15,7 +15,7 @@ from experiments.stage import SystemScene
 from pat.cli.main import main
 from pat.fusion.results import Frame
 from pat.fusion.steps import resolution_ratio
-from pat.fusion.views import read_views
+from pat.fusion.views import ViewFiles
 from pat.media.colour import linear_from_srgb, srgb_from_linear
 from pat.media.images import read_image
 from pat.media.raw import demosaiced
@@ -113,7 +113,7 @@ def test_recordings_are_files_as_cameras_write_them(tiny, tmp_path):
     rig = Rig.load(tmp_path / "inputs" / "rig.yaml")
     files = {name: tmp_path / "inputs" / f"{name}_000.png" for name in rig.names}
     assert read_image(files["nir"]).max() <= 1023 / 65535
-    assert read_views(rig, files, alpha="nir").images["nir"].max() > 0.3
+    assert ViewFiles(rig, files, alpha="nir")["nir"].max() > 0.3
     assert {p.name for p in result.written} >= {"figure.png", "scores.md", "fused.png", "view.yaml"}
     rows = {line.split("|")[1].strip(): line.split("|")[2] for line in result.table.splitlines() if "|" in line}
     assert float(rows["fusion"]) > float(rows["alpha alone"]) + 2

@@ -5,7 +5,7 @@ import torch
 
 from pat.data.sample_array import load_sample
 from pat.fusion.fuse import fuse
-from pat.fusion.own_colour import with_own_colours
+from pat.fusion.luminance import with_own_colours
 from pat.fusion.results import Frame
 from pat.media.colour import from_luma_chroma, luminance, to_luma_chroma
 from pat.networks.weights import load_weights

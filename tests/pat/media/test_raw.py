@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from arraygeom import Rig, Sensor, View
-from pat.fusion.views import read_views
+from pat.fusion.views import ViewFiles
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.media.images import write_image
 from pat.media.raw import as_bright, demosaiced, develop, developed
@@ -45,9 +45,9 @@ def rig(**sensors):
 def test_counts_of_any_depth_become_the_light_they_stood_for(tmp_path, bits, suffix):
     save(tmp_path / f"a.{suffix}", counts(light(), bits=bits, black=64))
     sensor = Sensor(coding="linear", bits=bits, black_level=64)
-    read = read_views(rig(a=sensor), {"a": tmp_path / f"a.{suffix}"}, alpha="a")
-    assert (linear_from_srgb(read.images["a"]) - light()).abs().max() < 0.6 / (2**bits - 65)
-    assert read.rig["a"].sensor == Sensor()
+    read = ViewFiles(rig(a=sensor), {"a": tmp_path / f"a.{suffix}"}, alpha="a")
+    assert (linear_from_srgb(read["a"]) - light()).abs().max() < 0.6 / (2**bits - 65)
+    assert read.developed["a"].sensor == Sensor()
 
 
 def test_packed_tiffs_need_no_bits_and_follow_them(tmp_path):
@@ -61,15 +61,15 @@ def test_packed_tiffs_need_no_bits_and_follow_them(tmp_path):
     head = b"II*\0" + np.array([8 + len(data)], "<u4").tobytes()
     (tmp_path / "a.tif").write_bytes(head + data + np.array([len(tags)], "<u2").tobytes() + entry + bytes(4))
     for given in (None, 12):
-        read = read_views(rig(a=Sensor(coding="linear", bits=given)), {"a": tmp_path / "a.tif"}, alpha="a")
-        assert (linear_from_srgb(read.images["a"]) - light(channels=1)).abs().max() < 0.6 / 4095
+        read = ViewFiles(rig(a=Sensor(coding="linear", bits=given)), {"a": tmp_path / "a.tif"}, alpha="a")
+        assert (linear_from_srgb(read["a"]) - light(channels=1)).abs().max() < 0.6 / 4095
 
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
 def test_colours_come_back_from_behind_each_filter_pattern(tmp_path, pattern):
     save(tmp_path / "a.png", counts(mosaic(light(), pattern), bits=12, black=100))
     sensor = Sensor(coding="linear", bits=12, black_level=100, bayer=pattern)
-    read = read_views(rig(a=sensor), {"a": tmp_path / "a.png"}, alpha="a").images["a"]
+    read = ViewFiles(rig(a=sensor), {"a": tmp_path / "a.png"}, alpha="a")["a"]
     off = (linear_from_srgb(read) - light()).abs()[:, 2:-2, 2:-2]
     assert off.mean() < 0.006  # the bands vary independently here, for which the median costs a quarter
     assert off.max() < 0.08
@@ -106,7 +106,7 @@ def test_ordinary_images_pass_unchanged():
 def test_what_does_not_fit_the_rig_is_named(tmp_path, sensor, values, message):
     save(tmp_path / "a.png", values)
     with pytest.raises(ValueError, match=message):
-        read_views(rig(a=sensor), {"a": tmp_path / "a.png"}, alpha="a")
+        ViewFiles(rig(a=sensor), {"a": tmp_path / "a.png"}, alpha="a")["a"]
 
 
 def test_exr_is_written_and_holds_the_floats(tmp_path):

@@ -1,0 +1,167 @@
+"""Which combination of any bands of beta alpha sees.
+
+Alpha is explained as offset + weights . beta around each pixel, and how alpha's detail adds to
+each is found too. All sums over such bands are of sorted summands, so that their order cannot matter at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from arraygeom.robust import RobustFit, gaussian, least_squares, robust_least_squares
+
+from ..support.settings import size, tuned
+from .filters import box_mean
+
+
+@dataclass(frozen=True)
+class MixSettings:
+    """Brightness is 0 to 1."""
+
+    outlier: float = tuned(
+        0.06,
+        "Source not recorded: difference from alpha at which a match counts 1 / e in the second of two fits",
+    )
+    equal: float = size(
+        1e-4, "How strongly the combination is drawn to one of equal parts: share of the bands' mean variance"
+    )
+    misfit: float = tuned(
+        0.016,
+        "Source not recorded: difference from alpha, averaged over `smooth` pixels to either side, at which "
+        "the combination counts half",
+    )
+    smooth: int = size(4, "See `misfit`")
+    alike: float = tuned(
+        0.08,
+        "Source not recorded: where the combination's black and white are so near to alpha's, black is "
+        "taken for black and white for white, and the difference for that of two exposures",
+    )
+    diluted: float = tuned(
+        0.8,
+        "Source not recorded: wrong matches make least squares' weights too small; they are enlarged until "
+        "the combination varies as much as alpha, as if no less than this share of alpha's variance were "
+        "explained",
+    )
+    wide: int = size(
+        4, "Bands are compared with alpha within squares whose radius is the image's longer side over this"
+    )
+
+
+SETTINGS = MixSettings()
+
+
+class SpectralMix(NamedTuple):
+    """The combination of C bands that is most like alpha, for each of a batch: offset + sum of weights times
+    bands.
+
+    slopes: (B, C), by how much each band rises where the combination rises by 1 from one pixel to the next;
+        less if that explains alpha badly.
+    gain: (B), 0 to 1: how far what alpha has beyond the combination is the bands' error, and not another
+        spectrum. 0 for one band, where that cannot be known.
+    """
+
+    weights: Float[Tensor, "b c"]
+    offset: Float[Tensor, " b"]
+    slopes: Float[Tensor, "b c"]
+    gain: Float[Tensor, " b"]
+
+    @classmethod
+    def equal(cls, bands: Float[Tensor, "b c _ _"]) -> SpectralMix:
+        """The mean of the bands."""
+        ones = torch.ones(bands.shape[:2], dtype=torch.float64, device=bands.device)
+        return cls(ones / bands.shape[1], 0 * ones[:, 0], ones, 0 * ones[:, 0])
+
+    @classmethod
+    def fitted(
+        cls,
+        bands: Float[Tensor, "b c h w"],
+        alpha: Float[Tensor, "b 1 h w"],
+        weight: Float[Tensor, "b 1 h w"],
+    ) -> SpectralMix:
+        """The one most like alpha by weighted least squares, around each pixel's surroundings; twice, the
+        second time without outliers."""
+        parts = [_mix(*part) for part in zip(bands.double(), alpha.double(), weight.double())]
+        return cls(*(torch.stack(part) for part in zip(*parts)))
+
+    def of(self, bands: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 h w"]:
+        """The combination of these bands."""
+        products = self.weights[:, :, None, None] * bands.double()
+        total = products.sort(1).values.sum(1, keepdim=True) + self.offset[:, None, None, None]
+        return total.to(bands)
+
+    def rises(self, like: Tensor) -> Float[Tensor, "b c 1 1"]:
+        """The slopes."""
+        return self.slopes[:, :, None, None].to(like)
+
+    def reconciled(
+        self, bands: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"]
+    ) -> Float[Tensor, "b c h w"]:
+        """The bands corrected so that their combination is nearer to alpha, by as much as it is reliable."""
+        step = self.gain[:, None, None, None].to(bands) * self.rises(bands)
+        return bands + step * (alpha - self.of(bands))
+
+
+def _mix(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Weights, offset, slopes and gain for bands (C, h, w) and alpha (1, h, w)."""
+    order = bands.flatten(1).sum(1).argsort()
+    weight = weight + 1e-6
+    x, y = (_beyond_local_mean(planes, weight).flatten(1) for planes in (bands[order], alpha))
+    weights, rest, share = _combination(x, y[0], weight.flatten())
+    unexplained = weight.flatten() @ rest.square() / (weight.flatten() @ y[0].square()).clamp(min=1e-12)
+    explained = (1 - unexplained).clamp(min=0)
+    weights = weights / explained.clamp(min=SETTINGS.diluted).sqrt()
+    # What pixels have beyond the mean of those around: how materials differ does not count.
+    detail = (bands[order] - _mean_around(bands[order], 1)).flatten(1)
+    combined = weights @ detail
+    slopes = explained * (detail @ (share * combined)) / (share @ combined.square()).clamp(min=1e-12)
+    misfit = _smooth_misfit(rest.view_as(alpha), share.view_as(alpha))
+    gain = explained / (1 + (misfit / SETTINGS.misfit) ** 6)
+    offset = share @ (alpha.flatten() - weights @ bands[order].flatten(1))
+    if max(abs(weights.sum() + offset - 1), abs(offset)) < SETTINGS.alike:
+        weights, offset, slopes = weights / weights.sum(), 0 * offset, slopes * weights.sum()
+    back = order.argsort()
+    return weights[back], offset, slopes[back], gain
+
+
+def _combination(x: Tensor, y: Tensor, weight: Tensor) -> RobustFit:
+    """Weights (C) with which bands x (C, n) make y (n), both about 0; drawn to equal ones. The second time
+    without outliers."""
+    share, mean = weight / weight.sum(), x.mean(0)
+    scale = (share @ y.square()).sqrt() / (share @ mean.square()).sqrt().clamp(min=1e-3)
+    equal = scale.expand(len(x)) / len(x)
+    ridge = SETTINGS.equal * (share @ x.square().mean(0)) + 1e-12
+    precision, beyond = ridge * torch.eye(len(x)).to(x), y - equal @ x
+
+    def weigh(rest: Tensor) -> Tensor:
+        robust = weight * gaussian(rest, SETTINGS.outlier)
+        return robust / robust.sum()
+
+    start = least_squares(x, beyond, share, precision)
+    found = robust_least_squares(x, beyond, start, weigh, precision=precision, steps=1)
+    return found._replace(coefficients=equal + found.coefficients)
+
+
+def _beyond_local_mean(planes: Tensor, weight: Tensor) -> Tensor:
+    """Planes (c, h, w) less their weighted mean in wide squares: light and lenses differ between views,
+    slowly."""
+    radius = max(planes.shape[-2:]) // SETTINGS.wide
+    return planes - (box_mean((planes * weight)[None], radius) / box_mean(weight[None], radius))[0]
+
+
+def _mean_around(planes: Tensor, radius: int) -> Tensor:
+    """Of planes (c, h, w), within squares around each pixel."""
+    return avg_pool2d(planes[None], 2 * radius + 1, 1, radius, count_include_pad=False)[0]
+
+
+def _smooth_misfit(rest: Tensor, share: Tensor) -> Tensor:
+    """Root mean square of the rest (1, h, w) averaged around each pixel: errors of matches, at edges, average
+    out."""
+    total = _mean_around(share, SETTINGS.smooth).clamp(min=1e-12)
+    smooth = _mean_around(share * rest, SETTINGS.smooth) / total
+    return (share * smooth.square()).sum().sqrt()
