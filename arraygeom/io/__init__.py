@@ -28,9 +28,11 @@ from . import (
     colmap,
     kalibr,
     kitti,
+    luxonis,
     matlab,
     metashape,
     middlebury,
+    mrcal,
     multical,
     native,
     nerfstudio,
@@ -66,6 +68,8 @@ READERS: dict[str, Any] = {
     "open3d": open3d,
     "metashape": metashape,
     "xmp": xmp,
+    "luxonis": luxonis,
+    "mrcal": mrcal,
 }
 READERS["caliscope"] = aniposelib
 WRITERS: dict[str, Any] = {

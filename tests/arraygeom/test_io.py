@@ -39,6 +39,8 @@ PAIRS = [
     ("caliscope.toml", "aniposelib", ("cam0", "cam1"), {}),
     ("ros", "ros", ("a", "b"), {}),
     ("boofcv.yaml", "boofcv", ("left", "right"), {}),
+    ("luxonis.json", "luxonis", ("CAM_B", "CAM_C"), {}),
+    ("mrcal", "mrcal", ("a", "b"), {}),
     ("pycalib.json", "pycalib", ("cam0", "cam1"), SIZE),
 ]
 POINT = torch.tensor([-0.782, -0.22, 1.876], dtype=torch.float64)

@@ -123,7 +123,12 @@ def refusal_of_folder(folder: Path) -> str:
 
 
 # In every file: camera b's focal length, its name in the messages, and its rotation's or quaternion's first number.
-FOCAL = {"cam_syntim_g": "500.000000", "kitti_calib.txt": "7.000000000000e+02", "middlebury.txt": "1000"}
+FOCAL = {
+    "a.cameramodel": "500",
+    "cam_syntim_g": "500.000000",
+    "kitti_calib.txt": "7.000000000000e+02",
+    "middlebury.txt": "1000",
+}
 FOCAL |= {
     "extrinsics.yml": "",
     "images.txt": "",
@@ -147,7 +152,7 @@ def focal_pattern(file: Path) -> str:
 def test_focal_lengths(file, value, cause, tmp_path):
     if value == "nan":
         value = {".json": "NaN", ".yaml": ".nan", ".yml": ".Nan", ".xml": ".Nan"}.get(file.suffix, "nan")
-        value = "nan" if file.name == "metashape.xml" else value
+        value = {"metashape.xml": "nan", "a.cameramodel": "1e999", "b.cameramodel": "1e999"}.get(file.name, value)
         if file.name == "opencv_mono.json":
             pytest.skip("OpenCV's JSON has no NaN")
     text, count = re.subn(focal_pattern(file), value, file.read_text(), count=1)
@@ -172,6 +177,7 @@ NOT_ROTATIONS = {
     "boofcv.yaml": ("[0.8, 0.0, -0.6,", "[0.8, 0.0, -0.7,"),
     "pycalib.json": ("[[0.8, 0, 0.6]", "[[0.8, 0, 0.7]"),
     "metashape.xml": ("0.8 0 0.6 0.05", "0.8 0 0.7 0.05"),
+    "luxonis.json": ("[[0.8, 0.0, 0.6]", "[[0.8, 0.0, 0.7]"),
 }
 
 
@@ -182,6 +188,31 @@ def test_rotations(name, change, tmp_path):
     assert text.count(change[0]) == 1
     message = refusal(copied(file, tmp_path, text.replace(*change)), formats(file))
     assert "not a rotation" in message or "quaternion of length" in message, message
+
+
+OTHER_MAKERS = {
+    "a circle": ("luxonis.json", '"toCameraSocket": -1', '"toCameraSocket": 1', "the chain of extrinsics is a circle"),
+    "in metres": (
+        "luxonis.json",
+        '"toCameraSocket": 2,',
+        '"toCameraSocket": 2, "lengthUnit": 0,',
+        r"lengthUnit: is 0; centi",
+    ),
+    "a sphere": ("luxonis.json", '"cameraType": 0', '"cameraType": 2', r"cameraType: is 2; perspective \(0\)"),
+    "alone": ("luxonis.json", '"toCameraSocket": 2', '"toCameraSocket": -1', "CAM_C: is related to no camera"),
+    "splines": ("mrcal/b.cameramodel", "OPENCV4", "SPLINED_STEREOGRAPHIC_order=3", "use mrcal-convert-lensmodel"),
+    "too few": ("mrcal/b.cameramodel", "-0.2, 0.1, ", "", "intrinsics: has 6 numbers, wanted 8"),
+    "a call": ("mrcal/b.cameramodel", "'icam_intrinsics': 0", "'x': print('run')", "is not a dictionary of numbers"),
+    "cut": ("mrcal/b.cameramodel", "    'icam_intrinsics': 0,\n}", "", "is the file whole"),
+}
+
+
+@pytest.mark.parametrize("case", OTHER_MAKERS.values(), ids=list(OTHER_MAKERS))
+def test_files_of_box_cameras_and_of_mrcal(case, tmp_path):
+    name, old, new, wanted = case
+    text = (FIXTURES / name).read_text()
+    assert old in text
+    assert re.search(wanted, refusal(copied(FIXTURES / name, tmp_path, text.replace(old, new, 1))))
 
 
 def test_reflections_and_rounded_rotations(tmp_path):

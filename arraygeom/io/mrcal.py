@@ -1,0 +1,60 @@
+"""mrcal's .cameramodel: one camera a file, or a folder of them.
+
+Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `rt_cam_ref`, in older files `extrinsics`,
+is a rotation vector and a translation in metres that take points of the reference frame into the camera's.
+"""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import Any
+
+from ..camera import Camera
+from ..rig import Rig
+from .source import RigSource
+
+CONVENTION = "first pixel's centre at 0 (shift 0); rt_cam_ref (extrinsics) = X_camera from X_reference, in metres"
+SUFFIX = ".cameramodel"
+LENSES = {"LENSMODEL_PINHOLE": 0, **{f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)}}
+"""How many coefficients follow fx, fy, cx, cy."""
+LONGEST = 1_000_000
+"""Characters of a file at most: splined models have thousands of numbers."""
+
+
+def recognises(path: Path, head: str) -> bool:
+    return any(path.glob(f"*{SUFFIX}")) if path.is_dir() else path.suffix == SUFFIX or "LENSMODEL_" in head
+
+
+def read(source: RigSource) -> Rig:
+    """The cameras by the names of their files."""
+    files = sorted(source.path.glob(f"*{SUFFIX}")) if source.path.is_dir() else [source.path]
+    return source.rig((file.stem, _camera(RigSource(file))) for file in files)
+
+
+def _camera(source: RigSource) -> Camera:
+    fields = _fields(source)
+    model = source.get(fields, ("lensmodel", "lens_model"), "")
+    if model not in LENSES:
+        known = ", ".join(LENSES)
+        raise source.fail("lensmodel", f"is '{model}'; of mrcal's {known} are read: use mrcal-convert-lensmodel")
+    numbers = source.numbers(source.get(fields, "intrinsics", ""), (4 + LENSES[model],), "intrinsics")
+    where = "rt_cam_ref" if "rt_cam_ref" in fields else "extrinsics"
+    rt = source.numbers(source.get(fields, where, ""), (6,), where)
+    return Camera(
+        K=source.focal_and_centre(numbers[:4], "intrinsics"),
+        cam_from_world=source.pose(rt[:3], rt[3:], where),
+        hw=source.size_of(source.get(fields, "imagersize", ""), "imagersize"),
+        distortion=source.brown_conrady(numbers[4:], "intrinsics"),
+    )
+
+
+def _fields(source: RigSource) -> dict[str, Any]:
+    """What the file, a dictionary of Python's literals with comments, says."""
+    text = source.text(LONGEST)
+    try:
+        document = ast.literal_eval(text.strip())
+    except (ValueError, SyntaxError, MemoryError, RecursionError):
+        raise source.fail(None, "is not a dictionary of numbers and texts; is the file whole?") from None
+    fields = source.mapping(document, None)
+    return {key.decode() if isinstance(key, bytes) else str(key): value for key, value in fields.items()}
