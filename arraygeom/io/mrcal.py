@@ -34,7 +34,7 @@ def read(source: RigSource) -> Rig:
 
 def _camera(source: RigSource) -> Camera:
     fields = _fields(source)
-    model = source.get(fields, ("lensmodel", "lens_model"), "")
+    model = source.get(fields, "lensmodel", "")
     if model not in LENSES:
         known = ", ".join(LENSES)
         raise source.fail("lensmodel", f"is '{model}'; of mrcal's {known} are read: use mrcal-convert-lensmodel")
