@@ -20,16 +20,10 @@ from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom.sampling import sample
-
-from ..data.pairs import PAPER_DISPARITY, Disparity, StereoPair
-from ..fusion.fuse import corrections_of
-from ..media.colour import from_luma_chroma, luminance, to_luma_chroma
-from ..media.figures import save_curves
-from ..networks.protocol import FusionNetwork
-from ..sensors.noise_level import NoiseLevel
-from .baseline import classical_fusion, non_local_means, sgbm_disparity
-from .metrics import bootstrap_interval, score
-from .protocols import (
+from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
+from pat.evaluation.baseline import classical_fusion, non_local_means, sgbm_disparity
+from pat.evaluation.metrics import bootstrap_interval, score
+from pat.evaluation.protocols import (
     MonoColourTask,
     StereoMethod,
     StereoResult,
@@ -39,8 +33,13 @@ from .protocols import (
     rectified_fusion,
     rectified_rig,
 )
-from .stereo import disparity_errors
-from .tables import distinct, markdown_table
+from pat.evaluation.stereo import disparity_errors
+from pat.evaluation.tables import distinct, markdown_table
+from pat.fusion.fuse import corrections_of
+from pat.media.colour import from_luma_chroma, luminance, to_luma_chroma
+from pat.media.figures import save_curves
+from pat.networks.protocol import FusionNetwork
+from pat.sensors.noise_level import NoiseLevel
 
 LEFT_CROP = 64
 """Columns at the left that stereo super-resolution leaves out of its scores."""
