@@ -25,10 +25,9 @@ from pat.matching.inputs import Inputs
 from pat.matching.match import match
 from pat.matching.matches import BetaMatches, Matches
 from pat.matching.positions import FINE
-from pat.media.figures import save_curves
 from pat.networks.protocol import FusionNetwork
 
-from .conditions import CONDITIONS, regions_of
+from .conditions import CONDITIONS, regions_of, save_curves
 
 PIXELS = 6000
 """Of a pair under a condition that take part, drawn evenly: every pair counts the same."""

@@ -35,13 +35,13 @@ from arraygeom import (
     pixel_grid,
 )
 from arraygeom.fields.straight import covering_displacement
+from experiments.peaks import with_peak
 from pat.data.pairs import PAPER_DISPARITY, StereoPair
 from pat.evaluation.metrics import score
 from pat.evaluation.protocols import hw_of, mono_colour_task, rectified_rig
 from pat.evaluation.tables import distinct, markdown_table
 from pat.media.figures import colour_depth
 from pat.networks.protocol import Comparing
-from pat.support.memory import with_peak
 from pat.synthesis.photos import PhotoBank
 
 from .sweeps import ALPHA, BETA, RecordedScene, fused, made, rig_of
