@@ -53,21 +53,21 @@ readme: demo showcase
 		--image out/demo/demo.png docs/demo.jpg
 
 conditions: $(READY)
-	@$(BIN)/pat evaluate --middlebury $(DATA)/middlebury --conditions --half report --out out/conditions
+	@$(BIN)/python -m experiments conditions --middlebury $(DATA)/middlebury --half report --out out/conditions
 	@$(BIN)/python -m docs.update_readme --document docs/results.md --block conditions=out/conditions/conditions.md \
 		--image out/conditions/conditions.png docs/conditions.jpg
 
 certainty: $(READY)
-	@$(BIN)/python -m pat.evaluation.certainty --middlebury $(DATA)/middlebury --out out/certainty
+	@$(BIN)/python -m experiments certainty --middlebury $(DATA)/middlebury --out out/certainty
 	@$(BIN)/python -m docs.update_readme --document docs/weights.md --block reliability=out/certainty/certainty.md \
 		--image out/certainty/reliability.png docs/reliability.jpg
 
 without-rig: $(READY)
-	@$(BIN)/pat evaluate --middlebury $(DATA)/middlebury --without-rig --rates 2 --half report --out out/without-rig
+	@$(BIN)/python -m experiments evaluate --middlebury $(DATA)/middlebury --without-rig --rates 2 --half report --out out/without-rig
 	@$(BIN)/python -m docs.update_readme --document docs/results.md --block without-rig=out/without-rig/scores.md
 
 paper-network: $(READY)
-	@$(BIN)/pat evaluate --middlebury $(DATA)/middlebury --rates 2 --half report \
+	@$(BIN)/python -m experiments evaluate --middlebury $(DATA)/middlebury --rates 2 --half report \
 		--weights tests/benchmarks/paper-2-narrow.safetensors --out out/paper-network
 	@$(BIN)/python -m docs.update_readme --document docs/results.md --block paper=out/paper-network/scores.md
 

@@ -13,7 +13,6 @@ from typing import Any
 from uuid import uuid4
 
 from .atomic import alone
-from .linked import options_of_linked
 
 COMPILED = "arraygeom:compiled"
 LONGEST = 60.0
@@ -23,7 +22,7 @@ LONGEST = 60.0
 def compiled(function=None, **options):
     """numba's njit, of the bare function: a checker of types that tests put around it cannot be compiled.
 
-    With `cache` it is called from Python; without, by compiled functions alone. Where there is no folder that
+    With `cache` it is called from Python; without, mostly by compiled functions. Where there is no folder that
     can be written, what `cache` asks to keep is compiled by each process.
     """
     from numba import njit
@@ -32,8 +31,6 @@ def compiled(function=None, **options):
         return lambda function: compiled(function, **options)
     if options.get("cache"):
         options["no_cfunc_wrapper"] = True
-    elif options.get("inline") != "always":
-        options |= options_of_linked()
     try:
         entry = njit(inspect.unwrap(function), **options)
     except RuntimeError as error:
@@ -77,16 +74,6 @@ def _warn_of_no_folder() -> None:
         "that can be written",
         stacklevel=1,
     )
-
-
-def numba_loaded() -> None:
-    """Let numba load what it needs before the first compiled function, which takes it half a second: in a
-    thread beside other work."""
-    from numba.core.compiler_lock import global_compiler_lock
-    from numba.core.registry import cpu_target
-
-    with global_compiler_lock:
-        cpu_target.target_context.refresh()
 
 
 def cache_file(entry: Any) -> Any:

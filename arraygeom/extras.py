@@ -1,9 +1,13 @@
-"""Modules that only some users need."""
+"""Modules that only some users need, and those of users."""
 
 from __future__ import annotations
 
+import importlib
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 
 @contextmanager
@@ -14,3 +18,15 @@ def needs(extra: str, purpose: str) -> Iterator[None]:
     except ImportError as error:
         module = (error.name or str(error)).partition(".")[0]
         raise ImportError(f"{purpose} needs {module}: pip install 'arraygeom-pat[{extra}]'") from error
+
+
+def imported(name: str, what: str) -> Any:
+    """The "module:object" of a user, looked for from here too. Raises ValueError, which says what it was to be."""
+    module, _, attribute = name.partition(":")
+    try:
+        sys.path.insert(0, str(Path.cwd()))
+        return getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"the {what} '{name}' cannot be imported: {error}") from None
+    finally:
+        sys.path.pop(0)

@@ -1,4 +1,4 @@
-"""`python -m experiments COMMAND ...`: the paper's four arrays, and fusion of real images."""
+"""`python -m experiments COMMAND ...`: the paper's four arrays, fusion of real images, tables of the documentation."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from tyro.conf import Positional
 
 from pat.cli.main import main
 from pat.cli.options import MaybeOut, MaybePath, Memory, Out, Weights, say, working, writable
+
+from .evaluation import commands
 
 
 @dataclass
@@ -118,9 +120,20 @@ class Systems:
 
 
 class Experiments:
-    """Run the paper's arrays, and fuse real images."""
+    """Run the paper's arrays, fuse real images, and measure the tables of the documentation."""
 
-    commands: ClassVar[Mapping[str, Any]] = {"systems": Systems, "showcase": Showcase, "alignment": Alignment}
+    commands: ClassVar[Mapping[str, Any]] = {
+        "systems": Systems,
+        "showcase": Showcase,
+        "alignment": Alignment,
+        "evaluate": commands.Evaluate,
+        "conditions": commands.Conditions,
+        "outside": commands.Outside,
+        "certainty": commands.Certainty,
+        "sweeps": commands.Sweeps,
+        "fields": commands.Fields,
+        "patches": commands.Patches,
+    }
 
 
 if __name__ == "__main__":

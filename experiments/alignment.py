@@ -33,8 +33,8 @@ from calib.boards.target import parse_board
 from calib.images.guided_matches import ALIKE, guided_matches
 from calib.images.matches import seen_depths
 from calib.images.refinement import refine
+from experiments.evaluation.halves import of_half
 from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair, middlebury_pairs
-from pat.evaluation.halves import of_half
 from pat.evaluation.protocols import rectified_rig
 from pat.evaluation.tables import markdown_table
 from pat.fusion.align import LEAST_CONFIDENCE, SEEN, Aligned, align, resampled_values

@@ -10,10 +10,10 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from arraygeom import Camera, Rig
+from experiments.scenes import SCENES
 from experiments.stage import RenderedView, purpose_generator
 from pat.media.colour import srgb_from_linear
 from pat.synthesis.blender import RenderSettings, render
-from pat.synthesis.generators import GENERATORS
 
 FARTHEST = 300.0
 """Metres that the sky is given: haze leaves some of its colour."""
@@ -21,14 +21,14 @@ SETTINGS = RenderSettings(samples=40, denoise="accurate", fast_light=False, boun
 
 
 class RenderedScene:
-    """One of `pat.synthesis.generators` seen by a rig's cameras, each at its own frame rate and time offset.
+    """One of `experiments.scenes` seen by a rig's cameras, each at its own frame rate and time offset.
 
     `moving` seconds are what its moving object takes, `duration` seconds are rendered, `seed` determines all.
     """
 
     def __init__(self, rig: Rig, generator: str, seed: int, *, infrared: bool, moving: float, duration: float) -> None:
         self.rig, self.alpha, self.seed = rig, rig.names[0], seed
-        scene = GENERATORS[generator](seed, rig, moving=moving)
+        scene = SCENES[generator](seed, rig, moving=moving)
         pinholes = {n: c.replace(distortion=None) for n, c in rig.cameras.items() if isinstance(c, Camera)}
         settings = replace(SETTINGS, passes=("nir",) if infrared else (), duration=duration)
         with TemporaryDirectory() as folder:

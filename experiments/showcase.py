@@ -18,10 +18,11 @@ from torch import Tensor
 from arraygeom import HomographyDisplacement, Rig, View, apply_homography, pixel_grid, sample, shift_origin
 from arraygeom.atomic import write_text
 from calib.images.matches import FittedLink, fit_link, line_distance, match_points, near_lines, seen_depths
+from experiments.evaluation.halves import of_half
 from pat.evaluation.baseline import classical
 from pat.evaluation.metrics import score
 from pat.evaluation.protocols import BASELINES, rectified_fusion
-from pat.evaluation.stereo import StereoRow, evaluate_sets, markdown, sets_markdown, structure_kept
+from pat.evaluation.stereo import DATA_SETS, StereoRow, evaluate_sets, markdown, sets_markdown, structure_kept
 from pat.evaluation.tables import markdown_table
 from pat.fusion.fuse import fuse
 from pat.fusion.steps import resolution_ratio
@@ -59,13 +60,14 @@ def showcase(data: Path, out: Path, weights: str = "mono-colour", rates: Sequenc
 
 def _pairs(network: FusionNetwork, data: Path, out: Path, rates: Sequence[int]) -> str:
     methods = {name: BASELINES[name] for name in ("alpha", "classical")} | {"fusion": rectified_fusion(network)}
-    rows = evaluate_sets({name: data / name for name in PAIRS}, methods, rates, out=out / "pairs", half="report")
+    sets = {name: of_half(DATA_SETS[name](data / name), "report") for name in PAIRS}
+    rows = evaluate_sets(sets, methods, rates, out=out / "pairs")
     return (
         "### Stereo pairs\n\n"
         "The left image made grey is alpha, the right one reduced is beta, the left one in colour is the ground\n"
         "truth. PSNR in dB / SSIM; behind a mean, its 95% bootstrap interval. Pairs on which settings were chosen are\n"
-        "left out (`pat/evaluation/halves.yaml`). Every image is in `pairs/`: beta\n"
-        f"enlarged, alpha, classical, fusion, ground truth.\n\n{sets_markdown(rows)}"
+        "left out (`experiments/evaluation/halves.yaml`). Every image is in `pairs/`: beta\n"
+        f"enlarged, alpha, classical, fusion, ground truth.\n\n{sets_markdown(rows, depth=False)}"
     )
 
 

@@ -24,6 +24,7 @@ from arraygeom import Rig
 from arraygeom.atomic import write_text
 from arraygeom.io.native import write as rig_text
 from experiments.hdr import merged, missed, tone_curve, usable_range
+from experiments.peaks import watch_peak
 from pat.evaluation.baseline import classical_baseline
 from pat.evaluation.metrics import score
 from pat.evaluation.tables import markdown_table
@@ -39,7 +40,6 @@ from pat.media.raw import as_bright
 from pat.media.video import write_video
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
-from pat.support.memory import watch_peak
 from pat.support.tensor_files import write_tensors
 
 SceneKind = Literal["layered", "rendered"]

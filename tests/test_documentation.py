@@ -12,6 +12,7 @@ import torch
 
 from arraygeom import Rig
 from docs.hooks import on_page_markdown
+from experiments.__main__ import Experiments
 from pat.cli.main import command_paths
 from pat.media.images import write_image
 
@@ -95,6 +96,14 @@ def test_commands_in_the_pages_exist():
         if re.match(r"pat [a-z]", line)
     }
     assert shown
+    assert shown <= known
+
+
+def test_commands_of_the_experiments_in_the_pages_exist():
+    known = {path[0] for path in command_paths(Experiments)}
+    texts = [page.read_text() for page in [*PAGES, ROOT / "README.md", ROOT / "Makefile"]]
+    shown = {name for text in texts for name in re.findall(r"python\s-m\sexperiments\s([a-z-]+)", text)}
+    assert len(shown) > 6
     assert shown <= known
 
 

@@ -154,7 +154,6 @@ GEOMETRY_NEEDS = {"torch", "kornia", "numpy", "yaml", "jaxtyping", *sys.stdlib_m
 GEOMETRY_MAY_USE = {
     "atomic.py": {"filelock"},
     "compiled.py": {"numba"},
-    "linked.py": {"numba"},
     "opencv.py": {"cv2"},
     "matfile.py": {"scipy"},
     "viz.py": {"matplotlib"},

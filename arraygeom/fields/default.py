@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import difflib
-import importlib
-import sys
-from pathlib import Path
 from typing import Any, Literal
 
 from ..checks import check_field
 from ..epipolar import FRONT
+from ..extras import imported
 from ..pixels import coarse_grid
 from ..rig import Pair
 from ..tracing import traced
@@ -36,20 +34,13 @@ def named_field(name: str) -> ReceptiveField:
 
     A class is made without arguments. Raises ValueError for a name that is neither.
     """
-    module, colon, attribute = name.partition(":")
-    if not colon:
+    if ":" not in name:
         if name in FIELDS:
             return FIELDS[name]()
         near = difflib.get_close_matches(name, FIELDS, 1)
         hint = f"did you mean '{near[0]}'?" if near else f"use one of {', '.join(FIELDS)}, or MODULE:OBJECT"
         raise ValueError(f"no field is called '{name}': {hint}")
-    try:
-        sys.path.insert(0, str(Path.cwd()))
-        field = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"the field '{name}' cannot be imported: {error}") from None
-    finally:
-        sys.path.pop(0)
+    field = imported(name, "field")
     try:
         field = field() if isinstance(field, type) else field
         check_field(field)

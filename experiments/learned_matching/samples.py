@@ -22,9 +22,9 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Epipolar, Segments
 from arraygeom.fields.grid import FieldOnGrid
+from experiments.evaluation.conditions import regions_of
+from experiments.evaluation.halves import of_half
 from pat.data.pairs import StereoPair, middlebury_pairs
-from pat.evaluation.conditions import regions_of
-from pat.evaluation.halves import of_half
 from pat.matching.normalisation import Normalisation
 from pat.matching.positions import Extent
 from pat.media.colour import REC601

@@ -85,7 +85,6 @@ class Align(Known):
         limit = None if self.max_memory is None else parse_bytes(self.max_memory)
         options.response_of(self.response)
         options.noise_of(self.noise)
-        options.compile_at_once()
         with limited(limit), confidence_checked(strict=self.strict):
             for frame in self._frames_with_rig(image) if with_rig else self._frames_without():
                 self._align(frame)

@@ -25,7 +25,6 @@ class Demo:
     weights: Weights = "mono-colour"
 
     def run(self) -> None:
-        options.compile_at_once()
         from arraygeom.atomic import write_text
 
         from ..data.sample_array import ALPHA, load_motorcycle, load_sample
@@ -86,7 +85,6 @@ class WarmUp:
 
     def run(self) -> None:
         """Compile the kernels by fusing the sample array once."""
-        options.compile_at_once()
         from arraygeom.compiled import cache_folder
 
         from ..attention.kernels import forward

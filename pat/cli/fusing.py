@@ -146,13 +146,10 @@ class Fuse(Known):
         if self.classical and not self.report:
             raise ValueError("--classical needs the page: leave out --no-report")
         self._notes: list[str] = []
-        options.compile_at_once()
         with limited(limit), self._judged() as self._warnings:
             self._with_rig() if with_rig else self._without_rig()
 
     def _with_rig(self) -> None:
-        from arraygeom.compiled import numba_loaded
-
         from ..fusion.healing import checked_rig
         from ..fusion.views import ViewFiles
 
@@ -165,8 +162,7 @@ class Fuse(Known):
         views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=alpha)
         if self.sequence:
             return self._many(rig, found, alpha)
-        with ThreadPoolExecutor(2) as beside:
-            beside.submit(numba_loaded)
+        with ThreadPoolExecutor(1) as beside:
             compared = beside.submit(checked_rig, views, heal=self.align)
             several = max(map(len, found.values())) > 1
             if several or self.strict or self.max_memory is not None:

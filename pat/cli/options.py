@@ -342,13 +342,10 @@ def working(title: str) -> Iterator[Callable[[str], None]]:
 
 @cache
 def say_when_compiling() -> None:
-    """Say once, in one line, that kernels are compiled, before they are, and have a second process help: that takes
-    some seconds."""
+    """Say once, in one line, that kernels are compiled, before they are: that takes some seconds."""
     from numba.core import event
 
     from arraygeom.compiled import COMPILED
-
-    from ..fusion.compiling import compile_beside
 
     first = Lock()
 
@@ -356,20 +353,11 @@ def say_when_compiling() -> None:
         def on_start(self, event: object) -> None:
             if first.acquire(blocking=False):
                 say("compiling kernels for this machine, once (`pat warm-up` does so beforehand)")
-                compile_beside()
 
         def on_end(self, event: object) -> None:
             pass
 
     event.register(COMPILED, Compiling())
-
-
-def compile_at_once() -> None:
-    """Begin to compile kernels, in a second process, where none seem to be."""
-    from ..fusion.compiling import compile_beside, seems_compiled
-
-    if not seems_compiled():
-        compile_beside()
 
 
 def print_json(document: Any) -> None:

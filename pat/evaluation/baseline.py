@@ -146,14 +146,6 @@ def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Te
     return torch.from_numpy(np.ascontiguousarray(found.reshape(given.shape))).movedim(-1, 0).to(image)
 
 
-def sgbm_disparity(
-    alpha: Float[Tensor, "1 h w"], beta: Float[Tensor, "1 h w"], max_disparity: float
-) -> Float[Tensor, "h w"]:
-    """OpenCV's semi-global matching of a rectified pair, alpha on the left; NaN where it gives nothing."""
-    found = torch.from_numpy(_disparity(to_bytes(alpha[0]), to_bytes(beta[0]), max_disparity))
-    return torch.where(found >= 0, found, torch.nan)
-
-
 class _Plane(NamedTuple):
     """A common image plane: where alpha's and beta's pixels are in it, its size, its disparities."""
 
@@ -238,9 +230,9 @@ def checked_disparity(
     left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float
 ) -> tuple[Image, NDArray[np.bool_]]:
     """Disparity of left (h, w) by OpenCV's semi-global matching, and where the left-right check holds."""
-    ours = _disparity(left, right, max_disparity)
+    ours = raw_disparity(left, right, max_disparity)
     # Seen from beta, alpha's points lie to the right: mirrored, to the left again.
-    theirs = _disparity(right[:, ::-1], left[:, ::-1], max_disparity)[:, ::-1]
+    theirs = raw_disparity(right[:, ::-1], left[:, ::-1], max_disparity)[:, ::-1]
     columns, rows = _grid(left.shape)
     back = _sampled(np.ascontiguousarray(theirs), columns - ours, rows, how=cv2.INTER_NEAREST)
     return ours, (np.abs(back - ours) <= CHECK) & (ours >= 0) & (columns - ours >= -0.5)
@@ -280,7 +272,7 @@ def _softened(mono: Image, sharpness: float) -> Image:
     return cv2.resize(small, mono.shape[::-1], interpolation=cv2.INTER_CUBIC)
 
 
-def _disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float) -> Image:
+def raw_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float) -> Image:
     """Semi-global matching, padded because OpenCV leaves `count` columns at the left without disparity."""
     count = 16 * int(np.ceil((min(max_disparity, left.shape[1]) + 1) / 16))
     matcher = cv2.StereoSGBM.create(

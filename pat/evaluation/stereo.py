@@ -15,9 +15,8 @@ from torch import Tensor
 
 from ..data.pairs import PAPER_DISPARITY, Disparity, StereoPair, folder_pairs, middlebury_pairs
 from ..media.images import write_image
-from .halves import Half, of_half
 from .metrics import bootstrap_interval, disparity_score, score
-from .protocols import PRINTED, MonoColourTask, StereoMethod, StereoResult, beta_alone, mono_colour_task
+from .protocols import MonoColourTask, StereoMethod, StereoResult, beta_alone, mono_colour_task
 from .tables import distinct, markdown_table
 
 DATA_SETS: dict[str, Callable[[Path], Iterable[StereoPair]]] = {
@@ -57,21 +56,10 @@ class StereoSummary(NamedTuple):
 
 
 def evaluate_sets(
-    folders: Mapping[str, Path],
-    methods: Mapping[str, StereoMethod],
-    rates: Sequence[int],
-    *,
-    out: Path,
-    half: Half = "all",
-    change: Callable[[StereoPair], StereoPair] = lambda pair: pair,
+    sets: Mapping[str, Iterable[StereoPair]], methods: Mapping[str, StereoMethod], rates: Sequence[int], *, out: Path
 ) -> dict[str, list[StereoRow]]:
-    """`evaluate_pairs` on data sets by name (see `DATA_SETS`): rows by set, a strip of images a pair in out/set.
-    Of the pairs of one half, or all, each after `change`.
-
-    All folders are opened before the work begins: a missing one raises FileNotFoundError or ValueError.
-    """
-    pairs = {name: map(change, of_half(DATA_SETS[name](folder), half)) for name, folder in folders.items()}
-    return {name: evaluate_pairs(found, methods, rates, images=out / name) for name, found in pairs.items()}
+    """`evaluate_pairs` on data sets by name: rows by set, a strip of images a pair in out/set."""
+    return {name: evaluate_pairs(pairs, methods, rates, images=out / name) for name, pairs in sets.items()}
 
 
 def evaluate_pairs(
@@ -108,22 +96,19 @@ def summarise(rows: Sequence[StereoRow]) -> list[StereoSummary]:
     return [_summary(*key, group) for key, group in sorted(groups.items(), key=lambda item: item[0][0])]
 
 
-def sets_markdown(rows: Mapping[str, Sequence[StereoRow]], *, protocol: str = "") -> str:
-    """`markdown` of each data set under its name, followed by `structure_kept`.
-
-    With a protocol, also the paper's printed figures, and errors of depth.
-    """
-    return "\n".join(_set_markdown(name, found, protocol) for name, found in rows.items())
-
-
-def _set_markdown(name: str, rows: Sequence[StereoRow], protocol: str) -> str:
-    tables = markdown(rows, printed=PRINTED.get((protocol, name), {}))
-    depth = depth_markdown(rows) if protocol else ""
-    return f"#### {name}\n\n{tables}\n{structure_kept(rows)}\n" + (f"\n{depth}" if depth else "")
-
-
 PrintedScores = Mapping[int, tuple[float, float]]
 """Published PSNR and SSIM, by rate."""
+
+
+def sets_markdown(
+    rows: Mapping[str, Sequence[StereoRow]], *, printed: Mapping[str, PrintedScores] = {}, depth: bool = True
+) -> str:
+    """`markdown` of each data set under its name, followed by `structure_kept` and, with `depth`, its errors."""
+    parts = []
+    for name, found in rows.items():
+        parts += [f"#### {name}\n\n{markdown(found, printed=printed.get(name, {}))}\n{structure_kept(found)}\n"]
+        parts += [errors] if depth and (errors := depth_markdown(found)) else []
+    return "\n".join(parts)
 
 
 def markdown(rows: Sequence[StereoRow], *, printed: PrintedScores = {}) -> str:  # noqa: B006
@@ -178,16 +163,6 @@ def _depth_cell(rows: Sequence[StereoRow]) -> str:
         return ""
     error, within = (float(np.mean([getattr(row, name) for row in rows])) for name in ("end_point_error", "within_one"))
     return f"{error:.2f} px / {within:.1%}"
-
-
-def falls(rows: Sequence[StereoRow], *, method: str = "fusion", names: Iterable[str]) -> str:
-    """A line for each of `names`: its mean PSNR against that of `method`, and the extremes over the images."""
-    psnr = {(row.pair, row.rate, row.method): row.psnr for row in rows}
-    lines = []
-    for name in names:
-        gains = [psnr[pair, rate, name] - value for (pair, rate, m), value in psnr.items() if m == method]
-        lines.append(f"- {name}: {np.mean(gains):+.2f} dB against {method}, {min(gains):+.2f} to {max(gains):+.2f}\n")
-    return "".join(lines)
 
 
 def structure_kept(rows: Sequence[StereoRow], *, method: str = "fusion", than: str = "alpha") -> str:

@@ -23,7 +23,7 @@ from pat.synthesis.blender.lens import lens_for
 from pat.synthesis.blender.settings import RenderSettings
 from pat.synthesis.blender.task import fitted, render_here, shots
 from pat.synthesis.check import CheckLimits, SceneCheck, check_views
-from pat.synthesis.generators import GENERATORS
+from pat.synthesis.generators import generator_named
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.patterns import patterns
 from pat.synthesis.photos import PhotoBank
@@ -73,10 +73,10 @@ class LayeredSettings:
 class BlenderSettings:
     """Blender's scenes: a generator, a preset, and settings that differ from the preset's.
 
-    `photos` is the folder of images for the generator "photographs".
+    The generator is "abstract", "photographs" (with `photos`, a folder of images), or "module:function".
     """
 
-    generator: Literal["abstract", "photographs", "still-life", "landscape"] = "abstract"
+    generator: str = "abstract"
     photos: Path | None = None
     preset: Literal["fast", "paper"] = "fast"
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -84,6 +84,8 @@ class BlenderSettings:
     def __post_init__(self) -> None:
         if (self.generator == "photographs") != (self.photos is not None):
             raise ValueError("the generator 'photographs' needs a folder `photos`, and only that one takes it")
+        if ":" not in self.generator:
+            generator_named(self.generator)
         self.render_settings()
 
     def render_settings(self) -> RenderSettings:
@@ -187,7 +189,7 @@ class BlenderRenderer:
         """Render, write and check."""
         further = {} if self.settings.photos is None else {"folder": self.settings.photos}
         moving = self.render_settings.duration
-        scene = GENERATORS[self.settings.generator](seed, self.rig, moving=moving, **further)
+        scene = generator_named(self.settings.generator)(seed, self.rig, moving=moving, **further)
         rendered = render_here(scene, self.rig, out, settings=self.render_settings)
         check = dict(rendered.about["check"])
         return SceneCheck(views=check["views"], pairs=check["pairs"], reasons=tuple(check["reasons"]))

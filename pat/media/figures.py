@@ -16,7 +16,6 @@ from torch.nn.functional import interpolate
 
 from arraygeom.atomic import write_atomically
 from arraygeom.chunks import chunked
-from arraygeom.viz import new_figure
 
 from .colour import to_bytes
 
@@ -89,19 +88,3 @@ def save_panels(panels: Mapping[str, Float[Tensor, "_ _ _"]], path: Path, *, col
     """`draw_panels`, 16 inches wide, written atomically."""
     with write_atomically(path) as temporary:
         draw_panels(panels, columns=columns, width=16).save(temporary, compress_level=3)
-
-
-Curves = Mapping[str, list[tuple[float, float]]]
-"""Points (x, y) by name."""
-
-
-def save_curves(plots: Mapping[str, Curves], path: Path, *, ylabel: str) -> None:
-    """Curves in one figure, a plot beside the other by the title of its x axis, written atomically."""
-    figure = new_figure(figsize=(5 * len(plots), 4), layout="constrained")
-    for i, (title, curves) in enumerate(plots.items()):
-        axes = figure.add_subplot(1, len(plots), i + 1, xlabel=title, ylabel=ylabel)
-        for name, points in curves.items():
-            axes.plot(*zip(*points), marker="o", label=name)
-        axes.grid(alpha=0.3)
-        axes.legend()
-    save_figure(figure, path)

@@ -16,7 +16,7 @@ from .electronics import Clip, Exposure, Jitter, Noise, Quantise
 from .grids import Crop, Demosaic, Mosaic, Resample
 from .noise_level import NoiseLevel
 from .optics import BoxBlur, Defocus, DiscBlur, GaussianBlur, MotionBlur, Vignetting, circle_of_confusion
-from .recipe import STEPS, read_cases, read_chain, read_chains
+from .recipe import STEPS, read_chain, read_chains
 from .spectral import DecodeSRGB, EncodeSRGB, Gamma, Spectral, band_weights, curve_weights
 
 __all__ = [
@@ -54,7 +54,6 @@ __all__ = [
     "curve_weights",
     "generator_for",
     "paper_cases",
-    "read_cases",
     "read_chain",
     "read_chains",
     "record",

@@ -24,7 +24,6 @@ from typing import Any
 from pat.support.naming import near
 from pat.support.schema import from_document
 
-from .cases import DegradationCase
 from .chain import Step
 from .electronics import Clip, Exposure, Jitter, Noise, Quantise
 from .grids import Crop, Demosaic, Mosaic, Resample
@@ -57,23 +56,6 @@ def read_chains(value: Any, where: str = "sensors") -> dict[str, tuple[Step, ...
     if not isinstance(value, Mapping):
         raise ValueError(f"{where}: wanted a mapping of cameras to lists of steps")
     return {str(name): read_chain(steps, f"{where}.{name}") for name, steps in value.items()}
-
-
-def read_cases(value: Any) -> tuple[DegradationCase, ...]:
-    """Cases for pairs, from a list of mappings with `name` and, if degraded, `alpha` and `beta`."""
-    if not isinstance(value, list) or not value:
-        raise ValueError("cases: wanted a list of cases, such as [{name: blur beta, beta: [{box-blur: 5}]}]")
-    return tuple(_case(entry, f"cases[{i}]") for i, entry in enumerate(value))
-
-
-def _case(entry: Any, where: str) -> DegradationCase:
-    if not isinstance(entry, Mapping) or "name" not in entry:
-        raise ValueError(f"{where}: wanted a mapping with name, alpha and beta")
-    for key in entry:
-        if key not in ("name", "alpha", "beta"):
-            raise ValueError(f"{where}.{key}: unknown key{near(key, ('name', 'alpha', 'beta'))}")
-    alpha, beta = (read_chain(entry.get(side, []), f"{where}.{side}") for side in ("alpha", "beta"))
-    return DegradationCase(str(entry["name"]), alpha, beta)
 
 
 def _step(entry: Any, where: str) -> Step:

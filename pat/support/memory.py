@@ -6,15 +6,11 @@ import ctypes
 import os
 import re
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from threading import Event, Thread
-from typing import TypeVar
-
-Result = TypeVar("Result")
 
 M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -4, -8
 """Options of glibc's mallopt (malloc.h)."""
@@ -112,45 +108,10 @@ def how_many_fit(nbytes: float) -> int | None:
     return max(int((ROOM * limit - resident()) // nbytes), 1)
 
 
-def watch_peak(pid: int, *, every: float = 0.2) -> Callable[[], float]:
-    """Watch a process until it ends; the returned function waits for that and gives its peak resident bytes, or 0.
-
-    `wait4` would count what the parent had resident when it started the process.
-    """
-    found = [0.0]
-
-    def watch() -> None:
-        while (resident := peak_memory(pid)) is not None:
-            found[0] = resident
-            time.sleep(every)
-
-    watching = Thread(target=watch, daemon=True)
-    watching.start()
-
-    def peak() -> float:
-        watching.join()
-        return found[0]
-
-    return peak
-
-
 def peak_memory(pid: int | str = "self") -> float | None:
     """Peak resident bytes of a process, by default of this one; None where the system does not say (Linux does)."""
     line = re.search(r"VmHWM:\s+(\d+) kB", _text(Path(f"/proc/{pid}/status")))
     return None if line is None else float(line[1]) * 2**10
-
-
-def with_peak(work: Callable[[], Result]) -> tuple[Result, float | None]:
-    """What `work` returns, and the bytes by which this process grew at most meanwhile; None where the system
-    cannot say (Linux can)."""
-    give_back()
-    before = resident()
-    try:
-        Path("/proc/self/clear_refs").write_text("5")  # the peak is that from here on
-    except OSError:
-        return work(), None
-    result, peak = work(), peak_memory()
-    return result, None if peak is None else max(peak - before, 0.0)
 
 
 def _text(path: Path) -> str:

@@ -15,6 +15,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from arraygeom.extras import imported
 from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 
@@ -22,9 +23,7 @@ from ..media.colour import linear_from_srgb
 from ..media.images import decoded_photograph
 from ..support.folders import files_below
 from .furnish import Setting, furnished, seeded, vec
-from .landscape import landscape
 from .scene import BoardObject, Key, Light, Material, Motion, Object, Paint, Scene, Texture, TextureKind, Vec3, World
-from .still_life import still_life
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 
@@ -87,10 +86,20 @@ GENERATORS: dict[str, Callable[..., Scene]] = {
     "abstract": abstract,
     "photographs": photographs,
     "board": board,
-    "still-life": still_life,
-    "landscape": landscape,
 }
 """By name. All take a seed; "abstract" and "photographs" a rig."""
+
+
+def generator_named(name: str) -> Callable[..., Scene]:
+    """ "abstract", "photographs", or one's own, called with a seed, a rig and `moving` seconds, as "module:function".
+
+    Raises ValueError for a name that is neither.
+    """
+    if name in ("abstract", "photographs"):
+        return GENERATORS[name]
+    if ":" not in name:
+        raise ValueError(f"no generator is called '{name}': use abstract, photographs or MODULE:FUNCTION")
+    return imported(name, "generator")  # type: ignore[no-any-return]
 
 
 # Surfaces -------------------------------------------------------------------------------------------------------

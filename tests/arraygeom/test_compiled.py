@@ -1,4 +1,4 @@
-"""Compiled functions: those that only compiled ones call, and where nothing can be kept."""
+"""Compiled functions: what is kept, who waits for whom, and where nothing can be kept."""
 
 import errno
 import time
@@ -9,7 +9,6 @@ import pytest
 from filelock import FileLock
 
 from arraygeom import compiled as module
-from arraygeom import linked
 
 caching = pytest.importorskip("numba.core.caching")
 
@@ -46,23 +45,6 @@ def entry(monkeypatch, tmp_path):
     return module.compiled(sum_of_halves, cache=True)
 
 
-def test_what_compiled_functions_alone_call_becomes_machine_code_only_within_them(entry, monkeypatch):
-    from numba.core.codegen import JITCodeLibrary
-
-    names, finalize = [], JITCodeLibrary._finalize_specific
-    monkeypatch.setattr(JITCodeLibrary, "_finalize_specific", lambda self: (names.append(self.name), finalize(self))[1])
-    assert entry(4.0) == 4.5
-    assert names.count("sum_of_halves") == 1
-    assert not {"half", "halves"} & {*names}
-
-
-def test_called_from_python_such_a_function_raises(entry):
-    entry(4.0)
-    for number in (4.0, 4):
-        with pytest.raises(TypeError):
-            half(number)
-
-
 def test_one_process_compiles_and_others_wait_for_it(entry):
     lock = Path(module.cache_file(entry)._index_path).with_suffix(".lock")
     with ThreadPoolExecutor() as beside, FileLock(lock) as held:
@@ -97,10 +79,3 @@ def test_what_is_kept_is_loaded_without_waiting(entry):
         assert again(4.0) == 4.5
         assert time.monotonic() - begin < 10
     assert again.stats.cache_hits
-
-
-def test_another_numba_compiles_it_as_any_other(monkeypatch):
-    from numba.core.compiler import Compiler
-
-    monkeypatch.setattr(linked, "_INTERNAL", ("no_such_name",))
-    assert linked._linked_compiler.__wrapped__() is Compiler

@@ -14,8 +14,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from arraygeom import Rig
+from experiments.peaks import watch_peak
 from pat.evaluation.tables import markdown_table
-from pat.support.memory import watch_peak
 from tests.benchmarks.job_parts import scene
 
 CASES = {"1280x800, 4 betas": (1280, 800, 4, None), "4032x3024, 1 beta": (4032, 3024, 1, "4GiB")}

@@ -19,9 +19,9 @@ from typing import NamedTuple
 import cv2
 import tyro
 
+from experiments.peaks import with_peak
 from pat.cli.main import main
 from pat.evaluation.tables import markdown_table
-from pat.support.memory import with_peak
 
 from .input_kinds import Kind, kinds
 

@@ -11,10 +11,11 @@ import time
 from pathlib import Path
 
 import torch
+from pat.data.patches import cut
 
 from arraygeom import Camera, Pose, Rig, Sensor, intrinsics
-from pat.data import PatchGrid, ScenePatches
-from pat.data.patches import cut
+from experiments.patches.dataset import ScenePatches
+from experiments.patches.grid import PatchGrid
 from pat.farm.backends import LayeredSettings
 from pat.synthesis.check import CheckLimits
 

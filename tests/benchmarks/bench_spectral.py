@@ -3,7 +3,8 @@
     python -m tests.benchmarks.bench_spectral --photos DIR
 
 Layered scenes of photographs that training holds out. The classical baseline sees red, green and blue at one place as
-one colour image, and all other bands one by one. Table 2 on real pairs is `pat evaluate --protocol table2`.
+one colour image, and all other bands one by one. Table 2 on real pairs is `python -m
+experiments evaluate --protocol table2`.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
     python -m tests.benchmarks.bench_unseen DATA [--half report] [--out tests/benchmarks/RESULTS_unseen.md]
 
-PSNR (dB) by region, mean over Middlebury's pairs of one half of `pat/evaluation/halves.yaml` in the folder DATA, beta
-reduced 2x. The best choice is made with the ground truth, for each block of 16x16 pixels.
+PSNR (dB) by region, mean over Middlebury's pairs of one half of `experiments/evaluation/halves.yaml` in the folder
+DATA, beta reduced 2x. The best choice is made with the ground truth, for each block of 16x16 pixels.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, one_hot
 
+from experiments.evaluation.conditions import regions_of
+from experiments.evaluation.halves import of_half
 from pat import load_weights
 from pat.data.pairs import PAPER_DISPARITY, StereoPair, middlebury_pairs
 from pat.evaluation.baseline import classical_fusion
-from pat.evaluation.conditions import regions_of
-from pat.evaluation.halves import of_half
 from pat.evaluation.protocols import mono_colour_task, rectified_fusion
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.matching.colour_transfer import FILLS

@@ -76,10 +76,10 @@ def _pose(view: Camera, random: np.random.Generator) -> Pose:
 
 def photograph(out: Path, *, count: int = POSES, samples: int = 8) -> None:
     """The images, `out/<camera>/<frame>.png` (8 bits), and `out/true.yaml`."""
+    from experiments.scenes.image_files import light, write_light
     from pat.synthesis.blender import RenderSettings
     from pat.synthesis.blender.client import render
     from pat.synthesis.generators import board
-    from pat.synthesis.image_files import light, write_light
 
     cameras = rig()
     slow = {name: c.replace(sensor=Sensor(frame_rate=1.0)) for name, c in cameras.cameras.items()}

@@ -214,7 +214,7 @@ def test_evaluate_writes_and_prints_the_tables(data, tmp_path, capsys):
     )
     printed = capsys.readouterr().out
     assert printed == (tmp_path / "scores.md").read_text()
-    assert printed.startswith("#### kitti\n\n| beta reduced 2x | alpha | beta | classical | fusion | the paper")
+    assert printed.startswith("#### kitti\n\n| beta reduced 2x | alpha | beta | classical | fusion |\n")
     assert len((tmp_path / "scores.csv").read_text().splitlines()) == 5
     assert len(list((tmp_path / "kitti").glob("*_x2.png"))) == 1
 
@@ -233,3 +233,34 @@ def test_evaluate_says_what_is_wrong(arguments, complaint, tmp_path, capsys):
     assert stop.value.code == 2
     assert complaint in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (
+            ["evaluate", "--kitti", ".", "--without-rig", "--protocol", "table2"],
+            "--without-rig needs --protocol table1",
+        ),
+        (["conditions", "--kitti", ".", "--only", "dusk"], "--only: no condition 'dusk': there are ideal, x1"),
+        (["conditions", "--kitti", "DATA/kitti", "--half", "tune"], "--half tune: no pair belongs to that half"),
+        (["outside", "--kitti", "DATA/kitti"], "none of its pairs has a true disparity"),
+        (["certainty", "--middlebury", ".", "--conditions", "dusk"], "--conditions: no condition 'dusk'"),
+    ],
+)
+def test_the_tables_commands_say_what_is_wrong(arguments, complaint, data, tmp_path, capsys):
+    given = [argument.replace("DATA", str(data)) for argument in arguments]
+    with pytest.raises(SystemExit) as stop:
+        main([*given, "--out", str(tmp_path / "out")], group=Experiments)
+    assert stop.value.code == 2
+    assert complaint in capsys.readouterr().err
+
+
+def test_the_papers_figures_are_beside_ours(data, tmp_path, capsys):
+    arguments = ["evaluate", "--kitti", str(data / "kitti"), "--rates", "2", "--controls", "--out", str(tmp_path)]
+    main([*arguments, "--weights", "mono-colour-small"], group=Experiments)
+    printed = capsys.readouterr().out
+    assert printed == (tmp_path / "scores.md").read_text()
+    assert "| shuffled fields | the paper, printed, on its own data |" in printed
+    assert "29.55 / 0.9097" in printed
+    assert printed.count(" dB against fusion, ") == 3

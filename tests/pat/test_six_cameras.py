@@ -27,11 +27,11 @@ from arraygeom import (
     triangulate,
 )
 from arraygeom.io import write_rig
+from experiments.evaluation.sweeps import ablate as ablate_rigs
 from pat import fuse, load_weights
 from pat.cli.main import main
 from pat.evaluation.ablation import AblationCase, FieldFamily, ablate, families
 from pat.evaluation.metrics import score
-from pat.evaluation.sweeps import ablate as ablate_rigs
 from pat.explore.page import opened
 from tests.pat.any_camera import hit, recorded
 from tests.pat.own_cameras import (

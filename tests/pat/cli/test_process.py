@@ -6,9 +6,11 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from threading import Barrier, Thread
 
 import pytest
 
+from pat.cli import options
 from pat.cli.demo import Demo
 from pat.cli.main import Pat, command_paths, main
 from pat.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named
@@ -185,3 +187,22 @@ def test_threads_that_wait_sleep():
         line = [sys.executable, "-c", code, "--help"]
         done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, env=others | given)
         assert done.stdout.split()[-1] == wanted
+
+
+def test_that_kernels_are_compiled_is_said_once(monkeypatch):
+    event = pytest.importorskip("numba.core.event")
+    said, listeners, barrier = [], [], Barrier(4)
+    monkeypatch.setattr(event, "register", lambda kind, listener: listeners.append(listener))
+    monkeypatch.setattr(options, "say", said.append)
+    options.say_when_compiling.__wrapped__()
+
+    def compile_one() -> None:
+        barrier.wait()
+        listeners[0].on_start(None)
+
+    threads = [Thread(target=compile_one) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(said) == 1

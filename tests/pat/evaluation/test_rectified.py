@@ -5,9 +5,9 @@ import torch
 
 from arraygeom import Epipolar, apply_homography, pixel_grid
 from arraygeom.epipolar import epipolar_distance
+from experiments.evaluation.sweeps import ALPHA, BETA, Directly, made, point
 from pat.evaluation.ablation import sample_photographs
 from pat.evaluation.rectified import rectified
-from pat.evaluation.sweeps import ALPHA, BETA, Directly, made, point
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
 

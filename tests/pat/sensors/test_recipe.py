@@ -5,20 +5,16 @@ import yaml
 from arraygeom.sensor import Band, Curve
 from pat.sensors import (
     STEPS,
-    BoxBlur,
     Clip,
     Crop,
     DecodeSRGB,
     Defocus,
-    DegradationCase,
     Demosaic,
     EncodeSRGB,
     Noise,
     Quantise,
     Resample,
     Spectral,
-    paper_cases,
-    read_cases,
     read_chain,
     read_chains,
     record,
@@ -58,18 +54,6 @@ def test_a_file_says_what_each_camera_does():
     )
 
 
-def test_the_papers_cases_as_a_list():
-    reduced = [{"resample": {"to": 0.5, "method": "bicubic"}}, {"resample": {"to": 2, "method": "bicubic"}}, "clip"]
-    listed = [
-        {"name": "blur alpha", "alpha": [{"box-blur": 5}]},
-        {"name": "blur beta", "beta": [{"box-blur": 5}]},
-        {"name": "reduce beta", "beta": reduced},
-        {"name": "blur and reduce beta", "beta": [{"box-blur": 5}, *reduced]},
-    ]
-    assert read_cases(listed) == paper_cases()
-    assert read_cases([{"name": "one", "alpha": [{"box-blur": 3}]}]) == (DegradationCase("one", alpha=(BoxBlur(3),)),)
-
-
 def test_every_step_has_a_name():
     assert set(STEPS) >= {"box-blur", "motion-blur", "vignetting", "mosaic", "demosaic", "noise", "gamma"}
 
@@ -104,10 +88,3 @@ def test_a_chain_from_a_file_runs():
 def test_typos_are_named_with_their_entry(text, words):
     with pytest.raises(ValueError, match=words):
         read_chain(yaml.safe_load(text))
-
-
-def test_typos_of_cases_are_named():
-    with pytest.raises(ValueError, match="did you mean 'beta'"):
-        read_cases([{"name": "x", "bta": []}])
-    with pytest.raises(ValueError, match="list of cases"):
-        read_cases([])

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import threading
 
 import numpy as np
 import pytest
@@ -13,10 +12,7 @@ from pat.support.memory import (
     how_many_fit,
     limited,
     parse_bytes,
-    peak_memory,
     resident,
-    watch_peak,
-    with_peak,
 )
 
 
@@ -29,16 +25,6 @@ def test_freed_memory_is_given_back():
     give_back()
     assert before - resident() > 0.8 * 2000 * 2**16
     assert all(block[0] == 1 for block in blocks)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_the_peak_of_work_is_what_it_held_at_most():
-    """100 MiB held and let go, whatever was held before."""
-    held = np.ones(2**25)
-    del held
-    value, grown = with_peak(lambda: float(np.ones(100 * 2**17).sum()))
-    assert value == 100 * 2**17
-    assert 95 * 2**20 < grown < 115 * 2**20
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -56,33 +42,6 @@ def test_bytes_are_read():
     assert parse_bytes(7) == 7.0
     with pytest.raises(ValueError, match="'4 gigs'"):
         parse_bytes("4 gigs")
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="read from /proc")
-def test_the_peak_of_a_process_is_its_own_not_that_of_its_parent(monkeypatch):
-    held = np.ones(2**26)  # 512 MiB resident here while the other starts
-    code = "held = bytearray(100 << 20); del held; print(flush=True); input()"
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    looked = threading.Semaphore(0)
-
-    def noted(pid):
-        found = peak_memory(pid)
-        looked.release()
-        return found
-
-    monkeypatch.setattr("pat.support.memory.peak_memory", noted)
-    with subprocess.Popen([sys.executable, "-I", "-S", "-c", code], **pipes) as process:
-        peak = watch_peak(process.pid, every=0.01)
-        process.stdout.readline()
-        while looked.acquire(blocking=False):
-            pass
-        assert all(looked.acquire(timeout=300) for _ in range(2))  # the second is after it had its memory
-        process.communicate("\n")
-        peak = peak()
-    assert process.returncode == 0
-    assert held.nbytes == 2**29
-    assert 100 * 2**20 < peak < 200 * 2**20
-    assert watch_peak(process.pid)() == 0
 
 
 KEPT = """

@@ -8,12 +8,11 @@ from arraygeom.rig import Rig
 from pat.media.images import write_image
 from pat.synthesis.boards import PIXELS, draw_board, opencv_board
 from pat.synthesis.furnish import Setting
-from pat.synthesis.generators import GENERATORS, abstract, board, photographs
+from pat.synthesis.generators import GENERATORS, abstract, board, generator_named, photographs
 from pat.synthesis.scene import BoardObject, Key, Motion, Object, Scene
 from pat.synthesis.shapes import inside, mesh
 from tests.pat.synthesis.scenes import inner_corners, posed, unlike_cameras
 
-ENDS = ("armchair seat", "rug", "window panes", "chair seat")
 BOARD = BoardObject(squares=(7, 5), square=0.05, marker=0.04, dictionary="DICT_4X4_50")
 
 
@@ -56,49 +55,6 @@ def test_a_rig_without_depths_gets_those_of_the_paper():
     assert abstract(0, Rig({"a": camera}, depth=(1.0, torch.inf))).depth == (1.0, 10.0)
 
 
-@pytest.mark.parametrize(
-    ("generator", "focal", "bounds"), [("still-life", 820.0, (1.4, 20)), ("landscape", 1990, (9, 250))]
-)
-def test_arranged_scenes_fill_the_first_image_wherever_the_rig_stands(generator, focal, bounds):
-    camera = Camera(K=intrinsics(focal, (400, 640)), cam_from_world=posed(), hw=(400, 640))
-    rig = Rig({"a": camera}, depth=bounds)
-    scene = GENERATORS[generator](1, rig)
-    assert Scene.from_yaml(scene.to_yaml()) == scene != GENERATORS[generator](2, rig)
-    assert all(o.motion.still for o in scene.objects)
-    seen = depths(scene, camera)
-    assert len(seen) > 5000
-    assert float(seen.quantile(0.02)) > bounds[0]
-    assert float(seen.max()) < bounds[1]
-    up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
-    sun = torch.tensor(scene.lights[0].direction, dtype=torch.float64)
-    assert float((camera.R @ sun) @ up) < 0, "the light comes from above"
-
-
-def test_a_wide_camera_sees_a_room_around_the_still_life():
-    narrow = Camera(K=intrinsics(820.0, (400, 640)), cam_from_world=posed(), hw=(400, 640))
-    wide = Camera(K=intrinsics(240.0, (400, 640)), cam_from_world=posed(), hw=(400, 640))
-    table, room = (GENERATORS["still-life"](1, Rig(c)) for c in ({"a": narrow}, {"a": narrow, "b": wide}))
-    assert room.objects[: len(table.objects)] == table.objects
-    around = {o.name: o for o in room.objects[len(table.objects) :]}
-    assert len(around) > 80
-    middles = {name: torch.tensor(around[name].motion.keys[0].position, dtype=torch.float64) for name in ENDS}
-    x = {name: wide.project(X).x for name, X in middles.items()}
-    assert all(bool(wide.contains(at)) for at in x.values())
-    assert x["armchair seat"][0] < x["rug"][0] < x["window panes"][0]
-    assert x["window panes"][1] < x["chair seat"][1]
-    assert not bool(narrow.contains(narrow.project(middles["armchair seat"]).x))
-
-
-def test_the_ball_is_thrown_in_the_time_that_is_given():
-    camera = Camera(K=intrinsics(820.0, (400, 640)), cam_from_world=posed(), hw=(400, 640))
-    scene = GENERATORS["still-life"](1, Rig({"a": camera}), moving=0.5)
-    (ball,) = (o for o in scene.objects if not o.motion.still)
-    assert ball.motion.keys[-1].time == 0.5
-    x = camera.project(torch.tensor([k.position for k in ball.motion.keys], dtype=torch.float64)).x
-    assert bool(camera.contains(x).all())
-    assert bool((x[1:, 0] > x[:-1, 0] + 20).all())
-
-
 def test_a_lathe_is_what_its_profile_sweeps():
     """A profile that is a half circle makes a sphere, with the outside outside."""
     angles = np.linspace(0, np.pi, 33)
@@ -129,7 +85,17 @@ def test_what_cannot_be_generated_is_said(tmp_path):
         board([], BOARD)
     with pytest.raises(ValueError, match="unknown marker dictionary 'DICT_9'"):
         draw_board(BoardObject(dictionary="DICT_9"))
-    assert set(GENERATORS) == {"abstract", "photographs", "board", "still-life", "landscape"}
+    assert set(GENERATORS) == {"abstract", "photographs", "board"}
+    with pytest.raises(ValueError, match="no generator is called 'still-life': use abstract, photographs or MODULE:F"):
+        generator_named("still-life")
+    with pytest.raises(ValueError, match="the generator 'nowhere:scene' cannot be imported"):
+        generator_named("nowhere:scene")
+
+
+def test_a_generator_of_ones_own_is_found_from_here(tmp_path, monkeypatch):
+    (tmp_path / "own_scenes.py").write_text("def one(seed, rig, *, moving=0.0):\n    return seed + 1\n")
+    monkeypatch.chdir(tmp_path)
+    assert generator_named("own_scenes:one")(4, None) == 5
 
 
 def test_the_drawn_board_is_the_one_opencv_knows():

@@ -15,10 +15,10 @@ from arraygeom.pixels import pixel_grid
 from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 from arraygeom.sensor import Sensor
+from experiments.scenes.image_files import export, export_video
 from pat.media.images import read_image
 from pat.synthesis.blender import Optics, RenderSettings
 from pat.synthesis.generators import abstract, board, photographs
-from pat.synthesis.image_files import export, export_video
 from pat.synthesis.rendered import is_rendered
 from pat.synthesis.scene import BoardObject, Key, Light, Material, Motion, Object, Paint, Scene, Texture
 from pat.synthesis.shapes import inside

@@ -16,6 +16,7 @@ from arraygeom.fields import ReceptiveField
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.rig import Rig
 from arraygeom.sensor import Band, Curve, Sensor
+from pat.data.windows import same_cameras, scene_folders, scene_rig, stacked
 from pat.media.colour import srgb_image
 from pat.sensors import (
     Clip,
@@ -30,8 +31,7 @@ from pat.sensors import (
     seed_for,
 )
 
-from .patches import PatchGrid, PatchStack, cut
-from .windows import same_cameras, scene_folders, scene_rig, stacked
+from .grid import PatchGrid, PatchStack, cut
 
 LOADED = 64
 """Scenes whose patches each process caches in memory."""

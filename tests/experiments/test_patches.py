@@ -18,18 +18,12 @@ from arraygeom import (
     rotation_from_vector,
     sampling_locations,
 )
-from pat.data import (
-    PatchGrid,
-    ScenePatches,
-    SceneShuffle,
-    agreement,
-    collate,
-    index_files,
-    read_indices,
-    scene_folders,
-    write_indices,
-)
-from pat.data.patches import cut
+from experiments.__main__ import Experiments
+from experiments.patches.dataset import ScenePatches, SceneShuffle, collate
+from experiments.patches.grid import PatchGrid, cut
+from experiments.patches.indices import agreement, index_files, read_indices, write_indices
+from pat.cli.main import main
+from pat.data import scene_folders
 from pat.data.windows import reduced_depth
 from pat.farm.backends import LayeredSettings
 from pat.media.images import read_image
@@ -206,18 +200,17 @@ def test_names_that_the_rig_lacks_are_reported(rendered):
 
 
 def test_show_and_info_on_the_command_line(rendered, tmp_path, capsys):
-    from pat.cli.main import main
-
     sensors = tmp_path / "sensors.yaml"
     sensors.write_text("mono: [{spectral: luminance}, clip, coded]\ncolour: [{box-blur: 3}, clip, coded]\n")
-    main(["data", "show", str(rendered), "--out", str(tmp_path / "x.png"), "--samples", "2", "--sensors", str(sensors)])
+    arguments = ["patches", str(rendered), "--sensors", str(sensors), "--out", str(tmp_path / "x.png")]
+    main([*arguments, "--samples", "2"], group=Experiments)
     assert read_image(tmp_path / "x.png").std() > 0.1
     assert "147 patches of 3 scenes" in " ".join(capsys.readouterr().err.split())
     main(["data", "info", str(rendered)])
     assert "3 scenes of mono 128x96, colour 112x80" in capsys.readouterr().out
     sensors.write_text("mono: [{spectrl: luminance}]\n")
     with pytest.raises(SystemExit):
-        main(["data", "show", str(rendered), "--sensors", str(sensors)])
+        main(arguments, group=Experiments)
     assert "no step is called 'spectrl'; did you mean 'spectral'" in " ".join(capsys.readouterr().err.split())
 
 

@@ -11,10 +11,10 @@ from dataclasses import replace
 from numpy.random import Generator
 
 from arraygeom.rig import Rig
+from pat.synthesis.furnish import seeded
+from pat.synthesis.scene import Light, Material, Object, Paint, Relief, Scene, Texture, TextureKind, Vec3, World
 
-from .furnish import seeded
 from .props import arranged, ball, box, first_camera, lathed, paint, plain
-from .scene import Light, Material, Object, Paint, Relief, Scene, Texture, TextureKind, Vec3, World
 
 WIDE = 5.6
 """Metres that the first camera's image is wide at the washing line."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -38,20 +38,19 @@ from arraygeom import (
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.fields.straight import covering_displacement
 from arraygeom.pixels import HW
-
-from ..attention.scores import peak_position
-from ..fusion.steps import resolution_ratio
-from ..matching.inputs import Inputs
-from ..media.colour import luminance
-from ..networks.protocol import Comparing
-from ..sensors import Clip, Noise, Quantise, generator_for, record
-from ..synthesis.layered import LayeredScenes
-from ..synthesis.photos import PhotoBank
-from ..synthesis.rig_distribution import RigDistribution
-from ..synthesis.rigs import RigBatch
-from .ablation import sample_photographs
-from .metrics import score
-from .rectified import rectified
+from pat.attention.scores import peak_position
+from pat.evaluation.ablation import sample_photographs
+from pat.evaluation.metrics import score
+from pat.evaluation.rectified import rectified
+from pat.fusion.steps import resolution_ratio
+from pat.matching.inputs import Inputs
+from pat.media.colour import luminance
+from pat.networks.protocol import Comparing
+from pat.sensors import Clip, Noise, Quantise, generator_for, record
+from pat.synthesis.layered import LayeredScenes
+from pat.synthesis.photos import PhotoBank
+from pat.synthesis.rig_distribution import RigDistribution
+from pat.synthesis.rigs import RigBatch
 
 ALPHA, BETA = "alpha", "beta"
 SIZE: HW = (96, 128)
@@ -194,12 +193,11 @@ def ablate(
     scenes: int = 6,
     photos: PhotoBank | None = None,
     seed: int = 0,
-    each: Callable[[Row], None] = lambda row: None,
 ) -> list[Row]:
     """Each field on so many scenes of each rig; `rigs` by name, or points of sweeps (`points`).
 
     A rig has two calibrated pinhole cameras, alpha first, and a depth range: its scenes lie in it. `fields` are fields,
-    one's own included, or ways. `each` is called with every row. Raises ValueError for another kind of rig.
+    one's own included, or ways. Raises ValueError for another kind of rig.
     """
     given = [Point(name, 0.0, rig, rig) for name, rig in rigs.items()] if isinstance(rigs, Mapping) else rigs
     bank = photos or sample_photographs()
@@ -215,7 +213,6 @@ def ablate(
                 if isinstance(field, Dense):
                     everywhere[key] = row
                 rows.append(row._replace(sweep=point.sweep, value=point.value))
-                each(rows[-1])
     return rows
 
 

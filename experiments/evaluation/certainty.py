@@ -1,4 +1,4 @@
-"""How well stated certainty holds, and the fit of it: `python -m pat.evaluation.certainty --middlebury DIR`.
+"""How well stated certainty holds, and the fit of it: `python -m experiments certainty --middlebury DIR`.
 
 Pairs with true disparity are fused under many conditions: how often are matches right that are stated to be so with
 some probability, and how many true positions lie in the interval of 9 of 10? With `--fit FILE` a network is fitted to
@@ -8,34 +8,26 @@ these pairs and written; the tables are then of three fits, each judged by the t
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-import tyro
 from jaxtyping import Bool, Float
-from rich.progress import track
 from torch import Generator, Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from arraygeom.atomic import write_text
+from pat.data.pairs import PAPER_DISPARITY, StereoPair
+from pat.evaluation.protocols import hw_of, rectified_field, rectified_rig
+from pat.evaluation.tables import distinct, markdown_table
+from pat.fusion.fuse import fuse
+from pat.matching.certainty import SETTINGS, CertaintyNetwork, measured, typical_facts
+from pat.matching.inputs import Inputs
+from pat.matching.match import match
+from pat.matching.matches import BetaMatches, Matches
+from pat.matching.positions import FINE
+from pat.networks.protocol import FusionNetwork
 
-from ..data.pairs import PAPER_DISPARITY, StereoPair, middlebury_pairs
-from ..fusion.fuse import fuse
-from ..matching.certainty import SETTINGS, CertaintyNetwork, fitted_network, measured, typical_facts
-from ..matching.inputs import Inputs
-from ..matching.match import match
-from ..matching.matches import BetaMatches, Matches
-from ..matching.positions import FINE
-from ..media.figures import save_curves
-from ..networks.protocol import FusionNetwork
-from ..networks.weights import load_weights
-from ..support.tensor_files import write_tensors
-from .conditions import CONDITIONS, regions_of
-from .halves import Half, of_half
-from .protocols import hw_of, rectified_field, rectified_rig
-from .tables import distinct, markdown_table
+from .conditions import CONDITIONS, regions_of, save_curves
 
 PIXELS = 6000
 """Of a pair under a condition that take part, drawn evenly: every pair counts the same."""
@@ -216,38 +208,3 @@ def save_reliability(held: dict[str, Held], path: Path) -> None:
         points = torch.stack(one.stated[:2], 1)[enough].tolist()
         curves[name] = [(float(x), float(y)) for x, y in points]
     save_curves({"probability stated": curves}, path, ylabel="share of matches that are right")
-
-
-@dataclass(frozen=True)
-class CertaintyRun:
-    """What is measured."""
-
-    middlebury: Path
-    """Folder of Middlebury's scenes."""
-    half: Half = "report"
-    """Pairs that take part: it is fitted to tune."""
-    conditions: tuple[str, ...] = FITTED_ON
-    weights: str = "mono-colour"
-    """The network that fuses."""
-    fit: Path | None = None
-    """Fit to these pairs, and write that here."""
-    out: Path | None = None
-    """Folder for certainty.md, the tables, and reliability.png."""
-
-
-def main(run: CertaintyRun) -> str:
-    """The tables."""
-    pairs = list(of_half(middlebury_pairs(run.middlebury), run.half))
-    found = list(judged(load_weights(run.weights), track(pairs, "fusing"), run.conditions))
-    if run.fit:
-        write_tensors(run.fit, widened(found).state_dict())
-    shown = held(found, by_thirds(found) if run.fit else lambda one: Stated.by(fitted_network(), one.numbers))
-    text = held_markdown(shown)
-    if run.out:
-        save_reliability(shown, run.out / "reliability.png")
-        write_text(run.out / "certainty.md", text)
-    return text
-
-
-if __name__ == "__main__":
-    print(main(tyro.cli(CertaintyRun, prog="python -m pat.evaluation.certainty")))

@@ -1,4 +1,4 @@
-"""Training of the denoisers: `python -m pat.training.denoiser --photos DIR --out runs/low-light`.
+"""Training of the denoisers: `python -m experiments.low_light.training --photos DIR --out runs/low-light`.
 
 First those of single views, on photographs with noise of random kind and level; then that of the fused image, on
 layered scenes that are recorded with such noise, denoised view by view, and fused.
@@ -26,9 +26,9 @@ from pat.sensors import generator_for
 from pat.support.locks import folder_lock
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rigs import below
+from pat.training.checkpoints import collect, newest_checkpoint, restore, write_checkpoint
+from pat.training.losses import image_loss
 
-from .checkpoints import collect, newest_checkpoint, restore, write_checkpoint
-from .losses import image_loss
 from .noisy_scenes import NoisyScenes, flipped, noise_levels, noisy
 
 AVERAGE = 300
@@ -185,4 +185,4 @@ def _save(network: LowLightNetwork, config: DenoiserTraining, path: Path) -> Non
 
 
 if __name__ == "__main__":
-    print(train_denoiser(tyro.cli(DenoiserTraining, prog="python -m pat.training.denoiser")))
+    print(train_denoiser(tyro.cli(DenoiserTraining, prog="python -m experiments.low_light.training")))

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..media.colour import REC709, luminance, srgb_image
-from ..media.images import write_image
-from ..media.video import write_video
-from .rendered import Rendered, RenderedFrame
+from pat.media.colour import REC709, luminance, srgb_image
+from pat.media.images import write_image
+from pat.media.video import write_video
+from pat.synthesis.rendered import Rendered, RenderedFrame
 
 Channels = Literal["bw", "rgb", "rgba", "nir"]
 Kind = Literal["png8", "png16", "jpeg", "exr"]

@@ -1,4 +1,4 @@
-"""Makes the sample array that ships in pat/data/sample: `python -m pat.data.make_sample`; needs Blender."""
+"""Makes the sample array that ships in pat/data/sample: `python -m experiments.scenes.make_sample`; needs Blender."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from pat.data.sample_array import ALPHA, BETA, SAMPLE
 from pat.media.colour import luminance, srgb_from_linear
 from pat.media.images import write_image
 from pat.sensors import Clip, Noise, Quantise, record
+from pat.synthesis.blender import RenderSettings, render
 
-from ..synthesis.blender import RenderSettings, render
-from ..synthesis.still_life import still_life
+from .still_life import still_life
 
 HW = (400, 640)
 

@@ -23,9 +23,8 @@ from pat.sensors import NoiseLevel, generator_for
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rigs import below, one_of
-
-from .config import GENERAL, RECTIFIED
-from .samples import enlarged, pair_of
+from pat.training.config import GENERAL, RECTIFIED
+from pat.training.samples import enlarged, pair_of
 
 HW = (128, 256)
 """Height and width of alpha in the scenes."""

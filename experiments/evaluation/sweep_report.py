@@ -12,11 +12,11 @@ import numpy as np
 
 from arraygeom.atomic import write_text
 from arraygeom.viz import new_figure
+from pat.evaluation.metrics import bootstrap_interval
+from pat.evaluation.tables import distinct, markdown_table
+from pat.media.figures import save_figure
 
-from ..media.figures import save_figure
-from .metrics import bootstrap_interval
 from .sweeps import SWEEPS, Row
-from .tables import distinct, markdown_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,7 +47,7 @@ def read_rows(path: str | Path) -> list[Row]:
 
 
 def shipped_rows() -> list[Row]:
-    """The rows of `pat ablate` with the weights that ship, computed once."""
+    """The rows of `python -m experiments sweeps` with the weights that ship, computed once."""
     return read_rows(Path(__file__).with_name("ablation.json"))
 
 

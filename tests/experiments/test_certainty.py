@@ -3,7 +3,16 @@
 import pytest
 import torch
 
-from pat.evaluation.certainty import Judged, Reliability, Stated, by_thirds, fitted, held, held_markdown, widened
+from experiments.evaluation.certainty import (
+    Judged,
+    Reliability,
+    Stated,
+    by_thirds,
+    fitted,
+    held,
+    held_markdown,
+    widened,
+)
 from pat.matching.certainty import MEASURED
 
 

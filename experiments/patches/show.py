@@ -13,7 +13,7 @@ from arraygeom.fields import ReceptiveField, recorded_field
 from arraygeom.viz import COLOURS, draw_sampling_locations, numpy, show_image
 from pat.media.figures import colour_depth
 
-from .scenes import Patch
+from .dataset import Patch
 
 SHOWN = 6
 """Pixels of alpha whose fields are drawn."""

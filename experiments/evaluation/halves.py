@@ -5,13 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
-from typing import Literal
 
 from arraygeom.safe_yaml import load_yaml
-
-from ..data.pairs import StereoPair
-
-Half = Literal["tune", "report", "all"]
+from pat.data.pairs import StereoPair
 
 
 @cache
@@ -20,8 +16,8 @@ def tune_pairs() -> tuple[str, ...]:
     return tuple(load_yaml(Path(__file__).with_name("halves.yaml").read_text(encoding="utf-8"))["tune"])
 
 
-def of_half(pairs: Iterable[StereoPair], half: Half) -> Iterator[StereoPair]:
-    """The pairs of one half, by name."""
+def of_half(pairs: Iterable[StereoPair], half: str) -> Iterator[StereoPair]:
+    """The pairs of one half, "tune" or "report", or "all"."""
     for pair in pairs:
         tune = any(f"/{part}/" in f"/{pair.name}/" for part in tune_pairs())
         if half == "all" or tune == (half == "tune"):

@@ -14,16 +14,15 @@ from torch.nn.functional import interpolate
 
 from arraygeom import ReceptiveField
 from arraygeom.fields import AroundDepth
-
-from ..data.pairs import PAPER_DISPARITY, StereoPair
-from ..fusion.fuse import fuse
-from ..media.colour import luminance, to_bytes
-from ..networks.protocol import FusionNetwork
-from .baseline import checked_disparity
-from .metrics import score
-from .protocols import MonoColourTask, hw_of, mono_colour_task, rectified_rig
-from .stereo import disparity_errors
-from .tables import distinct, markdown_table
+from pat.data.pairs import PAPER_DISPARITY, StereoPair
+from pat.evaluation.baseline import checked_disparity
+from pat.evaluation.metrics import score
+from pat.evaluation.protocols import MonoColourTask, hw_of, mono_colour_task, rectified_rig
+from pat.evaluation.stereo import disparity_errors
+from pat.evaluation.tables import distinct, markdown_table
+from pat.fusion.fuse import fuse
+from pat.media.colour import luminance, to_bytes
+from pat.networks.protocol import FusionNetwork
 
 PRIOR = 0.05
 """Share by which the depths of the prior are off at most."""
@@ -42,22 +41,12 @@ class OutsideRow(NamedTuple):
     seconds: float
 
 
-def evaluate_outside(
-    pairs: Iterable[StereoPair],
-    network: FusionNetwork,
-    *,
-    rate: int = 2,
-    each: Callable[[OutsideRow], None] = lambda row: None,
-) -> list[OutsideRow]:
-    """Every source on every pair with true disparity, beta reduced `rate` times."""
+def evaluate_outside(pairs: Iterable[StereoPair], network: FusionNetwork, *, rate: int = 2) -> list[OutsideRow]:
+    """Every source on every pair, all with true disparity, beta reduced `rate` times."""
     rows = []
     for pair in pairs:
-        if pair.disparity is None:
-            continue
         task = mono_colour_task(pair, rate)
-        for source, field_of in SOURCES.items():
-            rows.append(_row(pair, task, network, source, field_of))
-            each(rows[-1])
+        rows += [_row(pair, task, network, source, field_of) for source, field_of in SOURCES.items()]
     return rows
 
 

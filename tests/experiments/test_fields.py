@@ -7,11 +7,8 @@ import torch
 
 from arraygeom import Dense, Epipolar, EpipolarLine, Rectified, sample
 from arraygeom.fields.grid import FieldOnGrid
-from pat.attention.scores import peak_position
-from pat.cli.main import main
-from pat.data.pairs import Disparity, StereoPair
-from pat.evaluation.ablation import sample_photographs
-from pat.evaluation.field_table import (
+from experiments.__main__ import Experiments
+from experiments.evaluation.fields import (
     FieldRow,
     drawn_peaks,
     evaluate_fields,
@@ -21,7 +18,11 @@ from pat.evaluation.field_table import (
     rectified_cases,
     row_link,
 )
-from pat.evaluation.sweeps import ALPHA, BETA, fused
+from experiments.evaluation.sweeps import ALPHA, BETA, fused
+from pat.attention.scores import peak_position
+from pat.cli.main import main
+from pat.data.pairs import Disparity, StereoPair
+from pat.evaluation.ablation import sample_photographs
 from pat.matching.inputs import Inputs
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
@@ -126,6 +127,6 @@ def test_drawn_peaks_are_red_where_the_table_counts_them_wrong(network, pair):
 def test_weights_for_two_bands_are_refused_at_once(tmp_path, capsys):
     save_weights(PAT(PATConfig(betas=2, in_channels=1, dim=8)), tmp_path / "two.safetensors")
     with pytest.raises(SystemExit) as stop:
-        main(["ablate", "--weights", str(tmp_path / "two.safetensors"), "--out", str(tmp_path)])
+        main(["fields", "--weights", str(tmp_path / "two.safetensors"), "--out", str(tmp_path)], group=Experiments)
     assert stop.value.code == 2
     assert "they are for 2 betas: give some for one beta in colour, or for three" in capsys.readouterr().err

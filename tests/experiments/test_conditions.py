@@ -5,9 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from pat.data.pairs import Disparity, StereoPair
-from pat.evaluation import conditions
-from pat.evaluation.conditions import (
+from experiments.evaluation import conditions
+from experiments.evaluation.conditions import (
     CONDITIONS,
     ConditionRow,
     conditions_markdown,
@@ -15,7 +14,8 @@ from pat.evaluation.conditions import (
     evaluate_conditions,
     regions_of,
 )
-from pat.evaluation.halves import of_half
+from experiments.evaluation.halves import of_half
+from pat.data.pairs import Disparity, StereoPair
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
 

@@ -35,16 +35,16 @@ from arraygeom import (
     pixel_grid,
 )
 from arraygeom.fields.straight import covering_displacement
+from experiments.peaks import with_peak
+from pat.data.pairs import PAPER_DISPARITY, StereoPair
+from pat.evaluation.metrics import score
+from pat.evaluation.protocols import hw_of, mono_colour_task, rectified_rig
+from pat.evaluation.tables import distinct, markdown_table
+from pat.media.figures import colour_depth
+from pat.networks.protocol import Comparing
+from pat.synthesis.photos import PhotoBank
 
-from ..data.pairs import PAPER_DISPARITY, StereoPair
-from ..media.figures import colour_depth
-from ..networks.protocol import Comparing
-from ..support.memory import with_peak
-from ..synthesis.photos import PhotoBank
-from .metrics import score
-from .protocols import hw_of, mono_colour_task, rectified_rig
 from .sweeps import ALPHA, BETA, RecordedScene, fused, made, rig_of
-from .tables import distinct, markdown_table
 
 DENSE_LIMIT = 2**28
 """Samples that an image may take; more are left out."""
@@ -136,7 +136,6 @@ def evaluate_fields(
     cases: Iterable[Case],
     *,
     fields: Callable[[float], Mapping[str, ReceptiveField]] = fields_of,
-    each: Callable[[FieldRow], None] = lambda row: None,
 ) -> list[FieldRow]:
     """Every field on every case. The first is computed once before, so that what is loaded and compiled then is not
     counted as its time and memory."""
@@ -147,7 +146,6 @@ def evaluate_fields(
             _row(network, case, *next(iter(chosen.items())))
         for name, field in chosen.items():
             rows.append(_row(network, case, name, field))
-            each(rows[-1])
     return rows
 
 

@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from arraygeom.camera import Camera
 from arraygeom.rig import Rig
+from pat.synthesis.furnish import seeded, vec
+from pat.synthesis.scene import Key, Light, Material, Motion, Object, Paint, Scene, Texture, Vec3, World
 
-from .furnish import seeded, vec
 from .props import arranged, ball, box, first_camera, lathed, moved, on_path, paint, plain
 from .room import BRASS, FLOOR, OAK, SHELF, WALNUT, furniture
-from .scene import Key, Light, Material, Motion, Object, Paint, Scene, Texture, Vec3, World
 
 VIEW = 1.4
 """Metres of the still life that the first camera's image is wide."""

@@ -20,16 +20,11 @@ from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom.sampling import sample
-
-from ..data.pairs import PAPER_DISPARITY, Disparity, StereoPair
-from ..fusion.fuse import corrections_of
-from ..media.colour import from_luma_chroma, luminance, to_luma_chroma
-from ..media.figures import save_curves
-from ..networks.protocol import FusionNetwork
-from ..sensors.noise_level import NoiseLevel
-from .baseline import classical_fusion, non_local_means, sgbm_disparity
-from .metrics import bootstrap_interval, score
-from .protocols import (
+from arraygeom.viz import new_figure
+from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
+from pat.evaluation.baseline import classical_fusion, non_local_means, raw_disparity
+from pat.evaluation.metrics import bootstrap_interval, score
+from pat.evaluation.protocols import (
     MonoColourTask,
     StereoMethod,
     StereoResult,
@@ -39,8 +34,13 @@ from .protocols import (
     rectified_fusion,
     rectified_rig,
 )
-from .stereo import disparity_errors
-from .tables import distinct, markdown_table
+from pat.evaluation.stereo import disparity_errors
+from pat.evaluation.tables import distinct, markdown_table
+from pat.fusion.fuse import corrections_of
+from pat.media.colour import from_luma_chroma, luminance, to_bytes, to_luma_chroma
+from pat.media.figures import save_figure
+from pat.networks.protocol import FusionNetwork
+from pat.sensors.noise_level import NoiseLevel
 
 LEFT_CROP = 64
 """Columns at the left that stereo super-resolution leaves out of its scores."""
@@ -194,6 +194,14 @@ def classical(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult
     return StereoResult(image, sgbm_disparity(alpha, luminance(enlarged), max_disparity))
 
 
+def sgbm_disparity(
+    alpha: Float[Tensor, "1 h w"], beta: Float[Tensor, "1 h w"], max_disparity: float
+) -> Float[Tensor, "h w"]:
+    """OpenCV's semi-global matching of a rectified pair, alpha on the left; NaN where it gives nothing."""
+    found = torch.from_numpy(raw_disparity(to_bytes(alpha[0]), to_bytes(beta[0]), max_disparity))
+    return torch.where(found >= 0, found, torch.nan)
+
+
 def regions_of(pair: StereoPair, hw: tuple[int, int]) -> dict[str, Bool[Tensor, "h w"]]:
     """Where left's pixels are seen in right, occluded there, beyond its left edge; and all but the left columns."""
     h, w = hw
@@ -324,6 +332,22 @@ def _depth(rows: Sequence[ConditionRow]) -> str:
         rate = f"x{CONDITIONS[condition].rate}"
         lines.append([rate, name, f"{np.mean(errors):.2f} px", *(f"{share:.1f} %" for share in shares)])
     return markdown_table(["beta", "", "end-point error", "within 1 px, of all", "of those that beta sees"], lines)
+
+
+Curves = Mapping[str, list[tuple[float, float]]]
+"""Points (x, y) by name."""
+
+
+def save_curves(plots: Mapping[str, Curves], path: Path, *, ylabel: str) -> None:
+    """Curves in one figure, a plot beside the other by the title of its x axis, written atomically."""
+    figure = new_figure(figsize=(5 * len(plots), 4), layout="constrained")
+    for i, (title, curves) in enumerate(plots.items()):
+        axes = figure.add_subplot(1, len(plots), i + 1, xlabel=title, ylabel=ylabel)
+        for name, points in curves.items():
+            axes.plot(*zip(*points), marker="o", label=name)
+        axes.grid(alpha=0.3)
+        axes.legend()
+    save_figure(figure, path)
 
 
 def save_condition_curves(rows: Sequence[ConditionRow], path: Path) -> None:

@@ -11,10 +11,11 @@ import torch
 
 from arraygeom import Epipolar, pixel_grid, sample
 from arraygeom.epipolar import epipolar_distance
+from experiments.__main__ import Experiments
+from experiments.evaluation.sweep_report import markdown, read_rows, write_report
+from experiments.evaluation.sweeps import ALPHA, BETA, SWEEPS, Resampled, Row, ablate, made, point, points, seen_at
 from pat.cli.main import main
 from pat.evaluation.ablation import sample_photographs
-from pat.evaluation.sweep_report import markdown, read_rows, write_report
-from pat.evaluation.sweeps import ALPHA, BETA, SWEEPS, Resampled, Row, ablate, made, point, points, seen_at
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
 
@@ -170,12 +171,12 @@ def test_sweeps_that_there_are_not_are_named():
         (["--scenes", "0"], "give at least 1"),
         (["--sweeps", "zoom"], "no sweep 'zoom'"),
         (["--without", "all"], "no field 'all'"),
-        (["--weights", "mono-colour"], "needs --families"),
+        (["--weights", "mono-colour"], "matches without attention"),
     ],
 )
 def test_the_command_refuses_in_a_line(arguments, words, tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
-        main(["ablate", *arguments, "--out", str(tmp_path / "out")])
+        main(["sweeps", *arguments, "--out", str(tmp_path / "out")], group=Experiments)
     assert stop.value.code == 2
     text = capsys.readouterr().err
     assert words in text
@@ -184,7 +185,7 @@ def test_the_command_refuses_in_a_line(arguments, words, tmp_path, capsys):
 
 def test_the_command_writes_what_it_says(tmp_path, capsys):
     arguments = ["--sweeps", "ahead", "--without", "dense", "--scenes", "1", "--hw", "48", "64"]
-    main(["ablate", *arguments, "--out", str(tmp_path)])
+    main(["sweeps", *arguments, "--out", str(tmp_path)], group=Experiments)
     rows = json.loads((tmp_path / "ablation.json").read_text())
     assert {row["field"] for row in rows} == {"calibrated segments", "rectified, warped", "rows", "local 5x5"}
     assert "#### ahead" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""The room around the table of `pat.synthesis.still_life`: what only a wide camera sees of it.
+"""The room around the table of `still_life.py`: what only a wide camera sees of it.
 
 In the frame of the still life: metres, x right, y down, z away, the origin on the table's top.
 """
@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from pat.synthesis.scene import Material, Object, Paint, Texture, Vec3
+
 from .props import ball, box, lathed, moved, paint, plain, wood
-from .scene import Material, Object, Paint, Texture, Vec3
 
 FLOOR, SHELF, WALL = 0.76, 1.15, 1.45
 """Height of the floor, and depths of the bookshelf's front and of the wall behind it."""

@@ -19,8 +19,7 @@ from arraygeom.batching import stack
 from arraygeom.camera import Camera
 from arraygeom.pixels import HW
 from arraygeom.rig import Rig, middle_depth
-
-from .windows import read_view, scene_rig, window
+from pat.data.windows import read_view, scene_rig, window
 
 PAPER_WIDTH = 2048
 

@@ -1,0 +1,1 @@
+"""The tables of the documentation: the paper's protocols, conditions, certainty, sweeps of calibration, every field."""

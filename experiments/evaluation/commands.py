@@ -1,0 +1,343 @@
+"""The commands of this room: `python -m experiments evaluate`, `conditions`, `outside`, `certainty`, ...
+
+As in `pat.cli`, nothing here imports torch before a command runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from pat.cli import authors, options
+from pat.cli.options import MaybePath, Out, Weights, optional, say, writable
+
+if TYPE_CHECKING:
+    from arraygeom import ReceptiveField
+    from pat.data.pairs import StereoPair
+    from pat.networks.protocol import Comparing
+    from pat.networks.weights import Network
+
+Half = Literal["tune", "report", "all"]
+RIG_FOUND = "fusion, rig found"
+
+
+@dataclass
+class Pairs(authors.Evaluate):
+    """Pairs of one half."""
+
+    half: Half = "all"
+    """The pairs on which settings may be chosen, or those that are reported."""
+
+    def sets(self) -> dict[str, Iterable[StereoPair]]:
+        """The pairs of the half by data set."""
+        from .halves import of_half
+
+        return {name: of_half(pairs, self.half) for name, pairs in super().sets().items()}
+
+    def pairs(self) -> list[StereoPair]:
+        """All of them. Raises ValueError if there is none."""
+        found = [pair for pairs in self.sets().values() for pair in pairs]
+        if not found:
+            raise ValueError(f"--half {self.half}: no pair belongs to that half: give more pairs, or the other half")
+        return found
+
+
+@dataclass
+class Evaluate(Pairs):
+    """As `pat evaluate`, by the paper's protocols, of one half of the pairs, with controls, without a rig.
+
+    Example: python -m experiments evaluate --middlebury data/middlebury --half report --controls
+    """
+
+    protocol: Literal["table1", "table2"] = "table1"
+    """The paper's: mono + colour (table1), or mono + three bands (table2)."""
+    as_authors: bool = False
+    """As the paper's code tests: images of half the size (its "x2" and its "x4"), rows of 80 pixels without the pixel
+    itself. Give --rates 2."""
+    controls: bool = False
+    """Also fuse without beta, with another scene's, and with shuffled fields: the fusion must get worse."""
+    without_rig: bool = False
+    """Also fuse with the rig that is found from the two images alone, as `pat fuse a.png b.png` does."""
+
+    def run(self) -> None:
+        """Write and print the scores. Raises ValueError for no images, and for rates below 1."""
+        from pat.evaluation import protocols, stereo
+        from pat.networks.weights import load_weights
+
+        from . import paper
+
+        if self.without_rig and self.protocol != "table1":
+            raise ValueError("--without-rig needs --protocol table1")
+        sets, network, bands = self.sets(), load_weights(self.weights), paper.PROTOCOLS[self.protocol]
+        compared = paper.controls(network, bands=bands) if self.controls else {}
+        if self.without_rig:
+            compared[RIG_FOUND] = paper.with_found_rig(network)
+        field = paper.AuthorsRows() if self.as_authors else None
+        if self.as_authors:
+            sets = {name: map(paper.halved, pairs) for name, pairs in sets.items()}
+        fusion = protocols.rectified_fusion(network, bands=bands, field=field)
+        methods = {**protocols.BASELINES, "fusion": fusion, **compared}
+        rows = stereo.evaluate_sets(sets, methods, self.rates, out=self.out)
+        printed = {name: scores for (protocol, name), scores in paper.PRINTED.items() if protocol == self.protocol}
+        text = stereo.sets_markdown(rows, printed=printed)
+        if compared:
+            text += "\n" + paper.falls([row for found in rows.values() for row in found], names=compared)
+        self.write(rows, text)
+
+
+@dataclass
+class Conditions(Pairs):
+    """Fuse stereo pairs under other responses, exposures, noise, misalignment; by region, with depth.
+
+    Example: python -m experiments conditions --middlebury data/middlebury --only ideal "50 electrons"
+    """
+
+    only: tuple[str, ...] = ()
+    """Some conditions, by name."""
+    out: Out = Path("out/conditions")
+    """Folder for conditions.md and conditions.png."""
+
+    def run(self) -> None:
+        """Write and print the tables. Raises ValueError for no images, and a condition that is none."""
+        from arraygeom.atomic import write_text
+        from pat.networks.weights import load_weights
+
+        from . import conditions
+
+        names = self.only or tuple(conditions.CONDITIONS)
+        unknown = [name for name in names if name not in conditions.CONDITIONS]
+        if unknown:
+            raise ValueError(f"--only: no condition '{unknown[0]}': there are {', '.join(conditions.CONDITIONS)}")
+        pairs, network = self.pairs(), load_weights(self.weights)
+        rows = conditions.evaluate_conditions(pairs, network, names, progress=options.progress("evaluating"))
+        text = conditions.conditions_markdown(rows)
+        write_text(self.out / "conditions.md", text)
+        conditions.save_condition_curves(rows, self.out / "conditions.png")
+        print(text, end="")
+        say(f"written: {self.out / 'conditions.md'}")
+
+
+@dataclass
+class Outside(Pairs):
+    """Fuse stereo pairs with disparities from elsewhere: OpenCV's SGBM, the true ones, a prior."""
+
+    out: Out = Path("out/outside")
+    """Folder for outside.md."""
+
+    def run(self) -> None:
+        """Write and print the table. Raises ValueError for no images, and for none with a true disparity."""
+        from arraygeom.atomic import write_text
+        from pat.networks.weights import load_weights
+
+        from .outside import evaluate_outside, outside_markdown
+
+        pairs = [pair for pair in self.pairs() if pair.disparity is not None]
+        if not pairs:
+            raise ValueError(f"--half {self.half}: none of its pairs has a true disparity: give the other half")
+        shown = options.progress("evaluating")(pairs, len(pairs))
+        text = outside_markdown(evaluate_outside(shown, load_weights(self.weights)))
+        write_text(self.out / "outside.md", text)
+        print(text, end="")
+        say(f"written: {self.out / 'outside.md'}")
+
+
+@dataclass
+class Certainty:
+    """How well stated certainty holds, on Middlebury's pairs under many conditions; and the fit of it."""
+
+    middlebury: Path
+    """Folder of Middlebury's scenes."""
+    half: Half = "report"
+    """Pairs that take part: it is fitted to tune."""
+    conditions: tuple[str, ...] = ()
+    """Of the conditions, by name; those on which it was fitted if none is given."""
+    weights: Weights = "mono-colour"
+    """The network that fuses."""
+    fit: MaybePath = None
+    """Fit to these pairs, and write that here."""
+    out: Out = Path("out/certainty")
+    """Folder for certainty.md, the tables, and reliability.png."""
+
+    def run(self) -> None:
+        """Write and print the tables. Raises ValueError for a condition that is none."""
+        from arraygeom.atomic import write_text
+        from pat.data.pairs import middlebury_pairs
+        from pat.matching.certainty import fitted_network
+        from pat.networks.weights import load_weights
+        from pat.support.tensor_files import write_tensors
+
+        from . import certainty
+        from .conditions import CONDITIONS
+        from .halves import of_half
+
+        names = self.conditions or certainty.FITTED_ON
+        unknown = [name for name in names if name not in CONDITIONS]
+        if unknown:
+            raise ValueError(f"--conditions: no condition '{unknown[0]}': there are {', '.join(CONDITIONS)}")
+        writable(self.out, folder=True)
+        pairs, network = list(of_half(middlebury_pairs(self.middlebury), self.half)), load_weights(self.weights)
+        shown = options.progress("fusing")(pairs, len(pairs))
+        found = list(certainty.judged(network, shown, names))
+        if not found:
+            raise ValueError(f"--half {self.half}: none of its pairs has a true disparity: give the other half")
+        if self.fit:
+            write_tensors(self.fit, certainty.widened(found).state_dict())
+            held = certainty.held(found, certainty.by_thirds(found))
+        else:
+            held = certainty.held(found, lambda one: certainty.Stated.by(fitted_network(), one.numbers))
+        certainty.save_reliability(held, self.out / "reliability.png")
+        text = certainty.held_markdown(held)
+        write_text(self.out / "certainty.md", text)
+        print(text, end="")
+        say(f"written: {self.out / 'certainty.md'}, and reliability.png beside it")
+
+
+@dataclass
+class OnScenes:
+    """What ablations on layered scenes share."""
+
+    weights: Weights = "pat-supervised"
+    without: tuple[str, ...] = ()
+    """Fields to leave out, such as dense, which takes most of the time."""
+    photos: tuple[Path, ...] = ()
+    """Folders of photographs; those that scikit-image ships if none is given."""
+    scenes: int = 6
+    """Number of scenes, of each rig."""
+    out: Out = Path("out/ablate")
+    """Folder for ablation.md, its figures and its numbers."""
+
+    def comparing(self, fields: Iterable[str]) -> Comparing:
+        """The network, once it is known that its attention alone finds the points and that there are such fields."""
+        from pat.networks.protocol import Comparing
+        from pat.networks.weights import load_weights
+
+        if self.scenes < 1:
+            raise ValueError(f"--scenes: {self.scenes}: give at least 1")
+        unknown = [name for name in self.without if name not in fields]
+        if unknown:
+            raise ValueError(f"--without: no field '{unknown[0]}': there are {', '.join(fields)}")
+        writable(self.out, folder=True)
+        network: Network = load_weights(self.weights)
+        if not isinstance(network, Comparing):
+            raise ValueError(
+                f"--weights {self.weights}: this network matches without attention, too: `pat ablate` takes it"
+            )
+        if network.betas not in (1, 3):
+            wanted = "give some for one beta in colour, or for three with a band each"
+            raise ValueError(f"--weights {self.weights}: they are for {network.betas} betas: {wanted}")
+        return network
+
+    def say_written(self) -> None:
+        """Print the table."""
+        print((self.out / "ablation.md").read_text(encoding="utf-8"), end="")
+        say(f"written: {self.out / 'ablation.md'}, and its figures and numbers beside it")
+
+
+@dataclass
+class Sweeps(OnScenes):
+    """What calibration is worth as it gets wrong or the rig changes: one network, each field, the same scenes.
+
+    Curves of calibrated segments, images that are rectified and the result warped back, rows, a local window and all
+    of beta, on layered scenes with exact positions. Example: python -m experiments sweeps --sweeps rotation ahead
+    """
+
+    sweeps: tuple[str, ...] = ()
+    """Of rotation, "principal point", baseline, "focal ratio" and ahead; all by default."""
+    hw: Annotated[tuple[int, int], arg(metavar="H W")] = (96, 128)
+    """Height and width of both images."""
+    seed: int = 0
+    """Of the scenes."""
+
+    def run(self) -> None:
+        """Write ablation.md, .json, .svg and .png, and print the table. Raises ValueError for a sweep that is none."""
+        from pat.synthesis.photos import PhotoBank
+
+        from .sweep_report import write_report
+        from .sweeps import FIELDS, SWEEPS, ablate, points
+
+        network = self.comparing(FIELDS)
+        fields = {name: field for name, field in FIELDS.items() if name not in self.without}
+        rigs = list(points(self.sweeps or tuple(SWEEPS), hw=self.hw))
+        bank = PhotoBank.load(*self.photos) if self.photos else None
+        shown = options.progress("ablating")(rigs, len(rigs))
+        write_report(ablate(network, shown, fields, scenes=self.scenes, photos=bank, seed=self.seed), self.out)
+        self.say_written()
+
+
+@dataclass
+class Fields(OnScenes):
+    """Every field of the toolkit, with time and memory: unrectified scenes, rectified pairs, the same with F alone."""
+
+    middlebury: MaybePath = None
+    """Folder of Middlebury's pairs with true disparity; those of the report half."""
+
+    def run(self) -> None:
+        """Write ablation.md, .csv and peaks.png (where attention is largest in three pictures); print the table."""
+        from arraygeom.atomic import write_text
+        from pat.data.pairs import middlebury_pairs
+        from pat.evaluation.ablation import sample_photographs
+        from pat.evaluation.tables import write_csv
+        from pat.media.figures import save_panels
+        from pat.synthesis.photos import PhotoBank
+
+        from . import fields
+        from .halves import of_half
+
+        network = self.comparing(fields.fields_of(1.0))
+        bank = PhotoBank.load(*self.photos) if self.photos else sample_photographs()
+        cases = list(fields.layered_cases(bank, self.scenes))
+        if self.middlebury is not None:
+            for linked in (True, False):
+                pairs = of_half(middlebury_pairs(self.middlebury), "report")
+                cases += fields.rectified_cases(pairs, linked=linked)
+
+        def chosen(max_displacement: float) -> Mapping[str, ReceptiveField]:
+            every = fields.fields_of(max_displacement)
+            return {name: field for name, field in every.items() if name not in self.without}
+
+        rows = fields.evaluate_fields(network, options.progress("fusing")(cases, len(cases)), fields=chosen)
+        looked_at = [case for case in cases if case.kind != "F alone"]
+        panels = fields.drawn_peaks(network, looked_at[:: -(-len(looked_at) // 3)])
+        save_panels(panels, self.out / "peaks.png", columns=4)
+        write_text(self.out / "ablation.md", fields.fields_markdown(rows))
+        write_csv(self.out / "ablation.csv", fields.FieldRow._fields, rows)
+        self.say_written()
+
+
+@dataclass
+class Patches:
+    """Draw the paper's patches of rendered scenes: recorded images, segments of some pixels, ground truth and depth."""
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder written by `pat render`.")]
+    out: Out = Path("out/patches.png")
+    """Image to write."""
+    samples: int = 6
+    """Number of patches."""
+    alpha: Annotated[str | None, optional("NAME")] = None
+    """The camera at whose view is fused; by default the first."""
+    sensors: MaybePath = None
+    """File (YAML) with a list of steps for each camera, instead of those that follow from their responses."""
+    seed: int = 0
+    """Of the choice of patches, and of noise."""
+
+    def run(self) -> None:
+        """Draw patches chosen by the seed. Raises ValueError for less than one."""
+        import torch
+
+        from experiments.patches.dataset import ScenePatches
+        from experiments.patches.show import draw_patches
+        from pat.media.figures import save_figure
+        from pat.sensors import generator_for, read_chains
+        from pat.support.schema import read_yaml
+
+        if self.samples < 1:
+            raise ValueError(f"--samples: {self.samples}: give a whole number from 1 up")
+        chains = None if self.sensors is None else read_chains(read_yaml(self.sensors), str(self.sensors))
+        data = ScenePatches(self.folder, alpha=self.alpha, chains=chains, seed=self.seed)
+        chosen = torch.randperm(len(data), generator=generator_for(self.seed, "show"))[: self.samples]
+        save_figure(draw_patches([data[i] for i in chosen.tolist()]), self.out)
+        say(f"written: {self.out} ({len(data)} patches of {len(data.scenes)} scenes in {self.folder})")

@@ -1,0 +1,1 @@
+"""How the denoisers that ship for low light were trained."""

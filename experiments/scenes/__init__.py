@@ -1,0 +1,13 @@
+"""Scenes as one would photograph them, for Blender: a still life in a room, and a landscape."""
+
+from collections.abc import Callable
+
+from pat.synthesis.scene import Scene
+
+from .landscape import landscape
+from .still_life import still_life
+
+SCENES: dict[str, Callable[..., Scene]] = {"still-life": still_life, "landscape": landscape}
+"""By name; each takes a seed and a rig."""
+
+__all__ = ["SCENES", "landscape", "still_life"]
