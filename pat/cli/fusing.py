@@ -82,8 +82,9 @@ class Fuse(Known):
     exposure: Annotated[Literal["auto", "keep"] | None, optional("{auto,keep}")] = None
     """Brightness of the fused image: auto makes a dark or overexposed one as bright as a photograph; keep leaves it as
     alpha has it. By default auto without a rig, and keep with one."""
-    noise: UseAppendAction[Annotated[tuple[str, ...], options.arg(metavar="NAME=ELECTRONS[,READ]|estimate")]] = ()
-    """Low light: a camera's electrons at white and read noise in electrons, or estimate: views are denoised jointly."""
+    noise: UseAppendAction[Annotated[tuple[str, ...], options.arg(metavar="NAME=ELECTRONS[,READ]|estimate|none")]] = ()
+    """Low light: a camera's electrons at white and read noise in electrons, or estimate: views are denoised jointly.
+    By default so where an image shows noise plainly, but for a sequence."""
     keep_alpha: bool = False
     """With --noise, leave alpha's values as recorded; always so if alpha has hardly any noise."""
     luminance: Literal["alpha", "mix", "beta"] = "alpha"
@@ -363,7 +364,7 @@ class Fuse(Known):
             "field": options.field_named(self.field),
             "match_levels": self.normalise_radiometry,
             "response": options.response_of(self.response),
-            "noise": options.noise_of(self.noise),
+            "noise": options.noise_of(self.noise, by_default=not self.sequence and self.luminance == "alpha"),
         }
 
     def _facts(self, rig: Rig, found: tuple[str, ...] | None, seconds: float) -> Facts:

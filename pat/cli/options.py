@@ -60,13 +60,18 @@ def response_of(text: str) -> Any:
     return red, green, blue
 
 
-def noise_of(texts: Iterable[str]) -> Any:
-    """The noise of `--noise estimate` or `--noise NAME=ELECTRONS[,READ]`; None without. Raises ValueError else."""
+def noise_of(texts: Iterable[str], *, by_default: bool = False) -> Any:
+    """The noise of `--noise estimate` or `--noise NAME=ELECTRONS[,READ]`; of none, None. Raises ValueError else.
+
+    Without, None or, `by_default`, "auto": estimated where it shows plainly.
+    """
     from ..sensors import NoiseLevel
 
     entries = list(texts)
-    if entries == ["estimate"] or not entries:
-        return entries[0] if entries else None
+    if not entries:
+        return "auto" if by_default else None
+    if entries in (["estimate"], ["none"]):
+        return None if entries == ["none"] else "estimate"
     levels = []
     for entry in entries:
         name, _, numbers = entry.partition("=")
@@ -74,7 +79,7 @@ def noise_of(texts: Iterable[str]) -> Any:
             electrons, *read = (float(number) for number in numbers.split(","))
         except ValueError:
             raise ValueError(
-                f"--noise: '{entry}' is neither 'estimate' nor NAME=ELECTRONS[,READ], as mono=200,2"
+                f"--noise: '{entry}' is neither estimate nor none nor NAME=ELECTRONS[,READ], as mono=200,2"
             ) from None
         if len(read) > 1:
             raise ValueError(

@@ -11,8 +11,8 @@ import torch
 
 from ..matching.inputs import Inputs
 from ..networks.protocol import FusionNetwork
-from ..sensors import NoiseLevel
 from .inputs import FrameInputs
+from .low_light import shown_noise
 from .results import Frame
 
 LOW_CONFIDENCE = 0.25
@@ -26,8 +26,6 @@ times .27 to .55, and with 50 electrons from .23.
 """
 
 
-MIDDLE = 1024
-"""Side of the part of an image in which noise is looked for, pixels."""
 PLAIN_NOISE = 4 / 255
 """The standard deviation from which noise is named as a reason."""
 
@@ -66,11 +64,7 @@ def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs
 
 def noise_advice(inputs: Inputs) -> str:
     """What to do about noise that the middle of an image shows plainly; empty if there is hardly any."""
-    found = 0.0
-    for image in (inputs.alpha, *(beta.image for beta in inputs.betas)):
-        top, left = (max(n - MIDDLE, 0) // 2 for n in image.shape[-2:])
-        part = image[:1, :, top : top + MIDDLE, left : left + MIDDLE].detach().clamp(0, 1)
-        found = max(found, float(NoiseLevel.estimated(part).deviation(part).mean()))
+    found = max(shown_noise(image[0]) for image in (inputs.alpha, *(beta.image for beta in inputs.betas)))
     if found < PLAIN_NOISE:
         return ""
     return f"; noise of {255 * found:.0f}/255 shows: try `--noise estimate` first"

@@ -99,7 +99,8 @@ def fuse(
         corrections: what is known of both from another frame of the same cameras (`corrections_of`), instead.
         explain: called with a line for each thing that was found and put right.
         noise: the noise level of each camera that has some, or "estimate": views are denoised before they are
-            matched, and jointly once they are fused.
+            matched, and jointly once they are fused. "auto", as without rig: so where an image shows noise
+            plainly ({} never).
         keep_alpha: leave alpha's values as recorded, noise included; otherwise so if alpha has no noise to
             speak of.
         luminance: the image's: "alpha", which the network keeps exactly, that of "beta" in alpha's detail,
@@ -123,6 +124,7 @@ def fuse(
         LowConfidenceWarning: the images hardly match: the rig is probably wrong. A filter makes it an error,
             as `warnings.simplefilter("error", LowConfidenceWarning)`.
     """
+    noise = "auto" if noise is None and rig is None and luminance == "alpha" else noise
     network, rig, images, alpha, grey_world = _with_rig(network, rig, images, alpha, explain)
     align = not differentiable if align is None else align
     if differentiable and not (max_memory is None and store is None):
@@ -131,6 +133,8 @@ def fuse(
     limit = None if max_memory is None else parse_bytes(max_memory)
     views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
     check_bands(network, views)
+    if noise == "auto" and low_light.noisy and explain:
+        explain(low_light.described())
     betas, in_colour, noisy = views.betas, views.alpha_in_colour, bool(low_light.noisy)
     steps = steps_for(network, normalise=match_levels or grey_world)
     inputs, undo = prepared(network, views, steps)

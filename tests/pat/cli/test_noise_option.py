@@ -8,6 +8,8 @@ from pat.sensors import NoiseLevel
 
 def test_levels_by_camera_or_estimated():
     assert noise_of([]) is None
+    assert noise_of([], by_default=True) == "auto"
+    assert noise_of(["none"], by_default=True) is None
     assert noise_of(["estimate"]) == "estimate"
     levels = {"mono": NoiseLevel.of_electrons(200, 2), "colour": NoiseLevel.of_electrons(50)}
     assert noise_of(["mono=200,2", "colour=50"]) == levels
@@ -16,8 +18,8 @@ def test_levels_by_camera_or_estimated():
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (["mono"], "neither 'estimate' nor NAME=ELECTRONS"),
-        (["mono=dark"], "neither 'estimate' nor NAME=ELECTRONS"),
+        (["mono"], "neither estimate nor none nor NAME=ELECTRONS"),
+        (["mono=dark"], "neither estimate nor none nor NAME=ELECTRONS"),
         (["mono=200,2,1"], "has 3 numbers"),
         (["mono=-200"], "electrons at white must be 1 or more"),
         (["mono=0.02"], "not a standard deviation"),

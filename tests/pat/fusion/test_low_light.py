@@ -16,7 +16,7 @@ from pat.evaluation.baseline import classical, non_local_means
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
 from pat.fusion.inputs import FrameInputs, Placement
-from pat.fusion.low_light import denoised, denoised_views, warped
+from pat.fusion.low_light import denoised, denoised_views, noise_levels, shown_noise, warped
 from pat.fusion.tiles import Tile, fuse_tile
 from pat.fusion.views import Views
 from pat.matching.inputs import Beta, Inputs
@@ -250,3 +250,15 @@ def test_a_darker_beta_keeps_its_colours(network):
         image = fuse(network, sample.rig, images, alpha=ALPHA, noise=dict.fromkeys(images, level)).image
         saturations.append(float((image.amax(0) - image.amin(0)).mean()))
     assert saturations[1] == pytest.approx(saturations[0], rel=0.1)
+
+
+def test_noise_that_shows_plainly_is_removed_unasked(network):
+    sample, images, _ = in_low_light(200)
+    said: list[str] = []
+    frame = fuse(network, sample.rig, images, alpha=ALPHA, noise="auto", explain=said.append)
+    asked = fuse(network, sample.rig, images, alpha=ALPHA, noise="estimate")
+    assert torch.equal(frame.image, asked.image)
+    assert sum(line.startswith("noise shows plainly and is removed: mono ") for line in said) == 1
+    clean = {name: image * 255 // 1 / 255 for name, image in sample.images.items()}
+    assert max(map(shown_noise, clean.values())) < 4 / 255
+    assert not noise_levels(clean, "auto")
