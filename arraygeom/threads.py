@@ -6,14 +6,23 @@ A plain pool, for loops that release Python's lock: its idle threads sleep. Torc
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
-from functools import lru_cache
+from functools import lru_cache, partial
+from typing import Any
 
 import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+
+WORTH_STRIPS = 10**8
+"""Multiplications of a convolution from which on strips are worth their while: some milliseconds."""
+STRIPS = 2
+"""Strips for each thread: other processes may take one's core."""
 
 _ALLOWED: ContextVar[int | None] = ContextVar("threads", default=None)
 
@@ -39,10 +48,46 @@ def torch_in_one_thread() -> Iterator[None]:
 
 
 @contextmanager
-def torch_in_all_threads() -> Iterator[None]:
-    """Within `torch_in_one_thread`: let torch have all `threads`, for convolutions."""
-    with _torch_threads(threads()):
+def convolutions_in_parallel() -> Iterator[None]:
+    """Within `torch_in_one_thread`: compute convolutions on all `threads`, those without gradients in strips of rows.
+
+    Strips are computed by the pool's threads, which sleep where they wait; the rest by torch's.
+    """
+    with _InStrips() if threads() > 1 else nullcontext():
         yield
+
+
+class _InStrips(TorchFunctionMode):
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func is not torch.conv2d or kwargs or len(args) != 7:
+            return func(*args, **(kwargs or {}))
+        if torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"):
+            with _torch_threads(threads()):
+                return func(*args)
+        return _convolved(*args)
+
+
+def _convolved(x: Tensor, weight: Tensor, bias: Any, stride: Any, padding: Any, dilation: Any, groups: int) -> Tensor:
+    """`torch.conv2d`, to the bit; a plain one of a large image in strips of rows, each seen with the rows around it."""
+    further = bias, stride, padding, dilation, groups
+    plain = x.device.type == "cpu" and len(x) == 1 and tuple(stride) == (1, 1) and not isinstance(padding, str)
+    if not plain or weight[0].numel() * len(weight) * x[0, 0].numel() < WORTH_STRIPS:
+        return torch.conv2d(x, weight, *further)
+    seen, above = dilation[0] * (weight.shape[2] - 1), padding[0]
+    width = x.shape[3] + 2 * padding[1] - dilation[1] * (weight.shape[3] - 1)
+    order = torch.contiguous_format if x.is_contiguous() and weight.is_contiguous() else torch.channels_last
+    out = x.new_empty(1, len(weight), x.shape[2] + 2 * above - seen, width).to(memory_format=order)
+    rows = math.ceil(out.shape[2] / (STRIPS * threads()))
+
+    @torch.no_grad()  # of the thread that computes it
+    def strip(top: int) -> None:
+        bottom = min(top + rows, out.shape[2])
+        first = max(top - above, 0)
+        found = torch.conv2d(x[:, :, first : max(bottom - above + seen, first + 1)], weight, *further)
+        out[:, :, top:bottom] = found[:, :, top - first : bottom - first]
+
+    in_parallel([partial(strip, top) for top in range(0, out.shape[2], rows)])
+    return out
 
 
 def in_parallel(tasks: Sequence[Callable[[], object]], *, most: int | None = None) -> None:

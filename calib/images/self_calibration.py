@@ -18,7 +18,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Camera, LensView, Link, Pair, Pose, Rig, View, intrinsics, rotation_from_vector, triangulate
-from arraygeom.pixels import map_homogeneous
+from arraygeom.pixels import HW, map_homogeneous
+from arraygeom.robust import cauchy, least_squares, normal_deviation, robust_least_squares
 from arraygeom.text import angle
 from arraygeom.threads import torch_in_one_thread
 
@@ -56,6 +57,9 @@ DENSE_POINTS = 2000
 SPACING = 4
 """Dense points at most, and their least distance, pixels."""
 LEAST_CONFIDENCE = 0.5
+SMOOTH_STEPS = 30
+STILL_SHARE = 0.9
+"""Where so many points move as one smooth map does, what the others do may be wrong matches."""
 WELL_LOCALISED = 0.3
 """Largest standard deviation of a dense point, pixels."""
 
@@ -84,6 +88,8 @@ def self_calibrated(
     pixels, by camera; others are assumed. Cameras have the lenses of their views; the pair then is not `exact`.
     """
     alpha, beta = views
+    if not has_parallax(matches, views[alpha].hw):
+        return None
     lenses = {name: view for name, view in views.items() if isinstance(view, LensView) and view.distortion is not None}
     matches = _without_lenses(list(views.values()), matches)
     K = {name: intrinsics(length, views[name].hw) for name, length in _focal_lengths(views, link, focal).items()}
@@ -106,6 +112,23 @@ def self_calibrated(
     for name, view in lenses.items():
         rig = rig.with_camera(name, with_lens_of(_pair(rig).cameras[rig.names.index(name)], view))
     return found._replace(rig=rig, exact=found.distance <= best and not lenses)
+
+
+def has_parallax(matches: PointMatches, hw: HW) -> bool:
+    """Whether points of alpha, an image of this size, move in a way that lenses and a rotation do not explain.
+
+    Those move all points by one smooth map, here a cubic one as radial distortion is; so does a plane, whose depths
+    two images of unknown lenses do not determine.
+    """
+    x, y = (2 * (matches.alpha - matches.alpha.new_tensor(hw).flip(0) / 2) / max(hw)).unbind(-1)
+    terms = torch.stack([x**i * y**j for i in range(4) for j in range(4 - i)])
+
+    def weigh(rest: Tensor) -> Tensor:
+        return cauchy(size := rest.norm(dim=-1), normal_deviation(size, LOCALISED))
+
+    start = least_squares(terms, matches.beta, torch.ones_like(x))
+    rest = robust_least_squares(terms, matches.beta, start, weigh, steps=SMOOTH_STEPS).rest
+    return float(rest.norm(dim=-1).quantile(STILL_SHARE)) > LOCALISED
 
 
 def _without_lenses(views: Sequence[View], matches: PointMatches) -> PointMatches:

@@ -259,8 +259,8 @@ def _calibrated(
             note(next(line for line in found.as_text().splitlines() if line.startswith(f"{alpha} > {name}")))
         if pair is None:
             note(
-                f"no depth by {name}: its points show no parallax, beside {alpha} it is too near or "
-                "its scene too far"
+                f"no depth by {name}: its points show no parallax, beside {alpha} it is too near, or "
+                "its scene too far or flat"
             )
             continue
         if pair.exact:

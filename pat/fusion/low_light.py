@@ -18,7 +18,7 @@ from torch import Tensor
 from arraygeom import sample
 from arraygeom.chunks import chunked
 from arraygeom.pixels import HW
-from arraygeom.threads import torch_in_all_threads
+from arraygeom.threads import convolutions_in_parallel
 
 from ..matching.radiometry import Response
 from ..media.colour import luminance
@@ -213,7 +213,7 @@ def exposed(view: NoisyView, response: Response) -> NoisyView:
     return NoisyView(response.exposed(view.recorded), response.exposed(view.denoised), (more - less) / 2)
 
 
-@torch_in_all_threads()
+@convolutions_in_parallel()
 @torch.no_grad()
 def denoised(
     image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"]
@@ -226,7 +226,7 @@ def denoised(
     return torch.cat([in_tiles(partial(without_noise, network.band), *band) for band in bands], 1)
 
 
-@torch_in_all_threads()
+@convolutions_in_parallel()
 @torch.no_grad()
 def jointly_denoised(
     image: Float[Tensor, "3 h w"],

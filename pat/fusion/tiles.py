@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from arraygeom import pixel_grid
 from arraygeom.chunks import Box, Tile, area, assembled, sides_by_work, tiles_of, whole
 from arraygeom.pixels import HW
-from arraygeom.threads import torch_in_all_threads
+from arraygeom.threads import convolutions_in_parallel
 
 from ..matching.inputs import Inputs
 from ..matching.matches import Matches
@@ -238,7 +238,7 @@ def _fused(
 ) -> FusedTile:
     top, bottom, left, right = tile.inner
     box = (top - tile.outer[0], bottom - tile.outer[0], left - tile.outer[2], right - tile.outer[2])
-    with torch_in_all_threads():
+    with convolutions_in_parallel():
         output = certain(network(inputs, matches), matches, inputs).cut(box)
     part = replace(inputs, betas=tuple(replace(beta, field=beta.field.cut(box)) for beta in inputs.betas))
     hw = bottom - top, right - left

@@ -7,7 +7,8 @@ from contextlib import nullcontext
 import pytest
 import torch
 
-from arraygeom.threads import in_parallel, threads, torch_in_all_threads, torch_in_one_thread
+from arraygeom import threads as threads_module
+from arraygeom.threads import convolutions_in_parallel, in_parallel, threads, torch_in_one_thread
 
 
 class Noted(list):
@@ -65,8 +66,8 @@ def test_torch_runs_in_one_thread_beside_the_pool_and_has_its_own_back(two_threa
     """Else its threads and the pool's are more than there are cores."""
     with torch_in_one_thread():
         assert (torch.get_num_threads(), threads()) == (1, 2)
-        with torch_in_all_threads():
-            assert torch.get_num_threads() == 2
+        with convolutions_in_parallel():
+            assert (torch.get_num_threads(), threads()) == (1, 2)
         with torch_in_one_thread():
             assert threads() == 2
         assert torch.get_num_threads() == 1
@@ -93,3 +94,29 @@ def test_every_task_has_torch_in_its_own_thread_alone(two_threads, alone):
     other.start()
     other.join()
     assert born == [2]
+
+
+@pytest.mark.parametrize("of", [{}, {"dilation": 8, "padding": 8}, {"padding": 0}, {"stride": 2}, {"groups": 4}])
+@pytest.mark.parametrize("channels_last", [False, True])
+def test_convolutions_in_strips_are_the_same_to_the_bit(two_threads, monkeypatch, of, channels_last):
+    conv = torch.nn.Conv2d(16, 16, 3, **{"padding": 1, **of})
+    x = torch.rand(1, 16, 301, 207)
+    x = x.contiguous(memory_format=torch.channels_last) if channels_last else x
+    strips = []
+    monkeypatch.setattr(threads_module, "in_parallel", lambda tasks: strips.extend(t() for t in tasks))
+    monkeypatch.setattr(threads_module, "WORTH_STRIPS", 0)
+    with torch.no_grad(), torch_in_one_thread():
+        whole = conv(x)
+        with convolutions_in_parallel():
+            made = conv(x)
+    assert torch.equal(made, whole)
+    assert made.stride() == whole.stride()
+    assert len(strips) == (0 if "stride" in of else 4)
+
+
+def test_convolutions_keep_gradients_and_precision(two_threads):
+    conv, x = torch.nn.Conv2d(16, 16, 3, padding=1), torch.rand(1, 16, 301, 207)
+    with torch_in_one_thread(), convolutions_in_parallel():
+        assert conv(x).requires_grad
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+            assert conv(x).dtype == torch.bfloat16
