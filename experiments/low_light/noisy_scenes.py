@@ -18,7 +18,7 @@ from pat.matching.inputs import Inputs
 from pat.media.colour import luminance
 from pat.networks.collaborative import without_noise
 from pat.networks.denoiser import LowLightNetwork, NoisyView
-from pat.networks.protocol import FusionNetwork
+from pat.networks.protocol import FusionNetwork, fused_at_once
 from pat.sensors import NoiseLevel, generator_for
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.photos import PhotoBank
@@ -104,7 +104,7 @@ class NoisyScenes:
         alpha = _view(self.denoiser.band, luminance(ideal), level, g)
         beta = NoisyView(*(enlarged(part, HW) for part in _view(self.denoiser.colour, other, second, g)))
         field = FieldOnGrid.of(Epipolar(), pair_of(scene, 1, g))
-        found = self.fusion(Inputs.of(alpha.denoised, [beta.denoised], [field]))
+        found = fused_at_once(self.fusion, Inputs.of(alpha.denoised, [beta.denoised], [field]))
         where = found.position[0].movedim(1, -1).float()
         warped = NoisyView(*(sample(part, where).values for part in beta))
         return NoisyScene(

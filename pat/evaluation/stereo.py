@@ -165,12 +165,12 @@ def _depth_cell(rows: Sequence[StereoRow]) -> str:
     return f"{error:.2f} px / {within:.1%}"
 
 
-def structure_kept(rows: Sequence[StereoRow], *, method: str = "fusion", than: str = "alpha") -> str:
-    """One line: on which pairs, if any, the SSIM of `method` is below that of alpha alone."""
+def structure_kept(rows: Sequence[StereoRow]) -> str:
+    """One line: on which pairs, if any, the SSIM of the fusion is below that of alpha alone."""
     ssim = {(row.pair, row.rate, row.method): row.ssim for row in rows}
-    cases = [(pair, rate) for pair, rate, name in ssim if name == method]
-    lost = [f"{pair} {rate}x" for pair, rate in cases if ssim[pair, rate, method] < ssim[pair, rate, than]]
-    kept = f"SSIM of {method} is at least that of {than} in {len(cases) - len(lost)} of {len(cases)} cases"
+    cases = [(pair, rate) for pair, rate, name in ssim if name == "fusion"]
+    lost = [f"{pair} {rate}x" for pair, rate in cases if ssim[pair, rate, "fusion"] < ssim[pair, rate, "alpha"]]
+    kept = f"SSIM of fusion is at least that of alpha in {len(cases) - len(lost)} of {len(cases)} cases"
     return f"{kept}; **below it**: {', '.join(lost)}." if lost else f"{kept}."
 
 

@@ -95,7 +95,8 @@ class BlenderSettings:
         return RenderSettings.preset(self.preset, **{"threads": 1, **changes})
 
     def check_rig(self, rig: Rig) -> None:
-        """Raises ValueError for a rig that cannot be rendered."""
+        """Raises ValueError for a rig that cannot be rendered, and a generator that cannot be imported."""
+        generator_named(self.generator)
         for name, camera in rig.cameras.items():
             lens_for(camera, name)
 

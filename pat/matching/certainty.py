@@ -2,7 +2,7 @@
 
 Both are read off what matching found: its facts at a pixel and around it, how much disparities differ there,
 by how much one image had to be blurred to be compared, and what facts the pair's consistent matches have. A
-small network does it, which was fitted to pairs with true disparity (`python -m pat.evaluation.certainty`).
+small network does it, which was fitted to pairs with true disparity (`python -m experiments certainty`).
 It knows nothing of the image, so it holds for any network that uses the matches.
 """
 

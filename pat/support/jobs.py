@@ -7,6 +7,7 @@ only where tasks run.
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import time
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from .steps import about, steps_shown
 
@@ -199,34 +200,24 @@ def followed(
 
     `status` counts an outcome and returns what else to show.
     """
-    ends = [time.monotonic()]
-    printed = ends[0]
+    printed = time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    further = (TextColumn("{task.fields[left]}"), TextColumn("{task.fields[status]}"))
-    with Progress(*columns, *further, console=console, disable=not console.is_terminal) as bar:
-        shown = bar.add_task(title, total=total, completed=done, status="", left="")
+    further = (TimeRemainingColumn(), TextColumn("{task.fields[status]}"))
+    hidden = not console.is_terminal
+    with Progress(*columns, *further, console=console, disable=hidden, speed_estimate_period=math.inf) as bar:
+        shown = bar.add_task(title, total=total, completed=done, status="")
         with steps_shown(lambda step: bar.update(shown, status=step)):
             for outcome in outcomes:
                 done += 1
-                ends.append(time.monotonic())
-                text, left = status(outcome), time_left(ends, total - done)
-                bar.update(shown, completed=done, status=text, left=left)
-                if not console.is_terminal and time.monotonic() - printed > LINE_EVERY:
+                text = status(outcome)
+                bar.update(shown, completed=done, status=text)
+                if hidden and time.monotonic() - printed > LINE_EVERY:
                     printed = time.monotonic()
-                    line = f"{title}: {done} of {total}" + f", {left}" * bool(left) + f": {text}" * bool(text)
+                    seconds = bar.tasks[0].time_remaining
+                    left = f", {about(seconds)}" if seconds else ""
+                    line = f"{title}: {done} of {total}{left}" + f": {text}" * bool(text)
                     console.print(line, soft_wrap=True, highlight=False, markup=False)
                 yield outcome
-
-
-def time_left(ends: Sequence[float], left: int) -> str:
-    """About how long `left` tasks will take, given when the job began and when each task so far ended, seconds.
-
-    The first task counts only while it is the only one: it loads and compiles what the others use.
-    """
-    if left == 0 or len(ends) < 2:
-        return ""
-    first = 0 if len(ends) == 2 else 1
-    return about(left * (ends[-1] - ends[first]) / (len(ends) - 1 - first))
 
 
 def _in_this_process(tasks: Iterable[Task], workers: Workers) -> Iterator[TaskOutcome]:

@@ -11,11 +11,10 @@ import time
 from pathlib import Path
 
 import torch
-from pat.data.patches import cut
 
 from arraygeom import Camera, Pose, Rig, Sensor, intrinsics
 from experiments.patches.dataset import ScenePatches
-from experiments.patches.grid import PatchGrid
+from experiments.patches.grid import PatchGrid, cut
 from pat.farm.backends import LayeredSettings
 from pat.synthesis.check import CheckLimits
 

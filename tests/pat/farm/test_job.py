@@ -117,6 +117,11 @@ def fails(arguments, capfd) -> str:
         ({"rig": "rg.yaml"}, "rg.yaml: no such file or folder"),
         ({"layered": {"photos": ["images"]}}, "images: no such file or folder"),
         ({"blender": {"generator": "photographs"}}, "blender: the generator 'photographs' needs a folder `photos`"),
+        ({"blender": {"generator": "still-life"}}, "blender: no generator is called 'still-life': use abstract,"),
+        (
+            {"backend": "blender", "blender": {"generator": "experiments.scenes:no"}},
+            "the generator 'experiments.scenes:no' cannot be imported",
+        ),
         ({"blender": {"settings": {"sample": 3}}}, "settings.sample: unknown key; did you mean 'samples'?"),
     ],
 )

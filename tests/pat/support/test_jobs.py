@@ -7,13 +7,14 @@ import subprocess
 import sys
 import threading
 import time
-from itertools import accumulate
+from io import StringIO
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from arraygeom.atomic import write_text
-from pat.support.jobs import JobError, Task, Workers, run_tasks, time_left
+from pat.support.jobs import JobError, Task, Workers, followed, run_tasks
 from tests.pat.fusion.test_batch import contents, material  # noqa: F401  (a fixture)
 
 
@@ -158,13 +159,21 @@ def test_workers_of_a_scheduler_elsewhere_do_the_work(tmp_path):
 
 
 @pytest.mark.parametrize("seconds", [[40, 10, 11, 9, 10, 12, 10, 9], [8, 10, 9, 11, 10, 10], [3, 3]])
-def test_the_time_left_is_right_within_half_once_two_tasks_are_done(seconds):
+def test_the_time_left_is_right_within_half_once_two_tasks_are_done(seconds, monkeypatch):
     """The first task of a process may take far longer, as it compiles."""
-    ends = [0.0, *accumulate(seconds)]
-    for done in range(2, len(seconds)):
-        said = time_left(ends[: done + 1], len(seconds) - done)
+    now, text = [0.0], StringIO()
+    monkeypatch.setattr("pat.support.jobs.LINE_EVERY", -1.0)
+
+    def outcomes():
+        for one in seconds:
+            now[0] += one
+            yield one
+
+    console = Console(file=text, width=80, get_time=lambda: now[0])
+    assert list(followed(outcomes(), title="jobs", total=len(seconds), console=console)) == seconds
+    lines = text.getvalue().splitlines()
+    assert "left" not in lines[0]
+    assert lines[-1] == f"jobs: {len(seconds)} of {len(seconds)}"
+    for done, line in [*enumerate(lines, 1)][1:-1]:
         left = sum(seconds[done:])
-        assert left / 1.5 <= float(re.search(r"about (\d+) s left", said)[1]) <= 1.5 * left
-    assert time_left(ends, 0) == ""
-    assert time_left(ends[:1], 3) == ""
-    assert time_left([0, 600], 2) == "about 20 min left"
+        assert left / 1.5 <= float(re.search(r"about (\d+) s left", line)[1]) <= 1.5 * left
