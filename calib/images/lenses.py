@@ -31,6 +31,15 @@ def with_lenses(rig: Rig, names: Iterable[str]) -> Rig:
     return rig
 
 
+def with_distortion(rig: Rig) -> Rig:
+    """The rig with a lens without distortion for those of its calibrated cameras that have none."""
+    for name, view in rig.cameras.items():
+        if isinstance(view, Camera) and view.distortion is None:
+            lens = Distortion("brown-conrady", torch.zeros(TERMS, dtype=torch.float64))
+            rig = rig.with_camera(name, view.replace(distortion=lens))
+    return rig
+
+
 def with_lens_of(camera: Camera, view: LensView) -> Camera:
     """A pinhole camera with the lens of a view of the same centre, whose terms are in units of another length."""
     assert isinstance(view.distortion, Distortion)

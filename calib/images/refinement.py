@@ -32,7 +32,7 @@ from arraygeom.threads import torch_in_one_thread
 from .depth_change import LARGE_CHANGE, NEGLIGIBLE, DepthChange, depth_modes, log_depths, relative_change, share_behind
 from .held_out import PARTS, held_out_pixels, image_parts, line_distances, line_statistics, median_off, nearer, split
 from .least_squares import JoinedResiduals, Residuals, Solution, jacobian, left_out, most_probable, noise_scale, solve
-from .lenses import with_lenses
+from .lenses import with_distortion, with_lenses
 from .matches import ENOUGH, Images, Pairs, agreeing_pairs, match_cameras, matching_time, with_map
 from .parameters import FreeParameter, apply_change, considered_parameters, free_parameters
 from .photometric import Attend, PhotometricFrame, photometric_errors, with_depths
@@ -59,6 +59,8 @@ CORRELATED_PIXELS = 10.0
 """Photometric errors of this many neighbouring pixels count as one measurement."""
 ROUNDS, EVALUATIONS = 8, 13
 """Iterations of the photometric minimisation, and how often it evaluates the error of all pairs, roughly."""
+LENS_SIGMA = 1.0
+"""Prior deviation of lens terms that may have been left out, as a share of typical ones."""
 FITTED = 1.4
 """Seconds that one core takes to fit a rig to the points of a pair, roughly."""
 
@@ -274,6 +276,8 @@ class RefinementProblem:
         objections += _contradictions(self.parameters, solution.z)
         objections += _remaining(refined, self.held_out, held_out[1]) if moved else []
         objections += [*_uncertain_depth(depth), *_behind(refined, self.used)]
+        if not objections and depth is not None and depth.change > NEGLIGIBLE:
+            objections += self._explained_by_lenses(distances[1][1])
         accepted = moved and (force or not objections)
         return Refinement(
             rig=_with_maps(refined, self.used) if accepted else self.rig,
@@ -286,6 +290,23 @@ class RefinementProblem:
             objections=tuple(objections),
             kept=tuple(_kept(self.parameters, solution)),
         )
+
+    def _explained_by_lenses(self, distances: Tensor) -> list[str]:
+        """An objection if other lenses and the same poses put held-out points as near to their lines as at these
+        distances: images do not tell both apart, and poses would change depth."""
+        if any(u.name.endswith(".distortion") for u in self.parameters) or self.rig.links:
+            return []
+        rig = with_distortion(self.rig)
+        names = [name for name in rig.names if any(name in pair for pair in self.used)]
+        lenses = free_parameters(rig, names, free=["distortion"], sigma={"distortion": LENS_SIGMA})
+        lens_alone = replace(self, rig=rig, parameters=tuple(lenses), considered=())
+        explained = lens_alone.after(lens_alone.solve_freely().z)
+        if nearer(line_distances(explained, self.held_out), distances):
+            return []
+        return [
+            "other lenses explain the points as well as other poses, which would change depth: state the lenses that "
+            "were calibrated, or refine those with --free distortion"
+        ]
 
     def _depth_change(self, refined: Rig, solution: Solution) -> DepthChange | None:
         """None for uncalibrated rigs and for too few points whose depth is observable."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Camera, Link, Rig, View
+from arraygeom import Camera, Distortion, Link, Rig, View
 from calib.images.depth_change import relative_change
 from calib.images.held_out import median_off
 from calib.images.matches import PointMatches, match_cameras
@@ -337,3 +337,17 @@ def test_depth_that_is_lost_counts_as_changed():
     points = simulated_matches(rig, "wide", g)
     reversed_rig = swap(rig, "c0", "c1")
     assert relative_change(rig, reversed_rig, points) == 1.0
+
+
+def test_poses_do_not_stand_in_for_lenses():
+    """Wrong lenses were explained by other poses, with which depth changed; a rotation is not explained by lenses."""
+    g = np.random.default_rng([0, 2, 4])
+    rig = simulated_rig("wide", 2, g)
+    matches = simulated_matches(rig, "wide", g)
+    lens = Distortion("brown-conrady", torch.tensor([0.2, 0.0, 0.0, 0.0], dtype=torch.float64))
+    bent = rig.replace(cameras={name: camera.replace(distortion=lens) for name, camera in rig.cameras.items()})
+    found = refine_matches(bent, [matches])
+    assert not found.accepted
+    assert ["other lenses" in objection for objection in found.objections] == [True]
+    turned = rig.perturbed({"c1.rotation": torch.tensor([0.003, 0.003, 0.003], dtype=torch.float64)})
+    assert refine_matches(turned, [matches]).accepted
