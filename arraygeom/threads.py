@@ -49,9 +49,9 @@ def torch_in_one_thread() -> Iterator[None]:
 
 @contextmanager
 def convolutions_in_parallel() -> Iterator[None]:
-    """Within `torch_in_one_thread`: compute convolutions on all `threads`, those without gradients in strips of rows.
+    """Within `torch_in_one_thread`: compute convolutions on all `threads`.
 
-    Strips are computed by the pool's threads, which sleep where they wait; the rest by torch's.
+    Those without gradients in strips of rows by the pool's threads, which sleep where they wait; others by torch's.
     """
     with _InStrips() if threads() > 1 else nullcontext():
         yield
@@ -68,10 +68,10 @@ class _InStrips(TorchFunctionMode):
 
 
 def _convolved(x: Tensor, weight: Tensor, bias: Any, stride: Any, padding: Any, dilation: Any, groups: int) -> Tensor:
-    """`torch.conv2d`, to the bit; a plain one of a large image in strips of rows, each seen with the rows around it."""
+    """`torch.conv2d`, to the bit; of one large image in strips of rows, each with the rows around it."""
     further = bias, stride, padding, dilation, groups
-    plain = x.device.type == "cpu" and len(x) == 1 and tuple(stride) == (1, 1) and not isinstance(padding, str)
-    if not plain or weight[0].numel() * len(weight) * x[0, 0].numel() < WORTH_STRIPS:
+    plain = x.device.type == "cpu" and tuple(stride) == (1, 1) and not isinstance(padding, str)
+    if not plain or len(x) != 1 or weight[0].numel() * len(weight) * x[0, 0].numel() < WORTH_STRIPS:
         return torch.conv2d(x, weight, *further)
     seen, above = dilation[0] * (weight.shape[2] - 1), padding[0]
     width = x.shape[3] + 2 * padding[1] - dilation[1] * (weight.shape[3] - 1)

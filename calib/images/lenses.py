@@ -25,9 +25,8 @@ def with_lenses(rig: Rig, names: Iterable[str]) -> Rig:
     for name in names:
         view = rig[name]
         if name in linked and not isinstance(view, LensView):
-            lens = Distortion("brown-conrady", torch.zeros(TERMS, dtype=torch.float64))
             K = intrinsics(max(view.hw) / 2, view.hw)
-            rig = rig.with_camera(name, LensView(hw=view.hw, sensor=view.sensor, K=K, distortion=lens))
+            rig = rig.with_camera(name, LensView(hw=view.hw, sensor=view.sensor, K=K, distortion=_no_distortion()))
     return rig
 
 
@@ -35,9 +34,12 @@ def with_distortion(rig: Rig) -> Rig:
     """The rig with a lens without distortion for those of its calibrated cameras that have none."""
     for name, view in rig.cameras.items():
         if isinstance(view, Camera) and view.distortion is None:
-            lens = Distortion("brown-conrady", torch.zeros(TERMS, dtype=torch.float64))
-            rig = rig.with_camera(name, view.replace(distortion=lens))
+            rig = rig.with_camera(name, view.replace(distortion=_no_distortion()))
     return rig
+
+
+def _no_distortion() -> Distortion:
+    return Distortion("brown-conrady", torch.zeros(TERMS, dtype=torch.float64))
 
 
 def with_lens_of(camera: Camera, view: LensView) -> Camera:

@@ -59,7 +59,7 @@ CORRELATED_PIXELS = 10.0
 """Photometric errors of this many neighbouring pixels count as one measurement."""
 ROUNDS, EVALUATIONS = 8, 13
 """Iterations of the photometric minimisation, and how often it evaluates the error of all pairs, roughly."""
-LENS_SIGMA = 1.0
+LEFT_OUT_SIGMA = 1.0
 """Prior deviation of lens terms that may have been left out, as a share of typical ones."""
 FITTED = 1.4
 """Seconds that one core takes to fit a rig to the points of a pair, roughly."""
@@ -292,21 +292,21 @@ class RefinementProblem:
         )
 
     def _explained_by_lenses(self, distances: Tensor) -> list[str]:
-        """An objection if other lenses and the same poses put held-out points as near to their lines as at these
-        distances: images do not tell both apart, and poses would change depth."""
+        """An objection if other lenses, with the same poses, put held-out points as near to their lines.
+
+        Images do not tell the two apart then, and the poses would change depth.
+        """
         if any(u.name.endswith(".distortion") for u in self.parameters) or self.rig.links:
             return []
         rig = with_distortion(self.rig)
         names = [name for name in rig.names if any(name in pair for pair in self.used)]
-        lenses = free_parameters(rig, names, free=["distortion"], sigma={"distortion": LENS_SIGMA})
+        lenses = free_parameters(rig, names, free=["distortion"], sigma={"distortion": LEFT_OUT_SIGMA})
         lens_alone = replace(self, rig=rig, parameters=tuple(lenses), considered=())
         explained = lens_alone.after(lens_alone.solve_freely().z)
         if nearer(line_distances(explained, self.held_out), distances):
             return []
-        return [
-            "other lenses explain the points as well as other poses, which would change depth: state the lenses that "
-            "were calibrated, or refine those with --free distortion"
-        ]
+        what_to_do = "state the lenses that were calibrated" if rig is not self.rig else "give --free distortion"
+        return [f"other lenses explain the points as well as other poses, which would change depth: {what_to_do}"]
 
     def _depth_change(self, refined: Rig, solution: Solution) -> DepthChange | None:
         """None for uncalibrated rigs and for too few points whose depth is observable."""

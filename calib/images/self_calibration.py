@@ -57,9 +57,8 @@ DENSE_POINTS = 2000
 SPACING = 4
 """Dense points at most, and their least distance, pixels."""
 LEAST_CONFIDENCE = 0.5
-SMOOTH_STEPS = 30
 STILL_SHARE = 0.9
-"""Where so many points move as one smooth map does, what the others do may be wrong matches."""
+"""The share of points that move as one smooth map does from which on the others may be wrong matches."""
 WELL_LOCALISED = 0.3
 """Largest standard deviation of a dense point, pixels."""
 
@@ -127,7 +126,7 @@ def has_parallax(matches: PointMatches, hw: HW) -> bool:
         return cauchy(size := rest.norm(dim=-1), normal_deviation(size, LOCALISED))
 
     start = least_squares(terms, matches.beta, torch.ones_like(x))
-    rest = robust_least_squares(terms, matches.beta, start, weigh, steps=SMOOTH_STEPS).rest
+    rest = robust_least_squares(terms, matches.beta, start, weigh).rest
     return float(rest.norm(dim=-1).quantile(STILL_SHARE)) > LOCALISED
 
 

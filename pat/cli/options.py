@@ -73,6 +73,8 @@ def noise_of(texts: Iterable[str], *, by_default: bool = False) -> Any:
     if entries in (["estimate"], ["none"]):
         return None if entries == ["none"] else "estimate"
     levels = []
+    if {"estimate", "none"} & {*entries}:
+        raise ValueError(f"--noise: got {', '.join(entries)}: give estimate or none alone, or NAME=ELECTRONS of each")
     for entry in entries:
         name, _, numbers = entry.partition("=")
         try:

@@ -19,6 +19,7 @@ def test_levels_by_camera_or_estimated():
     ("given", "said"),
     [
         (["mono"], "neither estimate nor none nor NAME=ELECTRONS"),
+        (["none", "mono=200"], "give estimate or none alone"),
         (["mono=dark"], "neither estimate nor none nor NAME=ELECTRONS"),
         (["mono=200,2,1"], "has 3 numbers"),
         (["mono=-200"], "electrons at white must be 1 or more"),
