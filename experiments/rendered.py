@@ -30,7 +30,7 @@ class RenderedScene:
         self.rig, self.alpha, self.seed = rig, rig.names[0], seed
         scene = SCENES[generator](seed, rig, moving=moving)
         pinholes = {n: c.replace(distortion=None) for n, c in rig.cameras.items() if isinstance(c, Camera)}
-        settings = replace(SETTINGS, passes=("nir",) if infrared else (), duration=duration)
+        settings = replace(SETTINGS, infrared=infrared, duration=duration)
         with TemporaryDirectory() as folder:
             rendered = render(scene, rig.replace(cameras=pinholes), Path(folder) / "scene", settings=settings)
             self.frames = {n: [rendered.frame(n, i) for i in range(rendered.frames(n))] for n in rig.names}

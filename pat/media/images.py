@@ -116,7 +116,6 @@ def write_image(
     image: Float[Tensor, "c h w"],
     *,
     bits: int = 8,
-    coverage: Float[Tensor, "1 h w"] | None = None,
     unknown: bool = False,
     profile: bool = False,
 ) -> None:
@@ -124,7 +123,7 @@ def write_image(
 
     8 and 16 bits are rounded, after values are clipped to 0..1; 32 bits (.tif and .exr only) keep floats as they are.
     With `profile`, PNG and JPEG files in colour say by an ICC profile that they are sRGB.
-    `coverage` makes the image RGBA (.png and .exr). An .exr file needs the extra `synthesis`. Raises ValueError for
+    An .exr file needs the extra `synthesis`. Raises ValueError for
     an image with another number of channels or with values that are not finite (allowed with `unknown`, for maps of 32
     bits in which some pixels are not known), and for a format that cannot hold it.
     """
@@ -132,16 +131,11 @@ def write_image(
     planes = image.detach().cpu().numpy()
     if planes.shape[0] not in (1, 3):
         raise ValueError(f"{path}: an image has 1 or 3 channels, got {planes.shape[0]}: write channels one by one")
-    if coverage is not None:
-        if path.suffix.lower() not in (".png", ".exr"):
-            raise ValueError(f"{path}: only PNG and EXR hold coverage (rgba)")
-        planes = np.concatenate([planes, coverage.detach().cpu().numpy()])
     if not (unknown and bits == 32) and not np.isfinite(planes).all():
         raise ValueError(f"{path}: the image to write has NaN or infinite values")
     if path.suffix.lower() == ".exr":
         return _write_exr(path, planes, bits)
-    order = [2, 1, 0, 3] if coverage is not None else slice(None, None, -1)
-    content = _encode(path, np.ascontiguousarray(planes[order].transpose(1, 2, 0)), bits)
+    content = _encode(path, np.ascontiguousarray(planes[::-1].transpose(1, 2, 0)), bits)
     content = with_srgb_profile(content, path.suffix.lower()) if profile else content
     with write_atomically(path) as temporary:
         temporary.write_bytes(content)
@@ -341,7 +335,7 @@ def _write_exr(path: Path, planes: NDArray, bits: int) -> None:
     if bits != 32:
         raise ValueError(f"{path}: EXR holds 32-bit floats here, not {bits} bits: write .png or .tif")
     OpenEXR = exr_writer(path)
-    names = {1: "Y", 3: "RGB", 4: "RGBA"}[len(planes)]
+    names = {1: "Y", 3: "RGB"}[len(planes)]
     channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in zip(names, planes)}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with write_atomically(path) as temporary:

@@ -1,10 +1,10 @@
-"""Scenes from seeds: the paper's abstract ones, photograph-textured ones, calibration boards."""
+"""Scenes from seeds: the paper's abstract ones, and photograph-textured ones."""
 
 from __future__ import annotations
 
 import colorsys
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -12,18 +12,15 @@ import cv2
 import numpy as np
 import torch
 from numpy.random import Generator
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from arraygeom.extras import imported
-from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 
 from ..media.colour import linear_from_srgb
 from ..media.images import decoded_photograph
 from ..support.folders import files_below
-from .furnish import Setting, furnished, seeded, vec
-from .scene import BoardObject, Key, Light, Material, Motion, Object, Paint, Scene, Texture, TextureKind, Vec3, World
+from .furnish import Setting, furnished, vec
+from .scene import Paint, Scene, Texture, TextureKind, Vec3
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 
@@ -55,48 +52,15 @@ def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0)
     return furnished("photographs", seed, rig, image, moving)
 
 
-def board(poses: Sequence[Pose], spec: BoardObject, *, seed: int = 0) -> Scene:
-    """A calibration board that is at the k-th pose (world_from_board) at the time of k seconds.
-
-    Render it with cameras of one frame a second for as many seconds as there are poses.
-    """
-    if not poses:
-        raise ValueError("a board needs at least one pose")
-    width, height = spec.wh
-    middle = np.array([width / 2 - spec.margin, height / 2 - spec.margin, 0.0])
-    keys = tuple(_board_key(pose, middle, (width, height, 1.0), float(k)) for k, pose in enumerate(poses))
-    ink = Texture(kind="board", board=spec, paints=(Paint((0.85, 0.85, 0.85), 0.85),))
-    sheet = Object(name="board", shape="plane", motion=Motion(keys), material=Material(texture=ink, specular=0.1))
-    rng = seeded("board", seed)
-    facing = np.mean([p.R[:, 2].tolist() for p in poses], axis=0) + rng.normal(0, 0.3, 3)
-    sun = Light(kind="sun", power=1.6, direction=vec(facing), size=0.2)
-    centres = [np.asarray(k.position) for k in keys]
-    far = float(max(np.linalg.norm(c) for c in centres)) + max(width, height)
-    return Scene(
-        objects=(sheet,),
-        lights=(sun,),
-        world=World((0.3, 0.3, 0.3), 0.3),
-        depth=(0.1, far),
-        generator="board",
-        seed=seed,
-    )
-
-
-GENERATORS: dict[str, Callable[..., Scene]] = {
-    "abstract": abstract,
-    "photographs": photographs,
-    "board": board,
-}
-"""By name. All take a seed; "abstract" and "photographs" a rig."""
-
-
 def generator_named(name: str) -> Callable[..., Scene]:
     """ "abstract", "photographs", or one's own, called with a seed, a rig and `moving` seconds, as "module:function".
 
     Raises ValueError for a name that is neither.
     """
-    if name in ("abstract", "photographs"):
-        return GENERATORS[name]
+    if name == "abstract":
+        return abstract
+    if name == "photographs":
+        return photographs
     if ":" not in name:
         raise ValueError(f"no generator is called '{name}': use abstract, photographs or MODULE:FUNCTION")
     return imported(name, "generator")  # type: ignore[no-any-return]
@@ -160,10 +124,3 @@ def _blackness(file: str) -> float:
     """The share of pixels that are nearly black; 1 for what is no image, or one too large."""
     small = decoded_photograph(Path(file), cv2.IMREAD_REDUCED_GRAYSCALE_8)
     return 1.0 if small is None else float((small < 24).mean())
-
-
-def _board_key(pose: Pose, middle: NDArray, extent: Vec3, time: float) -> Key:
-    R, t = (np.asarray(v.detach().cpu().double()) for v in (pose.R, pose.t))
-    return Key(
-        position=vec(R @ middle + t), rotation=vec(Rotation.from_matrix(R).as_rotvec()), extent=extent, time=time
-    )

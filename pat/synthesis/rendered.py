@@ -33,20 +33,15 @@ class RenderedFrame:
     """One image and its ground truth, at the pixels' centres.
 
     `rgb` is linear radiance (stored as float16, 1 is white by intent, brighter is possible), `nir` that of the near
-    infrared, `alpha` how much of a pixel objects cover. `depth` is z in metres (float32), infinite where nothing
-    is. `index` is 0 where nothing is, else the object's number in the scene plus one. `normals` are unit vectors in
-    the camera's frame; `flow` is how far each pixel's point moves in the image until the camera's next frame (for
-    one frame: 1/30 s). Pixels that a lens does not see have `depth` NaN and index 0.
+    infrared. `depth` is z in metres (float32), infinite where nothing is. `index` is 0 where nothing is, else the
+    object's number in the scene plus one. Pixels that a lens does not see have `depth` NaN and index 0.
     """
 
     time: float
     rgb: Float[Tensor, "3 h w"]
     depth: Float[Tensor, "h w"]
     index: Int[Tensor, "h w"]
-    normals: Float[Tensor, "3 h w"] | None = None
-    flow: Float[Tensor, "2 h w"] | None = None
     nir: Float[Tensor, "1 h w"] | None = None
-    alpha: Float[Tensor, "1 h w"] | None = None
 
 
 @dataclass(frozen=True)
@@ -87,7 +82,7 @@ class Rendered:
         return RenderedFrame(time=entry["time"], **tensors)
 
 
-_STORED = {"rgb": np.float16, "nir": np.float16, "alpha": np.float16, "normals": np.float16, "index": np.uint16}
+_STORED = {"rgb": np.float16, "nir": np.float16, "index": np.uint16}
 _MOST = 6e4
 
 

@@ -25,7 +25,7 @@ from ..support.schema import from_document, parse_yaml, to_document
 
 Vec3 = tuple[float, float, float]
 Shape = Literal["plane", "cube", "sphere", "cylinder", "cone", "torus", "lathe", "room"]
-TextureKind = Literal["plain", "voronoi", "magic", "brick", "checker", "noise", "wave", "image", "board"]
+TextureKind = Literal["plain", "voronoi", "magic", "brick", "checker", "noise", "wave", "image"]
 
 FORMAT = "pat-scene 1"
 
@@ -39,29 +39,6 @@ class Paint:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoardObject:
-    """A calibration target, printed in black on white.
-
-    `squares` are (columns, rows) of `square` metres; a ChArUco board has markers of `marker` metres from an OpenCV
-    `dictionary` in its white squares. `margin` metres of white surround it. Its frame has the origin at the outer
-    corner of the first square, x along the columns, y along the rows, z away from the viewer (as OpenCV's).
-    """
-
-    kind: Literal["charuco", "chessboard"] = "charuco"
-    squares: tuple[int, int] = (9, 6)
-    square: float = 0.04
-    marker: float = 0.03
-    dictionary: str = "DICT_5X5_250"
-    margin: float = 0.02
-
-    @property
-    def wh(self) -> tuple[float, float]:
-        """Width and height of the sheet in metres, margins included."""
-        columns, rows = self.squares
-        return columns * self.square + 2 * self.margin, rows * self.square + 2 * self.margin
-
-
-@dataclass(frozen=True, kw_only=True)
 class Texture:
     """How paints are laid on a surface.
 
@@ -69,7 +46,7 @@ class Texture:
     shifts them, `distortion` (0 to some) makes them irregular, `grain` (0..1) lays fine noise over them. They run
     through the `paints` in order. An "image" is a file (sRGB) whose width covers 1 / `scale` metres of the surface
     and which repeats beyond; it is multiplied by the first paint's colour. Its near infrared is its red plus
-    1.5 times by how much green exceeds red and blue (leaves), times the paint's. A "board" fills its plane.
+    1.5 times by how much green exceeds red and blue (leaves), times the paint's.
     """
 
     kind: TextureKind = "plain"
@@ -79,7 +56,6 @@ class Texture:
     distortion: float = 0.0
     grain: float = 0.0
     image: str = ""
-    board: BoardObject | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,11 +19,10 @@ import torch
 
 from arraygeom import Camera, Pose, Rig, rotation_from_vector
 from arraygeom.sensor import Sensor
-from pat.synthesis.scene import BoardObject
 from tests.calib.board_scenes import camera, tensor
-from tests.pat.synthesis.scenes import inner_corners
+from tests.pat.synthesis.boards import Sheet, board_scene
 
-SHEET = BoardObject(squares=(12, 9), square=0.06, marker=0.045, dictionary="DICT_5X5_250", margin=0.03)
+SHEET = Sheet(squares=(12, 9), square=0.06, marker=0.045, margin=0.03)
 BOARD = "charuco:12x9:60mm:45mm:5x5_250"
 DEPTHS = 0.9, 2.6
 TILT = 40.0
@@ -58,7 +57,7 @@ def board_poses(cameras: Rig, count: int = POSES, *, seed: int = 0) -> list[Pose
 
 def _seen(view: Camera, pose: Pose) -> float:
     """The share of the board's corners in the image."""
-    x, _, valid = view.project(pose.apply(torch.from_numpy(inner_corners(SHEET))))
+    x, _, valid = view.project(pose.apply(torch.from_numpy(SHEET.inner_corners)))
     return float((valid & view.contains(x)).double().mean())
 
 
@@ -76,10 +75,9 @@ def _pose(view: Camera, random: np.random.Generator) -> Pose:
 
 def photograph(out: Path, *, count: int = POSES, samples: int = 8) -> None:
     """The images, `out/<camera>/<frame>.png` (8 bits), and `out/true.yaml`."""
-    from experiments.scenes.image_files import light, write_light
-    from pat.synthesis.blender import RenderSettings
-    from pat.synthesis.blender.client import render
-    from pat.synthesis.generators import board
+    from pat.media.colour import REC709, luminance, srgb_image
+    from pat.media.images import write_image
+    from pat.synthesis.blender import RenderSettings, render
 
     cameras = rig()
     slow = {name: c.replace(sensor=Sensor(frame_rate=1.0)) for name, c in cameras.cameras.items()}
@@ -87,11 +85,12 @@ def photograph(out: Path, *, count: int = POSES, samples: int = 8) -> None:
         samples=samples, denoise="none", fast_light=False, bounces=0, threads=1, duration=float(count)
     )
     with tempfile.TemporaryDirectory() as scratch:
-        scene = board(board_poses(cameras, count), SHEET)
+        scene = board_scene(board_poses(cameras, count), SHEET, Path(scratch) / "board.png")
         done = render(scene, Rig(slow), Path(scratch) / "rendered", settings=settings)
         for name in cameras.names:
             for number in range(done.frames(name)):
-                write_light(out / name / f"{number:03d}.png", light(done.frame(name, number), "bw"))
+                light = luminance(done.frame(name, number).rgb, REC709)
+                write_image(out / name / f"{number:03d}.png", srgb_image(light))
     cameras.save(out / "true.yaml")
 
 

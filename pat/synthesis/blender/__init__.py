@@ -4,8 +4,7 @@ bpy is imported when a scene is rendered: by `render` in a process of its own, b
 workers of a farm).
 """
 
-from .client import RenderError, Worker, render
-from .settings import Optics, RenderSettings
-from .task import render_here
+from .settings import RenderSettings
+from .task import render, render_here
 
-__all__ = ["Optics", "RenderError", "RenderSettings", "Worker", "render", "render_here"]
+__all__ = ["RenderSettings", "render", "render_here"]

@@ -7,10 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 
-from ..boards import PIXELS, draw_board
 from ..scene import Light, Material, Object, Paint, Scene, Texture, TextureKind, World
 from ..shapes import mesh
 from . import compat
@@ -33,13 +31,13 @@ class BuiltScene:
             paint(spectrum)
 
 
-def build(bpy: Any, scene: Scene, world: Any, scratch: Path) -> BuiltScene:
-    """All objects and lights of a scene. `scratch` is a folder for files that are needed until the end."""
+def build(bpy: Any, scene: Scene, world: Any) -> BuiltScene:
+    """All objects and lights of a scene."""
     stage = BuiltScene([], [])
     for i, thing in enumerate(scene.objects):
         item = _object(bpy, thing)
         item.pass_index = i + 1
-        item.data.materials.append(_material(bpy, thing, stage, scratch))
+        item.data.materials.append(_material(bpy, thing, stage))
         stage.objects.append(item)
     for light in scene.lights:
         _light(bpy, light, stage)
@@ -151,13 +149,13 @@ class _Nodes:
         return node
 
 
-def _material(bpy: Any, thing: Object, stage: BuiltScene, scratch: Path) -> Any:
+def _material(bpy: Any, thing: Object, stage: BuiltScene) -> Any:
     material = thing.material
     made = bpy.data.materials.new(thing.name)
     compat.use_nodes(made)
     nodes = _Nodes(made.node_tree)
     shader = made.node_tree.nodes["Principled BSDF"]
-    paint, height = _texture(bpy, nodes, material.texture, stage, scratch)
+    paint, height = _texture(bpy, nodes, material.texture, stage)
     for name, value in _principled(material).items():
         shader.inputs[name].default_value = value
     nodes.give(shader.inputs["Base Color"], paint)
@@ -181,10 +179,10 @@ def _principled(material: Material) -> dict[str, float]:
     }
 
 
-def _texture(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene, scratch: Path) -> tuple[Any, Any]:
+def _texture(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene) -> tuple[Any, Any]:
     """The outputs of colour and of bump height (None for images)."""
-    if texture.kind in ("image", "board"):
-        return _image(bpy, nodes, texture, stage, scratch), None
+    if texture.kind == "image":
+        return _image(bpy, nodes, texture, stage), None
     height = _PATTERNS[texture.kind](nodes, texture)
     ramp = nodes.new("ValToRGB")
     nodes.give(ramp.inputs[0], height)
@@ -268,11 +266,14 @@ _PATTERNS: dict[TextureKind, Callable[[_Nodes, Texture], Any]] = {
 }
 
 
-def _image(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene, scratch: Path) -> Any:
-    image = _loaded(bpy, texture, scratch)
+def _image(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene) -> Any:
+    file = Path(texture.image)
+    if not file.is_file():
+        raise ValueError(f"{texture.image or 'a texture without a file'}: no such image for a texture")
+    image = bpy.data.images.load(str(file.resolve()), check_existing=True)
     node = nodes.new("TexImage", image=image, extension="MIRROR")
-    (w, h), (left, top) = _laid(image.size, texture)
-    onto = (1 / w, -1 / h, 0), (left / w + texture.offset[0], 1 - top / h + texture.offset[1], 0)
+    w, h = 1 / texture.scale, image.size[1] / image.size[0] / texture.scale
+    onto = (1 / w, -1 / h, 0), (texture.offset[0], 1 + texture.offset[1], 0)
     nodes.give(node.inputs["Vector"], nodes.vector("MULTIPLY_ADD", nodes.new("TexCoord").outputs["UV"], *onto))
     rgb = node.outputs["Color"]
     infrared = nodes.vector("SUBTRACT", _infrared(nodes, rgb), rgb)
@@ -288,14 +289,6 @@ def _image(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene, scratch
     return _grained(nodes, texture, paint)
 
 
-def _laid(wh: tuple[int, int], texture: Texture) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Size of an image in metres, and the surface's corner on it. Boards are centred, true to scale."""
-    if texture.board is None:
-        return (1 / texture.scale, wh[1] / wh[0] / texture.scale), (0, 0)
-    w, h = (n * texture.board.square / PIXELS for n in wh)
-    return (w, h), ((w - texture.board.wh[0]) / 2, (h - texture.board.wh[1]) / 2)
-
-
 def _infrared(nodes: _Nodes, rgb: Any) -> Any:
     """Red, and 1.5 times by how much green exceeds red and blue, in all channels; at most 1."""
     split = nodes.new("SeparateXYZ")
@@ -307,15 +300,3 @@ def _infrared(nodes: _Nodes, rgb: Any) -> Any:
     for socket in joined.inputs:
         nodes.give(socket, value)
     return joined.outputs[0]
-
-
-def _loaded(bpy: Any, texture: Texture, scratch: Path) -> Any:
-    if texture.kind == "image":
-        if not Path(texture.image).is_file():
-            raise ValueError(f"{texture.image or 'a texture without a file'}: no such image for a texture")
-        return bpy.data.images.load(str(Path(texture.image).resolve()), check_existing=True)
-    if texture.board is None:
-        raise ValueError("a texture of kind 'board' needs a board")
-    path = scratch / f"board-{len(bpy.data.images)}.png"
-    cv2.imwrite(str(path), draw_board(texture.board))
-    return bpy.data.images.load(str(path))

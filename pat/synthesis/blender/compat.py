@@ -52,17 +52,6 @@ def use_nodes(item: Any) -> None:
         item.use_nodes = True
 
 
-def eevee(scene: Any) -> str:
-    """What EEVEE is called here: BLENDER_EEVEE, or BLENDER_EEVEE_NEXT up to 4.5."""
-    for name in ("BLENDER_EEVEE_NEXT", "BLENDER_EEVEE"):
-        try:
-            scene.render.engine = name
-        except TypeError:
-            continue
-        return name
-    raise ValueError("this Blender has no EEVEE: use engine 'cycles'")
-
-
 def write_layers(scene: Any) -> None:
     """Make renders go to one multi-layer float EXR file, of one part: several fail if pixels are not square (5.0)."""
     images = scene.render.image_settings
@@ -84,15 +73,6 @@ def factor(node: Any) -> Any:
 def index_name(channels: Mapping[str, Any]) -> str:
     """The channel of the object index among those of a file."""
     return next(name for name in _INDEX if name in channels)
-
-
-def make_linear(item: Any) -> None:
-    """Make all keys of an object linear. Works with the layered actions of 4.4 and newer."""
-    animation = item.animation_data
-    channels = animation.action.layers[0].strips[0].channelbag(animation.action_slot)
-    for curve in channels.fcurves:
-        for key in curve.keyframe_points:
-            key.interpolation = "LINEAR"
 
 
 def use_gpu(bpy: Any) -> bool:

@@ -21,14 +21,13 @@ from arraygeom.camera import Camera
 from ..scene import Motion, Scene
 from . import compat
 from .build import BuiltScene, Spectrum, build
-from .settings import Optics, RenderSettings
+from .settings import RenderSettings
 
 NOTHING = 1e9
 """Depths beyond this mean that the ray hit nothing."""
 
 _FLIP = np.diag([1.0, -1.0, -1.0])
 _SENSOR = 36.0
-_EXPOSURE = (0, 1, 2)
 
 
 class Studio:
@@ -41,31 +40,17 @@ class Studio:
         self.camera = self.bpy.data.objects.new("camera", self.bpy.data.cameras.new("camera"))
         self.blender.collection.objects.link(self.camera)
         self.blender.camera = self.camera
-        self.stage: BuiltScene = build(self.bpy, scene, self.blender.world, scratch)
+        self.stage: BuiltScene = build(self.bpy, scene, self.blender.world)
         self._quality()
 
-    def colours(self, camera: Camera, time: float, optics: Optics, spectrum: Spectrum) -> dict[str, Tensor]:
-        """Channels by Blender's names (H, W), blur included where the optics have it."""
-        self._engine()
-        self._expose(time, optics.shutter)
-        self._aim(camera, optics)
+    def channels(self, camera: Camera, time: float, spectrum: Spectrum) -> dict[str, Tensor]:
+        """Colours, depth and index by Blender's names (H, W)."""
+        for item, thing in zip(self.stage.objects, self.scene.objects):
+            _place(item, thing.motion, time)
+        self.blender.frame_set(1)
+        self._aim(camera)
         self.stage.show(spectrum)
         return self._shoot()
-
-    def geometry(self, camera: Camera, time: float) -> dict[str, Tensor]:
-        """The same with one sample, without any blur, and with all surfaces plain: exact depth, index and normals."""
-        cycles, layer = self.blender.cycles, self.blender.view_layers[0]
-        self._expose(time, None)
-        self._aim(camera, Optics())
-        self.blender.render.engine = "CYCLES"
-        former = cycles.samples, cycles.use_denoising
-        cycles.samples, cycles.use_denoising = 1, False
-        layer.material_override = self._plain()
-        try:
-            return self._shoot()
-        finally:
-            cycles.samples, cycles.use_denoising = former
-            layer.material_override = None
 
     def close(self) -> None:
         """Drop Blender's persistent data: until then one of its threads spins, half a core."""
@@ -87,11 +72,10 @@ class Studio:
         self._light_paths()
         render.use_persistent_data = True
         render.dither_intensity = 0
-        render.film_transparent = "alpha" in s.passes
         render.threads_mode = "FIXED" if s.threads else "AUTO"
         render.threads = s.threads or 1
         layer = self.blender.view_layers[0]
-        layer.use_pass_z = layer.use_pass_object_index = layer.use_pass_normal = True
+        layer.use_pass_z = layer.use_pass_object_index = True
         compat.write_layers(self.blender)
 
     def _light_paths(self) -> None:
@@ -114,32 +98,9 @@ class Studio:
             raise ValueError("no GPU that Cycles can use was found: take device 'cpu' or 'auto'")
         return found
 
-    def _engine(self) -> None:
-        if self.settings.engine == "eevee":
-            self.blender.render.engine = compat.eevee(self.blender)
-            self.blender.eevee.taa_render_samples = self.settings.samples
-
-    def _plain(self) -> Any:
-        name = "plain"
-        return self.bpy.data.materials.get(name) or self.bpy.data.materials.new(name)
-
     # One image -----------------------------------------------------------------------------------------
 
-    def _expose(self, time: float, shutter: float | None) -> None:
-        """Place objects for a time, or animate them over the exposure: from frame 0 to 2, 1 the middle."""
-        render = self.blender.render
-        moving = False
-        for item, thing in zip(self.stage.objects, self.scene.objects):
-            item.animation_data_clear()
-            _place(item, thing.motion, time)
-            if shutter and not thing.motion.still:
-                moving = True
-                _key(item, thing.motion, time, shutter)
-        render.use_motion_blur = moving
-        render.motion_blur_position, render.motion_blur_shutter = "CENTER", 2.0
-        self.blender.frame_set(1)
-
-    def _aim(self, camera: Camera, optics: Optics) -> None:
+    def _aim(self, camera: Camera) -> None:
         """Blender's camera as ours, 36 units wide whatever the true sensor: Blender refuses less than 1 mm."""
         data, render = self.camera.data, self.blender.render
         (h, w), K = camera.hw, camera.K
@@ -151,10 +112,6 @@ class Studio:
         data.shift_x = (w / 2 - 0.5 - float(K[0, 2])) / w
         data.shift_y = (float(K[1, 2]) + 0.5 - h / 2) * aspect / w
         data.clip_start, data.clip_end = 1e-3, 1e5
-        data.dof.use_dof = optics.f_number is not None
-        if optics.f_number is not None and optics.focus is not None:
-            aperture = 1e3 * fx * optics.pixel_pitch / optics.f_number
-            data.dof.focus_distance, data.dof.aperture_fstop = optics.focus, data.lens / aperture
         self.camera.matrix_world = _blender_pose(camera).T.tolist()
 
     def _shoot(self) -> dict[str, Tensor]:
@@ -207,16 +164,6 @@ def _blender_pose(camera: Camera) -> Float[NDArray, "4 4"]:
 def _place(item: Any, motion: Motion, time: float) -> None:
     R, position, extent = motion.at(time)
     x, y, z, w = Rotation.from_matrix(R).as_quat()
-    old = np.array(item.rotation_quaternion)
-    sign = -1.0 if old @ [w, x, y, z] < 0 else 1.0
     item.location = position.tolist()
-    item.rotation_quaternion = [sign * w, sign * x, sign * y, sign * z]
+    item.rotation_quaternion = [w, x, y, z]
     item.scale = (extent / np.asarray(motion.keys[0].extent)).tolist()
-
-
-def _key(item: Any, motion: Motion, time: float, shutter: float) -> None:
-    for frame in _EXPOSURE:
-        _place(item, motion, time + (frame - 1) * shutter / 2)
-        for channel in ("location", "rotation_quaternion", "scale"):
-            item.keyframe_insert(channel, frame=frame)
-    compat.make_linear(item)

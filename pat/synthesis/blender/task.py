@@ -2,37 +2,33 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import shutil
 import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing, contextmanager
 from importlib.metadata import version
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 from uuid import uuid4
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from arraygeom.camera import Camera
 from arraygeom.rig import Rig
 
 from ...support.schema import to_document
 from ..check import check_views
-from ..flow import flow
 from ..rendered import RENDER_FILE, Rendered, RenderedFrame, frame_file, save_frame
 from ..scene import Scene
 from ..shapes import inside
 from . import compat
 from .lens import Lens, lens_for
-from .probe import refuse_eevee
-from .settings import Optics, RenderSettings
+from .settings import RenderSettings
 from .studio import NOTHING, Studio
 
 _RATE = 30.0
@@ -41,21 +37,27 @@ _SCRATCH = "pat-render-"
 
 
 class Shot(NamedTuple):
-    """One frame to render: camera, number, time and interval to the next, seconds."""
+    """One frame to render: camera, number, and time in seconds."""
 
     camera: str
     number: int
     time: float
-    step: float
+
+
+def render(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Rendered:
+    """`render_here` in a process of its own, so that this one does not import bpy."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as process:
+        return process.submit(render_here, scene, rig.to("cpu"), out, settings=settings).result()
 
 
 def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Rendered:
-    """Like `pat.synthesis.blender.render`, in this process, which imports bpy. Raises ValueError."""
+    """Render a scene into the folder `out`, atomically, in this process, which imports bpy.
+
+    Raises ValueError for what cannot be rendered (one line: skew, a camera inside an object, a missing library).
+    """
     out = Path(out)
     if out.exists():
         raise ValueError(f"{out} exists: give a new folder, or remove it first")
-    if settings.engine == "eevee":
-        refuse_eevee()
     rig, started = fitted(rig, settings), time.monotonic()
     lenses = {name: lens_for(camera, name) for name, camera in rig.cameras.items()}
     planned = shots(rig, settings)
@@ -64,7 +66,7 @@ def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) 
         files: dict[str, list[dict[str, Any]]] = {name: [] for name in rig.names}
         first: dict[str, RenderedFrame] = {}
         for shot in planned:
-            frame = take(studio, rig[shot.camera], lenses[shot.camera], shot)
+            frame = take(studio, lenses[shot.camera], shot)
             file = frame_file(rig, shot.camera, shot.number)
             save_frame(folder / file, frame)
             files[shot.camera].append({"file": file, "time": shot.time})
@@ -83,9 +85,7 @@ def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) 
 
 
 def fitted(rig: Rig, settings: RenderSettings) -> Rig:
-    """The rig at the size that is rendered. Raises ValueError for optics of cameras it does not have."""
-    for name in settings.optics:
-        rig.require(name)
+    """The rig at the size that is rendered."""
     if settings.width is None:
         return rig
     scale = settings.width / max(camera.hw[1] for camera in rig.cameras.values())
@@ -101,7 +101,7 @@ def shots(rig: Rig, settings: RenderSettings) -> list[Shot]:
     for name, camera in rig.cameras.items():
         rate = camera.sensor.frame_rate or _RATE
         count = max(1, int(np.ceil(settings.duration * rate - 1e-9)))
-        planned += [Shot(name, k, camera.sensor.time_offset + k / rate, 1 / rate) for k in range(count)]
+        planned += [Shot(name, k, camera.sensor.time_offset + k / rate) for k in range(count)]
     return planned
 
 
@@ -116,62 +116,23 @@ def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
                 )
 
 
-def take(studio: Studio, camera: Camera, lens: Lens, shot: Shot) -> RenderedFrame:
-    """One frame with the passes that the settings ask for. Raises ValueError if the camera sees nothing."""
-    settings = studio.settings
-    optics = settings.optics.get(shot.camera, Optics())
-    colours = studio.colours(lens.pinhole, shot.time, optics, "rgb")
-    exact = colours if _is_exact(settings, optics) else studio.geometry(lens.pinhole, shot.time)
-    index = exact[compat.index_name(exact)].round().int()
-    depth = torch.where(exact["Depth.Z"] < NOTHING, exact["Depth.Z"], torch.inf)
+def take(studio: Studio, lens: Lens, shot: Shot) -> RenderedFrame:
+    """One frame. Raises ValueError if the camera sees nothing."""
+    found = studio.channels(lens.pinhole, shot.time, "rgb")
+    index = found[compat.index_name(found)].round().int()
+    depth = torch.where(found["Depth.Z"] < NOTHING, found["Depth.Z"], torch.inf)
     if not (index > 0).any():
         raise ValueError(f"camera '{shot.camera}' sees nothing of the scene at {shot.time:g} s: rotate it or move it")
-    frame = RenderedFrame(
+    nir = None
+    if studio.settings.infrared:
+        nir = lens.resampled(studio.channels(lens.pinhole, shot.time, "nir")["Combined.R"][None])
+    return RenderedFrame(
         time=shot.time,
-        rgb=lens.resampled(_stack(colours, "Combined", "RGB")),
+        rgb=lens.resampled(torch.stack([found[f"Combined.{letter}"] for letter in "RGB"])),
         depth=lens.depth(depth, index),
         index=lens.nearest(index[None].float())[0].int(),
+        nir=nir,
     )
-    return dataclasses.replace(frame, **_further(studio, camera, lens, shot, optics, frame, colours, exact))
-
-
-def _further(
-    studio: Studio,
-    camera: Camera,
-    lens: Lens,
-    shot: Shot,
-    optics: Optics,
-    frame: RenderedFrame,
-    colours: dict[str, Tensor],
-    exact: dict[str, Tensor],
-) -> dict[str, Any]:
-    """The passes beyond colour, depth and index."""
-    wanted, found = studio.settings.passes, {}
-    if "normals" in wanted:
-        found["normals"] = _normals(lens.nearest(_stack(exact, "Normal", "XYZ")), camera)
-    if "flow" in wanted:
-        found["flow"] = flow(studio.scene, camera, frame, shot.step)
-    if "alpha" in wanted:
-        found["alpha"] = lens.resampled(colours["Combined.A"][None]).clamp(0, 1)
-    if "nir" in wanted:
-        infrared = studio.colours(lens.pinhole, shot.time, optics, "nir")
-        found["nir"] = lens.resampled(infrared["Combined.R"][None])
-    return found
-
-
-def _is_exact(settings: RenderSettings, optics: Optics) -> bool:
-    """Whether an image's own depth and normals are exact: no blur, no normals asked for, and rendered by Cycles."""
-    blurred = optics.f_number is not None or optics.shutter is not None
-    return not blurred and settings.engine == "cycles" and "normals" not in settings.passes
-
-
-def _normals(world: Float[Tensor, "3 h w"], camera: Camera) -> Float[Tensor, "3 h w"]:
-    local = torch.einsum("ij,jhw->ihw", camera.R.to(world), world)
-    return local / local.norm(dim=0, keepdim=True).clamp(min=1e-6)
-
-
-def _stack(channels: dict[str, Tensor], name: str, letters: str) -> Tensor:
-    return torch.stack([channels[f"{name}.{letter}"] for letter in letters])
 
 
 @contextmanager

@@ -236,22 +236,6 @@ def test_what_a_killed_process_left_is_swept_away_and_nothing_else(tmp_path):
     assert sorted(os.listdir(tmp_path)) == [".hidden-file.png", "a-b.png"]
 
 
-@pytest.mark.parametrize("suffix", ["png", "exr"])
-def test_coverage_is_written_beside_the_colours(tmp_path, suffix):
-    if suffix == "exr":
-        OpenEXR = pytest.importorskip("OpenEXR")
-    rgb, coverage = torch.tensor([0.2, 0.4, 0.6])[:, None, None].expand(3, 4, 5), torch.full((1, 4, 5), 0.8)
-    path = tmp_path / f"a.{suffix}"
-    write_image(path, rgb, bits=8 if suffix == "png" else 32, coverage=coverage)
-    if suffix == "png":
-        assert cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[0, 0].tolist() == [153, 102, 51, 204]
-    else:
-        channels = OpenEXR.File(str(path), separate_channels=True).channels()
-        assert [round(float(channels[c].pixels[0, 0]), 4) for c in "RGBA"] == [0.2, 0.4, 0.6, 0.8]
-    with pytest.raises(ValueError, match="only PNG and EXR hold coverage"):
-        write_image(tmp_path / "a.jpg", rgb, coverage=coverage)
-
-
 def with_orientation(path, image: np.ndarray, orientation: int) -> None:
     """Write an image with an orientation tag by Pillow or tifffile."""
     if path.suffix == ".tif":

@@ -1,13 +1,12 @@
 """Small scenes and rigs that several test files use."""
 
-import numpy as np
 import torch
 
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.distortion import BROWN_CONRADY, Distortion
 from arraygeom.pose import Pose, rotation_from_vector
 from arraygeom.rig import Rig
-from pat.synthesis.scene import BoardObject, Key, Light, Material, Motion, Object, Paint, Relief, Scene, Texture, Vec3
+from pat.synthesis.scene import Key, Light, Material, Motion, Object, Paint, Relief, Scene, Texture, Vec3
 
 LENS = Distortion(BROWN_CONRADY, torch.tensor([-0.3, 0.08, 0.001, -0.002], dtype=torch.float64))
 
@@ -63,10 +62,3 @@ def room_scene() -> Scene:
         Light(kind="point", power=300.0, position=(-2.0, -1.5, 0.5)),
     )
     return Scene(objects=objects, lights=lights, depth=(2.0, 12.0))
-
-
-def inner_corners(board: BoardObject) -> np.ndarray:
-    """The corners between squares (n, 3) in the board's frame, metres, row by row (as OpenCV numbers ChArUco's)."""
-    columns, rows = board.squares
-    y, x = np.mgrid[1:rows, 1:columns] * board.square
-    return np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)

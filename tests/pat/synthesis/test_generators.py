@@ -3,17 +3,13 @@ import pytest
 import torch
 
 from arraygeom.camera import Camera, View, intrinsics
-from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 from pat.media.images import write_image
-from pat.synthesis.boards import PIXELS, draw_board, opencv_board
 from pat.synthesis.furnish import Setting
-from pat.synthesis.generators import GENERATORS, abstract, board, generator_named, photographs
-from pat.synthesis.scene import BoardObject, Key, Motion, Object, Scene
+from pat.synthesis.generators import abstract, generator_named, photographs
+from pat.synthesis.scene import Key, Motion, Object, Scene
 from pat.synthesis.shapes import inside, mesh
-from tests.pat.synthesis.scenes import inner_corners, posed, unlike_cameras
-
-BOARD = BoardObject(squares=(7, 5), square=0.05, marker=0.04, dictionary="DICT_4X4_50")
+from tests.pat.synthesis.scenes import posed, unlike_cameras
 
 
 def depths(scene: Scene, camera: Camera) -> torch.Tensor:
@@ -81,11 +77,6 @@ def test_what_cannot_be_generated_is_said(tmp_path):
         photographs(0, unlike_cameras(), tmp_path)
     with pytest.raises(ValueError, match="no calibrated camera"):
         abstract(0, Rig({"a": View(hw=(4, 4))}))
-    with pytest.raises(ValueError, match="at least one pose"):
-        board([], BOARD)
-    with pytest.raises(ValueError, match="unknown marker dictionary 'DICT_9'"):
-        draw_board(BoardObject(dictionary="DICT_9"))
-    assert set(GENERATORS) == {"abstract", "photographs", "board"}
     with pytest.raises(ValueError, match="no generator is called 'still-life': use abstract, photographs or MODULE:F"):
         generator_named("still-life")
     with pytest.raises(ValueError, match="the generator 'nowhere:scene' cannot be imported"):
@@ -96,28 +87,6 @@ def test_a_generator_of_ones_own_is_found_from_here(tmp_path, monkeypatch):
     (tmp_path / "own_scenes.py").write_text("def one(seed, rig, *, moving=0.0):\n    return seed + 1\n")
     monkeypatch.chdir(tmp_path)
     assert generator_named("own_scenes:one")(4, None) == 5
-
-
-def test_the_drawn_board_is_the_one_opencv_knows():
-    sheet = draw_board(BOARD)
-    margin = round(BOARD.margin / BOARD.square * PIXELS)
-    assert sheet.shape == (5 * PIXELS + 2 * margin, 7 * PIXELS + 2 * margin)
-    np.testing.assert_allclose(opencv_board(BOARD).getChessboardCorners(), inner_corners(BOARD), atol=1e-7)
-    inner = sheet[margin:-margin, margin:-margin]
-    for x, y, _ in (inner_corners(BOARD) / BOARD.square * PIXELS).round().astype(int):
-        a, b, c, d = (int(inner[y + j, x + i]) for i, j in ((-2, -2), (1, -2), (-2, 1), (1, 1)))
-        assert a == d != b == c
-
-
-def test_a_board_is_where_its_poses_say():
-    shifts = torch.rand(5, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    poses = [Pose(posed((10 * k, -20, 5)).R, shift) for k, shift in enumerate(shifts)]
-    sheet = board(poses, BOARD).objects[0]
-    for k, pose in enumerate(poses):
-        place = sheet.motion.at(float(k))
-        local = torch.tensor([-BOARD.margin, -BOARD.margin, 0.0], dtype=torch.float64)
-        corner = place.R @ (np.array([-0.5, -0.5, 0]) * place.extent) + place.position
-        np.testing.assert_allclose(pose.apply(local[None])[0], corner, atol=1e-12)
 
 
 def test_a_setting_measures_pixels_in_the_finest_camera():

@@ -15,14 +15,14 @@ from arraygeom.pixels import pixel_grid
 from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 from arraygeom.sensor import Sensor
-from experiments.scenes.image_files import export, export_video
-from pat.media.images import read_image
-from pat.synthesis.blender import Optics, RenderSettings
-from pat.synthesis.generators import abstract, board, photographs
+from pat.media.colour import luminance, srgb_image, to_bytes
+from pat.synthesis.blender import RenderSettings
+from pat.synthesis.generators import abstract, photographs
 from pat.synthesis.rendered import is_rendered
-from pat.synthesis.scene import BoardObject, Key, Light, Material, Motion, Object, Paint, Scene, Texture
+from pat.synthesis.scene import Key, Light, Material, Motion, Object, Paint, Scene, Texture
 from pat.synthesis.shapes import inside
-from tests.pat.synthesis.scenes import inner_corners, posed, room_scene, unlike_cameras
+from tests.pat.synthesis.boards import Sheet, board_scene
+from tests.pat.synthesis.scenes import posed, room_scene, unlike_cameras
 
 QUICK = RenderSettings(samples=1, threads=1)
 CLEAN = RenderSettings(samples=64, threads=1, denoise="none", fast_light=False, bounces=0)
@@ -52,8 +52,8 @@ def single(width: int = 64, focal: float = 100.0, **sensor: float) -> Rig:
 def test_a_tiny_scene_is_true_in_unlike_cameras(worker, tmp_path):
     assert "bpy" not in sys.modules
     rig, scene = unlike_cameras(48), room_scene()
-    settings = RenderSettings(samples=2, threads=1, passes=("normals", "nir"))
-    done = worker.render(scene, rig, tmp_path / "scene", settings=settings, timeout=300)
+    settings = RenderSettings(samples=2, threads=1, infrared=True)
+    done = worker.render(scene, rig, tmp_path / "scene", settings=settings)
     assert done.accepted, done.about["check"]["reasons"]
     assert is_rendered(done.folder)
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
@@ -67,7 +67,6 @@ def test_a_tiny_scene_is_true_in_unlike_cameras(worker, tmp_path):
         on_walls(scene, camera, frame)
         if camera.distortion is None:
             on_sphere(scene, camera, frame)
-        assert (frame.normals.norm(dim=0) - 1).abs().max() < 2e-3
         grey = frame.rgb.mean(0)
         assert torch.corrcoef(torch.stack([grey.flatten(), frame.nir[0].flatten()]))[0, 1] < 0.98
     assert "bpy" not in sys.modules
@@ -112,9 +111,6 @@ def on_sphere(scene: Scene, camera: Camera, frame) -> None:
     radius = np.linalg.norm(X, axis=1)
     assert len(X) > 15
     assert (np.abs(np.quantile(radius, [0.02, 0.98]) - 0.4985) < 0.0025).all()
-    outwards = torch.from_numpy(X / radius[:, None]) @ camera.R.T
-    normals = frame.normals[:, frame.index == 1].mT.double()
-    assert (outwards * normals).sum(1).quantile(0.05) > 0.97
 
 
 def fiducials(camera: Camera, count: int = 12) -> list[Object]:
@@ -168,113 +164,38 @@ def test_fiducials_are_where_arraygeom_projects_them(worker, tmp_path, name):
     assert errors.norm(dim=1).mean() < 0.02
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("depth", "f_number"), [(2.0, 2.0), (6.0, 4.0)])
-def test_the_circle_of_defocus_is_that_of_theory(worker, tmp_path, depth, f_number):
-    """A disc of diameter D has variance D^2 / 16; the sharp image's own is taken off."""
-    rig, pitch, focus = single(64, 400.0), 7.5e-4, 3.0
-    dot = Scene(
-        objects=(glowing("dot", Motion((Key(position=(0, 0, depth), extent=(depth / 400,) * 3),)), brightness=50.0),)
-    )
-    sharp = worker.render(dot, rig, tmp_path / "sharp", settings=CLEAN).frame("a")
-    optics = {"a": Optics(f_number=f_number, focus=focus, pixel_pitch=pitch)}
-    blurred = worker.render(
-        dot, rig, tmp_path / "blurred", settings=replaced(CLEAN, samples=1024, optics=optics)
-    ).frame("a")
-    wanted = 400 * (400 * pitch / f_number) * abs(1 / focus - 1 / depth)
-    variance = spread(blurred.rgb.mean(0))[1] - spread(sharp.rgb.mean(0))[1]
-    found = 4 * variance.mean().sqrt()
-    print(f"defocus circle: {found:.3f} px, theory {wanted:.3f} px")
-    assert found == pytest.approx(wanted, rel=0.05)
-    torch.testing.assert_close(blurred.depth, sharp.depth)
-
-
-@pytest.mark.slow
-def test_the_length_of_motion_blur_is_that_of_theory(worker, tmp_path):
-    """Even motion over L pixels has variance L^2 / 12, centred on where the object is at the frame's time."""
-    rig, speed, shutter = single(96, 200.0, time_offset=0.4), 0.6, 0.25
-    path = Motion(
-        (Key(position=(-0.24, 0, 3.0), extent=(0.02,) * 3), Key(position=(0.36, 0, 3.0), extent=(0.02,) * 3, time=1.0))
-    )
-    scene = Scene(objects=(glowing("dot", path, brightness=20.0),))
-    sharp = worker.render(scene, rig, tmp_path / "sharp", settings=CLEAN).frame("a")
-    moving = replaced(CLEAN, samples=1024, optics={"a": Optics(shutter=shutter)})
-    blurred = worker.render(scene, rig, tmp_path / "blurred", settings=moving).frame("a")
-    (where, before), (middle, after) = spread(sharp.rgb.mean(0)), spread(blurred.rgb.mean(0))
-    length, wanted = (12 * (after - before)[0]).sqrt(), 200 * speed * shutter / 3
-    print(f"motion blur: {length:.3f} px, theory {wanted:.3f} px")
-    assert length == pytest.approx(wanted, rel=0.05)
-    torch.testing.assert_close(where, torch.tensor([47.5, 35.5]).double(), atol=0.05, rtol=0)
-    torch.testing.assert_close(middle, where, atol=0.1, rtol=0)
-    torch.testing.assert_close(blurred.depth, sharp.depth)
-
-
 def replaced(settings: RenderSettings, **changes: object) -> RenderSettings:
     return RenderSettings(**{**vars(settings), **changes})
 
 
 @pytest.mark.slow
-def test_an_animation_at_each_cameras_own_times_with_flow_and_video(worker, tmp_path):
+def test_an_animation_at_each_cameras_own_times(worker, tmp_path):
     rig = unlike_cameras(64)
     rates = {"oblong": Sensor(frame_rate=10.0), "distorted": Sensor(frame_rate=5.0, time_offset=0.05)}
     rig = Rig({n: rig[n].replace(sensor=s) for n, s in rates.items()}, depth=rig.depth)
     scene = abstract(11, rig, moving=3.0)
-    done = worker.render(scene, rig, tmp_path / "x", settings=replaced(QUICK, passes=("flow",), duration=0.6))
+    done = worker.render(scene, rig, tmp_path / "x", settings=replaced(QUICK, duration=0.6))
     assert [done.frames(n) for n in rig.names] == [6, 3]
     assert done.frame("distorted", 2).time == pytest.approx(0.45)
-    for name, camera in rig.cameras.items():
-        follows_flow(camera, done.frame(name, 0), done.frame(name, 1))
-    export_video(done, "oblong", tmp_path / "x.mp4")
-    reader = cv2.VideoCapture(str(tmp_path / "x.mp4"))
-    assert (reader.get(cv2.CAP_PROP_FRAME_COUNT), reader.get(cv2.CAP_PROP_FPS)) == (6, 10)
-
-
-def follows_flow(camera: Camera, first, second) -> None:
-    """Where the flow leads, the next frame has the same object (or one that has come in front of it)."""
-    target = (pixel_grid(camera.hw) + first.flow.movedim(0, -1)).round().long()
-    moving = first.flow.norm(dim=0) > 0.5
-    inside_image = camera.contains(target.float()) & moving
-    x, y = target[inside_image].unbind(-1)
-    same = second.index[y, x] == first.index[inside_image]
-    nearer = second.depth[y, x] < first.depth[inside_image]
-    assert moving.float().mean() > 0.05
-    assert same.float().mean() > 0.75
-    assert (same | nearer).float().mean() > 0.9
-
-
-@pytest.mark.slow
-def test_images_in_every_format(worker, tmp_path):
-    rig = Rig({"oblong": unlike_cameras(48)["oblong"]})
-    scene = Scene(**{**vars(room_scene()), "objects": room_scene().objects[:3]})
-    done = worker.render(scene, rig, tmp_path / "x", settings=replaced(QUICK, passes=("alpha", "nir")))
-    frame = done.frame("oblong")
-    inner = (frame.index > 0).float()
-    assert (frame.alpha[0] - inner).abs().mean() < 0.05
-    for kind in ("png8", "png16", "jpeg", "exr"):
-        for channels in ("bw", "rgb", "rgba", "nir"):
-            if (kind, channels) == ("jpeg", "rgba"):
-                with pytest.raises(ValueError, match="only PNG and EXR"):
-                    export(done, tmp_path / kind / channels, kind=kind, channels=channels)
-            else:
-                (path,) = export(done, tmp_path / kind / channels, kind=kind, channels=channels)
-                assert path.stat().st_size > 300
-    assert read_image(tmp_path / "png16/bw/oblong-0000.png").shape == (1, 36, 48)
-    assert cv2.imread(str(tmp_path / "png8/rgba/oblong-0000.png"), cv2.IMREAD_UNCHANGED).shape == (36, 48, 4)
+    first, last = done.frame("oblong", 0), done.frame("oblong", 5)
+    assert 0.01 < (first.index != last.index).float().mean() < 0.6
 
 
 @pytest.mark.slow
 def test_a_rendered_board_has_its_corners_where_it_should(worker, tmp_path):
-    """OpenCV refines the corners of a chessboard to where arraygeom projects them."""
-    spec = BoardObject(kind="chessboard", squares=(7, 5), square=0.3, margin=0.1)
+    """OpenCV refines the corners of a board to where arraygeom projects them."""
+    sheet = Sheet(squares=(7, 5), square=0.3, marker=0.2, margin=0.1)
     pose = Pose(posed((20, -15, 5)).R, torch.tensor([-1.0, -0.6, 3.5], dtype=torch.float64))
     rig = Rig({n: unlike_cameras(192)[n] for n in ("oblong", "distorted")})
-    done = worker.render(board([pose], spec), rig, tmp_path / "x", settings=replaced(CLEAN, samples=32))
-    for path, camera in zip(export(done, tmp_path / "images", channels="bw"), rig.cameras.values()):
-        projected = camera.project(pose.apply(torch.from_numpy(inner_corners(spec))))
+    scene = board_scene([pose], sheet, tmp_path / "board.png")
+    done = worker.render(scene, rig, tmp_path / "x", settings=replaced(CLEAN, samples=32))
+    for name, camera in rig.cameras.items():
+        projected = camera.project(pose.apply(torch.from_numpy(sheet.inner_corners)))
         assert camera.contains(projected.x).all()
         x = projected.x.numpy().astype(np.float32)[:, None]
         stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
-        found = cv2.cornerSubPix(cv2.imread(str(path), 0), x.copy(), (4, 4), (-1, -1), stop)
+        grey = to_bytes(srgb_image(luminance(done.frame(name).rgb)))[0]
+        found = cv2.cornerSubPix(grey, x.copy(), (4, 4), (-1, -1), stop)
         error = np.linalg.norm((found - x)[:, 0], axis=1)
         print(f"board corners: mean {error.mean():.3f} px, bias {(found - x)[:, 0].mean(0)}")
         assert error.mean() < 0.1
@@ -307,7 +228,7 @@ def test_leaves_and_skin_are_unlike_their_luminance_in_near_infrared(worker, tmp
         for name, paint, x in (("leaf", leaf, -1.0), ("skin", skin, 0.0), ("soot", soot, 1.0))
     ]
     scene = Scene(objects=tuple(strips), lights=(Light(kind="sun", power=float(np.pi), direction=(0, 0, 1)),))
-    done = worker.render(scene, single(60, 50.0), tmp_path / "x", settings=replaced(CLEAN, samples=4, passes=("nir",)))
+    done = worker.render(scene, single(60, 50.0), tmp_path / "x", settings=replaced(CLEAN, samples=4, infrared=True))
     frame = done.frame("a")
     for index, paint in enumerate((leaf, skin, soot), 1):
         here = (frame.index == index) & (pixel_grid((45, 60))[..., 1] - 22 < 8)
