@@ -29,7 +29,7 @@ from pat.evaluation.baseline import classical_baseline
 from pat.evaluation.metrics import score
 from pat.evaluation.tables import markdown_table
 from pat.fusion.frames import ImageFiles
-from pat.fusion.fuse import fuse
+from pat.fusion.fuse import FuseSettings, fuse
 from pat.fusion.results import Frame, save_frame, view_of
 from pat.fusion.sequence import SequenceFusion, flicker
 from pat.fusion.views import ViewFiles
@@ -291,7 +291,9 @@ def fused_apart(job: SystemRun, files: Mapping[str, Path]) -> tuple[Frame, list[
 def _sequence(job: SystemRun) -> tuple[list[str], Panels]:
     alpha, rig, out, ground_truth = job.system.alpha, job.rig, job.out, job.recording.ground_truth
     frames = {name: ImageFiles(paths, rig, name, alpha=alpha) for name, paths in job.files.items()}
-    fusion = SequenceFusion(load_weights(job.weights), rig, frames, alpha, options={"max_memory": job.max_memory})
+    fusion = SequenceFusion(
+        load_weights(job.weights), rig, frames, alpha, settings=FuseSettings(max_memory=job.max_memory)
+    )
     keys = fusion.timeline.key_frames()
     colours = {key.alpha: fusion.colour(key) for key in keys}
     fused = [fusion.frame(i, keys, lambda key: colours[key.alpha]) for i in range(len(ground_truth))]

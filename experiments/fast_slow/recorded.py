@@ -12,6 +12,7 @@ from arraygeom.atomic import write_text
 from experiments.showcase import FAST, SCENE, SLOW, FastSlowArray, bright_gain, fast_and_slow_array
 from experiments.system import SystemResult
 from pat.evaluation.tables import markdown_table
+from pat.fusion.fuse import FuseSettings
 from pat.fusion.results import Frame, save_frame
 from pat.fusion.sequence import SequenceFusion, flicker
 from pat.media.colour import luminance_of, srgb_image
@@ -35,7 +36,8 @@ def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], 
     array = fast_and_slow_array(folder)
     rig, frames = clocked(array.rig), recorded_frames(folder)
     field = HomographyDisplacement(array.displacement)
-    job = SequenceFusion(load_weights(weights), rig, frames, FAST, field=field, match_levels=True)
+    settings = FuseSettings(field=field, match_levels=True)
+    job = SequenceFusion(load_weights(weights), rig, frames, FAST, settings=settings)
     keys = job.timeline.key_frames()
     say(f"fusing key frames {', '.join(str(FAST_FRAMES[k.alpha]) for k in keys)}, then all")
     colours = {key.alpha: job.colour(key) for key in keys}

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from arraygeom import Rig
 
+    from ..fusion.fuse import FuseSettings
     from ..fusion.healing import Healed
     from ..fusion.report import Facts
     from ..fusion.results import Frame
@@ -307,14 +308,10 @@ class Fuse(Known):
             sweep(self.out)
             if not self.resume:
                 shutil.rmtree(store, ignore_errors=True)
-            further = {**self._options(), "explain": self._note, "store": store, "device": self.device}
-            own = further["field"]
-            known, further["field"] = self.with_known(rig, alpha, files, own)
-            frame = fuse_with_progress(rig=known, images=images, alpha=alpha, **further)
+            frame = self._fused(rig, images, alpha, files, store)
             if (healed := healing()) is not None and healed.text not in self._notes:
                 rig = self._healed(rig, healed)
-                known, further["field"] = self.with_known(rig, alpha, files, own)
-                frame = fuse_with_progress(rig=known, images=images, alpha=alpha, **further)
+                frame = self._fused(rig, images, alpha, files, store)
             frame, gain = self._exposed(frame)
             if found is None and not frame.depth.isfinite().any():
                 self._note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
@@ -340,6 +337,24 @@ class Fuse(Known):
         if self.report:
             say(f"to see the result, open {self.out / 'index.html'} in a browser")
 
+    def _fused(
+        self, rig: Rig, images: Mapping[str, Tensor], alpha: str, files: Mapping[str, str | Path], store: Path
+    ) -> Frame:
+        """One frame, with a rig and what else is known of the scene."""
+        settings = self._settings()
+        known, field = self.with_known(rig, alpha, files, options.field_named(self.field))
+        return fuse_with_progress(
+            self.weights or "mono-colour",
+            known,
+            images,
+            alpha=alpha,
+            device=self.device,
+            precision=self.precision,
+            settings=replace(settings, field=field),
+            explain=self._note,
+            store=store,
+        )
+
     def _healed(self, rig: Rig, healed: Healed | None) -> Rig:
         """The rig, or the one that its images healed, which is written beside the results."""
         from ..fusion.results import HEALED_RIG
@@ -356,16 +371,20 @@ class Fuse(Known):
             self._note(f"the healed rig: {path}")
         return healed.rig
 
-    def _options(self) -> dict[str, Any]:
+    def _settings(self) -> FuseSettings:
         """What a frame and many frames have in common."""
-        same = ("align", "keep_alpha", "luminance", "max_memory", "precision")
-        return {name: getattr(self, name) for name in same} | {
-            "weights": self.weights or "mono-colour",
-            "field": options.field_named(self.field),
-            "match_levels": self.normalise_radiometry,
-            "response": options.response_of(self.response),
-            "noise": options.noise_of(self.noise, by_default=not self.sequence and self.luminance == "alpha"),
-        }
+        from ..fusion.fuse import FuseSettings
+
+        return FuseSettings(
+            field=options.field_named(self.field),
+            max_memory=self.max_memory,
+            match_levels=self.normalise_radiometry,
+            response=options.response_of(self.response),
+            align=self.align,
+            noise=options.noise_of(self.noise, by_default=not self.sequence and self.luminance == "alpha"),
+            keep_alpha=self.keep_alpha,
+            luminance=self.luminance,
+        )
 
     def _facts(self, rig: Rig, found: tuple[str, ...] | None, seconds: float) -> Facts:
         """What the page says."""
@@ -424,7 +443,9 @@ class Fuse(Known):
             kind=self.kind,
             alone=not self.propagate,
             strict=self.strict,
-            **self._options(),
+            weights=self.weights or "mono-colour",
+            precision=self.precision,
+            settings=self._settings(),
         )
         several = self.workers > 1 or self.scheduler is not None
         report = batch.run(

@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import yaml
 from rich.console import Console
@@ -43,9 +43,8 @@ from ..support.memory import limited, parse_bytes
 from ..support.tensor_files import write_tensors
 from .checks import confidence_checked
 from .frames import ImageFiles
-from .fuse import fuse
+from .fuse import FuseSettings, fuse
 from .low_light import Noise
-from .luminance import Luminance
 from .results import Frame, ImageFormat, band_names, save_frame, view_of
 from .sequence import KeyColour, SequenceFusion
 from .timeline import KeyFrame
@@ -62,7 +61,7 @@ FIELD_CLASSES = {kind.__name__: kind for kind in (*FIELDS.values(), ThroughLense
 class Batch:
     """What is to be fused and how: `files` by camera, the frames in order; `out`, the folder of the results.
 
-    Options are as of `fuse` and `save_frame`. A `sequence` is fused as `fuse_sequence` does, else the first
+    Options are as of `save_frame`. A `sequence` is fused as `fuse_sequence` does, else the first
     frame with the first of every other camera, the second with the second and so on (`frame_matching` finds
     which these are).
     """
@@ -74,14 +73,7 @@ class Batch:
     weights: str = "mono-colour"
     sequence: bool = False
     speed: float | None = None
-    field: ReceptiveField | None = None
-    match_levels: bool = False
-    response: Literal["fit", "rec601"] | tuple[float, float, float] = "fit"
-    align: bool = True
-    noise: Noise | None = None
-    keep_alpha: bool = False
-    luminance: Luminance = "alpha"
-    max_memory: str | None = None
+    settings: FuseSettings = FuseSettings()  # noqa: RUF009
     bits: int = 8
     kind: ImageFormat = "png"
     alone: bool = False
@@ -109,13 +101,14 @@ class Batch:
         return names if len(set(names)) == len(names) else [f"{i:06d}" for i in range(len(names))]
 
     @property
-    def settings(self) -> str:
+    def dependencies(self) -> str:
         """What the results depend on, as text."""
         digest = hashlib.sha256(find_weights(self.weights).read_bytes()).hexdigest()
         entries = json.loads(self.to_json())
         files = entries.pop("files")
-        for name in ("format", "out", "max_memory", "strict"):
+        for name in ("format", "out", "strict"):
             del entries[name]
+        del entries["settings"]["max_memory"]
         entries["weights"] = f"{self.weights} (SHA-256 {digest[:16]})"
         entries["frames"] = {name: len(paths) for name, paths in files.items()}
         entries["first"] = {name: paths[0] for name, paths in files.items()}
@@ -185,7 +178,7 @@ class Batch:
 
         Frames whose images are not those of before are removed.
         """
-        text, file = self.settings, self.out / SETTINGS
+        text, file = self.dependencies, self.out / SETTINGS
         if resume and file.is_file() and file.read_text(encoding="utf-8") != text:
             raise ValueError(
                 f"{file}: the frames there were made with other settings: give the same ones, or "
@@ -210,8 +203,11 @@ class Batch:
         entries["rig"] = rig_text(self.rig)
         entries["files"] = {name: [str(file) for file in files] for name, files in self.files.items()}
         entries["out"] = str(self.out)
-        entries["field"] = field_document(self.field)
-        entries["noise"] = noise_document(self.noise)
+        settings = {
+            entry.name: getattr(self.settings, entry.name) for entry in dataclasses.fields(FuseSettings)
+        }
+        settings |= {"field": field_document(settings["field"]), "noise": noise_document(settings["noise"])}
+        entries["settings"] = settings
         return json.dumps({"format": PLAN_FORMAT, **entries})
 
     @classmethod
@@ -226,12 +222,14 @@ class Batch:
                 name: [Path(file) for file in files] for name, files in entries["files"].items()
             }
             entries["out"] = Path(entries["out"])
-            entries["field"] = field_of(entries["field"])
-            if isinstance(entries["noise"], dict):
-                entries["noise"] = {name: NoiseLevel(**level) for name, level in entries["noise"].items()}
-            if not isinstance(entries["response"], str):
-                entries["response"] = tuple(entries["response"])
-            return cls(**entries)
+            settings = entries["settings"]
+            settings["field"] = field_of(settings["field"])
+            if isinstance(settings["noise"], dict):
+                settings["noise"] = {name: NoiseLevel(**level) for name, level in settings["noise"].items()}
+            for name in ("response", "depth"):
+                if isinstance(settings[name], list):
+                    settings[name] = tuple(settings[name])
+            return cls(**{**entries, "settings": FuseSettings(**settings)})
         except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
             raise ValueError(f"{source}: not a plan of this program ({error}): start the job again") from None
 
@@ -240,18 +238,7 @@ class Batch:
         """The sequence, with the images that its frames have in common."""
         frames = {n: ImageFiles(files, self.rig, n, alpha=self.alpha) for n, files in self.files.items()}
         rig, network = developed_rig(self.rig, self.files), _network(self.weights, self.precision)
-        return SequenceFusion(
-            network, rig, frames, self.alpha, self.speed, **self._of_both(), options=self._of_frames()
-        )
-
-    def _of_both(self) -> dict[str, Any]:
-        """Options of `fuse` that are those of `SequenceFusion`, too."""
-        names = ("field", "match_levels", "response", "align", "noise", "keep_alpha")
-        return {name: getattr(self, name) for name in names}
-
-    def _of_frames(self) -> dict[str, Any]:
-        """Options of `fuse` that are the same in every frame of a sequence."""
-        return {"max_memory": self.max_memory, "luminance": self.luminance}
+        return SequenceFusion(network, rig, frames, self.alpha, self.speed, self.settings)
 
     def _key_file(self, key: KeyFrame) -> Path:
         return self.out / KEYS / f"{key.alpha:08d}.safetensors"
@@ -274,7 +261,8 @@ class Batch:
 
     def fuse_one(self, i: int) -> None:
         """Write a frame."""
-        with limited(None if self.max_memory is None else parse_bytes(self.max_memory)):
+        limit = self.settings.max_memory
+        with limited(None if limit is None else parse_bytes(limit)):
             with confidence_checked(strict=self.strict):
                 frame = self._frame(i)
             view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
@@ -287,8 +275,7 @@ class Batch:
         if not self.sequence:
             images = ViewFiles(self.rig, {n: files[i] for n, files in self.files.items()}, alpha=self.alpha)
             network = _network(self.weights, self.precision)
-            options = self._of_both() | self._of_frames()
-            return fuse(network, images.developed, images, alpha=self.alpha, **options)
+            return fuse(network, images.developed, images, alpha=self.alpha, settings=self.settings)
         fusion = self.fusion
         return fusion.alone(i) if self.alone else fusion.frame(i, fusion.timeline.key_frames(), self._fetch)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from .checks import warn_of_confidence
 from .corrections import Corrections, corrections_for, expected_work
 from .depth import background_filled
 from .inputs import FrameInputs, check_bands, prepared
-from .low_light import Noise, denoised_views
+from .low_light import LowLight, Noise, denoised_views
 from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail, with_own_colours
 from .results import Frame
 from .steps import steps_for, undone
@@ -42,6 +42,42 @@ Progress = Callable[[Iterable[Tile], int], Iterable[Tile]]
 """Wraps the tiles (and their number) to show how far the work is, as `rich.progress.track` does."""
 
 
+@dataclass(frozen=True)
+class FuseSettings:
+    """How frames are fused: what one frame, many and a sequence have in common.
+
+    depth: (near, far) in metres, instead of the rig's.
+    field: the receptive field, or one for each of some betas, by name; by default `arraygeom`'s
+        `default_field`.
+    max_memory: bytes, or like "4GiB": what the process may take in all, libraries and images included, if
+        there is nothing else in it. Default: no limit.
+    match_levels: bring each beta to alpha's mean and standard deviation first, for cameras whose exposures or
+        filters differ and which are not radiometrically calibrated.
+    response: how alpha weighs red, green and blue of its one colour beta. "fit" fits it to matches, with a
+        gain and a gamma, and leaves it at Rec. 601 luma ("rec601") where that explains the images as well;
+        three numbers state it. The result has alpha as this combination of its colours.
+    align: find how far the betas lie across their search segments, and put that right; by default unless the
+        fusion is differentiable, where a rig that is put right has no gradient of being off.
+    noise: the noise level of each camera that has some, or "estimate": views are denoised before they are
+        matched, and jointly once they are fused. "auto", as without rig: so where an image shows noise
+        plainly ({} never).
+    keep_alpha: leave alpha's values as recorded, noise included; otherwise so if alpha has no noise to speak
+        of.
+    luminance: the image's: "alpha", which the network keeps exactly, that of "beta" in alpha's detail, where
+        alpha sees another part of the spectrum, or their "mix".
+    """
+
+    depth: tuple[float, float] | None = None
+    field: ReceptiveField | Mapping[str, ReceptiveField | None] | None = None
+    max_memory: float | str | None = None
+    match_levels: bool = False
+    response: Given = "fit"
+    align: bool | None = None
+    noise: Noise | None = None
+    keep_alpha: bool = False
+    luminance: Luminance = "alpha"
+
+
 @torch_in_one_thread()
 def fuse(
     network: FusionNetwork | ImageSources,
@@ -49,22 +85,15 @@ def fuse(
     images: Images | None = None,
     *,
     alpha: str | None = None,
-    depth: tuple[float, float] | None = None,
-    field: ReceptiveField | Mapping[str, ReceptiveField | None] | None = None,
-    max_memory: float | str | None = None,
-    match_levels: bool = False,
-    response: Given = "fit",
-    align: bool | None = None,
+    settings: FuseSettings = FuseSettings(),
     corrections: Corrections | None = None,
     explain: Callable[[str], None] | None = None,
-    noise: Noise | None = None,
-    keep_alpha: bool = False,
-    luminance: Luminance = "alpha",
     progress: Progress | None = None,
     announce: Callable[[Plan], None] | None = None,
     store: Path | None = None,
     differentiable: bool = False,
     matcher: Matcher = match,
+    **changes: Any,
 ) -> Frame:
     """Fuse one frame at the view of camera `alpha`: `fuse(network, rig, images, alpha=...)`, or
     `fuse(images)`.
@@ -84,27 +113,11 @@ def fuse(
         images: tensors by camera name, (C, H, W) in 0..1, each of the size that the rig states. A mapping
             that reads them when asked saves memory (`pat.fusion.views.ViewFiles`).
         alpha: the camera whose view is wanted; without a rig by default the largest grey image.
-        depth: (near, far) in metres, instead of the rig's.
-        field: the receptive field, or one for each of some betas, by name; by default `arraygeom`'s
-            `default_field`.
-        max_memory: bytes, or like "4GiB": what the process may take in all, libraries and images included, if
-            there is nothing else in it. Default: no limit.
-        match_levels: bring each beta to alpha's mean and standard deviation first, for cameras whose
-            exposures or filters differ and which are not radiometrically calibrated.
-        response: how alpha weighs red, green and blue of its one colour beta. "fit" fits it to matches, with
-            a gain and a gamma, and leaves it at Rec. 601 luma ("rec601") where that explains the images as
-            well; three numbers state it. The result has alpha as this combination of its colours.
-        align: find how far the betas lie across their search segments, and put that right; by default unless
-            `differentiable`, where a rig that is put right has no gradient of being off.
-        corrections: what is known of both from another frame of the same cameras (`corrections_of`), instead.
+        settings: what frames of the same cameras have in common; any of `FuseSettings` may be given as an
+            argument of its own, as `noise="estimate"`.
+        corrections: what is known of response and alignment from another frame of the same cameras
+            (`corrections_of`), instead.
         explain: called with a line for each thing that was found and put right.
-        noise: the noise level of each camera that has some, or "estimate": views are denoised before they are
-            matched, and jointly once they are fused. "auto", as without rig: so where an image shows noise
-            plainly ({} never).
-        keep_alpha: leave alpha's values as recorded, noise included; otherwise so if alpha has no noise to
-            speak of.
-        luminance: the image's: "alpha", which the network keeps exactly, that of "beta" in alpha's detail,
-            where alpha sees another part of the spectrum, or their "mix".
         progress: shows the tiles as they are done.
         store: a folder for finished tiles of a frame of several, so that one that was stopped goes on;
             tiles of other images, rigs or weights are not taken. Whoever gave it removes it afterwards.
@@ -124,19 +137,20 @@ def fuse(
         LowConfidenceWarning: the images hardly match: the rig is probably wrong. A filter makes it an error,
             as `warnings.simplefilter("error", LowConfidenceWarning)`.
     """
+    settings = replace(settings, **changes)
+    noise, luminance, response = settings.noise, settings.luminance, settings.response
     noise = "auto" if noise is None and rig is None and luminance == "alpha" else noise
     network, rig, images, alpha, grey_world = _with_rig(network, rig, images, alpha, explain)
-    align = not differentiable if align is None else align
-    if differentiable and not (max_memory is None and store is None):
+    align = not differentiable if settings.align is None else settings.align
+    if differentiable and not (settings.max_memory is None and store is None):
         raise ValueError("differentiable=True fuses the whole frame at once: leave out max_memory and store")
     check_luminance(network, luminance, noisy=noise is not None)
-    limit = None if max_memory is None else parse_bytes(max_memory)
-    views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
-    check_bands(network, views)
+    limit = None if settings.max_memory is None else parse_bytes(settings.max_memory)
+    views, low_light = _seen(network, rig, images, alpha, settings, noise)
     if noise == "auto" and low_light.noisy and explain:
         explain(low_light.described())
     betas, in_colour, noisy = views.betas, views.alpha_in_colour, bool(low_light.noisy)
-    steps = steps_for(network, normalise=match_levels or grey_world)
+    steps = steps_for(network, normalise=settings.match_levels or grey_world)
     inputs, undo = prepared(network, views, steps)
     held = _bytes_beside(inputs.inputs, [views.own, *(images.values() if isinstance(images, dict) else ())])
     del views  # whose images are there again, padded
@@ -167,7 +181,7 @@ def fuse(
         frame = _completed(done.frame, inputs, luminance)
         del inputs, right  # the segments of a large frame: what follows needs memory, too
         frame = low_light.corrected(
-            found.undone(frame), done.found, steps, found.response, keep_alpha=keep_alpha
+            found.undone(frame), done.found, steps, found.response, keep_alpha=settings.keep_alpha
         )
         LOG.info("back to the pixels of %s", alpha)
         frame = undone(frame, undo)
@@ -230,19 +244,25 @@ def corrections_of(
     images: Images,
     *,
     alpha: str,
-    depth: tuple[float, float] | None = None,
-    field: ReceptiveField | Mapping[str, ReceptiveField | None] | None = None,
-    match_levels: bool = False,
-    response: Given = "fit",
-    align: bool = True,
-    noise: Noise | None = None,
+    settings: FuseSettings = FuseSettings(),
+    **changes: Any,
 ) -> Corrections:
     """What `fuse` finds and puts right before it fuses; give it to `fuse` for other frames of the same
     cameras.
 
     Arguments and errors are as of `fuse`.
     """
-    views, _ = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
+    settings = replace(settings, **changes)
+    views, _ = _seen(network, rig, images, alpha, settings, settings.noise)
+    inputs, _ = prepared(network, views, steps_for(network, normalise=settings.match_levels))
+    return corrections_for(network, inputs, settings.response, align=settings.align is not False)
+
+
+def _seen(
+    network: FusionNetwork, rig: Rig, images: Images, alpha: str, settings: FuseSettings, noise: Noise | None
+) -> tuple[Views, LowLight]:
+    """The views to fuse, denoised, and what is known of their noise."""
+    views = Views.of(rig, images, alpha=alpha, depth=settings.depth, field=settings.field)
+    views, low_light = denoised_views(views, noise)
     check_bands(network, views)
-    inputs, _ = prepared(network, views, steps_for(network, normalise=match_levels))
-    return corrections_for(network, inputs, response, align=align)
+    return views, low_light

@@ -10,7 +10,6 @@ order, with the same result.
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,15 +25,15 @@ from arraygeom import Moved, ReceptiveField, Rig, Widened
 from arraygeom.fields.default import straight_field
 
 from ..matching.normalisation import mean_moments
-from ..matching.radiometry import Given, Response
+from ..matching.radiometry import Response
 from ..media.colour import to_luma_chroma
 from ..networks.protocol import FusionNetwork
 from ..sensors import NoiseLevel
 from ..support.settings import physics, size, tuned
 from .corrections import Corrections
 from .frames import CachedFrames, DenoisedFrames, Frames
-from .fuse import corrections_of, fuse
-from .low_light import Noise, noise_levels
+from .fuse import FuseSettings, corrections_of, fuse
+from .low_light import noise_levels
 from .optical_flow import flow_between, still, warped
 from .results import Frame
 from .timeline import KeyFrame, Timeline
@@ -78,7 +77,7 @@ class KeyColour(NamedTuple):
 class SequenceFusion:
     """A sequence to fuse: `colour` of its key frames, and any `frame`.
 
-    What it is made of is as `fuse_sequence` has it; `options` go to `fuse`.
+    What it is made of is as `fuse_sequence` has it.
     """
 
     network: FusionNetwork
@@ -86,13 +85,7 @@ class SequenceFusion:
     frames: Mapping[str, Frames]
     alpha: str
     speed: float | None = None
-    field: ReceptiveField | None = None
-    match_levels: bool = False
-    response: Given = "fit"
-    align: bool = True
-    noise: Noise | None = None
-    keep_alpha: bool = False
-    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    settings: FuseSettings = FuseSettings()  # noqa: RUF009
 
     def __post_init__(self) -> None:
         cached = {n: f if isinstance(f, CachedFrames) else CachedFrames(f) for n, f in self.frames.items()}
@@ -113,7 +106,7 @@ class SequenceFusion:
 
     def base(self, i: int) -> Float[Tensor, "1 h w"]:
         """What colours are added to: with `keep_alpha` alpha's frame as recorded."""
-        return self.recorded(i) if self.keep_alpha else self.grey(i)
+        return self.recorded(i) if self.settings.keep_alpha else self.grey(i)
 
     def alone(self, i: int) -> Frame:
         """The frame fused by itself with the betas nearest in time, motion or not: what warping is compared
@@ -171,7 +164,7 @@ class SequenceFusion:
 
     def _field(self, name: str, index: int, time: float) -> tuple[ReceptiveField, Tensor]:
         """The field of a beta that records at `time`, and the weight of the motion until then."""
-        field = self.field or straight_field(self.rig.pair(self.alpha, name))
+        field = self._common_field or straight_field(self.rig.pair(self.alpha, name))
         weight = torch.ones(self.rig[self.alpha].hw)
         steps = (time - self._time(index)) * self.timeline.rate(self.alpha)
         count = len(self.frames[self.alpha])
@@ -195,22 +188,28 @@ class SequenceFusion:
         """Alpha's frame with those of betas. Levels are matched over several frames, or in this one if it is
         alone or its noise, which is of images as recorded, is to be removed."""
         images = {name: self.frames[name][j] for name, j in betas.items()}
-        alone = alone or self.noise is not None
-        if self.match_levels and not alone:
+        alone = alone or self.settings.noise is not None
+        match_levels = self.settings.match_levels
+        if match_levels and not alone:
             images = {name: self._normalised(name, image, i) for name, image in images.items()}
-        common = dict.fromkeys(betas, self.field) if self.field else {}
+        common = dict.fromkeys(betas, self._common_field) if self._common_field else {}
         return fuse(
             self.network,
             self.rig,
             {self.alpha: self.recorded(i), **images},
             alpha=self.alpha,
-            field={**common, **fields},
-            match_levels=self.match_levels and alone,
+            settings=self.settings,
             corrections=self._corrections,
+            field={**common, **fields},
+            match_levels=match_levels and alone,
             noise=self._noise,
-            keep_alpha=self.keep_alpha,
-            **self.options,
         )
+
+    @property
+    def _common_field(self) -> ReceptiveField | None:
+        """The field of all betas."""
+        assert not isinstance(self.settings.field, Mapping)
+        return self.settings.field
 
     @cached_property
     def _corrections(self) -> Corrections:
@@ -225,10 +224,11 @@ class SequenceFusion:
     def _noise(self) -> Mapping[str, NoiseLevel] | None:
         """The noise of each camera, stated or estimated once, near the middle; None if views are not
         denoised."""
-        if not isinstance(self.noise, str):
-            return self.noise
+        noise = self.settings.noise
+        if not isinstance(noise, str):
+            return noise
         nothing: Mapping[str, NoiseLevel] = {}
-        return self._at_middle(lambda key: noise_levels(self._images_at(key), self.noise), nothing)
+        return self._at_middle(lambda key: noise_levels(self._images_at(key), noise), nothing)
 
     @cached_property
     def _quiet(self) -> Frames:
@@ -262,11 +262,8 @@ class SequenceFusion:
             self.rig,
             self._images_at(key),
             alpha=self.alpha,
-            depth=self.options.get("depth"),
-            field=self.field,
-            match_levels=self.match_levels,
-            response=self.response,
-            align=self.align and together,
+            settings=self.settings,
+            align=self.settings.align is not False and together,
             noise=self._noise,
         )
 
@@ -318,29 +315,23 @@ def fuse_sequence(
     *,
     alpha: str,
     speed: float | None = None,
-    field: ReceptiveField | None = None,
-    match_levels: bool = False,
-    response: Given = "fit",
-    align: bool = True,
-    noise: Noise | None = None,
-    keep_alpha: bool = False,
-    **options: Any,
+    **settings: Any,
 ) -> Iterator[Frame]:
     """Fuse every frame of alpha, in order, as they are asked for.
 
-    Args: network: as of `fuse`, and so are `field`, `match_levels`, `response`, `align` (both found once, at
-        the key frame in the middle), `noise` (estimated there too), `keep_alpha` and other options (`depth`,
-        `max_memory`, `luminance`). rig: cameras with `frame_rate` (a second) and `time_offset` (seconds after
-        a common clock). frames: by camera name, in the order of time. Cameras without are left out. alpha:
-        the camera whose frames are wanted. speed: how fast things move at most, pixels of alpha a second, for
-        the room that fields leave where a beta did not record at a key frame's time. By default a quarter of
-        the motion seen between alpha's frames.
+    Args:
+        network: as of `fuse`, and so are `settings`, those of `FuseSettings`; response, alignment and noise are
+            found once, at the key frame in the middle.
+        rig: cameras with `frame_rate` (a second) and `time_offset` (seconds after a common clock).
+        frames: by camera name, in the order of time. Cameras without are left out.
+        alpha: the camera whose frames are wanted.
+        speed: how fast things move at most, pixels of alpha a second, for the room that fields leave where a
+            beta did not record at a key frame's time. By default a quarter of the motion seen between alpha's
+            frames.
 
     Raises ValueError for frame rates that are not known and for recordings that do not overlap in time.
     """
-    job = SequenceFusion(
-        network, rig, frames, alpha, speed, field, match_levels, response, align, noise, keep_alpha, options
-    )
+    job = SequenceFusion(network, rig, frames, alpha, speed, FuseSettings(**settings))
     keys = job.timeline.key_frames()
 
     @lru_cache(maxsize=2 * int(SETTINGS.intervals) + 1)

@@ -6,7 +6,7 @@ import math
 import os
 import pickle
 import shutil
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -18,6 +18,7 @@ from arraygeom.io.native import write as rig_text
 from pat.cli.main import main
 from pat.fusion.batch import KEYS, PLAN, Batch, find_images, fuse_one
 from pat.fusion.checks import LowConfidenceWarning
+from pat.fusion.fuse import FuseSettings
 from pat.fusion.results import Frame
 from pat.media.images import read_image, write_image
 from pat.media.raw import LIGHT
@@ -48,7 +49,9 @@ def batch(material, out, **options) -> Batch:
     files = {name: find_images(material / name) for name in ("fast", "slow")}
     if not options.get("sequence"):
         files["slow"] = [files["slow"][0]] * len(files["fast"])
+    of_frames = {entry.name: options.pop(entry.name) for entry in fields(FuseSettings) if entry.name in options}
     options = {"weights": str(material / "tiny.safetensors"), "files": files, **options}
+    options["settings"] = FuseSettings(**of_frames)
     return Batch(rig=Rig.load(material / "rig.yaml"), alpha="fast", out=out, **options)
 
 
@@ -267,32 +270,27 @@ def test_a_plan_comes_back_exactly(material, tmp_path, field):
 def test_noise_and_luminance_are_planned_and_among_the_settings(material, tmp_path, noise):
     job = batch(material, tmp_path, noise=noise, keep_alpha=True)
     again = Batch.from_json(job.to_json())
-    assert (again.noise, again.keep_alpha) == (noise, True)
+    assert (again.settings.noise, again.settings.keep_alpha) == (noise, True)
     other = (
         batch(material, tmp_path),
         batch(material, tmp_path, noise=noise),
         batch(material, tmp_path, luminance="mix"),
     )
-    assert len({job.settings, *(b.settings for b in other)}) == 4
+    assert len({job.dependencies, *(b.dependencies for b in other)}) == 4
 
 
-def test_options_reach_the_fusion_of_frames_and_of_sequences(material, tmp_path, monkeypatch):
-    options = {
-        **{"field": Epipolar(), "match_levels": True, "response": "rec601", "align": False, "noise": "estimate"},
-        **{"keep_alpha": True, "luminance": "mix", "max_memory": "2GiB"},
-    }
-    given = {}
+def test_settings_reach_the_fusion_of_frames_and_of_sequences(material, tmp_path, monkeypatch):
+    given = []
 
     def fuse(*_, **further):
-        given.update(further)
+        given.append(further)
         return Frame(torch.zeros(3, 1, 1), *torch.zeros(3, 1, 1))
 
     monkeypatch.setattr("pat.fusion.batch.fuse", fuse)
-    batch(material, tmp_path, **options)._frame(0)
-    assert given == options | {"alpha": "fast"}
-    fusion = batch(material, tmp_path, sequence=True, **options).fusion
-    own = {name: getattr(fusion, name) for name in options.keys() - fusion.options.keys()}
-    assert own | fusion.options == options
+    job = batch(material, tmp_path, field=Epipolar(), keep_alpha=True, luminance="mix", max_memory="2GiB")
+    job._frame(0)
+    assert given == [{"alpha": "fast", "settings": job.settings}]
+    assert replace(job, sequence=True).fusion.settings == job.settings
 
 
 def test_a_field_that_is_a_function_is_refused_before_anything_is_fused(material, tmp_path):

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from arraygeom import Epipolar, Moved, Rig, Sensor, View, Widened, pixel_grid
+from pat.fusion.fuse import FuseSettings
 from pat.fusion.optical_flow import flow_between, warped
 from pat.fusion.sequence import KeyContribution, SequenceFusion, flicker, fuse_sequence, mixed
 from pat.fusion.timeline import Timeline
@@ -167,9 +168,12 @@ def test_a_noisy_sequence_is_denoised(fused):
     plain = psnr(fusion(), ground_truth)
     stated = dict.fromkeys(recorded, level)
     assert psnr(fusion(noise=stated), ground_truth) > plain + 2.0
-    alone = [SequenceFusion(network, rig, recorded, "fast", noise=noise).alone(3) for noise in (None, stated)]
+    alone = [
+        SequenceFusion(network, rig, recorded, "fast", settings=FuseSettings(noise=noise)).alone(3)
+        for noise in (None, stated)
+    ]
     assert psnr(alone[1:], ground_truth[3:4]) > psnr(alone[:1], ground_truth[3:4]) + 2.0
-    estimated = SequenceFusion(network, rig, recorded, "fast", noise="estimate")._noise
+    estimated = SequenceFusion(network, rig, recorded, "fast", settings=FuseSettings(noise="estimate"))._noise
     assert estimated is not None
     assert set(estimated) == {"fast", "slow"}
     assert estimated["fast"].deviation(recorded["fast"][0][None]).mean() == pytest.approx(
