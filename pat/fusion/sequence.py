@@ -320,7 +320,7 @@ def fuse_sequence(
     """Fuse every frame of alpha, in order, as they are asked for.
 
     Args:
-        network: as of `fuse`, and so are `settings`, those of `FuseSettings`; response, alignment and noise are
+        network: as of `fuse`, and so are settings (`FuseSettings`); response, alignment and noise are
             found once, at the key frame in the middle.
         rig: cameras with `frame_rate` (a second) and `time_offset` (seconds after a common clock).
         frames: by camera name, in the order of time. Cameras without are left out.
