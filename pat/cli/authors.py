@@ -124,12 +124,12 @@ class Ablate:
 
 @dataclass
 class DataInfo:
-    """Summarise a folder of rendered scenes: sizes, refused seeds, abandoned scenes and the reasons."""
+    """Summarise a folder of rendered scenes: sizes, time and memory they took, refused seeds."""
 
     folder: RenderedFolder
 
     def run(self) -> None:
-        from ..farm.summary import summarise
+        from ..farm.job import summarise
 
         print(summarise(self.folder))
 
@@ -155,19 +155,17 @@ class Render:
     out: Out
     """Folder of the scenes."""
     workers: int = 1
-    """Processes on this machine; with --scheduler local, of that cluster."""
+    """Processes on this machine."""
     shard: Annotated[str, arg(metavar="I/N")] = "1/1"
     """Only every N-th scene from the I-th on, for batch systems."""
     scheduler: Annotated[str | None, optional("ADDRESS")] = None
-    """Address of a Dask scheduler (tcp://...), or "local"."""
+    """Address of a Dask scheduler whose workers render the scenes, such as tcp://host:8786."""
 
     def run(self) -> None:
         """Render what is missing; exit status 1 if the job is not complete then."""
-        from ..farm.folders import Shard
-        from ..farm.job import RenderConfig
-        from ..farm.run import render
+        from ..farm.job import RenderConfig, Shard, render
 
-        summary = render(
+        report = render(
             RenderConfig.load(self.config),
             scenes=self.scenes,
             out=self.out,
@@ -176,8 +174,8 @@ class Render:
             scheduler=self.scheduler,
             console=options.console(),
         )
-        say(f"{self.out}: {summary}")
-        if not summary.complete:
+        say(f"{self.out}: {report}" + ": the same command tries these again" * bool(report.failed))
+        if report.failed:
             sys.exit(1)
 
 

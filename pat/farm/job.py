@@ -1,29 +1,59 @@
-"""The configuration of a job: the file that people write, and the manifest in the job's folder."""
+"""Many scenes rendered: a file that says what, and the job that makes those that are missing.
+
+The folder of a job holds `manifest.yaml` (what is rendered, by which versions) and `scenes/000012/` (scene 12; that the
+folder exists means that it is complete). `.work` holds unfinished scenes.
+"""
 
 from __future__ import annotations
 
+import errno
 import json
+import math
+import os
 import platform
+import shutil
+import time
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
+from uuid import uuid4
 
 import yaml
+from rich.console import Console
 
-from arraygeom.atomic import write_text
+from arraygeom.atomic import sweep, write_text
 from arraygeom.rig import Rig
 from arraygeom.safe_yaml import load_yaml
 from pat.sensors import seed_for
+from pat.support.jobs import JobError, JobReport, Task, Workers, run_tasks
+from pat.support.locks import folder_lock
+from pat.support.memory import resident
 from pat.support.schema import from_document, read_yaml, to_document
 from pat.synthesis.check import CheckLimits
 
 from .backends import BlenderSettings, LayeredSettings, Renderer
-from .folders import JobFolder
-from .workshop import RetryLimits
 
 MANIFEST = "manifest.yaml"
 FORMAT = "pat-render 1"
+FACTS = "farm.json"
+"""In every scene's folder: its number, attempt, seed, figures of the self-check, and its cost."""
+RESERVE = 64 << 20
+"""Bytes of disk that stay free."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RetryLimits:
+    """A scene may take `timeout` seconds; one that its check refuses is made from the next seed, `refusals` times."""
+
+    timeout: float = 900.0
+    refusals: int = 20
+
+    def __post_init__(self) -> None:
+        for name in ("timeout", "refusals"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be above 0, got {getattr(self, name):g}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,64 +133,87 @@ class RenderConfig:
         }
 
 
-@dataclass(frozen=True, kw_only=True)
-class Job:
-    """A configuration and the folder it is rendered into, one shard of it; workers read it from a file."""
+@dataclass(frozen=True)
+class Shard:
+    """Part `number` (from 1) of `count`: scenes number - 1, number - 1 + count, and so on."""
 
-    config: RenderConfig
-    root: Path
-    tag: str
-
-    @property
-    def folder(self) -> JobFolder:
-        """The folder."""
-        return JobFolder(self.root)
-
-    def seed(self, index: int, attempt: int) -> int:
-        """The seed of a scene; another one for every attempt that the self-check refused."""
-        return seed_for(self.config.seed, "scene", index, attempt)
-
-    @property
-    def file(self) -> Path:
-        """Where workers read this job."""
-        return self.folder.work / f"job-{self.tag}.json"
-
-    def save(self) -> None:
-        """Write the file for workers."""
-        document = {"root": str(self.root), "tag": self.tag, "config": to_document(self.config)}
-        write_text(self.file, json.dumps(document))
+    number: int = 1
+    count: int = 1
 
     @classmethod
-    def load(cls, path: Path) -> Job:
-        """Read it again."""
-        document = json.loads(path.read_text(encoding="utf-8"))
-        config = from_document(RenderConfig, document["config"])
-        return cls(config=config, root=Path(document["root"]), tag=document["tag"])
+    def parse(cls, text: str) -> Shard:
+        """From "2/4". Raises ValueError.
 
-    def write_manifest(self) -> None:
-        """Write the manifest, or check that the existing one is the same.
-
-        Raises ValueError if the folder holds scenes of another configuration.
+        >>> Shard.parse("2/4").of(10)
+        [1, 5, 9]
         """
-        path, identity = self.root / MANIFEST, self.config.identity()
-        if path.is_file():
-            former = read_yaml(path).get("made from", {})
-            other = [key for key in identity if former.get(key) != json.loads(json.dumps(identity[key]))]
-            if other:
-                raise ValueError(
-                    f"{self.root} holds scenes made from another {' and '.join(other)}: give another --out, "
-                    f"or put {self.config.rig.name if other == ['rig'] else 'the configuration'} back"
-                )
-            return
-        manifest = {"format": FORMAT, "made from": json.loads(json.dumps(identity)), "versions": versions()}
-        write_text(path, yaml.safe_dump(manifest, sort_keys=False, width=120, default_flow_style=None))
+        number, _, count = text.partition("/")
+        if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+            raise ValueError(f"--shard: '{text}' is not i/n with i from 1 to n, such as 2/4")
+        return cls(int(number), int(count))
 
-    def write_table(self, fact_file: str) -> int:
-        """Write `scenes.jsonl` from the files in the scenes' folders; the number of scenes."""
-        facts = [(self.folder.scene(i) / fact_file) for i in self.folder.done()]
-        lines = [json.dumps(json.loads(path.read_text(encoding="utf-8"))) for path in facts]
-        write_text(self.root / "scenes.jsonl", "".join(line + "\n" for line in lines))
-        return len(lines)
+    def of(self, scenes: int) -> list[int]:
+        """The scenes of this part."""
+        return list(range(self.number - 1, scenes, self.count))
+
+
+def render(
+    config: RenderConfig,
+    *,
+    scenes: int,
+    out: Path,
+    workers: int = 1,
+    shard: Shard = Shard(),
+    scheduler: str | None = None,
+    console: Console | None = None,
+) -> JobReport:
+    """Render what is missing of `scenes` scenes into the folder `out`, by `workers` processes or a Dask scheduler's.
+
+    Raises ValueError for what cannot be rendered, more scenes than the disk holds, or a folder in use or of another
+    configuration; JobError if the job cannot go on.
+    """
+    if scenes < 1 or workers < 1:
+        raise ValueError(f"give at least one scene and one worker, got --scenes {scenes} --workers {workers}")
+    config.load_rig()
+    root = Path(out).absolute()
+    work = root / ".work" / f"{shard.number}of{shard.count}"
+    with folder_lock(work):
+        for left in work.iterdir():
+            if left.is_dir():
+                shutil.rmtree(left)
+        if shard.count == 1:  # no other run writes to this folder
+            sweep(root)
+        write_manifest(config, root)
+        given = json.dumps(to_document(config)), work
+        folders = {i: root / "scenes" / f"{i:06d}" for i in shard.of(scenes)}
+        check_space(root, sum(not folder.exists() for folder in folders.values()), config.scene_bytes())
+        return run_tasks(
+            [Task(folder, make_scene, (*given, folder, i), f"scene {i}") for i, folder in folders.items()],
+            workers=Workers(workers, scheduler, apart=True, timeout=config.limits.timeout),
+            resume=True,
+            on_error="skip",
+            title="scenes",
+            console=console,
+        )
+
+
+def write_manifest(config: RenderConfig, root: Path) -> None:
+    """Write the manifest, or check that the existing one is the same.
+
+    Raises ValueError if the folder holds scenes of another configuration.
+    """
+    path, identity = root / MANIFEST, json.loads(json.dumps(config.identity()))
+    if path.is_file():
+        former = read_yaml(path).get("made from", {})
+        other = [key for key in identity if former.get(key) != identity[key]]
+        if other:
+            raise ValueError(
+                f"{root} holds scenes made from another {' and '.join(other)}: give another --out, "
+                f"or put {config.rig.name if other == ['rig'] else 'the configuration'} back"
+            )
+        return
+    manifest = {"format": FORMAT, "made from": identity, "versions": versions()}
+    write_text(path, yaml.safe_dump(manifest, sort_keys=False, width=120, default_flow_style=None))
 
 
 def versions() -> dict[str, str]:
@@ -172,3 +225,111 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
+
+
+def check_space(root: Path, scenes: int, scene_bytes: float) -> None:
+    """Raises ValueError if so many more scenes do not fit on the disk."""
+    need, free = scenes * scene_bytes + RESERVE, shutil.disk_usage(root).free
+    if scenes and need > free:
+        fits = max(int((free - RESERVE) / scene_bytes), 0)
+        raise ValueError(
+            f"{scenes} more scenes of about {scene_bytes / 1e6:.1f} MB need {need / 1e9:.1f} GB and {root} has "
+            f"{free / 1e9:.1f} GB free: {fits} would fit; free space, ask for fewer --scenes, or another --out"
+        )
+
+
+def make_scene(config_text: str, work: Path, scene: Path, index: int) -> None:
+    """The task of a scene: rendered from the first seed that the self-check accepts, and published as a whole.
+
+    Raises ValueError for one that is refused again and again, JobError if no scene can be made.
+    """
+    config, renderer = _ready(config_text)
+    reason = ""
+    for attempt in range(config.limits.refusals):
+        seed = scene_seed(config, index, attempt)
+        partial = work / f"{index:06d}-{uuid4().hex[:12]}"
+        wall, cpu = time.monotonic(), time.process_time()
+        try:
+            report = renderer.render(seed, partial)
+            if report.accepted:
+                facts = {
+                    "scene": index,
+                    "attempt": attempt,
+                    "seed": seed,
+                    "check": report.to_document(),
+                    "seconds": round(time.monotonic() - wall, 3),
+                    "cpu_seconds": round(time.process_time() - cpu, 3),
+                    "memory_mb": round((resident() or math.nan) / 1e6, 1),
+                    "process": os.getpid(),
+                }
+                (partial / FACTS).write_text(json.dumps(facts, indent=1), encoding="utf-8")
+                return publish(partial, scene)
+            reason = "; ".join(report.reasons)
+        except ValueError as error:  # a camera inside an object, for instance
+            reason = str(error)
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            raise JobError(f"the disk of {work} is full: free space and run the same command again") from None
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+    raise ValueError(f"{config.limits.refusals} seeds were refused, the last one: {reason}")
+
+
+def scene_seed(config: RenderConfig, index: int, attempt: int) -> int:
+    """The seed of a scene; another one for every attempt that the self-check refused."""
+    return seed_for(config.seed, "scene", index, attempt)
+
+
+@lru_cache(maxsize=1)
+def _ready(config_text: str) -> tuple[RenderConfig, Renderer]:
+    try:
+        config = from_document(RenderConfig, json.loads(config_text))
+        return config, config.renderer()
+    except ValueError as error:
+        raise JobError(f"{error}") from None
+
+
+def publish(partial: Path, final: Path) -> None:
+    """Publish a complete folder under its name, after all of it is on disk; one that is there stays."""
+    for path in [*partial.iterdir(), partial]:
+        _sync(path)
+    final.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.rename(partial, final)
+    except OSError as error:
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+            raise
+    _sync(final.parent)
+
+
+def _sync(path: Path) -> None:
+    if os.name == "nt" and path.is_dir():  # Windows opens no folders
+        return
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def summarise(root: Path) -> str:
+    """Scenes, images, disk, time and memory, and refusals. Raises ValueError if there is none."""
+    from statistics import median
+
+    from pat.data.windows import scene_folders, scene_rig
+
+    folders = scene_folders(root)
+    rig = scene_rig(folders[0])
+    size = sum(file.stat().st_size for folder in folders for file in folder.iterdir())
+    sizes = ", ".join(f"{name} {c.hw[1]}x{c.hw[0]}" for name, c in rig.cameras.items())
+    text = f"{len(folders)} scenes of {sizes}; {size / 1e6 / len(folders):.2f} MB each, {size / 1e9:.2f} GB in all"
+    facts = [json.loads((f / FACTS).read_text(encoding="utf-8")) for f in folders if (f / FACTS).is_file()]
+    if not facts:
+        return text
+    seconds, cpu = (median(f[key] for f in facts) for key in ("seconds", "cpu_seconds"))
+    memory, refused = max(f["memory_mb"] for f in facts), sum(f["attempt"] for f in facts)
+    return (
+        f"{text}\na scene took {seconds:.1f} s, {cpu:.1f} s of a core (medians); workers had up to {memory:.0f} MB; "
+        f"{refused} seeds were refused by the check"
+    )

@@ -1,20 +1,25 @@
-"""Many tasks on many machines: each writes a file atomically, and is not repeated if that file is there.
+"""Many tasks in many processes: each writes a file or a folder atomically, and is not repeated if that is there.
 
-In this process, in local processes, or on the workers of a Dask scheduler. If a worker is killed, others repeat the
-tasks it was running; a job that is killed as a whole and started again does only what is missing. Torch is imported
-only where tasks run.
+In this process, in others on this machine, or on the workers of a Dask scheduler. If a process is killed, another one
+repeats the task it was running; a job that is killed as a whole and started again does only what is missing. Torch is
+imported only where tasks run.
 """
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 import re
+import signal
+import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
@@ -24,7 +29,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from .steps import about, steps_shown
 
 if TYPE_CHECKING:
-    from distributed import Client, Future, LocalCluster
+    from distributed import Future
 
 T = TypeVar("T")
 OnError = Literal["stop", "skip"]
@@ -79,68 +84,21 @@ class JobError(ValueError):
     """A job cannot or must not go on; what is made stays."""
 
 
-ENVIRONMENT = {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1}
-"""Of local workers. Not Dask's own, which makes glibc return every freed image to the system at once: half of the
-time of two workers was then spent on getting the same pages again."""
-
-
-@contextmanager
-def environment_restored() -> Iterator[None]:
-    """Restore the environment afterwards: Dask sets the variables of its workers in their parent too."""
-    before = dict(os.environ)
-    try:
-        yield
-    finally:
-        for name in os.environ.keys() - before.keys():
-            del os.environ[name]
-        os.environ.update(before)
-
-
 @dataclass(frozen=True)
 class Workers:
     """Where tasks run.
 
-    `scheduler` is the address of a Dask scheduler ("tcp://host:8786"), or "local" for one on this machine with `count`
-    processes; without, `count` processes on this machine, or this process itself for 1. `threads` are torch's in each:
-    results are identical to the bit for the same number.
+    `scheduler` is the address of a Dask scheduler ("tcp://host:8786"); without, `count` processes on this machine, or
+    this process itself for 1, unless tasks are to be kept `apart`, as what crashes or hangs. `threads` are torch's in
+    each: results are identical to the bit for the same number. A task of a process of its own may take `timeout`
+    seconds.
     """
 
     count: int = 1
     scheduler: str | None = None
     threads: int = 1
-
-    @contextmanager
-    def client(self) -> Iterator[Client]:
-        """The Dask client; its local workers are gone afterwards. Raises ValueError without Dask or scheduler."""
-        try:
-            from dask import config
-            from distributed import Client, LocalCluster
-        except ImportError:
-            raise ValueError("several workers need Dask: pip install 'arraygeom-pat[cluster]'") from None
-        if self.scheduler in (None, "local"):
-            options = {"n_workers": self.count, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
-            with (
-                environment_restored(),
-                config.set({"distributed.nanny.pre-spawn-environ": ENVIRONMENT}),
-                _started(lambda: LocalCluster(**options, memory_limit=0)) as cluster,
-                Client(cluster) as client,
-            ):
-                yield client
-        else:
-            try:
-                client = Client(self.scheduler, timeout=20)
-            except (OSError, ValueError) as error:
-                raise ValueError(f"no Dask scheduler at {self.scheduler}: {error}") from None
-            with client:
-                yield client
-
-
-def _started(cluster: Callable[[], LocalCluster]) -> LocalCluster:
-    """A cluster, once its workers run. Raises ValueError if one of them died at its start."""
-    try:
-        return cluster()
-    except RuntimeError as error:
-        raise ValueError(f"a worker died while it started ({error}): give the same command again") from None
+    apart: bool = False
+    timeout: float | None = None
 
 
 HERE = Workers()
@@ -159,7 +117,7 @@ def run_tasks(
     """Run all tasks; with `resume`, only those whose file is missing. Without, such files are removed first.
 
     An error of a task (ValueError, OSError) is reported with its file's name and the task skipped, or it stops the
-    job: then JobError is raised, and what is made stays.
+    job: then JobError is raised, and what is made stays. A task's own JobError always stops it.
     """
     if not resume:
         for task in tasks:
@@ -169,7 +127,8 @@ def run_tasks(
     named = {t.makes: t.about or t.makes.name for t in tasks}
     left = [t for t in tasks if t.makes not in there]
     console = console or Console(stderr=True)
-    run = _in_this_process if workers.count == 1 and workers.scheduler is None else _on_dask
+    here = workers.count == 1 and not workers.apart
+    run = _on_dask if workers.scheduler else _in_this_process if here else _in_processes
     for outcome in followed(run(left, workers), title=title, total=len(tasks), done=len(there), console=console):
         if outcome.error is None:
             report.made.append(outcome.makes)
@@ -187,19 +146,8 @@ LINE_EVERY = 30.0
 """Seconds between lines of progress where there is no terminal."""
 
 
-def followed(
-    outcomes: Iterable[T],
-    *,
-    title: str,
-    total: int,
-    done: int = 0,
-    console: Console,
-    status: Callable[[T], str] = lambda _: "",
-) -> Iterator[T]:
-    """The outcomes as they come, their number shown: as a bar on a terminal, elsewhere as a line now and then.
-
-    `status` counts an outcome and returns what else to show.
-    """
+def followed(outcomes: Iterable[T], *, title: str, total: int, done: int = 0, console: Console) -> Iterator[T]:
+    """The outcomes as they come, their number shown: as a bar on a terminal, elsewhere as a line now and then."""
     printed = time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     further = (TimeRemainingColumn(), TextColumn("{task.fields[status]}"))
@@ -209,13 +157,11 @@ def followed(
         with steps_shown(lambda step: bar.update(shown, status=step)):
             for outcome in outcomes:
                 done += 1
-                text = status(outcome)
-                bar.update(shown, completed=done, status=text)
+                bar.update(shown, completed=done, status="")
                 if hidden and time.monotonic() - printed > LINE_EVERY:
                     printed = time.monotonic()
                     seconds = bar.tasks[0].time_remaining
-                    left = f", {about(seconds)}" if seconds else ""
-                    line = f"{title}: {done} of {total}{left}" + f": {text}" * bool(text)
+                    line = f"{title}: {done} of {total}" + (f", {about(seconds)}" if seconds else "")
                     console.print(line, soft_wrap=True, highlight=False, markup=False)
                 yield outcome
 
@@ -231,58 +177,165 @@ def _in_this_process(tasks: Iterable[Task], workers: Workers) -> Iterator[TaskOu
         torch.set_num_threads(before)
 
 
-def _on_dask(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
-    """Outcomes as they come; a task that kills its workers is an outcome too."""
-    for task, future in completed(attempt_on_worker, [(task, workers.threads) for task in tasks], workers):
-        yield future.result() if future.status == "finished" else TaskOutcome(task[0].makes, why(future))
+ENVIRONMENT = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+"""Of processes on this machine."""
+TRIES = 3
+"""How often a task is begun whose process dies or takes too long."""
 
 
+def _in_processes(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
+    """Outcomes as they come. Each process has a thread that waits for it, and with which it would die."""
+    own, processes, before = threading.local(), [], dict(os.environ)
+
+    def made(task: Task) -> TaskOutcome:
+        if not hasattr(own, "process"):
+            own.process = _Process(workers)
+            processes.append(own.process)
+        return own.process.made(task)
+
+    os.environ.update(ENVIRONMENT)
+    threads = ThreadPoolExecutor(workers.count)
+    try:
+        for future in as_completed([threads.submit(made, task) for task in tasks]):
+            yield future.result()
+    finally:
+        threads.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.end(for_good=True)
+        for name in ENVIRONMENT.keys() - before.keys():
+            del os.environ[name]
+        os.environ.update(before)
+
+
+class _Process:
+    """A process that runs one task after another; another one takes its place when it dies."""
+
+    def __init__(self, workers: Workers):
+        self.workers, self.over = workers, False
+        self.process: Any = None
+        self.pipe: Any = None
+
+    def made(self, task: Task) -> TaskOutcome:
+        """The outcome of a task. Raises the JobError of one that stops the job."""
+        error = ""
+        for _ in range(TRIES):
+            if self.over:
+                break
+            try:
+                outcome = self._answer(task)
+            except (EOFError, OSError):
+                died, self.process = self.process, None
+                if died is not None:
+                    died.join()
+                    code = died.exitcode
+                    error = f"its process died ({signal.Signals(-code).name if code < 0 else f'exit status {code}'})"
+                continue
+            if outcome is None:
+                self.end()
+                error = f"took longer than {self.workers.timeout:g} s"
+            elif isinstance(outcome, JobError):
+                raise outcome
+            else:
+                return outcome
+        return TaskOutcome(task.makes, error)
+
+    def _answer(self, task: Task) -> TaskOutcome | JobError | None:
+        """The answer of the process; None if there is none in time. Raises EOFError or OSError if it dies."""
+        if self.process is None:
+            spawn = get_context("spawn")
+            self.pipe, theirs = spawn.Pipe()
+            self.process = spawn.Process(target=_serve, args=(theirs, self.workers.threads, os.getpid()), daemon=True)
+            self.process.start()
+            theirs.close()
+        self.pipe.send(task)
+        return self.pipe.recv() if self.pipe.poll(self.workers.timeout) else None
+
+    def end(self, *, for_good: bool = False) -> None:
+        """End the process at once."""
+        self.over |= for_good
+        if self.process is not None:
+            self.process.kill()
+            self.process.join()
+            self.process = None
+
+
+def _serve(pipe: Any, threads: int, parent: int) -> None:
+    """Run tasks that come through a pipe, until its other end is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    while os.getppid() == parent:
+        try:
+            task = pipe.recv()
+        except EOFError:
+            return
+        try:
+            answer: TaskOutcome | JobError = attempt_on_worker(task, threads)
+        except JobError as error:
+            answer = error
+        except Exception as error:
+            answer = TaskOutcome(task.makes, f"{type(error).__name__}: {error}")
+        pipe.send(answer)
+
+
+PR_SET_PDEATHSIG = 1
+"""Option of Linux's prctl: the signal that a process gets when the thread that started it ends."""
 AHEAD = 4
-"""Tasks submitted for each worker at once, so that none of them waits for the next."""
+"""Tasks submitted for each Dask worker at once, so that none of them waits for the next."""
 
 
-def completed(
-    run: Callable[..., object], items: Sequence[tuple[Any, ...]], workers: Workers
-) -> Iterator[tuple[tuple[Any, ...], Future]]:
-    """`run(*item)` of all items on Dask: each item with its future, as they complete.
+def _on_dask(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
+    """Outcomes as they come; Dask repeats what a dead worker was running, and what kills several is an outcome too.
 
-    Dask repeats what a dead worker was running; what kills several workers completes with an error (see `why`).
+    Raises ValueError without Dask or scheduler.
     """
-    if not items:
+    if not tasks:
         return
-    with workers.client() as client:
-        from distributed import as_completed
-
+    try:
+        from distributed import Client, as_completed
+    except ImportError:
+        raise ValueError("a scheduler needs Dask: pip install 'arraygeom-pat[cluster]'") from None
+    try:
+        client = Client(workers.scheduler, timeout=20)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"no Dask scheduler at {workers.scheduler}: {error}") from None
+    with client:
         client.wait_for_workers(1, timeout=60)
-        queue = iter(items)
+        queue = iter(tasks)
         running = {}
 
-        def submit(item: tuple[Any, ...]) -> Future:
-            future = client.submit(run, *item, pure=False, retries=0)
-            running[future.key] = future, item
+        def submit(task: Task) -> Future:
+            future = client.submit(attempt_on_worker, task, workers.threads, pure=False, retries=0)
+            running[future.key] = future, task
             return future
 
         ahead = max(AHEAD * len(client.scheduler_info()["workers"]), 8)
-        done = as_completed([submit(item) for _, item in zip(range(ahead), queue)], with_results=False)
+        done = as_completed([submit(task) for _, task in zip(range(ahead), queue)], with_results=False)
         try:
             for future in done:
-                _, item = running.pop(future.key)
+                _, task = running.pop(future.key)
                 following = next(queue, None)
                 if following is not None:
                     done.add(submit(following))
-                yield item, future
+                yield future.result() if future.status == "finished" else _failed(task, future)
         finally:
             client.cancel([future for future, _ in running.values()])
 
 
-def why(future: Future) -> str:
-    """Why a future has no result."""
+def _failed(task: Task, future: Future) -> TaskOutcome:
+    """The outcome of a task that has no result. Raises its JobError."""
     error = future.exception()
-    return f"its workers died: {error}" if type(error).__name__ == "KilledWorker" else f"{error}"
+    if isinstance(error, JobError):
+        raise error
+    died = type(error).__name__ == "KilledWorker"
+    return TaskOutcome(task.makes, f"its workers died: {error}" if died else f"{error}")
 
 
 def attempt(task: Task, threads: int) -> TaskOutcome:
-    """Run a task, unless a worker that died since has done it; errors of what was given become the outcome."""
+    """Run a task, unless a worker that died since has done it; errors of what was given become the outcome.
+
+    Raises JobError for what would happen to every task.
+    """
     import torch
 
     if task.makes.exists():
@@ -293,6 +346,8 @@ def attempt(task: Task, threads: int) -> TaskOutcome:
     with warnings.catch_warnings(record=True) as caught:
         try:
             task.run(*task.given)
+        except JobError:
+            raise
         except (ValueError, OSError) as failure:
             error = " ".join(str(failure).split())
         except Warning as failure:
@@ -302,7 +357,7 @@ def attempt(task: Task, threads: int) -> TaskOutcome:
 
 
 def attempt_on_worker(task: Task, threads: int) -> TaskOutcome:
-    """`attempt` in a process of Dask's, which does nothing else."""
+    """`attempt` in a process that does nothing else."""
     from .memory import keep_freed
 
     keep_freed()

@@ -24,10 +24,7 @@ import yaml
 from arraygeom import Camera, Pose, Rig, intrinsics
 from arraygeom.atomic import write_text
 from pat.evaluation.tables import markdown_header, markdown_row
-from pat.farm.folders import JobFolder
-from pat.farm.job import RenderConfig
-from pat.farm.run import render
-from pat.farm.worker import FACTS
+from pat.farm.job import FACTS, RenderConfig, render
 from pat.synthesis.blender import RenderSettings
 from pat.synthesis.blender import render as render_scene
 from pat.synthesis.generators import abstract
@@ -51,13 +48,13 @@ def made(root: Path, name: str, scenes: int, workers: int) -> tuple[list[dict[st
     """Render scenes: what each worker says of each, seconds in all, and seeds that the check refused."""
     rig().save(root / "rig.yaml")
     blender = {"generator": "abstract", "preset": "fast", "settings": SETTINGS[name]}
-    config = {"rig": "rig.yaml", "backend": "blender", "blender": blender, "limits": {"recycle": 1000}}
+    config = {"rig": "rig.yaml", "backend": "blender", "blender": blender}
     (root / "render.yaml").write_text(yaml.safe_dump(config))
     out, begin = root / name.replace(" ", "-"), time.monotonic()
-    summary = render(RenderConfig.load(root / "render.yaml"), scenes=scenes, out=out, workers=workers)
+    render(RenderConfig.load(root / "render.yaml"), scenes=scenes, out=out, workers=workers)
     seconds = time.monotonic() - begin
-    folder = JobFolder(out)
-    return [json.loads((folder.scene(i) / FACTS).read_text()) for i in folder.done()], seconds, summary.refusals
+    facts = [json.loads(path.read_text()) for path in sorted(out.glob(f"scenes/*/{FACTS}"))]
+    return facts, seconds, sum(f["attempt"] for f in facts)
 
 
 def speed(name: str, facts: list[dict[str, Any]], seconds: float | None, workers: int) -> str:

@@ -227,7 +227,7 @@ def _is_worker(process: psutil.Process) -> bool:
         words = " ".join(process.cmdline())
     except psutil.Error:
         return False
-    return "spawn_main" in words or "pat.farm.worker" in words
+    return "spawn_main" in words
 
 
 def _ended_well(child: int, folder: Path, wanted: tuple[int, ...]) -> int:

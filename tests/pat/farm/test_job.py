@@ -5,29 +5,24 @@ import importlib.util
 import json
 import os
 import signal
+import subprocess
 import sys
-import threading
-from dataclasses import replace
+import time
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 
 from arraygeom import Camera, Pose, Rig, intrinsics
 from arraygeom.distortion import Distortion
 from pat.cli.main import main
-from pat.farm.backends import rig_from_alpha
-from pat.farm.folders import JobFolder, Shard
-from pat.farm.job import Job, RenderConfig
-from pat.farm.run import RenderSummary, _prepared, check_space, render
-from pat.farm.worker import _Server
-from pat.farm.workshop import SceneOutcome
+from pat.farm.backends import LayeredRenderer, rig_from_alpha
+from pat.farm.job import RenderConfig, Shard, check_space, publish, render, scene_seed, write_manifest
 from pat.support.jobs import JobError
 from pat.synthesis.rendered import Rendered
-from tests.pat.farm import kills
-from tests.pat.farm.journals import events, started_after_done
-from tests.pat.farm.test_workshop import ROOT, children
 
+ROOT = Path(__file__).parents[3]
 RIG = """
 depth: [2, 20]
 cameras:
@@ -51,24 +46,53 @@ def write(path: Path, **changes) -> None:
     path.write_text(yaml.safe_dump(settings | changes))
 
 
+def done(out: Path) -> list[int]:
+    """The scenes that are there."""
+    return sorted(int(path.name) for path in (out / "scenes").glob("*"))
+
+
+def times(out: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_mtime_ns for path in (out / "scenes").glob("*")}
+
+
+def children(pid: int) -> list[int]:
+    """The processes that render for a command."""
+    try:
+        found = [int(c) for t in Path(f"/proc/{pid}/task").iterdir() for c in (t / "children").read_text().split()]
+        return [c for c in found if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
+    except OSError:
+        return []
+
+
+def wait_until(condition) -> None:
+    end = time.monotonic() + 300
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
 def test_a_job_is_rendered_killed_and_resumed(config, tmp_path, capfd):
-    """The first run loses a worker and then its parent; the second makes the rest."""
+    """The first run loses a worker and then is killed itself, and its worker with it; the second makes the rest."""
     out = tmp_path / "data"
-    command = [sys.executable, "-c", "from pat.cli.main import main; main()", "render", str(config), "--out", str(out)]
-    with kills.killed_in_the_end([*command, "--scenes", "40"]) as parent:
-        kills.wait_until(lambda: len(JobFolder(out).done()) >= 2)
-        os.kill(children(parent.pid)[0], signal.SIGKILL)
-        known = len(JobFolder(out).done())
-        kills.wait_until(lambda: len(JobFolder(out).done()) > known)
-    had = len(JobFolder(out).done())
-    main(["render", str(config), "--scenes", str(had + 2), "--out", str(out)])
-    said = " ".join(capfd.readouterr().err.split())
-    assert f"2 scenes made, {had} were there" in said
-    assert JobFolder(out).done() == list(range(had + 2))
-    assert started_after_done(out) == []
-    table = [json.loads(line) for line in (out / "scenes.jsonl").read_text().splitlines()]
-    assert [row["scene"] for row in table] == list(range(had + 2))
-    assert all(row["check"]["accepted"] and row["memory_mb"] > 50 for row in table)
+    command = [sys.executable, "-m", "pat", "render", str(config), "--out", str(out), "--scenes", "40"]
+    parent = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    wait_until(lambda: len(done(out)) >= 2)
+    os.kill(children(parent.pid)[0], signal.SIGKILL)
+    known = len(done(out))
+    wait_until(lambda: len(done(out)) > known)
+    (worker,) = children(parent.pid)
+    parent.kill()
+    parent.wait()
+    wait_until(lambda: not Path(f"/proc/{worker}").exists())
+    had = times(out)
+    main(["render", str(config), "--scenes", str(len(had) + 2), "--out", str(out), "--workers", "2"])
+    assert f"2 made, {len(had)} there already" in " ".join(capfd.readouterr().err.split())
+    assert done(out) == list(range(len(had) + 2))
+    assert {name: times(out)[name] for name in had} == had
+    assert not list(tmp_path.rglob("[.]work/*/*"))
+    facts = [json.loads(path.read_text()) for path in sorted(out.glob("scenes/*/farm.json"))]
+    assert [row["scene"] for row in facts] == done(out)
+    assert all(row["check"]["accepted"] and row["memory_mb"] > 50 for row in facts)
     scene = Rendered(out / "scenes/000001")
     assert scene.accepted
     assert scene.rig.names == ("mono", "colour")
@@ -76,28 +100,40 @@ def test_a_job_is_rendered_killed_and_resumed(config, tmp_path, capfd):
     assert frame.rgb.shape == (3, 60, 80)
     assert frame.depth.isfinite().all()
     assert (frame.index > 0).all()
+    main(["data", "info", str(out)])
+    assert f"{len(facts)} scenes of mono 96x64, colour 80x60" in capfd.readouterr().out
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(3600)
 @pytest.mark.parametrize("backend", ["layered", "blender"])
-def test_thirty_scenes_survive_ten_kills_and_dask_makes_the_same(tmp_path, monkeypatch, backend):
+def test_shards_and_dask_make_the_same(config, tmp_path, backend):
     if backend == "blender" and importlib.util.find_spec("bpy") is None:
         pytest.skip("Blender is not installed: pip install '.[synthesis]'")
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    path, out = kills.write_config(tmp_path, backend), tmp_path / "data"
-    survived = kills.killed_again_and_again(path, out, scenes=30, kills=10)
-    assert survived.workers_killed + survived.commands_killed == 10
-    assert kills.faults(out, 30) == []
-    again = tmp_path / "dask"
-    summary = render(RenderConfig.load(path), scenes=30, out=again, workers=2, scheduler="local")
-    assert summary.made == 30
-    light = [kills.difference(JobFolder(out).scene(i), JobFolder(again).scene(i)) for i in range(30)]
-    assert max(light) < 1e-3
-    part = tmp_path / "part"
-    render(RenderConfig.load(path), scenes=2, out=part, shard=Shard(1, 2))
-    assert JobFolder(part).done() == [0]
-    assert kills.difference(JobFolder(out).scene(0), JobFolder(part).scene(0)) < 1e-3
+    from distributed import LocalCluster
+
+    write(config, backend=backend, blender={"settings": {"width": 96, "samples": 2}})
+    chosen, whole, parts, dask = RenderConfig.load(config), *(tmp_path / name for name in ("whole", "parts", "dask"))
+    assert len(render(chosen, scenes=4, out=whole, workers=2).made) == 4
+    assert [len(render(chosen, scenes=4, out=parts, shard=Shard(i, 2)).made) for i in (1, 2)] == [2, 2]
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        assert len(render(chosen, scenes=4, out=dask, scheduler=cluster.scheduler_address).made) == 4
+    for i in range(4):
+        for other in (parts, dask):
+            a, b = (Rendered(out / "scenes" / f"{i:06d}") for out in (whole, other))
+            for name in a.rig.names:
+                torch.testing.assert_close(a.frame(name).depth, b.frame(name).depth)
+                assert (a.frame(name).rgb - b.frame(name).rgb).abs().max() < 1e-3
+
+
+def test_refused_scenes_are_named_and_the_others_made(config, tmp_path, capfd):
+    write(config, check={"texture": 1.1}, limits={"refusals": 2})
+    with pytest.raises(SystemExit) as stop:
+        main(["render", str(config), "--scenes", "2", "--out", str(tmp_path / "data")])
+    assert stop.value.code == 1
+    said = " ".join(capfd.readouterr().err.split())
+    assert "skipped scene 1: 2 seeds were refused, the last one: " in said
+    assert "has texture (at least 110%)" in said
+    assert "0 made, 2 failed: the same command tries these again" in said
 
 
 def fails(arguments, capfd) -> str:
@@ -142,87 +178,80 @@ def test_other_mistakes_are_one_line(config, tmp_path, capfd):
     assert "camera 'mono' is not calibrated: rendering needs its K, R and t" in said
 
 
-@pytest.mark.parametrize(("shard", "stays"), [(Shard(), False), (Shard(1, 2), True)])
-def test_what_a_killed_run_had_begun_to_write_is_removed_where_no_other_writes(shard, stays, config, tmp_path):
-    out = tmp_path / "data"
-    left = [out / name for name in (f".scenes-{'0' * 32}.jsonl", f".work/.job-{shard.tag}-{'0' * 32}.json")]
-    left[1].parent.mkdir(parents=True)
-    for path in left:
-        path.touch()
-    _prepared(Job(config=RenderConfig.load(config), root=out, tag=shard.tag), [0])
-    assert [path.exists() for path in left] == [stays, False]
-
-
 def test_a_folder_of_another_configuration_is_refused(config, tmp_path):
-    job = Job(config=RenderConfig.load(config), root=tmp_path / "data", tag="1of1")
-    job.root.mkdir()
-    job.write_manifest()
-    job.write_manifest()
+    out = tmp_path / "data"
+    for _ in range(2):
+        write_manifest(RenderConfig.load(config), out)
     write(config, seed=2)
     with pytest.raises(ValueError, match="holds scenes made from another seed: give another --out"):
-        Job(config=RenderConfig.load(config), root=job.root, tag="1of1").write_manifest()
+        write_manifest(RenderConfig.load(config), out)
     write(config)
     (tmp_path / "rig.yaml").write_text(RIG.replace("120", "130"))
     with pytest.raises(ValueError, match=r"another rig: give another --out, or put rig\.yaml back"):
-        Job(config=RenderConfig.load(config), root=job.root, tag="1of1").write_manifest()
+        write_manifest(RenderConfig.load(config), out)
 
 
 def test_more_scenes_than_disk_are_refused_before_the_first(config, tmp_path, monkeypatch):
-    monkeypatch.setattr(JobFolder, "free", lambda self: 100_000_000)
+    usage = type("Usage", (), {"free": 100_000_000})
+    monkeypatch.setattr("pat.farm.job.shutil.disk_usage", lambda path: usage)
     with pytest.raises(ValueError, match=r"5000 more scenes of about 1.0 MB need 5.1 GB .* 32 would fit"):
-        check_space(JobFolder(tmp_path), 5000, 1e6)
-    check_space(JobFolder(tmp_path), 0, 1e6)
+        check_space(tmp_path, 5000, 1e6)
+    check_space(tmp_path, 0, 1e6)
     with pytest.raises(ValueError, match="100000 more scenes"):
         render(RenderConfig.load(config), scenes=100_000, out=tmp_path / "data")
-    assert not JobFolder(tmp_path / "data").done()
+    assert not done(tmp_path / "data")
 
 
 def test_a_disk_that_fills_stops_the_job_cleanly(config, tmp_path, monkeypatch):
-    monkeypatch.setattr("pat.farm.run.check_space", lambda *_: None)
-    monkeypatch.setattr(JobFolder, "free", lambda self: 1000)
+    def full(self, seed, out):
+        out.mkdir()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(LayeredRenderer, "render", full)
+    monkeypatch.setattr("pat.support.jobs._in_processes", jobs_here)
     with pytest.raises(JobError, match="is full: free space"):
         render(RenderConfig.load(config), scenes=3, out=tmp_path / "data")
-    assert (tmp_path / "data" / "scenes.jsonl").read_text() == ""
+    assert not done(tmp_path / "data")
+    assert not (tmp_path / "data/.work").exists()
 
 
-def test_a_worker_reads_its_job_and_reports_what_goes_wrong(config, tmp_path, monkeypatch):
-    write(config, check={"texture": 1.1})
-    job = Job(config=RenderConfig.load(config), root=tmp_path / "data", tag="1of1")
-    job.root.mkdir()
-    job.save()
-    assert Job.load(job.file) == job
-    server = _Server(job.file)
-    answer = server.answer(0, 0)
-    assert answer["answer"] == "refused"
-    assert "mono: " in answer["reason"]
-    assert "has texture (at least 110%)" in answer["reason"]
-    for error, wanted in (
-        (
-            OSError(errno.ENOSPC, "No space left on device"),
-            {"answer": "stop", "reason": "[Errno 28] No space left on device"},
-        ),
-        (OSError(errno.EIO, "broken"), {"answer": "crashed", "reason": "[Errno 5] broken"}),
-        (RuntimeError("two\nlines"), {"answer": "crashed", "reason": "RuntimeError: two lines"}),
-        (ValueError("inside an object"), {"answer": "refused", "reason": "inside an object"}),
-    ):
-        monkeypatch.setattr(server, "_make", raising(error))
-        assert server.answer(0, 0) == wanted
-    assert not list((tmp_path / "data/.work").glob("1of1-*"))
+def jobs_here(tasks, workers):
+    from pat.support.jobs import attempt
+
+    return (attempt(task, 1) for task in tasks)
 
 
-def raising(error: Exception):
-    def fail(*_):
-        raise error
+def test_one_run_at_a_time_writes_to_a_shard(config, tmp_path, monkeypatch):
+    chosen, out = RenderConfig.load(config), tmp_path / "data"
 
-    return fail
+    def meanwhile(*_):
+        with pytest.raises(ValueError, match="another command is writing there"):
+            render(chosen, scenes=2, out=out, shard=Shard(1, 2))
+        return iter(())
+
+    monkeypatch.setattr("pat.support.jobs._in_processes", meanwhile)
+    render(chosen, scenes=2, out=out, shard=Shard(1, 2))
 
 
-def test_seeds_are_of_the_scene_and_the_attempt_alone(config, tmp_path):
-    job = Job(config=RenderConfig.load(config), root=tmp_path, tag="1of1")
-    other = Job(config=RenderConfig.load(config), root=tmp_path / "x", tag="2of4")
-    seeds = {job.seed(i, k) for i in range(20) for k in range(3)}
-    assert len(seeds) == 60
-    assert job.seed(7, 1) == other.seed(7, 1)
+def test_publishing_keeps_what_is_there(tmp_path):
+    for name, text in (("first", "1"), ("second", "2")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a").write_text(text)
+        publish(tmp_path / name, tmp_path / "scenes" / "x")
+    assert (tmp_path / "scenes/x/a").read_text() == "1"
+
+
+def test_shards_share_the_scenes_out():
+    parts = [Shard.parse(f"{i}/3").of(10) for i in (1, 2, 3)]
+    assert sorted(i for part in parts for i in part) == list(range(10))
+    for text in ("0/3", "4/3", "1", "a/b", "1/0"):
+        with pytest.raises(ValueError, match="is not i/n"):
+            Shard.parse(text)
+
+
+def test_seeds_are_of_the_scene_and_the_attempt_alone(config):
+    chosen = RenderConfig.load(config)
+    assert len({scene_seed(chosen, i, k) for i in range(20) for k in range(3)}) == 60
 
 
 def test_rigs_that_layers_cannot_show_are_refused():
@@ -233,17 +262,3 @@ def test_rigs_that_layers_cannot_show_are_refused():
     with pytest.raises(ValueError, match="no depth range"):
         rig_from_alpha(Rig({"a": camera}))
     assert rig_from_alpha(Rig({"a": camera}, depth=(1, float("inf")))).far.tolist() == [50.0]
-
-
-def test_the_summary_counts():
-    summary = RenderSummary(there=3)
-    for state, refusals in (("done", 2), ("done", 0), ("given up", 20), ("stopped", 0)):
-        outcome = SceneOutcome(index=5, state=state, refusals=refusals, crashes=1)
-        summary.add(replace(outcome, reason="its workers died: X") if state == "stopped" else outcome)
-    assert not summary.complete
-    assert str(summary).endswith("given up: 5, 1 not made (its workers died: X): run the command again")
-    assert str(summary).startswith("2 scenes made, 3 were there")
-    assert "22 refused by the check, 4 crashed, given up: 5" in str(summary)
-    assert Shard.parse("1/1") == Shard()
-    assert threading.active_count() >= 1
-    assert events(Path("/nonexistent")) == []

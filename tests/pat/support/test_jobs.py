@@ -58,32 +58,51 @@ def test_a_message_names_what_a_task_is_about(tmp_path):
         run_tasks([bad])
 
 
-@pytest.mark.slow
-def test_workers_do_the_same_and_say_the_same(tmp_path):
+def test_processes_do_the_same_and_say_the_same(tmp_path, monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     names = [f"{i}" for i in range(10)]
     report = run_tasks(tasks(tmp_path, *names, "bad"), workers=Workers(2), on_error="skip")
     assert len(report.made) == 10
     assert list(report.failed.values()) == ["not good at all"]
     pids = {line for name in names for line in (tmp_path / f"{name}.calls").read_text().split()}
+    assert len(pids) == 2
     assert str(os.getpid()) not in pids
     with pytest.raises(JobError, match="bad"):
         run_tasks(tasks(tmp_path, "bad"), workers=Workers(2))
+    assert "OMP_NUM_THREADS" not in os.environ, "that is for the processes alone"
 
 
-def test_local_workers_keep_freed_memory(monkeypatch):
-    """With Dask's own setting glibc gives back every freed image at once, and two workers were slower than one."""
-    for name in ("MALLOC_TRIM_THRESHOLD_", "OMP_NUM_THREADS"):
-        monkeypatch.delenv(name, raising=False)
-    with Workers(2).client() as client:
-        told = client.run(lambda: (os.environ.get("MALLOC_TRIM_THRESHOLD_"), os.environ["OMP_NUM_THREADS"]))
-    assert list(told.values()) == [(None, "1")] * 2
+def befallen(path: Path, fate: str) -> None:
+    """What may befall a task: at the first try, or at all."""
+    first = not path.with_suffix(".tried").exists()
+    path.with_suffix(".tried").touch()
+    if fate == "crash" or (fate == "crash once" and first):
+        os.kill(os.getpid(), signal.SIGSEGV)
+    if fate == "hang once" and first:
+        time.sleep(1000)
+    if fate == "bug":
+        raise LookupError("no such key")
+    if fate == "full":
+        raise JobError("the disk is full")
+    write_text(path, os.environ["OMP_NUM_THREADS"])
 
 
-def test_the_environment_of_workers_does_not_stay_in_this_process(monkeypatch):
-    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
-    with Workers(1).client():
-        pass
-    assert "OPENBLAS_NUM_THREADS" not in os.environ
+def test_what_crashes_or_hangs_is_tried_again_and_fails_alone(tmp_path):
+    fates = ("well", "crash once", "hang once", "crash", "bug")
+    todo = [Task(tmp_path / f"{fate}.txt", befallen, (tmp_path / f"{fate}.txt", fate)) for fate in fates]
+    report = run_tasks(todo, workers=Workers(apart=True, timeout=20.0), on_error="skip")
+    assert {path.stem for path in report.made} == {"well", "crash once", "hang once"}
+    assert (tmp_path / "well.txt").read_text() == "1"
+    said = {path.stem: error for path, error in report.failed.items()}
+    assert said == {"crash": "its process died (SIGSEGV)", "bug": "LookupError: no such key"}
+
+
+def test_what_would_befall_every_task_stops_the_job(tmp_path):
+    todo = [Task(tmp_path / f"{i}.txt", befallen, (tmp_path / f"{i}.txt", "full")) for i in range(20)]
+    for workers in (Workers(), Workers(2)):
+        with pytest.raises(JobError, match=r"^the disk is full$"):
+            run_tasks(todo, workers=workers, on_error="skip")
+    assert len(list(tmp_path.glob("*.tried"))) < 20
 
 
 def test_a_scheduler_that_is_not_there_is_named(tmp_path):
