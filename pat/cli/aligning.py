@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
-
-from tyro.conf import Positional, UseAppendAction, arg
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from . import options
 from .fusing import files_by_camera, named_images
 from .known import Known
-from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Out, optional, say
+from .options import FIRST, Out, say
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -35,15 +32,6 @@ class Align(Known):
 
     spellings: ClassVar[Mapping[str, str]] = {"--rig": FIRST, "--to": "--alpha"}
 
-    given: Annotated[Positional[tuple[Path, ...]], arg(metavar="RIG|IMAGE IMAGE")] = ()
-    """Rig file of any known format (also: --rig RIG); or, without one, an image or folder of each camera."""
-    alpha: Annotated[str | None, optional("NAME")] = None
-    """The camera to whose pixels the others are aligned; without a rig by default the largest grey image. Also:
-    --to."""
-    image: Images = ()
-    """With a rig: an image of each camera, once each; or NAME=FOLDER, or NAME=PATTERN."""
-    depth: Depth = None
-    """Near and far bounds in metres, instead of the rig's; far may be inf."""
     out: Out = Path("out")
     """Folder for aligned.tif (all bands, with names and wavelengths), NAME_visibility.png (255 seen, 128 occluded, 0
     beyond the edge), NAME_confidence.png, NAME_positions.npy, depth.tif, visibility.txt and index.html."""
@@ -57,35 +45,15 @@ class Align(Known):
     """Write a file of each camera, NAME.tif, instead of one of all bands."""
     positions: Literal["npy", "tif", "none"] = "npy"
     """Format of the sub-pixel positions of alpha's pixels in each camera's image (x, y)."""
-    weights: Annotated[str | None, arg(metavar="NAME|FILE", help=WEIGHTS_HELP, help_behavior_hint="")] = None
-    field: FieldName = "auto"
-    """Receptive field in the other cameras; auto takes what the rig allows."""
-    max_memory: Memory = None
-    """Memory limit of the whole process, such as 4GiB."""
-    normalise_radiometry: bool = False
-    """First bring every beta to alpha's mean and contrast, for matching alone: values stay as recorded."""
-    response: Annotated[str, options.arg(metavar="fit|rec601|R,G,B")] = "fit"
-    """How a mono alpha weighs red, green and blue; fit: found from matches, with gain and gamma."""
     correct: bool = True
     """Find how far the other cameras lie off their search segments, and put that right."""
-    noise: UseAppendAction[Annotated[tuple[str, ...], options.arg(metavar="NAME=ELECTRONS[,READ]|estimate")]] = ()
-    """Low light: views are denoised before they are matched; values stay as recorded."""
-    report: bool = True
-    """Of a single frame, also write index.html: a page with any two bands or composites under a slider."""
-    strict: bool = False
-    """Write nothing, instead of warning, where the confidence says that the rig does not fit the images."""
 
     def run(self) -> None:
         """Align one frame or several, with the rig that is given or one that is found."""
         image, with_rig = named_images(self.given, self.image, "align")
-        from ..fusion.checks import confidence_checked
-        from ..support.memory import limited, parse_bytes
-
         options.writable(self.out, folder=True)
-        limit = None if self.max_memory is None else parse_bytes(self.max_memory)
-        options.response_of(self.response)
-        options.noise_of(self.noise)
-        with limited(limit), confidence_checked(strict=self.strict):
+        self.settings()
+        with self.judged():
             for frame in self._frames_with_rig(image) if with_rig else self._frames_without():
                 self._align(frame)
 
@@ -130,20 +98,13 @@ class Align(Known):
         from ..networks.weights import load_weights
         from ..support.locks import folder_lock
 
-        begin, texts = time.monotonic(), []
-        show = warnings.showwarning
-
-        def noted(message: Warning | str, *further: Any, **options: Any) -> None:
-            texts.append(str(message))
-            show(message, *further, **options)
-
+        begin, warned = time.monotonic(), len(options.WARNED)
+        settings = self.settings()
         options.say_when_compiling()
-        with folder_lock(self.out), warnings.catch_warnings():
-            warnings.showwarning = noted
+        with folder_lock(self.out):
             if frame.name:
                 self.refuse_several()
-            field = options.field_named(self.field)
-            rig, known = self.with_known(frame.rig, frame.alpha, frame.files, field)
+            rig, known = self.with_known(frame.rig, frame.alpha, frame.files, options.field_named(self.field))
             with options.working(f"aligning {frame.name}".strip()):
                 aligned = align(
                     rig,
@@ -155,23 +116,22 @@ class Align(Known):
                     interpolation=self.interpolation,
                     min_confidence=self.confidence,
                     fill=self.fill,
-                    max_memory=self.max_memory,
-                    match_levels=self.normalise_radiometry,
-                    response=options.response_of(self.response),
+                    max_memory=settings.max_memory,
+                    match_levels=settings.match_levels,
+                    response=settings.response,
                     correct=self.correct,
-                    noise=options.noise_of(self.noise),
+                    noise=settings.noise,
                 )
             written = save_aligned(aligned, self.out, separate=self.separate, positions=self.positions, name=frame.name)
             if frame.found:
                 frame.recorded.save(self.out / "rig.yaml")
                 written.append(self.out / "rig.yaml")
             if self.report and not frame.name:
+                texts = [str(message) for message in options.WARNED[warned:]]
                 facts = Facts(frame.notes, texts, time.monotonic() - begin)
                 written.append(write_aligned_page(self.out / "index.html", aligned, frame.recorded, facts))
-        print(
-            (self.out / f"{frame.name}_visibility.txt" if frame.name else self.out / "visibility.txt").read_text(),
-            end="",
-        )
+        prefix = f"{frame.name}_" if frame.name else ""
+        print((self.out / f"{prefix}visibility.txt").read_text(), end="")
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
 
 

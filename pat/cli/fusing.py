@@ -6,22 +6,18 @@ import filecmp
 import shutil
 import sys
 import time
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
-
-from tyro.conf import Positional, UseAppendAction, arg
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from . import options
 from .known import Known
 from .one_frame import fuse_with_progress
-from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Numbers, Out, optional, say
+from .options import FIRST, Numbers, Out, optional, say
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -56,36 +52,17 @@ class Fuse(Known):
         "--no-match-levels": "--no-normalise-radiometry",
     }
 
-    given: Annotated[Positional[tuple[Path, ...]], arg(metavar="RIG|IMAGE IMAGE")] = ()
-    """Rig file of any known format (also: --rig RIG); or, without one, an image, folder or video of each camera."""
-    alpha: Annotated[str | None, optional("NAME")] = None
-    """The camera whose view is wanted; without a rig by default the largest grey image."""
-    image: Images = ()
-    """With a rig: an image of each camera, once each; or NAME=FOLDER, or NAME=PATTERN."""
-    depth: Depth = None
-    """Near and far bounds in metres, instead of the rig's; far may be inf."""
     focal: Numbers = ()
     """Without a rig: the focal length in pixels of a camera whose file does not state it."""
     out: Out = Path("out")
     """Folder for fused.png, confidence.png, depth.tif, depth_16.png (16 bits; 0 is unknown), depth.png,
     depth_nearest.tif and depth_farthest.tif (the true depth is between them in 9 of 10 pixels), index.html (a page
     that shows them) and view.yaml (the rig of the fused view)."""
-    weights: Annotated[str | None, arg(metavar="NAME|FILE", help=WEIGHTS_HELP, help_behavior_hint="")] = None
-    field: FieldName = "auto"
-    max_memory: Memory = None
-    """Memory limit of the whole process, such as 4GiB; larger frames are fused in tiles."""
-    normalise_radiometry: bool = False
-    """First bring every beta to alpha's mean and contrast (other exposures, filters). Also: --match-levels."""
-    response: Annotated[str, options.arg(metavar="fit|rec601|R,G,B")] = "fit"
-    """How a mono alpha weighs red, green and blue; fit: found from matches, with gain and gamma."""
     align: bool = True
     """Find how far the other cameras lie off their search segments, and put that right."""
     exposure: Annotated[Literal["auto", "keep"] | None, optional("{auto,keep}")] = None
     """Brightness of the fused image: auto makes a dark or overexposed one as bright as a photograph; keep leaves it as
     alpha has it. By default auto without a rig, and keep with one."""
-    noise: UseAppendAction[Annotated[tuple[str, ...], options.arg(metavar="NAME=ELECTRONS[,READ]|estimate|none")]] = ()
-    """Low light: a camera's electrons at white and read noise in electrons, or estimate: views are denoised jointly.
-    By default so where an image shows noise plainly, but for a sequence."""
     keep_alpha: bool = False
     """With --noise, leave alpha's values as recorded; always so if alpha has hardly any noise."""
     luminance: Literal["alpha", "mix", "beta"] = "alpha"
@@ -111,12 +88,8 @@ class Fuse(Known):
     """Fuse only frames that are not in --out yet, or whose images changed; of one frame, only unfinished tiles."""
     points: bool = False
     """Of a single frame, also write points.ply: the pixels of known depth as a coloured point cloud."""
-    report: bool = True
-    """Of a single frame, also write index.html: a page that shows images, confidence, depth and rig."""
     classical: bool = False
     """Show the classical baseline (semi-global matching, warped colour) on that page, to compare; some seconds more."""
-    strict: bool = False
-    """Write nothing, instead of warning, where the confidence says that the rig does not fit the images."""
     on_error: Literal["stop", "skip"] = "stop"
     """What to do when a frame cannot be fused (a corrupt image, a full disk): stop, or report it and go on."""
     workers: int = 1
@@ -139,16 +112,12 @@ class Fuse(Known):
 
             exr_writer(self.out)
         self.image, with_rig = named_images(self.given, self.image, "fuse")
-        from ..support.memory import limited, parse_bytes
-
-        limit = None if self.max_memory is None else parse_bytes(self.max_memory)
-        options.response_of(self.response)
-        options.noise_of(self.noise)
+        self._settings()
         options.device_of(self.device)
         if self.classical and not self.report:
             raise ValueError("--classical needs the page: leave out --no-report")
         self._notes: list[str] = []
-        with limited(limit), self._judged() as self._warnings:
+        with self.judged():
             self._with_rig() if with_rig else self._without_rig()
 
     def _with_rig(self) -> None:
@@ -248,32 +217,6 @@ class Fuse(Known):
             return files
         return matched_frames(files)
 
-    @contextmanager
-    def _judged(self) -> Iterator[list[str]]:
-        """Exit status 3 if the rig does not fit the images. Gives the list of the warnings' texts."""
-        from ..fusion.checks import LowConfidenceWarning, confidence_checked
-
-        categories: list[type[Warning]] = []
-        texts: list[str] = []
-        with confidence_checked(strict=self.strict):
-            show = warnings.showwarning
-
-            def noted(message: Warning | str, category: type[Warning], *further: Any, **options: Any) -> None:
-                categories.append(category)
-                texts.append(str(message))
-                show(message, category, *further, **options)
-
-            warnings.showwarning = noted
-            try:
-                yield texts
-            except Exception as error:
-                if not isinstance(error.__cause__ or error, LowConfidenceWarning):
-                    raise
-                say(f"pat: {error}; not written (--strict)", style="red")
-                sys.exit(LowConfidenceWarning.exit_status)
-        if LowConfidenceWarning in categories:
-            sys.exit(LowConfidenceWarning.exit_status)
-
     def _rig(self) -> Rig:
         rig = options.load_rig_or_say_no_image(self.given[0], self.depth)
         for name, rate in options.numbers_by_name(self.frame_rate, "--frame-rate").items():
@@ -341,7 +284,6 @@ class Fuse(Known):
         self, rig: Rig, images: Mapping[str, Tensor], alpha: str, files: Mapping[str, str | Path], store: Path
     ) -> Frame:
         """One frame, with a rig and what else is known of the scene."""
-        settings = self._settings()
         known, field = self.with_known(rig, alpha, files, options.field_named(self.field))
         return fuse_with_progress(
             self.weights or "mono-colour",
@@ -350,7 +292,7 @@ class Fuse(Known):
             alpha=alpha,
             device=self.device,
             precision=self.precision,
-            settings=replace(settings, field=field),
+            settings=replace(self._settings(), field=field),
             explain=self._note,
             store=store,
         )
@@ -373,18 +315,9 @@ class Fuse(Known):
 
     def _settings(self) -> FuseSettings:
         """What a frame and many frames have in common."""
-        from ..fusion.fuse import FuseSettings
-
-        return FuseSettings(
-            field=options.field_named(self.field),
-            max_memory=self.max_memory,
-            match_levels=self.normalise_radiometry,
-            response=options.response_of(self.response),
-            align=self.align,
-            noise=options.noise_of(self.noise, by_default=not self.sequence and self.luminance == "alpha"),
-            keep_alpha=self.keep_alpha,
-            luminance=self.luminance,
-        )
+        quiet = not self.sequence and self.luminance == "alpha"
+        own = {"align": self.align, "keep_alpha": self.keep_alpha, "luminance": self.luminance}
+        return self.settings(noise_by_default=quiet, **own)
 
     def _facts(self, rig: Rig, found: tuple[str, ...] | None, seconds: float) -> Facts:
         """What the page says."""
@@ -395,7 +328,7 @@ class Fuse(Known):
 
         notes = [f"weights: {self.weights or 'mono-colour'}", *self._notes, *(found or ())]
         unit = "baselines" if rig.name == UNSCALED else "m"
-        return Facts(notes, self._warnings, seconds, peak_memory(), unit)
+        return Facts(notes, [str(message) for message in options.WARNED], seconds, peak_memory(), unit)
 
     def _note(self, line: str) -> None:
         """Say a line, and keep it for the page."""

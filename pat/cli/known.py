@@ -1,16 +1,34 @@
-"""Options for what is known from elsewhere: a depth map of alpha, and matched points."""
+"""The options that `pat fuse` and `pat align` share."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import arg
+from tyro.conf import Positional, UseAppendAction, arg
+
+from .options import (
+    WARNED,
+    WEIGHTS_HELP,
+    Depth,
+    FieldName,
+    Images,
+    Memory,
+    field_named,
+    noise_of,
+    optional,
+    response_of,
+    say,
+)
 
 if TYPE_CHECKING:
     from arraygeom import ReceptiveField, Rig
+
+    from ..fusion.fuse import FuseSettings
 
 MATCHES_HELP = "Matched points to use: CSV (x0,y0,x1,y1 a line, of two images in order) or a COLMAP database."
 MatchesFile = Annotated[Path | None, arg(metavar="FILE", help=MATCHES_HELP, help_behavior_hint="")]
@@ -21,8 +39,16 @@ OUT_OF_RANGE = 0.9
 
 @dataclass
 class Known:
-    """What `pat fuse` and `pat align` may be given of the scene."""
+    """What `pat fuse` and `pat align` are both given: an array, how to match its images, what is known of the scene."""
 
+    given: Annotated[Positional[tuple[Path, ...]], arg(metavar="RIG|IMAGE IMAGE")] = ()
+    """Rig file of any known format (also: --rig RIG); or, without one, an image, folder or video of each camera."""
+    alpha: Annotated[str | None, optional("NAME")] = None
+    """The camera whose view is wanted; without a rig by default the largest grey image. Of align also: --to."""
+    image: Images = ()
+    """With a rig: an image of each camera, once each; or NAME=FOLDER, or NAME=PATTERN."""
+    depth: Depth = None
+    """Near and far bounds in metres, instead of the rig's; far may be inf."""
     depth_map: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Depth of alpha's pixels, of a single frame: PFM, TIFF or PNG of 16 bits; matches are searched around it."""
     depth_scale: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
@@ -30,6 +56,52 @@ class Known:
     depth_tolerance: float = 0.05
     """By what share --depth-map may be off; 0 takes it as it is."""
     matches: MatchesFile = None
+    weights: Annotated[str | None, arg(metavar="NAME|FILE", help=WEIGHTS_HELP, help_behavior_hint="")] = None
+    field: FieldName = "auto"
+    max_memory: Memory = None
+    """Memory limit of the whole process, such as 4GiB; larger frames are done in tiles."""
+    normalise_radiometry: bool = False
+    """First bring every beta to alpha's mean and contrast (other exposures, filters). Also: --match-levels."""
+    response: Annotated[str, arg(metavar="fit|rec601|R,G,B")] = "fit"
+    """How a mono alpha weighs red, green and blue; fit: found from matches, with gain and gamma."""
+    noise: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=ELECTRONS[,READ]|estimate|none")]] = ()
+    """Low light: a camera's electrons at white and read noise in electrons, or estimate: views are denoised. A frame is
+    by default fused so where an image shows noise plainly."""
+    strict: bool = False
+    """Write nothing, instead of warning, where the confidence says that the rig does not fit the images."""
+    report: bool = True
+    """Of a single frame, also write index.html: a page that shows images, confidence and depth."""
+
+    def settings(self, *, noise_by_default: bool = False, **further: Any) -> FuseSettings:
+        """How frames are fused. Raises ValueError for options that are none."""
+        from ..fusion.fuse import FuseSettings
+
+        return FuseSettings(
+            field=field_named(self.field),
+            max_memory=self.max_memory,
+            match_levels=self.normalise_radiometry,
+            response=response_of(self.response),
+            noise=noise_of(self.noise, by_default=noise_by_default),
+            **further,
+        )
+
+    @contextmanager
+    def judged(self) -> Iterator[None]:
+        """A block of work within --max-memory; exit status 3 if the rig does not fit the images."""
+        from ..fusion.checks import LowConfidenceWarning, confidence_checked
+        from ..support.memory import limited, parse_bytes
+
+        limit = None if self.max_memory is None else parse_bytes(self.max_memory)
+        try:
+            with limited(limit), confidence_checked(strict=self.strict):
+                yield
+        except Exception as error:
+            if not isinstance(error.__cause__ or error, LowConfidenceWarning):
+                raise
+            say(f"pat: {error}; not written (--strict)", style="red")
+            sys.exit(LowConfidenceWarning.exit_status)
+        if any(isinstance(message, LowConfidenceWarning) for message in WARNED):
+            sys.exit(LowConfidenceWarning.exit_status)
 
     def with_known(
         self, rig: Rig, alpha: str, files: Mapping[str, str | Path], field: ReceptiveField | None

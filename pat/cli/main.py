@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, NoReturn, Union
 import tyro
 
 from . import aligning, authors, calibration, demo, fusing, rigs, weights
-from .options import refuse_missing_rig, respelled, say
+from .options import WARNED, refuse_missing_rig, respelled, say, warn
 from .parsing import parsed
 
 
@@ -67,7 +67,8 @@ def main(arguments: list[str] | None = None, *, group: Any = Pat, prog: str = "p
 def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
     try:
         with warnings.catch_warnings():
-            warnings.showwarning = _warn
+            warnings.showwarning = warn
+            WARNED.clear()
             command = _command(arguments, group, prog)
             if isinstance(rig := getattr(command, "rig", None), Path):
                 refuse_missing_rig(rig)
@@ -92,11 +93,6 @@ def _fail(error: BaseException, text: str, debug: bool) -> NoReturn:
         raise error
     say(f"pat: {' '.join(line.strip() for line in text.splitlines())}", style="red")
     sys.exit(2)
-
-
-def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
-    """A warning as one line, without its position in the code."""
-    say(f"pat: warning: {message}", style="yellow")
 
 
 def _command(arguments: list[str], group: Any, prog: str) -> Any:

@@ -5,8 +5,6 @@ Nothing here or in the modules of the commands imports torch before a command ru
 
 from __future__ import annotations
 
-import ast
-import importlib.util
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -33,16 +31,8 @@ SHIPPED = Path(__file__).parents[1] / "networks" / "shipped"
 WEIGHT_NAMES = tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
 
 
-def _field_names() -> tuple[str, ...]:
-    """The keys of `arraygeom.fields.default.FIELDS`, from its text: importing it would import torch."""
-    package = importlib.util.find_spec("arraygeom")
-    folder = Path((package and package.origin) or "").parent
-    tree = ast.parse((folder / "fields" / "default.py").read_text(encoding="utf-8"))
-    made = next(n for n in tree.body if isinstance(n, ast.AnnAssign) and ast.unparse(n.target) == "FIELDS")
-    return tuple(ast.literal_eval(key) for key in made.value.keys if key)  # type: ignore[union-attr]
-
-
-FIELD_NAMES = _field_names()
+FIELD_NAMES = ("epipolar", "line", "homography", "rectified", "nearest", "local", "dense", "curved")
+"""The keys of `arraygeom.fields.FIELDS`, whose import takes torch."""
 FIELD_HELP = f"Receptive field in the other cameras: {', '.join(FIELD_NAMES)}, or MODULE:OBJECT for your own; "
 FieldName = Annotated[str, arg(metavar="NAME|MODULE:OBJECT", help=f"{FIELD_HELP}auto takes what the rig allows.")]
 
@@ -116,8 +106,8 @@ def respelled(arguments: Iterable[str], command: Any) -> list[str]:
     FIRST and LAST stand for the first and the last positional argument, whose value follows the option: a rig may
     always be given so. Images that are positional arguments may stand anywhere.
     """
-    spellings = {"--rig": FIRST} if "rig" in command.__annotations__ else {}
-    spellings |= getattr(command, "spellings", {})
+    options = getattr(command, "__dataclass_fields__", {})
+    spellings = ({"--rig": FIRST} if "rig" in options else {}) | getattr(command, "spellings", {})
     words = iter(arguments)
     first: list[str] = []
     rest: list[str] = []
@@ -132,7 +122,7 @@ def respelled(arguments: Iterable[str], command: Any) -> list[str]:
         if not value:
             raise ValueError(f"{option}: give a file")
         (first if new == FIRST else last).append(value)
-    if "given" in command.__annotations__:
+    if "given" in options:
         rest = _images_first(rest)
     return [*first, *rest, *last]
 
@@ -301,6 +291,16 @@ def console() -> Console:
     from rich.console import Console
 
     return Console(stderr=True, highlight=False)
+
+
+WARNED: list[Warning | str] = []
+"""What a command has warned of."""
+
+
+def warn(message: Warning | str, *_: Any, **__: Any) -> None:
+    """A warning as one line, without its position in the code."""
+    WARNED.append(message)
+    say(f"pat: warning: {message}", style="yellow")
 
 
 def say(text: object, style: str | None = None) -> None:
