@@ -7,7 +7,6 @@ imported before it is used.
 from __future__ import annotations
 
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -15,9 +14,9 @@ if TYPE_CHECKING:
     from .fusion.fuse import fuse
     from .fusion.results import Frame
     from .media.images import read_image
-    from .networks.weights import Network, load_weights
+    from .networks.weights import load_weights
 
-__all__ = ["Aligned", "Frame", "align", "from_pretrained", "fuse", "load_weights", "read_image"]
+__all__ = ["Aligned", "Frame", "align", "fuse", "load_weights", "read_image"]
 
 _MODULES = {
     "Aligned": "pat.fusion.align",
@@ -40,14 +39,3 @@ if not TYPE_CHECKING:
 
 def __dir__() -> list[str]:
     return [*globals(), *_MODULES]
-
-
-def from_pretrained(name: str | Path) -> Network:
-    """The network of a weights file, or of a name that ships with the package, such as "mono-colour".
-
-    Shapes and version are checked, and nothing is unpickled. Raises FileNotFoundError for neither, ValueError for a
-    file that is not of this format or does not fit.
-    """
-    from .networks.weights import load_weights
-
-    return load_weights(name)

@@ -20,7 +20,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from arraygeom import (
-    Camera,
     Curved,
     Dense,
     HomographyDisplacement,
@@ -32,7 +31,6 @@ from arraygeom import (
     Rectified,
     Rig,
     Segments,
-    Widened,
     depth_of,
     pixel_grid,
     sample,
@@ -55,10 +53,8 @@ WINDOWS = "windows"
 class ExplorerState:
     """Values of the controls.
 
-    `x` is alpha's pixel. `near` and `far` (metres) replace the rig's, `displacement` (pixels of beta) the one that
-    covers the depth range; None keeps them. `across` widens the field (pixels). `changes` are steps of the rig's
-    parameters, with the names and units of `Rig.parameters` (radians, metres, pixels). `weights` are by windows, whose
-    scores `sharpness` multiplies, or by a network of that name.
+    `x` is alpha's pixel. `near` and `far` (metres) replace the rig's; None keeps them. `weights` are by windows, or by
+    a network of that name.
     """
 
     alpha: str
@@ -66,11 +62,7 @@ class ExplorerState:
     family: str = "auto"
     near: float | None = None
     far: float | None = None
-    displacement: float | None = None
-    across: float = 0.0
-    sharpness: float = 30.0
     weights: str = WINDOWS
-    changes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     def replace(self, **changes: object) -> ExplorerState:
         """A copy with some values changed."""
@@ -93,9 +85,8 @@ class BetaReport(NamedTuple):
 
     xy: samples in beta's pixels; `valid` marks those in the image. ends: start and end where the field is a segment.
     weight: of each sample, 1 in all. depth: of each sample in metres, NaN where there is none.
-    value: beta's image, weighted. position, deviation, peak: mean position, its standard deviation (pixels) and the
-    largest weight, as in `pat.attention`. offset: how far the images' own match lies from the line, None without a
-    segment or a clear match.
+    value: beta's image, weighted. peak: the largest weight. offset: how far the images' own match lies from the line,
+    None without a segment or a clear match.
     """
 
     xy: Float[Tensor, "l 2"]
@@ -104,16 +95,13 @@ class BetaReport(NamedTuple):
     weight: Float[Tensor, "l"]
     depth: Float[Tensor, "l"]
     value: Float[Tensor, "c"]
-    position: Float[Tensor, "2"]
-    deviation: float
     peak: float
     offset: MatchOffset | None = None
 
 
 class PixelReport(NamedTuple):
-    """The rig with its changes, a report or a problem for each beta, and the fused colour and depth of the pixel."""
+    """A report or a problem for each beta, and the fused colour and depth of the pixel."""
 
-    rig: Rig
     betas: dict[str, BetaReport]
     problems: dict[str, str]
     colour: Float[Tensor, "c"]
@@ -181,43 +169,35 @@ def shipped_attention(name: str) -> PAT:
 
 DENSE = 2048
 """Positions of the dense field, roughly."""
-SIZED: dict[str, Callable[[Pair, ExplorerState], ReceptiveField]] = {
-    "homography": lambda pair, state: HomographyDisplacement(displacement(pair, state)),
-    "rectified": lambda pair, state: Rectified(displacement(pair, state), alpha_is="either"),
-    "nearest": lambda pair, state: NearestVoxels(window=max(1, round(displacement(pair, state)))),
-    "local": lambda pair, state: Local(9),
-    "dense": lambda pair, state: Dense(stride=max(1, math.ceil(math.sqrt(math.prod(pair.beta.hw) / DENSE)))),
-    "curved": lambda pair, state: Curved(256),
+SIZED: dict[str, Callable[[Pair, Tensor], ReceptiveField]] = {
+    "homography": lambda pair, x: HomographyDisplacement(displacement(pair, x)),
+    "rectified": lambda pair, x: Rectified(displacement(pair, x), alpha_is="either"),
+    "nearest": lambda pair, x: NearestVoxels(window=max(1, round(displacement(pair, x)))),
+    "local": lambda pair, x: Local(9),
+    "dense": lambda pair, x: Dense(stride=max(1, math.ceil(math.sqrt(math.prod(pair.beta.hw) / DENSE)))),
+    "curved": lambda pair, x: Curved(256),
 }
-"""Families whose extent is set by the controls or by the images' size."""
+"""Families whose extent is that of the depth range at a pixel, or follows from the images' size."""
 FAMILIES = ("auto", *FIELDS)
 """Names of the fields: `auto` is the default field, which `pat fuse` uses. A state takes MODULE:OBJECT, too."""
 
 
-def chosen_field(pair: Pair, state: ExplorerState) -> ReceptiveField:
-    """The field of the state's family. For `auto` a displacement in the state replaces the default one."""
-    family = state.family
+def chosen_field(pair: Pair, family: str, x: Float[Tensor, "1 2"]) -> ReceptiveField:
+    """The field of a family at a pixel."""
     if family in SIZED:
-        return SIZED[family](pair, state)
-    found = recorded_field(pair) if family == "auto" else named_field(family)
-    if state.displacement is not None and isinstance(found, HomographyDisplacement | Rectified):
-        return SIZED["homography" if isinstance(found, HomographyDisplacement) else "rectified"](pair, state)
-    return found
+        return SIZED[family](pair, x)
+    return recorded_field(pair) if family == "auto" else named_field(family)
 
 
-def displacement(pair: Pair, state: ExplorerState) -> float:
-    """The state's displacement, else what covers the depth range at this pixel, else a share of beta's longer side."""
-    if state.displacement is not None:
-        return state.displacement
+def displacement(pair: Pair, x: Float[Tensor, "1 2"]) -> float:
+    """What covers the depth range at this pixel, else a share of beta's longer side."""
     if pair.link is None and pair.calibrated and pair.depth is not None:
-        return max(1.0, float(covering_displacement(pair, pixel_of(state))))
+        return max(1.0, float(covering_displacement(pair, x)))
     return LINE_SHARE * max(pair.beta.hw)
 
 
-def changed_rig(rig: Rig, state: ExplorerState) -> Rig:
-    """The rig with the state's numbers. Raises ValueError if near is beyond far."""
-    steps = {name: torch.tensor(step, dtype=torch.float64) for name, step in state.changes.items() if any(step)}
-    rig = rig.perturbed(steps)
+def with_depths(rig: Rig, state: ExplorerState) -> Rig:
+    """The rig with the state's depths. Raises ValueError if near is beyond far."""
     if state.near is None and state.far is None:
         return rig
     if rig.depth is None and (state.near is None or state.far is None):
@@ -231,7 +211,7 @@ def inspect_pixel(scene: ExplorerScene, state: ExplorerState) -> PixelReport:
 
     Raises ValueError for a rig that the state makes impossible. Errors that concern one beta go to `problems`.
     """
-    rig = changed_rig(scene.rig, state)
+    rig = with_depths(scene.rig, state)
     betas: dict[str, BetaReport] = {}
     problems: dict[str, str] = {}
     for name in rig.betas(state.alpha):
@@ -244,7 +224,7 @@ def inspect_pixel(scene: ExplorerScene, state: ExplorerState) -> PixelReport:
             problems[name] = str(error)
         except Exception as error:  # of a field of one's own
             problems[name] = f"the field '{state.family}' failed: {type(error).__name__}: {error}"
-    return PixelReport(rig, betas, problems, fused_colour(scene, betas, state), joint_depth(betas))
+    return PixelReport(betas, problems, fused_colour(scene, betas, state), joint_depth(betas))
 
 
 def pixel_of(state: ExplorerState) -> Float[Tensor, "1 2"]:
@@ -255,19 +235,18 @@ def pixel_of(state: ExplorerState) -> Float[Tensor, "1 2"]:
 def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerState) -> BetaReport:
     """The pixel's samples in one beta, their weights and depths. Raises ValueError where the field does not fit."""
     x = pixel_of(state)
-    chosen = scene.fields[state.family] if state.family in scene.fields else chosen_field(pair, state)
-    found = (Widened(chosen, across=state.across) if state.across else chosen)(pair, x)
+    field = scene.fields.get(state.family) or chosen_field(pair, state.family, x)
+    found = field(pair, x)
     samples = found.positions(samples_along(found)) if isinstance(found, Segments) else found
     xy, valid = samples.xy[0], samples.mask[0]
     if state.weights == WINDOWS:
-        scores = state.sharpness * correlations(scene.guides[state.alpha], scene.guides[name], pair, x, xy)
+        scores = SHARPNESS * correlations(scene.guides[state.alpha], scene.guides[name], pair, x, xy)
     else:
         query = sampled(scene.query(state.weights, state.alpha), x)
         key = scene.key(state.weights, name, pair)
         larger = xy.new_tensor([key.shape[-1] / pair.beta.hw[1], key.shape[-2] / pair.beta.hw[0]])
         scores = (query.T @ sampled(key, (xy + 0.5) * larger - 0.5))[0]
     weight = softmax(scores, valid)
-    position = weight @ xy
     value = sampled(scene.images[name][None], xy) @ weight
     return BetaReport(
         xy,
@@ -276,8 +255,6 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
         weight,
         depths(pair, x, xy, valid),
         value,
-        position,
-        float((weight @ (xy - position).square().sum(-1)).sqrt()),
         float(weight.max()),
         match_offset((scene.guides[state.alpha], scene.guides[name]), pair, x, (xy, weight), ends_of(found)),
     )
@@ -341,6 +318,8 @@ def samples_along(found: Segments) -> int:
     return math.ceil(float(torch.where(found.valid, found.length, 0.0).max())) + 1
 
 
+SHARPNESS = 30.0
+"""What correlations are multiplied with to be scores."""
 RADIUS = 5
 """Windows of 11 x 11 pixels are compared."""
 
@@ -422,13 +401,6 @@ def fused_colour(scene: ExplorerScene, betas: Mapping[str, BetaReport], state: E
     weights = sum(s.peak for s in coloured)
     difference = sum((s.peak / weights) * (s.value - luminance(s.value[:, None, None]).reshape(1)) for s in coloured)
     return own + difference
-
-
-def parameter_lengths(rig: Rig) -> dict[str, int]:
-    """Lengths of the rig's parameters by name, without the depth range."""
-    if not any(isinstance(camera, Camera) for camera in rig.cameras.values()):
-        return {}
-    return {name: step.numel() for name, step in rig.parameters(free=["*.*"]).items() if not name.startswith("depth.")}
 
 
 def image_pixel(x: float, y: float, hw: HW) -> tuple[float, float]:

@@ -5,14 +5,13 @@ import torch
 
 from arraygeom import Camera, Pair, Pose, Rectified, Rig, View, intrinsics
 from arraygeom.fields.grid import FieldOnGrid
-from pat import from_pretrained
 from pat.fusion.fuse import fuse
 from pat.fusion.steps import co_located
 from pat.matching.inputs import Inputs
 from pat.networks.bandwise import BandwisePAT
 from pat.networks.configs import BandwisePATConfig
 from pat.networks.protocol import fused_at_once
-from pat.networks.weights import save_weights
+from pat.networks.weights import load_weights, save_weights
 from tests.pat.matching.test_spectral_mix import texture
 
 HW = (32, 48)
@@ -109,6 +108,6 @@ def test_only_single_bands():
 
 def test_written_and_read_back(network, tmp_path):
     save_weights(network, tmp_path / "w.safetensors")
-    again = from_pretrained(tmp_path / "w.safetensors")
+    again = load_weights(tmp_path / "w.safetensors")
     assert again.config == network.config
     assert all(torch.equal(v, network.state_dict()[k]) for k, v in again.state_dict().items())
