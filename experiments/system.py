@@ -23,6 +23,7 @@ from torch import Tensor
 from arraygeom import Rig
 from arraygeom.atomic import write_text
 from arraygeom.io.native import write as rig_text
+from experiments.flicker import flicker
 from experiments.hdr import merged, missed, tone_curve, usable_range
 from experiments.peaks import watch_peak
 from pat.evaluation.baseline import classical_baseline
@@ -31,7 +32,7 @@ from pat.evaluation.tables import markdown_table
 from pat.fusion.frames import ImageFiles
 from pat.fusion.fuse import FuseSettings, fuse
 from pat.fusion.results import Frame, save_frame, view_of
-from pat.fusion.sequence import SequenceFusion, flicker
+from pat.fusion.sequence import SequenceFusion
 from pat.fusion.views import ViewFiles
 from pat.media.colour import linear_from_srgb, luminance, to_luma_chroma
 from pat.media.figures import colour_depth, save_panels

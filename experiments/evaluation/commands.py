@@ -330,8 +330,9 @@ class Patches:
 
         from experiments.patches.dataset import ScenePatches
         from experiments.patches.show import draw_patches
+        from experiments.sensors import read_chains
         from pat.media.figures import save_figure
-        from pat.sensors import generator_for, read_chains
+        from pat.sensors import generator_for
         from pat.support.schema import read_yaml
 
         if self.samples < 1:

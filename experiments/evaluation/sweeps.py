@@ -269,7 +269,7 @@ def made(rig: Rig, bank: PhotoBank, number: int, seed: int = 0) -> RecordedScene
     position, visible = seen_at(pair, *(depth[0].double() for depth in batch.depth))
     steps = [Noise(8000, 3), Clip(), Quantise(8)]
     images = {ALPHA: luminance(batch.images[0]), BETA: batch.images[1]}
-    recorded = {name: record(image, steps, g).image[0] for name, image in images.items()}
+    recorded = {name: record(image, steps, g)[0] for name, image in images.items()}
     return RecordedScene(recorded, batch.images[0][0], position, visible)
 
 

@@ -11,11 +11,12 @@ from torch import Tensor
 
 from arraygeom import Band
 from experiments.rendered import RenderedScene
+from experiments.sensors import Spectral
 from experiments.stage import SystemScene
 from experiments.system import SystemRecording
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.media.raw import light_of
-from pat.sensors import Clip, Noise, Spectral, record
+from pat.sensors import Clip, Noise, record
 
 TITLE = "four mono cameras, three filters, four exposures: more range than any one of them has"
 REDUCED = 2 / 5
@@ -41,7 +42,7 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
         own = luminance(lit) if name == alpha else banded(lit, sensor.response)
         seen = own * light_of(sensor, rig[alpha].sensor)
         lights[name] = own[0]
-        raw[name] = [record(seen, (Noise(ELECTRONS, READ), Clip()), stage.generator(name)).image[0]]
+        raw[name] = [record(seen, (Noise(ELECTRONS, READ), Clip()), stage.generator(name))[0]]
         if name != alpha:
             bands[name] = banded(light(stage, alpha), sensor.response)[0]
     return SystemRecording(raw, [srgb_from_linear(torch.cat([bands[name] for name in rig.betas(alpha)]))], lights)
@@ -62,4 +63,4 @@ def banded(linear: Tensor, response: object) -> Tensor:
     """What passes a filter, white staying white."""
     if not isinstance(response, Band):
         raise ValueError("the betas of this system have filters: give each a band as its response")
-    return record(linear, (Spectral(response),), torch.Generator()).image
+    return record(linear, (Spectral(response),), torch.Generator())

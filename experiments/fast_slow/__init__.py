@@ -36,7 +36,7 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     for name, frames in lights(stage).items():
         for lit in frames:
             own = luminance(lit) if name == stage.alpha else banded(lit, rig[name].sensor.response)
-            raw[name].append(record(own, (Noise(8_000, 4), Clip()), generator).image[0])
+            raw[name].append(record(own, (Noise(8_000, 4), Clip()), generator)[0])
             if name == stage.alpha:
                 bands = [banded(lit, rig[b].sensor.response)[0] for b in rig.betas(name)]
                 ground_truth.append(srgb_from_linear(torch.cat(bands)))

@@ -9,12 +9,13 @@ from torch import Tensor
 
 from arraygeom import HomographyDisplacement, Rig, Sensor
 from arraygeom.atomic import write_text
+from experiments.flicker import flicker
 from experiments.showcase import FAST, SCENE, SLOW, FastSlowArray, bright_gain, fast_and_slow_array
 from experiments.system import SystemResult
 from pat.evaluation.tables import markdown_table
 from pat.fusion.fuse import FuseSettings
 from pat.fusion.results import Frame, save_frame
-from pat.fusion.sequence import SequenceFusion, flicker
+from pat.fusion.sequence import SequenceFusion
 from pat.media.colour import luminance_of, srgb_image
 from pat.media.figures import save_panels
 from pat.media.images import read_image

@@ -250,7 +250,7 @@ def _recorded(image: Tensor, g: Generator, recording: MatchingRecording, rate: i
     if _chance(recording.vignetting, g):
         image = image * _vignetting(image, 0.5 * float(torch.rand((), generator=g)))
     if _chance(recording.blur, g):
-        image = record(image, [GaussianBlur(0.4 + 1.1 * float(torch.rand((), generator=g)))], g).image
+        image = record(image, [GaussianBlur(0.4 + 1.1 * float(torch.rand((), generator=g)))], g)
     image = avg_pool2d(image, rate).clamp(0, 1)
     if _chance(recording.noise, g):
         electrons = 10 ** (2.0 + 2.2 * float(torch.rand((), generator=g)))

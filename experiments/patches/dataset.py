@@ -16,22 +16,12 @@ from arraygeom.fields import ReceptiveField
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.rig import Rig
 from arraygeom.sensor import Band, Curve, Sensor
-from pat.data.windows import same_cameras, scene_folders, scene_rig, stacked
+from experiments.sensors import EncodeSRGB, Spectral, record_array
+from pat.data.windows import scene_folders, scene_rig
 from pat.media.colour import srgb_image
-from pat.sensors import (
-    Clip,
-    DegradationCase,
-    EncodeSRGB,
-    Noise,
-    Quantise,
-    Spectral,
-    Step,
-    generator_for,
-    record_array,
-    seed_for,
-)
+from pat.sensors import Clip, DegradationCase, Noise, Quantise, Step, generator_for, seed_for
 
-from .grid import PatchGrid, PatchStack, cut
+from .grid import PatchGrid, PatchStack, cut, same_cameras, stacked
 
 LOADED = 64
 """Scenes whose patches each process caches in memory."""

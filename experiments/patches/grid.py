@@ -136,3 +136,19 @@ def _beta_size(alpha: Camera, beta: Camera, patches: PatchGrid) -> HW:
     if min(h, w) < r:
         raise ValueError(f"an image of {beta.hw[1]}x{beta.hw[0]} is too small for patches reduced {r} times")
     return h, w
+
+
+def stacked(rigs: list[Rig]) -> Rig:
+    """A batch of rigs of the same cameras. Raises ValueError where sizes or names differ."""
+    first = rigs[0]
+    for rig in rigs[1:]:
+        same_cameras(first, rig)
+    return stack(rigs)
+
+
+def same_cameras(one: Rig, other: Rig) -> None:
+    """Raises ValueError unless two rigs have the same cameras with images of the same sizes."""
+    sizes = [{name: f"{c.hw[1]}x{c.hw[0]}" for name, c in rig.cameras.items()} for rig in (one, other)]
+    if sizes[0] != sizes[1]:
+        shown = [", ".join(f"{name} {wh}" for name, wh in s.items()) for s in sizes]
+        raise ValueError(f"has images of other sizes than the first ({shown[1]}; first: {shown[0]}): one rig a folder")

@@ -47,8 +47,8 @@ def main(out: Path = SAMPLE, seed: int = 2, samples: int = 64) -> None:
     with TemporaryDirectory() as folder:
         rendered = render(still_life(seed, rig), rig, Path(folder) / "scene", settings=settings)
         ground_truth, seen = (srgb_from_linear(rendered.frame(name).rgb[None]).clamp(0, 1) for name in (ALPHA, BETA))
-    mono = record(luminance(ground_truth), [Noise(8000, 3), Clip(), Quantise(8)], generator).image
-    colour = record(seen, [Noise(4000, 3), Clip(), Quantise(8)], generator).image
+    mono = record(luminance(ground_truth), [Noise(8000, 3), Clip(), Quantise(8)], generator)
+    colour = record(seen, [Noise(4000, 3), Clip(), Quantise(8)], generator)
     out.mkdir(parents=True, exist_ok=True)
     rig.save(out / "rig.yaml")
     for name, image in {ALPHA: mono, BETA: colour, "truth": ground_truth}.items():

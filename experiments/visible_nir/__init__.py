@@ -31,8 +31,8 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     else:
         infrared = linear_from_srgb(stage.seen("nir", stage.mixed(infrared_weights(stage)))[0][:, :1])
     own, other = (hazed(*stage.seen(name)) for name in ("nir", "colour"))
-    nir = record(infrared, (Noise(8_000, 4), Clip()), generator).image
-    colour = record(other, (Noise(6_000, 3), Clip()), generator).image
+    nir = record(infrared, (Noise(8_000, 4), Clip()), generator)
+    colour = record(other, (Noise(6_000, 3), Clip()), generator)
     ground_truth = from_luma_chroma(srgb_from_linear(infrared[0]), to_luma_chroma(srgb_from_linear(own[0]))[1])
     return SystemRecording({"nir": [nir[0]], "colour": [colour[0]]}, [ground_truth.clamp(0, 1)])
 

@@ -11,10 +11,11 @@ from torch import Tensor
 
 from arraygeom import Rig
 from experiments.rendered import RenderedScene
+from experiments.sensors import DecodeSRGB, Mosaic
 from experiments.stage import SystemScene
 from experiments.system import SystemRecording
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
-from pat.sensors import Clip, DecodeSRGB, GaussianBlur, Mosaic, Noise, record
+from pat.sensors import Clip, GaussianBlur, Noise, record
 
 TITLE = "mono telephoto, and a wide colour camera with 10 times fewer pixels on what both see"
 REDUCED = 1 / 8
@@ -29,8 +30,8 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     generator = stage.generator("record")
     sharp = linear_from_srgb(image)
     ground_truth = defocused(sharp, depth, stage.rig)
-    tele = record(luminance(ground_truth), (Noise(10_000, 3), Clip()), generator).image
-    wide = record(stage.seen("wide")[0], (DecodeSRGB(), Noise(6_000, 3), Clip(), Mosaic("RGGB")), generator).image
+    tele = record(luminance(ground_truth), (Noise(10_000, 3), Clip()), generator)
+    wide = record(stage.seen("wide")[0], (DecodeSRGB(), Noise(6_000, 3), Clip(), Mosaic("RGGB")), generator)
     return SystemRecording({"narrow": [tele[0]], "wide": [wide[0]]}, [srgb_from_linear(ground_truth[0])])
 
 
@@ -40,7 +41,7 @@ def defocused(image: Tensor, depth: Tensor, rig: Rig) -> Tensor:
     circle = FOCAL_LENGTH**2 / F_NUMBER / (FOCUS - FOCAL_LENGTH) * (depth - FOCUS).abs() / depth
     sigma = circle / PITCH * scale / 4
     steps = torch.linspace(0, float(sigma.max()) + 1e-3, 6)
-    stack = [image, *(record(image, (GaussianBlur(float(s)),), torch.Generator()).image for s in steps[1:])]
+    stack = [image, *(record(image, (GaussianBlur(float(s)),), torch.Generator()) for s in steps[1:])]
     level = (sigma / steps[-1] * (len(steps) - 1)).clamp(0, len(steps) - 1 - 1e-4)
     low, within = level.floor().long(), level.frac()
     stacked = torch.stack(stack)[:, 0]

@@ -13,7 +13,6 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from arraygeom.batching import stack
 from arraygeom.camera import Camera
 from arraygeom.pixels import HW, map_homogeneous, pixel_grid, resize_matrix
 from arraygeom.rig import Rig
@@ -125,19 +124,3 @@ def reduced_depth(depth: Float[Tensor, "n h w"], hw: HW) -> Float[Tensor, "n h2 
     nearest = sample(depth[:, None], x, interpolation="nearest").values[:, 0]
     even = (between / nearest - 1).abs() < 0.01
     return torch.where(even, between, nearest)
-
-
-def stacked(rigs: list[Rig]) -> Rig:
-    """A batch of rigs of the same cameras. Raises ValueError where sizes or names differ."""
-    first = rigs[0]
-    for rig in rigs[1:]:
-        same_cameras(first, rig)
-    return stack(rigs)
-
-
-def same_cameras(one: Rig, other: Rig) -> None:
-    """Raises ValueError unless two rigs have the same cameras with images of the same sizes."""
-    sizes = [{name: f"{c.hw[1]}x{c.hw[0]}" for name, c in rig.cameras.items()} for rig in (one, other)]
-    if sizes[0] != sizes[1]:
-        shown = [", ".join(f"{name} {wh}" for name, wh in s.items()) for s in sizes]
-        raise ValueError(f"has images of other sizes than the first ({shown[1]}; first: {shown[0]}): one rig a folder")

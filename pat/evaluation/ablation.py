@@ -219,7 +219,7 @@ def _recorded(name: str, rig: Rig, ground_truth: Tensor, seen: Tensor, depth: Te
     known = depth[depth.isfinite()]
     steps = [Noise(8000, 3), Clip(), Quantise(8)]
     ideal = {ALPHA: luminance(ground_truth), BETA: seen}
-    images = {name: record(scene[None], steps, g).image[0] for name, scene in ideal.items()}
+    images = {name: record(scene[None], steps, g)[0] for name, scene in ideal.items()}
     return AblationCase(
         name, rig.replace(depth=(float(known.min()) / 1.1, float(known.max()) * 1.1)), images, ground_truth, depth
     )

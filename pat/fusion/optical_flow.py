@@ -8,7 +8,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import pixel_grid, sample
@@ -27,9 +27,6 @@ class FlowSettings:
         "below 1 / e",
     )
     unlike: float = tuned(0.08, "Source not recorded: so is flow between pixels whose values differ by this")
-    still: float = tuned(
-        0.5, "Source not recorded: pixels that move less than this between two frames are still"
-    )
 
 
 SETTINGS = FlowSettings()
@@ -62,12 +59,6 @@ def warped(image: Float[Tensor, "c h w"], step: Float[Tensor, "2 h w"]) -> Float
     x = pixel_grid((h, w)) + step.movedim(0, -1)
     x = torch.minimum(x.clamp(min=0), x.new_tensor([w - 1, h - 1]))
     return sample(image[None], x[None]).values[0]
-
-
-def still(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Bool[Tensor, "h w"]:
-    """Where nothing moves from frame a to b, and nothing near does."""
-    moves = (_steps(a, b).square().sum(0) > SETTINGS.still**2).numpy().astype(np.uint8)
-    return torch.from_numpy(cv2.dilate(moves, np.ones((9, 9), np.uint8)) == 0)
 
 
 def _steps(a: Tensor, b: Tensor) -> Float[Tensor, "2 h w"]:

@@ -14,7 +14,6 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -26,7 +25,6 @@ from arraygeom.fields.default import straight_field
 
 from ..matching.normalisation import mean_moments
 from ..matching.radiometry import Response
-from ..media.colour import to_luma_chroma
 from ..networks.protocol import FusionNetwork
 from ..sensors import NoiseLevel
 from ..support.settings import physics, size, tuned
@@ -34,7 +32,7 @@ from .corrections import Corrections
 from .frames import CachedFrames, DenoisedFrames, Frames
 from .fuse import FuseSettings, corrections_of, fuse
 from .low_light import noise_levels
-from .optical_flow import flow_between, still, warped
+from .optical_flow import flow_between, warped
 from .results import Frame
 from .timeline import KeyFrame, Timeline
 from .views import grey_alpha
@@ -341,17 +339,3 @@ def fuse_sequence(
     numbers = {key.alpha: number for number, key in enumerate(keys)}
     for i in range(len(frames[alpha])):
         yield job.frame(i, keys, lambda key: colour(numbers[key.alpha]))
-
-
-def flicker(images: Sequence[Float[Tensor, "3 h w"]], greys: Sequence[Float[Tensor, "1 h w"]]) -> float:
-    """Mean change of chroma (R - Y, B - Y) from frame to frame where nothing moves, 0..1.
-
-    `greys` are alpha's frames, which show what moves. Raises ValueError for fewer than two frames.
-    """
-    if len(images) < 2:
-        raise ValueError("flicker needs two frames or more")
-    changes = []
-    for (a, b), (grey_a, grey_b) in zip(pairwise(images), pairwise(greys)):
-        change = (to_luma_chroma(b)[1] - to_luma_chroma(a)[1]).abs().mean(0)
-        changes.append(float(change[still(grey_a, grey_b)].mean()))
-    return sum(changes) / len(changes)

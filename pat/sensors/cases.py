@@ -10,10 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
-from .chain import Step, record
-from .electronics import Clip
-from .grids import Resample
-from .optics import BoxBlur
+from .steps import BoxBlur, Clip, Resample, Step, record
 
 
 @dataclass(frozen=True)
@@ -25,17 +22,17 @@ class DegradationCase:
     beta: tuple[Step, ...] = ()
 
 
-def paper_cases(blur: int = 5) -> tuple[DegradationCase, DegradationCase, DegradationCase, DegradationCase]:
+def paper_cases() -> tuple[DegradationCase, ...]:
     """The paper's four augmentations for two inputs; each is drawn with probability 1/4.
 
-    The paper does not give the blur; here it is a box of `blur` pixels.
+    The paper does not give the blur; here it is a box of 5 pixels.
     """
     reduced = (Resample(0.5, "bicubic"), Resample(2.0, "bicubic"), Clip())
     return (
-        DegradationCase("blur alpha", alpha=(BoxBlur(blur),)),
-        DegradationCase("blur beta", beta=(BoxBlur(blur),)),
+        DegradationCase("blur alpha", alpha=(BoxBlur(5),)),
+        DegradationCase("blur beta", beta=(BoxBlur(5),)),
         DegradationCase("reduce beta", beta=reduced),
-        DegradationCase("blur and reduce beta", beta=(BoxBlur(blur), *reduced)),
+        DegradationCase("blur and reduce beta", beta=(BoxBlur(5), *reduced)),
     )
 
 
@@ -65,7 +62,7 @@ def augment(
 
 
 def _same_size(image: Tensor, steps: Sequence[Step], generator: Generator, name: str) -> Tensor:
-    degraded = record(image, steps, generator).image
+    degraded = record(image, steps, generator)
     if degraded.shape != image.shape:
         old, new = tuple(image.shape[1:]), tuple(degraded.shape[1:])
         raise ValueError(

@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import avg_pool2d, conv2d, pad
 
 from ..media.colour import linear_from_srgb, srgb_from_linear
-from .chain import normal
+from .steps import normal
 
 AddedTo = Literal["light", "values"]
 """What noise was added to: linear light, encoded as sRGB afterwards, or the values themselves."""

@@ -269,7 +269,7 @@ def recorded(image: Tensor, camera: Camera, g: Generator, recording: RecordingCo
     """The recorded image, perhaps distorted by a lens and undistorted, up to `lost` of it missing on each side."""
 
     def record_here(image: Tensor) -> Tensor:
-        return record(image, steps(g, recording), g).image
+        return record(image, steps(g, recording), g)
 
     b, _, h, w = image.shape
     if recording.lens and _chance(recording.lens, g):

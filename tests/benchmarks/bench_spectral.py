@@ -75,7 +75,7 @@ def cases(args: Args, places: int, random: int) -> Iterator[tuple[Rig, dict[str,
         near, far = (float(d) for d in made.depth_range[0])
         rig = Rig({"alpha": cameras[0]} | {name: cameras[place] for name, place in at.items()}, depth=(near, far))
         steps = [Noise(8000, 3), Clip(), Quantise(8)]
-        yield rig, {name: record(p, steps, g).image[0] for name, p in images.items()}, seen[0][0]
+        yield rig, {name: record(p, steps, g)[0] for name, p in images.items()}, seen[0][0]
 
 
 def baseline(rig: Rig, images: dict[str, Tensor], places: int, random: int) -> Tensor:

@@ -11,6 +11,7 @@ from arraygeom import Rig
 from experiments import NAMES, load_system, run_system
 from experiments.__main__ import Experiments
 from experiments.hdr import merged, usable_range
+from experiments.sensors import Mosaic
 from experiments.stage import SystemScene
 from pat.cli.main import main
 from pat.fusion.results import Frame
@@ -19,7 +20,6 @@ from pat.fusion.views import ViewFiles
 from pat.media.colour import linear_from_srgb, srgb_from_linear
 from pat.media.images import read_image
 from pat.media.raw import demosaiced
-from pat.sensors import Mosaic
 
 
 def angle(focal: float, pixels: int) -> float:

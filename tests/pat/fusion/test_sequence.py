@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from arraygeom import Epipolar, Moved, Rig, Sensor, View, Widened, pixel_grid
+from experiments.flicker import flicker
 from pat.fusion.fuse import FuseSettings
 from pat.fusion.optical_flow import flow_between, warped
-from pat.fusion.sequence import KeyContribution, SequenceFusion, flicker, fuse_sequence, mixed
+from pat.fusion.sequence import KeyContribution, SequenceFusion, fuse_sequence, mixed
 from pat.fusion.timeline import Timeline
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from arraygeom import Rig, Sensor, View
+from experiments.sensors import Mosaic
 from pat.fusion.views import ViewFiles
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.media.images import write_image
 from pat.media.raw import as_bright, demosaiced, develop, developed
-from pat.sensors import Mosaic
 
 HW = (48, 64)
 

@@ -6,24 +6,18 @@ import torch
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.pose import Pose
 from arraygeom.sensor import Band, Curve
+from experiments.sensors import DecodeSRGB, DiscBlur, EncodeSRGB, Exposure, Gamma, Spectral, record
 from pat.sensors import (
     BoxBlur,
     Clip,
-    DecodeSRGB,
     DegradationCase,
-    DiscBlur,
-    EncodeSRGB,
-    Exposure,
-    Gamma,
     GaussianBlur,
     Jitter,
     Noise,
     Quantise,
     Resample,
-    Spectral,
     augment,
     paper_cases,
-    record,
 )
 
 

@@ -21,14 +21,13 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
+from pat.sensors import BoxBlur, Clip, GaussianBlur, Jitter, Noise, Quantise, Resample, Step
 from pat.support.naming import near
 from pat.support.schema import from_document
 
-from .chain import Step
-from .electronics import Clip, Exposure, Jitter, Noise, Quantise
-from .grids import Crop, Demosaic, Mosaic, Resample
-from .optics import BoxBlur, Defocus, DiscBlur, GaussianBlur, MotionBlur, Vignetting
-from .spectral import DecodeSRGB, EncodeSRGB, Gamma, Spectral
+from .grids import Crop, Demosaic, Mosaic
+from .optics import Defocus, DiscBlur, MotionBlur, Vignetting
+from .spectral import DecodeSRGB, EncodeSRGB, Exposure, Gamma, Spectral
 
 _CLASSES: tuple[type[Step], ...] = (
     *(DecodeSRGB, EncodeSRGB, Gamma, Spectral, Exposure, Vignetting),

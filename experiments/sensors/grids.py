@@ -1,4 +1,4 @@
-"""The grid of pixels: resampling, cropping, colour filters."""
+"""The grid of pixels: cropping, colour filters."""
 
 from __future__ import annotations
 
@@ -8,56 +8,14 @@ from typing import Literal
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
-from torch.nn.functional import interpolate
 
-from arraygeom.pixels import HW, resize_matrix, shift_matrix
-
-from ..media.raw import demosaiced
-from .chain import Step
+from arraygeom.pixels import HW, shift_matrix
+from pat.media.raw import demosaiced
+from pat.sensors import Step
 
 Pattern = Literal["RGGB", "GRBG", "BGGR", "GBRG"]
 _KORNIA = {"RGGB": "BG", "GRBG": "GB", "BGGR": "RG", "GBRG": "GR"}
 """kornia's names of the patterns. It is imported where it is used: that takes a quarter of a second."""
-
-
-@dataclass(frozen=True)
-class Resample(Step):
-    """Another number of pixels for the same field of view: c' = (c + 0.5) s - 0.5.
-
-    `to` is a factor (sizes are rounded, and the factor along each axis is what they give) or a (height, width).
-    "area" is what a sensor with larger pixels records: it keeps the mean of the image exactly. "bicubic" is
-    the usual antialiased resize with a = -0.5.
-    """
-
-    to: float | HW
-    method: Literal["area", "bicubic"] = "area"
-
-    def __post_init__(self) -> None:
-        if min(self.to if isinstance(self.to, tuple) else (self.to,)) <= 0:
-            raise ValueError(f"resample: give a positive factor or a (height, width), got {self.to}")
-
-    def hw(self, hw: HW) -> HW:
-        if isinstance(self.to, tuple):
-            return self.to
-        return max(round(hw[0] * self.to), 1), max(round(hw[1] * self.to), 1)
-
-    def pixel_matrix(self, hw: HW) -> Float[Tensor, "3 3"]:
-        return resize_matrix(hw, self.hw(hw))
-
-    def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h2 w2"]:
-        h, w = image.shape[-2:]
-        new = self.hw((h, w))
-        if self.method == "bicubic":
-            return interpolate(image, new, mode="bicubic", align_corners=False, antialias=True)
-        return _area_weights(h, new[0]).to(image) @ image @ _area_weights(w, new[1]).to(image).mT
-
-
-def _area_weights(old: int, new: int) -> Tensor:
-    """(new, old): the share of each old pixel in each new one, rows adding up to 1."""
-    edge = torch.arange(new + 1, dtype=torch.float64) * (old / new)
-    pixel = torch.arange(old, dtype=torch.float64)
-    overlap = torch.minimum(edge[1:, None], pixel + 1) - torch.maximum(edge[:-1, None], pixel)
-    return overlap.clamp(min=0) * (new / old)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,8 @@ import torch
 
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.pose import Pose
-from pat.sensors import Defocus, DiscBlur, GaussianBlur, MotionBlur, Resample, Vignetting, circle_of_confusion, record
+from experiments.sensors import Defocus, DiscBlur, MotionBlur, Vignetting, circle_of_confusion, record
+from pat.sensors import GaussianBlur, Resample
 
 HW = (61, 81)
 LENS, F_NUMBER = 50.0, 2.0
@@ -125,20 +126,6 @@ def test_motion_blur_is_as_long_as_shutter_times_velocity_and_stays_centred():
     assert (spread[0, 0].sum(0) * columns).sum().item() == pytest.approx(40)
 
 
-def test_motion_of_every_pixel_blurs_as_the_same_velocity():
-    image = torch.rand(1, 3, *HW, generator=generator(), dtype=torch.float64)
-    motion = torch.tensor([300.0, -200.0]).double()[:, None, None].expand(1, 2, *HW)
-    one = record(image, [MotionBlur(0.02)], generator(), motion=motion).image
-    other = record(image, [MotionBlur(0.02, (300.0, -200.0))], generator()).image
-    torch.testing.assert_close(one, other)
-
-
-def test_motion_follows_the_resampled_image():
-    motion = torch.tensor([600.0, 0.0]).double()[:, None, None].expand(1, 2, *HW)
-    spread = record(point(), [Resample((61, 162)), MotionBlur(0.02)], generator(), motion=motion).image
-    assert (12 * variances(spread)[0]) ** 0.5 == pytest.approx(24, rel=0.05)
-
-
 def test_motion_blur_agrees_with_a_line_filter_of_opencv():
     image = torch.rand(1, 1, *HW, generator=generator(), dtype=torch.float64)
     mean = cv2.blur(image[0, 0].numpy(), (9, 1), borderType=cv2.BORDER_REPLICATE)
@@ -174,7 +161,6 @@ def test_what_a_step_misses_is_named():
     image = torch.rand(1, 1, 8, 8)
     for step, words in (
         (Defocus(2, 2, 50), "depth"),
-        (MotionBlur(0.01), "velocity"),
         (Vignetting(natural=True), "camera"),
     ):
         with pytest.raises(ValueError, match=words):

@@ -1,4 +1,4 @@
-"""Spectral responses, and the encoding of light."""
+"""Spectral responses, the encoding of light, and exposure."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from arraygeom.sensor import Band, Curve
-
-from ..media.colour import REC601, linear_from_srgb, srgb_from_linear
-from .chain import Step
+from pat.media.colour import REC601, linear_from_srgb, srgb_from_linear
+from pat.sensors import Step
 
 CHANNELS = ((600.0, 35.0), (540.0, 35.0), (460.0, 35.0), (850.0, 60.0))
 """Assumed responses of the channels R, G, B and NIR of an ideal image: Gaussians, centre and sigma in nm."""
@@ -47,6 +46,16 @@ class Gamma(Step):
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         return image.clamp(min=1e-8) ** (1 / self.gamma)
+
+
+@dataclass(frozen=True)
+class Exposure(Step):
+    """Linear light times a gain: exposure time, aperture and amplification together."""
+
+    gain: float | Tensor
+
+    def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
+        return image * self.gain
 
 
 @dataclass(frozen=True)

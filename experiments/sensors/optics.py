@@ -9,42 +9,14 @@ from typing import Literal
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
-from torch.nn.functional import conv2d, pad
 
 from arraygeom.camera import Camera
 from arraygeom.pixels import pixel_grid
 from arraygeom.sampling import sample
+from pat.sensors import Step
+from pat.sensors.steps import convolved
 
-from .chain import LitStep, OpticalImage, Step
-
-
-@dataclass(frozen=True)
-class BoxBlur(Step):
-    """Mean over a square of an odd number of pixels; the border is replicated."""
-
-    width: int
-
-    def __post_init__(self) -> None:
-        if self.width < 1 or self.width % 2 == 0:
-            raise ValueError(f"the width of a box blur must be an odd number of pixels, got {self.width}")
-
-    def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        kernel = image.new_full((self.width,), 1 / self.width)
-        return _convolved(_convolved(image, kernel[None]), kernel[:, None])
-
-
-@dataclass(frozen=True)
-class GaussianBlur(Step):
-    """Uniform Gaussian defocus; sigma in pixels."""
-
-    sigma: float | Tensor
-
-    def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        r = math.ceil(4 * _value(self.sigma))
-        x = torch.arange(-r, r + 1, dtype=image.dtype, device=image.device)
-        kernel = torch.exp(-0.5 * (x / max(self.sigma, 1e-6)) ** 2)
-        kernel = kernel / kernel.sum()
-        return _convolved(_convolved(image, kernel[None]), kernel[:, None])
+from .chain import LitStep, OpticalImage
 
 
 @dataclass(frozen=True)
@@ -54,7 +26,7 @@ class DiscBlur(Step):
     radius: float | Tensor
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        return _convolved(image, disc_kernel(self.radius, image))
+        return convolved(image, disc_kernel(self.radius, image))
 
 
 @dataclass(frozen=True)
@@ -96,7 +68,7 @@ class Defocus(LitStep):
             inside = (bins == i)[:, None].to(image)
             light = torch.cat([image, torch.ones_like(cover)], 1)
             near, far = (self._kernel(abs(levels[i + k]), aspect, image) for k in (1, 0))
-            scattered = _convolved(inside * share * light, near) + _convolved(inside * (1 - share) * light, far)
+            scattered = convolved(inside * share * light, near) + convolved(inside * (1 - share) * light, far)
             colour, opacity = scattered[:, :-1], scattered[:, -1:]
             seen, cover = colour + (1 - opacity) * seen, opacity + (1 - opacity) * cover
         return seen / cover.clamp(min=1e-6)
@@ -133,35 +105,26 @@ def _levels(low: float, high: float) -> list[float]:
 
 
 @dataclass(frozen=True)
-class MotionBlur(LitStep):
+class MotionBlur(Step):
     """The mean over the time the shutter is open, `shutter` seconds, centred on the moment of the sharp image.
 
-    Everything moves with `velocity` (x, y) in pixels a second, or each pixel with the motion given to `record`.
-    Sampled backwards along each pixel's own motion: exact where neighbours move alike. The border is replicated.
+    Everything moves with `velocity` (x, y) in pixels a second. The border is replicated.
     """
 
     shutter: float
-    velocity: tuple[float, float] | None = None
+    velocity: tuple[float, float]
 
     def __post_init__(self) -> None:
         if self.shutter < 0:
             raise ValueError(f"motion blur: shutter is a time in seconds, got {self.shutter:g}")
 
-    def expose(self, light: OpticalImage, generator: Generator) -> OpticalImage:
-        path = self.shutter * self._motion(light).movedim(1, -1)
-        steps = max(math.ceil(2 * float(path.detach().norm(dim=-1).max())), 1)
+    def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
+        path = self.shutter * image.new_tensor(self.velocity)
+        steps = max(math.ceil(2 * float(path.norm())), 1)
         times = (torch.arange(steps, dtype=path.dtype) + 0.5) / steps - 0.5
-        grid = pixel_grid(light.hw, dtype=path.dtype, device=path.device)
-        frames = [sample(light.image, grid - t * path, extended=True).values for t in times.tolist()]
-        return replace(light, image=torch.stack(frames).mean(0))
-
-    def _motion(self, light: OpticalImage) -> Tensor:
-        if self.velocity is not None:
-            b, _, h, w = light.image.shape
-            return light.image.new_tensor(self.velocity)[:, None, None].expand(b, 2, h, w)
-        if light.motion is None:
-            raise ValueError("motion blur needs `velocity`, or the motion of every pixel given to record()")
-        return light.motion.to(light.image)
+        grid = pixel_grid((image.shape[-2], image.shape[-1]), dtype=path.dtype, device=path.device)
+        frames = [sample(image, (grid - t * path)[None], extended=True).values for t in times.tolist()]
+        return torch.stack(frames).mean(0)
 
 
 @dataclass(frozen=True)
@@ -220,10 +183,3 @@ def _kernel_grid(disparity: float, aspect: float, like: Tensor) -> tuple[Tensor,
 
 def _value(x: float | Tensor) -> float:
     return float(x.detach()) if isinstance(x, Tensor) else float(x)
-
-
-def _convolved(image: Tensor, kernel: Tensor) -> Tensor:
-    """Each channel with the odd-sized kernel (kh, kw), the border replicated."""
-    h, w = kernel.shape
-    planes = pad(image.flatten(0, 1)[:, None], (w // 2, w // 2, h // 2, h // 2), mode="replicate")
-    return conv2d(planes, kernel[None, None]).view(image.shape)

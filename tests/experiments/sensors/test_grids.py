@@ -7,20 +7,8 @@ from arraygeom.camera import Camera, intrinsics
 from arraygeom.distortion import Distortion
 from arraygeom.pose import Pose, rotation_from_vector
 from arraygeom.rig import Rig
-from pat.sensors import (
-    BoxBlur,
-    Crop,
-    Defocus,
-    Demosaic,
-    GaussianBlur,
-    Mosaic,
-    MotionBlur,
-    Noise,
-    Resample,
-    Vignetting,
-    record,
-    record_array,
-)
+from experiments.sensors import Crop, Defocus, Demosaic, Mosaic, MotionBlur, Vignetting, record, record_array
+from pat.sensors import BoxBlur, GaussianBlur, Noise, Resample
 
 PATTERNS = ["RGGB", "GRBG", "BGGR", "GBRG"]
 

@@ -3,22 +3,19 @@ import torch
 import yaml
 
 from arraygeom.sensor import Band, Curve
-from pat.sensors import (
+from experiments.sensors import (
     STEPS,
-    Clip,
     Crop,
     DecodeSRGB,
     Defocus,
     Demosaic,
     EncodeSRGB,
-    Noise,
-    Quantise,
-    Resample,
     Spectral,
     read_chain,
     read_chains,
     record,
 )
+from pat.sensors import Clip, Noise, Quantise, Resample
 
 TEXT = """
 mono:
