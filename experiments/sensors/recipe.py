@@ -22,8 +22,7 @@ from dataclasses import fields
 from typing import Any
 
 from pat.sensors import BoxBlur, Clip, GaussianBlur, Jitter, Noise, Quantise, Resample, Step
-from pat.support.naming import near
-from pat.support.schema import from_document
+from pat.support.schema import from_document, near
 
 from .grids import Crop, Demosaic, Mosaic
 from .optics import Defocus, DiscBlur, MotionBlur, Vignetting

@@ -200,7 +200,7 @@ class Train:
         return cls(config=command_line(arguments))
 
     def run(self) -> None:
-        from ..training.train import train
+        from ..training.loop import train
 
         say(f"written: {train(self.config)}")
 
@@ -226,3 +226,37 @@ class Settings:
         for entry in found:
             print(f"{entry.kind:8}{entry.algorithm.removesuffix('Settings')}.{entry.name} = {entry.value}  {entry.why}")
         print(f"{sum(s.numbers for s in found)} numbers under {len(found)} names")
+
+
+@dataclass
+class Import:
+    """Convert a checkpoint of the paper's authors (best.pth.tar) to a weights file for `--weights`.
+
+    The file is read as tensors and numbers; nothing in it is run.
+    Example: pat weights import log_2inputs/x4/best.pth.tar --out pat-authors.safetensors
+    """
+
+    checkpoint: Annotated[Positional[Path], arg(metavar="FILE", help="Checkpoint, for any number of inputs.")]
+    out: Out = Path("pat-authors.safetensors")
+    """Weights file to write."""
+
+    def run(self) -> None:
+        """Write the weights. Raises FileNotFoundError or ValueError for a file that is not such a checkpoint."""
+        from ..networks.authors import read_authors
+        from ..networks.paper import PAT
+        from ..networks.weights import save_weights
+
+        writable(self.out)
+        read = read_authors(self.checkpoint)
+        network = PAT(read.config)
+        network.load_state_dict(read.state)
+        save_weights(network, self.out, facts=read.facts)
+        betas, c = read.config.betas, read.config
+        what = f"{betas} beta{'s' * (betas > 1)}, images of {c.in_channels} channels, enlarged {c.scale}x"
+        say(f"written: {self.out} (PAT for {what})")
+
+
+class WeightsCommands:
+    """Convert weights of other programs."""
+
+    commands: ClassVar[Mapping[str, Any]] = {"import": Import}

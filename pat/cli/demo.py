@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from . import options
-from .one_frame import fuse_with_progress
+from .known import fuse_with_progress
 from .options import Out, Weights, say
 
 

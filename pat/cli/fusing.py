@@ -15,8 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from . import options
-from .known import Known
-from .one_frame import fuse_with_progress
+from .known import Known, fuse_with_progress
 from .options import FIRST, Numbers, Out, optional, say
 
 if TYPE_CHECKING:
@@ -339,7 +338,7 @@ class Fuse(Known):
         """The classical baseline as bright as the fused image; None, and a line, where the cameras do not allow it."""
         from ..evaluation.baseline import classical_view
         from ..fusion.report import LONGEST
-        from ..media.exposure import exposed
+        from ..media.colour import exposed
 
         try:
             with options.working("classical baseline"):
@@ -349,7 +348,7 @@ class Fuse(Known):
             return None
 
     def _exposed(self, frame: Frame) -> tuple[Frame, float]:
-        from ..media.exposure import exposed, exposure_gain
+        from ..media.colour import exposed, exposure_gain
 
         gain = exposure_gain(frame.image) if self.exposure == "auto" else 1.0
         if gain != 1:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import os
+import re
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import redirect_stderr
 from dataclasses import make_dataclass
 from inspect import getdoc
 from pathlib import Path
@@ -13,9 +16,8 @@ from typing import Annotated, Any, ClassVar, NoReturn, Union
 
 import tyro
 
-from . import aligning, authors, calibration, demo, fusing, rigs, weights
+from . import aligning, authors, calibration, demo, fusing, rigs
 from .options import WARNED, refuse_missing_rig, respelled, say, warn
-from .parsing import parsed
 
 
 class Pat:
@@ -39,7 +41,7 @@ class Pat:
         "render": authors.Render,
         "train": authors.Train,
         "settings": authors.Settings,
-        "weights": weights.WeightsCommands,
+        "weights": authors.WeightsCommands,
     }
     commands: ClassVar[Mapping[str, Any]] = {**users, **authors}
 
@@ -111,7 +113,7 @@ def _command(arguments: list[str], group: Any, prog: str) -> Any:
             print(_help(path, command))
             sys.exit(0)
         if word not in command.commands:
-            from ..support.naming import near
+            from ..support.schema import near
 
             raise ValueError(f"no command '{path} {word}'{near(word, command.commands)}")
         path, command, arguments = f"{path} {word}", command.commands[word], arguments[1:]
@@ -146,3 +148,56 @@ def _union(group: Any) -> Any:
             command = make_dataclass(name, [("command", inner)])
         made.append(Annotated[command, tyro.conf.subcommand(name)])
     return Union[tuple(made)]  # noqa: UP007
+
+
+def _choices(given: str, option: str, choices: str) -> str:
+    """What an option can be, without the None of one that may be left out, numbers in order."""
+    named = [choice for choice in choices.split(", ") if choice != "'None'"]
+    if all(choice.strip("'").isdecimal() for choice in named):
+        named.sort(key=lambda choice: int(choice.strip("'")))
+    return f"{option}: {given} is not one of {', '.join(named)}"
+
+
+REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
+    (r"^Error parsing (\S+): ", r"\1: "),
+    (r"no type matching (?:\{None\}\|)?\{(.+?)\} could be instantiated from \[(.*?)\].*", r"wanted \1, got \2"),
+    (r"Could not find valid parse for arguments: \[(.*?)\].*", r"\1 does not fit"),
+    (r"invalid literal for int\(\) with base 10: (.+)", r"\1 is not a whole number"),
+    (r"could not convert string to float: (.+)", r"\1 is not a number"),
+    (
+        r"^invalid choice (.+) for argument '(\S+)'\. Expected one of \((.*?),?\)\.",
+        lambda found: _choices(*found.groups()),
+    ),
+    (r"^Missing value for argument '(\S+)'.*", r"\1: give a value"),
+    (r"^Missing from .+?: (\S+) (.+?) \(required\)", r"\1 is missing: \2"),
+    (r"^Unrecognized options: ", r"unknown here: "),
+    (r" Perhaps you meant: (\S+).*", r"; did you mean \1?"),
+)
+"""tyro's messages, and the same in the words of `--help`."""
+
+
+def parsed(command: Any, prog: str, arguments: list[str]) -> Any:
+    """The command with its options. Raises ValueError, one line, for what tyro refuses; `--help` exits."""
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            return tyro.cli(command, prog=prog, args=arguments, config=(tyro.conf.DisallowNone,))
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+    raise ValueError(f"{reworded(said.getvalue())} (`{prog} --help` explains)")
+
+
+def reworded(box: str) -> str:
+    """One line of what a box of tyro says, without the help that it repeats.
+
+    >>> reworded("╭─ Unrecognized options ──╮\\n│ Unrecognized options: --x │\\n╰─────╯")
+    'unknown here: --x'
+    """
+    lines = box.strip().splitlines()  # without a frame, where the terminal has no Unicode, the title is underlined
+    rows = [row.strip("│ ") for row in (lines[1:-1] if box.startswith("╭") else lines[2:])]
+    said = [" ".join(text.split()) for text in re.split(r"[─-]{9,}", " ".join(rows))]
+    text = " ".join(part for i, part in enumerate(said) if part and (i == 0 or part.startswith("Perhaps you meant")))
+    for pattern, words in REWORDED:
+        text = re.sub(pattern, words, text)
+    return text

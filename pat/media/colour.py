@@ -8,6 +8,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from arraygeom.chunks import chunked
+
 REC601 = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in luma, on sRGB-encoded values (ITU-R BT.601)."""
 REC709 = (0.2126, 0.7152, 0.0722)
@@ -62,3 +64,27 @@ def to_bytes(values: Float[Tensor, "*b"] | Float[NDArray, "*b"]) -> NDArray[np.u
     """Values 0..1, clipped, as 8-bit counts, rounded to nearest (halves to even)."""
     array = values.detach().cpu().numpy() if isinstance(values, Tensor) else values
     return np.rint(np.clip(np.asarray(array, np.float32), 0, 1) * 255).astype(np.uint8)
+
+
+BRIGHT = 0.99
+"""The share of pixels that are at most as bright as the brightest that counts."""
+ORDINARY = (0.2, 1.25)
+"""Linear light of that brightest pixel, 1 is white, in images that are left as they are."""
+WANTED = 0.8
+"""Its light in images that are not."""
+
+
+def exposure_gain(image: Float[Tensor, "c h w"]) -> float:
+    """The factor of linear light that brings a dark or an overexposed image to a sensible brightness; 1 for others."""
+    light = linear_from_srgb(luminance_of(image).mean(0)).flatten()
+    brightest = float(light[:: max(light.numel() // 100_000, 1)].quantile(BRIGHT))
+    if ORDINARY[0] <= brightest <= ORDINARY[1] or brightest <= 1e-4:
+        return 1.0
+    return WANTED / brightest
+
+
+def exposed(image: Float[Tensor, "c h w"], gain: float) -> Float[Tensor, "c h w"]:
+    """The image with its linear light times a factor."""
+    if gain == 1:
+        return image
+    return chunked(lambda rows: srgb_from_linear(gain * linear_from_srgb(rows)), image)

@@ -4,18 +4,20 @@ A list of steps is applied in order to images (B, C, H, W) with values 0..1 on a
 it from the generator given to `record`, separately for each image of the batch.
 """
 
-from .cases import DegradationCase, augment, paper_cases
 from .noise_level import NoiseLevel
 from .steps import (
     BoxBlur,
     Clip,
+    DegradationCase,
     GaussianBlur,
     Jitter,
     Noise,
     Quantise,
     Resample,
     Step,
+    augment,
     generator_for,
+    paper_cases,
     record,
     seed_for,
 )

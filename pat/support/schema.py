@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
-
-from .naming import near
 
 T = TypeVar("T")
 
@@ -169,3 +168,14 @@ def _is_number(text: str) -> bool:
 
 def _below(entry: str, key: object) -> str:
     return f"{entry}.{key}" if entry else str(key)
+
+
+def near(name: object, known: Iterable[object]) -> str:
+    """The end of a message about an unknown name: the nearest known one, or all of them.
+
+    >>> near("nois", ["noise", "clip"])
+    "; did you mean 'noise'?"
+    """
+    names = [str(k) for k in known]
+    close = difflib.get_close_matches(str(name), names, 1)
+    return f"; did you mean '{close[0]}'?" if close else f"; known here: {', '.join(names)}"

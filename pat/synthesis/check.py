@@ -17,8 +17,7 @@ from arraygeom.pixels import pixel_grid
 from arraygeom.rig import Rig
 from arraygeom.sampling import sample
 
-from .rendered import RenderedFrame
-from .surfaces import depth_between
+from .rendered import RenderedFrame, depth_between
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,8 +12,7 @@ import tyro
 import yaml
 
 from pat.networks.configs import CONFIGS, BandwisePATConfig, GuidedPATConfig, PATConfig
-from pat.support.naming import near
-from pat.support.schema import from_document, parse_yaml, to_document
+from pat.support.schema import from_document, near, parse_yaml, to_document
 from pat.synthesis.rig_distribution import RigDistribution
 
 RECIPES = Path(__file__).parent / "recipes"

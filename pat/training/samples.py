@@ -36,10 +36,9 @@ from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rigs import below
 
 from .config import RecordingConfig, TrainConfig
-from .lenses import LOST, through_lenses
+from .lenses import LOST, MOST, Spectra, through_lenses
 from .measured import MeasuredPairs
 from .scenes import RenderedCrops
-from .spectra import MOST, Spectra
 from .stereo import PairCrops
 
 CACHED = 48

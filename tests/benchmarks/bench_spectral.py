@@ -30,8 +30,8 @@ from pat.sensors import Clip, Noise, Quantise, record
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.rig_distribution import RigDistribution
 from pat.training.config import TrainConfig
+from pat.training.lenses import Spectra
 from pat.training.samples import photographs
-from pat.training.spectra import Spectra
 
 HW = (240, 320)
 RIGS = RigDistribution(mode="rectified", parallax=(10.0, 60.0), resolutions=(0.5,))

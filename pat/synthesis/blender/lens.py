@@ -16,7 +16,7 @@ from arraygeom.pixels import map_homogeneous, pixel_grid
 from arraygeom.pose import Pose
 from arraygeom.sampling import sample
 
-from ..surfaces import depth_between
+from ..rendered import depth_between
 
 WIDEST = math.radians(80)
 """The largest angle off axis that a plane image covers."""

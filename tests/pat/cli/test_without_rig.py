@@ -225,8 +225,7 @@ def test_focal_lengths_come_from_exif(tmp_path):
 
 
 def test_a_dark_image_is_brought_to_an_ordinary_brightness():
-    from pat.media.colour import linear_from_srgb, srgb_from_linear
-    from pat.media.exposure import exposed, exposure_gain
+    from pat.media.colour import exposed, exposure_gain, linear_from_srgb, srgb_from_linear
 
     light = torch.linspace(0, 1, 400).reshape(1, 20, 20).expand(3, -1, -1)
     ordinary, dark, bright = (srgb_from_linear(factor * light) for factor in (0.9, 0.05, 3.0))

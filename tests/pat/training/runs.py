@@ -8,7 +8,7 @@ from torch import Generator
 
 from pat.media.images import write_image
 from pat.networks.configs import GuidedPATConfig
-from pat.training.train import TrainConfig
+from pat.training.config import TrainConfig
 
 SMALL = GuidedPATConfig(widths=(8, 8, 8, 8), taps=5)
 

@@ -20,11 +20,11 @@ from pat.networks.weights import load_weights, save_weights
 from pat.support.locks import folder_lock
 from pat.training import loop
 from pat.training.checkpoints import newest_checkpoint
-from pat.training.loop import new_network, shape
+from pat.training.config import save_config
+from pat.training.loop import new_network, shape, train
 from pat.training.losses import Objective, validation
 from pat.training.processes import Process
 from pat.training.samples import made_ahead, scenes
-from pat.training.train import save_config, train
 
 from .runs import SMALL, losses, short_run
 

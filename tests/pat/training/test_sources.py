@@ -29,14 +29,13 @@ from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rendered import Rendered, save_frame
 from pat.synthesis.rig_distribution import RigDistribution
 from pat.synthesis.rigs import random_rigs
-from pat.training.config import RecordingConfig, TrainConfig, parse_config
+from pat.training.config import RecordingConfig, TrainConfig, parse_config, save_config
 from pat.training.lenses import lens_over, through_lenses
-from pat.training.loop import new_network
+from pat.training.loop import new_network, train
 from pat.training.losses import explained, match_loss, validation
 from pat.training.samples import degraded, pair_of, plan, scenes, transfer
 from pat.training.scenes import ACTIVE, GROUPS_PER_EXCHANGE, SKY, RenderedCrops, active_items, batched, finite_window
 from pat.training.stereo import PairCrops
-from pat.training.train import save_config, train
 
 from .runs import losses, short_run
 from .test_loop import command, one_thread, stopped  # noqa: F401

@@ -8,10 +8,10 @@ from torch import Generator
 from arraygeom import sample
 from pat.media.colour import luminance
 from pat.networks.configs import BandwisePATConfig
+from pat.training.lenses import Spectra
 from pat.training.loop import new_network
 from pat.training.losses import Objective
 from pat.training.samples import scenes
-from pat.training.spectra import Spectra
 
 from .runs import short_run
 

@@ -11,7 +11,10 @@ from pat.media.colour import luminance
 from pat.media.images import write_image
 from pat.networks.configs import GuidedPATConfig
 from pat.networks.weights import load_weights
-from pat.training.train import TrainConfig, degraded, image_loss, scenes, train
+from pat.training.config import TrainConfig
+from pat.training.loop import train
+from pat.training.losses import image_loss
+from pat.training.samples import degraded, scenes
 
 SMALL = GuidedPATConfig(widths=(8, 8, 8, 8), taps=5)
 
@@ -90,7 +93,7 @@ def test_a_short_run_learns_and_leaves_weights(config):
 def test_degradation_keeps_the_ground_truth_in_colour(config):
     from pat.synthesis.layered import LayeredScenes
     from pat.synthesis.rig_distribution import RigDistribution
-    from pat.training.train import photographs
+    from pat.training.samples import photographs
 
     scene = LayeredScenes(photographs(config)[0], RigDistribution(), hw=(32, 48)).sample(2, Generator().manual_seed(1))
     given = degraded(scene, Generator().manual_seed(2))
