@@ -191,11 +191,10 @@ def _one_kill(arguments: list[str], right: Reference, folder: Path, way: str, rn
         limit = int(rng.integers(1, right.largest + 1))
         resource.prlimit(child, resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
         return _ended_well(child, folder, (0, -signal.SIGXFSZ)) != 0
-    if victim != child:  # others do its work, unless none had started: then the command says so
+    if victim != child:  # another does its work
         with suppress(ProcessLookupError):
             os.kill(victim, signal.SIGKILL)
-        if _ended_well(child, folder, (0, 2)) == 2 and "died while it started" not in (folder / "log.txt").read_text():
-            raise AssertionError((folder / "log.txt").read_text()[-2000:])
+        _ended_well(child, folder, (0,))
         return True
     kill_group(child)
     return True

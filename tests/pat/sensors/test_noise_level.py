@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from pat.sensors import Clip, DecodeSRGB, EncodeSRGB, Noise, NoiseLevel, generator_for, record
+from experiments.sensors import DecodeSRGB, EncodeSRGB, record
+from pat.sensors import Clip, Noise, NoiseLevel, generator_for
 from tests.pat.layered_array import load_sample
 
 LEVELS = {

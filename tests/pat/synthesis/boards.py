@@ -20,7 +20,8 @@ PIXELS = 112
 
 @dataclass(frozen=True, kw_only=True)
 class Sheet:
-    """A ChArUco board of (columns, rows) squares, printed in black on white with a margin (metres).
+    """A ChArUco board of (columns, rows) squares, printed in black on white with a margin (metres); without
+    markers (0) a chessboard.
 
     Its frame has the origin at the outer corner of the first square, x along the columns, y along the rows, z away
     from the viewer (as OpenCV's).
@@ -52,7 +53,11 @@ class Sheet:
     def drawn(self) -> np.ndarray:
         """Black and white (h, w), `PIXELS` a square, margins included."""
         columns, rows = self.squares
-        image = self.opencv.generateImage((columns * PIXELS, rows * PIXELS))
+        if self.marker:
+            image = self.opencv.generateImage((columns * PIXELS, rows * PIXELS))
+        else:
+            squares = np.indices((rows, columns)).sum(0) % 2 * np.uint8(255)
+            image = np.kron(squares, np.ones((PIXELS, PIXELS), np.uint8))
         return np.pad(image, round(self.margin / self.square * PIXELS), constant_values=255)
 
 

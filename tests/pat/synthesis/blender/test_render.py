@@ -184,7 +184,7 @@ def test_an_animation_at_each_cameras_own_times(worker, tmp_path):
 @pytest.mark.slow
 def test_a_rendered_board_has_its_corners_where_it_should(worker, tmp_path):
     """OpenCV refines the corners of a board to where arraygeom projects them."""
-    sheet = Sheet(squares=(7, 5), square=0.3, marker=0.2, margin=0.1)
+    sheet = Sheet(squares=(7, 5), square=0.3, marker=0, margin=0.1)
     pose = Pose(posed((20, -15, 5)).R, torch.tensor([-1.0, -0.6, 3.5], dtype=torch.float64))
     rig = Rig({n: unlike_cameras(192)[n] for n in ("oblong", "distorted")})
     scene = board_scene([pose], sheet, tmp_path / "board.png")
