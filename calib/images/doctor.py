@@ -48,7 +48,7 @@ WRONG_SIDE_PENALTY = 100.0
 """Penalty, pixels, of points behind the cameras, outside the depth range, or mirrored."""
 LARGEST_REMAINDER = 0.33
 """A mistake is named if its remedy leaves no more than this share of the misfit: many wrong remedies improve a drifted
-rig somewhat."""
+rig somewhat. Nor is one as good as another that leaves this share of what it leaves."""
 MARGIN, TIE = 12.0, 2.0
 """A mistake is named if -2 log evidence is smaller by this than that of a drift, and others are as good that have less
 than this more; of those within the second, the likely one is named."""
@@ -233,6 +233,8 @@ def _by_evidence(
     some = [i for i in order if i and figures[i].penalised_misfit <= limit][:MOST_COMPARED]
     if not some:
         return 0, []
+    limit = figures[some[0]].penalised_misfit / LARGEST_REMAINDER + EQUAL[1]
+    some = [i for i in some if figures[i].penalised_misfit <= limit]
     found = {i: DriftEvidence.of(tried[i].repair(rig), pairs, inliers, noise) for i in some}
     given = DriftEvidence.of(rig, pairs, inliers, noise)
     mirrored = figures[0].handed < 0.5
