@@ -12,7 +12,7 @@ from . import options
 from .options import Depth, Out, say
 
 if TYPE_CHECKING:
-    from calib.boards.parameters import StartDeviations
+    from calib.boards.poses import StartDeviations
 
 BOARDS = (
     "charuco:8x6:30mm (squares), chessboard:9x6:25mm (inner corners), circles:7x5:20mm, acircles:4x11:20mm, "
@@ -85,15 +85,15 @@ class Calibrate:
         say(f"written: {', '.join(map(str, found.written))}")
 
     def _deviations(self) -> StartDeviations:
-        from calib.boards.parameters import StartDeviations
+        from calib.boards.poses import StartDeviations
 
         if self.deviation and self.start is None:
             raise ValueError("--deviation needs --start: give the rig whose positions it is about")
         return StartDeviations.of(options.numbers_by_name(self.deviation, "--deviation"))
 
     def _watch(self, patterns: dict[str, str]) -> None:
+        from calib.boards.run import watch
         from calib.boards.target import parse_boards
-        from calib.boards.watch import watch
 
         page = self.out.with_suffix(".watch.html")
         say(f"open {page} in a browser; Ctrl-C calibrates with all images and ends")

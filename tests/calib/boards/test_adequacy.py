@@ -6,14 +6,15 @@ import torch
 
 from arraygeom import Pose, Rig
 from calib.boards.adequacy import next_views, proposed_views
-from calib.boards.intrinsics import LensComparison, board_pose, compare_lenses
-from calib.boards.parameters import camera_jacobian, parameter_names
+from calib.boards.bundle import camera_jacobian, parameter_names
+from calib.boards.intrinsics import board_pose
 from calib.boards.report import by_cameras
 from calib.boards.rig import calibrate
+from calib.boards.run import watch
 from calib.boards.simulation import simulate_photos
 from calib.boards.target import parse_board
-from calib.boards.uncertainty import half_difference, intrinsics_of, uncertainty
-from calib.boards.watch import watch
+from calib.boards.uncertainty import intrinsics_of, uncertainty
+from calib.boards.validation import LensComparison, compare_lenses, half_difference
 from tests.calib.board_scenes import BOARD, board_poses, camera, see
 
 TRUE = camera(700.0, (480, 640), lens=(-0.2, 0.05, 0.0, 0.0, 0.0))

@@ -8,15 +8,13 @@ import torch
 
 from arraygeom import Pose, Rig
 from calib.boards.adequacy import coverage
-from calib.boards.bundle import jackknife
 from calib.boards.detect import BoardViews, Detection
-from calib.boards.intrinsics import calibrate_single
 from calib.boards.poses import symmetry_poses
 from calib.boards.report import report_html
-from calib.boards.rig import calibrate, many_wrong
-from calib.boards.solve import with_disagreement
+from calib.boards.rig import calibrate
+from calib.boards.solve import calibrate_single, many_wrong
 from calib.boards.target import parse_board
-from calib.boards.uncertainty import RigCovariance, beta_covariance, rig_covariance
+from calib.boards.uncertainty import RigCovariance, beta_covariance, jackknife, rig_covariance, with_disagreement
 from tests.benchmarks.bench_robust import drawn
 from tests.calib.board_scenes import BOARD, board_poses, camera, errors_of, four_cameras, see, tensor
 
@@ -191,9 +189,9 @@ def test_boards_that_move_between_the_exposures_do_not_distort_the_lenses(pair):
     result = calibrate(views, BOARD)
     assert any("taken at the same moments" in note for note in result.notes)
     alone = calibrate_single("colour", views["colour"], BOARD)
-    deviations = dict(zip(alone.solved.names, np.sqrt(alone.solved.covariance.diagonal())))
+    deviations = dict(zip(alone.names, np.sqrt(alone.covariance.diagonal())))
     for i in range(2):
-        change = abs(float(result.rig["colour"].K[i, i] - alone.camera.K[i, i]))
+        change = abs(float(result.rig["colour"].K[i, i] - alone.problem.cameras["colour"].K[i, i]))
         assert change < deviations[f"colour.focal.{i}"]
     assert len(set(result.fit.sigma.values())) == 1
 
@@ -309,7 +307,7 @@ def test_frames_that_disagree_about_the_focal_lengths_raise_those_alone(found, m
     disagreeing = found.fit.covariance * factor[:, None] * factor
     given = jackknife(found.fit.problem)._replace(covariance=disagreeing, left_out=disagreeing)
     assert found.raised == 1.0
-    monkeypatch.setattr("calib.boards.solve.jackknife", lambda _: given)
+    monkeypatch.setattr("calib.boards.uncertainty.jackknife", lambda _: given)
     raised = with_disagreement(found.fit, BOARD.extents)
     ratio = np.sqrt(raised.covariance.diagonal() / found.fit.covariance.diagonal())
     assert ratio == pytest.approx(np.where(factor > 1, np.sqrt((1 + 25) / 2), 1.0))

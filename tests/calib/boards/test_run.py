@@ -9,9 +9,9 @@ import pytest
 from arraygeom import Pose, Rig
 from arraygeom.io import read_rig
 from calib.boards.detect import collect_folder
-from calib.boards.intrinsics import calibrate_single
 from calib.boards.rig import calibrate
 from calib.boards.simulation import fine_rays, photograph
+from calib.boards.solve import calibrate_single
 from calib.boards.target import parse_board
 from pat.cli.main import main
 from tests.calib.board_scenes import board_poses, camera, errors_of, four_cameras, pose_errors
@@ -222,10 +222,10 @@ def test_action_cameras(camera_name, focal, shared_data):
     alone = calibrate_single("cam", found.views["cam"], board)
     print(
         camera_name,
-        alone.camera.K,
-        alone.solved.problem.rms(),
+        alone.problem.cameras["cam"].K,
+        alone.problem.rms(),
         len(found.views["cam"].seen),
         found.notes,
-        alone.solved.notes,
+        alone.notes,
     )
-    assert float(alone.camera.K[0, 0]) == pytest.approx(focal, rel=0.015)
+    assert float(alone.problem.cameras["cam"].K[0, 0]) == pytest.approx(focal, rel=0.015)

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig
-from calib.boards.parameters import CameraPrior, StartDeviations, intrinsic_values, parameter_sizes, start_prior
+from calib.boards.bundle import CameraPrior, intrinsic_values, parameter_sizes
+from calib.boards.poses import StartDeviations, start_prior
 from calib.boards.rig import calibrate
 from calib.boards.simulation import photograph
 from calib.boards.target import parse_board
