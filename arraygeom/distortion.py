@@ -34,7 +34,7 @@ from torch import Tensor
 
 from .checks import check_numbers, checking
 from .lenses.brown import Brown, brown_distort, brown_limit, brown_undistort
-from .lenses.central import FOV, MODELS, central_project, central_unproject
+from .lenses.central import EXTENDED_UNIFIED, FOV, MODELS, central_project, central_unproject
 from .lenses.common import WIDEST, finite_points, unit
 from .lenses.fisheye import fisheye_limit, fisheye_project, fisheye_unproject
 from .lenses.model import LensModel
@@ -196,6 +196,12 @@ def typical_coefficients(lens: LensModel) -> tuple[float, ...]:
     """Usual sizes of a lens's numbers; 1 for those of a camera model."""
     count = lens.coefficients.shape[-1]
     return TYPICAL_COEFFICIENTS.get(lens.model, (1.0,) * count)[:count]
+
+
+def pinhole_coefficients(lens: LensModel) -> Float[Tensor, "*b n"]:
+    """Numbers with which the terms of a lens do nothing: zeros, but for the extended unified model's beta."""
+    none = torch.zeros_like(lens.coefficients)
+    return none + none.new_tensor([0.0, 1.0]) if lens.model == EXTENDED_UNIFIED else none
 
 
 def term(lens: LensModel, index: int) -> str:

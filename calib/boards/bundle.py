@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from arraygeom import Camera, Pose, Rig, stack
-from arraygeom.distortion import term, typical_coefficients
+from arraygeom.distortion import pinhole_coefficients, term, typical_coefficients
 from arraygeom.pose import rotation_vector
 
 from .board import Board, KnownPoints
@@ -390,26 +390,19 @@ def linear_projection(
     return x.detach().numpy(), torch.cat([rotational, along, torch.stack(by_change, 1)], -1).numpy()
 
 
-def with_default(camera: Camera, entry: str) -> Camera:
-    """The camera with one parameter at its default: principal point centred, coefficient 0."""
-    kind, index = entry.split(".")
+def with_default(camera: Camera, entry: str) -> tuple[Camera, str]:
+    """The camera with a principal point's entry at the centre, or a lens's term without effect; and that in words."""
+    kind, index = entry.split(".")[0], int(entry.split(".")[1])
     if kind == "centre":
         K = camera.K.clone()
-        K[int(index), 2] = (camera.hw[1 - int(index)] - 1) / 2
-        return camera.replace(K=K)
-    assert camera.distortion is not None
-    coefficients = camera.distortion.coefficients.clone()
-    coefficients[int(index)] = 0.0
-    return camera.replace(distortion=camera.distortion.with_coefficients(coefficients))
-
-
-def described_default(camera: Camera, entry: str) -> str:
-    """What `with_default` does, in words."""
-    kind, index = entry.split(".")
-    if kind == "centre":
-        return f"the principal point's {'xy'[int(index)]} is fixed at the image's centre"
-    assert camera.distortion is not None
-    return f"the lens's {term(camera.distortion, int(index))} is fixed at 0"
+        K[index, 2] = (camera.hw[1 - index] - 1) / 2
+        return camera.replace(K=K), f"the principal point's {'xy'[index]} is fixed at the image's centre"
+    lens = camera.distortion
+    assert lens is not None
+    coefficients = lens.coefficients.clone()
+    coefficients[index] = pinhole_coefficients(lens)[index]
+    words = f"the lens's {term(lens, index)} is fixed at {float(coefficients[index]):g}"
+    return camera.replace(distortion=lens.with_coefficients(coefficients)), words
 
 
 # Priors ----------------------------------------------------------------------------------------------------------
@@ -466,6 +459,7 @@ def typical_prior(camera: Camera) -> CameraPrior:
     deviation[8:10] = CENTRE_DEVIATION * w
     mean = np.zeros(len(deviation))
     mean[8:10] = (w - 1) / 2, (h - 1) / 2
+    mean[10:] = () if camera.distortion is None else pinhole_coefficients(camera.distortion)
     information = np.diag(deviation**-2.0)
     information[:8, :8] = 0.0
     information[6:8, 6:8] = np.array([[1, -1], [-1, 1]]) / (ASPECT_DEVIATION * _mean_focal(camera)) ** 2

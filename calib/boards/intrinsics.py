@@ -13,13 +13,26 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 
 from arraygeom import Camera, Distortion, Pose, intrinsics
+from arraygeom.lenses.central import MODELS
 from arraygeom.pixels import HW
 
 from .board import Board
 from .detect import BoardViews, Detection
 from .photos import FrameKey
 
-Lens = Literal["brown-conrady", "rational", "thin-prism", "tilted", "kannala-brandt", "omni", "none"]
+Lens = Literal[
+    "brown-conrady",
+    "rational",
+    "thin-prism",
+    "tilted",
+    "kannala-brandt",
+    "omni",
+    "double-sphere",
+    "extended-unified",
+    "scaramuzza",
+    "thin-prism-fisheye",
+    "none",
+]
 LENSES: dict[Lens, tuple[str, int]] = {
     "brown-conrady": ("brown-conrady", 5),
     "rational": ("brown-conrady", 8),
@@ -27,6 +40,10 @@ LENSES: dict[Lens, tuple[str, int]] = {
     "tilted": ("brown-conrady", 14),
     "kannala-brandt": ("kannala-brandt", 4),
     "omni": ("unified", 5),
+    "double-sphere": ("double-sphere", 2),
+    "extended-unified": ("extended-unified", 2),
+    "scaramuzza": ("scaramuzza", 3),
+    "thin-prism-fisheye": ("thin-prism-fisheye", 8),
 }
 """Model and number of coefficients; those of Brown and Conrady have all terms of the former."""
 FEWEST_IMAGES = 3
@@ -148,12 +165,13 @@ def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Cam
     distortion = Distortion(model if pinhole else "kannala-brandt", torch.tensor(coefficients)) if count else None
     camera = Camera(K=torch.tensor(K), cam_from_world=Pose.identity(), hw=views.hw, distortion=distortion)
     if not pinhole and model != "kannala-brandt":
-        camera = _with_model(camera, model, count)
+        camera = _with_model(camera, model)
     return camera, {key: _pose(r, t) for key, r, t in zip(views.seen, rotations, translations)}
 
 
-def _with_model(camera: Camera, model: str, count: int) -> Camera:
+def _with_model(camera: Camera, model: str) -> Camera:
     """A fisheye's camera with another lens model of nearly the same rays: its focal length and two terms are fitted."""
+    plain = np.array(MODELS[model].harmless)
     h, w = camera.hw
     grid = np.stack(np.meshgrid(np.linspace(0, w - 1, 16), np.linspace(0, h - 1, 12)), -1).reshape(-1, 2)
     rays, valid = camera.rays(torch.from_numpy(grid))
@@ -162,11 +180,10 @@ def _with_model(camera: Camera, model: str, count: int) -> Camera:
     def changed(values: np.ndarray) -> Camera:
         K = camera.K.clone()
         K[:2, :2] *= float(np.exp(values[0]))
-        coefficients = torch.zeros(count, dtype=torch.float64)
-        coefficients[:2] = torch.from_numpy(values[1:])
+        coefficients = torch.from_numpy(np.concatenate([values[1:], plain[2:]]))
         return camera.replace(K=K, distortion=Distortion(model, coefficients))
 
-    first = np.array([np.log(2.0), 1.0, 0.0])
+    first = np.array([0.0, *plain[:2]])
     found = least_squares(lambda v: (changed(v).project_local(rays).x - x).numpy().ravel(), first, loss="soft_l1")
     return changed(found.x)
 

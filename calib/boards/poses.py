@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig
+from arraygeom.distortion import pinhole_coefficients
 
 from .board import Board
 from .bundle import CameraPrior, InitialRig, Solved, intrinsic_values, typical_prior
@@ -116,7 +117,7 @@ def rig_near_start(
     return consistent_boards(seen, poses, board)._replace(priors=priors)
 
 
-def _start_camera(name: str, start: Rig, views: BoardViews, lens: Lens) -> Camera:
+def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) -> Camera:
     """A camera of a start, with a lens. Raises ValueError if it is missing or differs in size from the images."""
     camera = start.cameras.get(name)
     if not isinstance(camera, Camera):
@@ -124,9 +125,10 @@ def _start_camera(name: str, start: Rig, views: BoardViews, lens: Lens) -> Camer
     if camera.hw != views.hw:
         (h, w), (rows, columns) = camera.hw, views.hw
         raise ValueError(f"{name}: its images are {columns}x{rows} and the start states {w}x{h}")
-    if camera.distortion is None and lens != "none":
-        model, count = LENSES[lens]
-        camera = camera.replace(distortion=Distortion(model, torch.zeros(count, dtype=torch.float64)))
+    if camera.distortion is None and model_name != "none":
+        model, count = LENSES[model_name]
+        lens = Distortion(model, torch.zeros(count, dtype=torch.float64))
+        camera = camera.replace(distortion=lens.with_coefficients(pinhole_coefficients(lens)))
     return camera.to(torch.float64)
 
 

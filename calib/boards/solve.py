@@ -19,7 +19,6 @@ from .bundle import (
     CameraPrior,
     Masks,
     Solved,
-    described_default,
     intrinsic_values,
     linearised,
     normal_equations,
@@ -145,8 +144,8 @@ def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, l
             )
         free[name][index] = False
         information = np.delete(np.delete(information, worst, 0), worst, 1)
-        cameras[name] = with_default(cameras[name], entry)
-        notes.append(f"{name}: {described_default(cameras[name], entry)}: the images do not determine it")
+        cameras[name], fixed = with_default(cameras[name], entry)
+        notes.append(f"{name}: {fixed}: the images do not determine it")
     return replace(problem, cameras=cameras, free=free), notes
 
 

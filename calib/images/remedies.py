@@ -19,11 +19,6 @@ from arraygeom import Camera, Distortion, Pose, Rig, View, resize_matrix, rotati
 from arraygeom.pixels import HW, rot90_matrix, shift_matrix
 from arraygeom.pose import rotation_vector
 
-KINDS = (
-    *("nothing", "resized", "rotated or mirrored", "cameras swapped", "pose inverted", "R transposed", "sign of t"),
-    *("centre as t", "OpenGL axes", "order of quaternions", "degrees and radians"),
-    *("x and y exchanged", "units", "distortion", "half-pixel shift", "one-pixel shift"),
-)
 RESIZED = (0.5, 2.0, 0.25, 4.0, 1 / 3, 3.0, 2 / 3, 1.5, 0.75, 4 / 3)
 UNITS = {
     1e-3: "millimetres taken for metres",
@@ -37,7 +32,7 @@ TRANSPOSE = torch.eye(3, dtype=torch.float64)[[1, 0, 2]]
 
 @dataclass(frozen=True)
 class Remedy:
-    """A possible mistake: its kind (one of `KINDS`), its description in words, and the change that undoes it.
+    """A possible mistake: its kind ("resized", "units", ...), its description in words, and the change that undoes it.
 
     approximate: the change holds numbers that were estimated, and undoes it roughly.
     """

@@ -46,10 +46,14 @@ class Calibrate:
         "tilted",
         "kannala-brandt",
         "omni",
+        "double-sphere",
+        "extended-unified",
+        "scaramuzza",
+        "thin-prism-fisheye",
         "none",
     ] = "brown-conrady"
-    """Lens model; kannala-brandt or omni for fisheyes. auto compares them on held-out frames and takes the best
-    supported."""
+    """Lens model; from kannala-brandt on, they are for fisheyes. auto compares the first five, on held-out frames, and
+    takes the best supported."""
     depth: Depth = None
     """Near and far bounds in metres of the scenes to come, written into the rig."""
     start: Annotated[Path | None, options.optional("RIG")] = None

@@ -225,7 +225,7 @@ def test_a_poorly_constrained_camera_stays_plausible():
     """Four boards in the middle, hardly tilted, corners to half a pixel: square pixels, a middle in the middle."""
     true = camera(900.0, (480, 640), lens=(-0.1, 0.0, 0.0, 0.0, 0.0))
     views = see(Rig({"cam": true}), board_poses(4, tilt=18.0, depth=(1.3, 1.6), spread=0.02), noise=0.5)
-    found = calibrate_single("cam", views["cam"], BOARD, final=False).camera
+    found = calibrate_single("cam", views["cam"], BOARD, final=False).problem.cameras["cam"]
     assert float(found.K[0, 0] / found.K[1, 1]) == pytest.approx(1, abs=0.01)
     assert np.abs(found.K[:2, 2].numpy() - (319.5, 239.5)).max() < 0.06 * 640
 
