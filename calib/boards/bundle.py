@@ -15,10 +15,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_array
 
 from arraygeom import Camera, Pose, Rig, stack
 from arraygeom.distortion import pinhole_coefficients, term, typical_coefficients
+from arraygeom.pixels import map_homogeneous
 from arraygeom.pose import rotation_vector
+from arraygeom.rig import focal_positions
 
 from .board import Board, KnownPoints
 from .deformation import BoardDeformation
@@ -321,15 +324,21 @@ def normal_equations(problem: BundleProblem, parts: Mapping[str, Linearised]) ->
             information, slope = prior.equations(problem.cameras[name])
             H[np.ix_(own, own)] += information[np.ix_(free, free)]
             g[own] += slope[free]
-        np.add.at(B, part.block, np.einsum("nid,nie->nde", part.by_board, part.by_board))
-        np.add.at(h, part.block, np.einsum("nid,ni->nd", part.by_board, part.r))
-        coupled = np.zeros((b, len(columns), POSE))
-        np.add.at(coupled, part.block, np.einsum("nip,nid->npd", part.by_shared, part.by_board))
-        W[:, columns] += coupled
+        B += block_sums(part.block, part.by_board.swapaxes(1, 2) @ part.by_board, b)
+        h += block_sums(part.block, np.einsum("nid,ni->nd", part.by_board, part.r), b)
+        W[:, columns] += block_sums(part.block, part.by_shared.swapaxes(1, 2) @ part.by_board, b)
     if problem.deformation is not None:
         H[range(c - shapes, c), range(c - shapes, c)] += problem.deformation.information
         g[c - shapes :] -= problem.deformation.information * problem.deformation.values.ravel()
     return NormalEquations(H, W, B, g, h, shapes)
+
+
+def block_sums(
+    block: Int[np.ndarray, " n"], values: Float[np.ndarray, "n *k"], count: int
+) -> Float[np.ndarray, "b *k"]:
+    """Sums of values by their block, of which there are so many."""
+    marks = csr_array((np.ones(len(block)), (block, np.arange(len(block)))), (count, len(block)))
+    return np.asarray(marks @ values.reshape(len(values), -1)).reshape(count, *values.shape[1:])
 
 
 def robust_weights(lengths: Array) -> Array:
@@ -376,18 +385,21 @@ def linear_projection(
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 p"]]:
     """Pixels of world points, and their derivatives with respect to the camera (`camera_jacobian`).
 
-    Two reverse passes with a copy of the intrinsics per point; those of the pose follow by the chain rule.
+    Two reverse passes through the lens, with a copy of its coefficients per point; the others by the chain rule.
     """
     local = camera.cam_from_world.apply(torch.from_numpy(X)).detach().requires_grad_()
-    sizes = {key: size for key, size in parameter_sizes(camera).items() if key not in (".rotation", ".translation")}
-    change = torch.zeros(len(X), sum(sizes.values()), dtype=local.dtype, requires_grad=True)
-    copies = Rig({"": camera}).perturbed(dict(zip(sizes, change.split(list(sizes.values()), -1))))[""]
-    assert isinstance(copies, Camera)
-    x = copies.project_local(local[:, None]).x[:, 0]
-    by_point, by_change = zip(*(torch.autograd.grad(v.sum(), (local, change), retain_graph=True) for v in x.unbind(-1)))
-    along = torch.stack(by_point, 1)
-    rotational = torch.linalg.cross((local.detach() - camera.t)[:, None].expand_as(along), along)
-    return x.detach().numpy(), torch.cat([rotational, along, torch.stack(by_change, 1)], -1).numpy()
+    through, lens = (local,), camera.distortion
+    if lens is not None:
+        copies = lens.coefficients.detach().requires_grad_().expand(len(X), -1)
+        through, lens = (local, copies), lens.with_coefficients(copies)
+    plane = camera.replace(K=torch.eye(3).to(camera.K), distortion=lens).project_local(local[:, None]).x[:, 0]
+    slopes = [torch.autograd.grad(v.sum(), through, retain_graph=True) for v in plane.unbind(-1)]
+    by_point, *by_lens = (camera.K[:2, :2] @ torch.stack(parts, 1) for parts in zip(*slopes))
+    rotational = torch.linalg.cross((local.detach() - camera.t)[:, None].expand_as(by_point), by_point)
+    plane = plane.detach()
+    by_focal, by_centre = focal_positions(camera.K) * plane[:, None], torch.eye(2).to(plane).expand(len(X), 2, 2)
+    x = map_homogeneous(camera.K[:2], plane)
+    return x.numpy(), torch.cat([rotational, by_point, by_focal, by_centre, *by_lens], -1).numpy()
 
 
 def with_default(camera: Camera, entry: str) -> tuple[Camera, str]:

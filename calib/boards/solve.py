@@ -17,6 +17,7 @@ from .bundle import (
     Array,
     BundleProblem,
     CameraPrior,
+    InitialRig,
     Masks,
     Solved,
     intrinsic_values,

@@ -26,6 +26,7 @@ from .bundle import (
     Array,
     BundleProblem,
     Solved,
+    block_sums,
     camera_jacobian,
     linearised,
     normal_equations,
@@ -233,11 +234,8 @@ def jackknife(problem: BundleProblem) -> Jackknife:
     H, g = np.zeros((b, c, c)), np.zeros((b, c))
     for part in parts.values():
         columns = part.columns
-        own, slope = np.zeros((b, len(columns), len(columns))), np.zeros((b, len(columns)))
-        np.add.at(own, part.block, np.einsum("nip,niq->npq", part.by_shared, part.by_shared))
-        np.add.at(slope, part.block, np.einsum("nip,ni->np", part.by_shared, part.r))
-        H[:, columns[:, None], columns] += own
-        g[:, columns] += slope
+        H[:, columns[:, None], columns] += block_sums(part.block, part.by_shared.swapaxes(1, 2) @ part.by_shared, b)
+        g[:, columns] += block_sums(part.block, np.einsum("nip,ni->np", part.by_shared, part.r), b)
     total, Y, _ = equations.reduced(0.0)
     H -= Y @ equations.W.swapaxes(-1, -2)
     g -= np.einsum("bcd,bd->bc", Y, equations.h)
