@@ -119,8 +119,8 @@ class Session:
     problem: str = "waiting for images"
     photos: Photos = field(default_factory=dict)
 
-    def update(self, photos: Photos) -> bool:
-        """Detect the board in images that are new; calibrate again if there are any. Returns whether there were."""
+    def detect(self, photos: Photos) -> bool:
+        """Detect the board in images that are new. Returns whether there were any."""
         fresh = [(name, key) for name, moments in photos.items() for key in moments if (name, key) not in self.seen]
         for name, key in fresh:
             try:
@@ -128,10 +128,7 @@ class Session:
             except ValueError as error:  # still being written: it is tried again
                 self.problem = str(error)
         self.photos = photos
-        done = any(image in self.seen for image in fresh)
-        if done:
-            self._calibrate()
-        return done
+        return any(image in self.seen for image in fresh)
 
     def views(self) -> dict[str, BoardViews]:
         """The board points of all cameras."""
@@ -145,7 +142,8 @@ class Session:
                 found[name] = BoardViews(sizes.pop(), {k: d for _, views in mine for k, d in views.items()})
         return found
 
-    def _calibrate(self) -> None:
+    def calibrate(self) -> None:
+        """Calibrate with all that was detected."""
         try:
             self.calibration, self.problem = calibrate(self.views(), self.board, lens=self.lens), ""
         except ValueError as error:
@@ -173,7 +171,9 @@ def watch(
             photos = find_photos(folder, patterns=patterns)
         except ValueError as error:
             photos, session.problem = {}, str(error)
-        if session.update(photos):
+        if session.detect(photos):
+            write_text(page, _page(session))  # at once, with the advice of before
+            session.calibrate()
             write_text(page, _page(session))
         time.sleep(interval)
     return session
