@@ -455,9 +455,10 @@ class CameraPrior(NamedTuple):
 
 def typical_sizes(camera: Camera) -> Float[np.ndarray, " p"]:
     """Typical errors of a camera's parameters before any measurement, in the order of `parameter_names`."""
-    focal = TYPICAL_FOCAL_ERROR * _mean_focal(camera)
     lens = camera.distortion
     coefficients = () if lens is None else typical_coefficients(lens)
+    scaled = lens is not None and term(lens, 0) == "xi"  # in the middle, by 1 / (1 + xi)
+    focal = (coefficients[0] if scaled else TYPICAL_FOCAL_ERROR) * _mean_focal(camera)
     return np.array([3.0] * 3 + [100.0] * 3 + [focal] * 2 + [TYPICAL_CENTRE_ERROR * camera.hw[1]] * 2 + [*coefficients])
 
 
