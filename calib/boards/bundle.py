@@ -388,7 +388,8 @@ def linear_projection(
     Two reverse passes through the lens, with a copy of its coefficients per point; the others by the chain rule.
     """
     local = camera.cam_from_world.apply(torch.from_numpy(X)).detach().requires_grad_()
-    through, lens = (local,), camera.distortion
+    through: tuple[torch.Tensor, ...] = (local,)
+    lens = camera.distortion
     if lens is not None:
         copies = lens.coefficients.detach().requires_grad_().expand(len(X), -1)
         through, lens = (local, copies), lens.with_coefficients(copies)

@@ -94,7 +94,7 @@ def test_videos_are_read_frame_by_frame(tmp_path):
 @pytest.mark.parametrize(
     ("files", "message"),
     [
-        ([], ""),
+        ([], "images or videos"),
         (["a/x01.png", "a/x1.png", "a/y.txt"], "a: "),
     ],
 )
