@@ -34,7 +34,7 @@ from torch import Tensor
 
 from .checks import check_numbers, checking
 from .lenses.brown import Brown, brown_distort, brown_limit, brown_undistort
-from .lenses.central import FOV, MODELS, central_project, central_unproject
+from .lenses.central import EXTENDED_UNIFIED, FOV, MODELS, central_project, central_unproject
 from .lenses.common import WIDEST, finite_points, unit
 from .lenses.fisheye import fisheye_limit, fisheye_project, fisheye_unproject
 from .lenses.model import LensModel
@@ -48,6 +48,29 @@ COEFFICIENT_COUNTS = {
     KANNALA_BRANDT: (4,),
     **{name: (len(model.harmless),) for name, model in MODELS.items()},
 }
+
+TYPICAL_COEFFICIENTS = {
+    "brown-conrady": (1.0, 1.0, 0.02, 0.02, 1.0, 1.0, 1.0, 1.0, 0.02, 0.02, 0.02, 0.02, 0.1, 0.1),
+    "kannala-brandt": (0.3, 0.3, 0.3, 0.3),
+    "thin-prism-fisheye": (0.3, 0.3, 0.02, 0.02, 0.3, 0.3, 0.02, 0.02),
+    "double-sphere": (0.3, 0.3),
+    "extended-unified": (0.3, 0.5),
+    "unified": (1.0, 1.0, 1.0, 0.02, 0.02),
+    "fov": (0.5,),
+    "scaramuzza": (0.5, 0.5, 0.5),
+}
+"""Upper bounds of the usual sizes of coefficients."""
+LENS_TERMS = {
+    "brown-conrady": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty"),
+    "kannala-brandt": ("k1", "k2", "k3", "k4"),
+    "thin-prism-fisheye": ("k1", "k2", "p1", "p2", "k3", "k4", "sx", "sy"),
+    "double-sphere": ("xi", "alpha"),
+    "extended-unified": ("alpha", "beta"),
+    "unified": ("xi", "k1", "k2", "p1", "p2"),
+    "fov": ("omega",),
+    "scaramuzza": ("b2", "b3", "b4"),
+}
+"""Names of the coefficients, in order."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -167,3 +190,20 @@ class Distortion(LensModel):
         """Coefficients (*b, 1.., n): the batch axes in front, one axis of length 1 for each further axis."""
         c = self.coefficients
         return c.reshape(*c.shape[:-1], *[1] * (points.ndim - c.ndim), c.shape[-1])
+
+
+def typical_coefficients(lens: LensModel) -> tuple[float, ...]:
+    """Usual sizes of a lens's numbers; 1 for those of a camera model."""
+    count = lens.coefficients.shape[-1]
+    return TYPICAL_COEFFICIENTS.get(lens.model, (1.0,) * count)[:count]
+
+
+def pinhole_coefficients(lens: LensModel) -> Float[Tensor, "*b n"]:
+    """Numbers with which the terms of a lens do nothing: zeros, but for the extended unified model's beta."""
+    none = torch.zeros_like(lens.coefficients)
+    return none + none.new_tensor([0.0, 1.0]) if lens.model == EXTENDED_UNIFIED else none
+
+
+def term(lens: LensModel, index: int) -> str:
+    """The name of a lens's number."""
+    return LENS_TERMS[lens.model][index] if lens.model in LENS_TERMS else f"number {index + 1}"

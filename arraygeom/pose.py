@@ -136,6 +136,12 @@ class Pose(Batched):
         """Where the origin of `to` is in `from`: a camera's optical centre in the world."""
         return self.inverse().t
 
+    @property
+    def centre_jacobian(self) -> Float[Tensor, "*b 3 6"]:
+        """Derivatives of the centre by the rotation vector and the translation of `perturbed`."""
+        eye = torch.eye(3).to(self.t).expand_as(self.R)
+        return -self.R.mT @ torch.cat([cross_matrix(self.t), eye], -1)
+
     def perturbed(
         self, rotation: Float[Tensor, "*b 3"] | None = None, translation: Float[Tensor, "*b 3"] | None = None
     ) -> Pose:

@@ -428,7 +428,7 @@ def _shown(d: Tensor) -> str:
     return ", ".join(f"{v:g}" for v in d.reshape(-1).tolist())
 
 
-def _focal_positions(K: Tensor) -> Tensor:
+def focal_positions(K: Tensor) -> Tensor:
     """The positions of fx and fy in K, with their signs: the diagonal, or for a rotated image the other one."""
     block = K.detach()[..., :2, :2]
     largest = block.abs() == block.abs().amax(-2, keepdim=True)
@@ -448,7 +448,7 @@ def _perturbed_camera(name: str, camera: View, changes: Mapping[str, Tensor]) ->
     if mine.keys() & {"rotation", "translation"}:
         pose = pose.perturbed(mine.get("rotation"), mine.get("translation"))
     if "focal" in mine:
-        K = K + torch.nn.functional.pad(_focal_positions(K) * mine["focal"][..., None, :], (0, 1, 0, 1))
+        K = K + torch.nn.functional.pad(focal_positions(K) * mine["focal"][..., None, :], (0, 1, 0, 1))
     if "centre" in mine:
         K = K + torch.nn.functional.pad(mine["centre"][..., None], (2, 0, 0, 1))
     return camera.replace(K=K, cam_from_world=pose)

@@ -57,7 +57,7 @@ def triangulate(
     for i in range(refinements):
         p = p.detach() if i == refinements - FOLLOWED else p
         step = _normal_equations(sights, chart, p)
-        p = p + torch.linalg.solve(step.matrix, step.target[..., None])[..., 0]
+        p = p + torch.cholesky_solve(step.target[..., None], torch.linalg.cholesky(step.matrix))[..., 0]
         p = torch.cat([p[..., :2], p[..., 2:].clamp(min=SMALLEST_PARALLAX)], -1)
     last = _normal_equations(sights, chart, p)
     of_chart = deviation**2 * torch.linalg.inv(last.matrix)
@@ -201,7 +201,8 @@ def _normal_equations(sights: Sequence[_Sight], chart: _Chart, p: Tensor) -> _No
         worst = torch.maximum(worst, r.detach().square().sum(-1))
     size = matrix.diagonal(dim1=-2, dim2=-1).amax(-1)
     ratio = torch.linalg.det(matrix / torch.where(size > 0, size, 1.0)[..., None, None])
-    solvable = (ratio > LEAST_DETERMINANT) & (torch.stack([s.usable for s in sights]).sum(0) >= 2)
+    definite = torch.linalg.cholesky_ex(matrix.detach()).info == 0
+    solvable = definite & (ratio > LEAST_DETERMINANT) & (torch.stack([s.usable for s in sights]).sum(0) >= 2)
     matrix = torch.where(solvable[..., None, None], matrix, torch.eye(3).to(matrix))
     return _NormalEquations(matrix, torch.where(solvable[..., None], target, 0.0), solvable, in_front, worst.sqrt())
 

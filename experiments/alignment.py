@@ -27,7 +27,7 @@ from arraygeom.atomic import write_text
 from arraygeom.pixels import pixel_grid
 from arraygeom.undistortion import pixels_between, recorded_pixels
 from calib.boards.detect import collect_folder
-from calib.boards.parameters import StartDeviations
+from calib.boards.poses import StartDeviations
 from calib.boards.rig import Calibration, calibrate
 from calib.boards.target import parse_board
 from calib.images.guided_matches import ALIKE, guided_matches

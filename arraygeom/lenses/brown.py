@@ -10,7 +10,7 @@ from torch import Tensor
 from ..pixels import product, to_homogeneous
 from ..roots import first_root, invert_increasing
 from ..tracing import traced
-from .common import BEYOND, MARGIN, POLE, SOLVED, TINY, WIDEST, norm, polynomial_product
+from .common import BEYOND, MARGIN, POLE, SOLVED, TINY, WIDEST, norm, once, polynomial_product
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,7 @@ class Brown:
 
 def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
     """Points (*n, 2) to distorted ones, and which are within the range."""
-    lens = Brown.named(c)
-    limit = brown_limit(lens).to(xy)
+    lens, limit = Brown.named(c), once(lambda c: brown_limit(Brown.named(c)), c).to(xy)
     squared = xy.square().sum(-1)
     inside = squared < limit
     pull = torch.where(inside, 1.0, (limit / torch.where(inside, 1.0, squared.clamp(min=TINY))).sqrt())

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ..roots import first_root, invert_increasing
+from ..tracing import traced
 from .brown import brown_distort, brown_undistort
 from .common import MARGIN, TINY, WIDEST, angle_over_radius, cosine_and_sinc, unit
 
@@ -79,6 +80,8 @@ def central_unproject(model: str, c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tens
 
 def _sound(kind: _Model, c: Tensor) -> tuple[Tensor, Tensor]:
     sound = kind.sound(c.detach()) & c.detach().isfinite().all(-1)
+    if not traced() and bool(sound.all()):
+        return c, sound
     return torch.where(sound[..., None], c, c.new_tensor(kind.harmless)), sound
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -49,6 +51,13 @@ def polynomial_product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> list[Ten
         for j, b_j in enumerate(b):
             terms[i + j] = terms[i + j] + a_i * b_j
     return terms
+
+
+@torch.no_grad()
+def once(bound: Callable[[Tensor], Tensor], c: Tensor) -> Tensor:
+    """A bound of lenses by their coefficients (*b, n); of copies of one lens, made by `expand`, it is computed once."""
+    copies = c.ndim > 1 and len(c) > 1 and c.stride(0) == 0
+    return bound(c[:1]).expand(c.shape[:-1]) if copies else bound(c)
 
 
 def unit(ray: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..roots import first_root, invert_increasing
-from .common import MARGIN, SOLVED, TINY, angle_over_radius, cosine_and_sinc, unit
+from .common import MARGIN, SOLVED, TINY, angle_over_radius, cosine_and_sinc, once, unit
 
 
 def fisheye_project(c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
@@ -17,7 +17,7 @@ def fisheye_project(c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
     u = xy.square().sum(-1)
     ratio = angle_over_radius(u, z)
     v = u * ratio.square()
-    limit = fisheye_limit(c).to(v)
+    limit = once(fisheye_limit, c).to(v)
     inside = v < limit
     pull = torch.where(inside, 1.0, (limit / torch.where(inside, 1.0, v.clamp(min=TINY))).sqrt())
     p, _ = _fisheye_factor(c, torch.where(inside, v, limit))

@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 from arraygeom import Camera, Pose, rotation_from_vector
 
 from .board import Board
+from .bundle import camera_jacobian
 from .detect import BoardViews
-from .parameters import camera_jacobian
 from .photos import FrameKey
 from .rig import Calibration
 from .uncertainty import Intrinsics, intrinsics_of, moved_pixels

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from arraygeom.pixels import HW
 
@@ -47,6 +47,10 @@ class Detection(NamedTuple):
 
     ids: Int[np.ndarray, " n"]
     x: Float[np.ndarray, "n 2"]
+
+    def where(self, mask: Bool[np.ndarray, " n"]) -> Detection:
+        """Some of the points."""
+        return Detection(self.ids[mask], self.x[mask])
 
 
 @dataclass(frozen=True)

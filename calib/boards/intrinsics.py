@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -13,15 +13,26 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 
 from arraygeom import Camera, Distortion, Pose, intrinsics
+from arraygeom.lenses.central import MODELS
 from arraygeom.pixels import HW
 
 from .board import Board
-from .bundle import POSE, BundleProblem, Observations, Solved, readjusted
 from .detect import BoardViews, Detection
 from .photos import FrameKey
-from .solve import board_problem, flat_boards, solve
 
-Lens = Literal["brown-conrady", "rational", "thin-prism", "tilted", "kannala-brandt", "omni", "none"]
+Lens = Literal[
+    "brown-conrady",
+    "rational",
+    "thin-prism",
+    "tilted",
+    "kannala-brandt",
+    "omni",
+    "double-sphere",
+    "extended-unified",
+    "scaramuzza",
+    "thin-prism-fisheye",
+    "none",
+]
 LENSES: dict[Lens, tuple[str, int]] = {
     "brown-conrady": ("brown-conrady", 5),
     "rational": ("brown-conrady", 8),
@@ -29,6 +40,10 @@ LENSES: dict[Lens, tuple[str, int]] = {
     "tilted": ("brown-conrady", 14),
     "kannala-brandt": ("kannala-brandt", 4),
     "omni": ("unified", 5),
+    "double-sphere": ("double-sphere", 2),
+    "extended-unified": ("extended-unified", 2),
+    "scaramuzza": ("scaramuzza", 3),
+    "thin-prism-fisheye": ("thin-prism-fisheye", 8),
 }
 """Model and number of coefficients; those of Brown and Conrady have all terms of the former."""
 FEWEST_IMAGES = 3
@@ -38,26 +53,10 @@ OUTLIER = 6.0
 """Points beyond this many standard deviations (of a coordinate) are left out."""
 LEAST_SIGMA = 0.02
 """Lower bound of that deviation, pixels: no real corners are better."""
-MEDIAN_TO_DEVIATION = 1 / 1.17741
-"""The standard deviation of a coordinate is this share of the median distance."""
+RAYLEIGH_MEDIAN = 1.17741
+"""The median length of a vector of two independent standard normal variables."""
 FEWEST_TILT = 8.0
 """Boards whose normals differ by less than this many degrees count as parallel."""
-ROUNDS = 3
-"""Times that outliers may change."""
-COMPARED: tuple[Lens, ...] = (
-    "none",
-    "kannala-brandt",
-    "brown-conrady",
-    "rational",
-    "thin-prism",
-    "tilted",
-)
-"""Models that are compared, by number of coefficients."""
-FOLDS = 4
-FEWEST_FRAMES = 8
-EQUAL = 0.01
-"""Held-out errors that differ by less than this share are equal."""
-
 Points = Float[np.ndarray, "n 3"]
 OpenCVSolution = tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]
 """K, coefficients, rotations, translations."""
@@ -71,49 +70,6 @@ class CalibratedViews:
     camera: Camera
     views: BoardViews
     poses: Mapping[FrameKey, Pose]
-
-
-class SingleCalibration(NamedTuple):
-    """One camera calibrated by itself, with the images used."""
-
-    solved: Solved
-    seen: CalibratedViews
-
-    @property
-    def camera(self) -> Camera:
-        """The camera, at the origin."""
-        return self.seen.camera
-
-    @property
-    def rms(self) -> float:
-        """Its reprojection error, pixels."""
-        return self.solved.problem.rms()
-
-
-def calibrate_single(
-    name: str, views: BoardViews, board: Board, *, lens: Lens = "brown-conrady", final: bool = True
-) -> SingleCalibration:
-    """One camera's intrinsics and lens from its own images. Raises ValueError, with advice, where they do not suffice.
-
-    Unless `final`, a poorly constrained focal length is accepted, as other cameras will add constraints.
-    """
-    initial = initial_camera(name, views, board, lens)
-    kept = _without_bad_images(views, initial, board)
-    if len(kept.seen) < len(views.seen):
-        initial = initial_camera(name, kept, board, lens)
-    camera, poses, deformation = initial.camera, initial.poses, None
-    used = without_outliers(kept, camera, poses, board.points)
-    flat = flat_boards(board, poses, {name: kept})
-    for _ in range(ROUNDS):
-        problem = board_problem({name: camera}, poses, {name: used}, board)
-        solved = solve(replace(problem, deformation=deformation), flat, final=final)
-        camera, poses = solved.problem.cameras[name], solved.problem.board_poses
-        deformation = solved.problem.deformation
-        before, used = used, near_fit(solved, name, kept, board)
-        if used.count == before.count:
-            break
-    check_tilts(name, poses, board)
-    return SingleCalibration(solved, CalibratedViews(name, camera, before, poses))
 
 
 def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> CalibratedViews:
@@ -137,22 +93,52 @@ def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> Ca
     return CalibratedViews(name, camera, plausible, poses)
 
 
-def _without_bad_images(views: BoardViews, initial: CalibratedViews, board: Board) -> BoardViews:
+def without_bad_images(views: BoardViews, initial: CalibratedViews, board: Board) -> BoardViews:
     """The views without images whose reprojection error is far above the others'."""
     rms = {}
     for key, pose in initial.poses.items():
-        distances = _distances(initial.camera, pose, initial.views.seen[key], board.points)
-        rms[key] = float(np.sqrt((distances**2).mean()))
+        errors = projection_errors(initial.camera, pose, initial.views.seen[key], board.points)
+        rms[key] = float(np.sqrt((errors**2).mean()))
     limit = max(2.0, 10 * float(np.median(list(rms.values()))))
     return views.only([key for key in views.seen if rms[key] < limit])
 
 
-def near_fit(solved: Solved, name: str, views: BoardViews, board: Board) -> BoardViews:
-    """A camera's views without the points that a solution shows to be outliers."""
-    camera, boards, deformation = solved.problem.cameras[name], solved.problem.board_poses, solved.problem.deformation
-    poses = {key: camera.cam_from_world @ boards[key] for key in views.seen}
-    points = board.points if deformation is None else deformation.deformed(board.points, board.part)
-    return without_outliers(views, camera, poses, points, sigma=solved.sigma[name])
+def without_outliers(
+    views: BoardViews,
+    camera: Camera,
+    poses: Mapping[FrameKey, Pose],
+    points: Float[np.ndarray, "n 3"],
+    *,
+    sigma: float | None = None,
+) -> BoardViews:
+    """The views without points farther from a camera's projections than `OUTLIER` standard deviations.
+
+    `points` are the board's, metres. `sigma` is along x or y, pixels; by default estimated from the median of all
+    distances. Images without a pose, or with fewer than `FEWEST_POINTS` points or one row of them left, keep all.
+    """
+    off = {key: projection_errors(camera, poses[key], d, points) for key, d in views.seen.items() if key in poses}
+    sigma = max(sigma or float(np.median(np.concatenate(list(off.values())))) / RAYLEIGH_MEDIAN, LEAST_SIGMA)
+    kept = {key: views.seen[key].where(r < OUTLIER * sigma) for key, r in off.items()}
+    return BoardViews(
+        views.hw,
+        {key: kept[key] if key in kept and _spans(points[kept[key].ids]) else d for key, d in views.seen.items()},
+    )
+
+
+def _spans(points: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether there are enough points, and not all on a line."""
+    if len(points) < FEWEST_POINTS:
+        return False
+    _, second, _ = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    return bool(second > 1e-6)
+
+
+def projection_errors(
+    camera: Camera, pose: Pose, found: Detection, points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, " m"]:
+    """How far the points of an image are from a camera's projections of the board's, pixels."""
+    projected = camera.project_local(pose.apply(torch.from_numpy(points[found.ids]))).x.numpy()
+    return np.linalg.norm(projected - found.x, axis=-1)
 
 
 def near_homography(found: Detection, board: Board) -> Detection:
@@ -164,36 +150,7 @@ def near_homography(found: Detection, board: Board) -> Detection:
     if H is None:
         return found
     off = np.linalg.norm(cv2.perspectiveTransform(plane[:, None], H)[:, 0] - found.x, axis=-1)
-    return _only(found, off < max(1.0, 4 * MEDIAN_TO_DEVIATION * float(np.median(off))))
-
-
-def without_outliers(
-    views: BoardViews, camera: Camera, poses: Mapping[FrameKey, Pose], points: Points, *, sigma: float | None = None
-) -> BoardViews:
-    """The views without points farther from a camera's projections than `OUTLIER` standard deviations.
-
-    `points` are the board's, metres. `sigma` is along x or y, pixels; by default estimated from the median of all
-    distances. Images without a pose, or with fewer than `FEWEST_POINTS` points or one row of them left, keep all.
-    """
-    off = {key: _distances(camera, poses[key], d, points) for key, d in views.seen.items() if key in poses}
-    sigma = max(sigma or MEDIAN_TO_DEVIATION * float(np.median(np.concatenate(list(off.values())))), LEAST_SIGMA)
-    kept = {key: _only(views.seen[key], r < OUTLIER * sigma) for key, r in off.items()}
-    return BoardViews(
-        views.hw,
-        {key: kept[key] if key in kept and _spans(points[kept[key].ids]) else d for key, d in views.seen.items()},
-    )
-
-
-def _spans(points: Points) -> bool:
-    """Whether there are enough points, and not all on a line."""
-    if len(points) < FEWEST_POINTS:
-        return False
-    _, second, _ = np.linalg.svd(points - points.mean(0), compute_uv=False)
-    return bool(second > 1e-6)
-
-
-def _only(found: Detection, mask: np.ndarray) -> Detection:
-    return Detection(found.ids[mask], found.x[mask])
+    return found.where(off < max(1.0, 4 * float(np.median(off)) / RAYLEIGH_MEDIAN))
 
 
 def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Camera, dict[FrameKey, Pose]]:
@@ -208,12 +165,13 @@ def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Cam
     distortion = Distortion(model if pinhole else "kannala-brandt", torch.tensor(coefficients)) if count else None
     camera = Camera(K=torch.tensor(K), cam_from_world=Pose.identity(), hw=views.hw, distortion=distortion)
     if not pinhole and model != "kannala-brandt":
-        camera = _with_model(camera, model, count)
+        camera = _with_model(camera, model)
     return camera, {key: _pose(r, t) for key, r, t in zip(views.seen, rotations, translations)}
 
 
-def _with_model(camera: Camera, model: str, count: int) -> Camera:
+def _with_model(camera: Camera, model: str) -> Camera:
     """A fisheye's camera with another lens model of nearly the same rays: its focal length and two terms are fitted."""
+    plain = np.array(MODELS[model].harmless)
     h, w = camera.hw
     grid = np.stack(np.meshgrid(np.linspace(0, w - 1, 16), np.linspace(0, h - 1, 12)), -1).reshape(-1, 2)
     rays, valid = camera.rays(torch.from_numpy(grid))
@@ -222,11 +180,10 @@ def _with_model(camera: Camera, model: str, count: int) -> Camera:
     def changed(values: np.ndarray) -> Camera:
         K = camera.K.clone()
         K[:2, :2] *= float(np.exp(values[0]))
-        coefficients = torch.zeros(count, dtype=torch.float64)
-        coefficients[:2] = torch.from_numpy(values[1:])
+        coefficients = torch.from_numpy(np.concatenate([values[1:], plain[2:]]))
         return camera.replace(K=K, distortion=Distortion(model, coefficients))
 
-    first = np.array([np.log(2.0), 1.0, 0.0])
+    first = np.array([0.0, *plain[:2]])
     found = least_squares(lambda v: (changed(v).project_local(rays).x - x).numpy().ravel(), first, loss="soft_l1")
     return changed(found.x)
 
@@ -312,79 +269,5 @@ def _fisheye(views: BoardViews, board: Board) -> OpenCVSolution:
     return K, c.reshape(-1), list(rotations), list(translations)
 
 
-def _distances(camera: Camera, pose: Pose, found: Detection, points: Points) -> np.ndarray:
-    projected = camera.project_local(pose.apply(torch.from_numpy(points[found.ids]))).x.numpy()
-    return np.linalg.norm(projected - found.x, axis=-1)
-
-
 def _pose(r: np.ndarray, t: np.ndarray) -> Pose:
     return Pose(torch.from_numpy(cv2.Rodrigues(r)[0]), torch.from_numpy(t.reshape(3).astype(np.float64)))
-
-
-# Lens models --------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class LensComparison:
-    """Mean square errors of a coordinate (pixels^2) of each frame by each model that can be fitted without it."""
-
-    errors: Mapping[Lens, Float[np.ndarray, " f"]]
-
-    def rms(self, lens: Lens) -> float:
-        """The held-out error along x or y, pixels."""
-        return float(np.sqrt(self.errors[lens].mean()))
-
-    @property
-    def advised(self) -> Lens:
-        """The model with fewest coefficients that predicts as well as the best, to a standard error or one percent."""
-        if not self.errors:
-            return "brown-conrady"
-        best = min(self.errors, key=self.rms)
-        return next(lens for lens in COMPARED if lens in self.errors and self._equal(lens, best))
-
-    def _equal(self, lens: Lens, best: Lens) -> bool:
-        worse = self.errors[lens] - self.errors[best]
-        error = float(worse.std(ddof=1)) / len(worse) ** 0.5
-        return float(worse.mean()) <= max(error, 2 * EQUAL * float(self.errors[best].mean()))
-
-    @property
-    def advice(self) -> str:
-        """The advised model and all errors, in a sentence."""
-        if not self.errors:
-            return f"too few frames to compare lens models ({FEWEST_FRAMES} are needed): brown-conrady is used"
-        listed = ", ".join(f"{lens} {self.rms(lens):.3f}" for lens in COMPARED if lens in self.errors)
-        return f"the images support the lens model {self.advised} (error on held-out frames, px: {listed})"
-
-
-def compare_lenses(views: Mapping[str, BoardViews], board: Board) -> dict[str, LensComparison]:
-    """The lens models of each camera, judged on frames that they were not fitted to."""
-    return {name: _compared(name, v, board) for name, v in views.items()}
-
-
-def _compared(name: str, views: BoardViews, board: Board) -> LensComparison:
-    if len(views.seen) < FEWEST_FRAMES:
-        return LensComparison({})
-    kept = calibrate_single(name, views, board, final=False).seen.views
-    found: dict[Lens, np.ndarray] = {}
-    for lens in COMPARED:
-        try:
-            problem = calibrate_single(name, kept, board, lens=lens, final=False).solved.problem
-        except ValueError:
-            continue  # it does not fit at all, as a fisheye's model of a long lens may
-        index = np.arange(len(problem.frames))
-        found[lens] = np.concatenate([_held_out(problem, index % FOLDS == fold) for fold in range(FOLDS)])
-    return LensComparison(found)
-
-
-def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"]:
-    """Mean squares of the frames held `out` by a camera fitted to the others, their boards' poses fitted to them."""
-    fitted, judged = readjusted(problem.of_boards(~out)), problem.of_boards(out)
-    (name,) = fitted.cameras
-    if fitted.deformation is not None and judged.deformation is not None:
-        judged = replace(judged, deformation=fitted.deformation.of_blocks(judged.deformation.part))
-    seen = Observations(judged.seen[name].block, judged.on_board(name), judged.seen[name].x)
-    fixed = {name: np.zeros(len(judged.free[name]), dtype=bool)}
-    posed = replace(judged, cameras=fitted.cameras, seen={name: seen}, free=fixed, priors={}, deformation=None)
-    squares = (readjusted(posed).residuals()[name] ** 2).sum(-1)
-    count = np.bincount(seen.block)
-    return np.asarray(np.bincount(seen.block, squares) / np.maximum(2 * count - POSE, 1))

@@ -5,7 +5,8 @@ Relative poses of pairs by vote, joined along a maximum spanning tree; or those 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
 
@@ -13,8 +14,10 @@ import numpy as np
 import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig
+from arraygeom.distortion import pinhole_coefficients
 
 from .board import Board
+from .bundle import CameraPrior, InitialRig, Solved, intrinsic_values, typical_prior
 from .detect import BoardViews, Detection
 from .intrinsics import LENSES, CalibratedViews, Lens, board_pose
 from .photos import FrameKey
@@ -41,58 +44,66 @@ class RelativePose(NamedTuple):
         return len(self.shared) < FEWEST_TO_JUDGE or len(self.agreeing) > max(1, len(self.shared) // 2)
 
 
-class InitialRig(NamedTuple):
-    """The cameras, `world_from_board` of each moment, and the views, numbered consistently.
+@dataclass(frozen=True)
+class StartDeviations:
+    """How far a rig may be from its start: standard deviations of each camera's parameters.
 
-    left_out: images that disagree with the others, (camera, moment).
+    position: of the optical centre along each axis, metres. rotation: about each axis, degrees. focal: a share of the
+    focal length. centre: of the principal point, a share of the width.
     """
 
-    cameras: dict[str, Camera]
-    boards: dict[FrameKey, Pose]
-    views: dict[str, BoardViews]
-    left_out: list[tuple[str, FrameKey]]
+    position: float = 5e-4
+    rotation: float = 3.0
+    focal: float = 0.02
+    centre: float = 0.01
 
-    def without(self, images: Collection[tuple[str, FrameKey]]) -> InitialRig:
-        """Without these images too."""
-        views = {name: v.only([key for key in v.seen if (name, key) not in images]) for name, v in self.views.items()}
-        boards = {key: pose for key, pose in self.boards.items() if any(key in v.seen for v in views.values())}
-        return InitialRig(self.cameras, boards, views, [*self.left_out, *images])
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0 < value < float("inf"):
+                raise ValueError(f"the start's deviation {name}={value:g} is not a positive number")
+
+    @classmethod
+    def of(cls, given: Mapping[str, float]) -> StartDeviations:
+        """By name. Raises ValueError for another name."""
+        if unknown := given.keys() - vars(cls()).keys():
+            raise ValueError(f"a start has no deviation '{min(unknown)}': it has {', '.join(vars(cls()))}")
+        return cls(**given)
 
 
-def initial_rig(cameras: Sequence[CalibratedViews], board: Board) -> InitialRig:
+def start_prior(camera: Camera, deviations: StartDeviations) -> CameraPrior:
+    """The prior of a camera by its start, and of what that does not state by ordinary cameras."""
+    information = typical_prior(camera).information.copy()
+    information[:3, :3] = np.eye(3) / np.radians(deviations.rotation) ** 2
+    information[3:6, 3:6] = np.eye(3) / deviations.position**2
+    focal = camera.K.diagonal()[:2].numpy()
+    information[6:8, 6:8] += np.full((2, 2), 0.25) / (deviations.focal * float(focal.mean())) ** 2
+    information[8:10, 8:10] = np.eye(2) / (deviations.centre * camera.hw[1]) ** 2
+    return CameraPrior(intrinsic_values(camera), information, camera.cam_from_world)
+
+
+def initial_rig(singles: Mapping[str, Solved], board: Board) -> InitialRig:
     """Poses of all cameras and boards from pairs, along the tree whose edges have most corners; the first is the world.
 
     Raises ValueError if cameras are not connected by shared frames, or if the frames of a pair contradict
     each other: images that are mirrored, or not of the same moments.
     """
+    cameras = [
+        CalibratedViews(name, alone.problem.cameras[name], alone.views[name], alone.problem.board_poses)
+        for name, alone in singles.items()
+    ]
     pairs = {(a.name, b.name): found for a, b in combinations(cameras, 2) if (found := pair_pose(a, b, board))}
     return consistent_boards(cameras, _along_tree(cameras, pairs, board), board)
 
 
-def start_cameras(start: Rig, views: Mapping[str, BoardViews], lens: Mapping[str, Lens]) -> dict[str, Camera]:
-    """The cameras of a start that have images, with a lens. Raises ValueError if one is missing or differs in size."""
-    found = {}
-    for name, v in views.items():
-        camera = start.cameras.get(name)
-        if not isinstance(camera, Camera):
-            raise ValueError(
-                f"{name}: the start has no camera of this name with K and pose; it has {list(start.names)}"
-            )
-        if camera.hw != v.hw:
-            (h, w), (rows, columns) = camera.hw, v.hw
-            raise ValueError(f"{name}: its images are {columns}x{rows} and the start states {w}x{h}")
-        if camera.distortion is None and lens[name] != "none":
-            model, count = LENSES[lens[name]]
-            camera = camera.replace(distortion=Distortion(model, torch.zeros(count, dtype=torch.float64)))
-        found[name] = camera.to(torch.float64)
-    return found
-
-
-def rig_near_start(cameras: Mapping[str, Camera], views: Mapping[str, BoardViews], board: Board) -> InitialRig:
+def rig_near_start(
+    start: Rig, views: Mapping[str, BoardViews], board: Board, lens: Mapping[str, Lens], deviations: StartDeviations
+) -> InitialRig:
     """Cameras at the start's positions, rotated so that they agree on the boards, and the boards in the start's world.
 
-    The camera with most images keeps its orientation. Raises ValueError if a camera shares no moment with another.
+    The camera with most images keeps its orientation. Raises ValueError if the start has no such camera, or one of
+    another size, or if a camera shares no moment with another.
     """
+    cameras = {name: _start_camera(name, start, v, lens[name]) for name, v in views.items()}
     for name, v in views.items():
         if len(views) > 1 and not any(v.seen.keys() & other.seen.keys() for n, other in views.items() if n != name):
             raise ValueError(f"{name}: never sees the board in the same frame as another camera: check the numbers")
@@ -102,7 +113,23 @@ def rig_near_start(cameras: Mapping[str, Camera], views: Mapping[str, BoardViews
     ]
     anchor = max(seen, key=lambda v: len(v.poses))
     poses = {v.name: _aligned(anchor, v, board) for v in seen}
-    return consistent_boards(seen, poses, board)
+    priors = {name: start_prior(camera, deviations) for name, camera in cameras.items()}
+    return consistent_boards(seen, poses, board)._replace(priors=priors)
+
+
+def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) -> Camera:
+    """A camera of a start, with a lens. Raises ValueError if it is missing or differs in size from the images."""
+    camera = start.cameras.get(name)
+    if not isinstance(camera, Camera):
+        raise ValueError(f"{name}: the start has no camera of this name with K and pose; it has {list(start.names)}")
+    if camera.hw != views.hw:
+        (h, w), (rows, columns) = camera.hw, views.hw
+        raise ValueError(f"{name}: its images are {columns}x{rows} and the start states {w}x{h}")
+    if camera.distortion is None and model_name != "none":
+        model, count = LENSES[model_name]
+        lens = Distortion(model, torch.zeros(count, dtype=torch.float64))
+        camera = camera.replace(distortion=lens.with_coefficients(pinhole_coefficients(lens)))
+    return camera.to(torch.float64)
 
 
 def _aligned(a: CalibratedViews, b: CalibratedViews, board: Board) -> Pose:

@@ -10,17 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from arraygeom import Camera, Pose, Rig, triangulate
 from arraygeom.pose import cross_matrix
 
-from .parameters import camera_jacobian
+from .bundle import camera_jacobian
 from .uncertainty import RigCovariance, beta_covariance, grid_points
 
 DEPTHS = 3
@@ -318,3 +319,37 @@ def _of(sigma: np.ndarray, digits: int) -> str:
         if np.isnan(sigma).all()
         else f" (both calibrations' deviations: {_rms(sigma[np.isfinite(sigma)]):.{digits}f})"
     )
+
+
+def draw_difference(found: RigDifference) -> Figure:
+    """How far two rigs' pixels differ, at the nearest and the farthest depth, and depths by each pair, in percent."""
+    panels = []
+    for name, camera in found.cameras.items():
+        for depth in (camera.depth.min(), camera.depth.max()):
+            at = camera.depth == depth
+            panels.append((f"{name}, {depth:.3g} m: pixels", camera.x[at], np.linalg.norm(camera.change[at], axis=1)))
+    for name, by_pair in found.depths.items():
+        for depth in (by_pair.depth.min(), by_pair.depth.max()):
+            at = by_pair.depth == depth
+            panels.append(
+                (f"depth by {found.alpha} and {name}, {depth:.3g} m: %", by_pair.x[at], 100 * by_pair.change[at])
+            )
+    figure = Figure(figsize=(9, 2.7 * len(panels) / 2), layout="constrained")
+    for i, (title, x, values) in enumerate(panels, 1):
+        axes: Any = figure.add_subplot(len(panels) // 2, 2, i)
+        signed = "%" in title
+        most = float(np.nanquantile(np.abs(values), 0.98)) if len(values) else 1.0
+        shown = axes.scatter(
+            *x.T,
+            c=values,
+            s=22,
+            marker="s",
+            cmap="RdBu" if signed else "viridis",
+            vmin=-most if signed else 0,
+            vmax=most,
+        )
+        figure.colorbar(shown, ax=axes)
+        axes.set_title(title.replace("$", r"\$"), fontsize=9)
+        axes.set(aspect="equal", xticks=[], yticks=[])
+        axes.invert_yaxis()
+    return figure

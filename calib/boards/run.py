@@ -1,24 +1,40 @@
-"""Calibration of a folder of images to files."""
+"""From a folder of images to files: a calibration, or a page of guidance that follows while they are taken."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from glob import escape
+import base64
+import glob
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
 from pathlib import Path
 from typing import Literal, NamedTuple
+
+import cv2
+import numpy as np
 
 from arraygeom import Rig
 from arraygeom.atomic import sweep, write_text, write_together
 from arraygeom.rig import depth_range
 
-from .adequacy import coverage_advice, coverages
-from .detect import Progress, collect_folder
-from .intrinsics import Lens, compare_lenses
-from .parameters import StartDeviations
-from .report import by_cameras, report_html, summary
-from .rig import calibrate
+from .adequacy import coverage_advice, coverages, next_views
+from .board import Board
+from .detect import BoardViews, Detection, Progress, collect_folder, detected
+from .intrinsics import Lens
+from .photos import FrameKey, Photos, find_photos
+from .poses import StartDeviations
+from .report import STYLE, by_cameras, report_html, summary
+from .rig import Calibration, calibrate
 from .target import parse_boards
-from .uncertainty import rig_covariance
+from .uncertainty import intrinsics_of, rig_covariance
+from .validation import compare_lenses
+
+WIDTH = 420
+"""Of the images shown, pixels."""
+GRID = 6, 8
+COLOURS = (60, 60, 230), (80, 200, 80)
+"""Blue, green, red of cells without and with points."""
 
 
 class CalibrationOutput(NamedTuple):
@@ -85,5 +101,150 @@ def calibrate_photos(
 
 def _named_like(folder: Path, rig: Rig) -> dict[str, str] | None:
     """A pattern for each camera if the folder holds a file called like each."""
-    patterns = {name: f"{escape(name)}.*" for name in rig.names}
+    patterns = {name: f"{glob.escape(name)}.*" for name in rig.names}
     return patterns if all(any(folder.glob(pattern)) for pattern in patterns.values()) else None
+
+
+# While images are taken ---------------------------------------------------------------------------------------
+
+
+@dataclass
+class Session:
+    """What was detected so far, and the last calibration or why there is none."""
+
+    board: Board
+    lens: Lens = "brown-conrady"
+    seen: dict[tuple[str, FrameKey], tuple[tuple[int, int], dict[FrameKey, Detection]]] = field(default_factory=dict)
+    calibration: Calibration | None = None
+    problem: str = "waiting for images"
+    photos: Photos = field(default_factory=dict)
+
+    def detect(self, photos: Photos) -> bool:
+        """Detect the board in images that are new. Returns whether there were any."""
+        fresh = [(name, key) for name, moments in photos.items() for key in moments if (name, key) not in self.seen]
+        for name, key in fresh:
+            try:
+                self.seen[name, key] = detected(photos[name][key], key, self.board)
+            except ValueError as error:  # still being written: it is tried again
+                self.problem = str(error)
+        self.photos = photos
+        return any(image in self.seen for image in fresh)
+
+    def views(self) -> dict[str, BoardViews]:
+        """The board points of all cameras."""
+        found = {}
+        for name in self.photos:
+            mine = [entry for (camera, _), entry in self.seen.items() if camera == name]
+            sizes = {hw for hw, _ in mine}
+            if len(sizes) > 1:
+                raise ValueError(f"{name}: its images differ in size: keep those of one camera at one setting")
+            if mine:
+                found[name] = BoardViews(sizes.pop(), {k: d for _, views in mine for k, d in views.items()})
+        return found
+
+    def calibrate(self) -> None:
+        """Calibrate with all that was detected."""
+        try:
+            self.calibration, self.problem = calibrate(self.views(), self.board, lens=self.lens), ""
+        except ValueError as error:
+            self.calibration, self.problem = None, str(error)
+
+
+def watch(
+    folder: Path,
+    board: Board,
+    page: Path,
+    *,
+    patterns: Mapping[str, str] | None = None,
+    lens: Lens = "brown-conrady",
+    interval: float = 1.0,
+    finished: Callable[[], bool] = lambda: False,
+) -> Session:
+    """Write a page on the images of a folder again whenever some arrive, until `finished` or Ctrl-C.
+
+    It shows what was detected, coverage, the current uncertainty, and which view would help most. Raises OSError.
+    """
+    session = Session(board, lens)
+    write_text(page, _page(session))
+    while not finished():
+        try:
+            photos = find_photos(folder, patterns=patterns)
+        except ValueError as error:
+            photos, session.problem = {}, str(error)
+        if session.detect(photos):
+            write_text(page, _page(session))  # at once, with the advice of before
+            session.calibrate()
+            write_text(page, _page(session))
+        time.sleep(interval)
+    return session
+
+
+def _page(session: Session) -> str:
+    parts = [f"<h1>{len(session.seen)} images</h1>"]
+    parts.append(f'<p class="note">{escape(session.problem)}</p>' if session.problem else _state(session))
+    parts += [_camera(session, name) for name in session.photos]
+    head = (
+        f'<meta charset="utf-8"><meta http-equiv="refresh" content="2"><title>Calibration</title><style>{STYLE}</style>'
+    )
+    return f'<!DOCTYPE html>\n<html lang="en">{head}\n{"".join(parts)}\n</html>\n'
+
+
+def _state(session: Session) -> str:
+    assert session.calibration is not None
+    found = session.calibration
+    return f"<p>Reprojection error {found.rms:.3f} px, {len(found.frames)} frames.</p>" + "".join(
+        f'<p class="note">{escape(note)}</p>' for note in found.notes
+    )
+
+
+def _camera(session: Session, name: str) -> str:
+    keys = [key for camera, key in session.seen if camera == name]
+    count = sum(bool(session.seen[name, key][1]) for key in keys)
+    parts = [f"<h2>{escape(name)}: the board is in {count} of {len(keys)} images</h2>"]
+    if session.calibration is not None and name in session.calibration.views:
+        parts.append(_advice(session.calibration, name))
+    if keys:
+        shown, cells = _drawn(session, name, keys[-1]), _coverage(session, name)
+        parts.append(f"<table><tr><td>{_picture(shown)}<br>the last: {escape(str(keys[-1]))}</td>")
+        parts.append(f"<td>{_picture(cells)}<br>where points were (red: nowhere)</td></tr></table>")
+    return "".join(parts)
+
+
+def _advice(calibration: Calibration, name: str) -> str:
+    focal, deviation = calibration.rig[name].K[0, 0], calibration.deviations().get(f"{name}.focal.0")
+    parts = [f"<p>Focal length {float(focal):.1f} px" + (f" ± {deviation:.2g}" if deviation else "") + ".</p>"]
+    covered = coverages(calibration)[name]
+    known = intrinsics_of(calibration.fit, name)
+    if len(known.covariance):
+        (best,) = next_views(known, calibration.board, float(np.mean(covered.depths)), count=1)
+        parts.append(
+            f"<p><b>Next: {escape(best.text)}</b> (uncertainty of projection {best.before:.2g} px, with it "
+            f"{best.after:.2g}).</p>"
+        )
+    return "".join(parts) + "".join(f'<p class="note">{escape(text)}</p>' for text in covered.missing)
+
+
+def _drawn(session: Session, name: str, key: FrameKey) -> np.ndarray:
+    """The last image with the points found in it."""
+    grey = session.photos[name][key].read()
+    scale = WIDTH / grey.shape[1]
+    small = cv2.cvtColor(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
+    for found in session.seen[name, key][1].values():
+        for x, y in (found.x + 0.5) * scale - 0.5:
+            cv2.circle(small, (round(float(x)), round(float(y))), 2, COLOURS[1], -1)
+    return small
+
+
+def _coverage(session: Session, name: str) -> np.ndarray:
+    """Cells of the image with and without points."""
+    entries = [entry for (camera, _), entry in session.seen.items() if camera == name]
+    (h, w), points = entries[0][0], [d.x for _, views in entries for d in views.values()]
+    x = np.concatenate([np.zeros((0, 2)), *points])
+    count, _, _ = np.histogram2d(x[:, 1], x[:, 0], bins=GRID, range=((-0.5, h - 0.5), (-0.5, w - 0.5)))
+    cells = np.where((count > 0)[..., None], COLOURS[1], COLOURS[0]).astype(np.uint8)
+    return cv2.resize(cells, (WIDTH, round(WIDTH * h / w)), interpolation=cv2.INTER_NEAREST)
+
+
+def _picture(image: np.ndarray) -> str:
+    data = base64.b64encode(cv2.imencode(".jpg", image)[1].tobytes()).decode()
+    return f'<img alt="" src="data:image/jpeg;base64,{data}">'

@@ -1,72 +1,95 @@
-"""The solution of a calibration: which parameters the images determine, how boards are shaped, how frames disagree."""
+"""Bundle adjustment of a calibration: which parameters the images determine, how boards are shaped, what is left out.
+
+Gauss-Newton with Levenberg's damping (Triggs et al. 2000).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from arraygeom import Camera, Pose, stack
-
-from .board import Board, KnownPoints
-from .bundle import BundleProblem, Masks, Observations, Solved, adjust, jackknife, linearised, noise, normal_equations
-from .deformation import LEAST_GAIN, BoardDeformation, described, fewest_frames, is_significant
-from .detect import BoardViews
-from .parameters import (
+from .board import Board
+from .bundle import (
+    POSE,
+    Array,
+    BundleProblem,
     CameraPrior,
-    described_default,
+    InitialRig,
+    Masks,
+    Solved,
+    intrinsic_values,
+    linearised,
+    normal_equations,
     parameter_names,
-    typical_prior,
+    robust_weights,
     typical_sizes,
     with_default,
 )
+from .deformation import LEAST_GAIN, BoardDeformation, fewest_frames, is_significant
+from .detect import BoardViews
+from .intrinsics import (
+    LEAST_SIGMA,
+    RAYLEIGH_MEDIAN,
+    Lens,
+    check_tilts,
+    initial_camera,
+    without_bad_images,
+    without_outliers,
+)
 from .photos import FrameKey
+from .uncertainty import jackknife
 
+LEAST_NOISE = 1e-3
+"""Lower bound of the noise, pixels: perfect corners must not get infinite weight."""
+CONVERGED = 1e-3
+"""Iteration ends once a step lowers the loss by less than this, in squared standard deviations."""
+POOLED = 50
+"""Each camera's noise is estimated as if it had this many additional residuals of the average noise."""
 UNOBSERVABLE = 0.5
 """A parameter is unobservable if its posterior deviation stays above this share of its typical size."""
 ROUNDS = 3
-"""Times that parameters may return."""
-FEWEST_TO_JACKKNIFE = 6
-UNCHECKED = 3.0
-"""The factor by which standard deviations are raised of fewer frames, which cannot be checked: real sets
-of six frames and more are raised by 1.0 to 4.8 (tests/benchmarks/RESULTS_sigma.md)."""
-CONSIDERABLE = 1.3
-"""Standard deviations are raised if the jackknife's are larger by this."""
+"""Times that parameters may return, and that outliers may change."""
+MISFIT = 1.8
+"""A frame does not fit if its residuals exceed those of the camera's median frame by this factor,"""
+CONSPICUOUS = 1.8
+"""and the camera's noise by this one."""
+SYNCHRONISED = "taken at the same moments, with matching numbers, not mirrored, with a stiff board"
+INCONSISTENT, REJECTED = 3.0, 20.0
+"""Ratios of joint to single RMS from which a camera is inconsistent with the others, or refused."""
+LISTED = 5
+"""Frames named at most."""
+MANY_WRONG = 0.34
+"""The share of a camera's images that may be left out, in all, because they contradict the others."""
 
 
-def board_problem(
-    cameras: Mapping[str, Camera],
-    boards: Mapping[FrameKey, Pose],
-    views: Mapping[str, BoardViews],
-    board: Board,
-    priors: Mapping[str, CameraPrior] | None = None,
-) -> BundleProblem:
-    """Cameras, boards and views as a problem; without stated `priors`, those of ordinary cameras, the first fixed."""
-    index, seen, free = {key: i for i, key in enumerate(boards)}, {}, {}
-    for number, (name, camera) in enumerate(cameras.items()):
-        parts = [(np.full(len(d.ids), index[key]), board.points[d.ids], d.x) for key, d in views[name].seen.items()]
-        seen[name] = Observations(*(np.concatenate(part) for part in zip(*parts)))
-        free[name] = np.ones(len(parameter_names(camera)), dtype=bool)
-        free[name][:6] = number > 0 or priors is not None
-    usual = {name: typical_prior(camera) for name, camera in cameras.items()} if priors is None else priors
-    return BundleProblem(cameras, stack(list(boards.values())), seen, tuple(boards), free, priors=usual)
+def calibrate_single(
+    name: str, views: BoardViews, board: Board, *, lens: Lens = "brown-conrady", final: bool = True
+) -> Solved:
+    """One camera's intrinsics and lens from its own images. Raises ValueError, with advice, where they do not suffice.
+
+    Unless `final`, a poorly constrained focal length is accepted, as other cameras will add constraints.
+    """
+    first = initial_camera(name, views, board, lens)
+    kept = without_bad_images(views, first, board)
+    if len(kept.seen) < len(views.seen):
+        first = initial_camera(name, kept, board, lens)
+    used = without_outliers(kept, first.camera, first.poses, board.points)
+    initial = InitialRig({name: first.camera}, first.poses, {name: used})
+    solved = solve_inliers(initial, {name: kept}, board, final=final)
+    check_tilts(name, solved.problem.board_poses, board)
+    return solved
 
 
-def flat_boards(board: Board, frames: Iterable[FrameKey], views: Mapping[str, BoardViews]) -> BoardDeformation | None:
-    """Flat boards, in the order of the frames; None for points whose positions are known."""
-    if isinstance(board, KnownPoints):
-        return None
-    first = {key: d.ids[0] for v in views.values() for key, d in v.seen.items()}
-    return BoardDeformation.flat(board.points, board.part, board.part[[first[key] for key in frames]])
-
-
-def solve(problem: BundleProblem, flat: BoardDeformation | None, *, final: bool = True) -> Solved:
+def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
     """Fit all observable parameters; those that turn out to be unobservable are fixed, until none is.
 
     Parameters fixed before the fit, when the noise was overestimated, may return after it; and boards that are clearly
-    neither `flat` nor printed true are deformed. Raises ValueError where a `final` fit has no focal length.
+    neither flat nor printed true are deformed. Raises ValueError where a `final` fit has no focal length.
     """
+    problem, flat = initial.problem(board), initial.flat(board)
     full = problem.free
     problem, notes = observable(replace(problem, sigma=noise(problem, 0)), final=False)
     solved = _with_deformation(adjust(problem), flat)
@@ -79,9 +102,26 @@ def solve(problem: BundleProblem, flat: BoardDeformation | None, *, final: bool 
     while True:
         fewer, dropped = observable(solved.problem, final=final)
         if not dropped:
-            return replace(solved, notes=tuple(notes))
+            return replace(solved, notes=tuple(notes), views=initial.views, left_out=initial.left_out)
         notes = notes + dropped
         solved = adjust(fewer)
+
+
+def solve_inliers(
+    initial: InitialRig, detected: Mapping[str, BoardViews], board: Board, *, rounds: int = ROUNDS, final: bool = True
+) -> Solved:
+    """`solve` in some rounds, each without those of the `detected` points that the one before shows to be outliers."""
+    solved = solve(initial, board, final=final)
+    for _ in range(rounds - 1):
+        views = {name: near_fit(solved, name, v, board) for name, v in detected.items()}
+        if all(v.count == solved.views[name].count for name, v in views.items()):
+            break
+        problem = solved.problem
+        again = initial._replace(
+            cameras=problem.cameras, boards=problem.board_poses, views=views, deformation=problem.deformation
+        )
+        solved = solve(again, board, final=final)
+    return solved
 
 
 def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, list[str]]:
@@ -105,8 +145,8 @@ def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, l
             )
         free[name][index] = False
         information = np.delete(np.delete(information, worst, 0), worst, 1)
-        cameras[name] = with_default(cameras[name], entry)
-        notes.append(f"{name}: {described_default(cameras[name], entry)}: the images do not determine it")
+        cameras[name], fixed = with_default(cameras[name], entry)
+        notes.append(f"{name}: {fixed}: the images do not determine it")
     return replace(problem, cameras=cameras, free=free), notes
 
 
@@ -152,47 +192,222 @@ def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
     return deformed if gain > (max(left, LEAST_GAIN) if few else LEAST_GAIN) else solved
 
 
-def with_disagreement(solved: Solved, extents: list[tuple[float, float]], *, unchecked: bool = False) -> Solved:
-    """The solution with its covariance raised if frames disagree considerably; with notes on that and on the boards.
+# The adjustment -----------------------------------------------------------------------------------------------
 
-    Where frames are too few to tell, it is raised by `UNCHECKED` if it is of such frames alone (`unchecked`).
 
-    `extents` are the boards' sizes, metres. The raised covariance is the mean of the jackknife's, which few frames make
-    noisy, and of that of the points' noise, scaled to the jackknife's level: the median over the parameters, as frames
-    that disagree about a focal length say nothing of the lens.
+def adjust(problem: BundleProblem, *, rounds: int = 4, equal_noise: bool = False) -> Solved:
+    """Minimise the reprojection error over the free camera parameters and all boards.
+
+    First by least squares of equal noise, as the initial values may be poor; then `rounds` times with the noise of each
+    camera estimated from its residuals. (Individual noise from the beginning would discard the camera that starts
+    worst.) With `equal_noise` all cameras share one noise: where the board moves between exposures, a camera with a
+    noise of its own would attract every board pose.
     """
-    problem, covariance, notes = solved.problem, solved.covariance, list[str]()
-    enough = len(problem.names) > 0 and len(problem.frames) >= FEWEST_TO_JACKKNIFE
-    raised = 1.0
-    if covariance is not None and unchecked and len(problem.frames) < FEWEST_TO_JACKKNIFE:
-        covariance, raised = UNCHECKED**2 * covariance, UNCHECKED
-        notes.append(
-            f"{len(problem.frames)} frames are too few to check standard deviations: they are raised by "
-            f"{UNCHECKED:.0f}, as more frames do of real boards; take {FEWEST_TO_JACKKNIFE} or more"
-        )
-    if problem.deformation is None and (covariance is None or not enough):
-        return replace(solved, covariance=covariance, raised=raised, notes=(*solved.notes, *notes))
-    found = jackknife(problem)
-    if problem.deformation is not None:
-        deviations = np.sqrt(found.deformations.diagonal()).reshape(problem.deformation.values.shape)
-        notes += described(problem.deformation, deviations, extents)
-    if enough and covariance is not None and _excess(found.covariance, covariance) > CONSIDERABLE:
-        level = max(1.0, float(np.median(_ratio(found.left_out, covariance))))
-        before, covariance = covariance, (level**2 * covariance + found.left_out) / 2
-        raised = float(_ratio(covariance, before).max())
-        notes.append(
-            "frames disagree more than the points' noise explains: standard deviations are raised, by up to "
-            f"{raised:.1f}, to those of a jackknife over frames (is the board flat and printed true to size, and were "
-            "the images sharp?)"
-        )
-    return replace(solved, covariance=covariance, raised=raised, notes=(*solved.notes, *notes))
+    parameters = len(problem.names) + POSE * len(problem.frames)
+    start = dict.fromkeys(problem.cameras, max(problem.rms(), LEAST_NOISE))
+    problem, converged = _minimised(replace(problem, sigma=start))
+    sigma = _pooled(noise(problem, parameters))
+    for _ in range(rounds):
+        problem, converged = _minimised(replace(problem, sigma=sigma))
+        before, sigma = sigma, noise(problem, parameters)
+        sigma = _pooled(sigma) if equal_noise else sigma
+        if all(abs(np.log(sigma[name] / before[name])) < 1e-2 for name in sigma):
+            break
+    problem = replace(problem, sigma=sigma)
+    return Solved(problem, _covariance(problem), converged)
 
 
-def _excess(a: np.ndarray, b: np.ndarray) -> float:
-    """The typical ratio of the standard deviations of two covariances, in all directions."""
-    return float(np.sqrt(np.trace(np.linalg.solve(b, a)) / len(b)))
+def readjusted(problem: BundleProblem) -> BundleProblem:
+    """The problem adjusted once more, from a solution of nearly the same problem and with its noise."""
+    return _minimised(problem, iterations=10)[0]
 
 
-def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of the standard deviations of two covariances."""
-    return np.asarray(np.sqrt(a.diagonal() / b.diagonal()))
+def noise(problem: BundleProblem, parameters: int) -> dict[str, float]:
+    """A robust estimate of each camera's noise along x or y, pixels, given the number of fitted parameters."""
+    residuals = problem.residuals()
+    numbers = 2 * sum(len(r) for r in residuals.values())
+    left = numbers / max(numbers - parameters, 0.1 * numbers)
+    squares = np.array([_square(r) for r in residuals.values()])
+    counts = np.array([len(r) for r in residuals.values()], dtype=float)
+    average = np.exp(np.average(np.log(squares), weights=counts))
+    pooled = left * (counts * squares + POOLED * average) / (counts + POOLED)
+    return dict(zip(residuals, np.sqrt(pooled).tolist()))
+
+
+def _pooled(sigma: Mapping[str, float]) -> dict[str, float]:
+    """Their root mean square, for all cameras."""
+    return dict.fromkeys(sigma, float(np.sqrt(np.mean(np.square(list(sigma.values()))))))
+
+
+def _square(r: Array) -> float:
+    """The mean square of a coordinate, with outliers down-weighted."""
+    lengths = np.linalg.norm(r, axis=-1)
+    typical = max(float(np.median(lengths)) / RAYLEIGH_MEDIAN, LEAST_NOISE)
+    return max(float((robust_weights(lengths / typical) * lengths**2).mean() / 2), LEAST_NOISE**2)
+
+
+def _minimised(problem: BundleProblem, *, iterations: int = 50) -> tuple[BundleProblem, bool]:
+    """Levenberg's loop: the problem, and whether it converged."""
+    least, damping = problem.loss(), 1e-4
+    for _ in range(iterations):
+        equations = normal_equations(problem, linearised(problem))
+        while True:
+            trial = problem.stepped(*equations.solve(damping))
+            trial_loss = trial.loss()
+            if trial_loss < least:
+                break
+            damping *= 10
+            if damping > 1e6:
+                return problem, True
+        gained = least - trial_loss
+        problem, least = trial, trial_loss
+        damping = max(damping / 10, 1e-12)
+        if gained < CONVERGED:
+            return problem, True
+    return problem, False
+
+
+def _covariance(problem: BundleProblem) -> Array | None:
+    """Of the free camera parameters; None if some combination of them changes no pixel."""
+    information = normal_equations(problem, linearised(problem)).information()
+    scale = 1 / np.sqrt(np.maximum(information.diagonal(), 1e-300))
+    scaled = information * scale[:, None] * scale
+    if len(scaled) and np.linalg.eigvalsh(scaled)[0] < 1e-13:
+        return None
+    return np.linalg.inv(scaled) * scale[:, None] * scale
+
+
+# Outliers -----------------------------------------------------------------------------------------------------
+
+
+def near_fit(solved: Solved, name: str, views: BoardViews, board: Board) -> BoardViews:
+    """A camera's views without the points that a solution shows to be outliers."""
+    camera, boards, deformation = solved.problem.cameras[name], solved.problem.board_poses, solved.problem.deformation
+    poses = {key: camera.cam_from_world @ boards[key] for key in views.seen}
+    points = board.points if deformation is None else deformation.deformed(board.points, board.part)
+    return without_outliers(views, camera, poses, points, sigma=solved.sigma[name])
+
+
+class FrameMisfit(NamedTuple):
+    """A frame that a camera does not fit: its residuals, and those of the camera's median frame (RMS, pixels)."""
+
+    camera: str
+    frame: FrameKey
+    rms: float
+    typical: float
+
+
+def frame_rms(problem: BundleProblem) -> dict[str, dict[FrameKey, float]]:
+    """By camera and frame: root mean square residual, pixels."""
+    found = {}
+    for name, r in problem.residuals().items():
+        block = problem.seen[name].block
+        squared, count = np.bincount(block, (r**2).sum(-1)), np.bincount(block)
+        found[name] = {problem.frames[b]: float(np.sqrt(squared[b] / count[b])) for b in np.flatnonzero(count)}
+    return found
+
+
+def misfits(fit: Solved) -> list[FrameMisfit]:
+    """Frames whose residuals stand out, worst first."""
+    found = []
+    for name, by_frame in frame_rms(fit.problem).items():
+        typical = float(np.median(list(by_frame.values())))
+        limit = max(MISFIT * typical, CONSPICUOUS * 2**0.5 * max(fit.sigma[name], LEAST_SIGMA))
+        found += [FrameMisfit(name, frame, rms, typical) for frame, rms in by_frame.items() if rms > limit]
+    return sorted(found, key=lambda m: -m.rms / m.typical)
+
+
+def misfit_notes(fit: Solved) -> list[str]:
+    """One note per camera on its frames that do not fit."""
+    notes = []
+    for name in fit.problem.cameras:
+        if mine := [m for m in misfits(fit) if m.camera == name]:
+            listed = ", ".join(f"{m.frame} ({m.rms:.2f} px)" for m in mine[:LISTED])
+            more = f" and {len(mine) - LISTED} more" if len(mine) > LISTED else ""
+            notes.append(
+                f"{name}: frames that do not fit: {listed}{more}, others {mine[0].typical:.2f} px: "
+                "moved, blurred or wrongly detected? See the report"
+            )
+    return notes
+
+
+# All cameras --------------------------------------------------------------------------------------------------
+
+
+def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solved]) -> Solved:
+    """All cameras at once; if they fit far worse than alone, with their single calibrations as priors.
+
+    Boards that move between the exposures of unsynchronised cameras would distort the lens models otherwise. A few
+    images that contradict the others (boards detected a square off, say) are left out. Raises ValueError if a camera
+    contradicts the others altogether.
+    """
+    if len(singles) == 1:
+        return next(iter(singles.values()))
+    rms = {name: alone.problem.rms() for name, alone in singles.items()}
+    solved = solve(initial, board)
+    while wrong := _wrong_images(solved, rms):
+        initial = _without(initial, wrong)
+        solved = solve(initial, board)
+    if not (doubts := _inconsistent_cameras(solved, rms)):
+        return solved
+    priors = {name: _as_prior(name, alone) for name, alone in singles.items()}
+    free = {name: prior.information.diagonal() > 0 for name, prior in priors.items()}
+    for index, mask in enumerate(free.values()):
+        mask[:6] = index > 0
+    held = replace(initial.problem(board), priors=priors, deformation=solved.problem.deformation, free=free)
+    notes = [note for alone in singles.values() for note in alone.notes]
+    notes.append(f"{doubts}; so each camera's intrinsics keep close to its own calibration")
+    found = adjust(held, equal_noise=True)
+    return replace(found, notes=tuple(notes), views=initial.views, left_out=initial.left_out)
+
+
+def _wrong_images(solved: Solved, alone: Mapping[str, float]) -> list[tuple[str, FrameKey]]:
+    """Images so far off that their camera would be refused, one of a moment, unless they are many of a camera's."""
+    found = dict[FrameKey, str]()
+    for misfit in misfits(solved):
+        if misfit.rms > _refused_from(alone[misfit.camera]):
+            found.setdefault(misfit.frame, misfit.camera)
+    seen = {name: len(v.seen) for name, v in solved.views.items()}
+    many = many_wrong(list(found.values()), [name for name, _ in solved.left_out], seen)
+    return [] if many else [(camera, frame) for frame, camera in found.items()]
+
+
+def _without(initial: InitialRig, images: Sequence[tuple[str, FrameKey]]) -> InitialRig:
+    views = {name: v.only([key for key in v.seen if (name, key) not in images]) for name, v in initial.views.items()}
+    boards = {key: pose for key, pose in initial.boards.items() if any(key in v.seen for v in views.values())}
+    return initial._replace(boards=boards, views=views, left_out=[*initial.left_out, *images])
+
+
+def many_wrong(found: Sequence[str], before: Sequence[str], seen: Mapping[str, int]) -> bool:
+    """Whether images found wrong, and those left out before (the camera of each), are more than `MANY_WRONG` of all of
+    a camera's; `seen` are those that are left of it."""
+    return any(found.count(n) + before.count(n) > MANY_WRONG * (seen[n] + before.count(n)) for n in set(found))
+
+
+def _refused_from(alone: float) -> float:
+    """The reprojection error (RMS, px) with the other cameras from which a camera contradicts them."""
+    return REJECTED * max(alone, 0.3)
+
+
+def _inconsistent_cameras(solved: Solved, alone: Mapping[str, float]) -> str:
+    """Text on cameras that fit much worse together than alone, or "". Raises ValueError if far worse."""
+    doubts = []
+    for name, r in solved.problem.residuals().items():
+        together = float(np.sqrt((r**2).sum(-1).mean()))
+        fits = f"{name} fits to {alone[name]:.2f} px alone but to {together:.2f} px with the others"
+        if together > _refused_from(alone[name]):
+            raise ValueError(f"{fits}: were the images {SYNCHRONISED}?")
+        if together > 0.5 and together > INCONSISTENT * alone[name]:
+            doubts.append(fits)
+    return f"{', '.join(doubts)} (were the images {SYNCHRONISED}?)" if doubts else ""
+
+
+def _as_prior(name: str, alone: Solved) -> CameraPrior:
+    """The single calibration of a camera as a prior of its intrinsics; none for parameters that were fixed."""
+    camera = alone.problem.cameras[name]
+    entries = parameter_names(camera)
+    free = [entries.index(entry.removeprefix(f"{name}.")) for entry in alone.names]
+    information = np.zeros((len(entries), len(entries)))
+    if alone.covariance is not None:
+        information[np.ix_(free, free)] = np.linalg.inv(alone.covariance)
+    return CameraPrior(intrinsic_values(camera), information)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,15 +22,29 @@ from arraygeom.io.source import float64_of
 from arraygeom.pixels import HW
 from arraygeom.safe_yaml import load_json
 
-from .bundle import BundleProblem, Solved, readjusted
-from .parameters import camera_jacobian, centre_derivatives, parameter_names
+from .bundle import (
+    Array,
+    BundleProblem,
+    Solved,
+    block_sums,
+    camera_jacobian,
+    linearised,
+    normal_equations,
+    parameter_names,
+)
+from .deformation import described
 
 FORMAT = "arraygeom-covariance 1"
 GRID = 15, 20
 """Rows and columns of the pixels at which projections are compared."""
-FEWEST_TO_HALVE = 8
 SEEN = 400
 """Board points of a camera by which its motion is compensated, about."""
+FEWEST_TO_JACKKNIFE = 6
+UNCHECKED = 3.0
+"""The factor by which standard deviations are raised of fewer frames, which cannot be checked: real sets
+of six frames and more are raised by 1.0 to 4.8 (tests/benchmarks/RESULTS_sigma.md)."""
+CONSIDERABLE = 1.3
+"""Standard deviations are raised if the jackknife's are larger by this."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +126,9 @@ def baseline_deviation(rig: Mapping[str, Camera], a: str, b: str, covariance: Ri
     """The standard deviation of the distance between two cameras, metres."""
     baseline = (rig[b].centre - rig[a].centre).numpy()
     direction = baseline / max(float(np.linalg.norm(baseline)), 1e-12)
-    of_a, of_b = (direction @ centre_derivatives(rig[n]) @ covariance.of(n, rig[n])[:6] for n in (a, b))
+    of_a, of_b = (
+        direction @ rig[n].cam_from_world.centre_jacobian.numpy() @ covariance.of(n, rig[n])[:6] for n in (a, b)
+    )
     return float(np.sqrt((of_b - of_a) @ covariance.matrix @ (of_b - of_a)))
 
 
@@ -135,14 +151,14 @@ class Intrinsics(NamedTuple):
 def intrinsics_of(fit: Solved, name: str) -> Intrinsics:
     """One camera of a fit that has a covariance."""
     assert fit.covariance is not None
-    camera, seen = _alone(fit.problem, name)
+    camera, seen = in_own_frame(fit.problem, name)
     entries = [f"{name}.{entry}" for entry in parameter_names(camera)]
     free = np.array([i >= 6 and entry in fit.names for i, entry in enumerate(entries)])
     index = [fit.names.index(entry) for entry, is_free in zip(entries, free) if is_free]
     return Intrinsics(camera, fit.covariance[np.ix_(index, index)], free, fit.sigma[name], seen)
 
 
-def _alone(problem: BundleProblem, name: str) -> tuple[Camera, Float[np.ndarray, "m 3"]]:
+def in_own_frame(problem: BundleProblem, name: str) -> tuple[Camera, Float[np.ndarray, "m 3"]]:
     """A camera at the origin, and some of the board points that it observed, in its frame."""
     camera = problem.cameras[name]
     X = camera.cam_from_world.apply(torch.from_numpy(problem.world(name))).numpy()
@@ -173,42 +189,13 @@ def moved_pixels(known: Intrinsics, depth: float) -> tuple[np.ndarray, np.ndarra
     """
     x, X = grid_points(known.camera, depth)
     J, at_boards = camera_jacobian(known.camera, X), camera_jacobian(known.camera, known.seen)
-    motion = _compensation(at_boards[..., :6], at_boards[..., known.free])
+    motion = compensation(at_boards[..., :6], at_boards[..., known.free])
     return x, J[..., known.free] - J[..., :6] @ motion
 
 
-def _compensation(by_pose: np.ndarray, moved: np.ndarray) -> np.ndarray:
+def compensation(by_pose: np.ndarray, moved: np.ndarray) -> np.ndarray:
     """The motion (6, f) of a camera by whose derivatives (m, 2, 6) pixels move like (m, 2, f), by least squares."""
     return np.asarray(np.linalg.lstsq(by_pose.reshape(-1, 6), moved.reshape(len(by_pose) * 2, -1), rcond=None)[0])
-
-
-def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """By camera: pixels (n, 2) near those of board points, and how far (n, 2) projections differ between two fits.
-
-    Each is to every other frame; elsewhere lens models are extrapolated. Empty if there are too few frames.
-    """
-    count = len(fit.problem.frames)
-    if count < FEWEST_TO_HALVE:
-        return {}
-    even = np.arange(count) % 2 == 0
-    try:
-        halves = [readjusted(fit.problem.of_boards(kept)) for kept in (even, ~even)]
-    except np.linalg.LinAlgError:
-        return {}
-    found = {}
-    for name in fit.problem.cameras:
-        (a, seen), (b, _) = (_alone(half, name) for half in halves)
-        motion = _compensation(camera_jacobian(a, seen)[..., :6], _difference(a, b, seen))
-        x, X = grid_points(a, depth)
-        near = covered(x, fit.problem.seen[name].x, a.hw)
-        x, X = x[near], X[near]
-        found[name] = x, _difference(a, b, X) - (camera_jacobian(a, X)[..., :6] @ motion)[..., 0]
-    return found
-
-
-def _difference(a: Camera, b: Camera, X: np.ndarray) -> Float[np.ndarray, "n 2"]:
-    xa, xb = (camera.project_local(torch.from_numpy(X)).x.numpy() for camera in (a, b))
-    return np.asarray(xb - xa)
 
 
 def covered(x: Float[np.ndarray, "n 2"], seen: Float[np.ndarray, "m 2"], hw: HW) -> Bool[np.ndarray, " n"]:
@@ -216,3 +203,105 @@ def covered(x: Float[np.ndarray, "n 2"], seen: Float[np.ndarray, "m 2"], hw: HW)
     reach = max(hw[0] / GRID[0], hw[1] / GRID[1])
     nearest = np.array([np.linalg.norm(seen - each, axis=1).min() for each in x])
     return np.asarray(nearest < reach)
+
+
+# How frames disagree -------------------------------------------------------------------------------------------
+
+
+class Jackknife(NamedTuple):
+    """By how the frames disagree: covariances of the cameras' parameters and of the boards' deformations.
+
+    left_out: of the cameras' parameters by leaving out each frame in turn. step: the deformations after a Gauss-Newton
+    step.
+    """
+
+    covariance: Float[np.ndarray, "c c"]
+    left_out: Float[np.ndarray, "c c"]
+    deformations: Float[np.ndarray, "s s"]
+    step: Float[np.ndarray, " s"]
+
+
+def jackknife(problem: BundleProblem) -> Jackknife:
+    """The covariance of the free parameters by how the frames disagree, to first order.
+
+    It contains what frames have in common beyond their points' noise: a bent board, blur, wrong exposure times. A plain
+    jackknife's deviations are too large by 15 to 40 % with a dozen boards that determine all parameters between them;
+    Bell and McCaffrey's (2002) correction removes that.
+    """
+    parts = linearised(problem)
+    equations = normal_equations(problem, parts)
+    b, c = equations.W.shape[:2]
+    H, g = np.zeros((b, c, c)), np.zeros((b, c))
+    for part in parts.values():
+        columns = part.columns
+        H[:, columns[:, None], columns] += block_sums(part.block, part.by_shared.swapaxes(1, 2) @ part.by_shared, b)
+        g[:, columns] += block_sums(part.block, np.einsum("nip,ni->np", part.by_shared, part.r), b)
+    total, Y, _ = equations.reduced(0.0)
+    H -= Y @ equations.W.swapaxes(-1, -2)
+    g -= np.einsum("bcd,bd->bc", Y, equations.h)
+    whole = equations.g - np.einsum("bcd,bd->c", Y, equations.h)
+    step = np.linalg.lstsq(total, whole, rcond=1e-14)[0]
+    covariance = _clustered(total, H, g - H @ step)
+    each = np.stack([np.linalg.lstsq(total - P, whole - slope, rcond=1e-14)[0] for P, slope in zip(H, g)])
+    each -= each.mean(0)
+    cameras, shapes = slice(c - equations.shapes), slice(c - equations.shapes, c)
+    deformation = problem.deformation
+    after = np.zeros(0) if deformation is None else deformation.values.ravel() + step[shapes]
+    left_out = (b - 1) / b * (each.T @ each)[cameras, cameras]
+    return Jackknife(covariance[cameras, cameras], left_out, covariance[shapes, shapes], after)
+
+
+def _clustered(total: Array, H: Array, g: Array) -> Array:
+    """The covariance by the slopes g (b, c) of frames, each scaled by (1 - its share H of the information)^(-1/2)."""
+    scale = 1 / np.sqrt(total.diagonal())
+    whiten = np.linalg.inv(np.linalg.cholesky(total * scale * scale[:, None])) * scale
+    share, axes = np.linalg.eigh(whiten @ H @ whiten.T)
+    slopes = np.einsum("bji,bj->bi", axes, g @ whiten.T) / np.sqrt(np.maximum(1 - share, 1e-6))
+    changes = np.einsum("bij,bj->bi", axes, slopes) @ whiten
+    return np.asarray(changes.T @ changes)
+
+
+def with_disagreement(solved: Solved, extents: list[tuple[float, float]], *, unchecked: bool = False) -> Solved:
+    """The solution with its covariance raised if frames disagree considerably; with notes on that and on the boards.
+
+    Where frames are too few to tell, it is raised by `UNCHECKED` if it is of such frames alone (`unchecked`).
+
+    `extents` are the boards' sizes, metres. The raised covariance is the mean of the jackknife's, which few frames make
+    noisy, and of that of the points' noise, scaled to the jackknife's level: the median over the parameters, as frames
+    that disagree about a focal length say nothing of the lens.
+    """
+    problem, covariance, notes = solved.problem, solved.covariance, list[str]()
+    enough = len(problem.names) > 0 and len(problem.frames) >= FEWEST_TO_JACKKNIFE
+    raised = 1.0
+    if covariance is not None and unchecked and len(problem.frames) < FEWEST_TO_JACKKNIFE:
+        covariance, raised = UNCHECKED**2 * covariance, UNCHECKED
+        notes.append(
+            f"{len(problem.frames)} frames are too few to check standard deviations: they are raised by "
+            f"{UNCHECKED:.0f}, as more frames do of real boards; take {FEWEST_TO_JACKKNIFE} or more"
+        )
+    if problem.deformation is None and (covariance is None or not enough):
+        return replace(solved, covariance=covariance, raised=raised, notes=(*solved.notes, *notes))
+    found = jackknife(problem)
+    if problem.deformation is not None:
+        deviations = np.sqrt(found.deformations.diagonal()).reshape(problem.deformation.values.shape)
+        notes += described(problem.deformation, deviations, extents)
+    if enough and covariance is not None and _excess(found.covariance, covariance) > CONSIDERABLE:
+        level = max(1.0, float(np.median(_ratio(found.left_out, covariance))))
+        before, covariance = covariance, (level**2 * covariance + found.left_out) / 2
+        raised = float(_ratio(covariance, before).max())
+        notes.append(
+            "frames disagree more than the points' noise explains: standard deviations are raised, by up to "
+            f"{raised:.1f}, to those of a jackknife over frames (is the board flat and printed true to size, and were "
+            "the images sharp?)"
+        )
+    return replace(solved, covariance=covariance, raised=raised, notes=(*solved.notes, *notes))
+
+
+def _excess(a: np.ndarray, b: np.ndarray) -> float:
+    """The typical ratio of the standard deviations of two covariances, in all directions."""
+    return float(np.sqrt(np.trace(np.linalg.solve(b, a)) / len(b)))
+
+
+def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of the standard deviations of two covariances."""
+    return np.asarray(np.sqrt(a.diagonal() / b.diagonal()))

@@ -1,97 +1,47 @@
-"""How well a calibrated rig predicts: epipolar errors, frames held out in turn, frames that do not fit."""
+"""How well a calibration predicts: epipolar errors, frames held out, lens models compared by those, and notes."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from arraygeom import Rig, epipolar_distance
+from arraygeom import Camera, Rig, epipolar_distance
 
-from .bundle import BundleProblem, Solved, readjusted
+from .board import Board
+from .bundle import POSE, BundleProblem, Observations, Solved, camera_jacobian
 from .detect import BoardViews
-from .intrinsics import LEAST_SIGMA
-from .photos import FrameKey
+from .intrinsics import Lens
+from .poses import StartDeviations
+from .solve import calibrate_single, readjusted
+from .uncertainty import compensation, covered, grid_points, in_own_frame
 
 FEWEST_TO_HOLD_OUT = 8
 """Frames are held out from this many on that two cameras share."""
 FOLDS = 5
 """Frames are held out in so many parts, each once."""
+FEWEST_TO_HALVE = 8
 FEWEST_LEFT = 3
 """Frames that every camera must keep."""
-MISFIT = 1.8
-"""A frame does not fit if its residuals exceed those of the camera's median frame by this factor,"""
-CONSPICUOUS = 1.8
-"""and the camera's noise by this one."""
-LISTED = 5
-
-
-def held_out_errors(fit: Solved, views: Mapping[str, BoardViews]) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
-    """Epipolar errors of all frames, each by a rig calibrated without it; empty if there are too few.
-
-    Frames are held out in five parts.
-    """
-    frames = fit.problem.frames
-    shared = [key for key in frames if sum(key in v.seen for v in views.values()) > 1]
-    if len(shared) < FEWEST_TO_HOLD_OUT:
-        return {}
-    found = dict[tuple[str, str], list[np.ndarray]]()
-    for fold in range(FOLDS):
-        out = set(shared[fold::FOLDS])
-        if any(len(v.seen.keys() - out) < FEWEST_LEFT for v in views.values()):
-            return {}
-        used = readjusted(fit.problem.of_boards(np.array([key not in out for key in frames])))
-        judged = {name: v.only(out) for name, v in views.items()}
-        for names, errors in epipolar_errors(Rig(used.cameras), judged).items():
-            found.setdefault(names, []).append(errors)
-    return {names: np.concatenate(errors) for names, errors in found.items()}
-
-
-class FrameMisfit(NamedTuple):
-    """A frame that a camera does not fit: its residuals, and those of the camera's median frame (RMS, pixels)."""
-
-    camera: str
-    frame: FrameKey
-    rms: float
-    typical: float
-
-
-def frame_rms(problem: BundleProblem) -> dict[str, dict[FrameKey, float]]:
-    """By camera and frame: root mean square residual, pixels."""
-    found = {}
-    for name, r in problem.residuals().items():
-        block = problem.seen[name].block
-        squared, count = np.bincount(block, (r**2).sum(-1)), np.bincount(block)
-        found[name] = {problem.frames[b]: float(np.sqrt(squared[b] / count[b])) for b in np.flatnonzero(count)}
-    return found
-
-
-def misfits(fit: Solved) -> list[FrameMisfit]:
-    """Frames whose residuals stand out, worst first."""
-    found = []
-    for name, by_frame in frame_rms(fit.problem).items():
-        typical = float(np.median(list(by_frame.values())))
-        limit = max(MISFIT * typical, CONSPICUOUS * 2**0.5 * max(fit.sigma[name], LEAST_SIGMA))
-        found += [FrameMisfit(name, frame, rms, typical) for frame, rms in by_frame.items() if rms > limit]
-    return sorted(found, key=lambda m: -m.rms / m.typical)
-
-
-def misfit_notes(fit: Solved) -> list[str]:
-    """One note per camera on its frames that do not fit."""
-    notes = []
-    for name in fit.problem.cameras:
-        if mine := [m for m in misfits(fit) if m.camera == name]:
-            listed = ", ".join(f"{m.frame} ({m.rms:.2f} px)" for m in mine[:LISTED])
-            more = f" and {len(mine) - LISTED} more" if len(mine) > LISTED else ""
-            notes.append(
-                f"{name}: frames that do not fit: {listed}{more}, others {mine[0].typical:.2f} px: "
-                "moved, blurred or wrongly detected? See the report"
-            )
-    return notes
+FAR_FROM_START = 4.0
+"""Standard deviations from the start beyond which a camera is named."""
+COMPARED: tuple[Lens, ...] = (
+    "none",
+    "kannala-brandt",
+    "brown-conrady",
+    "rational",
+    "thin-prism",
+    "tilted",
+)
+"""Models that are compared, by number of coefficients."""
+LENS_FOLDS = 4
+FEWEST_TO_COMPARE = 8
+EQUAL = 0.01
+"""Held-out errors that differ by less than this share are equal."""
 
 
 def epipolar_errors(rig: Rig, views: Mapping[str, BoardViews]) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
@@ -121,3 +71,200 @@ def _common(a: BoardViews, b: BoardViews) -> tuple[np.ndarray, np.ndarray]:
             parts.append((a.seen[key].x[i], b.seen[key].x[j]))
     xa, xb = (np.concatenate(part) for part in zip(*parts))
     return xa, xb
+
+
+# Frames held out ----------------------------------------------------------------------------------------------
+
+
+def held_out_errors(fit: Solved, views: Mapping[str, BoardViews]) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
+    """Epipolar errors of all frames, each by a rig calibrated without it; empty if there are too few.
+
+    Frames are held out in five parts.
+    """
+    frames = fit.problem.frames
+    shared = [key for key in frames if sum(key in v.seen for v in views.values()) > 1]
+    if len(shared) < FEWEST_TO_HOLD_OUT:
+        return {}
+    found = dict[tuple[str, str], list[np.ndarray]]()
+    for fold in range(FOLDS):
+        out = set(shared[fold::FOLDS])
+        if any(len(v.seen.keys() - out) < FEWEST_LEFT for v in views.values()):
+            return {}
+        used = readjusted(fit.problem.of_boards(np.array([key not in out for key in frames])))
+        judged = {name: v.only(out) for name, v in views.items()}
+        for names, errors in epipolar_errors(Rig(used.cameras), judged).items():
+            found.setdefault(names, []).append(errors)
+    return {names: np.concatenate(errors) for names, errors in found.items()}
+
+
+def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """By camera: pixels (n, 2) near those of board points, and how far (n, 2) projections differ between two fits.
+
+    Each is to every other frame; elsewhere lens models are extrapolated. Empty if there are too few frames.
+    """
+    count = len(fit.problem.frames)
+    if count < FEWEST_TO_HALVE:
+        return {}
+    even = np.arange(count) % 2 == 0
+    try:
+        halves = [readjusted(fit.problem.of_boards(kept)) for kept in (even, ~even)]
+    except np.linalg.LinAlgError:
+        return {}
+    found = {}
+    for name in fit.problem.cameras:
+        (a, seen), (b, _) = (in_own_frame(half, name) for half in halves)
+        motion = compensation(camera_jacobian(a, seen)[..., :6], _difference(a, b, seen))
+        x, X = grid_points(a, depth)
+        near = covered(x, fit.problem.seen[name].x, a.hw)
+        x, X = x[near], X[near]
+        found[name] = x, _difference(a, b, X) - (camera_jacobian(a, X)[..., :6] @ motion)[..., 0]
+    return found
+
+
+def _difference(a: Camera, b: Camera, X: np.ndarray) -> Float[np.ndarray, "n 2"]:
+    xa, xb = (camera.project_local(torch.from_numpy(X)).x.numpy() for camera in (a, b))
+    return np.asarray(xb - xa)
+
+
+@dataclass(frozen=True)
+class LensComparison:
+    """Mean square errors of a coordinate (pixels^2) of each frame by each model that can be fitted without it."""
+
+    errors: Mapping[Lens, Float[np.ndarray, " f"]]
+
+    def rms(self, lens: Lens) -> float:
+        """The held-out error along x or y, pixels."""
+        return float(np.sqrt(self.errors[lens].mean()))
+
+    @property
+    def advised(self) -> Lens:
+        """The model with fewest coefficients that predicts as well as the best, to a standard error or one percent."""
+        if not self.errors:
+            return "brown-conrady"
+        best = min(self.errors, key=self.rms)
+        return next(lens for lens in COMPARED if lens in self.errors and self._equal(lens, best))
+
+    def _equal(self, lens: Lens, best: Lens) -> bool:
+        worse = self.errors[lens] - self.errors[best]
+        error = float(worse.std(ddof=1)) / len(worse) ** 0.5
+        return float(worse.mean()) <= max(error, 2 * EQUAL * float(self.errors[best].mean()))
+
+    @property
+    def advice(self) -> str:
+        """The advised model and all errors, in a sentence."""
+        if not self.errors:
+            return f"too few frames to compare lens models ({FEWEST_TO_COMPARE} are needed): brown-conrady is used"
+        listed = ", ".join(f"{lens} {self.rms(lens):.3f}" for lens in COMPARED if lens in self.errors)
+        return f"the images support the lens model {self.advised} (error on held-out frames, px: {listed})"
+
+
+def compare_lenses(views: Mapping[str, BoardViews], board: Board) -> dict[str, LensComparison]:
+    """The lens models of each camera, judged on frames that they were not fitted to."""
+    return {name: _compared(name, v, board) for name, v in views.items()}
+
+
+def _compared(name: str, views: BoardViews, board: Board) -> LensComparison:
+    if len(views.seen) < FEWEST_TO_COMPARE:
+        return LensComparison({})
+    kept = calibrate_single(name, views, board, final=False).views[name]
+    found: dict[Lens, np.ndarray] = {}
+    for lens in COMPARED:
+        try:
+            problem = calibrate_single(name, kept, board, lens=lens, final=False).problem
+        except ValueError:
+            continue  # it does not fit at all, as a fisheye's model of a long lens may
+        index = np.arange(len(problem.frames))
+        found[lens] = np.concatenate([_held_out(problem, index % LENS_FOLDS == fold) for fold in range(LENS_FOLDS)])
+    return LensComparison(found)
+
+
+def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"]:
+    """Mean squares of the frames held `out` by a camera fitted to the others, their boards' poses fitted to them."""
+    fitted, judged = readjusted(problem.of_boards(~out)), problem.of_boards(out)
+    (name,) = fitted.cameras
+    if fitted.deformation is not None and judged.deformation is not None:
+        judged = replace(judged, deformation=fitted.deformation.of_blocks(judged.deformation.part))
+    seen = Observations(judged.seen[name].block, judged.on_board(name), judged.seen[name].x)
+    fixed = {name: np.zeros(len(judged.free[name]), dtype=bool)}
+    posed = replace(judged, cameras=fitted.cameras, seen={name: seen}, free=fixed, priors={}, deformation=None)
+    squares = (readjusted(posed).residuals()[name] ** 2).sum(-1)
+    count = np.bincount(seen.block)
+    return np.asarray(np.bincount(seen.block, squares) / np.maximum(2 * count - POSE, 1))
+
+
+# Notes --------------------------------------------------------------------------------------------------------
+
+
+def left_out_notes(detected: Mapping[str, BoardViews], singles: Mapping[str, Solved], solved: Solved) -> Iterator[str]:
+    """Notes on images and points that cameras were calibrated without, by themselves (`singles`) and together."""
+    for name, v in detected.items():
+        used = singles[name].views[name]
+        if rejected := [str(key) for key in v.seen if key not in used.seen]:
+            yield f"{name}: left out {', '.join(rejected)}: the detected board does not fit the camera"
+        yield from _points_left_out(name, v, used)
+        if inconsistent := [str(key) for other, key in solved.left_out if other == name]:
+            yield f"{name}: left out {', '.join(inconsistent)}: they contradict the other cameras' images"
+
+
+def start_notes(detected: Mapping[str, BoardViews], solved: Solved, deviations: StartDeviations) -> Iterator[str]:
+    """Notes on a rig that was known roughly: what images add, what lies far from it, what was left out."""
+    yield _gains(solved, deviations)
+    yield from _far(solved)
+    for name, key in solved.left_out:
+        yield f"{name}: left out {key}: its board contradicts the start"
+    for name, used in solved.views.items():
+        yield from _points_left_out(name, detected[name], used)
+
+
+def _points_left_out(name: str, detected: BoardViews, used: BoardViews) -> Iterator[str]:
+    """A note on points that were left out as outliers, most of an image first."""
+    counts = {key: len(d.ids) - len(used.seen[key].ids) for key, d in detected.seen.items() if key in used.seen}
+    worst = sorted((key for key in counts if counts[key]), key=lambda key: -counts[key])
+    if worst:
+        listed = ", ".join(f"{counts[key]} of {key}" for key in worst[:5]) + (", ..." if len(worst) > 5 else "")
+        yield f"{name}: {sum(counts.values())} of {detected.count} points left out as outliers ({listed})"
+
+
+def _gains(fit: Solved, deviations: StartDeviations) -> str:
+    """What the images add to the start, by kind of parameter."""
+    assert fit.covariance is not None
+    after = dict(zip(fit.names, np.sqrt(fit.covariance.diagonal()).tolist()))
+    focal = np.mean([float(c.K[0, 0]) for c in fit.problem.cameras.values()])
+    width = np.mean([c.hw[1] for c in fit.problem.cameras.values()])
+    kinds = {
+        "focal": ("focal lengths", deviations.focal * focal),
+        "centre": ("principal points", deviations.centre * width),
+    }
+    texts = []
+    for kind, (label, before) in kinds.items():
+        found = [d for name, d in after.items() if f".{kind}." in name]
+        texts += [f"{label} ±{before:.3g} > ±{np.median(found):.3g} px"] if found else []
+    positions = np.median(_position_deviations(fit))
+    texts.append(f"positions ±{1e3 * deviations.position:.3g} > ±{1e3 * positions:.3g} mm")
+    return f"held to the start; standard deviations stated > with the images: {', '.join(texts)}"
+
+
+def _position_deviations(fit: Solved) -> list[float]:
+    """Of each camera's optical centre, root mean square of the axes, metres."""
+    assert fit.covariance is not None
+    found = []
+    for name, camera in fit.problem.cameras.items():
+        mine = [fit.names.index(f"{name}.{kind}.{i}") for kind in ("rotation", "translation") for i in range(3)]
+        derivatives = camera.cam_from_world.centre_jacobian.numpy()
+        covariance = derivatives @ fit.covariance[np.ix_(mine, mine)] @ derivatives.T
+        found.append(float(np.sqrt(np.trace(covariance) / 3)))
+    return found
+
+
+def _far(fit: Solved) -> list[str]:
+    """Which cameras lie far from the start."""
+    notes = []
+    for name, camera in fit.problem.cameras.items():
+        prior = fit.problem.priors[name]
+        ratio = np.abs(prior.residual(camera)) / np.sqrt(np.linalg.inv(prior.information).diagonal())
+        parts = np.split(ratio[:10], [3, 6, 8])
+        kinds = zip(("orientation", "position", "focal length", "principal point"), (part.max() for part in parts))
+        if far := [f"{kind} ({worst:.0f} deviations)" for kind, worst in kinds if worst > FAR_FROM_START]:
+            listed = ", ".join(far)
+            notes.append(f"{name}: far from the start: {listed}: is the start right, or its deviations too small?")
+    return notes

@@ -6,6 +6,7 @@ import json
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from statistics import fmean
 from typing import NamedTuple
@@ -14,18 +15,21 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.spatial import Delaunay, QhullError
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from arraygeom import Camera, LensView, Pair, Rig
 from arraygeom.pixels import HW
+from arraygeom.pose import rotation_vector
 from arraygeom.rig import Depths
 from arraygeom.robust import cauchy, least_squares, robust_least_squares
 from arraygeom.threads import torch_in_one_thread
 
 from .depth_change import relative_change
 from .held_out import image_parts, line_distances, trimmed_square
-from .matches import Images, Pairs, PointMatches, agreeing_pairs, match_cameras
-from .plausibility import DriftEvidence, plausible
-from .remedies import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
+from .matches import Images, Pairs, PointMatches, agreeing_pairs, match_cameras, seen_depths
+from .parameters import SIGMA
+from .plausibility import SCALES, DriftEvidence, plausible
+from .remedies import NOTHING, TURNS, Remedy, bare_cameras, degrees_remedy, from_degrees, lens_remedy, remedies
 from .residuals import lines_basis, related, residuals_and_depths, stack_key, stacked
 
 LOG = logging.getLogger(__name__)
@@ -39,15 +43,18 @@ HEALTHY_MISFIT = 0.2
 OF_TRIMMED = 0.52
 """`trimmed_square` of normal points of variance 1."""
 EQUAL = (1.4, 0.03)
-"""Explanations are indistinguishable whose misfit is less than 1.4 times the best one's plus 0.03 px."""
+"""Explanations of an image's size are equal whose misfit is less than 1.4 times the best one's plus 0.03 px."""
 WRONG_SIDE_PENALTY = 100.0
 """Penalty, pixels, of points behind the cameras, outside the depth range, or mirrored."""
 LARGEST_REMAINDER = 0.33
 """A mistake is named if its remedy leaves no more than this share of the misfit: many wrong remedies improve a drifted
-rig somewhat."""
-MARGIN = 12.0
-"""A mistake is named if -2 log evidence is smaller by this than that of a drift."""
-EXPLAINED, ROUGHLY = (HEALTHY_MISFIT, 0.06), 0.9
+rig somewhat. Nor is one as good as another that leaves this share of what it leaves."""
+MARGIN, TIE = 12.0, 2.0
+"""A mistake is named if -2 log evidence is smaller by this than that of a drift, and others are as good that have less
+than this more; of those within the second, the likely one is named."""
+MOST_COMPARED = 10
+"""Explanations whose evidence is computed: those that leave least."""
+EXPLAINED, ROUGHLY = (2 * HEALTHY_MISFIT, 0.06), 0.9
 """A mistake explains the points if no more than so many pixels, or that share of the misfit, are left; pixels of those
 whose remedy is approximate."""
 SAME_DEPTH, SAME_DISTANCE = 1e-3, 1e-3
@@ -120,30 +127,17 @@ class Diagnosis:
     certain: bool
 
     @property
-    def outside_depth_range(self) -> bool:
-        """Whether the rig fits but for its depth range, outside which most points lie."""
-        return self.before.misfit < HEALTHY_MISFIT and self.before.front >= 0.5 and self.before.inside < 0.5
-
-    @property
     def verdict(self) -> str:
         """The diagnosis in a sentence or two."""
-        excluded = (
-            f"the depth range excludes the scene: {self.before.inside:.0%} of the points lie within it, their median "
-            f"depth is {self.before.depth:.3g} m: correct `depth` in the rig file, or give --depth"
-        )
+        others = "; or: ".join(remedy.words for remedy in self.equal)
         if self.named.kind != "nothing":
-            others = "".join(f"; or: {remedy.words}" for remedy in self.equal)
-            range_alone = f"; or {excluded}" if self.named.kind == "units" and self.outside_depth_range else ""
-            return f"likely mistake: {self.named.words}{others}{range_alone}"
+            return f"likely mistake: {self.named.words}" + (f"; or: {others}" if others else "")
         if self.healthy:
             return "nothing wrong: the points lie on their lines to the accuracy of their positions"
-        shifts = "; or: ".join(remedy.words for remedy in self.equal)
-        if self.outside_depth_range:
-            return excluded + (f". Or: {shifts}" if shifts else "")
         return (
             f"none of the usual mistakes, but the rig is {self.before.misfit:.2f} px off these images: "
             "it has drifted or was inaccurate from the beginning; `pat rig refine` may repair what can be observed"
-        ) + (f". As plausible as a drift, but not more: {shifts}" if shifts else "")
+        ) + (f". As plausible as a drift, but not more: {others}" if others else "")
 
     def as_text(self) -> str:
         """The verdict, and the statistics before and after, as text."""
@@ -193,22 +187,23 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
     tried = [r for r in remedies(rig, sizes) if not fits or plausible(r, rig)]
-    tried = [NOTHING, *tried, *_ignored_lens(rig, sizes, pairs)]
+    tried = [NOTHING, *tried]
+    if fits:
+        tried += [*_ignored_lens(rig, pairs), *_degrees(rig, pairs), *_depth_range(rig, pairs)]
     LOG.info("trying %d mistakes on %d pairs", len(tried), len(pairs))
     figures, inliers, noise = _evaluate(rig, tried, pairs)
     order = sorted(range(0 if fits else 1, len(tried)), key=lambda i: figures[i].penalised_misfit)
-    least = EQUAL[0] * figures[order[0]].penalised_misfit + EQUAL[1]
-    best = min(i for i in order if figures[i].penalised_misfit <= least)
     healthy = fits and figures[0].penalised_misfit < HEALTHY_MISFIT
-    if healthy or (fits and figures[best].penalised_misfit > LARGEST_REMAINDER * figures[0].penalised_misfit):
-        best = 0
-    candidate = best
-    LOG.info("comparing the mistake found with a drift")
-    if best and fits and not _clearly_better(rig, tried[best], (figures[0], figures[best]), pairs, inliers, noise):
-        best = 0
-    as_good = [i for i in order if figures[i].penalised_misfit <= least and candidate]
+    if not fits:
+        least = EQUAL[0] * figures[order[0]].penalised_misfit + EQUAL[1]
+        as_good = [i for i in order if figures[i].penalised_misfit <= least]
+        best = min(as_good)
+    elif healthy:
+        best, as_good = 0, []
+    else:
+        LOG.info("comparing the mistakes that leave least with a drift")
+        best, as_good = _by_evidence(rig, tried, figures, order, pairs, inliers, noise)
     equal = {tried[i].kind: tried[i] for i in reversed(as_good)}
-    equal.pop("nothing", None)
     equal.pop(tried[best].kind, None)
     table = tuple((tried[i], figures[i]) for i in order)
     count = sum(len(matches.alpha) for matches in pairs.values())
@@ -219,6 +214,46 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     )
 
 
+def _by_evidence(
+    rig: Rig,
+    tried: Sequence[Remedy],
+    figures: Sequence[FitStatistics],
+    order: Sequence[int],
+    pairs: Pairs,
+    inliers: Tensor,
+    noise: float,
+) -> tuple[int, list[int]]:
+    """The mistake that explains the points clearly better than a drift of the rig does, 0 if none; all that are as
+    good as it, or as the drift, best first.
+
+    Points of one object, or wrong ones in one place, do not decide: it is better without each part of them in turn.
+    No drift mirrors an image.
+    """
+    limit = LARGEST_REMAINDER * figures[0].penalised_misfit
+    some = [i for i in order if i and figures[i].penalised_misfit <= limit][:MOST_COMPARED]
+    if not some:
+        return 0, []
+    limit = figures[some[0]].penalised_misfit / LARGEST_REMAINDER + EQUAL[1]
+    some = [i for i in some if figures[i].penalised_misfit <= limit]
+    found = {i: DriftEvidence.of(tried[i].repair(rig), pairs, inliers, noise) for i in some}
+    given = DriftEvidence.of(rig, pairs, inliers, noise)
+    mirrored = figures[0].handed < 0.5
+    some.sort(key=lambda i: found[i].surprise)
+    least = found[some[0]].surprise
+    best = min(i for i in some if found[i].surprise <= least + TIE)
+    allowed = max(ROUGHLY if tried[best].approximate else EXPLAINED[0], EXPLAINED[1] * figures[0].penalised_misfit)
+    parts = image_parts(rig, pairs)
+    rest = (inliers & (parts != part) for part in parts.unique().tolist())
+    clear = (
+        figures[best].penalised_misfit <= allowed
+        and found[best].surprise + MARGIN < given.surprise
+        and all(found[best].by(used) + MARGIN < given.by(used) for used in rest)
+    )
+    named = mirrored or clear
+    bound = MARGIN + (least if named else min(least, given.surprise))
+    return best if named else 0, [i for i in some if found[i].surprise <= bound]
+
+
 def _same_rig(rig: Rig, other: Rig, pairs: Pairs) -> bool:
     """Whether no point tells two rigs apart: by its depth or, if they are not calibrated, by its line."""
     change = relative_change(rig, other, pairs)
@@ -226,27 +261,6 @@ def _same_rig(rig: Rig, other: Rig, pairs: Pairs) -> bool:
         return change < SAME_DEPTH
     off = [line_distances(each, pairs).abs() for each in (rig, other)]
     return bool((off[0] - off[1]).abs().median() < SAME_DISTANCE)
-
-
-def _clearly_better(
-    rig: Rig, remedy: Remedy, figures: tuple[FitStatistics, FitStatistics], pairs: Pairs, inliers: Tensor, noise: float
-) -> bool:
-    """Whether a mistake explains the points clearly better than a drift of the rig does, whatever part is left out.
-
-    Points of one object, or wrong ones in one place, do not decide: the mistake is better without each part in turn.
-    """
-    before, after = (f.penalised_misfit for f in figures)
-    if after > max(ROUGHLY if remedy.approximate else EXPLAINED[0], EXPLAINED[1] * before):
-        return False
-    mirrored, still = (f.handed < 0.5 for f in figures)
-    if mirrored or still:
-        return mirrored and not still
-    given, repaired = (DriftEvidence.of(r, pairs, inliers, noise) for r in (rig, remedy.repair(rig)))
-    parts = image_parts(rig, pairs)
-    rest = (inliers & (parts != part) for part in parts.unique().tolist())
-    return repaired.surprise + MARGIN < given.surprise and all(
-        repaired.by(used) + MARGIN < given.by(used) for used in rest
-    )
 
 
 def _thinned(matches: PointMatches) -> PointMatches:
@@ -269,7 +283,7 @@ def _evaluate(rig: Rig, tried: Sequence[Remedy], pairs: Pairs) -> tuple[list[Fit
             *(part[i] for part in observed),
             inliers=inliers,
             floor=floor,
-            bounds=rig.depth,
+            bounds=repaired.depth,
             handed=fmean(abs(share - _mirrors(repaired, names)) for share, names in zip(preserved, pairs)),
         )
         for i, repaired in enumerate(rigs)
@@ -380,10 +394,10 @@ def _inside(bounds: Depths | None, depth: Tensor) -> float:
     return float(((depth > 0.5 * near) & (depth < 2 * far)).double().mean())
 
 
-def _ignored_lens(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> list[Remedy]:
+def _ignored_lens(rig: Rig, pairs: Pairs) -> list[Remedy]:
     """The distortion that best explains the points, for cameras that have none."""
-    bare = bare_cameras(rig, sizes)
-    if not bare or any(rig[name].hw != hw for name, hw in sizes.items()):
+    bare = bare_cameras(rig, {name for names in pairs for name in names})
+    if not bare:
         return []
     squared = max(_corner_radius(camera) for camera in bare.values()) ** 2
     lowest, highest = BARREL / squared, PINCUSHION / squared
@@ -402,3 +416,51 @@ def _corner_radius(camera: Camera) -> float:
     h, w = camera.hw
     corners = camera.K.new_tensor([[0, 0], [w - 1, 0], [0, h - 1], [w - 1, h - 1]])
     return float(camera.rays(corners)[0][:, :2].norm(dim=-1).max())
+
+
+def _degrees(rig: Rig, pairs: Pairs) -> list[Remedy]:
+    """Rotation vectors in degrees, taken for radians, with the whole turns, which are lost, that suit the points best.
+
+    Not where a drift may be what turned the cameras.
+    """
+    first, *others = dict.fromkeys(name for names in pairs for name in names)
+    if any((first, other) not in pairs or not rig.pair(first, other).calibrated for other in others):
+        return []
+    turns, cost = {}, torch.zeros(len(TURNS), dtype=torch.float64)
+    for other in others:
+        off = _off_planes(rig, (first, other), pairs[first, other])
+        cost = cost + off.amin(1)
+        turns[other] = off.argmin(1)
+    best = int(cost.argmin())
+    remedy = degrees_remedy({first: TURNS[best]} | {other: TURNS[int(i[best])] for other, i in turns.items()})
+    repaired = remedy.repair(rig)
+    before, after = ([r.pair(first, other).beta_from_alpha.R for other in others] for r in (rig, repaired))
+    angles = [float(rotation_vector(R.mT @ Q).norm()) for R, Q in zip(before, after)]
+    return [remedy] if max(angles) > 3 * SCALES[-1] * SIGMA["rotation"] else []
+
+
+def _off_planes(rig: Rig, names: tuple[str, str], matches: PointMatches) -> Float[Tensor, "k k"]:
+    """Sines of the rays of beta with their epipolar planes, medians, by the turns of alpha and of beta."""
+    alpha, beta = rig.pair(*names).cameras
+    rays = [normalize(camera.rays(points)[0], dim=-1) for camera, points in zip((alpha, beta), matches)]
+    of_alpha, of_beta = (from_degrees(camera.R, torch.tensor(TURNS)) for camera in (alpha, beta))
+    R = of_beta @ of_alpha[:, None].mT
+    t = beta.t - R @ alpha.t
+    normals = torch.linalg.cross(t[..., None, :].expand(*R.shape[:2], len(rays[0]), 3), rays[0] @ R.mT)
+    sines = (normalize(normals, dim=-1) * rays[1]).sum(-1).abs()
+    return sines.nan_to_num(1.0).median(-1).values
+
+
+def _depth_range(rig: Rig, pairs: Pairs) -> list[Remedy]:
+    """The depth range of the points, for a rig that has another."""
+    found = []
+    for names, matches in pairs.items() if rig.depth is not None else ():
+        pair = rig.pair(*names)
+        if pair.calibrated and pair.link is None:
+            with suppress(ValueError):
+                found.append(seen_depths(pair, matches))
+    if not found:
+        return []
+    near, far = min(bounds[0] for bounds in found), max(bounds[1] for bounds in found)
+    words = f"the depth range excludes the scene, which is {near:.3g} to {far:.3g} m away: correct `depth` in the file"
+    return [Remedy("depth range", words, lambda rig: rig.replace(depth=(near, far)))]

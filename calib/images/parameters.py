@@ -13,9 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Camera, LensView, Link, Rig, rotation_from_vector
+from arraygeom.distortion import typical_coefficients
 from arraygeom.pixels import HW
-
-from ..boards.parameters import typical_coefficients
 
 SIGMA = {"rotation": math.radians(0.5), "translation": 0.01, "focal": 0.01, "centre": 5.0, "distortion": 0.02}
 """Default standard deviations: radians, a share of the longest baseline, a share of the focal length, pixels of the

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from arraygeom import Camera, LensView, Rig
 
-from .least_squares import JoinedResiduals, jacobian
+from .least_squares import JoinedResiduals, Residuals, jacobian
 from .matches import Pairs
 from .parameters import SIGMA, UNCERTAIN, apply_change, free_parameters
 from .refinement import LARGEST_CHANGE, systematic_columns
@@ -71,12 +71,15 @@ class DriftEvidence:
     """A rig with the drift that fits matched points best.
 
     surprise: -2 log evidence of the rig and that drift by the points used. Smaller is better; differences count.
-    r, J, B: the distances of all points, in standard deviations of their noise, were there no drift, and their
-    derivatives by the drift and by what lens models leave; linear about the best drift. scale: of the drift. fixed:
-    the part of the surprise that does not depend on the distances. clipped: the largest distance that counts.
+    distances: of all points by a drift, in standard deviations of their noise. z: the drift. r, J, B: the distances,
+    were there no drift, and their derivatives by the drift and by what lens models leave; linear about z. scale: of
+    the drift. fixed: the part of the surprise that does not depend on the distances. clipped: the largest distance
+    that counts.
     """
 
     surprise: float
+    distances: Residuals
+    z: Tensor
     r: Tensor
     J: Tensor
     B: Tensor
@@ -99,26 +102,30 @@ class DriftEvidence:
         wrong_side = _rotation_to_plausible_depth(rig, pairs)
         fixed = {scale: RARE * math.log1p(scale**2) + (wrong_side / scale) ** 2 for scale in SCALES}
         best = min(SCALES, key=lambda scale: _Drift.of(r[used], J[used], B[used], scale).surprise + fixed[scale])
-        found = cls(math.inf, r, J, B, best, fixed[best], clipped)
+        found = cls(math.inf, distances, z, r, J, B, best, fixed[best], clipped)
         for _ in range(STEPS):
-            surprise = found._at(z, used)
-            if surprise > found.surprise - NO_BETTER:
+            surprise = found._at(found.z, used)
+            if not surprise < found.surprise - NO_BETTER:
                 return replace(found, surprise=min(surprise, found.surprise))
-            found = replace(found, surprise=surprise)
-            z = _Drift.of(found.r[used], found.J[used], B[used], best).z
+            z = found._refitted(used)
             r, J = jacobian(distances, z)
-            found = replace(found, r=r - J @ z, J=J)
+            found = replace(found, surprise=surprise, z=z, r=r - J @ z, J=J)
         return found
 
     def by(self, used: Bool[Tensor, " n"]) -> float:
-        """The surprise by other points, to first order about the best drift."""
-        return self._at(_Drift.of(self.r[used], self.J[used], self.B[used], self.scale).z, used)
+        """The surprise by other points, of this drift or of the best by them to first order, whichever is better."""
+        return min(self._at(z, used) for z in (self.z, self._refitted(used)))
 
-    def _at(self, z: Tensor, used: Tensor) -> float:
-        r, J, B = ((self.r + self.J @ z)[used], self.J[used], self.B[used])
+    def _refitted(self, used: Bool[Tensor, " n"]) -> Tensor:
+        return _Drift.of(self.r[used], self.J[used], self.B[used], self.scale).z
+
+    def _at(self, z: Tensor, used: Bool[Tensor, " n"]) -> float:
+        """The surprise of a drift by the points' distances as they are then; infinite where there are none."""
+        r, J, B = self.distances(z).detach()[used], self.J[used], self.B[used]
         clipped = _Drift.of(r.clamp(-self.clipped, self.clipped), J[:, :0], B, self.scale)
         volume = _Drift.of(r, J, B, self.scale).volume
-        return clipped.surprise - clipped.volume + volume + float((z / self.scale).square().sum()) + self.fixed
+        surprise = clipped.surprise - clipped.volume + volume + float((z / self.scale).square().sum()) + self.fixed
+        return surprise if math.isfinite(surprise) else math.inf
 
 
 class _Drift(NamedTuple):

@@ -6,24 +6,20 @@ does not state (rotation, resizing, cropping) are applied to the rig's camera.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from arraygeom import Camera, Distortion, Pose, Rig, View, resize_matrix, rotation_from_vector
 from arraygeom.pixels import HW, rot90_matrix, shift_matrix
 from arraygeom.pose import rotation_vector
 
-KINDS = (
-    *("nothing", "resized", "rotated or mirrored", "cameras swapped", "pose inverted", "R transposed", "sign of t"),
-    *("centre as t", "OpenGL axes", "order of quaternions", "degrees and radians"),
-    *("x and y exchanged", "units", "distortion", "half-pixel shift", "one-pixel shift"),
-)
 RESIZED = (0.5, 2.0, 0.25, 4.0, 1 / 3, 3.0, 2 / 3, 1.5, 0.75, 4 / 3)
 UNITS = {
     1e-3: "millimetres taken for metres",
@@ -37,7 +33,7 @@ TRANSPOSE = torch.eye(3, dtype=torch.float64)[[1, 0, 2]]
 
 @dataclass(frozen=True)
 class Remedy:
-    """A possible mistake: its kind (one of `KINDS`), its description in words, and the change that undoes it.
+    """A possible mistake: its kind ("resized", "units", ...), its description in words, and the change that undoes it.
 
     approximate: the change holds numbers that were estimated, and undoes it roughly.
     """
@@ -88,6 +84,34 @@ def lens_remedy(rig: Rig, names: Iterable[str], k1: float) -> Remedy:
     lens = Distortion("brown-conrady", torch.tensor([k1, 1.5 * k1**2, 0, 0], dtype=torch.float64))
     repair = partial(on_cameras, names=bare, change=lambda c: c.replace(distortion=lens))
     return Remedy("distortion", words, repair, approximate=True)
+
+
+TURNS = tuple(range(-29, 29))
+"""Whole turns, in radians, that may be missing from a rotation vector in degrees: it is at most 180 long."""
+
+
+def from_degrees(R: Float[Tensor, "3 3"], turns: Int[Tensor, "*b"]) -> Float[Tensor, "*b 3 3"]:
+    """The rotations whose vector was in degrees, so many turns longer, and was taken for radians."""
+    vector = rotation_vector(R)
+    angle = vector.norm()
+    whole = torch.deg2rad(angle + 2 * math.pi * turns)[..., None]
+    return rotation_from_vector(vector / angle.clamp(min=1e-12) * whole)
+
+
+def degrees_remedy(turns: Mapping[str, int]) -> Remedy:
+    """Rotation vectors of cameras were in degrees, taken for radians; `turns` of each are missing."""
+
+    def repair(rig: Rig) -> Rig:
+        for name, missing in turns.items():
+            change = partial(_with_rotation, missing=missing)
+            rig = on_cameras(rig, [name], change)
+        return rig
+
+    return Remedy("degrees and radians", "rotation of all cameras in degrees, taken for radians", repair)
+
+
+def _with_rotation(camera: Camera, missing: int) -> Camera:
+    return camera.replace(cam_from_world=Pose(from_degrees(camera.R, torch.tensor(missing)), camera.t))
 
 
 def mirror_matrix(hw: HW, *, across: bool) -> Float[Tensor, "3 3"]:

@@ -12,7 +12,7 @@ from . import options
 from .options import Depth, Out, say
 
 if TYPE_CHECKING:
-    from calib.boards.parameters import StartDeviations
+    from calib.boards.poses import StartDeviations
 
 BOARDS = (
     "charuco:8x6:30mm (squares), chessboard:9x6:25mm (inner corners), circles:7x5:20mm, acircles:4x11:20mm, "
@@ -46,10 +46,14 @@ class Calibrate:
         "tilted",
         "kannala-brandt",
         "omni",
+        "double-sphere",
+        "extended-unified",
+        "scaramuzza",
+        "thin-prism-fisheye",
         "none",
     ] = "brown-conrady"
-    """Lens model; kannala-brandt or omni for fisheyes. auto compares them on held-out frames and takes the best
-    supported."""
+    """Lens model; from kannala-brandt on, they are for fisheyes. auto compares the first five, on held-out frames, and
+    takes the best supported."""
     depth: Depth = None
     """Near and far bounds in metres of the scenes to come, written into the rig."""
     start: Annotated[Path | None, options.optional("RIG")] = None
@@ -85,15 +89,15 @@ class Calibrate:
         say(f"written: {', '.join(map(str, found.written))}")
 
     def _deviations(self) -> StartDeviations:
-        from calib.boards.parameters import StartDeviations
+        from calib.boards.poses import StartDeviations
 
         if self.deviation and self.start is None:
             raise ValueError("--deviation needs --start: give the rig whose positions it is about")
         return StartDeviations.of(options.numbers_by_name(self.deviation, "--deviation"))
 
     def _watch(self, patterns: dict[str, str]) -> None:
+        from calib.boards.run import watch
         from calib.boards.target import parse_boards
-        from calib.boards.watch import watch
 
         page = self.out.with_suffix(".watch.html")
         say(f"open {page} in a browser; Ctrl-C calibrates with all images and ends")

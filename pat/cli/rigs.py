@@ -399,8 +399,7 @@ class RigDiff:
     """Picture to write: how far pixels and depths differ, over the images."""
 
     def run(self) -> None:
-        from calib.boards.figures import draw_difference
-        from calib.boards.rig_diff import rig_difference
+        from calib.boards.rig_diff import draw_difference, rig_difference
         from calib.boards.uncertainty import RigCovariance
 
         from ..media.figures import save_figure

@@ -8,10 +8,9 @@ import torch
 from torch.autograd import gradcheck, gradgradcheck
 
 from arraygeom import Camera, Curved, Pose, Rig, intrinsics, unchecked
-from arraygeom.distortion import COEFFICIENT_COUNTS, Distortion
+from arraygeom.distortion import COEFFICIENT_COUNTS, LENS_TERMS, TYPICAL_COEFFICIENTS, Distortion
 from arraygeom.lenses import PolynomialFisheye
 from arraygeom.lenses.model import LensModel
-from calib.boards.parameters import LENS_TERMS, TYPICAL_COEFFICIENTS
 from tests.oracles import Oracle
 
 cv2 = Oracle("cv2")

@@ -1,4 +1,5 @@
 import math
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -312,3 +313,22 @@ def test_lenses_of_huge_coefficients_see_nothing_but_their_middle(huge):
                 assert seen.dtype == valid.dtype == torch.bool
                 if not math.isfinite(huge):
                     assert not seen.any()
+
+
+@pytest.mark.parametrize("bound", ["brown.brown_limit", "fisheye.fisheye_limit"])
+def test_the_bound_of_copies_of_a_lens_is_computed_once(bound, monkeypatch):
+    lens = brown(4) if bound.startswith("brown") else fisheye(FISHEYES[0])
+    X = torch.rand(50, 1, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + 0.5
+    module, name = bound.split(".")
+    limit, counts = getattr(import_module(f"arraygeom.lenses.{module}"), name), []
+
+    def counted(given):
+        counts.append(len(given if isinstance(given, torch.Tensor) else given.k[0]))
+        return limit(given)
+
+    monkeypatch.setattr(f"arraygeom.lenses.{bound}", counted)
+    copies = lens.with_coefficients(lens.coefficients.expand(50, -1))
+    each = lens.with_coefficients(lens.coefficients.repeat(50, 1))
+    for one, other in zip(copies.project(X), each.project(X)):
+        assert torch.equal(one, other)
+    assert counts == [1, 50]

@@ -20,10 +20,9 @@ import numpy as np
 from arraygeom import Camera, Rig
 from arraygeom.atomic import write_text
 from arraygeom.io import read_rig
-from calib.boards.bundle import adjust
 from calib.boards.detect import collect_folder
-from calib.boards.intrinsics import calibrate_single
 from calib.boards.rig import Calibration, calibrate
+from calib.boards.solve import adjust, calibrate_single
 from calib.boards.target import parse_board
 from calib.boards.validation import epipolar_errors
 from pat.evaluation.tables import markdown_header, markdown_row
@@ -89,8 +88,8 @@ def action_cameras(data: Path) -> Iterator[Figure]:
     for number, published in ACTION_CAMERAS.items():
         found = collect_folder(folder, board, patterns={"cam": f"int_cam{number:02d}_img/*.jpg"})
         alone = calibrate_single("cam", found.views["cam"], board)
-        off = float(alone.camera.K[0, 0]) / published - 1
-        rms = alone.solved.problem.rms()
+        off = float(alone.problem.cameras["cam"].K[0, 0]) / published - 1
+        rms = alone.problem.rms()
         yield Figure(f"action camera {number}: f", f"{100 * off:+.2f} % (RMS {rms:.3f} px)", "to 1.5 %")
 
 

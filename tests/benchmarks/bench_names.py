@@ -169,8 +169,6 @@ def judged(mistake: Mistake, case: Case, bad: Rig) -> Outcome:
     sizes = {name: camera.hw for name, camera in case.rig.cameras.items()}
     found = diagnose_matches(bad, sizes, case.matches)
     name = found.named.kind
-    if name == "nothing" and found.outside_depth_range:
-        name = "depth range"
     if name == "nothing":
         alarm = bad is case.rig and not found.healthy
         return ("drifted" if alarm else "right" if mistake.kind == "nothing" else DRIFTED), found

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from calib.boards.bundle import BundleProblem, Solved, readjusted
+from calib.boards.bundle import BundleProblem, Solved, intrinsic_values
 from calib.boards.detect import collect_folder
-from calib.boards.parameters import intrinsic_values
 from calib.boards.rig import Calibration, calibrate
+from calib.boards.solve import readjusted
 from calib.boards.target import parse_board
 from pat.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.printed import data_and_out, print_tables

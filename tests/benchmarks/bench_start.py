@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import torch
 
-from calib.boards.parameters import StartDeviations
+from calib.boards.poses import StartDeviations
 from calib.boards.uncertainty import baseline_deviation, rig_covariance
 from calib.images.held_out import line_distances
 from calib.images.matches import PointMatches, match_cameras

@@ -4,9 +4,8 @@ import numpy as np
 import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_vector
-from calib.boards.bundle import BundleProblem, Observations
+from calib.boards.bundle import BundleProblem, Observations, parameter_names
 from calib.boards.detect import BoardViews, Detection
-from calib.boards.parameters import parameter_names
 from calib.boards.target import Board, parse_board
 
 BOARD = parse_board("charuco:9x7:60mm")

@@ -72,9 +72,9 @@ def test_kalibrs_target_file(tmp_path):
     (tmp_path / "april.yaml").write_text(KALIBR)
     assert str(parse_board(str(tmp_path / "april.yaml"))) == str(GRID) == "aprilgrid:5x4:50mm:0.3"
     (tmp_path / "other.yaml").write_text("target_type: circlegrid\n")
-    with pytest.raises(ValueError, match=r"other.yaml: not a target of Kalibr's that is known here"):
+    with pytest.raises(ValueError, match=r"other\.yaml"):
         parse_board(str(tmp_path / "other.yaml"))
-    with pytest.raises(FileNotFoundError, match="no such file"):
+    with pytest.raises(FileNotFoundError, match=r"none\.yaml"):
         parse_board(str(tmp_path / "none.yaml"))
 
 
@@ -106,9 +106,9 @@ def test_two_boards_in_one_image(tmp_path):
 
 
 def test_boards_that_share_markers_are_refused():
-    with pytest.raises(ValueError, match=r"its markers are on another board too: print it with ':from15'"):
+    with pytest.raises(ValueError, match=":from15"):
         parse_boards(["charuco:6x5:40mm", "charuco:6x5:30mm"])
-    with pytest.raises(ValueError, match="several boards at once need markers"):
+    with pytest.raises(ValueError, match="chessboard:6x5:30mm"):
         parse_boards(["charuco:6x5:40mm", "chessboard:6x5:30mm"])
 
 
@@ -116,5 +116,5 @@ def test_paper():
     board = parse_board("charuco:8x5:30mm")
     assert "print it on A4 or larger at 100 %" in page_note(board)
     assert draw_board(board, paper="A4").get_size_inches() * 25.4 == pytest.approx([297, 210])
-    with pytest.raises(ValueError, match=r"the board needs 324 x 278 mm .* and A4 has 210 x 297: use A3"):
+    with pytest.raises(ValueError, match=r"A4.*A3"):
         draw_board(parse_board("charuco:10x8:30mm"), paper="A4")

@@ -9,9 +9,18 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from arraygeom import Pose, Rig
-from calib.boards.bundle import Observations, adjust, linearised, normal_equations
-from calib.boards.parameters import CameraPrior, camera_jacobian, changed, intrinsic_values, parameter_names
+from calib.boards.bundle import (
+    CameraPrior,
+    Observations,
+    camera_jacobian,
+    changed,
+    intrinsic_values,
+    linearised,
+    normal_equations,
+    parameter_names,
+)
 from calib.boards.rig import calibrate
+from calib.boards.solve import adjust
 from calib.boards.target import parse_board
 from tests.calib.board_scenes import (
     all_free,

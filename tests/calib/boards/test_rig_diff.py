@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig, View, rotation_from_vector
-from calib.boards.bundle import adjust
-from calib.boards.parameters import changed, parameter_names
+from calib.boards.bundle import changed, parameter_names
 from calib.boards.rig_diff import _projections, rig_difference
+from calib.boards.solve import adjust
 from calib.boards.uncertainty import rig_covariance
 from pat.cli.main import main
 from pat.data.sample_array import SAMPLE

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig
-from calib.boards.bundle import jackknife
 from calib.boards.deformation import BoardDeformation
 from calib.boards.detect import BoardViews, Detection, detect
 from calib.boards.rig import calibrate
 from calib.boards.simulation import photograph
 from calib.boards.target import parse_board
+from calib.boards.uncertainty import jackknife
 from tests.calib.board_scenes import BOARD, board_poses, camera, errors_of, four_cameras, see
 
 CYLINDER = (0.0, 0.5, 0.0, 0.0)

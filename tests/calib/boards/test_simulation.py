@@ -61,7 +61,7 @@ def test_boards_are_tilted_and_at_several_depths(rig):
 def test_cameras_with_no_common_view_are_named(rig, monkeypatch):
     monkeypatch.setattr("calib.boards.simulation.TRIES", 200)
     apart = Rig({"a": rig["a"], "b": camera(260.0, (220, 300), (5.0, 0, 0), (0, 170, 0))})
-    with pytest.raises(ValueError, match=r"the cameras see the board charuco:7x5:60mm.* together almost nowhere"):
+    with pytest.raises(ValueError, match="charuco:7x5:60mm"):
         board_poses(apart, BOARD, 3)
 
 

