@@ -146,7 +146,7 @@ def through(root):
             depth = resampled(frame.depth[None], camera, lossy, interpolation="nearest")
             rgb = resampled(frame.rgb, camera, lossy).values[0].clamp(min=0)
             known = torch.where(depth.valid[0], depth.values[0, 0], torch.nan)
-            plain = replace(frame, rgb=rgb, depth=known, normals=None, flow=None)
+            plain = replace(frame, rgb=rgb, depth=known)
             save_frame(folder / source.about["frames"][name][0]["file"], plain)
             rig = rig.with_camera(name, lossy)
         rig.save(folder / "rig.yaml")
