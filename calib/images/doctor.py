@@ -43,7 +43,7 @@ HEALTHY_MISFIT = 0.2
 OF_TRIMMED = 0.52
 """`trimmed_square` of normal points of variance 1."""
 EQUAL = (1.4, 0.03)
-"""Explanations of an image's size are equal whose misfit is less than 1.4 times the best one's plus 0.03 px."""
+"""Explanations are equal whose misfit is less than 1.4 times the best one's plus 0.03 px."""
 WRONG_SIDE_PENALTY = 100.0
 """Penalty, pixels, of points behind the cameras, outside the depth range, or mirrored."""
 LARGEST_REMAINDER = 0.33
@@ -251,7 +251,9 @@ def _by_evidence(
     )
     named = mirrored or clear
     bound = MARGIN + (least if named else min(least, given.surprise))
-    return best if named else 0, [i for i in some if found[i].surprise <= bound]
+    near = EQUAL[0] * figures[best].penalised_misfit + EQUAL[1] if named else 0.0
+    as_good = [i for i in some if found[i].surprise <= bound or figures[i].penalised_misfit <= near]
+    return best if named else 0, as_good
 
 
 def _same_rig(rig: Rig, other: Rig, pairs: Pairs) -> bool:

@@ -116,7 +116,9 @@ def measured(found: BetaMatches, typical: Float[Tensor, "b 2"]) -> Float[Tensor,
 def _range(x: Tensor, radius: int) -> Tensor:
     """The greatest less the least value within squares around each pixel."""
     side = 2 * radius + 1
-    return max_pool2d(x, side, 1, radius) + max_pool2d(-x, side, 1, radius)
+    rows, columns = ((side, 1), 1, (radius, 0)), ((1, side), 1, (0, radius))
+    greatest, negative = (max_pool2d(max_pool2d(x, *rows), *columns) for x in (x, -x))
+    return greatest + negative
 
 
 def _logarithm(x: Tensor, least: float) -> Tensor:
