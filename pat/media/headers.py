@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import struct
 from io import BytesIO
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -18,7 +18,7 @@ from arraygeom.image_bytes import DAMAGED, PNG, TIFF, first_tiff_page, png_chunk
 HW = tuple[int, int]
 
 _ORIENTATION = 274
-_FILES = {b"\xff\xd8": JpegImageFile, b"RI": WebPImageFile, b"BM": BmpImageFile}
+_FILES: dict[bytes, Any] = {b"\xff\xd8": JpegImageFile, b"RI": WebPImageFile, b"BM": BmpImageFile}
 """By their first bytes. Not `Image.open`, which refuses sizes that are expected here."""
 
 
@@ -69,11 +69,12 @@ def _pnm(content: bytes) -> ImageHeader | None:
     return ImageHeader((int(found[2]), int(found[1])), bits=16 if int(found[3] or 0) > 255 else 8) if found else None
 
 
-def _tiff(content: bytes) -> ImageHeader:
+def _tiff(content: bytes) -> ImageHeader | None:
     page = first_tiff_page(content)
     tag, bits = page.tags.get(_ORIENTATION), int(np.max(page.bitspersample))
     place = (tag.valueoffset, page.parent.byteorder + tag.dataformat) if tag else None
-    return ImageHeader((page.imagelength, page.imagewidth), _known(tag.value) if tag else 1, bits, place)
+    hw = int(page.imagelength), int(page.imagewidth)
+    return ImageHeader(hw, _known(tag.value) if tag else 1, bits, place) if min(hw) > 0 else None
 
 
 def _exif_orientation(exif: bytes) -> int:
