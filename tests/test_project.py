@@ -155,6 +155,7 @@ GEOMETRY_MAY_USE = {
     "atomic.py": {"filelock"},
     "compiled.py": {"numba"},
     "opencv.py": {"cv2"},
+    "image_bytes.py": {"tifffile"},
     "matfile.py": {"scipy"},
     "viz.py": {"matplotlib"},
 }

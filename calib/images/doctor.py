@@ -43,12 +43,12 @@ HEALTHY_MISFIT = 0.2
 OF_TRIMMED = 0.52
 """`trimmed_square` of normal points of variance 1."""
 EQUAL = (1.4, 0.03)
-"""Explanations of an image's size are equal whose misfit is less than 1.4 times the best one's plus 0.03 px."""
+"""Explanations are equal whose misfit is less than 1.4 times the best one's plus 0.03 px."""
 WRONG_SIDE_PENALTY = 100.0
 """Penalty, pixels, of points behind the cameras, outside the depth range, or mirrored."""
-LARGEST_REMAINDER = 0.33
-"""A mistake is named if its remedy leaves no more than this share of the misfit: many wrong remedies improve a drifted
-rig somewhat. Nor is one as good as another that leaves this share of what it leaves."""
+LARGEST_REMAINDER = (0.33, 0.2)
+"""A mistake is named if its remedy leaves no more than the first share of the misfit: many wrong remedies improve a
+drifted rig somewhat. Nor is one as good as another that leaves less than the second share of what it leaves."""
 MARGIN, TIE = 12.0, 2.0
 """A mistake is named if -2 log evidence is smaller by this than that of a drift, and others are as good that have less
 than this more; of those within the second, the likely one is named."""
@@ -229,11 +229,11 @@ def _by_evidence(
     Points of one object, or wrong ones in one place, do not decide: it is better without each part of them in turn.
     No drift mirrors an image.
     """
-    limit = LARGEST_REMAINDER * figures[0].penalised_misfit
+    limit = LARGEST_REMAINDER[0] * figures[0].penalised_misfit
     some = [i for i in order if i and figures[i].penalised_misfit <= limit][:MOST_COMPARED]
     if not some:
         return 0, []
-    limit = figures[some[0]].penalised_misfit / LARGEST_REMAINDER + EQUAL[1]
+    limit = figures[some[0]].penalised_misfit / LARGEST_REMAINDER[1] + EQUAL[1]
     some = [i for i in some if figures[i].penalised_misfit <= limit]
     found = {i: DriftEvidence.of(tried[i].repair(rig), pairs, inliers, noise) for i in some}
     given = DriftEvidence.of(rig, pairs, inliers, noise)
@@ -251,7 +251,9 @@ def _by_evidence(
     )
     named = mirrored or clear
     bound = MARGIN + (least if named else min(least, given.surprise))
-    return best if named else 0, [i for i in some if found[i].surprise <= bound]
+    near = EQUAL[0] * figures[best].penalised_misfit + EQUAL[1] if named else 0.0
+    as_good = [i for i in some if found[i].surprise <= bound or figures[i].penalised_misfit <= near]
+    return best if named else 0, as_good
 
 
 def _same_rig(rig: Rig, other: Rig, pairs: Pairs) -> bool:

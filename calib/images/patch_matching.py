@@ -82,7 +82,7 @@ def _step(
     both, power, own = ((a * b) @ weight for a, b in ((seen, wanted), (seen, seen), (wanted, wanted)))
     gain = (both / (power + 1e-6))[:, None]
     J = np.stack([across, down, *(slope * part for slope in (across, down) for part in around.T)], -1)
-    J = gain[..., None] * (J - np.einsum("p,npi->ni", weight, J)[:, None])
+    J = gain[..., None] * (J - (weight @ J)[:, None])
     weighted = (weight[:, None] * J).swapaxes(1, 2)
     H = weighted @ J
     H += np.eye(6) * (1e-3 * np.trace(H, axis1=1, axis2=2)[:, None, None] / 6 + 1e-9)

@@ -84,17 +84,25 @@ class WarmUp:
     """Compile the kernels that `pat fuse` uses, once for this machine, so that no later command waits for it."""
 
     def run(self) -> None:
-        """Compile the kernels by fusing the sample array once."""
+        """Compile the kernels by fusing the sample array once: with noise, and as two betas with lenses."""
+        import torch
+
+        from arraygeom import Distortion
         from arraygeom.compiled import cache_folder
 
         from ..attention.kernels import forward
         from ..data.sample_array import ALPHA, load_sample
         from ..fusion.fuse import fuse
         from ..networks.weights import load_weights
+        from ..sensors import NoiseLevel
 
         options.say_when_compiling()
         sample, begin = load_sample(), time.monotonic()
-        fuse(load_weights("mono-colour"), sample.rig, sample.images, alpha=ALPHA)
+        colour = sample.rig["colour"].replace(distortion=Distortion("brown-conrady", torch.full((4,), -1e-3).double()))
+        rig = sample.rig.with_camera("colour", colour).with_camera("second", colour)
+        images = {**sample.images, "second": sample.images["colour"]}
+        noise = dict.fromkeys(images, NoiseLevel.of_electrons(300))
+        fuse(load_weights("mono-colour"), rig, images, alpha=ALPHA, noise=noise)
         folder = cache_folder(forward)
         kept = "" if folder is None else f", kept in {folder}"
         say(f"kernels are ready: {time.monotonic() - begin:.0f} s{kept}")

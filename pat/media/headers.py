@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import re
 import struct
-from typing import NamedTuple
+from io import BytesIO
+from typing import Any, NamedTuple
 
-from arraygeom.image_bytes import PNG, TIFF, png_chunks, tiff_entries
+import numpy as np
+from PIL import Image
+from PIL.BmpImagePlugin import BmpImageFile
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.WebPImagePlugin import WebPImageFile
+
+from arraygeom.image_bytes import DAMAGED, PNG, TIFF, first_tiff_page, png_chunks
 
 HW = tuple[int, int]
 
-_WIDTH, _HEIGHT, _BITS, _ORIENTATION = 256, 257, 258, 274
+_ORIENTATION = 274
+_FILES: dict[bytes, Any] = {b"\xff\xd8": JpegImageFile, b"RI": WebPImageFile, b"BM": BmpImageFile}
+"""By their first bytes. Not `Image.open`, which refuses sizes that are expected here."""
 
 
 class ImageHeader(NamedTuple):
@@ -36,88 +45,47 @@ def image_header(content: bytes) -> ImageHeader | None:
     try:
         if content.startswith(PNG):
             return _png(content)
-        if content.startswith(b"\xff\xd8"):
-            return _jpeg(content)
         if content[:4] in TIFF:
             return _tiff(content)
-        if content.startswith(b"RIFF") and content[8:12] == b"WEBP":
-            return _webp(content)
-        return _bmp(content) if content.startswith(b"BM") else _pnm(content)
-    except (struct.error, IndexError, KeyError, ValueError):
+        if content[:2] not in _FILES:
+            return _pnm(content)
+        image = _FILES[content[:2]](BytesIO(content))
+    except DAMAGED:
         return None
+    return ImageHeader(image.size[::-1], _exif_orientation(image.info.get("exif", b"")))
 
 
 def _png(content: bytes) -> ImageHeader:
+    """By hand: Pillow decodes the image to find a tag behind it."""
     width, height = struct.unpack_from(">II", content, 16)
-    orientation = 1
-    for kind, start, end in png_chunks(content):
-        if kind == b"eXIf":
-            orientation = _exif_orientation(content[start + 8 : end - 4])
-    return ImageHeader((height, width), orientation, content[24])
-
-
-def _jpeg(content: bytes) -> ImageHeader | None:
-    at, orientation = 2, 1
-    while at + 4 <= len(content):
-        marker, length = struct.unpack_from(">HH", content, at)
-        if marker == 0xFFFF:
-            at += 1
-            continue
-        if marker == 0xFFE1 and content[at + 4 : at + 10] == b"Exif\0\0":
-            orientation = _exif_orientation(content[at + 10 : at + 2 + length])
-        # Start of a frame; C4, C8 and CC are tables.
-        if 0xFFC0 <= marker <= 0xFFCF and marker not in (0xFFC4, 0xFFC8, 0xFFCC):
-            return ImageHeader(struct.unpack_from(">HH", content, at + 5), orientation)
-        at += 2 + length
-    return None
-
-
-def _webp(content: bytes) -> ImageHeader | None:
-    at, orientation, size = 12, 1, None
-    while at + 8 <= len(content):
-        kind, length = struct.unpack_from("<4sI", content, at)
-        data = content[at + 8 : at + 8 + length]
-        if kind == b"VP8X":
-            size = 1 + int.from_bytes(data[7:10], "little"), 1 + int.from_bytes(data[4:7], "little")
-        elif kind == b"VP8 " and size is None:
-            width, height = struct.unpack_from("<HH", data, 6)
-            size = height & 0x3FFF, width & 0x3FFF
-        elif kind == b"VP8L" and size is None:
-            packed = struct.unpack_from("<I", data, 1)[0]
-            size = 1 + (packed >> 14 & 0x3FFF), 1 + (packed & 0x3FFF)
-        elif kind == b"EXIF":
-            orientation = _exif_orientation(data.removeprefix(b"Exif\0\0"))
-        at += 8 + length + length % 2
-    return ImageHeader(size, orientation) if size else None
-
-
-def _bmp(content: bytes) -> ImageHeader:
-    old = struct.unpack_from("<I", content, 14)[0] == 12
-    width, height = struct.unpack_from("<HH" if old else "<ii", content, 18)
-    return ImageHeader((abs(height), width))
+    tags = [content[start + 8 : end - 4] for kind, start, end in png_chunks(content) if kind == b"eXIf"]
+    return ImageHeader((height, width), _exif_orientation(tags[-1] if tags else b""), content[24])
 
 
 def _pnm(content: bytes) -> ImageHeader | None:
+    """By hand: Pillow does not state the bits."""
     gap = rb"(?:\s|#[^\n]*\n)+"
     found = re.match(rb"P[1-6]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})\s(?:\s*(\d{1,5})\s)?", content[:4096])
     return ImageHeader((int(found[2]), int(found[1])), bits=16 if int(found[3] or 0) > 255 else 8) if found else None
 
 
-def _tiff(content: bytes) -> ImageHeader:
-    entries = tiff_entries(content)
-    tag = entries.get(_ORIENTATION)
-    bits = entries[_BITS].value if _BITS in entries else 1
-    size = entries[_HEIGHT].value, entries[_WIDTH].value
-    return ImageHeader(size, _known(tag.value) if tag else 1, bits, (tag.place, tag.form) if tag else None)
+def _tiff(content: bytes) -> ImageHeader | None:
+    page = first_tiff_page(content)
+    tag, bits = page.tags.get(_ORIENTATION), int(np.max(page.bitspersample))
+    place = (tag.valueoffset, page.parent.byteorder + tag.dataformat) if tag else None
+    hw = int(page.imagelength), int(page.imagewidth)
+    return ImageHeader(hw, _known(tag.value) if tag else 1, bits, place) if min(hw) > 0 else None
 
 
 def _exif_orientation(exif: bytes) -> int:
-    """Of an Exif block, which is a TIFF file without an image; 1 if it is damaged."""
+    """Of an Exif block; 1 if it is damaged."""
+    tags = Image.Exif()
     try:
-        return _known(tiff_entries(exif).get(_ORIENTATION, (1,))[0])
-    except (struct.error, IndexError, ValueError):
+        tags.load(exif)
+        return _known(tags.get(_ORIENTATION, 1))
+    except DAMAGED:
         return 1
 
 
-def _known(orientation: int) -> int:
-    return orientation if 1 <= orientation <= 8 else 1
+def _known(orientation: object) -> int:
+    return int(orientation) if isinstance(orientation, int) and 1 <= orientation <= 8 else 1

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
-from torch.nn.functional import avg_pool2d, conv2d, pad
+from torch.nn.functional import avg_pool2d, pad
 
 from ..media.colour import linear_from_srgb, srgb_from_linear
 from .steps import normal
@@ -70,7 +70,7 @@ class NoiseLevel:
         """
         if min(image.shape[-2:]) < SIDE + 2:
             return cls()
-        value, variance = _smoothest(image.double())
+        value, variance = (found.double() for found in _smoothest(image))
         if not len(value) or not float(variance.max()) > 0:
             return cls()
         fits = [_fitted(added_to, value, variance) for added_to in ("light", "values")]
@@ -127,11 +127,9 @@ def _smoothed(image: Tensor) -> Tensor:
 
 def _smoothest(image: Float[Tensor, "1 c h w"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
     """Values, and the variance of the noise there: of the blocks of about each value those that vary least."""
-    c = image.shape[1]
-    kernel = image.new_tensor([[1, -2, 1], [-2, 4, -2], [1, -2, 1]]).expand(c, 1, 3, 3) / 6
     inner = image[..., 1:-1, 1:-1]
-    rough = avg_pool2d(conv2d(image, kernel, groups=c).square(), SIDE)
-    mean, empty = avg_pool2d(inner, SIDE), avg_pool2d((inner <= 0).double(), SIDE)
+    rough = avg_pool2d((image.diff(n=2, dim=-1).diff(n=2, dim=-2) / 6).square(), SIDE)
+    mean, empty = avg_pool2d(inner, SIDE), avg_pool2d((inner <= 0).to(inner), SIDE)
     unclipped = (empty < 0.02) & (mean < 0.95)
     mean, rough = mean[unclipped], rough[unclipped]
     groups = mean.argsort().split(max(-(-len(mean) // GROUPS), FEWEST)) if len(mean) else ()

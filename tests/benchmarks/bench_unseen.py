@@ -3,7 +3,9 @@
     python -m tests.benchmarks.bench_unseen DATA [--half report] [--out tests/benchmarks/RESULTS_unseen.md]
 
 PSNR (dB) by region, mean over Middlebury's pairs of one half of `experiments/evaluation/halves.yaml` in the folder
-DATA, beta reduced 2x. The best choice is made with the ground truth, for each block of 16x16 pixels.
+DATA, beta reduced 2x. The best choice is made with the ground truth, for each block of 16x16 pixels. The second table
+is of the network's choice by the distance from what beta sees: *strength* is the factor of the true chroma that is
+nearest to the chroma filled in, the *gains* are over alpha's grey image, of pairs with 500 such pixels.
 """
 
 from __future__ import annotations
@@ -11,11 +13,16 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
+from statistics import fmean
 from types import MethodType
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, one_hot
 
@@ -27,12 +34,17 @@ from pat.evaluation.baseline import classical_fusion
 from pat.evaluation.protocols import mono_colour_task, rectified_fusion
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.matching.colour_transfer import FILLS
+from pat.media.colour import to_luma_chroma
 from pat.networks.guided import BetaEstimate, Encoded, GuidedPAT
 from tests.benchmarks.printed import print_tables
 
 REGIONS = ("whole", "seen", "occluded", "beyond")
 BLOCK = 16
 """Sides of the blocks of the best choice, pixels."""
+DISTANCES = (0, 4, 12, 24, 48, 96, 192)
+"""Bounds of the second table's rows, pixels."""
+LEAST = 500
+"""Least number of pixels of a pair for a row."""
 FILL_NAMES = ("propagated", "diffused by brightness", "diffused")
 
 
@@ -70,11 +82,37 @@ def best(images: list[Tensor], truth: Tensor) -> Tensor:
     return torch.stack(images).gather(0, which.expand(1, 3, h, w))[0]
 
 
-def table(pairs: list[StereoPair]) -> Iterator[str]:
-    """A row for each way to fill: means over the pairs that have such pixels."""
+class Unseen(NamedTuple):
+    """What is filled in at some pixels of a pair: the gain over grey in dB, and how strong the colours are."""
+
+    gain: float
+    strength: float
+
+
+def by_distance(
+    image: Float[Tensor, "3 h w"], truth: Float[Tensor, "3 h w"], seen: Bool[Tensor, "h w"], known: Bool[Tensor, "h w"]
+) -> dict[int, Unseen]:
+    """What is filled in at the known pixels that are not seen, by the lower bound of their distance from seen ones."""
+    distance = torch.from_numpy(distance_transform_edt(~seen.numpy()))
+    luma, chroma = to_luma_chroma(truth)
+    filled = to_luma_chroma(image)[1]
+    errors = [(each - truth).square().mean(0) for each in (image, luma.expand_as(truth))]
+    found = {}
+    for low, high in pairwise((*DISTANCES, math.inf)):
+        at = known & (distance > low) & (distance <= high)
+        if int(at.sum()) >= LEAST:
+            own, grey = (float(error[at].mean()) for error in errors)
+            strength = (filled * chroma).sum(0)[at].sum() / chroma.square().sum(0)[at].sum()
+            found[low] = Unseen(10 * math.log10(grey / own), float(strength))
+    return found
+
+
+def tables(pairs: list[StereoPair]) -> tuple[list[str], list[str]]:
+    """A row for each way to fill: means over the pairs that have such pixels; a row for each distance."""
     network = load_weights("mono-colour")
     assert isinstance(network, GuidedPAT)
     found: dict[str, list[dict[str, float]]] = {}
+    distances: dict[int, list[Unseen]] = {low: [] for low in DISTANCES}
     for pair in pairs:
         images, truth = images_of(network, pair)
         regions = regions_of(pair, (truth.shape[-2], truth.shape[-1]))
@@ -83,10 +121,28 @@ def table(pairs: list[StereoPair]) -> Iterator[str]:
             found.setdefault(name, []).append(
                 {n: -10 * math.log10(float(error[at].mean())) for n, at in regions.items() if at.any()}
             )
+        if "seen" in regions:
+            known = regions["occluded"] | regions["beyond"]
+            for low, unseen in by_distance(images["chosen"], truth, regions["seen"], known).items():
+                distances[low].append(unseen)
+    return list(by_fill(found)), list(by_distances(distances))
+
+
+def by_fill(found: dict[str, list[dict[str, float]]]) -> Iterator[str]:
     yield from markdown_header(["unseen colour", *REGIONS]).splitlines()
     for name, rows in found.items():
         means = (np.mean([row[region] for row in rows if region in row]) for region in REGIONS)
         yield markdown_row([name, *(f"{mean:.2f}" for mean in means)])
+
+
+def by_distances(found: dict[int, list[Unseen]]) -> Iterator[str]:
+    yield from markdown_header(["pixels from what beta sees", "pairs", "strength", "gain", "least gain"]).splitlines()
+    for (low, rows), high in zip(found.items(), (*DISTANCES[1:], math.inf)):
+        if rows:
+            label = f"over {low}" if high == math.inf else f"{low} to {high}"
+            gains, strengths = zip(*rows)
+            means = f"{fmean(strengths):.2f}", f"{fmean(gains):.1f} dB"
+            yield markdown_row([label, str(len(rows)), *means, f"{min(gains):.1f} dB"])
 
 
 def main() -> None:
@@ -96,7 +152,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     pairs = list(of_half(middlebury_pairs(args.data / "middlebury"), args.half))
-    print_tables("Colour where beta does not see", [table(pairs)], args.out)
+    print_tables("Colour where beta does not see", tables(pairs), args.out)
 
 
 if __name__ == "__main__":

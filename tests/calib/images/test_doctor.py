@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Link, Pose, Rig, View, rotation_from_vector
+from arraygeom import Link, Pose, Rig, View, rotation_from_vector, triangulate
 from arraygeom.pose import rotation_vector
 from calib.images.doctor import diagnose, diagnose_matches
 from calib.images.least_squares import most_probable
@@ -275,3 +275,15 @@ def test_command_line(tmp_path, capsys):
     with pytest.raises(SystemExit, match="4"):
         main(["rig", "doctor", str(tmp_path / "other.yaml"), *files, "--fix", str(tmp_path / "none.yaml")])
     assert not (tmp_path / "none.yaml").exists()
+
+
+def test_points_whose_equations_are_singular_are_invalid():
+    """A rotation in degrees taken for radians leaves a point whose rounded equations cannot be solved."""
+    g = np.random.default_rng([6, 5])
+    rig = simulated_rig("wide", 2, g)
+    (names, matches), *_ = simulated_matches(rig, "wide", g).items()
+    cameras = [
+        camera.replace(cam_from_world=Pose(rotation_from_vector(torch.rad2deg(rotation_vector(camera.R))), camera.t))
+        for camera in rig.pair(*names).cameras
+    ]
+    assert not triangulate(cameras, torch.stack(list(matches))).valid.all()

@@ -206,3 +206,16 @@ def test_that_kernels_are_compiled_is_said_once(monkeypatch):
     for thread in threads:
         thread.join()
     assert len(said) == 1
+
+
+@pytest.mark.slow
+def test_nothing_is_compiled_after_warm_up(tmp_path):
+    """Not by the demo either, which removes noise, nor by cameras with lenses."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+
+    def said(*words):
+        command = [sys.executable, "-m", "pat", *words]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stderr
+
+    assert "compiling kernels" in said("warm-up")
+    assert "compiling" not in said("demo", "--out", str(tmp_path / "demo"))

@@ -323,6 +323,16 @@ def test_headers_state_the_size_of_every_format(tmp_path, suffix, shape):
         image_header(content[:cut])
 
 
+def test_a_tiff_of_two_widths_has_no_header(tmp_path):
+    """What fuzzing found: the width's tag with as many values as the file states, not one."""
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros((3, 4), np.uint8))
+    content = bytearray((tmp_path / "a.tif").read_bytes())
+    with tifffile.TiffFile(tmp_path / "a.tif") as file:
+        place = file.pages.first.tags["ImageWidth"].offset
+    struct.pack_into("<HII", content, place + 2, 3, 2, 4)  # as two values of 16 bits
+    assert image_header(bytes(content)) is None
+
+
 def test_comments_bigtiff_and_damaged_orientation(tmp_path):
     (tmp_path / "a.pgm").write_bytes(b"P5 # by hand\n#\n3\t2\n255\n" + bytes(6))
     assert read_image(tmp_path / "a.pgm").shape == (1, 2, 3)
