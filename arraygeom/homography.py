@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .pixels import map_homogeneous, product, to_homogeneous
+from .robust import LocalModel, levenberg_marquardt
 from .tracing import needs_numbers
 
 
@@ -117,18 +118,16 @@ def _damped_fit(u1: Tensor, v: Tensor) -> Tensor:
     linear = _linear_fit(u1, v)
     linear = linear / torch.where(linear[2, 2] > 0, linear[2, 2], 1.0)
     H = min((affine, linear), key=lambda start: float(_cost(start, u1, v)))
-    damping, cost = 1e-6, _cost(H, u1, v)
-    for _ in range(50):
-        trial = _stepped(H, u1, v, damping)
-        reached = _cost(trial, u1, v)
-        better = bool(reached < cost)
-        if better and bool(cost - reached <= 1e-15 * cost):
-            return trial
-        H, cost = (trial, reached) if better else (H, cost)
-        damping = max(damping / 10, 1e-12) if better else damping * 10
-        if damping > 1e6:
-            break
-    return H
+
+    def model(H: Tensor) -> LocalModel[Tensor]:
+        return LocalModel(
+            float(_cost(H, u1, v)), lambda H: float(_cost(H, u1, v)), lambda damping: _stepped(H, u1, v, damping)
+        )
+
+    def is_converged(_: Tensor, __: Tensor, before: float, after: float) -> bool:
+        return before - after <= 1e-15 * before
+
+    return levenberg_marquardt(H, model, is_converged, steps=50, damping=1e-6)[0]
 
 
 def _linear_fit(u1: Tensor, v: Tensor) -> Tensor:
