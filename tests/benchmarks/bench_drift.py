@@ -57,7 +57,9 @@ def with_lens_mistake(rig: Rig, kind: str) -> Rig | None:
         bare = {name: camera.replace(distortion=None) for name, camera in rig.cameras.items()}
         return rig.replace(cameras=bare) if any(c.distortion is not None for c in rig.cameras.values()) else None
     some = {
-        name: camera.replace(distortion=camera.distortion or Distortion("brown-conrady", torch.zeros(5, dtype=torch.float64)))
+        name: camera.replace(
+            distortion=camera.distortion or Distortion("brown-conrady", torch.zeros(5, dtype=torch.float64))
+        )
         for name, camera in rig.cameras.items()
     }
     change = torch.tensor([float(kind.split()[1]), 0, 0, 0, 0], dtype=torch.float64)
