@@ -1,4 +1,4 @@
-"""Weighted linear least squares, with a prior or without, and the same where some of the values may be wrong.
+"""Weighted least squares: linear, with a prior or without, the same where some values may be wrong, and nonlinear.
 
 Wrong values are down-weighted by iteratively reweighted least squares (Holland and Welsch 1977).
 `terms` (k, n) are what k coefficients are multiplied with in each of n values.
@@ -6,8 +6,9 @@ Wrong values are down-weighted by iteratively reweighted least squares (Holland 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -18,6 +19,10 @@ NORMAL_DEVIATION = 1.4826
 STEPS = 8
 """Size: how often the values are weighted again."""
 
+LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
+"""Size: shares of the information's diagonal that are added to it."""
+
+State = TypeVar("State")
 Weigh = Callable[[Tensor], Float[Tensor, " n"]]
 Precision = Float[Tensor, "k k"] | Callable[[Tensor], Float[Tensor, "k k"]]
 
@@ -90,3 +95,39 @@ def robust_least_squares(
         prior = precision(coefficients) if callable(precision) else precision
         coefficients = least_squares(terms, values, weight, prior)
     return RobustFit(coefficients, values - terms.T @ coefficients, weight)
+
+
+class LocalModel(NamedTuple, Generic[State]):
+    """A cost near a state: its value there, at any state, and the state after a step.
+
+    step: of Gauss and Newton, with the diagonal of the information raised by a share of it, the damping.
+    """
+
+    cost: float
+    cost_of: Callable[[State], float]
+    step: Callable[[float], State]
+
+
+def levenberg_marquardt(
+    state: State,
+    model: Callable[[State], LocalModel[State]],
+    is_converged: Callable[[State, State, float, float], bool],
+    *,
+    steps: int,
+    damping: float,
+) -> tuple[State, bool]:
+    """A state of least cost, and whether it was reached in so many steps: Marquardt's (1963) damping of each.
+
+    The damping rises tenfold until a step does not raise the cost, and falls tenfold after it. `is_converged` takes the
+    states before and after a step, and their costs. A state from which no step leads is of least cost.
+    """
+    for _ in range(steps):
+        before = model(state)
+        while not math.isfinite(cost := before.cost_of(moved := before.step(damping))) or cost > before.cost:
+            damping *= 10
+            if damping >= MOST_DAMPING:
+                return state, True
+        if is_converged(state, moved, before.cost, cost):
+            return moved, True
+        state, damping = moved, max(damping / 10, LEAST_DAMPING)
+    return state, False

@@ -1,6 +1,6 @@
 """Bundle adjustment of a calibration: which parameters the images determine, how boards are shaped, what is left out.
 
-Gauss-Newton with Levenberg's damping (Triggs et al. 2000).
+Gauss-Newton with Marquardt's damping (Triggs et al. 2000).
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+
+from arraygeom.robust import LocalModel, levenberg_marquardt
 
 from .board import Board
 from .bundle import (
@@ -46,6 +48,8 @@ LEAST_NOISE = 1e-3
 """Lower bound of the noise, pixels: perfect corners must not get infinite weight."""
 CONVERGED = 1e-3
 """Iteration ends once a step lowers the loss by less than this, in squared standard deviations."""
+DAMPING = 1e-4
+"""Of the first step."""
 POOLED = 50
 """Each camera's noise is estimated as if it had this many additional residuals of the average noise."""
 UNOBSERVABLE = 0.5
@@ -247,24 +251,17 @@ def _square(r: Array) -> float:
 
 
 def _minimised(problem: BundleProblem, *, iterations: int = 50) -> tuple[BundleProblem, bool]:
-    """Levenberg's loop: the problem, and whether it converged."""
-    least, damping = problem.loss(), 1e-4
-    for _ in range(iterations):
+    """The problem with its loss minimised, and whether that converged."""
+
+    def model(problem: BundleProblem) -> LocalModel[BundleProblem]:
         equations = normal_equations(problem, linearised(problem))
-        while True:
-            trial = problem.stepped(*equations.solve(damping))
-            trial_loss = trial.loss()
-            if trial_loss < least:
-                break
-            damping *= 10
-            if damping > 1e6:
-                return problem, True
-        gained = least - trial_loss
-        problem, least = trial, trial_loss
-        damping = max(damping / 10, 1e-12)
-        if gained < CONVERGED:
-            return problem, True
-    return problem, False
+        return LocalModel(
+            problem.loss(), BundleProblem.loss, lambda damping: problem.stepped(*equations.solve(damping))
+        )
+
+    return levenberg_marquardt(
+        problem, model, lambda _, __, before, after: before - after < CONVERGED, steps=iterations, damping=DAMPING
+    )
 
 
 def _covariance(problem: BundleProblem) -> Array | None:

@@ -6,6 +6,7 @@ free; the rest are considered: uncertain, so that they explain what they may, bu
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from arraygeom.progress import log_step
-from arraygeom.robust import cauchy, normal_deviation, normal_equations
+from arraygeom.robust import LocalModel, cauchy, levenberg_marquardt, normal_deviation, normal_equations
 
 LOG = logging.getLogger(__name__)
 
@@ -27,8 +28,8 @@ FURTHER_STEPS = 6
 """About so many follow, wherever a fit is: they are fewer than `STEPS` in most."""
 CONVERGED = 5e-3
 """Iteration ends at a step of this many prior deviations."""
-DAMPING = 1e-3, 1e9
-"""Of the first step, as a share of the information; and where no step lowers the cost any more."""
+DAMPING = 1e-3
+"""Of the first step."""
 LEAST_NOISE = 0.03
 """Lower bound of the noise of matched points, pixels."""
 
@@ -108,31 +109,29 @@ def left_out(residuals: Residuals, solution: Solution, groups: Int[Tensor, " m"]
 def most_probable(
     residuals: Residuals, z: Float[Tensor, " k"], basis: Float[Tensor, "k m"], *, steps: int = STEPS
 ) -> Float[Tensor, " k"]:
-    """The most probable parameters z + basis y, from z on, by Levenberg and Marquardt.
+    """The most probable parameters z + basis y, from z on, by damped steps.
 
     Undamped steps shortened until the cost falls would stop short where some parameters are hardly observable, as poses
     by a flat scene are.
     """
-    damping = DAMPING[0]
-    for i in range(steps):
-        log_step(LOG, i / (i + FURTHER_STEPS), "step %d of the fit", i + 1)
+    numbers = itertools.count(1)
+
+    def model(z: Tensor) -> LocalModel[Tensor]:
+        log_step(LOG, 1 - FURTHER_STEPS / ((number := next(numbers)) - 1 + FURTHER_STEPS), "step %d of the fit", number)
         r, J = jacobian(residuals, z)
         information, slope = _normal_equations(r, J, z)
         information, slope = basis.T @ information @ basis, basis.T @ slope
-        scale = noise_scale(r)
-        before = _cost(r, z, scale)
-        while damping < DAMPING[1]:
-            damped = information + damping * information.diagonal().diag()
-            step = basis @ torch.linalg.solve(damped, slope)
-            if _cost(residuals(z + step).detach(), z + step, scale) <= before:
-                break
-            damping *= 10
-        else:
-            break
-        z, damping = z + step, max(damping / 10, 1e-9)
-        if float(step.abs().max()) < CONVERGED:
-            break
-    return z
+        scale, diagonal = noise_scale(r), information.diagonal().diag()
+
+        def step(damping: float) -> Tensor:
+            return z + basis @ torch.linalg.solve(information + damping * diagonal, slope)
+
+        return LocalModel(_cost(r, z, scale), lambda z: _cost(residuals(z).detach(), z, scale), step)
+
+    def is_converged(z: Tensor, moved: Tensor, *_: float) -> bool:
+        return float((moved - z).abs().max()) < CONVERGED
+
+    return levenberg_marquardt(z, model, is_converged, steps=steps, damping=DAMPING)[0]
 
 
 def _cost(r: Tensor, z: Tensor, scale: float) -> float:

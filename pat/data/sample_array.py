@@ -29,11 +29,11 @@ class SampleArray(NamedTuple):
     ground_truth: Float[Tensor, "3 h w"]
 
 
-def load_sample(folder: Path = SAMPLE) -> SampleArray:
-    """The sample array, or another one of a folder with the same files."""
-    rig = Rig.load(folder / "rig.yaml")
-    images = {name: read_image(folder / f"{name}.png") for name in rig.names}
-    return SampleArray(rig, {**images, ALPHA: luminance_of(images[ALPHA])}, read_image(folder / "truth.png"))
+def load_sample() -> SampleArray:
+    """The sample array that ships."""
+    rig = Rig.load(SAMPLE / "rig.yaml")
+    images = {name: read_image(SAMPLE / f"{name}.png") for name in rig.names}
+    return SampleArray(rig, {**images, ALPHA: luminance_of(images[ALPHA])}, read_image(SAMPLE / "truth.png"))
 
 
 def load_motorcycle() -> SampleArray:

@@ -19,9 +19,10 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import max_pool2d
 
+from arraygeom.chunks import ROWS, Tile, assembled, tiles_of
+
 from ..support.settings import size
 from .filters import box_mean
-from .inputs import Inputs
 from .matches import BetaMatches, Matches
 from .positions import FINE
 from .semi_global import CONSISTENT
@@ -74,24 +75,26 @@ def fitted_network() -> CertaintyNetwork:
 
 
 @torch.no_grad()
-def with_certainty(inputs: Inputs, matches: Matches) -> Matches:
+def with_certainty(matches: Matches) -> Matches:
     """The matches, with the certainty of each.
 
     Of matches on which several betas agree, whose certainty alone was known before: a beta sees a point only
     if both say so.
     """
-    return Matches(tuple(_judged(inputs, found) for found in matches.betas))
+    return Matches(tuple(map(_judged, matches.betas)))
 
 
-def _judged(inputs: Inputs, found: BetaMatches) -> BetaMatches:
-    typical = typical_facts(found)
+def _judged(found: BetaMatches) -> BetaMatches:
+    typical, (h, w) = typical_facts(found), found.disparity.shape[-2:]
+    bare = replace(found, bands=None, diffused=None, certainty=None)
 
-    def of(_: Inputs, part: BetaMatches) -> Tensor:
-        numbers = measured(part, typical).movedim(1, -1)
+    def of(tile: Tile) -> Tensor:
+        numbers = measured(bare.cut(tile.outer), typical).movedim(1, -1)
         logit, half_width = fitted_network().to(numbers)(numbers).unbind(-1)
         return torch.stack([logit.sigmoid(), half_width.exp()], 1)
 
-    certainty = inputs.in_pieces(of, replace(found, bands=None, diffused=None, certainty=None))
+    halo = FINE * max(SETTINGS.around + SETTINGS.apart)
+    certainty = assembled((h, w), ((tile, of(tile)) for tile in tiles_of((h, w), (FINE * ROWS, w), halo)))
     if found.certainty is not None:
         certainty[:, :1] = certainty[:, :1].minimum(found.certainty[:, :1])
     return replace(found, certainty=certainty)

@@ -112,9 +112,10 @@ class Inputs:
         """Whether the beta is one of several of which some show all bands of the result, and shows them."""
         return len(self.betas) > 1 and beta.image.shape[1] == self.bands
 
-    def of_beta(self, i: int) -> Inputs:
-        """The same with one beta alone."""
-        return replace(self, betas=self.betas[i : i + 1])
+    @property
+    def by_beta(self) -> list[Inputs]:
+        """The same with each beta alone."""
+        return [replace(self, betas=(beta,)) for beta in self.betas]
 
     def cut(self, box: Box) -> Inputs:
         """A part of alpha, (top, bottom, left, right), with the part of each beta that its segments touch."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -18,14 +18,14 @@ from arraygeom import Segments
 from ..support.settings import size
 from .certainty import with_certainty
 from .colour_transfer import transferred
-from .inputs import Beta, Inputs
+from .inputs import Inputs
 from .matches import BetaMatches, Matches, is_consistent
 from .multiview import agreed
 from .normalisation import Comparison
 from .positions import FINE, at_matches, reduced
 from .semi_global import HalfSizeMatches, matched_at_half_size
 from .spectral_mix import SpectralMix
-from .subpixel import matched_at_full_size, with_gradients
+from .subpixel import following, matched_at_full_size
 
 LOG = logging.getLogger(__name__)
 
@@ -54,29 +54,16 @@ def match(inputs: Inputs) -> Matches:
     """
     found = located(inputs)
     if torch.is_grad_enabled():
-        found = Matches(tuple(_following(inputs.alpha, *one) for one in zip(inputs.betas, found.betas)))
-    found = with_certainty(inputs, found)
-    return transferred(inputs, found)
-
-
-def _following(alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaMatches:
-    """The matches, which follow images and segments that have gradients."""
-    segments, comparison = beta.field.straight, found.comparison
-    if not any(x.requires_grad for x in (alpha, beta.image, segments.start, segments.end)):
-        return found
-    views = comparison.views(alpha, beta.image)
-    return replace(found, disparity=with_gradients(views, segments, found.disparity))
+        found = following(inputs, found)
+    return transferred(inputs, with_certainty(found))
 
 
 @torch.no_grad()
 def located(inputs: Inputs) -> Matches:
     """Where alpha's pixels are in each beta, without colours; of several calibrated betas, where all
     agree."""
-    alone = Matches(tuple(located_in_one(inputs.of_beta(i)) for i in range(len(inputs.betas))))
-    if not inputs.can_agree:
-        return alone
-    alone = with_certainty(inputs, alone)
-    return agreed(inputs, alone)
+    alone = Matches(tuple(located_in_one(one) for one in inputs.by_beta))
+    return agreed(inputs, with_certainty(alone)) if inputs.can_agree else alone
 
 
 def located_in_one(inputs: Inputs) -> BetaMatches:

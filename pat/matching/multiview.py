@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, depth_from_track, pixel_grid
-from arraygeom.chunks import Box, spans
+from arraygeom.chunks import Tile, assembled, spans
 from arraygeom.epipolar import FRONT, Track
 
 from ..media.colour import to_bytes
@@ -222,12 +222,6 @@ class Agreement(NamedTuple):
         facts = avg_pool2d(torch.stack([margin, cost]), FINE)
         return cls(inverse_depth[None].to(like), taken.any(0)[None], facts.to(like))
 
-    def cut(self, box: Box) -> Agreement:
-        """The part at alpha's (top, bottom, left, right), of inverse depth; facts are whole."""
-        top, bottom, left, right = box
-        part = (slice(None), slice(top, bottom), slice(left, right))
-        return self._replace(inverse_depth=self.inverse_depth[part], known=self.known[part])
-
 
 def agreed(inputs: Inputs, matches: Matches) -> Matches:
     """The matches of each beta, with `disparity` and `facts` from the inverse depths on which all agree."""
@@ -321,15 +315,19 @@ def _agree(terms: Tensor, own: Tensor, rise: Tensor, solutions: Float[Tensor, "k
 def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
     """Inverse depth diffused to where no match is consistent, and without outliers."""
 
-    def of(piece: Inputs, part: Agreement) -> Tensor:
-        plane, known = part.inverse_depth.cpu().numpy(), part.known.cpu().numpy()
-        smooth = filled(
-            plane, known[0].astype(np.float32) + 1e-5, to_bytes(piece.alpha[0, 0]), DISPARITY_FILL
-        )
-        median = cv2.medianBlur(np.where(known, plane, smooth)[0], 5)
-        return torch.from_numpy(median)[None].to(piece.alpha)
+    guide = to_bytes(inputs.alpha[0, 0])
+    plane, known = (part.cpu().numpy() for part in (agreement.inverse_depth, agreement.known))
 
-    return agreement._replace(inverse_depth=inputs.in_pieces(of, agreement))
+    def of(tile: Tile) -> Tensor:
+        top, bottom, left, right = tile.outer
+        part = (..., slice(top, bottom), slice(left, right))
+        weight = known[0][part].astype(np.float32) + 1e-5
+        smooth = filled(plane[part], weight, guide[part], DISPARITY_FILL)
+        median = cv2.medianBlur(np.where(known[part], plane[part], smooth)[0], 5)
+        return torch.from_numpy(median)[None].to(inputs.alpha)
+
+    tiles = ((tile, of(tile)) for tile in inputs.pieces)
+    return agreement._replace(inverse_depth=assembled(inputs.hw, tiles))
 
 
 def _of_beta(

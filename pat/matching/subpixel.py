@@ -8,7 +8,7 @@ size.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
@@ -23,6 +23,8 @@ from arraygeom import Segments
 
 from ..support.settings import size, tuned
 from .filters import box_mean, filled, numpy_of
+from .inputs import Beta, Inputs
+from .matches import BetaMatches, Matches
 from .normalisation import ComparedViews
 from .positions import FINE, Extent, at_matches, matches
 from .semi_global import CONSISTENT, SemiGlobalSettings, Windows, geometry_of, matched_by_labels
@@ -94,6 +96,19 @@ def _precise(
         [filled(d, w, _surfaces(d[0], brightness), SETTINGS.surface) for d, w, brightness in planes]
     )
     return torch.from_numpy(smooth).to(disparity)
+
+
+def following(inputs: Inputs, found: Matches) -> Matches:
+    """The matches, which follow images and segments that have gradients."""
+    return Matches(tuple(_following(inputs.alpha, *one) for one in zip(inputs.betas, found.betas)))
+
+
+def _following(alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaMatches:
+    segments = beta.field.straight
+    if not any(x.requires_grad for x in (alpha, beta.image, segments.start, segments.end)):
+        return found
+    views = found.comparison.views(alpha, beta.image)
+    return replace(found, disparity=with_gradients(views, segments, found.disparity))
 
 
 def with_gradients(

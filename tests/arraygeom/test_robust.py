@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom.robust import Precision, cauchy, gaussian, least_squares, normal_deviation, robust_least_squares
+from arraygeom.robust import (
+    LocalModel,
+    Precision,
+    cauchy,
+    gaussian,
+    least_squares,
+    levenberg_marquardt,
+    normal_deviation,
+    robust_least_squares,
+)
 
 TRUE = torch.tensor([0.5, -1.0, 2.0]).double()
 
@@ -82,3 +91,42 @@ def test_the_deviation_of_normal_values_by_their_median():
     noise = torch.randn(100_000, generator=torch.Generator().manual_seed(0))
     assert normal_deviation(0.3 * noise, 0.0) == pytest.approx(0.3, rel=0.01)
     assert normal_deviation(0 * noise, 0.05) == 0.05
+
+
+def rosenbrock(x: torch.Tensor) -> torch.Tensor:
+    """Its residuals, 0 at (1, 1)."""
+    return torch.stack([10 * (x[1] - x[0] ** 2), 1 - x[0]])
+
+
+def descent(start: list[float], steps: int = 50, where_known: float = torch.inf) -> tuple[torch.Tensor, bool]:
+    """Rosenbrock's function minimised; its cost is NaN from a distance of the origin on."""
+
+    def cost(x: torch.Tensor) -> float:
+        return float(rosenbrock(x).square().sum()) if float(x.norm()) < where_known else float("nan")
+
+    def model(x: torch.Tensor) -> LocalModel[torch.Tensor]:
+        J, r = torch.func.jacrev(rosenbrock)(x), rosenbrock(x)
+        information = J.T @ J
+
+        def step(damping: float) -> torch.Tensor:
+            return x - torch.linalg.solve(information + damping * information.diagonal().diag(), J.T @ r)
+
+        return LocalModel(cost(x), cost, step)
+
+    first = torch.tensor(start, dtype=torch.float64)
+    return levenberg_marquardt(first, model, lambda *states: states[3] < 1e-20, steps=steps, damping=1e-3)
+
+
+def test_damped_steps_follow_a_curved_valley():
+    found, converged = descent([-1.2, 1.0])
+    assert converged
+    torch.testing.assert_close(found, torch.ones(2).double())
+    assert not descent([-1.2, 1.0], steps=3)[1]
+
+
+def test_a_step_to_where_there_is_no_cost_is_not_made():
+    """The undamped step from (-1.2, 1) goes to (1, -3.8)."""
+    torch.testing.assert_close(descent([-1.2, 1.0], where_known=2.0)[0], torch.ones(2).double())
+    found, converged = descent([-1.2, 1.0], where_known=1e-9)  # there is nowhere to go
+    assert converged
+    assert found.tolist() == [-1.2, 1.0]

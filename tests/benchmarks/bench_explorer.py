@@ -40,7 +40,8 @@ const frame = () => new Promise(requestAnimationFrame);
   for (let i = 0; i <= points; i++) {
     const box = canvas.getBoundingClientRect(), before = caption.textContent, start = performance.now();
     canvas.dispatchEvent(new PointerEvent('pointermove', { bubbles: true,
-      clientX: box.left + box.width * (0.2 + 0.6 * i / points), clientY: box.top + box.height * (0.3 + 0.01 * (i % 40)) }));
+      clientX: box.left + box.width * (0.2 + 0.6 * i / points),
+      clientY: box.top + box.height * (0.3 + 0.01 * (i % 40)) }));
     while (caption.textContent === before && performance.now() - start < 5000) await frame();
     if (i) times.push(performance.now() - start);
   }

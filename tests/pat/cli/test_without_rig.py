@@ -207,7 +207,7 @@ def test_videos_are_read_as_they_were_written(tmp_path):
 
 
 def test_focal_lengths_come_from_exif(tmp_path):
-    from pat.media.exif import focal_length
+    from pat.media.headers import focal_length
 
     def saved(width=400, height=300, **tags):
         image, exif = Image.new("L", (width, height)), Image.Exif()

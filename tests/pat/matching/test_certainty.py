@@ -10,7 +10,7 @@ from experiments.evaluation.certainty import Reliability
 from pat.data.sample_array import load_motorcycle, load_sample
 from pat.fusion.fuse import fuse
 from pat.fusion.results import Frame
-from pat.matching import inputs as pieces
+from pat.matching import certainty
 from pat.matching.certainty import MEASURED, measured, typical_facts, with_certainty
 from pat.matching.match import match
 from pat.matching.matches import BetaMatches, Matches
@@ -59,10 +59,10 @@ def kept():
 
 
 def test_pieces_are_as_certain_as_the_whole(kept, monkeypatch):
-    inputs, found, *_ = kept
-    monkeypatch.setattr(pieces, "SETTINGS", replace(pieces.SETTINGS, at_once=60_000, halo=64))
-    assert len(inputs.pieces) > 3
-    again = with_certainty(inputs, found)
+    _, found, *_ = kept
+    monkeypatch.setattr(certainty, "ROWS", 32)
+    assert found.hw[0] > 5 * 64
+    again = with_certainty(found)
     torch.testing.assert_close(again.betas[0].certainty, found.betas[0].certainty, atol=1e-5, rtol=1e-4)
 
 
@@ -125,8 +125,8 @@ def test_interval_is_of_the_pixels_that_it_says():
 
 
 def test_a_beta_that_was_doubted_alone_is_doubted_where_several_agree(kept):
-    inputs, found, *_ = kept
+    _, found, *_ = kept
     doubted = replace(found.betas[0], certainty=0.25 * found.betas[0].certainty)
-    again = with_certainty(inputs, Matches((doubted,))).betas[0].certainty
+    again = with_certainty(Matches((doubted,))).betas[0].certainty
     torch.testing.assert_close(again[:, 0], doubted.certainty[:, 0])
     torch.testing.assert_close(again[:, 1], found.betas[0].certainty[:, 1])

@@ -248,7 +248,7 @@ def test_betas_whose_lengths_do_not_fit_agree_all_the_same(network, scene):
 
 def located_alone(inputs):
     """Each beta's own matches."""
-    return [located(inputs.of_beta(i)).betas[0] for i in range(len(inputs.betas))]
+    return [located(one).betas[0] for one in inputs.by_beta]
 
 
 def test_a_plane_is_no_ambiguity():
