@@ -138,7 +138,8 @@ def in_jupyter(driver: Any, folder: Path, network: str, points: int) -> list[flo
     with server(command, folder) as address:
         base = address.split("/lab")[0].split("/tree")[0].rstrip("/")
         driver.get(f"{base}/lab/tree/explorer.ipynb")
-        begun = "return ![null, '[ ]:'].includes(document.querySelector('.jp-CodeCell .jp-InputPrompt')?.textContent ?? null)"
+        begun = """const prompt = document.querySelector('.jp-CodeCell .jp-InputPrompt');
+            return prompt && prompt.textContent !== '[ ]:'"""
         end = time.monotonic() + 120
         while not driver.execute_script(begun):
             if time.monotonic() > end:
