@@ -76,7 +76,7 @@ def test_what_is_refused(tmp_path):
     path.write_bytes(b"SQLite format 3\0" + bytes(100))
     with pytest.raises(ValueError, match="not a COLMAP database"):
         read_matches(path, FILES, SIZES)
-    with pytest.raises(FileNotFoundError, match="none.csv"):
+    with pytest.raises(FileNotFoundError, match=r"none\.csv"):
         read_matches(tmp_path / "none.csv", FILES, SIZES)
     database(tmp_path / "other.db", first="c.png")
     with pytest.raises(ValueError, match=r"a.png .*c.png, b.png"):

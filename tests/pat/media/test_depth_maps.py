@@ -46,7 +46,7 @@ def test_the_scale_that_our_own_file_states_is_taken(tmp_path):
 
 
 def test_what_is_no_depth_map_is_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match="none.tif"):
+    with pytest.raises(FileNotFoundError, match=r"none\.tif"):
         read_depth(tmp_path / "none.tif")
     tifffile.imwrite(tmp_path / "float.tif", DEPTH.numpy())
     with pytest.raises(ValueError, match=r"30x20, .*30x21"):
