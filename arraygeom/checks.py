@@ -172,13 +172,13 @@ def check_pixels(x: Any) -> None:
         raise ValueError(f"the pixels have shape {tuple(x.shape)}; wanted (..., 2), each (x, y)")
 
 
-def check_field(field: Any, where: str = "") -> None:
+def check_field(field: Any) -> None:
     """Raises TypeError unless it is a field that can be called: not its class."""
     if isinstance(field, type):
-        raise TypeError(f"{where}{field.__name__} is a class: make a field of it, {field.__name__}()")
+        raise TypeError(f"{field.__name__} is a class: make a field of it, {field.__name__}()")
     if not callable(field):
         raise TypeError(
-            f"{where}a field is a function of a pair and alpha's pixels, this is a {type(field).__name__}: "
+            f"a field is a function of a pair and alpha's pixels, this is a {type(field).__name__}: "
             "give a field such as Epipolar()"
         )
 

@@ -86,12 +86,12 @@ def fit_similarity(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Te
     return _affine(linear, y_mean - linear @ x_mean).to(dtype)
 
 
-def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], *, steps: int = 10) -> Float[Tensor, "3 3"]:
+def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Tensor, "3 3"]:
     """The homography that takes x nearest to y, least squares in the pixels of y; n >= 4.
 
     Levenberg and Marquardt's steps from the better of the affine and the linear fit (Hartley & Zisserman, algorithm
     4.2), on points centred and scaled (section 4.4), computed in float64; oriented so that the scale is positive at the
-    points. Differentiable, through `steps` of Gauss and Newton at the end. Raises ValueError where there is no such
+    points. Differentiable, through ten steps of Gauss and Newton at the end. Raises ValueError where there is no such
     homography: points on a line, or some that would be behind.
     """
     needs_numbers("the number of steps of fit_homography", x, y)
@@ -101,7 +101,7 @@ def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], *, steps: i
     u, v = x @ A[:2, :2].T + A[:2, 2], y @ B[:2, :2].T + B[:2, 2]
     u1 = to_homogeneous(u)
     H = _damped_fit(u1.detach(), v.detach())
-    for _ in range(steps):
+    for _ in range(10):
         trial = _stepped(H, u1, v, 1e-12)
         with torch.no_grad():
             kept = _cost(trial, u1, v) <= _cost(H, u1, v) * (1 + 1e-9) + 1e-24
@@ -112,7 +112,7 @@ def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], *, steps: i
 
 
 @torch.no_grad()
-def _damped_fit(u1: Tensor, v: Tensor, iterations: int = 50) -> Tensor:
+def _damped_fit(u1: Tensor, v: Tensor) -> Tensor:
     """The least squares homography of normalised points, H[2, 2] = 1 where possible."""
     affine = torch.cat([torch.linalg.lstsq(u1, v).solution.T, u1.new_tensor([[0.0, 0.0, 1.0]])])
     linear = _linear_fit(u1, v)
@@ -127,7 +127,7 @@ def _damped_fit(u1: Tensor, v: Tensor, iterations: int = 50) -> Tensor:
     def is_converged(_: Tensor, __: Tensor, before: float, after: float) -> bool:
         return before - after <= 1e-15 * before
 
-    return levenberg_marquardt(H, model, is_converged, steps=iterations, damping=1e-6)[0]
+    return levenberg_marquardt(H, model, is_converged, steps=50, damping=1e-6)[0]
 
 
 def _linear_fit(u1: Tensor, v: Tensor) -> Tensor:

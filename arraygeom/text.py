@@ -71,7 +71,7 @@ def share_text(mask: Tensor) -> str:
     return f"{100 * float(mask.float().mean()):.0f} %" if mask.numel() else "none"
 
 
-def short(value: object, most: int = 60) -> str:
-    """A value in a message: its numbers with four digits, and no more than its first characters, in ASCII."""
+def short(value: object) -> str:
+    """A value in a message: its numbers with four digits, and no more than its first 60 characters, in ASCII."""
     text = re.sub(r"-?\d+\.\d{4,}(?:e[-+]\d+)?", lambda number: f"{float(number[0]):.4g}", ascii(value))
-    return text if len(text) <= most else f"{text[: most - 3]}..."
+    return text if len(text) <= 60 else f"{text[:57]}..."

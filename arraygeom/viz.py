@@ -6,7 +6,7 @@ figure as the last line of a notebook's cell. Matplotlib is imported when someth
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import cycle, pairwise
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -36,17 +36,16 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8
 # The rig in space ---------------------------------------------------------------------------------------------
 
 
-def draw_rig(rig: Rig, *, alpha: str | None = None, size: float | None = None, title: str = "") -> Figure:
+def draw_rig(rig: Rig, *, alpha: str | None = None) -> Figure:
     """The rig in three dimensions: each camera's frustum and name, and alpha's view from near to far.
 
-    `size` is the frusta's length in metres (by default a fraction of the rig's extent), `alpha` the camera whose
-    depth range is drawn (the first calibrated one; the range is left out where it would dwarf the rig, beyond 6
-    times its extent, or is infinite). Up in the figure is -y of the world.
+    `alpha` is the camera whose depth range is drawn (the first calibrated one; the range is left out where it would
+    dwarf the rig, beyond 6 times its extent, or is infinite). Up in the figure is -y of the world.
     """
     cameras = calibrated(rig)
     figure = new_figure(figsize=(5.2, 4.6), layout="constrained")
     axes: Any = figure.add_subplot(projection="3d", proj_type="ortho")
-    size = size or frustum_size(cameras)
+    size = frustum_size(cameras)
     middle = fmean(float(camera.centre[0]) for camera in cameras.values())
     for colour, (name, camera) in zip(cycle(COLOURS), cameras.items()):
         for line in frustum(camera, size):
@@ -60,7 +59,7 @@ def draw_rig(rig: Rig, *, alpha: str | None = None, size: float | None = None, t
     axes.tick_params(labelsize=7, pad=-1)
     axes.locator_params(nbins=5)
     axes.view_init(elev=24, azim=-62)
-    figure.suptitle(title or rig.name, fontsize=10)
+    figure.suptitle(rig.name, fontsize=10)
     return figure
 
 
@@ -104,11 +103,11 @@ def depth_outline(rig: Rig, cameras: Mapping[str, Camera], alpha: str | None) ->
     return borders + [np.stack(edge) for edge in edges]
 
 
-def image_border(hw: HW, points: int = 16) -> Float[Tensor, "n 2"]:
-    """Points round the image's area from its first corner back to it, `points` a side, in pixels."""
+def image_border(hw: HW) -> Float[Tensor, "n 2"]:
+    """Points round the image's area from its first corner back to it, 16 a side, in pixels."""
     h, w = hw
     corners = torch.tensor([[0.0, 0], [w, 0], [w, h], [0, h], [0, 0]], dtype=torch.float64) - 0.5
-    steps = torch.arange(points, dtype=torch.float64)[:, None] / points
+    steps = torch.arange(16, dtype=torch.float64)[:, None] / 16
     sides = [a + steps * (b - a) for a, b in pairwise(corners)]
     return torch.cat([*sides, corners[:1]])
 
@@ -139,7 +138,6 @@ def draw_fields(
     *,
     field: ReceptiveField | Mapping[str, ReceptiveField] | None = None,
     images: Mapping[str, Any] | None = None,
-    betas: Sequence[str] | None = None,
 ) -> Figure:
     """Alpha's pixels x, and their sampling locations in every beta, in the same colours.
 
@@ -147,11 +145,11 @@ def draw_fields(
     (H, W, 3) or (3, H, W) images by camera name.
     Segments are lines with a dot at their near end, positions are dots.
     """
-    betas = tuple(betas or rig.betas(alpha))
+    names = (alpha, *rig.betas(alpha))
     images = images or {}
-    figure = new_figure(figsize=_sheet([rig[n].hw for n in (alpha, *betas)]), layout="constrained")
-    for index, name in enumerate((alpha, *betas)):
-        axes = figure.add_subplot(1, 1 + len(betas), 1 + index)
+    figure = new_figure(figsize=_sheet([rig[n].hw for n in names]), layout="constrained")
+    for index, name in enumerate(names):
+        axes = figure.add_subplot(1, len(names), 1 + index)
         show_image(axes, rig[name].hw, images.get(name))
         axes.set_title(f"{name} (alpha)" if name == alpha else name, fontsize=9)
         if name == alpha:
@@ -207,16 +205,14 @@ def draw_matches(
     alpha: str,
     matches: Mapping[str, tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2"]]],
     images: Mapping[str, Any],
-    *,
-    count: int = 7,
-    half: int = 18,
 ) -> Figure:
     """Patches around points matched between alpha and each beta, spread over alpha's image, and the lines they miss.
 
-    Above, alpha's patch, `half` pixels to either side of the point; below, beta's around the match, with the line that
+    Above, alpha's patch, 18 pixels to either side of the point; below, beta's around the match, with the line that
     the rig gives to alpha's point and the distance in pixels. `matches` holds points (x, y) of alpha and of the beta,
     by beta, found in the images: they are on their lines only if the rig is right.
     """
+    count, half = 7, 18
     figure = new_figure(figsize=(1.55 * count, 3.7 * len(matches)), layout="constrained")
     parts: Any = figure.subfigures(len(matches), 1, squeeze=False)
     for row, (part, (name, (x, y))) in enumerate(zip(parts[:, 0], matches.items())):
@@ -265,12 +261,11 @@ def draw_residuals(
     x_beta: Float[Tensor, "n 2"],
     *,
     image: Any = None,
-    magnify: float | None = None,
 ) -> Figure:
     """Measured matches against the geometry: distances from beta's points to their epipolar lines.
 
-    Left, each distance drawn across its line and `magnify` times as long (by default so that the median is 2 % of
-    the width); right, their histogram, with the median. Pixels of undistorted images.
+    Left, each distance drawn across its line and enlarged so that the median is 2 % of the width; right, their
+    histogram, with the median. Pixels of undistorted images.
     """
     with needs("plots", "drawing"):
         from matplotlib.collections import LineCollection
@@ -278,7 +273,7 @@ def draw_residuals(
     distance = epipolar_distance(pair.fundamental.to(x_alpha.dtype), x_alpha, x_beta)
     size = distance.abs()
     median = float(size.median())
-    magnify = magnify or max(1.0, float(np.round(0.02 * pair.beta.hw[1] / max(median, 1e-9), 0)))
+    magnify = max(1.0, float(np.round(0.02 * pair.beta.hw[1] / max(median, 1e-9), 0)))
     ends = numpy(x_beta - magnify * distance[:, None] * direction(line[:, :2]))
     figure = new_figure(figsize=(8.4, 3.4), layout="constrained")
     axes, histogram = figure.subplots(1, 2, width_ratios=[1.5, 1])

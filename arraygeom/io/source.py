@@ -270,13 +270,6 @@ class RigSource:
             raise self.fail(None, "holds no camera; is the file whole?")
         return Rig(named, **fields)
 
-    def _unique(self, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        fields = dict(pairs)
-        if len(fields) < len(pairs):
-            names = [name for name, _ in pairs]
-            raise self.fail(next(n for n in names if names.count(n) > 1), "occurs twice; keep one")
-        return fields
-
 
 def float64_of(value: Any) -> Tensor | None:
     """Numbers, nested in lists or not, as a float64 tensor; None for what holds anything else, such as true or text."""

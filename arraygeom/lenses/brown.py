@@ -183,12 +183,12 @@ def _pulled_in(xy: Tensor, squared_radius: Tensor) -> Tensor:
     return xy * factor.clamp_max(1.0)[..., None]
 
 
-def _brown_solve(lens: Brown, xy: Tensor, target: Tensor, limit: Tensor, iterations: int = 30) -> Tensor:
+def _brown_solve(lens: Brown, xy: Tensor, target: Tensor, limit: Tensor) -> Tensor:
     """Newton, with halved steps where a whole one goes too far or does not help."""
     planar, jacobian = _brown_planar(lens, xy)
     error, scale = norm(planar - target), torch.ones_like(target[..., 0])
     enough = 2 * torch.finfo(target.dtype).eps * (1 + norm(target))
-    for _ in range(iterations):
+    for _ in range(30):
         if not traced() and bool(((error <= enough) | (scale < 1e-3)).all()):
             break
         trial = xy - scale[..., None] * _newton_step(planar, jacobian, target)

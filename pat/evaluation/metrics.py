@@ -61,17 +61,13 @@ def disparity_score(
     return DisparityScore(float(error.mean()), float((error <= 1).double().mean()))
 
 
-def bootstrap_interval(
-    values: Sequence[float], *, confidence: float = 0.95, resamples: int = 10_000, seed: int = 0
-) -> tuple[float, float]:
-    """The percentile bootstrap interval of the mean of `values`; (nan, nan) for fewer than two.
+def bootstrap_interval(values: Sequence[float]) -> tuple[float, float]:
+    """The 95 % percentile bootstrap interval of the mean of `values`; (nan, nan) for fewer than two.
 
-    Efron & Tibshirani 1993, section 13.3. The same seed gives the same interval.
+    Efron & Tibshirani 1993, section 13.3. The same values give the same interval.
     """
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence must be between 0 and 1, got {confidence}")
     if len(values) < 2:
         return math.nan, math.nan
-    drawn = np.random.default_rng(seed).choice(np.asarray(values, float), (resamples, len(values)))
-    low, high = np.quantile(drawn.mean(1), [(1 - confidence) / 2, (1 + confidence) / 2])
+    drawn = np.random.default_rng(0).choice(np.asarray(values, float), (10_000, len(values)))
+    low, high = np.quantile(drawn.mean(1), [0.025, 0.975])
     return float(low), float(high)

@@ -23,7 +23,7 @@ from calib.images.known_intrinsics import centres_found
 from calib.images.lenses import describe_lenses
 from calib.images.self_calibration import UNSCALED, RefinedPair, joined, refined_by_depth, self_calibrated
 
-from ..media.exif import focal_length
+from ..media.headers import focal_length
 from ..media.images import read_image, write_image
 from ..media.raw import developed_rig
 from ..media.video import read_video

@@ -61,10 +61,9 @@ def at_matches(
     beta: Float[Tensor, "b c hb wb"],
     segments: Segments,
     disparity: Float[Tensor, "b 1 _ _"],
-    extent: Extent | None = None,
 ) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
     """What beta shows at the matches, at its edge where these are beyond it, and where they are not."""
-    hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, disparity, extent=extent).to(beta)
+    hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, disparity).to(beta)
     position = middle.reshape(len(beta), -1, 2)
     inside = position.clamp(min=0).minimum(position.new_tensor([hw[1] - 1, hw[0] - 1]))
     values = sample(beta, inside, interpolation="bicubic").values

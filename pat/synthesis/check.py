@@ -99,10 +99,8 @@ def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
     return (deviation > 0.02 * mean.clamp(min=0.01)).float().mean()
 
 
-def pair_figures(
-    alpha: Camera, here: RenderedFrame, beta: Camera, there: RenderedFrame, *, most: int = 200_000
-) -> dict[str, float]:
-    """How well alpha's depth predicts beta's view, at up to `most` pixels.
+def pair_figures(alpha: Camera, here: RenderedFrame, beta: Camera, there: RenderedFrame) -> dict[str, float]:
+    """How well alpha's depth predicts beta's view, at up to 200,000 pixels.
 
     `inside` is the share of alpha's pixels whose points are on beta's image; of all, `visible` are seen there,
     `hidden` lie behind something nearer, `contradicted` in front of what beta records. Points beside an edge in beta
@@ -111,7 +109,7 @@ def pair_figures(
     against the other by all of these differences together.
     """
     alpha, beta = alpha.to(dtype=torch.float64), beta.to(dtype=torch.float64)
-    x, depth, index = _chosen(here, most)
+    x, depth, index = _chosen(here, 200_000)
     ahead = beta.project(alpha.unproject(x, depth))
     inside = ahead.valid & beta.contains(ahead.x.nan_to_num(-1e9))
     if not inside.any():

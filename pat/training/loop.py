@@ -15,7 +15,6 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from arraygeom import ReceptiveField
 from arraygeom.atomic import sweep
 from pat.networks.blocks import in_bfloat16
 from pat.networks.weights import NETWORKS, Network, convolutions, load_weights, save_weights
@@ -34,8 +33,8 @@ EARLY = 16
 """From this step on, at each doubling until the first validation, images are written."""
 
 
-def train(config: TrainConfig, *, field: ReceptiveField | None = None) -> Path:
-    """Train with the receptive field `field` (or `config.field`); returns the file of the best weights.
+def train(config: TrainConfig) -> Path:
+    """Train with the receptive field that the configuration names; returns the file of the best weights.
 
     In `config.out`: best.safetensors, config.yaml, log.jsonl (a line for each validation), steps.csv (a line for
     each step), images/ and checkpoints/. If that folder holds the same run, interrupted, it continues: with
@@ -52,7 +51,7 @@ def train(config: TrainConfig, *, field: ReceptiveField | None = None) -> Path:
         if here.first:
             for folder in (config.out, config.out / CHECKPOINTS, config.out / "images"):
                 sweep(folder)
-        run = Run(config, here, field, former)
+        run = Run(config, here, former)
         try:
             run.work()
         finally:
@@ -65,9 +64,7 @@ def train(config: TrainConfig, *, field: ReceptiveField | None = None) -> Path:
 class Run:
     """The state of a training run."""
 
-    def __init__(
-        self, config: TrainConfig, here: Process, field: ReceptiveField | None, checkpoint: Checkpoint | None
-    ) -> None:
+    def __init__(self, config: TrainConfig, here: Process, checkpoint: Checkpoint | None) -> None:
         self.config, self.here = config, here
         self.groups = here.share(config.groups)
         torch.manual_seed(config.seed)
@@ -75,7 +72,7 @@ class Run:
         self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / config.average))
         self.adam = torch.optim.Adam(self.network.parameters(), lr=config.rate, betas=config.momenta)
         self.step, self.best, minutes = 0, -math.inf, 0.0
-        self.learn, validate = self._scenes(field)
+        self.learn, validate = self._scenes()
         self.validation = [] if not here.first else list(validate(8))
         if checkpoint:
             restore(checkpoint, self.network, self.adam, self.average)
@@ -168,11 +165,11 @@ class Run:
     def _minutes(self) -> float:
         return (time.monotonic() - self.began) / 60
 
-    def _scenes(self, field: ReceptiveField | None) -> tuple[SampleSource, SampleSource]:
+    def _scenes(self) -> tuple[SampleSource, SampleSource]:
         """Photographs are read by the first process first, which may leave a cache to the others."""
         if not self.here.first:
             self.here.wait()
-        sources = scenes(self.config, field=field, device=str(self.here.device))
+        sources = scenes(self.config, device=str(self.here.device))
         if self.here.first:
             self.here.wait()
         return sources

@@ -103,7 +103,7 @@ def test_disparities_of_a_rectified_pair_without_calibration():
 
 def test_wrong_uses_are_refused():
     rig = rig_of()
-    with pytest.raises(ValueError, match="have 90x59 pixels, alpha has 90x60"):
+    with pytest.raises(ValueError, match=r"90x59.*90x60"):
         AroundDepth(torch.ones(59, 90), 0.1, rig["a"])
     with pytest.raises(ValueError, match="tolerance is -1"):
         AroundDepth(torch.ones(HW), -1.0)

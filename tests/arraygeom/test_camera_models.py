@@ -224,7 +224,7 @@ def test_a_batch_of_rigs_has_the_fields_of_its_rigs():
 def test_what_a_model_lacks_is_said():
     with pytest.raises(ValueError, match="do not meet in a point: there is no fundamental matrix"):
         _ = rig("orthographic", "own").pair("a", "b").fundamental
-    with pytest.raises(TypeError, match="overrides rays, which fields do not ask"):
+    with pytest.raises(TypeError, match="rays"):
 
         class Silent(Camera):
             def rays(self, x):
@@ -244,5 +244,5 @@ def test_a_file_that_lacks_a_number_of_its_model_says_which(tmp_path):
     rig("port", "port").save(tmp_path / "rig.yaml")
     text = (tmp_path / "rig.yaml").read_text()
     (tmp_path / "rig.yaml").write_text("\n".join(line for line in text.splitlines() if "water" not in line))
-    with pytest.raises(ValueError, match="has no water, which a flat-port camera has"):
+    with pytest.raises(ValueError, match="water"):
         Rig.load(tmp_path / "rig.yaml")

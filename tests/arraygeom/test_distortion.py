@@ -272,11 +272,11 @@ def test_no_points():
 
 
 def test_what_does_not_exist_is_refused():
-    with pytest.raises(ValueError, match="unknown lens model 'wide'"):
+    with pytest.raises(ValueError, match="'wide'"):
         Distortion("wide", torch.zeros(1))
     with pytest.raises(ValueError, match="4 or 5 or 8 or 12 or 14 coefficients, got 6"):
         Distortion("brown-conrady", torch.zeros(6))
-    with pytest.raises(ValueError, match="takes 4 coefficients, got 5"):
+    with pytest.raises(ValueError, match=r"4 .*5"):
         Distortion("kannala-brandt", torch.zeros(5))
 
 

@@ -231,7 +231,7 @@ def test_a_number_of_samples_by_the_longest_segment_cannot_be_traced():
         return attend(query, image, image, Segments(start, segments.end, segments.valid), samples=samples)
 
     starts = torch.stack([segments.start, segments.start + 0.1]).float()
-    with pytest.raises(NotImplementedError, match=r"the longest segment \(give `samples`\) depends on numbers"):
+    with pytest.raises(NotImplementedError, match="`samples`"):
         torch.vmap(attended)(starts)
     torch.testing.assert_close(torch.vmap(lambda s: attended(s, 5))(starts)[0], attended(starts[0], 5))
 

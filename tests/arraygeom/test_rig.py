@@ -106,9 +106,9 @@ def test_wrong_names_are_refused():
     rig = random_rig(0)
     with pytest.raises(ValueError, match="did you mean 'beta'"):
         rig["bta"]
-    with pytest.raises(ValueError, match="no rig parameter matches 'gamma"):
+    with pytest.raises(ValueError, match="'gamma"):
         rig.parameters(free=["gamma.*"])
-    with pytest.raises(ValueError, match=r"no such rig parameter: beta\.zoom"):
+    with pytest.raises(ValueError, match=r"beta\.zoom"):
         rig.perturbed({"beta.zoom": torch.zeros(2)})
 
 

@@ -128,4 +128,5 @@ def test_a_step_to_where_there_is_no_cost_is_not_made():
     """The undamped step from (-1.2, 1) goes to (1, -3.8)."""
     torch.testing.assert_close(descent([-1.2, 1.0], where_known=2.0)[0], torch.ones(2).double())
     found, converged = descent([-1.2, 1.0], where_known=1e-9)  # there is nowhere to go
-    assert converged and found.tolist() == [-1.2, 1.0]
+    assert converged
+    assert found.tolist() == [-1.2, 1.0]

@@ -72,7 +72,7 @@ def test_the_papers_windows_reach_from_edge_to_edge():
     assert corners[0] == (0, 0)
     assert corners[-1] == (1536 - 128, 2048 - 384)
     assert PatchGrid.like_the_papers((1536, 2048)) == PatchGrid()
-    with pytest.raises(ValueError, match="patches of 384x128 do not fit into an image of 300x200"):
+    with pytest.raises(ValueError, match=r"384x128 .*300x200"):
         PatchGrid().corners((200, 300))
     with pytest.raises(ValueError, match="cannot be reduced 3 times"):
         PatchGrid(reduce=3)
@@ -167,10 +167,10 @@ def test_folders_without_whole_scenes_are_reported(broken, tmp_path):
     with pytest.raises(FileNotFoundError, match="no such folder"):
         scene_folders(tmp_path / "none")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match="holds no rendered scene: make some with 'pat render"):
+    with pytest.raises(ValueError, match="'pat render"):
         scene_folders(tmp_path / "empty")
     (broken / "scenes/000001/render.json").unlink()
-    with pytest.raises(ValueError, match=r"000001: is not a whole scene \(no render.json\): remove it"):
+    with pytest.raises(ValueError, match=r"000001: .*render.json"):
         ScenePatches(broken)
 
 
@@ -179,16 +179,14 @@ def test_scenes_that_cannot_be_read_are_reported(broken):
     file.write_bytes(file.read_bytes()[:500])
     data = ScenePatches(broken, patches=SMALL)
     assert data[0].ground_truth.shape == (3, 16, 24)
-    with pytest.raises(ValueError, match=r"000001: cannot be read \(.*\): remove it and run 'pat render' again"):
+    with pytest.raises(ValueError, match=r"000001: .*'pat render'"):
         data[6]
 
 
 def test_images_of_changing_size_are_reported(broken):
     shutil.rmtree(broken / "scenes/000002")
     LayeredSettings(oversampling=1).renderer(make_rig(160), CheckLimits()).render(2, broken / "scenes/000002")
-    with pytest.raises(
-        ValueError, match=r"000002: has images of other sizes than the first \(mono 160x96, .*mono 128x96"
-    ):
+    with pytest.raises(ValueError, match=r"000002: .*mono 160x96, .*mono 128x96"):
         ScenePatches(broken, patches=SMALL)[12]
 
 
@@ -228,13 +226,13 @@ def test_index_files_give_back_what_was_written(tmp_path):
 
 
 def test_index_files_that_are_not_as_documented_are_reported(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"xxs_a\.npy: no such index file"):
+    with pytest.raises(FileNotFoundError, match=r"xxs_a\.npy"):
         read_indices(tmp_path, "a", (2, 3))
     np.save(tmp_path / "xxs_a.npy", np.zeros((6, 4), np.int16))
     np.save(tmp_path / "yys_a.npy", np.zeros((6, 5), np.int16))
     with pytest.raises(ValueError, match="not of one field"):
         read_indices(tmp_path, "a", (2, 3))
-    with pytest.raises(ValueError, match="has 6 lines; an alpha of 3x3 pixels has 9"):
+    with pytest.raises(ValueError, match=r"6 .*3x3 .*9"):
         read_indices(tmp_path, "a", (3, 3))
     np.save(tmp_path / "xxs_a.npy", np.zeros((6, 4)))
     with pytest.raises(ValueError, match="holds float64"):

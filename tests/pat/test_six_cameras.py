@@ -177,7 +177,7 @@ def test_what_cannot_serve_says_what_is_missing(name, tmp_path):
     rig = rig_of(name)
     pair, x = rig.pair("alpha", "beta"), number(80.0, 60.0)[None]
     for field in STRAIGHT:
-        with pytest.raises(ValueError, match="needs pinhole cameras: use Curved"):
+        with pytest.raises(ValueError, match="Curved"):
             sampling_locations(field, pair, x)
     with pytest.raises(ValueError, match=f"a {pair.alpha.distortion.model} lens"):
         write_rig(rig, tmp_path / "transforms.json", format="nerfstudio")
@@ -186,7 +186,7 @@ def test_what_cannot_serve_says_what_is_missing(name, tmp_path):
     rig.save(tmp_path / "rig.yaml")
     text = (tmp_path / "rig.yaml").read_text().replace("own-", "unknown-")
     (tmp_path / "rig.yaml").write_text(text)
-    with pytest.raises(ValueError, match=r"model: is 'unknown-.*: import the module that defines a model of your own"):
+    with pytest.raises(ValueError, match="model: is 'unknown-"):
         Rig.load(tmp_path / "rig.yaml")
     if not pair.cameras[0].central:
         with pytest.raises(ValueError, match="do not meet in a point"):

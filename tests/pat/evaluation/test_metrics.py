@@ -69,8 +69,3 @@ def test_the_interval_of_a_mean_is_scipys():
 
 def test_one_value_has_no_interval():
     assert all(math.isnan(x) for x in bootstrap_interval([30.0]))
-
-
-def test_a_confidence_in_percent_is_refused():
-    with pytest.raises(ValueError, match="confidence"):
-        bootstrap_interval([1.0, 2.0], confidence=95.0)

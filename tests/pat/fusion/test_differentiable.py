@@ -106,5 +106,5 @@ def test_a_differentiable_fusion_is_of_the_whole_frame(cropped, tmp_path):
     rig, images, _ = cropped
     network = load_weights("mono-colour-small")
     for more in ({"max_memory": "2GiB"}, {"store": tmp_path}):
-        with pytest.raises(ValueError, match="leave out max_memory and store"):
+        with pytest.raises(ValueError, match="max_memory and store"):
             fuse(network, rig, images, alpha="mono", differentiable=True, **more)

@@ -45,7 +45,7 @@ def test_a_frame_that_a_camera_lacks_shifts_none(prefix_a, prefix_b):
 
 
 def test_a_time_without_another_near_it_is_missing():
-    with pytest.warns(MissingFramesWarning, match=r"'b' has none of 10\.5"):
+    with pytest.warns(MissingFramesWarning, match=r"'b' .*10\.5"):
         found = stems(matched_frames(files(a=["10.0", "10.5", "11.0", "11.5"], b=["10.1", "11.1", "11.6"])))
     assert found == {"a": ["10.0", "11.0", "11.5"], "b": ["10.1", "11.1", "11.6"]}
 
@@ -54,7 +54,7 @@ def test_frames_that_nothing_relates_are_taken_in_order_and_that_is_said():
     with pytest.warns(MissingFramesWarning, match="taken in order"):
         found = stems(matched_frames(files(a=["1", "2"], b=["x", "y"])))
     assert found == {"a": ["1", "2"], "b": ["x", "y"]}
-    with pytest.raises(ValueError, match="as many images of each camera, got 2 of 'a', 3 of 'b'"):
+    with pytest.raises(ValueError, match="2 of 'a', 3 of 'b'"):
         matched_frames(files(a=["1", "2"], b=["x", "y", "z"]))
 
 
@@ -64,7 +64,7 @@ def test_many_missing_frames_are_not_all_listed():
 
 
 def test_a_gap_in_a_sequence_is_said():
-    with pytest.warns(MissingFramesWarning, match=r"'a' has no frame between 2\.png and 4\.png"):
+    with pytest.warns(MissingFramesWarning, match=r"'a' .*2\.png and 4\.png"):
         warn_of_gaps(files(a=["0", "1", "2", "4", "5"], b=["0", "1", "2"]))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

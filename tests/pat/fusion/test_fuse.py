@@ -173,7 +173,7 @@ def test_memory_decides_the_tiles():
     area = max((t.outer[1] - t.outer[0]) * (t.outer[3] - t.outer[2]) for t in tiles)
     assert network.working_bytes(area, [0]) <= 2**31
     assert sum((t.inner[1] - t.inner[0]) * (t.inner[3] - t.inner[2]) for t in tiles) == math.prod(hw)
-    with pytest.raises(ValueError, match="need at least 80 MiB"):
+    with pytest.raises(ValueError, match="80 MiB"):
         tiles_within(network, frame, 2.0**20)
 
 
@@ -342,7 +342,7 @@ def test_views_must_overlap():
     back = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64))
     rig = rig.with_camera("colour", rig["colour"].replace(cam_from_world=Pose(back, torch.zeros(3).double())))
     images = {"mono": torch.rand(1, 50, 70), "colour": torch.rand(3, 40, 60)}
-    with pytest.raises(ValueError, match="'colour's views do not overlap between 2 and 20 m"):
+    with pytest.raises(ValueError, match=r"'colour'.* 2 and 20 m"):
         fuse(network_of("PAT"), rig, images, alpha="mono", field=Epipolar())
     with pytest.raises(ValueError, match="0 < near <= far"):
         fuse(network_of("PAT"), rig, images, alpha="mono", depth=(20, 2))

@@ -46,10 +46,10 @@ def test_the_scale_that_our_own_file_states_is_taken(tmp_path):
 
 
 def test_what_is_no_depth_map_is_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no such depth map"):
+    with pytest.raises(FileNotFoundError, match=r"none\.tif"):
         read_depth(tmp_path / "none.tif")
     tifffile.imwrite(tmp_path / "float.tif", DEPTH.numpy())
-    with pytest.raises(ValueError, match="is 30x20, alpha's image is 30x21"):
+    with pytest.raises(ValueError, match=r"30x20, .*30x21"):
         read_depth(tmp_path / "float.tif", hw=(21, 30))
     Image.fromarray(np.zeros((20, 30), np.uint8)).save(tmp_path / "eight.png")
     with pytest.raises(ValueError, match="8 bits, too few"):

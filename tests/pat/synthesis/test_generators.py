@@ -77,9 +77,9 @@ def test_what_cannot_be_generated_is_said(tmp_path):
         photographs(0, unlike_cameras(), tmp_path)
     with pytest.raises(ValueError, match="no calibrated camera"):
         abstract(0, Rig({"a": View(hw=(4, 4))}))
-    with pytest.raises(ValueError, match="no generator is called 'still-life': use abstract, photographs or MODULE:F"):
+    with pytest.raises(ValueError, match=r"'still-life': .*abstract, photographs"):
         generator_named("still-life")
-    with pytest.raises(ValueError, match="the generator 'nowhere:scene' cannot be imported"):
+    with pytest.raises(ValueError, match="'nowhere:scene'"):
         generator_named("nowhere:scene")
 
 

@@ -181,7 +181,7 @@ def test_a_hundred_and_twenty_steps_learn(folder):
 
 def test_groups_must_be_shared_evenly():
     assert [Process(rank, 2).share(4) for rank in (0, 1)] == [[0, 2], [1, 3]]
-    with pytest.raises(ValueError, match="3 groups cannot be shared by 2 processes"):
+    with pytest.raises(ValueError, match=r"3 groups .* 2 processes"):
         Process(0, 2).share(3)
 
 
@@ -215,7 +215,7 @@ def test_no_room_for_a_checkpoint(folder, whole, monkeypatch):
     room = 2 * (whole.out / "best.safetensors").stat().st_size
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
     try:
-        with pytest.raises(OSError, match=r"checkpoint of step 6 .* could not be written.*step-00000003") as caught:
+        with pytest.raises(OSError, match=r"step 6 .*step-00000003") as caught:
             train(config)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -226,7 +226,7 @@ def test_no_room_for_a_checkpoint(folder, whole, monkeypatch):
 
 
 def test_another_recipe_is_not_mixed_in(whole):
-    with pytest.raises(ValueError, match=r"holds a run of another recipe \(rate: 0.02, 0.01 there\)"):
+    with pytest.raises(ValueError, match=r"rate: 0.02, 0.01"):
         train(replace(whole, rate=2e-2))
 
 
@@ -234,7 +234,7 @@ def test_starting_from_weights(folder, whole):
     network = new_network(replace(whole, start=whole.out / "best.safetensors"))
     theirs = load_weights(whole.out / "best.safetensors").state_dict()
     assert all(torch.equal(v, theirs[k]) for k, v in network.state_dict().items())
-    with pytest.raises(ValueError, match=r"holds a GuidedPAT of .*, the recipe is for a PAT of"):
+    with pytest.raises(ValueError, match=r"GuidedPAT .* PAT "):
         new_network(replace(whole, network=PATConfig(), start=whole.out / "best.safetensors"))
     save_weights(new_network(replace(whole, network=replace(SMALL, taps=7))), folder / "other.safetensors")
     with pytest.raises(ValueError, match="give its own recipe"):
@@ -280,9 +280,7 @@ def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_again(folder, wh
         older.read_bytes()[: 8 + header].replace(b'\\"step\\"', b'\\"stop\\"') + older.read_bytes()[8 + header :]
     )
     log = (config.out / "log.jsonl").read_bytes()
-    with pytest.raises(
-        ValueError, match=r"no checkpoint there can be read \(step-00000006.*step-00000003.*begin again"
-    ):
+    with pytest.raises(ValueError, match=r"step-00000006.*step-00000003"):
         train(config)
     assert (config.out / "log.jsonl").read_bytes() == log
     for file in (newer, older):

@@ -24,7 +24,7 @@ def without(monkeypatch, error: Exception) -> None:
 
 def test_skew_is_refused_before_blender_starts(tmp_path):
     skewed = RIG["oblong"].replace(K=RIG["oblong"].K + torch.tensor([[0, 0.5, 0], [0, 0, 0], [0, 0, 0]]))
-    with pytest.raises(ValueError, match=r"camera 'oblong' has skew .*, which Blender's cameras cannot have"):
+    with pytest.raises(ValueError, match=r"'oblong' .*skew"):
         render_here(room_scene(), RIG.with_camera("oblong", skewed), tmp_path / "x", settings=SETTINGS)
     assert "bpy" not in sys.modules
 
@@ -38,14 +38,14 @@ def test_errors_of_a_process_of_its_own_come_back_as_they_are(tmp_path):
 def test_a_camera_inside_an_object_is_refused():
     moved = RIG["shifted"].replace(cam_from_world=posed((0, 0, 0), (-0.7, -0.3, 4.1)))
     rig = RIG.with_camera("shifted", moved)
-    with pytest.raises(ValueError, match="camera 'shifted' is inside the object 'sphere' at 0 s"):
+    with pytest.raises(ValueError, match=r"'shifted' .*'sphere' .*0 s"):
         task.refuse_inside(room_scene(), rig, task.shots(rig, SETTINGS))
 
 
 def test_another_version_of_python_is_refused(monkeypatch):
     without(monkeypatch, ModuleNotFoundError("No module named 'bpy'", name="bpy"))
     monkeypatch.setattr(sys, "version_info", (3, 12, 1))
-    with pytest.raises(ValueError, match=r"exists for Python 3.11 .* or 3.13 .*; this is 3.12$"):
+    with pytest.raises(ValueError, match=r"3.11 .*3.13 .*3.12$"):
         compat.load()
     monkeypatch.setattr(sys, "version_info", (3, 11, 2))
     with pytest.raises(ValueError, match=r"pip install 'arraygeom-pat\[synthesis\]'$"):
@@ -54,7 +54,7 @@ def test_another_version_of_python_is_refused(monkeypatch):
 
 def test_missing_libraries_are_named_with_the_packages_that_bring_them(monkeypatch):
     without(monkeypatch, ImportError("libX11.so.6: cannot open shared object file: No such file or directory"))
-    with pytest.raises(ValueError, match=r"\(libX11.so.6 is missing\): apt-get install -y libx11-6 .* libgl1$"):
+    with pytest.raises(ValueError, match=r"libX11.so.6.* apt-get install -y libx11-6 .* libgl1$"):
         compat.load()
 
 

@@ -74,7 +74,7 @@ def test_a_tiny_scene_is_true_in_unlike_cameras(worker, tmp_path):
     with pytest.raises(ValueError, match="exists: give a new folder"):
         worker.render(scene, rig, tmp_path / "scene", settings=settings)
     away = Scene(objects=(glowing("behind", Motion((Key(position=(0, 0, -5)),))),))
-    with pytest.raises(ValueError, match="camera 'oblong' sees nothing of the scene at 0 s"):
+    with pytest.raises(ValueError, match=r"'oblong' .*0 s"):
         worker.render(away, rig, tmp_path / "nothing", settings=settings)
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
 
