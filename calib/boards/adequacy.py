@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 
 from arraygeom import Camera, Pose, rotation_from_vector
+from arraygeom.pixels import HW
 
 from .board import Board
 from .bundle import camera_jacobian
@@ -54,15 +55,19 @@ class Coverage(NamedTuple):
 
 def coverage(views: BoardViews, cam_from_board: Mapping[FrameKey, Pose], board: Board) -> Coverage:
     """Coverage of a camera by its boards, from their poses in it."""
-    h, w = views.hw
-    x = np.concatenate([d.x for d in views.seen.values()])
-    rows, columns = CELLS
-    cells, _, _ = np.histogram2d(x[:, 1], x[:, 0], bins=(rows, columns), range=((-0.5, h - 0.5), (-0.5, w - 0.5)))
+    cells = point_counts([d.x for d in views.seen.values()], views.hw)
     poses = {key: cam_from_board[key] for key in views.seen}
     depths = [board.points[d.ids] @ poses[k].R[2].numpy() + float(poses[k].t[2]) for k, d in views.seen.items()]
     tilts = np.degrees([np.arccos(min(1.0, abs(float(pose.R[2, 2])))) for pose in poses.values()])
-    found = Coverage(cells.astype(np.int64), _range(np.concatenate(depths)), _range(tilts), ())
+    found = Coverage(cells, _range(np.concatenate(depths)), _range(tilts), ())
     return found._replace(missing=tuple(_missing(found)))
+
+
+def point_counts(parts: Iterable[Float[np.ndarray, "_ 2"]], hw: HW) -> Int[np.ndarray, "r c"]:
+    """The number of points in each of the `CELLS` of an image."""
+    x = np.concatenate([np.zeros((0, 2)), *parts])
+    counts, _, _ = np.histogram2d(x[:, 1], x[:, 0], bins=CELLS, range=((-0.5, hw[0] - 0.5), (-0.5, hw[1] - 0.5)))
+    return counts.astype(np.int64)
 
 
 def _range(values: np.ndarray) -> tuple[float, float]:

@@ -102,9 +102,13 @@ def report_html(
             f"pixels of the first, at {near:.3g} m (nearest board) and {far:.3g} m (furthest).</p>",
             image(draw_uncertainty(calibration, (near, far))),
         ]
-    body = "\n".join(parts)
-    head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style>'
-    return f'<!DOCTYPE html>\n<html lang="en">{head}\n{body}\n</html>\n'
+    return html_page(parts, title)
+
+
+def html_page(parts: Iterable[str], title: str, further: str = "") -> str:
+    """A page of these parts in the report's style; `further` is for its head."""
+    head = f'<meta charset="utf-8">{further}<title>{escape(title)}</title><style>{STYLE}</style>'
+    return "\n".join([f'<!DOCTYPE html>\n<html lang="en">{head}', *parts, "</html>\n"])
 
 
 def by_cameras(notes: Iterable[str]) -> list[str]:

@@ -18,13 +18,13 @@ from arraygeom import Rig
 from arraygeom.atomic import sweep, write_text, write_together
 from arraygeom.rig import depth_range
 
-from .adequacy import coverage_advice, coverages, next_views
+from .adequacy import coverage_advice, coverages, next_views, point_counts
 from .board import Board
 from .detect import BoardViews, Detection, Progress, collect_folder, detected
 from .intrinsics import Lens
 from .photos import FrameKey, Photos, find_photos
 from .poses import StartDeviations
-from .report import STYLE, by_cameras, report_html, summary
+from .report import by_cameras, html_page, report_html, summary
 from .rig import Calibration, calibrate
 from .target import parse_boards
 from .uncertainty import intrinsics_of, rig_covariance
@@ -32,7 +32,6 @@ from .validation import compare_lenses
 
 WIDTH = 420
 """Of the images shown, pixels."""
-GRID = 6, 8
 COLOURS = (60, 60, 230), (80, 200, 80)
 """Blue, green, red of cells without and with points."""
 
@@ -183,10 +182,7 @@ def _page(session: Session) -> str:
     parts = [f"<h1>{len(session.seen)} images</h1>"]
     parts.append(f'<p class="note">{escape(session.problem)}</p>' if session.problem else _state(session))
     parts += [_camera(session, name) for name in session.photos]
-    head = (
-        f'<meta charset="utf-8"><meta http-equiv="refresh" content="2"><title>Calibration</title><style>{STYLE}</style>'
-    )
-    return f'<!DOCTYPE html>\n<html lang="en">{head}\n{"".join(parts)}\n</html>\n'
+    return html_page(parts, "Calibration", '<meta http-equiv="refresh" content="2">')
 
 
 def _state(session: Session) -> str:
@@ -238,10 +234,9 @@ def _drawn(session: Session, name: str, key: FrameKey) -> np.ndarray:
 def _coverage(session: Session, name: str) -> np.ndarray:
     """Cells of the image with and without points."""
     entries = [entry for (camera, _), entry in session.seen.items() if camera == name]
-    (h, w), points = entries[0][0], [d.x for _, views in entries for d in views.values()]
-    x = np.concatenate([np.zeros((0, 2)), *points])
-    count, _, _ = np.histogram2d(x[:, 1], x[:, 0], bins=GRID, range=((-0.5, h - 0.5), (-0.5, w - 0.5)))
-    cells = np.where((count > 0)[..., None], COLOURS[1], COLOURS[0]).astype(np.uint8)
+    h, w = entries[0][0]
+    counts = point_counts([d.x for _, views in entries for d in views.values()], (h, w))
+    cells = np.where((counts > 0)[..., None], COLOURS[1], COLOURS[0]).astype(np.uint8)
     return cv2.resize(cells, (WIDTH, round(WIDTH * h / w)), interpolation=cv2.INTER_NEAREST)
 
 

@@ -23,6 +23,7 @@ from itertools import product
 
 import torch
 from jaxtyping import Float
+from scipy.linalg import qr
 from torch import Tensor
 
 from arraygeom import Camera, Rig
@@ -461,15 +462,18 @@ def _changes(parameters: Sequence[FreeParameter], solution: Solution) -> Iterabl
 
 
 def _kept(parameters: Sequence[FreeParameter], solution: Solution) -> Iterable[str]:
-    """The parameter with the largest part in each combination that keeps its value."""
+    """As many parameters as there are combinations that keep their values: those with the largest part in them.
+
+    They are the same for any basis of these combinations: pivots of an orthogonal decomposition.
+    """
     active = solution.active
-    covariance = solution.covariance[active][:, active]
-    moved = torch.linalg.lstsq(torch.linalg.cholesky(covariance), solution.directions[active]).solution
-    complement = torch.linalg.svd(moved).U[:, moved.shape[1] :]
+    root = torch.linalg.cholesky(solution.covariance[active][:, active])
+    moved = torch.linalg.lstsq(root, solution.directions[active]).solution
+    parts = root @ torch.linalg.svd(moved).U[:, moved.shape[1] :]
     every = [u.label(i) for u in parameters for i in range(len(u.sigma))]
     labels = [label for label, free in zip(every, active.tolist()) if free]
-    parts = (torch.linalg.cholesky(covariance) @ complement).abs()
-    return dict.fromkeys(labels[int(i)] for i in parts.argmax(0)) if parts.numel() else ()
+    pivots = qr(parts.T.numpy(), mode="r", pivoting=True)[1] if parts.numel() else ()
+    return (labels[i] for i in pivots[: parts.shape[1]])
 
 
 def _unobservable(parameters: Sequence[FreeParameter], active: Tensor) -> Iterable[str]:

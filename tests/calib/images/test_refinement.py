@@ -75,6 +75,25 @@ def test_depth_that_points_do_not_determine_stays():
     assert found.kept
 
 
+def test_what_is_kept_is_named_alike_by_any_basis():
+    """A name for each combination, whichever of them span what is kept."""
+    _, bad = small_drift()
+    problem = RefinementProblem.of(bad, ["rotation", "centre", "focal"], frames=[seen_points(bad)])
+    solution, g = problem.solve_freely(), torch.Generator().manual_seed(0)
+    root = torch.linalg.cholesky(solution.covariance[solution.active][:, solution.active])
+    basis = torch.linalg.qr(torch.randn(root.shape, generator=g, dtype=torch.float64)).Q[:, 4:]
+    names = []
+    for turn in (
+        torch.eye(basis.shape[1]).double(),
+        torch.randn(2 * basis.shape[1:], generator=g, dtype=torch.float64),
+    ):
+        directions = torch.zeros(problem.count, basis.shape[1], dtype=torch.float64)
+        directions[solution.active] = root @ basis @ torch.linalg.qr(turn).Q
+        names.append(problem.report(solution._replace(directions=directions), force=True).kept)
+    assert names[0] == names[1]
+    assert len(set(names[0])) == 4
+
+
 @pytest.mark.parametrize("field", ["narrow", "wide"])
 def test_a_wrong_focal_length_does_not_ruin_depth(field):
     rig = simulated_rig(field, 2, np.random.default_rng(7))
