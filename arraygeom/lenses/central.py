@@ -29,14 +29,14 @@ class _Model(NamedTuple):
     """A radial map and its inverse in closed form or by iteration.
 
     `project` takes coefficients and directions within the cone to points, `unproject` points to directions of any
-    length; `limit` gives the squared radius that is reached, `sound` whether the coefficients are a lens at all, and
-    `harmless` ones that stand in for those that are not; `planar` Brown-Conrady's coefficients of the second stage.
+    length; `limit` gives the squared radius that is reached, `bounds` are those of the first coefficients of any lens,
+    and `harmless` ones that stand in for those beyond; `planar` Brown-Conrady's coefficients of the second stage.
     """
 
     project: Callable[[Tensor, Tensor], Tensor]
     unproject: Callable[[Tensor, Tensor], Tensor]
     limit: Callable[[Tensor], Tensor]
-    sound: Callable[[Tensor], Tensor]
+    bounds: tuple[tuple[float, float], ...]
     harmless: tuple[float, ...]
     planar: Callable[[Tensor], Tensor | None] = lambda _: None
 
@@ -78,8 +78,15 @@ def central_unproject(model: str, c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tens
     return unit(kind.unproject(c, xy_d * pull[..., None])), valid & inside
 
 
+def within_bounds(kind: _Model, c: Tensor) -> Tensor:
+    """The nearest coefficients of a lens."""
+    free = ((-torch.inf, torch.inf),) * (c.shape[-1] - len(kind.bounds))
+    low, high = c.new_tensor([*kind.bounds, *free]).T
+    return c.clamp(low, high)
+
+
 def _sound(kind: _Model, c: Tensor) -> tuple[Tensor, Tensor]:
-    sound = kind.sound(c.detach()) & c.detach().isfinite().all(-1)
+    sound = (within_bounds(kind, c.detach()) == c.detach()).all(-1) & c.detach().isfinite().all(-1)
     if not traced() and bool(sound.all()):
         return c, sound
     return torch.where(sound[..., None], c, c.new_tensor(kind.harmless)), sound
@@ -231,33 +238,27 @@ def _scaramuzza_limit(c: Tensor) -> Tensor:
     return first_root(torch.cat([one, none, -b * b.new_tensor([1.0, 2.0, 3.0])], -1)).square()
 
 
-def _within(c: Tensor, *bounds: tuple[float, float]) -> Tensor:
-    """Whether the first coefficients lie between these bounds."""
-    inside = [(c[..., i] >= low) & (c[..., i] <= high) for i, (low, high) in enumerate(bounds)]
-    return torch.stack(inside, -1).all(-1)
-
-
 SMALLEST = 1e-6
 MODELS: dict[str, _Model] = {
     DOUBLE_SPHERE: _Model(
         _double_sphere,
         _double_sphere_inverse,
         lambda c: _reciprocal(2 * c[..., 1] - 1),
-        lambda c: _within(c, (SMALLEST - 1, 1 - SMALLEST), (0, 1)),
+        ((SMALLEST - 1, 1 - SMALLEST), (0, 1)),
         (0.0, 0.5),
     ),
     EXTENDED_UNIFIED: _Model(
         _extended_unified,
         _extended_unified_inverse,
         lambda c: _reciprocal(c[..., 1] * (2 * c[..., 0] - 1)),
-        lambda c: _within(c, (0, 1), (SMALLEST, torch.inf)),
+        ((0, 1), (SMALLEST, torch.inf)),
         (0.5, 1.0),
     ),
     UNIFIED: _Model(
         _unified,
         _unified_inverse,
         lambda c: _reciprocal(c[..., 0].square() - 1),
-        lambda c: c[..., 0] >= 0,
+        ((0, torch.inf),),
         (0.5, 0.0, 0.0, 0.0, 0.0),
         lambda c: c[..., 1:],
     ),
@@ -265,15 +266,15 @@ MODELS: dict[str, _Model] = {
         _fov,
         _fov_inverse,
         lambda c: ((2 * WIDEST * (c[..., 0] / 2).tan()).atan() / c[..., 0]).square(),
-        lambda c: _within(c, (SMALLEST, pi - SMALLEST)),
+        ((SMALLEST, pi - SMALLEST),),
         (1.0,),
     ),
-    SCARAMUZZA: _Model(_scaramuzza, _scaramuzza_inverse, _scaramuzza_limit, lambda c: c[..., 0].isfinite(), (0.0,) * 3),
+    SCARAMUZZA: _Model(_scaramuzza, _scaramuzza_inverse, _scaramuzza_limit, (), (0.0,) * 3),
     THIN_PRISM_FISHEYE: _Model(
         _equidistant,
         _equidistant_inverse,
         lambda c: torch.full_like(c[..., 0], pi**2),
-        lambda c: c[..., 0].isfinite(),
+        (),
         (0.0,) * 8,
         _prism_coefficients,
     ),

@@ -19,6 +19,7 @@ from scipy.sparse import csr_array
 
 from arraygeom import Camera, Pose, Rig, stack
 from arraygeom.distortion import pinhole_coefficients, term, typical_coefficients
+from arraygeom.lenses.central import MODELS, within_bounds
 from arraygeom.pixels import map_homogeneous
 from arraygeom.pose import rotation_vector
 from arraygeom.rig import focal_positions
@@ -368,11 +369,17 @@ def intrinsic_values(camera: Camera) -> Float[np.ndarray, " p"]:
 
 
 def changed(camera: Camera, change: torch.Tensor) -> Camera:
-    """The camera after a change of all its parameters, in the order of `parameter_names`."""
+    """The camera after a change of all its parameters, in the order of `parameter_names`.
+
+    Coefficients stay within their lens's bounds: of unified's xi, 0 is the least.
+    """
     sizes = parameter_sizes(camera)
     moved = Rig({"": camera}).perturbed(dict(zip(sizes, change.split(list(sizes.values())))))[""]
     assert isinstance(moved, Camera)
-    return moved
+    lens = moved.distortion
+    if lens is None or lens.model not in MODELS:
+        return moved
+    return moved.replace(distortion=lens.with_coefficients(within_bounds(MODELS[lens.model], lens.coefficients)))
 
 
 def camera_jacobian(camera: Camera, X: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 p"]:

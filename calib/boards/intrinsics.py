@@ -258,15 +258,23 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
 
 
 def _fisheye(views: BoardViews, board: Board) -> OpenCVSolution:
+    """From the focal length of half a sphere, or, where OpenCV then finds no poses, from one of a narrow view."""
     if not board.flat:
         raise ValueError("fisheyes need a flat board to start from: points of known position give pinhole cameras")
     points = [board.points[d.ids][:, None] for d in views.seen.values()]
     pixels = [d.x[:, None] for d in views.seen.values()]
     h, w = views.hw
-    K = np.array([[w / np.pi, 0, (w - 1) / 2], [0, w / np.pi, (h - 1) / 2], [0, 0, 1]])
     flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW | cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
-    _, K, c, rotations, translations = cv2.fisheye.calibrate(points, pixels, (w, h), K, np.zeros((4, 1)), flags=flags)
-    return K, c.reshape(-1), list(rotations), list(translations)
+
+    def calibrated(focal: float) -> OpenCVSolution:
+        K, none = np.array(intrinsics(focal, views.hw)), np.zeros((4, 1))
+        _, K, c, rotations, translations = cv2.fisheye.calibrate(points, pixels, (w, h), K, none, flags=flags)
+        return K, c.reshape(-1), list(rotations), list(translations)
+
+    try:
+        return calibrated(w / np.pi)
+    except cv2.error:
+        return calibrated(float(w))
 
 
 def _pose(r: np.ndarray, t: np.ndarray) -> Pose:

@@ -98,9 +98,9 @@ def held_out_errors(fit: Solved, views: Mapping[str, BoardViews]) -> dict[tuple[
 
 
 def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """By camera: pixels (n, 2) near those of board points, and how far (n, 2) projections differ between two fits.
+    """By camera: pixels (n, 2) near board points of both halves, and how far (n, 2) projections of their fits differ.
 
-    Each is to every other frame; elsewhere lens models are extrapolated. Empty if there are too few frames.
+    Halves are every other frame; elsewhere a lens model is extrapolated. Empty if there are too few frames.
     """
     count = len(fit.problem.frames)
     if count < FEWEST_TO_HALVE:
@@ -115,7 +115,7 @@ def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np
         (a, seen), (b, _) = (in_own_frame(half, name) for half in halves)
         motion = compensation(camera_jacobian(a, seen)[..., :6], _difference(a, b, seen))
         x, X = grid_points(a, depth)
-        near = covered(x, fit.problem.seen[name].x, a.hw)
+        near = np.logical_and(*(covered(x, half.seen[name].x, a.hw) for half in halves))
         x, X = x[near], X[near]
         found[name] = x, _difference(a, b, X) - (camera_jacobian(a, X)[..., :6] @ motion)[..., 0]
     return found

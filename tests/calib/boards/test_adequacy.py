@@ -57,6 +57,18 @@ def test_halves_are_compared_only_where_boards_were_seen():
     assert max(np.linalg.norm(seen - each, axis=1).min() for each in x) < 32
 
 
+def test_halves_are_compared_only_where_both_saw_boards():
+    """Boards to the left in even frames, and to the right in the others, meet in a stripe."""
+    boards = board_poses(12, spread=0.1, depth=(1.6, 2.4))
+    side = torch.tensor([[-0.3, 0.0, 0.0], [0.3, 0.0, 0.0]], dtype=torch.float64).repeat(6, 1)
+    fit = calibrate(see(Rig({"cam": TRUE}), Pose(boards.R, boards.t + side), noise=0.2), BOARD).fit
+    x, _ = half_difference(fit, 1.5)["cam"]
+    seen, block = fit.problem.seen["cam"].x, fit.problem.seen["cam"].block
+    halves = [seen[block % 2 == half] for half in (0, 1)]
+    assert len(x) > 5
+    assert all(np.linalg.norm(half - each, axis=1).min() < 32 for half in halves for each in x)
+
+
 FISHEYES = {
     "kannala-brandt": ("kannala-brandt", (0.02, -0.01, 0.003, -0.001), 240.0),
     "omni": ("unified", (0.9, -0.1, 0.02, 0.0, 0.0), 420.0),

@@ -227,3 +227,19 @@ def test_action_cameras(camera_name, focal, shared_data):
         alone.notes,
     )
     assert float(alone.problem.cameras["cam"].K[0, 0]) == pytest.approx(focal, rel=0.015)
+
+
+NARROW = {
+    "opencv_stereo": ({"cam": "left*.jpg"}, "chessboard:9x6:25mm", "omni", 0.16),
+    "pose2sim_4cam/intrinsics": ({"cam": "int_cam01_img/*.jpg"}, "chessboard:4x7:60mm", "kannala-brandt", 0.14),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", NARROW)
+def test_narrow_lenses_by_models_of_fisheyes(shared_data, folder):
+    """They ask for an xi of omni below its bound, 0; and from a fisheye's focal length OpenCV finds no poses."""
+    patterns, board, lens, wanted = NARROW[folder]
+    board = parse_board(board)
+    views = collect_folder(shared_data / "calibration" / folder, board, patterns=patterns).views
+    assert calibrate(views, board, lens=lens).rms < wanted
