@@ -37,6 +37,8 @@ SIGMA = {"rotation": math.radians(3), "translation": 0.3, "focal": 0.05}
 CENTRE_SHARE = 0.05
 """Standard deviations of what is assumed: radians, a share of the baseline, of the focal length; of the principal
 point, as a share of the longer side."""
+SHORTEST = 1e-12
+"""Least length of a baseline of 1 after refinement: the direction of a shorter one is rounding."""
 NEAR_LINE = 2.0
 """Points this near to their lines, in pixels, are used."""
 AS_GOOD = 1.5
@@ -270,11 +272,16 @@ def _camera(view: View, K: Tensor, pose: Pose) -> Camera:
 def _refined_pair(
     rig: Rig, matches: PointMatches, near: PointMatches, *, fixed: Sequence[str] = ()
 ) -> RefinedPair | None:
-    """The pair refined by matches, its distance and depths those of `near`; None without parallax."""
+    """The pair refined by matches, its distance and depths those of `near`; None without parallax.
+
+    Nor if the baseline, whose length matches do not determine, is shorter than `SHORTEST` then.
+    """
     alpha, beta = rig.names
     free = [f"{beta}.{kind}" for kind in (*SIGMA, "centre") if kind not in fixed]
     sigma = {**SIGMA, "centre": CENTRE_SHARE * max(rig[beta].hw)}
     refined = refine_matches(rig, [{(alpha, beta): matches}], free=free, sigma=sigma, keep_depth=False).rig
+    if not float(_pair(refined).cameras[1].t.norm()) > SHORTEST:
+        return None
     refined = _unit_baseline(refined)
     bounds = depth_bounds(refined, near)
     if bounds is None:

@@ -23,9 +23,9 @@ from arraygeom.chunks import chunked
 from arraygeom.threads import in_parallel
 
 from ..media.colour import linear_from_srgb
+from ..media.depth_maps import write_points
 from ..media.figures import colour_depth
 from ..media.images import write_image
-from ..media.points import write_points
 from ..media.raw import developed
 from ..support.memory import how_many_fit
 

@@ -1,4 +1,4 @@
-"""Depth maps from files: PFM, TIFF, and PNG of 16 bits."""
+"""Depth maps from files (PFM, TIFF, and PNG of 16 bits), and to point clouds (PLY)."""
 
 from __future__ import annotations
 
@@ -12,11 +12,27 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from arraygeom import Camera, pixel_grid
+from arraygeom.atomic import write_atomically
+
+from .colour import to_bytes
 from .headers import HW
 from .images import read_recorded
 
 MILLIMETRE = 0.001
 """Metres of a count in maps of whole numbers: depth cameras (RealSense, ZED, Kinect) count millimetres."""
+PLY_HEADER = """ply
+format binary_little_endian 1.0
+element vertex {count}
+property float x
+property float y
+property float z
+property uchar red
+property uchar green
+property uchar blue
+end_header
+"""
+VERTEX = np.dtype([("X", "<f4", 3), ("colour", "u1", 3)])
 
 
 def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = None) -> Float[Tensor, "h w"]:
@@ -68,3 +84,22 @@ def _stated_scale(path: Path) -> float | None:
     with Image.open(path) as image:
         said = re.match(r"depth: ([0-9.e+-]+) counts a metre", str(image.info.get("Description", "")))
     return None if said is None else 1 / float(said[1])
+
+
+def write_points(path: Path, camera: Camera, depth: Float[Tensor, "h w"], image: Float[Tensor, "c h w"]) -> int:
+    """Write the pixels of known depth as a coloured point cloud (binary PLY), atomically; returns their number.
+
+    Coordinates are the camera's: x right, y down, z ahead, in the unit of the depth. An image of one band is grey.
+    """
+    known = depth.isfinite()
+    x = pixel_grid(camera.hw, dtype=torch.float64)[known]
+    colours = image.expand(3, -1, -1) if len(image) == 1 else image[:3]
+    own = camera.to(torch.float64)
+    X = own.cam_from_world.apply(own.unproject(x, depth[known].double()))
+    seen = X.isfinite().all(-1)
+    vertices = np.empty(int(seen.sum()), VERTEX)
+    vertices["X"] = X[seen].numpy()
+    vertices["colour"] = to_bytes(colours[:, known][:, seen]).T
+    with write_atomically(path) as temporary:
+        temporary.write_bytes(PLY_HEADER.format(count=len(vertices)).encode() + vertices.tobytes())
+    return len(vertices)

@@ -1,5 +1,6 @@
 """Calibrated pairs from matched points alone."""
 
+import dataclasses
 import math
 
 import pytest
@@ -7,6 +8,7 @@ import torch
 
 from arraygeom import Distortion, LensView, Pose, Rig, intrinsics, rotation_from_vector
 from arraygeom.pixels import coarse_grid
+from calib.images import self_calibration
 from calib.images.held_out import line_distances
 from calib.images.matches import PointMatches, with_map
 from calib.images.self_calibration import (
@@ -48,6 +50,26 @@ def test_pose_and_bounds_are_found_with_the_focal_lengths():
     near, far = (float(bound) for bound in found.rig.depth)
     assert near < 2.0 / 0.2
     assert far > 6.0 / 0.2
+
+
+def test_a_start_whose_baseline_vanishes_is_left_out(monkeypatch):
+    """Matches do not determine the baseline's length: from a wrong start it shrank to nothing (Cloth3 of 2006)."""
+    rig = rectified_pair()
+    (matches,) = seen_points(rig, noise=0.1, near=2.0, far=6.0).values()
+    refine, calls = self_calibration.refine_matches, []
+
+    def vanishing(rig, *args, **kwargs):
+        found = refine(rig, *args, **kwargs)
+        calls.append(found)
+        if len(calls) > 1:
+            return found
+        name = rig.names[1]
+        short = found.rig[name].replace(cam_from_world=Pose(found.rig[name].R, 0 * found.rig[name].t))
+        return dataclasses.replace(found, rig=found.rig.with_camera(name, short))
+
+    monkeypatch.setattr(self_calibration, "refine_matches", vanishing)
+    assert calibrated_from(rig, matches).rig.pair(*rig.names).beta_from_alpha.t.norm() == pytest.approx(1)
+    assert len(calls) > 1
 
 
 def test_focal_lengths_that_the_points_contradict_give_rough_depths_alone():

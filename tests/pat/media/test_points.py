@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from arraygeom import Camera, Pose, intrinsics
-from pat.media.points import VERTEX, write_points
+from pat.media.depth_maps import VERTEX, write_points
 
 
 def test_points_are_the_pixels_of_known_depth_in_the_camera_frame(tmp_path):
