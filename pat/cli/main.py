@@ -170,6 +170,7 @@ REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     ),
     (r"^Missing value for argument '(\S+)'.*", r"\1: give a value"),
     (r"^Missing from .+?: (\S+) (.+?) \(required\)", r"\1 is missing: \2"),
+    (r"^Unrecognized options: ([^-\s]\S*=\S+).*", r"\1: write the option before each, as in --image a=A --image b=B"),
     (r"^Unrecognized options: ", r"unknown here: "),
     (r" Perhaps you meant: (\S+).*", r"; did you mean \1?"),
 )

@@ -85,6 +85,7 @@ REFUSED = {
     ("fuse", "--wieghts", "x"): "unknown here: --wieghts, x; did you mean --weights?",
     ("fuse", "--workers", "x"): "--workers: 'x' is not a whole number",
     ("fuse", "--alpha"): "--alpha: give a value",
+    ("fuse", "r", "--image", "a=A", "b=B"): "b=B: write the option before each, as in --image a=A --image b=B",
     ("evaluate", "--rates", "x"): "--rates: 'x' does not fit",
     ("rig", "convert", "a"): "OUT is missing: File or folder to write; also: --out OUT.",
 }
