@@ -70,7 +70,7 @@ class NoiseLevel:
         """
         if min(image.shape[-2:]) < SIDE + 2:
             return cls()
-        value, variance = (found.double() for found in _smoothest(image))
+        value, variance = _smoothest(image.double())
         if not len(value) or not float(variance.max()) > 0:
             return cls()
         fits = [_fitted(added_to, value, variance) for added_to in ("light", "values")]
