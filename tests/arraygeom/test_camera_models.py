@@ -98,7 +98,7 @@ def of_parallel(X):
 
 def of_moving(X):
     """By bisection of the row at which a point is seen, over the image's rows alone."""
-    from scipy.spatial.transform import Rotation
+    Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
 
     def at(row):
         time = MOTION["readout"] * row

@@ -162,6 +162,8 @@ PARTS = [path for path in sorted(FIXTURES.rglob("*")) if path.is_file() and path
 @pytest.mark.parametrize("part", PARTS, ids=lambda path: f"{path.parent.name}/{path.name}")
 def test_a_pipe_in_place_of_a_part_is_read_by_no_reader(part, tmp_path):
     """`extrinsics.yml` as a pipe was waited for. What a format can do without is not looked at."""
+    if part.suffix == ".yml":
+        pytest.importorskip("cv2")
     home = tmp_path / "rig"
     shutil.copytree(part.parent, home)
     (home / part.name).unlink()

@@ -18,7 +18,6 @@ from arraygeom import (
     Positions,
     Rectified,
     Rig,
-    Segments,
     ThroughLenses,
     View,
     default_field,
@@ -28,13 +27,11 @@ from arraygeom import (
     intrinsics,
     pixel_grid,
     rectify,
-    sample,
     sampling_locations,
     triangulate,
 )
 from arraygeom.distortion import COEFFICIENT_COUNTS
 from arraygeom.fields.straight import covering_displacement
-from pat.attention import attend
 from tests.arraygeom.rigs import random_rig
 from tests.arraygeom.test_camera_models import MODELS
 from tests.arraygeom.test_precision import FIELDS, WHOLE
@@ -51,19 +48,6 @@ def pinholes() -> Rig:
 def bent() -> Rig:
     rig = random_rig(1)
     return Rig({name: rig[name].replace(distortion=LENS) for name in rig.names}, depth=rig.depth)
-
-
-@pytest.mark.parametrize("width", [6, 7, 4000, 12_000])
-def test_the_nearest_pixel_of_halves_is_the_same_everywhere(width):
-    """Attention takes the pixel on whose area a position lies; `sample` rounded halves either way."""
-    image = torch.arange(width, dtype=torch.float32).expand(1, 1, 1, width)
-    halves = torch.arange(width - 1, dtype=torch.float32)[-50:] + 0.5
-    x = torch.stack([halves, torch.zeros_like(halves)], -1)
-    found = sample(image, x[None], interpolation="nearest").values[0, 0]
-    assert found.equal(halves + 0.5)
-    where = Positions(x[None, :, None], torch.ones(1, len(x), 1, dtype=torch.bool))
-    query = torch.ones(1, 1, 1, len(x))
-    assert attend(query, torch.ones_like(image), image, where, interpolation="nearest").flatten().equal(found)
 
 
 LENSES = {name: Distortion(name, torch.full((counts[0],), 0.01)) for name, counts in COEFFICIENT_COUNTS.items()}
@@ -221,19 +205,6 @@ def test_cameras_of_108_megapixels(dtype):
     voxels = [NearestVoxels(9, 3)(rig.to(t).pair("alpha", "beta"), x[::20, ::20].to(t)) for t in (dtype, F64)]
     off = (voxels[0].xy.double() - voxels[1].xy).abs().amax(-1)
     assert float((off > 0).double().mean()) < 0.05
-
-
-def test_a_number_of_samples_by_the_longest_segment_cannot_be_traced():
-    segments = Epipolar()(pinholes().pair("alpha", "beta"), WHOLE)
-    query, image = torch.randn(1, 2, *segments.valid.shape), torch.randn(1, 2, 40, 60)
-
-    def attended(start, samples=None):
-        return attend(query, image, image, Segments(start, segments.end, segments.valid), samples=samples)
-
-    starts = torch.stack([segments.start, segments.start + 0.1]).float()
-    with pytest.raises(NotImplementedError, match="`samples`"):
-        torch.vmap(attended)(starts)
-    torch.testing.assert_close(torch.vmap(lambda s: attended(s, 5))(starts)[0], attended(starts[0], 5))
 
 
 FAR_ORIGIN = torch.tensor([500_000.0, 5_000_000.0, 300.0], dtype=F64)
