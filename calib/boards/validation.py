@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -159,7 +160,10 @@ class LensComparison:
 
 
 def compare_lenses(views: Mapping[str, BoardViews], board: Board) -> dict[str, LensComparison]:
-    """The lens models of each camera, judged on frames that they were not fitted to."""
+    """The lens models of each camera, judged on frames that they were not fitted to.
+
+    A model that contradicts frames which others fit is left out.
+    """
     return {name: _compared(name, v, board) for name, v in views.items()}
 
 
@@ -167,15 +171,19 @@ def _compared(name: str, views: BoardViews, board: Board) -> LensComparison:
     if len(views.seen) < FEWEST_TO_COMPARE:
         return LensComparison({})
     kept = calibrate_single(name, views, board, final=False).views[name]
-    found: dict[Lens, np.ndarray] = {}
+    fitted: dict[Lens, BundleProblem] = {}
     for lens in COMPARED:
-        try:
-            problem = calibrate_single(name, kept, board, lens=lens, final=False).problem
-        except ValueError:
-            continue  # it does not fit at all, as a fisheye's model of a long lens may
-        index = np.arange(len(problem.frames))
-        found[lens] = np.concatenate([_held_out(problem, index % LENS_FOLDS == fold) for fold in range(LENS_FOLDS)])
-    return LensComparison(found)
+        with suppress(ValueError):  # it does not fit at all, as a fisheye's model of a long lens may
+            fitted[lens] = calibrate_single(name, kept, board, lens=lens, final=False).problem
+    frames = max((problem.frames for problem in fitted.values()), key=len, default=())
+    parts = [np.arange(len(frames)) % LENS_FOLDS == fold for fold in range(LENS_FOLDS)]
+    return LensComparison(
+        {
+            lens: np.concatenate([_held_out(problem, part) for part in parts])
+            for lens, problem in fitted.items()
+            if problem.frames == frames
+        }
+    )
 
 
 def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"]:
