@@ -24,6 +24,9 @@ WORTH_STRIPS = 10**8
 STRIPS = 2
 """Strips for each thread: other processes may take one's core."""
 
+_SLEEPING = os.environ.get("OMP_WAIT_POLICY", "").upper() == "PASSIVE"
+"""Whether torch's own threads sleep, too, while they wait, as where a command loads it."""
+
 _ALLOWED: ContextVar[int | None] = ContextVar("threads", default=None)
 
 
@@ -61,7 +64,7 @@ class _InStrips(TorchFunctionMode):
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func is not torch.conv2d or kwargs or len(args) != 7:
             return func(*args, **(kwargs or {}))
-        if torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"):
+        if _SLEEPING or torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"):
             with _torch_threads(threads()):
                 return func(*args)
         return _convolved(*args)
