@@ -227,7 +227,7 @@ def _by_evidence(
     good as it, or as the drift, best first.
 
     Points of one object, or wrong ones in one place, do not decide: it is better without each part of them in turn.
-    No drift mirrors an image.
+    No drift mirrors an image; one of the principal point does what a small shift of pixels does.
     """
     limit = LARGEST_REMAINDER[0] * figures[0].penalised_misfit
     some = [i for i in order if i and figures[i].penalised_misfit <= limit][:MOST_COMPARED]
@@ -249,7 +249,7 @@ def _by_evidence(
         and found[best].surprise + MARGIN < given.surprise
         and all(found[best].by(used) + MARGIN < given.by(used) for used in rest)
     )
-    named = mirrored or clear
+    named = mirrored or (clear and (bool(rig.links) or not tried[best].small))
     bound = MARGIN + (least if named else min(least, given.surprise))
     near = EQUAL[0] * figures[best].penalised_misfit + EQUAL[1] if named else 0.0
     as_good = [i for i in some if found[i].surprise <= bound or figures[i].penalised_misfit <= near]

@@ -36,12 +36,14 @@ class Remedy:
     """A possible mistake: its kind ("resized", "units", ...), its description in words, and the change that undoes it.
 
     approximate: the change holds numbers that were estimated, and undoes it roughly.
+    small: a drift of a calibrated camera's principal point does the same.
     """
 
     kind: str
     words: str
     repair: Callable[[Rig], Rig]
     approximate: bool = False
+    small: bool = False
 
 
 NOTHING = Remedy("nothing", "as given", lambda rig: rig)
@@ -274,7 +276,7 @@ def _shifts(names: list[str]) -> Iterator[Remedy]:
         for group, label in _groups(names):
             for shift in (-pixels, pixels):
                 words = f"pixels of {label} are {shift:+g} from where the rig counts them"
-                yield Remedy(kind, words, _same_size(group, shift_matrix(-shift, -shift)))
+                yield Remedy(kind, words, _same_size(group, shift_matrix(-shift, -shift)), small=True)
 
 
 def _same_size(names: tuple[str, ...], A: Tensor) -> Callable[[Rig], Rig]:
