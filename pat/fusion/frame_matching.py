@@ -117,16 +117,17 @@ def _numbers(files: Files) -> Keys | None:
         rows = [tuple(map(float, re.findall(r"\d+(?:\.\d+)?", path.stem))) for path in paths]
         if len({len(row) for row in rows}) != 1 or len(set(rows)) < len(rows):
             return None
-        columns = [column for column in zip(*rows) if len(set(column)) > 1]
+        columns = [column for column in zip(*rows) if len(set(column)) > 1 or len(rows) == 1]
         varying[name] = list(zip(*columns))
-    if {len(rows[0]) for rows in varying.values()} != {1}:
+    if {len(row) for rows in varying.values() for row in rows} != {1}:
         return {name: list(rows) for name, rows in varying.items()}
     return _common_times({name: [row[0] for row in rows] for name, rows in varying.items()})
 
 
 def _common_times(times: Mapping[str, Sequence[float]]) -> Keys:
     """Each time as the first of those of other cameras that are less than half an interval from it."""
-    near = min(median(b - a for a, b in pairwise(sorted(row))) for row in times.values()) / 2
+    intervals = [median(b - a for a, b in pairwise(sorted(row))) for row in times.values() if len(row) > 1]
+    near = min(intervals, default=float("inf")) / 2
     common: dict[tuple[str, float], float] = {}
     first, here = -float("inf"), set[str]()
     for time, name in sorted((time, name) for name, row in times.items() for time in row):

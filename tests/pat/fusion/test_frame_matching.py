@@ -69,3 +69,11 @@ def test_a_gap_in_a_sequence_is_said():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warn_of_gaps(files(a=["0", "2", "4", "6"], b=["kitchen", "garden"]))
+
+
+def test_one_frame_of_a_camera_has_no_gap():
+    """A sequence of many fast frames and one slow one ended with an IndexError."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_gaps(files(fast=["fast_0", "fast_1", "fast_2"], slow=["slow_0"]))
+    assert len(matched_frames(files(a=["a_0"], b=["b_7"]))["a"]) == 1
