@@ -12,6 +12,7 @@ from torch import Tensor
 from .camera import Camera, Projected
 from .pixels import product
 from .rig import Rig
+from .robust import LEAST_DAMPING
 
 STEP = 1e-5
 """Of central differences, in distances from the camera: in float64 they are then good to 1e-9."""
@@ -91,8 +92,6 @@ def bundle_adjusted(
 
 ROUNDED = 1e-9
 """A step that raises the cost by no more than this share is made: at the optimum gradients need it."""
-LEAST_DAMPING = 1e-9
-"""Of a diagonal in float64: less would not hold what images leave free, such as scale."""
 
 
 def _cost(rig: Rig, X: Tensor, x: Tensor, seen: Tensor | None) -> Tensor:
