@@ -1,8 +1,8 @@
-"""Roots of polynomials, and inverses of increasing functions, for many at once."""
+"""Roots of polynomials, and inverses of increasing functions and of maps of the plane, for many at once."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -69,3 +69,55 @@ def invert_increasing(
 
 PATIENCE = 12
 """Iterations after which a step of Newton that is not half the one before is replaced by halving the bracket."""
+
+
+PlaneMap = Callable[[Tensor], tuple[Tensor, Sequence[Tensor]]]
+"""Points (*n, 2) to their images and the Jacobian (dx'/dx, dx'/dy, dy'/dx, dy'/dy), each (*n)."""
+
+
+def solve_in_plane(
+    f: PlaneMap,
+    start: Tensor,
+    target: Tensor,
+    within: Callable[[Tensor], Tensor],
+    *,
+    rounding: float = 2.0,
+    steps: int = 30,
+) -> Tensor:
+    """Points whose images are `target`, by Newton, with halved steps where a whole one leaves where points may be or
+    does not help; the nearest that is found where there is none. `rounding`: of f's values, in units of the last place.
+    """
+    xy = start
+    value, jacobian = f(xy)
+    error, scale = _distance(value, target), torch.ones_like(target[..., 0])
+    enough = rounding * torch.finfo(target.dtype).eps * (1 + target.square().sum(-1).sqrt())
+    for _ in range(steps):
+        if not traced() and bool(((error <= enough) | (scale < 1e-3)).all()):
+            break
+        trial = xy - scale[..., None] * newton_step(value, jacobian, target)
+        value_there, jacobian_there = f(trial)
+        error_there = _distance(value_there, target)
+        better = (error_there < error) & within(trial)
+        xy, value = (torch.where(better[..., None], a, b) for a, b in ((trial, xy), (value_there, value)))
+        jacobian = [torch.where(better, a, b) for a, b in zip(jacobian_there, jacobian)]
+        error, scale = torch.where(better, error_there, error), torch.where(better, 1.0, scale / 2)
+    return xy
+
+
+def newton_step(value: Tensor, jacobian: Sequence[Tensor], target: Tensor) -> Tensor:
+    """What to take from points whose images are `value` for `target`."""
+    xx, xy, yx, yy = jacobian
+    ex, ey = (value - target).unbind(-1)
+    determinant = xx * yy - xy * yx
+    determinant = torch.where(determinant.abs() < 1e-12, 1e-12, determinant)
+    return torch.stack([(yy * ex - xy * ey) / determinant, (xx * ey - yx * ex) / determinant], -1)
+
+
+def keeps_orientation(jacobian: Sequence[Tensor]) -> Tensor:
+    """Whether a map keeps orientation here: past a fold it mirrors, past two it rotates by 180 degrees."""
+    xx, xy, yx, yy = jacobian
+    return (xx * yy - xy * yx > 0) & (xx + yy > 0)
+
+
+def _distance(a: Tensor, b: Tensor) -> Tensor:
+    return (a - b).square().sum(-1).sqrt()

@@ -28,6 +28,7 @@ from . import (
     colmap,
     kalibr,
     kitti,
+    lensboy,
     luxonis,
     matlab,
     metashape,
@@ -39,6 +40,7 @@ from . import (
     open3d,
     opencv,
     pycalib,
+    realsense,
     ros,
     strecha,
     syntim,
@@ -70,6 +72,8 @@ READERS: dict[str, Any] = {
     "xmp": xmp,
     "luxonis": luxonis,
     "mrcal": mrcal,
+    "lensboy": lensboy,
+    "realsense": realsense,
 }
 READERS["caliscope"] = aniposelib
 WRITERS: dict[str, Any] = {

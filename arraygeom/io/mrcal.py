@@ -2,15 +2,22 @@
 
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `rt_cam_ref`, in older files `extrinsics`,
 is a rotation vector and a translation in metres that take points of the reference frame into the camera's.
+LENSMODEL_SPLINED_STEREOGRAPHIC's displacements are of stereographic points: the camera model `Splined`.
 """
 
 from __future__ import annotations
 
 import ast
+import math
+import re
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from ..camera import Camera
+from ..lenses import Equirectangular, Splined
+from ..lenses.model import LensModel
 from ..rig import Rig
 from .source import RigSource
 
@@ -18,6 +25,8 @@ CONVENTION = "first pixel's centre at 0 (shift 0); rt_cam_ref (extrinsics) = X_c
 SUFFIX = ".cameramodel"
 LENSES = {"LENSMODEL_PINHOLE": 0, **{f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)}}
 """How many coefficients follow fx, fy, cx, cy."""
+SPHERE = "LENSMODEL_LONLAT"
+SPLINED = re.compile(r"LENSMODEL_SPLINED_STEREOGRAPHIC_order=([23])_Nx=(\d+)_Ny=(\d+)_fov_x_deg=(\d+(?:\.\d+)?)")
 LONGEST = 1_000_000
 """Characters of a file at most: splined models have thousands of numbers."""
 
@@ -34,19 +43,35 @@ def read(source: RigSource) -> Rig:
 
 def _camera(source: RigSource) -> Camera:
     fields = _fields(source)
-    model = source.get(fields, "lensmodel", "")
-    if model not in LENSES:
-        known = ", ".join(LENSES)
-        raise source.fail("lensmodel", f"is '{model}'; of mrcal's {known} are read: use mrcal-convert-lensmodel")
-    numbers = source.numbers(source.get(fields, "intrinsics", ""), (4 + LENSES[model],), "intrinsics")
+    model = str(source.get(fields, "lensmodel", ""))
+    numbers = source.numbers(source.get(fields, "intrinsics", ""), None, "intrinsics")
+    lens = _lens(source, model, numbers)
     where = "rt_cam_ref" if "rt_cam_ref" in fields else "extrinsics"
     rt = source.numbers(source.get(fields, where, ""), (6,), where)
     return Camera(
         K=source.focal_and_centre(numbers[:4], "intrinsics"),
         cam_from_world=source.pose(rt[:3], rt[3:], where),
         hw=source.size_of(source.get(fields, "imagersize", ""), "imagersize"),
-        distortion=source.brown_conrady(numbers[4:], "intrinsics"),
+        distortion=lens,
     )
+
+
+def _lens(source: RigSource, model: str, numbers: torch.Tensor) -> LensModel | None:
+    """The lens of a model's name and of what follows focal lengths and centre in the numbers."""
+    splined = SPLINED.fullmatch(model)
+    if not splined and model not in LENSES and model != SPHERE:
+        known = ", ".join([*LENSES, SPHERE, "LENSMODEL_SPLINED_STEREOGRAPHIC"])
+        raise source.fail("lensmodel", f"is '{model}'; of mrcal's {known} are read: use mrcal-convert-lensmodel")
+    if not splined:
+        rest = source.numbers(numbers, (4 + LENSES.get(model, 0),), "intrinsics")[4:]
+        return Equirectangular() if model == SPHERE else source.brown_conrady(rest, "intrinsics")
+    order, nx, ny = (int(number) for number in splined.groups()[:3])
+    knots = source.numbers(numbers, (4 + 2 * nx * ny,), "intrinsics")[4:].reshape(ny, nx, 2)
+    edge = 2 * math.tan(math.radians(float(splined[4])) / 4)
+    try:
+        return Splined(knots, knots.new_full((2,), 2 * edge / max(nx - order, 1)), order)
+    except ValueError as error:
+        raise source.fail("lensmodel", str(error)) from None
 
 
 def _fields(source: RigSource) -> dict[str, Any]:

@@ -6,6 +6,7 @@ A model of one's own is a subclass of `CameraModel`; see the page "A camera of o
 from .angular import Equirectangular, PolynomialFisheye
 from .model import CAMERA_MODELS, CameraModel, beside_points
 from .not_central import FlatPort, Orthographic, RollingShutter
+from .splined import Splined
 
 __all__ = [
     "CAMERA_MODELS",
@@ -15,5 +16,6 @@ __all__ = [
     "Orthographic",
     "PolynomialFisheye",
     "RollingShutter",
+    "Splined",
     "beside_points",
 ]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..pixels import product, to_homogeneous
-from ..roots import first_root, invert_increasing
+from ..roots import first_root, invert_increasing, keeps_orientation, newton_step, solve_in_plane
 from ..tracing import traced
 from .common import BEYOND, MARGIN, POLE, SOLVED, TINY, WIDEST, norm, once, polynomial_product
 
@@ -41,7 +41,7 @@ def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
     pull = torch.where(inside, 1.0, (limit / torch.where(inside, 1.0, squared.clamp(min=TINY))).sqrt())
     planar, jacobian = _brown_planar(lens, xy * pull[..., None])
     tilted, ahead = _apply(_tilt_matrix(lens), planar)
-    return tilted, inside & _orients(jacobian) & ahead
+    return tilted, inside & keeps_orientation(jacobian) & ahead
 
 
 def brown_undistort(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
@@ -59,7 +59,7 @@ def brown_undistort(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
     safe_target = torch.where(valid[..., None], target, 0.0)
     xy = torch.where(valid[..., None], solved, 0.0)
     for _ in range(2):
-        xy = xy - _newton_step(*_brown_planar(lens, xy), safe_target)
+        xy = xy - newton_step(*_brown_planar(lens, xy), safe_target)
     return torch.where(valid[..., None], xy, solved), valid & ahead
 
 
@@ -166,12 +166,20 @@ def _brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     lens = Brown.named(c)
     limit = brown_limit(lens).to(target)
     start = solved = _brown_start(lens, target, limit)
+
+    def distorted(xy: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
+        return _brown_planar(lens, xy)
+
+    def within(xy: Tensor) -> Tensor:
+        return xy.square().sum(-1) < BEYOND * limit
+
     valid = torch.zeros_like(target[..., 0], dtype=torch.bool)
     for begin in (start, _pulled_in(start, 0.9 * limit), _pulled_in(target, 0.5 * limit)):
-        attempt = _brown_solve(lens, torch.where(valid[..., None], solved, begin), target, limit)
+        begun = torch.where(valid[..., None], solved, begin)
+        attempt = solve_in_plane(distorted, begun, target, within)
         planar, jacobian = _brown_planar(lens, attempt)
         tolerance = SOLVED * torch.finfo(target.dtype).eps * (1 + norm(target))
-        valid = (norm(planar - target) < tolerance) & (attempt.square().sum(-1) < limit) & _orients(jacobian)
+        valid = (norm(planar - target) < tolerance) & (attempt.square().sum(-1) < limit) & keeps_orientation(jacobian)
         solved = torch.where(valid[..., None], attempt, start)
         if not traced() and bool(valid.all()):
             break
@@ -181,38 +189,6 @@ def _brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 def _pulled_in(xy: Tensor, squared_radius: Tensor) -> Tensor:
     factor = (squared_radius / xy.square().sum(-1).clamp_min(1e-30)).sqrt()
     return xy * factor.clamp_max(1.0)[..., None]
-
-
-def _brown_solve(lens: Brown, xy: Tensor, target: Tensor, limit: Tensor) -> Tensor:
-    """Newton, with halved steps where a whole one goes too far or does not help."""
-    planar, jacobian = _brown_planar(lens, xy)
-    error, scale = norm(planar - target), torch.ones_like(target[..., 0])
-    enough = 2 * torch.finfo(target.dtype).eps * (1 + norm(target))
-    for _ in range(30):
-        if not traced() and bool(((error <= enough) | (scale < 1e-3)).all()):
-            break
-        trial = xy - scale[..., None] * _newton_step(planar, jacobian, target)
-        planar_trial, jacobian_trial = _brown_planar(lens, trial)
-        error_trial = norm(planar_trial - target)
-        better = (error_trial < error) & (trial.square().sum(-1) < BEYOND * limit)
-        xy, planar = (torch.where(better[..., None], a, b) for a, b in ((trial, xy), (planar_trial, planar)))
-        jacobian = tuple(torch.where(better, a, b) for a, b in zip(jacobian_trial, jacobian))  # type: ignore[assignment]
-        error, scale = torch.where(better, error_trial, error), torch.where(better, 1.0, scale / 2)
-    return xy
-
-
-def _newton_step(value: Tensor, jacobian: tuple[Tensor, Tensor, Tensor, Tensor], target: Tensor) -> Tensor:
-    xx, xy, yx, yy = jacobian
-    ex, ey = (value - target).unbind(-1)
-    determinant = xx * yy - xy * yx
-    determinant = torch.where(determinant.abs() < 1e-12, 1e-12, determinant)
-    return torch.stack([(yy * ex - xy * ey) / determinant, (xx * ey - yx * ex) / determinant], -1)
-
-
-def _orients(jacobian: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
-    """Whether the map keeps orientation here: past a fold it mirrors, past two it rotates by 180 degrees."""
-    xx, xy, yx, yy = jacobian
-    return (xx * yy - xy * yx > 0) & (xx + yy > 0)
 
 
 def _tilt_matrix(lens: Brown) -> Tensor | None:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from arraygeom.lenses import (
     Orthographic,
     PolynomialFisheye,
     RollingShutter,
+    Splined,
 )
 
 HW = (96, 128)
@@ -53,12 +55,15 @@ class Stereographic(CameraModel, name="stereographic"):
 K = (0.02, -0.03, 0.005)
 MOTION = {"velocity": (0.5, 0.1, 0.2), "rotation": (0.1, 0.3, 0.2), "readout": 0.05}
 PORT = {"distance": 0.05, "thickness": 0.01, "glass": 1.52, "water": 1.333}
+KNOTS = torch.from_numpy(np.random.default_rng(3).normal(size=(7, 8, 2)) * 0.03)
 MODELS = {
     "polynomial": (PolynomialFisheye(number(*K), number(1.9)), 35.0),
     "equirectangular": (Equirectangular(), HW[1] / (2 * math.pi)),
     "orthographic": (Orthographic(), 40.0),
     "rolling shutter": (RollingShutter(**{n: number(*np.atleast_1d(v)) for n, v in MOTION.items()}), 110.0),
     "port": (FlatPort(**{n: number(v) for n, v in PORT.items()}), 110.0),
+    "splined": (Splined(KNOTS, number(0.75, 0.7), 2), 35.0),
+    "splined pinhole": (Splined(KNOTS, number(0.6, 0.55), base="pinhole"), 90.0),
     "own": (Stereographic(), 35.0),
 }
 
@@ -128,6 +133,26 @@ def of_port(X):
     return X[:, :2] / radius[:, None] * np.tan(low)[:, None], depth > 0
 
 
+def of_splines(X, *, spacing, order, pinhole):
+    """By SciPy's B-splines: knots evenly spaced, the middle one at u = 0."""
+    spline = pytest.importorskip("scipy.interpolate").BSpline
+    length = np.linalg.norm(X, axis=1)
+    some = length + X[:, 2] > 1e-6 * length
+    u = 2 * X[:, :2] / np.where(some, length + X[:, 2], 1.0)[:, None]
+    counts = np.array([8, 7])
+    at = u / np.array(spacing) + (counts - 1) / 2
+    margin = (order - 1) / 2
+    inside = some & (at >= margin).all(1) & (at <= counts - 1 - margin).all(1) & (X[:, 2] > 0 if pinhole else True)
+    clipped = np.clip(at, margin, counts - 1 - margin - 1e-9)
+    weights = [
+        spline.design_matrix(clipped[:, i], np.arange(counts[i] + order + 1) - (order + 1) / 2, order).toarray()
+        for i in range(2)
+    ]
+    moved = np.einsum("nx,ny,yxc->nc", *weights, KNOTS.numpy())
+    base = X[:, :2] / np.where(X[:, 2] > 0, X[:, 2], 1.0)[:, None] if pinhole else u
+    return base + moved, inside
+
+
 def of_own(X):
     direction = X / np.linalg.norm(X, axis=1, keepdims=True)
     half = np.arccos(direction[:, 2]) / 2
@@ -141,6 +166,8 @@ ORACLES = {
     "orthographic": of_parallel,
     "rolling shutter": of_moving,
     "port": of_port,
+    "splined": partial(of_splines, spacing=(0.75, 0.7), order=2, pinhole=False),
+    "splined pinhole": partial(of_splines, spacing=(0.6, 0.55), order=3, pinhole=True),
     "own": of_own,
 }
 

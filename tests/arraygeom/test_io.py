@@ -41,6 +41,7 @@ PAIRS = [
     ("boofcv.yaml", "boofcv", ("left", "right"), {}),
     ("luxonis.json", "luxonis", ("CAM_B", "CAM_C"), {}),
     ("mrcal", "mrcal", ("a", "b"), {}),
+    ("realsense.txt", "realsense", ("Depth", "Color"), {}),
     ("pycalib.json", "pycalib", ("cam0", "cam1"), SIZE),
 ]
 POINT = torch.tensor([-0.782, -0.22, 1.876], dtype=torch.float64)

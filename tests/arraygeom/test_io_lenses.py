@@ -40,6 +40,46 @@ def test_kalibrs_wide_cameras():
         np.testing.assert_allclose(pixels(rig, name, POINTS), expected, atol=1e-9)
 
 
+SPLINED = {
+    "splined_quadratic.cameramodel": [
+        *([203.0801058, 91.3013001], [66.2592018, 181.1903377], [166.5018141, 119.3022604]),
+        *([287.9837165, 160.7773555], [76.7903893, 45.3919523]),
+    ],
+    "splined_cubic.cameramodel": [
+        *([191.3779769, 97.5998981], [91.3854572, 163.8429519], [164.7146297, 118.3932334]),
+        *([255.3497842, 148.6349385], [98.8161924, 61.5929395]),
+    ],
+    "lensboy.json": [
+        *([199.5283693, 91.2921426], [60.7742698, 185.4619071], [161.9432258, 117.327744]),
+        *([306.7872959, 162.6586132], [70.1686254, 37.5007067]),
+    ],
+}
+"""The pixels of `POINTS` that mrcal 2.2 (`mrcal.project`) and lensboy 4.0.3 (`project_points`) give."""
+
+
+@pytest.mark.parametrize("file", SPLINED)
+def test_splined_cameras(file, tmp_path):
+    """Random knots; written in our own format, the camera is the same."""
+    rig = read_rig(FIXTURES / file)
+    (name,) = rig.names
+    np.testing.assert_allclose(pixels(rig, name, POINTS), SPLINED[file], atol=1e-7)
+    rig.save(tmp_path / "rig.yaml")
+    again = Rig.load(tmp_path / "rig.yaml")
+    np.testing.assert_array_equal(pixels(again, name, POINTS), pixels(rig, name, POINTS))
+
+
+def test_mrcals_sphere(tmp_path):
+    """LENSMODEL_LONLAT: fx and fy are pixels a radian."""
+    text = (FIXTURES / "mrcal" / "b.cameramodel").read_text()
+    text = text.replace("OPENCV4", "LONLAT").replace("-0.2, 0.1, 0.001, -0.002,", "")
+    (tmp_path / "sphere.cameramodel").write_text(text)
+    rig = read_rig(tmp_path / "sphere.cameramodel")
+    X = rig["sphere"].cam_from_world.apply(torch.from_numpy(POINTS)).numpy()
+    longitude, latitude = np.arctan2(X[:, 0], X[:, 2]), np.arcsin(X[:, 1] / np.linalg.norm(X, axis=1))
+    expected = np.stack([400 * longitude + 310.25, 404 * latitude + 244.75], -1)
+    np.testing.assert_allclose(pixels(rig, "sphere", POINTS), expected, atol=1e-9)
+
+
 def test_colmaps_wide_cameras():
     """COLMAP's first pixel has its centre at 0.5."""
     rig = read_rig(FIXTURES / "colmap_wide")
