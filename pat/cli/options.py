@@ -206,7 +206,10 @@ def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> R
 def refuse_missing_rig(path: Path) -> None:
     """Raise FileNotFoundError for a rig file that does not exist, before torch is imported to read it."""
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such rig file: check the path")
+        _, _, file = str(path).partition("=")
+        named = file and Path(file).exists()
+        advice = "if it is an image, write --image before each NAME=FILE" if named else "check the path"
+        raise FileNotFoundError(f"{path}: no such rig file: {advice}")
 
 
 def refuse_missing_image(path: Path) -> None:

@@ -272,10 +272,10 @@ def main() -> None:
             first += [shown(FIRST_COLUMNS, [f"`{cells[0]}`{note}", *cells[1:]]) for cells in lines]
     threads = os.environ.get("OMP_NUM_THREADS", "all")
     text = (
-        f"`pat fuse` as a process, imports and written files included. "
+        "`pat fuse` as a process, imports and written files included. Written by `make bench-job`.\n"
         f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores, {threads} threads; "
-        f"load {load:.1f} before, {os.getloadavg()[0]:.1f} after; "
-        f"medians of {runs} runs (4024x3036: one), in turn with the others. Written by `make bench-job`.\n\n"
+        f"load {load:.1f} before, {os.getloadavg()[0]:.1f} after;\n"
+        f"medians of {runs} runs (4024x3036: one), in turn with the others.\n\n"
         f"{table(COLUMNS, rows)}\nWhere the time goes: share of the seconds, and seconds of a core. Each part without "
         f"those within it.\n\n{table(('', *STAGE_NAMES), stages)}"
     )

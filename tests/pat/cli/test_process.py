@@ -103,6 +103,7 @@ def test_what_the_parser_refuses_is_one_line(words, capsys):
     [
         (["fuse", "no.yaml", "--image", "a=b.png"], "no.yaml: no such rig file"),
         (["rig", "info", "no.yaml"], "no.yaml: no such rig file"),
+        (["fuse", "--image", "a=LICENSE", "b=README.md"], "b=README.md: no such rig file: if it is an image, write"),
         (["fuse", "no.png", "nothing.png"], "no.png: no such image"),
         (["align", "no.png", "nothing.png"], "no.png: no such image"),
         (["fuse", "--image", "mono.png", "--image", "c=b.png"], "the images alone: `pat fuse mono.png b.png`"),
