@@ -176,8 +176,9 @@ def test_importing_arraygeom_and_fusion_is_light():
         return set(done.stdout.split())
 
     assert not loaded("arraygeom") & {"kornia", "cv2", "scipy", "matplotlib"}
-    assert "pat.fusion.fuse" in loaded("pat.fusion.batch")
-    assert not loaded("pat.fusion.batch") & {"matplotlib", "av", "anywidget", "bpy"}
+    of_batches = loaded("pat.fusion.batch")
+    assert "pat.fusion.fuse" in of_batches
+    assert not of_batches & {"matplotlib", "av", "anywidget", "bpy"}
 
 
 def test_an_optional_package_that_is_missing_is_named_with_its_extra():

@@ -1,7 +1,10 @@
 """The checker that the tests put around every function sees wrong types and sizes."""
 
+import itertools
+import random
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 import torch
 from jaxtyping import Float
@@ -11,7 +14,7 @@ from arraygeom import Camera, Pose, intrinsics, sample
 from pat.media.colour import from_luma_chroma
 from pat.networks.blocks import enlarge
 
-from .typecheck import jaxtyped
+from .typecheck import WITH_ARGUMENTS, jaxtyped, of_types
 
 
 def refused():
@@ -94,3 +97,32 @@ def test_annotations_stay_as_they_are_written():
     notes = dict(f.__annotations__)
     jaxtyped(f)
     assert f.__annotations__ == notes
+
+
+def test_axes_are_compared_as_jaxtyping_compares_them():
+    """Types of arrays of every kind, each with a few of many values, in calls of two arguments."""
+    words = ("n", "n m", "n 3", "*b n", "*b 3 n", "*b n n", "...", "... n", "_ n", "*b", "2 *b n", "", "n *_ m", "n _")
+    shapes = [shape for k in range(4) for shape in itertools.product((2, 3), repeat=k)]
+    values = [torch.zeros(shape) for shape in shapes] + [torch.zeros(2, 3, dtype=torch.int64), np.zeros((2, 3)), 1.0]
+    pairs, rng = list(itertools.product(values, repeat=2)), random.Random(0)
+    seen = set()
+    for one, other in itertools.product(words, repeat=2):
+
+        def f(x, y): ...
+
+        f.__annotations__ = {"x": Float[Tensor, one], "y": Float[Tensor, other]}
+        f.__qualname__ = "f"
+        ours, theirs = jaxtyped(f), WITH_ARGUMENTS(f, typechecker=of_types)
+        for x, y in rng.sample(pairs, 8):
+            verdicts = [accepts(function, x, y) for function in (ours, theirs)]
+            assert verdicts[0] == verdicts[1], (one, other, x, y)
+            seen.add(verdicts[0])
+    assert seen == {True, False}
+
+
+def accepts(function, *given):
+    try:
+        function(*given)
+    except TypeError:
+        return False
+    return True

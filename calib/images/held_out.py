@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from arraygeom import Rig
+from arraygeom.pixels import HW
 
 from .matches import Pairs, PointMatches
 from .refined import LineStatistics
@@ -60,17 +61,17 @@ def split(frames: Sequence[Pairs]) -> tuple[dict[tuple[str, str], PointMatches],
         held_out = max(1, len(frames) // HELD_OUT)
         return _joined(frames[:-held_out]), _joined(frames[-held_out:])
     (pairs,) = frames
-    marks = {names: _held_out_points(matches) for names, matches in pairs.items()}
+    marks = {names: held_out_parts(matches) == 0 for names, matches in pairs.items()}
     return (
         {names: matches.only(~marks[names]) for names, matches in pairs.items()},
         {names: matches.only(marks[names]) for names, matches in pairs.items() if bool(marks[names].any())},
     )
 
 
-def _held_out_points(matches: PointMatches) -> Tensor:
-    """Points in one square out of `HELD_OUT`."""
+def held_out_parts(matches: PointMatches) -> Int[Tensor, " n"]:
+    """Which of `HELD_OUT` parts, each of squares of alpha, a point is in; that of number 0 is held out."""
     column, row = (matches.alpha / CELL).floor().long().unbind(-1)
-    return (column + 2 * row) % HELD_OUT == 0
+    return (column + 2 * row) % HELD_OUT
 
 
 def _joined(frames: Sequence[Pairs]) -> dict[tuple[str, str], PointMatches]:
@@ -87,9 +88,11 @@ def held_out_pixels(error: Tensor) -> Tensor:
 
 def image_parts(rig: Rig, pairs: Pairs) -> Int[Tensor, " n"]:
     """Which of `PARTS` x `PARTS` parts of alpha's image each point is in."""
-    found = []
-    for names, matches in pairs.items():
-        h, w = rig[names[0]].hw
-        cell = (matches.alpha * PARTS / matches.alpha.new_tensor([w, h])).floor().long().clamp(0, PARTS - 1)
-        found.append(cell[:, 0] + PARTS * cell[:, 1])
-    return torch.cat(found)
+    return torch.cat([parts_of(rig[alpha].hw, matches.alpha) for (alpha, _), matches in pairs.items()])
+
+
+def parts_of(hw: HW, points: Float[Tensor, "n 2"]) -> Int[Tensor, " n"]:
+    """Which of `PARTS` x `PARTS` parts of an image of this size each point (x, y) is in."""
+    h, w = hw
+    cell = (points * PARTS / points.new_tensor([w, h])).floor().long().clamp(0, PARTS - 1)
+    return cell[:, 0] + PARTS * cell[:, 1]

@@ -93,17 +93,40 @@ def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
 
 def left_out(residuals: Residuals, solution: Solution, groups: Int[Tensor, " m"], count: int) -> Float[Tensor, "g n"]:
     """The changes of the free parameters, to first order, when the residuals of one group (0 to g - 1) are left out."""
-    r, J = jacobian(residuals, solution.full)
-    J = J[:, torch.cat([solution.active, torch.ones(J.shape[1] - len(solution.active), dtype=torch.bool)])]
+    considered = len(solution.full) - len(solution.active)
+    kept = torch.cat([solution.active, torch.ones(considered, dtype=torch.bool)])
+    changes = torch.zeros(count, len(solution.z), dtype=solution.z.dtype)
+    shifts = shifts_left_out(residuals, solution.full, groups, count, kept)
+    changes[:, solution.active] = shifts[:, : int(solution.active.sum())]
+    return changes
+
+
+def shifts_left_out(
+    residuals: Residuals,
+    z: Float[Tensor, " k"],
+    groups: Int[Tensor, " m"],
+    count: int,
+    kept: Bool[Tensor, " k"] | None = None,
+) -> Float[Tensor, "g n"]:
+    """The changes of those parameters that are `kept`, all unless stated, when one group of residuals is left out.
+
+    To first order, from the most probable z on.
+    """
+    r, J = jacobian(residuals, z)
+    J = J if kept is None else J[:, kept]
     weight = _weight(r)
     information = normal_equations(J.T, r, weight)[0] + torch.eye(J.shape[1], dtype=J.dtype)
-    changes = torch.zeros(count, len(solution.z), dtype=J.dtype)
+    changes = []
     for group in range(count):
         mine = groups == group
         part, slope = normal_equations(J[mine].T, r[mine], weight[mine])
-        step = torch.linalg.solve(information - part, slope)
-        changes[group, solution.active] = step[: int(solution.active.sum())]
-    return changes
+        changes.append(torch.linalg.solve(information - part, slope))
+    return torch.stack(changes)
+
+
+def posterior_covariance(residuals: Residuals, z: Float[Tensor, " k"]) -> Float[Tensor, "k k"]:
+    """Of all parameters, at the most probable z."""
+    return torch.linalg.inv(_normal_equations(*jacobian(residuals, z), z)[0])
 
 
 def most_probable(
@@ -126,7 +149,7 @@ def most_probable(
         def step(damping: float) -> Tensor:
             return z + basis @ torch.linalg.solve(information + damping * diagonal, slope)
 
-        return LocalModel(_cost(r, z, scale), lambda z: _cost(residuals(z).detach(), z, scale), step)
+        return LocalModel(cost(r, z, scale), lambda z: cost(residuals(z).detach(), z, scale), step)
 
     def is_converged(z: Tensor, moved: Tensor, *_: float) -> bool:
         return float((moved - z).abs().max()) < CONVERGED
@@ -134,7 +157,8 @@ def most_probable(
     return levenberg_marquardt(z, model, is_converged, steps=steps, damping=DAMPING)[0]
 
 
-def _cost(r: Tensor, z: Tensor, scale: float) -> float:
+def cost(r: Float[Tensor, " m"], z: Float[Tensor, " k"], scale: float) -> float:
+    """Minus twice the log probability of z and residuals of this scale, Cauchy's loss."""
     return float((r / scale).square().log1p().sum() + z.square().sum())
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from arraygeom import Camera, LensView, Link, Pair, Rig, View, essential_matrix, stack
-from arraygeom.pixels import to_homogeneous
+from arraygeom.pixels import HW, to_homogeneous
 
 from .matches import Pairs, PointMatches, fit_fundamental, line_distance, undistort_matches
 
@@ -86,15 +86,15 @@ def systematic_modes(pair: Pair, matches: PointMatches) -> tuple[Float[Tensor, "
         slopes = torch.autograd.grad(((b @ F) * a).sum(), (alpha, beta))
     norm = torch.cat(slopes, -1).norm(dim=-1).clamp(min=1e-150)
     found = [
-        torch.einsum("ni,nim->nm", slope / norm[:, None], _displacements(view, x)).nan_to_num()
+        torch.einsum("ni,nim->nm", slope / norm[:, None], displacements(view.hw, x)).nan_to_num()
         for slope, view, x in zip(slopes, (pair.alpha, pair.beta), matches)
     ]
     return found[0], found[1]
 
 
-def _displacements(view: View, points: Tensor) -> Tensor:
-    """(n, 2, 4)"""
-    h, w = view.hw
+def displacements(hw: HW, points: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2 4"]:
+    """Those of `systematic_modes`, at points (x, y) of an image of this size."""
+    h, w = hw
     p = (points - points.new_tensor([(w - 1) / 2, (h - 1) / 2])) / (0.5 * math.hypot(h, w))
     x, y = p.unbind(-1)
     r2 = (p * p).sum(-1, keepdim=True)

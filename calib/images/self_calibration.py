@@ -96,9 +96,8 @@ def self_calibrated(
     K = {name: intrinsics(length, views[name].hw) for name, length in _focal_lengths(views, link, focal).items()}
     near = near_lines(matches, link.F, within=NEAR_LINE)
     best = AS_GOOD * float(line_distance(near, link.F).median()) + SLACK
-    upright = _upright(link)
     trials: list[RefinedPair] = []
-    for pose in (*_lateral_poses(near, upright, K[alpha], K[beta]), *_poses(near, link.F, K[alpha], K[beta])):
+    for pose in initial_poses(near, link, K[alpha], K[beta]):
         cameras = {alpha: _camera(views[alpha], K[alpha], Pose.identity()), beta: _camera(views[beta], K[beta], pose)}
         LOG.info("calibrating %s and %s, pose %d", alpha, beta, len(trials) + 1)
         trial = _refined_pair(Rig(cameras), matches, near, fixed=("centre",) if lenses else ())
@@ -108,7 +107,7 @@ def self_calibrated(
         return None
     least = min(trial.distance for trial in trials)
     fitting = [t for t in trials if t.distance <= (1 + ALIKE / math.sqrt(t.points)) * least + ALIKE_SLACK]
-    found = min(fitting, key=lambda trial: float(angle(_pair(trial.rig).beta_from_alpha.R.T @ upright)))
+    found = min(fitting, key=lambda trial: float(angle(_pair(trial.rig).beta_from_alpha.R.T @ _upright(link))))
     rig = found.rig
     for name, view in lenses.items():
         rig = rig.with_camera(name, with_lens_of(_pair(rig).cameras[rig.names.index(name)], view))
@@ -234,6 +233,13 @@ def _focal_lengths(views: Mapping[str, View], link: Link, focal: Mapping[str, fl
     assumed = focal[beta] / ratio if beta in focal else FOCAL_SHARE * max(views[alpha].hw)
     own = focal.get(alpha, assumed)
     return {alpha: own, beta: focal.get(beta, own * ratio)}
+
+
+def initial_poses(
+    matches: PointMatches, link: Link, K: Float[Tensor, "3 3"], K_beta: Float[Tensor, "3 3"]
+) -> list[Pose]:
+    """Poses of beta, with baselines of 1, from which to fit: of parallel axes, by F, and by an essential matrix."""
+    return [*_lateral_poses(matches, _upright(link), K, K_beta), *_poses(matches, link.F, K, K_beta)]
 
 
 def _poses(matches: PointMatches, F: Tensor, K: Tensor, K_beta: Tensor) -> list[Pose]:

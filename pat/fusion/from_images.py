@@ -18,6 +18,7 @@ from arraygeom import Link, Rig
 from arraygeom.io.xmp import named_by_band, rig_of_images, states_cameras
 from arraygeom.progress import log_step, part, stage
 from arraygeom.undistortion import pixels_between
+from calib.images.focal_length import common_focal_length
 from calib.images.from_images import UncalibratedRig, rig_from_images
 from calib.images.known_intrinsics import centres_found
 from calib.images.lenses import describe_lenses
@@ -228,8 +229,31 @@ def found_rig(
         )
     for name in images.keys() - {alpha, *betas}:
         note(f"{name}: left out, too little in common with {alpha}")
+    observed = {} if lengths.keys() & {alpha, *betas} else _observed_focal_lengths(found, alpha, betas)
+    for name, (length, deviation) in observed.items():
+        note(
+            f"{name}: focal length {length / factors[name]:.0f} pixels +- {deviation:.0%}, by matched points"
+        )
+    lengths |= {name: length for name, (length, _) in observed.items()}
     rig = _calibrated(found, reduced, alpha, betas, lengths, network, note)
     return resized_rig(rig, images), [alpha, *betas]
+
+
+def _observed_focal_lengths(
+    found: UncalibratedRig, alpha: str, betas: Sequence[str]
+) -> dict[str, tuple[float, float]]:
+    """Of alpha and the betas of its size, pixels, and its relative deviation: that which the points of a pair
+    determine best; of none where no pair does."""
+    fits = []
+    for name in betas:
+        LOG.info("looking for the focal length of %s and %s", alpha, name)
+        views = {n: found.rig[n] for n in (alpha, name)}
+        fits.append(common_focal_length(views, found.rig.links[alpha, name], found.matches[alpha, name]))
+    best = min((fit for fit in fits if fit is not None), key=lambda fit: fit.deviation, default=None)
+    if best is None:
+        return {}
+    alike = [name for name in (alpha, *betas) if found.rig[name].hw == found.rig[alpha].hw]
+    return dict.fromkeys(alike, (best.length, best.deviation))
 
 
 def _calibrated(

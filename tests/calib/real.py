@@ -29,7 +29,8 @@ class RealPair(NamedTuple):
     images: dict[str, Tensor]
 
 
-def _named(name: str, rig: Rig, files: dict[str, Path]) -> RealPair:
+def named(name: str, rig: Rig, files: dict[str, Path]) -> RealPair:
+    """A pair of images in files, by camera."""
     images = {camera: read_image(file) for camera, file in files.items()}
     cameras = {c: rig[c].replace(hw=tuple(images[c].shape[1:])) for c in files}
     return RealPair(name, rig.replace(cameras=cameras), images)
@@ -40,7 +41,7 @@ def syntim(data: Path, names: tuple[str, ...] = SYNTIM) -> Iterator[RealPair]:
     for name in names:
         files = [sorted((data / "syntim").glob(f"{name}{i}_O*.png"))[0] for i in (0, 1)]
         rig = read_rig(data / "syntim" / f"cam_{name}_g")
-        yield _named(f"SYNTIM {name}", rig, dict(zip(("left", "right"), files)))
+        yield named(f"SYNTIM {name}", rig, dict(zip(("left", "right"), files)))
 
 
 def bumblebee(data: Path, names: tuple[str, ...] = BUMBLEBEE) -> Iterator[RealPair]:
@@ -48,11 +49,11 @@ def bumblebee(data: Path, names: tuple[str, ...] = BUMBLEBEE) -> Iterator[RealPa
     folder = data / "bumblebee2_scenes"
     rig = read_rig(folder / "stereo.yaml", scale=1e-3)
     for name in names:
-        yield _named(f"Bumblebee2 {name}", rig, {s: folder / f"{name}_{s}.jpg" for s in ("left", "right")})
+        yield named(f"Bumblebee2 {name}", rig, {s: folder / f"{name}_{s}.jpg" for s in ("left", "right")})
     folder = data / "calibration" / "bumblebee2_chess"
     rig = read_rig(folder / "stereo.yaml", scale=1e-3)
     for name in ("01", "06"):
-        yield _named(f"Bumblebee2 chess{name}", rig, {s: folder / f"{s}{name}.jpg" for s in ("left", "right")})
+        yield named(f"Bumblebee2 chess{name}", rig, {s: folder / f"{s}{name}.jpg" for s in ("left", "right")})
 
 
 def kitti(data: Path) -> Iterator[RealPair]:
@@ -60,10 +61,10 @@ def kitti(data: Path) -> Iterator[RealPair]:
     folder = data / "kitti" / "odometry_03_gray_stereo" / "sequences" / "03"
     rig = read_rig(folder / "calib.txt")
     for frame in ("000000", "000003"):
-        yield _named(f"KITTI 03/{frame}", rig, {f"cam{i}": folder / f"image_{i}" / f"{frame}.png" for i in (0, 1)})
+        yield named(f"KITTI 03/{frame}", rig, {f"cam{i}": folder / f"image_{i}" / f"{frame}.png" for i in (0, 1)})
     folder = data / "kitti" / "object_StereoRCNN"
     files = {"cam2": folder / "left.png", "cam3": folder / "right.png"}
-    yield _named("KITTI object", read_rig(folder / "calib.txt"), files)
+    yield named("KITTI object", read_rig(folder / "calib.txt"), files)
 
 
 def middlebury(data: Path) -> Iterator[RealPair]:
@@ -74,7 +75,7 @@ def middlebury(data: Path) -> Iterator[RealPair]:
         K = intrinsics(3740.0 / factor, hw)
         poses = [Pose(torch.eye(3).double(), torch.tensor([x, 0.0, 0.0]).double()) for x in (0.0, -0.16)]
         rig = Rig({side: Camera(K=K, cam_from_world=pose, hw=hw) for side, pose in zip(files, poses)})
-        yield _named(f"Middlebury {name}", rig, files)
+        yield named(f"Middlebury {name}", rig, files)
 
 
 def hilti(data: Path) -> Iterator[RealPair]:
@@ -82,7 +83,7 @@ def hilti(data: Path) -> Iterator[RealPair]:
     folder = data / "rigs" / "kalibr_hilti_5cam"
     rig = read_rig(folder / "calibration" / "calib_3_cam0-1-camchain-imucam.yaml")
     for i in (0, 2):
-        yield _named(f"Hilti {i}", rig, {f"cam{k}": folder / "rig_frames" / f"{i}_{k}.png" for k in (0, 1)})
+        yield named(f"Hilti {i}", rig, {f"cam{k}": folder / "rig_frames" / f"{i}_{k}.png" for k in (0, 1)})
 
 
 def lund(data: Path) -> Iterator[RealPair]:
@@ -90,7 +91,7 @@ def lund(data: Path) -> Iterator[RealPair]:
     folder = data / "rigs" / "colmap_lund_door"
     rig = read_rig(folder / "colmap_ground_truth")
     for a, b in ((1, 3), (4, 6), (8, 11)):
-        yield _named(f"Lund {a}-{b}", rig, {f"DSC_{i:04d}.JPG": folder / "images" / f"DSC_{i:04d}.JPG" for i in (a, b)})
+        yield named(f"Lund {a}-{b}", rig, {f"DSC_{i:04d}.JPG": folder / "images" / f"DSC_{i:04d}.JPG" for i in (a, b)})
 
 
 def fox(data: Path) -> Iterator[RealPair]:
@@ -98,7 +99,7 @@ def fox(data: Path) -> Iterator[RealPair]:
     folder = data / "rigs" / "nerf_fox"
     rig = read_rig(folder / "transforms.json")
     for a, b in (("0001", "0009"), ("0073", "0077"), ("0089", "0097")):
-        yield _named(f"fox {a}-{b}", rig, {f"images/{i}.jpg": folder / "images" / f"{i}.jpg" for i in (a, b)})
+        yield named(f"fox {a}-{b}", rig, {f"images/{i}.jpg": folder / "images" / f"{i}.jpg" for i in (a, b)})
 
 
 def ball(data: Path) -> Iterator[RealPair]:
@@ -110,7 +111,7 @@ def ball(data: Path) -> Iterator[RealPair]:
         hw = tuple(read_image(file).shape[1:])
         cameras[name] = Camera(K=numbers["K"], cam_from_world=Pose(numbers["R"], numbers["t"]), hw=hw)
     for a, b in (("cam1", "cam2"), ("cam2", "cam3")):
-        yield _named(f"rendered {a}-{b}", Rig(cameras), {c: files[c] for c in (a, b)})
+        yield named(f"rendered {a}-{b}", Rig(cameras), {c: files[c] for c in (a, b)})
 
 
 def every_pair(data: Path) -> Iterator[RealPair]:

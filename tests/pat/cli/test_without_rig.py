@@ -4,6 +4,7 @@ import io
 import re
 import shutil
 import sys
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -292,3 +293,20 @@ def test_focal_lengths_are_of_the_images_as_given(halved, monkeypatch):
     focal = {name: float(known[name].K[0, 0]) for name in known.names}
     rig, _ = found_rig(images, "mono", focal, load_weights("mono-colour"), lambda line: None)
     assert float(rig["mono"].K[0, 0]) == pytest.approx(focal["mono"], rel=1e-3)
+
+
+def test_a_focal_length_that_points_determine_is_used_and_said(halved, monkeypatch):
+    """It was assumed, by up to 146 % wrong, whatever the images said."""
+    _, images, _ = halved
+    images = {name: image[..., :360, :480] for name, image in images.items()}
+    monkeypatch.setattr("pat.fusion.from_images.MATCHED", 300)
+    same = {name: image[..., : images["mono"].shape[-2], : images["mono"].shape[-1]] for name, image in images.items()}
+    fit = SimpleNamespace(length=250.0, deviation=0.07)
+    monkeypatch.setattr("pat.fusion.from_images.common_focal_length", lambda *given: fit)
+    lines = []
+    found_rig(same, "mono", {}, load_weights("mono-colour"), lines.append)
+    assert any("mono: focal length" in line and "+- 7%, by matched points" in line for line in lines)
+    assert not any("focal lengths assumed of mono" in line for line in lines)
+    given = []
+    found_rig(same, "mono", {"mono": 300.0}, load_weights("mono-colour"), given.append)
+    assert not any("by matched points" in line for line in given)

@@ -1,0 +1,217 @@
+"""A common focal length of two cameras of one kind, from matched points alone, where these determine it.
+
+F has seven degrees of freedom and a pose five, so that two views determine a focal length unless their axes are nearly
+parallel or meet at equal distances (Hartley and Zisserman, section 19.3.1). What else is unknown of the cameras takes
+its share of the residuals: principal points, a radial term, what it leaves of the lenses, and how unlike both focal
+lengths are. Parameters are in units of their prior standard deviations, as in `least_squares`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from arraygeom import Camera, Link, Pose, Rig, View, intrinsics, rotation_from_vector
+from arraygeom.pixels import HW
+from arraygeom.threads import torch_in_one_thread
+
+from .depth_change import share_behind
+from .held_out import HELD_OUT, PARTS, held_out_parts, nearer, parts_of
+from .least_squares import cost, most_probable, noise_scale, posterior_covariance, shifts_left_out
+from .matches import PointMatches
+from .residuals import displacements
+from .self_calibration import FOCAL_SHARE, initial_poses
+
+SIGMA = {"focal": 0.5, "ratio": 0.01, "pose": 3.0, "centre": 0.03, "radial": 0.1, "systematic": 0.3}
+"""Prior standard deviations: of the focal length as a share of the one assumed (the log of), and of the ratio of both;
+radians, and of a baseline of 1; of principal points as a share of the longer side; of the radial term at half the
+longer side; of the smooth displacements that it leaves, pixels at the image's corner."""
+SEARCHED = (0.5, 1.0, 2.0)
+"""Multiples of the assumed focal length from which the fit starts; from the two best poses at each."""
+STEPS = 30
+POINTS = 500
+"""Points that are used: more hardly determine it better."""
+LARGEST_DEVIATION = 0.25
+"""A focal length is found if its relative standard deviation is no larger than this,"""
+SIGNIFICANT = 3.0
+"""if it differs from the one assumed by this many, and if held-out points are nearer to their lines with it."""
+BEHIND = 0.5
+"""Share of points that may lie behind a camera: of mirrored poses all do."""
+
+
+@torch_in_one_thread()
+def common_focal_length(views: Mapping[str, View], link: Link, matches: PointMatches) -> FocalFit | None:
+    """The focal length that two cameras (alpha, beta) of one image size share, if the points determine it.
+
+    Square pixels are taken for granted. None where the points do not tell it from the focal length that is assumed, or
+    not well, and for views of unlike sizes, a mirrored one, or points that no pose has in front of both cameras.
+    """
+    fit = fit_focal_length(views, link, matches)
+    return fit if fit is not None and fit.found else None
+
+
+def fit_focal_length(views: Mapping[str, View], link: Link, matches: PointMatches) -> FocalFit | None:
+    """The most probable of the fits from several focal lengths and poses, whether or not points determine it.
+
+    None for views of unlike sizes, a mirrored one, or points that no pose has in front of both cameras.
+    """
+    (alpha, beta), (hw, hw_beta) = views, (view.hw for view in views.values())
+    if hw != hw_beta or _is_mirrored(matches):
+        return None
+    kept = torch.randperm(len(matches.alpha), generator=torch.Generator().manual_seed(0))[:POINTS]
+    points = PointMatches(*(x[kept].double() for x in matches))
+    fits: list[FocalFit] = []
+    for factor in SEARCHED:
+        K = intrinsics(factor * FOCAL_SHARE * max(hw), hw).double()
+        starts = [TwoViews(hw, pose, points) for pose in initial_poses(points, link, K, K)]
+        z = torch.zeros(len(starts[0].sigma), dtype=torch.float64)
+        z[0] = math.log(factor) / SIGMA["focal"]
+        ahead = [start for start in starts if start.share_behind((alpha, beta), z) <= BEHIND]
+        best = sorted(ahead, key=lambda start: cost(start.residuals(z), z, 1.0))[:2]
+        fits += [FocalFit(start, start.fitted(z)) for start in best]
+    fits = [fit for fit in fits if fit.views.share_behind((alpha, beta), fit.z) <= BEHIND]
+    if not fits:
+        return None
+    left = [fit.views.residuals(fit.z) for fit in fits]
+    scale = min(noise_scale(r) for r in left)
+    return min(zip(fits, left), key=lambda pair: cost(pair[1], pair[0].z, scale))[0]
+
+
+def _is_mirrored(matches: PointMatches) -> bool:
+    """Whether beta's points are best fitted by a map that mirrors: no pose has such lines."""
+    x = torch.cat([matches.alpha, torch.ones_like(matches.alpha[:, :1])], -1)
+    return float(torch.linalg.det(torch.linalg.lstsq(x, matches.beta).solution[:2])) <= 0
+
+
+@dataclass(frozen=True)
+class TwoViews:
+    """Two cameras of one size, a pose of beta from which changes count, and the points.
+
+    z: change of the log focal length, of the ratio's, rotation (3), baseline's direction (2), principal points (4),
+    radial terms (their mean, half their difference), displacements (8).
+    """
+
+    hw: HW
+    pose: Pose
+    points: PointMatches
+
+    @cached_property
+    def unit(self) -> float:
+        """Half the longer side, pixels."""
+        return max(self.hw) / 2
+
+    @cached_property
+    def sigma(self) -> Float[Tensor, " k"]:
+        """Of each component."""
+        centre, pose = SIGMA["centre"] * max(self.hw), SIGMA["pose"]
+        parts = [SIGMA["focal"], SIGMA["ratio"], *[pose] * 5, *[centre] * 4, SIGMA["radial"]]
+        left = [SIGMA["systematic"] / math.hypot(*self.hw) * 2, *[SIGMA["systematic"]] * 8]
+        return torch.tensor(parts + left, dtype=torch.float64)
+
+    @cached_property
+    def basis(self) -> Float[Tensor, "3 3"]:
+        """Columns: two directions across the baseline, and its own."""
+        across = torch.linalg.svd(self.pose.t[None]).Vh[1:]
+        return torch.cat([across, self.pose.t[None]]).T
+
+    @cached_property
+    def centred(self) -> list[Tensor]:
+        """Points about the images' centres."""
+        h, w = self.hw
+        return [x - x.new_tensor([(w - 1) / 2, (h - 1) / 2]) for x in self.points]
+
+    @cached_property
+    def smooth(self) -> list[Tensor]:
+        """Smooth displacements of the points, (n, 2, 4)."""
+        return [displacements(self.hw, x) for x in self.points]
+
+    def length(self, z: Tensor) -> Tensor:
+        """Of alpha, pixels."""
+        return FOCAL_SHARE * max(self.hw) * (self.sigma[0] * z[0]).exp()
+
+    def moved(self, z: Tensor) -> Pose:
+        """The pose after a change, its baseline of length 1."""
+        change = self.sigma * z
+        t = self.basis @ torch.cat([change[5:7], torch.ones_like(change[:1])])
+        return Pose(rotation_from_vector(change[2:5]) @ self.pose.R, t / t.norm())
+
+    def residuals(self, z: Float[Tensor, " k"]) -> Float[Tensor, " n"]:
+        """Sampson distances of the points after a change, pixels."""
+        change, pose = self.sigma * z, self.moved(z)
+        f = self.length(z)
+        rays = []
+        lengths = f, f * change[1].exp()
+        for i, (x, smooth, length) in enumerate(zip(self.centred, self.smooth, lengths)):
+            x = x - change[7 + 2 * i : 9 + 2 * i] + smooth @ change[13 + 4 * i : 17 + 4 * i]
+            radial = change[11] + (change[12] if i else -change[12])
+            x = x * (1 + radial * (x / self.unit).square().sum(-1, keepdim=True))
+            rays.append(torch.cat([x / length, torch.ones_like(x[:, :1])], -1))
+        a, b = rays
+        rotated = a @ pose.R.T
+        line = torch.linalg.cross(pose.t.expand_as(rotated), rotated)
+        line_alpha = torch.linalg.cross(b, pose.t.expand_as(b)) @ pose.R
+        slopes = [part[:, :2] / length for part, length in zip((line_alpha, line), lengths)]
+        return (b * line).sum(-1) / torch.cat(slopes, -1).square().sum(-1).clamp(min=1e-24).sqrt()
+
+    def fitted(self, z: Tensor, *, fixed: int = 0) -> Tensor:
+        """The most probable change, from z on; the first `fixed` components stay."""
+        return most_probable(self.residuals, z, torch.eye(len(z), dtype=z.dtype)[:, fixed:], steps=STEPS)
+
+    def share_behind(self, names: tuple[str, str], z: Tensor) -> float:
+        """Of the points, behind a camera."""
+        K = intrinsics(float(self.length(z)), self.hw).double()
+        poses = Pose.identity(), self.moved(z)
+        rig = Rig({n: Camera(hw=self.hw, K=K, cam_from_world=pose) for n, pose in zip(names, poses)})
+        return share_behind(rig, {names: self.points})
+
+
+@dataclass(frozen=True)
+class FocalFit:
+    """The most probable change z of two views, and what it says of their focal length."""
+
+    views: TwoViews
+    z: Float[Tensor, " k"]
+
+    @property
+    def length(self) -> float:
+        """Pixels."""
+        return float(self.views.length(self.z))
+
+    @property
+    def change(self) -> float:
+        """Of the logarithm, from the one that is assumed."""
+        return float(self.views.sigma[0] * self.z[0])
+
+    @cached_property
+    def deviation(self) -> float:
+        """Relative, of the focal length: that of the points' noise, or of a jackknife over parts of the image."""
+        residuals, z = self.views.residuals, self.z
+        covariance = posterior_covariance(residuals, z)
+        groups = parts_of(self.views.hw, self.views.points.alpha)
+        shifts = shifts_left_out(residuals, z, groups, PARTS**2)[:, 0]
+        jackknife = (PARTS**2 - 1) / PARTS**2 * shifts.square().sum()
+        return float(self.views.sigma[0] * torch.maximum(covariance[0, 0], jackknife).sqrt())
+
+    def is_nearer(self) -> bool:
+        """Whether points are nearer to their lines than with the focal length assumed, by fits that held them out."""
+        points, part = self.views.points, held_out_parts(self.views.points)
+        distances = torch.zeros(2, len(part), dtype=torch.float64)
+        for held_out in range(HELD_OUT):
+            out = part == held_out
+            others = replace(self.views, points=points.only(~out))
+            for row, first in enumerate((0.0, float(self.z[0]))):
+                z = torch.cat([self.z.new_tensor([first]), self.z[1:]])
+                distances[row, out] = self.views.residuals(others.fitted(z, fixed=1))[out]
+        return nearer(*distances)
+
+    @property
+    def found(self) -> bool:
+        """Whether the points tell it from the focal length that is assumed, and determine it well."""
+        well = self.deviation <= LARGEST_DEVIATION and abs(self.change) >= SIGNIFICANT * self.deviation
+        return well and self.is_nearer()
