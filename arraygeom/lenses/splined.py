@@ -174,7 +174,7 @@ def _length(X: Tensor) -> Tensor:
 
 
 def _basis(t: Tensor, order: int) -> tuple[Tensor, Tensor]:
-    """Uniform B-splines (*n, side), and their slopes, of knots 0, 1, ... at the coordinates t from the first of them."""
+    """Uniform B-splines (*n, side) and their slopes, of knots 0, 1, ...; t is from the first of them."""
     s = t - 1
     if order == 2:
         weights = [(0.5 - s) ** 2 / 2, 0.75 - s**2, (0.5 + s) ** 2 / 2]
