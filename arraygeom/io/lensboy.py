@@ -37,9 +37,7 @@ def read(source: RigSource) -> Rig:
     camera = Camera(
         K=source.focal_and_centre(numbers, "fx, fy, cx, cy"),
         cam_from_world=Pose.identity(),
-        hw=source.size(
-            *(source.get(fields, key, "") for key in ("image_width", "image_height")), "image_width, height"
-        ),
+        hw=source.size_of([source.get(fields, f"image_{side}", "") for side in ("width", "height")], "image_width"),
         distortion=_lens(source, fields),
     )
     return source.rig([(source.path.stem, camera)])
