@@ -66,7 +66,7 @@ CASES = (
     Case(4, "1600MiB", lens=True),
     Case(4, "1600MiB", rig=False),
     Case(4, "2GiB", betas=2),
-    Case(4, "2GiB", betas=4),
+    Case(4, "3GiB", betas=4),
     Case(4, "2GiB", noise=True),
     Case(12, None),
     Case(12, "2GiB", lens=True),
