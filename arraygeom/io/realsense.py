@@ -26,8 +26,6 @@ EXTRINSIC = re.compile(
     re.M,
 )
 ENTRY = re.compile(r"^\s*([^:\n]+?)\s*:\s*(.*?)\s*$", re.M)
-LENSES = {"None": None, "Brown Conrady": "brown", "Modified Brown Conrady": "brown", "Inverse Brown Conrady": "inverse"}
-LENSES |= {"Kannala Brandt4": "fisheye"}
 
 
 class Stream(NamedTuple):
@@ -94,13 +92,21 @@ def _camera(source: RigSource, stream: Stream, pose: Pose) -> Camera:
 
 
 def _lens(source: RigSource, name: str, fields: dict[str, str]) -> Distortion | None:
-    """A lens; of the inverse model, whose polynomial undistorts, only one whose coefficients are 0."""
+    """A lens; none of coefficients 0.
+
+    The modified model applies p1 and p2 to points that are distorted already: it is read where they are 0, and then the
+    same. The inverse model's polynomial undistorts.
+    """
     c = source.numbers_in(fields.get("Coeffs", ""), None, f"{name} Coeffs")
     kind = source.get(fields, "Distortion", name)
     if not c.any():
         return None
-    if LENSES.get(kind) in ("brown", "fisheye"):
-        return (source.brown_conrady if LENSES[kind] == "brown" else source.kannala_brandt)(c, f"{name} Coeffs")
+    if kind == "Brown Conrady" or (kind == "Modified Brown Conrady" and not c[2:4].any()):
+        return source.brown_conrady(c, f"{name} Coeffs")
+    if kind == "Kannala Brandt4" and not c[4:].any():  # printed as five numbers
+        return source.kannala_brandt(c[:4], f"{name} Coeffs")
     raise source.fail(
-        f"{name} Distortion", f"is '{kind}' with coefficients; Brown Conrady and Kannala Brandt4 are read"
+        f"{name} Distortion",
+        f"is '{kind}' with these coefficients; Brown Conrady, Kannala Brandt4, and Modified Brown Conrady without "
+        "tangential terms are read",
     )

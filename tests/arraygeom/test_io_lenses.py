@@ -80,6 +80,23 @@ def test_mrcals_sphere(tmp_path):
     np.testing.assert_allclose(pixels(rig, "sphere", POINTS), expected, atol=1e-9)
 
 
+REALSENSE = {
+    "Modified Brown Conrady": ("-0.2  \t0.1  \t0  \t0  \t0.01", "brown-conrady", [-0.2, 0.1, 0, 0, 0.01]),
+    "Kannala Brandt4": ("0.1  \t-0.02  \t0.003  \t-0.004  \t0", "kannala-brandt", [0.1, -0.02, 0.003, -0.004]),
+}
+
+
+@pytest.mark.parametrize(("kind", "case"), REALSENSE.items(), ids=list(REALSENSE))
+def test_realsenses_other_lenses(kind, case, tmp_path):
+    """Fisheyes are printed with a fifth number; without tangential terms the modified model is the plain one."""
+    text = (FIXTURES / "realsense.txt").read_text().replace("-0.2  \t0.1  \t0.001  \t-0.002  \t0", case[0])
+    (tmp_path / "camera.txt").write_text(
+        text.replace("404\n  Distortion: \tBrown Conrady", f"404\n  Distortion: \t{kind}")
+    )
+    lens = read_rig(tmp_path / "camera.txt")["Color"].distortion
+    assert (lens.model, lens.coefficients.tolist()) == (case[1], pytest.approx(case[2]))
+
+
 def test_colmaps_wide_cameras():
     """COLMAP's first pixel has its centre at 0.5."""
     rig = read_rig(FIXTURES / "colmap_wide")

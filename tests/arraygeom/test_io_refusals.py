@@ -213,9 +213,15 @@ OTHER_MAKERS = {
     "no field": ("lensboy.json", '"fov_deg_y": 64.0', '"fov_deg_y": 400', "fov_deg_y: is 400 of 6 knots"),
     "inverse": (
         "realsense.txt",
-        "404\n  Distortion: \tModified",
-        "404\n  Distortion: \tInverse",
-        "Color Distortion: is 'Inverse Brown Conrady'",
+        "404\n  Distortion: \t",
+        "404\n  Distortion: \tInverse ",
+        "Color Distortion: is 'Inverse",
+    ),
+    "modified": (
+        "realsense.txt",
+        "404\n  Distortion: \t",
+        "404\n  Distortion: \tModified ",
+        "without tangential terms",
     ),
     "unrelated": ("realsense.txt", 'To\t  "Color"', 'To\t  "Gyro"', "Color: has no extrinsic from or to Depth"),
     "no width": ("realsense.txt", "Width:      \t640", "Width:      \tmany", "Depth Width, Height: holds something"),
