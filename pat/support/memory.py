@@ -48,9 +48,9 @@ def keep_freed() -> None:
 
 
 def planned(limit: float | None, memory: float, *, large: bool) -> float | None:
-    """The limit, or for a large task without one the memory that it is planned to take: freed memory that is kept
-    (`keep_freed`) comes on top, half as much again for a frame of 12 megapixels."""
-    return memory if limit is None and large and _keeps else limit
+    """The limit; for a large task what it is planned to take, if that is less: freed memory that is kept (`keep_freed`)
+    comes on top, half as much again for a frame of 12 megapixels."""
+    return min(memory, limit or memory) if large and _keeps else limit
 
 
 def give_back() -> None:
