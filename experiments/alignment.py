@@ -32,7 +32,7 @@ from calib.boards.rig import Calibration, calibrate
 from calib.boards.target import parse_board
 from calib.images.guided_matches import ALIKE, guided_matches
 from calib.images.matches import seen_depths
-from calib.images.refinement import refine
+from calib.images.refinement import EXTRA_FREE, FREE, refine
 from experiments.evaluation.halves import of_half
 from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair, middlebury_pairs
 from pat.evaluation.protocols import rectified_rig
@@ -420,7 +420,7 @@ def nine_band_scene(data: Path) -> Iterator[AlignmentScene]:
     images = {name: views[name] for name in rig.names}
     depths = [_depths_seen(rig, images, alpha, name) for name in ("Cam-3", "Cam-5")]
     bounds = min(near for near, _ in depths), max(far for _, far in depths)
-    refined = refine(views.developed.replace(depth=bounds), [images]).rig
+    refined = refine(views.developed.replace(depth=bounds), [images], free=(*FREE, *EXTRA_FREE, "distortion")).rig
     yield AlignmentScene("nine-band", refined, images, RecordedFiles(rig, files), alpha, True)
 
 
