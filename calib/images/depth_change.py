@@ -31,7 +31,9 @@ NEGLIGIBLE = 5e-4
 LARGE_CHANGE = 0.25
 """Relative change of depth that is not accepted unasked."""
 SMALL_CHANGE = 0.03
-"""Relative change of depth of no concern, where lines come nearer."""
+"""Relative change of depth of no concern, where lines come nearer and depth becomes more certain."""
+UNGAINED_CHANGE = 3.0
+"""A change of depth is of concern beyond this many times the deviation of it that it takes away."""
 FEW = 10
 """Least number of points whose depth is observable."""
 
@@ -50,8 +52,15 @@ class DepthChange(NamedTuple):
 
     @property
     def doubtful(self) -> bool:
-        """Whether depth changes considerably, and by less than some deviations of what the points determine."""
-        return self.change > SMALL_CHANGE and self.change < SIGNIFICANT_CHANGE * self.known
+        """Whether depth changes by less than some deviations of what the points determine, and considerably.
+
+        That is by more than a small share, or by far more than it gains in certainty: by a mode of depth that was
+        uncertain by so little beforehand, some other mistake of the rig (of a lens, say) is explained.
+        """
+        if self.change <= NEGLIGIBLE or self.change >= SIGNIFICANT_CHANGE * self.known:
+            return False
+        gained = max(self.before**2 - self.after**2, 0.0) ** 0.5
+        return self.change > SMALL_CHANGE or self.change > UNGAINED_CHANGE * gained
 
     def __str__(self) -> str:
         return (

@@ -18,7 +18,9 @@ from calib.images.residuals import epipolar_residuals, sampson_of_pairs
 from pat.attention import attend_with_statistics
 from pat.cli.main import main
 from pat.media.images import write_image
+from tests.benchmarks.bench_drift import DRIFTS, drifted, with_lens_mistake
 from tests.benchmarks.bench_drift import error as depth_error
+from tests.calib.real import bumblebee, syntim
 from tests.calib.scenes import (
     HW,
     rectified_images,
@@ -370,3 +372,32 @@ def test_poses_do_not_stand_in_for_lenses():
     assert ["other lenses" in objection for objection in found.objections] == [True]
     turned = rig.perturbed({"c1.rotation": torch.tensor([0.003, 0.003, 0.003], dtype=torch.float64)})
     assert refine_matches(turned, [matches]).accepted
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "seed"), [("SmRub", "k1 +.05", 0), ("SmRub", "centre 5 px", 1), ("Poly", "rotation 1", 1)]
+)
+def test_depth_does_not_change_for_nothing(shared_data, name, kind, seed):
+    """Real pairs' depth changed by 2.3 % or more, 4 to 76 times what its deviation fell by, and was worse for it."""
+    (pair,) = syntim(shared_data, (name,))
+    matches = match_cameras(pair.images)
+    rig = Rig({name: pair.rig[name] for name in pair.images})
+    lens = kind.startswith("k1")
+    bad = (
+        with_lens_mistake(rig, kind) if lens else drifted(rig, kind, np.random.default_rng([seed, DRIFTS.index(kind)]))
+    )
+    assert bad is not None
+    found = refine_matches(bad, [matches])
+    assert depth_error(found.rig, rig, matches) < depth_error(bad, rig, matches) + 0.01
+
+
+def test_depth_changes_far_where_it_is_known(shared_data):
+    """A real pair's second camera turned by a degree: depth changes by six times what its deviation falls by."""
+    (pair,) = (pair for pair in bumblebee(shared_data, ("chair01",)) if pair.name.endswith("chair01"))
+    matches = match_cameras(pair.images)
+    rig = Rig({name: pair.rig[name] for name in pair.images})
+    found = refine_matches(
+        drifted(rig, "rotation 1", np.random.default_rng([1, DRIFTS.index("rotation 1")])), [matches]
+    )
+    assert found.accepted
+    assert depth_error(found.rig, rig, matches) < 0.02
