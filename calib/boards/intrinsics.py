@@ -224,21 +224,26 @@ def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:
 
 
 def _pinhole(views: BoardViews, board: Board, count: int) -> OpenCVSolution:
-    """Two radial terms suffice initially: (K, coefficients, rotations, translations)."""
+    """K, coefficients, rotations, translations: of square pixels, a central principal point and one radial term.
+
+    The rest is left to the adjustment and its prior: few, small or similar boards determine neither the aspect ratio
+    nor further terms, and a fit of these without a prior ends anywhere.
+    """
     initial = board.points * (1, 1, 0) if board.flat else board.points
     points = [initial[d.ids].astype(np.float32) for d in views.seen.values()]
     pixels = [d.x.astype(np.float32)[:, None] for d in views.seen.values()]
     h, w = views.hw
-    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    flags = cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    flags |= cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_PRINCIPAL_POINT
     if not count:
-        flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
+        flags |= cv2.CALIB_FIX_K1
     K: np.ndarray = np.eye(3)
     if not board.flat:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
         K = _linear_intrinsics(max(zip(points, pixels), key=lambda view: len(view[0])), views.hw)
     _, K, c, rotations, translations = cv2.calibrateCamera(points, pixels, (w, h), K, np.zeros(5), flags=flags)
-    coefficients = np.zeros(max(count, 2))
-    coefficients[:2] = c.reshape(-1)[:2]
+    coefficients = np.zeros(max(count, 1))
+    coefficients[0] = c.reshape(-1)[0]
     return K, coefficients, list(rotations), list(translations)
 
 
