@@ -27,7 +27,8 @@ def found():
 
 def test_a_calibration_is_shown_in_a_few_lines(found):
     """In a notebook it was four thousand lines of residuals."""
-    assert "Rig" in repr(found) and len(repr(found)) < 1000
+    assert "Rig" in repr(found)
+    assert len(repr(found)) < 1000
 
 
 def test_projections_are_off_by_what_is_said(found):
