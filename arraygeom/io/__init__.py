@@ -17,7 +17,6 @@ import torch
 from ..atomic import sweep, write_text, write_together
 from ..camera import Camera, LensView
 from ..pixels import HW
-from ..pose import Pose
 from ..rig import Rig
 from ..rig_check import unit_oddity
 from ..sensor import Sensor
@@ -110,7 +109,7 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
     except (ArithmeticError, AttributeError, LookupError, OSError, RecursionError, TypeError, ValueError) as error:
         cause = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RigFileError(path, None, f"cannot be read as {format} ({cause}); is the file whole?") from error
-    rig = rig if scale == 1.0 else _scaled(rig, scale)
+    rig = rig if scale == 1.0 else rig.scaled(scale)
     _check_magnitudes(path, rig)
     if doubt := unit_oddity(rig):
         RigSource(path).warn(doubt)
@@ -185,13 +184,3 @@ def _check_magnitudes(path: Path, rig: Rig) -> None:
             raise RigFileError(path, name, f"has a translation of {float(view.t.abs().max()):g} m: use metres")
     if rig.depth is not None and float(rig.depth[0]) < 1 / LARGEST_NUMBER:
         raise RigFileError(path, "depth", f"begins at {float(rig.depth[0]):g} m: give a near bound in metres")
-
-
-def _scaled(rig: Rig, scale: float) -> Rig:
-    """The rig with all lengths multiplied."""
-    cameras = {
-        name: camera.replace(cam_from_world=Pose(camera.R, camera.t * scale)) if isinstance(camera, Camera) else camera
-        for name, camera in rig.cameras.items()
-    }
-    depth = None if rig.depth is None else tuple(bound * scale for bound in rig.depth)
-    return dataclasses.replace(rig, cameras=cameras, depth=depth)

@@ -218,7 +218,7 @@ def test_deviations_are_those_of_repeated_draws():
         bad = apply_change(rig, parameters, -z)
         fit = RefinementProblem.of(bad, ["right.rotation"], frames=[seen_points(rig, noise=0.2, seed=seed)])
         found = fit.solve()
-        errors.append((found.full[:3] - z[:3]) / found.full_covariance.diagonal()[:3].sqrt())
+        errors.append((found.full[:3] - z[:3]) / found.covariance.diagonal()[:3].sqrt())
     rms = torch.stack(errors).square().mean(0).sqrt()
     assert (rms > 0.3).all()
     assert (rms < 2).all()
