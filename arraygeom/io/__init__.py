@@ -44,6 +44,7 @@ from . import (
     strecha,
     syntim,
     xmp,
+    zed,
 )
 from .source import RigFileError, RigFileWarning, RigSource, UnknownRigFormat
 
@@ -73,6 +74,7 @@ READERS: dict[str, Any] = {
     "mrcal": mrcal,
     "lensboy": lensboy,
     "realsense": realsense,
+    "zed": zed,
 }
 READERS["caliscope"] = aniposelib
 WRITERS: dict[str, Any] = {

@@ -33,9 +33,9 @@ class Calibration:
 
     rig: Rig
     board: Board
-    fit: Solved
+    fit: Solved = field(repr=False)
     single: Mapping[str, float]
-    epipolar: Mapping[tuple[str, str], Float[np.ndarray, "_"]]
+    epipolar: Mapping[tuple[str, str], Float[np.ndarray, "_"]] = field(repr=False)
     notes: tuple[str, ...] = field(default=())
 
     @property

@@ -317,7 +317,8 @@ class RefinementProblem:
         explained = lens_alone.after(lens_alone.solve_freely().z)
         if nearer(line_distances(explained, self.held_out), distances):
             return []
-        what_to_do = "state the lenses that were calibrated" if rig is not self.rig else "give --free distortion"
+        every = ",".join((*FREE, *EXTRA_FREE, "distortion"))
+        what_to_do = "state the lenses that were calibrated" if rig is not self.rig else f"try --free {every}"
         return [f"other lenses explain the points as well as other poses, which would change depth: {what_to_do}"]
 
     def _depth_change(self, refined: Rig, solution: Solution) -> DepthChange | None:
