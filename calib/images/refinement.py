@@ -281,25 +281,22 @@ class RefinementProblem:
     def report(self, solution: Solution, *, force: bool = False) -> Refinement:
         """The changes by a solution, and whether the held-out points, the prior and depth's uncertainty support it."""
         refined = self.after(solution.z)
-        distances = [
-            [line_distances(rig, pairs) for rig in (self.rig, refined)] for pairs in (self.used, self.held_out)
-        ]
-        fitted, held_out = ((line_statistics(before), line_statistics(after)) for before, after in distances)
+        before, after = (line_distances(rig, self.held_out) for rig in (self.rig, refined))
+        held_out = line_statistics(before), line_statistics(after)
         depth = self._depth_change(refined, solution)
         moved = bool(solution.z.any())
-        objections = [] if moved and nearer(*distances[1]) else [NO_NEARER]
+        objections = [] if moved and nearer(before, after) else [NO_NEARER]
         objections += _contradictions(self.parameters, solution.z)
         objections += _remaining(refined, self.held_out, held_out[1]) if moved else []
         objections += [*_uncertain_depth(depth), *_behind(refined, self.used)]
         if not objections and depth is not None and depth.change > NEGLIGIBLE:
-            objections += self._explained_by_lenses(distances[1][1])
+            objections += self._explained_by_lenses(after)
         accepted = moved and (force or not objections)
         return Refinement(
             rig=_with_maps(refined, self.used) if accepted else self.rig,
             accepted=accepted,
             changes=tuple(_changes(self.parameters, solution)) if accepted else (),
             unobservable=tuple(_unobservable(self.parameters, solution.active)),
-            fitted=fitted,
             held_out=held_out,
             depth=depth,
             objections=tuple(objections),
