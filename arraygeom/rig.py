@@ -314,6 +314,15 @@ class Rig(Batched):
         }
         return self.with_camera(name, self[name].transformed(A, hw)).replace(links=links)
 
+    def scaled(self, factor: float) -> Rig:
+        """The rig with all lengths (translations, the depth range) times a positive factor: in another unit, say."""
+        cameras = {
+            name: view.replace(cam_from_world=Pose(view.R, view.t * factor)) if isinstance(view, Camera) else view
+            for name, view in self.cameras.items()
+        }
+        depth = None if self.depth is None else (self.depth[0] * factor, self.depth[1] * factor)
+        return self.replace(cameras=cameras, depth=depth)
+
     def parameters(self, *, free: Iterable[str]) -> dict[str, Tensor]:
         """Changes an optimiser may make, all zero and requiring grad; `perturbed` applies them.
 

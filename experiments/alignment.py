@@ -32,7 +32,7 @@ from calib.boards.rig import Calibration, calibrate
 from calib.boards.target import parse_board
 from calib.images.guided_matches import ALIKE, guided_matches
 from calib.images.matches import seen_depths
-from calib.images.refinement import refine
+from calib.images.refinement import EXTRA_FREE, FREE, refine
 from experiments.evaluation.halves import of_half
 from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair, middlebury_pairs
 from pat.evaluation.protocols import rectified_rig
@@ -55,6 +55,8 @@ LEVELS = 4
 SCALE = np.diag([2.0, 2.0, 1.0])
 BOARD = "chessboard:11x8:30mm"
 CAMERAS = 9
+ONE_BOARD = 0.1
+"""How uncertain a lens is that was calibrated by one board in a quarter of the picture, in units of `--sigma`."""
 WIDEST = 0.15
 """Largest disparity in the scene of nine bands that is searched, as a share of the width."""
 
@@ -410,8 +412,8 @@ def nine_band_calibration(folder: Path, deviations: StartDeviations) -> Calibrat
 
 
 def nine_band_scene(data: Path) -> Iterator[AlignmentScene]:
-    """The array of nine bands, calibrated by its one board, refined by the scene, as `pat rig refine` does it: the
-    middle camera is alpha, the four beside it the betas."""
+    """The array of nine bands, calibrated by its one board, refined by the scene, lenses too, as `pat rig refine` does
+    it: the middle camera is alpha, the four beside it the betas."""
     folder, alpha = data / "nine_band_array", "Cam-4"
     rig = nine_band_calibration(folder, StartDeviations()).rig
     rig = Rig({name: rig[name] for name in (alpha, "Cam-1", "Cam-3", "Cam-5", "Cam-7")})
@@ -420,7 +422,8 @@ def nine_band_scene(data: Path) -> Iterator[AlignmentScene]:
     images = {name: views[name] for name in rig.names}
     depths = [_depths_seen(rig, images, alpha, name) for name in ("Cam-3", "Cam-5")]
     bounds = min(near for near, _ in depths), max(far for _, far in depths)
-    refined = refine(views.developed.replace(depth=bounds), [images]).rig
+    start, free = views.developed.replace(depth=bounds), (*FREE, *EXTRA_FREE, "distortion")
+    refined = refine(start, [images], free=free, sigma={"distortion": ONE_BOARD}).rig
     yield AlignmentScene("nine-band", refined, images, RecordedFiles(rig, files), alpha, True)
 
 

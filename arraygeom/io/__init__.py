@@ -7,7 +7,6 @@ one line as `CONVENTION`.
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,10 +16,10 @@ import torch
 from ..atomic import sweep, write_text, write_together
 from ..camera import Camera, LensView
 from ..pixels import HW
-from ..pose import Pose
 from ..rig import Rig
 from ..rig_check import unit_oddity
 from ..sensor import Sensor
+from ..warned import warn
 from . import (
     aniposelib,
     boofcv,
@@ -45,6 +44,7 @@ from . import (
     strecha,
     syntim,
     xmp,
+    zed,
 )
 from .source import RigFileError, RigFileWarning, RigSource, UnknownRigFormat
 
@@ -74,6 +74,7 @@ READERS: dict[str, Any] = {
     "mrcal": mrcal,
     "lensboy": lensboy,
     "realsense": realsense,
+    "zed": zed,
 }
 READERS["caliscope"] = aniposelib
 WRITERS: dict[str, Any] = {
@@ -110,7 +111,7 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
     except (ArithmeticError, AttributeError, LookupError, OSError, RecursionError, TypeError, ValueError) as error:
         cause = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RigFileError(path, None, f"cannot be read as {format} ({cause}); is the file whole?") from error
-    rig = rig if scale == 1.0 else _scaled(rig, scale)
+    rig = rig if scale == 1.0 else rig.scaled(scale)
     _check_magnitudes(path, rig)
     if doubt := unit_oddity(rig):
         RigSource(path).warn(doubt)
@@ -127,7 +128,7 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
         raise ValueError(f"cannot write rig format '{format}' (known: {', '.join(WRITERS)})")
     path, contents = Path(path), WRITERS[format].write(rig)
     if format != "native" and (lost := _left_out(rig, format)):
-        warnings.warn(f"{path}: {format} files do not hold the rig's {lost}: use the native format", RigFileWarning, 2)
+        warn(f"{path}: {format} files do not hold the rig's {lost}: use the native format", RigFileWarning)
     if isinstance(contents, Mapping):
         last = list(contents)[-1]
         sweep(path, Path(last).stem)
@@ -185,13 +186,3 @@ def _check_magnitudes(path: Path, rig: Rig) -> None:
             raise RigFileError(path, name, f"has a translation of {float(view.t.abs().max()):g} m: use metres")
     if rig.depth is not None and float(rig.depth[0]) < 1 / LARGEST_NUMBER:
         raise RigFileError(path, "depth", f"begins at {float(rig.depth[0]):g} m: give a near bound in metres")
-
-
-def _scaled(rig: Rig, scale: float) -> Rig:
-    """The rig with all lengths multiplied."""
-    cameras = {
-        name: camera.replace(cam_from_world=Pose(camera.R, camera.t * scale)) if isinstance(camera, Camera) else camera
-        for name, camera in rig.cameras.items()
-    }
-    depth = None if rig.depth is None else tuple(bound * scale for bound in rig.depth)
-    return dataclasses.replace(rig, cameras=cameras, depth=depth)

@@ -215,6 +215,13 @@ class Solved:
         """Each camera's noise along x or y, pixels."""
         return self.problem.sigma
 
+    @property
+    def deviations(self) -> dict[str, float]:
+        """Of each free parameter by name ("left.focal.0"), in its own unit; empty without a covariance."""
+        if self.covariance is None:
+            return {}
+        return dict(zip(self.names, np.sqrt(self.covariance.diagonal()).tolist()))
+
 
 # Linear equations ------------------------------------------------------------------------------------------------
 

@@ -194,8 +194,7 @@ def _mean_and_quantile(errors: np.ndarray, between: str = ", ") -> str:
 
 
 def _with_deviations(calibration: Calibration, name: str, camera: Camera, kind: str) -> str:
-    covariance = rig_covariance(calibration.fit)
-    lens = camera.distortion
+    lens, deviations = camera.distortion, calibration.fit.deviations
     values = {
         "focal": camera.K.diagonal()[:2],
         "centre": camera.K[:2, 2],
@@ -207,7 +206,7 @@ def _with_deviations(calibration: Calibration, name: str, camera: Camera, kind: 
         if f"{name}.{kind}.{i}" not in calibration.fit.names:
             texts.append(f"{label}{value:.4g} (fixed)" if value or kind != "distortion" else "")
             continue
-        deviation = covariance.deviation(f"{name}.{kind}.{i}") if covariance else float("nan")
+        deviation = deviations.get(f"{name}.{kind}.{i}", math.nan)
         texts.append(f"{label}{value:.{_digits(deviation)}f} ± {deviation:.2g}")
     return ", ".join(t for t in texts if t)
 

@@ -33,9 +33,9 @@ class Calibration:
 
     rig: Rig
     board: Board
-    fit: Solved
+    fit: Solved = field(repr=False)
     single: Mapping[str, float]
-    epipolar: Mapping[tuple[str, str], Float[np.ndarray, "_"]]
+    epipolar: Mapping[tuple[str, str], Float[np.ndarray, "_"]] = field(repr=False)
     notes: tuple[str, ...] = field(default=())
 
     @property
@@ -65,8 +65,7 @@ class Calibration:
 
     def deviations(self) -> dict[str, float]:
         """The standard deviation of each free parameter by name ("left.focal.0"), in its own unit."""
-        assert self.fit.covariance is not None
-        return dict(zip(self.fit.names, np.sqrt(self.fit.covariance.diagonal()).tolist()))
+        return self.fit.deviations
 
 
 @torch_in_one_thread()

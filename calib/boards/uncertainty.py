@@ -58,13 +58,6 @@ class RigCovariance:
     names: tuple[str, ...]
     matrix: Float[np.ndarray, "c c"]
 
-    def deviation(self, name: str) -> float:
-        """The standard deviation of one parameter; 0 for one that is fixed."""
-        if name not in self.names:
-            return 0.0
-        i = self.names.index(name)
-        return float(np.sqrt(self.matrix[i, i]))
-
     def of(self, name: str, camera: Camera) -> Float[np.ndarray, "p c"]:
         """The selection matrix of a camera's parameters, in the order of `parameter_names`, among these."""
         entries = np.array([f"{name}.{entry}" for entry in parameter_names(camera)])

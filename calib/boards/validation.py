@@ -235,8 +235,6 @@ def _points_left_out(name: str, detected: BoardViews, used: BoardViews) -> Itera
 
 def _gains(fit: Solved, deviations: StartDeviations) -> str:
     """What the images add to the start, by kind of parameter."""
-    assert fit.covariance is not None
-    after = dict(zip(fit.names, np.sqrt(fit.covariance.diagonal()).tolist()))
     focal = np.mean([float(c.K[0, 0]) for c in fit.problem.cameras.values()])
     width = np.mean([c.hw[1] for c in fit.problem.cameras.values()])
     kinds = {
@@ -245,7 +243,7 @@ def _gains(fit: Solved, deviations: StartDeviations) -> str:
     }
     texts = []
     for kind, (label, before) in kinds.items():
-        found = [d for name, d in after.items() if f".{kind}." in name]
+        found = [d for name, d in fit.deviations.items() if f".{kind}." in name]
         texts += [f"{label} ±{before:.3g} > ±{np.median(found):.3g} px"] if found else []
     positions = np.median(_position_deviations(fit))
     texts.append(f"positions ±{1e3 * deviations.position:.3g} > ±{1e3 * positions:.3g} mm")

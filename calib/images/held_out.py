@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -30,7 +29,7 @@ PARTS = 3
 
 def line_statistics(distance: Float[Tensor, " n"]) -> LineStatistics:
     """Statistics of the distances of points from their lines."""
-    return LineStatistics(len(distance), float(distance.abs().median()), math.sqrt(trimmed_square(distance)))
+    return LineStatistics(len(distance), float(distance.abs().median()))
 
 
 def trimmed_square(distance: Float[Tensor, " n"]) -> float:

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from arraygeom import Camera, Pose, Rig
+from arraygeom import Pose, Rig
 from arraygeom.pixels import map_homogeneous
 
 from .guided_matches import guided_matches
@@ -66,7 +66,7 @@ def centres_found(
         free = [f"{name}.{kind}" for name in rig.betas(alpha) for kind in SIGMA]
         rig = refine_matches(rig, [near], free=free, sigma=SIGMA, keep_depth=False).rig
     first = float(rig.pair(alpha, rig.betas(alpha)[0]).beta_from_alpha.t.norm())
-    rig = _scaled(rig, alpha, (stated[0] if any(stated) else 1.0) / first)
+    rig = rig.scaled((stated[0] if any(stated) else 1.0) / first)
     facts = {b: _fit(rig, near, b) for b in rig.betas(alpha)}
     return rig.replace(depth=_depths(rig, alpha, near)), facts
 
@@ -151,15 +151,6 @@ def _points_ahead(rig: Rig, pair: tuple[str, str], matches: PointMatches, centre
     baseline = (centres[b] - centres[a]).expand_as(one)
     # one z = baseline + two z2, and so z (one x two) = baseline x two
     return float((torch.linalg.cross(one, two) * torch.linalg.cross(baseline, two)).sum(-1).sign().sum())
-
-
-def _scaled(rig: Rig, alpha: str, factor: float) -> Rig:
-    cameras = {}
-    for name, camera in rig.cameras.items():
-        assert isinstance(camera, Camera)
-        pose = camera.cam_from_world
-        cameras[name] = camera.replace(cam_from_world=Pose(pose.R, pose.t * factor))
-    return rig.replace(cameras=cameras)
 
 
 def _fit(rig: Rig, near: Mapping[tuple[str, str], PointMatches], name: str) -> tuple[int, float]:

@@ -53,10 +53,9 @@ class JoinedResiduals:
 class Solution(NamedTuple):
     """The free parameters z, which of them were observable, and their covariance, in units of the prior's deviations.
 
-    directions: (n, m), z is a sum of these columns; along the others the images do not determine it. full,
-    full_covariance: the most probable values of free and considered parameters without that restriction, and their
-    covariance. gained: the variance of depth that the changes lose, relative to depth squared. known: the deviation of
-    depth that is left if the full solution is right.
+    directions: (n, m), z is a sum of these columns; along the others the images do not determine it. full: the most
+    probable values of free and considered parameters without that restriction. gained: the variance of depth that the
+    changes lose, relative to depth squared. known: the deviation of depth that is left if the full solution is right.
     """
 
     z: Float[Tensor, " n"]
@@ -64,7 +63,6 @@ class Solution(NamedTuple):
     covariance: Float[Tensor, "n n"]
     directions: Float[Tensor, "n m"]
     full: Float[Tensor, " k"]
-    full_covariance: Float[Tensor, "k k"]
     gained: float = 0.0
     known: float = 0.0
 
@@ -87,18 +85,8 @@ def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
         observable[count:] = True
         if bool((observable == active).all()):
             root = torch.linalg.cholesky(covariance[:count, :count])[:, active[:count]]
-            return Solution(z[:count], active[:count], covariance[:count, :count], root, z, covariance)
+            return Solution(z[:count], active[:count], covariance[:count, :count], root, z)
         active = active & observable
-
-
-def left_out(residuals: Residuals, solution: Solution, groups: Int[Tensor, " m"], count: int) -> Float[Tensor, "g n"]:
-    """The changes of the free parameters, to first order, when the residuals of one group (0 to g - 1) are left out."""
-    considered = len(solution.full) - len(solution.active)
-    kept = torch.cat([solution.active, torch.ones(considered, dtype=torch.bool)])
-    changes = torch.zeros(count, len(solution.z), dtype=solution.z.dtype)
-    shifts = shifts_left_out(residuals, solution.full, groups, count, kept)
-    changes[:, solution.active] = shifts[:, : int(solution.active.sum())]
-    return changes
 
 
 def shifts_left_out(
@@ -108,9 +96,9 @@ def shifts_left_out(
     count: int,
     kept: Bool[Tensor, " k"] | None = None,
 ) -> Float[Tensor, "g n"]:
-    """The changes of those parameters that are `kept`, all unless stated, when one group of residuals is left out.
+    """The changes of those parameters that are `kept`, all unless stated, without the residuals of one of the groups.
 
-    To first order, from the most probable z on.
+    Groups are 0 to g - 1. To first order, from the most probable z on.
     """
     r, J = jacobian(residuals, z)
     J = J if kept is None else J[:, kept]

@@ -28,11 +28,10 @@ class ParameterChange:
 
 
 class LineStatistics(NamedTuple):
-    """Distances of points from their lines, pixels: number, median, and root mean square of the nearest 85%."""
+    """Distances of points from their lines: their number and their median, pixels."""
 
     points: int
     median: float
-    rms: float
 
     def __str__(self) -> str:
         return f"{self.median:.2f} px"
@@ -51,17 +50,16 @@ class Refinement:
     """The result of a refinement.
 
     rig: the refined one if `accepted`, else the given one. changes: its differences. unobservable: parameters that the
-    images do not determine. fitted, held_out: statistics before and after of the points used, and of those held out.
-    depth: what happens to depth, for calibrated cameras. objections: why the result should not be accepted. kept: the
-    parameters of combinations that would change depth without being determined. photometric: the photometric error, if
-    it was minimised.
+    images do not determine. held_out: statistics of the points held out, before and after. depth: what happens to
+    depth, for calibrated cameras. objections: why the result should not be accepted. kept: the parameters of
+    combinations that would change depth without being determined. photometric: the photometric error, if it was
+    minimised.
     """
 
     rig: Rig
     accepted: bool
     changes: tuple[ParameterChange, ...]
     unobservable: tuple[str, ...]
-    fitted: tuple[LineStatistics, LineStatistics]
     held_out: tuple[LineStatistics, LineStatistics]
     depth: DepthChange | None = None
     objections: tuple[str, ...] = ()

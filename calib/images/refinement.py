@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.linalg import qr
 from torch import Tensor
 
@@ -32,7 +32,16 @@ from arraygeom.threads import torch_in_one_thread
 
 from .depth_change import LARGE_CHANGE, NEGLIGIBLE, DepthChange, depth_modes, log_depths, relative_change, share_behind
 from .held_out import PARTS, held_out_pixels, image_parts, line_distances, line_statistics, median_off, nearer, split
-from .least_squares import JoinedResiduals, Residuals, Solution, jacobian, left_out, most_probable, noise_scale, solve
+from .least_squares import (
+    JoinedResiduals,
+    Residuals,
+    Solution,
+    jacobian,
+    most_probable,
+    noise_scale,
+    shifts_left_out,
+    solve,
+)
 from .lenses import with_distortion, with_lenses
 from .matches import ENOUGH, Images, Pairs, agreeing_pairs, match_cameras, matching_time, with_map
 from .parameters import FreeParameter, apply_change, considered_parameters, free_parameters
@@ -231,7 +240,9 @@ class RefinementProblem:
         """
         if not bool(solution.active.any()):
             return solution
-        changes = left_out(residuals, solution, image_parts(self.rig, self.used), PARTS**2)
+        active = torch.ones(len(solution.full), dtype=torch.bool)
+        active[: self.count] = solution.active
+        shifts = shifts_left_out(residuals, solution.full, image_parts(self.rig, self.used), PARTS**2, active)
         found = solution._replace(z=torch.zeros_like(solution.z))
         for _ in range(2):
             values = log_depths(self.after, [self.rig, self.after(found.z)], self.used)
@@ -239,53 +250,53 @@ class RefinementProblem:
                 return solution
             G = jacobian(values, found.z)[1][:, solution.active]
             covariance = solution.covariance[solution.active][:, solution.active]
-            modes = depth_modes(G, solution.z[solution.active], covariance, changes[:, solution.active])
+            modes = depth_modes(G, solution.z[solution.active], covariance, shifts[:, : G.shape[1]])
             kept = modes.deviation < NEGLIGIBLE if keep_depth else modes.kept
             patterns = torch.nn.functional.normalize(G @ modes.root[:, ~kept], dim=0)
-            found = self._without_patterns(solution, patterns, residuals, values)
+            found = self._without_patterns(solution, active, patterns, residuals, values)
             directions = torch.zeros(self.count, int(kept.sum()), dtype=torch.float64)
             directions[solution.active] = modes.root[:, kept]
             found = found._replace(directions=directions, gained=modes.gained(kept), known=modes.total)
         return found
 
     def _without_patterns(
-        self, solution: Solution, patterns: Float[Tensor, "m p"], residuals: Residuals, log_depth: Residuals
+        self,
+        solution: Solution,
+        active: Bool[Tensor, " k"],
+        patterns: Float[Tensor, "m p"],
+        residuals: Residuals,
+        log_depth: Residuals,
     ) -> Solution:
-        """The most probable parameters that leave these patterns of depth as they were."""
+        """The most probable `active` parameters that leave these patterns of depth as they were."""
         before = log_depth(torch.zeros_like(solution.z)).detach()
         tight = noise_scale(residuals(solution.full).detach()) / (UNCHANGED * len(before) ** 0.5)
 
         def constrained(full: Tensor) -> Tensor:
             return torch.cat([residuals(full), tight * (patterns.T @ (log_depth(full[: self.count]) - before))])
 
-        free = torch.ones(len(solution.full), dtype=torch.bool)
-        free[: self.count] = solution.active
         start = torch.zeros_like(solution.full)
-        full = most_probable(constrained, start, torch.eye(len(free), dtype=start.dtype)[:, free], steps=12)
+        full = most_probable(constrained, start, torch.eye(len(start), dtype=start.dtype)[:, active], steps=12)
         return solution._replace(z=full[: self.count])
 
     def report(self, solution: Solution, *, force: bool = False) -> Refinement:
         """The changes by a solution, and whether the held-out points, the prior and depth's uncertainty support it."""
         refined = self.after(solution.z)
-        distances = [
-            [line_distances(rig, pairs) for rig in (self.rig, refined)] for pairs in (self.used, self.held_out)
-        ]
-        fitted, held_out = ((line_statistics(before), line_statistics(after)) for before, after in distances)
+        before, after = (line_distances(rig, self.held_out) for rig in (self.rig, refined))
+        held_out = line_statistics(before), line_statistics(after)
         depth = self._depth_change(refined, solution)
         moved = bool(solution.z.any())
-        objections = [] if moved and nearer(*distances[1]) else [NO_NEARER]
+        objections = [] if moved and nearer(before, after) else [NO_NEARER]
         objections += _contradictions(self.parameters, solution.z)
         objections += _remaining(refined, self.held_out, held_out[1]) if moved else []
         objections += [*_uncertain_depth(depth), *_behind(refined, self.used)]
         if not objections and depth is not None and depth.change > NEGLIGIBLE:
-            objections += self._explained_by_lenses(distances[1][1])
+            objections += self._explained_by_lenses(after)
         accepted = moved and (force or not objections)
         return Refinement(
             rig=_with_maps(refined, self.used) if accepted else self.rig,
             accepted=accepted,
             changes=tuple(_changes(self.parameters, solution)) if accepted else (),
             unobservable=tuple(_unobservable(self.parameters, solution.active)),
-            fitted=fitted,
             held_out=held_out,
             depth=depth,
             objections=tuple(objections),
@@ -306,7 +317,8 @@ class RefinementProblem:
         explained = lens_alone.after(lens_alone.solve_freely().z)
         if nearer(line_distances(explained, self.held_out), distances):
             return []
-        what_to_do = "state the lenses that were calibrated" if rig is not self.rig else "give --free distortion"
+        every = ",".join((*FREE, *EXTRA_FREE, "distortion"))
+        what_to_do = "state the lenses that were calibrated" if rig is not self.rig else f"try --free {every}"
         return [f"other lenses explain the points as well as other poses, which would change depth: {what_to_do}"]
 
     def _depth_change(self, refined: Rig, solution: Solution) -> DepthChange | None:

@@ -169,14 +169,12 @@ def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig
 
     The depth range is that of all pairs.
     """
-    first = next(iter(pairs.values())).rig
+    rigs = {name: pair.rig.scaled(scales[name]) for name, pair in pairs.items()}
+    first = next(iter(rigs.values()))
     rig = Rig({first.names[0]: first[first.names[0]]})
-    for name, pair in pairs.items():
-        camera = _pair(pair.rig).cameras[1]
-        pose = camera.cam_from_world
-        rig = rig.with_camera(name, camera.replace(cam_from_world=Pose(pose.R, pose.t * scales[name])))
-    bounds = [[float(bound) * scales[name] for bound in pair.rig.depth or ()] for name, pair in pairs.items()]
-    near, far = zip(*bounds)
+    for name, scaled in rigs.items():
+        rig = rig.with_camera(name, scaled[scaled.names[1]])
+    near, far = zip(*([float(bound) for bound in scaled.depth or ()] for scaled in rigs.values()))
     return rig.replace(depth=(min(near), max(far)), name=UNSCALED)
 
 

@@ -189,7 +189,7 @@ class Info:
             seen = "" if p.seen is None else f"{p.seen:.0%}"
             further = seen, _two(p.length, " - "), _two(p.depth_step, " - ")
             of_pairs.add_row(f"{p.alpha} > {p.beta}", f"{p.baseline:.4g}", f"{p.rotation:.2f}", *further)
-        for table in (of_cameras, of_pairs):
+        for table in (of_cameras, of_pairs)[: 1 + bool(pairs)]:
             Console().print(table)
 
 

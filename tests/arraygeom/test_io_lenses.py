@@ -2,6 +2,7 @@
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -11,6 +12,8 @@ from arraygeom.io import RigFileError, RigFileWarning, read_rig, recognise, writ
 from tests.arraygeom.test_central_lenses import FORMULAS
 from tests.arraygeom.test_io import FIXTURES
 
+ZED_K = (700, 701, 640.35, 356.42), (698, 699, 637.9, 361.1)
+ZED_C = np.array([[-0.17, 0.025, 0.0001, -0.0002, 0], [-0.171, 0.026, 0.0002, -0.0001, 0]])
 POINTS = np.array([[0.3, -0.2, 1.5], [-0.6, 0.4, 1.2], [0.05, 0.02, 3.0], [1.0, 0.3, 1.4], [-0.9, -0.8, 2.0]])
 
 
@@ -95,6 +98,34 @@ def test_realsenses_other_lenses(kind, case, tmp_path):
     )
     lens = read_rig(tmp_path / "camera.txt")["Color"].distortion
     assert (lens.model, lens.coefficients.tolist()) == (case[1], pytest.approx(case[2]))
+
+
+def test_zeds_rows_are_those_that_the_makers_code_makes():
+    """It gives OpenCV's rectification the rotation vector (RX, CV, RZ) and (Baseline, TY, TZ) as they are."""
+    rig = read_rig(FIXTURES / "zed.conf")
+    K = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy in ZED_K]
+    R, t = cv2.Rodrigues(np.array([0.0024, 0.007, -0.0021]))[0], np.array([119.905, 0.5, -2.5])
+    R1, R2, P1, P2 = cv2.stereoRectify(K[0], ZED_C[0], K[1], ZED_C[1], (1280, 720), R, t)[:4]
+    rows = [
+        cv2.undistortPoints(pixels(rig, name, POINTS)[:, None], *camera)[:, 0, 1]
+        for name, camera in (("left", (K[0], ZED_C[0], None, R1, P1)), ("right", (K[1], ZED_C[1], None, R2, P2)))
+    ]
+    np.testing.assert_allclose(*rows, atol=0.01)
+    assert rig["right"].centre[0] == pytest.approx(0.12, abs=1e-3)
+    assert float(rig["right"].project(torch.tensor([0.0, 0, 10])).x[0] - 637.9) < 0
+
+
+def test_zeds_sizes(tmp_path):
+    """The largest, or the one that is asked for; fisheyes by their k4; numbers with a decimal comma."""
+    small = read_rig(FIXTURES / "zed.conf", hw=(376, 672))
+    assert small["left"].distortion.model == "kannala-brandt"
+    assert small["left"].distortion.coefficients.tolist() == [-0.03, -0.004, 0.037, -0.02]
+    (tmp_path / "SN1.conf").write_text((FIXTURES / "zed.conf").read_text().replace("119.905", "119,905"))
+    torch.testing.assert_close(
+        read_rig(tmp_path / "SN1.conf")["right"].centre, read_rig(FIXTURES / "zed.conf")["right"].centre
+    )
+    with pytest.raises(RigFileError, match="has no cameras of 1920x1080; it has 1280x720, 672x376"):
+        read_rig(FIXTURES / "zed.conf", hw=(1080, 1920))
 
 
 def test_colmaps_wide_cameras():

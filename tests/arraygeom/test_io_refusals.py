@@ -141,6 +141,7 @@ FOCAL |= {
     "lensboy.json": "200.0",
     "splined_cubic.cameramodel": "150",
     "splined_quadratic.cameramodel": "200",
+    "zed.conf": "698",
 }
 WITH_FOCAL = [f for f in TEXTS if FOCAL.get(f.name, "400")]
 
@@ -226,6 +227,10 @@ OTHER_MAKERS = {
     "unrelated": ("realsense.txt", 'To\t  "Color"', 'To\t  "Gyro"', "Color: has no extrinsic from or to Depth"),
     "no width": ("realsense.txt", "Width:      \t640", "Width:      \tmany", "Depth Width, Height: holds something"),
     "mirrored": ("realsense.txt", "   0.8              0   ", "   0.9              0   ", "not a rotation"),
+    "no focal": ("zed.conf", "RIGHT_CAM_HD]\nfx=698", "RIGHT_CAM_HD]\nfx=", "RIGHT_CAM_HD: has 3 numbers, wanted 4"),
+    "no baseline": ("zed.conf", "Baseline=119.905", "", "STEREO: has no baseline"),
+    "no convergence": ("zed.conf", "CV_HD=0.007", "CV_HD=", "STEREO RX, CV, RZ: has 2 numbers, wanted 3"),
+    "twice": ("zed.conf", "RX_HD", "CV_HD", "is not an INI file"),
     "too few": ("mrcal/b.cameramodel", "-0.2, 0.1, ", "", "intrinsics: has 6 numbers, wanted 8"),
     "a call": ("mrcal/b.cameramodel", "'icam_intrinsics': 0", "'x': print('run')", "is not a dictionary of numbers"),
     "cut": ("mrcal/b.cameramodel", "    'icam_intrinsics': 0,\n}", "", "is the file whole"),

@@ -131,3 +131,12 @@ def test_betas_and_replacement():
     rig = random_rig(0).with_camera("third", View(hw=(5, 5)))
     assert rig.betas("beta") == ("alpha", "third")
     assert rig.to(torch.float32).pair("alpha", "beta").fundamental.dtype == torch.float32
+
+
+def test_a_scaled_rig_shows_the_scaled_scene_alike():
+    rig, X = random_rig(0).replace(depth=(1.0, 4.0)), scene_points(random_rig(0))
+    scaled = rig.scaled(1e3)
+    for name in rig.names:
+        torch.testing.assert_close(scaled[name].project(1e3 * X).x, rig[name].project(X).x)
+    assert [float(bound) for bound in scaled.depth] == [1e3, 4e3]
+    assert uncalibrated().scaled(2.0).links == uncalibrated().links

@@ -52,7 +52,7 @@ def uninformed(fit: RefinementProblem) -> Solution:
     """The prior of a fit as a solution: no change, give or take a standard deviation."""
     n = sum(len(parameter.sigma) for parameter in fit.parameters)
     z, covariance = torch.zeros(n, dtype=torch.float64), torch.eye(n, dtype=torch.float64)
-    return Solution(z, torch.ones(n, dtype=torch.bool), covariance, covariance, z, covariance)
+    return Solution(z, torch.ones(n, dtype=torch.bool), covariance, covariance, z)
 
 
 def seen_points(rig, *, count=200, near=2.0, far=6.0, noise=0.15, seed=0) -> dict[tuple[str, str], PointMatches]:

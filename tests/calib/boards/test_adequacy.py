@@ -25,6 +25,12 @@ def found():
     return calibrate(see(Rig({"cam": TRUE}), board_poses(12, spread=0.4), noise=0.2), BOARD)
 
 
+def test_a_calibration_is_shown_in_a_few_lines(found):
+    """In a notebook it was four thousand lines of residuals."""
+    assert "Rig" in repr(found)
+    assert len(repr(found)) < 1000
+
+
 def test_projections_are_off_by_what_is_said(found):
     known = intrinsics_of(found.fit, "cam")
     x, deviation = uncertainty(known, 1.5)

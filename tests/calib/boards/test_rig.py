@@ -85,7 +85,8 @@ def test_the_covariance_is_kept_in_a_file(found, tmp_path):
     again = RigCovariance.load(tmp_path / "c.json")
     assert again.names == covariance.names
     assert (again.matrix == covariance.matrix).all()
-    assert again.deviation("colour.translation.0") > 0 == again.deviation("mono.translation.0")
+    assert "colour.translation.0" in again.names
+    assert "mono.translation.0" not in again.names
     (tmp_path / "d.json").write_text("{}")
     with pytest.raises(ValueError, match=r"d\.json"):
         RigCovariance.load(tmp_path / "d.json")

@@ -182,6 +182,14 @@ def test_rig_convert_and_back(small, capsys):
     assert "known" in fails(["rig", "convert", str(small / "rig.yaml"), "x", "--write-as", "word"], capsys)
 
 
+def test_rig_info_of_one_camera_has_no_pairs(small, tmp_path, capsys):
+    """It printed a table of pairs with nothing in it."""
+    rig = Rig.load(small / "rig.yaml")
+    Rig({"mono": rig["mono"]}).save(tmp_path / "one.yaml")
+    main(["rig", "info", str(tmp_path / "one.yaml")])
+    assert "alpha" not in capsys.readouterr().out
+
+
 def test_rig_info_as_json(small, capsys):
     main(["rig", "info", str(small / "rig.yaml"), "--json"])
     told = json.loads(capsys.readouterr().out)

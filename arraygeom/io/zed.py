@@ -1,0 +1,84 @@
+"""The factory calibration of a ZED camera, `SN12345.conf`: an INI file with the pair at each of its resolutions.
+
+Source convention, as the maker's own rectification reads it (zed-open-capture, `calibration.hpp`): pixels with the
+first centre at 0 (shift 0); OpenCV axes; lenses of OpenCV, fisheye ones where there is a k4 and no p1; RX, CV, RZ are
+the rotation vector that takes points of the left camera into the right one, with T along (Baseline, TY, TZ), in
+millimetres. There the sign of T is lost, as rectification does not need it; the right camera is on the right of the
+left one, so that t = -(Baseline, TY, TZ). World = left camera.
+"""
+
+from __future__ import annotations
+
+import configparser
+from collections.abc import Mapping
+from pathlib import Path
+
+from torch import Tensor
+
+from ..camera import Camera
+from ..pixels import HW
+from ..pose import Pose
+from ..rig import Rig
+from .source import RigSource
+
+CONVENTION = "first pixel's centre at 0 (shift 0); rotation vector left to right, baseline in mm; world = left"
+LONGEST = 100_000
+SIZES: dict[str, HW] = {
+    "2k": (1242, 2208),
+    "fhd1200": (1200, 1920),
+    "fhd": (1080, 1920),
+    "hd": (720, 1280),
+    "svga": (600, 960),
+    "vga": (376, 672),
+}
+"""Of one camera's image, by the name of the resolution; the largest first."""
+
+
+def recognises(path: Path, head: str) -> bool:
+    return path.is_file() and "[LEFT_CAM_" in head.upper()
+
+
+def read(source: RigSource) -> Rig:
+    """Both cameras, `left` and `right`, at the size that is asked for, else at the largest."""
+    parser = configparser.ConfigParser(interpolation=None)
+    try:
+        parser.read_string(source.text(LONGEST))
+    except configparser.Error as error:
+        raise source.fail(None, f"is not an INI file ({str(error).splitlines()[0]}); is the file whole?") from None
+    sections = {name.lower(): dict(parser[name]) for name in parser.sections()}
+    there = {name: hw for name, hw in SIZES.items() if {f"left_cam_{name}", f"right_cam_{name}"} <= sections.keys()}
+    listed = ", ".join(f"{w}x{h}" for h, w in there.values())
+    if not there:
+        raise source.fail(None, f"has no LEFT_CAM and RIGHT_CAM of a known resolution ({', '.join(SIZES)})")
+    if source.hw is not None and source.hw not in there.values():
+        raise source.fail(None, f"has no cameras of {source.hw[1]}x{source.hw[0]}; it has {listed}")
+    name = next(name for name, hw in there.items() if source.hw in (None, hw))
+    pose = _pose(source, sections.get("stereo", {}), name)
+    return source.rig(
+        (side, _camera(source, f"{side}_cam_{name}", sections, there[name], pose))
+        for side, pose in (("left", Pose.identity()), ("right", pose))
+    )
+
+
+def _pose(source: RigSource, stereo: Mapping[str, str], name: str) -> Pose:
+    """Of the right camera, whose points are R X + t. The offsets have been written for all resolutions at once too."""
+    rotation = [source.get(stereo, f"{key}_{name}", "STEREO") for key in ("rx", "cv", "rz")]
+    baseline = source.get(stereo, "baseline", "STEREO")
+    offsets = [stereo.get(f"{key}_{name}", stereo.get(key, "0")) for key in ("ty", "tz")]
+    t = _numbers(source, [baseline, *offsets], "STEREO Baseline, TY, TZ")
+    return source.pose(_numbers(source, rotation, "STEREO RX, CV, RZ"), -t, "STEREO", metres=1e-3)
+
+
+def _camera(source: RigSource, section: str, sections: Mapping[str, Mapping[str, str]], hw: HW, pose: Pose) -> Camera:
+    fields, entry = sections[section], section.upper()
+    K = _numbers(source, [source.get(fields, key, entry) for key in ("fx", "fy", "cx", "cy")], entry)
+    fisheye = "k4" in fields and "p1" not in fields
+    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    c = _numbers(source, [fields.get(key, "0") for key in keys], entry)
+    lens = source.kannala_brandt(c, entry) if fisheye else source.brown_conrady(c, entry)
+    return Camera(K=source.focal_and_centre(K, entry), cam_from_world=pose, hw=hw, distortion=lens)
+
+
+def _numbers(source: RigSource, words: list[str], entry: str) -> Tensor:
+    """Numbers, which some systems have written with a decimal comma."""
+    return source.numbers_in(" ".join(words).replace(",", "."), (len(words),), entry)
