@@ -318,7 +318,7 @@ class RefinementProblem:
         if nearer(line_distances(explained, self.held_out), distances):
             return []
         every = ",".join((*FREE, *EXTRA_FREE, "distortion"))
-        what_to_do = "state the lenses that were calibrated" if rig is not self.rig else f"try --free {every}"
+        what_to_do = "state the lenses that were calibrated" if rig is not self.rig else f"if those may be wrong, --free {every}"
         return [f"other lenses explain the points as well as other poses, which would change depth: {what_to_do}"]
 
     def _depth_change(self, refined: Rig, solution: Solution) -> DepthChange | None:
