@@ -73,7 +73,7 @@ paper-network: $(READY)
 
 test: $(READY)
 	@echo "== tests"
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" --numprocesses auto --dist worksteal
+	@PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" --numprocesses auto --dist worksteal
 
 test-long: $(READY)
 	@echo "== tests, longer ones included"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import warnings
 from collections.abc import Iterable
 from functools import cache
 from importlib.util import find_spec
@@ -13,6 +12,7 @@ from typing import Any
 from uuid import uuid4
 
 from .atomic import alone
+from .warned import warn
 
 COMPILED = "arraygeom:compiled"
 LONGEST = 60.0
@@ -69,10 +69,9 @@ def can_compile() -> bool:
 
 @cache
 def _warn_of_no_folder() -> None:
-    warnings.warn(
+    warn(
         "compiled kernels cannot be kept, and each process compiles them again: let NUMBA_CACHE_DIR name a folder "
-        "that can be written",
-        stacklevel=1,
+        "that can be written"
     )
 
 

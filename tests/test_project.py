@@ -2,6 +2,7 @@
 
 import ast
 import doctest
+import functools
 import importlib
 import importlib.metadata
 import inspect
@@ -39,6 +40,7 @@ def sources(*packages: str) -> list[Path]:
     return [path for package in packages for path in sorted((ROOT / package).rglob("*.py"))]
 
 
+@functools.cache
 def imports(path: Path) -> set[str]:
     """The outermost names of all modules that a file imports from other packages."""
     names: set[str] = set()
@@ -50,6 +52,7 @@ def imports(path: Path) -> set[str]:
     return names
 
 
+@functools.cache
 def names(path: Path) -> set[str]:
     """All names that a file's code uses: variables, attributes, imported names."""
     found: set[str] = set()
@@ -100,6 +103,7 @@ def test_calib_knows_nothing_of_pat():
     assert [module_name(p) for p in sources("calib") if "pat" in imports(p)] == []
 
 
+@functools.cache
 def imported_modules(path: Path) -> set[str]:
     """The full names of all modules of this project that a file imports anywhere."""
     here = module_name(path).split(".")

@@ -7,7 +7,6 @@ one line as `CONVENTION`.
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from ..pixels import HW
 from ..rig import Rig
 from ..rig_check import unit_oddity
 from ..sensor import Sensor
+from ..warned import warn
 from . import (
     aniposelib,
     boofcv,
@@ -128,7 +128,7 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
         raise ValueError(f"cannot write rig format '{format}' (known: {', '.join(WRITERS)})")
     path, contents = Path(path), WRITERS[format].write(rig)
     if format != "native" and (lost := _left_out(rig, format)):
-        warnings.warn(f"{path}: {format} files do not hold the rig's {lost}: use the native format", RigFileWarning, 2)
+        warn(f"{path}: {format} files do not hold the rig's {lost}: use the native format", RigFileWarning)
     if isinstance(contents, Mapping):
         last = list(contents)[-1]
         sweep(path, Path(last).stem)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import tomllib
-import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from ..pose import Pose, rotation_error, rotation_from_vector
 from ..rig import Rig
 from ..safe_yaml import load_json, load_yaml, yaml_problem
 from ..text import short
+from ..warned import warn
 
 # Of a rotation vector, in radians; it may go round a few times.
 LARGEST_ANGLE = 1e3
@@ -57,7 +57,7 @@ class RigSource:
 
     def warn(self, message: str) -> None:
         """Warn about the file as a whole."""
-        warnings.warn(f"{self.path}: {message}", RigFileWarning, stacklevel=2)
+        warn(f"{self.path}: {message}", RigFileWarning)
 
     def content(self) -> bytes:
         """The file's bytes; reading a pipe would wait for ever."""
@@ -174,7 +174,8 @@ class RigSource:
             return self.hw
         w, h = (max(1, round(2 * c + 1)) for c in K[:2, 2].tolist())
         self.warn(
-            f"states no image size: took {w} x {h}, twice the principal point; say `hw=(height, width)` when reading"
+            f"states no image size: took {w} x {h}, twice the principal point; give it by "
+            "`pat rig convert --size W H`, or hw=(height, width)"
         )
         return h, w
 

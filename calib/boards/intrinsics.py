@@ -243,9 +243,11 @@ def _pinhole(views: BoardViews, board: Board, count: int) -> OpenCVSolution:
     if not board.flat:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
         given = _linear_intrinsics(max(zip(points, pixels), key=lambda view: len(view[0])), views.hw)
+    K: np.ndarray
     for further in (0, cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_K2):
-        K, c = given.copy(), np.zeros(5)
-        _, K, c, rotations, translations = cv2.calibrateCamera(points, pixels, (w, h), K, c, flags=flags | further)
+        _, K, c, rotations, translations = cv2.calibrateCamera(
+            points, pixels, (w, h), given.copy(), np.zeros(5), flags=flags | further
+        )
         if abs(np.log(K[0, 0] / K[1, 1])) < OBLONG:
             break
     coefficients = np.zeros(max(count, 2))

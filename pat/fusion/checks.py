@@ -9,6 +9,8 @@ from contextlib import contextmanager
 
 import torch
 
+from arraygeom.warned import warn
+
 from ..matching.inputs import Inputs
 from ..networks.protocol import FusionNetwork
 from .inputs import FrameInputs
@@ -56,10 +58,10 @@ def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs
         text = (
             f"{found}: the rig does not fit the images, or they hardly match: check it with `pat rig doctor`"
         )
-        warnings.warn(text + advice, LowConfidenceWarning, stacklevel=3)
+        warn(text + advice, LowConfidenceWarning)
     else:
         text = f"{found}: little texture, noise, or a rig that `pat rig doctor` finds wrong"
-        warnings.warn(text + advice, stacklevel=3)
+        warn(text + advice)
 
 
 def noise_advice(inputs: Inputs) -> str:

@@ -7,11 +7,12 @@ A camera that missed a frame would else shift all that follow.
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from itertools import pairwise, takewhile
 from pathlib import Path
 from statistics import median
+
+from arraygeom.warned import warn
 
 LEAST_WHOLE = 0.5
 """Of all frames, those that every camera has: of fewer, names agree by chance, as those of a sequence may."""
@@ -46,9 +47,7 @@ def matched_frames(files: Files) -> dict[str, list[Path]]:
     if len({len(paths) for paths in given.values()}) > 1:
         counts = ", ".join(f"{len(paths)} of '{name}'" for name, paths in given.items())
         raise ValueError(f"frames need as many images of each camera, got {counts}; or is it a --sequence?")
-    warnings.warn(
-        f"no name or number relates the frames ({spans}): taken in order", MissingFramesWarning, stacklevel=2
-    )
+    warn(f"no name or number relates the frames ({spans}): taken in order", MissingFramesWarning)
     return given
 
 
@@ -64,7 +63,7 @@ def warn_of_gaps(files: Files) -> None:
                 f"'{name}' has no frame between {before} and {after}: those after it count as recorded "
                 "earlier"
             )
-            warnings.warn(f"{text} than they were; give all frames", MissingFramesWarning, stacklevel=2)
+            warn(f"{text} than they were; give all frames", MissingFramesWarning)
 
 
 def _frames(files: Mapping[str, Sequence[Path]], keys: Keys) -> list[dict[str, Path]]:
@@ -89,7 +88,7 @@ def _warn_of_missing(files: Files, frames: Sequence[Mapping[str, Path]], what: s
     if missing:
         whole = sum(len(frame) == len(files) for frame in frames)
         text = f"frames are matched by their {what}: {'; '.join(missing)}: {whole} of {len(frames)} are fused"
-        warnings.warn(text, MissingFramesWarning, stacklevel=3)
+        warn(text, MissingFramesWarning)
 
 
 def _names(files: Files) -> Keys:

@@ -3,7 +3,6 @@ file does."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -11,6 +10,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from arraygeom import Rig
+from arraygeom.warned import warn
 from calib.images.matches import Pairs, match_cameras
 from calib.images.misfit import OUTSIDE, find_misfit, share_outside
 from calib.images.refinement import refine_matches
@@ -61,7 +61,7 @@ def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
     wrong = misfit.mistaken or misfit.outside > OUTSIDE
     if heal and not misfit.outside > OUTSIDE and (healed := healed_rig(views.developed, images, views.alpha)):
         return healed._replace(text=f"{healed.text}; {misfit.text}") if misfit.mistaken else healed
-    warnings.warn(misfit.text, LowConfidenceWarning if wrong else UserWarning, stacklevel=2)
+    warn(misfit.text, LowConfidenceWarning if wrong else UserWarning)
     return None
 
 

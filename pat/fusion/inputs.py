@@ -4,7 +4,6 @@ alpha."""
 from __future__ import annotations
 
 import logging
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
@@ -18,6 +17,7 @@ from arraygeom.fields import AroundDepth, AroundMatches, default_field, pinhole_
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
 from arraygeom.fields.ray_depth import ray_depth
 from arraygeom.pixels import HW
+from arraygeom.warned import warn
 
 from ..matching.inputs import Beta, Inputs
 from ..matching.normalisation import combined_bands
@@ -81,9 +81,7 @@ def check_bands(network: FusionNetwork, views: Views) -> None:
     for name in views.betas:
         image = views.images[name]
         if len(image) == 3 and not is_in_colour(image):
-            warnings.warn(
-                f"the image of '{name}' has three equal bands: it is grey, and gives no colour", stacklevel=3
-            )
+            warn(f"the image of '{name}' has three equal bands: it is grey, and gives no colour")
 
 
 def _refuse_bands(network: FusionNetwork, views: Views) -> None:

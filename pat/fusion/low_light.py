@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -19,6 +18,7 @@ from arraygeom import sample
 from arraygeom.chunks import chunked
 from arraygeom.pixels import HW
 from arraygeom.threads import convolutions_in_parallel
+from arraygeom.warned import warn
 
 from ..matching.radiometry import Response
 from ..media.colour import luminance
@@ -193,11 +193,10 @@ def warn_of_noise(name: str, image: Float[Tensor, "c h w"], view: NoisyView) -> 
         255 * float(deviation.mean()) for deviation in (view.deviation, shown.deviation(image[None]))
     )
     if stated > SETTINGS.far_more * max(found, 255 * SETTINGS.least_deviation):
-        warnings.warn(
+        warn(
             f"noise of '{name}': a standard deviation of {stated:.0f}/255 is stated, its image shows "
             f"{found:.1f}/255: "
-            "detail will be lost; state electrons at white, or have the noise estimated",
-            stacklevel=3,
+            "detail will be lost; state electrons at white, or have the noise estimated"
         )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Pair, ReceptiveField, Rig, Sensor
+from arraygeom.warned import warn
 
 from ..media.colour import luminance_of as grey
 from ..media.images import Images, read_image
@@ -99,7 +99,7 @@ def grey_alpha(name: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "1 h w
     """Alpha's image in grey. Warns if it was in colour."""
     if is_in_colour(image):
         text = "is in colour: colours come from the betas, its own only where they do not see"
-        warnings.warn(f"the image of alpha, '{name}', {text}", stacklevel=2)
+        warn(f"the image of alpha, '{name}', {text}")
     return grey(image)
 
 

@@ -10,7 +10,6 @@ and what follows is as for any segment.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -27,6 +26,7 @@ from arraygeom.chunks import spans
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.fields.widened import direction
 from arraygeom.pixels import HW, pixel_grid
+from arraygeom.warned import warn
 
 from ..media.colour import to_bytes
 from . import semi_global_numba as kernels
@@ -62,10 +62,7 @@ def along_tangents(
     grid = _BlockCentres(field, (alpha.shape[-2] // FINE, alpha.shape[-1] // FINE))
     ordered = grid.ordered()
     if not ordered:
-        warnings.warn(
-            f"the field in '{name}' is a set of positions without an order: each pixel is matched alone",
-            stacklevel=2,
-        )
+        warn(f"the field in '{name}' is a set of positions without an order: each pixel is matched alone")
     with torch.no_grad():
         labels = torch.from_numpy(_labels(alpha, guide, grid, ordered=ordered))
     lines = grid.tangents(labels) if ordered else _around(grid.chosen(labels), to_bytes(alpha[:, 0])[0])

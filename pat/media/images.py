@@ -7,7 +7,6 @@ images), colours in the order red, green, blue. Files are written atomically.
 from __future__ import annotations
 
 import struct
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +21,7 @@ from torch import Tensor
 from arraygeom.atomic import write_atomically
 from arraygeom.chunks import ROWS, spans
 from arraygeom.image_bytes import decodable
+from arraygeom.warned import warn
 
 from .headers import HW, ImageHeader, image_header
 from .profiles import in_srgb, with_srgb_profile
@@ -191,13 +191,12 @@ def _applied(header: ImageHeader, orientation: str, label: str) -> int:
     if header.orientation == 1:
         return 1
     if orientation == "ignore":
-        warnings.warn(f"{label}: orientation tag {header.orientation} is ignored: pixels are as stored", stacklevel=3)
+        warn(f"{label}: orientation tag {header.orientation} is ignored: pixels are as stored")
         return 1
     h, w = header.upright
-    warnings.warn(
+    warn(
         f"{label}: orientation tag {header.orientation} is applied, which makes it {w}x{h}; "
-        "remove the tag if the calibration is of the pixels as stored",
-        stacklevel=3,
+        "remove the tag if the calibration is of the pixels as stored"
     )
     return header.orientation
 
@@ -307,10 +306,9 @@ def _counts(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArr
     largest = int(planes.max())
     if own == 16 and not bits and 0 < largest < 2 ** max(FEW_BITS):
         needed = next(n for n in FEW_BITS if largest < 2**n)
-        warnings.warn(
+        warn(
             f"{label}: has 16 bits a value, and none above {largest}, so it is nearly black: if its camera counts to "
-            f"{2**needed - 1}, state `bits: {needed}` in the rig file",
-            stacklevel=4,
+            f"{2**needed - 1}, state `bits: {needed}` in the rig file"
         )
     if largest > white:
         raise ValueError(

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
+from arraygeom.warned import warn
+
 _JPEG_PART = 65_000
 """Bytes of a profile in one segment of a JPEG file, at most."""
 
@@ -38,13 +40,13 @@ def in_srgb(values: NDArray, content: bytes, label: str) -> NDArray:
             return values
         if values.dtype != np.uint8:
             text = f"{label}: colour profile '{name}' is ignored, as values have 16 bits: save it in sRGB"
-            warnings.warn(text, stacklevel=3)
+            warn(text)
             return values
         converted = _converted(values, opened)
     except (ImageCms.PyCMSError, OSError, ValueError) as error:
-        warnings.warn(f"{label}: its colour profile cannot be used ({error}): save it in sRGB", stacklevel=3)
+        warn(f"{label}: its colour profile cannot be used ({error}): save it in sRGB")
         return values
-    warnings.warn(f"{label}: converted from colour profile '{name}' to sRGB", stacklevel=3)
+    warn(f"{label}: converted from colour profile '{name}' to sRGB")
     return converted
 
 

@@ -26,6 +26,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from arraygeom.warned import warn
+
 from .steps import about, steps_shown
 
 if TYPE_CHECKING:
@@ -70,7 +72,7 @@ class JobReport:
             kind = re.sub(r"[\d.]+", "", f"{type(warning).__name__}: {warning}")
             files = self.warned.setdefault(kind, [])
             if not files:
-                warnings.warn(f"{about}: {warning}", type(warning), stacklevel=3)
+                warn(f"{about}: {warning}", type(warning))
             if outcome.makes not in files:
                 files.append(outcome.makes)
 

@@ -22,7 +22,7 @@ def sample():
 
 @pytest.fixture(scope="module")
 def network():
-    return load_weights("mono-colour")
+    return load_weights("mono-colour-small")
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_vignetting_is_found_by_itself(sample, network, images, ideal):
     found = psnr(network, sample, other, explain=lines.append)
     assert found > ideal - 0.7
     assert "vignetting" in lines[0]
-    assert psnr(network, sample, other, response="rec601") < found - 0.3
+    assert psnr(network, sample, other, response="rec601") < found - 0.15
 
 
 def test_nothing_is_changed_where_the_cameras_are_as_the_rig_says(sample, network, images):
@@ -117,7 +117,7 @@ def test_a_sequence_finds_corrections_once(sample, network, images, monkeypatch)
     for name in (ALPHA, BETA):
         rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=10.0)))
     frames = {name: [image] * 3 for name, image in images.items()}
-    job = SequenceFusion(load_weights("mono-colour-small"), rig, frames, ALPHA)
+    job = SequenceFusion(network, rig, frames, ALPHA)
     for key in job.timeline.key_frames():
         job.colour(key)
     assert calls == [1]

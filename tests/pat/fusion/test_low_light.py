@@ -35,20 +35,25 @@ def network():
     return load_weights("mono-colour-small")
 
 
-def in_low_light(electrons, *, middle=False):
-    """The sample, or the middle of alpha's view of it; its images with noise; and the levels of that."""
-    sample, level = load_sample(), NoiseLevel.of_electrons(electrons, 2)
-    if middle:
-        window = (..., slice(104, 296), slice(192, 448))
-        images = {**sample.images, ALPHA: sample.images[ALPHA][window]}
-        sample = SampleArray(sample.rig.crop(ALPHA, 104, 192, (192, 256)), images, sample.ground_truth[window])
+def middle():
+    """The middle of alpha's view of the sample, and what beta sees of it."""
+    sample = load_sample()
+    window, of_beta = (..., slice(104, 296), slice(192, 448)), (..., slice(84, 300), slice(130, 418))
+    rig = sample.rig.crop(ALPHA, 104, 192, (192, 256)).crop(BETA, 84, 130, (216, 288))
+    images = {ALPHA: sample.images[ALPHA][window], BETA: sample.images[BETA][of_beta]}
+    return SampleArray(rig, images, sample.ground_truth[window])
+
+
+def in_low_light(electrons, of=middle):
+    """The middle of the sample, or all of it; its images with noise; and the levels of that."""
+    sample, level = of(), NoiseLevel.of_electrons(electrons, 2)
     images = {n: level.recorded(i[None], generator_for(0, n))[0] for n, i in sample.images.items()}
     return sample, images, dict.fromkeys(images, level)
 
 
 @pytest.fixture(scope="module")
 def fused(network):
-    """The sample fused, by its electrons at white, each once."""
+    """The middle of the sample fused, by its electrons at white, each once."""
 
     @cache
     def of(electrons):
@@ -64,15 +69,14 @@ def psnr(image, sample):
 
 @pytest.mark.parametrize("noise", [{}, {ALPHA: NoiseLevel.of_electrons(1e6)}])
 def test_views_without_noticeable_noise_are_fused_as_ever(network, noise):
-    sample = load_sample()
+    sample = middle()
     plain, same = (fuse(network, sample.rig, sample.images, alpha=ALPHA, noise=n) for n in (None, noise))
     assert torch.equal(plain.image, same.image)
     assert torch.equal(plain.confidence, same.confidence)
 
 
-@pytest.mark.parametrize(("electrons", "gain", "margin"), [(200, 2.5, -0.2), (50, 5.0, 0.7)])
+@pytest.mark.parametrize(("electrons", "gain", "margin"), [(200, 3.5, 0.5), (50, 6.5, 1.2)])
 def test_low_light_against_the_classical_baseline_and_denoising_before_it(fused, electrons, gain, margin):
-    """At 200 electrons non-local means do as well here: the scene has thin lines of equal brightness."""
     sample, images, _ = in_low_light(electrons)
     ours = psnr(fused(electrons).image, sample)
     assert ours > psnr(classical(sample.rig, images, ALPHA, BETA), sample) + gain
@@ -97,7 +101,7 @@ def test_the_joint_correction_improves_on_denoising_alone(network, fused, monkey
 @pytest.mark.parametrize("given", [(ALPHA, BETA), (BETA,)])
 def test_alphas_values_are_kept(network, given):
     """Asked for, or because no noise of alpha is stated."""
-    sample, images, noise = in_low_light(200, middle=True)
+    sample, images, noise = in_low_light(200)
     noise = {name: noise[name] for name in given}
     frame = fuse(network, sample.rig, images, alpha=ALPHA, noise=noise, keep_alpha=ALPHA in given)
     torch.testing.assert_close(luminance(frame.image), images[ALPHA], atol=1e-4, rtol=0)
@@ -105,24 +109,27 @@ def test_alphas_values_are_kept(network, given):
 
 def test_tiles_are_denoised_as_the_whole(network, fused, monkeypatch):
     """But for coefficients at the threshold and blocks equally alike: rounding chooses, and then a match may differ."""
-    sample, images, noise = in_low_light(200)
-    frame = fused(200)
-    view, level = images[ALPHA][None], noise[ALPHA]
+    _, images, noise = in_low_light(200, load_sample)
+    view, level = images[ALPHA][None, :, 120:280], noise[ALPHA]
     views = view, level.deviation(view)
     whole = denoised(*views)
-    monkeypatch.setattr("pat.fusion.low_light.in_tiles", partial(pat.fusion.low_light.in_tiles, rows=320))
+    ordinary_tiles = pat.fusion.low_light.in_tiles
+    monkeypatch.setattr("pat.fusion.low_light.in_tiles", partial(ordinary_tiles, rows=320))
     pieces, ordinary = [], pat.fusion.low_light.without_noise
     monkeypatch.setattr("pat.fusion.low_light.without_noise", lambda *a: pieces.append(a) or ordinary(*a))
     tiles = denoised(*views)
-    assert len(pieces) == 4
+    assert len(pieces) == 2
     torch.testing.assert_close(tiles, whole, atol=5e-3, rtol=0)
     assert float(((tiles - whole).abs() > 1e-3).float().mean()) < 1e-3
+    sample, images, noise = in_low_light(200)
+    monkeypatch.setattr("pat.fusion.low_light.in_tiles", partial(ordinary_tiles, rows=160))
     in_tiles = fuse(network, sample.rig, images, alpha=ALPHA, noise=noise)
-    assert float(((in_tiles.image - frame.image).abs() > 2e-3).float().mean()) < 0.005
+    assert len(pieces) > 6
+    assert float(((in_tiles.image - fused(200).image).abs() > 2e-3).float().mean()) < 0.01
 
 
 def test_a_distorted_alpha_is_denoised_too(network):
-    sample, images, noise = in_low_light(50, middle=True)
+    sample, images, noise = in_low_light(50)
     lens = Distortion("brown-conrady", torch.tensor([-0.05, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
     rig = sample.rig.with_camera(ALPHA, sample.rig[ALPHA].replace(distortion=lens))
     frame = fuse(network, rig, images, alpha=ALPHA, noise=noise)
@@ -133,7 +140,7 @@ def test_a_distorted_alpha_is_denoised_too(network):
 
 def test_noisy_bands_at_one_position_are_joined():
     """As one beta of three bands; in the rig's order, and nearer to the ground truth than if fused as recorded."""
-    sample, images, noise = in_low_light(200)
+    sample, images, noise = in_low_light(200, load_sample)
     cameras = {ALPHA: sample.rig[ALPHA], **dict.fromkeys(("r", "g", "b"), sample.rig[BETA])}
     rig = Rig(cameras, depth=sample.rig.depth).crop(ALPHA, 100, 200, (160, 200))
     for name in "rgb":
@@ -171,7 +178,7 @@ def test_noise_stated_far_beyond_what_the_image_shows_is_said():
 
 
 def test_what_is_held_for_low_light_is_planned_for(network):
-    sample, images, noise = in_low_light(200, middle=True)
+    sample, images, noise = in_low_light(200)
     plans = []
     for given in (None, noise):
         fuse(network, sample.rig, images, alpha=ALPHA, noise=given, announce=plans.append)
@@ -180,7 +187,7 @@ def test_what_is_held_for_low_light_is_planned_for(network):
 
 
 def test_the_time_announced_has_the_correction_in_it(network, monkeypatch):
-    sample, images, noise = in_low_light(200, middle=True)
+    sample, images, noise = in_low_light(200)
     monkeypatch.setattr(pat.fusion.tiles, "ESTIMATED", 0)
     monkeypatch.setattr(pat.fusion.low_light, "SETTINGS", replace(pat.fusion.low_light.SETTINGS, jointly=1e4))
     plans, steps = [], []
@@ -236,12 +243,12 @@ def test_positions_are_those_of_the_matched_colours(network):
     fuse(network, sample.rig, images, alpha=ALPHA, noise=noise)
     monkey.undo()
     high = (seen["confidence"] > 0.8).expand_as(seen["image"])
-    assert float((seen["beta"].denoised - seen["image"])[high].abs().mean()) < 0.025
+    assert float((seen["beta"].denoised - seen["image"])[high].abs().mean()) < 0.04
 
 
 def test_a_darker_beta_keeps_its_colours(network):
     """The joint correction saw a beta at its own exposure, and pulled colours towards its darker ones."""
-    sample, _, _ = in_low_light(200, middle=True)
+    sample, _, _ = in_low_light(200)
     level = NoiseLevel.of_electrons(200, 2)
     saturations = []
     for exposure in (1.0, 0.5):

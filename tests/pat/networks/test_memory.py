@@ -22,7 +22,7 @@ from pat.support.memory import give_back, limited, peak_memory, resident
 
 RESETS_PEAK = Path("/proc/self/clear_refs").exists()
 REPEATS = 2
-SIDE, TILE = 1024, (256, 704, 256, 704)
+SIDE, TILE = 768, (192, 576, 192, 576)
 
 
 def frame_of(side, betas):
@@ -71,7 +71,7 @@ def growth(work):
 
 def bytes_to_agree(betas):
     """For each pixel."""
-    inputs = frame_of(1280, betas)[1].inputs
+    inputs = frame_of(800, betas)[1].inputs
     found = found_in(inputs)
     return growth(lambda: agreed(inputs, found)) / inputs.alpha.numel()
 
@@ -83,32 +83,33 @@ def bytes_of_a_tile(betas):
     return growth(lambda: fuse_tile(network, frame, matches, tile)) / working_memory(network, frame.inputs, tile)
 
 
-JOBS = {"agree": bytes_to_agree, "tile": bytes_of_a_tile}
+MEASURED = {"agree": (bytes_to_agree, 3), "tile of 1": (bytes_of_a_tile, 1), "tile of 3": (bytes_of_a_tile, 3)}
 
 
-def measured(job, betas):
-    """In a process of its own."""
-    command = [sys.executable, "-m", "tests.pat.networks.test_memory", job, str(betas)]
+@pytest.fixture(scope="module")
+def measured():
+    """In a process of their own."""
+    if not RESETS_PEAK:
+        pytest.skip("peak memory is read as Linux tells it")
+    command = [sys.executable, "-m", "tests.pat.networks.test_memory"]
     done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[3])
     return json.loads(done.stdout.splitlines()[-1])
 
 
-@pytest.mark.skipif(not RESETS_PEAK, reason="peak memory is read as Linux tells it")
-def test_agreement_takes_little_more_than_its_result():
+def test_agreement_takes_little_more_than_its_result(measured):
     """Disparity and facts, 7 bytes for each beta, and what is computed on the way. In float64 for the whole image it
     was 460 bytes a pixel."""
-    assert measured("agree", 3) < 220
+    assert measured["agree"] < 220
 
 
-@pytest.mark.skipif(not RESETS_PEAK, reason="peak memory is read as Linux tells it")
 @pytest.mark.parametrize("betas", [1, 3])
-def test_a_tile_takes_what_is_counted(betas):
+def test_a_tile_takes_what_is_counted(betas, measured):
     """Not more, or a limit is exceeded, and not much less, or tiles are small for nothing. Some more if what is freed
     goes back late."""
-    assert 0.55 < measured("tile", betas) < 1.25
+    assert 0.55 < measured[f"tile of {betas}"] < 1.25
 
 
 if __name__ == "__main__":
     with torch.no_grad():
         torch.set_num_threads(1)
-        print(json.dumps(JOBS[sys.argv[1]](int(sys.argv[2]))))
+        print(json.dumps({what: of(betas) for what, (of, betas) in MEASURED.items()}))

@@ -13,20 +13,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from arraygeom.atomic import write_text
 from pat.support.jobs import JobError, Task, Workers, followed, run_tasks
 from tests.pat.fusion.test_batch import contents, material  # noqa: F401  (a fixture)
-
-
-def note(path: Path, wait: float = 0.0) -> None:
-    """Writes the number of times it was called, and who did."""
-    calls = path.with_suffix(".calls")
-    with calls.open("a") as file:
-        file.write(f"{os.getpid()}\n")
-    time.sleep(wait)
-    if path.stem == "bad":
-        raise ValueError("not good\nat all")
-    write_text(path, "done")
+from tests.pat.support.work import befallen, note
 
 
 def tasks(folder: Path, *names: str, wait: float = 0.0) -> list[Task]:
@@ -67,30 +56,14 @@ def test_processes_do_the_same_and_say_the_same(tmp_path, monkeypatch):
     pids = {line for name in names for line in (tmp_path / f"{name}.calls").read_text().split()}
     assert len(pids) == 2
     assert str(os.getpid()) not in pids
-    with pytest.raises(JobError, match="bad"):
-        run_tasks(tasks(tmp_path, "bad"), workers=Workers(2))
     assert "OMP_NUM_THREADS" not in os.environ, "that is for the processes alone"
 
 
-def befallen(path: Path, fate: str) -> None:
-    """What may befall a task: at the first try, or at all."""
-    first = not path.with_suffix(".tried").exists()
-    path.with_suffix(".tried").touch()
-    if fate == "crash" or (fate == "crash once" and first):
-        os.kill(os.getpid(), signal.SIGSEGV)
-    if fate == "hang once" and first:
-        time.sleep(1000)
-    if fate == "bug":
-        raise LookupError("no such key")
-    if fate == "full":
-        raise JobError("the disk is full")
-    write_text(path, os.environ["OMP_NUM_THREADS"])
-
-
-def test_what_crashes_or_hangs_is_tried_again_and_fails_alone(tmp_path):
+def test_what_crashes_or_hangs_is_tried_again_and_fails_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr("pat.support.jobs.TRIES", 2)
     fates = ("well", "crash once", "hang once", "crash", "bug")
     todo = [Task(tmp_path / f"{fate}.txt", befallen, (tmp_path / f"{fate}.txt", fate)) for fate in fates]
-    report = run_tasks(todo, workers=Workers(apart=True, timeout=20.0), on_error="skip")
+    report = run_tasks(todo, workers=Workers(apart=True, timeout=12.0), on_error="skip")
     assert {path.stem for path in report.made} == {"well", "crash once", "hang once"}
     assert (tmp_path / "well.txt").read_text() == "1"
     said = {path.stem: error for path, error in report.failed.items()}

@@ -1,0 +1,22 @@
+"""Warnings that stand at the line of whoever called this software, however deep their cause is."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from types import FrameType
+
+OWN, WRAPPERS = {"arraygeom", "calib", "pat"}, {"contextlib", "torch"}
+"""The packages whose lines are not the caller's, and those whose decorators may stand around them."""
+
+
+def warn(text: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the line outside these packages that led here; the outermost one where there is none."""
+    roots: list[str] = []
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None:
+        roots.append(str(frame.f_globals.get("__name__")).partition(".")[0])
+        frame = frame.f_back
+    entered = max((i for i, root in enumerate(roots) if root in OWN), default=-1)
+    callers = (i for i, root in enumerate(roots) if i > entered and root not in WRAPPERS)
+    warnings.warn(text, category, stacklevel=next(callers, len(roots) - 1) + 2)
