@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -73,7 +74,16 @@ def error(rig: Rig, truth: Rig, matches: dict) -> float:
     return float(off[~true.isnan()].median())
 
 
-def row(label: str, rig: Rig, bad: Rig, matches: dict, kind: str) -> tuple[str, float, float]:
+class Row(NamedTuple):
+    """A line of the table, the error of depth before and after, and whether the refined rig was accepted."""
+
+    line: str
+    before: float
+    after: float
+    accepted: bool
+
+
+def row(label: str, rig: Rig, bad: Rig, matches: dict, kind: str) -> Row:
     found = refine_matches(bad, [matches])
     before, after = (error(r, rig, matches) for r in (bad, found.rig))
     given, refined = (s.median for s in found.held_out)
@@ -82,7 +92,16 @@ def row(label: str, rig: Rig, bad: Rig, matches: dict, kind: str) -> tuple[str, 
     stated = "" if found.depth is None else f"{found.depth.before:.0%} > {found.depth.after:.0%}"
     why = "; ".join(text.split(":")[0] for text in found.objections)
     cells = (label, kind, *distances, f"{before:.2%}", f"{after:.2%}", said, stated, why)
-    return markdown_row(list(cells)), before, after
+    return Row(markdown_row(list(cells)), before, after, found.accepted)
+
+
+def summary(what: str, rows: Sequence[Row]) -> str:
+    """How many of the rows were accepted, and how much worse that made depth."""
+    worse = [100 * (row.after - row.before) for row in rows if row.accepted]
+    return (
+        f"\n{what}: {len(worse)} of {len(rows)} accepted, which increases depth's error by {max(worse):.1f} points at "
+        f"most, by more than one in {sum(points > 1 for points in worse)} cases."
+    )
 
 
 HEAD = ["rig", "drift", "px before", "px after", "depth before", "depth after", "said", "stated", "objections"]
@@ -90,7 +109,7 @@ HEAD = ["rig", "drift", "px before", "px after", "depth before", "depth after", 
 
 def simulated(draws: int) -> Iterator[str]:
     yield markdown_header(HEAD)
-    worst = 0.0
+    rows = []
     for field in ("wide", "narrow"):
         for count in (2, 4):
             for kind in DRIFTS:
@@ -98,25 +117,24 @@ def simulated(draws: int) -> Iterator[str]:
                     g = np.random.default_rng([draw, count, DRIFTS.index(kind)])
                     rig = simulated_rig(field, count, g)
                     matches = simulated_matches(rig, field, g)
-                    line, before, after = row(f"{field}, {count} cameras", rig, drifted(rig, kind, g), matches, kind)
-                    worst = max(worst, after - before)
-                    yield line
-    yield f"\nLargest increase of depth's error: {worst:.2%}"
+                    rows.append(row(f"{field}, {count} cameras", rig, drifted(rig, kind, g), matches, kind))
+                    yield rows[-1].line
+    yield summary("Simulated rigs", rows)
 
 
 def real(data: Path, draws: int) -> Iterator[str]:
     yield markdown_header(HEAD)
     rows = [found for pair in pairs(data) for found in _real_pair(pair, draws)]
-    yield from (line for line, _, _ in rows)
-    lenses = [after - before for line, before, after in rows if line.split(" | ")[1] in LENSES]
-    yield f"\nLargest increase of depth's error by a lens mistake: {max(lenses):.2%}, of {len(lenses)} cases"
+    yield from (found.line for found in rows)
+    yield summary("Real pairs", rows)
+    yield summary("Of those, lens mistakes", [found for found in rows if found.line.split(" | ")[1] in LENSES])
 
 
 def pairs(data: Path) -> Iterator[RealPair]:
     yield from chain(syntim(data, REAL), bumblebee(data, ("chair01", "stones01")))
 
 
-def _real_pair(pair: RealPair, draws: int) -> Iterator[tuple[str, float, float]]:
+def _real_pair(pair: RealPair, draws: int) -> Iterator[Row]:
     rig = Rig({name: pair.rig[name] for name in pair.images})
     matches = match_cameras(pair.images)
     shifted = rig.perturbed({f"{rig.names[1]}.centre": torch.tensor([1.0, 0.0], dtype=torch.float64)})
