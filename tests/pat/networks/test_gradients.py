@@ -27,7 +27,7 @@ from pat import fuse, load_weights
 from pat.matching.inputs import Inputs
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
-from tests.pat.layered_array import load_sample
+from tests.pat.layered_array import middle_of_sample
 
 HW = (7, 9)
 FIELDS = {
@@ -84,18 +84,15 @@ def test_the_loss_is_differentiable_in_rotation_translation_K_and_lens(name):
 
 def test_a_rotation_is_recovered_by_optimising_through_attention_alone():
     """The shipped weights: no matching but attention's, its only way to beta the field of the rig."""
-    sample = load_sample()
-    window = (slice(None), slice(104, 296), slice(192, 448))
-    images = sample.images | {"mono": sample.images["mono"][window]}
-    rig = sample.rig.crop("mono", 104, 192, (192, 256))
+    sample = middle_of_sample()
     supervised = load_weights("pat-supervised")
     assert not supervised.uses_matches
     angle = torch.tensor(math.radians(0.3), dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.Rprop([angle], lr=math.radians(0.13), etas=(0.3, 1.01))
     for _ in range(10):
         optimiser.zero_grad()
-        turned = rig.perturbed({"colour.rotation": angle * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)})
-        frame = fuse(supervised, turned, images, alpha="mono", align=False, differentiable=True)
-        (frame.image - sample.ground_truth[window]).square().mean().backward()
+        turned = sample.rig.perturbed({"colour.rotation": angle * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)})
+        frame = fuse(supervised, turned, sample.images, alpha="mono", align=False, differentiable=True)
+        (frame.image - sample.ground_truth).square().mean().backward()
         optimiser.step()
     assert abs(math.degrees(angle.item())) < 0.02
