@@ -127,7 +127,7 @@ def _median(change: np.ndarray, covariance: np.ndarray) -> float:
 def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarray, "n 3"]]:
     """Views of a board in words, and its points in the camera's frame."""
     found, (h, w) = {}, camera.hw
-    middle = torch.from_numpy((board.points.max(0) + board.points.min(0)) / 2)
+    middle = torch.from_numpy(board.middle)
     for fill in FILLS:
         depth = float(camera.K[0, 0]) * max(board.extent) / (fill * w)
         for (i, j), position in NAMES.items():

@@ -69,6 +69,11 @@ class Board(ABC):
         return np.zeros(len(self.points), dtype=int)
 
     @property
+    def middle(self) -> Float[np.ndarray, "3"]:
+        """The point half way between its outermost ones, metres."""
+        return np.asarray((self.points.max(0) + self.points.min(0)) / 2)
+
+    @property
     def extents(self) -> list[tuple[float, float]]:
         """`extent` of each board."""
         return [self.extent]

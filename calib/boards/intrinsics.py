@@ -57,6 +57,8 @@ RAYLEIGH_MEDIAN = 1.17741
 """The median length of a vector of two independent standard normal variables."""
 FEWEST_TILT = 8.0
 """Boards whose normals differ by less than this many degrees count as parallel."""
+OBLONG = 0.1
+"""Pixels whose sides differ by more than this share are no camera's."""
 Points = Float[np.ndarray, "n 3"]
 OpenCVSolution = tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]
 """K, coefficients, rotations, translations."""
@@ -224,26 +226,32 @@ def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:
 
 
 def _pinhole(views: BoardViews, board: Board, count: int) -> OpenCVSolution:
-    """K, coefficients, rotations, translations: of square pixels, a central principal point and one radial term.
+    """K, coefficients, rotations, translations; two radial terms suffice initially.
 
-    The rest is left to the adjustment and its prior: few, small or similar boards determine neither the aspect ratio
-    nor further terms, and a fit of these without a prior ends anywhere.
+    Few, small or similar boards determine neither these nor the aspect ratio, and a fit without a prior ends anywhere.
+    Where pixels become oblong, a camera with square ones, a central principal point and one radial term is fitted
+    instead: the rest is left to the adjustment and its prior.
     """
     initial = board.points * (1, 1, 0) if board.flat else board.points
     points = [initial[d.ids].astype(np.float32) for d in views.seen.values()]
     pixels = [d.x.astype(np.float32)[:, None] for d in views.seen.values()]
     h, w = views.hw
-    flags = cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    flags |= cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_PRINCIPAL_POINT
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     if not count:
-        flags |= cv2.CALIB_FIX_K1
-    K: np.ndarray = np.eye(3)
+        flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
+    given: np.ndarray = np.eye(3)
     if not board.flat:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
-        K = _linear_intrinsics(max(zip(points, pixels), key=lambda view: len(view[0])), views.hw)
-    _, K, c, rotations, translations = cv2.calibrateCamera(points, pixels, (w, h), K, np.zeros(5), flags=flags)
-    coefficients = np.zeros(max(count, 1))
-    coefficients[0] = c.reshape(-1)[0]
+        given = _linear_intrinsics(max(zip(points, pixels), key=lambda view: len(view[0])), views.hw)
+    K: np.ndarray
+    for further in (0, cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_K2):
+        _, K, c, rotations, translations = cv2.calibrateCamera(
+            points, pixels, (w, h), given.copy(), np.zeros(5), flags=flags | further
+        )
+        if abs(np.log(K[0, 0] / K[1, 1])) < OBLONG:
+            break
+    coefficients = np.zeros(max(count, 2))
+    coefficients[:2] = c.reshape(-1)[:2]
     return K, coefficients, list(rotations), list(translations)
 
 

@@ -29,7 +29,15 @@ from .detect import BoardViews
 from .photos import FrameKey, Photos
 from .rig import Calibration
 from .solve import frame_rms, misfits
-from .uncertainty import GRID, baseline_deviation, beta_covariance, intrinsics_of, rig_covariance, uncertainty
+from .uncertainty import (
+    GRID,
+    baseline_deviation,
+    beta_covariance,
+    intrinsics_of,
+    rig_covariance,
+    uncertainty,
+    worst_deviation,
+)
 from .validation import half_difference
 
 THUMBNAIL = 480
@@ -318,7 +326,7 @@ def draw_uncertainty(calibration: Calibration, at: tuple[float, float]) -> Figur
             pixels = beta_covariance(calibration.rig, covariance, alpha, beta, x, depth)
             usable = np.isfinite(pixels).all((1, 2))
             deviation = np.full(len(x), np.nan)
-            deviation[usable] = np.sqrt(np.linalg.eigvalsh(pixels[usable])[:, -1])
+            deviation[usable] = worst_deviation(pixels[usable])
             shown = axes.imshow(
                 deviation.reshape(len(ys), len(xs)), extent=_extent((h, w)), cmap="viridis", norm=LogNorm()
             )

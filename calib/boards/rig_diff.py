@@ -22,7 +22,7 @@ from arraygeom import Camera, Pose, Rig, triangulate
 from arraygeom.pose import cross_matrix
 
 from .bundle import camera_jacobian
-from .uncertainty import RigCovariance, beta_covariance, grid_points
+from .uncertainty import RigCovariance, beta_covariance, grid_points, worst_deviation
 
 DEPTHS = 3
 """Depths at which projections are compared, at even steps of inverse depth."""
@@ -155,7 +155,10 @@ def rig_difference(
     end = 0
     for (name, (x, _, z)), part in zip(grids.items(), parts):
         start, end = end, end + part.change.size
-        sigma = np.full(len(x), np.nan) if spread is None else _worst(spread[start:end].reshape(len(x), 2, -1))
+        sigma = np.full(len(x), np.nan)
+        if spread is not None:
+            mine = spread[start:end].reshape(len(x), 2, -1)
+            sigma = worst_deviation(mine @ mine.swapaxes(-1, -2))
         cameras[name] = CameraDifference(x, z, part.change, sigma)
     alpha, *betas = names
     depths = {name: _depths(a, b, alpha, name, grids[alpha], known) for name in betas}
@@ -249,10 +252,6 @@ def _best_motion(a: Rig, b: Rig, grids: Mapping[str, Grid]) -> Pose:
 def _root(covariance: RigCovariance) -> np.ndarray:
     values, vectors = np.linalg.eigh(covariance.matrix)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
-
-
-def _worst(spread: Float[np.ndarray, "n 2 p"]) -> Float[np.ndarray, " n"]:
-    return np.asarray(np.sqrt(np.linalg.eigvalsh(spread @ spread.swapaxes(-1, -2))[:, -1]))
 
 
 def _tested(

@@ -171,7 +171,12 @@ def grid_points(camera: Camera, depth: float) -> tuple[Float[np.ndarray, "n 2"],
 def uncertainty(known: Intrinsics, depth: float) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
     """Standard deviations (pixels, worst direction) of the projection of points at a depth (metres), over the image."""
     x, change = moved_pixels(known, depth)
-    return x, np.sqrt(np.linalg.eigvalsh(change @ known.covariance @ change.swapaxes(-1, -2))[:, -1])
+    return x, worst_deviation(change @ known.covariance @ change.swapaxes(-1, -2))
+
+
+def worst_deviation(covariance: Float[np.ndarray, "n 2 2"]) -> Float[np.ndarray, " n"]:
+    """The standard deviation in the direction in which it is largest."""
+    return np.asarray(np.sqrt(np.linalg.eigvalsh(covariance)[:, -1]))
 
 
 def moved_pixels(known: Intrinsics, depth: float) -> tuple[np.ndarray, np.ndarray]:

@@ -317,8 +317,9 @@ class RefinementProblem:
         explained = lens_alone.after(lens_alone.solve_freely().z)
         if nearer(line_distances(explained, self.held_out), distances):
             return []
-        every = ",".join((*FREE, *EXTRA_FREE, "distortion"))
-        what_to_do = "state the lenses that were calibrated" if rig is not self.rig else f"try --free {every}"
+        all_kinds = ",".join((*FREE, *EXTRA_FREE, "distortion"))
+        freed = f"if those may be wrong, --free {all_kinds}"
+        what_to_do = freed if rig is self.rig else "state the lenses that were calibrated"
         return [f"other lenses explain the points as well as other poses, which would change depth: {what_to_do}"]
 
     def _depth_change(self, refined: Rig, solution: Solution) -> DepthChange | None:

@@ -209,13 +209,23 @@ class Convert:
     """File or folder to write; also: --out OUT."""
     read_as: Annotated[str | None, optional("FORMAT")] = None
     """Format of the source; by default recognised."""
+    size: Annotated[tuple[int, int] | None, optional("W H")] = None
+    """Of the images, pixels: for files that state none, or several."""
     write_as: Annotated[str, arg(metavar="FORMAT")] = "native"
     """Format of the target."""
 
     def run(self) -> None:
         from arraygeom.io import read_rig, write_rig
 
-        rig = read_rig(self.source, format=self.read_as)
+        hw = None if self.size is None else (self.size[1], self.size[0])
+        if hw is not None and min(hw) < 1:
+            raise ValueError("--size: wanted width and height in pixels")
+        rig = read_rig(self.source, format=self.read_as, hw=hw)
+        for name in rig.names if hw is not None else ():
+            if rig[name].hw != hw:
+                raise ValueError(
+                    f"--size: the file states {rig[name].hw[1]}x{rig[name].hw[0]} for '{name}': leave it out"
+                )
         write_rig(rig, self.target, format=self.write_as)
         say(f"written: {self.target} ({len(rig.names)} cameras)")
 

@@ -18,6 +18,7 @@ from pat.cli.options import respelled
 from pat.data.sample_array import SAMPLE, load_motorcycle, load_sample
 from pat.evaluation.metrics import score
 from pat.media.images import read_image, write_image
+from tests.arraygeom.test_io import FIXTURES
 
 
 @pytest.fixture
@@ -180,6 +181,17 @@ def test_rig_convert_and_back(small, capsys):
         assert torch.allclose(a.K, b.K)
         assert torch.allclose(a.cam_from_world.t, b.cam_from_world.t, atol=1e-9)
     assert "known" in fails(["rig", "convert", str(small / "rig.yaml"), "x", "--write-as", "word"], capsys)
+
+
+def test_the_size_of_files_that_state_none_or_several(small, tmp_path, capsys):
+    """The command had no way to say it: a ZED's file with images of 672x376 was of its largest size."""
+    zed, rig = str(FIXTURES / "zed.conf"), str(tmp_path / "rig.yaml")
+    main(["rig", "convert", zed, rig, "--size", "672", "376"])
+    assert Rig.load(rig)["left"].hw == (376, 672)
+    assert "it has 1280x720, 672x376" in fails(["rig", "convert", zed, rig, "--size", "640", "480"], capsys)
+    stated = fails(["rig", "convert", str(small / "rig.yaml"), rig, "--size", "9", "9"], capsys)
+    assert "--size: the file states" in stated
+    assert "--size: wanted" in fails(["rig", "convert", zed, rig, "--size", "0", "9"], capsys)
 
 
 def test_rig_info_of_one_camera_has_no_pairs(small, tmp_path, capsys):
