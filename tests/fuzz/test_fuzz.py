@@ -199,10 +199,10 @@ def test_numbers_that_no_camera_has_are_refused(old, new, tmp_path):
         Rig.load(tmp_path / "rig.yaml")
 
 
-@pytest.mark.parametrize(("cameras", "distorted"), [(200, True), (1000, False)])
+@pytest.mark.parametrize(("cameras", "distorted"), [(100, True), (1000, False)])
 def test_rigs_of_many_cameras_are_read_and_summarised_within_seconds(cameras, distorted, tmp_path, monkeypatch):
     """The tests' own checks of shapes take half of it; of so many, not every pair is described."""
-    monkeypatch.setattr(sandbox, "SECONDS", 30)
+    monkeypatch.setattr(sandbox, "SECONDS", 15 if distorted else 30)
     lens = ", distortion: {model: brown-conrady, coefficients: [-0.1, 0.02, 0.001, 0.001]}" if distorted else ""
     entries = (f"  c{i}: {{size: [64, 48], focal: 50, translation: [{i}, 0, 0]{lens}}}" for i in range(cameras))
     text = "\n".join(["format: arraygeom-rig 1", "depth: [1, 10]", "cameras:", *entries])

@@ -59,7 +59,7 @@ def test_more_samples_and_channels_than_are_processed_at_once(interpolation, d, 
     assert all(relative(here[name], there[name]) < 1e-10 for name in tensors)
 
 
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("dtype", [torch.bfloat16, pytest.param(torch.float16, marks=pytest.mark.slow)])
 def test_16_bit_inputs_are_accumulated_in_float32(dtype):
     tensors, options = random_case(3, dtype=torch.float32)
     stored = {

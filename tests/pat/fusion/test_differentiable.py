@@ -9,19 +9,14 @@ from arraygeom import Pair, Rig
 from arraygeom.multiview import warp
 from pat import fuse, load_weights
 from pat.media.colour import luminance
-from tests.pat.layered_array import load_sample
-
-HW = (192, 256)
-TOP, LEFT = 104, 192
+from tests.pat.layered_array import middle_of_sample
 
 
 @pytest.fixture(scope="module")
 def cropped():
-    """The sample array with a window of alpha; its rig, images and ground truth."""
-    sample = load_sample()
-    window = (slice(None), slice(TOP, TOP + HW[0]), slice(LEFT, LEFT + HW[1]))
-    images = sample.images | {"mono": sample.images["mono"][window]}
-    return sample.rig.crop("mono", TOP, LEFT, HW), images, sample.ground_truth[window]
+    """The middle of the sample array; its rig, images and ground truth."""
+    sample = middle_of_sample()
+    return sample.rig, sample.images, sample.ground_truth
 
 
 def rotated(rig: Rig, angle: torch.Tensor) -> Rig:

@@ -106,7 +106,7 @@ def test_tiled_equals_whole(kind, dtype, bound, monkeypatch):
 
 
 def test_matching_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(monkeypatch):
-    sample, network = load_sample(), load_weights("mono-colour")
+    sample, network = load_sample(), load_weights("mono-colour-small")
     images = {name: sample.images[name] for name in sample.rig.names}
     whole = fuse(network, sample.rig, images, alpha="mono")
     monkeypatch.setattr(pat.matching.inputs, "SETTINGS", InputsSettings(halo=128, at_once=150_000))

@@ -32,7 +32,21 @@ def material(tmp_path_factory):
 
 def fused(folder, rig, out, *more):
     images = [f"--image={name}={folder / name}.png" for name in ("mono", "colour")]
-    main(["fuse", str(folder / rig), "--alpha", "mono", *images, "--no-report", "-o", str(folder / out), *more])
+    main(
+        [
+            "fuse",
+            str(folder / rig),
+            "--alpha",
+            "mono",
+            *images,
+            "--weights",
+            "mono-colour-small",
+            "--no-report",
+            "-o",
+            str(folder / out),
+            *more,
+        ]
+    )
     return read_image(folder / out / "fused.png")
 
 

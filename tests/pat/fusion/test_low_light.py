@@ -27,7 +27,7 @@ from pat.networks.protocol import FusionOutput
 from pat.networks.weights import load_weights
 from pat.sensors import NoiseLevel, generator_for
 from pat.support.steps import steps_shown
-from tests.pat.layered_array import ALPHA, BETA, SampleArray, load_sample
+from tests.pat.layered_array import ALPHA, BETA, load_sample, middle_of_sample
 
 
 @pytest.fixture(scope="module")
@@ -35,16 +35,7 @@ def network():
     return load_weights("mono-colour-small")
 
 
-def middle():
-    """The middle of alpha's view of the sample, and what beta sees of it."""
-    sample = load_sample()
-    window, of_beta = (..., slice(104, 296), slice(192, 448)), (..., slice(84, 300), slice(130, 418))
-    rig = sample.rig.crop(ALPHA, 104, 192, (192, 256)).crop(BETA, 84, 130, (216, 288))
-    images = {ALPHA: sample.images[ALPHA][window], BETA: sample.images[BETA][of_beta]}
-    return SampleArray(rig, images, sample.ground_truth[window])
-
-
-def in_low_light(electrons, of=middle):
+def in_low_light(electrons, of=middle_of_sample):
     """The middle of the sample, or all of it; its images with noise; and the levels of that."""
     sample, level = of(), NoiseLevel.of_electrons(electrons, 2)
     images = {n: level.recorded(i[None], generator_for(0, n))[0] for n, i in sample.images.items()}
@@ -69,7 +60,7 @@ def psnr(image, sample):
 
 @pytest.mark.parametrize("noise", [{}, {ALPHA: NoiseLevel.of_electrons(1e6)}])
 def test_views_without_noticeable_noise_are_fused_as_ever(network, noise):
-    sample = middle()
+    sample = middle_of_sample()
     plain, same = (fuse(network, sample.rig, sample.images, alpha=ALPHA, noise=n) for n in (None, noise))
     assert torch.equal(plain.image, same.image)
     assert torch.equal(plain.confidence, same.confidence)

@@ -4,6 +4,7 @@ import json
 import os
 import resource
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -123,14 +124,10 @@ def test_a_stopped_run_goes_on_bit_for_bit(step, what, folder, whole, monkeypatc
     assert all(torch.equal(ours.tensors[k], v) for k, v in theirs.tensors.items())
 
 
-def command(*arguments, processes=1):
-    torchrun = (
-        ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", str(processes)] if processes > 1 else []
-    )
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+def command(*arguments, launcher=(), **environment):
     return subprocess.Popen(
-        [sys.executable, *torchrun, "-m", "pat", "train", *map(str, arguments)],
-        env=environment,
+        [sys.executable, *launcher, "-m", "pat", "train", *map(str, arguments)],
+        env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), **environment},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -157,10 +154,29 @@ def test_killed_at_any_moment_and_started_again(folder, whole):
     assert losses(config.out) == losses(whole.out)
 
 
-def test_two_processes_are_as_one(folder, whole):
-    config = replace(whole, out=folder / "two")
+def two_processes(config, file, monkeypatch):
+    """This process and the command in another one, told of each other as by torchrun."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    told = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    other = command(file, RANK="1", LOCAL_RANK="1", **told)
+    with monkeypatch.context() as context:
+        for name, value in {"RANK": "0", "LOCAL_RANK": "0", **told}.items():
+            context.setenv(name, value)
+        train(config)
+    return other
+
+
+def by_torchrun(config, file, monkeypatch):
+    return command(file, launcher=["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"])
+
+
+@pytest.mark.parametrize("run", [two_processes, pytest.param(by_torchrun, marks=pytest.mark.slow)])
+def test_two_processes_are_as_one(run, folder, whole, monkeypatch):
+    config = replace(whole, out=folder / run.__name__)
     save_config(config, folder / "two.yaml")
-    running = command(folder / "two.yaml", processes=2)
+    running = run(config, folder / "two.yaml", monkeypatch)
     said, _ = running.communicate()
     assert running.returncode == 0, said
     ours, theirs = ([[float(x) for x in row] for row in losses(c.out)[1:]] for c in (config, whole))
