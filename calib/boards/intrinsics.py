@@ -59,7 +59,6 @@ FEWEST_TILT = 8.0
 """Boards whose normals differ by less than this many degrees count as parallel."""
 OBLONG = 0.1
 """Pixels whose sides differ by more than this share are no camera's."""
-Points = Float[np.ndarray, "n 3"]
 OpenCVSolution = tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]
 """K, coefficients, rotations, translations."""
 
