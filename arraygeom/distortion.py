@@ -33,9 +33,9 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .checks import check_numbers, checking
-from .lenses.brown import Brown, brown_distort, brown_limit, brown_undistort
+from .lenses.brown import brown_distort, brown_limit, brown_undistort
 from .lenses.central import EXTENDED_UNIFIED, FOV, MODELS, central_project, central_unproject
-from .lenses.common import WIDEST, finite_points, unit
+from .lenses.common import WIDEST, finite_points, once, unit
 from .lenses.fisheye import fisheye_limit, fisheye_project, fisheye_unproject
 from .lenses.model import LensModel
 from .pixels import to_homogeneous
@@ -184,7 +184,7 @@ class Distortion(LensModel):
     def squared_limit(self) -> float:
         """Up to where one lens is valid: a squared normalised radius (Brown-Conrady), or angle (Kannala-Brandt)."""
         c = self.coefficients.detach()
-        return float(fisheye_limit(c) if self.model == KANNALA_BRANDT else brown_limit(Brown.named(c)))
+        return float(once(fisheye_limit if self.model == KANNALA_BRANDT else brown_limit, c))
 
     def _lifted(self, points: Tensor) -> Tensor:
         """Coefficients (*b, 1.., n): the batch axes in front, one axis of length 1 for each further axis."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from .tracing import traced
+from .tracing import followed, traced
 
 
 def first_root(coefficients: Tensor) -> Tensor:
@@ -21,6 +21,8 @@ def first_root(coefficients: Tensor) -> Tensor:
     n = a.shape[-1]
     if a.numel() > n and not traced() and bool((a == a.reshape(-1, n)[0]).all()):
         return first_root(coefficients.reshape(-1, n + 1)[0]).expand(a.shape[:-1])  # copies of one lens
+    if not followed() and not bool(a.any()):
+        return a.new_full(a.shape[:-1], torch.inf)
     finite = a.isfinite().all(-1)
     a = torch.where(finite[..., None], a, 0.0)
     powers = torch.arange(1, n + 1).to(a)

@@ -35,7 +35,7 @@ class Brown:
 
 def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
     """Points (*n, 2) to distorted ones, and which are within the range."""
-    lens, limit = Brown.named(c), once(lambda c: brown_limit(Brown.named(c)), c).to(xy)
+    lens, limit = Brown.named(c), once(brown_limit, c).to(xy)
     squared = xy.square().sum(-1)
     inside = squared < limit
     pull = torch.where(inside, 1.0, (limit / torch.where(inside, 1.0, squared.clamp(min=TINY))).sqrt())
@@ -89,11 +89,12 @@ def _radial_factor(lens: Brown, u: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def brown_limit(lens: Brown) -> Tensor:
+def brown_limit(c: Tensor) -> Tensor:
     """The squared radius up to which the radial part r g(r^2) rises: float64 on the CPU, shape (*b, 1..).
 
     With g = N / D the slope is P / D^2, P(u) = (N + 2 u N') D - 2 u N D', of degree 6 (or 7) with P(0) = 1.
     """
+    lens = Brown.named(c)
     k1, k2, k3, k4, k5, k6 = (k.detach().to("cpu", torch.float64) for k in lens.k)
     one = torch.ones_like(k1)
     k7 = () if lens.eighth is None else (lens.eighth.detach().to("cpu", torch.float64),)
@@ -164,7 +165,7 @@ def _brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     Close to the turn the slope is nearly 0 and leads nowhere, hence two more attempts from further in.
     """
     lens = Brown.named(c)
-    limit = brown_limit(lens).to(target)
+    limit = once(brown_limit, c).to(target)
     start = solved = _brown_start(lens, target, limit)
 
     def distorted(xy: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:

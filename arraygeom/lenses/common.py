@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from ..pixels import floating
+from ..tracing import followed
 
 # The range of validity ends this fraction (of the squared radius) inside the turn, where the inverse is still
 # good to 1e-6 px in float64.
@@ -55,9 +57,20 @@ def polynomial_product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> list[Ten
 
 @torch.no_grad()
 def once(bound: Callable[[Tensor], Tensor], c: Tensor) -> Tensor:
-    """A bound of lenses by their coefficients (*b, n); of copies of one lens, made by `expand`, it is computed once."""
-    copies = c.ndim > 1 and len(c) > 1 and c.stride(0) == 0
-    return bound(c[:1]).expand(c.shape[:-1]) if copies else bound(c)
+    """A bound of lenses by their coefficients (*b, n), which is computed once for copies of one lens, made by `expand`.
+
+    It is remembered for the lenses that were asked for last, unless torch has to see how it is computed.
+    """
+    if c.ndim > 1 and len(c) > 1 and c.stride(0) == 0:
+        return once(bound, c[:1]).expand(c.shape[:-1])
+    if followed() or torch.is_inference_mode_enabled() or c.device.type != "cpu" or not c.numel():
+        return bound(c)
+    return _remembered(bound, c.dtype, c.shape, c.detach().contiguous().view(torch.uint8).numpy().tobytes())
+
+
+@lru_cache(maxsize=256)
+def _remembered(bound: Callable[[Tensor], Tensor], dtype: torch.dtype, shape: torch.Size, content: bytes) -> Tensor:
+    return bound(torch.frombuffer(bytearray(content), dtype=dtype).reshape(shape))
 
 
 def unit(ray: Tensor) -> Tensor:

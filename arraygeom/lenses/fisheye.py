@@ -26,7 +26,7 @@ def fisheye_project(c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
 
 def fisheye_unproject(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
     """Solve v p(v)^2 = |xy_d|^2 for the squared angle v: smooth on the axis too, where the angle is not."""
-    limit = fisheye_limit(c).to(xy_d)
+    limit = once(fisheye_limit, c).to(xy_d)
     u_d = xy_d.square().sum(-1)
     outermost = limit * _fisheye_factor(c, limit)[0].square()
     inside = u_d < outermost
