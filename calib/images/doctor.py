@@ -25,10 +25,10 @@ from arraygeom.robust import cauchy, least_squares, robust_least_squares
 from arraygeom.threads import torch_in_one_thread
 
 from .depth_change import relative_change
+from .evidence import SCALES, DriftEvidence
 from .held_out import image_parts, line_distances, trimmed_square
 from .matches import Images, Pairs, PointMatches, agreeing_pairs, match_cameras, seen_depths
 from .parameters import SIGMA
-from .plausibility import SCALES, DriftEvidence, plausible
 from .remedies import NOTHING, TURNS, Remedy, bare_cameras, degrees_remedy, from_degrees, lens_remedy, remedies
 from .residuals import lines_basis, related, residuals_and_depths, stack_key, stacked
 
@@ -186,7 +186,7 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     """`diagnose` from matched points of images of these sizes."""
     pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
-    tried = [r for r in remedies(rig, sizes) if not fits or plausible(r, rig)]
+    tried = [r for r in remedies(rig, sizes) if not fits or r.is_plausible(rig)]
     tried = [NOTHING, *tried]
     if fits:
         tried += [*_ignored_lens(rig, pairs), *_degrees(rig, pairs), *_depth_range(rig, pairs)]
@@ -238,21 +238,21 @@ def _by_evidence(
     found = {i: DriftEvidence.of(tried[i].repair(rig), pairs, inliers, noise) for i in some}
     given = DriftEvidence.of(rig, pairs, inliers, noise)
     mirrored = figures[0].handed < 0.5
-    some.sort(key=lambda i: found[i].surprise)
-    least = found[some[0]].surprise
-    best = min(i for i in some if found[i].surprise <= least + TIE)
+    some.sort(key=lambda i: found[i].cost)
+    least = found[some[0]].cost
+    best = min(i for i in some if found[i].cost <= least + TIE)
     allowed = max(ROUGHLY if tried[best].approximate else EXPLAINED[0], EXPLAINED[1] * figures[0].penalised_misfit)
     parts = image_parts(rig, pairs)
     rest = (inliers & (parts != part) for part in parts.unique().tolist())
     clear = (
         figures[best].penalised_misfit <= allowed
-        and found[best].surprise + MARGIN < given.surprise
+        and found[best].cost + MARGIN < given.cost
         and all(found[best].by(used) + MARGIN < given.by(used) for used in rest)
     )
     named = mirrored or (clear and (bool(rig.links) or not tried[best].small))
-    bound = MARGIN + (least if named else min(least, given.surprise))
+    bound = MARGIN + (least if named else min(least, given.cost))
     near = EQUAL[0] * figures[best].penalised_misfit + EQUAL[1] if named else 0.0
-    as_good = [i for i in some if found[i].surprise <= bound or figures[i].penalised_misfit <= near]
+    as_good = [i for i in some if found[i].cost <= bound or figures[i].penalised_misfit <= near]
     return best if named else 0, as_good
 
 

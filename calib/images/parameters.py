@@ -19,6 +19,8 @@ from arraygeom.pixels import HW
 SIGMA = {"rotation": math.radians(0.5), "translation": 0.01, "focal": 0.01, "centre": 5.0, "distortion": 0.02}
 """Default standard deviations: radians, a share of the longest baseline, a share of the focal length, pixels of the
 principal point, and a share of `typical_coefficients`."""
+LARGEST_CHANGE = 4.0
+"""Prior standard deviations by which a parameter may change: beyond, the rig is not the one that the prior is of."""
 UNCERTAIN = ("rotation", "translation", "focal", "centre")
 """Kinds of parameters that are uncertain even where they are not free."""
 ALIASES = {"principal_point": "centre", "focal_length": "focal"}

@@ -44,7 +44,7 @@ from .least_squares import (
 )
 from .lenses import with_distortion, with_lenses
 from .matches import ENOUGH, Images, Pairs, agreeing_pairs, match_cameras, matching_time, with_map
-from .parameters import FreeParameter, apply_change, considered_parameters, free_parameters
+from .parameters import LARGEST_CHANGE, FreeParameter, apply_change, considered_parameters, free_parameters
 from .photometric import Attend, PhotometricFrame, photometric_errors, with_depths
 from .refined import LineStatistics, ParameterChange, PhotometricResult, Refinement
 from .residuals import own_distance, related, sampson_of_pairs, systematic_modes
@@ -56,8 +56,6 @@ EXTRA_FREE = ("focal", "translation")
 """Freed too if held-out points improve."""
 SYSTEMATIC = 0.3
 """Prior deviation, pixels at the image's corner, of each smooth displacement that a lens model leaves."""
-LARGEST_CHANGE = 4.0
-"""Prior standard deviations by which a parameter may change: beyond, the rig is not the one that the prior is of."""
 LARGEST_DISTANCE, OF_OWN = 1.0, 3.0
 """A refined rig is refused whose held-out points lie farther from their lines than this, in pixels (median), and than
 this many times their distance from the lines of an F fitted to them."""

@@ -16,9 +16,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from arraygeom import Camera, Distortion, Pose, Rig, View, resize_matrix, rotation_from_vector
+from arraygeom import Camera, Distortion, LensView, Pose, Rig, View, resize_matrix, rotation_from_vector
 from arraygeom.pixels import HW, rot90_matrix, shift_matrix
 from arraygeom.pose import rotation_vector
+
+from .parameters import LARGEST_CHANGE, SIGMA
 
 RESIZED = (0.5, 2.0, 0.25, 4.0, 1 / 3, 3.0, 2 / 3, 1.5, 0.75, 4 / 3)
 UNITS = {
@@ -27,6 +29,8 @@ UNITS = {
     1e-2: "centimetres taken for metres",
     1e2: "metres taken for centimetres",
 }
+OFF_CENTRE = 0.05
+"""Principal points within this of the middle of the image, as a share of its longer side, are plausible."""
 TRANSPOSE = torch.eye(3, dtype=torch.float64)[[1, 0, 2]]
 """Exchanges x and y."""
 
@@ -44,6 +48,33 @@ class Remedy:
     repair: Callable[[Rig], Rig]
     approximate: bool = False
     small: bool = False
+
+    def is_plausible(self, rig: Rig) -> bool:
+        """Whether a rig may hold this mistake, by its numbers alone.
+
+        Another size and exchanged axes change K by more than a drift does, and take principal points away from the
+        middles of images, not towards them. By points alone a drift is taken for such a mistake now and then: lines of
+        distant narrow views depend on little but the difference of two principal points.
+        """
+        if self.kind not in ("resized", "x and y exchanged"):
+            return True
+        views = zip(rig.cameras.values(), self.repair(rig).cameras.values())
+        changed = [(a, b) for a, b in views if a is not b and isinstance(a, LensView) and isinstance(b, LensView)]
+        nearer = all(_centre_offset(b) <= max(_centre_offset(a), OFF_CENTRE) for a, b in changed)
+        return nearer and (not changed or any(_beyond_drift(a.K, b.K) for a, b in changed))
+
+
+def _beyond_drift(given: Tensor, other: Tensor) -> bool:
+    """Whether a focal length or a principal point differs by more than `LARGEST_CHANGE` prior deviations."""
+    focal = (other / given - 1).diagonal()[:2].abs().max() / SIGMA["focal"]
+    centre = (other - given)[:2, 2].norm() / SIGMA["centre"]
+    return bool(torch.maximum(focal, centre) > LARGEST_CHANGE)
+
+
+def _centre_offset(view: LensView) -> float:
+    """Of the principal point from the middle of the image, as a share of its longer side."""
+    middle = view.K.new_tensor([view.hw[1] - 1, view.hw[0] - 1]) / 2
+    return float((view.K[:2, 2] - middle).norm()) / max(view.hw)
 
 
 NOTHING = Remedy("nothing", "as given", lambda rig: rig)

@@ -15,13 +15,12 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from arraygeom import Camera, LensView, Rig
+from arraygeom import Camera, Rig
 
 from .least_squares import JoinedResiduals, Residuals, jacobian
 from .matches import Pairs
 from .parameters import SIGMA, UNCERTAIN, apply_change, free_parameters
-from .refinement import LARGEST_CHANGE, systematic_columns
-from .remedies import Remedy
+from .refinement import systematic_columns
 from .residuals import match_depths, sampson_of_pairs
 
 SCALES = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)
@@ -32,52 +31,22 @@ STEPS = 4
 """Steps of Gauss and Newton to the most probable drift."""
 NO_BETTER = 0.1
 """... which end once the evidence improves by less."""
-OFF_CENTRE = 0.05
-"""Principal points within this of the middle of the image, as a share of its longer side, are plausible."""
 CLIPPED = 30.0
 """Residuals count as at most so many pixels."""
-
-
-def plausible(remedy: Remedy, rig: Rig) -> bool:
-    """Whether a rig may hold this mistake, by its numbers alone.
-
-    Another size and exchanged axes change K by more than a drift does, and take principal points away from the middles
-    of images, not towards them. By points alone a drift is taken for such a mistake now and then: lines of distant
-    narrow views depend on little but the difference of two principal points.
-    """
-    if remedy.kind not in ("resized", "x and y exchanged"):
-        return True
-    views = zip(rig.cameras.values(), remedy.repair(rig).cameras.values())
-    changed = [(a, b) for a, b in views if a is not b and isinstance(a, LensView) and isinstance(b, LensView)]
-    nearer = all(_centre_offset(b) <= max(_centre_offset(a), OFF_CENTRE) for a, b in changed)
-    return nearer and (not changed or any(_beyond_drift(a.K, b.K) for a, b in changed))
-
-
-def _beyond_drift(given: Tensor, other: Tensor) -> bool:
-    """Whether a focal length or a principal point differs by more than `LARGEST_CHANGE` prior deviations."""
-    focal = (other / given - 1).diagonal()[:2].abs().max() / SIGMA["focal"]
-    centre = (other - given)[:2, 2].norm() / SIGMA["centre"]
-    return bool(torch.maximum(focal, centre) > LARGEST_CHANGE)
-
-
-def _centre_offset(view: LensView) -> float:
-    """Of the principal point from the middle of the image, as a share of its longer side."""
-    middle = view.K.new_tensor([view.hw[1] - 1, view.hw[0] - 1]) / 2
-    return float((view.K[:2, 2] - middle).norm()) / max(view.hw)
 
 
 @dataclass(frozen=True)
 class DriftEvidence:
     """A rig with the drift that fits matched points best.
 
-    surprise: -2 log evidence of the rig and that drift by the points used. Smaller is better; differences count.
+    cost: -2 log evidence of the rig and that drift by the points used. Smaller is better; differences count.
     distances: of all points by a drift, in standard deviations of their noise. z: the drift. r, J, B: the distances,
     were there no drift, and their derivatives by the drift and by what lens models leave; linear about z. scale: of
-    the drift. fixed: the part of the surprise that does not depend on the distances. clipped: the largest distance
-    that counts.
+    the drift. fixed: the part of the cost that does not depend on the distances. clipped: the largest distance that
+    counts.
     """
 
-    surprise: float
+    cost: float
     distances: Residuals
     z: Tensor
     r: Tensor
@@ -101,31 +70,31 @@ class DriftEvidence:
         B, clipped = systematic_columns(rig, pairs) / noise, CLIPPED / noise
         wrong_side = _rotation_to_plausible_depth(rig, pairs)
         fixed = {scale: RARE * math.log1p(scale**2) + (wrong_side / scale) ** 2 for scale in SCALES}
-        best = min(SCALES, key=lambda scale: _Drift.of(r[used], J[used], B[used], scale).surprise + fixed[scale])
+        best = min(SCALES, key=lambda scale: _Drift.of(r[used], J[used], B[used], scale).cost + fixed[scale])
         found = cls(math.inf, distances, z, r, J, B, best, fixed[best], clipped)
         for _ in range(STEPS):
-            surprise = found._at(found.z, used)
-            if not surprise < found.surprise - NO_BETTER:
-                return replace(found, surprise=min(surprise, found.surprise))
+            cost = found._at(found.z, used)
+            if not cost < found.cost - NO_BETTER:
+                return replace(found, cost=min(cost, found.cost))
             z = found._refitted(used)
             r, J = jacobian(distances, z)
-            found = replace(found, surprise=surprise, z=z, r=r - J @ z, J=J)
+            found = replace(found, cost=cost, z=z, r=r - J @ z, J=J)
         return found
 
     def by(self, used: Bool[Tensor, " n"]) -> float:
-        """The surprise by other points, of this drift or of the best by them to first order, whichever is better."""
+        """The cost by other points, of this drift or of the best by them to first order, whichever is better."""
         return min(self._at(z, used) for z in (self.z, self._refitted(used)))
 
     def _refitted(self, used: Bool[Tensor, " n"]) -> Tensor:
         return _Drift.of(self.r[used], self.J[used], self.B[used], self.scale).z
 
     def _at(self, z: Tensor, used: Bool[Tensor, " n"]) -> float:
-        """The surprise of a drift by the points' distances as they are then; infinite where there are none."""
+        """The cost of a drift by the points' distances as they are then; infinite where there are none."""
         r, J, B = self.distances(z).detach()[used], self.J[used], self.B[used]
         clipped = _Drift.of(r.clamp(-self.clipped, self.clipped), J[:, :0], B, self.scale)
         volume = _Drift.of(r, J, B, self.scale).volume
-        surprise = clipped.surprise - clipped.volume + volume + float((z / self.scale).square().sum()) + self.fixed
-        return surprise if math.isfinite(surprise) else math.inf
+        cost = clipped.cost - clipped.volume + volume + float((z / self.scale).square().sum()) + self.fixed
+        return cost if math.isfinite(cost) else math.inf
 
 
 class _Drift(NamedTuple):
@@ -134,7 +103,7 @@ class _Drift(NamedTuple):
     z: the most probable one.
     """
 
-    surprise: float
+    cost: float
     volume: float
     z: Tensor
 
