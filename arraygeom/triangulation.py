@@ -37,7 +37,6 @@ def triangulate(
     seen: Bool[Tensor, "v *n"] | None = None,
     deviation: float = 1.0,
     residual: float | None = None,
-    refinements: int = 5,
 ) -> Triangulated:
     """Points from their pixels in two views or more, of least reprojection error, through any lens.
 
@@ -54,8 +53,8 @@ def triangulate(
         raise ValueError(f"wanted pixels (views, ..., 2) of {len(cameras)} >= 2 cameras, got {tuple(x.shape)}")
     dtype = torch.promote_types(floating(x).dtype, cameras[0].t.dtype)
     sights, chart, p = _sighted([c.to(torch.float64) for c in cameras], x.double(), seen)
-    for i in range(refinements):
-        p = p.detach() if i == refinements - FOLLOWED else p
+    for i in range(STEPS):
+        p = p.detach() if i == STEPS - FOLLOWED else p
         step = _normal_equations(sights, chart, p)
         p = p + torch.cholesky_solve(step.target[..., None], torch.linalg.cholesky(step.matrix))[..., 0]
         p = torch.cat([p[..., :2], p[..., 2:].clamp(min=SMALLEST_PARALLAX)], -1)
@@ -71,6 +70,8 @@ def triangulate(
     return Triangulated(X.to(dtype), covariance.to(dtype), valid, last.residual.to(dtype))
 
 
+STEPS = 5
+"""Of Gauss and Newton."""
 FOLLOWED = 3
 """Steps that derivatives go through: each takes the difference to those of the least error down by about
 residual / disparity."""

@@ -2,6 +2,7 @@
 
 RAW_SUFFIXES = {".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef"}
 """Of cameras' raw files."""
-IMAGE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".bmp", ".webp", ".heic", ".heif"}
-IMAGE_SUFFIXES |= RAW_SUFFIXES
+PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".ppm"}
+"""Of photographs among other files: .pgm are masks and disparities as often."""
+IMAGE_SUFFIXES = PHOTO_SUFFIXES | RAW_SUFFIXES | {".pgm", ".pnm", ".heic", ".heif"}
 VIDEO_SUFFIXES = {".mp4", ".mkv", ".mov", ".avi", ".m4v", ".webm"}

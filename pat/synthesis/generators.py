@@ -18,11 +18,10 @@ from arraygeom.rig import Rig
 
 from ..media.colour import linear_from_srgb
 from ..media.images import decoded_photograph
+from ..media.suffixes import PHOTO_SUFFIXES
 from ..support.folders import files_below
 from .furnish import Setting, furnished, vec
 from .scene import Paint, Scene, Texture, TextureKind, Vec3
-
-IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 
 
 def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
@@ -107,9 +106,9 @@ def _near_infrared(rng: Generator, rgb: Vec3) -> float:
 
 @lru_cache(maxsize=8)
 def _images(folder: Path) -> tuple[str, ...]:
-    found = sorted(str(p.resolve()) for p in files_below(folder) if p.suffix.lower() in IMAGE_SUFFIXES)
+    found = sorted(str(p.resolve()) for p in files_below(folder) if p.suffix.lower() in PHOTO_SUFFIXES)
     if not found:
-        raise ValueError(f"{folder}: no images ({', '.join(sorted(IMAGE_SUFFIXES))}) under this folder")
+        raise ValueError(f"{folder}: no images ({', '.join(sorted(PHOTO_SUFFIXES))}) under this folder")
     return tuple(found)
 
 

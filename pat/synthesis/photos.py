@@ -16,12 +16,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..media.images import decoded_photograph
+from ..media.suffixes import PHOTO_SUFFIXES
 from ..support.folders import files_below
 from .patterns import patterns, recoloured
 
 LEVELS = 6
 _MULTIPLE = 2 ** (LEVELS - 1)
-_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".ppm"}
 
 
 class PhotoBank:
@@ -132,7 +132,7 @@ def _mirrored(i: Tensor, n: Tensor) -> Tensor:
 
 def read_photographs(folders: tuple[str | Path, ...], max_edge: int) -> list[np.ndarray]:
     """RGB bytes of all images under the folders, reduced to `max_edge` pixels. Raises ValueError if there is none."""
-    paths = sorted(p for folder in folders for p in files_below(folder) if p.suffix.lower() in _SUFFIXES)
+    paths = sorted(p for folder in folders for p in files_below(folder) if p.suffix.lower() in PHOTO_SUFFIXES)
     images = [_reduced(p, max_edge) for p in map(_decoded, paths) if p is not None]
     if not images:
         raise ValueError(f"no image found under {', '.join(map(str, folders)) or 'no folder'}")

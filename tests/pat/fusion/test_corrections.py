@@ -12,7 +12,7 @@ from pat.fusion.sequence import SequenceFusion
 from pat.matching.epipolar_offset import Misalignment, fit_misalignment
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
-from tests.pat.layered_array import ALPHA, BETA, load_sample
+from tests.pat.layered_array import ALPHA, BETA, load_sample, middle_of_sample
 
 
 @pytest.fixture(scope="module")
@@ -25,15 +25,21 @@ def network():
     return load_weights("mono-colour-small")
 
 
-@pytest.fixture(scope="module")
-def images(sample):
+def as_expected(sample):
+    """Images with the response that the network expects."""
     return {ALPHA: luminance(sample.ground_truth), BETA: sample.images[BETA]}
 
 
 @pytest.fixture(scope="module")
-def ideal(sample, network, images):
-    """PSNR with the response that the network expects and a rig that fits."""
-    return psnr(network, sample, images)
+def images(sample):
+    return as_expected(sample)
+
+
+@pytest.fixture(scope="module")
+def middle(network):
+    """The middle of the sample, its images, and PSNR with them."""
+    sample = middle_of_sample()
+    return sample, as_expected(sample), psnr(network, sample, as_expected(sample))
 
 
 def combined(image, weights):
@@ -54,25 +60,29 @@ def with_beta_rotated(rig, degrees):
 
 
 @pytest.mark.parametrize("weights", [(1 / 3, 1 / 3, 1 / 3), (0.2, 0.4, 0.4), (0.6, 0.3, 0.1)])
-def test_a_response_is_fitted_by_itself(sample, network, images, ideal, weights):
+def test_a_response_is_fitted_by_itself(network, middle, weights):
+    sample, images, ideal = middle
     other = images | {ALPHA: combined(sample.ground_truth, weights)}
     fitted = psnr(network, sample, other)
     assert fitted > ideal - 1.5
     assert fitted > psnr(network, sample, other, response="rec601") + 1.0
 
 
-def test_gain_and_gamma_are_fitted_by_themselves(sample, network, images, ideal):
+def test_gain_and_gamma_are_fitted_by_themselves(network, middle):
+    sample, images, ideal = middle
     other = images | {BETA: 0.6 * images[BETA] ** 1.3}
     assert psnr(network, sample, other) > ideal - 1.0
 
 
 @pytest.mark.parametrize("gain", [0.6, 0.9])
-def test_another_exposure_is_not_taken_for_another_response(sample, network, images, ideal, gain):
+def test_another_exposure_is_not_taken_for_another_response(network, middle, gain):
+    sample, images, ideal = middle
     other = images | {BETA: gain * images[BETA]}
     assert psnr(network, sample, other) > ideal - 0.5
 
 
-def test_vignetting_is_found_by_itself(sample, network, images, ideal):
+def test_vignetting_is_found_by_itself(network, middle):
+    sample, images, ideal = middle
     h, w = images[BETA].shape[-2:]
     y, x = torch.meshgrid(torch.linspace(-1, 1, h) * h / w, torch.linspace(-1, 1, w), indexing="ij")
     other = images | {BETA: images[BETA] * (1 + 0.5 * (x.square() + y.square())) ** -0.9}
@@ -93,8 +103,9 @@ def test_nothing_is_changed_where_the_cameras_are_as_the_rig_says(sample, networ
 
 
 @pytest.mark.parametrize("degrees", [0.3, -0.3])
-def test_a_rotated_camera_is_put_right(sample, network, images, ideal, degrees):
+def test_a_rotated_camera_is_put_right(sample, network, images, degrees):
     rig, lines = with_beta_rotated(sample.rig, degrees), []
+    ideal = psnr(network, sample, images)
     assert psnr(network, sample, images, rig=rig, explain=lines.append) > ideal - 0.5
     assert psnr(network, sample, images, rig=rig, align=False) < ideal - 1.0
     assert "off its search segments" in lines[0]

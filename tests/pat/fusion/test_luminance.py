@@ -6,12 +6,12 @@ import torch
 from pat.fusion.fuse import fuse
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
-from tests.pat.layered_array import ALPHA, load_sample
+from tests.pat.layered_array import ALPHA, middle_of_sample
 
 
 @pytest.fixture(scope="module")
 def sample():
-    return load_sample()
+    return middle_of_sample()
 
 
 @pytest.fixture(scope="module")

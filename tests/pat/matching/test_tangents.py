@@ -14,7 +14,7 @@ from pat.matching import cost
 from pat.matching import semi_global_numba as kernels
 from pat.matching.cost import planes_of
 from pat.matching.tangents import along_tangents
-from tests.pat.layered_array import ALPHA, load_sample
+from tests.pat.layered_array import ALPHA, middle_of_sample
 
 
 def along_the_segment(pair, x):
@@ -51,14 +51,14 @@ def test_tangents_touch_their_curve_at_the_match():
 
 @pytest.mark.parametrize("field", [NearestVoxels(), Local(9), Dense(stride=24)], ids=lambda f: type(f).__name__)
 def test_sets_are_fused_and_said_to_have_no_order(field):
-    s = load_sample()
+    s = middle_of_sample()
     with pytest.warns(UserWarning, match="without an order"):
         frame = fuse(load_weights("mono-colour"), s.rig, s.images, alpha=ALPHA, field=field, response="rec601")
     assert bool(frame.image.isfinite().all())
 
 
 def test_a_curve_of_ones_own_is_fused_as_well_as_the_segment():
-    s, network = load_sample(), load_weights("mono-colour")
+    s, network = middle_of_sample(), load_weights("mono-colour")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         frames = [fuse(network, s.rig, s.images, alpha=ALPHA, field=f) for f in (None, along_the_segment)]

@@ -11,7 +11,7 @@ from pat.evaluation.metrics import score
 from pat.matching.inputs import Inputs
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
-from tests.pat.layered_array import load_sample
+from tests.pat.layered_array import middle_of_sample
 
 
 def fields(network: PAT, alpha: torch.Tensor, betas: list[torch.Tensor]) -> list[FieldOnGrid]:
@@ -79,16 +79,14 @@ def test_samples_follow_the_longest_segment():
 
 def test_four_inputs_a_band_each_give_the_colours():
     """The shipped weights: alpha, red, green and blue, in this order."""
-    sample = load_sample()
-    window = (slice(None), slice(104, 296), slice(192, 448))
-    rig = sample.rig.crop("mono", 104, 192, (192, 256))
+    rig, images, truth = middle_of_sample()
     depth = tuple(float(d) for d in rig.pair("mono", "colour").depth_range)
     four = Rig({"mono": rig["mono"]} | dict.fromkeys("rgb", rig["colour"]), depth=depth)
-    mono, truth = sample.images["mono"][window], sample.ground_truth[window]
+    mono = images["mono"]
 
     def psnr(bands: str) -> float:
-        images = {"mono": mono} | dict(zip(bands, sample.images["colour"].split(1)))
-        return score(fuse(load_weights("pat-supervised-4"), four, images, alpha="mono").image.clamp(0, 1), truth).psnr
+        taken = {"mono": mono} | dict(zip(bands, images["colour"].split(1)))
+        return score(fuse(load_weights("pat-supervised-4"), four, taken, alpha="mono").image.clamp(0, 1), truth).psnr
 
     assert psnr("rgb") > score(mono.expand(3, -1, -1), truth).psnr + 5
     assert psnr("bgr") < psnr("rgb") - 5
