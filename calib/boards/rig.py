@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -68,6 +69,13 @@ class Calibration:
         return self.fit.deviations
 
 
+def _known_lens(lens: Any, name: str) -> Lens:
+    if lens not in get_args(Lens):
+        raise ValueError(f"lens of '{name}': '{lens}' is none of {', '.join(get_args(Lens))}")
+    known: Lens = lens
+    return known
+
+
 @torch_in_one_thread()
 def calibrate(
     views: Mapping[str, BoardViews],
@@ -79,11 +87,11 @@ def calibrate(
 ) -> Calibration:
     """Calibrate a rig from detected board points. Its world is the first camera.
 
-    `lens` is the model of all cameras, or of each by name. Raises ValueError, with advice, if a camera has too few
-    images or only parallel boards, if cameras are not connected, or if their frames contradict each other.
+    `lens` is the model of all cameras, or of each by name. Raises ValueError, with advice, for another model, if a
+    camera has too few images or only parallel boards, if cameras are not connected, or if frames contradict each other.
     With `start`, a rig known to within `deviations`, one image of each camera is enough, and the world is the start's.
     """
-    models = {name: lens if isinstance(lens, str) else lens[name] for name in views}
+    models = {name: _known_lens(lens if isinstance(lens, str) else lens.get(name), name) for name in views}
     if start is None:
         singles = {
             name: calibrate_single(name, v, board, lens=models[name], final=len(views) == 1)

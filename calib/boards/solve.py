@@ -315,8 +315,8 @@ def misfits(fit: Solved) -> list[FrameMisfit]:
 
 
 def misfit_notes(fit: Solved) -> list[str]:
-    """One note per camera on its frames that do not fit."""
-    notes = []
+    """A note if the adjustment went on changing, and one per camera on its frames that do not fit."""
+    notes = [] if fit.converged else ["the adjustment has not come to rest: too few boards, or some that contradict it"]
     for name in fit.problem.cameras:
         if mine := [m for m in misfits(fit) if m.camera == name]:
             listed = ", ".join(f"{m.frame} ({m.rms:.2f} px)" for m in mine[:LISTED])

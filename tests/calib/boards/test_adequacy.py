@@ -1,5 +1,7 @@
 """Uncertainty of projection, halves of the frames, proposed views, lens models, the page for watching a folder."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -12,6 +14,7 @@ from calib.boards.report import by_cameras
 from calib.boards.rig import calibrate
 from calib.boards.run import watch
 from calib.boards.simulation import simulate_photos
+from calib.boards.solve import misfit_notes
 from calib.boards.target import parse_board
 from calib.boards.uncertainty import intrinsics_of, uncertainty
 from calib.boards.validation import LensComparison, compare_lenses, half_difference
@@ -29,6 +32,19 @@ def test_a_calibration_is_shown_in_a_few_lines(found):
     """In a notebook it was four thousand lines of residuals."""
     assert "Rig" in repr(found)
     assert len(repr(found)) < 1000
+
+
+def test_lenses_that_there_are_not():
+    """They counted as none, without a word."""
+    views = see(Rig({"cam": TRUE}), board_poses(4, spread=0.4), noise=0.2)
+    with pytest.raises(ValueError, match="lens of 'cam': 'None' is none of brown-conrady, rational"):
+        calibrate(views, BOARD, lens={"other": "none"})
+
+
+def test_an_adjustment_that_goes_on_is_said(found):
+    """It was known, and read by nobody."""
+    going = "the adjustment has not come to rest"
+    assert [going in " ".join(misfit_notes(replace(found.fit, converged=c))) for c in (True, False)] == [False, True]
 
 
 def test_projections_are_off_by_what_is_said(found):
