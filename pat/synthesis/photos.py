@@ -16,8 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..media.images import decoded_photograph
-from ..media.suffixes import PHOTO_SUFFIXES
-from ..support.folders import files_below
+from ..support.folders import PHOTO_SUFFIXES, files_below
 from .patterns import patterns, recoloured
 
 LEVELS = 6
