@@ -33,10 +33,10 @@ from arraygeom.io.native import write as rig_text
 
 from ..media.images import read_image
 from ..media.raw import developed_rig
+from ..media.suffixes import IMAGE_SUFFIXES
 from ..media.video import write_video
 from ..networks.weights import Network, Precision, find_weights, load_weights
 from ..sensors import NoiseLevel
-from ..support.folders import IMAGE_SUFFIXES
 from ..support.jobs import HERE, JobReport, OnError, Task, Workers, run_tasks
 from ..support.locks import folder_lock
 from ..support.memory import limited, parse_bytes

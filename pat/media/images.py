@@ -23,9 +23,9 @@ from arraygeom.chunks import ROWS, spans
 from arraygeom.image_bytes import decodable
 from arraygeom.warned import warn
 
-from ..support.folders import RAW_SUFFIXES
 from .headers import HW, ImageHeader, image_header
 from .profiles import in_srgb, with_srgb_profile
+from .suffixes import RAW_SUFFIXES
 
 FEW_BITS = (8, 10, 12)
 """Bits of cameras that may be stored in 16 bits as they are."""

@@ -1,19 +1,9 @@
-"""Files of a folder and of those within it, and the suffixes of images and videos.
-
-Only the standard library is imported: the command line needs them before torch.
-"""
+"""Files of a folder and of those within it."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-
-RAW_SUFFIXES = {".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef"}
-"""Of cameras' raw files."""
-PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".ppm"}
-"""Of photographs among other files: .pgm are masks and disparities as often."""
-IMAGE_SUFFIXES = PHOTO_SUFFIXES | RAW_SUFFIXES | {".pgm", ".pnm", ".heic", ".heif"}
-VIDEO_SUFFIXES = {".mp4", ".mkv", ".mov", ".avi", ".m4v", ".webm"}
 
 
 def files_below(folder: str | Path, within: frozenset[str] = frozenset()) -> list[Path]:

@@ -18,7 +18,8 @@ from arraygeom.rig import Rig
 
 from ..media.colour import linear_from_srgb
 from ..media.images import decoded_photograph
-from ..support.folders import PHOTO_SUFFIXES, files_below
+from ..media.suffixes import PHOTO_SUFFIXES
+from ..support.folders import files_below
 from .furnish import Setting, furnished, vec
 from .scene import Paint, Scene, Texture, TextureKind, Vec3
 

@@ -16,7 +16,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..media.images import decoded_photograph
-from ..support.folders import PHOTO_SUFFIXES, files_below
+from ..media.suffixes import PHOTO_SUFFIXES
+from ..support.folders import files_below
 from .patterns import patterns, recoloured
 
 LEVELS = 6
