@@ -23,7 +23,7 @@ from uuid import uuid4
 import yaml
 from rich.console import Console
 
-from arraygeom.atomic import sweep, write_text
+from arraygeom.atomic import flush, sweep, write_text
 from arraygeom.rig import Rig
 from arraygeom.safe_yaml import load_yaml
 from pat.sensors import seed_for
@@ -293,24 +293,14 @@ def _ready(config_text: str) -> tuple[RenderConfig, Renderer]:
 def publish(partial: Path, final: Path) -> None:
     """Publish a complete folder under its name, after all of it is on disk; one that is there stays."""
     for path in [*partial.iterdir(), partial]:
-        _sync(path)
+        flush(path)
     final.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.rename(partial, final)
     except OSError as error:
         if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
             raise
-    _sync(final.parent)
-
-
-def _sync(path: Path) -> None:
-    if os.name == "nt" and path.is_dir():  # Windows opens no folders
-        return
-    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    flush(final.parent)
 
 
 def summarise(root: Path) -> str:

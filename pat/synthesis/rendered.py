@@ -7,7 +7,6 @@ one `<camera>-<frame>.npz` for every frame of every camera, with the arrays of `
 from __future__ import annotations
 
 import json
-import os
 import re
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from arraygeom.atomic import flush
 from arraygeom.rig import Rig
 from arraygeom.sampling import sample
 
@@ -97,8 +97,7 @@ def save_frame(path: Path, frame: RenderedFrame) -> None:
             arrays[name] = (np.minimum(array, _MOST) if kind == np.float16 else array).astype(kind)
     with path.open("wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-        file.flush()
-        os.fsync(file.fileno())
+    flush(path)
 
 
 def frame_file(rig: Rig, camera: str, number: int = 0) -> str:

@@ -34,7 +34,7 @@ def test_files_written_in_place_are_seen(conversion, monkeypatch):
     @contextmanager
     def in_place(path):
         yield path
-        arraygeom.atomic._flush(path)
+        arraygeom.atomic.flush(path)
 
     @contextmanager
     def one_by_one(folder, *, last):

@@ -128,14 +128,14 @@ def test_a_missing_beta_of_a_key_frame_leaves_the_other_key_frames(material, tmp
 
 def test_a_full_disk_leaves_whole_files_only(material, tmp_path, monkeypatch):
     """The third file to be flushed does not fit."""
-    flush, count = arraygeom.atomic._flush, iter(range(100))
+    flush, count = arraygeom.atomic.flush, iter(range(100))
 
     def full(path):
         if "fused" in path.name and next(count) == 2:
             raise OSError(errno.ENOSPC, "No space left on device")
         flush(path)
 
-    monkeypatch.setattr(arraygeom.atomic, "_flush", full)
+    monkeypatch.setattr(arraygeom.atomic, "flush", full)
     job = batch(material, tmp_path / "out")
     with pytest.raises(JobError, match="No space left"):
         job.run()
