@@ -53,6 +53,8 @@ class Fuzz:
 
     def run(self) -> int:
         torch.set_num_threads(1)
+        if self.out is not None and not self.out.is_file():
+            raise SystemExit(f"{self.out}: no such document, of which a block is to be replaced")
         shutil.rmtree(FAULTS, ignore_errors=True)
         rows, begin = [], time.monotonic()
         for kind in KINDS if self.only is None else [self.only]:

@@ -58,6 +58,8 @@ class Kills:
 
     def run(self) -> int:
         torch.set_num_threads(1)
+        if self.out is not None and not self.out.is_file():
+            raise SystemExit(f"{self.out}: no such document, of which a block is to be replaced")
         begin, rows, faults = time.monotonic(), {}, []
         with tempfile.TemporaryDirectory() as folder:
             for job in all_jobs(Path(folder)):
