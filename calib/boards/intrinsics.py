@@ -55,8 +55,6 @@ LEAST_SIGMA = 0.02
 """Lower bound of that deviation, pixels: no real corners are better."""
 RAYLEIGH_MEDIAN = 1.17741
 """The median length of a vector of two independent standard normal variables."""
-FEWEST_TILT = 8.0
-"""Boards whose normals differ by less than this many degrees count as parallel."""
 OBLONG = 0.1
 """Pixels whose sides differ by more than this share are no camera's."""
 OpenCVSolution = tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]
@@ -76,8 +74,7 @@ class CalibratedViews:
 def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> CalibratedViews:
     """A camera's intrinsics, lens and board poses from its own images, without outliers.
 
-    Raises ValueError if there are fewer than three images with a board (one, with points that are not in a plane), or
-    if the board was never tilted.
+    Raises ValueError if there are fewer than three images with a board (one, with points that are not in a plane).
     """
     fewest = FEWEST_IMAGES if board.flat else 1
     if len(views.seen) < fewest:
@@ -90,7 +87,6 @@ def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> Ca
     for _ in range(2):
         plausible = without_outliers(views, camera, poses, board.points)
         camera, poses = _solved(name, plausible, board, lens)
-    check_tilts(name, poses, board)
     return CalibratedViews(name, camera, plausible, poses)
 
 
@@ -187,19 +183,6 @@ def _with_model(camera: Camera, model: str) -> Camera:
     first = np.array([0.0, *plain[:2]])
     found = least_squares(lambda v: (changed(v).project_local(rays).x - x).numpy().ravel(), first, loss="soft_l1")
     return changed(found.x)
-
-
-def check_tilts(name: str, poses: Mapping[FrameKey, Pose], board: Board) -> None:
-    """Raises ValueError if all (flat) boards are parallel: focal length and distance are ambiguous then."""
-    if not board.flat:
-        return
-    normals = np.stack([pose.R[:, 2].numpy() for pose in poses.values()])
-    widest = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)).max()))
-    if widest < FEWEST_TILT:
-        raise ValueError(
-            f"{name}: all boards are parallel (to {widest:.1f} degrees), so that focal length and distance are "
-            "ambiguous: tilt the board by 20 to 40 degrees, to different sides, in most of the images"
-        )
 
 
 def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from arraygeom import Pose
 from arraygeom.robust import LocalModel, levenberg_marquardt
 
 from .board import Board
@@ -36,7 +37,6 @@ from .intrinsics import (
     LEAST_SIGMA,
     RAYLEIGH_MEDIAN,
     Lens,
-    check_tilts,
     initial_camera,
     without_bad_images,
     without_outliers,
@@ -65,6 +65,8 @@ INCONSISTENT, REJECTED = 3.0, 20.0
 """Ratios of joint to single RMS from which a camera is inconsistent with the others, or refused."""
 LISTED = 5
 """Frames named at most."""
+FEWEST_TILT = 8.0
+"""Boards whose normals differ by less than this many degrees count as parallel."""
 MANY_WRONG = 0.34
 """The share of a camera's images that may be left out, in all, because they contradict the others."""
 
@@ -81,10 +83,24 @@ def calibrate_single(
     if len(kept.seen) < len(views.seen):
         first = initial_camera(name, kept, board, lens)
     used = without_outliers(kept, first.camera, first.poses, board.points)
+    _check_tilts(name, first.poses, board)
     initial = InitialRig({name: first.camera}, first.poses, {name: used})
     solved = solve_inliers(initial, {name: kept}, board, final=final)
-    check_tilts(name, solved.problem.board_poses, board)
+    _check_tilts(name, solved.problem.board_poses, board)
     return solved
+
+
+def _check_tilts(name: str, poses: Mapping[FrameKey, Pose], board: Board) -> None:
+    """Raises ValueError if all (flat) boards are parallel: focal length and distance are ambiguous then."""
+    if not board.flat:
+        return
+    normals = np.stack([pose.R[:, 2].numpy() for pose in poses.values()])
+    widest = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)).max()))
+    if widest < FEWEST_TILT:
+        raise ValueError(
+            f"{name}: all boards are parallel (to {widest:.1f} degrees), so that focal length and distance are "
+            "ambiguous: tilt the board by 20 to 40 degrees, to different sides, in most of the images"
+        )
 
 
 def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
