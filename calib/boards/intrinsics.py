@@ -44,6 +44,7 @@ LENSES: dict[Lens, tuple[str, int]] = {
     "extended-unified": ("extended-unified", 2),
     "scaramuzza": ("scaramuzza", 3),
     "thin-prism-fisheye": ("thin-prism-fisheye", 8),
+    "none": ("none", 0),
 }
 """Model and number of coefficients; those of Brown and Conrady have all terms of the former."""
 FEWEST_IMAGES = 3
@@ -151,7 +152,7 @@ def near_homography(found: Detection, board: Board) -> Detection:
 
 
 def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Camera, dict[FrameKey, Pose]]:
-    model, count = LENSES.get(lens, ("none", 0))
+    model, count = LENSES[lens]
     pinhole = model in ("brown-conrady", "none")
     try:
         K, coefficients, rotations, translations = _pinhole(views, board, count) if pinhole else _fisheye(views, board)

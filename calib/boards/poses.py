@@ -125,8 +125,8 @@ def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) ->
     if camera.hw != views.hw:
         (h, w), (rows, columns) = camera.hw, views.hw
         raise ValueError(f"{name}: its images are {columns}x{rows} and the start states {w}x{h}")
-    if camera.distortion is None and model_name != "none":
-        model, count = LENSES[model_name]
+    model, count = LENSES[model_name]
+    if camera.distortion is None and count:
         lens = Distortion(model, torch.zeros(count, dtype=torch.float64))
         camera = camera.replace(distortion=lens.with_coefficients(pinhole_coefficients(lens)))
     return camera.to(torch.float64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +16,7 @@ from arraygeom.threads import torch_in_one_thread
 from .board import Board
 from .bundle import Solved
 from .detect import BoardViews
-from .intrinsics import Lens
+from .intrinsics import LENSES, Lens
 from .photos import FrameKey
 from .poses import StartDeviations, initial_rig, rig_near_start
 from .solve import calibrate_single, misfit_notes, solve_inliers, solve_together
@@ -70,8 +70,8 @@ class Calibration:
 
 
 def _known_lens(lens: Any, name: str) -> Lens:
-    if lens not in get_args(Lens):
-        raise ValueError(f"lens of '{name}': '{lens}' is none of {', '.join(get_args(Lens))}")
+    if lens not in LENSES:
+        raise ValueError(f"lens of '{name}': {lens!r} is none of {', '.join(LENSES)}")
     known: Lens = lens
     return known
 
