@@ -12,6 +12,7 @@ from pat.support.memory import (
     how_many_fit,
     limited,
     parse_bytes,
+    planned,
     resident,
 )
 
@@ -74,3 +75,11 @@ def test_freed_memory_is_kept_but_near_a_limit():
     """In a process of its own, as the options are of a whole process."""
     done = subprocess.run([sys.executable, "-c", KEPT], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["1", "1", "0", "1"]
+
+
+@pytest.mark.parametrize(("limit", "wanted"), [(None, 2.0), (1.5, 1.5), (3.0, 2.0)])
+def test_a_large_task_takes_what_is_planned_whatever_more_is_allowed(limit, wanted, monkeypatch):
+    """Where 3 GiB were allowed and 2.2 planned, 2.8 were taken: freed memory was kept until near the limit."""
+    monkeypatch.setattr("pat.support.memory._keeps", True)
+    assert planned(limit, 2.0, large=True) == wanted
+    assert planned(limit, 2.0, large=False) == limit
