@@ -38,7 +38,13 @@ from .fields import (
     lazily,
     sampling_locations,
 )
-from .homography import apply_homography, fit_homography, fit_similarity, infinite_homography, plane_homography
+from .homography import (
+    apply_homography,
+    fit_homography,
+    fit_similarity,
+    infinite_homography,
+    plane_homography,
+)
 from .multiview import ConsistentDepth, WorldRays, consistent_depth, plane_sweep, warp, world_rays
 from .pixels import pixel_grid, resize_matrix
 from .pose import Pose, rotation_from_vector

@@ -15,9 +15,10 @@ from uuid import uuid4
 def write_atomically(path: str | Path) -> Iterator[Path]:
     """A temporary path beside `path` to write to; it replaces `path` when the block ends without error.
 
-    After an error (a full disk, say) the temporary file is gone and a former `path` is as it was. The temporary name
-    ends as `path` does, so that writers that choose the format by suffix choose the same. Missing folders are made.
-    The content is on the disk before the name is, so that a file that is there after a crash is whole.
+    After an error (a full disk, say) the temporary file is gone and a former `path` is as it was. The
+    temporary name ends as `path` does, so that writers that choose the format by suffix choose the same.
+    Missing folders are made. The content is on the disk before the name is, so that a file that is there
+    after a crash is whole.
 
     Raises OSError that names `path`, whatever file the system's own names.
     """
@@ -39,12 +40,13 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def write_together(folder: str | Path, *, last: str, stale: Iterable[str] = ()) -> Iterator[Path]:
-    """A temporary folder inside `folder` to write files to that belong together, the one named `last` among them.
+    """A temporary folder inside `folder` to write files to that belong together, the one named `last` among
+    them.
 
-    They replace those of the same names when the block ends without error: the former last one is removed first, then
-    those named `stale`, and the new last one comes last, so where it is, the others are of the same making. After an
-    error (a full disk, say) all former files are as they were. Missing folders are made. Raises OSError that names the
-    file.
+    They replace those of the same names when the block ends without error: the former last one is removed
+    first, then those named `stale`, and the new last one comes last, so where it is, the others are of the
+    same making. After an error (a full disk, say) all former files are as they were. Missing folders are
+    made. Raises OSError that names the file.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -65,7 +67,8 @@ def write_together(folder: str | Path, *, last: str, stale: Iterable[str] = ()) 
 
 
 def sweep(folder: Path, stem: str | None = None) -> None:
-    """Remove the temporary files and folders of killed processes from a folder; or only those of files of one stem.
+    """Remove the temporary files and folders of killed processes from a folder; or only those of files of one
+    stem.
 
     Those of safetensors, which writes to a file of its own first, are among the former.
     """
@@ -94,8 +97,8 @@ def write_text(path: str | Path, text: str) -> None:
 
 @contextmanager
 def alone(lock: Path, longest: float) -> Iterator[None]:
-    """A block that one process is in at a time, or one that has waited so many seconds for the others, or that cannot
-    lock the file. The system unlocks what a process that ended had locked."""
+    """A block that one process is in at a time, or one that has waited so many seconds for the others, or
+    that cannot lock the file. The system unlocks what a process that ended had locked."""
     from filelock import FileLock
 
     lock_file = FileLock(lock, timeout=longest)

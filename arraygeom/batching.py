@@ -21,8 +21,9 @@ LABELS = ("name", "sensor")
 class Batched:
     """Base of frozen dataclasses whose tensors have leading batch axes: `[i]`, `len`, `to` and `==`.
 
-    `item_axes` holds, by field, the number of a tensor's last axes that belong to one item. A tensor without batch axes
-    is shared by all items of a batch. Instances are not hashable: they are equal if their tensors are.
+    `item_axes` holds, by field, the number of a tensor's last axes that belong to one item. A tensor without
+    batch axes is shared by all items of a batch. Instances are not hashable: they are equal if their tensors
+    are.
     """
 
     item_axes: ClassVar[Mapping[str, int]] = {}
@@ -64,7 +65,9 @@ class Batched:
         def moved(t: Tensor, axes: int) -> Tensor:
             there = t.to(*args, **kwargs)
             if t.is_floating_point() and not there.is_floating_point():
-                raise TypeError(f"the numbers of a {type(self).__name__} are floating point; got {there.dtype}")
+                raise TypeError(
+                    f"the numbers of a {type(self).__name__} are floating point; got {there.dtype}"
+                )
             return there if t.is_floating_point() else there.to(t.dtype)
 
         return map_tensors(self, moved)
@@ -92,15 +95,17 @@ class Batched:
     def _batched(self) -> torch.Size:
         shape = self.batch_shape
         if not shape:
-            raise TypeError(f"this {type(self).__name__} is one item, not a batch: make a batch with arraygeom.stack")
+            raise TypeError(
+                f"this {type(self).__name__} is one item, not a batch: make a batch with arraygeom.stack"
+            )
         return shape
 
 
 def stack(items: Sequence[T]) -> T:
     """One batch of items alike, along a new first axis.
 
-    What is not a tensor has to be the same in all (sizes, lens models, the cameras of rigs), but for names and
-    sensors, which are the first's. Raises ValueError where it is not.
+    What is not a tensor has to be the same in all (sizes, lens models, the cameras of rigs), but for names
+    and sensors, which are the first's. Raises ValueError where it is not.
     """
     if not items:
         raise ValueError("nothing to stack: give one item or more")
@@ -112,7 +117,10 @@ def map_tensors(value: Any, f: Callable[[Tensor, int], Tensor], axes: int = 0) -
     if isinstance(value, Tensor):
         return f(value, axes)
     if isinstance(value, Batched):
-        held = {g.name: map_tensors(getattr(value, g.name), f, value.item_axes.get(g.name, 0)) for g in _fields(value)}
+        held = {
+            g.name: map_tensors(getattr(value, g.name), f, value.item_axes.get(g.name, 0))
+            for g in _fields(value)
+        }
         return derived(dataclasses.replace, value, **held)
     if isinstance(value, Mapping):
         return {key: map_tensors(v, f, axes) for key, v in value.items()}
@@ -143,7 +151,9 @@ def _flattened(value: Batched) -> tuple[list[Any], _Layout]:
     held = {f.name: getattr(value, f.name) for f in _fields(value)}
     names = vars(value).get(_NAMES)  # of a tree with something else in place of tensors
     if names is None:
-        names = tuple(name for name, v in held.items() if isinstance(v, Batched) or any(True for _ in tensors_of(v)))
+        names = tuple(
+            name for name, v in held.items() if isinstance(v, Batched) or any(True for _ in tensors_of(v))
+        )
     rest = {name: v for name, v in held.items() if name not in names}
     return [held[name] for name in names], _Layout(type(value), names, rest)
 
@@ -190,7 +200,9 @@ def _stacked(values: list[Any], where: str) -> Any:
         raise ValueError(f"cannot stack {where}: some are {kinds}")
     if isinstance(first, Tensor):
         if len({v.shape for v in values}) > 1:
-            raise ValueError(f"cannot stack {where}: shapes {' and '.join(map(str, {tuple(v.shape) for v in values}))}")
+            raise ValueError(
+                f"cannot stack {where}: shapes {' and '.join(map(str, {tuple(v.shape) for v in values}))}"
+            )
         return torch.stack(values)
     if isinstance(first, Batched):
         held = {f.name: [getattr(v, f.name) for v in values] for f in _fields(first)}

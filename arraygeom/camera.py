@@ -58,7 +58,9 @@ class View(Batched):
         if checking():
             check_hw(self.hw)
             if not isinstance(self.sensor, Sensor):
-                raise TypeError(f"sensor is a {type(self.sensor).__name__}: give a Sensor, as Sensor(response='mono')")
+                raise TypeError(
+                    f"sensor is a {type(self.sensor).__name__}: give a Sensor, as Sensor(response='mono')"
+                )
 
     def resize(self: AnyView, hw: HW) -> AnyView:
         """The same view at another size."""
@@ -102,9 +104,9 @@ class View(Batched):
 class LensView(View):
     """A view with a lens model, whose focal length and pose need not be known.
 
-    `K` maps the plane z = 1 (after the lens) to pixels. Without a calibration it is only the scale and the centre in
-    which `distortion` counts: then `rays` follow the lens but their angles mean nothing. Links of such views relate
-    undistorted pixels.
+    `K` maps the plane z = 1 (after the lens) to pixels. Without a calibration it is only the scale and the
+    centre in which `distortion` counts: then `rays` follow the lens but their angles mean nothing. Links of
+    such views relate undistorted pixels.
 
     >>> lens = Distortion("brown-conrady", torch.tensor([-0.1, 0, 0, 0], dtype=torch.float64))
     >>> view = LensView(hw=(61, 101), K=intrinsics(50.0, (61, 101)), distortion=lens)
@@ -122,7 +124,8 @@ class LensView(View):
         if own and cls.__module__ != __name__:
             raise TypeError(
                 f"{cls.__name__} overrides {' and '.join(own)}, which fields do not ask: make it a "
-                "arraygeom.lenses.CameraModel with project and unproject, and give that to a Camera as `distortion`"
+                "arraygeom.lenses.CameraModel with project and unproject, and give that to a Camera as "
+                "`distortion`"
             )
 
     def __post_init__(self) -> None:
@@ -132,12 +135,15 @@ class LensView(View):
             if not isinstance(self.distortion, LensModel | None):
                 kind = type(self.distortion).__name__
                 raise TypeError(
-                    f"distortion is a {kind}: give a Distortion(model, coefficients), or a camera model of your own, "
+                    f"distortion is a {kind}: give a Distortion(model, coefficients), or a camera model of "
+                    "your own, "
                     "a subclass of arraygeom.lenses.CameraModel"
                 )
             if self.distortion is not None and not is_dataclass(self.distortion):
                 kind = type(self.distortion).__name__
-                raise TypeError(f"{kind} is no dataclass: put @dataclass(frozen=True, eq=False, repr=False) before it")
+                raise TypeError(
+                    f"{kind} is no dataclass: put @dataclass(frozen=True, eq=False, repr=False) before it"
+                )
 
     def project_local(self, X: Real[Tensor, "*n 3"]) -> Projected:
         """Points in the camera's own frame to pixels."""
@@ -153,7 +159,9 @@ class LensView(View):
         return self.distortion.unproject(normalised)
 
     def ray_origins(self, x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*m 3"]:
-        """Where the rays of pixels start, metres in the camera's frame: its origin, unless its model is not central."""
+        """Where the rays of pixels start, metres in the camera's frame: its origin, unless its model is not
+        central.
+        """
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:
             return torch.zeros_like(to_homogeneous(normalised))
@@ -161,7 +169,9 @@ class LensView(View):
 
     @property
     def has_pinhole_view(self) -> bool:
-        """Whether it is a pinhole, has a `Distortion` or a model whose rays meet, all within 75 degrees of the axis."""
+        """Whether it is a pinhole, has a `Distortion` or a model whose rays meet, all within 75 degrees of
+        the axis.
+        """
         if isinstance(self.distortion, Distortion | None):
             return True
         if not self.distortion.central or traced():
@@ -227,7 +237,9 @@ class Camera(LensView):
         super().__post_init__()
         if checking():
             if not isinstance(self.cam_from_world, Pose):
-                raise TypeError(f"cam_from_world is a {type(self.cam_from_world).__name__}: give a Pose(R, t)")
+                raise TypeError(
+                    f"cam_from_world is a {type(self.cam_from_world).__name__}: give a Pose(R, t)"
+                )
             check_batches("K and cam_from_world", self.K.shape[:-2], self.cam_from_world.batch_shape)
             check_origin(self.cam_from_world.t)
 
@@ -268,9 +280,9 @@ class Camera(LensView):
     def to_kornia(self) -> PinholeCamera | CameraModel:
         """The same camera in kornia: a `PinholeCamera`, batched (B, 4, 4), or with a lens a `CameraModel`.
 
-        Kornia's camera models (`kornia.sensors.camera`) have no pose: keep `cam_from_world`. Pixels and axes are alike.
-        `PinholeCamera.scale` moves the principal point otherwise: `resize` before. Raises ValueError for a lens that
-        kornia does not have.
+        Kornia's camera models (`kornia.sensors.camera`) have no pose: keep `cam_from_world`. Pixels and axes
+        are alike. `PinholeCamera.scale` moves the principal point otherwise: `resize` before. Raises
+        ValueError for a lens that kornia does not have.
         """
         from kornia.geometry.camera import PinholeCamera
 
@@ -291,8 +303,8 @@ class Camera(LensView):
     ) -> Camera:
         """The camera of a kornia pinhole; a batch of one becomes a single camera unless `batched`.
 
-        Of a `CameraModel`, which has no pose, at `cam_from_world`. Raises ValueError if the images of a batch differ in
-        size.
+        Of a `CameraModel`, which has no pose, at `cam_from_world`. Raises ValueError if the images of a batch
+        differ in size.
         """
         from kornia.geometry.camera import PinholeCamera
 
@@ -300,10 +312,14 @@ class Camera(LensView):
 
         if not isinstance(camera, PinholeCamera):
             return from_kornia_model(camera, cam_from_world)
-        sizes = sorted({(int(h), int(w)) for h, w in zip(camera.height.reshape(-1), camera.width.reshape(-1))})
+        sizes = sorted(
+            {(int(h), int(w)) for h, w in zip(camera.height.reshape(-1), camera.width.reshape(-1))}
+        )
         if len(sizes) > 1:
             found = " and ".join(f"{w}x{h}" for h, w in sizes)
-            raise ValueError(f"the cameras of a kornia batch have images of {found}: convert those of each size apart")
+            raise ValueError(
+                f"the cameras of a kornia batch have images of {found}: convert those of each size apart"
+            )
         pose = Pose(camera.extrinsics[..., :3, :3], camera.extrinsics[..., :3, 3])
         made = cls(K=camera.intrinsics[..., :3, :3], cam_from_world=pose, hw=sizes[0])
         return made[0] if made.batch_shape == (1,) and not batched else made
@@ -323,7 +339,9 @@ def intrinsics(
     cx, cy = _two(((hw[1] - 1) / 2, (hw[0] - 1) / 2) if centre is None else centre, "centre")
     entries = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
     device = next((v.device for v in entries if isinstance(v, Tensor)), None)
-    return torch.stack([torch.as_tensor(v, dtype=torch.float64, device=device) for v in entries]).reshape(3, 3)
+    return torch.stack([torch.as_tensor(v, dtype=torch.float64, device=device) for v in entries]).reshape(
+        3, 3
+    )
 
 
 def _two(value: Any, name: str) -> tuple[Any, Any]:
@@ -332,5 +350,7 @@ def _two(value: Any, name: str) -> tuple[Any, Any]:
         value = tuple(value)
     pair = tuple(value) if isinstance(value, tuple | list) else (value, value)
     if len(pair) != 2:
-        raise ValueError(f"{name} is one number or two, in pixels; got {len(pair)}: make one K a camera and stack them")
+        raise ValueError(
+            f"{name} is one number or two, in pixels; got {len(pair)}: make one K a camera and stack them"
+        )
     return tuple(v.reshape(()) if isinstance(v, Tensor) else v for v in pair)  # type: ignore[return-value]

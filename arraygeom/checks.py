@@ -1,6 +1,7 @@
 """What constructors refuse: numbers that no camera, pose, lens or field has, each in one sentence.
 
-Numbers cannot be asked while torch compiles, traces or transforms: nothing is checked then, nor within `unchecked`.
+Numbers cannot be asked while torch compiles, traces or transforms: nothing is checked then, nor within
+`unchecked`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ from .tracing import followed
 T = TypeVar("T")
 
 LARGEST_SIDE, MOST_PIXELS = 65_535, 2**30
-"""A size beyond these bounds is more likely a damaged number than an image (the largest sensors have 4e8 pixels)."""
+"""A size beyond these bounds is more likely a damaged number than an image (the largest sensors have 4e8
+pixels).
+"""
 ROUNDED = 1e-3
 """Numbers in text files are rounded: up to this much of R R^T - I, or in the last row of K, is rounding."""
 SINGULAR = 1e-9
@@ -52,7 +55,9 @@ def checking() -> bool:
 
 
 def check_numbers(value: Any, shape: tuple[int, ...], what: str) -> Tensor:
-    """The value, detached, if it is a tensor of finite numbers (\\*b, \\*shape). Raises TypeError or ValueError."""
+    """The value, detached, if it is a tensor of finite numbers (\\*b, \\*shape). Raises TypeError or
+    ValueError.
+    """
     if not isinstance(value, Tensor):
         raise TypeError(f"{what} is a {type(value).__name__}: give a tensor of {_shape(shape)} numbers")
     if not value.is_floating_point():
@@ -89,7 +94,9 @@ def check_rotation(R: Any) -> None:
         return
     wide = R.double() if R.dtype != torch.float64 else R
     if not bool((torch.linalg.det(wide) > 0).all()):
-        raise ValueError("R is a reflection or singular (determinant not 1), not a rotation: was an axis flipped?")
+        raise ValueError(
+            "R is a reflection or singular (determinant not 1), not a rotation: was an axis flipped?"
+        )
     error = float((wide @ wide.mT - torch.eye(3, dtype=wide.dtype, device=wide.device)).abs().max())
     if error > max(ROUNDED, 4 * torch.finfo(R.dtype).eps):
         raise ValueError(f"R is not a rotation (R R^T is off by {error:.2g}): was it scaled, or a row lost?")
@@ -118,7 +125,8 @@ def check_hw(hw: Any) -> None:
         raise ValueError(f"hw is {(h, w)}; wanted (height, width), each 1 or more")
     if max(h, w) > LARGEST_SIDE or h * w > MOST_PIXELS:
         raise ValueError(
-            f"hw is {(h, w)}; images of up to {LARGEST_SIDE} pixels a side and {MOST_PIXELS / 1e6:.0f} million in all "
+            f"hw is {(h, w)}; images of up to {LARGEST_SIDE} pixels a side and {MOST_PIXELS / 1e6:.0f} "
+            "million in all "
             "are supported: is it in pixels?"
         )
 

@@ -1,4 +1,6 @@
-"""A large thing in parts: boxes of an image with halos, and functions that are called for one part after the other."""
+"""A large thing in parts: boxes of an image with halos, and functions that are called for one part after the
+other.
+"""
 
 from __future__ import annotations
 
@@ -59,11 +61,13 @@ def chunked(
 ) -> Any:
     """`function(*tensors)`, computed for some rows at a time; with several axes, for one tile at a time.
 
-    The tensors are cut along the axis, and so is what the function gives: a tensor or several, as long as what it is
-    given or shorter by a whole factor, of which `rows` and `halo` are multiples. Each part is given `halo` more rows on
-    either side, as far as there are any; what the function gives for those is dropped. Gradients pass through.
+    The tensors are cut along the axis, and so is what the function gives: a tensor or several, as long as
+    what it is given or shorter by a whole factor, of which `rows` and `halo` are multiples. Each part is
+    given `halo` more rows on either side, as far as there are any; what the function gives for those is
+    dropped. Gradients pass through.
 
-    Gives a tensor if the function does, else a tuple. If all fits into one part the function is called as it is.
+    Gives a tensor if the function does, else a tuple. If all fits into one part the function is called as it
+    is.
     """
     axes = [axis] if isinstance(axis, int) else axis
     lengths = [tensors[0].shape[a] for a in axes]
@@ -74,11 +78,13 @@ def chunked(
     return assembled(lengths, ((tile, part(tile.outer)) for tile in tiles_of(lengths, rows, halo)), axes)
 
 
-def assembled(lengths: Sequence[int], parts: Iterable[tuple[Tile, Any]], axes: Sequence[int] = (-2, -1)) -> Any:
+def assembled(
+    lengths: Sequence[int], parts: Iterable[tuple[Tile, Any]], axes: Sequence[int] = (-2, -1)
+) -> Any:
     """Tensors of a frame (h, w), put together from the inner parts of those of its tiles.
 
-    Of each tile a tensor or several are given, as large as the outer box or smaller by a whole factor. A tile that is
-    the whole frame is given back as it is.
+    Of each tile a tensor or several are given, as large as the outer box or smaller by a whole factor. A tile
+    that is the whole frame is given back as it is.
     """
     planes: list[_Plane] = []
     single = False
@@ -101,7 +107,10 @@ def sides_by_work(hw: Sequence[int], halo: int, multiple: int, most: float) -> l
     sides: dict[tuple[int, int], int] = {}
     for rows in range(1, -(-h // 64) + 1):
         for columns in range(1, -(-w // 64) + 1):
-            side = max(-(-h // rows // multiple) * multiple, 64), max(-(-w // columns // multiple) * multiple, 64)
+            side = (
+                max(-(-h // rows // multiple) * multiple, 64),
+                max(-(-w // columns // multiple) * multiple, 64),
+            )
             if side not in sides and math.prod(min(s + 2 * halo, n) for s, n in zip(side, hw)) <= most:
                 sides[side] = math.prod(_covered_length(n, s, halo) for n, s in zip(hw, side))
     return sorted(sides, key=lambda side: sides[side])
@@ -115,8 +124,8 @@ def _covered_length(length: int, side: int, halo: int) -> int:
 class _Plane:
     """A tensor put together from parts: written in place, so that parts can be forgotten.
 
-    Along a single axis they are concatenated at the end where something follows them (gradients, transformations):
-    gradients through writing in place copy the whole once a part.
+    Along a single axis they are concatenated at the end where something follows them (gradients,
+    transformations): gradients through writing in place copy the whole once a part.
     """
 
     def __init__(self, part: Tensor, tile: Tile, lengths: Sequence[int], axes: Sequence[int]) -> None:

@@ -22,8 +22,8 @@ LONGEST = 60.0
 def compiled(function=None, **options):
     """numba's njit, of the bare function: a checker of types that tests put around it cannot be compiled.
 
-    With `cache` it is called from Python; without, mostly by compiled functions. Where there is no folder that
-    can be written, what `cache` asks to keep is compiled by each process.
+    With `cache` it is called from Python; without, mostly by compiled functions. Where there is no folder
+    that can be written, what `cache` asks to keep is compiled by each process.
     """
     from numba import njit
 
@@ -70,7 +70,8 @@ def can_compile() -> bool:
 @cache
 def _warn_of_no_folder() -> None:
     warn(
-        "compiled kernels cannot be kept, and each process compiles them again: let NUMBA_CACHE_DIR name a folder "
+        "compiled kernels cannot be kept, and each process compiles them again: let NUMBA_CACHE_DIR name a "
+        "folder "
         "that can be written"
     )
 

@@ -1,26 +1,28 @@
 """Lens models: undistorted to distorted points, and back.
 
-All points here are *normalised*: for a pinhole (x, y) = (X / Z, Y / Z) in the camera's frame (x right, y down,
-z forward), before the focal length and the principal point. Distorted points are what K multiplies to give
-pixels.
+All points here are *normalised*: for a pinhole (x, y) = (X / Z, Y / Z) in the camera's frame (x right, y
+down, z forward), before the focal length and the principal point. Distorted points are what K multiplies to
+give pixels.
 
 Models, with their coefficients:
 
-- ``brown-conrady``: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]], 4, 5, 8, 12 or 14 numbers in OpenCV's order:
-  rational radial, tangential, thin-prism and tilted-sensor terms (its ``projectPoints``; Brown 1966, Conrady 1919).
+- ``brown-conrady``: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]], 4, 5, 8, 12 or 14 numbers in OpenCV's
+  order: rational radial, tangential, thin-prism and tilted-sensor terms (its ``projectPoints``; Brown 1966,
+      Conrady 1919).
 - ``kannala-brandt``: k1 k2 k3 k4, the angle theta from the optical axis goes to the radius
-  theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (Kannala and Brandt 2006; OpenCV's ``fisheye``,
-  Kalibr's ``equidistant``, COLMAP's ``OPENCV_FISHEYE``).
+  theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (Kannala and Brandt 2006; OpenCV's
+  ``fisheye``, Kalibr's ``equidistant``, COLMAP's ``OPENCV_FISHEYE``).
 - ``thin-prism-fisheye``: k1 k2 p1 p2 k3 k4 sx sy, the same angle, then Brown-Conrady's polynomials (COLMAP).
 - ``double-sphere``: xi alpha (Usenko, Demmel and Cremers 2018; Kalibr's ``ds``).
 - ``extended-unified``: alpha beta (Khomutenko, Garcia and Martinet 2016; Kalibr's ``eucm``).
 - ``unified``: xi k1 k2 p1 p2 (Mei and Rives 2007; Kalibr's ``omni``, OpenCV's ``omnidir``).
-- ``fov``: omega, the undistorted radius r goes to atan(2 r tan(omega / 2)) / omega (Devernay and Faugeras 2001).
-- ``scaramuzza``: b2 b3 b4, the point (x, y) is seen along (x, y, 1 + b2 r^2 + b3 r^3 + b4 r^4) (Scaramuzza 2006;
-  MATLAB's fisheye; with its a0 as the focal length, b2 = a2 a0, b3 = a3 a0^2, b4 = a4 a0^3).
+- ``fov``: omega, the undistorted radius r goes to atan(2 r tan(omega / 2)) / omega (Devernay and Faugeras
+  2001).
+- ``scaramuzza``: b2 b3 b4, the point (x, y) is seen along (x, y, 1 + b2 r^2 + b3 r^3 + b4 r^4) (Scaramuzza
+  2006; MATLAB's fisheye; with its a0 as the focal length, b2 = a2 a0, b3 = a3 a0^2, b4 = a4 a0^3).
 
-Each follows its lens up to some radius or angle. Points past it are not valid; their values stay finite and bounded
-(the point is moved in to the limit first).
+Each follows its lens up to some radius or angle. Points past it are not valid; their values stay finite and
+bounded (the point is moved in to the limit first).
 """
 
 from __future__ import annotations
@@ -78,8 +80,8 @@ class Distortion(LensModel):
     """One lens, or a batch of lenses of one model.
 
     The batch axes of `coefficients` meet the *leading* axes of the points: coefficients (5, 8) go with points
-    (5, 2), (5, 100, 2), (5, 20, 30, 2). Points are independent of each other; all maps are differentiable, twice,
-    in the points and the coefficients.
+    (5, 2), (5, 100, 2), (5, 20, 30, 2). Points are independent of each other; all maps are differentiable,
+    twice, in the points and the coefficients.
 
     Raises ValueError for an unknown model or a number of coefficients that the model does not have.
     """
@@ -91,7 +93,9 @@ class Distortion(LensModel):
     def __post_init__(self) -> None:
         if checking() and not isinstance(self.coefficients, Tensor):
             kind = type(self.coefficients).__name__
-            raise TypeError(f"the coefficients are a {kind}: give a tensor, such as torch.tensor([-0.1, 0, 0, 0])")
+            raise TypeError(
+                f"the coefficients are a {kind}: give a tensor, such as torch.tensor([-0.1, 0, 0, 0])"
+            )
         if self.model not in COEFFICIENT_COUNTS:
             raise ValueError(f"unknown lens model {self.model!r}: use one of {', '.join(COEFFICIENT_COUNTS)}")
         counts = COEFFICIENT_COUNTS[self.model]
@@ -149,8 +153,9 @@ class Distortion(LensModel):
     def project(self, X: Real[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Points in the camera's frame (any unit) to distorted normalised points.
 
-        Brown-Conrady and the field-of-view model: only points ahead (z > 0) are valid. The others: any direction that
-        the model reaches is, also at and beyond 90 degrees off axis; the point (0, 0, 0) is not.
+        Brown-Conrady and the field-of-view model: only points ahead (z > 0) are valid. The others: any
+        direction that the model reaches is, also at and beyond 90 degrees off axis; the point (0, 0, 0) is
+        not.
         """
         X, finite = finite_points(X)
         if self.model != BROWN_CONRADY:
@@ -175,14 +180,22 @@ class Distortion(LensModel):
 
     def _unproject(self, xy_d: Tensor) -> tuple[Tensor, Tensor]:
         c = self._lifted(xy_d)
-        return fisheye_unproject(c, xy_d) if self.model == KANNALA_BRANDT else central_unproject(self.model, c, xy_d)
+        return (
+            fisheye_unproject(c, xy_d)
+            if self.model == KANNALA_BRANDT
+            else central_unproject(self.model, c, xy_d)
+        )
 
     def _text(self) -> str:
-        return self.model + ("" if self.batch_shape else "".join(f" {c:.4g}" for c in self.coefficients.tolist()))
+        return self.model + (
+            "" if self.batch_shape else "".join(f" {c:.4g}" for c in self.coefficients.tolist())
+        )
 
     @property
     def squared_limit(self) -> float:
-        """Up to where one lens is valid: a squared normalised radius (Brown-Conrady), or angle (Kannala-Brandt)."""
+        """Up to where one lens is valid: a squared normalised radius (Brown-Conrady), or angle
+        (Kannala-Brandt).
+        """
         c = self.coefficients.detach()
         return float(once(fisheye_limit if self.model == KANNALA_BRANDT else brown_limit, c))
 

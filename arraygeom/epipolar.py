@@ -47,21 +47,25 @@ def shift_origin(F: Float[Tensor, "*b 3 3"], first_pixel: float) -> Float[Tensor
 def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*m 3"]:
     """l_beta = F x_alpha, scaled so that l . (x, y, 1) is a distance in pixels.
 
-    At alpha's epipole, to the rounding of x's type, and where F is zero, there is no line: all zeros. Batched F as in
-    `map_homogeneous`.
+    At alpha's epipole, to the rounding of x's type, and where F is zero, there is no line: all zeros. Batched
+    F as in `map_homogeneous`.
     """
     size = F.abs().amax((-2, -1), keepdim=True)
     line = map_homogeneous(F / torch.where(size > 0, size, 1.0), x)
     squared = line[..., 0].square() + line[..., 1].square()
     across = (F / torch.where(size > 0, size, 1.0))[..., :2, :].abs().amax(-2, keepdim=True)
-    rounding = 4 * torch.finfo(line.dtype).eps * map_homogeneous(across.detach(), floating(x).detach().abs())[..., 0]
+    rounding = (
+        4 * torch.finfo(line.dtype).eps * map_homogeneous(across.detach(), floating(x).detach().abs())[..., 0]
+    )
     positive = squared > rounding.square().clamp(min=SMALLEST_SQUARE)
     scale = torch.where(positive, torch.where(positive, squared, 1.0).rsqrt(), 0.0)
     return line * scale[..., None]
 
 
 SMALLEST_SQUARE = 1e-30
-"""A line F x whose (x, y) part is smaller than this, squared and with the largest entry of F at 1, is no line."""
+"""A line F x whose (x, y) part is smaller than this, squared and with the largest entry of F at 1, is no
+line.
+"""
 
 
 def epipoles(F: Float[Tensor, "*b 3 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 3"]]:
@@ -88,14 +92,19 @@ class Track(NamedTuple):
     b: Float[Tensor, "*m 3"]
 
     def at(self, w: Float[Tensor, "*n"]) -> Float[Tensor, "*n 2"]:
-        """Beta's pixels at inverse depths; where the point is not in front of beta the value is finite only."""
+        """Beta's pixels at inverse depths; where the point is not in front of beta the value is finite
+        only.
+        """
         P = self.a + w[..., None] * self.b
         z = P[..., 2:]
         return P[..., :2] / torch.where(z > FRONT, z, 1.0)
 
 
 def track(
-    K_alpha: Float[Tensor, "*b 3 3"], K_beta: Float[Tensor, "*b 3 3"], beta_from_alpha: Pose, x: Real[Tensor, "*n 2"]
+    K_alpha: Float[Tensor, "*b 3 3"],
+    K_beta: Float[Tensor, "*b 3 3"],
+    beta_from_alpha: Pose,
+    x: Real[Tensor, "*n 2"],
 ) -> Track:
     """The track in beta of each alpha pixel. Batched rigs (*b, 3, 3) take pixels (*b, ..., 2).
 
@@ -106,14 +115,19 @@ def track(
     return Track(a, beside(b, a.ndim, trailing=1))
 
 
-def segments_between(track: Track, near: Float[Tensor, "*b"], far: Float[Tensor, "*b"], beta_hw: HW) -> Segments:
-    """The part of each track between the depths `near` and `far` (metres; far may be inf) inside beta's image.
+def segments_between(
+    track: Track, near: Float[Tensor, "*b"], far: Float[Tensor, "*b"], beta_hw: HW
+) -> Segments:
+    """The part of each track between the depths `near` and `far` (metres; far may be inf) inside beta's
+    image.
 
     Clipped to the image's area and to the front of beta, in closed form (`clipped`).
     """
     h, w = beta_hw
     part = clipped(track, near, far, (-0.5, -0.5, w - 0.5, h - 0.5))
-    start, end = (_place(part.P.unbind(-1), part.D.unbind(-1), s, part.valid, beta_hw) for s in (part.high, part.low))
+    start, end = (
+        _place(part.P.unbind(-1), part.D.unbind(-1), s, part.valid, beta_hw) for s in (part.high, part.low)
+    )
     return Segments(start, end, part.valid)
 
 
@@ -135,10 +149,11 @@ def clipped(
     *,
     in_front: bool = True,
 ) -> Clipped:
-    """The part of each track within `limits` (x low, y low, x high, y high; None: everywhere) and in front of beta.
+    """The part of each track within `limits` (x low, y low, x high, y high; None: everywhere) and in front of
+    beta.
 
-    With s going from 0 at far to 1 at near in proportion to inverse depth, every limit is linear in s with a slope that
-    is one number for the whole image.
+    With s going from 0 at far to 1 at near in proportion to inverse depth, every limit is linear in s with a
+    slope that is one number for the whole image.
     """
     a, b = track
     w_far, w_near = (beside((1 / d.to(a.dtype)).clamp(max=HIGHEST), a.ndim - 1) for d in (far, near))
@@ -157,10 +172,14 @@ def clipped(
 
 
 HIGHEST = 1e30
-"""Inverse depths (1/m) count as no more than this, so that their products with a baseline in pixels are finite."""
+"""Inverse depths (1/m) count as no more than this, so that their products with a baseline in pixels are
+finite.
+"""
 
 
-def _limited(low: Tensor, high: Tensor, valid: Tensor, g: Tensor, slope: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _limited(
+    low: Tensor, high: Tensor, valid: Tensor, g: Tensor, slope: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """The range of s within [low, high] where g + s slope >= 0; `slope` holds one number for many pixels."""
     rising, falling = slope > FLAT, slope < -FLAT
     flat = ~(rising | falling)
@@ -185,7 +204,9 @@ def _place(P: tuple[Tensor, ...], D: tuple[Tensor, ...], s: Tensor, valid: Tenso
 
 
 def beside(v: Tensor, ndim: int, trailing: int = 0) -> Tensor:
-    """A value for each rig of a batch (*b, and `trailing` axes), with axes of length 1 for its pixels: `ndim` axes."""
+    """A value for each rig of a batch (*b, and `trailing` axes), with axes of length 1 for its pixels: `ndim`
+    axes.
+    """
     if v.ndim == trailing:
         return v
     batch = v.ndim - trailing
@@ -207,16 +228,22 @@ class Depth(NamedTuple):
     valid: Bool[Tensor, "*n"]
 
 
-def depth_from_track(track: Track, x: Real[Tensor, "*n 2"], deviation: Float[Tensor, "*n"] | None = None) -> Depth:
+def depth_from_track(
+    track: Track, x: Real[Tensor, "*n 2"], deviation: Float[Tensor, "*n"] | None = None
+) -> Depth:
     """Depth in alpha of the point of a track nearest to beta's pixels `x`.
 
     `deviation` is the standard deviation of x along the track in pixels (default 0); the depth's is
-    propagated to first order, d depth = depth^2 / |dx/dw|. Invalid where the baseline gives no depth, or where
-    the depth is not positive or the point not in front of beta.
+    propagated to first order, d depth = depth^2 / |dx/dw|. Invalid where the baseline gives no depth, or
+    where the depth is not positive or the point not in front of beta.
     """
     a, b = track
     x = floating(x)
-    (X, Y, Z), (DX, DY, DZ), (column, row) = a.unbind(-1), b.unbind(-1), x.unbind(-1)  # faster than axes of length 2
+    (X, Y, Z), (DX, DY, DZ), (column, row) = (
+        a.unbind(-1),
+        b.unbind(-1),
+        x.unbind(-1),
+    )  # faster than axes of length 2
     along_x, along_y = DX * Z - X * DZ, DY * Z - Y * DZ
     slope = (DX - column * DZ) * along_x + (DY - row * DZ) * along_y
     moves = slope.abs() > FLAT * FLAT

@@ -55,9 +55,9 @@ def apply_homography(H: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Tra
     """Map points (*n, 2); with batched H (*b), points are (*b, ..., 2).
 
     `valid` where the result is finite and its homogeneous scale is positive. The sign of H matters:
-    `plane_homography` and `infinite_homography` give it such that the scale is positive in front of both cameras;
-    a fitted H is fixed only up to sign and has to be oriented first. Where not valid, x is zero and so is its
-    gradient.
+    `plane_homography` and `infinite_homography` give it such that the scale is positive in front of both
+    cameras; a fitted H is fixed only up to sign and has to be oriented first. Where not valid, x is zero and
+    so is its gradient.
     """
     X, Y, scale = map_homogeneous(H, x).unbind(-1)
     valid = (scale > SMALLEST_SCALE) & X.isfinite() & Y.isfinite()
@@ -89,10 +89,10 @@ def fit_similarity(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Te
 def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Tensor, "3 3"]:
     """The homography that takes x nearest to y, least squares in the pixels of y; n >= 4.
 
-    Levenberg and Marquardt's steps from the better of the affine and the linear fit (Hartley & Zisserman, algorithm
-    4.2), on points centred and scaled (section 4.4), computed in float64; oriented so that the scale is positive at the
-    points. Differentiable, through ten steps of Gauss and Newton at the end. Raises ValueError where there is no such
-    homography: points on a line, or some that would be behind.
+    Levenberg and Marquardt's steps from the better of the affine and the linear fit (Hartley & Zisserman,
+    algorithm 4.2), on points centred and scaled (section 4.4), computed in float64; oriented so that the
+    scale is positive at the points. Differentiable, through ten steps of Gauss and Newton at the end. Raises
+    ValueError where there is no such homography: points on a line, or some that would be behind.
     """
     needs_numbers("the number of steps of fit_homography", x, y)
     dtype = torch.promote_types(x.dtype, y.dtype)
@@ -121,7 +121,9 @@ def _damped_fit(u1: Tensor, v: Tensor) -> Tensor:
 
     def model(H: Tensor) -> LocalModel[Tensor]:
         return LocalModel(
-            float(_cost(H, u1, v)), lambda H: float(_cost(H, u1, v)), lambda damping: _stepped(H, u1, v, damping)
+            float(_cost(H, u1, v)),
+            lambda H: float(_cost(H, u1, v)),
+            lambda damping: _stepped(H, u1, v, damping),
         )
 
     def is_converged(_: Tensor, __: Tensor, before: float, after: float) -> bool:

@@ -69,4 +69,8 @@ def _is_whole(content: bytes) -> bool:
     # Not `page.dataoffsets`, which leaves out what it does not expect.
     starts, lengths = (page.tags.valueof(a) or page.tags.valueof(b) for a, b in ((273, 324), (279, 325)))
     lengths = lengths or page.databytecounts
-    return bool(starts) and len(starts) == len(lengths) and all(a + b <= len(content) for a, b in zip(starts, lengths))
+    return (
+        bool(starts)
+        and len(starts) == len(lengths)
+        and all(a + b <= len(content) for a, b in zip(starts, lengths))
+    )

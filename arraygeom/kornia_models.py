@@ -40,7 +40,8 @@ def to_kornia_model(camera: LensView) -> CameraModel:
         kind, numbers = CameraModelType.BROWN_CONRADY, _eight(lens)
     else:
         raise ValueError(
-            f"kornia has no {lens.model} model: it has pinholes, brown-conrady, kannala-brandt and orthographic"
+            f"kornia has no {lens.model} model: it has pinholes, brown-conrady, kannala-brandt and "
+            "orthographic"
         )
     focal_and_centre = torch.stack([K[..., 0, 0], K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]], -1)
     batch = torch.broadcast_shapes(K.shape[:-2], numbers.shape[:-1])
@@ -58,7 +59,9 @@ def _eight(lens: LensModel) -> Tensor:
 
 
 def from_kornia_model(model: CameraModel, cam_from_world: Pose | None = None) -> Camera:
-    """The camera of a kornia camera model, of one or of a batch, at a pose (the world's origin by default)."""
+    """The camera of a kornia camera model, of one or of a batch, at a pose (the world's origin by
+    default).
+    """
     from kornia.sensors.camera.distortion_model import BrownConradyTransform, KannalaBrandtK3Transform
     from kornia.sensors.camera.projection_model import OrthographicProjection
 
@@ -73,4 +76,6 @@ def from_kornia_model(model: CameraModel, cam_from_world: Pose | None = None) ->
     if cam_from_world is None:
         here = Pose.identity().to(K)
         cam_from_world = Pose(here.R.expand_as(K), here.t.expand(K.shape[:-1]))
-    return Camera(K=K, cam_from_world=cam_from_world, hw=(int(model.height), int(model.width)), distortion=lens)
+    return Camera(
+        K=K, cam_from_world=cam_from_world, hw=(int(model.height), int(model.width)), distortion=lens
+    )

@@ -1,4 +1,6 @@
-"""What cameras see of each other: rays in the world, images warped by depth, plane sweeps, depth maps that agree."""
+"""What cameras see of each other: rays in the world, images warped by depth, plane sweeps, depth maps that
+agree.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,8 @@ class WorldRays(NamedTuple):
 def world_rays(camera: Camera, x: Real[Tensor, "*n 2"] | None = None) -> WorldRays:
     """The rays of pixels in the world, of all of the image (*b, H, W) by default; through any lens.
 
-    >>> camera = Camera(K=torch.eye(3), cam_from_world=Pose(torch.eye(3), torch.tensor([0.0, -1, 0])), hw=(4, 6))
+    >>> pose = Pose(torch.eye(3), torch.tensor([0.0, -1, 0]))
+    >>> camera = Camera(K=torch.eye(3), cam_from_world=pose, hw=(4, 6))
     >>> world_rays(camera, torch.tensor([0.0, 0.0])).plucker.tolist()
     [0.0, 0.0, 1.0, 1.0, 0.0, -0.0]
     """
@@ -59,9 +62,9 @@ def warp(
 ) -> Sampled:
     """Beta's image as alpha sees it, given the depth (metres) of alpha's pixels; through any lenses.
 
-    Values (B, C, *d, Ha, Wa) and which are valid: depth is finite and positive, and the point is in front of beta and
-    on its image. Occlusion is not looked for. A batch of pairs (B) takes depths (B, *d, Ha, Wa), or (1, ...) for the
-    same in each. Differentiable in image, depth and cameras.
+    Values (B, C, *d, Ha, Wa) and which are valid: depth is finite and positive, and the point is in front of
+    beta and on its image. Occlusion is not looked for. A batch of pairs (B) takes depths (B, *d, Ha, Wa), or
+    (1, ...) for the same in each. Differentiable in image, depth and cameras.
     """
     seen = _in_beta(pair, depth)
     batch = max(len(image), len(depth))
@@ -77,7 +80,8 @@ def plane_sweep(
     *,
     interpolation: Interpolation = "bilinear",
 ) -> Sampled:
-    """Beta's image warped to alpha by planes z = depth in alpha's frame: values (B, C, D, Ha, Wa) and validity.
+    """Beta's image warped to alpha by planes z = depth in alpha's frame: values (B, C, D, Ha, Wa) and
+    validity.
 
     Of any cameras: through lenses too, where planes are no homographies. Depths are metres.
     """
@@ -87,7 +91,9 @@ def plane_sweep(
 
 
 def _in_beta(pair: Pair, depth: Tensor, x: Tensor | None = None) -> Projected:
-    """Where beta sees alpha's pixels (all of them, or x (*n, 2)) at depths (*b, *d, *n); a batch's axes come first."""
+    """Where beta sees alpha's pixels (all of them, or x (*n, 2)) at depths (*b, *d, *n); a batch's axes come
+    first.
+    """
     alpha, beta = pair.cameras
     depth = floating(depth)
     x = pixel_grid(alpha.hw, dtype=depth.dtype, device=depth.device) if x is None else x
@@ -103,7 +109,9 @@ def _in_beta(pair: Pair, depth: Tensor, x: Tensor | None = None) -> Projected:
 
 
 class ConsistentDepth(NamedTuple):
-    """Depth of alpha's pixels (metres; the mean of the views that agree), how many others agree, and validity."""
+    """Depth of alpha's pixels (metres; the mean of the views that agree), how many others agree, and
+    validity.
+    """
 
     depth: Float[Tensor, "h w"]
     views: Int[Tensor, "h w"]
@@ -121,13 +129,16 @@ def consistent_depth(
 ) -> ConsistentDepth:
     """Alpha's depth map fused with those of other cameras that agree with it, through any lenses.
 
-    A view agrees where alpha's point, replaced by what the view's own depth map has at its pixel, comes back to within
-    `pixels` of where it was in alpha and to within `relative` of its depth (Yao et al. 2018, MVSNet). Valid where
-    `views` others agree. Depths that are not finite or not positive are unknown. Differentiable in depths and cameras.
+    A view agrees where alpha's point, replaced by what the view's own depth map has at its pixel, comes back
+    to within `pixels` of where it was in alpha and to within `relative` of its depth (Yao et al. 2018,
+    MVSNet). Valid where `views` others agree. Depths that are not finite or not positive are unknown.
+    Differentiable in depths and cameras.
     """
     own = floating(depths[rig.require(alpha)])
     if own.shape != rig[alpha].hw:
-        raise ValueError(f"the depth map of '{alpha}' is {tuple(own.shape)}, its camera {rig[alpha].hw}: resize one")
+        raise ValueError(
+            f"the depth map of '{alpha}' is {tuple(own.shape)}, its camera {rig[alpha].hw}: resize one"
+        )
     x = pixel_grid(rig[alpha].hw, dtype=own.dtype, device=own.device)
     total, count = own, torch.ones_like(own)
     for name, other in depths.items():
@@ -138,7 +149,9 @@ def consistent_depth(
         found, inside = sample(known[None, None].to(own), there.x[None])
         back = _in_beta(rig.pair(name, alpha), found[0, 0], there.x)
         agrees = there.valid & inside[0] & back.valid
-        agrees = agrees & ((back.x - x).square().sum(-1) < pixels**2) & ((back.depth - own).abs() < relative * own)
+        agrees = (
+            agrees & ((back.x - x).square().sum(-1) < pixels**2) & ((back.depth - own).abs() < relative * own)
+        )
         total, count = total + torch.where(agrees, back.depth, 0.0), count + agrees
     valid = (count > views) & own.isfinite() & (own > 0)
     return ConsistentDepth(torch.where(valid, total / count, 0.0), (count - 1).long(), valid)

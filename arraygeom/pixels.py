@@ -29,7 +29,9 @@ def pixel_grid(
 def pixel_coordinates(
     hw: HW, *, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """x and y of the centres of all pixels of an image: views of a row and of a column, which take no memory."""
+    """x and y of the centres of all pixels of an image: views of a row and of a column, which take no
+    memory.
+    """
     rows, columns = (torch.arange(n, dtype=dtype, device=device) for n in hw)
     x, y = torch.meshgrid(columns, rows, indexing="xy")
     return x, y
@@ -64,7 +66,9 @@ def rot90_matrix(hw: HW, quarter_turns: int) -> Float[Tensor, "3 3"]:
 
 
 def floating(x: Real[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Pixels in float32 or float64: integers and half precision, which holds no pixel position, become float32."""
+    """Pixels in float32 or float64: integers and half precision, which holds no pixel position, become
+    float32.
+    """
     return x.to(torch.promote_types(x.dtype, torch.float32))
 
 
@@ -77,7 +81,8 @@ def within(x: Real[Tensor, "*n 2"], hw: HW, slack: float = 0.0) -> Bool[Tensor, 
 def product(A: Float[Tensor, "*b i j"], B: Float[Tensor, "*c j k"]) -> Float[Tensor, "*d i k"]:
     """The matrix product of small matrices in the wider of their types, float32 or float64.
 
-    Float32 by multiplications and additions of its own: TF32 and autocast lower `matmul` to ten or eight bits.
+    Float32 by multiplications and additions of its own: TF32 and autocast lower `matmul` to ten or eight
+    bits.
     """
     dtype = torch.promote_types(torch.promote_types(A.dtype, B.dtype), torch.float32)
     A, B = A.to(dtype), B.to(dtype)
@@ -90,7 +95,9 @@ def product(A: Float[Tensor, "*b i j"], B: Float[Tensor, "*c j k"]) -> Float[Ten
 
 
 def broadcasts(batch: Sequence[int], points: Sequence[int]) -> bool:
-    """Whether axes of points begin with those of a batch, or with axes of length 1 (on either side) in their place."""
+    """Whether axes of points begin with those of a batch, or with axes of length 1 (on either side) in their
+    place.
+    """
     return len(points) >= len(batch) and all(a == b or 1 in (a, b) for a, b in zip(batch, points))
 
 
@@ -98,8 +105,9 @@ def map_homogeneous(M: Float[Tensor, "*b k 3"], x: Real[Tensor, "*n 2"]) -> Floa
     """M (x, y, 1) for every point, in the precision of `x` (`floating`).
 
     A batch of matrices (*b, k, 3) takes points (*b, ..., 2), or with axes of length 1 in place of *b.
-    By multiplications and additions of its own rather than by `matmul`, whose precision TF32 and autocast lower
-    to ten or eight bits: pixels need all of them. Raises ValueError for points without the batch's axes.
+    By multiplications and additions of its own rather than by `matmul`, whose precision TF32 and autocast
+    lower to ten or eight bits: pixels need all of them. Raises ValueError for points without the batch's
+    axes.
     """
     x = floating(x)
     batch = M.ndim - 2

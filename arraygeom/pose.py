@@ -51,12 +51,17 @@ class Pose(Batched):
 
     @classmethod
     def look_at(
-        cls, centre: Float[Tensor, "*b 3"], target: Float[Tensor, "*b 3"], *, down: Float[Tensor, "*b 3"] | None = None
+        cls,
+        centre: Float[Tensor, "*b 3"],
+        target: Float[Tensor, "*b 3"],
+        *,
+        down: Float[Tensor, "*b 3"] | None = None,
     ) -> Pose:
-        """`cam_from_world` of a camera at `centre` whose optical axis meets `target`, and whose y is towards `down`.
+        """`cam_from_world` of a camera at `centre` whose optical axis meets `target`, and whose y is towards
+        `down`.
 
-        All in world coordinates (metres); down is (0, 1, 0) unless given: that of a world with z upwards is (0, 0, -1).
-        Raises ValueError where down is along the axis, or the target at the centre.
+        All in world coordinates (metres); down is (0, 1, 0) unless given: that of a world with z upwards is
+        (0, 0, -1). Raises ValueError where down is along the axis, or the target at the centre.
 
         >>> Pose.look_at(torch.tensor([0.0, 0.0, -2.0]), torch.zeros(3)).t.tolist()
         [-0.0, -0.0, 2.0]
@@ -65,7 +70,9 @@ class Pose(Batched):
         z = target - centre
         x = torch.linalg.cross(down.expand_as(z), z)
         if not traced() and not bool((x.norm(dim=-1) > 1e-6 * down.norm(dim=-1) * z.norm(dim=-1)).all()):
-            raise ValueError("the target is at the centre, or `down` along the axis to it: give another `down`")
+            raise ValueError(
+                "the target is at the centre, or `down` along the axis to it: give another `down`"
+            )
         x, z = (v / v.norm(dim=-1, keepdim=True) for v in (x, z))
         return cls.from_centre(torch.stack([x, torch.linalg.cross(z, x), z], -2), centre)
 
@@ -91,7 +98,9 @@ class Pose(Batched):
 
     @property
     def quaternion(self) -> Float[Tensor, "*b 4"]:
-        """Of the rotation: (w, x, y, z), unit length, the sign as it comes (q and -q are the same rotation)."""
+        """Of the rotation: (w, x, y, z), unit length, the sign as it comes (q and -q are the same
+        rotation).
+        """
         from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
         return rotation_matrix_to_quaternion(self.R)
@@ -102,7 +111,9 @@ class Pose(Batched):
         return cls.from_matrix(pose.matrix())
 
     def to_kornia(self) -> Se3:
-        """The same as kornia's `Se3`, which keeps the rotation as a quaternion: R comes back but for rounding."""
+        """The same as kornia's `Se3`, which keeps the rotation as a quaternion: R comes back but for
+        rounding.
+        """
         from kornia.geometry.liegroup import Se3, So3
         from kornia.geometry.quaternion import Quaternion
 
@@ -123,7 +134,9 @@ class Pose(Batched):
         """
         X, batch = floating(X), self.batch_shape
         if not broadcasts(batch, X.shape[:-1]):
-            raise ValueError(f"poses batched over {tuple(batch)} need points (*batch, ..., 3), got {tuple(X.shape)}")
+            raise ValueError(
+                f"poses batched over {tuple(batch)} need points (*batch, ..., 3), got {tuple(X.shape)}"
+            )
         beside = (..., *[None] * (X.ndim - 1 - len(batch)))
         t = self.t.expand(*batch, 3).movedim(-1, 0)[beside].movedim(0, -1)
         if X.ndim - 1 == len(batch):
@@ -194,7 +207,8 @@ def rotation_vector(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 
 
 def in_float64(function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
-    """A function of small matrices computed in float64, which neither autocast nor TF32 lowers; their own type again.
+    """A function of small matrices computed in float64, which neither autocast nor TF32 lowers; their own
+    type again.
 
     Matrices are given the same batch axes.
     """

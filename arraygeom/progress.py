@@ -1,6 +1,7 @@
 """How far long work is: its steps go to the log, each with the share of its stage that is done.
 
-`pat.support.steps` shows them with the time that is left. Outside a stage a step is an ordinary line of the log.
+`pat.support.steps` shows them with the time that is left. Outside a stage a step is an ordinary line of the
+log.
 """
 
 from __future__ import annotations

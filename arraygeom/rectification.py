@@ -19,8 +19,8 @@ from .tracing import needs_numbers
 class Rectification(NamedTuple):
     """The rectification of a pair.
 
-    `R_alpha` and `R_beta` rotate the cameras' frames, `H_alpha` and `H_beta` take old pixels to new ones, `pair`
-    holds the rectified cameras: same K, same orientation, the baseline along x.
+    `R_alpha` and `R_beta` rotate the cameras' frames, `H_alpha` and `H_beta` take old pixels to new ones,
+    `pair` holds the rectified cameras: same K, same orientation, the baseline along x.
     """
 
     R_alpha: Float[Tensor, "3 3"]
@@ -33,11 +33,12 @@ class Rectification(NamedTuple):
 def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None = None) -> Rectification:
     """Rectifying homographies of a pinhole pair (Bouguet's: each camera is rotated half way).
 
-    The new images have the size `hw` (alpha's) and the intrinsics `K`; by default the smaller of the two focal
-    lengths, and the centres of the old images about the middle of the new. The same R_alpha and R_beta as
-    OpenCV's `stereoRectify` for a horizontal pair; a vertical one is rotated by 90 degrees, so that lines are rows
-    here too. Differentiable in everything. Raises ValueError for lenses, batches, without a baseline, and where the
-    baseline is so near an optical axis (motion forwards) that the new images would lie beside the old ones.
+    The new images have the size `hw` (alpha's) and the intrinsics `K`; by default the smaller of the two
+    focal lengths, and the centres of the old images about the middle of the new. The same R_alpha and R_beta
+    as OpenCV's `stereoRectify` for a horizontal pair; a vertical one is rotated by 90 degrees, so that lines
+    are rows here too. Differentiable in everything. Raises ValueError for lenses, batches, without a
+    baseline, and where the baseline is so near an optical axis (motion forwards) that the new images would
+    lie beside the old ones.
     """
     alpha, beta = pair.cameras
     if pair.has_lens:
@@ -53,7 +54,8 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
         ray = _middle_ray(camera, R)
         if not ray[2] > NEAREST_COSINE * ray.norm():
             raise ValueError(
-                "the baseline is nearly along an optical axis (motion forwards): no homography turns lines into rows; "
+                "the baseline is nearly along an optical axis (motion forwards): no homography turns lines "
+                "into rows; "
                 "use the pair as it is, with Epipolar or Curved"
             )
     hw = hw or alpha.hw
@@ -91,7 +93,9 @@ def middle_intrinsics(
     rays = [_middle_ray(camera, R) for camera, R in zip(cameras, rotations)]
     seen = torch.stack([ray[:2] / ray[2] for ray in rays])
     centre = intrinsics(1.0, hw).to(focal)[:2, 2] - focal * seen.mean(0)
-    return torch.cat([torch.cat([focal * torch.eye(2).to(focal), centre[:, None]], 1), focal.new_tensor([[0, 0, 1.0]])])
+    return torch.cat(
+        [torch.cat([focal * torch.eye(2).to(focal), centre[:, None]], 1), focal.new_tensor([[0, 0, 1.0]])]
+    )
 
 
 NEAREST_COSINE = 0.1

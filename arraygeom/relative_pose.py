@@ -15,12 +15,14 @@ from .pose import Pose, in_float64
 def poses_from_essential(E: Float[Tensor, "*b 3 3"]) -> Pose:
     """The four poses (*b, 4) that E allows (H&Z 9.14), |t| = 1: both rotations with t, then with -t.
 
-    Kornia's decomposition without a singular value decomposition (Horn 1990): differentiable, where E's two equal
-    singular values give SVD no gradient.
+    Kornia's decomposition without a singular value decomposition (Horn 1990): differentiable, where E's two
+    equal singular values give SVD no gradient.
     """
     from kornia.geometry.epipolar import decompose_essential_matrix_no_svd
 
-    R1, R2, t = (part.reshape(*E.shape[:-2], *part.shape[1:]) for part in decompose_essential_matrix_no_svd(E))
+    R1, R2, t = (
+        part.reshape(*E.shape[:-2], *part.shape[1:]) for part in decompose_essential_matrix_no_svd(E)
+    )
     t = t[..., 0]
     return Pose(torch.stack([R1, R2, R1, R2], -3), torch.stack([t, t, -t, -t], -2))
 
@@ -41,8 +43,9 @@ def relative_pose(
 ) -> TwoViewPose:
     """The pose that F of two pinholes allows and that has most of the matches in front of both cameras.
 
-    Scale is not known: the baseline has length 1. F is as it is given, noise included; E = K_beta^T F K_alpha is
-    F itself for normalised points. Matches through lenses are to be undistorted first (`LensView.undistort`).
+    Scale is not known: the baseline has length 1. F is as it is given, noise included; E = K_beta^T F K_alpha
+    is F itself for normalised points. Matches through lenses are to be undistorted first
+    (`LensView.undistort`).
     """
     from kornia.geometry.epipolar import essential_from_fundamental
 

@@ -21,7 +21,8 @@ STEP = 1e-5
 def projection_slopes(
     camera: Camera, X: Float[Tensor, "*n 3"], distance: Float[Tensor, "*n"]
 ) -> tuple[Projected, Float[Tensor, "*n 2 3"]]:
-    """Where a float64 camera sees world points, and dx / dX in pixels a metre: of any lens, by central differences.
+    """Where a float64 camera sees world points, and dx / dX in pixels a metre: of any lens, by central
+    differences.
 
     `distance` is the points' from the camera, metres. Differentiable as often as `Camera.project` is.
     """
@@ -40,7 +41,9 @@ def reprojection_residuals(
     *,
     seen: Bool[Tensor, "v *n"] | None = None,
 ) -> Float[Tensor, "v *n 2"]:
-    """Pixels x minus where the cameras see the world points X; zero where a point is not `seen` or cannot be."""
+    """Pixels x minus where the cameras see the world points X; zero where a point is not `seen` or cannot
+    be.
+    """
     projected = [camera.project(X) for camera in cameras]
     used = torch.stack([p.valid for p in projected])
     used = used if seen is None else used & seen
@@ -48,7 +51,9 @@ def reprojection_residuals(
 
 
 class Bundle(NamedTuple):
-    """The adjusted rig and points (n, 3), and the sum of squared residuals (steps + 1) from the first on, pixels^2."""
+    """The adjusted rig and points (n, 3), and the sum of squared residuals (steps + 1) from the first on,
+    pixels^2.
+    """
 
     rig: Rig
     X: Float[Tensor, "n 3"]
@@ -65,16 +70,20 @@ def bundle_adjusted(
     steps: int = 10,
     damping: float = 1e-3,
 ) -> Bundle:
-    """The rig and the points of least reprojection error: Levenberg-Marquardt with the points eliminated (Schur).
+    """The rig and the points of least reprojection error: Levenberg-Marquardt with the points eliminated
+    (Schur).
 
-    `x` are the points' pixels in the rig's cameras, in its order; `free` is as for `Rig.parameters`. In float64. A step
-    that does not lower the cost is not made, and the next is damped tenfold. Gradients follow the steps made: at the
-    optimum those of the least error, in everything that is given. The damping holds what images do not determine, such
-    as scale. Memory: points times free numbers. Raises ValueError for a batch, and for uncalibrated cameras.
+    `x` are the points' pixels in the rig's cameras, in its order; `free` is as for `Rig.parameters`. In
+    float64. A step that does not lower the cost is not made, and the next is damped tenfold. Gradients follow
+    the steps made: at the optimum those of the least error, in everything that is given. The damping holds
+    what images do not determine, such as scale. Memory: points times free numbers. Raises ValueError for a
+    batch, and for uncalibrated cameras.
     """
     cameras = list(rig.cameras.values())
     if rig.batch_shape or not all(isinstance(camera, Camera) for camera in cameras):
-        raise ValueError("bundle adjustment needs one rig of calibrated cameras: take one of the batch, or calibrate")
+        raise ValueError(
+            "bundle adjustment needs one rig of calibrated cameras: take one of the batch, or calibrate"
+        )
     if x.shape != (len(cameras), len(X), 2):
         raise ValueError(f"wanted pixels ({len(cameras)} cameras, {len(X)} points, 2), got {tuple(x.shape)}")
     rig, X, x = rig.to(torch.float64), X.double(), x.double()
@@ -122,7 +131,9 @@ def _stepped(
     points = _damped(product(by_X.mT, by_X).sum(0), damping)
     both = torch.einsum("vnij,vnik->njk", by_rig, by_X)
     back = torch.linalg.solve(points, both.mT).mT
-    whole = _damped(torch.einsum("vnij,vnik->jk", by_rig, by_rig), damping) - torch.einsum("njk,nlk->jl", back, both)
+    whole = _damped(torch.einsum("vnij,vnik->jk", by_rig, by_rig), damping) - torch.einsum(
+        "njk,nlk->jl", back, both
+    )
     at_points = torch.einsum("vnij,vni->nj", by_X, r)
     target = torch.einsum("vnij,vni->j", by_rig, r) - torch.einsum("njk,nk->j", back, at_points)
     change = torch.linalg.solve(whole, target)

@@ -102,7 +102,9 @@ class Pair(Batched):
         if checking():
             check_origin(alpha.t)
             check_origin(beta.t)
-        return beta.cam_from_world.__matmul__(alpha.cam_from_world.inverse())  # torch.compile cannot trace @ of these
+        return beta.cam_from_world.__matmul__(
+            alpha.cam_from_world.inverse()
+        )  # torch.compile cannot trace @ of these
 
     @property
     def depth_range(self) -> Depths:
@@ -116,7 +118,8 @@ class Pair(Batched):
 
     @property
     def fundamental(self) -> Float[Tensor, "*b 3 3"]:
-        """F with x_beta^T F x_alpha = 0, from the cameras or as given; between undistorted pixels through lenses.
+        """F with x_beta^T F x_alpha = 0, from the cameras or as given; between undistorted pixels through
+        lenses.
 
         0 where the cameras' baseline is no more than the rounding of their poses.
 
@@ -125,7 +128,9 @@ class Pair(Batched):
         if self.link is not None:
             return self.link.F
         if not self.calibrated:
-            raise ValueError("neither the cameras' calibration nor F is known for this pair: give the rig a link")
+            raise ValueError(
+                "neither the cameras' calibration nor F is known for this pair: give the rig a link"
+            )
         alpha, beta = self._central("fundamental matrix")
         F = fundamental_matrix(alpha.K, beta.K, self.beta_from_alpha)
         baseline, rounding = self.beta_from_alpha.t.norm(dim=-1), torch.finfo(alpha.t.dtype).eps
@@ -153,7 +158,9 @@ class Pair(Batched):
     def rot90_beta(self, quarter_turns: int) -> Pair:
         """The pair whose beta has its image rotated; see `Camera.rot90`."""
         h, w = self.beta.hw
-        return self.transform_beta(rot90_matrix((h, w), quarter_turns), (w, h) if quarter_turns % 2 else (h, w))
+        return self.transform_beta(
+            rot90_matrix((h, w), quarter_turns), (w, h) if quarter_turns % 2 else (h, w)
+        )
 
     def transform_beta(self, A: Float[Tensor, "3 3"], hw: HW) -> Pair:
         """The pair in which beta's pixels are x' ~ A x and its image's size is `hw`."""
@@ -173,7 +180,9 @@ class Pair(Batched):
         for camera in self.cameras:
             if not camera.central and camera.distortion is not None:
                 model = camera.distortion.model
-                raise ValueError(f"rays of a camera ({model}) do not meet in a point: there is no {what}; use Curved")
+                raise ValueError(
+                    f"rays of a camera ({model}) do not meet in a point: there is no {what}; use Curved"
+                )
         return self.cameras
 
     def _text(self) -> str:
@@ -192,9 +201,10 @@ def middle_depth(near: Float[Tensor, "*b"], far: Float[Tensor, "*b"]) -> Float[T
 class Rig(Batched):
     """Ordered, named cameras of different sizes, lenses and spectral responses.
 
-    `depth` is (near, far) in metres along the optical axis of whichever camera is alpha; far may be inf. Every
-    number may have leading batch axes, the same for all: a batch of rigs. Kornia's pinholes are converted.
-    `links` relate cameras that are not calibrated, by (alpha, beta). A rig never changes: methods return new ones.
+    `depth` is (near, far) in metres along the optical axis of whichever camera is alpha; far may be inf.
+    Every number may have leading batch axes, the same for all: a batch of rigs. Kornia's pinholes are
+    converted. `links` relate cameras that are not calibrated, by (alpha, beta). A rig never changes: methods
+    return new ones.
     """
 
     cameras: Mapping[str, Any]  # View once made; kornia pinholes serve as well
@@ -204,8 +214,12 @@ class Rig(Batched):
 
     def __post_init__(self) -> None:
         if not isinstance(self.cameras, Mapping):
-            raise TypeError(f"the cameras are a {type(self.cameras).__name__}: give a mapping of names to cameras")
-        object.__setattr__(self, "cameras", {name: _view(name, camera) for name, camera in self.cameras.items()})
+            raise TypeError(
+                f"the cameras are a {type(self.cameras).__name__}: give a mapping of names to cameras"
+            )
+        object.__setattr__(
+            self, "cameras", {name: _view(name, camera) for name, camera in self.cameras.items()}
+        )
         if self.depth is not None:
             if not isinstance(self.depth, Sequence | Tensor) or len(self.depth) != 2:
                 raise TypeError(f"depth is {self.depth!r}: wanted (near, far), in metres")
@@ -222,16 +236,20 @@ class Rig(Batched):
                 raise ValueError(f"a link relates two cameras; this one is from '{alpha}' to itself")
 
     @classmethod
-    def from_kornia(cls, cameras: Mapping[str, PinholeCamera], *, batched: bool = False, **fields: Any) -> Rig:
+    def from_kornia(
+        cls, cameras: Mapping[str, PinholeCamera], *, batched: bool = False, **fields: Any
+    ) -> Rig:
         """The rig of kornia pinholes by name; `fields` are the rig's own, such as `depth`.
 
-        Kornia's cameras are always batched: a batch of one becomes a single camera unless `batched`. Raises ValueError
-        for batches of unequal length. `Rig(cameras)` serves as well, for batches of one or more as they come.
+        Kornia's cameras are always batched: a batch of one becomes a single camera unless `batched`. Raises
+        ValueError for batches of unequal length. `Rig(cameras)` serves as well, for batches of one or more as
+        they come.
         """
         lengths = {name: camera.batch_size for name, camera in cameras.items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(
-                f"a rig's cameras are batches of one length, got {lengths}: expand those that are the same in all"
+                f"a rig's cameras are batches of one length, got {lengths}: expand those that are the same "
+                "in all"
             )
         made = {name: Camera.from_kornia(camera, batched=batched) for name, camera in cameras.items()}
         return cls(made, **fields)
@@ -243,12 +261,15 @@ class Rig(Batched):
         """
         views = [name for name, view in self.cameras.items() if not isinstance(view, Camera)]
         if views:
-            raise ValueError(f"kornia has no camera without a calibration: {', '.join(views)} of this rig are such")
+            raise ValueError(
+                f"kornia has no camera without a calibration: {', '.join(views)} of this rig are such"
+            )
         shape = self.batch_shape
         lenses = [(name, camera.distortion) for name, camera in self.cameras.items()]
         if bent := [name for name, lens in lenses if lens is not None and not lens.harmless]:
             raise ValueError(
-                f"kornia's cameras with a lens have no pose ({', '.join(bent)}): give each as camera.to_kornia() and "
+                f"kornia's cameras with a lens have no pose ({', '.join(bent)}): give each as "
+                "camera.to_kornia() and "
                 "keep its cam_from_world"
             )
         return {name: _expanded(camera, shape).to_kornia() for name, camera in self.cameras.items()}
@@ -303,21 +324,29 @@ class Rig(Batched):
     def rot90(self, name: str, quarter_turns: int) -> Rig:
         """The rig whose camera `name` has its image rotated; see `Camera.rot90`."""
         hw = self[name].hw
-        return self.transformed(name, rot90_matrix(hw, quarter_turns), hw if quarter_turns % 2 == 0 else (hw[1], hw[0]))
+        return self.transformed(
+            name, rot90_matrix(hw, quarter_turns), hw if quarter_turns % 2 == 0 else (hw[1], hw[0])
+        )
 
     def transformed(self, name: str, A: Float[Tensor, "3 3"], hw: HW) -> Rig:
         """The rig in which the pixels of camera `name` are x' ~ A x and its image's size is `hw`."""
         eye = torch.eye(3, dtype=torch.float64)
         links = {
-            (a, b): link.transformed(A if a == name else eye, A if b == name else eye) if name in (a, b) else link
+            (a, b): link.transformed(A if a == name else eye, A if b == name else eye)
+            if name in (a, b)
+            else link
             for (a, b), link in self.links.items()
         }
         return self.with_camera(name, self[name].transformed(A, hw)).replace(links=links)
 
     def scaled(self, factor: float) -> Rig:
-        """The rig with all lengths (translations, the depth range) times a positive factor: in another unit, say."""
+        """The rig with all lengths (translations, the depth range) times a positive factor: in another unit,
+        say.
+        """
         cameras = {
-            name: view.replace(cam_from_world=Pose(view.R, view.t * factor)) if isinstance(view, Camera) else view
+            name: view.replace(cam_from_world=Pose(view.R, view.t * factor))
+            if isinstance(view, Camera)
+            else view
             for name, view in self.cameras.items()
         }
         depth = None if self.depth is None else (self.depth[0] * factor, self.depth[1] * factor)
@@ -326,10 +355,10 @@ class Rig(Batched):
     def parameters(self, *, free: Iterable[str]) -> dict[str, Tensor]:
         """Changes an optimiser may make, all zero and requiring grad; `perturbed` applies them.
 
-        `free` holds patterns over "camera.rotation" (rotation vector, radians), "camera.translation" (metres),
-        "camera.focal" (fx, fy in pixels), "camera.centre" (cx, cy in pixels), "camera.distortion", "depth.near"
-        and "depth.far" (metres), for instance ["colour.*", "depth.near"]. An uncalibrated view has its lens's.
-        Raises ValueError for a pattern that matches nothing.
+        `free` holds patterns over "camera.rotation" (rotation vector, radians), "camera.translation"
+        (metres), "camera.focal" (fx, fy in pixels), "camera.centre" (cx, cy in pixels), "camera.distortion",
+        "depth.near" and "depth.far" (metres), for instance ["colour.*", "depth.near"]. An uncalibrated view
+        has its lens's. Raises ValueError for a pattern that matches nothing.
         """
         known = self._parameter_shapes()
         chosen: dict[str, Tensor] = {}
@@ -348,7 +377,9 @@ class Rig(Batched):
         unknown = set(changes) - set(self._parameter_shapes())
         if unknown:
             raise ValueError(f"no such rig parameter: {', '.join(sorted(unknown))}")
-        cameras = {name: derived(_perturbed_camera, name, camera, changes) for name, camera in self.cameras.items()}
+        cameras = {
+            name: derived(_perturbed_camera, name, camera, changes) for name, camera in self.cameras.items()
+        }
         depth = self.depth
         if depth is not None:
             near, far = depth
@@ -358,8 +389,8 @@ class Rig(Batched):
     def check(self) -> tuple[str, ...]:
         """What is odd about the rig, a sentence each; none if nothing is.
 
-        Constructors refuse numbers that cannot be; these can, and are mistakes more often than not: another unit, poses
-        of another convention, axes exchanged, views that do not overlap.
+        Constructors refuse numbers that cannot be; these can, and are mistakes more often than not: another
+        unit, poses of another convention, axes exchanged, views that do not overlap.
         """
         from .rig_check import oddities
 
@@ -419,16 +450,23 @@ def _view(name: str, camera: Any) -> View:
     if isinstance(camera, PinholeCamera):
         return Camera.from_kornia(camera)
     kind = type(camera).__name__
-    raise TypeError(f"camera '{name}' is a {kind}: give a Camera, a LensView, a View or a kornia PinholeCamera")
+    raise TypeError(
+        f"camera '{name}' is a {kind}: give a Camera, a LensView, a View or a kornia PinholeCamera"
+    )
 
 
 def depth_range(near: Any, far: Any) -> Depths:
-    """(near, far) as tensors, numbers in float64. Raises ValueError unless 0 < near <= far (where they are known)."""
-    bounds = [d if isinstance(d, Tensor) else torch.tensor(float(d), dtype=torch.float64) for d in (near, far)]
+    """(near, far) as tensors, numbers in float64. Raises ValueError unless 0 < near <= far (where they are
+    known).
+    """
+    bounds = [
+        d if isinstance(d, Tensor) else torch.tensor(float(d), dtype=torch.float64) for d in (near, far)
+    ]
     near, far = bounds
     if not traced() and not bool(((near > 0) & (far >= near)).all()):
         raise ValueError(
-            f"depth bounds must satisfy 0 < near <= far, in metres; got near = {_shown(near)}, far = {_shown(far)}"
+            f"depth bounds must satisfy 0 < near <= far, in metres; got near = {_shown(near)}, far = "
+            f"{_shown(far)}"
         )
     return near, far
 
@@ -438,7 +476,9 @@ def _shown(d: Tensor) -> str:
 
 
 def focal_positions(K: Tensor) -> Tensor:
-    """The positions of fx and fy in K, with their signs: the diagonal, or for a rotated image the other one."""
+    """The positions of fx and fy in K, with their signs: the diagonal, or for a rotated image the other
+    one.
+    """
     block = K.detach()[..., :2, :2]
     largest = block.abs() == block.abs().amax(-2, keepdim=True)
     return torch.where(largest, block.sign(), 0.0)

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 SMALLEST_BASELINE, LARGEST_BASELINE = 1e-4, 50.0
 """A baseline outside these bounds, in metres, is more likely a mistaken unit than a camera array."""
 NARROWEST, WIDEST = 0.5, 140.0
-"""Degrees across a pinhole's image outside which its focal length is more likely in another unit than pixels: a 1 m
-telephoto lens on an inch of sensor has 1.5, the widest rectilinear lenses have 130."""
+"""Degrees across a pinhole's image outside which its focal length is more likely in another unit than pixels:
+a 1 m telephoto lens on an inch of sensor has 1.5, the widest rectilinear lenses have 130."""
 DECENTRED = 0.1
-"""Principal points farther than this from the image's middle, as a share of its longer side, are more likely of another
-image: exchanging the sides of a 4:3 image moves the middle by 0.18, halving the image by 0.3."""
+"""Principal points farther than this from the image's middle, as a share of its longer side, are more likely
+of another image: exchanging the sides of a 4:3 image moves the middle by 0.18, halving the image by 0.3."""
 LEAST_DISPARITY = 0.5
 """Pixels that matches move from near to far below which depth is not seen."""
 COVERED = 0.5
@@ -56,7 +56,8 @@ def unit_oddity(rig: Rig) -> str | None:
         )
     if 0 < longest < SMALLEST_BASELINE:
         return (
-            f"has cameras at most {1e3 * longest:.3g} mm apart: is this file in metres, and read as millimetres? "
+            f"has cameras at most {1e3 * longest:.3g} mm apart: is this file in metres, and read as "
+            "millimetres? "
             "Then read it with scale=1000"
         )
     return None
@@ -104,7 +105,8 @@ def _of_K(name: str, camera: Camera) -> Iterator[str]:
     if off > DECENTRED * max(h, w):
         x, y = K[:2, 2].tolist()
         yield (
-            f"'{name}' has its principal point at ({x:.4g}, {y:.4g}), {off:.3g} px from the middle of {w}x{h}: "
+            f"'{name}' has its principal point at ({x:.4g}, {y:.4g}), {off:.3g} px from the middle of "
+            f"{w}x{h}: "
             "is hw (height, width), and K of whole images of this size?"
         )
 
@@ -123,9 +125,12 @@ def _of_overlap(rig: Rig, alpha: str, beta: str) -> Iterator[str]:
     pair = rig.pair(alpha, beta)
     found = recorded_field(pair)(pair, _grid(rig[alpha]).to(rig[alpha].K))
     if not bool((found.valid if hasattr(found, "valid") else found.mask).any()):
-        bounds = "" if rig.depth is None else f" between {float(rig.depth[0]):g} and {float(rig.depth[1]):g} m"
+        bounds = (
+            "" if rig.depth is None else f" between {float(rig.depth[0]):g} and {float(rig.depth[1]):g} m"
+        )
         yield (
-            f"'{beta}' sees nothing of what '{alpha}' sees{bounds}: check the poses, which are X_cam = R X_world + t "
+            f"'{beta}' sees nothing of what '{alpha}' sees{bounds}: check the poses, which are X_cam = R "
+            "X_world + t "
             "with z forward and y down (OpenGL's look along -z), and the depth range"
         )
 
@@ -140,12 +145,14 @@ def _of_baseline(rig: Rig, a: str, b: str) -> Iterator[str]:
         moved = focal * baseline * (1 / near - 1 / far)
         if near < far and moved < LEAST_DISPARITY:
             yield (
-                f"'{a}' and '{b}' are {baseline:.3g} m apart: from {near:g} to {far:g} m a match moves by {moved:.2g} "
+                f"'{a}' and '{b}' are {baseline:.3g} m apart: from {near:g} to {far:g} m a match moves by "
+                f"{moved:.2g} "
                 "px; are depth and poses both in metres?"
             )
         if focal * baseline / far > 2 * max(rig[b].hw) * focal / float(rig[a].K[:2, :2].det().abs().sqrt()):
             yield (
-                f"'{a}' and '{b}' are {baseline:.3g} m apart, which is more than the depth of {far:g} m allows: "
+                f"'{a}' and '{b}' are {baseline:.3g} m apart, which is more than the depth of {far:g} m "
+                "allows: "
                 "are depth and poses both in metres?"
             )
 
@@ -153,5 +160,9 @@ def _of_baseline(rig: Rig, a: str, b: str) -> Iterator[str]:
 def _of_sides(rig: Rig) -> Iterator[str]:
     """Cameras called left and right that are the other way round."""
     left, right = rig.cameras.get("left"), rig.cameras.get("right")
-    if isinstance(left, Camera) and isinstance(right, Camera) and left.cam_from_world.apply(right.centre)[0] < 0:
+    if (
+        isinstance(left, Camera)
+        and isinstance(right, Camera)
+        and left.cam_from_world.apply(right.centre)[0] < 0
+    ):
         yield "'right' is to the left of 'left': is t a position (t is -R times that), or of the wrong sign?"

@@ -1,4 +1,5 @@
-"""Weighted least squares: linear, with a prior or without, the same where some values may be wrong, and nonlinear.
+"""Weighted least squares: linear, with a prior or without, the same where some values may be wrong, and
+nonlinear.
 
 Wrong values are down-weighted by iteratively reweighted least squares (Holland and Welsch 1977).
 `terms` (k, n) are what k coefficients are multiplied with in each of n values.
@@ -20,8 +21,8 @@ STEPS = 8
 """Size: how often the values are weighted again."""
 
 LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
-"""Size: shares of the information's diagonal that are added to it. Less would not hold, in float64, what images leave
-free, such as scale."""
+"""Size: shares of the information's diagonal that are added to it. Less would not hold, in float64, what
+images leave free, such as scale."""
 
 State = TypeVar("State")
 Weigh = Callable[[Tensor], Float[Tensor, " n"]]
@@ -119,8 +120,9 @@ def levenberg_marquardt(
 ) -> tuple[State, bool]:
     """A state of least cost, and whether it was reached in so many steps: Marquardt's (1963) damping of each.
 
-    The damping rises tenfold until a step does not raise the cost, and falls tenfold after it. `is_converged` takes the
-    states before and after a step, and their costs. A state from which no step leads is of least cost.
+    The damping rises tenfold until a step does not raise the cost, and falls tenfold after it. `is_converged`
+    takes the states before and after a step, and their costs. A state from which no step leads is of least
+    cost.
     """
     for _ in range(steps):
         before = model(state)

@@ -11,7 +11,8 @@ from .tracing import followed, traced
 
 
 def first_root(coefficients: Tensor) -> Tensor:
-    """The smallest positive root of 1 + a_1 u + ... + a_n u^n, infinity if there is none, 0 if an a is not finite.
+    """The smallest positive root of 1 + a_1 u + ... + a_n u^n, infinity if there is none, 0 if an a is not
+    finite.
 
     `coefficients` (*b, n + 1) starts with the 1. The roots are the inverses of those of the reversed
     polynomial, which is monic, so a leading coefficient of 0 needs no care: eigenvalues of its companion.
@@ -58,7 +59,8 @@ def invert_increasing(
         low, top = torch.where(value < y, r, low), torch.where(value > y, r, top)
         newton = r - (value - y) / slope
         enough = 4 * torch.finfo(y.dtype).eps * r
-        # Newton's steps can cycle within the bracket: from some iteration on either they halve or the bracket does.
+        # Newton's steps can cycle within the bracket: from some iteration on either they halve or the bracket
+        # does.
         cycles = ((newton - r).abs() > torch.maximum(step / 2, enough)) & (i >= PATIENCE)
         following = torch.where((newton >= low) & (newton <= top) & ~cycles, newton, (low + top) / 2)
         step = (following - r).abs()
@@ -70,7 +72,8 @@ def invert_increasing(
 
 
 PATIENCE = 12
-"""Iterations after which a step of Newton that is not half the one before is replaced by halving the bracket."""
+"""Iterations after which a step of Newton that is not half the one before is replaced by halving the bracket.
+"""
 
 
 PlaneMap = Callable[[Tensor], tuple[Tensor, Sequence[Tensor]]]
@@ -86,8 +89,9 @@ def solve_in_plane(
     rounding: float = 2.0,
     steps: int = 30,
 ) -> Tensor:
-    """Points whose images are `target`, by Newton, with halved steps where a whole one leaves where points may be or
-    does not help; the nearest that is found where there is none. `rounding`: of f's values, in units of the last place.
+    """Points whose images are `target`, by Newton, with halved steps where a whole one leaves where points
+    may be or does not help; the nearest that is found where there is none. `rounding`: of f's values, in
+    units of the last place.
     """
     xy = start
     value, jacobian = f(xy)

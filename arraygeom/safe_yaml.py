@@ -1,4 +1,5 @@
-"""YAML and JSON from files of unknown origin: bounded in nesting, YAML in size and aliases, without repeated keys.
+"""YAML and JSON from files of unknown origin: bounded in nesting, YAML in size and aliases, without repeated
+keys.
 
 The one loader of each in the project. Both build plain values only, so nothing in a file can run code.
 """
@@ -25,8 +26,8 @@ _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 def load_yaml(text: str) -> Any:
     """The document of a YAML text.
 
-    Raises yaml.YAMLError, with the line where one is known, for text that is not YAML, for repeated keys (1 and "1" are
-    the same key, and so are 1 and true), and for a document beyond the limits of this module.
+    Raises yaml.YAMLError, with the line where one is known, for text that is not YAML, for repeated keys (1
+    and "1" are the same key, and so are 1 and true), and for a document beyond the limits of this module.
     """
     if len(text) > LARGEST_TEXT:
         raise _refused(f"has {len(text):,} characters; at most {LARGEST_TEXT:,} are read")
@@ -42,15 +43,18 @@ def load_yaml(text: str) -> Any:
 def load_json(text: str) -> Any:
     """The document of a JSON text.
 
-    Raises json.JSONDecodeError, with the line, for text that is not JSON; ValueError for repeated keys, text that is
-    half a character (a lone surrogate, which cannot be printed), and for one that is nested too deeply.
+    Raises json.JSONDecodeError, with the line, for text that is not JSON; ValueError for repeated keys, text
+    that is half a character (a lone surrogate, which cannot be printed), and for one that is nested too
+    deeply.
     """
     try:
         document = json.loads(text, object_pairs_hook=_without_repeated_keys)
         if "\\u" in text:
             json.dumps(document, ensure_ascii=False).encode()
     except UnicodeEncodeError as error:
-        raise ValueError(f"holds half a character ({error.object[error.start]!a}): write it as UTF-8") from None
+        raise ValueError(
+            f"holds half a character ({error.object[error.start]!a}): write it as UTF-8"
+        ) from None
     except RecursionError:
         raise ValueError("is nested too deeply") from None
     return document
@@ -60,7 +64,9 @@ def _without_repeated_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     fields: dict[str, Any] = {}
     for name, value in pairs:
         if name in fields:
-            raise ValueError(f"'{name[:60]}' occurs twice; keep one".encode(errors="backslashreplace").decode())
+            raise ValueError(
+                f"'{name[:60]}' occurs twice; keep one".encode(errors="backslashreplace").decode()
+            )
         fields[name] = value
     return fields
 
@@ -85,7 +91,9 @@ def _check_extent(text: str) -> None:
             raise _refused(f"has more than {MOST_VALUES:,} values", event.start_mark)
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in sizes:
-                raise _refused(f"alias *{event.anchor} is within, or before, what it stands for", event.start_mark)
+                raise _refused(
+                    f"alias *{event.anchor} is within, or before, what it stands for", event.start_mark
+                )
             values += sizes[event.anchor]
             aliased += sizes[event.anchor]
             if aliased > MOST_ALIASED:

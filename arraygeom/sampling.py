@@ -50,8 +50,8 @@ def sample(
 ) -> Sampled:
     """Images (B, C, H, W) at positions x (B, *n, 2), or (1, *n, 2) for the same positions in each, in pixels.
 
-    On the outer half pixel of the area the nearest pixels count; "nearest" takes the pixel on whose area a position
-    lies, halves upwards. Outside it values are 0 and valid is False; or, if
+    On the outer half pixel of the area the nearest pixels count; "nearest" takes the pixel on whose area a
+    position lies, halves upwards. Outside it values are 0 and valid is False; or, if
     `extended`, they are those of the nearest pixel, which are valid.
     """
     batch, hw = len(image), (image.shape[-2], image.shape[-1])

@@ -40,8 +40,8 @@ class Positions(Batched):
 class Segments(Batched):
     """One straight piece of beta's image for each alpha pixel, from `start` to `end`, in beta's pixels.
 
-    For a depth-bounded field `start` is where the point would be at the near bound and `end` at the far bound.
-    Where `valid` is False there is nothing to sample and the ends mean nothing (but are finite).
+    For a depth-bounded field `start` is where the point would be at the near bound and `end` at the far
+    bound. Where `valid` is False there is nothing to sample and the ends mean nothing (but are finite).
     """
 
     item_axes: ClassVar = {"start": 1, "end": 1}
@@ -83,7 +83,9 @@ class Segments(Batched):
         return Positions(xy, self.valid[..., None].expand(xy.shape[:-1]))
 
     def distance(self, xy: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
-        """Pixels from points to their segments, to an end beyond it; infinite where the segment is not valid."""
+        """Pixels from points to their segments, to an end beyond it; infinite where the segment is not
+        valid.
+        """
         u = self.fraction(xy).clamp(0, 1)
         squared = (xy - self.at(u)).square().sum(-1)
         distance = torch.where(squared > 0, torch.where(squared > 0, squared, 1.0).sqrt(), 0.0)
@@ -92,8 +94,8 @@ class Segments(Batched):
     def mask(self, hw: HW, radius: float = 0.5) -> Bool[Tensor, "*n p"]:
         """Which of beta's H W pixels, row by row, are within `radius` pixels of each segment.
 
-        As it is an `attn_mask` of `scaled_dot_product_attention` for alpha's pixels (n) as queries and beta's as keys:
-        n H W flags, so for small images; `pat.attention.segment_block_mask` is for large ones.
+        As it is an `attn_mask` of `scaled_dot_product_attention` for alpha's pixels (n) as queries and beta's
+        as keys: n H W flags, so for small images; `pat.attention.segment_block_mask` is for large ones.
         """
         axes = (*self.valid.shape, hw[0] * hw[1])
         xy = pixel_grid(hw, dtype=self.start.dtype, device=self.start.device).reshape(-1, 2).expand(*axes, 2)
@@ -117,7 +119,9 @@ def clip_to_image(start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: 
 def fractions_on_image(
     start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: HW
 ) -> tuple[Float[Tensor, "*n"], Float[Tensor, "*n"]]:
-    """From which to which fraction (0 at start, 1 at end) each segment is on the image: low > high where nowhere."""
+    """From which to which fraction (0 at start, 1 at end) each segment is on the image: low > high where
+    nowhere.
+    """
     low, high = torch.zeros_like(start[..., 0]), torch.ones_like(start[..., 0])
     for a, b, limit in zip(start.unbind(-1), end.unbind(-1), (hw[1] - 0.5, hw[0] - 0.5)):
         moves = b - a
@@ -138,7 +142,9 @@ def _on_image(start: Tensor, end: Tensor, s: Tensor, valid: Tensor, hw: HW) -> T
 
 
 FLAT = 1e-6
-"""A limit of the image that moves by less than this along a whole segment, in pixels, is either inside or not."""
+"""A limit of the image that moves by less than this along a whole segment, in pixels, is either inside or
+not.
+"""
 
 
 def sample_fractions(samples: int, *, like: Tensor) -> Float[Tensor, "l"]:

@@ -47,8 +47,8 @@ class Sensor:
     "srgb" or "linear". `bayer` is the colour filter pattern from the top left ("RGGB"), for raw images.
 
     A file's values are counts from 0 to 2^bits - 1 (by default the file's own 8 or 16 bits), of which
-    `black_level` stands for no light. Light times `exposure` (seconds) times `gain` makes the value; a gain of three
-    numbers is of red, green and blue. Both are relative: only their ratios between cameras matter.
+    `black_level` stands for no light. Light times `exposure` (seconds) times `gain` makes the value; a gain
+    of three numbers is of red, green and blue. Both are relative: only their ratios between cameras matter.
     """
 
     response: str | Band | Curve | None = None
@@ -68,7 +68,10 @@ class Sensor:
             check_above(0, itself=False, gain=gain)
         check_above(1, whole=True, bits=self.bits)
         check_above(0, black_level=self.black_level)
-        for name, value, known in (("coding", self.coding, CODINGS), ("bayer", self.bayer, (None, *PATTERNS))):
+        for name, value, known in (
+            ("coding", self.coding, CODINGS),
+            ("bayer", self.bayer, (None, *PATTERNS)),
+        ):
             if value not in known:
                 raise ValueError(f"{name} is {value!r}: wanted {' or '.join(repr(v) for v in known if v)}")
 

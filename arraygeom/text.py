@@ -56,7 +56,9 @@ def depth_text(depth: tuple[Tensor, Tensor] | None) -> str:
 def angle(R: Tensor) -> Tensor:
     """The angle of a rotation, radians; exact for small ones too."""
     R = R.detach()
-    skew = torch.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
+    skew = torch.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
+    )
     return torch.atan2(0.5 * skew.norm(dim=-1), 0.5 * (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1))
 
 
@@ -72,6 +74,8 @@ def share_text(mask: Tensor) -> str:
 
 
 def short(value: object) -> str:
-    """A value in a message: its numbers with four digits, and no more than its first 60 characters, in ASCII."""
+    """A value in a message: its numbers with four digits, and no more than its first 60 characters, in
+    ASCII.
+    """
     text = re.sub(r"-?\d+\.\d{4,}(?:e[-+]\d+)?", lambda number: f"{float(number[0]):.4g}", ascii(value))
     return text if len(text) <= 60 else f"{text[:57]}..."

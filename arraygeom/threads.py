@@ -1,7 +1,8 @@
 """Compiled loops on as many threads as torch may use, and torch's own loops kept out of their way.
 
-A plain pool, for loops that release Python's lock: its idle threads sleep. Torch's spin while they wait, unless
-`OMP_WAIT_POLICY=PASSIVE` was set before torch was loaded, and take the cores of the pool and of other processes.
+A plain pool, for loops that release Python's lock: its idle threads sleep. Torch's spin while they wait,
+unless `OMP_WAIT_POLICY=PASSIVE` was set before torch was loaded, and take the cores of the pool and of other
+processes.
 """
 
 from __future__ import annotations
@@ -37,10 +38,11 @@ def threads() -> int:
 
 @contextmanager
 def torch_in_one_thread() -> Iterator[None]:
-    """Let torch's own loops run in the calling thread alone, while `in_parallel` takes as many `threads` as before.
+    """Let torch's own loops run in the calling thread alone, while `in_parallel` takes as many `threads` as
+    before.
 
-    For work that is mostly in compiled loops, beside which torch's own threads spin between short loops: without this
-    a frame of 640x400 took twice the time of the cores where other processes wanted them.
+    For work that is mostly in compiled loops, beside which torch's own threads spin between short loops:
+    without this a frame of 640x400 took twice the time of the cores where other processes wanted them.
     """
     allowed = _ALLOWED.set(threads())
     with _torch_threads(1):
@@ -54,7 +56,8 @@ def torch_in_one_thread() -> Iterator[None]:
 def convolutions_in_parallel() -> Iterator[None]:
     """Within `torch_in_one_thread`: compute convolutions on all `threads`.
 
-    Those without gradients in strips of rows by the pool's threads, which sleep where they wait; others by torch's.
+    Those without gradients in strips of rows by the pool's threads, which sleep where they wait; others by
+    torch's.
     """
     with _InStrips() if threads() > 1 else nullcontext():
         yield
@@ -70,7 +73,9 @@ class _InStrips(TorchFunctionMode):
         return _convolved(*args)
 
 
-def _convolved(x: Tensor, weight: Tensor, bias: Any, stride: Any, padding: Any, dilation: Any, groups: int) -> Tensor:
+def _convolved(
+    x: Tensor, weight: Tensor, bias: Any, stride: Any, padding: Any, dilation: Any, groups: int
+) -> Tensor:
     """`torch.conv2d`, to the bit; of one large image in strips of rows, each with the rows around it."""
     further = bias, stride, padding, dilation, groups
     plain = x.device.type == "cpu" and tuple(stride) == (1, 1) and not isinstance(padding, str)

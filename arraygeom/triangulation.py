@@ -40,17 +40,21 @@ def triangulate(
 ) -> Triangulated:
     """Points from their pixels in two views or more, of least reprojection error, through any lens.
 
-    Gauss-Newton in float64 on direction and inverse distance from the first view that sees the point (Civera, Davison
-    and Montiel 2008), in which the error is nearly linear however far the point is; from the inverse distance at which
-    rays meet in least squares. Exact derivatives; batched cameras (*b) take pixels (views, *b, ..., 2).
+    Gauss-Newton in float64 on direction and inverse distance from the first view that sees the point (Civera,
+    Davison and Montiel 2008), in which the error is nearly linear however far the point is; from the inverse
+    distance at which rays meet in least squares. Exact derivatives; batched cameras (*b) take pixels (views,
+    *b, ..., 2).
 
-    `deviation` is the standard deviation of the pixels' coordinates. The covariance is of that noise, to first order
-    across the ray; along it, three deviations extend to where the inverse distance is three deviations less: the error
-    stays within them as often as a normal distribution's. Valid where that is still finite, all views that see the
-    point (`seen`) have it in front, and no residual exceeds `residual` pixels (five deviations).
+    `deviation` is the standard deviation of the pixels' coordinates. The covariance is of that noise, to
+    first order across the ray; along it, three deviations extend to where the inverse distance is three
+    deviations less: the error stays within them as often as a normal distribution's. Valid where that is
+    still finite, all views that see the point (`seen`) have it in front, and no residual exceeds `residual`
+    pixels (five deviations).
     """
     if len(cameras) != len(x) or len(cameras) < 2:
-        raise ValueError(f"wanted pixels (views, ..., 2) of {len(cameras)} >= 2 cameras, got {tuple(x.shape)}")
+        raise ValueError(
+            f"wanted pixels (views, ..., 2) of {len(cameras)} >= 2 cameras, got {tuple(x.shape)}"
+        )
     dtype = torch.promote_types(floating(x).dtype, cameras[0].t.dtype)
     sights, chart, p = _sighted([c.to(torch.float64) for c in cameras], x.double(), seen)
     for i in range(STEPS):
@@ -80,19 +84,24 @@ SMALLEST_PARALLAX = 1e-9
 
 
 def depth_of(
-    pair: Pair, x: Real[Tensor, "*n 2"], x_beta: Real[Tensor, "*n 2"], deviation: Float[Tensor, "*n"] | None = None
+    pair: Pair,
+    x: Real[Tensor, "*n 2"],
+    x_beta: Real[Tensor, "*n 2"],
+    deviation: Float[Tensor, "*n"] | None = None,
 ) -> Depth:
     """Depth in alpha of what its pixels x see at beta's pixels `x_beta`; through lenses too.
 
-    `deviation` is the standard deviation of x_beta along the segment, in pixels; that of the depth is propagated
-    to first order. Raises ValueError for uncalibrated pairs.
+    `deviation` is the standard deviation of x_beta along the segment, in pixels; that of the depth is
+    propagated to first order. Raises ValueError for uncalibrated pairs.
     """
     alpha, beta = pair.cameras
     x, x_beta = floating(x), floating(x_beta)
     if not pair.has_lens:
         return depth_from_track(track(alpha.K, beta.K, pair.beta_from_alpha, x), x_beta, deviation)
     if not (alpha.central and beta.central):
-        raise ValueError("rays of one of these cameras do not meet in a point: use arraygeom.fields.ray_depth")
+        raise ValueError(
+            "rays of one of these cameras do not meet in a point: use arraygeom.fields.ray_depth"
+        )
     pose = pair.beta_from_alpha
     normalised, seen = zip(*(_normalised(c.to(x.dtype), p) for c, p in ((alpha, x), (beta, x_beta))))
     eye = torch.eye(3).to(pose.R).expand_as(pose.R)
@@ -129,7 +138,9 @@ class _Sight(NamedTuple):
 
 
 class _Chart(NamedTuple):
-    """Points by p = (a, b, w): `origin` + `scale` (a u + b v + d) / w; `axes` (*n, 3, 3) has the columns u, v, d."""
+    """Points by p = (a, b, w): `origin` + `scale` (a u + b v + d) / w; `axes` (*n, 3, 3) has the columns u,
+    v, d.
+    """
 
     origin: Tensor
     axes: Tensor
@@ -158,9 +169,15 @@ class _NormalEquations(NamedTuple):
     residual: Tensor
 
 
-def _sighted(cameras: Sequence[Camera], x: Tensor, seen: Tensor | None) -> tuple[list[_Sight], _Chart, Tensor]:
-    """What is seen of each point, the chart of its first view, and where in it the rays meet in least squares."""
-    centres, directions, usable = (torch.stack(part) for part in zip(*(world_rays(c, p) for c, p in zip(cameras, x))))
+def _sighted(
+    cameras: Sequence[Camera], x: Tensor, seen: Tensor | None
+) -> tuple[list[_Sight], _Chart, Tensor]:
+    """What is seen of each point, the chart of its first view, and where in it the rays meet in least
+    squares.
+    """
+    centres, directions, usable = (
+        torch.stack(part) for part in zip(*(world_rays(c, p) for c, p in zip(cameras, x)))
+    )
     usable = usable if seen is None else usable & seen
     focal = [beside(c.K[..., :2, :2].det().abs(), x.ndim - 2).expand_as(u) for c, u in zip(cameras, usable)]
     first = usable.to(torch.uint8).argmax(0)[None, ..., None].expand(1, *x.shape[1:-1], 3)
@@ -205,8 +222,12 @@ def _normal_equations(sights: Sequence[_Sight], chart: _Chart, p: Tensor) -> _No
     definite = torch.linalg.cholesky_ex(matrix.detach()).info == 0
     solvable = definite & (ratio > LEAST_DETERMINANT) & (torch.stack([s.usable for s in sights]).sum(0) >= 2)
     matrix = torch.where(solvable[..., None, None], matrix, torch.eye(3).to(matrix))
-    return _NormalEquations(matrix, torch.where(solvable[..., None], target, 0.0), solvable, in_front, worst.sqrt())
+    return _NormalEquations(
+        matrix, torch.where(solvable[..., None], target, 0.0), solvable, in_front, worst.sqrt()
+    )
 
 
 LEAST_DETERMINANT = 1e-18
-"""Of the normal equations, their largest diagonal entry at 1: inverse distance is known 1e-9 as well as directions."""
+"""Of the normal equations, their largest diagonal entry at 1: inverse distance is known 1e-9 as well as
+directions.
+"""

@@ -18,17 +18,19 @@ from .sampling import Interpolation, Sampled, sample
 from .tracing import needs_numbers
 
 WIDEST = math.radians(62)
-"""How far off axis a pinhole view reaches: there it stretches outwards 4.5 times what it does in its middle."""
+"""How far off axis a pinhole view reaches: there it stretches outwards 4.5 times what it does in its middle.
+"""
 AT_ONCE = 1 << 18
 """Pixels that are resampled at once."""
 
 
 def pinhole_view(camera: AnyLensView, *, widest: float = WIDEST) -> AnyLensView:
-    """The camera without its lens, large enough for all that the old image shows up to `widest` radians off axis.
+    """The camera without its lens, large enough for all that the old image shows up to `widest` radians off
+    axis.
 
-    Same position, orientation and K but for the principal point: pixels in the middle keep their size. Links follow by
-    `rig.transformed(name, view.K @ camera.K^-1, view.hw)`. Raises ValueError for a batch of cameras, and for an image
-    whose middle is outside its lens's range.
+    Same position, orientation and K but for the principal point: pixels in the middle keep their size. Links
+    follow by `rig.transformed(name, view.K @ camera.K^-1, view.hw)`. Raises ValueError for a batch of
+    cameras, and for an image whose middle is outside its lens's range.
     """
     needs_numbers("the size of a pinhole view", camera.K)
     if camera.K.ndim > 2:
@@ -37,7 +39,9 @@ def pinhole_view(camera: AnyLensView, *, widest: float = WIDEST) -> AnyLensView:
         rays, valid = camera.rays(coarse_grid(camera.hw).to(camera.K))
     near_axis = valid & (rays[..., 2] >= math.cos(widest) * rays.norm(dim=-1))
     if not near_axis.any():
-        raise ValueError("no pixel of the image is within its lens's range: check the distortion's coefficients")
+        raise ValueError(
+            "no pixel of the image is within its lens's range: check the distortion's coefficients"
+        )
     seen = rays[near_axis]
     x = product(seen[:, :2] / seen[:, 2:], camera.K[:2, :2].mT) + camera.K[:2, 2]
     low, high = x.detach().amin(0).floor(), x.detach().amax(0).ceil()
@@ -50,8 +54,8 @@ def pinhole_view(camera: AnyLensView, *, widest: float = WIDEST) -> AnyLensView:
 def pixels_between(
     source: LensView, target: LensView, x: Float[Tensor, "h w 2"] | None = None
 ) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
-    """For pixels x of `target`, by default all, their positions in the co-located `source`, and whether `source` sees
-    them. Float64."""
+    """For pixels x of `target`, by default all, their positions in the co-located `source`, and whether
+    `source` sees them. Float64."""
     if x is None:
         return _by_rows(lambda x: pixels_between(source, target, x), target.hw, axis=0)
     source, target = source.to(torch.float64), target.to(torch.float64)
@@ -63,7 +67,9 @@ def pixels_between(
 
 
 def _by_rows(function: Callable[[Tensor], Any], hw: HW, *, axis: int) -> Any:
-    """What a function makes of an image's pixels (h, w, 2), some rows at a time: it takes some 300 bytes a pixel."""
+    """What a function makes of an image's pixels (h, w, 2), some rows at a time: it takes some 300 bytes a
+    pixel.
+    """
     x, y = pixel_coordinates(hw, dtype=torch.float64)
     rows = max(AT_ONCE // hw[1], 1)
     return chunked(lambda x, y: function(torch.stack([x, y], -1)), x, y, rows=rows, axis=axis)
@@ -72,7 +78,8 @@ def _by_rows(function: Callable[[Tensor], Any], hw: HW, *, axis: int) -> Any:
 def recorded_pixels(
     x: Float[Tensor, "*n 2"], now: View, recorded: LensView
 ) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-    """Pixels of a view without its lens, cropped, resized or rotated, in the image as recorded; which it can show.
+    """Pixels of a view without its lens, cropped, resized or rotated, in the image as recorded; which it can
+    show.
 
     K of both views says how pixels were changed: x ~ K_now K_recorded^-1 x_recorded but for the lens.
     """
@@ -91,12 +98,16 @@ def straight_pixels(
 def _between(recorded: LensView, now: View) -> Float[Tensor, "3 3"]:
     """K_recorded K_now^-1."""
     if not isinstance(now, LensView):
-        raise ValueError("which pixels were recorded views without K do not say: give them one (`with_pixels`)")
+        raise ValueError(
+            "which pixels were recorded views without K do not say: give them one (`with_pixels`)"
+        )
     return product(recorded.K.double(), torch.linalg.inv(now.K.double()))
 
 
 def with_pixels(rig: Rig) -> Rig:
-    """The rig whose views all have a K, the identity if they are not calibrated: it follows every change of pixels."""
+    """The rig whose views all have a K, the identity if they are not calibrated: it follows every change of
+    pixels.
+    """
     for name, view in rig.cameras.items():
         if not isinstance(view, LensView):
             eye = torch.eye(3, dtype=torch.float64)
@@ -112,14 +123,17 @@ def resampled(
     interpolation: Interpolation = "bicubic",
     extended: bool = False,
 ) -> Sampled:
-    """The image that `target`, co-located with `source`, would have recorded: values (1, C, H, W) and validity.
+    """The image that `target`, co-located with `source`, would have recorded: values (1, C, H, W) and
+    validity.
 
-    Where `source` sees nothing values are 0, or if `extended` those of its nearest pixel; they are not valid. The
-    baseline between the two is ignored; uncalibrated views count as having the same orientation.
+    Where `source` sees nothing values are 0, or if `extended` those of its nearest pixel; they are not valid.
+    The baseline between the two is ignored; uncalibrated views count as having the same orientation.
     """
 
     def part(x: Tensor) -> Sampled:
-        return sampled_between(image, source, pixels_between(source, target, x), interpolation, extended=extended)
+        return sampled_between(
+            image, source, pixels_between(source, target, x), interpolation, extended=extended
+        )
 
     return Sampled(*_by_rows(part, target.hw, axis=-2))
 

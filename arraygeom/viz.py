@@ -1,7 +1,7 @@
 """Drawings of rigs, fields and residuals. Functions give back a figure and show nothing.
 
-Matplotlib figures are made without pyplot, so there is no global state: `figure.savefig("rig.png")`, or leave the
-figure as the last line of a notebook's cell. Matplotlib is imported when something is drawn.
+Matplotlib figures are made without pyplot, so there is no global state: `figure.savefig("rig.png")`, or leave
+the figure as the last line of a notebook's cell. Matplotlib is imported when something is drawn.
 """
 
 from __future__ import annotations
@@ -33,14 +33,15 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8
 """Okabe and Ito's, which colour-blind readers can tell apart."""
 
 
-# The rig in space ---------------------------------------------------------------------------------------------
+# The rig in space
+# ---------------------------------------------------------------------------------------------
 
 
 def draw_rig(rig: Rig, *, alpha: str | None = None) -> Figure:
     """The rig in three dimensions: each camera's frustum and name, and alpha's view from near to far.
 
-    `alpha` is the camera whose depth range is drawn (the first calibrated one; the range is left out where it would
-    dwarf the rig, beyond 6 times its extent, or is infinite). Up in the figure is -y of the world.
+    `alpha` is the camera whose depth range is drawn (the first calibrated one; the range is left out where it
+    would dwarf the rig, beyond 6 times its extent, or is infinite). Up in the figure is -y of the world.
     """
     cameras = calibrated(rig)
     figure = new_figure(figsize=(5.2, 4.6), layout="constrained")
@@ -115,8 +116,8 @@ def image_border(hw: HW) -> Float[Tensor, "n 2"]:
 def seen_at(camera: Camera, x: Float[Tensor, "n 2"], depth: float) -> np.ndarray:
     """World points of pixels at a depth; NaN where the lens has no ray.
 
-    Pixels outside the lens model's range are moved towards the middle until they are inside, and rays more than 53
-    degrees off axis are cut at 1 / 0.6 of the depth: a fisheye's border would be at infinity.
+    Pixels outside the lens model's range are moved towards the middle until they are inside, and rays more
+    than 53 degrees off axis are cut at 1 / 0.6 of the depth: a fisheye's border would be at infinity.
     """
     camera = camera.to(torch.float64)
     middle = x.mean(0)
@@ -128,7 +129,8 @@ def seen_at(camera: Camera, x: Float[Tensor, "n 2"], depth: float) -> np.ndarray
     return numpy(torch.where(valid.any(0)[:, None], points, torch.nan))
 
 
-# Receptive fields ------------------------------------------------------------------------------------------------
+# Receptive fields
+# ------------------------------------------------------------------------------------------------
 
 
 def draw_fields(
@@ -175,18 +177,22 @@ def draw_sampling_locations(axes: Axes, field: ReceptiveField, pair: Pair, x: Fl
             axes.scatter(*numpy(found.xy[i][found.mask[i]]).T, color=colour, s=1.5, linewidths=0)
 
 
-# How well it fits ---------------------------------------------------------------------------------------------
+# How well it fits
+# ---------------------------------------------------------------------------------------------
 
 
 class NearLine(NamedTuple):
-    """The part of an epipolar line (a curve, through a lens) around a point of beta, and the point's distance."""
+    """The part of an epipolar line (a curve, through a lens) around a point of beta, and the point's
+    distance.
+    """
 
     curve: Float[Tensor, "n p 2"]
     distance: Float[Tensor, " n"]
 
 
 def near_line(pair: Pair, x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], half: float) -> NearLine:
-    """The lines of alpha's points x where they pass y, `half` pixels to either side. Pixels of the images as recorded.
+    """The lines of alpha's points x where they pass y, `half` pixels to either side. Pixels of the images as
+    recorded.
 
     Distances are from the nearest point of the line. NaN where a lens has no ray.
     """
@@ -197,7 +203,9 @@ def near_line(pair: Pair, x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], half
     along = torch.stack([-line[:, 1], line[:, 0]], -1)
     points = nearest[:, None] + torch.linspace(-half, half, 65).double()[:, None] * direction(along)[:, None]
     curve, valid = pair.beta.distort(points)
-    return NearLine(torch.where(valid[..., None], curve, torch.nan), (pair.beta.distort(nearest)[0] - y).norm(dim=-1))
+    return NearLine(
+        torch.where(valid[..., None], curve, torch.nan), (pair.beta.distort(nearest)[0] - y).norm(dim=-1)
+    )
 
 
 def draw_matches(
@@ -206,11 +214,12 @@ def draw_matches(
     matches: Mapping[str, tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2"]]],
     images: Mapping[str, Any],
 ) -> Figure:
-    """Patches around points matched between alpha and each beta, spread over alpha's image, and the lines they miss.
+    """Patches around points matched between alpha and each beta, spread over alpha's image, and the lines
+    they miss.
 
-    Above, alpha's patch, 18 pixels to either side of the point; below, beta's around the match, with the line that
-    the rig gives to alpha's point and the distance in pixels. `matches` holds points (x, y) of alpha and of the beta,
-    by beta, found in the images: they are on their lines only if the rig is right.
+    Above, alpha's patch, 18 pixels to either side of the point; below, beta's around the match, with the line
+    that the rig gives to alpha's point and the distance in pixels. `matches` holds points (x, y) of alpha and
+    of the beta, by beta, found in the images: they are on their lines only if the rig is right.
     """
     count, half = 7, 18
     figure = new_figure(figsize=(1.55 * count, 3.7 * len(matches)), layout="constrained")
@@ -230,7 +239,8 @@ def draw_matches(
             below.set_title(f"{float(near.distance[i]):.2f} px off", fontsize=9)
         median = float(near.distance.nanmedian())
         part.suptitle(
-            f"{alpha} (above) and {name} (below): {len(x)} matched points, {median:.2f} px from their lines (median)",
+            f"{alpha} (above) and {name} (below): {len(x)} matched points, {median:.2f} px from their lines "
+            "(median)",
             fontsize=10,
         )
     return figure
@@ -264,8 +274,8 @@ def draw_residuals(
 ) -> Figure:
     """Measured matches against the geometry: distances from beta's points to their epipolar lines.
 
-    Left, each distance drawn across its line and enlarged so that the median is 2 % of the width; right, their
-    histogram, with the median. Pixels of undistorted images.
+    Left, each distance drawn across its line and enlarged so that the median is 2 % of the width; right,
+    their histogram, with the median. Pixels of undistorted images.
     """
     with needs("plots", "drawing"):
         from matplotlib.collections import LineCollection
@@ -280,7 +290,11 @@ def draw_residuals(
     show_image(axes, pair.beta.hw, image)
     limit = max(float(size.quantile(0.95)), 1e-9)
     arrows = LineCollection(
-        list(np.stack([numpy(x_beta), ends], 1)), array=numpy(size), cmap="viridis", clim=(0, limit), linewidths=1.3
+        list(np.stack([numpy(x_beta), ends], 1)),
+        array=numpy(size),
+        cmap="viridis",
+        clim=(0, limit),
+        linewidths=1.3,
     )
     axes.add_collection(arrows)
     axes.set_title(f"distance to the epipolar line, {magnify:g} times as long", fontsize=9)
@@ -292,7 +306,8 @@ def draw_residuals(
     return figure
 
 
-# Shared -------------------------------------------------------------------------------------------------------
+# Shared
+# -------------------------------------------------------------------------------------------------------
 
 
 def new_figure(**options: Any) -> Figure:
@@ -309,7 +324,9 @@ def show_image(axes: Axes, hw: HW, image: Any = None) -> None:
         pixels = np.asarray(image.detach().cpu() if isinstance(image, Tensor) else image)
         pixels = pixels.transpose(1, 2, 0) if pixels.ndim == 3 and pixels.shape[0] in (1, 3) else pixels
         white = 1.0 if np.issubdtype(pixels.dtype, np.floating) else np.iinfo(pixels.dtype).max
-        axes.imshow(np.squeeze(pixels), cmap="gray", vmin=0, vmax=white, interpolation="antialiased", aspect="equal")
+        axes.imshow(
+            np.squeeze(pixels), cmap="gray", vmin=0, vmax=white, interpolation="antialiased", aspect="equal"
+        )
     axes.set(xlim=(-0.5, w - 0.5), ylim=(h - 0.5, -0.5), aspect="equal", xticks=[], yticks=[])
     axes.set_facecolor("0.94")
 

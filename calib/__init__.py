@@ -1,7 +1,8 @@
 """Calibration of camera rigs.
 
-`calib.boards` calibrates a rig from images of a calibration board; `calib.images` finds mistakes in a rig, refines it,
-or makes an uncalibrated one, from ordinary images. `calib.images` may use `calib.boards`, not the reverse.
+`calib.boards` calibrates a rig from images of a calibration board; `calib.images` finds mistakes in a rig,
+refines it, or makes an uncalibrated one, from ordinary images. `calib.images` may use `calib.boards`, not the
+reverse.
 """
 
 from collections.abc import Callable, Mapping
@@ -10,7 +11,9 @@ from typing import Any
 
 
 def _lazy(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """A package's `__getattr__` that imports functions from modules on first use: OpenCV and matplotlib load slowly."""
+    """A package's `__getattr__` that imports functions from modules on first use: OpenCV and matplotlib load
+    slowly.
+    """
 
     def get(name: str) -> Any:
         if name not in modules:

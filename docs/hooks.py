@@ -1,7 +1,8 @@
 """What the site's pages take from elsewhere.
 
-In place of a link titled "included", alone in its line, the file or notebook it leads to; in place of the comments
-`<!-- commands -->` and `<!-- formats -->` what is made of the code. On a code host the link is a link.
+In place of a link titled "included", alone in its line, the file or notebook it leads to; in place of the
+comments `<!-- commands -->` and `<!-- formats -->` what is made of the code. On a code host the link is a
+link.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ MISSING = "*(not made yet)*"
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Fill in what a page asks for."""
-    markdown = re.sub(r'(?m)^\[[^]]*\]\((?:\.\./)+(\S+) "included"\)$', lambda found: included(found[1]), markdown)
+    markdown = re.sub(
+        r'(?m)^\[[^]]*\]\((?:\.\./)+(\S+) "included"\)$', lambda found: included(found[1]), markdown
+    )
     for name, made in (("commands", commands), ("formats", formats)):
         if f"<!-- {name} -->" in markdown:
             markdown = markdown.replace(f"<!-- {name} -->", made())
@@ -68,7 +71,9 @@ def commands() -> str:
     """Every command with what its --help says."""
     from pat.cli.main import command_paths
 
-    return "\n".join(f"## pat {' '.join(path)}\n\n```text\n{help_of(path)}\n```\n" for path in command_paths())
+    return "\n".join(
+        f"## pat {' '.join(path)}\n\n```text\n{help_of(path)}\n```\n" for path in command_paths()
+    )
 
 
 def help_of(path: tuple[str, ...]) -> str:
@@ -88,6 +93,10 @@ def formats() -> str:
     from arraygeom.io import READERS, WRITERS
 
     rows = [
-        f"| `{n}` | {r.CONVENTION} | {'yes' if n in WRITERS else ''} |" for n, r in READERS.items() if n != "native"
+        f"| `{n}` | {r.CONVENTION} | {'yes' if n in WRITERS else ''} |"
+        for n, r in READERS.items()
+        if n != "native"
     ]
-    return "\n".join(["| name | its convention, and what is done about it | written |", "|---|---|---|", *rows])
+    return "\n".join(
+        ["| name | its convention, and what is done about it | written |", "|---|---|---|", *rows]
+    )

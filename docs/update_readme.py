@@ -31,12 +31,16 @@ class Readme:
             text = with_block(text, name, without_images(Path(file).read_text()))
         if self.image:
             image = read_image(self.image[0])[None]
-            write_image(self.image[1], interpolate(image, scale_factor=0.75, mode="bicubic", antialias=True)[0])
+            write_image(
+                self.image[1], interpolate(image, scale_factor=0.75, mode="bicubic", antialias=True)[0]
+            )
         write_text(self.document, text)
 
 
 def with_block(text: str, name: str, content: str) -> str:
-    """The text with the block of that name replaced. Raises ValueError if its marks are not there once, in order."""
+    """The text with the block of that name replaced. Raises ValueError if its marks are not there once, in
+    order.
+    """
     begin, end = (f"<!-- {name}:{which} -->" for which in ("begin", "end"))
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
         raise ValueError(f"the document needs one {begin} and, after it, one {end}")

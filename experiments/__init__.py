@@ -1,7 +1,8 @@
-"""The paper's four demonstrations, each a folder: the rig (`rig.yaml`), how it records, and the expected figures.
+"""The paper's four demonstrations, each a folder: the rig (`rig.yaml`), how it records, and the expected
+figures.
 
-`python -m experiments systems list` names them, `... systems run NAME` renders a scene for the rig, records it, fuses
-it and compares with the ground truth. Beside the package, not in it.
+`python -m experiments systems list` names them, `... systems run NAME` renders a scene for the rig, records
+it, fuses it and compares with the ground truth. Beside the package, not in it.
 """
 
 from .system import NAMES, ArraySystem, SystemResult, load_system, run_system

@@ -1,4 +1,6 @@
-"""`python -m experiments COMMAND ...`: the paper's four arrays, fusion of real images, tables of the documentation."""
+"""`python -m experiments COMMAND ...`: the paper's four arrays, fusion of real images, tables of the
+documentation.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ from .evaluation import commands
 
 @dataclass
 class Showcase:
-    """Fuse real images: stereo pairs, calibrated pairs that are not rectified, the paper's fast + slow array."""
+    """Fuse real images: stereo pairs, calibrated pairs that are not rectified, the paper's fast + slow
+    array.
+    """
 
     data: Path
     """Folder with kitti, middlebury, flickr1024, syntim and hfr_lfr."""
@@ -36,7 +40,9 @@ class Showcase:
 
 @dataclass
 class Alignment:
-    """Measure how well bands are aligned, beside a homography: stereo pairs as bands, multispectral cameras."""
+    """Measure how well bands are aligned, beside a homography: stereo pairs as bands, multispectral
+    cameras.
+    """
 
     data: Path = Path("data")
     """Folder with middlebury, multispectral and nine_band_array."""
@@ -53,7 +59,9 @@ class Alignment:
 
         writable(self.out, folder=True)
         with working("aligning") as retitle:
-            text = evaluate_alignment(self.data, self.out, self.scenes, min_confidence=self.confidence, each=retitle)
+            text = evaluate_alignment(
+                self.data, self.out, self.scenes, min_confidence=self.confidence, each=retitle
+            )
         print(text, end="")
         say(f"written: {self.out / 'alignment.md'}, and figures")
 
@@ -82,16 +90,22 @@ class SystemsRun:
     full: bool = False
     """At the full size of the paper's cameras; by default reduced, minutes on two cores."""
     scene: Literal["layered", "rendered"] = "layered"
-    """Photographs on planes; or a still life (a landscape for visible-nir) rendered with Blender, as one sees it."""
+    """Photographs on planes; or a still life (a landscape for visible-nir) rendered with Blender, as one sees
+    it.
+    """
     photos: MaybePath = None
-    """Folder of photographs for the layers' surfaces; by default patterns and images that scikit-image ships."""
+    """Folder of photographs for the layers' surfaces; by default patterns and images that scikit-image ships.
+    """
     recording: MaybePath = None
-    """For fast-slow: the paper's own frames in place of a rendered scene, a folder with pillow_1 and the matrices."""
+    """For fast-slow: the paper's own frames in place of a rendered scene, a folder with pillow_1 and the
+    matrices.
+    """
     out: MaybeOut = None
     """Folder for the results; by default out/systems/NAME."""
     weights: Weights = "mono-colour"
     max_memory: Memory = None
-    """Memory limit of fusing, such as 4GiB; a single frame is then fused in a process of its own, measured."""
+    """Memory limit of fusing, such as 4GiB; a single frame is then fused in a process of its own, measured.
+    """
 
     def run(self) -> None:
         """Print the scores, and the expected ones where they are of the same settings."""

@@ -1,8 +1,9 @@
-"""How well bands are aligned: beside a homography, on stereo pairs as bands and on real multispectral cameras.
+"""How well bands are aligned: beside a homography, on stereo pairs as bands and on real multispectral
+cameras.
 
-A patch counts around a corner of alpha's image that the alignment says the beta sees (with true disparity: and whose
-patch it does see), if it can be located: its best match within some pixels of where the alignment, or the homography,
-puts it is like it. It is well aligned if that match is within half a pixel.
+A patch counts around a corner of alpha's image that the alignment says the beta sees (with true disparity:
+and whose patch it does see), if it can be located: its best match within some pixels of where the alignment,
+or the homography, puts it is like it. It is well aligned if that match is within half a pixel.
 The homography is OpenCV's ECC on gradients, coarse to fine, of images without their lenses, as the makers of
 multispectral cameras align their bands.
 """
@@ -56,20 +57,21 @@ SCALE = np.diag([2.0, 2.0, 1.0])
 BOARD = "chessboard:11x8:30mm"
 CAMERAS = 9
 ONE_BOARD = 0.1
-"""How uncertain a lens is that was calibrated by one board in a quarter of the picture, in units of `--sigma`; a round
-number: .5 gives the same patches to a percent, a drift's .02 too few."""
+"""How uncertain a lens is that was calibrated by one board in a quarter of the picture, in units of
+`--sigma`; a round number: .5 gives the same patches to a percent, a drift's .02 too few."""
 WIDEST = 0.15
 """Largest disparity in the scene of nine bands that is searched, as a share of the width."""
 
 
 class AlignmentRow(NamedTuple):
-    """One beta of one scene. Shares of: corners (truly visible ones) that the alignment sees; of those, patches that
-    can be located; of those, patches within half a pixel of their best match by the alignment, and by the homography;
-    with the truth, patches within half a pixel of their best match if aligned by it, seen patches within half a pixel
-    of it, and occluded pixels wrongly filled.
+    """One beta of one scene. Shares of: corners (truly visible ones) that the alignment sees; of those,
+    patches that can be located; of those, patches within half a pixel of their best match by the alignment,
+    and by the homography; with the truth, patches within half a pixel of their best match if aligned by it,
+    seen patches within half a pixel of it, and occluded pixels wrongly filled.
 
-    median, median_homography: of the distances of patches from their best match, pixels (searched 5 along x and y).
-    off: largest difference of the values, in their own units, from samples of the recorded image, rounded as they are.
+    median, median_homography: of the distances of patches from their best match, pixels (searched 5 along x
+    and y). off: largest difference of the values, in their own units, from samples of the recorded image,
+    rounded as they are.
     """
 
     scene: str
@@ -92,7 +94,9 @@ MEDIANS = "median", "median_homography"
 
 
 class AlignmentScene(NamedTuple):
-    """What is aligned: a rig, developed images, recorded values, alpha, and alpha's true disparity if it is known."""
+    """What is aligned: a rig, developed images, recorded values, alpha, and alpha's true disparity if it is
+    known.
+    """
 
     name: str
     rig: Rig
@@ -112,7 +116,8 @@ def evaluate_alignment(
     min_confidence: float = LEAST_CONFIDENCE,
     each: Callable[[str], None] = lambda line: None,
 ) -> str:
-    """Align the scenes of these names (see `SCENES`) below `data`; write alignment.md and figures. Returns the text.
+    """Align the scenes of these names (see `SCENES`) below `data`; write alignment.md and figures. Returns
+    the text.
 
     Raises ValueError for a name that there is not, FileNotFoundError for missing images.
     """
@@ -206,7 +211,9 @@ def composites(scene: AlignmentScene, aligned: Aligned) -> dict[str, Float[Tenso
     for name in names:
         values, view = np.asarray(scene.recorded[name]), aligned[name]
         rigid = by_homography(scene, name, straight, pinhole)
-        planes = [resampled_values(values, plane, "bilinear")[0] for plane in (rigid, np.nan_to_num(view.positions))]
+        planes = [
+            resampled_values(values, plane, "bilinear")[0] for plane in (rigid, np.nan_to_num(view.positions))
+        ]
         scale = 0.95 / np.percentile(values[0], 99)
         found["by a homography"].append(planes[0] * scale)
         found["by pat align, white where not seen"].append(np.where(view.valid, planes[1] * scale, 1.0))
@@ -224,8 +231,9 @@ def composites(scene: AlignmentScene, aligned: Aligned) -> dict[str, Float[Tenso
 def local_offsets(
     own: NDArray[np.uint8], other: NDArray[np.uint8], x: NDArray[Any]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """How far the patch of `other` that is most like that of `own` at pixels x (n, 2) lies from there, and how much it
-    is: correlation squared, which does not depend on the sign of a band's contrast. The peak is found by a parabola.
+    """How far the patch of `other` that is most like that of `own` at pixels x (n, 2) lies from there, and
+    how much it is: correlation squared, which does not depend on the sign of a band's contrast. The peak is
+    found by a parabola.
     """
     offsets, like = np.full(len(x), np.inf), np.zeros(len(x))
     reach = PATCH + SEARCH
@@ -252,7 +260,9 @@ def _peak(found: NDArray[Any], best: Sequence[Any], axis: int) -> float:
 def by_homography(
     scene: AlignmentScene, name: str, straight: Rig, pinhole: Mapping[str, Tensor]
 ) -> Float[np.ndarray, "h w 2"]:
-    """Where alpha's recorded pixels are in a beta's recorded image by the homography of images without lenses."""
+    """Where alpha's recorded pixels are in a beta's recorded image by the homography of images without
+    lenses.
+    """
     alpha = scene.alpha
     own, other = (shown_band(pinhole[n].numpy()) for n in (alpha, name))
     H = torch.from_numpy(ecc_homography(own, other))
@@ -261,7 +271,8 @@ def by_homography(
 
 
 def ecc_homography(own: NDArray[np.uint8], other: NDArray[np.uint8]) -> Float[np.ndarray, "3 3"]:
-    """The homography from `own` to `other` by enhanced correlation (Evangelidis and Psarakis 2008) of gradients.
+    """The homography from `own` to `other` by enhanced correlation (Evangelidis and Psarakis 2008) of
+    gradients.
 
     It starts from a translation by phase correlation, or from none; no level may lower the correlation.
     """
@@ -296,8 +307,8 @@ def _gradients(image: NDArray[np.uint8], factor: float) -> NDArray[np.float32]:
 
 
 def occluded_pixels(truth: Disparity) -> Bool[np.ndarray, "h w"]:
-    """Pixels of the left image that the right one does not see, by the left one's true disparities: another of their
-    row, nearer by more than a pixel, falls on the same pixel."""
+    """Pixels of the left image that the right one does not see, by the left one's true disparities: another
+    of their row, nearer by more than a pixel, falls on the same pixel."""
     disparity, valid = truth.value.numpy(), truth.valid.numpy()
     h, w = disparity.shape
     nearest = np.zeros((h, w + 1))
@@ -314,7 +325,9 @@ def patch_mean(plane: NDArray[Any], x: NDArray[Any]) -> Float[np.ndarray, " n"]:
 
 
 def sampling_error(view: Any, values: NDArray[Any]) -> float:
-    """The largest difference of an aligned view's values from samples of what was recorded, rounded if they are."""
+    """The largest difference of an aligned view's values from samples of what was recorded, rounded if they
+    are.
+    """
     where = torch.from_numpy(view.positions[view.valid]).double()[None]
     taken = sample(torch.from_numpy(values.astype(np.float64))[None], where).values[0].numpy()
     if np.issubdtype(values.dtype, np.integer):
@@ -341,7 +354,16 @@ def alignment_markdown(rows: Sequence[AlignmentRow]) -> str:
         }
         scene, off = f"{len(mine)} stereo pairs", max(row.off for row in mine)
         lines.append(_line(mine[0]._replace(scene=scene, off=off, **means)))
-    columns = ["scene", "beta", "corners seen", "located", "within .5 px", "homography", "by the truth", "of the truth"]
+    columns = [
+        "scene",
+        "beta",
+        "corners seen",
+        "located",
+        "within .5 px",
+        "homography",
+        "by the truth",
+        "of the truth",
+    ]
     return markdown_table([*columns, "occluded, filled", "median px, both", "values off", "type"], lines)
 
 
@@ -352,11 +374,14 @@ def _line(row: AlignmentRow) -> list[str]:
     return [row.scene, row.beta, *shares, medians, f"{row.off:.1g}", row.dtype]
 
 
-# Scenes -------------------------------------------------------------------------------------------------------
+# Scenes
+# -------------------------------------------------------------------------------------------------------
 
 
 def middlebury_scenes(data: Path) -> Iterator[AlignmentScene]:
-    """Green of the left image and red and blue of the right one: three cameras of one band, of the report half."""
+    """Green of the left image and red and blue of the right one: three cameras of one band, of the report
+    half.
+    """
     for pair in of_half(middlebury_pairs(data / "middlebury"), "report"):
         if pair.disparity is not None and len(pair.left) == 3 and pair.left.shape == pair.right.shape:
             yield _as_bands(pair, pair.disparity)
@@ -386,7 +411,9 @@ def capture(name: str, pattern: str) -> Callable[[Path], Iterator[AlignmentScene
         array = array_from_images(files)
         files = {camera: files[camera] for camera in array.rig.names}
         recorded = RecordedFiles(array.recorded, files)
-        yield AlignmentScene(name, array.rig, array.images, recorded, array.alpha, array.match_levels, array.recorded)
+        yield AlignmentScene(
+            name, array.rig, array.images, recorded, array.alpha, array.match_levels, array.recorded
+        )
 
     return scenes
 
@@ -408,13 +435,15 @@ def nine_band_start(folder: Path) -> Rig:
 def nine_band_calibration(folder: Path, deviations: StartDeviations) -> Calibration:
     """The array of nine bands from its image of a board by each camera."""
     start, board = nine_band_start(folder), parse_board(BOARD)
-    views = collect_folder(folder / "calibration", board, patterns={name: f"{name}.png" for name in start.names}).views
+    views = collect_folder(
+        folder / "calibration", board, patterns={name: f"{name}.png" for name in start.names}
+    ).views
     return calibrate(views, board, start=start, deviations=deviations)
 
 
 def nine_band_scene(data: Path) -> Iterator[AlignmentScene]:
-    """The array of nine bands, calibrated by its one board, refined by the scene, lenses too, as `pat rig refine` does
-    it: the middle camera is alpha, the four beside it the betas."""
+    """The array of nine bands, calibrated by its one board, refined by the scene, lenses too, as `pat rig
+    refine` does it: the middle camera is alpha, the four beside it the betas."""
     folder, alpha = data / "nine_band_array", "Cam-4"
     rig = nine_band_calibration(folder, StartDeviations()).rig
     rig = Rig({name: rig[name] for name in (alpha, "Cam-1", "Cam-3", "Cam-5", "Cam-7")})

@@ -19,16 +19,19 @@ from pat.media.raw import light_of
 WHITE = 0.97
 """Values from here on count as saturated."""
 READ_NOISE = 1.5e-3
-"""Variance of the read noise over the shot noise at white, for weighting exposures: typical of machine vision."""
+"""Variance of the read noise over the shot noise at white, for weighting exposures: typical of machine
+vision.
+"""
 
 
 def merged(frame: Frame, rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]], alpha: str) -> Frame:
-    """The fused frame with brightness from all cameras, sRGB-encoded, above 1 where alpha's white is exceeded.
+    """The fused frame with brightness from all cameras, sRGB-encoded, above 1 where alpha's white is
+    exceeded.
 
-    Betas, one band each, are sampled at the frame's depth. Alpha's value is predicted as a weighted sum of the bands
-    that are not saturated, fitted where no camera is; it is averaged with alpha's own value by the noise and error of
-    each, and replaces it where alpha is saturated. `rig` has the exposures and gains. Raises ValueError if hardly a
-    point is within the range of all cameras.
+    Betas, one band each, are sampled at the frame's depth. Alpha's value is predicted as a weighted sum of
+    the bands that are not saturated, fitted where no camera is; it is averaged with alpha's own value by the
+    noise and error of each, and replaces it where alpha is saturated. `rig` has the exposures and gains.
+    Raises ValueError if hardly a point is within the range of all cameras.
     """
     own = linear_from_srgb(images[alpha])[0]
     names = [name for name in rig.betas(alpha) if name in images and images[name].shape[0] == 1]
@@ -79,7 +82,10 @@ def _predicted(
             error = math.hypot(error, MISPLACED)
             value = (weights[:, None, None] * bands[some]).sum(0).clamp(min=0)
             parts = zip(weights, [scale[i] for i in some], bands[some])
-            variance = sum((w / s) ** 2 * (b * s + READ_NOISE) for w, s, b in parts) + FULL_WELL * (error * value) ** 2
+            variance = (
+                sum((w / s) ** 2 * (b * s + READ_NOISE) for w, s, b in parts)
+                + FULL_WELL * (error * value) ** 2
+            )
             here = good[some].all(0) & noise.isinf()
             predicted, noise = torch.where(here, value, predicted), torch.where(here, variance, noise)
     return predicted, noise
@@ -107,7 +113,8 @@ class DynamicRange(NamedTuple):
 def usable_range(
     measured: Float[Tensor, "*n"], ground_truth: Float[Tensor, "*n"], *, within: float = 0.25
 ) -> DynamicRange:
-    """The widest run of half-stops of true light in which an image's median relative error is at most `within`.
+    """The widest run of half-stops of true light in which an image's median relative error is at most
+    `within`.
 
     Raises ValueError if there is none.
     """
@@ -149,9 +156,12 @@ CLIPPED = 0.1
 
 
 def missed(image: Float[Tensor, "1 h w"], light: Float[Tensor, "1 h w"], *, within: float = 0.25) -> Tensor:
-    """A camera's image (3, H, W): red where it is clipped, and measures less of its light by more than that part; blue
-    where noise exceeds it."""
+    """A camera's image (3, H, W): red where it is clipped, and measures less of its light by more than that
+    part; blue where noise exceeds it."""
     value = linear_from_srgb(image)
     wrong, clipped = (value - light).abs() > within * light, (value < light) & (value > CLIPPED)
-    red, blue = image.new_tensor([0.9, 0.1, 0.1])[:, None, None], image.new_tensor([0.15, 0.35, 0.95])[:, None, None]
+    red, blue = (
+        image.new_tensor([0.9, 0.1, 0.1])[:, None, None],
+        image.new_tensor([0.15, 0.35, 0.95])[:, None, None],
+    )
     return torch.where(wrong & clipped, red, torch.where(wrong, blue, image.expand(3, -1, -1)))

@@ -26,7 +26,9 @@ class RenderedScene:
     `moving` seconds are what its moving object takes, `duration` seconds are rendered, `seed` determines all.
     """
 
-    def __init__(self, rig: Rig, generator: str, seed: int, *, infrared: bool, moving: float, duration: float) -> None:
+    def __init__(
+        self, rig: Rig, generator: str, seed: int, *, infrared: bool, moving: float, duration: float
+    ) -> None:
         self.rig, self.alpha, self.seed = rig, rig.names[0], seed
         scene = SCENES[generator](seed, rig, moving=moving)
         pinholes = {n: c.replace(distortion=None) for n, c in rig.cameras.items() if isinstance(c, Camera)}
@@ -40,7 +42,9 @@ class RenderedScene:
         return purpose_generator(self.seed, purpose)
 
     def light(self, name: str, frame: int = 0) -> Float[Tensor, "1 3 h w"]:
-        """The linear light that a camera receives in a frame; more than 1 is brighter than paper in the window."""
+        """The linear light that a camera receives in a frame; more than 1 is brighter than paper in the
+        window.
+        """
         return self.frames[name][frame].rgb[None]
 
     def infrared(self, name: str) -> Float[Tensor, "1 1 h w"]:

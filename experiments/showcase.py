@@ -43,7 +43,8 @@ SCENE, FAST_FRAME, SLOW_FRAME = "pillow_1", "141", "4"
 
 
 def showcase(data: Path, out: Path, weights: str = "mono-colour", rates: Sequence[int] = (2, 4)) -> str:
-    """Fuse the images in `data`; write showcase.md, figures and rig files into `out`. Returns showcase.md's text.
+    """Fuse the images in `data`; write showcase.md, figures and rig files into `out`. Returns showcase.md's
+    text.
 
     Raises FileNotFoundError or ValueError naming what is missing, before any work where possible.
     """
@@ -51,28 +52,41 @@ def showcase(data: Path, out: Path, weights: str = "mono-colour", rates: Sequenc
         if not (data / folder).is_dir():
             raise FileNotFoundError(f"{data / folder}: no such folder: give the folder that holds {folder}")
     network = load_weights(weights)
-    scenes, array = [syntim_scene(data / "syntim", name) for name in SYNTIM], fast_and_slow_array(data / "hfr_lfr")
-    parts = (_pairs(network, data, out, rates), _syntim(network, scenes, out), _fast_and_slow(network, array, out))
+    scenes, array = (
+        [syntim_scene(data / "syntim", name) for name in SYNTIM],
+        fast_and_slow_array(data / "hfr_lfr"),
+    )
+    parts = (
+        _pairs(network, data, out, rates),
+        _syntim(network, scenes, out),
+        _fast_and_slow(network, array, out),
+    )
     text = "\n".join(parts)
     write_text(out / "showcase.md", text)
     return text
 
 
 def _pairs(network: FusionNetwork, data: Path, out: Path, rates: Sequence[int]) -> str:
-    methods = {name: BASELINES[name] for name in ("alpha", "classical")} | {"fusion": rectified_fusion(network)}
+    methods = {name: BASELINES[name] for name in ("alpha", "classical")} | {
+        "fusion": rectified_fusion(network)
+    }
     sets = {name: of_half(DATA_SETS[name](data / name), "report") for name in PAIRS}
     rows = evaluate_sets(sets, methods, rates, out=out / "pairs")
     return (
         "### Stereo pairs\n\n"
-        "The left image made grey is alpha, the right one reduced is beta, the left one in colour is the ground\n"
-        "truth. PSNR in dB / SSIM; behind a mean, its 95% bootstrap interval. Pairs on which settings were chosen are\n"
+        "The left image made grey is alpha, the right one reduced is beta, the left one in colour is the "
+        "ground\n"
+        "truth. PSNR in dB / SSIM; behind a mean, its 95% bootstrap interval. Pairs on which settings were "
+        "chosen are\n"
         "left out (`experiments/evaluation/halves.yaml`). Every image is in `pairs/`: beta\n"
         f"enlarged, alpha, classical, fusion, ground truth.\n\n{sets_markdown(rows, depth=False)}"
     )
 
 
 class SyntimScene(NamedTuple):
-    """A calibrated pair, left and right, with the depth range of the points that both see, and its images in colour."""
+    """A calibrated pair, left and right, with the depth range of the points that both see, and its images in
+    colour.
+    """
 
     name: str
     rig: Rig
@@ -93,8 +107,10 @@ def _syntim(network: FusionNetwork, scenes: Sequence[SyntimScene], out: Path) ->
     figures = "".join(f"![{scene.name}](syntim_{scene.name}.png)\n" for scene in scenes)
     return (
         "### Calibrated pairs, not rectified (SYNTIM)\n\n"
-        "Two cameras rotated against each other, K, R and t as published; the depth range is that of matched points,\n"
-        "widened. Alpha is the left image made grey. The rigs are `syntim_SCENE.yaml`. Between the images of\n"
+        "Two cameras rotated against each other, K, R and t as published; the depth range is that of "
+        "matched points,\n"
+        "widened. Alpha is the left image made grey. The rigs are `syntim_SCENE.yaml`. Between the images "
+        "of\n"
         "Serfaty two binders were moved: their misplaced colour comes from that.\n\n"
         f"{markdown(rows)}\n{structure_kept(rows)}\n\n{figures}"
     )
@@ -111,7 +127,11 @@ def _fused_scene(network: FusionNetwork, scene: SyntimScene, out: Path) -> list[
         "fusion": frame.image.clamp(0, 1),
     }
     shown = {"alpha: left, grey": images["left"], "beta: right": right, "ground truth: left": left}
-    shown |= {"classical": results["classical"], "fusion": results["fusion"], "depth": colour_depth(frame.depth)}
+    shown |= {
+        "classical": results["classical"],
+        "fusion": results["fusion"],
+        "depth": colour_depth(frame.depth),
+    }
     save_panels(shown, out / f"syntim_{name}.png", columns=3)
     rig.save(out / f"syntim_{name}.yaml")
     return [StereoRow(name, 1, method, *score(image, left)) for method, image in results.items()]
@@ -125,7 +145,9 @@ def _syntim_image(folder: Path, scene: str, side: int) -> Tensor:
 
 
 class FastSlowArray(NamedTuple):
-    """The fast + slow array at one instant: rig, images, the link fitted to each pair, and a table of the fits."""
+    """The fast + slow array at one instant: rig, images, the link fitted to each pair, and a table of the
+    fits.
+    """
 
     rig: Rig
     images: dict[str, Tensor]
@@ -149,11 +171,16 @@ def _fast_and_slow(network: FusionNetwork, array: FastSlowArray, out: Path) -> s
     array.rig.save(out / "fast_slow.yaml")
     return (
         "### The paper's fast + slow array\n\n"
-        "Alpha is a frame of the fast camera; the slow ones have filters: 600 nm is shown as red, 550 nm as green,\n"
-        "450 nm as blue. Only fundamental matrices are published. They put points seen in both images some pixels\n"
-        "beside their lines, so F is fitted to those points, and with it a rough homography H and the displacement\n"
-        "along the line. All that is in `fast_slow.yaml`. Values are taken to be linear, alpha's brightest 0.5% are\n"
-        "brought to white, all are sRGB-encoded, and each beta is normalised to alpha's mean and standard deviation:\n"
+        "Alpha is a frame of the fast camera; the slow ones have filters: 600 nm is shown as red, 550 nm as "
+        "green,\n"
+        "450 nm as blue. Only fundamental matrices are published. They put points seen in both images some "
+        "pixels\n"
+        "beside their lines, so F is fitted to those points, and with it a rough homography H and the "
+        "displacement\n"
+        "along the line. All that is in `fast_slow.yaml`. Values are taken to be linear, alpha's brightest "
+        "0.5% are\n"
+        "brought to white, all are sRGB-encoded, and each beta is normalised to alpha's mean and standard "
+        "deviation:\n"
         "so colours are in proportion to a grey world, not measured. There is no ground truth.\n\n"
         f"{array.table}\n"
         f"Search segments: +-{array.displacement:.0f} pixels of alpha.\n\n![fast + slow](fast_slow.png)\n"
@@ -174,23 +201,36 @@ def fast_and_slow_array(folder: Path) -> FastSlowArray:
         matches = match_points(images[FAST], images[name])
         fits[name] = fit = fit_link(matches, F)
         off = [float(line_distance(near_lines(matches, F, within=6), G).median()) for G in (F, fit.link.F)]
-        rows.append((name, len(fit.matches.alpha), f"{off[0]:.2f}", f"{off[1]:.2f}", f"+-{fit.displacement:.0f}"))
+        rows.append(
+            (name, len(fit.matches.alpha), f"{off[0]:.2f}", f"{off[1]:.2f}", f"+-{fit.displacement:.0f}")
+        )
     links = {(FAST, name): fit.link for name, fit in fits.items()}
     views = {name: View(hw=(image.shape[1], image.shape[2])) for name, image in images.items()}
-    return FastSlowArray(Rig(views, links=links, name="fast + slow"), images, fits, markdown_table(columns, rows))
+    return FastSlowArray(
+        Rig(views, links=links, name="fast + slow"), images, fits, markdown_table(columns, rows)
+    )
 
 
 def published_matrices(file: Path) -> dict[str, Float[Tensor, "3 3"]]:
-    """F of the fast camera and each slow one, in our pixels; the file counts from 1. Raises ValueError naming it."""
+    """F of the fast camera and each slow one, in our pixels; the file counts from 1. Raises ValueError naming
+    it.
+    """
     try:
         matrices = json.loads(file.read_text())["pillow"]
-        return {name: shift_origin(torch.tensor(matrices[key], dtype=torch.float64), 1.0) for name, key in SLOW.items()}
+        return {
+            name: shift_origin(torch.tensor(matrices[key], dtype=torch.float64), 1.0)
+            for name, key in SLOW.items()
+        }
     except (KeyError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{file}: wanted 3x3 matrices {', '.join(SLOW.values())} under 'pillow' ({error!r})") from None
+        raise ValueError(
+            f"{file}: wanted 3x3 matrices {', '.join(SLOW.values())} under 'pillow' ({error!r})"
+        ) from None
 
 
 def transformed(array: FastSlowArray) -> Float[Tensor, "3 h w"]:
-    """The slow images at alpha's view by their rough homographies, as red, green and blue normalised to alpha."""
+    """The slow images at alpha's view by their rough homographies, as red, green and blue normalised to
+    alpha.
+    """
     alpha = array.images[FAST]
     x = pixel_grid((alpha.shape[1], alpha.shape[2]))
     bands = []

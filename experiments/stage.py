@@ -35,11 +35,19 @@ def purpose_generator(seed: int, purpose: str) -> Generator:
 class SystemScene(LayeredScenes):
     """A scene in front of a rig's alpha, between two depths in metres.
 
-    Textures are the images of a folder, or patterns and the images that scikit-image ships; `seed` determines all.
+    Textures are the images of a folder, or patterns and the images that scikit-image ships; `seed` determines
+    all.
     """
 
     def __init__(
-        self, rig: Rig, alpha: str, *, depths: tuple[float, float], layers: int, photos: Path | None, seed: int
+        self,
+        rig: Rig,
+        alpha: str,
+        *,
+        depths: tuple[float, float],
+        layers: int,
+        photos: Path | None,
+        seed: int,
     ) -> None:
         self.rig, self.alpha, self.seed = rig, alpha, seed
         bank = PhotoBank.load(photos, seed=seed) if photos else sample_photographs(count=10, seed=seed)
@@ -87,7 +95,11 @@ class SystemScene(LayeredScenes):
 
     def mixed(self, weights: Float[Tensor, "l 4"]) -> Layers:
         """The scene in grey: for each layer weights of its texture's red, green and blue, and a constant."""
-        grey = (weights[None, :, None, :3].to(self.scene.colour) @ self.scene.colour).expand(-1, -1, 3, -1).clone()
+        grey = (
+            (weights[None, :, None, :3].to(self.scene.colour) @ self.scene.colour)
+            .expand(-1, -1, 3, -1)
+            .clone()
+        )
         grey[..., 3] += weights[None, :, None, 3].to(grey)
         return dataclasses.replace(self.scene, colour=grey)
 
@@ -95,7 +107,9 @@ class SystemScene(LayeredScenes):
         """The scene with one layer moved, metres in alpha's frame."""
         planes, moving = self.scene.plane_from_world, torch.zeros_like(self.scene.plane_from_world.t)
         moving[:, layer] = step.to(moving)
-        return dataclasses.replace(self.scene, plane_from_world=Pose(planes.R, planes.t - matvec(planes.R, moving)))
+        return dataclasses.replace(
+            self.scene, plane_from_world=Pose(planes.R, planes.t - matvec(planes.R, moving))
+        )
 
     def shares(self) -> Float[Tensor, " l"]:
         """The part of alpha's image that each layer covers."""

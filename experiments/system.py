@@ -61,7 +61,9 @@ class SystemRecording:
     @property
     def reference(self) -> dict[str, Tensor]:
         """All but the raw images, by name."""
-        ground_truth = {f"ground truth/{i:03d}": image.contiguous() for i, image in enumerate(self.ground_truth)}
+        ground_truth = {
+            f"ground truth/{i:03d}": image.contiguous() for i, image in enumerate(self.ground_truth)
+        }
         return ground_truth | {f"light/{name}": image.contiguous() for name, image in self.light.items()}
 
     @classmethod
@@ -69,7 +71,9 @@ class SystemRecording:
         """The recording of a `reference`, without the raw images."""
         kinds = {name.partition("/")[::2]: tensor for name, tensor in reference.items()}
         ground_truth = [kinds[key] for key in sorted(kinds) if key[0] == "ground truth"]
-        return cls({}, ground_truth, {name: tensor for (kind, name), tensor in kinds.items() if kind == "light"})
+        return cls(
+            {}, ground_truth, {name: tensor for (kind, name), tensor in kinds.items() if kind == "light"}
+        )
 
 
 @dataclass(frozen=True)
@@ -135,8 +139,8 @@ def run_system(
     """Render, record, fuse and compare; inputs, images, figure.png and scores.md go to `out`.
 
     At `full` size, or at `scale` times the reduced one, which is minutes on two cores; half of it is seconds.
-    `scene` is layered photographs, or a believable one rendered with Blender. `photos` is a folder of images for the
-    layers' textures; without, patterns and scikit-image's images are used.
+    `scene` is layered photographs, or a believable one rendered with Blender. `photos` is a folder of images
+    for the layers' textures; without, patterns and scikit-image's images are used.
     """
     system = load_system(name)
     rig = system.sized(full, scale=scale)
@@ -172,7 +176,9 @@ def recorded(
     photos: Path | None,
     say: Callable[[str], None],
 ) -> tuple[SystemRecording, dict[str, list[Path]]]:
-    """The recording of the system's scene, and its files; rendered unless it was before with the same settings."""
+    """The recording of the system's scene, and its files; rendered unless it was before with the same
+    settings.
+    """
     module, cache = system.module, out / "recorded.safetensors"
     key = f"{system.name}, {scene}, seed {module.SEED}, textures {photos or 'our own'}\n{rig_text(rig)}"
     if cache.is_file():
@@ -180,7 +186,10 @@ def recorded(
             if file.metadata()["key"] == key:
                 say(f"using the recording in {out}")
                 counts = json.loads(file.metadata()["counts"])
-                return SystemRecording.of({name: file.get_tensor(name) for name in file.keys()}), _files(out, counts)  # noqa: SIM118
+                names = file.keys()  # not a mapping: it cannot be iterated
+                return SystemRecording.of({name: file.get_tensor(name) for name in names}), _files(
+                    out, counts
+                )
     say(f"rendering and recording {', '.join(f'{n} {rig[n].hw[1]}x{rig[n].hw[0]}' for n in rig.names)}")
     cache.unlink(missing_ok=True)
     recording = module.record_scene(_stage(system, rig, scene, photos))
@@ -202,7 +211,9 @@ def _stage(system: ArraySystem, rig: Rig, scene: SceneKind, photos: Path | None)
     frames, rate = getattr(module, "FRAMES", 1), rig[system.alpha].sensor.frame_rate or 1.0
     duration = 0.0 if frames == 1 else frames / rate
     moving, infrared = getattr(module, "MOVING", 0.0), "nir" in rig.names
-    return RenderedScene(rig, module.GENERATOR, module.SEED, infrared=infrared, moving=moving, duration=duration)
+    return RenderedScene(
+        rig, module.GENERATOR, module.SEED, infrared=infrared, moving=moving, duration=duration
+    )
 
 
 def _files(out: Path, counts: Mapping[str, int]) -> dict[str, list[Path]]:
@@ -253,13 +264,20 @@ def _still(job: SystemRun) -> tuple[list[str], Panels]:
     white = 1.0 if not recording.light else float(ground_truth.max())
     panels = {f"{n}{' (alpha)' if n == alpha else ''}": images[n] for n in rig.names}
     panels |= {
-        f"{n}: clipped red, noisy blue": missed(images[n], recording.light[n]) for n in rig.names if recording.light
+        f"{n}: clipped red, noisy blue": missed(images[n], recording.light[n])
+        for n in rig.names
+        if recording.light
     }
     compared = {"ground truth": ground_truth, **{n: p for n, p in rows.items() if n != "alpha alone"}}
     shown = tone_curve(ground_truth) if recording.light else torch.Tensor.clone
     panels |= {name: shown(image) for name, image in compared.items()}
     panels |= {"depth (red is near)": colour_depth(frame.depth), "confidence": frame.confidence[None]}
-    return [*_table(rows, ground_truth, white), *_confidence_line(frame, ground_truth), *extra, *memory], panels
+    return [
+        *_table(rows, ground_truth, white),
+        *_confidence_line(frame, ground_truth),
+        *extra,
+        *memory,
+    ], panels
 
 
 def fused_apart(job: SystemRun, files: Mapping[str, Path]) -> tuple[Frame, list[str]]:
@@ -267,7 +285,16 @@ def fused_apart(job: SystemRun, files: Mapping[str, Path]) -> tuple[Frame, list[
     images = [text for name, path in files.items() for text in ("--image", f"{name}={path}")]
     out, rig = job.out, job.out / "inputs" / "rig.yaml"
     command = [sys.executable, "-m", "pat", "fuse", "--rig", str(rig), "--alpha", job.system.alpha, *images]
-    command += ["--out", str(out), "--bits", "16", "--weights", job.weights, "--max-memory", str(job.max_memory)]
+    command += [
+        "--out",
+        str(out),
+        "--bits",
+        "16",
+        "--weights",
+        job.weights,
+        "--max-memory",
+        str(job.max_memory),
+    ]
     begin, planned = time.monotonic(), ""
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     most = watch_peak(process.pid)
@@ -313,14 +340,21 @@ def _sequence(job: SystemRun) -> tuple[list[str], Panels]:
     lines = [*_sequence_table(methods, ground_truth, greys), *_confidence_line(fused[2], ground_truth[2])]
     i = next(i for i in range(len(fused)) if i not in colours)
     first = next(name for name in rig.betas(alpha))
-    panels = {f"alpha, frame {i}": greys[i], f"beta {first}": frames[first][0], "ground truth": ground_truth[i]}
+    panels = {
+        f"alpha, frame {i}": greys[i],
+        f"beta {first}": frames[first][0],
+        "ground truth": ground_truth[i],
+    }
     panels |= {n: p[i] for n, p in methods.items() if n != "alpha alone"}
     panels |= {"confidence": fused[i].confidence[None], "confidence, frame alone": alone[i].confidence[None]}
     return lines, panels
 
 
 def _images(fusion: SequenceFusion, i: int) -> dict[str, Tensor]:
-    return {fusion.alpha: fusion.grey(i), **{n: fusion.frames[n][j] for n, j in fusion.timeline.at(i).items()}}
+    return {
+        fusion.alpha: fusion.grey(i),
+        **{n: fusion.frames[n][j] for n, j in fusion.timeline.at(i).items()},
+    }
 
 
 def _table(rows: Mapping[str, Tensor], ground_truth: Tensor, white: float) -> list[str]:
@@ -329,7 +363,9 @@ def _table(rows: Mapping[str, Tensor], ground_truth: Tensor, white: float) -> li
     return markdown_table(["", "PSNR, dB", "SSIM"], cells).splitlines()
 
 
-def _sequence_table(methods: Mapping[str, list[Tensor]], ground_truth: list[Tensor], greys: list[Tensor]) -> list[str]:
+def _sequence_table(
+    methods: Mapping[str, list[Tensor]], ground_truth: list[Tensor], greys: list[Tensor]
+) -> list[str]:
     rows = []
     for name, images in methods.items():
         scores = [score(p.clamp(0, 1), t) for p, t in zip(images, ground_truth)]
@@ -339,7 +375,8 @@ def _sequence_table(methods: Mapping[str, list[Tensor]], ground_truth: list[Tens
     rows.append(("ground truth", "", "", "", f"{1000 * flicker(ground_truth, greys):.2f}"))
     table = markdown_table(["", "PSNR, dB", "lowest", "SSIM", "flicker x 1000"], rows)
     return [
-        "Means over the frames; flicker is the mean change of chroma from frame to frame where nothing moves.",
+        "Means over the frames; flicker is the mean change of chroma from frame to frame where nothing "
+        "moves.",
         "",
         *table.splitlines(),
     ]
@@ -355,7 +392,10 @@ def _confidence_line(frame: Frame, ground_truth: Tensor) -> list[str]:
     order = frame.confidence.flatten().argsort()
     quarter = len(order) // 4
     high, low = (float((off[part] > WRONG).float().mean()) for part in (order[-quarter:], order[:quarter]))
-    return ["", f"Wrong colours: {high:.1%} of the quarter where confidence is highest, {low:.1%} where lowest."]
+    return [
+        "",
+        f"Wrong colours: {high:.1%} of the quarter where confidence is highest, {low:.1%} where lowest.",
+    ]
 
 
 def _ranges(
@@ -372,8 +412,12 @@ def _ranges(
     return ["", *markdown_table(columns, rows).splitlines()]
 
 
-def _permuted(network: FusionNetwork, rig: Rig, images: Mapping[str, Tensor], alpha: str, frame: Frame) -> list[str]:
-    """How far a fusion with the betas in another order differs from the same fusion with its bands reordered."""
+def _permuted(
+    network: FusionNetwork, rig: Rig, images: Mapping[str, Tensor], alpha: str, frame: Frame
+) -> list[str]:
+    """How far a fusion with the betas in another order differs from the same fusion with its bands
+    reordered.
+    """
     betas = rig.betas(alpha)
     order = [2, 0, 1]
     permuted = rig.replace(cameras={n: rig[n] for n in (alpha, *(betas[i] for i in order))})
@@ -382,5 +426,6 @@ def _permuted(network: FusionNetwork, rig: Rig, images: Mapping[str, Tensor], al
     before = score(other.clamp(0, 1), frame.image.clamp(0, 1)).psnr
     return [
         "",
-        f"Betas in another order: the bands follow to {same:.1f} dB (against the former order: {before:.1f} dB).",
+        f"Betas in another order: the bands follow to {same:.1f} dB (against the former order: {before:.1f} "
+        "dB).",
     ]

@@ -1,7 +1,7 @@
 """The physics-aware transformer: one image from an array of unlike cameras.
 
-The front door: `fuse`, its result `Frame`, `align`, its result `Aligned`, `load_weights` and `read_image`. Nothing is
-imported before it is used.
+The front door: `fuse`, its result `Frame`, `align`, its result `Aligned`, `load_weights` and `read_image`.
+Nothing is imported before it is used.
 """
 
 from __future__ import annotations

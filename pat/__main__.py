@@ -8,8 +8,9 @@ import sys
 def main() -> None:
     """Run `pat`; an interruption while it is still being imported is one line, too.
 
-    Torch's threads sleep while they wait: spinning, they took the cores from each other and from other processes.
-    Cycles of objects are sought a hundred times less often: there are few, and imports alone took .4 s for them.
+    Torch's threads sleep while they wait: spinning, they took the cores from each other and from other
+    processes. Cycles of objects are sought a hundred times less often: there are few, and imports alone took
+    .4 s for them.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     gc.set_threshold(70_000, 20)

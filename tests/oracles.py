@@ -12,5 +12,7 @@ class Oracle:
         self._module = module
 
     def __getattr__(self, name: str) -> Any:
-        found = pytest.importorskip(self._module, reason=f"compares with {self._module}, which is not installed")
+        found = pytest.importorskip(
+            self._module, reason=f"compares with {self._module}, which is not installed"
+        )
         return getattr(found, name)

@@ -12,7 +12,17 @@ import pytest
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
-NEEDED = ("torch", "kornia", "numpy", "PyYAML", "jaxtyping", "filelock", "pytest", "pytest-timeout", "hypothesis")
+NEEDED = (
+    "torch",
+    "kornia",
+    "numpy",
+    "PyYAML",
+    "jaxtyping",
+    "filelock",
+    "pytest",
+    "pytest-timeout",
+    "hypothesis",
+)
 
 
 def with_requirements(names):
@@ -38,19 +48,35 @@ def link_packages(folder):
 
 def test_its_own_distribution_agrees_with_that_of_the_whole():
     """Version, bounds of what it needs, and packages: `make wheel` installs it alone."""
-    own, whole = (tomllib.loads((ROOT / path).read_text()) for path in ("arraygeom/pyproject.toml", "pyproject.toml"))
+    own, whole = (
+        tomllib.loads((ROOT / path).read_text()) for path in ("arraygeom/pyproject.toml", "pyproject.toml")
+    )
     assert own["project"]["version"] == whole["project"]["version"]
     assert set(own["project"]["dependencies"]) <= set(whole["project"]["dependencies"])
-    packages = {".".join(path.parent.relative_to(ROOT).parts) for path in (ROOT / "arraygeom").rglob("__init__.py")}
+    packages = {
+        ".".join(path.parent.relative_to(ROOT).parts) for path in (ROOT / "arraygeom").rglob("__init__.py")
+    }
     assert set(own["tool"]["setuptools"]["packages"]) == packages
 
 
 @pytest.mark.slow
 def test_the_tests_of_arraygeom_need_torch_kornia_numpy_yaml_and_jaxtyping(tmp_path):
     link_packages(tmp_path)
-    command = [sys.executable, "-S", "-m", "pytest", "-m", "not slow", "-p", "no:cacheprovider", "tests/arraygeom"]
+    command = [
+        sys.executable,
+        "-S",
+        "-m",
+        "pytest",
+        "-m",
+        "not slow",
+        "-p",
+        "no:cacheprovider",
+        "tests/arraygeom",
+    ]
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-4000:]
-    blocked = subprocess.run([sys.executable, "-S", "-c", "import numba"], env=environment, capture_output=True)
+    blocked = subprocess.run(
+        [sys.executable, "-S", "-c", "import numba"], env=environment, capture_output=True
+    )
     assert blocked.returncode != 0, "numba is there all the same"

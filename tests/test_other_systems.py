@@ -1,4 +1,6 @@
-"""What Windows has not (fcntl, resource, a process's pwd) is not needed to import the packages or to fuse images."""
+"""What Windows has not (fcntl, resource, a process's pwd) is not needed to import the packages or to fuse
+images.
+"""
 
 import os
 import subprocess

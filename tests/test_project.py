@@ -28,11 +28,34 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = {"bpy", "OpenEXR", "Imath", "triton", "jupyterlab"}
 """Modules that need not be installed."""
 
-SHAPED = {"Float", "Float32", "Float64", "Bool", "Int", "Int32", "Int64", "UInt8", "Integer", "Real", "Num", "Shaped"}
+SHAPED = {
+    "Float",
+    "Float32",
+    "Float64",
+    "Bool",
+    "Int",
+    "Int32",
+    "Int64",
+    "UInt8",
+    "Integer",
+    "Real",
+    "Num",
+    "Shaped",
+}
 
 READING_FILES = {
     *("open", "read_text", "read_bytes", "write_text", "write_bytes", "safe_load"),
-    *("imread", "imwrite", "FileStorage", "loadtxt", "savetxt", "genfromtxt", "loadmat", "fromfile", "tofile"),
+    *(
+        "imread",
+        "imwrite",
+        "FileStorage",
+        "loadtxt",
+        "savetxt",
+        "genfromtxt",
+        "loadmat",
+        "fromfile",
+        "tofile",
+    ),
 }
 
 
@@ -96,7 +119,9 @@ def blocks(document: str, language: str) -> list[str]:
 
 
 def test_arraygeom_knows_nothing_of_pat_and_calib():
-    assert {p.name: imports(p) & {"pat", "calib"} for p in sources("arraygeom") if imports(p) & {"pat", "calib"}} == {}
+    assert {
+        p.name: imports(p) & {"pat", "calib"} for p in sources("arraygeom") if imports(p) & {"pat", "calib"}
+    } == {}
 
 
 def test_calib_knows_nothing_of_pat():
@@ -131,7 +156,9 @@ def imported_modules(path: Path) -> set[str]:
 )
 def test_rooms_import_only_what_is_below_them(room, forbidden):
     """A network is known to the fusion by its protocol alone."""
-    crossing = {module_name(p): [m for m in imported_modules(p) if re.match(forbidden, m)] for p in sources(room)}
+    crossing = {
+        module_name(p): [m for m in imported_modules(p) if re.match(forbidden, m)] for p in sources(room)
+    }
     assert {name: found for name, found in crossing.items() if found} == {}
 
 
@@ -168,7 +195,9 @@ GEOMETRY_MAY_USE = {
 
 @each(sources("arraygeom"))
 def test_arraygeom_needs_few_packages(path):
-    assert imported_at_once(path) <= GEOMETRY_NEEDS - {"kornia"}, "kornia takes 0.4 s to import: import it where used"
+    assert imported_at_once(path) <= GEOMETRY_NEEDS - {"kornia"}, (
+        "kornia takes 0.4 s to import: import it where used"
+    )
     assert imports(path) <= GEOMETRY_NEEDS | GEOMETRY_MAY_USE.get(path.name, set())
 
 
@@ -176,7 +205,9 @@ def test_importing_arraygeom_and_fusion_is_light():
     code = "import sys, {}; print(*sorted(sys.modules))"
 
     def loaded(module: str) -> set[str]:
-        done = subprocess.run([sys.executable, "-c", code.format(module)], cwd=ROOT, capture_output=True, text=True)
+        done = subprocess.run(
+            [sys.executable, "-c", code.format(module)], cwd=ROOT, capture_output=True, text=True
+        )
         return set(done.stdout.split())
 
     assert not loaded("arraygeom") & {"kornia", "cv2", "scipy", "matplotlib"}
@@ -197,7 +228,11 @@ def test_extras_exist_that_messages_name():
     extras = PROJECT["optional-dependencies"]
     named = {n for p in sources(*PACKAGES) for n in re.findall(r'needs\("(\w+)", "', p.read_text())}
     named |= {
-        extra for texts in extras.values() for text in texts for extra in Requirement(text).extras if "pat" in text
+        extra
+        for texts in extras.values()
+        for text in texts
+        for extra in Requirement(text).extras
+        if "pat" in text
     }
     assert {"video", "plots", "calibration"} <= named <= set(extras)
 

@@ -8,7 +8,9 @@ LISTED = Path(__file__).with_name("public_names.txt")
 
 
 def public(path: Path) -> list[str]:
-    """What a module offers: its `__all__`, else what it defines without an underscore; not what it imports."""
+    """What a module offers: its `__all__`, else what it defines without an underscore; not what it
+    imports.
+    """
     tree = ast.parse(path.read_text())
     names: list[str] = []
     for node in tree.body:
@@ -22,7 +24,9 @@ def public(path: Path) -> list[str]:
 
 
 def every_name() -> list[str]:
-    paths = sorted(p for package in ("arraygeom", "pat", "calib") for p in (ROOT / package).rglob("__init__.py"))
+    paths = sorted(
+        p for package in ("arraygeom", "pat", "calib") for p in (ROOT / package).rglob("__init__.py")
+    )
     modules = {".".join(p.relative_to(ROOT).parent.parts): public(p) for p in paths}
     return sorted(f"{module}.{name}" for module, names in modules.items() for name in names)
 

@@ -101,9 +101,28 @@ def test_annotations_stay_as_they_are_written():
 
 def test_axes_are_compared_as_jaxtyping_compares_them():
     """Types of arrays of every kind, each with a few of many values, in calls of two arguments."""
-    words = ("n", "n m", "n 3", "*b n", "*b 3 n", "*b n n", "...", "... n", "_ n", "*b", "2 *b n", "", "n *_ m", "n _")
+    words = (
+        "n",
+        "n m",
+        "n 3",
+        "*b n",
+        "*b 3 n",
+        "*b n n",
+        "...",
+        "... n",
+        "_ n",
+        "*b",
+        "2 *b n",
+        "",
+        "n *_ m",
+        "n _",
+    )
     shapes = [shape for k in range(4) for shape in itertools.product((2, 3), repeat=k)]
-    values = [torch.zeros(shape) for shape in shapes] + [torch.zeros(2, 3, dtype=torch.int64), np.zeros((2, 3)), 1.0]
+    values = [torch.zeros(shape) for shape in shapes] + [
+        torch.zeros(2, 3, dtype=torch.int64),
+        np.zeros((2, 3)),
+        1.0,
+    ]
     pairs, rng = list(itertools.product(values, repeat=2)), random.Random(0)
     seen = set()
     for one, other in itertools.product(words, repeat=2):

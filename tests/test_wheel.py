@@ -1,4 +1,6 @@
-"""What is in the wheel is enough: `pat demo` runs from it in an empty folder. `make wheel` also installs it afresh."""
+"""What is in the wheel is enough: `pat demo` runs from it in an empty folder. `make wheel` also installs it
+afresh.
+"""
 
 import os
 import subprocess
@@ -29,4 +31,8 @@ def test_the_demo_runs_from_the_wheel(tmp_path):
     assert str(tmp_path / "installed") in printed.splitlines()[0]
     assert "fusion" in printed
     assert (empty / "here" / "fused.png").exists()
-    assert sorted(p.parent.name for p in (tmp_path / "installed").glob("*/py.typed")) == ["arraygeom", "calib", "pat"]
+    assert sorted(p.parent.name for p in (tmp_path / "installed").glob("*/py.typed")) == [
+        "arraygeom",
+        "calib",
+        "pat",
+    ]

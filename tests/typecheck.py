@@ -1,8 +1,8 @@
 """The checker of types and shapes that the tests put around every function, by jaxtyping's import hook.
 
-jaxtyping's own decorator checks arguments twice, binds each call by hand, and decorates inner functions anew whenever
-their outer one runs: it doubled the time of the tests. This one checks the same once, and leaves inner functions alone;
-axes that are numbers or names it compares itself, in a fifth of the time.
+jaxtyping's own decorator checks arguments twice, binds each call by hand, and decorates inner functions anew
+whenever their outer one runs: it doubled the time of the tests. This one checks the same once, and leaves
+inner functions alone; axes that are numbers or names it compares itself, in a fifth of the time.
 """
 
 from __future__ import annotations
@@ -18,19 +18,25 @@ import jaxtyping
 from beartype import BeartypeConf, beartype
 
 of_types = beartype(conf=BeartypeConf(is_pep484_tower=True, violation_type=TypeError))
-"""beartype, taking an int where a float is asked for, as PEP 484 does; as jaxtyping's, its errors are TypeErrors."""
+"""beartype, taking an int where a float is asked for, as PEP 484 does; as jaxtyping's, its errors are
+TypeErrors.
+"""
 WITH_ARGUMENTS = jaxtyping.jaxtyped
 """jaxtyping's own, which also knows axes named after arguments, as "h*{factor}"."""
 ARRAY = type(jaxtyping.Float[Any, ""])
 """The class of the types of arrays."""
 AS_JAXTYPING = ARRAY.__instancecheck_str__
-"""What is wrong with a value for such a type, in words; empty if nothing is. With axes as those of the call before."""
+"""What is wrong with a value for such a type, in words; empty if nothing is. With axes as those of the call
+before.
+"""
 ORDINARY = re.compile(r"\*?[A-Za-z_]\w*|\d+|\.\.\.")
 """An axis that is a name, a number, or any number of axes."""
 
 
 class Calls(threading.local):
-    """For each call that is being checked in a thread the sizes of its axes by name; None: jaxtyping knows them."""
+    """For each call that is being checked in a thread the sizes of its axes by name; None: jaxtyping knows
+    them.
+    """
 
     def __init__(self) -> None:
         self.sizes: list[dict[str, Any] | None] = []
@@ -58,7 +64,9 @@ def jaxtyped(fn: Any = None, *, typechecker: Any = None) -> Any:
 
 
 def checked(fn: Callable) -> Callable:
-    """The function with its arguments and its result checked: types, and the sizes of axes against each other."""
+    """The function with its arguments and its result checked: types, and the sizes of axes against each
+    other.
+    """
     if any("{" in str(hint) for hint in fn.__annotations__.values()):
         return with_axes(WITH_ARGUMENTS(fn, typechecker=of_types), ours=False)
     written = fn.__annotations__
@@ -108,13 +116,15 @@ def arrays_in(hint: Any) -> list[Any]:
 
 @functools.cache
 def axes_of(array: Any) -> tuple[list[str | int | None], int, Any] | None:
-    """The names (None: any size) and sizes of axes, the place of the one that stands for any number of them (-1: none),
-    and the same type with any axes. None for axes that are not `ORDINARY`."""
+    """The names (None: any size) and sizes of axes, the place of the one that stands for any number of them
+    (-1: none), and the same type with any axes. None for axes that are not `ORDINARY`."""
     words = array.dim_str.split()
     if not all(ORDINARY.fullmatch(word) for word in words):
         return None
     several = [i for i, word in enumerate(words) if word == "..." or word.startswith("*")]
-    axes = [int(w) if w.isdigit() else None if w == "..." or w.lstrip("*").startswith("_") else w for w in words]
+    axes = [
+        int(w) if w.isdigit() else None if w == "..." or w.lstrip("*").startswith("_") else w for w in words
+    ]
     return axes, several[0] if several else -1, array.dtype[array.array_type, "..."]
 
 

@@ -1,7 +1,7 @@
 """Receptive fields: the sampling locations in beta for the point that an alpha pixel sees.
 
-A field is anything that can be called with a `Pair` and alpha pixels x (*n, 2), and answers with `Segments` or
-`Positions` over *n. The families here are frozen dataclasses; a plain function serves as well:
+A field is anything that can be called with a `Pair` and alpha pixels x (*n, 2), and answers with `Segments`
+or `Positions` over *n. The families here are frozen dataclasses; a plain function serves as well:
 
 >>> import torch
 >>> from arraygeom import Segments
@@ -19,7 +19,14 @@ from .explicit import Dense, Local, NearestVoxels
 from .moved import Moved
 from .protocol import ReceptiveField, SamplingLocations, lazily, sampling_locations
 from .ray_depth import ray_depth
-from .straight import Epipolar, EpipolarLine, HomographyDisplacement, Rectified, covering_displacement, pinhole_track
+from .straight import (
+    Epipolar,
+    EpipolarLine,
+    HomographyDisplacement,
+    Rectified,
+    covering_displacement,
+    pinhole_track,
+)
 from .widened import Widened
 
 __all__ = [

@@ -19,9 +19,9 @@ def approximated(pair: Pair, kind: Literal["homography", "similarity"] = "homogr
     """The pair with its exact F and the H that fits best to the middles of its depth-bounded segments.
 
     Least squares in pixels of beta, over the segments that beta's image holds of every 16th alpha pixel:
-    what the paper calls the homography-based approximation. `HomographyDisplacement()` on the result takes the
-    displacement that covers near to far. Differentiable. Raises ValueError for uncalibrated or batched pairs and
-    where beta sees nothing between the bounds.
+    what the paper calls the homography-based approximation. `HomographyDisplacement()` on the result takes
+    the displacement that covers near to far. Differentiable. Raises ValueError for uncalibrated or batched
+    pairs and where beta sees nothing between the bounds.
     """
     alpha, _ = pair.cameras
     if alpha.K.ndim > 2:
@@ -31,7 +31,9 @@ def approximated(pair: Pair, kind: Literal["homography", "similarity"] = "homogr
     seen = segments.valid
     needs_numbers("which pixels an approximation is fitted to", segments.start)
     if int(seen.sum()) < 4:
-        raise ValueError("beta sees next to nothing of alpha's image between near and far: nothing to fit a map to")
+        raise ValueError(
+            "beta sees next to nothing of alpha's image between near and far: nothing to fit a map to"
+        )
     fit = fit_homography if kind == "homography" else fit_similarity
     H = fit(x[seen], (0.5 * (segments.start + segments.end))[seen])
     return dataclasses.replace(pair, link=Link(pair.fundamental, H))

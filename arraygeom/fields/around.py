@@ -22,10 +22,11 @@ from .straight import pinhole_track, require_pinholes
 
 @dataclass(frozen=True, eq=False)
 class AroundDepth:
-    """The segment between depth / (1 + tolerance) and depth * (1 + tolerance) of a known depth map; needs calibration.
+    """The segment between depth / (1 + tolerance) and depth * (1 + tolerance) of a known depth map; needs
+    calibration.
 
-    `depth` (H, W) is z in metres at the pixels of `view`, alpha as it was recorded (None: the pair's alpha, without a
-    lens). Where it is not positive and finite, the segment is that between the pair's depth bounds.
+    `depth` (H, W) is z in metres at the pixels of `view`, alpha as it was recorded (None: the pair's alpha,
+    without a lens). Where it is not positive and finite, the segment is that between the pair's depth bounds.
     """
 
     depth: Float[Tensor, "h w"]
@@ -59,9 +60,10 @@ BESIDE = 1.0
 class AroundMatches:
     """The parts of another field's segments within `tolerance` pixels of known matches.
 
-    `positions` (H, W, 2) are where the pixels of alpha are in beta (x, y), NaN where it is not known; both as recorded,
-    by `views` (None: as the pair has them, without lenses). Where no match is known, or it is off its segment by more
-    than `tolerance` and a pixel, the segment is the whole one of `field` (default: the pair's default field).
+    `positions` (H, W, 2) are where the pixels of alpha are in beta (x, y), NaN where it is not known; both as
+    recorded, by `views` (None: as the pair has them, without lenses). Where no match is known, or it is off
+    its segment by more than `tolerance` and a pixel, the segment is the whole one of `field` (default: the
+    pair's default field).
     """
 
     positions: Float[Tensor, "h w 2"]
@@ -77,7 +79,9 @@ class AroundMatches:
 
     @classmethod
     def from_disparity(cls, disparity: Float[Tensor, "h w"], tolerance: float = 1.0) -> AroundMatches:
-        """Of a rectified pair with alpha on the left: the point at x is at x - disparity in beta; NaN if unknown."""
+        """Of a rectified pair with alpha on the left: the point at x is at x - disparity in beta; NaN if
+        unknown.
+        """
         grid = pixel_grid((disparity.shape[0], disparity.shape[1]), dtype=disparity.dtype)
         return cls(torch.stack([grid[..., 0] - disparity, grid[..., 1]], -1), tolerance)
 
@@ -91,7 +95,9 @@ class AroundMatches:
         views: tuple[LensView, LensView] | None = None,
         field: ReceptiveField | None = None,
     ) -> AroundMatches:
-        """Of points (x, y) of an alpha of size `hw` and the same points in beta; each is known in 3 x 3 pixels."""
+        """Of points (x, y) of an alpha of size `hw` and the same points in beta; each is known in 3 x 3
+        pixels.
+        """
         positions = torch.full((*hw, 2), torch.nan, dtype=torch.float32)
         column, row = alpha.round().long().unbind(-1)
         displacement = (beta - alpha).float()
@@ -108,7 +114,9 @@ class AroundMatches:
         x = floating(x)
         whole = (self.field or straight_field(pair))(pair, x)
         if not isinstance(whole, Segments):
-            raise ValueError("matches are parts of straight segments: give a field of segments, such as Epipolar")
+            raise ValueError(
+                "matches are parts of straight segments: give a field of segments, such as Epipolar"
+            )
         own, beta = self.views or (None, None)
         there = _at_nearest(self.positions, x, pair.alpha, own).to(x)
         known = there.isfinite().all(-1)
@@ -130,12 +138,14 @@ def _check_size(plane: Tensor, view: LensView | None) -> None:
     if view is not None and tuple(plane.shape[:2]) != tuple(view.hw):
         (h, w), (height, width) = plane.shape[:2], view.hw
         raise ValueError(
-            f"the known depth or matches have {w}x{h} pixels, alpha has {width}x{height}: give them at alpha's pixels"
+            f"the known depth or matches have {w}x{h} pixels, alpha has {width}x{height}: give them at "
+            "alpha's pixels"
         )
 
 
 def _at_nearest(plane: Tensor, x: Float[Tensor, "*n 2"], now: View, recorded: LensView | None) -> Tensor:
-    """The values (H, W, ...) of the recorded pixels nearest to pixels `x` of alpha as it is now; no gradients.
+    """The values (H, W, ...) of the recorded pixels nearest to pixels `x` of alpha as it is now; no
+    gradients.
 
     Between two pixels of different depth there is no depth: values are not interpolated.
     """

@@ -1,4 +1,5 @@
-"""The compiled loops of `Curved`: what its readable form in `curved.py` computes, in float64, a pixel at a time.
+"""The compiled loops of `Curved`: what its readable form in `curved.py` computes, in float64, a pixel at a
+time.
 
 Each in one thread and without Python's lock. Imported when first needed.
 """
@@ -23,8 +24,8 @@ SERIES = 1e-3
 def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, xy, mask):
     """Positions xy (n, samples, 2) and mask (n, samples) of alpha's pixels `begin` to `end`.
 
-    `first`, `last` (n, 3) and `valid` (n) are of the curve; `lens` is what `lens_of` makes; `even` are the fractions
-    of the nodes and `fractions` those of the samples.
+    `first`, `last` (n, 3) and `valid` (n) are of the curve; `lens` is what `lens_of` makes; `even` are the
+    fractions of the nodes and `fractions` those of the samples.
     """
     nodes, samples = len(even), len(fractions)
     s, x, y, seen = np.empty(nodes), np.empty(nodes), np.empty(nodes), np.empty(nodes, np.bool_)
@@ -53,7 +54,9 @@ def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, 
 
 @compiled(inline="always")
 def _shares(first, last, wide, u, s):
-    """What share of `last` there is in the points at fractions u: evenly in undistorted pixels, or in angle."""
+    """What share of `last` there is in the points at fractions u: evenly in undistorted pixels, or in
+    angle.
+    """
     if not wide:
         z0, z1 = first[2], last[2]
         for i in range(len(u)):
@@ -106,8 +109,8 @@ def _project(first, last, s, lens, x, y, seen):
 
 @compiled(inline="always")
 def _brown(c, limit, x, y, seen):
-    """Normalised points become distorted ones, and those that are not valid unseen; `distortion._brown_distort` without
-    a tilt."""
+    """Normalised points become distorted ones, and those that are not valid unseen;
+    `distortion._brown_distort` without a tilt."""
     farthest = 0.0
     for i in range(len(x)):
         farthest = max(farthest, x[i] * x[i] + y[i] * y[i])
@@ -126,7 +129,11 @@ def _brown(c, limit, x, y, seen):
         dg = (k1 + u * (2 * k2 + 3 * u * k3) - g * (k4 + u * (2 * k5 + 3 * u * k6))) * inverse
         x[i] = a * g + 2 * p1 * a * b + p2 * (u + 2 * a * a) + u * (s1 + s2 * u)
         y[i] = b * g + p1 * (u + 2 * b * b) + 2 * p2 * a * b + u * (s3 + s4 * u)
-        cross, prism_x, prism_y = 2 * (a * b * dg + p1 * a + p2 * b), 2 * (s1 + 2 * s2 * u), 2 * (s3 + 2 * s4 * u)
+        cross, prism_x, prism_y = (
+            2 * (a * b * dg + p1 * a + p2 * b),
+            2 * (s1 + 2 * s2 * u),
+            2 * (s3 + 2 * s4 * u),
+        )
         xx = g + 2 * a * a * dg + 2 * p1 * b + 6 * p2 * a + prism_x * a
         yy = g + 2 * b * b * dg + 6 * p1 * b + 2 * p2 * a + prism_y * b
         determinant = xx * yy - (cross + prism_x * b) * (cross + prism_y * a)
@@ -155,8 +162,8 @@ def _fisheye(c, limit, x, y, z):
 
 @compiled(inline="always")
 def _pieces(x, y, seen, hw, out):
-    """Of each piece between nodes from and to which fraction it is visible, its visible length, and the sum of the
-    lengths up to its end; gives the whole length. `curved.visible_pieces`."""
+    """Of each piece between nodes from and to which fraction it is visible, its visible length, and the sum
+    of the lengths up to its end; gives the whole length. `curved.visible_pieces`."""
     total = 0.0
     for i in range(out.shape[1]):
         low, high = 0.0, 1.0
@@ -172,7 +179,12 @@ def _pieces(x, y, seen, hw, out):
         if shown:
             length = math.sqrt((x[i + 1] - x[i]) ** 2 + (y[i + 1] - y[i]) ** 2 + 1e-6) * (high - low)
         total += length
-        out[0, i], out[1, i], out[2, i], out[3, i] = low if shown else 0.0, high if shown else 1.0, length, total
+        out[0, i], out[1, i], out[2, i], out[3, i] = (
+            low if shown else 0.0,
+            high if shown else 1.0,
+            length,
+            total,
+        )
     return total
 
 

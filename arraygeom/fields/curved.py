@@ -31,14 +31,16 @@ from .straight import Epipolar
 
 @dataclass(frozen=True)
 class Curved:
-    """Depth samples through the lens models: `samples` positions from near to far, evenly spaced in beta's pixels.
+    """Depth samples through the lens models: `samples` positions from near to far, evenly spaced in beta's
+    pixels.
 
-    Needs a calibrated pair; without lenses it is `Epipolar` sampled. The part of each ray that can be on beta's image
-    is clipped in closed form, followed at `nodes` points (even in undistorted pixels, or in angle where beta sees more
-    than 75 degrees off axis), and what is on the image is divided evenly. `near` and `far` (metres) override the
-    pair's own. Positions are exact for their depths; with a lens the spacing, and where an edge of the image cuts the
-    curve, are to the accuracy of straight pieces between nodes. What alpha sees at 90 degrees or more off axis has no
-    depth along the axis and no samples, unless the bounds are of the `distance` along the ray.
+    Needs a calibrated pair; without lenses it is `Epipolar` sampled. The part of each ray that can be on
+    beta's image is clipped in closed form, followed at `nodes` points (even in undistorted pixels, or in
+    angle where beta sees more than 75 degrees off axis), and what is on the image is divided evenly. `near`
+    and `far` (metres) override the pair's own. Positions are exact for their depths; with a lens the spacing,
+    and where an edge of the image cuts the curve, are to the accuracy of straight pieces between nodes. What
+    alpha sees at 90 degrees or more off axis has no depth along the axis and no samples, unless the bounds
+    are of the `distance` along the ray.
     """
 
     samples: int = 96
@@ -79,8 +81,8 @@ FEW = 16
 class ThroughLenses:
     """A straight field seen through lenses: for pairs known by F, or any field other than `Epipolar`.
 
-    The field is evaluated for the pair without its lenses (`pinhole_view`) and the result is distorted by beta's lens.
-    Segments are sampled at `samples` positions, evenly spaced before distortion.
+    The field is evaluated for the pair without its lenses (`pinhole_view`) and the result is distorted by
+    beta's lens. Segments are sampled at `samples` positions, evenly spaced before distortion.
     """
 
     field: ReceptiveField
@@ -91,7 +93,9 @@ class ThroughLenses:
         check_above(1, whole=True, samples=self.samples)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
-        """Positions (*n, samples, 2) in beta's own pixels. Raises ValueError for a batch of rigs with lenses."""
+        """Positions (*n, samples, 2) in beta's own pixels. Raises ValueError for a batch of rigs with
+        lenses.
+        """
         alpha, beta = (_Straight.of(view) for view in (pair.alpha, pair.beta))
         link = None if pair.link is None else pair.link.transformed(alpha.A, beta.A)
         straight = dataclasses.replace(pair, alpha=alpha.pinhole, beta=beta.pinhole, link=link)
@@ -105,7 +109,9 @@ class ThroughLenses:
 
 
 class _Straight(NamedTuple):
-    """A view, the same without its lens, and A which takes the undistorted pixels of the one to those of the other."""
+    """A view, the same without its lens, and A which takes the undistorted pixels of the one to those of the
+    other.
+    """
 
     view: View
     pinhole: View
@@ -130,8 +136,8 @@ class _Straight(NamedTuple):
 
 
 EDGE, ROUNDED = 0.25, 1e-3
-"""How far outside the image a sample that should be on its edge may fall, pixels; it is moved onto the edge. By the
-spacing of nodes, and by rounding alone."""
+"""How far outside the image a sample that should be on its edge may fall, pixels; it is moved onto the edge.
+By the spacing of nodes, and by rounding alone."""
 
 
 def _onto_edge(xy: Tensor, hw: HW, margin: float) -> tuple[Tensor, Tensor]:
@@ -142,14 +148,16 @@ def _onto_edge(xy: Tensor, hw: HW, margin: float) -> tuple[Tensor, Tensor]:
 
 
 WIDE = math.tan(math.radians(75))
-"""A lens whose image reaches further than this from the axis, in undistorted focal lengths, is followed by angle."""
+"""A lens whose image reaches further than this from the axis, in undistorted focal lengths, is followed by
+angle.
+"""
 
 
 class RayCurve(NamedTuple):
     """The points from `first` (towards near) to `last` in beta's frame, in units of their depth in alpha.
 
-    Fractions go evenly in undistorted pixels, or in angle if `wide`; in metres where beta's rays are parallel.
-    `inverse` are the inverse depths (or distances) of both ends.
+    Fractions go evenly in undistorted pixels, or in angle if `wide`; in metres where beta's rays are
+    parallel. `inverse` are the inverse depths (or distances) of both ends.
     """
 
     first: Float[Tensor, "*n 3"]
@@ -161,7 +169,9 @@ class RayCurve(NamedTuple):
 
     @classmethod
     def of(cls, pair: Pair, near: Tensor, far: Tensor, x: Tensor, bounds: str = "depth") -> RayCurve:
-        """The curves of alpha's pixels x (*n, 2) from near to far (metres), as far as beta's image may show them."""
+        """The curves of alpha's pixels x (*n, 2) from near to far (metres), as far as beta's image may show
+        them.
+        """
         pose = pair.beta_from_alpha.to(x.dtype)
         alpha, beta = (c.to(x.dtype) for c in pair.cameras)
         start, rays, ahead = _lines(alpha, x, bounds)
@@ -196,12 +206,16 @@ class RayCurve(NamedTuple):
 
     @property
     def compilable(self) -> bool:
-        """Whether a compiled loop can follow the curve: on the CPU, of one pair, and no gradient is asked for."""
+        """Whether a compiled loop can follow the curve: on the CPU, of one pair, and no gradient is asked
+        for.
+        """
         lens = self.beta.distortion
         numbers = [self.first, self.last, self.beta.K, *([] if lens is None else [lens.coefficients])]
         free = torch.is_grad_enabled() and any(t.requires_grad for t in numbers)
         known = lens is None or (
-            isinstance(lens, Distortion) and lens.model in COMPILED_LENSES and lens.coefficients.shape[-1] < 14
+            isinstance(lens, Distortion)
+            and lens.model in COMPILED_LENSES
+            and lens.coefficients.shape[-1] < 14
         )
         return not free and known and not self.beta.batch_shape and compilable(self.first)
 
@@ -224,7 +238,9 @@ class RayCurve(NamedTuple):
         )
 
     def at(self, fraction: Tensor) -> tuple[Tensor, Tensor]:
-        """Beta's pixels (*n, l, 2) at fractions (*n, l) of the way from first to last, and which it can see."""
+        """Beta's pixels (*n, l, 2) at fractions (*n, l) of the way from first to last, and which it can
+        see.
+        """
         weights = self._weights_in_angle(fraction) if self.wide else self._weights_in_pixels(fraction)
         s = (weights[1] / (weights[0] + weights[1]))[..., None]
         X = torch.lerp(self.first[..., None, :], self.last[..., None, :], s)
@@ -244,7 +260,9 @@ class RayCurve(NamedTuple):
         return torch.lerp(first, last, s)
 
     def _weights_in_pixels(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """How much of first and of last there is in the point whose pixel, without the lens, is a fraction u along."""
+        """How much of first and of last there is in the point whose pixel, without the lens, is a fraction u
+        along.
+        """
         lens = self.beta.distortion
         parallel = lens is not None and not lens.central and lens.even == "distance"
         ends = self.inverse if parallel else (self.first[..., 2], self.last[..., 2])
@@ -257,12 +275,16 @@ class RayCurve(NamedTuple):
         opens = squared > TINY
         sine = torch.where(opens, torch.where(opens, squared, 1.0).sqrt(), 0.0)
         angle = torch.atan2(sine, torch.where(opens, (self.first * self.last).sum(-1), 1.0))[..., None]
-        r0, r1 = (X.square().sum(-1, keepdim=True).clamp(min=FRONT**2).sqrt() for X in (self.first, self.last))
+        r0, r1 = (
+            X.square().sum(-1, keepdim=True).clamp(min=FRONT**2).sqrt() for X in (self.first, self.last)
+        )
         return (1 - u) * torch.sinc((1 - u) * angle / math.pi) * r1, u * torch.sinc(u * angle / math.pi) * r0
 
 
 REMOTE = 1e-5
-"""Inverse metres that count as infinity for a beta whose rays do not meet: there a point is not only a direction."""
+"""Inverse metres that count as infinity for a beta whose rays do not meet: there a point is not only a
+direction.
+"""
 
 
 def _lines(alpha: Camera, x: Tensor, bounds: str) -> tuple[Tensor | None, Tensor, Tensor]:
@@ -306,18 +328,23 @@ class LensNumbers(NamedTuple):
 
 
 TINY = 1e-24
-"""Two rays of which the squared sine, times their squared lengths, is smaller than this have one direction."""
+"""Two rays of which the squared sine, times their squared lengths, is smaller than this have one direction.
+"""
 
 
 def undistorted_limits(camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
-    """(x low, y low, x high, y high) of a lens's image in normalised undistorted points, (*b) each, 2 % wider.
+    """(x low, y low, x high, y high) of a lens's image in normalised undistorted points, (*b) each, 2 %
+    wider.
 
-    None if it reaches 75 degrees off axis, or over the range of its lens, and where numbers cannot decide (`traced`).
+    None if it reaches 75 degrees off axis, or over the range of its lens, and where numbers cannot decide
+    (`traced`).
     """
     h, w = camera.hw
     along = torch.linspace(0, 1, 17).to(camera.K)
     zero, one = torch.zeros_like(along), torch.ones_like(along)
-    edges = torch.cat([torch.stack(e, -1) for e in ((along, zero), (along, one), (zero, along), (one, along))])
+    edges = torch.cat(
+        [torch.stack(e, -1) for e in ((along, zero), (along, one), (zero, along), (one, along))]
+    )
     edges = (edges * edges.new_tensor([w, h]) - 0.5).reshape(*[1] * len(camera.batch_shape), -1, 2)
     rays, valid = camera.rays(edges)
     ahead = valid & (rays[..., 2] > 1e-3)
@@ -337,7 +364,9 @@ def _each(M: Tensor, v: Tensor) -> Tensor:
 
 
 class Pieces(NamedTuple):
-    """The visible part of each piece of a polyline of m + 1 nodes: from `first` to `last` (0..1), `length` pixels."""
+    """The visible part of each piece of a polyline of m + 1 nodes: from `first` to `last` (0..1), `length`
+    pixels.
+    """
 
     first: Float[Tensor, "*n m"]
     last: Float[Tensor, "*n m"]
@@ -347,8 +376,8 @@ class Pieces(NamedTuple):
 def visible_pieces(nodes: Float[Tensor, "*n k 2"], seen: Tensor, hw: HW, longest: float = math.inf) -> Pieces:
     """The parts of a polyline that lie on the image, of pieces with a node that is `seen` (*n, k).
 
-    Pieces of more than `longest` pixels are across a seam, and left out. A visible piece of no length counts as 1e-3
-    pixels, so that a curve that is a point is somewhere.
+    Pieces of more than `longest` pixels are across a seam, and left out. A visible piece of no length counts
+    as 1e-3 pixels, so that a curve that is a point is somewhere.
     """
     first, last = fractions_on_image(nodes[..., :-1, :], nodes[..., 1:, :], hw)
     seen = (seen[..., :-1] | seen[..., 1:]) & (first <= last)
@@ -361,7 +390,9 @@ def visible_pieces(nodes: Float[Tensor, "*n k 2"], seen: Tensor, hw: HW, longest
 
 
 def along_pieces(pieces: Pieces, u: Float[Tensor, "l"]) -> Float[Tensor, "*n l"]:
-    """Where on the whole polyline (0 at the first node, 1 at the last) fractions u of the visible length are."""
+    """Where on the whole polyline (0 at the first node, 1 at the last) fractions u of the visible length
+    are.
+    """
     first, last, length = pieces
     ends = length.cumsum(-1)
     wanted = u * ends[..., -1:]

@@ -1,4 +1,6 @@
-"""The default field of a pair, and fields by name: the one policy that fusion, drawings and refinement share."""
+"""The default field of a pair, and fields by name: the one policy that fusion, drawings and refinement
+share.
+"""
 
 from __future__ import annotations
 
@@ -58,11 +60,11 @@ ROW_SHARE = 0.12
 def default_field(pair: Pair) -> ReceptiveField:
     """The field for a pair, which is what fusion uses; through lenses where a view has one.
 
-    A pair with a link has `HomographyDisplacement`, also if it is calibrated: a link was measured between these very
-    images. A calibrated one has `Epipolar`, which raises ValueError if the pair has no depth range: a search of the
-    whole line is ambiguous and has to be asked for (`EpipolarLine`). A pair of which only the sizes are known counts as
-    rectified, with alpha on either side. With lenses these are `Curved`, or `ThroughLenses` of the field without them.
-    The bounds of `Curved` are those of `natural_bounds`.
+    A pair with a link has `HomographyDisplacement`, also if it is calibrated: a link was measured between
+    these very images. A calibrated one has `Epipolar`, which raises ValueError if the pair has no depth
+    range: a search of the whole line is ambiguous and has to be asked for (`EpipolarLine`). A pair of which
+    only the sizes are known counts as rectified, with alpha on either side. With lenses these are `Curved`,
+    or `ThroughLenses` of the field without them. The bounds of `Curved` are those of `natural_bounds`.
     """
     return _through_lenses(straight_field(pair), pair)
 
@@ -85,7 +87,9 @@ def _through_lenses(field: ReceptiveField, pair: Pair, samples: int = 96, nodes:
 
 
 def natural_bounds(pair: Pair) -> Literal["depth", "distance"]:
-    """Of what the depth range of a pair is: the distance along the ray where alpha sees 90 degrees off axis."""
+    """Of what the depth range of a pair is: the distance along the ray where alpha sees 90 degrees off
+    axis.
+    """
     alpha = pair.cameras[0]
     if alpha.distortion is None or not alpha.distortion.sees_behind or traced():
         return "depth"
@@ -96,7 +100,8 @@ def natural_bounds(pair: Pair) -> Literal["depth", "distance"]:
 def recorded_field(pair: Pair, *, samples: int = 256, nodes: int = 64) -> ReceptiveField:
     """`default_field`, and the whole line without a depth range.
 
-    Drawings use it, which need no depth range. `samples` and `nodes` are those of `Curved` and `ThroughLenses`.
+    Drawings use it, which need no depth range. `samples` and `nodes` are those of `Curved` and
+    `ThroughLenses`.
     """
     field = straight_field(pair)
     if isinstance(field, Epipolar) and pair.depth is None:

@@ -40,7 +40,9 @@ class NearestVoxels:
         check_above(0, whole=True, window=self.window)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
-        """Positions (*n, count, 2), in beta's pixels. Not differentiable: pixels are whole. Not for lenses."""
+        """Positions (*n, count, 2), in beta's pixels. Not differentiable: pixels are whole. Not for
+        lenses.
+        """
         require_straight(pair)
         x = floating(x)
         with torch.no_grad():
@@ -109,7 +111,9 @@ class NearestVoxels:
         crossing = -(along * u + line[:, 2:]) / torch.where(other == 0, 1.0, other)
         v = crossing.round()[..., None] + across
         u = u[..., None].expand_as(v)
-        return torch.where(steep[:, None, None, None], torch.stack([v, u], -1), torch.stack([u, v], -1)).flatten(1, 2)
+        return torch.where(
+            steep[:, None, None, None], torch.stack([v, u], -1), torch.stack([u, v], -1)
+        ).flatten(1, 2)
 
     def _window(self, centre: Tensor) -> Tensor:
         """All pixels (n, k, 2) of the windows."""
@@ -124,7 +128,9 @@ TIE = 1e-3
 
 @dataclass(frozen=True)
 class Local:
-    """A `size` x `size` window around H x, `spacing` pixels between samples; from H only (the CNN-like case)."""
+    """A `size` x `size` window around H x, `spacing` pixels between samples; from H only (the CNN-like
+    case).
+    """
 
     size: int = 5
     spacing: float = 1.0

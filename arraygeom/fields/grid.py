@@ -27,12 +27,13 @@ _CHUNK = 1 << 18
 
 @dataclass(frozen=True)
 class FieldOnGrid:
-    """The search segments of every pixel of alpha, in float64: 33 bytes a pixel, and 8 for its share of a block.
+    """The search segments of every pixel of alpha, in float64: 33 bytes a pixel, and 8 for its share of a
+    block.
 
-    Float32 would round positions by up to 3e-5 px, which is enough to change which of two equally good matches is
-    taken: 7e-4 in the fused image. Those of a large grid are stored as float32 (17 bytes) nevertheless, without blocks,
-    and cut to float64: the rounding is the same whatever the parts. Explicit positions stay lazy: `pixels`
-    is None then, and only `at` answers.
+    Float32 would round positions by up to 3e-5 px, which is enough to change which of two equally good
+    matches is taken: 7e-4 in the fused image. Those of a large grid are stored as float32 (17 bytes)
+    nevertheless, without blocks, and cut to float64: the rounding is the same whatever the parts. Explicit
+    positions stay lazy: `pixels` is None then, and only `at` answers.
 
     pixels: (B or 1, H, W), in beta's pixels.
     blocks: (B or 1, H / 2, W / 2), of the centres of blocks of 2 x 2 pixels; None if not asked for.
@@ -46,14 +47,19 @@ class FieldOnGrid:
     blocks: Segments | None = None
 
     @classmethod
-    def of(cls, field: ReceptiveField, pair: Pair, *, hw: HW | None = None, blocks: bool = True) -> FieldOnGrid:
-        """Evaluate the field of a pair on alpha's pixels, with about one sample a pixel of the longest segment.
+    def of(
+        cls, field: ReceptiveField, pair: Pair, *, hw: HW | None = None, blocks: bool = True
+    ) -> FieldOnGrid:
+        """Evaluate the field of a pair on alpha's pixels, with about one sample a pixel of the longest
+        segment.
 
-        `hw` is the size of the grid if it is not alpha's, as for images that are padded at the bottom and the right.
+        `hw` is the size of the grid if it is not alpha's, as for images that are padded at the bottom and the
+        right.
         """
         at, hw = lazily(field, pair), hw or pair.alpha.hw
         device = pair.cameras[0].K.device if pair.calibrated else None
-        # Explicit positions of a whole frame may not fit into memory: one point shows which kind the field gives.
+        # Explicit positions of a whole frame may not fit into memory: one point shows which kind the field
+        # gives.
         kind = at(torch.full((1, 2), 0.25, dtype=torch.float64, device=device))
         if isinstance(kind, Positions):
             return cls(at, kind.xy.shape[-2], None)
@@ -71,7 +77,8 @@ class FieldOnGrid:
         return replace(found, blocks=found.of_blocks(BLOCK))
 
     def of_blocks(self, side: int) -> Segments:
-        """The segments of the centres of blocks of `side` x `side` pixels of the grid, (B or 1, H / side, W / side).
+        """The segments of the centres of blocks of `side` x `side` pixels of the grid, (B or 1, H / side, W /
+        side).
 
         Raises ValueError for a field of explicit positions.
         """
@@ -81,7 +88,9 @@ class FieldOnGrid:
         return _on_grid(self.at, (h // side, w // side), side, self.straight.start.device)
 
     def displaced(self, step: Callable[[Segments, Tensor], Tensor]) -> FieldOnGrid:
-        """A straight field with its segments moved by a step that depends on them and on alpha's pixels (*n, 2)."""
+        """A straight field with its segments moved by a step that depends on them and on alpha's pixels (*n,
+        2).
+        """
 
         def moved(found: SamplingLocations, x: Tensor) -> Segments:
             assert isinstance(found, Segments)
@@ -100,7 +109,9 @@ class FieldOnGrid:
         return replace(self, at=lambda x: moved(self.at(x), x), pixels=grid(self.straight, 1), blocks=blocks)
 
     def any_valid(self, hw: HW) -> bool:
-        """Whether any of alpha's h x w pixels has somewhere to look in beta; every eighth row and column counts."""
+        """Whether any of alpha's h x w pixels has somewhere to look in beta; every eighth row and column
+        counts.
+        """
         h, w = hw
         if self.pixels is not None:
             return bool(self.pixels.valid[..., :h:8, :w:8].any())
@@ -117,7 +128,9 @@ class FieldOnGrid:
     def straight(self) -> Segments:
         """`pixels`. Raises ValueError for a field of explicit positions."""
         if self.pixels is None:
-            raise ValueError("this network samples straight segments: choose a straight field, or undistort the images")
+            raise ValueError(
+                "this network samples straight segments: choose a straight field, or undistort the images"
+            )
         return self.pixels
 
     @property
@@ -127,7 +140,9 @@ class FieldOnGrid:
         return sum(t.nbytes for part in parts for t in (part.start, part.end, part.valid))
 
     def cut(self, box: Box, shift: tuple[int, int] = (0, 0)) -> FieldOnGrid:
-        """The field of alpha's pixels in a box (of even sides), for a beta whose first pixel was at `shift` (x, y)."""
+        """The field of alpha's pixels in a box (of even sides), for a beta whose first pixel was at `shift`
+        (x, y).
+        """
         top, _, left, _ = box
 
         def at(x: Tensor) -> SamplingLocations:
@@ -160,7 +175,9 @@ def _on_grid(at: At, hw: HW, side: int = 1, device: torch.device | None = None) 
         found = at((torch.stack([x, y], -1).reshape(-1, 2) + 0.5) * side - 0.5)
         assert isinstance(found, Segments)
         ends = (end.reshape(-1, *y.shape[1:], 2) for end in (found.start, found.end))
-        return *(end.float() if h * w >= LARGE else end for end in ends), found.valid.reshape(-1, *y.shape[1:])
+        return *(end.float() if h * w >= LARGE else end for end in ends), found.valid.reshape(
+            -1, *y.shape[1:]
+        )
 
     x, y = pixel_coordinates(hw, dtype=torch.float64, device=device)
     return Segments(*chunked(segments, x[None], y[None], rows=max(_CHUNK // max(w, 1), 1), axis=1))

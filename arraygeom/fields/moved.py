@@ -19,9 +19,9 @@ from .protocol import ReceptiveField, SamplingLocations
 class Moved:
     """Any field, for cameras that are not synchronised, evaluated where alpha's pixels are when beta records.
 
-    `displacement` (2, H, W) says by how many pixels of alpha each of its pixels moves from alpha's exposure to
-    beta's, in x and y, for instance by optical flow between alpha's own frames. It is interpolated bilinearly, and
-    extended by the nearest pixel outside alpha's image. `Widened` allows for its error.
+    `displacement` (2, H, W) says by how many pixels of alpha each of its pixels moves from alpha's exposure
+    to beta's, in x and y, for instance by optical flow between alpha's own frames. It is interpolated
+    bilinearly, and extended by the nearest pixel outside alpha's image. `Widened` allows for its error.
     """
 
     field: ReceptiveField
@@ -30,7 +30,9 @@ class Moved:
     def __post_init__(self) -> None:
         check_field(self.field)
         if self.displacement.ndim != 3 or len(self.displacement) != 2:
-            raise ValueError(f"displacement has shape {tuple(self.displacement.shape)}; wanted (2, height, width)")
+            raise ValueError(
+                f"displacement has shape {tuple(self.displacement.shape)}; wanted (2, height, width)"
+            )
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
         """The field's sampling locations for the points where alpha's pixels x will be."""

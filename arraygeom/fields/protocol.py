@@ -26,11 +26,15 @@ class ReceptiveField(Protocol):
     """The search segment or sampling locations in beta of each alpha pixel."""
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
-        """Segments or positions in beta's pixels, for alpha's pixels x. Differentiable in the pair's numbers."""
+        """Segments or positions in beta's pixels, for alpha's pixels x. Differentiable in the pair's
+        numbers.
+        """
         ...
 
 
-def sampling_locations(field: ReceptiveField, pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> SamplingLocations:
+def sampling_locations(
+    field: ReceptiveField, pair: Pair, x: Real[Tensor, "*n 2"] | None = None
+) -> SamplingLocations:
     """The field over given pixels, or over alpha's whole image (H, W); a batch of rigs gives (*b, H, W).
 
     Raises TypeError for what is not a field, such as the class of one.
@@ -78,7 +82,9 @@ PIECE = 1 << 12
 
 
 def segments_by_rows(f: Callable[[Tensor], Segments], pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
-    """f over pixels, some rows of the first axis after the batch's at a time; f must answer for each pixel alone."""
+    """f over pixels, some rows of the first axis after the batch's at a time; f must answer for each pixel
+    alone.
+    """
     axis = len(pair.batch_shape)
     if x.ndim <= axis + 1:
         return f(x)

@@ -1,4 +1,6 @@
-"""From positions in beta back to depth, for any cameras: along the curve that the pair's rays have in beta."""
+"""From positions in beta back to depth, for any cameras: along the curve that the pair's rays have in
+beta.
+"""
 
 from __future__ import annotations
 
@@ -34,9 +36,9 @@ def ray_depth(
 ) -> Depth:
     """Depth of what alpha's pixels see at beta's, or distance along the ray, within the pair's depth range.
 
-    That of the nearest point of the curve on which beta sees the ray. `deviation` is the standard deviation of x_beta
-    along the curve in pixels (default 0); that of the depth is propagated to first order. Raises ValueError for pairs
-    that are not calibrated or have no depth range.
+    That of the nearest point of the curve on which beta sees the ray. `deviation` is the standard deviation
+    of x_beta along the curve in pixels (default 0); that of the depth is propagated to first order. Raises
+    ValueError for pairs that are not calibrated or have no depth range.
     """
     pair.cameras  # noqa: B018  (raises for an uncalibrated pair)
     near, far = pair.depth_range
@@ -65,7 +67,9 @@ def ray_depth(
 
 
 def _inverse_depth_per_pixel(curve: RayCurve, fraction: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:
-    """How much inverse depth a pixel of beta along the curve is worth, by differences over a part of the curve."""
+    """How much inverse depth a pixel of beta along the curve is worth, by differences over a part of the
+    curve.
+    """
     ends = torch.cat([(fraction + step).clamp(0, 1) for step in (-PART, PART)], -1)
     xy, _ = curve.at(ends)
     pixels = (xy[:, 1] - xy[:, 0]).norm(dim=-1)
@@ -73,7 +77,9 @@ def _inverse_depth_per_pixel(curve: RayCurve, fraction: Float[Tensor, "n 1"]) ->
 
 
 def rough_transfer(pair: Pair, x: Real[Tensor, "n 2"]) -> TransformedPoints:
-    """Pixels of alpha in beta, roughly: by the pair's homography, or the middle of the curves of other cameras."""
+    """Pixels of alpha in beta, roughly: by the pair's homography, or the middle of the curves of other
+    cameras.
+    """
     if pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view:
         return apply_homography(pair.homography.detach().to(x), x)
     with torch.no_grad():
@@ -81,7 +87,9 @@ def rough_transfer(pair: Pair, x: Real[Tensor, "n 2"]) -> TransformedPoints:
     return TransformedPoints(found.xy[:, 1], found.mask[:, 1])
 
 
-def _apart(curve: RayCurve, fraction: Float[Tensor, "n l"], x_beta: Float[Tensor, "n 2"]) -> Float[Tensor, "n l"]:
+def _apart(
+    curve: RayCurve, fraction: Float[Tensor, "n l"], x_beta: Float[Tensor, "n 2"]
+) -> Float[Tensor, "n l"]:
     """Squared pixels from positions to the points at fractions, infinite where beta does not see these."""
     xy, seen = curve.at(fraction)
     return torch.where(seen, (xy - x_beta[:, None].to(xy)).square().sum(-1), torch.inf)

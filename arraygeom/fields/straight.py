@@ -87,9 +87,10 @@ NEAREST = 1e-4
 class HomographyDisplacement:
     """The part of the epipolar line within +-`displacement` pixels of H x; from F and H, or from calibration.
 
-    The paper's homography-based field. For a calibrated pair H is that of the plane at the middle of the depth
-    range (`approximated` fits a better one), and `displacement=None` takes the smallest that covers near to far
-    at every pixel of alpha's image. With calibration, the start is towards near and the end towards far.
+    The paper's homography-based field. For a calibrated pair H is that of the plane at the middle of the
+    depth range (`approximated` fits a better one), and `displacement=None` takes the smallest that covers
+    near to far at every pixel of alpha's image. With calibration, the start is towards near and the end
+    towards far.
 
     Where there is no line (at the epipole, and without a baseline) the segment is the point H x.
     """
@@ -119,13 +120,16 @@ class HomographyDisplacement:
 
 
 def covering_displacement(pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> Float[Tensor, "*b"]:
-    """The displacement from H x that reaches both near and far for every pixel of x, pixels of beta; one for each rig.
+    """The displacement from H x that reaches both near and far for every pixel of x, pixels of beta; one for
+    each rig.
 
     Of depth-bounded segments as beta's image clips them; 0 if there are none. Without x: for all of alpha's
     pixels. Raises ValueError for an uncalibrated pair.
     """
     squared = _squared_reach(pair, _widest(pair) if x is None else floating(x))
-    largest = squared.flatten(len(pair.batch_shape)).amax(-1) if squared.ndim > len(pair.batch_shape) else squared
+    largest = (
+        squared.flatten(len(pair.batch_shape)).amax(-1) if squared.ndim > len(pair.batch_shape) else squared
+    )
     return torch.where(largest > 0, torch.where(largest > 0, largest, 1.0).sqrt(), 0.0)
 
 
@@ -139,7 +143,8 @@ def _squared_reach(pair: Pair, x: Tensor) -> Tensor:
 
 
 def _widest(pair: Pair) -> Tensor:
-    """The alpha pixel (*b, 1, 2) that needs the largest displacement: searched once a pair, and anew when it changes.
+    """The alpha pixel (*b, 1, 2) that needs the largest displacement: searched once a pair, and anew when it
+    changes.
 
     Nothing is kept of a trace, nor as a tensor of inference mode, which no gradient could use later.
     """
@@ -168,7 +173,8 @@ SIDES = Literal["left", "right", "either"]
 
 @dataclass(frozen=True)
 class Rectified:
-    """A horizontal run of up to `max_disparity` pixels of beta; from nothing but the two sizes (the PAM case).
+    """A horizontal run of up to `max_disparity` pixels of beta; from nothing but the two sizes (the PAM
+    case).
 
     Alpha is the "left" or the "right" camera of a rectified pair ("either": the run goes both ways). Without
     `max_disparity`, the whole row.
@@ -218,7 +224,8 @@ def require_straight(pair: Pair) -> None:
     """Raises ValueError if a view has a lens."""
     if pair.has_lens:
         raise ValueError(
-            "a straight field needs pinhole cameras: use Curved or ThroughLenses, or undistort the images first"
+            "a straight field needs pinhole cameras: use Curved or ThroughLenses, or undistort the images "
+            "first"
         )
 
 

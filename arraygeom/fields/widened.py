@@ -23,13 +23,13 @@ from .straight import Epipolar, EpipolarLine, HomographyDisplacement
 class Widened:
     """Any field with `across` pixels to either side of it and `along` more pixels at either end.
 
-    Uncertain calibration moves lines sideways: `across` alone. Motion between cameras that are not synchronised
-    moves points anywhere: `across` and `along`, or `for_motion`.
+    Uncertain calibration moves lines sideways: `across` alone. Motion between cameras that are not
+    synchronised moves points anywhere: `across` and `along`, or `for_motion`.
 
     Segments made longer stay segments. Made wider they become positions: `samples` along, on rows at most one
     pixel apart, the rows following one another (the first `across` to the left of the way from start to end).
-    Positions (of `Curved`) are taken as ordered along a curve; each is stretched and widened about its own tangent.
-    A segment of no length widens to a window with sides along x and y.
+    Positions (of `Curved`) are taken as ordered along a curve; each is stretched and widened about its own
+    tangent. A segment of no length widens to a window with sides along x and y.
     """
 
     field: ReceptiveField
@@ -56,12 +56,16 @@ class Widened:
         return self._band(found, pair.beta.hw)
 
     def _evaluated(self, pair: Pair, x: Tensor) -> SamplingLocations:
-        """The field about beta's image too, as far as it may be brought in; fields of sizes alone on the image."""
+        """The field about beta's image too, as far as it may be brought in; fields of sizes alone on the
+        image.
+        """
         margin = math.ceil(self.across + self.along)
         if margin == 0 or not _follows_beta(self.field, pair):
             return self.field(pair, x)
         h, w = pair.beta.hw
-        found = self.field(pair.transform_beta(shift_matrix(-margin, -margin), (h + 2 * margin, w + 2 * margin)), x)
+        found = self.field(
+            pair.transform_beta(shift_matrix(-margin, -margin), (h + 2 * margin, w + 2 * margin)), x
+        )
         if isinstance(found, Segments):
             return Segments(found.start - margin, found.end - margin, found.valid)
         return Positions(found.xy - margin, found.mask)
@@ -96,7 +100,9 @@ class Widened:
 
 
 def _follows_beta(field: ReceptiveField, pair: Pair) -> bool:
-    """Whether the field of a beta that is padded is the same in its pixels: it is by F or calibration, not by sizes."""
+    """Whether the field of a beta that is padded is the same in its pixels: it is by F or calibration, not by
+    sizes.
+    """
     if isinstance(field, ThroughLenses | Moved):
         return _follows_beta(field.field, pair)
     if isinstance(field, HomographyDisplacement):

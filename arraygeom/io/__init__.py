@@ -1,7 +1,7 @@
 """Rig files: one module a format, one registry.
 
-Each reader's module states the convention of its format and the shift that it applies, in its docstring and in
-one line as `CONVENTION`.
+Each reader's module states the convention of its format and the shift that it applies, in its docstring and
+in one line as `CONVENTION`.
 """
 
 from __future__ import annotations
@@ -85,15 +85,25 @@ WRITERS: dict[str, Any] = {
     "nerfstudio": nerfstudio,
 }
 
-__all__ = ["READERS", "WRITERS", "RigFileError", "RigFileWarning", "convention", "read_rig", "recognise", "write_rig"]
+__all__ = [
+    "READERS",
+    "WRITERS",
+    "RigFileError",
+    "RigFileWarning",
+    "convention",
+    "read_rig",
+    "recognise",
+    "write_rig",
+]
 
 
 def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0, hw: HW | None = None) -> Rig:
     """The rig of a file (or folder, for formats of several files); its format is recognised unless named.
 
-    `scale` multiplies all lengths, for files in another unit than their format's. `hw` is the images' (height,
-    width), for formats that do not state it. Suspicious but readable values give a RigFileWarning.
-    Raises RigFileError, which names the file and the entry; FileNotFoundError; ValueError for an unknown format.
+    `scale` multiplies all lengths, for files in another unit than their format's. `hw` is the images'
+    (height, width), for formats that do not state it. Suspicious but readable values give a RigFileWarning.
+    Raises RigFileError, which names the file and the entry; FileNotFoundError; ValueError for an unknown
+    format.
     """
     path = Path(path)
     if not path.exists():
@@ -108,7 +118,15 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
         rig = reader.read(RigSource(path, hw=hw))
     except (RigFileError, FileNotFoundError):
         raise
-    except (ArithmeticError, AttributeError, LookupError, OSError, RecursionError, TypeError, ValueError) as error:
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        OSError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:
         cause = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RigFileError(path, None, f"cannot be read as {format} ({cause}); is the file whole?") from error
     rig = rig if scale == 1.0 else rig.scaled(scale)
@@ -119,10 +137,12 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
 
 
 def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
-    """Write a rig atomically. Formats of several files make a folder, the last of them once the others are there.
+    """Write a rig atomically. Formats of several files make a folder, the last of them once the others are
+    there.
 
-    What a format leaves out of the rig (all but the native one: the depth range, links, what a sensor records) is named
-    by one RigFileWarning. Raises ValueError for an unknown format, for a rig that the format cannot hold, and a batch.
+    What a format leaves out of the rig (all but the native one: the depth range, links, what a sensor
+    records) is named by one RigFileWarning. Raises ValueError for an unknown format, for a rig that the
+    format cannot hold, and a batch.
     """
     if format not in WRITERS:
         raise ValueError(f"cannot write rig format '{format}' (known: {', '.join(WRITERS)})")
@@ -170,7 +190,9 @@ def _left_out(rig: Rig, format: str) -> str:
 
 
 SMALLEST_FOCAL, LARGEST_NUMBER = 1e-3, 1e9
-"""Bounds of focal lengths (pixels), of all of K, and of translations (metres). Beyond them pixels lose their digits."""
+"""Bounds of focal lengths (pixels), of all of K, and of translations (metres). Beyond them pixels lose their
+digits.
+"""
 
 
 def _check_magnitudes(path: Path, rig: Rig) -> None:
@@ -183,6 +205,8 @@ def _check_magnitudes(path: Path, rig: Rig) -> None:
                     path, name, f"has a K of numbers up to {size:g} or a focal length near 0: use pixels"
                 )
         if isinstance(view, Camera) and float(view.t.abs().max()) > LARGEST_NUMBER:
-            raise RigFileError(path, name, f"has a translation of {float(view.t.abs().max()):g} m: use metres")
+            raise RigFileError(
+                path, name, f"has a translation of {float(view.t.abs().max()):g} m: use metres"
+            )
     if rig.depth is not None and float(rig.depth[0]) < 1 / LARGEST_NUMBER:
         raise RigFileError(path, "depth", f"begins at {float(rig.depth[0]):g} m: give a near bound in metres")

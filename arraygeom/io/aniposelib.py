@@ -1,8 +1,9 @@
 """The TOML camera arrays of aniposelib and caliscope.
 
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; world->camera, the rotation as a
-Rodrigues vector (or a matrix); lengths in the board's unit, taken as metres. caliscope's `rotation_count` says by how
-many quarters it rotates a camera's images for display; the numbers are of the images as recorded, so it is not applied.
+Rodrigues vector (or a matrix); lengths in the board's unit, taken as metres. caliscope's `rotation_count`
+says by how many quarters it rotates a camera's images for display; the numbers are of the images as recorded,
+so it is not applied.
 """
 
 from __future__ import annotations
@@ -25,7 +26,11 @@ def read(source: RigSource) -> Rig:
     """Every camera that is not marked `ignore`, under its name, or else that of its table."""
     document = source.toml()
     tables = document.get("cameras") if isinstance(document.get("cameras"), dict) else document
-    cameras = {key: fields for key, fields in (tables or {}).items() if isinstance(fields, dict) and key != "metadata"}
+    cameras = {
+        key: fields
+        for key, fields in (tables or {}).items()
+        if isinstance(fields, dict) and key != "metadata"
+    }
     if not any("matrix" in fields for fields in cameras.values()):
         raise source.fail("matrix", "is in no table; is this a camera array of aniposelib or caliscope?")
     used = {key: fields for key, fields in cameras.items() if not fields.get("ignore", False)}

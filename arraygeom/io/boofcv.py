@@ -1,8 +1,9 @@
 """BoofCV's stereo.yaml and intrinsic.yaml.
 
-Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `rightToLeft` takes points of the right
-camera into the left one, so it is inverted here; the world is the left camera. Lengths are in the board's unit, which
-the file does not state: they are taken as metres (use `scale=0.001` for a board measured in millimetres).
+Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `rightToLeft` takes points of the
+right camera into the left one, so it is inverted here; the world is the left camera. Lengths are in the
+board's unit, which the file does not state: they are taken as metres (use `scale=0.001` for a board measured
+in millimetres).
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ from ..pose import Pose
 from ..rig import Rig
 from .source import RigSource
 
-CONVENTION = "first pixel's centre at 0 (shift 0); rightToLeft inverted, world = left camera; the board's unit"
+CONVENTION = (
+    "first pixel's centre at 0 (shift 0); rightToLeft inverted, world = left camera; the board's unit"
+)
 MODELS = ("pinhole_radial_tangential", "pinhole")
 
 
@@ -46,13 +49,20 @@ def _camera(source: RigSource, fields: dict[str, Any], entry: str, pose: Pose) -
     if model not in MODELS:
         raise source.fail(f"{entry}.model", f"is '{model}'; supported: {', '.join(MODELS)}")
     pinhole = source.mapping(source.get(fields, "pinhole", entry), f"{entry}.pinhole")
-    f = {k: source.number(source.get(pinhole, k, f"{entry}.pinhole"), f"{entry}.{k}") for k in ("fx", "fy", "cx", "cy")}
+    f = {
+        k: source.number(source.get(pinhole, k, f"{entry}.pinhole"), f"{entry}.{k}")
+        for k in ("fx", "fy", "cx", "cy")
+    }
     skew = source.number(pinhole.get("skew", 0.0), f"{entry}.skew")
     K = source.intrinsics([[f["fx"], skew, f["cx"]], [0, f["fy"], f["cy"]], [0, 0, 1]], f"{entry}.pinhole")
     width, height = (source.get(pinhole, k, f"{entry}.pinhole") for k in ("width", "height"))
     hw = source.size(width, height, f"{entry}.width, height")
     lens = fields.get("radial_tangential")
-    c = None if lens is None else _coefficients(source, source.mapping(lens, entry), f"{entry}.radial_tangential")
+    c = (
+        None
+        if lens is None
+        else _coefficients(source, source.mapping(lens, entry), f"{entry}.radial_tangential")
+    )
     return Camera(K=K, cam_from_world=pose, hw=hw, distortion=source.brown_conrady(c, entry))
 
 

@@ -1,8 +1,8 @@
 """Calib_Results.mat and Calib_Results_stereo.mat of Bouguet's Camera Calibration Toolbox for MATLAB.
 
 Source convention: pixels with the first centre at 0 (shift 0), although of MATLAB; OpenCV's lens;
-X_right = R X_left + T with R from the rotation vector `om` where it is not stated; millimetres. The world is the left
-camera. K has the skew `alpha_c` times the first focal length.
+X_right = R X_left + T with R from the rotation vector `om` where it is not stated; millimetres. The world is
+the left camera. K has the skew `alpha_c` times the first focal length.
 """
 
 from __future__ import annotations
@@ -43,7 +43,13 @@ def read(source: RigSource) -> Rig:
 
 def _camera(source: RigSource, fields: dict[str, Any], which: str, pose: Pose) -> Camera:
     focal = source.numbers(source.get(fields, f"fc{which}", ""), None, f"fc{which}").tolist()
-    fx, fy = focal * 2 if len(focal) == 1 else focal if len(focal) == 2 else source.numbers(focal, (2,), f"fc{which}")
+    fx, fy = (
+        focal * 2
+        if len(focal) == 1
+        else focal
+        if len(focal) == 2
+        else source.numbers(focal, (2,), f"fc{which}")
+    )
     cx, cy = source.numbers(source.get(fields, f"cc{which}", ""), (2,), f"cc{which}").tolist()
     skew = source.number(fields.get(f"alpha_c{which}", 0.0), f"alpha_c{which}")
     K = source.intrinsics([[fx, skew * fx, cx], [0, fy, cy], [0, 0, 1]], f"fc{which}, cc{which}")

@@ -3,9 +3,9 @@
 Source convention: pixels with the first centre at 0.5 (shift -0.5); OpenCV axes; world->camera, quaternions
 scalar first. The scale of a COLMAP model is arbitrary unless it was set; it is taken as metres.
 
-Without rigs every *image* becomes a camera, named as the image is. Where the model has a rig of several cameras,
-those become the cameras, named "camera1" after their ids (or the folder of their images), and the world is the rig's
-frame.
+Without rigs every *image* becomes a camera, named as the image is. Where the model has a rig of several
+cameras, those become the cameras, named "camera1" after their ids (or the folder of their images), and the
+world is the rig's frame.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ from ..rig import Rig
 from .export import brown_conrady, calibrated, focal_and_centre
 from .source import RigFileError, RigSource
 
-CONVENTION = "first pixel's centre at 0.5 (shift -0.5); world->camera, quaternions w x y z; scale as in the model"
+CONVENTION = (
+    "first pixel's centre at 0.5 (shift -0.5); world->camera, quaternions w x y z; scale as in the model"
+)
 
 
 class _Model(NamedTuple):
@@ -74,7 +76,9 @@ def read(source: RigSource) -> Rig:
     """The cameras of a model's rig, or one for each image. Name the folder or any file in it."""
     folder = _folder(source.path)
     if folder is None:
-        raise source.fail(None, "is no COLMAP model: wanted a folder with cameras.txt and images.txt, or .bin")
+        raise source.fail(
+            None, "is no COLMAP model: wanted a folder with cameras.txt and images.txt, or .bin"
+        )
     suffix = ".bin" if (folder / "cameras.bin").exists() else ".txt"
     read_cameras, read_images, read_rigs = PARTS[suffix]
     cameras = read_cameras(_file(folder, "cameras", suffix))
@@ -95,7 +99,10 @@ def write(rig: Rig) -> dict[str, str]:
 
     Raises ValueError for what the format cannot hold.
     """
-    cameras, images = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"], ["# IMAGE_ID, QW..QZ, TX..TZ, CAMERA_ID, NAME"]
+    cameras, images = (
+        ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"],
+        ["# IMAGE_ID, QW..QZ, TX..TZ, CAMERA_ID, NAME"],
+    )
     for i, (name, camera) in enumerate(calibrated(rig, "COLMAP"), 1):
         h, w = camera.hw
         model, parameters = _parameters(name, camera)
@@ -108,7 +115,9 @@ def write(rig: Rig) -> dict[str, str]:
 
 def _folder(path: Path) -> Path | None:
     """The folder with the model, from itself, one of its files, or the project folder."""
-    files = {f"{stem}{suffix}" for stem in ("cameras", "images", "rigs", "frames") for suffix in (".txt", ".bin")}
+    files = {
+        f"{stem}{suffix}" for stem in ("cameras", "images", "rigs", "frames") for suffix in (".txt", ".bin")
+    }
     if path.is_file():
         return path.parent if path.name in files else None
     for folder in (path, path / "sparse" / "0", path / "sparse"):
@@ -126,7 +135,9 @@ def _file(folder: Path, stem: str, suffix: str) -> RigSource:
 
 def _camera(source: RigSource, cameras: dict[int, LensView], i: int, pose: Pose) -> Camera:
     if i not in cameras:
-        raise source.fail(f"camera {i}", "is used by an image or a rig and not defined; do the files belong together?")
+        raise source.fail(
+            f"camera {i}", "is used by an image or a rig and not defined; do the files belong together?"
+        )
     view = cameras[i]
     return Camera(K=view.K, cam_from_world=pose, hw=view.hw, distortion=view.distortion)
 
@@ -137,14 +148,22 @@ def _sensor_name(camera: int, images: list[_Image]) -> str:
     return folders.pop() if len(folders) == 1 and "." not in folders else f"camera{camera}"
 
 
-def _intrinsics(source: RigSource, entry: str, model: str, wh: tuple[Any, Any], parameters: list[Any]) -> LensView:
+def _intrinsics(
+    source: RigSource, entry: str, model: str, wh: tuple[Any, Any], parameters: list[Any]
+) -> LensView:
     if model not in MODELS:
-        raise source.fail(entry, f"has model {model}, which is not read: calibrate with one of {', '.join(MODELS)}")
+        raise source.fail(
+            entry, f"has model {model}, which is not read: calibrate with one of {', '.join(MODELS)}"
+        )
     kind = MODELS[model]
     p = source.numbers(parameters, (kind.focals + 2 + kind.coefficients,), f"{entry} ({model})").tolist()
-    K = source.focal_and_centre([p[0], p[kind.focals - 1], *p[kind.focals : kind.focals + 2]], entry, first_pixel=0.5)
+    K = source.focal_and_centre(
+        [p[0], p[kind.focals - 1], *p[kind.focals : kind.focals + 2]], entry, first_pixel=0.5
+    )
     hw, c = source.size(*wh, entry), p[kind.focals + 2 :]
-    lens = None if kind.lens is None or (kind.lens == FOV and not any(c)) else source.lens(kind.lens, c, entry)
+    lens = (
+        None if kind.lens is None or (kind.lens == FOV and not any(c)) else source.lens(kind.lens, c, entry)
+    )
     return LensView(hw=hw, K=K, distortion=lens)
 
 
@@ -152,7 +171,8 @@ def _pose(source: RigSource, entry: str, numbers: list[Any]) -> Pose:
     return source.pose(source.quaternion(numbers[:4], f"{entry} QW QX QY QZ"), numbers[4:7], entry)
 
 
-# The text files -------------------------------------------------------------------------------------------------
+# The text files
+# -------------------------------------------------------------------------------------------------
 
 
 def _cameras_text(source: RigSource) -> dict[int, LensView]:
@@ -215,7 +235,8 @@ def _sensors(source: RigSource, entry: str, fields: list[str]) -> Iterator[tuple
         raise source.fail(entry, "is not a rig (RIG_ID NUM_SENSORS ...); is the file whole?") from None
 
 
-# The binary files, little-endian ---------------------------------------------------------------------------------
+# The binary files, little-endian
+# ---------------------------------------------------------------------------------
 
 
 def _cameras_binary(source: RigSource) -> dict[int, LensView]:
@@ -287,7 +308,9 @@ class _Bytes:
         """The next count of entries."""
         (n,) = self.take("<Q")
         if n > len(self.data):
-            raise self.source.fail(f"byte {self.at}", f"counts {n} entries, more than fit; is this a COLMAP file?")
+            raise self.source.fail(
+                f"byte {self.at}", f"counts {n} entries, more than fit; is this a COLMAP file?"
+            )
         return int(n)
 
     def string(self) -> str:

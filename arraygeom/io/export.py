@@ -15,17 +15,25 @@ def calibrated(rig: Rig, format: str) -> list[tuple[str, Camera]]:
     cameras = []
     for name, camera in rig.cameras.items():
         if not isinstance(camera, Camera):
-            raise ValueError(f"{format} files hold calibrated cameras and '{name}' is not one: use the native format")
+            raise ValueError(
+                f"{format} files hold calibrated cameras and '{name}' is not one: use the native format"
+            )
         if camera.K.ndim != 2:
-            raise ValueError(f"camera '{name}' is a batch of cameras; rig files hold one of each: write one rig each")
+            raise ValueError(
+                f"camera '{name}' is a batch of cameras; rig files hold one of each: write one rig each"
+            )
         cameras.append((name, camera))
     if not cameras:
         raise ValueError("the rig has no cameras to write")
     return cameras
 
 
-def focal_and_centre(name: str, camera: Camera, *, first_pixel: float = 0.0) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy with the first pixel's centre at `first_pixel`. Raises ValueError if K has other entries."""
+def focal_and_centre(
+    name: str, camera: Camera, *, first_pixel: float = 0.0
+) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy with the first pixel's centre at `first_pixel`. Raises ValueError if K has other
+    entries.
+    """
     (fx, skew, cx), (other, fy, cy) = camera.K[:2].tolist()
     if skew != 0 or other != 0:
         raise ValueError(
@@ -41,7 +49,8 @@ def brown_conrady(name: str, lens: LensModel | None, *, at_most: int) -> list[fl
     c = lens.coefficients.tolist()
     if lens.model != BROWN_CONRADY or any(c[at_most:]):
         raise ValueError(
-            f"camera '{name}' has a {lens.model} lens of {len(c)} coefficients, which this format cannot hold "
+            f"camera '{name}' has a {lens.model} lens of {len(c)} coefficients, which this format cannot "
+            "hold "
             f"(brown-conrady with {at_most}): use the native format"
         )
     return c[:at_most]

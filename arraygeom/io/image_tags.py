@@ -20,7 +20,9 @@ _TYPES = {1: "B", 2: "c", 3: "H", 4: "I", 5: "II", 9: "i", 10: "ii", 11: "f", 12
 
 
 class ImageTags(NamedTuple):
-    """Size, TIFF and EXIF fields by their numbers, XMP tags by namespace and name (lists joined by commas)."""
+    """Size, TIFF and EXIF fields by their numbers, XMP tags by namespace and name (lists joined by
+    commas).
+    """
 
     hw: HW
     fields: dict[int, tuple[Any, ...]]
@@ -54,7 +56,11 @@ def _jpeg(content: bytes, xmp: dict[tuple[str, str], str]) -> ImageTags | None:
         marker, length = struct.unpack_from(">HH", content, at)
         if marker == 0xFFE1 and content[at + 4 : at + 10] == b"Exif\0\0":
             fields = _fields(content[at + 10 : at + 2 + length])
-        if 0xFFC0 <= marker <= 0xFFCF and marker not in (0xFFC4, 0xFFC8, 0xFFCC):  # the start of a frame, not a table
+        if 0xFFC0 <= marker <= 0xFFCF and marker not in (
+            0xFFC4,
+            0xFFC8,
+            0xFFCC,
+        ):  # the start of a frame, not a table
             height, width = struct.unpack_from(">HH", content, at + 5)
             return ImageTags((height, width), fields, xmp)
         at += 2 + length
@@ -106,7 +112,8 @@ def _xmp(content: bytes) -> dict[tuple[str, str], str]:
     for described in root.iter("{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"):
         parts = [(key, value) for key, value in described.attrib.items()]
         parts += [
-            (child.tag, ",".join(text for part in child.itertext() if (text := part.strip()))) for child in described
+            (child.tag, ",".join(text for part in child.itertext() if (text := part.strip())))
+            for child in described
         ]
         for key, value in parts:
             uri, _, name = key.removeprefix("{").partition("}")

@@ -1,9 +1,10 @@
 """Kalibr camchain files.
 
-Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `T_cn_cnm1` takes points of camera n-1
-into camera n, so poses are chained products; metres. The world is camera 0, or the IMU where every camera states
-`T_cam_imu`. `timeshift_cam_imu` (t_imu = t_cam + shift) becomes the sensor's time offset. Camera models pinhole (with
-radtan, equidistant, fov or no distortion), omni (with radtan or none), ds and eucm (with none).
+Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `T_cn_cnm1` takes points of
+camera n-1 into camera n, so poses are chained products; metres. The world is camera 0, or the IMU where every
+camera states `T_cam_imu`. `timeshift_cam_imu` (t_imu = t_cam + shift) becomes the sensor's time offset.
+Camera models pinhole (with radtan, equidistant, fov or no distortion), omni (with radtan or none), ds and
+eucm (with none).
 """
 
 from __future__ import annotations
@@ -92,7 +93,9 @@ def _poses(source: RigSource, chain: dict[str, dict[str, Any]]) -> dict[str, Pos
 def _camera(source: RigSource, name: str, fields: dict[str, Any], pose: Pose) -> Camera:
     model = source.get(fields, "camera_model", name)
     if model not in CAMERA_MODELS:
-        raise source.fail(f"{name}.camera_model", f"is '{model}'; supported: {', '.join(CAMERA_MODELS)}: {AGAIN}")
+        raise source.fail(
+            f"{name}.camera_model", f"is '{model}'; supported: {', '.join(CAMERA_MODELS)}: {AGAIN}"
+        )
     first = len(CAMERA_MODELS[model])
     numbers = source.numbers(source.get(fields, "intrinsics", name), (first + 4,), f"{name}.intrinsics")
     K = source.focal_and_centre(numbers[first:], f"{name}.intrinsics")
@@ -106,18 +109,30 @@ def _camera(source: RigSource, name: str, fields: dict[str, Any], pose: Pose) ->
     )
 
 
-def _lens(source: RigSource, name: str, camera: str, before: list[float], fields: dict[str, Any]) -> Distortion | None:
-    """The lens of a camera model and a distortion model; `before` are the numbers before the focal lengths."""
+def _lens(
+    source: RigSource, name: str, camera: str, before: list[float], fields: dict[str, Any]
+) -> Distortion | None:
+    """The lens of a camera model and a distortion model; `before` are the numbers before the focal
+    lengths.
+    """
     model, entry = fields.get("distortion_model", "none"), f"{name}.distortion_coeffs"
     if model not in LENSES[camera]:
         known = ", ".join(LENSES[camera])
-        raise source.fail(f"{name}.distortion_model", f"is '{model}'; supported for {camera}: {known}: {AGAIN}")
+        raise source.fail(
+            f"{name}.distortion_model", f"is '{model}'; supported for {camera}: {known}: {AGAIN}"
+        )
     count = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}[model]
-    c = source.numbers(source.get(fields, "distortion_coeffs", name), (count,), entry).tolist() if count else []
+    c = (
+        source.numbers(source.get(fields, "distortion_coeffs", name), (count,), entry).tolist()
+        if count
+        else []
+    )
     if camera == "omni":
         return source.lens(UNIFIED, [*before, *(c or [0.0] * 4)], f"{name}.intrinsics")
     if camera != "pinhole":
-        return source.lens(DOUBLE_SPHERE if camera == "ds" else EXTENDED_UNIFIED, before, f"{name}.intrinsics")
+        return source.lens(
+            DOUBLE_SPHERE if camera == "ds" else EXTENDED_UNIFIED, before, f"{name}.intrinsics"
+        )
     lens = {"radtan": BROWN_CONRADY, "equidistant": KANNALA_BRANDT, "fov": FOV, "none": None}[model]
     return None if lens is None else source.lens(lens, c, entry)
 

@@ -1,8 +1,8 @@
 """KITTI's calibration: `calib.txt` (rectified) and `calib_cam_to_cam.txt` (raw, or rectified).
 
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; metres. P0..P3 act on points of
-rectified camera 0, so P = K [I | t] and t = K^-1 P[:, 3]; that has small y and z terms, and t_x = -baseline. The
-raw rig (S K D R T) has X_i = R X_0 + T. `calib.txt` states no image size. Cameras are named cam0..cam3.
+rectified camera 0, so P = K [I | t] and t = K^-1 P[:, 3]; that has small y and z terms, and t_x = -baseline.
+The raw rig (S K D R T) has X_i = R X_0 + T. `calib.txt` states no image size. Cameras are named cam0..cam3.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from ..pose import Pose
 from ..rig import Rig
 from .source import RigSource
 
-CONVENTION = "first pixel's centre at 0 (shift 0); P = K [I | t] on rectified camera 0, raw X_i = R X_0 + T; metres"
+CONVENTION = (
+    "first pixel's centre at 0 (shift 0); P = K [I | t] on rectified camera 0, raw X_i = R X_0 + T; metres"
+)
 
 
 def recognises(path: Path, head: str) -> bool:

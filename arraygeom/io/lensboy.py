@@ -1,8 +1,8 @@
 """lensboy's camera: one JSON a camera, OpenCV's lens or a splined one.
 
-Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes and coefficients; no pose: the camera is at
-the world's origin. A splined lens displaces pinhole points by cubic B-splines over the stereographic projection, whose
-outermost cells are beyond `fov_deg_x` and `fov_deg_y`.
+Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes and coefficients; no pose: the
+camera is at the world's origin. A splined lens displaces pinhole points by cubic B-splines over the
+stereographic projection, whose outermost cells are beyond `fov_deg_x` and `fov_deg_y`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ def read(source: RigSource) -> Rig:
     camera = Camera(
         K=source.focal_and_centre(numbers, "fx, fy, cx, cy"),
         cam_from_world=Pose.identity(),
-        hw=source.size_of([source.get(fields, f"image_{side}", "") for side in ("width", "height")], "image_width"),
+        hw=source.size_of(
+            [source.get(fields, f"image_{side}", "") for side in ("width", "height")], "image_width"
+        ),
         distortion=_lens(source, fields),
     )
     return source.rig([(source.path.stem, camera)])
@@ -54,9 +56,13 @@ def _lens(source: RigSource, fields: dict[str, Any]) -> LensModel | None:
         raise source.fail(
             "lensboy-version", f"is {version}; splines from version {OLDEST} on are read: calibrate again"
         )
-    counts = [int(source.number(source.get(fields, f"num_knots_{axis}", ""), f"num_knots_{axis}")) for axis in "xy"]
+    counts = [
+        int(source.number(source.get(fields, f"num_knots_{axis}", ""), f"num_knots_{axis}")) for axis in "xy"
+    ]
     nx, ny = counts
-    grids = [source.numbers(source.get(fields, f"d{axis}_grid", ""), (ny, nx), f"d{axis}_grid") for axis in "xy"]
+    grids = [
+        source.numbers(source.get(fields, f"d{axis}_grid", ""), (ny, nx), f"d{axis}_grid") for axis in "xy"
+    ]
     spacing = []
     for axis, count in zip("xy", counts):
         degrees = source.number(source.get(fields, f"fov_deg_{axis}", ""), f"fov_deg_{axis}")

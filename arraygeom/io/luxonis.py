@@ -1,8 +1,8 @@
 """Luxonis' calibration of an OAK camera: the JSON that DepthAI writes from a device's memory.
 
-Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes and lenses; each camera's `extrinsics` take
-points of that camera into another one's (`toCameraSocket`), in centimetres; intrinsics are of the stated size. The
-world is the first camera.
+Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes and lenses; each camera's
+`extrinsics` take points of that camera into another one's (`toCameraSocket`), in centimetres; intrinsics are
+of the stated size. The world is the first camera.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from ..rig import Rig
 from .source import RigSource
 
 CONVENTION = (
-    "first pixel's centre at 0 (shift 0); extrinsics to another camera of the box, in centimetres; world = first"
+    "first pixel's centre at 0 (shift 0); extrinsics to another camera of the box, in centimetres; "
+    "world = first"
 )
 PERSPECTIVE, FISHEYE = 0, 1
 CENTIMETRES = 1
@@ -39,7 +40,9 @@ def read(source: RigSource) -> Rig:
             raise source.fail("cameraData", "is not a list of [socket, camera]; is the file whole?")
         socket = int(source.number(item[0], "cameraData socket"))
         if not 0 <= socket < len(SOCKETS) or socket in entries:
-            raise source.fail("cameraData", f"has socket {socket} twice, or a socket that no board has; keep one")
+            raise source.fail(
+                "cameraData", f"has socket {socket} twice, or a socket that no board has; keep one"
+            )
         entry = source.mapping(item[1], _name(socket))
         if entry.get("width") and entry.get("height"):  # others are not calibrated
             entries[socket] = entry
@@ -50,9 +53,14 @@ def read(source: RigSource) -> Rig:
     for socket in sorted(entries):
         own_root, to_root = _to_root(source, entries, socket)
         if own_root != root:
-            raise source.fail(_name(socket), f"is related to no camera that {_name(min(entries))} is related to")
+            raise source.fail(
+                _name(socket), f"is related to no camera that {_name(min(entries))} is related to"
+            )
         cameras.append(
-            (_name(socket), _camera(source, entries[socket], _name(socket), to_root.inverse() @ first_to_root))
+            (
+                _name(socket),
+                _camera(source, entries[socket], _name(socket), to_root.inverse() @ first_to_root),
+            )
         )
     return source.rig(cameras)
 
@@ -73,7 +81,9 @@ def _to_root(source: RigSource, entries: dict[int, dict[str, Any]], socket: int)
         if to in passed:
             raise source.fail(f"{name}.toCameraSocket", f"is {to}: the chain of extrinsics is a circle")
         if extrinsics.get("lengthUnit", CENTIMETRES) != CENTIMETRES:
-            raise source.fail(f"{name}.lengthUnit", f"is {extrinsics['lengthUnit']}; centimetres (1) are read")
+            raise source.fail(
+                f"{name}.lengthUnit", f"is {extrinsics['lengthUnit']}; centimetres (1) are read"
+            )
         shift = source.mapping(source.get(extrinsics, "translation", name), f"{name}.translation")
         t = [source.get(shift, axis, f"{name}.translation") for axis in "xyz"]
         step = source.pose(source.get(extrinsics, "rotationMatrix", name), t, name, metres=0.01)

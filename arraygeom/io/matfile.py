@@ -1,7 +1,8 @@
-"""MAT-files of version 5, walked before scipy reads them: scipy trusts their lengths, and a damaged one can crash it.
+"""MAT-files of version 5, walked before scipy reads them: scipy trusts their lengths, and a damaged one can
+crash it.
 
-Layout: "MAT-File Format" (MathWorks). A header of 128 bytes, then elements of a tag (type, bytes) and data, padded to 8
-bytes; a matrix is an element whose data are elements again: flags, dimensions, name, contents.
+Layout: "MAT-File Format" (MathWorks). A header of 128 bytes, then elements of a tag (type, bytes) and data,
+padded to 8 bytes; a matrix is an element whose data are elements again: flags, dimensions, name, contents.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ class _Element(NamedTuple):
 
 
 def load_variables(source: RigSource) -> dict[str, Any]:
-    """The variables of a .mat file that consist of structs, cells, text and numbers, by name. Raises RigFileError."""
+    """The variables of a .mat file that consist of structs, cells, text and numbers, by name. Raises
+    RigFileError.
+    """
     data = source.content()
     if not data:
         raise source.fail(None, "is empty")
@@ -128,7 +131,9 @@ def _check_contents(parts: Iterator[_Element], order: str, depth: int, what: tup
     kind, count, is_complex = what
     if kind in (CELL, STRUCT):
         wanted = count * (_fields(parts, order) if kind == STRUCT else 1)
-        inner = [_check_matrix(part.data, order, depth + 1) if len(part.data) else "" for part in _matrices(parts)]
+        inner = [
+            _check_matrix(part.data, order, depth + 1) if len(part.data) else "" for part in _matrices(parts)
+        ]
         if len(inner) != wanted:
             raise ValueError("a struct or cell has another number of entries than it states")
         return None not in inner

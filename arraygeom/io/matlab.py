@@ -1,13 +1,15 @@
-"""MATLAB's stereoParameters and cameraParameters: the struct (`toStruct`) saved to .mat, or as JSON (`jsonencode`).
+"""MATLAB's stereoParameters and cameraParameters: the struct (`toStruct`) saved to .mat, or as JSON
+(`jsonencode`).
 
 Source convention: pixels with the first centre at 1 (shift -1); OpenCV-like axes; lengths in `WorldUnits`, by
 default millimetres. The old names are of row vectors (x2 = x1 R + t, [x y 1] ~ X K): `IntrinsicMatrix` and
-`RotationOfCamera2` are transposed. The new ones (`K`, `PoseCamera2`, since R2022b) are of columns and are not. The
-world is camera 1. A `FundamentalMatrix` in the file has to agree with the pose: that catches a transposed one.
+`RotationOfCamera2` are transposed. The new ones (`K`, `PoseCamera2`, since R2022b) are of columns and are
+not. The world is camera 1. A `FundamentalMatrix` in the file has to agree with the pose: that catches a
+transposed one.
 
-Fisheyes: the struct of fisheyeIntrinsics or fisheyeParameters, a camera "camera1" (Scaramuzza's model). A point u, v
-off `DistortionCenter`, after `StretchMatrix` is undone, is seen along (u, v, a0 + a2 r^2 + a3 r^3 + a4 r^4); a0 is the
-focal length here.
+Fisheyes: the struct of fisheyeIntrinsics or fisheyeParameters, a camera "camera1" (Scaramuzza's model). A
+point u, v off `DistortionCenter`, after `StretchMatrix` is undone, is seen along (u, v, a0 + a2 r^2 + a3 r^3
++ a4 r^4); a0 is the focal length here.
 """
 
 from __future__ import annotations
@@ -29,14 +31,31 @@ from ..rig import Rig
 from .matfile import load_variables
 from .source import RigSource
 
-CONVENTION = "first pixel's centre at 1 (shift -1); row vectors transposed, world = camera 1; WorldUnits, else mm"
+CONVENTION = (
+    "first pixel's centre at 1 (shift -1); row vectors transposed, world = camera 1; WorldUnits, else mm"
+)
 FISHEYE = "MappingCoefficients"
-UNITS = {"mm": 1e-3, "millimeters": 1e-3, "cm": 1e-2, "centimeters": 1e-2, "m": 1.0, "meters": 1.0, "in": 0.0254}
+UNITS = {
+    "mm": 1e-3,
+    "millimeters": 1e-3,
+    "cm": 1e-2,
+    "centimeters": 1e-2,
+    "m": 1.0,
+    "meters": 1.0,
+    "in": 0.0254,
+}
 UNITS |= {"millimetres": 1e-3, "centimetres": 1e-2, "metres": 1.0, "inches": 0.0254}
 
 
 def recognises(path: Path, head: str) -> bool:
-    names = ("CameraParameters1", "PoseCamera2", "RotationOfCamera2", "IntrinsicMatrix", "RadialDistortion", FISHEYE)
+    names = (
+        "CameraParameters1",
+        "PoseCamera2",
+        "RotationOfCamera2",
+        "IntrinsicMatrix",
+        "RadialDistortion",
+        FISHEYE,
+    )
     return path.suffix == ".mat" or head.startswith("MATLAB ") or any(f'"{name}"' in head for name in names)
 
 
@@ -51,7 +70,9 @@ def read(source: RigSource) -> Rig:
         for name, pose in zip(("CameraParameters1", "CameraParameters2"), poses)
     ]
     if fields.get("FundamentalMatrix") is not None:
-        _check_fundamental(source, source.numbers(fields["FundamentalMatrix"], (3, 3), "FundamentalMatrix"), *cameras)
+        _check_fundamental(
+            source, source.numbers(fields["FundamentalMatrix"], (3, 3), "FundamentalMatrix"), *cameras
+        )
     return source.rig(zip(("camera1", "camera2"), cameras))
 
 
@@ -66,11 +87,16 @@ def _outermost(source: RigSource, fields: dict[str, Any]) -> dict[str, Any]:
     for value in (fields, *fields.values()):
         if isinstance(value, dict) and ("CameraParameters1" in value or _is_camera(value)):
             return value
-        if value is fields and any(name.endswith("Camera2") or name == "CameraParameters2" for name in fields):
-            raise source.fail("CameraParameters1", "is missing, and the second camera's is here; is the file whole?")
+        if value is fields and any(
+            name.endswith("Camera2") or name == "CameraParameters2" for name in fields
+        ):
+            raise source.fail(
+                "CameraParameters1", "is missing, and the second camera's is here; is the file whole?"
+            )
     raise source.fail(
         "CameraParameters1",
-        "is missing: MATLAB objects cannot be read, save the struct, s = toStruct(stereoParams); save(f, 's', '-v7')",
+        "is missing: MATLAB objects cannot be read, save the struct, s = toStruct(stereoParams); save(f, "
+        "'s', '-v7')",
     )
 
 
@@ -88,7 +114,9 @@ def _camera(source: RigSource, fields: dict[str, Any], entry: str, pose: Pose) -
     if "K" in fields:
         K = source.intrinsics(fields["K"], f"{entry}.K", first_pixel=1.0)
     else:
-        rows = source.numbers(source.get(fields, ("IntrinsicMatrix", "K"), entry), (3, 3), f"{entry}.IntrinsicMatrix")
+        rows = source.numbers(
+            source.get(fields, ("IntrinsicMatrix", "K"), entry), (3, 3), f"{entry}.IntrinsicMatrix"
+        )
         K = source.intrinsics(rows.T, f"{entry}.IntrinsicMatrix", first_pixel=1.0)
     lens = _lens(source, fields, entry)
     return Camera(K=K, cam_from_world=pose, hw=_size(source, fields, entry, K), distortion=lens)
@@ -97,7 +125,9 @@ def _camera(source: RigSource, fields: dict[str, Any], entry: str, pose: Pose) -
 def _fisheye(source: RigSource, fields: dict[str, Any], entry: str, pose: Pose) -> Camera:
     a0, a2, a3, a4 = source.numbers(fields[FISHEYE], (4,), f"{entry}.{FISHEYE}").tolist()
     if not a0 > 0:
-        raise source.fail(f"{entry}.{FISHEYE}", f"begins with {a0:g}; it is positive, about the focal length in pixels")
+        raise source.fail(
+            f"{entry}.{FISHEYE}", f"begins with {a0:g}; it is positive, about the focal length in pixels"
+        )
     centre = source.numbers(source.get(fields, "DistortionCenter", entry), (2,), f"{entry}.DistortionCenter")
     stretch = source.numbers(fields.get("StretchMatrix", [[1, 0], [0, 1]]), (2, 2), f"{entry}.StretchMatrix")
     K = torch.eye(3, dtype=torch.float64)
@@ -117,7 +147,9 @@ def _size(source: RigSource, fields: dict[str, Any], entry: str, K: Tensor) -> H
 
 def _lens(source: RigSource, fields: dict[str, Any], entry: str) -> Distortion | None:
     radial = source.numbers(fields.get("RadialDistortion", []), None, f"{entry}.RadialDistortion").tolist()
-    tangential = source.numbers(fields.get("TangentialDistortion", []), None, f"{entry}.TangentialDistortion").tolist()
+    tangential = source.numbers(
+        fields.get("TangentialDistortion", []), None, f"{entry}.TangentialDistortion"
+    ).tolist()
     if not radial and not tangential:
         return None
     if len(radial) not in (2, 3) or len(tangential) not in (0, 2):
@@ -132,7 +164,9 @@ def _pose(source: RigSource, fields: dict[str, Any]) -> Pose:
         raise source.fail("WorldUnits", f"is '{unit}'; known: {', '.join(UNITS)}")
     if "PoseCamera2" not in fields:
         R = source.numbers(source.get(fields, "RotationOfCamera2", ""), (3, 3), "RotationOfCamera2")
-        return source.pose(R.T, source.get(fields, "TranslationOfCamera2", ""), "camera 2", metres=UNITS[unit])
+        return source.pose(
+            R.T, source.get(fields, "TranslationOfCamera2", ""), "camera 2", metres=UNITS[unit]
+        )
     pose = source.mapping(fields["PoseCamera2"], "PoseCamera2")
     if "A" in pose:
         return source.pose_matrix(pose["A"], "PoseCamera2.A", metres=UNITS[unit])
@@ -141,7 +175,9 @@ def _pose(source: RigSource, fields: dict[str, Any]) -> Pose:
 
 
 def _check_fundamental(source: RigSource, F: Tensor, one: Camera, two: Camera) -> None:
-    """Points that both pinholes see have to be on the lines of F as stated, which is of pixels counted from 1."""
+    """Points that both pinholes see have to be on the lines of F as stated, which is of pixels counted from
+    1.
+    """
     h, w = one.hw
     x = pixel_grid((4, 4), dtype=torch.float64).reshape(-1, 2) * torch.tensor([w / 4, h / 4])
     baseline = two.centre.norm()
@@ -153,5 +189,6 @@ def _check_fundamental(source: RigSource, F: Tensor, one: Camera, two: Camera) -
     if not distance < 1:
         raise source.fail(
             "FundamentalMatrix",
-            f"contradicts the pose of camera 2 by {distance:.3g} px; is the rotation transposed, or the pose inverted?",
+            f"contradicts the pose of camera 2 by {distance:.3g} px; is the rotation transposed, or the "
+            "pose inverted?",
         )

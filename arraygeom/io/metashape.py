@@ -1,9 +1,11 @@
-"""Cameras exported by Agisoft Metashape as XML (its own format): every aligned image is a camera, named by its label.
+"""Cameras exported by Agisoft Metashape as XML (its own format): every aligned image is a camera, named by
+its label.
 
-Source convention: pixels with the first centre at 0.5 (shift -0.5), the principal point cx, cy off the image's middle;
-OpenCV axes; `transform` is camera->chunk, inverted; the world is the chunk's frame, in the scale that the chunk or its
-component states, taken as metres (its rotation and translation into geographic coordinates are left out). In Brown's
-polynomials p1 and p2 change places; b1 adds to the first focal length and b2 is the skew. Frame and fisheye sensors.
+Source convention: pixels with the first centre at 0.5 (shift -0.5), the principal point cx, cy off the
+image's middle; OpenCV axes; `transform` is camera->chunk, inverted; the world is the chunk's frame, in the
+scale that the chunk or its component states, taken as metres (its rotation and translation into geographic
+coordinates are left out). In Brown's polynomials p1 and p2 change places; b1 adds to the first focal length
+and b2 is the skew. Frame and fisheye sensors.
 """
 
 from __future__ import annotations
@@ -20,7 +22,10 @@ from ..rig import Rig
 from ..safe_yaml import DEEPEST, LARGEST_TEXT
 from .source import RigSource
 
-CONVENTION = "first pixel's centre at 0.5 (shift -0.5); camera->chunk, inverted; the chunk's scale, else as in the file"
+CONVENTION = (
+    "first pixel's centre at 0.5 (shift -0.5); camera->chunk, inverted; the chunk's scale, else as "
+    "in the file"
+)
 LENS_NUMBERS = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 
 
@@ -55,7 +60,9 @@ def read(source: RigSource) -> Rig:
         pose = Pose(pose.R, pose.t * metres)
         cameras.append((name, Camera(K=view.K, cam_from_world=pose, hw=view.hw, distortion=view.distortion)))
     if left_out:
-        source.warn(f"holds {len(left_out)} cameras that are not aligned (such as {left_out[0]}); they are left out")
+        source.warn(
+            f"holds {len(left_out)} cameras that are not aligned (such as {left_out[0]}); they are left out"
+        )
     return source.rig(cameras)
 
 
@@ -95,10 +102,14 @@ def _sensor(source: RigSource, sensor: ET.Element, entry: str) -> LensView:
     resolution = sensor.find("resolution") if resolution is None else resolution
     if resolution is None:
         raise source.fail(entry, "has no resolution")
-    width, height = (source.numbers_in(resolution.get(n) or "", (1,), f"{entry} {n}") for n in ("width", "height"))
+    width, height = (
+        source.numbers_in(resolution.get(n) or "", (1,), f"{entry} {n}") for n in ("width", "height")
+    )
     h, w = source.size(width, height, f"{entry} resolution")
     f, cx, cy, b1, b2 = (_number(source, calibration, name, entry) for name in ("f", "cx", "cy", "b1", "b2"))
-    K = source.intrinsics([[f + b1, b2, w / 2 + cx], [0, f, h / 2 + cy], [0, 0, 1]], f"{entry} f", first_pixel=0.5)
+    K = source.intrinsics(
+        [[f + b1, b2, w / 2 + cx], [0, f, h / 2 + cy], [0, 0, 1]], f"{entry} f", first_pixel=0.5
+    )
     return LensView(hw=(h, w), K=K, distortion=_lens(source, calibration, entry))
 
 
@@ -106,9 +117,13 @@ def _lens(source: RigSource, calibration: ET.Element, entry: str) -> Distortion 
     k1, k2, k3, k4, p1, p2, p3, p4 = (_number(source, calibration, name, entry) for name in LENS_NUMBERS)
     kind = calibration.get("type", "frame")
     if kind not in ("frame", "fisheye"):
-        raise source.fail(entry, f"is of type '{kind}'; frame and fisheye are read: undistort the images first")
+        raise source.fail(
+            entry, f"is of type '{kind}'; frame and fisheye are read: undistort the images first"
+        )
     if p3 or p4 or (k4 and kind == "frame"):
-        raise source.fail(entry, "has p3, p4, or for a frame k4, which are not read: optimise the cameras without them")
+        raise source.fail(
+            entry, "has p3, p4, or for a frame k4, which are not read: optimise the cameras without them"
+        )
     if kind == "frame":
         return source.brown_conrady([k1, k2, p2, p1, k3], entry)
     return source.lens(THIN_PRISM_FISHEYE, [k1, k2, p2, p1, k3, k4, 0.0, 0.0], entry)

@@ -1,8 +1,9 @@
 """Middlebury's calib.txt (2014 and 2021 stereo sets).
 
-Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; rectified, with cam1 at `baseline`
-millimetres to the right of cam0; Z = baseline f / (d + doffs), with doffs the difference of the principal points.
-Where the file states the range of disparities (vmin, vmax), the rig's depth range follows from it.
+Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; rectified, with cam1 at
+`baseline` millimetres to the right of cam0; Z = baseline f / (d + doffs), with doffs the difference of the
+principal points. Where the file states the range of disparities (vmin, vmax), the rig's depth range follows
+from it.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ def read(source: RigSource) -> Rig:
     """The pair cam0, cam1."""
     entries = _entries(source)
     Ks = [source.intrinsics(source.get(entries, name, ""), name) for name in ("cam0", "cam1")]
-    width, height, baseline = (source.number(source.get(entries, k, ""), k) for k in ("width", "height", "baseline"))
+    width, height, baseline = (
+        source.number(source.get(entries, k, ""), k) for k in ("width", "height", "baseline")
+    )
     if baseline <= 0:
         raise source.fail("baseline", f"is {baseline:g}; it is positive, in millimetres")
     doffs = source.number(entries.get("doffs", Ks[1][0, 2] - Ks[0][0, 2]), "doffs")

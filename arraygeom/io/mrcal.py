@@ -1,8 +1,9 @@
 """mrcal's .cameramodel: one camera a file, or a folder of them.
 
-Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `rt_cam_ref`, in older files `extrinsics`,
-is a rotation vector and a translation in metres that take points of the reference frame into the camera's.
-LENSMODEL_SPLINED_STEREOGRAPHIC's displacements are of stereographic points: the camera model `Splined`.
+Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `rt_cam_ref`, in older files
+`extrinsics`, is a rotation vector and a translation in metres that take points of the reference frame into
+the camera's. LENSMODEL_SPLINED_STEREOGRAPHIC's displacements are of stereographic points: the camera model
+`Splined`.
 """
 
 from __future__ import annotations
@@ -21,12 +22,16 @@ from ..lenses.model import LensModel
 from ..rig import Rig
 from .source import RigSource
 
-CONVENTION = "first pixel's centre at 0 (shift 0); rt_cam_ref (extrinsics) = X_camera from X_reference, in metres"
+CONVENTION = (
+    "first pixel's centre at 0 (shift 0); rt_cam_ref (extrinsics) = X_camera from X_reference, in metres"
+)
 SUFFIX = ".cameramodel"
 LENSES = {"LENSMODEL_PINHOLE": 0, **{f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)}}
 """How many coefficients follow fx, fy, cx, cy."""
 SPHERE = "LENSMODEL_LONLAT"
-SPLINED = re.compile(r"LENSMODEL_SPLINED_STEREOGRAPHIC_order=([23])_Nx=(\d+)_Ny=(\d+)_fov_x_deg=(\d+(?:\.\d+)?)")
+SPLINED = re.compile(
+    r"LENSMODEL_SPLINED_STEREOGRAPHIC_order=([23])_Nx=(\d+)_Ny=(\d+)_fov_x_deg=(\d+(?:\.\d+)?)"
+)
 LONGEST = 1_000_000
 """Characters of a file at most: splined models have thousands of numbers."""
 
@@ -61,7 +66,9 @@ def _lens(source: RigSource, model: str, numbers: torch.Tensor) -> LensModel | N
     splined = SPLINED.fullmatch(model)
     if not splined and model not in LENSES and model != SPHERE:
         known = ", ".join([*LENSES, SPHERE, "LENSMODEL_SPLINED_STEREOGRAPHIC"])
-        raise source.fail("lensmodel", f"is '{model}'; of mrcal's {known} are read: use mrcal-convert-lensmodel")
+        raise source.fail(
+            "lensmodel", f"is '{model}'; of mrcal's {known} are read: use mrcal-convert-lensmodel"
+        )
     if not splined:
         rest = source.numbers(numbers, (4 + LENSES.get(model, 0),), "intrinsics")[4:]
         return Equirectangular() if model == SPHERE else source.brown_conrady(rest, "intrinsics")

@@ -1,8 +1,8 @@
 """multical's calibration.json.
 
-Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `camera_poses` of a camera takes points
-of the rig's frame into the camera's. An entry "B_to_A" likewise takes points of A into B, whatever its name suggests;
-the world is then A. Lengths are in the board's unit, taken as metres.
+Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `camera_poses` of a camera takes
+points of the rig's frame into the camera's. An entry "B_to_A" likewise takes points of A into B, whatever its
+name suggests; the world is then A. Lengths are in the board's unit, taken as metres.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ def read(source: RigSource) -> Rig:
     poses = _poses(source, source.mapping(source.get(document, "camera_poses", ""), "camera_poses"), cameras)
     missing = [name for name in cameras if name not in poses]
     if missing:
-        raise source.fail(f"camera_poses.{missing[0]}", "is missing; was this camera not calibrated with the others?")
+        raise source.fail(
+            f"camera_poses.{missing[0]}", "is missing; was this camera not calibrated with the others?"
+        )
     return source.rig((name, _camera(source, name, cameras[name], poses[name])) for name in cameras)
 
 

@@ -28,9 +28,9 @@ Units and the pixel convention stand in the file. Example:
     links:                            # pairs of cameras that have only a size
       - {alpha: mono, beta: colour, F: [[...], [...], [...]], H: [[...], [...], [...]]}
 
-A camera that is not calibrated may have a lens all the same, which says itself how many pixels count as 1 and where its
-centre is: `distortion: {model: ..., coefficients: [...], scale: 320, centre: [319.5, 199.5]}`. F and H of its links are
-between undistorted pixels.
+A camera that is not calibrated may have a lens all the same, which says itself how many pixels count as 1 and
+where its centre is: `distortion: {model: ..., coefficients: [...], scale: 320, centre: [319.5, 199.5]}`. F
+and H of its links are between undistorted pixels.
 
 Numbers in pixels are converted to ours (first centre at 0) when read; files are written in our convention.
 """
@@ -92,7 +92,8 @@ def write(rig: Rig) -> str:
     """The text of a native file. Raises ValueError for a batch of rigs."""
     if rig.batch_shape:
         raise ValueError(
-            f"a rig file holds one rig and this is a batch of {tuple(rig.batch_shape)}: write one each, rig[i]"
+            f"a rig file holds one rig and this is a batch of {tuple(rig.batch_shape)}: write one each, "
+            "rig[i]"
         )
     document: dict[str, Any] = {"format": FORMAT}
     if rig.name:
@@ -130,7 +131,9 @@ class _Document(RigSource):
             if not 0 < near <= far:
                 raise self.fail("depth", f"is [{near:g}, {far:g}] m; wanted [near, far] with 0 < near <= far")
             depth = (near, far)
-        return Rig(cameras, depth=depth, links=self.links(document, cameras), name=str(document.get("name", "")))
+        return Rig(
+            cameras, depth=depth, links=self.links(document, cameras), name=str(document.get("name", ""))
+        )
 
     def links(self, document: dict[str, Any], cameras: Mapping[str, View]) -> dict[tuple[str, str], Link]:
         links: dict[tuple[str, str], Link] = {}
@@ -138,14 +141,18 @@ class _Document(RigSource):
             names, link = self.link(f"links[{i}]", fields, cameras)
             if names in links:
                 first = list(links).index(names)
-                raise self.fail(f"links[{i}]", f"is between '{names[0]}' and '{names[1]}', as links[{first}]: keep one")
+                raise self.fail(
+                    f"links[{i}]", f"is between '{names[0]}' and '{names[1]}', as links[{first}]: keep one"
+                )
             links[names] = link
         return links
 
     def camera(self, entry: str, fields: Any) -> View:
         """A calibrated camera, a view with a lens alone, or one of which only the size is known."""
         self.keys(fields, CAMERA, entry)
-        width, height = (self.whole(n, f"{entry}.size") for n in self.pair(fields.get("size"), f"{entry}.size"))
+        width, height = (
+            self.whole(n, f"{entry}.size") for n in self.pair(fields.get("size"), f"{entry}.size")
+        )
         view = View(hw=self.bounded((height, width), f"{entry}.size"), sensor=self.sensor(entry, fields))
         stated = fields.keys() & CALIBRATION
         if not stated:
@@ -167,14 +174,17 @@ class _Document(RigSource):
         if not ("scale" in fields or "K" in fields):
             raise self.fail(
                 entry,
-                "is of a camera without 'focal': add that, or `scale` (the pixels that count as 1 in the lens model)",
+                "is of a camera without 'focal': add that, or `scale` (the pixels that count as 1 in the "
+                "lens model)",
             )
         K = self.K(entry, fields, view.hw, scale="scale")
         lens = self.distortion(entry, {key: fields.get(key) for key in ("model", "coefficients")})
         return LensView(hw=view.hw, sensor=view.sensor, K=K, distortion=lens)
 
     def K(self, entry: str, fields: Mapping[str, Any], hw: tuple[int, int], scale: str = "focal") -> Tensor:
-        """The intrinsic matrix as stated, or from `scale` (focal lengths, for a calibrated camera) and centre."""
+        """The intrinsic matrix as stated, or from `scale` (focal lengths, for a calibrated camera) and
+        centre.
+        """
         if "K" in fields:
             K = self.numbers(fields["K"], (3, 3), f"{entry}.K")
             if K[2].tolist() != [0, 0, 1] or K[:2, :2].det().abs() < 1e-9:
@@ -183,7 +193,9 @@ class _Document(RigSource):
                 )
             return shift_matrix(self.origin, self.origin) @ K
         if scale not in fields:
-            raise self.fail(entry, "has a pose or a centre but no 'focal' (pixels): add it, or leave only 'size'")
+            raise self.fail(
+                entry, "has a pose or a centre but no 'focal' (pixels): add it, or leave only 'size'"
+            )
         focal = self.pair(fields[scale], f"{entry}.{scale}")
         if min(focal) <= 0:
             raise self.fail(f"{entry}.{scale}", f"is {min(focal):g}; a {NAMED[scale]} is positive, in pixels")
@@ -197,8 +209,12 @@ class _Document(RigSource):
         if "translation" in fields and "position" in fields:
             raise self.fail(entry, "has both 'translation' (t) and 'position' (-R^T t): keep one")
         if "position" in fields:
-            return Pose.from_centre(R, self.numbers(fields["position"], (3,), f"{entry}.position") * self.metre)
-        return Pose(R, self.numbers(fields.get("translation", [0, 0, 0]), (3,), f"{entry}.translation") * self.metre)
+            return Pose.from_centre(
+                R, self.numbers(fields["position"], (3,), f"{entry}.position") * self.metre
+            )
+        return Pose(
+            R, self.numbers(fields.get("translation", [0, 0, 0]), (3,), f"{entry}.translation") * self.metre
+        )
 
     def stated_rotation(self, entry: str, value: Any) -> Tensor:
         """From a matrix, or a rotation vector in degrees."""
@@ -216,7 +232,8 @@ class _Document(RigSource):
             known = ", ".join([*COEFFICIENT_COUNTS, *CAMERA_MODELS])
             raise self.fail(
                 f"{entry}.model",
-                f"is '{value['model']}', not one of {known}: import the module that defines a model of your own first",
+                f"is '{value['model']}', not one of {known}: import the module that defines a model of your "
+                "own first",
             )
         self.keys(value, ("model", "coefficients"), entry)
         coefficients = self.numbers(value.get("coefficients"), None, f"{entry}.coefficients")
@@ -235,7 +252,9 @@ class _Document(RigSource):
                 numbers[name] = self.numbers(given, None if several else (), f"{entry}.{name}")
             elif name != "model":
                 numbers[name] = given
-        missing = [n for n, f in known.items() if n not in numbers and f.default is f.default_factory is MISSING]
+        missing = [
+            n for n, f in known.items() if n not in numbers and f.default is f.default_factory is MISSING
+        ]
         if missing:
             raise self.fail(entry, f"has no {' or '.join(missing)}, which a {value['model']} camera has")
         return self.made(entry, lambda: kind(**numbers))
@@ -307,7 +326,9 @@ class _Document(RigSource):
         names = [str(fields.get(key)) for key in ("alpha", "beta")]
         for key, name in zip(("alpha", "beta"), names):
             if name not in cameras:
-                raise self.fail(f"{entry}.{key}", f"is '{name}', which is no camera of this rig ({', '.join(cameras)})")
+                raise self.fail(
+                    f"{entry}.{key}", f"is '{name}', which is no camera of this rig ({', '.join(cameras)})"
+                )
         F = shift_origin(self.numbers(fields.get("F"), (3, 3), f"{entry}.F"), self.origin)
         H = None
         if fields.get("H") is not None:
@@ -324,7 +345,9 @@ class _Document(RigSource):
                 hint = f"did you mean '{near[0]}'?" if near else f"known here: {', '.join(allowed)}"
                 raise self.fail(f"{entry}.{key}" if entry else str(key), f"unknown key; {hint}")
 
-    def numbers(self, value: Any, shape: tuple[int, ...] | None, entry: str, *, infinite: bool = False) -> Tensor:
+    def numbers(
+        self, value: Any, shape: tuple[int, ...] | None, entry: str, *, infinite: bool = False
+    ) -> Tensor:
         lengths = " x ".join(map(str, shape or ()))
         wanted = "a list of numbers" if shape is None else f"{lengths} numbers" if shape else "a number"
         tensor = float64_of(value)
@@ -373,7 +396,9 @@ def _model_entry(lens: LensModel) -> dict[str, Any]:
         return {"model": lens.model, "coefficients": lens.coefficients.tolist()}
     if not isinstance(lens, CameraModel) or not lens.registered:
         kind = type(lens).__name__
-        raise ValueError(f"the camera model {kind} has no name for rig files: class {kind}(CameraModel, name=...)")
+        raise ValueError(
+            f"the camera model {kind} has no name for rig files: class {kind}(CameraModel, name=...)"
+        )
     held = {f.name: getattr(lens, f.name) for f in dataclasses.fields(lens)}  # type: ignore[arg-type]
     entry: dict[str, Any] = {"model": lens.model}
     for name, value in held.items():
@@ -395,7 +420,9 @@ def _sensor_entry(sensor: Sensor) -> dict[str, Any]:
     if isinstance(sensor.gain, tuple):
         entry["gain"] = list(sensor.gain)
     if isinstance(sensor.response, Band | Curve):
-        entry["response"] = {k: list(v) if isinstance(v, tuple) else v for k, v in vars(sensor.response).items()}
+        entry["response"] = {
+            k: list(v) if isinstance(v, tuple) else v for k, v in vars(sensor.response).items()
+        }
     return entry
 
 

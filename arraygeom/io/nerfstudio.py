@@ -1,8 +1,8 @@
 """transforms.json of nerfstudio and instant-ngp.
 
-Source convention: pixels with the first centre at 0.5 (shift -0.5); OpenGL axes (y up, optical axis -z), rotated
-into ours; `transform_matrix` is camera->world, inverted; the scale is the file's own, taken as metres.
-Intrinsics may stand at the top or in each frame.
+Source convention: pixels with the first centre at 0.5 (shift -0.5); OpenGL axes (y up, optical axis -z),
+rotated into ours; `transform_matrix` is camera->world, inverted; the scale is the file's own, taken as
+metres. Intrinsics may stand at the top or in each frame.
 """
 
 from __future__ import annotations
@@ -24,12 +24,15 @@ from .export import brown_conrady, calibrated, focal_and_centre, pose_rows
 from .source import RigSource
 
 CONVENTION = (
-    "first pixel's centre at 0.5 (shift -0.5); OpenGL camera->world, rotated and inverted; scale as in the file"
+    "first pixel's centre at 0.5 (shift -0.5); OpenGL camera->world, rotated and inverted; scale "
+    "as in the file"
 )
 FISHEYES = ("OPENCV_FISHEYE", "FISHEYE")
 PERSPECTIVES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 # Ours (y down, z forward) from OpenGL's (y up, z back).
-FLIP = Pose(torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)), torch.zeros(3, dtype=torch.float64))
+FLIP = Pose(
+    torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)), torch.zeros(3, dtype=torch.float64)
+)
 
 
 def recognises(path: Path, head: str) -> bool:
@@ -73,7 +76,9 @@ def _focal(source: RigSource, fields: Mapping[str, Any], axis: str, size: int, e
     """Stated, or from the field of view in radians."""
     if fields.get(f"fl_{axis}") is not None:
         return source.number(fields[f"fl_{axis}"], f"{entry} fl_{axis}")
-    angle = source.number(source.get(fields, (f"camera_angle_{axis}",), f"{entry} fl_{axis}"), f"{entry} camera_angle")
+    angle = source.number(
+        source.get(fields, (f"camera_angle_{axis}",), f"{entry} fl_{axis}"), f"{entry} camera_angle"
+    )
     if not 0 < angle < math.pi:
         raise source.fail(f"{entry} camera_angle_{axis}", f"is {angle:g}; wanted radians between 0 and pi")
     return size / 2 / math.tan(angle / 2)
@@ -82,14 +87,20 @@ def _focal(source: RigSource, fields: Mapping[str, Any], axis: str, size: int, e
 def _lens(source: RigSource, fields: Mapping[str, Any], entry: str) -> Distortion | None:
     model = str(fields.get("camera_model", "OPENCV")).upper()
     if model not in FISHEYES + PERSPECTIVES:
-        raise source.fail(f"{entry} camera_model", f"is {model}; supported: {', '.join(PERSPECTIVES + FISHEYES)}")
-    value = {k: source.number(fields.get(k, 0.0), f"{entry} {k}") for k in ("k1", "k2", "k3", "k4", "p1", "p2")}
+        raise source.fail(
+            f"{entry} camera_model", f"is {model}; supported: {', '.join(PERSPECTIVES + FISHEYES)}"
+        )
+    value = {
+        k: source.number(fields.get(k, 0.0), f"{entry} {k}") for k in ("k1", "k2", "k3", "k4", "p1", "p2")
+    }
     if fields.get("is_fisheye") or model in FISHEYES:
         return source.kannala_brandt([value[k] for k in ("k1", "k2", "k3", "k4")], entry)
     if not any(k in fields for k in value):
         return None
     if value["k4"] != 0:
-        raise source.fail(f"{entry} k4", "is the r^8 term of a perspective lens, which OpenCV's model does not have")
+        raise source.fail(
+            f"{entry} k4", "is the r^8 term of a perspective lens, which OpenCV's model does not have"
+        )
     c = [value[k] for k in ("k1", "k2", "p1", "p2", "k3")]
     return source.brown_conrady(c if "k3" in fields else c[:4], entry)
 
@@ -102,7 +113,9 @@ def _frame(name: str, camera: Camera) -> dict[str, Any]:
     if lens is None:
         fields["camera_model"] = "PINHOLE"
     elif lens.model == KANNALA_BRANDT:
-        fields |= {"camera_model": "OPENCV_FISHEYE"} | dict(zip(("k1", "k2", "k3", "k4"), lens.coefficients.tolist()))
+        fields |= {"camera_model": "OPENCV_FISHEYE"} | dict(
+            zip(("k1", "k2", "k3", "k4"), lens.coefficients.tolist())
+        )
     else:
         names = ("k1", "k2", "p1", "p2", "k3")
         fields |= {"camera_model": "OPENCV"} | dict(zip(names, brown_conrady(name, lens, at_most=5)))

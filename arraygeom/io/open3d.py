@@ -1,7 +1,7 @@
 """JSON of Open3D: PinholeCameraParameters, or a PinholeCameraTrajectory of several.
 
-Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; metres; `intrinsic_matrix` and `extrinsic`
-(world->camera, 4 x 4) column by column. Cameras of a trajectory are named cam0, cam1, ...
+Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; metres; `intrinsic_matrix` and
+`extrinsic` (world->camera, 4 x 4) column by column. Cameras of a trajectory are named cam0, cam1, ...
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ def _camera(source: RigSource, fields: Any, name: str) -> Camera:
     fields = source.mapping(fields, name)
     entry = f"{name}.intrinsic"
     intrinsic = source.mapping(source.get(fields, "intrinsic", name), entry)
-    columns = source.numbers(source.get(intrinsic, "intrinsic_matrix", entry), (3, 3), f"{entry}.intrinsic_matrix")
+    columns = source.numbers(
+        source.get(intrinsic, "intrinsic_matrix", entry), (3, 3), f"{entry}.intrinsic_matrix"
+    )
     extrinsic = source.numbers(source.get(fields, "extrinsic", name), (4, 4), f"{name}.extrinsic")
     width, height = (source.get(intrinsic, side, entry) for side in ("width", "height"))
     return Camera(

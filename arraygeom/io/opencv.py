@@ -2,8 +2,8 @@
 
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; X_2 = R X_1 + T, so the world is
 camera 1; lengths in the unit of the calibration board, taken as metres. OpenCV's stereo sample writes
-`intrinsics.yml` (M1 D1 M2 D2) and `extrinsics.yml` (R T ...): name either, or their folder. It states no image
-size.
+`intrinsics.yml` (M1 D1 M2 D2) and `extrinsics.yml` (R T ...): name either, or their folder. It states no
+image size.
 """
 
 from __future__ import annotations
@@ -48,8 +48,12 @@ def read(source: RigSource) -> Rig:
         nodes |= _nodes(RigSource(path))
     if not any(name.format(1) in nodes for name in K_NAMES):
         if "R" in nodes and "T" in nodes:
-            raise source.fail("M1", "is missing: a pair's R and T are here without its intrinsics.yml beside them")
-        return source.rig([(str(nodes.get("camera_name", "camera")), _camera(source, nodes, "", Pose.identity()))])
+            raise source.fail(
+                "M1", "is missing: a pair's R and T are here without its intrinsics.yml beside them"
+            )
+        return source.rig(
+            [(str(nodes.get("camera_name", "camera")), _camera(source, nodes, "", Pose.identity()))]
+        )
     if "R" not in nodes or "T" not in nodes:
         raise source.fail("R, T", "are missing: put the pair's extrinsics.yml beside its intrinsics.yml")
     poses = Pose.identity(), source.pose(nodes["R"], nodes["T"], "R, T:")
@@ -58,7 +62,8 @@ def read(source: RigSource) -> Rig:
 
 
 def write(rig: Rig) -> str | dict[str, str]:
-    """One camera as a file; two as `intrinsics.yml` and `extrinsics.yml` of a folder, the world becoming camera 1.
+    """One camera as a file; two as `intrinsics.yml` and `extrinsics.yml` of a folder, the world becoming
+    camera 1.
 
     Raises ValueError for more cameras, and for what the format cannot hold.
     """
@@ -66,7 +71,9 @@ def write(rig: Rig) -> str | dict[str, str]:
     if len(cameras) == 1:
         return _HEADER + f'camera_name: "{cameras[0][0]}"\n' + _camera_text(*cameras[0], "")
     if len(cameras) != 2:
-        raise ValueError(f"OpenCV files hold one camera or two and the rig has {len(cameras)}: use the native format")
+        raise ValueError(
+            f"OpenCV files hold one camera or two and the rig has {len(cameras)}: use the native format"
+        )
     (_, one), (_, two) = cameras
     relative = two.cam_from_world @ one.cam_from_world.inverse()
     names = "".join(f'name{i}: "{name}"\n' for i, (name, _) in enumerate(cameras, 1))
@@ -125,7 +132,9 @@ def _nodes(source: RigSource) -> dict[str, Any]:
         root = storage.root()
         return {name: _value(root.getNode(name)) for name in root.keys()}  # noqa: SIM118
     except (cv2.error, SystemError):
-        raise source.fail(None, "is not an OpenCV FileStorage (YAML, XML or JSON); is the file whole?") from None
+        raise source.fail(
+            None, "is not an OpenCV FileStorage (YAML, XML or JSON); is the file whole?"
+        ) from None
 
 
 def _check_nesting(source: RigSource, text: str) -> None:
@@ -164,7 +173,9 @@ def _camera_text(name: str, camera: Camera, i: str) -> str:
     lens, (h, w) = camera.distortion, camera.hw
     fisheye = lens is not None and lens.model == KANNALA_BRANDT
     text = f"image_width{i}: {w}\nimage_height{i}: {h}\n" + (f"fisheye_model{i}: 1\n" if fisheye else "")
-    text += _matrix_text(f"M{i}" if i else "camera_matrix", camera.K.new_tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+    text += _matrix_text(
+        f"M{i}" if i else "camera_matrix", camera.K.new_tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    )
     if lens is None:
         return text
     c = lens.coefficients if fisheye else camera.K.new_tensor(brown_conrady(name, lens, at_most=14))

@@ -1,7 +1,8 @@
 """Matched points of pairs of images, from a CSV file or a COLMAP database.
 
-CSV: x0 y0 x1 y1 a line, in the order of two images given, first pixel's centre at 0; a header may name the columns.
-COLMAP: verified matches where there are any; the first pixel's centre is at 0.5 (shift -0.5); images by file name.
+CSV: x0 y0 x1 y1 a line, in the order of two images given, first pixel's centre at 0; a header may name the
+columns. COLMAP: verified matches where there are any; the first pixel's centre is at 0.5 (shift -0.5); images
+by file name.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ PointPairs = dict[tuple[str, str], tuple[Tensor, Tensor]]
 def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mapping[str, HW]) -> PointPairs:
     """The matches of a file between the images of cameras, whose sizes are given too.
 
-    Raises FileNotFoundError, and ValueError for files of another kind, for more or fewer than two images with a CSV
-    file, for a database without these images, and for points outside the images.
+    Raises FileNotFoundError, and ValueError for files of another kind, for more or fewer than two images with
+    a CSV file, for a database without these images, and for points outside the images.
     """
     path = Path(path)
     if not path.is_file():
@@ -46,7 +47,8 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
             outside = ((x < -0.5) | (x > x.new_tensor([w, h]) - 0.5)).any(-1)
             if outside.any():
                 raise ValueError(
-                    f"{path}: {int(outside.sum())} of {len(x)} points are outside the image of '{name}', {w}x{h}: "
+                    f"{path}: {int(outside.sum())} of {len(x)} points are outside the image of '{name}', "
+                    f"{w}x{h}: "
                     "are they of this image, at this size?"
                 )
     return found
@@ -54,7 +56,9 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
 
 def _csv(path: Path, files: Mapping[str, Path]) -> PointPairs:
     if len(files) != 2:
-        raise ValueError(f"{path}: x0 y0 x1 y1 relate two images, and {len(files)} are given: give two, or a database")
+        raise ValueError(
+            f"{path}: x0 y0 x1 y1 relate two images, and {len(files)} are given: give two, or a database"
+        )
     try:
         lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
     except UnicodeDecodeError:
@@ -86,14 +90,18 @@ def _database(path: Path, files: Mapping[str, Path]) -> PointPairs:
         with closing(sqlite3.connect(f"file:{path.resolve()}?mode=ro", uri=True)) as database:
             return _colmap(database, path, files)
     except sqlite3.Error as error:
-        raise ValueError(f"{path}: not a COLMAP database ({error}): give COLMAP's database.db, or CSV") from None
+        raise ValueError(
+            f"{path}: not a COLMAP database ({error}): give COLMAP's database.db, or CSV"
+        ) from None
 
 
 def _colmap(database: sqlite3.Connection, path: Path, files: Mapping[str, Path]) -> PointPairs:
     ids = {Path(name).name: number for number, name in database.execute("SELECT image_id, name FROM images")}
     if missing := [file.name for file in files.values() if file.name not in ids]:
         known = ", ".join(list(ids)[:5])
-        raise ValueError(f"{path}: has no image {missing[0]} (it has {known}, ...): give the images it was made of")
+        raise ValueError(
+            f"{path}: has no image {missing[0]} (it has {known}, ...): give the images it was made of"
+        )
     names = {ids[file.name]: name for name, file in files.items()}
     found: PointPairs = {}
     for table in ("two_view_geometries", "matches"):

@@ -1,7 +1,7 @@
 """JSON of K, d, R and t, as pycalib writes: lists over the cameras, or one camera's matrices.
 
-Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; world->camera; the scale is arbitrary and
-taken as metres. No image size is stated. Cameras are named cam0, cam1, ...
+Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; world->camera; the scale is
+arbitrary and taken as metres. No image size is stated. Cameras are named cam0, cam1, ...
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ def read(source: RigSource) -> Rig:
     if not len(Ks) == len(Rs) == len(ts) == len(ds):
         counts = f"{len(Ks)}, {len(Rs)}, {len(ts)} and {len(ds)}"
         raise source.fail("K, R, t, d", f"have {counts} cameras; they are lists of equal length")
-    return source.rig((f"cam{i}", _camera(source, i, *numbers)) for i, numbers in enumerate(zip(Ks, Rs, ts, ds)))
+    return source.rig(
+        (f"cam{i}", _camera(source, i, *numbers)) for i, numbers in enumerate(zip(Ks, Rs, ts, ds))
+    )
 
 
 def _camera(source: RigSource, i: int, K: Any, R: Any, t: Any, d: Any) -> Camera:

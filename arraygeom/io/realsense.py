@@ -1,7 +1,8 @@
 """What `rs-enumerate-devices -c` prints of a RealSense camera, kept as a text file.
 
-Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `Extrinsic from "A" To "B"` takes points of
-A into B, in metres, the matrix row by row. The world is the depth camera, or the first stream that has intrinsics.
+Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `Extrinsic from "A" To "B"` takes
+points of A into B, in metres, the matrix row by row. The world is the depth camera, or the first stream that
+has intrinsics.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ from ..pose import Pose
 from ..rig import Rig
 from .source import RigSource
 
-CONVENTION = "first pixel's centre at 0 (shift 0); extrinsics from one stream to another, in metres; world = depth"
+CONVENTION = (
+    "first pixel's centre at 0 (shift 0); extrinsics from one stream to another, in metres; world = depth"
+)
 LONGEST = 1_000_000
 INTRINSIC = re.compile(r'^\s*Intrinsic of "([^"]+)"[^\n]*\n((?:\s+[^:\n]+:[^\n]*\n?)+)', re.M)
 EXTRINSIC = re.compile(
@@ -44,7 +47,9 @@ def _is_report(path: Path, head: str) -> bool:
     """The lists of modes before the intrinsics may be longer than what was read of the file."""
     if 'Intrinsic of "' in head:
         return True
-    return "Intel RealSense" in head and 'Intrinsic of "' in path.read_bytes()[:LONGEST].decode(errors="replace")
+    return "Intel RealSense" in head and 'Intrinsic of "' in path.read_bytes()[:LONGEST].decode(
+        errors="replace"
+    )
 
 
 def read(source: RigSource) -> Rig:
@@ -84,7 +89,9 @@ def _camera(source: RigSource, stream: Stream, pose: Pose) -> Camera:
     name, fields = stream.name, stream.fields
     numbers = [source.get(fields, key, name) for key in ("Fx", "Fy", "PPX", "PPY")]
     return Camera(
-        K=source.focal_and_centre(source.numbers_in(" ".join(numbers), (4,), f"{name} Fx, Fy, PPX, PPY"), name),
+        K=source.focal_and_centre(
+            source.numbers_in(" ".join(numbers), (4,), f"{name} Fx, Fy, PPX, PPY"), name
+        ),
         cam_from_world=pose,
         hw=stream.hw,
         distortion=_lens(source, name, fields),
@@ -94,8 +101,8 @@ def _camera(source: RigSource, stream: Stream, pose: Pose) -> Camera:
 def _lens(source: RigSource, name: str, fields: dict[str, str]) -> Distortion | None:
     """A lens; none of coefficients 0.
 
-    The modified model applies p1 and p2 to points that are distorted already: it is read where they are 0, and then the
-    same. The inverse model's polynomial undistorts.
+    The modified model applies p1 and p2 to points that are distorted already: it is read where they are 0,
+    and then the same. The inverse model's polynomial undistorts.
     """
     c = source.numbers_in(fields.get("Coeffs", ""), None, f"{name} Coeffs")
     kind = source.get(fields, "Distortion", name)
@@ -107,6 +114,7 @@ def _lens(source: RigSource, name: str, fields: dict[str, str]) -> Distortion | 
         return source.kannala_brandt(c[:4], f"{name} Coeffs")
     raise source.fail(
         f"{name} Distortion",
-        f"is '{kind}' with these coefficients; Brown Conrady, Kannala Brandt4, and Modified Brown Conrady without "
+        f"is '{kind}' with these coefficients; Brown Conrady, Kannala Brandt4, and Modified Brown Conrady "
+        "without "
         "tangential terms are read",
     )

@@ -1,9 +1,9 @@
 """ROS CameraInfo YAML: one camera a file, or a folder of such files as one rig.
 
-Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; metres. `projection_matrix` P = K' [I | t]
-acts on points of the *rectified* frame, which all cameras of a stereo pair share and which is the world here;
-`rectification_matrix` takes the camera's frame into it: X_cam = R_rect^T (X_world + t). A P of zeros states nothing:
-the camera is then at the world's origin, rotated by R_rect.
+Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; metres. `projection_matrix` P =
+K' [I | t] acts on points of the *rectified* frame, which all cameras of a stereo pair share and which is the
+world here; `rectification_matrix` takes the camera's frame into it: X_cam = R_rect^T (X_world + t). A P of
+zeros states nothing: the camera is then at the world's origin, rotated by R_rect.
 """
 
 from __future__ import annotations
@@ -76,7 +76,9 @@ def _lens(source: RigSource, info: dict[str, Any]) -> Distortion | None:
         return source.kannala_brandt(_data(source, info, entry), entry)
     if model in ("", "none"):
         return None
-    raise source.fail("distortion_model", f"is '{model}'; supported: plumb_bob, rational_polynomial, equidistant")
+    raise source.fail(
+        "distortion_model", f"is '{model}'; supported: plumb_bob, rational_polynomial, equidistant"
+    )
 
 
 def _data(source: RigSource, info: dict[str, Any], name: str) -> Any:

@@ -86,7 +86,9 @@ class RigSource:
         try:
             document = load_json(text)
         except json.JSONDecodeError as error:
-            raise self.fail(f"line {error.lineno}", f"is not JSON ({error.msg}); is the file whole?") from None
+            raise self.fail(
+                f"line {error.lineno}", f"is not JSON ({error.msg}); is the file whole?"
+            ) from None
         except ValueError as error:
             raise self.fail(None, str(error)) from None
         return self.mapping(document, None)
@@ -105,7 +107,9 @@ class RigSource:
             return self.mapping(load_yaml(self.text() if text is None else text), None)
         except yaml.YAMLError as error:
             line, problem = yaml_problem(error)
-            raise self.fail(f"line {line}" if line else None, f"is not YAML ({problem}); is the file whole?") from None
+            raise self.fail(
+                f"line {line}" if line else None, f"is not YAML ({problem}); is the file whole?"
+            ) from None
 
     def mapping(self, value: Any, entry: str | None) -> dict[str, Any]:
         """A value that has to be a mapping with something in it."""
@@ -122,7 +126,9 @@ class RigSource:
         raise self.fail(entry or None, f"has no {' or '.join(keys)}")
 
     def numbers(self, value: Any, shape: tuple[int, ...] | None, entry: str) -> Tensor:
-        """Finite numbers as a float64 tensor of a shape (any order of nesting that has as many), or a vector."""
+        """Finite numbers as a float64 tensor of a shape (any order of nesting that has as many), or a
+        vector.
+        """
         tensor = float64_of(value)
         if tensor is None:
             raise self.fail(entry, f"holds something other than numbers: {short(value)}")
@@ -183,9 +189,13 @@ class RigSource:
         """K (3, 3) with the first pixel's centre moved from `first_pixel` to 0."""
         K = self.numbers(value, (3, 3), entry)
         if K[2].tolist() != [0.0, 0.0, 1.0]:
-            raise self.fail(entry, f"has last row {short(K[2].tolist())}, wanted [0, 0, 1]; is it transposed?")
+            raise self.fail(
+                entry, f"has last row {short(K[2].tolist())}, wanted [0, 0, 1]; is it transposed?"
+            )
         if not (K[0, 0] > 0 and K[1, 1] > 0):
-            raise self.fail(entry, f"has focal lengths {K[0, 0]:g} and {K[1, 1]:g}; they are positive, in pixels")
+            raise self.fail(
+                entry, f"has focal lengths {K[0, 0]:g} and {K[1, 1]:g}; they are positive, in pixels"
+            )
         return shift_matrix(first_pixel, first_pixel) @ K
 
     def focal_and_centre(self, numbers: Any, entry: str, *, first_pixel: float = 0.0) -> Tensor:
@@ -214,14 +224,18 @@ class RigSource:
 
     def pose(self, R: Any, t: Any, entry: str, *, metres: float = 1.0) -> Pose:
         """X_to = R X_from + t with t given in units of `metres`."""
-        return Pose(self.rotation(R, f"{entry} rotation"), self.numbers(t, (3,), f"{entry} translation") * metres)
+        return Pose(
+            self.rotation(R, f"{entry} rotation"), self.numbers(t, (3,), f"{entry} translation") * metres
+        )
 
     def pose_matrix(self, T: Any, entry: str, *, metres: float = 1.0) -> Pose:
         """A pose from a 4 x 4 or 3 x 4 matrix."""
         numbers = self.numbers(T, None, entry)
         M = self.numbers(numbers, (3, 4) if numbers.numel() == 12 else (4, 4), entry)
         if len(M) == 4 and (M[3] - M.new_tensor([0, 0, 0, 1])).abs().max() > 1e-9:
-            raise self.fail(entry, f"has last row {short(M[3].tolist())}, wanted [0, 0, 0, 1]; is it transposed?")
+            raise self.fail(
+                entry, f"has last row {short(M[3].tolist())}, wanted [0, 0, 0, 1]; is it transposed?"
+            )
         return self.pose(M[:3, :3], M[:3, 3], entry, metres=metres)
 
     def quaternion(self, wxyz: Any, entry: str) -> Tensor:
@@ -234,7 +248,9 @@ class RigSource:
         return quaternion_to_rotation_matrix(q / q.norm())
 
     def brown_conrady(self, value: Any, entry: str) -> Distortion | None:
-        """A lens from OpenCV's coefficients, padded with zeros to a number that the model has; none if all are 0."""
+        """A lens from OpenCV's coefficients, padded with zeros to a number that the model has; none if all
+        are 0.
+        """
         c = self.numbers([] if value is None else value, None, entry)
         if not c.any():
             return None
@@ -251,13 +267,19 @@ class RigSource:
         return Distortion(KANNALA_BRANDT, torch.nn.functional.pad(c, (0, 4 - c.numel())))
 
     def lens(self, model: str, coefficients: Any, entry: str) -> Distortion | None:
-        """A lens of any model; of other models than the two above from all coefficients, within the model's bounds."""
+        """A lens of any model; of other models than the two above from all coefficients, within the model's
+        bounds.
+        """
         if model in (BROWN_CONRADY, KANNALA_BRANDT):
-            return (self.brown_conrady if model == BROWN_CONRADY else self.kannala_brandt)(coefficients, entry)
+            return (self.brown_conrady if model == BROWN_CONRADY else self.kannala_brandt)(
+                coefficients, entry
+            )
         c = self.numbers(coefficients, (COEFFICIENT_COUNTS[model][0],), entry)
         lens = Distortion(model, c)
         if not lens.project(c.new_tensor([0.0, 0.0, 1.0]))[1]:
-            raise self.fail(entry, f"is {short(c.tolist())}, which no {model} lens has; was the calibration good?")
+            raise self.fail(
+                entry, f"is {short(c.tolist())}, which no {model} lens has; was the calibration good?"
+            )
         return lens
 
     def rig(self, cameras: Iterable[tuple[str, Camera]], **fields: Any) -> Rig:
@@ -273,7 +295,9 @@ class RigSource:
 
 
 def float64_of(value: Any) -> Tensor | None:
-    """Numbers, nested in lists or not, as a float64 tensor; None for what holds anything else, such as true or text."""
+    """Numbers, nested in lists or not, as a float64 tensor; None for what holds anything else, such as true
+    or text.
+    """
     if _has_truth(value):
         return None
     try:

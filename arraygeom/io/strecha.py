@@ -1,8 +1,8 @@
 """The `.camera` files of Strecha's multi-view data: one camera a file, or a folder of them as one rig.
 
-Source convention: K (3 lines), a line of zeros, R (3 lines), C, and the image's size; x ~ K R^T (X - C), so R's columns
-are the camera's axes in the world and C is its centre. Pixels with the first centre at 0 (shift 0); the unit is the
-scene's, taken as metres.
+Source convention: K (3 lines), a line of zeros, R (3 lines), C, and the image's size; x ~ K R^T (X - C), so
+R's columns are the camera's axes in the world and C is its centre. Pixels with the first centre at 0 (shift
+0); the unit is the scene's, taken as metres.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """SYNTIM (INRIA) camera files, one a camera: `cam_NAME_g` (left) and `cam_NAME_d` (right).
 
-Source convention: X_cam = R^T (X - t) in millimetres; K from u0, v0, au, av; no distortion; pixels are taken to have
-the first centre at 0 (shift 0), which the files do not say; OpenCV axes. Name either file of a pair.
+Source convention: X_cam = R^T (X - t) in millimetres; K from u0, v0, au, av; no distortion; pixels are taken
+to have the first centre at 0 (shift 0), which the files do not say; OpenCV axes. Name either file of a pair.
 """
 
 from __future__ import annotations
@@ -37,11 +37,18 @@ def _camera(source: RigSource) -> Camera:
     values = {k: _value(source, text, k) for k in ("u0", "v0", "au", "av", "dimx", "dimy")}
     K = source.focal_and_centre([values[k] for k in ("au", "av", "u0", "v0")], "au, av, u0, v0")
     rotation, _, translation = text.partition("Rotation:")[2].partition("Translation:")
-    rotation, translation = (" ".join(re.findall(NUMBER, part, re.IGNORECASE)) for part in (rotation, translation))
-    R, t = source.numbers_in(rotation, (3, 3), "Rotation"), source.numbers_in(translation, (3,), "Translation")
+    rotation, translation = (
+        " ".join(re.findall(NUMBER, part, re.IGNORECASE)) for part in (rotation, translation)
+    )
+    R, t = (
+        source.numbers_in(rotation, (3, 3), "Rotation"),
+        source.numbers_in(translation, (3,), "Translation"),
+    )
     world_from_cam = source.pose(R, t, "Rotation, Translation:", metres=1e-3)
     return Camera(
-        K=K, cam_from_world=Pose.inverse(world_from_cam), hw=source.size(values["dimx"], values["dimy"], "dimx, dimy")
+        K=K,
+        cam_from_world=Pose.inverse(world_from_cam),
+        hw=source.size(values["dimx"], values["dimy"], "dimx, dimy"),
     )
 
 

@@ -1,14 +1,17 @@
-"""The tags of the images of one capture: Pix4D's `Camera:` (MicaSense, Parrot Sequoia, senseFly) and `drone-dji`.
+"""The tags of the images of one capture: Pix4D's `Camera:` (MicaSense, Parrot Sequoia, senseFly) and
+`drone-dji`.
 
-A file is one image; the others of its capture are those beside it whose names differ in what follows the last "_".
+A file is one image; the others of its capture are those beside it whose names differ in what follows the last
+"_".
 
-Source convention: principal points in millimetres (pixels where the units say so) from the image's first pixel, whose
-centre is 0, as in MicaSense's own code; focal lengths in millimetres or, above 100 or where the units say so, in
-pixels; radial R1 R2 R3 and tangential T1 T2 as OpenCV's k1 k2 k3 p1 p2. Fisheye: theta = 2 / pi times the angle off
-axis goes to p0 + p1 theta + p2 theta^2 + ..., which the matrix C D E F takes to pixels. `RigRelatives` are degrees
-about x, y and z, R = Rx Ry Rz: camera->rig, inverted; `RigTranslations` are the cameras' centres, metres. DJI's
-`DewarpData` is fx fy cx cy k1 k2 p1 p2 k3, with cx and cy counted from `CalibratedOpticalCenter`.
-All are of the pixels as stored: the rig is of the images as their orientation tags say.
+Source convention: principal points in millimetres (pixels where the units say so) from the image's first
+pixel, whose centre is 0, as in MicaSense's own code; focal lengths in millimetres or, above 100 or where the
+units say so, in pixels; radial R1 R2 R3 and tangential T1 T2 as OpenCV's k1 k2 k3 p1 p2. Fisheye: theta = 2 /
+pi times the angle off axis goes to p0 + p1 theta + p2 theta^2 + ..., which the matrix C D E F takes to
+pixels. `RigRelatives` are degrees about x, y and z, R = Rx Ry Rz: camera->rig, inverted; `RigTranslations`
+are the cameras' centres, metres. DJI's `DewarpData` is fx fy cx cy k1 k2 p1 p2 k3, with cx and cy counted
+from `CalibratedOpticalCenter`. All are of the pixels as stored: the rig is of the images as their orientation
+tags say.
 """
 
 from __future__ import annotations
@@ -32,19 +35,24 @@ from ..sensor import Band, Sensor
 from .image_tags import DJI, MICASENSE, PIX4D, ImageTags, image_tags
 from .source import RigSource
 
-CONVENTION = "first pixel's centre at 0 (no shift); millimetres by the sensor's resolution; RigRelatives camera->rig"
+CONVENTION = (
+    "first pixel's centre at 0 (no shift); millimetres by the sensor's resolution; RigRelatives camera->rig"
+)
 
 SUFFIXES = (".tif", ".tiff", ".jpg", ".jpeg")
 VIGNETTING = "VignettingPolynomial", "VignettingPolynomial2D"
 IN_PIXELS = 100.0
-"""A focal length above is in pixels: no lens of these cameras has so many millimetres, and no image so few pixels."""
+"""A focal length above is in pixels: no lens of these cameras has so many millimetres, and no image so few
+pixels.
+"""
 LONGEST_TRANSLATION = 1.0
 """Metres between cameras of one body; what is longer is in another unit."""
 BLACK_LEVEL, EXPOSURE, ISO, ISO_SPEED, TAKEN, SERIAL = 50714, 0x829A, 0x8827, 0x8833, 0x9003, 0xA431
 NORTH, LATITUDE, EAST, LONGITUDE = 1, 2, 3, 4
 """GPS tags: the hemispheres' letters, and degrees, minutes and seconds."""
 SAME_PLACE = 1e-3
-"""Degrees of latitude or longitude, some 100 m, by which images of one capture may differ: receivers wander."""
+"""Degrees of latitude or longitude, some 100 m, by which images of one capture may differ: receivers wander.
+"""
 RESOLUTION_X, RESOLUTION_Y, RESOLUTION_UNIT = 0xA20E, 0xA20F, 0xA210
 ORIENTATION, QUARTER_TURNS = 274, {1: 0, 3: 2, 6: 3, 8: 1}
 """EXIF's orientations, and the quarter turns counter-clockwise that put them upright."""
@@ -71,7 +79,9 @@ def capture_of(path: Path) -> list[Path]:
 
 
 def named_by_band(paths: Sequence[Path]) -> dict[str, Path]:
-    """Images by the names of their bands; where those are not given, by what follows the last "_" of the files'."""
+    """Images by the names of their bands; where those are not given, by what follows the last "_" of the
+    files'.
+    """
     bands = []
     for path in paths:
         tags = image_tags(path)
@@ -88,15 +98,17 @@ def named_by_band(paths: Sequence[Path]) -> dict[str, Path]:
 def states_cameras(paths: Sequence[Path]) -> bool:
     """Whether the tags of every image state its camera."""
     return bool(paths) and all(
-        path.suffix.lower() in SUFFIXES and path.is_file() and _states_camera(image_tags(path)) for path in paths
+        path.suffix.lower() in SUFFIXES and path.is_file() and _states_camera(image_tags(path))
+        for path in paths
     )
 
 
 def rig_of_images(files: Mapping[str, Path]) -> Rig:
-    """The rig of the images of one capture, by camera. Without translations in the tags all cameras are at one point.
+    """The rig of the images of one capture, by camera. Without translations in the tags all cameras are at
+    one point.
 
-    Warns of what the tags do not state. Raises RigFileError for images without tags, of several captures or bodies, and
-    for numbers that no camera has.
+    Warns of what the tags do not state. Raises RigFileError for images without tags, of several captures or
+    bodies, and for numbers that no camera has.
     """
     images = {name: _Image.of(path) for name, path in files.items()}
     _check_one_capture(images)
@@ -108,7 +120,9 @@ def rig_of_images(files: Mapping[str, Path]) -> Rig:
     if any(image.text(name) for image in images.values() for name in VIGNETTING):
         first.warn("vignetting polynomials are stated, and not applied: values are as recorded")
     if len(cameras) > 1 and not any(bool(image.centre.any()) for image in images.values()):
-        first.warn("RigTranslations are not stated: all cameras are at one point; state the translations, in metres")
+        first.warn(
+            "RigTranslations are not stated: all cameras are at one point; state the translations, in metres"
+        )
     return rig
 
 
@@ -147,7 +161,8 @@ class _Image(NamedTuple):
         fields = self.tags.fields
         if RESOLUTION_X not in fields:
             raise self.source.fail(
-                "FocalPlaneXResolution", "is not stated, and the camera's numbers are in millimetres: give a rig file"
+                "FocalPlaneXResolution",
+                "is not stated, and the camera's numbers are in millimetres: give a rig file",
             )
         unit = MILLIMETRES.get(int(fields.get(RESOLUTION_UNIT, (2,))[0]), 25.4)
         x = float(fields[RESOLUTION_X][0])
@@ -184,7 +199,9 @@ class _Image(NamedTuple):
         """Those by which a viewer, and `pat`, rotate the stored pixels, which the tags are of."""
         orientation = int(self.tags.fields.get(ORIENTATION, (1,))[0])
         if orientation not in QUARTER_TURNS:
-            raise self.source.fail("Orientation", f"is {orientation}, a mirrored image: save it as the camera did")
+            raise self.source.fail(
+                "Orientation", f"is {orientation}, a mirrored image: save it as the camera did"
+            )
         return QUARTER_TURNS[orientation]
 
     def _pix4d(self) -> tuple[Tensor, LensModel | None]:
@@ -200,7 +217,9 @@ class _Image(NamedTuple):
             if self.numbers("PerspectiveDistortion") is None:
                 return self._intrinsics(K), None
             r1, r2, r3, t1, t2 = self.needed("PerspectiveDistortion", 5)
-            return self._intrinsics(K), self.source.brown_conrady([r1, r2, t1, t2, r3], "PerspectiveDistortion")
+            return self._intrinsics(K), self.source.brown_conrady(
+                [r1, r2, t1, t2, r3], "PerspectiveDistortion"
+            )
         if kind != "fisheye":
             raise self.source.fail("ModelType", f"is '{kind}'; perspective and fisheye are read")
         p = self.numbers("FisheyePolynomial")
@@ -219,7 +238,9 @@ class _Image(NamedTuple):
         if not dated:
             raise self.source.fail("DewarpData", "is not a date and nine numbers: give a rig file instead")
         fx, fy, cx, cy, *c = self.source.numbers_in(numbers.replace(",", " "), (9,), "DewarpData").tolist()
-        middle = [(self.numbers(f"CalibratedOpticalCenter{axis}", DJI), n / 2) for axis, n in (("X", w), ("Y", h))]
+        middle = [
+            (self.numbers(f"CalibratedOpticalCenter{axis}", DJI), n / 2) for axis, n in (("X", w), ("Y", h))
+        ]
         x, y = (half if stated is None else float(stated[0]) for stated, half in middle)
         K = torch.tensor([[fx, 0, x + cx], [0, fy, y + cy], [0, 0, 1]], dtype=torch.float64)
         return self._intrinsics(K), self.source.brown_conrady(c, "DewarpData")
@@ -260,7 +281,9 @@ class _Image(NamedTuple):
 
 
 def _states_camera(tags: ImageTags | None) -> bool:
-    return tags is not None and (tags.text(PIX4D, "ModelType") is not None or tags.text(DJI, "DewarpData") is not None)
+    return tags is not None and (
+        tags.text(PIX4D, "ModelType") is not None or tags.text(DJI, "DewarpData") is not None
+    )
 
 
 def _check_one_capture(images: Mapping[str, _Image]) -> None:
@@ -276,14 +299,17 @@ def _check_one_capture(images: Mapping[str, _Image]) -> None:
             one, two = stated(first.tags), stated(image.tags)
             if one and two and one != two:
                 raise image.source.fail(
-                    None, f"is of another {kind} than the image of '{name}' ({two}, {one}): give images of one capture"
+                    None,
+                    f"is of another {kind} than the image of '{name}' ({two}, {one}): give images of one "
+                    "capture",
                 )
         place, other = _place(first.tags), _place(image.tags)
         if place and other and math.dist(place, other) > SAME_PLACE:
             here, there = (f"{north:.4f}, {east:.4f}" for north, east in (other, place))
             raise image.source.fail(
                 None,
-                f"is of another place by GPS than the image of '{name}' ({here}; {there}): give images of one capture",
+                f"is of another place by GPS than the image of '{name}' ({here}; {there}): give images of "
+                "one capture",
             )
 
 
@@ -301,7 +327,9 @@ def _place(tags: ImageTags) -> tuple[float, float] | None:
 
 def _rotation(degrees: Tensor) -> Tensor:
     """Rx Ry Rz of angles in degrees."""
-    (cx, sx), (cy, sy), (cz, sz) = zip(torch.deg2rad(degrees).cos().tolist(), torch.deg2rad(degrees).sin().tolist())
+    (cx, sx), (cy, sy), (cz, sz) = zip(
+        torch.deg2rad(degrees).cos().tolist(), torch.deg2rad(degrees).sin().tolist()
+    )
     about_x = torch.tensor([[1, 0, 0], [0, cx, -sx], [0, sx, cx]], dtype=torch.float64)
     about_y = torch.tensor([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]], dtype=torch.float64)
     about_z = torch.tensor([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]], dtype=torch.float64)

@@ -1,10 +1,11 @@
-"""The factory calibration of a ZED camera, `SN12345.conf`: an INI file with the pair at each of its resolutions.
+"""The factory calibration of a ZED camera, `SN12345.conf`: an INI file with the pair at each of its
+resolutions.
 
-Source convention, as the maker's own rectification reads it (zed-open-capture, `calibration.hpp`): pixels with the
-first centre at 0 (shift 0); OpenCV axes; lenses of OpenCV, fisheye ones where there is a k4 and no p1; RX, CV, RZ are
-the rotation vector that takes points of the left camera into the right one, with T along (Baseline, TY, TZ), in
-millimetres. There the sign of T is lost, as rectification does not need it; the right camera is on the right of the
-left one, so that t = -(Baseline, TY, TZ). World = left camera.
+Source convention, as the maker's own rectification reads it (zed-open-capture, `calibration.hpp`): pixels
+with the first centre at 0 (shift 0); OpenCV axes; lenses of OpenCV, fisheye ones where there is a k4 and no
+p1; RX, CV, RZ are the rotation vector that takes points of the left camera into the right one, with T along
+(Baseline, TY, TZ), in millimetres. There the sign of T is lost, as rectification does not need it; the right
+camera is on the right of the left one, so that t = -(Baseline, TY, TZ). World = left camera.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from ..pose import Pose
 from ..rig import Rig
 from .source import RigSource
 
-CONVENTION = "first pixel's centre at 0 (shift 0); rotation vector left to right, baseline in mm; world = left"
+CONVENTION = (
+    "first pixel's centre at 0 (shift 0); rotation vector left to right, baseline in mm; world = left"
+)
 LONGEST = 100_000
 SIZES: dict[str, HW] = {
     "2k": (1242, 2208),
@@ -44,9 +47,13 @@ def read(source: RigSource) -> Rig:
     try:
         parser.read_string(source.text(LONGEST))
     except configparser.Error as error:
-        raise source.fail(None, f"is not an INI file ({str(error).splitlines()[0]}); is the file whole?") from None
+        raise source.fail(
+            None, f"is not an INI file ({str(error).splitlines()[0]}); is the file whole?"
+        ) from None
     sections = {name.lower(): dict(parser[name]) for name in parser.sections()}
-    there = {name: hw for name, hw in SIZES.items() if {f"left_cam_{name}", f"right_cam_{name}"} <= sections.keys()}
+    there = {
+        name: hw for name, hw in SIZES.items() if {f"left_cam_{name}", f"right_cam_{name}"} <= sections.keys()
+    }
     listed = ", ".join(f"{w}x{h}" for h, w in there.values())
     if not there:
         raise source.fail(None, f"has no LEFT_CAM and RIGHT_CAM of a known resolution ({', '.join(SIZES)})")
@@ -61,7 +68,9 @@ def read(source: RigSource) -> Rig:
 
 
 def _pose(source: RigSource, stereo: Mapping[str, str], name: str) -> Pose:
-    """Of the right camera, whose points are R X + t. The offsets have been written for all resolutions at once too."""
+    """Of the right camera, whose points are R X + t. The offsets have been written for all resolutions at
+    once too.
+    """
     rotation = [source.get(stereo, f"{key}_{name}", "STEREO") for key in ("rx", "cv", "rz")]
     baseline = source.get(stereo, "baseline", "STEREO")
     offsets = [stereo.get(f"{key}_{name}", stereo.get(key, "0")) for key in ("ty", "tz")]
@@ -69,7 +78,9 @@ def _pose(source: RigSource, stereo: Mapping[str, str], name: str) -> Pose:
     return source.pose(_numbers(source, rotation, "STEREO RX, CV, RZ"), -t, "STEREO", metres=1e-3)
 
 
-def _camera(source: RigSource, section: str, sections: Mapping[str, Mapping[str, str]], hw: HW, pose: Pose) -> Camera:
+def _camera(
+    source: RigSource, section: str, sections: Mapping[str, Mapping[str, str]], hw: HW, pose: Pose
+) -> Camera:
     fields, entry = sections[section], section.upper()
     K = _numbers(source, [source.get(fields, key, entry) for key in ("fx", "fy", "cx", "cy")], entry)
     fisheye = "k4" in fields and "p1" not in fields

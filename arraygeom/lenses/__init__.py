@@ -1,6 +1,7 @@
 """Camera models: maps between directions and points of the image plane, a file each family.
 
-A model of one's own is a subclass of `CameraModel`; see the page "A camera of one's own" of the documentation.
+A model of one's own is a subclass of `CameraModel`; see the page "A camera of one's own" of the
+documentation.
 """
 
 from .angular import Equirectangular, PolynomialFisheye

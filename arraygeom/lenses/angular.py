@@ -17,10 +17,11 @@ from .model import CameraModel, beside_points
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
-    """The angle theta from the axis goes to the radius theta + k2 theta^2 + k3 theta^3 + ...: odd and even powers.
+    """The angle theta from the axis goes to the radius theta + k2 theta^2 + k3 theta^3 + ...: odd and even
+    powers.
 
-    Without coefficients it is the equidistant fisheye. `widest` is the angle, radians, up to which the lens was
-    calibrated, at most pi; where the radius stops increasing it ends before.
+    Without coefficients it is the equidistant fisheye. `widest` is the angle, radians, up to which the lens
+    was calibrated, at most pi; where the radius stops increasing it ends before.
     """
 
     item_axes: ClassVar = {"k": 1}
@@ -95,7 +96,8 @@ ITERATIONS = 40
 class Equirectangular(CameraModel, name="equirectangular"):
     """Longitude and latitude, radians: x to the right of the axis, up to pi either way, y down, up to pi / 2.
 
-    The K of a whole sphere W pixels wide has the focal length W / (2 pi) and the image's middle as its centre.
+    The K of a whole sphere W pixels wide has the focal length W / (2 pi) and the image's middle as its
+    centre.
     """
 
     period: ClassVar[float] = 2 * math.pi

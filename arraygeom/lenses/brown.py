@@ -30,7 +30,9 @@ class Brown:
         c = c[..., :14]
         padded = list(torch.cat([c, c.new_zeros((*c.shape[:-1], 14 - c.shape[-1]))], -1).unbind(-1))
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tx, ty = padded
-        return Brown((k1, k2, k3, k4, k5, k6), (p1, p2), (s1, s2, s3, s4), (tx, ty) if n == 14 else None, eighth)
+        return Brown(
+            (k1, k2, k3, k4, k5, k6), (p1, p2), (s1, s2, s3, s4), (tx, ty) if n == 14 else None, eighth
+        )
 
 
 def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
@@ -48,7 +50,8 @@ def brown_undistort(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
     """Undo the tilt exactly, solve for the radius in a bracket, then for (x, y) by Newton.
 
     The last two Newton steps are differentiable: from a solution that is a constant, one step propagates the
-    first derivatives and the next one the second (the error of a Newton step is the square of the one before).
+    first derivatives and the next one the second (the error of a Newton step is the square of the one
+    before).
     """
     lens = Brown.named(c)
     H = _tilt_matrix(lens)
@@ -109,10 +112,12 @@ def brown_limit(c: Tensor) -> Tensor:
 
 
 def _before_dip(lens: Brown, limit: Tensor) -> Tensor:
-    """The squared radius at which the radial slope is least, if tangential and prism terms may fold the image there and
-    the slope rises again after it: past such a fold points look right, and are another's; else the limit.
+    """The squared radius at which the radial slope is least, if tangential and prism terms may fold the image
+    there and the slope rises again after it: past such a fold points look right, and are another's; else the
+    limit.
 
-    The terms' Jacobian is at most 7 |p| r and 2 |s| r (4 |s| r^3): where the slope is larger there is no fold.
+    The terms' Jacobian is at most 7 |p| r and 2 |s| r (4 |s| r^3): where the slope is larger there is no
+    fold.
     """
     parts = (*lens.k, *lens.p, *lens.s, lens.k[0] * 0 if lens.eighth is None else lens.eighth)
     *k, p1, p2, s1, s2, s3, s4, k7 = (v.detach().to("cpu", torch.float64)[..., None] for v in parts)
@@ -180,7 +185,11 @@ def _brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         attempt = solve_in_plane(distorted, begun, target, within)
         planar, jacobian = _brown_planar(lens, attempt)
         tolerance = SOLVED * torch.finfo(target.dtype).eps * (1 + norm(target))
-        valid = (norm(planar - target) < tolerance) & (attempt.square().sum(-1) < limit) & keeps_orientation(jacobian)
+        valid = (
+            (norm(planar - target) < tolerance)
+            & (attempt.square().sum(-1) < limit)
+            & keeps_orientation(jacobian)
+        )
         solved = torch.where(valid[..., None], attempt, start)
         if not traced() and bool(valid.all()):
             break

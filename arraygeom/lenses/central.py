@@ -1,6 +1,8 @@
-"""Other wide-angle models: each a radial map of the direction, for two of them followed by Brown-Conrady's polynomials.
+"""Other wide-angle models: each a radial map of the direction, for two of them followed by Brown-Conrady's
+polynomials.
 
-Directions are limited to the cone that the model reaches; those outside count as on its border, and are not valid.
+Directions are limited to the cone that the model reaches; those outside count as on its border, and are not
+valid.
 """
 
 from __future__ import annotations
@@ -28,9 +30,10 @@ THIN_PRISM_FISHEYE = "thin-prism-fisheye"
 class _Model(NamedTuple):
     """A radial map and its inverse in closed form or by iteration.
 
-    `project` takes coefficients and directions within the cone to points, `unproject` points to directions of any
-    length; `limit` gives the squared radius that is reached, `bounds` are those of the first coefficients of any lens,
-    and `harmless` ones that stand in for those beyond; `planar` Brown-Conrady's coefficients of the second stage.
+    `project` takes coefficients and directions within the cone to points, `unproject` points to directions of
+    any length; `limit` gives the squared radius that is reached, `bounds` are those of the first coefficients
+    of any lens, and `harmless` ones that stand in for those beyond; `planar` Brown-Conrady's coefficients of
+    the second stage.
     """
 
     project: Callable[[Tensor, Tensor], Tensor]
@@ -94,7 +97,9 @@ def _sound(kind: _Model, c: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def _border(kind: _Model, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The squared radius that ends the model's range, sine and cosine of its angle: float64 on the CPU, (*b, 1..)."""
+    """The squared radius that ends the model's range, sine and cosine of its angle: float64 on the CPU, (*b,
+    1..).
+    """
     c = c.detach().to("cpu", torch.float64)
     limit = kind.limit(c).clamp(max=WIDEST**2) * (1 - MARGIN)
     ray = unit(kind.unproject(c, torch.stack([limit.sqrt(), torch.zeros_like(limit)], -1)))
@@ -206,7 +211,9 @@ def _scaramuzza(c: Tensor, X: Tensor) -> Tensor:
         depth, slope = _along(c, s * R)
         turn = z - R * slope
         step = (s * z - depth) / torch.where(turn != 0, turn, 1.0)
-        s = s - torch.where(step.abs() < 0.1 * s.abs(), step, 0.0)  # at the end of the range the slope is rounding
+        s = s - torch.where(
+            step.abs() < 0.1 * s.abs(), step, 0.0
+        )  # at the end of the range the slope is rounding
     return X[..., :2] * s[..., None]
 
 
@@ -220,7 +227,9 @@ def _scaramuzza_radius(c: Tensor, angle: Tensor) -> Tensor:
     return invert_increasing(seen_at, angle, high.expand_as(angle))
 
 
-@torch.library.custom_op("arraygeom::scaramuzza_radius", mutates_args=(), schema="(Tensor c, Tensor angle) -> Tensor")
+@torch.library.custom_op(
+    "arraygeom::scaramuzza_radius", mutates_args=(), schema="(Tensor c, Tensor angle) -> Tensor"
+)
 def _traced_scaramuzza_radius(c: Tensor, angle: Tensor) -> Tensor:
     """The same for torch.compile, which cannot follow iterations that numbers end."""
     return _scaramuzza_radius(c, angle).contiguous()
@@ -232,7 +241,9 @@ def _(c: Tensor, angle: Tensor) -> Tensor:
 
 
 def _scaramuzza_limit(c: Tensor) -> Tensor:
-    """The squared radius up to which the angle rises: depth - r depth' = 1 - b2 r^2 - 2 b3 r^3 - 3 b4 r^4 > 0."""
+    """The squared radius up to which the angle rises: depth - r depth' = 1 - b2 r^2 - 2 b3 r^3 - 3 b4 r^4 >
+    0.
+    """
     b = c.detach().to("cpu", torch.float64)
     one, none = torch.ones_like(b[..., :1]), torch.zeros_like(b[..., :1])
     return first_root(torch.cat([one, none, -b * b.new_tensor([1.0, 2.0, 3.0])], -1)).square()

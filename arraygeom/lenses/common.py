@@ -16,7 +16,8 @@ from ..tracing import followed
 MARGIN = 1e-6
 # Nothing past this normalised radius is valid under Brown-Conrady: 89.94 degrees off axis.
 WIDEST = 1e3
-# A denominator of the rational model this close (in squared radius) to its zero gives radii that mean nothing.
+# A denominator of the rational model this close (in squared radius) to its zero gives radii that mean
+# nothing.
 POLE = 0.9
 # How far beyond the limit the search for an inverse may pass (in squared radius); short of a pole.
 BEYOND = 1.1
@@ -57,7 +58,8 @@ def polynomial_product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> list[Ten
 
 @torch.no_grad()
 def once(bound: Callable[[Tensor], Tensor], c: Tensor) -> Tensor:
-    """A bound of lenses by their coefficients (*b, n), which is computed once for copies of one lens, made by `expand`.
+    """A bound of lenses by their coefficients (*b, n), which is computed once for copies of one lens, made by
+    `expand`.
 
     It is remembered for the lenses that were asked for last, unless torch has to see how it is computed.
     """
@@ -69,7 +71,9 @@ def once(bound: Callable[[Tensor], Tensor], c: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=256)
-def _remembered(bound: Callable[[Tensor], Tensor], dtype: torch.dtype, shape: torch.Size, content: bytes) -> Tensor:
+def _remembered(
+    bound: Callable[[Tensor], Tensor], dtype: torch.dtype, shape: torch.Size, content: bytes
+) -> Tensor:
     return bound(torch.frombuffer(bytearray(content), dtype=dtype).reshape(shape))
 
 

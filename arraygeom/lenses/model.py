@@ -34,11 +34,15 @@ class LensModel(Batched):
 
     def project(self, X: Real[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Points in the camera's frame to points of the image plane, and which are seen."""
-        raise NotImplementedError(f"{type(self).__name__} has no project(X): points (..., 3) to (x, y) and valid")
+        raise NotImplementedError(
+            f"{type(self).__name__} has no project(X): points (..., 3) to (x, y) and valid"
+        )
 
     def unproject(self, xy: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
         """The directions of rays of points of the image plane, of any length, and which have one."""
-        raise NotImplementedError(f"{type(self).__name__} has no unproject(xy): points (..., 2) to rays and valid")
+        raise NotImplementedError(
+            f"{type(self).__name__} has no unproject(xy): points (..., 2) to rays and valid"
+        )
 
     def origins(self, xy: Real[Tensor, "*n 2"]) -> Float[Tensor, "*n 3"]:
         """Where those rays start, metres in the camera's frame."""
@@ -72,10 +76,10 @@ class LensModel(Batched):
 class CameraModel(LensModel):
     """How points in a camera's frame become points (x, y) of its image plane, which `K` then takes to pixels.
 
-    A model of one's own is a frozen dataclass with `project` and `unproject`, the one the inverse of the other, and
-    tensors for its numbers; defined with a name, rig files hold it. It goes where a lens does, in `Camera.distortion`.
-    Resizing, cropping and rotating an image change `K` alone. Rays that do not start in the camera's origin also need
-    `origins`, and `central = False`.
+    A model of one's own is a frozen dataclass with `project` and `unproject`, the one the inverse of the
+    other, and tensors for its numbers; defined with a name, rig files hold it. It goes where a lens does, in
+    `Camera.distortion`. Resizing, cropping and rotating an image change `K` alone. Rays that do not start in
+    the camera's origin also need `origins`, and `central = False`.
     """
 
     registered: ClassVar[str] = ""
@@ -120,7 +124,9 @@ class CameraModel(LensModel):
 
 
 def beside_points(number: Tensor, points: Tensor, axes: int = 0) -> Tensor:
-    """A model's number (*b, and `axes` of its own) for points (*b, ..., k): axes of length 1 for the points'."""
+    """A model's number (*b, and `axes` of its own) for points (*b, ..., k): axes of length 1 for the
+    points'.
+    """
     batch = number.ndim - axes
     own = number.shape[batch:]
     return number.to(points).reshape((*number.shape[:batch], *[1] * (points.ndim - 1 - batch), *own))

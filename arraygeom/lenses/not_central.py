@@ -26,7 +26,9 @@ SETTLED = 64
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Orthographic(CameraModel, name="orthographic"):
-    """Parallel rays along the axis, as of a telecentric lens: (x, y) are metres, the focal length pixels a metre."""
+    """Parallel rays along the axis, as of a telecentric lens: (x, y) are metres, the focal length pixels a
+    metre.
+    """
 
     central: ClassVar[bool] = False
     even: ClassVar[Literal["pixels", "distance"]] = "distance"
@@ -86,7 +88,8 @@ class RollingShutter(BehindModel, name="rolling-shutter"):
 
     velocity: of the camera, metres a second along its axes.
     rotation: its angular velocity about its axes, radians a second.
-    readout: seconds that as many rows take as are one focal length, `row_time * fy`; the row of the principal point is
+    readout: seconds that as many rows take as are one focal length, `row_time * fy`; the row of the principal
+    point is
         read at time 0, for which the pose is. Both motions are constant while the image is read.
 
     K is upright: images that are rotated by a quarter turn have columns for rows.
@@ -118,7 +121,9 @@ class RollingShutter(BehindModel, name="rolling-shutter"):
             seen = self._through(self._at_rest(X, row))[0][..., 1]
             step = row - last
             moved = step.abs() > rounding**0.5
-            slope = torch.where(moved, (seen - before) / torch.where(moved, step, 1.0), slope).clamp(max=STEEPEST)
+            slope = torch.where(moved, (seen - before) / torch.where(moved, step, 1.0), slope).clamp(
+                max=STEEPEST
+            )
             last, before = row, seen
             row = row + (seen - row) / (1 - slope)
             if not followed() and bool(((row - last).abs() <= SETTLED * rounding * (1 + row.abs())).all()):
@@ -179,10 +184,11 @@ def _cross(w: Tensor, v: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class FlatPort(BehindModel, name="flat-port"):
-    """A camera in air that looks into water through a flat pane of glass, which is at right angles to its axis.
+    """A camera in air that looks into water through a flat pane of glass, which is at right angles to its
+    axis.
 
-    distance: from the camera's centre to the pane, metres. thickness: of the pane, metres. glass, water: their
-    refractive indices, at least 1 (Treibitz, Schechner, Kunz and Singh 2012).
+    distance: from the camera's centre to the pane, metres. thickness: of the pane, metres. glass, water:
+    their refractive indices, at least 1 (Treibitz, Schechner, Kunz and Singh 2012).
     """
 
     central: ClassVar[bool] = False
@@ -199,8 +205,8 @@ class FlatPort(BehindModel, name="flat-port"):
     def project(self, X: Tensor) -> tuple[Tensor, Tensor]:
         """Points in the water, by the tangent in air of the ray that reaches them.
 
-        By Newton's method on the tangent over the radius, from its value on the axis: how far off axis a ray gets is
-        concave in its tangent, so that no step goes too far.
+        By Newton's method on the tangent over the radius, from its value on the axis: how far off axis a ray
+        gets is concave in its tangent, so that no step goes too far.
         """
         X, finite = finite_points(X)
         distance, thickness = self._layers(X)

@@ -1,4 +1,6 @@
-"""Lenses by a smooth surface of B-splines in place of a formula: any lens, and each sensor's own unevenness."""
+"""Lenses by a smooth surface of B-splines in place of a formula: any lens, and each sensor's own
+unevenness.
+"""
 
 from __future__ import annotations
 
@@ -21,19 +23,22 @@ SUPPORT = {2: 3, 3: 4}
 STEPS, MOST = 6, 30
 """Of Newton for all points, and for those that six do not suffice for."""
 NEARLY = 1e-6
-"""A knot's spacing from the last whole one, and of the squared sine from 90 degrees: the border is left out."""
+"""A knot's spacing from the last whole one, and of the squared sine from 90 degrees: the border is left out.
+"""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Splined(CameraModel, name="splined"):
     """A point of the image plane is that of a simple projection plus a displacement, a surface of B-splines.
 
-    The surface is over the stereographic projection u = 2 tan(theta / 2) of directions: `knots` (ny, nx) displacements
-    (x, y), `spacing` of u apart along x and y, the middle one at u = 0; of `order` 2 (quadratic) or 3 (cubic). `base`
-    is what is displaced: the stereographic point itself (mrcal's LENSMODEL_SPLINED_STEREOGRAPHIC), or the pinhole's
-    (x / z, y / z) (lensboy's pinhole_splined), which has no directions at 90 degrees or more from the axis.
+    The surface is over the stereographic projection u = 2 tan(theta / 2) of directions: `knots` (ny, nx)
+    displacements (x, y), `spacing` of u apart along x and y, the middle one at u = 0; of `order` 2
+    (quadratic) or 3 (cubic). `base` is what is displaced: the stereographic point itself (mrcal's
+    LENSMODEL_SPLINED_STEREOGRAPHIC), or the pinhole's (x / z, y / z) (lensboy's pinhole_splined), which has
+    no directions at 90 degrees or more from the axis.
 
-    Directions beyond the knots, within half a support of the border, are not valid, nor are those past a fold.
+    Directions beyond the knots, within half a support of the border, are not valid, nor are those past a
+    fold.
 
     Raises ValueError for another base or order, and for too few knots.
     """
@@ -49,9 +54,15 @@ class Splined(CameraModel, name="splined"):
             raise ValueError(f"base is {self.base!r}: use {STEREOGRAPHIC!r} or {PINHOLE!r}")
         if self.order not in SUPPORT:
             raise ValueError(f"order is {self.order!r}: splines of order 2 and 3 are known")
-        if self.knots.ndim < 3 or self.knots.shape[-1] != 2 or min(self.knots.shape[-3:-1]) < SUPPORT[self.order]:
+        if (
+            self.knots.ndim < 3
+            or self.knots.shape[-1] != 2
+            or min(self.knots.shape[-3:-1]) < SUPPORT[self.order]
+        ):
             least = SUPPORT[self.order]
-            raise ValueError(f"knots are {tuple(self.knots.shape)}: wanted (ny, nx, 2), {least} or more to a side")
+            raise ValueError(
+                f"knots are {tuple(self.knots.shape)}: wanted (ny, nx, 2), {least} or more to a side"
+            )
         if self.spacing.shape[-1:] != (2,) or (checking() and not bool((self.spacing > 0).all())):
             raise ValueError("spacing is that of knots along x and y: two positive numbers")
 
@@ -99,12 +110,16 @@ class Splined(CameraModel, name="splined"):
         return solve_in_plane(self._displaced, start, xy, within, rounding=SOLVED / 8, steps=steps)
 
     def _off(self, u: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        """Which stereographic points are not those of points of the image plane, where they are, and the Jacobian."""
+        """Which stereographic points are not those of points of the image plane, where they are, and the
+        Jacobian.
+        """
         there, jacobian = self._displaced(u)
         return norm(there - xy) >= SOLVED * torch.finfo(xy.dtype).eps * (1 + norm(xy)), there, jacobian
 
     def _within(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Stereographic points, those outside at the border of what the knots (and the base) cover; which are not."""
+        """Stereographic points, those outside at the border of what the knots (and the base) cover; which are
+        not.
+        """
         spacing = beside_points(self.spacing, u, 1).detach()
         ny, nx = self.knots.shape[-3:-1]
         margin = 0.5 * (self.order - 1) + NEARLY
@@ -115,7 +130,9 @@ class Splined(CameraModel, name="splined"):
             return u, inside
         squared, limit = u.square().sum(-1), 4 * (1 - NEARLY)
         ahead = squared <= limit
-        return u * torch.where(ahead, 1.0, (limit / torch.where(ahead, 1.0, squared)).sqrt())[..., None], inside & ahead
+        return u * torch.where(ahead, 1.0, (limit / torch.where(ahead, 1.0, squared)).sqrt())[
+            ..., None
+        ], inside & ahead
 
     def _undisplaced(self, xy: Tensor) -> Tensor:
         """Stereographic points of points of the base."""
@@ -179,6 +196,11 @@ def _basis(t: Tensor, order: int) -> tuple[Tensor, Tensor]:
     if order == 2:
         weights = [(0.5 - s) ** 2 / 2, 0.75 - s**2, (0.5 + s) ** 2 / 2]
         return torch.stack(weights, -1), torch.stack([s - 0.5, -2 * s, s + 0.5], -1)
-    weights = [(1 - s) ** 3 / 6, (3 * s**3 - 6 * s**2 + 4) / 6, (1 + 3 * s + 3 * s**2 - 3 * s**3) / 6, s**3 / 6]
+    weights = [
+        (1 - s) ** 3 / 6,
+        (3 * s**3 - 6 * s**2 + 4) / 6,
+        (1 + 3 * s + 3 * s**2 - 3 * s**3) / 6,
+        s**3 / 6,
+    ]
     slopes = [-((1 - s) ** 2) / 2, (3 * s**2 - 4 * s) / 2, (1 + 2 * s - 3 * s**2) / 2, s**2 / 2]
     return torch.stack(weights, -1), torch.stack(slopes, -1)

@@ -1,10 +1,10 @@
 """Calibration from images of a board: from its specification to a rig with covariance and report.
 
-`board`, `target` (boards, from text and to print) -> `photos`, `corners`, `detect` (detections) -> `deformation`,
-`bundle` (what is adjusted, and its equations) -> `intrinsics`, `poses` (where the fit starts) -> `uncertainty`, `solve`
-(the fit) -> `validation` (frames held out, notes) -> `rig` (calibration) -> `adequacy`, `report`. `run` does all of it
-from files to files, or guides while images are taken, `simulation` renders the images that a planned rig would take,
-`rig_diff` compares two calibrations.
+`board`, `target` (boards, from text and to print) -> `photos`, `corners`, `detect` (detections) ->
+`deformation`, `bundle` (what is adjusted, and its equations) -> `intrinsics`, `poses` (where the fit starts)
+-> `uncertainty`, `solve` (the fit) -> `validation` (frames held out, notes) -> `rig` (calibration) ->
+`adequacy`, `report`. `run` does all of it from files to files, or guides while images are taken, `simulation`
+renders the images that a planned rig would take, `rig_diff` compares two calibrations.
 """
 
 from .. import _lazy

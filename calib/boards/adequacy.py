@@ -24,7 +24,11 @@ CELLS = 6, 8
 WIDE_ENOUGH = 0.6
 DEEP_ENOUGH = 1.5
 TILTED_ENOUGH = 20.0
-POSITIONS = ("top left", "top", "top right"), ("left", "middle", "right"), ("bottom left", "bottom", "bottom right")
+POSITIONS = (
+    ("top left", "top", "top right"),
+    ("left", "middle", "right"),
+    ("bottom left", "bottom", "bottom right"),
+)
 TILT = 30.0
 """Degrees by which a proposed board is tilted."""
 FILLS = 0.35, 0.7
@@ -57,7 +61,9 @@ def coverage(views: BoardViews, cam_from_board: Mapping[FrameKey, Pose], board: 
     """Coverage of a camera by its boards, from their poses in it."""
     cells = point_counts([d.x for d in views.seen.values()], views.hw)
     poses = {key: cam_from_board[key] for key in views.seen}
-    depths = [board.points[d.ids] @ poses[k].R[2].numpy() + float(poses[k].t[2]) for k, d in views.seen.items()]
+    depths = [
+        board.points[d.ids] @ poses[k].R[2].numpy() + float(poses[k].t[2]) for k, d in views.seen.items()
+    ]
     tilts = np.degrees([np.arccos(min(1.0, abs(float(pose.R[2, 2])))) for pose in poses.values()])
     found = Coverage(cells, _range(np.concatenate(depths)), _range(tilts), ())
     return found._replace(missing=tuple(_missing(found)))
@@ -66,7 +72,9 @@ def coverage(views: BoardViews, cam_from_board: Mapping[FrameKey, Pose], board: 
 def point_counts(parts: Iterable[Float[np.ndarray, "_ 2"]], hw: HW) -> Int[np.ndarray, "r c"]:
     """The number of points in each of the `CELLS` of an image."""
     x = np.concatenate([np.zeros((0, 2)), *parts])
-    counts, _, _ = np.histogram2d(x[:, 1], x[:, 0], bins=CELLS, range=((-0.5, hw[0] - 0.5), (-0.5, hw[1] - 0.5)))
+    counts, _, _ = np.histogram2d(
+        x[:, 1], x[:, 0], bins=CELLS, range=((-0.5, hw[0] - 0.5), (-0.5, hw[1] - 0.5))
+    )
     return counts.astype(np.int64)
 
 
@@ -84,13 +92,16 @@ def _missing(found: Coverage) -> list[str]:
         if not part.any()
     ]
     if empty:
-        missing.append(f"no points at the {', '.join(empty)} of the image: the lens model is extrapolated there")
+        missing.append(
+            f"no points at the {', '.join(empty)} of the image: the lens model is extrapolated there"
+        )
     elif found.share < WIDE_ENOUGH:
         missing.append(f"points in only {found.share:.0%} of the image: fill it, corners too")
     if found.depths[1] < DEEP_ENOUGH * found.depths[0]:
         near, far = found.depths
         missing.append(
-            f"boards at one depth only ({near:.3g} to {far:.3g} m): bring it closer in some, further in others"
+            f"boards at one depth only ({near:.3g} to {far:.3g} m): bring it closer in some, further in "
+            "others"
         )
     if found.tilts[1] < TILTED_ENOUGH:
         missing.append(f"boards tilted by {found.tilts[1]:.0f} degrees at most: tilt it by 20 to 40")
@@ -98,7 +109,9 @@ def _missing(found: Coverage) -> list[str]:
 
 
 class NextView(NamedTuple):
-    """A view of the board that would help, in words, and the median uncertainty (pixels) with and without it."""
+    """A view of the board that would help, in words, and the median uncertainty (pixels) with and without
+    it.
+    """
 
     text: str
     before: float
@@ -113,7 +126,9 @@ def next_views(known: Intrinsics, board: Board, depth: float, *, count: int = 2)
     information, found = np.linalg.inv(known.covariance), []
     before = _median(change, known.covariance)
     for _ in range(count):
-        after = {text: _median(change, np.linalg.inv(information + gain)) for text, gain in candidates.items()}
+        after = {
+            text: _median(change, np.linalg.inv(information + gain)) for text, gain in candidates.items()
+        }
         best = min(after, key=lambda text: after[text])
         found.append(NextView(best, before, after[best]))
         before, information = after[best], information + candidates[best]
@@ -142,7 +157,9 @@ def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarra
 
 
 def _gain(known: Intrinsics, X: np.ndarray) -> np.ndarray | None:
-    """The information of a view on the free intrinsics, its pose unknown; None if hardly any of it is visible."""
+    """The information of a view on the free intrinsics, its pose unknown; None if hardly any of it is
+    visible.
+    """
     seen = known.camera.project_local(torch.from_numpy(X))
     inside = (seen.valid & known.camera.contains(seen.x)).numpy()
     if inside.sum() < 0.6 * len(X) or not inside.any():

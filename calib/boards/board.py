@@ -1,6 +1,7 @@
 """Calibration boards: their points, the markers that identify some, how they are drawn.
 
-Points are (x, y, 0) in metres: x along the rows, y down the columns, z into the board, the first point at the origin.
+Points are (x, y, 0) in metres: x along the rows, y down the columns, z into the board, the first point at the
+origin.
 """
 
 from __future__ import annotations
@@ -47,10 +48,11 @@ class Board(ABC):
 
     @cached_property
     def symmetries(self) -> tuple[Int[np.ndarray, " n"], ...]:
-        """The renumberings of the points under rotations of the board, the identity first; it alone with markers.
+        """The renumberings of the points under rotations of the board, the identity first; it alone with
+        markers.
 
-        A detector may number the points in any of these ways: colours do not disambiguate them, as they are inverted
-        in some images (near infrared).
+        A detector may number the points in any of these ways: colours do not disambiguate them, as they are
+        inverted in some images (near infrared).
         """
         if self.identified:
             return (np.arange(len(self.points)),)
@@ -85,7 +87,9 @@ class Board(ABC):
 
     @property
     def offset(self) -> float:
-        """Distance of the first point from the upper and the left edge of the print without its margin, metres."""
+        """Distance of the first point from the upper and the left edge of the print without its margin,
+        metres.
+        """
         return self.spacing
 
     @abstractmethod
@@ -95,7 +99,8 @@ class Board(ABC):
 
 @dataclass(frozen=True)
 class MarkedBoard(Board):
-    """A board whose points are identified individually: a part of it is enough, its orientation is unambiguous.
+    """A board whose points are identified individually: a part of it is enough, its orientation is
+    unambiguous.
 
     first: the number of its first marker.
     """
@@ -141,7 +146,9 @@ class Charuco(MarkedBoard):
         """OpenCV's board, lengths in metres."""
         size = self.columns + 1, self.rows + 1
         ids = np.array(self.markers)
-        board = cv2.aruco.CharucoBoard(size, self.spacing, self.marker, marker_dictionary(self.dictionary), ids)
+        board = cv2.aruco.CharucoBoard(
+            size, self.spacing, self.marker, marker_dictionary(self.dictionary), ids
+        )
         board.setLegacyPattern(self.legacy)
         return board
 
@@ -154,7 +161,9 @@ class Charuco(MarkedBoard):
     def _draw(self, axes: Any) -> None:
         side, marker = 1e3 * self.spacing, 1e3 * self.marker
         white = set()
-        for corners, number in zip(np.array(self.opencv.getObjPoints()), np.array(self.opencv.getIds()).reshape(-1)):
+        for corners, number in zip(
+            np.array(self.opencv.getObjPoints()), np.array(self.opencv.getIds()).reshape(-1)
+        ):
             left, top = (1e3 * float(v) for v in corners[:, :2].min(0))
             white.add((int(left // side), int(top // side)))
             _draw_marker(axes, self.dictionary, int(number), left, top, marker)
@@ -165,7 +174,8 @@ class Charuco(MarkedBoard):
 
 @dataclass(frozen=True)
 class AprilGrid(MarkedBoard):
-    """Kalibr's grid of AprilTags; `columns` x `rows` counts the corners of all tags, `spacing` is twice the gap.
+    """Kalibr's grid of AprilTags; `columns` x `rows` counts the corners of all tags, `spacing` is twice the
+    gap.
 
     tag: side of a tag, metres; border: black bits around its code. Tags are numbered row by row from below.
     """
@@ -198,7 +208,9 @@ class AprilGrid(MarkedBoard):
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Width and height of the print without its margin, metres: the small squares at the tags' corners."""
+        """Width and height of the print without its margin, metres: the small squares at the tags'
+        corners.
+        """
         width, height = (float(v) + 2 * self.gap for v in self.points[:, :2].max(0))
         return width, height
 
@@ -209,7 +221,8 @@ class AprilGrid(MarkedBoard):
 
     def __str__(self) -> str:
         tail = (":border1" if self.border == 1 else "") + (f":from{self.first}" if self.first else "")
-        return f"aprilgrid:{self.columns // 2}x{self.rows // 2}:{millimetres(self.tag)}:{self.gap / self.tag:.6g}{tail}"
+        tags = f"{self.columns // 2}x{self.rows // 2}"
+        return f"aprilgrid:{tags}:{millimetres(self.tag)}:{self.gap / self.tag:.6g}{tail}"
 
     def _draw(self, axes: Any) -> None:
         tag, gap = 1e3 * self.tag, 1e3 * self.gap
@@ -256,7 +269,9 @@ class Boards(Board):
 
 @dataclass(frozen=True)
 class Circles(Board):
-    """Black circles on white, in rows; in an asymmetric grid every other row is shifted by half their distance."""
+    """Black circles on white, in rows; in an asymmetric grid every other row is shifted by half their
+    distance.
+    """
 
     asymmetric: bool = False
 
@@ -377,7 +392,9 @@ def _draw_marker(
     """Runs of black bits as one rectangle each: no hairlines between bits."""
     known = marker_dictionary(dictionary)
     bits = known.markerSize + 2 * border
-    black = np.rot90(cv2.aruco.generateImageMarker(known, number, bits, borderBits=border) == 0, quarter_turns)
+    black = np.rot90(
+        cv2.aruco.generateImageMarker(known, number, bits, borderBits=border) == 0, quarter_turns
+    )
     step = side / bits
     for row, line in enumerate(black):
         edges: np.ndarray = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))

@@ -1,9 +1,9 @@
 """The problem that bundle adjustment solves: cameras, boards, what was observed, and its normal equations.
 
-Boards are coupled by the cameras alone: the equations are those of the cameras after the Schur complement of the boards
-(Triggs et al. 2000, section 6); derivatives with respect to the camera parameters are automatic, through `arraygeom`.
-Pixels are weighted by the noise of their camera, and a residual r beyond k = 3 standard deviations by (k / r)^2, so
-that outliers have little influence.
+Boards are coupled by the cameras alone: the equations are those of the cameras after the Schur complement of
+the boards (Triggs et al. 2000, section 6); derivatives with respect to the camera parameters are automatic,
+through `arraygeom`. Pixels are weighted by the noise of their camera, and a residual r beyond k = 3 standard
+deviations by (k / r)^2, so that outliers have little influence.
 """
 
 from __future__ import annotations
@@ -34,9 +34,12 @@ ROBUST = 3.0
 POSE = 6
 """Parameters of a board: a rotation vector about the world's axes and a translation."""
 TYPICAL_FOCAL_ERROR, TYPICAL_CENTRE_ERROR = 0.1, 0.1
-"""Likewise of the error of a guessed focal length, as a share of it, and of the principal point, of the width."""
+"""Likewise of the error of a guessed focal length, as a share of it, and of the principal point, of the
+width.
+"""
 CENTRE_DEVIATION, ASPECT_DEVIATION = 0.03, 0.01
-"""Standard deviations of the principal point about the centre (share of the width), and of the aspect ratio."""
+"""Standard deviations of the principal point about the centre (share of the width), and of the aspect ratio.
+"""
 Array = np.ndarray
 Masks = Mapping[str, Bool[np.ndarray, "_"]]
 """By camera, which of its parameters are meant, in the order of `parameter_names`."""
@@ -54,8 +57,9 @@ class Observations(NamedTuple):
 class BundleProblem:
     """Cameras, boards and observations.
 
-    boards: `world_from_board`, a batch, of the `frames`. free: the parameters that may change. sigma: by camera, the
-    noise along x or y, pixels. deformation: that of the boards, adjusted with the cameras; None for flat ones.
+    boards: `world_from_board`, a batch, of the `frames`. free: the parameters that may change. sigma: by
+    camera, the noise along x or y, pixels. deformation: that of the boards, adjusted with the cameras; None
+    for flat ones.
     """
 
     cameras: Mapping[str, Camera]
@@ -136,7 +140,9 @@ class BundleProblem:
         )
 
     def stepped(self, change: Float[np.ndarray, " c"], boards: Float[np.ndarray, "b 6"]) -> BundleProblem:
-        """The problem after a change of its free parameters, the deformations' last, and of the boards' poses."""
+        """The problem after a change of its free parameters, the deformations' last, and of the boards'
+        poses.
+        """
         cameras, at = {}, 0
         for name, camera in self.cameras.items():
             full = np.zeros(len(self.free[name]))
@@ -156,8 +162,8 @@ class BundleProblem:
 class InitialRig(NamedTuple):
     """What a fit starts from: cameras, `world_from_board` of each moment, and views, numbered consistently.
 
-    left_out: images that disagree with the others, (camera, moment). priors: those of cameras whose poses are known
-    roughly; without them, those of ordinary cameras, the first of which is the world.
+    left_out: images that disagree with the others, (camera, moment). priors: those of cameras whose poses are
+    known roughly; without them, those of ordinary cameras, the first of which is the world.
     """
 
     cameras: Mapping[str, Camera]
@@ -178,14 +184,18 @@ class InitialRig(NamedTuple):
             free[name][:6] = number > 0 or self.priors is not None
         priors = self.priors or {name: typical_prior(camera) for name, camera in self.cameras.items()}
         poses = stack(list(self.boards.values()))
-        return BundleProblem(self.cameras, poses, seen, tuple(self.boards), free, {}, priors, self.deformation)
+        return BundleProblem(
+            self.cameras, poses, seen, tuple(self.boards), free, {}, priors, self.deformation
+        )
 
     def flat(self, board: Board) -> BoardDeformation | None:
         """Flat boards, in the order of the moments; None for points whose positions are known."""
         if isinstance(board, KnownPoints):
             return None
         first = {key: d.ids[0] for v in self.views.values() for key, d in v.seen.items()}
-        return BoardDeformation.flat(board.points, board.part, board.part[[first[key] for key in self.boards]])
+        return BoardDeformation.flat(
+            board.points, board.part, board.part[[first[key] for key in self.boards]]
+        )
 
 
 @dataclass(frozen=True)
@@ -193,8 +203,8 @@ class Solved:
     """A problem after bundle adjustment, its noise estimated from the residuals.
 
     covariance: of the cameras' free parameters, in their own units; None where they are not observable.
-    raised: the largest factor by which a standard deviation was raised to that of the jackknife. views: the detections
-    used. left_out: images that contradict other cameras'.
+    raised: the largest factor by which a standard deviation was raised to that of the jackknife. views: the
+    detections used. left_out: images that contradict other cameras'.
     """
 
     problem: BundleProblem
@@ -223,14 +233,15 @@ class Solved:
         return dict(zip(self.names, np.sqrt(self.covariance.diagonal()).tolist()))
 
 
-# Linear equations ------------------------------------------------------------------------------------------------
+# Linear equations
+# ------------------------------------------------------------------------------------------------
 
 
 class Linearised(NamedTuple):
     """One camera's residuals, and its pixels' derivatives, weighted.
 
-    by_shared: by the camera's free parameters and the boards' deformations, which are the `columns` of all cameras'.
-    by_board: by the pose of the board of each point.
+    by_shared: by the camera's free parameters and the boards' deformations, which are the `columns` of all
+    cameras'. by_board: by the pose of the board of each point.
     """
 
     r: Float[np.ndarray, "n 2"]
@@ -262,7 +273,9 @@ def linearised(problem: BundleProblem) -> dict[str, Linearised]:
 
 
 def _by_pose(problem: BundleProblem, name: str) -> Float[np.ndarray, "n 3 6"]:
-    """Derivatives of a camera's points in the world by the poses of their boards, exp(w) R and the translation."""
+    """Derivatives of a camera's points in the world by the poses of their boards, exp(w) R and the
+    translation.
+    """
     x, y, z = problem.rotated(name).T
     o, one = np.zeros_like(x), np.ones_like(x)
     rows = [[o, z, -y, one, o, o], [-z, o, x, o, one, o], [y, -x, o, o, o, one]]
@@ -302,7 +315,9 @@ class NormalEquations:
         return change, boards
 
     def information(self) -> Array:
-        """The inverse covariance (c, c) of the camera parameters, marginalised over the boards and deformations."""
+        """The inverse covariance (c, c) of the camera parameters, marginalised over the boards and
+        deformations.
+        """
         S, _, _ = self.reduced(0.0)
         c = len(S) - self.shapes
         return S[:c, :c] - S[:c, c:] @ np.linalg.solve(S[c:, c:], S[c:, :c])
@@ -354,7 +369,8 @@ def robust_weights(lengths: Array) -> Array:
     return np.minimum(1.0, (ROBUST / np.maximum(lengths, ROBUST)) ** 2)
 
 
-# Cameras' parameters ---------------------------------------------------------------------------------------------
+# Cameras' parameters
+# ---------------------------------------------------------------------------------------------
 
 
 def parameter_sizes(camera: Camera) -> dict[str, int]:
@@ -365,7 +381,9 @@ def parameter_sizes(camera: Camera) -> dict[str, int]:
 
 def parameter_names(camera: Camera) -> list[str]:
     """The parameters of a camera as `Rig.parameters` orders them: "rotation.0", ..., "distortion.4"."""
-    return [f"{key.removeprefix('.')}.{i}" for key, size in parameter_sizes(camera).items() for i in range(size)]
+    return [
+        f"{key.removeprefix('.')}.{i}" for key, size in parameter_sizes(camera).items() for i in range(size)
+    ]
 
 
 def intrinsic_values(camera: Camera) -> Float[np.ndarray, " p"]:
@@ -386,11 +404,15 @@ def changed(camera: Camera, change: torch.Tensor) -> Camera:
     lens = moved.distortion
     if lens is None or lens.model not in MODELS:
         return moved
-    return moved.replace(distortion=lens.with_coefficients(within_bounds(MODELS[lens.model], lens.coefficients)))
+    return moved.replace(
+        distortion=lens.with_coefficients(within_bounds(MODELS[lens.model], lens.coefficients))
+    )
 
 
 def camera_jacobian(camera: Camera, X: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 p"]:
-    """Derivatives of the pixels of world points with respect to the camera, in the order of `parameter_names`."""
+    """Derivatives of the pixels of world points with respect to the camera, in the order of
+    `parameter_names`.
+    """
     return linear_projection(camera, X)[1]
 
 
@@ -399,7 +421,8 @@ def linear_projection(
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 p"]]:
     """Pixels of world points, and their derivatives with respect to the camera (`camera_jacobian`).
 
-    Two reverse passes through the lens, with a copy of its coefficients per point; the others by the chain rule.
+    Two reverse passes through the lens, with a copy of its coefficients per point; the others by the chain
+    rule.
     """
     local = camera.cam_from_world.apply(torch.from_numpy(X)).detach().requires_grad_()
     through: tuple[torch.Tensor, ...] = (local,)
@@ -412,13 +435,18 @@ def linear_projection(
     by_point, *by_lens = (camera.K[:2, :2] @ torch.stack(parts, 1) for parts in zip(*slopes))
     rotational = torch.linalg.cross((local.detach() - camera.t)[:, None].expand_as(by_point), by_point)
     plane = plane.detach()
-    by_focal, by_centre = focal_positions(camera.K) * plane[:, None], torch.eye(2).to(plane).expand(len(X), 2, 2)
+    by_focal, by_centre = (
+        focal_positions(camera.K) * plane[:, None],
+        torch.eye(2).to(plane).expand(len(X), 2, 2),
+    )
     x = map_homogeneous(camera.K[:2], plane)
     return x.numpy(), torch.cat([rotational, by_point, by_focal, by_centre, *by_lens], -1).numpy()
 
 
 def with_default(camera: Camera, entry: str) -> tuple[Camera, str]:
-    """The camera with a principal point's entry at the centre, or a lens's term without effect; and that in words."""
+    """The camera with a principal point's entry at the centre, or a lens's term without effect; and that in
+    words.
+    """
     kind, index = entry.split(".")[0], int(entry.split(".")[1])
     if kind == "centre":
         K = camera.K.clone()
@@ -432,14 +460,16 @@ def with_default(camera: Camera, entry: str) -> tuple[Camera, str]:
     return camera.replace(distortion=lens.with_coefficients(coefficients)), words
 
 
-# Priors ----------------------------------------------------------------------------------------------------------
+# Priors
+# ----------------------------------------------------------------------------------------------------------
 
 
 class CameraPrior(NamedTuple):
-    """A normal prior of a camera's parameters: mean and inverse covariance, in the order of `parameter_names`.
+    """A normal prior of a camera's parameters: mean and inverse covariance, in the order of
+    `parameter_names`.
 
-    pose: the mean of its pose, whose entries are a rotation vector about the camera's axes and the optical centre in
-    the world (not the translation), metres. Without it, the entries of the pose are zero.
+    pose: the mean of its pose, whose entries are a rotation vector about the camera's axes and the optical
+    centre in the world (not the translation), metres. Without it, the entries of the pose are zero.
     """
 
     mean: Float[np.ndarray, " p"]
@@ -447,7 +477,9 @@ class CameraPrior(NamedTuple):
     pose: Pose | None = None
 
     def equations(self, camera: Camera) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
-        """The prior's part of the normal equations: inverse covariance and negative gradient by each parameter."""
+        """The prior's part of the normal equations: inverse covariance and negative gradient by each
+        parameter.
+        """
         derivatives = np.eye(len(self.mean))
         if self.pose is not None:
             derivatives[3:6, :6] = camera.cam_from_world.centre_jacobian.numpy()
@@ -474,7 +506,9 @@ def typical_sizes(camera: Camera) -> Float[np.ndarray, " p"]:
     coefficients = () if lens is None else typical_coefficients(lens)
     scaled = lens is not None and term(lens, 0) == "xi"  # in the middle, by 1 / (1 + xi)
     focal = (coefficients[0] if scaled else TYPICAL_FOCAL_ERROR) * _mean_focal(camera)
-    return np.array([3.0] * 3 + [100.0] * 3 + [focal] * 2 + [TYPICAL_CENTRE_ERROR * camera.hw[1]] * 2 + [*coefficients])
+    return np.array(
+        [3.0] * 3 + [100.0] * 3 + [focal] * 2 + [TYPICAL_CENTRE_ERROR * camera.hw[1]] * 2 + [*coefficients]
+    )
 
 
 def typical_prior(camera: Camera) -> CameraPrior:

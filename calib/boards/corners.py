@@ -1,10 +1,10 @@
 """Chessboard corners to a hundredth of a pixel, by fitting a parametric corner model to the image.
 
-Four squares meet in a corner: grey is a + b S(d) S(e) with d, e the distances in pixels from the two edges, S the step
-from -1 to 1 blurred by a Gaussian. Position, levels and blur of each corner are fitted by least squares to the pixels
-beside its edges (Gauss-Newton); the directions and curvatures of the edges come from a smooth map of the whole board,
-fitted to all its corners. The pixels used are symmetric about the corner, so that gamma, glare and ink bleed, which
-move every edge towards one colour, hardly move a corner.
+Four squares meet in a corner: grey is a + b S(d) S(e) with d, e the distances in pixels from the two edges, S
+the step from -1 to 1 blurred by a Gaussian. Position, levels and blur of each corner are fitted by least
+squares to the pixels beside its edges (Gauss-Newton); the directions and curvatures of the edges come from a
+smooth map of the whole board, fitted to all its corners. The pixels used are symmetric about the corner, so
+that gamma, glare and ink bleed, which move every edge towards one colour, hardly move a corner.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ Map = Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, "n 2"]]
 class EdgeGeometry(NamedTuple):
     """The two edges through each corner.
 
-    along: direction of each edge, pixels per square; normal: unit normal, towards the next square; curvature: pixels
-    along the normal by which the edge leaves its tangent, per square pixel.
+    along: direction of each edge, pixels per square; normal: unit normal, towards the next square; curvature:
+    pixels along the normal by which the edge leaves its tangent, per square pixel.
     """
 
     along: Float[np.ndarray, "n 2 2"]
@@ -63,12 +63,16 @@ class EdgeGeometry(NamedTuple):
 
 
 def refine_corners(
-    grey: UInt8[np.ndarray, "h w"], x: Float[np.ndarray, "n 2"], p: Float[np.ndarray, "n 2"], *, clear: float = 0.5
+    grey: UInt8[np.ndarray, "h w"],
+    x: Float[np.ndarray, "n 2"],
+    p: Float[np.ndarray, "n 2"],
+    *,
+    clear: float = 0.5,
 ) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
     """Refine corners near `x`, and flag those that fit the corner model.
 
-    `p` are their positions on the board, in squares; nothing but the corner's own squares is within `clear` squares of
-    its edges.
+    `p` are their positions on the board, in squares; nothing but the corner's own squares is within `clear`
+    squares of its edges.
     """
     found, good = x, np.ones(len(x), dtype=bool)
     for _ in range(PASSES):
@@ -126,7 +130,9 @@ def _fitted(grey: Array, start: Array, shape: EdgeGeometry, clear: float) -> tup
     """Corners fitted from their predicted positions."""
     h, w = grey.shape
     length = np.linalg.norm(shape.along, axis=-1).min(1)
-    inside = np.minimum(np.minimum(start[:, 0], w - 1 - start[:, 0]), np.minimum(start[:, 1], h - 1 - start[:, 1]))
+    inside = np.minimum(
+        np.minimum(start[:, 0], w - 1 - start[:, 0]), np.minimum(start[:, 1], h - 1 - start[:, 1])
+    )
     extent = np.minimum(np.minimum(0.45 * length, LONGEST_EDGE), inside - 1)
     sine = np.abs(np.linalg.det(shape.normal))
     width = np.minimum(clear * length * sine - BLEED, WIDEST_BAND)
@@ -156,7 +162,9 @@ class CornerModel(NamedTuple):
         )
 
 
-def _least_squares(grey: Array, start: Array, shape: EdgeGeometry, extent: Array, width: Array) -> tuple[Array, Array]:
+def _least_squares(
+    grey: Array, start: Array, shape: EdgeGeometry, extent: Array, width: Array
+) -> tuple[Array, Array]:
     """Gauss-Newton on all corners at once: positions, and residuals (root mean square) in contrasts."""
     pixels = _around(start, extent)
     values = grey[pixels[..., 1].clip(0, grey.shape[0] - 1), pixels[..., 0].clip(0, grey.shape[1] - 1)]
@@ -191,7 +199,9 @@ def _initial_model(values: Array, x: Array, root: Array, d: Array, e: Array) -> 
 
 
 def _linearised(values: Array, model: CornerModel, normal: Array, d: Array, e: Array) -> tuple[Array, Array]:
-    """Residuals (n, m) and derivatives of the model by a step (n, m, 5), at distances d and e from the edges."""
+    """Residuals (n, m) and derivatives of the model by a step (n, m, 5), at distances d and e from the
+    edges.
+    """
     _, _, b, blur = model
     S, T = (erf(v / (2**0.5 * blur)) for v in (d, e))
     by_d, by_e = (b * (2 / np.pi) ** 0.5 / blur * np.exp(-((v / blur) ** 2) / 2) for v in (d, e))

@@ -1,8 +1,9 @@
 """Boards that are neither flat nor printed true to size: their shape as unknowns of the bundle adjustment.
 
-A print may be longer along one axis, and a sheet be curved. To third order a bent sheet keeps the lengths on it: with
-the symmetric curvature C (1/m) about the board's middle, the point q moves to q - C q (q^T C q) / 6, and out of the
-plane by q^T C q / 2 - (q^T C q) (q^T C^2 q) / 24; exact to that order for cylinders of any axis.
+A print may be longer along one axis, and a sheet be curved. To third order a bent sheet keeps the lengths on
+it: with the symmetric curvature C (1/m) about the board's middle, the point q moves to q - C q (q^T C q) / 6,
+and out of the plane by q^T C q / 2 - (q^T C q) (q^T C^2 q) / 24; exact to that order for cylinders of any
+axis.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ STEP = 1e-5
 class BoardDeformation:
     """The shapes of some boards.
 
-    values: stretch (y / x - 1) and curvatures xx, xy, yy (1/m, positive: the middle lies in front) of each board.
-    middle: the board's middle, metres. part: the board of each block.
+    values: stretch (y / x - 1) and curvatures xx, xy, yy (1/m, positive: the middle lies in front) of each
+    board. middle: the board's middle, metres. part: the board of each block.
     """
 
     values: Float[np.ndarray, "k 4"]
@@ -52,7 +53,9 @@ class BoardDeformation:
         """Flat points of some boards on the boards as they are, metres."""
         return _deformed(p, self.middle[part], self.values[part])
 
-    def jacobian(self, p: Float[np.ndarray, "n 3"], part: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3 s"]:
+    def jacobian(
+        self, p: Float[np.ndarray, "n 3"], part: Int[np.ndarray, " n"]
+    ) -> Float[np.ndarray, "n 3 s"]:
         """Derivatives of the deformed points with respect to all values, by central differences."""
         found = np.zeros((len(p), 3, *self.values.shape))
         rows, middle, values = np.arange(len(p)), self.middle[part], self.values[part]
@@ -89,7 +92,9 @@ class BoardDeformation:
 
 
 class Curvature(NamedTuple):
-    """How far the middle lies off the plane of two opposite edges, metres; radius, metres; towards the cameras."""
+    """How far the middle lies off the plane of two opposite edges, metres; radius, metres; towards the
+    cameras.
+    """
 
     depth: float
     radius: float
@@ -110,8 +115,12 @@ def fewest_frames(count: int) -> int:
     return 2 * count + 2
 
 
-def is_significant(values: Float[np.ndarray, " s"], covariance: Float[np.ndarray, "s s"], frames: int) -> bool:
-    """Whether shapes differ from flat ones by more than the jackknife over frames explains (Hotelling's test)."""
+def is_significant(
+    values: Float[np.ndarray, " s"], covariance: Float[np.ndarray, "s s"], frames: int
+) -> bool:
+    """Whether shapes differ from flat ones by more than the jackknife over frames explains (Hotelling's
+    test).
+    """
     from scipy.stats import f as f_distribution  # here, as it takes half a second to import
 
     count = len(values)
@@ -131,14 +140,17 @@ def described(
         if abs(stretch) > 3 * deviation[0]:
             found.append(
                 f"{name} is stretched: squares are {100 * abs(stretch):.2f} ± {100 * deviation[0]:.2g} % "
-                f"{'longer' if stretch > 0 else 'shorter'} down than across; this is modelled, with the size across as "
+                f"{'longer' if stretch > 0 else 'shorter'} down than across; this is modelled, with the "
+                "size across as "
                 "specified: measure both"
             )
         relative = float(np.max(np.abs(shape.values[k, 1:]) / deviation[1:]))
         if relative > 3:
             found.append(
-                f"{name} is bent: its middle lies {1e3 * curved.depth:.2f} ± {1e3 * curved.depth / relative:.2g} mm "
-                f"{'in front of' if curved.towards else 'behind'} its edges (radius {curved.radius:.2f} m); this "
+                f"{name} is bent: its middle lies {1e3 * curved.depth:.2f} ± "
+                f"{1e3 * curved.depth / relative:.2g} mm "
+                f"{'in front of' if curved.towards else 'behind'} its edges (radius {curved.radius:.2f} m); "
+                "this "
                 "is modelled: glue it to something stiff and flat"
             )
     return found

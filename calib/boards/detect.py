@@ -1,7 +1,7 @@
 """Detection of a board's points in images, to a fraction of a pixel, with likely reasons where it fails.
 
-OpenCV 4.10 and newer, and 5. Images that are dim, flat or inverted (near infrared, narrow bands) are stretched,
-equalised and inverted in turn until the board is found.
+OpenCV 4.10 and newer, and 5. Images that are dim, flat or inverted (near infrared, narrow bands) are
+stretched, equalised and inverted in turn until the board is found.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ FEWEST_KNOWN = 6
 ENOUGH = 0.6
 """Share of a board's corners that must fit the corner model, else all are refined by gradients."""
 LARGEST_MISFIT = 0.35
-"""Largest median distance (in spacings) of the points from a smoothly distorted grid: beyond it, a false detection."""
+"""Largest median distance (in spacings) of the points from a smoothly distorted grid: beyond it, a false
+detection.
+"""
 SMALL = 640
 """Width to which images are reduced to identify the board they show."""
 OTHER_DICTIONARIES = ("4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000", "aruco_original", "apriltag_36h11")
@@ -170,14 +172,17 @@ def _crossing(corners: np.ndarray) -> np.ndarray:
 def _tags(grey: Grey, dictionary: str, border: int) -> dict[int, np.ndarray]:
     """The four corners of each visible marker, by number.
 
-    AprilTags touch other squares at their corners: OpenCV's way of finding them and that of their authors miss others.
+    AprilTags touch other squares at their corners: OpenCV's way of finding them and that of their authors
+    miss others.
     """
     found: dict[int, np.ndarray] = {}
     april = [cv2.aruco.CORNER_REFINE_APRILTAG] if dictionary.startswith("april") else []
     for method in (cv2.aruco.CORNER_REFINE_SUBPIX, *april):
         parameters = cv2.aruco.DetectorParameters()
         parameters.markerBorderBits, parameters.cornerRefinementMethod = border, method
-        corners, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters).detectMarkers(grey)
+        corners, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters).detectMarkers(
+            grey
+        )
         numbers = [] if ids is None else ids.reshape(-1).tolist()
         found |= {number: x.reshape(4, 2) for number, x in zip(numbers, corners)}
     return found
@@ -279,7 +284,10 @@ def _reason(grey: Grey, board: Board) -> str:
     if cv2.Laplacian(grey, cv2.CV_64F).std() < 4:
         return "the images are blurred: focus, and hold the board still"
     margin = "" if isinstance(board, MarkedBoard) else " completely and with its white margin"
-    return f"no such board is visible{margin}: check the board's name, and that it is in the image, large and lit"
+    return (
+        f"no such board is visible{margin}: check the board's name, and that it is in the image, large "
+        "and lit"
+    )
 
 
 def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
@@ -289,22 +297,30 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
         other = f"border{3 - border}"
         return f"its tags have {3 - border} black bits around their codes: add ':{other}' to the board's name"
     if isinstance(board, KnownPoints):
-        return f"{len(ids)} of its markers are visible, too few, or not of {board.dictionary}: name their dictionary"
+        return (
+            f"{len(ids)} of its markers are visible, too few, or not of {board.dictionary}: name their "
+            "dictionary"
+        )
     if len(ids) >= 4 and max(ids) > last:
         return (
-            f"markers up to number {max(ids)} are visible and the board has {board.first} to {last}: is its size right?"
+            f"markers up to number {max(ids)} are visible and the board has {board.first} to {last}: is "
+            "its size right?"
         )
     if len(ids) >= 4:
         legacy = ""
         if isinstance(board, Charuco):
             legacy = "? A board drawn by OpenCV before 4.6 needs ':legacy' at the end of its name"
         return (
-            f"{len(ids)} of its markers are visible, but not at their positions: is the size right (across x down)"
+            f"{len(ids)} of its markers are visible, but not at their positions: is the size right (across "
+            "x down)"
             f"{legacy}"
         )
     for name in OTHER_DICTIONARIES:
         if len(seen := _tags(grey, name, 1)) >= 6:
-            return f"{len(seen)} markers of the dictionary {name} are visible, not of {board.dictionary}: name that one"
+            return (
+                f"{len(seen)} markers of the dictionary {name} are visible, not of {board.dictionary}: "
+                "name that one"
+            )
     if len(_tags(np.ascontiguousarray(grey[:, ::-1]), board.dictionary, border)) >= 4:
         return "its markers are found once the image is mirrored: save the images as captured, not mirrored"
     return None
@@ -319,7 +335,8 @@ def _grid_size(grey: Grey) -> tuple[int, int] | None:
     return (meta.shape[1], meta.shape[0]) if done else None
 
 
-# All images ---------------------------------------------------------------------------------------------------
+# All images
+# ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -355,7 +372,11 @@ def collect(photos: Photos, board: Board, *, progress: Progress | None = None) -
 
 
 def collect_folder(
-    folder: str | Path, board: Board, *, patterns: Mapping[str, str] | None = None, progress: Progress | None = None
+    folder: str | Path,
+    board: Board,
+    *,
+    patterns: Mapping[str, str] | None = None,
+    progress: Progress | None = None,
 ) -> CollectedViews:
     """`collect` for the images of a folder (see `find_photos`)."""
     return collect(find_photos(Path(folder), patterns=patterns), board, progress=progress)
@@ -364,8 +385,8 @@ def collect_folder(
 def detected(photo: Photo, key: FrameKey, board: Board) -> tuple[HW, dict[FrameKey, Detection]]:
     """An image's size and the points of each board in it, numbered as those of all boards.
 
-    Each board has poses of its own, hence a key of its own; that of the first one is the image's. Raises ValueError if
-    the image cannot be read.
+    Each board has poses of its own, hence a key of its own; that of the first one is the image's. Raises
+    ValueError if the image cannot be read.
     """
     grey, found, before = photo.read(), dict[FrameKey, Detection](), 0
     for index, member in enumerate(board.members):
@@ -375,28 +396,41 @@ def detected(photo: Photo, key: FrameKey, board: Board) -> tuple[HW, dict[FrameK
     return (grey.shape[0], grey.shape[1]), found
 
 
-def _check_sizes(name: str, moments: Mapping[FrameKey, Photo], sizes: Mapping[FrameKey, tuple[int, int]]) -> None:
+def _check_sizes(
+    name: str, moments: Mapping[FrameKey, Photo], sizes: Mapping[FrameKey, tuple[int, int]]
+) -> None:
     counts = Counter(sizes.values())
     if len(counts) == 1:
         return
-    shown = [f"{w}x{h} ({_named([moments[k].label for k in sizes if sizes[k] == (h, w)], 2)})" for h, w in counts]
-    raise ValueError(f"{name}: its images differ in size: {'; '.join(shown)}; keep those of one camera at one setting")
+    shown = [
+        f"{w}x{h} ({_named([moments[k].label for k in sizes if sizes[k] == (h, w)], 2)})" for h, w in counts
+    ]
+    raise ValueError(
+        f"{name}: its images differ in size: {'; '.join(shown)}; keep those of one camera at one setting"
+    )
 
 
-def _check_board(name: str, moments: Mapping[FrameKey, Photo], seen: Collection[FrameKey], board: Board) -> None:
+def _check_board(
+    name: str, moments: Mapping[FrameKey, Photo], seen: Collection[FrameKey], board: Board
+) -> None:
     """Raises ValueError if no image shows the board, or if most of some show a larger one."""
     if not seen:
         why = explain(_greys(list(moments.values())), board.members[0])
         labels = _named([p.label for p in moments.values()], NAMED)
-        raise ValueError(f"{name}: the board {board} is found in none of {len(moments)} images ({labels}): {why}")
+        raise ValueError(
+            f"{name}: the board {board} is found in none of {len(moments)} images ({labels}): {why}"
+        )
     if other := other_size(_greys([moments[key] for key in seen]), board, larger=True):
         raise ValueError(
-            f"{name}: the images show a chessboard with {other} inner corners and the board given is {board}: "
+            f"{name}: the images show a chessboard with {other} inner corners and the board given is "
+            f"{board}: "
             "count the corners between squares, not the squares"
         )
 
 
-def _missing(name: str, moments: Mapping[FrameKey, Photo], seen: Collection[FrameKey], board: Board) -> list[str]:
+def _missing(
+    name: str, moments: Mapping[FrameKey, Photo], seen: Collection[FrameKey], board: Board
+) -> list[str]:
     missing = [photo for key, photo in moments.items() if key not in seen]
     if not missing:
         return []

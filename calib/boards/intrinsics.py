@@ -1,4 +1,6 @@
-"""One camera from its own images: Zhang's method by OpenCV, then all observable parameters; lens models compared."""
+"""One camera from its own images: Zhang's method by OpenCV, then all observable parameters; lens models
+compared.
+"""
 
 from __future__ import annotations
 
@@ -75,7 +77,8 @@ class CalibratedViews:
 def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> CalibratedViews:
     """A camera's intrinsics, lens and board poses from its own images, without outliers.
 
-    Raises ValueError if there are fewer than three images with a board (one, with points that are not in a plane).
+    Raises ValueError if there are fewer than three images with a board (one, with points that are not in a
+    plane).
     """
     fewest = FEWEST_IMAGES if board.flat else 1
     if len(views.seen) < fewest:
@@ -111,15 +114,21 @@ def without_outliers(
 ) -> BoardViews:
     """The views without points farther from a camera's projections than `OUTLIER` standard deviations.
 
-    `points` are the board's, metres. `sigma` is along x or y, pixels; by default estimated from the median of all
-    distances. Images without a pose, or with fewer than `FEWEST_POINTS` points or one row of them left, keep all.
+    `points` are the board's, metres. `sigma` is along x or y, pixels; by default estimated from the median of
+    all distances. Images without a pose, or with fewer than `FEWEST_POINTS` points or one row of them left,
+    keep all.
     """
-    off = {key: projection_errors(camera, poses[key], d, points) for key, d in views.seen.items() if key in poses}
+    off = {
+        key: projection_errors(camera, poses[key], d, points) for key, d in views.seen.items() if key in poses
+    }
     sigma = max(sigma or float(np.median(np.concatenate(list(off.values())))) / RAYLEIGH_MEDIAN, LEAST_SIGMA)
     kept = {key: views.seen[key].where(r < OUTLIER * sigma) for key, r in off.items()}
     return BoardViews(
         views.hw,
-        {key: kept[key] if key in kept and _spans(points[kept[key].ids]) else d for key, d in views.seen.items()},
+        {
+            key: kept[key] if key in kept and _spans(points[kept[key].ids]) else d
+            for key, d in views.seen.items()
+        },
     )
 
 
@@ -140,7 +149,9 @@ def projection_errors(
 
 
 def near_homography(found: Detection, board: Board) -> Detection:
-    """The points that a homography of the board fits (least median of squares), apart from the lens's distortion."""
+    """The points that a homography of the board fits (least median of squares), apart from the lens's
+    distortion.
+    """
     if len(found.ids) < FEWEST_POINTS or not board.flat:
         return found
     plane = board.points[found.ids, :2]
@@ -155,12 +166,17 @@ def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Cam
     model, count = LENSES[lens]
     pinhole = model in ("brown-conrady", "none")
     try:
-        K, coefficients, rotations, translations = _pinhole(views, board, count) if pinhole else _fisheye(views, board)
+        K, coefficients, rotations, translations = (
+            _pinhole(views, board, count) if pinhole else _fisheye(views, board)
+        )
     except cv2.error as error:
         raise ValueError(
-            f"{name}: OpenCV finds no camera that fits these boards ({error.err}): do all show the same board?"
+            f"{name}: OpenCV finds no camera that fits these boards ({error.err}): do all show the same "
+            "board?"
         ) from None
-    distortion = Distortion(model if pinhole else "kannala-brandt", torch.tensor(coefficients)) if count else None
+    distortion = (
+        Distortion(model if pinhole else "kannala-brandt", torch.tensor(coefficients)) if count else None
+    )
     camera = Camera(K=torch.tensor(K), cam_from_world=Pose.identity(), hw=views.hw, distortion=distortion)
     if not pinhole and model != "kannala-brandt":
         camera = _with_model(camera, model)
@@ -168,7 +184,9 @@ def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Cam
 
 
 def _with_model(camera: Camera, model: str) -> Camera:
-    """A fisheye's camera with another lens model of nearly the same rays: its focal length and two terms are fitted."""
+    """A fisheye's camera with another lens model of nearly the same rays: its focal length and two terms are
+    fitted.
+    """
     plain = np.array(MODELS[model].harmless)
     h, w = camera.hw
     grid = np.stack(np.meshgrid(np.linspace(0, w - 1, 16), np.linspace(0, h - 1, 12)), -1).reshape(-1, 2)
@@ -182,21 +200,25 @@ def _with_model(camera: Camera, model: str) -> Camera:
         return camera.replace(K=K, distortion=Distortion(model, coefficients))
 
     first = np.array([0.0, *plain[:2]])
-    found = least_squares(lambda v: (changed(v).project_local(rays).x - x).numpy().ravel(), first, loss="soft_l1")
+    found = least_squares(
+        lambda v: (changed(v).project_local(rays).x - x).numpy().ravel(), first, loss="soft_l1"
+    )
     return changed(found.x)
 
 
 def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:
     """`cam_from_board` of one image, for a camera whose intrinsics are known.
 
-    Raises ValueError for fewer than four points in front of the camera, as a lens far from the true one may see them.
+    Raises ValueError for fewer than four points in front of the camera, as a lens far from the true one may
+    see them.
     """
     directions, valid = camera.rays(torch.from_numpy(found.x))
     rays = directions.numpy()
     usable = valid.numpy() & (rays[:, 2] > 0.05 * np.linalg.norm(rays, axis=1))
     if usable.sum() < 4:
         raise ValueError(
-            f"only {usable.sum()} of {len(usable)} points of a board are in front of {camera}: a pose needs four; "
+            f"only {usable.sum()} of {len(usable)} points of a board are in front of {camera}: a pose needs "
+            "four; "
             "check its lens and focal length"
         )
     flat = rays[usable, :2] / rays[usable, 2:]
@@ -211,9 +233,9 @@ def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:
 def _pinhole(views: BoardViews, board: Board, count: int) -> OpenCVSolution:
     """K, coefficients, rotations, translations; two radial terms suffice initially.
 
-    Few, small or similar boards determine neither these nor the aspect ratio, and a fit without a prior ends anywhere.
-    Where pixels become oblong, a camera with square ones, a central principal point and one radial term is fitted
-    instead: the rest is left to the adjustment and its prior.
+    Few, small or similar boards determine neither these nor the aspect ratio, and a fit without a prior ends
+    anywhere. Where pixels become oblong, a camera with square ones, a central principal point and one radial
+    term is fitted instead: the rest is left to the adjustment and its prior.
     """
     initial = board.points * (1, 1, 0) if board.flat else board.points
     points = [initial[d.ids].astype(np.float32) for d in views.seen.values()]
@@ -239,7 +261,9 @@ def _pinhole(views: BoardViews, board: Board, count: int) -> OpenCVSolution:
 
 
 def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarray:
-    """K with square pixels and a central principal point by a linear camera of one view (Hartley & Zisserman 7.1)."""
+    """K with square pixels and a central principal point by a linear camera of one view (Hartley & Zisserman
+    7.1).
+    """
     X, x = view[0].astype(np.float64), view[1][:, 0].astype(np.float64)
     if len(X) < FEWEST_POINTS:
         return np.array(intrinsics(float(max(hw)), hw))
@@ -254,13 +278,21 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
 
 
 def _fisheye(views: BoardViews, board: Board) -> OpenCVSolution:
-    """From the focal length of half a sphere, or, where OpenCV then finds no poses, from one of a narrow view."""
+    """From the focal length of half a sphere, or, where OpenCV then finds no poses, from one of a narrow
+    view.
+    """
     if not board.flat:
-        raise ValueError("fisheyes need a flat board to start from: points of known position give pinhole cameras")
+        raise ValueError(
+            "fisheyes need a flat board to start from: points of known position give pinhole cameras"
+        )
     points = [board.points[d.ids][:, None] for d in views.seen.values()]
     pixels = [d.x[:, None] for d in views.seen.values()]
     h, w = views.hw
-    flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW | cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
+    flags = (
+        cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC
+        | cv2.fisheye.CALIB_FIX_SKEW
+        | cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
+    )
 
     def calibrated(focal: float) -> OpenCVSolution:
         K, none = np.array(intrinsics(focal, views.hw)), np.zeros((4, 1))

@@ -26,8 +26,8 @@ Grey = UInt8[np.ndarray, "h w"]
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"}
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"}
 MOST_FRAMES = 80
-"""Largest number of frames used of a video: every first, second, fourth, eighth ..., so that videos of somewhat
-different lengths share them."""
+"""Largest number of frames used of a video: every first, second, fourth, eighth ..., so that videos of
+somewhat different lengths share them."""
 
 ORIENTATION = 274
 """EXIF's tag."""
@@ -52,7 +52,9 @@ Photos = Mapping[str, Mapping[FrameKey, Photo]]
 
 
 def to_grey(image: np.ndarray) -> Grey:
-    """An image (H, W) or (H, W, 3) in grey, 8 bits; one that is dim or of 16 bits is stretched to all of them."""
+    """An image (H, W) or (H, W, 3) in grey, 8 bits; one that is dim or of 16 bits is stretched to all of
+    them.
+    """
     grey = image if image.ndim == 2 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
     low, high = np.percentile(grey[::4, ::4], (0.5, 99.5))
     if grey.dtype == np.uint8 and high - low > 100:
@@ -64,21 +66,27 @@ def to_grey(image: np.ndarray) -> Grey:
 def find_photos(folder: Path, *, patterns: Mapping[str, str] | None = None) -> Photos:
     """The images of every camera below a folder.
 
-    `patterns` maps camera names to patterns of file names, relative to the folder. Without it every subfolder with
-    images or a video is a camera; where there is none, every prefix of file names before a final number
+    `patterns` maps camera names to patterns of file names, relative to the folder. Without it every subfolder
+    with images or a video is a camera; where there is none, every prefix of file names before a final number
     (left01.jpg, right01.jpg), or every video. If each camera has one image, they are of one moment. Raises
     FileNotFoundError and ValueError.
     """
     if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder of images: give one with a subfolder for each camera")
+        raise FileNotFoundError(
+            f"{folder}: no such folder of images: give one with a subfolder for each camera"
+        )
     cameras = _by_pattern(folder, patterns) if patterns else _by_folder(folder) or _by_name(folder)
     if not cameras:
-        raise ValueError(f"{folder}: no images or videos here: give a folder with a subfolder for each camera")
+        raise ValueError(
+            f"{folder}: no images or videos here: give a folder with a subfolder for each camera"
+        )
     return _of_one_moment({name: _moments(name, files) for name, files in cameras.items()})
 
 
 def _of_one_moment(photos: dict[str, dict[FrameKey, Photo]]) -> Photos:
-    """Cameras with one image each took it at the same moment: numbers in the files' names are those of cameras."""
+    """Cameras with one image each took it at the same moment: numbers in the files' names are those of
+    cameras.
+    """
     keys = {key for moments in photos.values() for key in moments}
     if len(keys) == 1 or any(len(moments) > 1 for moments in photos.values()):
         return photos
@@ -86,7 +94,8 @@ def _of_one_moment(photos: dict[str, dict[FrameKey, Photo]]) -> Photos:
 
 
 def frame_keys(stems: list[str]) -> list[FrameKey]:
-    """What distinguishes the images of one camera: the part of the names that differs, as a number if it is one.
+    """What distinguishes the images of one camera: the part of the names that differs, as a number if it is
+    one.
 
     >>> frame_keys(["cam01_08_int", "cam01_09_int", "cam01_10_int"])
     [8, 9, 10]
@@ -136,29 +145,37 @@ def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
     videos = [f for f in files if f.suffix.lower() in VIDEOS]
     if len(videos) > 1 or (videos and len(videos) < len(files)):
         raise ValueError(
-            f"{name}: has {len(videos)} videos and {len(files) - len(videos)} images: keep one video, or images"
+            f"{name}: has {len(videos)} videos and {len(files) - len(videos)} images: keep one video, or "
+            "images"
         )
     if videos:
         return dict(_video_frames(videos[0]))
     _check_orientations(name, files)
     keys = frame_keys([f.stem for f in files])
     if len(set(keys)) < len(keys):
-        raise ValueError(f"{name}: two images have the same number, such as {files[0].name}: give each its own")
+        raise ValueError(
+            f"{name}: two images have the same number, such as {files[0].name}: give each its own"
+        )
     return {key: Photo(file.name, partial(_decode_file, file)) for key, file in zip(keys, files)}
 
 
 def _check_orientations(name: str, files: list[Path]) -> None:
-    """Tags are applied, so images of one camera that were stored alike would otherwise be rotated differently."""
+    """Tags are applied, so images of one camera that were stored alike would otherwise be rotated
+    differently.
+    """
     first: dict[int, Path] = {}
     for file in files:
         first.setdefault(_orientation(file), file)
     if len(first) > 1:
         listed = ", ".join(f"{tag} in {file.name}" for tag, file in first.items())
-        raise ValueError(f"{name}: its images have different orientation tags ({listed}): remove the tags from all")
+        raise ValueError(
+            f"{name}: its images have different orientation tags ({listed}): remove the tags from all"
+        )
 
 
 def _orientation(file: Path) -> int:
-    """The EXIF orientation, 1 if there is none or the file cannot be read, which is reported when it is decoded.
+    """The EXIF orientation, 1 if there is none or the file cannot be read, which is reported when it is
+    decoded.
 
     Raises ValueError for a file that states more pixels than any camera has, before anything is decoded.
     """
@@ -181,7 +198,9 @@ def _decode_file(path: Path) -> np.ndarray:
         raise ValueError(f"{path}: not an image that can be read: give a complete PNG, TIFF or JPEG file")
     if tag > 1 and content[8:12] == b"WEBP":  # of which OpenCV applies none
         with Image.open(path) as stored:
-            image = np.ascontiguousarray(np.asarray(ImageOps.exif_transpose(stored).convert("RGB"))[..., ::-1])
+            image = np.ascontiguousarray(
+                np.asarray(ImageOps.exif_transpose(stored).convert("RGB"))[..., ::-1]
+            )
     return image
 
 

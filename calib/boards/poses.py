@@ -1,6 +1,7 @@
 """Initial poses of the cameras and boards.
 
-Relative poses of pairs by vote, joined along a maximum spanning tree; or those of a rig that is known roughly.
+Relative poses of pairs by vote, joined along a maximum spanning tree; or those of a rig that is known
+roughly.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from .intrinsics import LENSES, CalibratedViews, Lens, board_pose
 from .photos import FrameKey
 
 TOLERANCE = 0.03
-"""A frame agrees with a pose if it predicts the board to this share of the image width: one view of a small board
-determines its tilt, hence the other camera's position, no better."""
+"""A frame agrees with a pose if it predicts the board to this share of the image width: one view of a small
+board determines its tilt, hence the other camera's position, no better."""
 FEWEST_TO_JUDGE = 3
 """Frames that two cameras must share for their consistency to be checked."""
 MOST_CANDIDATES = 15
@@ -48,8 +49,8 @@ class RelativePose(NamedTuple):
 class StartDeviations:
     """How far a rig may be from its start: standard deviations of each camera's parameters.
 
-    position: of the optical centre along each axis, metres. rotation: about each axis, degrees. focal: a share of the
-    focal length. centre: of the principal point, a share of the width.
+    position: of the optical centre along each axis, metres. rotation: about each axis, degrees. focal: a
+    share of the focal length. centre: of the principal point, a share of the width.
     """
 
     position: float = 5e-4
@@ -82,7 +83,8 @@ def start_prior(camera: Camera, deviations: StartDeviations) -> CameraPrior:
 
 
 def initial_rig(singles: Mapping[str, Solved], board: Board) -> InitialRig:
-    """Poses of all cameras and boards from pairs, along the tree whose edges have most corners; the first is the world.
+    """Poses of all cameras and boards from pairs, along the tree whose edges have most corners; the first is
+    the world.
 
     Raises ValueError if cameras are not connected by shared frames, or if the frames of a pair contradict
     each other: images that are mirrored, or not of the same moments.
@@ -91,24 +93,37 @@ def initial_rig(singles: Mapping[str, Solved], board: Board) -> InitialRig:
         CalibratedViews(name, alone.problem.cameras[name], alone.views[name], alone.problem.board_poses)
         for name, alone in singles.items()
     ]
-    pairs = {(a.name, b.name): found for a, b in combinations(cameras, 2) if (found := pair_pose(a, b, board))}
+    pairs = {
+        (a.name, b.name): found for a, b in combinations(cameras, 2) if (found := pair_pose(a, b, board))
+    }
     return consistent_boards(cameras, _along_tree(cameras, pairs, board), board)
 
 
 def rig_near_start(
-    start: Rig, views: Mapping[str, BoardViews], board: Board, lens: Mapping[str, Lens], deviations: StartDeviations
+    start: Rig,
+    views: Mapping[str, BoardViews],
+    board: Board,
+    lens: Mapping[str, Lens],
+    deviations: StartDeviations,
 ) -> InitialRig:
-    """Cameras at the start's positions, rotated so that they agree on the boards, and the boards in the start's world.
+    """Cameras at the start's positions, rotated so that they agree on the boards, and the boards in the
+    start's world.
 
-    The camera with most images keeps its orientation. Raises ValueError if the start has no such camera, or one of
-    another size, or if a camera shares no moment with another.
+    The camera with most images keeps its orientation. Raises ValueError if the start has no such camera, or
+    one of another size, or if a camera shares no moment with another.
     """
     cameras = {name: _start_camera(name, start, v, lens[name]) for name, v in views.items()}
     for name, v in views.items():
-        if len(views) > 1 and not any(v.seen.keys() & other.seen.keys() for n, other in views.items() if n != name):
-            raise ValueError(f"{name}: never sees the board in the same frame as another camera: check the numbers")
+        if len(views) > 1 and not any(
+            v.seen.keys() & other.seen.keys() for n, other in views.items() if n != name
+        ):
+            raise ValueError(
+                f"{name}: never sees the board in the same frame as another camera: check the numbers"
+            )
     seen = [
-        CalibratedViews(name, c, views[name], {key: board_pose(c, d, board) for key, d in views[name].seen.items()})
+        CalibratedViews(
+            name, c, views[name], {key: board_pose(c, d, board) for key, d in views[name].seen.items()}
+        )
         for name, c in cameras.items()
     ]
     anchor = max(seen, key=lambda v: len(v.poses))
@@ -118,10 +133,14 @@ def rig_near_start(
 
 
 def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) -> Camera:
-    """A camera of a start, with a lens. Raises ValueError if it is missing or differs in size from the images."""
+    """A camera of a start, with a lens. Raises ValueError if it is missing or differs in size from the
+    images.
+    """
     camera = start.cameras.get(name)
     if not isinstance(camera, Camera):
-        raise ValueError(f"{name}: the start has no camera of this name with K and pose; it has {list(start.names)}")
+        raise ValueError(
+            f"{name}: the start has no camera of this name with K and pose; it has {list(start.names)}"
+        )
     if camera.hw != views.hw:
         (h, w), (rows, columns) = camera.hw, views.hw
         raise ValueError(f"{name}: its images are {columns}x{rows} and the start states {w}x{h}")
@@ -149,7 +168,9 @@ def pair_pose(a: CalibratedViews, b: CalibratedViews, board: Board) -> RelativeP
         return None
     symmetries = symmetry_poses(board)
     tried = shared[:: max(1, len(shared) // MOST_CANDIDATES)]
-    candidates = [a.poses[key] @ symmetry @ b.poses[key].inverse() for key in tried for symmetry in symmetries]
+    candidates = [
+        a.poses[key] @ symmetry @ b.poses[key].inverse() for key in tried for symmetry in symmetries
+    ]
     voted = max((_vote(a, b, pose, shared, board) for pose in candidates), key=lambda v: v.score)
     for _ in range(2):
         poses = [nearest_pose(voted.pose, a.poses[k], b.poses[k], symmetries) for k in voted.agreeing]
@@ -165,7 +186,9 @@ class _Candidate(NamedTuple):
     score: tuple[int, float]
 
 
-def _vote(a: CalibratedViews, b: CalibratedViews, a_from_b: Pose, keys: Sequence[FrameKey], board: Board) -> _Candidate:
+def _vote(
+    a: CalibratedViews, b: CalibratedViews, a_from_b: Pose, keys: Sequence[FrameKey], board: Board
+) -> _Candidate:
     """The frames that agree with a relative pose; the score is their number, then minus their total error."""
     errors = _prediction_errors(a, b, a_from_b, keys, board)
     agree = errors < _tolerance(a)
@@ -194,20 +217,26 @@ def symmetry_poses(board: Board) -> list[Pose]:
         sine = (before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]).sum()
         angle = np.arctan2(sine, (before[:, :2] * after[:, :2]).sum())
         R = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-        found.append(Pose(torch.from_numpy(R), torch.from_numpy(board.points.mean(0) - R @ board.points.mean(0))))
+        found.append(
+            Pose(torch.from_numpy(R), torch.from_numpy(board.points.mean(0) - R @ board.points.mean(0)))
+        )
     return found
 
 
 def _prediction_errors(
     a: CalibratedViews, b: CalibratedViews, a_from_b: Pose, keys: Iterable[FrameKey], board: Board
 ) -> np.ndarray:
-    """By frame: the median distance in a's image from the points predicted by b's board pose, best numbering."""
+    """By frame: the median distance in a's image from the points predicted by b's board pose, best
+    numbering.
+    """
     detections, poses = zip(*((a.views.seen[key], b.poses[key]) for key in keys))
     counts = [len(d.ids) for d in detections]
     points = torch.from_numpy(board.points)
     errors = []
     for symmetry in symmetry_poses(board):
-        X = torch.cat([(a_from_b @ pose @ symmetry).apply(points[d.ids]) for d, pose in zip(detections, poses)])
+        X = torch.cat(
+            [(a_from_b @ pose @ symmetry).apply(points[d.ids]) for d, pose in zip(detections, poses)]
+        )
         x, _, valid = a.camera.project_local(X)
         distance = np.linalg.norm(x.numpy() - np.concatenate([d.x for d in detections]), axis=-1)
         distance = np.where(valid.numpy(), distance, np.inf)
@@ -227,7 +256,9 @@ def _along_tree(
     poses = {cameras[0].name: Pose.identity()}
     consistent = {names: pair for names, pair in pairs.items() if pair.consistent}
     while len(poses) < len(cameras):
-        edges = {names: pair for names, pair in consistent.items() if (names[0] in poses) != (names[1] in poses)}
+        edges = {
+            names: pair for names, pair in consistent.items() if (names[0] in poses) != (names[1] in poses)
+        }
         if not edges:
             raise ValueError(_connection_error(cameras, list(poses), pairs, board))
         (a, b), pair = max(edges.items(), key=lambda edge: edge[1].corners)
@@ -239,7 +270,9 @@ def _along_tree(
 
 
 def consistent_boards(cameras: Sequence[CalibratedViews], poses: dict[str, Pose], board: Board) -> InitialRig:
-    """Board poses from the camera most others agree with, and the other cameras' numbering made consistent."""
+    """Board poses from the camera most others agree with, and the other cameras' numbering made
+    consistent.
+    """
     boards: dict[FrameKey, Pose] = {}
     seen: dict[str, dict[FrameKey, Detection]] = {c.name: {} for c in cameras}
     left_out = []
@@ -254,11 +287,17 @@ def consistent_boards(cameras: Sequence[CalibratedViews], poses: dict[str, Pose]
             else:
                 left_out.append((camera.name, key))
     placed = {c.name: c.camera.replace(cam_from_world=poses[c.name]) for c in cameras}
-    return InitialRig(placed, boards, {c.name: BoardViews(c.views.hw, seen[c.name]) for c in cameras}, left_out)
+    return InitialRig(
+        placed, boards, {c.name: BoardViews(c.views.hw, seen[c.name]) for c in cameras}, left_out
+    )
 
 
 def _agreement(
-    anchor: CalibratedViews, views: Sequence[CalibratedViews], key: FrameKey, poses: Mapping[str, Pose], board: Board
+    anchor: CalibratedViews,
+    views: Sequence[CalibratedViews],
+    key: FrameKey,
+    poses: Mapping[str, Pose],
+    board: Board,
 ) -> int:
     """How many cameras agree with one camera's board pose."""
     world_from_board = poses[anchor.name].inverse() @ anchor.poses[key]
@@ -266,14 +305,20 @@ def _agreement(
     return sum(error < _tolerance(c) for c, error in errors)
 
 
-def _numbered(camera: CalibratedViews, key: FrameKey, cam_from_board: Pose, board: Board) -> tuple[float, Detection]:
+def _numbered(
+    camera: CalibratedViews, key: FrameKey, cam_from_board: Pose, board: Board
+) -> tuple[float, Detection]:
     """The numbering of an image's points that fits a board pose best, and its median error in pixels."""
     found = camera.views.seen[key]
     choices = [Detection(image[found.ids], found.x) for image in board.symmetries]
     errors = []
     for choice in choices:
-        x, _, valid = camera.camera.project_local(cam_from_board.apply(torch.from_numpy(board.points[choice.ids])))
-        errors.append(float(np.median(np.where(valid.numpy(), np.linalg.norm(x.numpy() - choice.x, axis=-1), np.inf))))
+        x, _, valid = camera.camera.project_local(
+            cam_from_board.apply(torch.from_numpy(board.points[choice.ids]))
+        )
+        errors.append(
+            float(np.median(np.where(valid.numpy(), np.linalg.norm(x.numpy() - choice.x, axis=-1), np.inf)))
+        )
     best = int(np.argmin(errors))
     return errors[best], choices[best]
 
@@ -290,13 +335,15 @@ def _connection_error(
     if not crossing:
         see = "see" if len(rest) > 1 else "sees"
         return (
-            f"{_listed(rest)} never {see} the board in the same frame as {_listed(joined)}: take images with the "
+            f"{_listed(rest)} never {see} the board in the same frame as {_listed(joined)}: take images "
+            "with the "
             "board where both see it, and check that images of one moment have the same number"
         )
     (a, b), pair = max(crossing.items(), key=lambda edge: len(edge[1].shared))
     by_name = {c.name: c for c in cameras}
     return (
-        f"{a} and {b} contradict each other: only {len(pair.agreeing)} of the {len(pair.shared)} frames both see fit "
+        f"{a} and {b} contradict each other: only {len(pair.agreeing)} of the {len(pair.shared)} frames "
+        "both see fit "
         f"one relative pose; {_explain_contradiction(by_name[a], by_name[b], board)}"
     )
 

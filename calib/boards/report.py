@@ -1,4 +1,6 @@
-"""The report of a calibration: one HTML file with tables and figures: the rig, residuals, coverage, uncertainty."""
+"""The report of a calibration: one HTML file with tables and figures: the rig, residuals, coverage,
+uncertainty.
+"""
 
 from __future__ import annotations
 
@@ -47,10 +49,12 @@ DRAWN = 6
 
 
 STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; max-width: 1080px; margin: 2em auto; padding: 0 1em; color: #222 }
+body { font: 15px/1.45 system-ui, sans-serif; max-width: 1080px; margin: 2em auto; padding: 0 1em;
+  color: #222 }
 table { border-collapse: collapse; margin: .6em 0 1.4em; font-variant-numeric: tabular-nums }
 td, th { padding: .2em .8em .2em 0; text-align: left; vertical-align: top; border-bottom: 1px solid #ddd }
-h2 { margin-top: 2em; font-size: 1.15em } img { max-width: 100% } .note { color: #8a3b00 } small { color: #666 }
+h2 { margin-top: 2em; font-size: 1.15em } img { max-width: 100% }
+.note { color: #8a3b00 } small { color: #666 }
 """
 
 
@@ -85,7 +89,8 @@ def report_html(
     worst = draw_worst_images(calibration, detected, photos) if detected and photos else None
     if worst is not None:
         parts += [
-            "<h2>Images that fit worst</h2><p>Points used (dots), left out (red circles), residuals (enlarged).</p>",
+            "<h2>Images that fit worst</h2><p>Points used (dots), left out (red circles), residuals "
+            "(enlarged).</p>",
             image(worst),
         ]
     for name in calibration.views:
@@ -96,9 +101,12 @@ def report_html(
     if calibration.fit.covariance is not None:
         parts += [
             "<h2>Adequacy of each camera</h2>",
-            "<p>Left, middle: standard deviation (pixels, worst direction) of the projection of points at the nearest "
-            "and the furthest depth of the boards, after the motion of the camera that keeps the boards where they "
-            "were seen best. Right: how far cameras fitted to every other frame differ, where boards were seen (grey: "
+            "<p>Left, middle: standard deviation (pixels, worst direction) of the projection of points at "
+            "the nearest "
+            "and the furthest depth of the boards, after the motion of the camera that keeps the boards "
+            "where they "
+            "were seen best. Right: how far cameras fitted to every other frame differ, where boards were "
+            "seen (grey: "
             "nowhere): where that is much more, the lens model or the boards are inadequate.</p>",
             image(draw_adequacy(calibration, depths(covers.values()))),
         ]
@@ -106,7 +114,8 @@ def report_html(
         near, far = depths(covers.values())
         parts += [
             "<h2>Uncertainty of predicted positions</h2>",
-            "<p>Standard deviation (pixels, worst direction) of the positions predicted in the other cameras for "
+            "<p>Standard deviation (pixels, worst direction) of the positions predicted in the other "
+            "cameras for "
             f"pixels of the first, at {near:.3g} m (nearest board) and {far:.3g} m (furthest).</p>",
             image(draw_uncertainty(calibration, (near, far))),
         ]
@@ -120,20 +129,25 @@ def html_page(parts: Iterable[str], title: str, further: str = "") -> str:
 
 
 def by_cameras(notes: Iterable[str]) -> list[str]:
-    """Notes such as "left: no points at the top", with the same text as one: "left, right: no points at the top"."""
+    """Notes such as "left: no points at the top", with the same text as one: "left, right: no points at the
+    top".
+    """
     names: dict[str, list[str]] = {}
     for note in notes:
         name, between, text = note.partition(": ")
         name, text = (name, text) if between else ("", note)
         names.setdefault(text, []).append(name)
-    return [": ".join(filter(None, [", ".join(dict.fromkeys(listed)), text])) for text, listed in names.items()]
+    return [
+        ": ".join(filter(None, [", ".join(dict.fromkeys(listed)), text])) for text, listed in names.items()
+    ]
 
 
 def summary(calibration: Calibration) -> str:
     """The calibration in a sentence or two."""
     points = sum(len(seen.x) for seen in calibration.fit.problem.seen.values())
     text = (
-        f"{len(calibration.views)} cameras, {len(calibration.frames)} frames of {calibration.board}, {points} points: "
+        f"{len(calibration.views)} cameras, {len(calibration.frames)} frames of {calibration.board}, "
+        f"{points} points: "
         f"reprojection error {calibration.rms:.3f} px (RMS)."
     )
     for where, errors in (("", calibration.epipolar), (" on held-out frames", calibration.held_out)):
@@ -149,13 +163,17 @@ def depths(covers: Iterable[Coverage]) -> tuple[float, float]:
     return max(min(near), 1e-3), max(far)
 
 
-# Tables -------------------------------------------------------------------------------------------------------
+# Tables
+# -------------------------------------------------------------------------------------------------------
 
 
 def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> str:
     """One row per camera: points, residuals, and parameters with standard deviations."""
     residuals = calibration.fit.problem.residuals()
-    head = "camera|images, points|error px, together (alone)|noise px|focal length px|principal point px|lens|covered"
+    head = (
+        "camera|images, points|error px, together (alone)|noise px|focal length px|principal point "
+        "px|lens|covered"
+    )
     rows = []
     for name, camera in calibration.fit.problem.cameras.items():
         views, r, covered = calibration.views[name], residuals[name], covers[name]
@@ -194,7 +212,9 @@ def pair_table(calibration: Calibration) -> str:
                 "" if held is None or not len(held) else _mean_and_quantile(held),
             )
         )
-    return _table(["pair", "baseline mm", "rotation deg", "epipolar error px, mean, 95 %", "on held-out frames"], rows)
+    return _table(
+        ["pair", "baseline mm", "rotation deg", "epipolar error px, mean, 95 %", "on held-out frames"], rows
+    )
 
 
 def _mean_and_quantile(errors: np.ndarray, between: str = ", ") -> str:
@@ -230,7 +250,8 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return f"<table><tr>{top}</tr>{''.join(lines)}</table>"
 
 
-# Figures ------------------------------------------------------------------------------------------------------
+# Figures
+# ------------------------------------------------------------------------------------------------------
 
 
 def draw_scene(calibration: Calibration) -> Figure:
@@ -250,7 +271,14 @@ def draw_scene(calibration: Calibration) -> Figure:
         dx, _, dz = camera.R[2].tolist()
         above.plot(x, z, "o", ms=4, color=colour)
         above.annotate(
-            escaped(name), (x, z), (0, -4), textcoords="offset points", fontsize=8, color=colour, va="top", ha="center"
+            escaped(name),
+            (x, z),
+            (0, -4),
+            textcoords="offset points",
+            fontsize=8,
+            color=colour,
+            va="top",
+            ha="center",
         )
         above.quiver(x, z, dx, dz, color=colour, width=0.004, scale=12)
     above.set(aspect="equal", xlabel="x (m)", ylabel="z (m)")
@@ -265,9 +293,18 @@ def draw_by_image(calibration: Calibration) -> Figure:
     figure = Figure(figsize=(10.4, 2.8), layout="constrained")
     axes = figure.subplots()
     for colour, (name, rms) in zip(cycle(COLOURS), frame_rms(calibration.fit.problem).items()):
-        axes.plot([frames.index(key) for key in rms], list(rms.values()), "o", ms=4, color=colour, label=escaped(name))
+        axes.plot(
+            [frames.index(key) for key in rms],
+            list(rms.values()),
+            "o",
+            ms=4,
+            color=colour,
+            label=escaped(name),
+        )
     step = max(1, len(frames) // 30)
-    axes.set_xticks(range(0, len(frames), step), [escaped(str(f)) for f in frames[::step]], fontsize=7, rotation=60)
+    axes.set_xticks(
+        range(0, len(frames), step), [escaped(str(f)) for f in frames[::step]], fontsize=7, rotation=60
+    )
     axes.set(ylim=(0, None), xlabel="frame", ylabel="RMS residual (px)")
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(fontsize=8, frameon=False, loc="outside right upper")
@@ -275,13 +312,19 @@ def draw_by_image(calibration: Calibration) -> Figure:
 
 
 def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figure:
-    """One camera: observed points; the median residual of each part of the image, magnified; their scatter."""
+    """One camera: observed points; the median residual of each part of the image, magnified; their
+    scatter.
+    """
     seen, r = calibration.fit.problem.seen[name], calibration.fit.problem.residuals()[name]
     hw = calibration.views[name].hw
-    figure = Figure(figsize=(10.4, 10.4 / 3.4 * min(1.6, max(0.8, 1.33 * hw[0] / hw[1])) + 0.5), layout="compressed")
+    figure = Figure(
+        figsize=(10.4, 10.4 / 3.4 * min(1.6, max(0.8, 1.33 * hw[0] / hw[1])) + 0.5), layout="compressed"
+    )
     left, middle, right = figure.subplots(1, 3)
     show_image(left, hw)
-    left.imshow(np.where(covered.cells, np.nan, 1.0), extent=_extent(hw), cmap="Reds", vmin=0, vmax=4, aspect="equal")
+    left.imshow(
+        np.where(covered.cells, np.nan, 1.0), extent=_extent(hw), cmap="Reds", vmin=0, vmax=4, aspect="equal"
+    )
     left.plot(*seen.x.T, ".", ms=1.5, color=COLOURS[0])
     left.set_title(f"points observed (red: none), {covered.share:.0%} covered", fontsize=9)
     show_image(middle, hw)
@@ -307,12 +350,16 @@ def _draw_field(axes: Any, x: np.ndarray, r: np.ndarray, hw: tuple[int, int]) ->
     arrows = np.array([np.median(r[cell == c], axis=0) for c in filled])
     longest = float(np.linalg.norm(arrows, axis=1).max())
     magnify = 1.2 * hw[1] / columns / max(longest, 1e-9)
-    axes.quiver(*at.T, *(magnify * arrows).T, angles="xy", scale_units="xy", scale=1, width=0.004, color=COLOURS[1])
+    axes.quiver(
+        *at.T, *(magnify * arrows).T, angles="xy", scale_units="xy", scale=1, width=0.004, color=COLOURS[1]
+    )
     axes.set_title(f"median residuals, longest {longest:.3f} px", fontsize=9)
 
 
 def draw_uncertainty(calibration: Calibration, at: tuple[float, float]) -> Figure:
-    """By beta (rows) and depth (columns): the deviation of the predicted pixel, over the first camera's image."""
+    """By beta (rows) and depth (columns): the deviation of the predicted pixel, over the first camera's
+    image.
+    """
     covariance = rig_covariance(calibration.fit)
     assert covariance is not None
     alpha, *betas = calibration.views
@@ -332,7 +379,9 @@ def draw_uncertainty(calibration: Calibration, at: tuple[float, float]) -> Figur
             )
             axes.set(xticks=[], yticks=[])
             median = float(np.median(deviation[usable])) if usable.any() else float("nan")
-            axes.set_title(f"{escaped(beta)} of {escaped(alpha)}, {depth:.3g} m: median {median:.2f} px", fontsize=9)
+            axes.set_title(
+                f"{escaped(beta)} of {escaped(alpha)}, {depth:.3g} m: median {median:.2f} px", fontsize=9
+            )
             figure.colorbar(shown, ax=axes, shrink=0.9)
     return figure
 
@@ -356,7 +405,9 @@ def _extent(hw: tuple[int, int]) -> tuple[float, float, float, float]:
 
 
 def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figure:
-    """A row per camera: uncertainty of projection at two depths, and the difference between halves of the frames."""
+    """A row per camera: uncertainty of projection at two depths, and the difference between halves of the
+    frames.
+    """
     names = list(calibration.views)
     figure = Figure(figsize=(10.4, 2.5 * len(names) + 0.3), layout="constrained")
     halves = half_difference(calibration.fit, float(np.mean(depths)))
@@ -376,19 +427,27 @@ def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figu
     return figure
 
 
-def _map(axes: Any, figure: Figure, hw: tuple[int, int], x: np.ndarray, value: np.ndarray, title: str) -> None:
+def _map(
+    axes: Any, figure: Figure, hw: tuple[int, int], x: np.ndarray, value: np.ndarray, title: str
+) -> None:
     """Values at pixels of `grid_points`; what lies between pixels that are no neighbours is grey."""
     triangles = Triangulation(*x.T)
     spread = np.ptp(x[triangles.triangles], axis=1) * (np.array(GRID)[::-1] - 1) / (hw[1], hw[0])
     triangles.set_mask((spread > 1.5).any(1))
-    drawn = axes.tripcolor(triangles, np.maximum(value, 1e-4), shading="gouraud", cmap="viridis", norm=LogNorm())
+    drawn = axes.tripcolor(
+        triangles, np.maximum(value, 1e-4), shading="gouraud", cmap="viridis", norm=LogNorm()
+    )
     axes.set(xlim=(0, hw[1]), ylim=(hw[0], 0), aspect="equal", xticks=[], yticks=[], facecolor="0.85")
     axes.set_title(escaped(f"{title}: median {np.median(value):.2g} px"), fontsize=9, loc="left")
     figure.colorbar(drawn, ax=axes, shrink=0.8)
 
 
-def draw_worst_images(calibration: Calibration, detected: Mapping[str, BoardViews], photos: Photos) -> Figure | None:
-    """The images with most points left out or largest residuals: points used, left out (red), residuals enlarged."""
+def draw_worst_images(
+    calibration: Calibration, detected: Mapping[str, BoardViews], photos: Photos
+) -> Figure | None:
+    """The images with most points left out or largest residuals: points used, left out (red), residuals
+    enlarged.
+    """
     chosen = _worst(calibration, detected)
     if not chosen:
         return None
@@ -435,7 +494,9 @@ def _draw_image(
         r = calibration.fit.problem.residuals()[name][mine]
         enlarge = 0.06 * views.hw[1] / max(float(np.linalg.norm(r, axis=1).max()), 1e-9)
         at = calibration.fit.problem.seen[name].x[mine]
-        axes.quiver(*at.T, *(enlarge * r).T, angles="xy", scale_units="xy", scale=1, width=0.004, color="orange")
+        axes.quiver(
+            *at.T, *(enlarge * r).T, angles="xy", scale_units="xy", scale=1, width=0.004, color="orange"
+        )
         text += f", {frame_rms(calibration.fit.problem)[name][key]:.2f} px"
     axes.set_title(escaped(text), fontsize=9)
 

@@ -61,7 +61,9 @@ class Calibration:
 
     @cached_property
     def held_out(self) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
-        """By pair: epipolar errors (pixels) of all frames, each by a rig calibrated without it; empty if too few."""
+        """By pair: epipolar errors (pixels) of all frames, each by a rig calibrated without it; empty if too
+        few.
+        """
         return held_out_errors(self.fit, self.views)
 
     def deviations(self) -> dict[str, float]:
@@ -87,9 +89,10 @@ def calibrate(
 ) -> Calibration:
     """Calibrate a rig from detected board points. Its world is the first camera.
 
-    `lens` is the model of all cameras, or of each by name. Raises ValueError, with advice, for another model, if a
-    camera has too few images or only parallel boards, if cameras are not connected, or if frames contradict each other.
-    With `start`, a rig known to within `deviations`, one image of each camera is enough, and the world is the start's.
+    `lens` is the model of all cameras, or of each by name. Raises ValueError, with advice, for another model,
+    if a camera has too few images or only parallel boards, if cameras are not connected, or if frames
+    contradict each other. With `start`, a rig known to within `deviations`, one image of each camera is
+    enough, and the world is the start's.
     """
     models = {name: _known_lens(lens if isinstance(lens, str) else lens.get(name), name) for name in views}
     if start is None:

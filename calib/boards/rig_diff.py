@@ -1,9 +1,10 @@
-"""Whether a rig has moved: two calibrations of the same cameras compared by what they say of pixels and depths.
+"""Whether a rig has moved: two calibrations of the same cameras compared by what they say of pixels and
+depths.
 
-Gauge: the whole rig may have been set up elsewhere, so the projections compared are those after the one rigid motion of
-space that brings all cameras' pixels together best, in least squares, over a grid of pixels at several depths. A pose
-and a lens can stand for one another: the difference of all pixels is tested together, against what the covariances of
-both calibrations let it be, and no parameter by itself.
+Gauge: the whole rig may have been set up elsewhere, so the projections compared are those after the one rigid
+motion of space that brings all cameras' pixels together best, in least squares, over a grid of pixels at
+several depths. A pose and a lens can stand for one another: the difference of all pixels is tested together,
+against what the covariances of both calibrations let it be, and no parameter by itself.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ ITERATIONS, CONVERGED = 5, 1e-6
 
 
 class CameraDifference(NamedTuple):
-    """One camera: pixels x of the first rig, depths there (metres), how far the second rig's are from them, and the
-    standard deviation of that by both calibrations (pixels, worst direction; NaN if unknown)."""
+    """One camera: pixels x of the first rig, depths there (metres), how far the second rig's are from them,
+    and the standard deviation of that by both calibrations (pixels, worst direction; NaN if unknown)."""
 
     x: Float[np.ndarray, "n 2"]
     depth: Float[np.ndarray, " n"]
@@ -49,8 +50,8 @@ class CameraDifference(NamedTuple):
 
 
 class DepthDifference(NamedTuple):
-    """Depth by one pair, at pixels x of its alpha: by the second rig over that by the first, minus 1, and its standard
-    deviation by both calibrations (NaN if unknown)."""
+    """Depth by one pair, at pixels x of its alpha: by the second rig over that by the first, minus 1, and its
+    standard deviation by both calibrations (NaN if unknown)."""
 
     x: Float[np.ndarray, "n 2"]
     depth: Float[np.ndarray, " n"]
@@ -97,13 +98,15 @@ class RigDifference:
         for name, found in self.cameras.items():
             off = np.linalg.norm(found.change, axis=1)
             lines.append(
-                f"{name}: pixels differ by {_rms(off):.3f} (RMS), {off.max():.3f} at most{_of(found.sigma, 3)}"
+                f"{name}: pixels differ by {_rms(off):.3f} (RMS), {off.max():.3f} at "
+                f"most{_of(found.sigma, 3)}"
             )
         for name, depth in self.depths.items():
             near, far = depth.depth.min(), depth.depth.max()
             percent = 100 * depth.change
             lines.append(
-                f"depth by {self.alpha} and {name}, {near:.3g} to {far:.3g} m: differs by {_rms(percent):.3f} % (RMS), "
+                f"depth by {self.alpha} and {name}, {near:.3g} to {far:.3g} m: differs by "
+                f"{_rms(percent):.3f} % (RMS), "
                 f"{np.abs(percent).max():.3f} % at most{_of(100 * depth.sigma, 3)}"
             )
         return "\n".join([*lines, self.verdict])
@@ -113,13 +116,21 @@ class RigDifference:
         """One line: whether the rig has moved."""
         found = self.significance
         if found is None:
-            return "verdict: none: no deviations are known; differences may be those of two calibrations of one rig"
+            return (
+                "verdict: none: no deviations are known; differences may be those of two calibrations of "
+                "one rig"
+            )
         test = f"chi-square {found.chi_square:.1f} of {found.freedom} parameters, p = {found.probability:.2g}"
         if not found.moved:
-            return f"verdict: the same: the rigs differ no more than their calibrations' errors let them ({test})"
+            return (
+                "verdict: the same: the rigs differ no more than their calibrations' errors let them "
+                f"({test})"
+            )
         return (
-            f"verdict: moved: the rigs differ by more than their calibrations' errors ({test}); a rotation of "
-            f"{found.camera} by {found.degrees:.3f} degrees and a shift of {1e3 * found.metres:.2f} mm explain "
+            f"verdict: moved: the rigs differ by more than their calibrations' errors ({test}); a rotation "
+            "of "
+            f"{found.camera} by {found.degrees:.3f} degrees and a shift of {1e3 * found.metres:.2f} mm "
+            "explain "
             f"{found.share:.0%} of it"
         )
 
@@ -131,8 +142,8 @@ def rig_difference(
     covariances: tuple[RigCovariance | None, RigCovariance | None] = (None, None),
     depth: tuple[float, float],
 ) -> RigDifference:
-    """Compare two calibrations of the same cameras over their images and a range of depths (metres, along the axis of
-    each camera). Where one covariance is None, the other one's serves for both.
+    """Compare two calibrations of the same cameras over their images and a range of depths (metres, along the
+    axis of each camera). Where one covariance is None, the other one's serves for both.
 
     Raises ValueError for rigs of other cameras, and for cameras that are not calibrated.
     """
@@ -172,11 +183,14 @@ def _same_cameras(a: Rig, b: Rig) -> tuple[str, ...]:
     for name in a.names:
         for rig in (a, b):
             if not isinstance(rig[name], Camera):
-                raise ValueError(f"'{name}' is not calibrated in both rigs: what it sees where cannot be compared")
+                raise ValueError(
+                    f"'{name}' is not calibrated in both rigs: what it sees where cannot be compared"
+                )
         if a[name].hw != b[name].hw:
             (h, w), (h2, w2) = a[name].hw, b[name].hw
             raise ValueError(
-                f"'{name}' has {w}x{h} pixels in one rig and {w2}x{h2} in the other: calibrate again with images as "
+                f"'{name}' has {w}x{h} pixels in one rig and {w2}x{h2} in the other: calibrate again with "
+                "images as "
                 "they were, or give a rig that is resized alike"
             )
     return a.names
@@ -198,7 +212,9 @@ def _points(camera: Camera, other: Camera, depth: tuple[float, float]) -> Grid:
 
 
 class _Part(NamedTuple):
-    """One camera: differences (n, 2), derivatives by the motion (2 n, 6), and by both cameras' parameters (n, 2, p)."""
+    """One camera: differences (n, 2), derivatives by the motion (2 n, 6), and by both cameras' parameters (n,
+    2, p).
+    """
 
     name: str
     cameras: tuple[Camera, Camera]
@@ -236,7 +252,9 @@ def _same_lens(a: Camera, b: Camera) -> bool:
 
 
 def _best_motion(a: Rig, b: Rig, grids: Mapping[str, Grid]) -> Pose:
-    """From the world of the first rig to that of the second: least squares of all pixels, by Gauss and Newton."""
+    """From the world of the first rig to that of the second: least squares of all pixels, by Gauss and
+    Newton.
+    """
     first = a.names[0]
     motion = b[first].cam_from_world.inverse() @ a[first].cam_from_world
     for _ in range(ITERATIONS):
@@ -255,9 +273,16 @@ def _root(covariance: RigCovariance) -> np.ndarray:
 
 
 def _tested(
-    change: np.ndarray, spread: np.ndarray, by_motion: np.ndarray, b: Rig, parts: list[_Part], names: tuple[str, ...]
+    change: np.ndarray,
+    spread: np.ndarray,
+    by_motion: np.ndarray,
+    b: Rig,
+    parts: list[_Part],
+    names: tuple[str, ...],
 ) -> Significance:
-    """The difference in the directions in which the calibrations' errors move pixels, in standard deviations."""
+    """The difference in the directions in which the calibrations' errors move pixels, in standard
+    deviations.
+    """
     U, s, _ = np.linalg.svd(spread, full_matrices=False)
     counts = s > LEAST * np.sqrt(len(change) / 2)
     U, s = U[:, counts], s[counts]
@@ -287,7 +312,9 @@ def _tested(
     )
 
 
-def _depths(a: Rig, b: Rig, alpha: str, beta: str, grid: Grid, known: list[RigCovariance | None]) -> DepthDifference:
+def _depths(
+    a: Rig, b: Rig, alpha: str, beta: str, grid: Grid, known: list[RigCovariance | None]
+) -> DepthDifference:
     """Depth of points by the second rig, found from the pixels at which the first one has them."""
     x, X, z = grid
     there = a[beta].project(torch.from_numpy(X))
@@ -303,7 +330,9 @@ def _depths(a: Rig, b: Rig, alpha: str, beta: str, grid: Grid, known: list[RigCo
     for d in np.unique(z):
         for covariance in known:
             at = z == d
-            of_y = np.nan if covariance is None else beta_covariance(a, covariance, alpha, beta, x[at], float(d))
+            of_y = (
+                np.nan if covariance is None else beta_covariance(a, covariance, alpha, beta, x[at], float(d))
+            )
             variance[at] += np.einsum("ni,nij,nj->n", along[at], of_y * np.ones((1, 2, 2)), along[at])
     return DepthDifference(x[valid], z[valid], change[valid], np.sqrt(variance)[valid])
 
@@ -321,17 +350,25 @@ def _of(sigma: np.ndarray, digits: int) -> str:
 
 
 def draw_difference(found: RigDifference) -> Figure:
-    """How far two rigs' pixels differ, at the nearest and the farthest depth, and depths by each pair, in percent."""
+    """How far two rigs' pixels differ, at the nearest and the farthest depth, and depths by each pair, in
+    percent.
+    """
     panels = []
     for name, camera in found.cameras.items():
         for depth in (camera.depth.min(), camera.depth.max()):
             at = camera.depth == depth
-            panels.append((f"{name}, {depth:.3g} m: pixels", camera.x[at], np.linalg.norm(camera.change[at], axis=1)))
+            panels.append(
+                (f"{name}, {depth:.3g} m: pixels", camera.x[at], np.linalg.norm(camera.change[at], axis=1))
+            )
     for name, by_pair in found.depths.items():
         for depth in (by_pair.depth.min(), by_pair.depth.max()):
             at = by_pair.depth == depth
             panels.append(
-                (f"depth by {found.alpha} and {name}, {depth:.3g} m: %", by_pair.x[at], 100 * by_pair.change[at])
+                (
+                    f"depth by {found.alpha} and {name}, {depth:.3g} m: %",
+                    by_pair.x[at],
+                    100 * by_pair.change[at],
+                )
             )
     figure = Figure(figsize=(9, 2.7 * len(panels) / 2), layout="constrained")
     for i, (title, x, values) in enumerate(panels, 1):

@@ -1,4 +1,6 @@
-"""From a folder of images to files: a calibration, or a page of guidance that follows while they are taken."""
+"""From a folder of images to files: a calibration, or a page of guidance that follows while they are
+taken.
+"""
 
 from __future__ import annotations
 
@@ -57,9 +59,9 @@ def calibrate_photos(
 ) -> CalibrationOutput:
     """Calibrate from a folder of images; write the rig file, its report and its covariance, the rig last.
 
-    Several boards may be in the images at once. The lens "auto" is, for each camera, the model that its images support.
-    `start` is the file of a rig known to within `deviations`: one image of each camera is enough then, such as one
-    called like the camera.
+    Several boards may be in the images at once. The lens "auto" is, for each camera, the model that its
+    images support. `start` is the file of a rig known to within `deviations`: one image of each camera is
+    enough then, such as one called like the camera.
     Raises ValueError and OSError for unusable images, and then writes nothing.
     """
     if out.suffix.lower() not in (".yaml", ".yml"):
@@ -104,7 +106,8 @@ def _named_like(folder: Path, rig: Rig) -> dict[str, str] | None:
     return patterns if all(any(folder.glob(pattern)) for pattern in patterns.values()) else None
 
 
-# While images are taken ---------------------------------------------------------------------------------------
+# While images are taken
+# ---------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -113,14 +116,18 @@ class Session:
 
     board: Board
     lens: Lens = "brown-conrady"
-    seen: dict[tuple[str, FrameKey], tuple[tuple[int, int], dict[FrameKey, Detection]]] = field(default_factory=dict)
+    seen: dict[tuple[str, FrameKey], tuple[tuple[int, int], dict[FrameKey, Detection]]] = field(
+        default_factory=dict
+    )
     calibration: Calibration | None = None
     problem: str = "waiting for images"
     photos: Photos = field(default_factory=dict)
 
     def detect(self, photos: Photos) -> bool:
         """Detect the board in images that are new. Returns whether there were any."""
-        fresh = [(name, key) for name, moments in photos.items() for key in moments if (name, key) not in self.seen]
+        fresh = [
+            (name, key) for name, moments in photos.items() for key in moments if (name, key) not in self.seen
+        ]
         for name, key in fresh:
             try:
                 self.seen[name, key] = detected(photos[name][key], key, self.board)
@@ -136,7 +143,9 @@ class Session:
             mine = [entry for (camera, _), entry in self.seen.items() if camera == name]
             sizes = {hw for hw, _ in mine}
             if len(sizes) > 1:
-                raise ValueError(f"{name}: its images differ in size: keep those of one camera at one setting")
+                raise ValueError(
+                    f"{name}: its images differ in size: keep those of one camera at one setting"
+                )
             if mine:
                 found[name] = BoardViews(sizes.pop(), {k: d for _, views in mine for k, d in views.items()})
         return found
@@ -161,7 +170,8 @@ def watch(
 ) -> Session:
     """Write a page on the images of a folder again whenever some arrive, until `finished` or Ctrl-C.
 
-    It shows what was detected, coverage, the current uncertainty, and which view would help most. Raises OSError.
+    It shows what was detected, coverage, the current uncertainty, and which view would help most. Raises
+    OSError.
     """
     session = Session(board, lens)
     write_text(page, _page(session))
@@ -208,7 +218,9 @@ def _camera(session: Session, name: str) -> str:
 
 def _advice(calibration: Calibration, name: str) -> str:
     focal, deviation = calibration.rig[name].K[0, 0], calibration.deviations().get(f"{name}.focal.0")
-    parts = [f"<p>Focal length {float(focal):.1f} px" + (f" ± {deviation:.2g}" if deviation else "") + ".</p>"]
+    parts = [
+        f"<p>Focal length {float(focal):.1f} px" + (f" ± {deviation:.2g}" if deviation else "") + ".</p>"
+    ]
     covered = coverages(calibration)[name]
     known = intrinsics_of(calibration.fit, name)
     if len(known.covariance):
@@ -224,7 +236,9 @@ def _drawn(session: Session, name: str, key: FrameKey) -> np.ndarray:
     """The last image with the points found in it."""
     grey = session.photos[name][key].read()
     scale = WIDTH / grey.shape[1]
-    small = cv2.cvtColor(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
+    small = cv2.cvtColor(
+        cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR
+    )
     for found in session.seen[name, key][1].values():
         for x, y in (found.x + 0.5) * scale - 0.5:
             cv2.circle(small, (round(float(x)), round(float(y))), 2, COLOURS[1], -1)

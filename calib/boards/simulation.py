@@ -1,7 +1,7 @@
 """Simulated calibration: images of a board by the cameras of a planned rig, before a board is printed.
 
-`simulate_photos` writes a folder that `pat calibrate` reads. It shows which board, how many images and which depths a
-planned array needs, and how accurately it would be calibrated.
+`simulate_photos` writes a folder that `pat calibrate` reads. It shows which board, how many images and which
+depths a planned array needs, and how accurately it would be calibrated.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ def simulate_photos(
 
 
 def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
-    """Random `world_from_board` (a batch) with the board's centre visible in every camera, at several depths and tilts.
+    """Random `world_from_board` (a batch) with the board's centre visible in every camera, at several depths
+    and tilts.
 
     Raises ValueError if there are too few such poses.
     """
@@ -78,7 +79,9 @@ def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
             found.append(Pose(R, centre - R @ middle))
         if len(found) == count:
             return stack(found)
-    raise ValueError(f"the cameras see the board {board} together almost nowhere: take a larger or a smaller one")
+    raise ValueError(
+        f"the cameras see the board {board} together almost nowhere: take a larger or a smaller one"
+    )
 
 
 Rays = tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]
@@ -115,7 +118,9 @@ def photograph(
     return np.asarray(cv2.resize(image, camera.hw[::-1], interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _on_deformed(deformation: BoardDeformation, along: np.ndarray, centre: np.ndarray, size: float) -> np.ndarray:
+def _on_deformed(
+    deformation: BoardDeformation, along: np.ndarray, centre: np.ndarray, size: float
+) -> np.ndarray:
     """Where rays from a centre meet a shaped board: positions (n, 2) on it as if it were flat, by iteration.
 
     Rays that pass its plane farther than `size` (metres) from its middle are not followed.

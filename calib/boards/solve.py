@@ -1,4 +1,5 @@
-"""Bundle adjustment of a calibration: which parameters the images determine, how boards are shaped, what is left out.
+"""Bundle adjustment of a calibration: which parameters the images determine, how boards are shaped, what is
+left out.
 
 Gauss-Newton with Marquardt's damping (Triggs et al. 2000).
 """
@@ -74,7 +75,8 @@ MANY_WRONG = 0.34
 def calibrate_single(
     name: str, views: BoardViews, board: Board, *, lens: Lens = "brown-conrady", final: bool = True
 ) -> Solved:
-    """One camera's intrinsics and lens from its own images. Raises ValueError, with advice, where they do not suffice.
+    """One camera's intrinsics and lens from its own images. Raises ValueError, with advice, where they do not
+    suffice.
 
     Unless `final`, a poorly constrained focal length is accepted, as other cameras will add constraints.
     """
@@ -98,7 +100,8 @@ def _check_tilts(name: str, poses: Mapping[FrameKey, Pose], board: Board) -> Non
     widest = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)).max()))
     if widest < FEWEST_TILT:
         raise ValueError(
-            f"{name}: all boards are parallel (to {widest:.1f} degrees), so that focal length and distance are "
+            f"{name}: all boards are parallel (to {widest:.1f} degrees), so that focal length and distance "
+            "are "
             "ambiguous: tilt the board by 20 to 40 degrees, to different sides, in most of the images"
         )
 
@@ -106,8 +109,9 @@ def _check_tilts(name: str, poses: Mapping[FrameKey, Pose], board: Board) -> Non
 def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
     """Fit all observable parameters; those that turn out to be unobservable are fixed, until none is.
 
-    Parameters fixed before the fit, when the noise was overestimated, may return after it; and boards that are clearly
-    neither flat nor printed true are deformed. Raises ValueError where a `final` fit has no focal length.
+    Parameters fixed before the fit, when the noise was overestimated, may return after it; and boards that
+    are clearly neither flat nor printed true are deformed. Raises ValueError where a `final` fit has no focal
+    length.
     """
     problem, flat = initial.problem(board), initial.flat(board)
     full = problem.free
@@ -128,9 +132,16 @@ def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
 
 
 def solve_inliers(
-    initial: InitialRig, detected: Mapping[str, BoardViews], board: Board, *, rounds: int = ROUNDS, final: bool = True
+    initial: InitialRig,
+    detected: Mapping[str, BoardViews],
+    board: Board,
+    *,
+    rounds: int = ROUNDS,
+    final: bool = True,
 ) -> Solved:
-    """`solve` in some rounds, each without those of the `detected` points that the one before shows to be outliers."""
+    """`solve` in some rounds, each without those of the `detected` points that the one before shows to be
+    outliers.
+    """
     solved = solve(initial, board, final=final)
     for _ in range(rounds - 1):
         views = {name: near_fit(solved, name, v, board) for name, v in detected.items()}
@@ -145,7 +156,8 @@ def solve_inliers(
 
 
 def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, list[str]]:
-    """The problem with every unobservable parameter of a lens or principal point fixed at its default, and notes.
+    """The problem with every unobservable parameter of a lens or principal point fixed at its default, and
+    notes.
 
     The worst is fixed first. Once the fit is `final`, raises ValueError where a focal length is unobservable.
     """
@@ -160,7 +172,8 @@ def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, l
             if not final:
                 break
             raise ValueError(
-                f"{name}: the images do not determine the focal length: tilt the board by 20 to 40 degrees, to "
+                f"{name}: the images do not determine the focal length: tilt the board by 20 to 40 degrees, "
+                "to "
                 "different sides, and bring it close in some of them"
             )
         free[name][index] = False
@@ -175,15 +188,21 @@ def _equal(a: Masks, b: Masks) -> bool:
 
 
 def _relative_information(problem: BundleProblem) -> np.ndarray:
-    """The inverse covariance of the free parameters in units of their typical sizes, by pixels and stated priors."""
-    sizes = np.concatenate([typical_sizes(camera)[problem.free[name]] for name, camera in problem.cameras.items()])
+    """The inverse covariance of the free parameters in units of their typical sizes, by pixels and stated
+    priors.
+    """
+    sizes = np.concatenate(
+        [typical_sizes(camera)[problem.free[name]] for name, camera in problem.cameras.items()]
+    )
     stated = {name: prior for name, prior in problem.priors.items() if prior.pose is not None}
     information = normal_equations(replace(problem, priors=stated), linearised(problem)).information()
     return information * sizes[:, None] * sizes
 
 
 def _worst(candidates: list[tuple[str, int]], information: np.ndarray) -> int | None:
-    """The parameter whose deviation is the largest share of its typical size, if too large; focal lengths last."""
+    """The parameter whose deviation is the largest share of its typical size, if too large; focal lengths
+    last.
+    """
     covariance = np.linalg.inv(information + np.eye(len(candidates)))
     shares = np.sqrt(np.maximum(covariance.diagonal(), 0))
     order = np.array([2 if i >= 8 else 1 if i >= 6 else 0 for _, i in candidates]) * (shares > UNOBSERVABLE)
@@ -192,7 +211,8 @@ def _worst(candidates: list[tuple[str, int]], information: np.ndarray) -> int | 
 
 
 def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
-    """The solution with the boards' deformations as unknowns if the points show them and frames agree on them.
+    """The solution with the boards' deformations as unknowns if the points show them and frames agree on
+    them.
 
     Where frames are too few to agree, the loss must fall by half.
     """
@@ -212,16 +232,17 @@ def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
     return deformed if gain > (max(left, LEAST_GAIN) if few else LEAST_GAIN) else solved
 
 
-# The adjustment -----------------------------------------------------------------------------------------------
+# The adjustment
+# -----------------------------------------------------------------------------------------------
 
 
 def adjust(problem: BundleProblem, *, rounds: int = 4, equal_noise: bool = False) -> Solved:
     """Minimise the reprojection error over the free camera parameters and all boards.
 
-    First by least squares of equal noise, as the initial values may be poor; then `rounds` times with the noise of each
-    camera estimated from its residuals. (Individual noise from the beginning would discard the camera that starts
-    worst.) With `equal_noise` all cameras share one noise: where the board moves between exposures, a camera with a
-    noise of its own would attract every board pose.
+    First by least squares of equal noise, as the initial values may be poor; then `rounds` times with the
+    noise of each camera estimated from its residuals. (Individual noise from the beginning would discard the
+    camera that starts worst.) With `equal_noise` all cameras share one noise: where the board moves between
+    exposures, a camera with a noise of its own would attract every board pose.
     """
     parameters = len(problem.names) + POSE * len(problem.frames)
     start = dict.fromkeys(problem.cameras, max(problem.rms(), LEAST_NOISE))
@@ -243,7 +264,9 @@ def readjusted(problem: BundleProblem) -> BundleProblem:
 
 
 def noise(problem: BundleProblem, parameters: int) -> dict[str, float]:
-    """A robust estimate of each camera's noise along x or y, pixels, given the number of fitted parameters."""
+    """A robust estimate of each camera's noise along x or y, pixels, given the number of fitted
+    parameters.
+    """
     residuals = problem.residuals()
     numbers = 2 * sum(len(r) for r in residuals.values())
     left = numbers / max(numbers - parameters, 0.1 * numbers)
@@ -276,7 +299,11 @@ def _minimised(problem: BundleProblem, *, iterations: int = 50) -> tuple[BundleP
         )
 
     return levenberg_marquardt(
-        problem, model, lambda _, __, before, after: before - after < CONVERGED, steps=iterations, damping=DAMPING
+        problem,
+        model,
+        lambda _, __, before, after: before - after < CONVERGED,
+        steps=iterations,
+        damping=DAMPING,
     )
 
 
@@ -290,19 +317,26 @@ def _covariance(problem: BundleProblem) -> Array | None:
     return np.linalg.inv(scaled) * scale[:, None] * scale
 
 
-# Outliers -----------------------------------------------------------------------------------------------------
+# Outliers
+# -----------------------------------------------------------------------------------------------------
 
 
 def near_fit(solved: Solved, name: str, views: BoardViews, board: Board) -> BoardViews:
     """A camera's views without the points that a solution shows to be outliers."""
-    camera, boards, deformation = solved.problem.cameras[name], solved.problem.board_poses, solved.problem.deformation
+    camera, boards, deformation = (
+        solved.problem.cameras[name],
+        solved.problem.board_poses,
+        solved.problem.deformation,
+    )
     poses = {key: camera.cam_from_world @ boards[key] for key in views.seen}
     points = board.points if deformation is None else deformation.deformed(board.points, board.part)
     return without_outliers(views, camera, poses, points, sigma=solved.sigma[name])
 
 
 class FrameMisfit(NamedTuple):
-    """A frame that a camera does not fit: its residuals, and those of the camera's median frame (RMS, pixels)."""
+    """A frame that a camera does not fit: its residuals, and those of the camera's median frame (RMS,
+    pixels).
+    """
 
     camera: str
     frame: FrameKey
@@ -316,7 +350,9 @@ def frame_rms(problem: BundleProblem) -> dict[str, dict[FrameKey, float]]:
     for name, r in problem.residuals().items():
         block = problem.seen[name].block
         squared, count = np.bincount(block, (r**2).sum(-1)), np.bincount(block)
-        found[name] = {problem.frames[b]: float(np.sqrt(squared[b] / count[b])) for b in np.flatnonzero(count)}
+        found[name] = {
+            problem.frames[b]: float(np.sqrt(squared[b] / count[b])) for b in np.flatnonzero(count)
+        }
     return found
 
 
@@ -332,7 +368,11 @@ def misfits(fit: Solved) -> list[FrameMisfit]:
 
 def misfit_notes(fit: Solved) -> list[str]:
     """A note if the adjustment went on changing, and one per camera on its frames that do not fit."""
-    notes = [] if fit.converged else ["the adjustment has not come to rest: too few boards, or some that contradict it"]
+    notes = (
+        []
+        if fit.converged
+        else ["the adjustment has not come to rest: too few boards, or some that contradict it"]
+    )
     for name in fit.problem.cameras:
         if mine := [m for m in misfits(fit) if m.camera == name]:
             listed = ", ".join(f"{m.frame} ({m.rms:.2f} px)" for m in mine[:LISTED])
@@ -344,15 +384,16 @@ def misfit_notes(fit: Solved) -> list[str]:
     return notes
 
 
-# All cameras --------------------------------------------------------------------------------------------------
+# All cameras
+# --------------------------------------------------------------------------------------------------
 
 
 def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solved]) -> Solved:
     """All cameras at once; if they fit far worse than alone, with their single calibrations as priors.
 
-    Boards that move between the exposures of unsynchronised cameras would distort the lens models otherwise. A few
-    images that contradict the others (boards detected a square off, say) are left out. Raises ValueError if a camera
-    contradicts the others altogether.
+    Boards that move between the exposures of unsynchronised cameras would distort the lens models otherwise.
+    A few images that contradict the others (boards detected a square off, say) are left out. Raises
+    ValueError if a camera contradicts the others altogether.
     """
     if len(singles) == 1:
         return next(iter(singles.values()))
@@ -375,7 +416,9 @@ def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solv
 
 
 def _wrong_images(solved: Solved, alone: Mapping[str, float]) -> list[tuple[str, FrameKey]]:
-    """Images so far off that their camera would be refused, one of a moment, unless they are many of a camera's."""
+    """Images so far off that their camera would be refused, one of a moment, unless they are many of a
+    camera's.
+    """
     found = dict[FrameKey, str]()
     for misfit in misfits(solved):
         if misfit.rms > _refused_from(alone[misfit.camera]):
@@ -386,15 +429,20 @@ def _wrong_images(solved: Solved, alone: Mapping[str, float]) -> list[tuple[str,
 
 
 def _without(initial: InitialRig, images: Sequence[tuple[str, FrameKey]]) -> InitialRig:
-    views = {name: v.only([key for key in v.seen if (name, key) not in images]) for name, v in initial.views.items()}
+    views = {
+        name: v.only([key for key in v.seen if (name, key) not in images])
+        for name, v in initial.views.items()
+    }
     boards = {key: pose for key, pose in initial.boards.items() if any(key in v.seen for v in views.values())}
     return initial._replace(boards=boards, views=views, left_out=[*initial.left_out, *images])
 
 
 def many_wrong(found: Sequence[str], before: Sequence[str], seen: Mapping[str, int]) -> bool:
-    """Whether images found wrong, and those left out before (the camera of each), are more than `MANY_WRONG` of all of
-    a camera's; `seen` are those that are left of it."""
-    return any(found.count(n) + before.count(n) > MANY_WRONG * (seen[n] + before.count(n)) for n in set(found))
+    """Whether images found wrong, and those left out before (the camera of each), are more than `MANY_WRONG`
+    of all of a camera's; `seen` are those that are left of it."""
+    return any(
+        found.count(n) + before.count(n) > MANY_WRONG * (seen[n] + before.count(n)) for n in set(found)
+    )
 
 
 def _refused_from(alone: float) -> float:
@@ -416,7 +464,9 @@ def _inconsistent_cameras(solved: Solved, alone: Mapping[str, float]) -> str:
 
 
 def _as_prior(name: str, alone: Solved) -> CameraPrior:
-    """The single calibration of a camera as a prior of its intrinsics; none for parameters that were fixed."""
+    """The single calibration of a camera as a prior of its intrinsics; none for parameters that were
+    fixed.
+    """
     camera = alone.problem.cameras[name]
     entries = parameter_names(camera)
     free = [entries.index(entry.removeprefix(f"{name}.")) for entry in alone.names]

@@ -7,13 +7,15 @@ A board is specified by a short text:
   dictionary, ``charuco:8x6:30mm:22mm:5x5``, and ``legacy`` for boards drawn by OpenCV before 4.6;
 - ``circles:7x5:20mm``: circles across x down, distance between centres;
 - ``acircles:4x11:20mm``: circles in every row x rows, distance between rows (OpenCV's asymmetric grid);
-- ``aprilgrid:6x6:88mm:0.3``: tags across x down, side of a tag, space between tags as a share of it (Kalibr's layout,
-  tag family 36h11; ``border1`` for tags with one black bit around them instead of two); or Kalibr's own target file.
+- ``aprilgrid:6x6:88mm:0.3``: tags across x down, side of a tag, space between tags as a share of it (Kalibr's
+  layout, tag family 36h11; ``border1`` for tags with one black bit around them instead of two); or Kalibr's
+  own target file.
 
-- ``targets.csv:4x4``: markers at known positions, on a wall, in a frame, in a room (columns id, x, y, z or id,
-  corner, x, y, z, in metres).
+- ``targets.csv:4x4``: markers at known positions, on a wall, in a frame, in a room (columns id, x, y, z or
+  id, corner, x, y, z, in metres).
 
-``from24`` at the end of a board with markers: its first marker has this number, so that several boards differ.
+``from24`` at the end of a board with markers: its first marker has this number, so that several boards
+differ.
 """
 
 from __future__ import annotations
@@ -48,7 +50,8 @@ from .board import (
 
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 FORMS = (
-    "chessboard:9x6:25mm (inner corners), charuco:8x6:30mm (squares), circles:7x5:20mm, acircles:4x11:20mm or "
+    "chessboard:9x6:25mm (inner corners), charuco:8x6:30mm (squares), circles:7x5:20mm, acircles:4x11:20mm "
+    "or "
     "aprilgrid:6x6:88mm:0.3 (tags)"
 )
 LARGEST = 100
@@ -104,11 +107,14 @@ def parse_boards(texts: Sequence[str]) -> Board:
     used: dict[str, set[int]] = {}
     for board in boards:
         if not isinstance(board, MarkedBoard):
-            raise ValueError(f"board '{board}': several boards at once need markers: use charuco or aprilgrid")
+            raise ValueError(
+                f"board '{board}': several boards at once need markers: use charuco or aprilgrid"
+            )
         taken = used.setdefault(board.dictionary, set())
         if taken & set(board.markers):
             raise ValueError(
-                f"board '{board}': its markers are on another board too: print it with ':from{max(taken) + 1}' at the "
+                f"board '{board}': its markers are on another board too: print it with "
+                f"':from{max(taken) + 1}' at the "
                 "end of its name, or with another dictionary"
             )
         taken |= set(board.markers)
@@ -118,14 +124,22 @@ def parse_boards(texts: Sequence[str]) -> Board:
 
 def _charuco(text: str, columns: int, rows: int, spacing: float, options: list[str]) -> Charuco:
     lengths = [o for o in options if re.fullmatch(r"[\d.]+ *[a-z]+", o)]
-    names = [o for o in options if re.fullmatch(r"\d+x\d+(_\d+)?", o) or o.startswith("aruco") or o.startswith("april")]
+    names = [
+        o
+        for o in options
+        if re.fullmatch(r"\d+x\d+(_\d+)?", o) or o.startswith("aruco") or o.startswith("april")
+    ]
     first, options = _first_marker(options)
     recognised = {*lengths[:1], *names[:1], "legacy"}
     if rest := [o for o in options if o not in recognised]:
-        raise ValueError(f"board '{text}': '{rest[0]}' is not recognised; write it like charuco:8x6:30mm:22mm:4x4_50")
+        raise ValueError(
+            f"board '{text}': '{rest[0]}' is not recognised; write it like charuco:8x6:30mm:22mm:4x4_50"
+        )
     marker = _length(text, lengths[0]) if lengths else 0.75 * spacing
     if not marker < spacing:
-        raise ValueError(f"board '{text}': markers of {millimetres(marker)} do not fit into squares that are no larger")
+        raise ValueError(
+            f"board '{text}': markers of {millimetres(marker)} do not fit into squares that are no larger"
+        )
     name = _smallest_dictionary(text, names[0] if names else "4x4", first + (columns * rows + 1) // 2)
     return Charuco(columns - 1, rows - 1, spacing, name, first, marker=marker, legacy="legacy" in options)
 
@@ -141,7 +155,9 @@ def _april_grid(text: str, parts: list[str]) -> AprilGrid:
     first, options = _first_marker(parts[2:])
     ratios = [o for o in options if re.fullmatch(r"\d*\.?\d+", o) and 0.05 <= float(o) <= 1]
     if rest := [o for o in options if o not in {*ratios[:1], "border1", "border2"}]:
-        raise ValueError(f"board '{text}': '{rest[0]}' is not recognised; write it like aprilgrid:6x6:88mm:0.3")
+        raise ValueError(
+            f"board '{text}': '{rest[0]}' is not recognised; write it like aprilgrid:6x6:88mm:0.3"
+        )
     if first + columns * rows > len(marker_dictionary(APRIL_TAGS).bytesList):
         raise ValueError(f"board '{text}': the tag family 36h11 has no {first + columns * rows} tags")
     tag = _length(text, parts[1])
@@ -159,12 +175,17 @@ def _kalibr_target(path: Path) -> str:
         if target["target_type"] == "aprilgrid":
             size, ratio = 1e3 * float(target["tagSize"]), float(target["tagSpacing"])
             return f"aprilgrid:{target['tagCols']}x{target['tagRows']}:{size:.6f}mm:{ratio:.6f}"
-        if target["target_type"] == "checkerboard" and target["rowSpacingMeters"] == target["colSpacingMeters"]:
+        if (
+            target["target_type"] == "checkerboard"
+            and target["rowSpacingMeters"] == target["colSpacingMeters"]
+        ):
             size = 1e3 * float(target["rowSpacingMeters"])
             return f"chessboard:{target['targetCols']}x{target['targetRows']}:{size:.6f}mm"
     except (KeyError, TypeError, ValueError, RecursionError, yaml.YAMLError):
         pass
-    raise ValueError(f"{path}: not a target of Kalibr's that is known here: an aprilgrid, or a checkerboard of squares")
+    raise ValueError(
+        f"{path}: not a target of Kalibr's that is known here: an aprilgrid, or a checkerboard of squares"
+    )
 
 
 def _counts(text: str, part: str, *, fewest: int = 3) -> tuple[int, int]:
@@ -192,11 +213,14 @@ def _smallest_dictionary(text: str, name: str, markers: int) -> str:
     for full in names:
         if hasattr(cv2.aruco, f"DICT_{full}") and len(marker_dictionary(full).bytesList) >= markers:
             return full.lower()
-    raise ValueError(f"board '{text}': no dictionary '{name}' of OpenCV has the {markers} markers it needs; try 4x4")
+    raise ValueError(
+        f"board '{text}': no dictionary '{name}' of OpenCV has the {markers} markers it needs; try 4x4"
+    )
 
 
 def _known_points(text: str) -> KnownPoints:
-    """The points of a CSV file `targets.csv`, or `targets.csv:5x5_100` with its markers' dictionary (4x4 by default).
+    """The points of a CSV file `targets.csv`, or `targets.csv:5x5_100` with its markers' dictionary (4x4 by
+    default).
 
     Columns id, x, y, z (metres) for markers' centres, or id, corner (0 to 3), x, y, z. Raises ValueError.
     """
@@ -208,7 +232,9 @@ def _known_points(text: str) -> KnownPoints:
         table = csv.DictReader(lines, skipinitialspace=True)
         head = tuple(name.strip().lower() for name in table.fieldnames or ())
         if head not in COLUMNS:
-            raise ValueError(f"{path}: its first line is '{','.join(head)[:60]}': write id,x,y,z or id,corner,x,y,z")
+            raise ValueError(
+                f"{path}: its first line is '{','.join(head)[:60]}': write id,x,y,z or id,corner,x,y,z"
+            )
         rows = [_point(path, number, row, head) for number, row in enumerate(table, 2)]
     ids = tuple(marker for marker, _ in rows)
     _check_points(path, ids)
@@ -241,7 +267,8 @@ def _check_points(path: Path, ids: Sequence[tuple[int, int]]) -> None:
         raise ValueError(f"{path}: marker {twice[0][0]} is there twice")
 
 
-# Printing -----------------------------------------------------------------------------------------------------
+# Printing
+# -----------------------------------------------------------------------------------------------------
 
 
 def page_of(board: Board, *, margin: float = 0.012) -> tuple[float, float]:
@@ -251,7 +278,9 @@ def page_of(board: Board, *, margin: float = 0.012) -> tuple[float, float]:
 
 
 def smallest_paper(page: tuple[float, float]) -> str | None:
-    """The smallest sheet that a page (millimetres) fits on, upright or across; None if none is large enough."""
+    """The smallest sheet that a page (millimetres) fits on, upright or across; None if none is large
+    enough.
+    """
     fitting = [name for name, paper in PAPERS.items() if all(a <= b for a, b in zip(sorted(page), paper))]
     return fitting[0] if fitting else None
 
@@ -266,10 +295,11 @@ def page_note(board: Board) -> str:
 
 
 def draw_board(board: Board, *, margin: float = 0.012, paper: str | None = None) -> Figure:
-    """The board as a figure whose size in inches is its true size, with a white margin (metres) and a ruler below.
+    """The board as a figure whose size in inches is its true size, with a white margin (metres) and a ruler
+    below.
 
-    Saved as PDF or SVG it prints at true size; the ruler serves to check it. On a sheet of `paper` ("A4") it is in the
-    middle. Raises ValueError if it does not fit there.
+    Saved as PDF or SVG it prints at true size; the ruler serves to check it. On a sheet of `paper` ("A4") it
+    is in the middle. Raises ValueError if it does not fit there.
     """
     width, height = (1e3 * v for v in board.extent)
     page = page_of(board, margin=margin)
@@ -295,7 +325,8 @@ def _sheet(paper: str, page: tuple[float, float]) -> tuple[float, float]:
             return sheet
     larger = smallest_paper(page)
     raise ValueError(
-        f"the board needs {page[0]:.0f} x {page[1]:.0f} mm with its margin and {paper} has {short} x {long}: use "
+        f"the board needs {page[0]:.0f} x {page[1]:.0f} mm with its margin and {paper} has {short} x "
+        f"{long}: use "
         f"{f'{larger}, ' if larger else ''}smaller squares or fewer of them"
     )
 

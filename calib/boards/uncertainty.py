@@ -1,7 +1,9 @@
-"""How uncertain a rig is: the covariance of its parameters, in a file beside the rig's, and what follows from it.
+"""How uncertain a rig is: the covariance of its parameters, in a file beside the rig's, and what follows from
+it.
 
-A camera's pose and its lens can stand for one another: what is compared are the pixels of points at a distance, after
-the small motion of the camera that fits them best (as in mrcal's projection uncertainty and difference).
+A camera's pose and its lens can stand for one another: what is compared are the pixels of points at a
+distance, after the small motion of the camera that fits them best (as in mrcal's projection uncertainty and
+difference).
 """
 
 from __future__ import annotations
@@ -51,8 +53,9 @@ CONSIDERABLE = 1.3
 class RigCovariance:
     """The covariance of some parameters of a rig; all others are fixed.
 
-    names: parameters as `Rig.parameters` names them with the index of a component, "left.rotation.0", "left.focal.1":
-    rotation vectors in radians about the camera's axes, metres, pixels, distortion coefficients.
+    names: parameters as `Rig.parameters` names them with the index of a component, "left.rotation.0",
+    "left.focal.1": rotation vectors in radians about the camera's axes, metres, pixels, distortion
+    coefficients.
     """
 
     names: tuple[str, ...]
@@ -85,7 +88,9 @@ class RigCovariance:
         if not all(isinstance(name, str) for name in names) or not np.isfinite(matrix).all():
             raise ValueError(f"{path}: holds names that are no text, or NaN or infinity: calibrate again")
         if matrix.shape != (len(names), len(names)):
-            raise ValueError(f"{path}: has {len(names)} names and a matrix of {matrix.shape}; is the file complete?")
+            raise ValueError(
+                f"{path}: has {len(names)} names and a matrix of {matrix.shape}; is the file complete?"
+            )
         return cls(names, matrix)
 
 
@@ -110,7 +115,9 @@ def beta_covariance(
     if usable.any():
         J_a, J_b = (camera_jacobian(camera, X.numpy()[usable]) for camera in (a, b))
         across = J_b[..., 3:6] @ (b.R @ a.R.T).numpy()[:, :2]
-        change = J_b @ covariance.of(beta, b) - across @ np.linalg.solve(J_a[..., 3:5], J_a @ covariance.of(alpha, a))
+        change = J_b @ covariance.of(beta, b) - across @ np.linalg.solve(
+            J_a[..., 3:5], J_a @ covariance.of(alpha, a)
+        )
         found[usable] = change @ covariance.matrix @ change.swapaxes(-1, -2)
     return found
 
@@ -120,16 +127,19 @@ def baseline_deviation(rig: Mapping[str, Camera], a: str, b: str, covariance: Ri
     baseline = (rig[b].centre - rig[a].centre).numpy()
     direction = baseline / max(float(np.linalg.norm(baseline)), 1e-12)
     of_a, of_b = (
-        direction @ rig[n].cam_from_world.centre_jacobian.numpy() @ covariance.of(n, rig[n])[:6] for n in (a, b)
+        direction @ rig[n].cam_from_world.centre_jacobian.numpy() @ covariance.of(n, rig[n])[:6]
+        for n in (a, b)
     )
     return float(np.sqrt((of_b - of_a) @ covariance.matrix @ (of_b - of_a)))
 
 
-# One camera ---------------------------------------------------------------------------------------------------
+# One camera
+# ---------------------------------------------------------------------------------------------------
 
 
 class Intrinsics(NamedTuple):
-    """A camera in its own frame, the covariance of its free intrinsics, which they are, and its noise in pixels.
+    """A camera in its own frame, the covariance of its free intrinsics, which they are, and its noise in
+    pixels.
 
     seen: some of the board points that it observed, in its frame.
     """
@@ -169,7 +179,9 @@ def grid_points(camera: Camera, depth: float) -> tuple[Float[np.ndarray, "n 2"],
 
 
 def uncertainty(known: Intrinsics, depth: float) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Standard deviations (pixels, worst direction) of the projection of points at a depth (metres), over the image."""
+    """Standard deviations (pixels, worst direction) of the projection of points at a depth (metres), over the
+    image.
+    """
     x, change = moved_pixels(known, depth)
     return x, worst_deviation(change @ known.covariance @ change.swapaxes(-1, -2))
 
@@ -182,8 +194,8 @@ def worst_deviation(covariance: Float[np.ndarray, "n 2 2"]) -> Float[np.ndarray,
 def moved_pixels(known: Intrinsics, depth: float) -> tuple[np.ndarray, np.ndarray]:
     """Pixels, and how they move with the free intrinsics: (n, 2), (n, 2, f).
 
-    That is after the motion of the camera that keeps the boards where they were seen best, so that points nearer or
-    farther than the boards move more.
+    That is after the motion of the camera that keeps the boards where they were seen best, so that points
+    nearer or farther than the boards move more.
     """
     x, X = grid_points(known.camera, depth)
     J, at_boards = camera_jacobian(known.camera, X), camera_jacobian(known.camera, known.seen)
@@ -192,8 +204,12 @@ def moved_pixels(known: Intrinsics, depth: float) -> tuple[np.ndarray, np.ndarra
 
 
 def compensation(by_pose: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """The motion (6, f) of a camera by whose derivatives (m, 2, 6) pixels move like (m, 2, f), by least squares."""
-    return np.asarray(np.linalg.lstsq(by_pose.reshape(-1, 6), moved.reshape(len(by_pose) * 2, -1), rcond=None)[0])
+    """The motion (6, f) of a camera by whose derivatives (m, 2, 6) pixels move like (m, 2, f), by least
+    squares.
+    """
+    return np.asarray(
+        np.linalg.lstsq(by_pose.reshape(-1, 6), moved.reshape(len(by_pose) * 2, -1), rcond=None)[0]
+    )
 
 
 def covered(x: Float[np.ndarray, "n 2"], seen: Float[np.ndarray, "m 2"], hw: HW) -> Bool[np.ndarray, " n"]:
@@ -203,14 +219,15 @@ def covered(x: Float[np.ndarray, "n 2"], seen: Float[np.ndarray, "m 2"], hw: HW)
     return np.asarray(nearest < reach)
 
 
-# How frames disagree -------------------------------------------------------------------------------------------
+# How frames disagree
+# -------------------------------------------------------------------------------------------
 
 
 class Jackknife(NamedTuple):
     """By how the frames disagree: covariances of the cameras' parameters and of the boards' deformations.
 
-    left_out: of the cameras' parameters by leaving out each frame in turn. step: the deformations after a Gauss-Newton
-    step.
+    left_out: of the cameras' parameters by leaving out each frame in turn. step: the deformations after a
+    Gauss-Newton step.
     """
 
     covariance: Float[np.ndarray, "c c"]
@@ -222,9 +239,9 @@ class Jackknife(NamedTuple):
 def jackknife(problem: BundleProblem) -> Jackknife:
     """The covariance of the free parameters by how the frames disagree, to first order.
 
-    It contains what frames have in common beyond their points' noise: a bent board, blur, wrong exposure times. A plain
-    jackknife's deviations are too large by 15 to 40 % with a dozen boards that determine all parameters between them;
-    Bell and McCaffrey's (2002) correction removes that.
+    It contains what frames have in common beyond their points' noise: a bent board, blur, wrong exposure
+    times. A plain jackknife's deviations are too large by 15 to 40 % with a dozen boards that determine all
+    parameters between them; Bell and McCaffrey's (2002) correction removes that.
     """
     parts = linearised(problem)
     equations = normal_equations(problem, parts)
@@ -232,7 +249,9 @@ def jackknife(problem: BundleProblem) -> Jackknife:
     H, g = np.zeros((b, c, c)), np.zeros((b, c))
     for part in parts.values():
         columns = part.columns
-        H[:, columns[:, None], columns] += block_sums(part.block, part.by_shared.swapaxes(1, 2) @ part.by_shared, b)
+        H[:, columns[:, None], columns] += block_sums(
+            part.block, part.by_shared.swapaxes(1, 2) @ part.by_shared, b
+        )
         g[:, columns] += block_sums(part.block, np.einsum("nip,ni->np", part.by_shared, part.r), b)
     total, Y, _ = equations.reduced(0.0)
     H -= Y @ equations.W.swapaxes(-1, -2)
@@ -250,7 +269,9 @@ def jackknife(problem: BundleProblem) -> Jackknife:
 
 
 def _clustered(total: Array, H: Array, g: Array) -> Array:
-    """The covariance by the slopes g (b, c) of frames, each scaled by (1 - its share H of the information)^(-1/2)."""
+    """The covariance by the slopes g (b, c) of frames, each scaled by (1 - its share H of the
+    information)^(-1/2).
+    """
     scale = 1 / np.sqrt(total.diagonal())
     whiten = np.linalg.inv(np.linalg.cholesky(total * scale * scale[:, None])) * scale
     share, axes = np.linalg.eigh(whiten @ H @ whiten.T)
@@ -259,14 +280,17 @@ def _clustered(total: Array, H: Array, g: Array) -> Array:
     return np.asarray(changes.T @ changes)
 
 
-def with_disagreement(solved: Solved, extents: list[tuple[float, float]], *, unchecked: bool = False) -> Solved:
-    """The solution with its covariance raised if frames disagree considerably; with notes on that and on the boards.
+def with_disagreement(
+    solved: Solved, extents: list[tuple[float, float]], *, unchecked: bool = False
+) -> Solved:
+    """The solution with its covariance raised if frames disagree considerably; with notes on that and on the
+    boards.
 
     Where frames are too few to tell, it is raised by `UNCHECKED` if it is of such frames alone (`unchecked`).
 
-    `extents` are the boards' sizes, metres. The raised covariance is the mean of the jackknife's, which few frames make
-    noisy, and of that of the points' noise, scaled to the jackknife's level: the median over the parameters, as frames
-    that disagree about a focal length say nothing of the lens.
+    `extents` are the boards' sizes, metres. The raised covariance is the mean of the jackknife's, which few
+    frames make noisy, and of that of the points' noise, scaled to the jackknife's level: the median over the
+    parameters, as frames that disagree about a focal length say nothing of the lens.
     """
     problem, covariance, notes = solved.problem, solved.covariance, list[str]()
     enough = len(problem.names) > 0 and len(problem.frames) >= FEWEST_TO_JACKKNIFE
@@ -289,7 +313,8 @@ def with_disagreement(solved: Solved, extents: list[tuple[float, float]], *, unc
         raised = float(_ratio(covariance, before).max())
         notes.append(
             "frames disagree more than the points' noise explains: standard deviations are raised, by up to "
-            f"{raised:.1f}, to those of a jackknife over frames (is the board flat and printed true to size, and were "
+            f"{raised:.1f}, to those of a jackknife over frames (is the board flat and printed true to "
+            "size, and were "
             "the images sharp?)"
         )
     return replace(solved, covariance=covariance, raised=raised, notes=(*solved.notes, *notes))

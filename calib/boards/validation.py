@@ -1,4 +1,6 @@
-"""How well a calibration predicts: epipolar errors, frames held out, lens models compared by those, and notes."""
+"""How well a calibration predicts: epipolar errors, frames held out, lens models compared by those, and
+notes.
+"""
 
 from __future__ import annotations
 
@@ -45,8 +47,12 @@ EQUAL = 0.01
 """Held-out errors that differ by less than this share are equal."""
 
 
-def epipolar_errors(rig: Rig, views: Mapping[str, BoardViews]) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
-    """By pair: distances in undistorted pixels from beta's points to the lines of alpha's, and the reverse."""
+def epipolar_errors(
+    rig: Rig, views: Mapping[str, BoardViews]
+) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
+    """By pair: distances in undistorted pixels from beta's points to the lines of alpha's, and the
+    reverse.
+    """
     found = {}
     for a, b in combinations(views, 2):
         xa, xb = _common(views[a], views[b])
@@ -74,10 +80,13 @@ def _common(a: BoardViews, b: BoardViews) -> tuple[np.ndarray, np.ndarray]:
     return xa, xb
 
 
-# Frames held out ----------------------------------------------------------------------------------------------
+# Frames held out
+# ----------------------------------------------------------------------------------------------
 
 
-def held_out_errors(fit: Solved, views: Mapping[str, BoardViews]) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
+def held_out_errors(
+    fit: Solved, views: Mapping[str, BoardViews]
+) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
     """Epipolar errors of all frames, each by a rig calibrated without it; empty if there are too few.
 
     Frames are held out in five parts.
@@ -99,7 +108,8 @@ def held_out_errors(fit: Solved, views: Mapping[str, BoardViews]) -> dict[tuple[
 
 
 def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """By camera: pixels (n, 2) near board points of both halves, and how far (n, 2) projections of their fits differ.
+    """By camera: pixels (n, 2) near board points of both halves, and how far (n, 2) projections of their fits
+    differ.
 
     Halves are every other frame; elsewhere a lens model is extrapolated. Empty if there are too few frames.
     """
@@ -129,7 +139,9 @@ def _difference(a: Camera, b: Camera, X: np.ndarray) -> Float[np.ndarray, "n 2"]
 
 @dataclass(frozen=True)
 class LensComparison:
-    """Mean square errors of a coordinate (pixels^2) of each frame by each model that can be fitted without it."""
+    """Mean square errors of a coordinate (pixels^2) of each frame by each model that can be fitted without
+    it.
+    """
 
     errors: Mapping[Lens, Float[np.ndarray, " f"]]
 
@@ -139,7 +151,9 @@ class LensComparison:
 
     @property
     def advised(self) -> Lens:
-        """The model with fewest coefficients that predicts as well as the best, to a standard error or one percent."""
+        """The model with fewest coefficients that predicts as well as the best, to a standard error or one
+        percent.
+        """
         if not self.errors:
             return "brown-conrady"
         best = min(self.errors, key=self.rms)
@@ -154,7 +168,10 @@ class LensComparison:
     def advice(self) -> str:
         """The advised model and all errors, in a sentence."""
         if not self.errors:
-            return f"too few frames to compare lens models ({FEWEST_TO_COMPARE} are needed): brown-conrady is used"
+            return (
+                f"too few frames to compare lens models ({FEWEST_TO_COMPARE} are needed): brown-conrady "
+                "is used"
+            )
         listed = ", ".join(f"{lens} {self.rms(lens):.3f}" for lens in COMPARED if lens in self.errors)
         return f"the images support the lens model {self.advised} (error on held-out frames, px: {listed})"
 
@@ -187,24 +204,33 @@ def _compared(name: str, views: BoardViews, board: Board) -> LensComparison:
 
 
 def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"]:
-    """Mean squares of the frames held `out` by a camera fitted to the others, their boards' poses fitted to them."""
+    """Mean squares of the frames held `out` by a camera fitted to the others, their boards' poses fitted to
+    them.
+    """
     fitted, judged = readjusted(problem.of_boards(~out)), problem.of_boards(out)
     (name,) = fitted.cameras
     if fitted.deformation is not None and judged.deformation is not None:
         judged = replace(judged, deformation=fitted.deformation.of_blocks(judged.deformation.part))
     seen = Observations(judged.seen[name].block, judged.on_board(name), judged.seen[name].x)
     fixed = {name: np.zeros(len(judged.free[name]), dtype=bool)}
-    posed = replace(judged, cameras=fitted.cameras, seen={name: seen}, free=fixed, priors={}, deformation=None)
+    posed = replace(
+        judged, cameras=fitted.cameras, seen={name: seen}, free=fixed, priors={}, deformation=None
+    )
     squares = (readjusted(posed).residuals()[name] ** 2).sum(-1)
     count = np.bincount(seen.block)
     return np.asarray(np.bincount(seen.block, squares) / np.maximum(2 * count - POSE, 1))
 
 
-# Notes --------------------------------------------------------------------------------------------------------
+# Notes
+# --------------------------------------------------------------------------------------------------------
 
 
-def left_out_notes(detected: Mapping[str, BoardViews], singles: Mapping[str, Solved], solved: Solved) -> Iterator[str]:
-    """Notes on images and points that cameras were calibrated without, by themselves (`singles`) and together."""
+def left_out_notes(
+    detected: Mapping[str, BoardViews], singles: Mapping[str, Solved], solved: Solved
+) -> Iterator[str]:
+    """Notes on images and points that cameras were calibrated without, by themselves (`singles`) and
+    together.
+    """
     for name, v in detected.items():
         used = singles[name].views[name]
         if rejected := [str(key) for key in v.seen if key not in used.seen]:
@@ -214,7 +240,9 @@ def left_out_notes(detected: Mapping[str, BoardViews], singles: Mapping[str, Sol
             yield f"{name}: left out {', '.join(inconsistent)}: they contradict the other cameras' images"
 
 
-def start_notes(detected: Mapping[str, BoardViews], solved: Solved, deviations: StartDeviations) -> Iterator[str]:
+def start_notes(
+    detected: Mapping[str, BoardViews], solved: Solved, deviations: StartDeviations
+) -> Iterator[str]:
     """Notes on a rig that was known roughly: what images add, what lies far from it, what was left out."""
     yield _gains(solved, deviations)
     yield from _far(solved)
@@ -226,10 +254,14 @@ def start_notes(detected: Mapping[str, BoardViews], solved: Solved, deviations: 
 
 def _points_left_out(name: str, detected: BoardViews, used: BoardViews) -> Iterator[str]:
     """A note on points that were left out as outliers, most of an image first."""
-    counts = {key: len(d.ids) - len(used.seen[key].ids) for key, d in detected.seen.items() if key in used.seen}
+    counts = {
+        key: len(d.ids) - len(used.seen[key].ids) for key, d in detected.seen.items() if key in used.seen
+    }
     worst = sorted((key for key in counts if counts[key]), key=lambda key: -counts[key])
     if worst:
-        listed = ", ".join(f"{counts[key]} of {key}" for key in worst[:5]) + (", ..." if len(worst) > 5 else "")
+        listed = ", ".join(f"{counts[key]} of {key}" for key in worst[:5]) + (
+            ", ..." if len(worst) > 5 else ""
+        )
         yield f"{name}: {sum(counts.values())} of {detected.count} points left out as outliers ({listed})"
 
 
@@ -255,7 +287,9 @@ def _position_deviations(fit: Solved) -> list[float]:
     assert fit.covariance is not None
     found = []
     for name, camera in fit.problem.cameras.items():
-        mine = [fit.names.index(f"{name}.{kind}.{i}") for kind in ("rotation", "translation") for i in range(3)]
+        mine = [
+            fit.names.index(f"{name}.{kind}.{i}") for kind in ("rotation", "translation") for i in range(3)
+        ]
         derivatives = camera.cam_from_world.centre_jacobian.numpy()
         covariance = derivatives @ fit.covariance[np.ix_(mine, mine)] @ derivatives.T
         found.append(float(np.sqrt(np.trace(covariance) / 3)))
@@ -269,8 +303,12 @@ def _far(fit: Solved) -> list[str]:
         prior = fit.problem.priors[name]
         ratio = np.abs(prior.residual(camera)) / np.sqrt(np.linalg.inv(prior.information).diagonal())
         parts = np.split(ratio[:10], [3, 6, 8])
-        kinds = zip(("orientation", "position", "focal length", "principal point"), (part.max() for part in parts))
+        kinds = zip(
+            ("orientation", "position", "focal length", "principal point"), (part.max() for part in parts)
+        )
         if far := [f"{kind} ({worst:.0f} deviations)" for kind, worst in kinds if worst > FAR_FROM_START]:
             listed = ", ".join(far)
-            notes.append(f"{name}: far from the start: {listed}: is the start right, or its deviations too small?")
+            notes.append(
+                f"{name}: far from the start: {listed}: is the start right, or its deviations too small?"
+            )
     return notes

@@ -1,9 +1,11 @@
-"""What a change of a rig does to depth, and which directions of change the points determine well enough to make it.
+"""What a change of a rig does to depth, and which directions of change the points determine well enough to
+make it.
 
-Epipolar distances hardly change under some rotations and shifts that change depth much (a rotation about the vertical
-and a shift of the principal point move points along their lines). The points' depth is therefore split into the modes
-of its posterior covariance, and the change along a mode is made only if it is significant, well determined, and clearly
-better known by the points than by the prior; otherwise that combination of parameters stays where it was.
+Epipolar distances hardly change under some rotations and shifts that change depth much (a rotation about the
+vertical and a shift of the principal point move points along their lines). The points' depth is therefore
+split into the modes of its posterior covariance, and the change along a mode is made only if it is
+significant, well determined, and clearly better known by the points than by the prior; otherwise that
+combination of parameters stays where it was.
 """
 
 from __future__ import annotations
@@ -41,8 +43,9 @@ FEW = 10
 class DepthChange(NamedTuple):
     """Relative change of the matched points' depth (median), and its deviations before and after (rms).
 
-    The deviations are those that the stated deviations of the parameters imply; after, given the matched points where
-    these changed the rig. known: the deviation if the rig had followed the matched points in everything.
+    The deviations are those that the stated deviations of the parameters imply; after, given the matched
+    points where these changed the rig. known: the deviation if the rig had followed the matched points in
+    everything.
     """
 
     change: float
@@ -54,8 +57,8 @@ class DepthChange(NamedTuple):
     def doubtful(self) -> bool:
         """Whether depth changes by less than some deviations of what the points determine, and considerably.
 
-        That is by more than a small share, or by far more than it gains in certainty: by a mode of depth that was
-        uncertain by so little beforehand, some other mistake of the rig (of a lens, say) is explained.
+        That is by more than a small share, or by far more than it gains in certainty: by a mode of depth that
+        was uncertain by so little beforehand, some other mistake of the rig (of a lens, say) is explained.
         """
         if self.change <= NEGLIGIBLE or self.change >= SIGNIFICANT_CHANGE * self.known:
             return False
@@ -64,7 +67,8 @@ class DepthChange(NamedTuple):
 
     def __str__(self) -> str:
         return (
-            f"depth changes by {self.change:.2%} (median of the points); its standard deviation, by the stated ones "
+            f"depth changes by {self.change:.2%} (median of the points); its standard deviation, by the "
+            "stated ones "
             f"of the parameters, is {self.before:.2%} before and {self.after:.2%} after"
         )
 
@@ -94,11 +98,15 @@ def observed_depths(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
 def share_behind(rig: Rig, pairs: Pairs) -> float:
     """The share of points behind a camera, of those whose rays meet anywhere; 0 for too few."""
     found = [match_depths(rig.pair(*names), matches) for names, matches in pairs.items()]
-    front = torch.cat([torch.ones(0, dtype=torch.bool), *(f.front[f.observable] for f in found if f is not None)])
+    front = torch.cat(
+        [torch.ones(0, dtype=torch.bool), *(f.front[f.observable] for f in found if f is not None)]
+    )
     return float((~front).double().mean()) if len(front) >= FEW else 0.0
 
 
-def log_depths(after: Callable[[Tensor], Rig], rigs: Sequence[Rig], pairs: Pairs) -> Callable[[Tensor], Tensor] | None:
+def log_depths(
+    after: Callable[[Tensor], Rig], rigs: Sequence[Rig], pairs: Pairs
+) -> Callable[[Tensor], Tensor] | None:
     """The logarithm of depth as a function of the parameters, of points observable in all these rigs.
 
     None for too few.
@@ -120,11 +128,12 @@ def log_depths(after: Callable[[Tensor], Rig], rigs: Sequence[Rig], pairs: Pairs
 
 
 class DepthModes(NamedTuple):
-    """Modes of the points' depth: z is a sum of uncorrelated parts, each of which changes depth in its own pattern.
+    """Modes of the points' depth: z is a sum of uncorrelated parts, each of which changes depth in its own
+    pattern.
 
     root: columns, one a mode; z = root a. a: the modes' changes in posterior standard deviations.
-    deviation, prior: the relative deviation of depth by each mode (rms over the points), posterior and prior; the
-    posterior's is raised to that of a jackknife over parts of the image where that is larger.
+    deviation, prior: the relative deviation of depth by each mode (rms over the points), posterior and prior;
+    the posterior's is raised to that of a jackknife over parts of the image where that is larger.
     """
 
     root: Float[Tensor, "n n"]
@@ -151,7 +160,10 @@ class DepthModes(NamedTuple):
 
 
 def depth_modes(
-    G: Float[Tensor, "m n"], z: Float[Tensor, " n"], covariance: Float[Tensor, "n n"], left_out: Float[Tensor, "g n"]
+    G: Float[Tensor, "m n"],
+    z: Float[Tensor, " n"],
+    covariance: Float[Tensor, "n n"],
+    left_out: Float[Tensor, "g n"],
 ) -> DepthModes:
     """The modes, from derivatives G of the logarithm of depth by parameters whose prior covariance is 1.
 
@@ -163,7 +175,9 @@ def depth_modes(
     pattern = G @ root
     norm = pattern.norm(dim=0)
     prior = (G.T @ (pattern / norm.clamp(min=1e-300))).norm(dim=0)
-    a, jackknife = (torch.linalg.solve_triangular(lower, part.T, upper=False).T @ V for part in (z[None], left_out))
+    a, jackknife = (
+        torch.linalg.solve_triangular(lower, part.T, upper=False).T @ V for part in (z[None], left_out)
+    )
     share = (len(left_out) - 1) / max(len(left_out), 1)
     raised = (share * jackknife.square().sum(0)).sqrt().clamp(min=1)
     size = len(G) ** 0.5

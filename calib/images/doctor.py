@@ -29,7 +29,16 @@ from .evidence import SCALES, DriftEvidence
 from .held_out import image_parts, line_distances, trimmed_square
 from .matches import Images, Pairs, PointMatches, agreeing_pairs, match_cameras, seen_depths
 from .parameters import SIGMA
-from .remedies import NOTHING, TURNS, Remedy, bare_cameras, degrees_remedy, from_degrees, lens_remedy, remedies
+from .remedies import (
+    NOTHING,
+    TURNS,
+    Remedy,
+    bare_cameras,
+    degrees_remedy,
+    from_degrees,
+    lens_remedy,
+    remedies,
+)
 from .residuals import lines_basis, related, residuals_and_depths, stack_key, stacked
 
 LOG = logging.getLogger(__name__)
@@ -47,18 +56,21 @@ EQUAL = (1.4, 0.03)
 WRONG_SIDE_PENALTY = 100.0
 """Penalty, pixels, of points behind the cameras, outside the depth range, or mirrored."""
 LARGEST_REMAINDER = (0.33, 0.2)
-"""A mistake is named if its remedy leaves no more than the first share of the misfit: many wrong remedies improve a
-drifted rig somewhat. Nor is one as good as another that leaves less than the second share of what it leaves."""
+"""A mistake is named if its remedy leaves no more than the first share of the misfit: many wrong remedies
+improve a drifted rig somewhat. Nor is one as good as another that leaves less than the second share of what
+it leaves."""
 MARGIN, TIE = 12.0, 2.0
-"""A mistake is named if -2 log evidence is smaller by this than that of a drift, and others are as good that have less
-than this more; of those within the second, the likely one is named."""
+"""A mistake is named if -2 log evidence is smaller by this than that of a drift, and others are as good that
+have less than this more; of those within the second, the likely one is named."""
 MOST_COMPARED = 10
 """Explanations whose evidence is computed: those that leave least."""
 EXPLAINED, ROUGHLY = (2 * HEALTHY_MISFIT, 0.06), 0.9
-"""A mistake explains the points if no more than so many pixels, or that share of the misfit, are left; pixels of those
-whose remedy is approximate."""
+"""A mistake explains the points if no more than so many pixels, or that share of the misfit, are left; pixels
+of those whose remedy is approximate."""
 SAME_DEPTH, SAME_DISTANCE = 1e-3, 1e-3
-"""Rigs are the same in which depths (relative) and distances from lines (pixels) differ by less, in the median."""
+"""Rigs are the same in which depths (relative) and distances from lines (pixels) differ by less, in the
+median.
+"""
 LEAST_NOISE = 0.05
 """Lower bound of the points' noise, pixels."""
 FEW = 10
@@ -74,8 +86,8 @@ class FitStatistics(NamedTuple):
     misfit: the part of it (root mean square, pixels) that is due to the rig and not to the matches' noise.
     front: share of the points in front of both cameras, of those whose depth is observable.
     inside: share of those in front that lie in the rig's depth range; NaN without one.
-    handed: share of the triangles of neighbouring points whose orientation changes between the images, or not, as the
-    rig implies: mirrored images change it.
+    handed: share of the triangles of neighbouring points whose orientation changes between the images, or
+    not, as the rig implies: mirrored images change it.
     depth: median depth in metres of the points in front; NaN if too few.
     """
 
@@ -109,11 +121,11 @@ class FitStatistics(NamedTuple):
 class Diagnosis:
     """The result of a diagnosis.
 
-    named: the mistake, or `NOTHING`: no mistake explains the images clearly better than a drift of the cameras does.
-    equal: other kinds of mistake that explain the images as well.
+    named: the mistake, or `NOTHING`: no mistake explains the images clearly better than a drift of the
+    cameras does. equal: other kinds of mistake that explain the images as well.
     before, after: statistics of the given rig and of the repaired one. tried: all explanations, best first.
-    matches: number of points used. healthy: the given rig fits the images. certain: all explanations that are as good
-    as the one named are undone by the same rig.
+    matches: number of points used. healthy: the given rig fits the images. certain: all explanations that are
+    as good as the one named are undone by the same rig.
     """
 
     named: Remedy
@@ -136,7 +148,8 @@ class Diagnosis:
             return "nothing wrong: the points lie on their lines to the accuracy of their positions"
         return (
             f"none of the usual mistakes, but the rig is {self.before.misfit:.2f} px off these images: "
-            "it has drifted or was inaccurate from the beginning; `pat rig refine` may repair what can be observed"
+            "it has drifted or was inaccurate from the beginning; `pat rig refine` may repair what can be "
+            "observed"
         ) + (f". As plausible as a drift, but not more: {others}" if others else "")
 
     def as_text(self) -> str:
@@ -173,8 +186,8 @@ def diagnose(rig: Rig, images: Images, matches: Pairs | None = None) -> Diagnosi
 
     `matches` are taken in place of those that would be found.
 
-    Raises ValueError, one line, for a camera that the rig lacks, fewer than two images, equal ones, and images in
-    which too few points match; and for a rig that does not relate its cameras.
+    Raises ValueError, one line, for a camera that the rig lacks, fewer than two images, equal ones, and
+    images in which too few points match; and for a rig that does not relate its cameras.
     """
     for name in images:
         rig.require(name)
@@ -210,7 +223,15 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     repaired = tried[best].repair(rig)
     certain = best > 0 and all(_same_rig(repaired, tried[i].repair(rig), pairs) for i in as_good if i != best)
     return Diagnosis(
-        tried[best], tuple(equal.values()), figures[0], figures[best], table, count, healthy, repaired, certain
+        tried[best],
+        tuple(equal.values()),
+        figures[0],
+        figures[best],
+        table,
+        count,
+        healthy,
+        repaired,
+        certain,
     )
 
 
@@ -223,11 +244,11 @@ def _by_evidence(
     inliers: Tensor,
     noise: float,
 ) -> tuple[int, list[int]]:
-    """The mistake that explains the points clearly better than a drift of the rig does, 0 if none; all that are as
-    good as it, or as the drift, best first.
+    """The mistake that explains the points clearly better than a drift of the rig does, 0 if none; all that
+    are as good as it, or as the drift, best first.
 
-    Points of one object, or wrong ones in one place, do not decide: it is better without each part of them in turn.
-    No drift mirrors an image; one of the principal point does what a small shift of pixels does.
+    Points of one object, or wrong ones in one place, do not decide: it is better without each part of them in
+    turn. No drift mirrors an image; one of the principal point does what a small shift of pixels does.
     """
     limit = LARGEST_REMAINDER[0] * figures[0].penalised_misfit
     some = [i for i in order if i and figures[i].penalised_misfit <= limit][:MOST_COMPARED]
@@ -241,7 +262,9 @@ def _by_evidence(
     some.sort(key=lambda i: found[i].cost)
     least = found[some[0]].cost
     best = min(i for i in some if found[i].cost <= least + TIE)
-    allowed = max(ROUGHLY if tried[best].approximate else EXPLAINED[0], EXPLAINED[1] * figures[0].penalised_misfit)
+    allowed = max(
+        ROUGHLY if tried[best].approximate else EXPLAINED[0], EXPLAINED[1] * figures[0].penalised_misfit
+    )
     parts = image_parts(rig, pairs)
     rest = (inliers & (parts != part) for part in parts.unique().tolist())
     clear = (
@@ -315,7 +338,8 @@ def _mirrors(rig: Rig, names: tuple[str, str]) -> bool:
 
 
 class PointObservations(NamedTuple):
-    """All points of all pairs (n) under several rigs (k): signed distance in pixels from the line, depth, in front.
+    """All points of all pairs (n) under several rigs (k): signed distance in pixels from the line, depth, in
+    front.
 
     Unobservable depths are NaN.
     """
@@ -350,7 +374,8 @@ def _observe_pair(pairs: Sequence[Pair], matches: PointMatches) -> PointObservat
 
 
 def _inliers(rig: Rig, tried: Sequence[Remedy], off: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
-    """The points consistent with some pose of the cameras, and their mean square distance then, in square pixels.
+    """The points consistent with some pose of the cameras, and their mean square distance then, in square
+    pixels.
 
     The pose is free, so only the lens matters: the best explanation that changes it is used.
     """
@@ -359,7 +384,9 @@ def _inliers(rig: Rig, tried: Sequence[Remedy], off: Tensor, pairs: Pairs) -> tu
         if remedy.kind in ("nothing", "distortion"):
             repaired = remedy.repair(rig)
             lengths = [len(matches.alpha) for matches in pairs.values()]
-            left = [_beyond_pose(repaired.pair(*n), m, r) for (n, m), r in zip(pairs.items(), o.split(lengths))]
+            left = [
+                _beyond_pose(repaired.pair(*n), m, r) for (n, m), r in zip(pairs.items(), o.split(lengths))
+            ]
             fits.append(torch.cat(left))
     left_over = min(fits, key=lambda e: float(e.abs().median()))
     inliers = left_over.abs() <= max(4 * float(left_over.abs().median()), 0.2)
@@ -373,11 +400,20 @@ def _beyond_pose(pair: Pair, matches: PointMatches, off: Tensor) -> Tensor:
     def weigh(rest: Tensor) -> Tensor:
         return cauchy(rest, 2 * max(float(rest.abs().median()), 1e-3)).square()
 
-    return robust_least_squares(terms, off, least_squares(terms, off, torch.ones_like(off)), weigh, steps=7).rest
+    return robust_least_squares(
+        terms, off, least_squares(terms, off, torch.ones_like(off)), weigh, steps=7
+    ).rest
 
 
 def _figures(
-    off: Tensor, depth: Tensor, front: Tensor, *, inliers: Tensor, floor: float, bounds: Depths | None, handed: float
+    off: Tensor,
+    depth: Tensor,
+    front: Tensor,
+    *,
+    inliers: Tensor,
+    floor: float,
+    bounds: Depths | None,
+    handed: float,
 ) -> FitStatistics:
     off = off[inliers]
     misfit = math.sqrt(max(trimmed_square(off) - floor, 0.0))
@@ -421,7 +457,8 @@ def _corner_radius(camera: Camera) -> float:
 
 
 def _degrees(rig: Rig, pairs: Pairs) -> list[Remedy]:
-    """Rotation vectors in degrees, taken for radians, with the whole turns, which are lost, that suit the points best.
+    """Rotation vectors in degrees, taken for radians, with the whole turns, which are lost, that suit the
+    points best.
 
     Not where a drift may be what turned the cameras.
     """
@@ -464,5 +501,8 @@ def _depth_range(rig: Rig, pairs: Pairs) -> list[Remedy]:
     if not found:
         return []
     near, far = min(bounds[0] for bounds in found), max(bounds[1] for bounds in found)
-    words = f"the depth range excludes the scene, which is {near:.3g} to {far:.3g} m away: correct `depth` in the file"
+    words = (
+        f"the depth range excludes the scene, which is {near:.3g} to {far:.3g} m away: correct `depth` "
+        "in the file"
+    )
     return [Remedy("depth range", words, lambda rig: rig.replace(depth=(near, far)))]

@@ -1,8 +1,9 @@
-"""How well matched points support a rig that may have drifted a little: the evidence of a mistake against mere drift.
+"""How well matched points support a rig that may have drifted a little: the evidence of a mistake against
+mere drift.
 
-The residuals are normal with the noise of the points, plus a drift of the cameras whose prior deviations are those of
-`parameters.SIGMA` times a scale, plus what lens models leave (`systematic_modes`); to first order in the drift. A
-mistake that a drift explains as well is not a mistake that can be named.
+The residuals are normal with the noise of the points, plus a drift of the cameras whose prior deviations are
+those of `parameters.SIGMA` times a scale, plus what lens models leave (`systematic_modes`); to first order in
+the drift. A mistake that a drift explains as well is not a mistake that can be named.
 """
 
 from __future__ import annotations
@@ -40,10 +41,10 @@ class DriftEvidence:
     """A rig with the drift that fits matched points best.
 
     cost: -2 log evidence of the rig and that drift by the points used. Smaller is better; differences count.
-    distances: of all points by a drift, in standard deviations of their noise. z: the drift. r, J, B: the distances,
-    were there no drift, and their derivatives by the drift and by what lens models leave; linear about z. scale: of
-    the drift. fixed: the part of the cost that does not depend on the distances. clipped: the largest distance that
-    counts.
+    distances: of all points by a drift, in standard deviations of their noise. z: the drift. r, J, B: the
+    distances, were there no drift, and their derivatives by the drift and by what lens models leave; linear
+    about z. scale: of the drift. fixed: the part of the cost that does not depend on the distances. clipped:
+    the largest distance that counts.
     """
 
     cost: float
@@ -63,7 +64,9 @@ class DriftEvidence:
         free = list(UNCERTAIN) if any(isinstance(rig[name], Camera) for name in names) else []
         parameters = tuple(free_parameters(rig, names, free=free))
         distances = JoinedResiduals(
-            lambda z: [r.nan_to_num() / noise for r in sampson_of_pairs(apply_change(rig, parameters, z), pairs)]
+            lambda z: [
+                r.nan_to_num() / noise for r in sampson_of_pairs(apply_change(rig, parameters, z), pairs)
+            ]
         )
         z = torch.zeros(sum(len(u.sigma) for u in parameters), dtype=torch.float64)
         r, J = jacobian(distances, z)
@@ -82,7 +85,9 @@ class DriftEvidence:
         return found
 
     def by(self, used: Bool[Tensor, " n"]) -> float:
-        """The cost by other points, of this drift or of the best by them to first order, whichever is better."""
+        """The cost by other points, of this drift or of the best by them to first order, whichever is
+        better.
+        """
         return min(self._at(z, used) for z in (self.z, self._refitted(used)))
 
     def _refitted(self, used: Bool[Tensor, " n"]) -> Tensor:
@@ -98,7 +103,8 @@ class DriftEvidence:
 
 
 class _Drift(NamedTuple):
-    """Residuals r + J z + B b of normal z, of deviation `scale`, and b: -2 log evidence, and its log determinant.
+    """Residuals r + J z + B b of normal z, of deviation `scale`, and b: -2 log evidence, and its log
+    determinant.
 
     z: the most probable one.
     """

@@ -1,9 +1,10 @@
 """A common focal length of two cameras of one kind, from matched points alone, where these determine it.
 
-F has seven degrees of freedom and a pose five, so that two views determine a focal length unless their axes are nearly
-parallel or meet at equal distances (Hartley and Zisserman, section 19.3.1). What else is unknown of the cameras takes
-its share of the residuals: principal points, a radial term, what it leaves of the lenses, and how unlike both focal
-lengths are. Parameters are in units of their prior standard deviations, as in `least_squares`.
+F has seven degrees of freedom and a pose five, so that two views determine a focal length unless their axes
+are nearly parallel or meet at equal distances (Hartley and Zisserman, section 19.3.1). What else is unknown
+of the cameras takes its share of the residuals: principal points, a radial term, what it leaves of the
+lenses, and how unlike both focal lengths are. Parameters are in units of their prior standard deviations, as
+in `least_squares`.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ from .residuals import displacements
 from .self_calibration import FOCAL_SHARE, initial_poses
 
 SIGMA = {"focal": 0.5, "ratio": 0.01, "pose": 3.0, "centre": 0.03, "radial": 0.1, "systematic": 0.3}
-"""Prior standard deviations: of the focal length as a share of the one assumed (the log of), and of the ratio of both;
-radians, and of a baseline of 1; of principal points as a share of the longer side; of the radial term at half the
-longer side; of the smooth displacements that it leaves, pixels at the image's corner."""
+"""Prior standard deviations: of the focal length as a share of the one assumed (the log of), and of the ratio
+of both; radians, and of a baseline of 1; of principal points as a share of the longer side; of the radial
+term at half the longer side; of the smooth displacements that it leaves, pixels at the image's corner."""
 SEARCHED = (0.5, 1.0, 2.0)
 """Multiples of the assumed focal length from which the fit starts; from the two best poses at each."""
 STEPS = 30
@@ -40,7 +41,8 @@ POINTS = 500
 LARGEST_DEVIATION = 0.25
 """A focal length is found if its relative standard deviation is no larger than this,"""
 SIGNIFICANT = 3.0
-"""if it differs from the one assumed by this many, and if held-out points are nearer to their lines with it."""
+"""if it differs from the one assumed by this many, and if held-out points are nearer to their lines with it.
+"""
 BEHIND = 0.5
 """Share of points that may lie behind a camera: of mirrored poses all do."""
 
@@ -49,8 +51,9 @@ BEHIND = 0.5
 def common_focal_length(views: Mapping[str, View], link: Link, matches: PointMatches) -> FocalFit | None:
     """The focal length that two cameras (alpha, beta) of one image size share, if the points determine it.
 
-    Square pixels are taken for granted. None where the points do not tell it from the focal length that is assumed, or
-    not well, and for views of unlike sizes, a mirrored one, or points that no pose has in front of both cameras.
+    Square pixels are taken for granted. None where the points do not tell it from the focal length that is
+    assumed, or not well, and for views of unlike sizes, a mirrored one, or points that no pose has in front
+    of both cameras.
     """
     fit = fit_focal_length(views, link, matches)
     return fit if fit is not None and fit.found else None
@@ -93,8 +96,8 @@ def _is_mirrored(matches: PointMatches) -> bool:
 class TwoViews:
     """Two cameras of one size, a pose of beta from which changes count, and the points.
 
-    z: change of the log focal length, of the ratio's, rotation (3), baseline's direction (2), principal points (4),
-    radial terms (their mean, half their difference), displacements (8).
+    z: change of the log focal length, of the ratio's, rotation (3), baseline's direction (2), principal
+    points (4), radial terms (their mean, half their difference), displacements (8).
     """
 
     hw: HW
@@ -190,7 +193,9 @@ class FocalFit:
 
     @cached_property
     def deviation(self) -> float:
-        """Relative, of the focal length: that of the points' noise, or of a jackknife over parts of the image."""
+        """Relative, of the focal length: that of the points' noise, or of a jackknife over parts of the
+        image.
+        """
         residuals, z = self.views.residuals, self.z
         covariance = posterior_covariance(residuals, z)
         groups = parts_of(self.views.hw, self.views.points.alpha)
@@ -199,7 +204,9 @@ class FocalFit:
         return float(self.views.sigma[0] * torch.maximum(covariance[0, 0], jackknife).sqrt())
 
     def is_nearer(self) -> bool:
-        """Whether points are nearer to their lines than with the focal length assumed, by fits that held them out."""
+        """Whether points are nearer to their lines than with the focal length assumed, by fits that held them
+        out.
+        """
         points, part = self.views.points, held_out_parts(self.views.points)
         distances = torch.zeros(2, len(part), dtype=torch.float64)
         for held_out in range(HELD_OUT):

@@ -40,9 +40,9 @@ JOINED = 1.0
 class UncalibratedRig(NamedTuple):
     """An uncalibrated rig, with statistics of each of its links.
 
-    points: their number. distance: median distance of held-out points from their lines, pixels of beta. displacement:
-    pixels of beta to either side of the rough map that contain the points. by_focal: whether focal lengths were used.
-    matches: the points.
+    points: their number. distance: median distance of held-out points from their lines, pixels of beta.
+    displacement: pixels of beta to either side of the rough map that contain the points. by_focal: whether
+    focal lengths were used. matches: the points.
     """
 
     rig: Rig
@@ -55,7 +55,8 @@ class UncalibratedRig(NamedTuple):
     def as_text(self) -> str:
         """One line per link, and one on lenses if there are any."""
         lines = [
-            f"{a} > {b}: {self.points[a, b]} points, held-out ones {self.distance[a, b]:.2f} px from their lines, all "
+            f"{a} > {b}: {self.points[a, b]} points, held-out ones {self.distance[a, b]:.2f} px from their "
+            "lines, all "
             f"within {self.displacement[a, b]:.0f} px of the rough map"
             + (", with the given focal lengths" if self.by_focal[a, b] else "")
             for a, b in self.rig.links
@@ -74,12 +75,12 @@ def rig_from_images(
 ) -> UncalibratedRig:
     """An uncalibrated rig of the cameras that took these images (C, H, W), good enough to fuse with.
 
-    F of every two cameras with a common field of view (of `alpha` and each other one, if it is given) by MAGSAC++
-    (Barath et al. 2020), and a rough map. With rough focal lengths, in pixels, of both cameras an essential matrix is
-    fitted too, with five degrees of freedom instead of seven: it is used where it fits held-out points better. All F
-    are then fitted jointly, with lenses, and accepted on the same condition. `matches` of pairs of images are taken in
-    place of those that would be found. Raises ValueError, one line: fewer than two images, equal ones, too few points,
-    a focal length of no camera.
+    F of every two cameras with a common field of view (of `alpha` and each other one, if it is given) by
+    MAGSAC++ (Barath et al. 2020), and a rough map. With rough focal lengths, in pixels, of both cameras an
+    essential matrix is fitted too, with five degrees of freedom instead of seven: it is used where it fits
+    held-out points better. All F are then fitted jointly, with lenses, and accepted on the same condition.
+    `matches` of pairs of images are taken in place of those that would be found. Raises ValueError, one line:
+    fewer than two images, equal ones, too few points, a focal length of no camera.
     """
     focal = dict(focal or {})
     for name, length in focal.items():
@@ -111,8 +112,12 @@ def rig_from_images(
     return found._replace(rig=rig.replace(links=links))
 
 
-def _fundamental(matches: PointMatches, K: Tensor | None, K_beta: Tensor | None) -> tuple[Tensor, float, bool]:
-    """F of all points; the median distance of held-out points if fitted to the rest; whether by focal lengths."""
+def _fundamental(
+    matches: PointMatches, K: Tensor | None, K_beta: Tensor | None
+) -> tuple[Tensor, float, bool]:
+    """F of all points; the median distance of held-out points if fitted to the rest; whether by focal
+    lengths.
+    """
     (used,), (held_out,) = (list(part.values()) for part in split([{("", ""): matches}]))
     fits: dict[bool, Callable[[PointMatches], Tensor]] = {False: fit_fundamental}
     if K is not None and K_beta is not None:
@@ -125,7 +130,9 @@ def _fundamental(matches: PointMatches, K: Tensor | None, K_beta: Tensor | None)
 def _by_focal(matches: PointMatches, K: Tensor, K_beta: Tensor) -> Tensor:
     x, y = (points.numpy() for points in matches)
     no_lens = np.zeros(5)
-    E, _ = cv2.findEssentialMat(x, y, K.numpy(), no_lens, K_beta.numpy(), no_lens, method=cv2.RANSAC, threshold=1.0)
+    E, _ = cv2.findEssentialMat(
+        x, y, K.numpy(), no_lens, K_beta.numpy(), no_lens, method=cv2.RANSAC, threshold=1.0
+    )
     if E is None or E.shape != (3, 3):
         return fit_fundamental(matches)
     return torch.linalg.inv(K_beta).T @ torch.from_numpy(E) @ torch.linalg.inv(K)

@@ -1,7 +1,8 @@
 """Matches between unlike bands where it is roughly known where a point is: patches whose structure agrees.
 
-Descriptors of features hardly match where leaves are dark in red and bright in near infrared. A patch's correlation,
-squared, does not depend on the sign of its contrast, and the search is confined to a window around what is expected.
+Descriptors of features hardly match where leaves are dark in red and bright in near infrared. A patch's
+correlation, squared, does not depend on the sign of its contrast, and the search is confined to a window
+around what is expected.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ PATCH = 20
 ALIKE = 0.4
 """The least squared correlation of patches that match."""
 DISTINCT = 0.9
-"""A second peak's squared correlation is at most this share of the first's, as in Lowe's ratio test (2004)."""
+"""A second peak's squared correlation is at most this share of the first's, as in Lowe's ratio test (2004).
+"""
 PEAK = 3
 """Pixels around a peak that are part of it."""
 
@@ -39,14 +41,17 @@ def guided_matches(
     window: int,
     shown: tuple[Bool[Tensor, "h w"], Bool[Tensor, "hb wb"]],
 ) -> PointMatches:
-    """Corners of alpha with the patch most like theirs within `window` pixels of where a homography puts them in beta.
+    """Corners of alpha with the patch most like theirs within `window` pixels of where a homography puts them
+    in beta.
 
     Images are to be alike in scale and orientation. `shown` says what of each image a camera recorded.
     """
     own, other = (contrast_equalised(image) for image in (alpha, beta))
     solid = np.ones((2 * PATCH + 1, 2 * PATCH + 1), np.uint8)
     mask, valid = (
-        np.asarray(cv2.erode(part.numpy().astype(np.uint8), solid, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)))
+        np.asarray(
+            cv2.erode(part.numpy().astype(np.uint8), solid, borderType=cv2.BORDER_CONSTANT, borderValue=(0,))
+        )
         for part in shown
     )
     corners = cv2.goodFeaturesToTrack(own, POINTS, 1e-3, SPACING, mask=mask)
@@ -66,7 +71,9 @@ def _most_alike(
     there: NDArray[np.float64],
     window: int,
 ) -> NDArray[np.float64] | None:
-    """The position in beta of the patch that is most like that around a pixel; None where none is clearly so."""
+    """The position in beta of the patch that is most like that around a pixel; None where none is clearly
+    so.
+    """
     (column, row), (left, top) = (np.rint(p).astype(int) for p in (x, there - window))
     patch = own[row - PATCH : row + PATCH + 1, column - PATCH : column + PATCH + 1]
     first, last = np.maximum([left, top], PATCH), np.array([left, top]) + 2 * window

@@ -1,8 +1,9 @@
-"""Where the cameras of one body are, whose lenses and, roughly, orientations are known: from one image of each.
+"""Where the cameras of one body are, whose lenses and, roughly, orientations are known: from one image of
+each.
 
-The tags of many multispectral cameras state everything but translations. With orientations known, every match says
-that one triple product with the baseline is zero: all pairs together give all centres, up to one scale (Hartley and
-Zisserman, section 18.5, for known rotations).
+The tags of many multispectral cameras state everything but translations. With orientations known, every match
+says that one triple product with the baseline is zero: all pairs together give all centres, up to one scale
+(Hartley and Zisserman, section 18.5, for known rotations).
 """
 
 from __future__ import annotations
@@ -25,11 +26,17 @@ from .refinement import refine_matches
 from .self_calibration import depth_bounds
 
 WINDOW = 0.09
-"""Largest displacement between images of parallel views, as a share of the longer side: 15 mm at .15 m, 60 degrees."""
+"""Largest displacement between images of parallel views, as a share of the longer side: 15 mm at .15 m, 60
+degrees.
+"""
 NEAR = 4.0
-"""Points this many pixels from the line of a baseline are consistent with it: orientations are known to .2 degrees."""
+"""Points this many pixels from the line of a baseline are consistent with it: orientations are known to .2
+degrees.
+"""
 SHARE = 0.4
-"""A baseline counts with which at least this share of a pair's matches is consistent: of wrong ones up to .3 are."""
+"""A baseline counts with which at least this share of a pair's matches is consistent: of wrong ones up to .3
+are.
+"""
 TRIALS = 500
 """Directions of each baseline that are tried (Fischler and Bolles 1981)."""
 SIGMA = {"rotation": math.radians(0.5), "translation": 0.3}
@@ -41,12 +48,12 @@ ROUNDS = (4.0, 2.0, 2.0)
 def centres_found(
     rig: Rig, images: Images, shown: Mapping[str, Bool[Tensor, "_ _"]], *, alpha: str
 ) -> tuple[Rig, dict[str, tuple[int, float]]]:
-    """The rig of pinhole cameras with translations, and orientations refined; of each beta how many points, and their
-    median distance from their lines, pixels.
+    """The rig of pinhole cameras with translations, and orientations refined; of each beta how many points,
+    and their median distance from their lines, pixels.
 
-    Alpha is at the origin, and the baseline of the first beta is 1, unless the rig states translations, whose scale is
-    kept. `shown` says what of each image its camera recorded. Cameras that match with none are left out. Raises
-    ValueError if none matches.
+    Alpha is at the origin, and the baseline of the first beta is 1, unless the rig states translations, whose
+    scale is kept. `shown` says what of each image its camera recorded. Cameras that match with none are left
+    out. Raises ValueError if none matches.
     """
     stated = [float(rig.pair(alpha, name).beta_from_alpha.t.norm()) for name in rig.betas(alpha)]
     pairs: dict[tuple[str, str], PointMatches] = {}
@@ -56,7 +63,9 @@ def centres_found(
             pairs[a, b] = found
     names = _connected(alpha, list(pairs))
     if len(names) < 2:
-        raise ValueError("the images hardly match, so their cameras' translations stay unknown: give a rig file")
+        raise ValueError(
+            "the images hardly match, so their cameras' translations stay unknown: give a rig file"
+        )
     rig = Rig({name: rig[name] for name in rig.names if name in names})
     pairs = {pair: matches for pair, matches in pairs.items() if set(pair) <= names}
     rig = _with_centres(rig, alpha, pairs)
@@ -78,13 +87,15 @@ def _matched(rig: Rig, a: str, b: str, images: Images, shown: Mapping[str, Tenso
 
 
 def _normals(rig: Rig, a: str, b: str, matches: PointMatches) -> Float[Tensor, "n 3"]:
-    """What is perpendicular to the baseline, of each match, in the rig's frame; times the focal length, so that the
-    product with a baseline of length 1 is about a distance in pixels."""
+    """What is perpendicular to the baseline, of each match, in the rig's frame; times the focal length, so
+    that the product with a baseline of length 1 is about a distance in pixels."""
     one, two = _rays(rig, a, b, matches)
     return float(rig[b].K[0, 0]) * torch.linalg.cross(one, two)
 
 
-def _rays(rig: Rig, a: str, b: str, matches: PointMatches) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+def _rays(
+    rig: Rig, a: str, b: str, matches: PointMatches
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """The matches' rays in the rig's frame, of both cameras."""
     one, two = (
         map_homogeneous(rig[name].R.mT @ torch.linalg.inv(rig[name].K), x.double())
@@ -144,7 +155,9 @@ def _with_centres(rig: Rig, alpha: str, pairs: Mapping[tuple[str, str], PointMat
     return Rig(cameras)
 
 
-def _points_ahead(rig: Rig, pair: tuple[str, str], matches: PointMatches, centres: Mapping[str, Tensor]) -> float:
+def _points_ahead(
+    rig: Rig, pair: tuple[str, str], matches: PointMatches, centres: Mapping[str, Tensor]
+) -> float:
     """How many more matches are in front of both cameras than behind."""
     a, b = pair
     one, two = _rays(rig, a, b, matches)
@@ -160,7 +173,9 @@ def _fit(rig: Rig, near: Mapping[tuple[str, str], PointMatches], name: str) -> t
 
 
 def _depths(rig: Rig, alpha: str, near: Mapping[tuple[str, str], PointMatches]) -> tuple[float, float]:
-    """The range of depths that all pairs' points have, extended. Raises ValueError for points without parallax."""
+    """The range of depths that all pairs' points have, extended. Raises ValueError for points without
+    parallax.
+    """
     found = []
     for (a, b), matches in near.items():
         bounds = depth_bounds(Rig({name: rig[name] for name in (a, b)}), matches)

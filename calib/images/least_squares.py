@@ -1,7 +1,9 @@
-"""The most probable parameters given residuals and a normal prior: damped Gauss-Newton, reweighted for Cauchy's loss.
+"""The most probable parameters given residuals and a normal prior: damped Gauss-Newton, reweighted for
+Cauchy's loss.
 
-Parameters are in units of their prior standard deviations, so that the prior's covariance is 1. The first ones are
-free; the rest are considered: uncertain, so that they explain what they may, but they never change the rig.
+Parameters are in units of their prior standard deviations, so that the prior's covariance is 1. The first
+ones are free; the rest are considered: uncertain, so that they explain what they may, but they never change
+the rig.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ Residuals = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class JoinedResiduals:
-    """Residuals of several parts, such as pairs of cameras, each of which depends on some of the parameters only.
+    """Residuals of several parts, such as pairs of cameras, each of which depends on some of the parameters
+    only.
 
     Derivatives by the others, which are 0, are not computed.
     """
@@ -51,11 +54,13 @@ class JoinedResiduals:
 
 
 class Solution(NamedTuple):
-    """The free parameters z, which of them were observable, and their covariance, in units of the prior's deviations.
+    """The free parameters z, which of them were observable, and their covariance, in units of the prior's
+    deviations.
 
-    directions: (n, m), z is a sum of these columns; along the others the images do not determine it. full: the most
-    probable values of free and considered parameters without that restriction. gained: the variance of depth that the
-    changes lose, relative to depth squared. known: the deviation of depth that is left if the full solution is right.
+    directions: (n, m), z is a sum of these columns; along the others the images do not determine it. full:
+    the most probable values of free and considered parameters without that restriction. gained: the variance
+    of depth that the changes lose, relative to depth squared. known: the deviation of depth that is left if
+    the full solution is right.
     """
 
     z: Float[Tensor, " n"]
@@ -70,8 +75,8 @@ class Solution(NamedTuple):
 def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
     """The most probable z under a normal prior of variance 1, with unobservable parameters fixed.
 
-    Free parameters whose standard deviation stays above `LARGEST_POSTERIOR` are reset to 0 and the others solved for
-    again. `residuals` takes `count` free parameters and then the `considered` ones.
+    Free parameters whose standard deviation stays above `LARGEST_POSTERIOR` are reset to 0 and the others
+    solved for again. `residuals` takes `count` free parameters and then the `considered` ones.
     """
     total = count + considered
     active = torch.ones(total, dtype=torch.bool)
@@ -96,7 +101,8 @@ def shifts_left_out(
     count: int,
     kept: Bool[Tensor, " k"] | None = None,
 ) -> Float[Tensor, "g n"]:
-    """The changes of those parameters that are `kept`, all unless stated, without the residuals of one of the groups.
+    """The changes of those parameters that are `kept`, all unless stated, without the residuals of one of the
+    groups.
 
     Groups are 0 to g - 1. To first order, from the most probable z on.
     """
@@ -122,13 +128,18 @@ def most_probable(
 ) -> Float[Tensor, " k"]:
     """The most probable parameters z + basis y, from z on, by damped steps.
 
-    Undamped steps shortened until the cost falls would stop short where some parameters are hardly observable, as poses
-    by a flat scene are.
+    Undamped steps shortened until the cost falls would stop short where some parameters are hardly
+    observable, as poses by a flat scene are.
     """
     numbers = itertools.count(1)
 
     def model(z: Tensor) -> LocalModel[Tensor]:
-        log_step(LOG, 1 - FURTHER_STEPS / ((number := next(numbers)) - 1 + FURTHER_STEPS), "step %d of the fit", number)
+        log_step(
+            LOG,
+            1 - FURTHER_STEPS / ((number := next(numbers)) - 1 + FURTHER_STEPS),
+            "step %d of the fit",
+            number,
+        )
         r, J = jacobian(residuals, z)
         information, slope = _normal_equations(r, J, z)
         information, slope = basis.T @ information @ basis, basis.T @ slope
@@ -170,8 +181,8 @@ def _normal_equations(r: Tensor, J: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
 def jacobian(f: Residuals, z: Float[Tensor, " n"]) -> tuple[Float[Tensor, " m"], Float[Tensor, "m n"]]:
     """f(z) and its derivatives, for many values of few parameters.
 
-    The gradient of u . f in z is linear in u; its derivatives in u are the columns of the Jacobian. An entry of the
-    gradient that is exactly 0 is of a parameter on which no value depends.
+    The gradient of u . f in z is linear in u; its derivatives in u are the columns of the Jacobian. An entry
+    of the gradient that is exactly 0 is of a parameter on which no value depends.
     """
     z = z.detach().requires_grad_()
     values, rows = f.parts(z) if isinstance(f, JoinedResiduals) else [f(z)], []
@@ -182,6 +193,8 @@ def jacobian(f: Residuals, z: Float[Tensor, " n"]) -> tuple[Float[Tensor, " m"],
         columns = torch.zeros(len(z), len(part), dtype=part.dtype)
         if bool(depends.any()):
             basis = torch.eye(len(z)).to(slope)[depends]
-            (columns[depends],) = torch.autograd.grad(slope, u, basis, is_grads_batched=True, retain_graph=True)
+            (columns[depends],) = torch.autograd.grad(
+                slope, u, basis, is_grads_batched=True, retain_graph=True
+            )
         rows.append(columns.T)
     return torch.cat([part.detach() for part in values]), torch.cat(rows)

@@ -1,8 +1,8 @@
 """Lenses of uncalibrated cameras, which distort epipolar lines so that F alone does not fit.
 
-Such a lens has OpenCV's first four terms about the image's centre, with r in units of half the longer side of the
-image; F relates undistorted pixels. `refinement` fits both together to matched points (Fitzgibbon 2001 has one
-radial term, as a quotient).
+Such a lens has OpenCV's first four terms about the image's centre, with r in units of half the longer side of
+the image; F relates undistorted pixels. `refinement` fits both together to matched points (Fitzgibbon 2001
+has one radial term, as a quotient).
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ def with_lenses(rig: Rig, names: Iterable[str]) -> Rig:
         view = rig[name]
         if name in linked and not isinstance(view, LensView):
             K = intrinsics(max(view.hw) / 2, view.hw)
-            rig = rig.with_camera(name, LensView(hw=view.hw, sensor=view.sensor, K=K, distortion=_no_distortion()))
+            rig = rig.with_camera(
+                name, LensView(hw=view.hw, sensor=view.sensor, K=K, distortion=_no_distortion())
+            )
     return rig
 
 
@@ -43,7 +45,9 @@ def _no_distortion() -> Distortion:
 
 
 def with_lens_of(camera: Camera, view: LensView) -> Camera:
-    """A pinhole camera with the lens of a view of the same centre, whose terms are in units of another length."""
+    """A pinhole camera with the lens of a view of the same centre, whose terms are in units of another
+    length.
+    """
     assert isinstance(view.distortion, Distortion)
     factor = float(camera.K[0, 0] / view.K[0, 0])
     powers = factor ** view.distortion.coefficients.new_tensor([2, 4, 1, 1])

@@ -32,7 +32,9 @@ MATCHED_AT_ONCE = 1024
 ENOUGH = 20
 """Least number of consistent matches for any conclusion."""
 LOCALISED = 1 / 3
-"""Standard deviation of a matched point, pixels, by which its depth is known or not: the middle of the bounds below."""
+"""Standard deviation of a matched point, pixels, by which its depth is known or not: the middle of the bounds
+below.
+"""
 LOCALISATION_BOUNDS = (0.15, 0.2, 0.3, np.inf)
 """Bounds of the standard deviation of points, pixels, estimated from the residuals of patches around them."""
 WELL_LOCALISED = 40
@@ -67,7 +69,8 @@ Images = Mapping[str, Float[Tensor, "_ _ _"]]
 def match_points(alpha: Float[Tensor, "_ h w"], beta: Float[Tensor, "_ hb wb"]) -> PointMatches:
     """Mutually nearest SIFT features of both images' luminance that pass the ratio test.
 
-    Contrast is equalised (CLAHE). Where patches around them correlate, beta's points are refined by least squares.
+    Contrast is equalised (CLAHE). Where patches around them correlate, beta's points are refined by least
+    squares.
     """
     return _match(detect_features(alpha), detect_features(beta))
 
@@ -125,7 +128,9 @@ def _match(a: SiftFeatures, b: SiftFeatures) -> PointMatches:
 
 
 def _well_localised(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """The best localised points, by the first bound that leaves `WELL_LOCALISED` of them; all, if none does."""
+    """The best localised points, by the first bound that leaves `WELL_LOCALISED` of them; all, if none
+    does.
+    """
     for bound in LOCALISATION_BOUNDS:
         if (kept := deviation < bound).sum() >= WELL_LOCALISED:
             return kept
@@ -136,12 +141,15 @@ def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str
     """Matches between the images of every two cameras that are consistent with some fundamental matrix.
 
     With `alpha`, only between that camera's image and each of the others, alpha first.
-    Where there are few, the second image is tried mirrored, to which features are not invariant. Pairs with fewer than
-    20 are left out. Raises ValueError, one line, if no pair is left, for fewer than two images, and for equal ones.
+    Where there are few, the second image is tried mirrored, to which features are not invariant. Pairs with
+    fewer than 20 are left out. Raises ValueError, one line, if no pair is left, for fewer than two images,
+    and for equal ones.
     """
     if len(images) < 2:
         raise ValueError("matching needs the images of two cameras or more: give --image NAME=FILE for each")
-    pairs = list(combinations(images, 2) if alpha is None else ((alpha, name) for name in images if name != alpha))
+    pairs = list(
+        combinations(images, 2) if alpha is None else ((alpha, name) for name in images if name != alpha)
+    )
     total, done = matching_time(images, len(pairs)), 0.0
     features = {}
     for name, image in images.items():
@@ -150,7 +158,9 @@ def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str
         done += matching_time({name: image}, 0)
     for name, own in features.items():
         if len(own.points) < ENOUGH:
-            raise ValueError(f"the image of '{name}' has hardly any texture to match: take one in focus, with detail")
+            raise ValueError(
+                f"the image of '{name}' has hardly any texture to match: take one in focus, with detail"
+            )
     found = {}
     for a, b in pairs:
         log_step(LOG, done / total, "matching %s and %s", a, b)
@@ -164,7 +174,8 @@ def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str
     if not kept:
         (a, b), most = max(found.items(), key=lambda item: len(item[1].alpha))
         raise ValueError(
-            f"only {len(most.alpha)} points seen in both '{a}' and '{b}' agree, {ENOUGH} are needed: do the cameras "
+            f"only {len(most.alpha)} points seen in both '{a}' and '{b}' agree, {ENOUGH} are needed: do the "
+            "cameras "
             "see the same things, at the same time and in focus?"
         )
     return kept
@@ -186,7 +197,9 @@ def _agreeing(a: SiftFeatures, b: SiftFeatures, image: Tensor) -> PointMatches:
 
 
 def agreeing(matches: PointMatches) -> PointMatches:
-    """The matches that some fundamental matrix puts within `AGREE` pixels of their lines; none if there are few."""
+    """The matches that some fundamental matrix puts within `AGREE` pixels of their lines; none if there are
+    few.
+    """
     if len(matches.alpha) >= ENOUGH:
         with suppress(ValueError):
             return near_lines(matches, fit_fundamental(matches), within=AGREE)
@@ -194,13 +207,16 @@ def agreeing(matches: PointMatches) -> PointMatches:
 
 
 def agreeing_pairs(given: Pairs) -> dict[tuple[str, str], PointMatches]:
-    """The consistent matches of pairs that have enough, of matches from elsewhere. Raises ValueError if none has."""
+    """The consistent matches of pairs that have enough, of matches from elsewhere. Raises ValueError if none
+    has.
+    """
     found = {names: agreeing(matches) for names, matches in given.items()}
     kept = {names: matches for names, matches in found.items() if len(matches.alpha) >= ENOUGH}
     if not kept:
         most = max((len(matches.alpha) for matches in found.values()), default=0)
         raise ValueError(
-            f"only {most} of the given matches agree with any rig, {ENOUGH} are needed: are they of these images?"
+            f"only {most} of the given matches agree with any rig, {ENOUGH} are needed: are they of these "
+            "images?"
         )
     return kept
 
@@ -231,8 +247,8 @@ class FittedLink(NamedTuple):
 def fit_link(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float = 6.0) -> FittedLink:
     """Improve `F`, and fit a rough map, by the matches within some pixels of their lines.
 
-    F by MAGSAC++ (Barath et al. 2020) to 1 px; H by `rough_map`. Raises ValueError for fewer than 20 consistent
-    matches.
+    F by MAGSAC++ (Barath et al. 2020) to 1 px; H by `rough_map`. Raises ValueError for fewer than 20
+    consistent matches.
     """
     near = near_lines(matches, F, within=within)
     fitted = fit_fundamental(near) if len(near.alpha) >= ENOUGH else F
@@ -240,20 +256,25 @@ def fit_link(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float = 
 
 
 def with_map(pair: Pair, matches: PointMatches) -> FittedLink:
-    """The pair's F, unchanged, with a rough map of the points near their lines. Raises ValueError for too few."""
+    """The pair's F, unchanged, with a rough map of the points near their lines. Raises ValueError for too
+    few.
+    """
     F = pair.fundamental
     return _with_rough_map(near_lines(undistort_matches(pair, matches), F, within=3), F)
 
 
 def _with_rough_map(matches: PointMatches, F: Tensor) -> FittedLink:
     if len(matches.alpha) < ENOUGH:
-        raise ValueError(f"only {len(matches.alpha)} points seen in both images agree with F: does it belong to them?")
+        raise ValueError(
+            f"only {len(matches.alpha)} points seen in both images agree with F: does it belong to them?"
+        )
     H, displacement = rough_map(matches, F)
     return FittedLink(Link(F, H), matches, displacement)
 
 
 def rough_map(matches: PointMatches, F: Float[Tensor, "3 3"]) -> tuple[Float[Tensor, "3 3"], float]:
-    """A similarity centred on the points along their lines, and the distance that contains 98% of them, pixels.
+    """A similarity centred on the points along their lines, and the distance that contains 98% of them,
+    pixels.
 
     By RANSAC, then shifted along the mean direction of the lines.
     """
@@ -273,9 +294,11 @@ def undistort_matches(pair: Pair, matches: PointMatches) -> PointMatches:
 
 
 def seen_depths(pair: Pair, matches: PointMatches) -> tuple[float, float]:
-    """Depth bounds of the matched points, metres in front of alpha: 0.9 of the nearest to 1.25 of the farthest.
+    """Depth bounds of the matched points, metres in front of alpha: 0.9 of the nearest to 1.25 of the
+    farthest.
 
-    Nearest and farthest without the outermost 2% of the points. Raises ValueError for fewer than 20 points in front.
+    Nearest and farthest without the outermost 2% of the points. Raises ValueError for fewer than 20 points in
+    front.
     """
     undistorted = PointMatches(pair.alpha.undistort(matches.alpha)[0], pair.beta.undistort(matches.beta)[0])
     near = matches.only(line_distance(undistorted, pair.fundamental) <= 3)
@@ -283,7 +306,9 @@ def seen_depths(pair: Pair, matches: PointMatches) -> tuple[float, float]:
     found = triangulate(cameras, torch.stack(near), deviation=LOCALISED, residual=3.0)
     depth = cameras[0].cam_from_world.apply(found.X)[found.valid, 2]
     if len(depth) < ENOUGH:
-        raise ValueError(f"only {len(depth)} points seen in both images fit the calibration: does it belong to them?")
+        raise ValueError(
+            f"only {len(depth)} points seen in both images fit the calibration: does it belong to them?"
+        )
     low, high = _percentiles(depth, 0.02)
     return 0.9 * low, 1.25 * high
 
@@ -309,7 +334,9 @@ def similarity(matches: PointMatches) -> Float[Tensor, "3 3"]:
     return torch.from_numpy(np.vstack([found, [0, 0, 1]]))
 
 
-def _along_lines(matches: PointMatches, F: Float[Tensor, "3 3"], H: Float[Tensor, "3 3"]) -> Float[Tensor, " n"]:
+def _along_lines(
+    matches: PointMatches, F: Float[Tensor, "3 3"], H: Float[Tensor, "3 3"]
+) -> Float[Tensor, " n"]:
     """Signed position of each match along its line, from the point nearest to H x, pixels of beta."""
     line = epipolar_lines(F, matches.alpha)
     from_map = matches.beta - apply_homography(H, matches.alpha).x
@@ -324,7 +351,8 @@ def _percentiles(values: Tensor, share: float) -> tuple[float, float]:
 def _nearest(a: NDArray[np.float32], b: NDArray[np.float32]) -> Int[Tensor, " n"]:
     """For each row of `a` the nearest of `b` if it passes the ratio test, else -1.
 
-    By matrix products, as they are several times faster than OpenCV's matcher; of SIFT's whole numbers they are exact.
+    By matrix products, as they are several times faster than OpenCV's matcher; of SIFT's whole numbers they
+    are exact.
     """
     others = torch.from_numpy(b)
     power = others.square().sum(1)

@@ -18,13 +18,16 @@ from .residuals import match_depths, own_distance, related
 LARGEST_SIDE = 1000
 """Images are reduced to this many pixels..."""
 ROUGH_SIDE = 500
-"""... but first to this many: a rig that fits then is not compared again. That takes a quarter of the time."""
+"""... but first to this many: a rig that fits then is not compared again. That takes a quarter of the time.
+"""
 MOST_CAMERAS = 4
 BADLY, OF_OWN = 1.5, 3.0
-"""A rig fits badly whose points lie farther from their lines than this, in pixels of the reduced images (median), and
-than this many times their distance from the lines of an F fitted to them."""
+"""A rig fits badly whose points lie farther from their lines than this, in pixels of the reduced images
+(median), and than this many times their distance from the lines of an F fitted to them."""
 OUTSIDE = 0.5
-"""And a rig is wrong that has more than this share of the points behind the cameras or outside its depth range..."""
+"""And a rig is wrong that has more than this share of the points behind the cameras or outside its depth
+range...
+"""
 BEYOND = 1.5
 """... by more than this factor."""
 FEW = 10
@@ -34,9 +37,9 @@ FEW = 10
 class Misfit(NamedTuple):
     """How badly a rig fits.
 
-    off: distance of the matched points from their lines (median, pixels of the reduced images). outside: the share of
-    them behind the cameras or outside the depth range. mistaken: the doctor names a mistake, not a drift. text: a
-    sentence on all this, with the doctor's.
+    off: distance of the matched points from their lines (median, pixels of the reduced images). outside: the
+    share of them behind the cameras or outside the depth range. mistaken: the doctor names a mistake, not a
+    drift. text: a sentence on all this, with the doctor's.
     """
 
     off: float
@@ -52,9 +55,11 @@ def misfit_warning(rig: Rig, images: Images) -> str | None:
 
 
 def find_misfit(rig: Rig, images: Images) -> Misfit | None:
-    """What is wrong if the rig fits one image (C, H, W) of each of two or more of its cameras badly; else None.
+    """What is wrong if the rig fits one image (C, H, W) of each of two or more of its cameras badly; else
+    None.
 
-    None too where nothing can be said: too few matched points, images of another size, cameras that are not related.
+    None too where nothing can be said: too few matched points, images of another size, cameras that are not
+    related.
     """
     some = {name: images[name] for name in list(images.keys())[:MOST_CAMERAS]}
     if len(some) < 2 or any(rig[name].hw != tuple(image.shape[1:]) for name, image in some.items()):
@@ -71,7 +76,10 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
         return None
     points = sum(len(matches.alpha) for matches in pairs.values())
     at = "" if _scale(some, LARGEST_SIDE) == 1 else f", in images reduced to {LARGEST_SIDE} px"
-    text = f"the rig fits these images badly: {points} matched points lie {off:.1f} px from their lines (median{at})"
+    text = (
+        f"the rig fits these images badly: {points} matched points lie {off:.1f} px from their lines "
+        f"(median{at})"
+    )
     if outside > OUTSIDE:
         text += f", {outside:.0%} of them behind the cameras or outside the depth range"
     from .doctor import diagnose_matches  # here, as SciPy's statistics take long to import
@@ -82,7 +90,9 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
 
 
 class _Compared(NamedTuple):
-    """Matched points of reduced images: their median distance from their lines (pixels), and `share_outside`."""
+    """Matched points of reduced images: their median distance from their lines (pixels), and
+    `share_outside`.
+    """
 
     rig: Rig
     pairs: Pairs
@@ -96,14 +106,18 @@ def _scale(images: Mapping[str, Tensor], largest: int) -> float:
 
 
 def _compared(rig: Rig, images: Mapping[str, Tensor], largest: int) -> _Compared | None:
-    """Points matched between images whose sides are reduced to that many pixels at most; None if they are too few."""
+    """Points matched between images whose sides are reduced to that many pixels at most; None if they are too
+    few.
+    """
     reduced = {}
     for name, image in images.items():
         h, w = image.shape[1:]
         scale = min(1.0, largest / max(h, w))
         hw = round(h * scale), round(w * scale)
         rig = rig.resize(name, hw)
-        reduced[name] = torch.nn.functional.interpolate(image[None], hw, mode="area")[0] if scale < 1 else image
+        reduced[name] = (
+            torch.nn.functional.interpolate(image[None], hw, mode="area")[0] if scale < 1 else image
+        )
     try:
         pairs = related(rig, match_cameras(reduced))
     except ValueError:
@@ -114,10 +128,12 @@ def _compared(rig: Rig, images: Mapping[str, Tensor], largest: int) -> _Compared
 def share_outside(rig: Rig, pairs: Pairs) -> float:
     """The share of points of observable depth that are behind the cameras or outside the rig's depth range.
 
-    Points of calibrated pairs only: 0 where there is no such pair, NaN for few points. The depth range counts with a
-    margin.
+    Points of calibrated pairs only: 0 where there is no such pair, NaN for few points. The depth range counts
+    with a margin.
     """
-    near, far = (0.0, math.inf) if rig.depth is None else (float(rig.depth[0]) / BEYOND, float(rig.depth[1]) * BEYOND)
+    near, far = (
+        (0.0, math.inf) if rig.depth is None else (float(rig.depth[0]) / BEYOND, float(rig.depth[1]) * BEYOND)
+    )
     outside = []
     for names, matches in pairs.items():
         if (found := match_depths(rig.pair(*names), matches)) is not None:

@@ -17,10 +17,12 @@ from arraygeom.distortion import typical_coefficients
 from arraygeom.pixels import HW
 
 SIGMA = {"rotation": math.radians(0.5), "translation": 0.01, "focal": 0.01, "centre": 5.0, "distortion": 0.02}
-"""Default standard deviations: radians, a share of the longest baseline, a share of the focal length, pixels of the
-principal point, and a share of `typical_coefficients`."""
+"""Default standard deviations: radians, a share of the longest baseline, a share of the focal length, pixels
+of the principal point, and a share of `typical_coefficients`."""
 LARGEST_CHANGE = 4.0
-"""Prior standard deviations by which a parameter may change: beyond, the rig is not the one that the prior is of."""
+"""Prior standard deviations by which a parameter may change: beyond, the rig is not the one that the prior is
+of.
+"""
 UNCERTAIN = ("rotation", "translation", "focal", "centre")
 """Kinds of parameters that are uncertain even where they are not free."""
 ALIASES = {"principal_point": "centre", "focal_length": "focal"}
@@ -43,8 +45,8 @@ LINK_SIGMA = 0.1
 class FreeParameter:
     """One parameter vector: "camera.rotation" and so on, or "alpha > beta" for an F.
 
-    sigma: prior standard deviations. correlation: between neighbouring components (fx and fy change together).
-    unit, factor: the unit for display and the factor that converts to it.
+    sigma: prior standard deviations. correlation: between neighbouring components (fx and fy change
+    together). unit, factor: the unit for display and the factor that converts to it.
     """
 
     name: str
@@ -69,11 +71,13 @@ class FreeParameter:
 def free_parameters(
     rig: Rig, names: Sequence[str], *, free: Iterable[str], sigma: Mapping[str, float] | None = None
 ) -> list[FreeParameter]:
-    """The free parameters of some cameras, the first of which keeps its pose: only relative poses are observable.
+    """The free parameters of some cameras, the first of which keeps its pose: only relative poses are
+    observable.
 
-    `free` holds kinds ("rotation", "translation", "focal", "centre" or "principal_point", "distortion"), or patterns
-    over "camera.kind". `sigma` overrides the standard deviations of `SIGMA` by kind. A link between two of the
-    cameras has its F free, and uncalibrated lenses are free. Raises ValueError for a pattern that matches nothing.
+    `free` holds kinds ("rotation", "translation", "focal", "centre" or "principal_point", "distortion"), or
+    patterns over "camera.kind". `sigma` overrides the standard deviations of `SIGMA` by kind. A link between
+    two of the cameras has its F free, and uncalibrated lenses are free. Raises ValueError for a pattern that
+    matches nothing.
     """
     stated = {ALIASES.get(k, k): v for k, v in (sigma or {}).items()}
     if wrong := [k for k, v in stated.items() if k not in SIGMA or not v > 0]:
@@ -81,7 +85,9 @@ def free_parameters(
     sigma = {**SIGMA, **stated}
     parameters = rig.parameters(free=["*"]) if any(isinstance(rig[n], LensView) for n in names) else {}
     calibrated = {
-        name: like for name, like in parameters.items() if isinstance(rig.cameras.get(_camera_of(name)), Camera)
+        name: like
+        for name, like in parameters.items()
+        if isinstance(rig.cameras.get(_camera_of(name)), Camera)
     }
     wanted = _matching(calibrated, free)
     wanted += [name for name in parameters if name not in calibrated and not name.startswith("depth.")]
@@ -98,7 +104,8 @@ def free_parameters(
 def considered_parameters(
     rig: Rig, names: Sequence[str], free: Sequence[FreeParameter], *, sigma: Mapping[str, float] | None = None
 ) -> list[FreeParameter]:
-    """The poses, focal lengths and principal points of these cameras that are not free but uncertain all the same.
+    """The poses, focal lengths and principal points of these cameras that are not free but uncertain all the
+    same.
 
     Their uncertainty counts, but they are not changed.
     """
@@ -114,7 +121,8 @@ def apply_change(rig: Rig, given: Sequence[FreeParameter], z: Float[Tensor, " n"
     parts = z.split([len(u.sigma) for u in given])
     values = {u.name: u.root.to(part) @ part for u, part in zip(given, parts)}
     links = {
-        names: _perturbed_link(link, values.get(" > ".join(names)), rig, names) for names, link in rig.links.items()
+        names: _perturbed_link(link, values.get(" > ".join(names)), rig, names)
+        for names, link in rig.links.items()
     }
     cameras = {name: value for name, value in values.items() if " > " not in name}
     return rig.perturbed(cameras).replace(links=links)
@@ -133,7 +141,9 @@ def _matching(parameters: Mapping[str, Tensor], free: Iterable[str]) -> list[str
         names = fnmatch.filter(parameters, kind if "." in kind else f"*.{kind}")
         names = [n for n in names if not n.startswith("depth.")]
         if not names:
-            kinds = ", ".join(dict.fromkeys(n.rpartition(".")[2] for n in parameters if not n.startswith("depth.")))
+            kinds = ", ".join(
+                dict.fromkeys(n.rpartition(".")[2] for n in parameters if not n.startswith("depth."))
+            )
             raise ValueError(f"--free: the rig has no '{pattern}' (it has: {kinds})")
         wanted += [n for n in names if n not in wanted]
     return wanted
@@ -160,7 +170,9 @@ def _longest_baseline(rig: Rig) -> float:
 
 
 def _perturbed_link(link: Link, value: Tensor | None, rig: Rig, names: tuple[str, str]) -> Link:
-    """F after seven small changes: rotations of both sets of singular vectors, and of its second singular value."""
+    """F after seven small changes: rotations of both sets of singular vectors, and of its second singular
+    value.
+    """
     if value is None:
         return link
     A, B = (_to_unit(rig[name].hw).to(link.F) for name in names)

@@ -1,7 +1,7 @@
 """Refinement of matched points by least-squares matching of small patches (Gruen 1985).
 
-A patch of alpha is mapped to beta by an affine map, with free brightness and contrast, that Gauss-Newton refines.
-Features are accurate to half a pixel, less where they are large; patches to about a tenth.
+A patch of alpha is mapped to beta by an affine map, with free brightness and contrast, that Gauss-Newton
+refines. Features are accurate to half a pixel, less where they are large; patches to about a tenth.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ def refine_points(
     y: Float[np.ndarray, "n 2"],
     beta_from_alpha: Float[np.ndarray, "n 2 2"],
 ) -> RefinedPoints:
-    """Refine `y` for points `x` of alpha, from rough maps between their neighbourhoods; unchanged where rejected."""
+    """Refine `y` for points `x` of alpha, from rough maps between their neighbourhoods; unchanged where
+    rejected.
+    """
     if not len(x):
         return RefinedPoints(y, np.zeros(0))
     step = np.maximum(1.0, 1 / np.sqrt(np.abs(np.linalg.det(beta_from_alpha))))[:, None, None]
@@ -56,7 +58,9 @@ def refine_points(
     weight = np.exp(-(around**2).sum(1) / (2 * (HALF_PATCH / 1.6) ** 2))
     image = beta.astype(np.float32)
     slopes = [cv2.Sobel(image, cv2.CV_32F, 1 - k, k, ksize=3) / 8 for k in (0, 1)]
-    found = PatchWarps(_sampled(alpha.astype(np.float32), x[:, None] + step * around), y, step * beta_from_alpha)
+    found = PatchWarps(
+        _sampled(alpha.astype(np.float32), x[:, None] + step * around), y, step * beta_from_alpha
+    )
     for _ in range(STEPS):
         found, correlation, moved, deviation = _step(found, [image, *slopes], around, weight)
         if np.quantile(moved, 0.9) < CONVERGED:
@@ -67,14 +71,16 @@ def refine_points(
 
 def _sampled(image: Array, x: Array) -> Array:
     x = x.astype(np.float32)
-    return cv2.remap(image, x[..., 0], x[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT).astype(np.float64)
+    return cv2.remap(image, x[..., 0], x[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT).astype(
+        np.float64
+    )
 
 
 def _step(
     found: PatchWarps, images: list[Array], around: Array, weights: Array
 ) -> tuple[PatchWarps, Array, Array, Array]:
-    """The patches after a step, their correlation before it, how far they moved, and the standard deviation of
-    their positions by the residuals (worse axis, pixels)."""
+    """The patches after a step, their correlation before it, how far they moved, and the standard deviation
+    of their positions by the residuals (worse axis, pixels)."""
     weight = weights / weights.sum()
     at = found.y[:, None] + around @ found.A.swapaxes(1, 2)
     seen, across, down = (_sampled(p, at) for p in images)
@@ -92,4 +98,9 @@ def _step(
     left = ((wanted - gain * seen) ** 2) @ weight
     covariance = np.linalg.inv(H)[:, :2, :2] * (left / weights.sum())[:, None, None]
     deviation = np.sqrt(np.linalg.eigvalsh(covariance)[:, 1])
-    return found._replace(y=found.y + shift, A=found.A + affine), correlation, np.linalg.norm(shift, axis=1), deviation
+    return (
+        found._replace(y=found.y + shift, A=found.A + affine),
+        correlation,
+        np.linalg.norm(shift, axis=1),
+        deviation,
+    )

@@ -1,8 +1,8 @@
 """The photometric error of the fusion as a function of the rig.
 
-C3 attention samples each alpha pixel's segment in beta and returns the weighted value: the error is its difference
-from alpha's own value. Attention determines the position along the segment; the position across it depends on the rig
-alone. Bilinear sampling propagates the gradient to the segments' ends and so to the rig.
+C3 attention samples each alpha pixel's segment in beta and returns the weighted value: the error is its
+difference from alpha's own value. Attention determines the position along the segment; the position across it
+depends on the rig alone. Bilinear sampling propagates the gradient to the segments' ends and so to the rig.
 """
 
 from __future__ import annotations
@@ -46,15 +46,17 @@ PIXELS = 6000
 SHARPNESS = 20.0
 """The inner product of two equal descriptors."""
 WINDOW = 9
-"""Values are relative to the mean and the deviation in windows this wide, for invariance to exposure and filters."""
+"""Values are relative to the mean and the deviation in windows this wide, for invariance to exposure and
+filters.
+"""
 EVEN = 0.02
 """Deviations below this, of images in 0..1, are noise."""
 
 
 @dataclass(frozen=True)
 class PhotometricFrame:
-    """One frame prepared, by camera: the reduced size, features (1, D, H, W) and values (1, 1, H, W) of each pixel,
-    and the grid (h, w, 2) of query pixels."""
+    """One frame prepared, by camera: the reduced size, features (1, D, H, W) and values (1, 1, H, W) of each
+    pixel, and the grid (h, w, 2) of query pixels."""
 
     hw: Mapping[str, tuple[int, int]]
     keys: Mapping[str, Tensor]
@@ -76,7 +78,8 @@ def photometric_errors(
 ) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
     """The error of attention's value against alpha's, at the pixels of the grid, and its validity.
 
-    Differentiable in the rig. Errors are weighted by the square root of attention's largest weight, its confidence.
+    Differentiable in the rig. Errors are weighted by the square root of attention's largest weight, its
+    confidence.
     """
     alpha, beta = names
     for name in names:
@@ -100,7 +103,9 @@ def with_depths(rig: Rig, pairs: Pairs) -> Rig:
         if (pair := rig.pair(*names)).calibrated:
             with suppress(ValueError):
                 bounds.append(seen_depths(pair, matches))
-    return rig.replace(depth=(min(near for near, _ in bounds), max(far for _, far in bounds))) if bounds else rig
+    return (
+        rig.replace(depth=(min(near for near, _ in bounds), max(far for _, far in bounds))) if bounds else rig
+    )
 
 
 def patches(grey: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 25 h w"]:

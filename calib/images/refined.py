@@ -38,7 +38,9 @@ class LineStatistics(NamedTuple):
 
 
 class PhotometricResult(NamedTuple):
-    """The photometric error on held-out pixels before and after its minimisation, and whether that was accepted."""
+    """The photometric error on held-out pixels before and after its minimisation, and whether that was
+    accepted.
+    """
 
     before: float
     after: float
@@ -49,11 +51,11 @@ class PhotometricResult(NamedTuple):
 class Refinement:
     """The result of a refinement.
 
-    rig: the refined one if `accepted`, else the given one. changes: its differences. unobservable: parameters that the
-    images do not determine. held_out: statistics of the points held out, before and after. depth: what happens to
-    depth, for calibrated cameras. objections: why the result should not be accepted. kept: the parameters of
-    combinations that would change depth without being determined. photometric: the photometric error, if it was
-    minimised.
+    rig: the refined one if `accepted`, else the given one. changes: its differences. unobservable: parameters
+    that the images do not determine. held_out: statistics of the points held out, before and after. depth:
+    what happens to depth, for calibrated cameras. objections: why the result should not be accepted. kept:
+    the parameters of combinations that would change depth without being determined. photometric: the
+    photometric error, if it was minimised.
     """
 
     rig: Rig
@@ -81,9 +83,13 @@ class Refinement:
             lines.append(f"fixed, as these images do not determine them: {', '.join(self.unobservable)}")
         if self.kept:
             kept = ", ".join(self.kept)
-            lines.append(f"kept, as they would change depth without the images determining it: combinations of {kept}")
+            lines.append(
+                f"kept, as they would change depth without the images determining it: combinations of {kept}"
+            )
         if self.photometric is not None:
             before, after, accepted = self.photometric
             verdict = "accepted" if accepted else "not accepted"
-            lines.append(f"photometric error on held-out pixels: {before:.4f} before, {after:.4f} after: {verdict}")
+            lines.append(
+                f"photometric error on held-out pixels: {before:.4f} before, {after:.4f} after: {verdict}"
+            )
         return "\n".join(lines)

@@ -4,13 +4,13 @@ The free parameters z, in units of their prior standard deviations (of a calibra
 
     sum_i log(1 + (r_i(z) / s)^2) + sum_k z_k^2
 
-with r the Sampson distances of matched points (Hartley & Zisserman 11.4.3) and s the scale of the points' noise:
-Gauss-Newton steps on automatic derivatives through `arraygeom`, reweighted (Cauchy's loss). What is not free (other
-parameters of the cameras, and what their lens models leave) is uncertain all the same and takes its share of the
-residuals. Parameters that the images do not determine keep their values, and so do combinations of them that would
-change depth without the images determining it (`depth_change`). Held-out points, the prior and the uncertainty of depth
-decide whether the result is accepted. Its posterior is then the prior of a second fit, to the photometric error of the
-fusion: see `photometric`.
+with r the Sampson distances of matched points (Hartley & Zisserman 11.4.3) and s the scale of the points'
+noise: Gauss-Newton steps on automatic derivatives through `arraygeom`, reweighted (Cauchy's loss). What is
+not free (other parameters of the cameras, and what their lens models leave) is uncertain all the same and
+takes its share of the residuals. Parameters that the images do not determine keep their values, and so do
+combinations of them that would change depth without the images determining it (`depth_change`). Held-out
+points, the prior and the uncertainty of depth decide whether the result is accepted. Its posterior is then
+the prior of a second fit, to the photometric error of the fusion: see `photometric`.
 """
 
 from __future__ import annotations
@@ -30,8 +30,25 @@ from arraygeom import Camera, Rig
 from arraygeom.progress import log_step, part, stage
 from arraygeom.threads import torch_in_one_thread
 
-from .depth_change import LARGE_CHANGE, NEGLIGIBLE, DepthChange, depth_modes, log_depths, relative_change, share_behind
-from .held_out import PARTS, held_out_pixels, image_parts, line_distances, line_statistics, median_off, nearer, split
+from .depth_change import (
+    LARGE_CHANGE,
+    NEGLIGIBLE,
+    DepthChange,
+    depth_modes,
+    log_depths,
+    relative_change,
+    share_behind,
+)
+from .held_out import (
+    PARTS,
+    held_out_pixels,
+    image_parts,
+    line_distances,
+    line_statistics,
+    median_off,
+    nearer,
+    split,
+)
 from .least_squares import (
     JoinedResiduals,
     Residuals,
@@ -57,8 +74,8 @@ EXTRA_FREE = ("focal", "translation")
 SYSTEMATIC = 0.3
 """Prior deviation, pixels at the image's corner, of each smooth displacement that a lens model leaves."""
 LARGEST_DISTANCE, OF_OWN = 1.0, 3.0
-"""A refined rig is refused whose held-out points lie farther from their lines than this, in pixels (median), and than
-this many times their distance from the lines of an F fitted to them."""
+"""A refined rig is refused whose held-out points lie farther from their lines than this, in pixels (median),
+and than this many times their distance from the lines of an F fitted to them."""
 AT_BEST = 1.1
 """No more is freed where held-out points are within this factor of their distance from such lines."""
 UNCHANGED = 1e-3
@@ -84,14 +101,15 @@ def refine(
     force: bool = False,
     matches: Sequence[Pairs] | None = None,
 ) -> Refinement:
-    """Refine a rig by points matched in frames, each with an image of every camera; or by given `matches` of them.
+    """Refine a rig by points matched in frames, each with an image of every camera; or by given `matches` of
+    them.
 
-    The first camera that has images keeps its pose. `free` and `sigma` are those of `parameters.free_parameters`; F of
-    links is always free, and views known by F alone are given lenses if held-out points improve. With two frames or
-    more, whole frames are held out, else parts of the image. With `attend` the photometric error of the fusion is then
-    minimised, with the posterior of the points as its prior. `force` accepts a result in spite of objections.
-    Raises ValueError, one line: a camera that the rig lacks, an image of another size than the rig states, equal
-    images, too few points.
+    The first camera that has images keeps its pose. `free` and `sigma` are those of
+    `parameters.free_parameters`; F of links is always free, and views known by F alone are given lenses if
+    held-out points improve. With two frames or more, whole frames are held out, else parts of the image. With
+    `attend` the photometric error of the fusion is then minimised, with the posterior of the points as its
+    prior. `force` accepts a result in spite of objections. Raises ValueError, one line: a camera that the rig
+    lacks, an image of another size than the rig states, equal images, too few points.
     """
     for frame in frames:
         _check(rig, frame)
@@ -124,7 +142,8 @@ def refine_matches(
 ) -> Refinement:
     """`refine` from matched points, without the photometric error.
 
-    Without `keep_depth` the rig's depths are only assumed: they may change in any way, and nothing is refused.
+    Without `keep_depth` the rig's depths are only assumed: they may change in any way, and nothing is
+    refused.
     """
     if not keep_depth:
         problem = RefinementProblem.of(rig, free, frames=frames, sigma=sigma)
@@ -161,7 +180,9 @@ def fitted(
 
 
 def _at_its_best(fit: RefinementProblem, solution: Solution) -> bool:
-    """Whether held-out points of calibrated cameras are as near to their lines as to those of an F fitted to them."""
+    """Whether held-out points of calibrated cameras are as near to their lines as to those of an F fitted to
+    them.
+    """
     if fit.rig.links:
         return False
     rig = fit.after(solution.z)
@@ -170,7 +191,9 @@ def _at_its_best(fit: RefinementProblem, solution: Solution) -> bool:
 
 @dataclass(frozen=True)
 class RefinementProblem:
-    """A rig, its free parameters, those that are uncertain though not free, and the points used and held out."""
+    """A rig, its free parameters, those that are uncertain though not free, and the points used and held
+    out.
+    """
 
     rig: Rig
     parameters: tuple[FreeParameter, ...]
@@ -180,19 +203,30 @@ class RefinementProblem:
 
     @classmethod
     def of(
-        cls, rig: Rig, free: Iterable[str], *, frames: Sequence[Pairs], sigma: Mapping[str, float] | None = None
+        cls,
+        rig: Rig,
+        free: Iterable[str],
+        *,
+        frames: Sequence[Pairs],
+        sigma: Mapping[str, float] | None = None,
     ) -> RefinementProblem:
         """Raises ValueError if nothing is free."""
         used, held_out = split([related(rig, pairs) for pairs in frames])
-        names = [name for name in rig.names if any(name in pair for pairs in (used, held_out) for pair in pairs)]
+        names = [
+            name for name in rig.names if any(name in pair for pairs in (used, held_out) for pair in pairs)
+        ]
         parameters = free_parameters(rig, names, free=free, sigma=sigma)
         if not parameters:
-            raise ValueError("nothing is free: the first camera keeps its pose; free more with --free, such as centre")
+            raise ValueError(
+                "nothing is free: the first camera keeps its pose; free more with --free, such as centre"
+            )
         considered = considered_parameters(rig, names, parameters, sigma=sigma)
         return cls(rig, tuple(parameters), used, held_out, tuple(considered))
 
     def after(self, z: Float[Tensor, " n"]) -> Rig:
-        """The rig after a change of z, in standard deviations; of the considered parameters too if z has them."""
+        """The rig after a change of z, in standard deviations; of the considered parameters too if z has
+        them.
+        """
         given = (*self.parameters, *self.considered)[: len(self.parameters) if len(z) == self.count else None]
         return apply_change(self.rig, given, z)
 
@@ -209,7 +243,8 @@ class RefinementProblem:
     def solve(self) -> Solution:
         """The posterior given the used points, without changes of depth that they do not determine.
 
-        If depth still changes by more than they determine it, without any change of depth that can be avoided.
+        If depth still changes by more than they determine it, without any change of depth that can be
+        avoided.
         """
         systematic = systematic_columns(self.rig, self.used)
         log_step(LOG, 0, "refining %d parameters by %d points", self.count, len(systematic))
@@ -270,14 +305,20 @@ class RefinementProblem:
         tight = noise_scale(residuals(solution.full).detach()) / (UNCHANGED * len(before) ** 0.5)
 
         def constrained(full: Tensor) -> Tensor:
-            return torch.cat([residuals(full), tight * (patterns.T @ (log_depth(full[: self.count]) - before))])
+            return torch.cat(
+                [residuals(full), tight * (patterns.T @ (log_depth(full[: self.count]) - before))]
+            )
 
         start = torch.zeros_like(solution.full)
-        full = most_probable(constrained, start, torch.eye(len(start), dtype=start.dtype)[:, active], steps=12)
+        full = most_probable(
+            constrained, start, torch.eye(len(start), dtype=start.dtype)[:, active], steps=12
+        )
         return solution._replace(z=full[: self.count])
 
     def report(self, solution: Solution, *, force: bool = False) -> Refinement:
-        """The changes by a solution, and whether the held-out points, the prior and depth's uncertainty support it."""
+        """The changes by a solution, and whether the held-out points, the prior and depth's uncertainty
+        support it.
+        """
         refined = self.after(solution.z)
         before, after = (line_distances(rig, self.held_out) for rig in (self.rig, refined))
         held_out = line_statistics(before), line_statistics(after)
@@ -318,7 +359,9 @@ class RefinementProblem:
         all_kinds = ",".join((*FREE, *EXTRA_FREE, "distortion"))
         freed = f"if those may be wrong, --free {all_kinds}"
         what_to_do = freed if rig is self.rig else "state the lenses that were calibrated"
-        return [f"other lenses explain the points as well as other poses, which would change depth: {what_to_do}"]
+        return [
+            f"other lenses explain the points as well as other poses, which would change depth: {what_to_do}"
+        ]
 
     def _depth_change(self, refined: Rig, solution: Solution) -> DepthChange | None:
         """None for uncalibrated rigs and for too few points whose depth is observable."""
@@ -346,7 +389,8 @@ def _contradictions(parameters: Sequence[FreeParameter], z: Tensor) -> list[str]
             size, sigma = (float(v[worst]) * u.factor for v in (change, u.sigma))
             found.append(
                 f"{u.label(worst)} would change by {size:+.3g} {u.unit}, {ratio:.0f} standard deviations of "
-                f"{sigma:.3g}: is something else wrong (`pat rig doctor`)? If so large a change is plausible, say so "
+                f"{sigma:.3g}: is something else wrong (`pat rig doctor`)? If so large a change is "
+                "plausible, say so "
                 "with --sigma"
             )
     return found
@@ -356,7 +400,8 @@ def _remaining(refined: Rig, held_out: Pairs, after: LineStatistics) -> list[str
     """An objection if the refined rig still fits far worse than any F would."""
     if after.median > max(LARGEST_DISTANCE, OF_OWN * own_distance(refined, held_out)):
         return [
-            f"points still lie {after.median:.1f} px from their lines: the rig has not drifted, see `pat rig doctor`"
+            f"points still lie {after.median:.1f} px from their lines: the rig has not drifted, see `pat "
+            "rig doctor`"
         ]
     return []
 
@@ -376,7 +421,8 @@ def _uncertain_depth(depth: DepthChange | None) -> list[str]:
     found = ["depth would be less certain than before"] if depth.after > depth.before else []
     if depth.doubtful:
         found.append(
-            f"depth would change by {depth.change:.1%} but these points determine it to {depth.known:.1%} only"
+            f"depth would change by {depth.change:.1%} but these points determine it to {depth.known:.1%} "
+            "only"
         )
     elif depth.change > LARGE_CHANGE:
         found.append(f"depth would change by {depth.change:.0%}: a rig so far off is better calibrated anew")
@@ -385,7 +431,9 @@ def _uncertain_depth(depth: DepthChange | None) -> list[str]:
 
 def systematic_columns(rig: Rig, pairs: Pairs) -> Float[Tensor, "m s"]:
     """Derivatives of all distances by what the calibrated cameras' lens models leave, in prior deviations."""
-    names = [name for name in rig.names if isinstance(rig[name], Camera) and any(name in pair for pair in pairs)]
+    names = [
+        name for name in rig.names if isinstance(rig[name], Camera) and any(name in pair for pair in pairs)
+    ]
     columns = {name: slice(4 * i, 4 * i + 4) for i, name in enumerate(names)}
     parts = []
     for pair, matches in pairs.items():
@@ -402,8 +450,9 @@ def polish(
 ) -> tuple[Solution, PhotometricResult]:
     """Minimise the photometric error of the fusion, with the solution of the points as its prior.
 
-    Errors are scaled by their own deviation and count as one measurement per `CORRELATED_PIXELS` pixels, as neighbours
-    are correlated. Accepted if the error on held-out pixels falls and held-out points are not significantly worse.
+    Errors are scaled by their own deviation and count as one measurement per `CORRELATED_PIXELS` pixels, as
+    neighbours are correlated. Accepted if the error on held-out pixels falls and held-out points are not
+    significantly worse.
     """
     rig = with_depths(fit.after(solution.z), fit.used)
     base = replace(fit, rig=fit.rig.replace(depth=rig.depth))
@@ -473,7 +522,8 @@ def _changes(parameters: Sequence[FreeParameter], solution: Solution) -> Iterabl
 
 
 def _kept(parameters: Sequence[FreeParameter], solution: Solution) -> Iterable[str]:
-    """As many parameters as there are combinations that keep their values: those with the largest part in them.
+    """As many parameters as there are combinations that keep their values: those with the largest part in
+    them.
 
     They are the same for any basis of these combinations: pivots of an orthogonal decomposition.
     """

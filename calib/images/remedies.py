@@ -1,7 +1,7 @@
 """The usual mistakes in rigs, each with the remedy that undoes it.
 
-A `Remedy` turns the given rig into the rig that is right if that mistake was made. Operations on images that the rig
-does not state (rotation, resizing, cropping) are applied to the rig's camera.
+A `Remedy` turns the given rig into the rig that is right if that mistake was made. Operations on images that
+the rig does not state (rotation, resizing, cropping) are applied to the rig's camera.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ TRANSPOSE = torch.eye(3, dtype=torch.float64)[[1, 0, 2]]
 
 @dataclass(frozen=True)
 class Remedy:
-    """A possible mistake: its kind ("resized", "units", ...), its description in words, and the change that undoes it.
+    """A possible mistake: its kind ("resized", "units", ...), its description in words, and the change that
+    undoes it.
 
     approximate: the change holds numbers that were estimated, and undoes it roughly.
     small: a drift of a calibrated camera's principal point does the same.
@@ -52,14 +53,16 @@ class Remedy:
     def is_plausible(self, rig: Rig) -> bool:
         """Whether a rig may hold this mistake, by its numbers alone.
 
-        Another size and exchanged axes change K by more than a drift does, and take principal points away from the
-        middles of images, not towards them. By points alone a drift is taken for such a mistake now and then: lines of
-        distant narrow views depend on little but the difference of two principal points.
+        Another size and exchanged axes change K by more than a drift does, and take principal points away
+        from the middles of images, not towards them. By points alone a drift is taken for such a mistake now
+        and then: lines of distant narrow views depend on little but the difference of two principal points.
         """
         if self.kind not in ("resized", "x and y exchanged"):
             return True
         views = zip(rig.cameras.values(), self.repair(rig).cameras.values())
-        changed = [(a, b) for a, b in views if a is not b and isinstance(a, LensView) and isinstance(b, LensView)]
+        changed = [
+            (a, b) for a, b in views if a is not b and isinstance(a, LensView) and isinstance(b, LensView)
+        ]
         nearer = all(_centre_offset(b) <= max(_centre_offset(a), OFF_CENTRE) for a, b in changed)
         return nearer and (not changed or any(_beyond_drift(a.K, b.K) for a, b in changed))
 
@@ -109,8 +112,8 @@ def bare_cameras(rig: Rig, names: Iterable[str]) -> dict[str, Camera]:
 def lens_remedy(rig: Rig, names: Iterable[str], k1: float) -> Remedy:
     """Distortion was ignored, and is about `k1` in all cameras that have none.
 
-    With k2 = 1.5 k1^2, as lenses tend to have it (a fisheye's r = theta has 1.8, ordinary wide ones about 1.3): one
-    parameter, and one to one at any radius.
+    With k2 = 1.5 k1^2, as lenses tend to have it (a fisheye's r = theta has 1.8, ordinary wide ones about
+    1.3): one parameter, and one to one at any radius.
     """
     bare = bare_cameras(rig, names)
     words = f"distortion ignored: about k1 = {k1:.3f} in {', '.join(map(repr, bare))}"
@@ -342,7 +345,9 @@ FITS: dict[str, Callable[[HW, HW], Tensor]] = {
 def _to_sizes(
     names: Iterable[str], sizes: Mapping[str, HW], matrix: Callable[[HW, HW], Tensor]
 ) -> Callable[[Rig], Rig]:
-    return partial(on_pixels, names=names, change=lambda name, view: (matrix(view.hw, sizes[name]), sizes[name]))
+    return partial(
+        on_pixels, names=names, change=lambda name, view: (matrix(view.hw, sizes[name]), sizes[name])
+    )
 
 
 def _lenses(rig: Rig, names: list[str]) -> Iterator[Remedy]:
@@ -350,7 +355,9 @@ def _lenses(rig: Rig, names: list[str]) -> Iterator[Remedy]:
     for group, label in _groups(curved):
         drop = partial(on_cameras, names=group, change=lambda camera: camera.replace(distortion=None))
         negate = partial(on_cameras, names=group, change=_opposite_lens)
-        yield Remedy("distortion", f"images of {label} are undistorted already: distortion applied twice", drop)
+        yield Remedy(
+            "distortion", f"images of {label} are undistorted already: distortion applied twice", drop
+        )
         yield Remedy("distortion", f"distortion of {label} with the wrong sign (the inverse map)", negate)
 
 

@@ -33,7 +33,9 @@ class EpipolarResiduals(NamedTuple):
 
 
 class MatchDepths(NamedTuple):
-    """Depth in alpha (metres) of matched points, whether they are in front of both cameras, and observable."""
+    """Depth in alpha (metres) of matched points, whether they are in front of both cameras, and
+    observable.
+    """
 
     depth: Float[Tensor, "*b n"]
     front: Bool[Tensor, "*b n"]
@@ -47,8 +49,8 @@ LEAST_PARALLAX = 2.0
 def epipolar_residuals(pair: Pair, matches: PointMatches) -> EpipolarResiduals:
     """The algebraic error x_beta^T F x_alpha divided by its gradient in the pixels, which counts as constant.
 
-    With cameras, rays replace pixels and E replaces F, so that lenses are respected to first order in the distance.
-    Raises ValueError if neither cameras nor F are known.
+    With cameras, rays replace pixels and E replaces F, so that lenses are respected to first order in the
+    distance. Raises ValueError if neither cameras nor F are known.
     """
     return _residuals(pair, matches)[0]
 
@@ -67,7 +69,9 @@ def residuals_and_depths(pair: Pair, matches: PointMatches) -> tuple[EpipolarRes
 
 
 def match_depths(pair: Pair, matches: PointMatches) -> MatchDepths | None:
-    """Depths where the rays are closest to each other, differentiable in the rig; None for uncalibrated pairs."""
+    """Depths where the rays are closest to each other, differentiable in the rig; None for uncalibrated
+    pairs.
+    """
     if not pair.calibrated or pair.link is not None:
         return None
     (a, b), _, valid = _rays(pair, *_for_each(pair, matches))
@@ -77,8 +81,8 @@ def match_depths(pair: Pair, matches: PointMatches) -> MatchDepths | None:
 def systematic_modes(pair: Pair, matches: PointMatches) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
     """Derivatives of the Sampson distances by smooth displacements of alpha's points, and of beta's.
 
-    The displacements are what a lens model leaves, each 1 pixel at the image's corner: radial, of third and fifth
-    order, and decentred along x and along y.
+    The displacements are what a lens model leaves, each 1 pixel at the image's corner: radial, of third and
+    fifth order, and decentred along x and along y.
     """
     alpha, beta = (x.detach().requires_grad_() for x in matches)
     with torch.enable_grad():
@@ -98,7 +102,9 @@ def displacements(hw: HW, points: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2 4"
     p = (points - points.new_tensor([(w - 1) / 2, (h - 1) / 2])) / (0.5 * math.hypot(h, w))
     x, y = p.unbind(-1)
     r2 = (p * p).sum(-1, keepdim=True)
-    decentred = [torch.stack(v, -1) / 3 for v in ((3 * x * x + y * y, 2 * x * y), (2 * x * y, x * x + 3 * y * y))]
+    decentred = [
+        torch.stack(v, -1) / 3 for v in ((3 * x * x + y * y, 2 * x * y), (2 * x * y, x * x + 3 * y * y))
+    ]
     return torch.stack([r2 * p, r2 * r2 * p, *decentred], -1)
 
 
@@ -110,7 +116,10 @@ def _residuals(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, tu
         at_alpha, at_beta = torch.autograd.grad(algebraic.sum(), (alpha, beta), retain_graph=True)
     across = at_beta.square().sum(-1)
     both = (across + at_alpha.square().sum(-1)).clamp(min=1e-300)
-    return EpipolarResiduals(algebraic / both.sqrt(), algebraic / across.clamp(min=1e-300).sqrt(), valid), (a, b)
+    return EpipolarResiduals(algebraic / both.sqrt(), algebraic / across.clamp(min=1e-300).sqrt(), valid), (
+        a,
+        b,
+    )
 
 
 def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
@@ -140,10 +149,18 @@ def _depths(pair: Pair, a: Tensor, b: Tensor, valid: Tensor) -> MatchDepths:
 
 
 def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
-    """Those of the pairs that the rig relates: calibrated ones and those with an F. Raises ValueError if none."""
-    found = {names: m for names, m in pairs.items() if (pair := rig.pair(*names)).calibrated or pair.link is not None}
+    """Those of the pairs that the rig relates: calibrated ones and those with an F. Raises ValueError if
+    none.
+    """
+    found = {
+        names: m
+        for names, m in pairs.items()
+        if (pair := rig.pair(*names)).calibrated or pair.link is not None
+    }
     if not found:
-        raise ValueError("the rig does not relate these cameras: calibrate them, or make a rig with `pat rig start`")
+        raise ValueError(
+            "the rig does not relate these cameras: calibrate them, or make a rig with `pat rig start`"
+        )
     return found
 
 
@@ -174,7 +191,9 @@ def _stacked(views: Sequence[View]) -> View:
 
 def _for_each(pair: Pair, matches: PointMatches) -> tuple[Tensor, Tensor]:
     """The points expanded to a batch of rigs."""
-    numbers = pair.link.F if pair.link is not None else pair.cameras[0].K if pair.calibrated else pair.fundamental
+    numbers = (
+        pair.link.F if pair.link is not None else pair.cameras[0].K if pair.calibrated else pair.fundamental
+    )
     x, y = (points.expand(*numbers.shape[:-2], *points.shape[-2:]) for points in matches)
     return x, y
 
@@ -189,7 +208,9 @@ def _rays(pair: Pair, x: Tensor, y: Tensor) -> tuple[tuple[Tensor, Tensor], Tens
 
 
 def own_distance(rig: Rig, pairs: Pairs) -> float:
-    """How near points can be to any lines: median distance, undistorted pixels, from those of an F fitted to them."""
+    """How near points can be to any lines: median distance, undistorted pixels, from those of an F fitted to
+    them.
+    """
     found = []
     for names, matches in pairs.items():
         undistorted = undistort_matches(rig.pair(*names), matches)

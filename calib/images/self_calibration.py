@@ -1,7 +1,9 @@
-"""Calibrated pairs from images alone: focal lengths as given or assumed, poses and the rest from matched points.
+"""Calibrated pairs from images alone: focal lengths as given or assumed, poses and the rest from matched
+points.
 
-Points determine the epipolar lines, and those are as good as with a calibration. They do not determine the scale of the
-scene, and focal lengths only poorly: depths are multiples of the baseline, and proportional to what is assumed.
+Points determine the epipolar lines, and those are as good as with a calibration. They do not determine the
+scale of the scene, and focal lengths only poorly: depths are multiples of the baseline, and proportional to
+what is assumed.
 """
 
 from __future__ import annotations
@@ -17,7 +19,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import Camera, LensView, Link, Pair, Pose, Rig, View, intrinsics, rotation_from_vector, triangulate
+from arraygeom import (
+    Camera,
+    LensView,
+    Link,
+    Pair,
+    Pose,
+    Rig,
+    View,
+    intrinsics,
+    rotation_from_vector,
+    triangulate,
+)
 from arraygeom.pixels import HW, map_homogeneous
 from arraygeom.robust import cauchy, least_squares, normal_deviation, robust_least_squares
 from arraygeom.text import angle
@@ -35,26 +48,27 @@ FOCAL_SHARE = 1.2
 """The focal length that is assumed, as a share of the image's longer side: that of a view 45 degrees wide."""
 SIGMA = {"rotation": math.radians(3), "translation": 0.3, "focal": 0.05}
 CENTRE_SHARE = 0.05
-"""Standard deviations of what is assumed: radians, a share of the baseline, of the focal length; of the principal
-point, as a share of the longer side."""
+"""Standard deviations of what is assumed: radians, a share of the baseline, of the focal length; of the
+principal point, as a share of the longer side."""
 SHORTEST = 1e-12
 """Least length of a baseline of 1 after refinement: the direction of a shorter one is rounding."""
 NEAR_LINE = 2.0
 """Points this near to their lines, in pixels, are used."""
 AS_GOOD = 1.5
 SLACK = 0.1
-"""A calibrated pair is accepted if points are at most `AS_GOOD` times as far from its lines as from those of F alone,
-and `SLACK` pixels more."""
+"""A calibrated pair is accepted if points are at most `AS_GOOD` times as far from its lines as from those of
+F alone, and `SLACK` pixels more."""
 ALIKE = 8.0
 ALIKE_SLACK = 0.03
-"""Poses whose points are farther from their lines than those of the best by no more than this, over the root of the
-points' number, as a share, and so many pixels more, are alike: points do not distinguish a rotation from a translation
-where they are few or far. The smallest rotation is taken."""
+"""Poses whose points are farther from their lines than those of the best by no more than this, over the root
+of the points' number, as a share, and so many pixels more, are alike: points do not distinguish a rotation
+from a translation where they are few or far. The smallest rotation is taken."""
 OUTLYING = 8.0
 """Inverse depths this many times their median deviation from the median are of wrong matches."""
 MARGIN, LEAST_MARGIN = 1.0, 0.12
-"""Depth bounds extend the range of the inverse depths of points by this share of it, and by at least this share of
-beta's longer side, as a disparity: points may all be on one surface, and too wide a range hardly costs quality."""
+"""Depth bounds extend the range of the inverse depths of points by this share of it, and by at least this
+share of beta's longer side, as a disparity: points may all be on one surface, and too wide a range hardly
+costs quality."""
 DENSE_POINTS = 2000
 SPACING = 4
 """Dense points at most, and their least distance, pixels."""
@@ -68,8 +82,9 @@ WELL_LOCALISED = 0.3
 class RefinedPair(NamedTuple):
     """A calibrated pair as a rig of two cameras, with the depth range of the points that determine it.
 
-    points: their number. distance: their median distance from their lines, pixels of beta. exact: whether these lines
-    fit as well as those of F alone; if not, the rig is good for rough depths, and the lines are to be F's.
+    points: their number. distance: their median distance from their lines, pixels of beta. exact: whether
+    these lines fit as well as those of F alone; if not, the rig is good for rough depths, and the lines are
+    to be F's.
     """
 
     rig: Rig
@@ -82,23 +97,34 @@ class RefinedPair(NamedTuple):
 def self_calibrated(
     views: Mapping[str, View], link: Link, matches: PointMatches, *, focal: Mapping[str, float]
 ) -> RefinedPair | None:
-    """Two cameras (alpha, beta) whose epipolar lines are those of `link`, as nearly as can be; None for points without
-    parallax.
+    """Two cameras (alpha, beta) whose epipolar lines are those of `link`, as nearly as can be; None for
+    points without parallax.
 
-    Alpha is at the origin with the principal point in the middle, and the baseline is 1. `focal` has focal lengths in
-    pixels, by camera; others are assumed. Cameras have the lenses of their views; the pair then is not `exact`.
+    Alpha is at the origin with the principal point in the middle, and the baseline is 1. `focal` has focal
+    lengths in pixels, by camera; others are assumed. Cameras have the lenses of their views; the pair then is
+    not `exact`.
     """
     alpha, beta = views
     if not has_parallax(matches, views[alpha].hw):
         return None
-    lenses = {name: view for name, view in views.items() if isinstance(view, LensView) and view.distortion is not None}
+    lenses = {
+        name: view
+        for name, view in views.items()
+        if isinstance(view, LensView) and view.distortion is not None
+    }
     matches = _without_lenses(list(views.values()), matches)
-    K = {name: intrinsics(length, views[name].hw) for name, length in _focal_lengths(views, link, focal).items()}
+    K = {
+        name: intrinsics(length, views[name].hw)
+        for name, length in _focal_lengths(views, link, focal).items()
+    }
     near = near_lines(matches, link.F, within=NEAR_LINE)
     best = AS_GOOD * float(line_distance(near, link.F).median()) + SLACK
     trials: list[RefinedPair] = []
     for pose in initial_poses(near, link, K[alpha], K[beta]):
-        cameras = {alpha: _camera(views[alpha], K[alpha], Pose.identity()), beta: _camera(views[beta], K[beta], pose)}
+        cameras = {
+            alpha: _camera(views[alpha], K[alpha], Pose.identity()),
+            beta: _camera(views[beta], K[beta], pose),
+        }
         LOG.info("calibrating %s and %s, pose %d", alpha, beta, len(trials) + 1)
         trial = _refined_pair(Rig(cameras), matches, near, fixed=("centre",) if lenses else ())
         if trial is not None:
@@ -107,7 +133,9 @@ def self_calibrated(
         return None
     least = min(trial.distance for trial in trials)
     fitting = [t for t in trials if t.distance <= (1 + ALIKE / math.sqrt(t.points)) * least + ALIKE_SLACK]
-    found = min(fitting, key=lambda trial: float(angle(_pair(trial.rig).beta_from_alpha.R.T @ _upright(link))))
+    found = min(
+        fitting, key=lambda trial: float(angle(_pair(trial.rig).beta_from_alpha.R.T @ _upright(link)))
+    )
     rig = found.rig
     for name, view in lenses.items():
         rig = rig.with_camera(name, with_lens_of(_pair(rig).cameras[rig.names.index(name)], view))
@@ -115,10 +143,11 @@ def self_calibrated(
 
 
 def has_parallax(matches: PointMatches, hw: HW) -> bool:
-    """Whether points of alpha, an image of this size, move in a way that lenses and a rotation do not explain.
+    """Whether points of alpha, an image of this size, move in a way that lenses and a rotation do not
+    explain.
 
-    Those move all points by one smooth map, here a cubic one as radial distortion is; so does a plane, whose depths
-    two images of unknown lenses do not determine.
+    Those move all points by one smooth map, here a cubic one as radial distortion is; so does a plane, whose
+    depths two images of unknown lenses do not determine.
     """
     x, y = (2 * (matches.alpha - matches.alpha.new_tensor(hw).flip(0) / 2) / max(hw)).unbind(-1)
     terms = torch.stack([x**i * y**j for i in range(4) for j in range(4 - i)])
@@ -151,7 +180,8 @@ def refined_by_depth(
 ) -> RefinedPair:
     """The pair refined by dense matches: where a fusion found alpha's pixels, improved by least squares.
 
-    `images`, `depth` and `confidence` are of the sizes of the pair's cameras. The same pair if there are too few.
+    `images`, `depth` and `confidence` are of the sizes of the pair's cameras. The same pair if there are too
+    few.
     """
     matches = dense_matches(pair.rig, images, depth, confidence)
     if len(matches.alpha) < 5 * ENOUGH:
@@ -165,7 +195,8 @@ UNSCALED = "found from images: lengths are multiples of the baseline, not metres
 
 
 def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig:
-    """One rig of pairs with the same alpha, by beta; each pair's lengths times its scale. Its name is `UNSCALED`.
+    """One rig of pairs with the same alpha, by beta; each pair's lengths times its scale. Its name is
+    `UNSCALED`.
 
     The depth range is that of all pairs.
     """
@@ -227,7 +258,9 @@ def depth_bounds(rig: Rig, matches: PointMatches) -> tuple[float, float] | None:
 def _focal_lengths(views: Mapping[str, View], link: Link, focal: Mapping[str, float]) -> dict[str, float]:
     """Focal lengths in pixels: as given, or by the ratio of the image scales to the other's, or assumed."""
     alpha, beta = views
-    ratio = 1.0 if link.H is None else float(torch.linalg.det(link.H[:2, :2]).abs().sqrt() / link.H[2, 2].abs())
+    ratio = (
+        1.0 if link.H is None else float(torch.linalg.det(link.H[:2, :2]).abs().sqrt() / link.H[2, 2].abs())
+    )
     assumed = focal[beta] / ratio if beta in focal else FOCAL_SHARE * max(views[alpha].hw)
     own = focal.get(alpha, assumed)
     return {alpha: own, beta: focal.get(beta, own * ratio)}
@@ -236,7 +269,9 @@ def _focal_lengths(views: Mapping[str, View], link: Link, focal: Mapping[str, fl
 def initial_poses(
     matches: PointMatches, link: Link, K: Float[Tensor, "3 3"], K_beta: Float[Tensor, "3 3"]
 ) -> list[Pose]:
-    """Poses of beta, with baselines of 1, from which to fit: of parallel axes, by F, and by an essential matrix."""
+    """Poses of beta, with baselines of 1, from which to fit: of parallel axes, by F, and by an essential
+    matrix.
+    """
     return [*_lateral_poses(matches, _upright(link), K, K_beta), *_poses(matches, link.F, K, K_beta)]
 
 
@@ -254,7 +289,9 @@ def _poses(matches: PointMatches, F: Tensor, K: Tensor, K_beta: Tensor) -> list[
 
 
 def _upright(link: Link) -> Float[Tensor, "3 3"]:
-    """The rotation about the axis, in steps of 90 degrees, by which beta's image is rotated against alpha's."""
+    """The rotation about the axis, in steps of 90 degrees, by which beta's image is rotated against
+    alpha's.
+    """
     H = torch.eye(3) if link.H is None else link.H
     steps = round(math.atan2(float(H[1, 0] / H[2, 2]), float(H[0, 0] / H[2, 2])) / (math.pi / 2))
     return rotation_from_vector(torch.tensor([0.0, 0.0, steps * math.pi / 2], dtype=torch.float64))
@@ -290,7 +327,9 @@ def _refined_pair(
     bounds = depth_bounds(refined, near)
     if bounds is None:
         return None
-    return RefinedPair(refined.replace(depth=bounds), len(near.alpha), median_off(refined, {(alpha, beta): near}))
+    return RefinedPair(
+        refined.replace(depth=bounds), len(near.alpha), median_off(refined, {(alpha, beta): near})
+    )
 
 
 def _unit_baseline(rig: Rig) -> Rig:

@@ -1,1 +1,3 @@
-"""The tables of the documentation: the paper's protocols, conditions, certainty, sweeps of calibration, every field."""
+"""The tables of the documentation: the paper's protocols, conditions, certainty, sweeps of calibration, every
+field.
+"""

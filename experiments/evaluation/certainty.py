@@ -1,8 +1,9 @@
 """How well stated certainty holds, and the fit of it: `python -m experiments certainty --middlebury DIR`.
 
-Pairs with true disparity are fused under many conditions: how often are matches right that are stated to be so with
-some probability, and how many true positions lie in the interval of 9 of 10? With `--fit FILE` a network is fitted to
-these pairs and written; the tables are then of three fits, each judged by the third of the pairs that it did not see.
+Pairs with true disparity are fused under many conditions: how often are matches right that are stated to be
+so with some probability, and how many true positions lie in the interval of 9 of 10? With `--fit FILE` a
+network is fitted to these pairs and written; the tables are then of three fits, each judged by the third of
+the pairs that it did not see.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ STEPS, BATCH, RATE, DECAY = 2000, 4096, 1e-2, 5e-2
 
 
 class Judged(NamedTuple):
-    """Some pixels (n) of a pair under a condition: what certainty is read off, whether the match is right, and the
-    error of depth in pixels."""
+    """Some pixels (n) of a pair under a condition: what certainty is read off, whether the match is right,
+    and the error of depth in pixels."""
 
     pair: str
     condition: str
@@ -52,7 +53,9 @@ class Judged(NamedTuple):
 
 
 class Stated(NamedTuple):
-    """What is stated of pixels (n): the probability that the match is right, the half-width of the interval."""
+    """What is stated of pixels (n): the probability that the match is right, the half-width of the
+    interval.
+    """
 
     probability: Float[Tensor, " n"]
     half_width: Float[Tensor, " n"]
@@ -87,7 +90,9 @@ class Reliability(NamedTuple):
         return float(((self.stated - self.right).abs() * self.share).sum())
 
 
-def judged(network: FusionNetwork, pairs: Iterable[StereoPair], conditions: Sequence[str]) -> Iterator[Judged]:
+def judged(
+    network: FusionNetwork, pairs: Iterable[StereoPair], conditions: Sequence[str]
+) -> Iterator[Judged]:
     """Every pair with true disparity under every condition, fused as `fuse` does."""
     for pair in pairs:
         if pair.disparity is not None:
@@ -122,7 +127,9 @@ def judged_pair(network: FusionNetwork, pair: StereoPair, condition: str) -> Jud
 
 def fitted(found: Sequence[Judged], *, steps: int = STEPS) -> CertaintyNetwork:
     """The network that states of all of these together what they ask for."""
-    numbers, right, error = (torch.cat([getattr(j, name) for j in found]) for name in ("numbers", "right", "error"))
+    numbers, right, error = (
+        torch.cat([getattr(j, name) for j in found]) for name in ("numbers", "right", "error")
+    )
     middle, spread = numbers.mean(0), numbers.std(0) + 1e-6
     farness = error.clamp(min=0.02).log()
     with torch.random.fork_rng():
@@ -155,8 +162,9 @@ def by_thirds(found: Sequence[Judged], *, steps: int = STEPS) -> Callable[[Judge
 
 
 def widened(found: Sequence[Judged], *, steps: int = STEPS) -> CertaintyNetwork:
-    """The fit to all, its intervals as much wider as makes those of `by_thirds` cover what they are to (conformal
-    prediction, Romano et al. 2019): other pairs are always a little farther off than those that were fitted to."""
+    """The fit to all, its intervals as much wider as makes those of `by_thirds` cover what they are to
+    (conformal prediction, Romano et al. 2019): other pairs are always a little farther off than those that
+    were fitted to."""
     stating, network = by_thirds(found, steps=steps), fitted(found, steps=steps)
     share = torch.cat([one.error / stating(one).half_width for one in found]).quantile(SETTINGS.covered)
     network.last.bias[1] += share.log()
@@ -164,7 +172,9 @@ def widened(found: Sequence[Judged], *, steps: int = STEPS) -> CertaintyNetwork:
 
 
 class Held(NamedTuple):
-    """How it held under a condition: the stated probability, and the share of true positions in the intervals."""
+    """How it held under a condition: the stated probability, and the share of true positions in the
+    intervals.
+    """
 
     stated: Reliability
     covered: float

@@ -42,7 +42,9 @@ class Pairs(authors.Evaluate):
         """All of them. Raises ValueError if there is none."""
         found = [pair for pairs in self.sets().values() for pair in pairs]
         if not found:
-            raise ValueError(f"--half {self.half}: no pair belongs to that half: give more pairs, or the other half")
+            raise ValueError(
+                f"--half {self.half}: no pair belongs to that half: give more pairs, or the other half"
+            )
         return found
 
 
@@ -56,8 +58,8 @@ class Evaluate(Pairs):
     protocol: Literal["table1", "table2"] = "table1"
     """The paper's: mono + colour (table1), or mono + three bands (table2)."""
     as_authors: bool = False
-    """As the paper's code tests: images of half the size (its "x2" and its "x4"), rows of 80 pixels without the pixel
-    itself. Give --rates 2."""
+    """As the paper's code tests: images of half the size (its "x2" and its "x4"), rows of 80 pixels without
+    the pixel itself. Give --rates 2."""
     controls: bool = False
     """Also fuse without beta, with another scene's, and with shuffled fields: the fusion must get worse."""
     without_rig: bool = False
@@ -82,7 +84,9 @@ class Evaluate(Pairs):
         fusion = protocols.rectified_fusion(network, bands=bands, field=field)
         methods = {**protocols.BASELINES, "fusion": fusion, **compared}
         rows = stereo.evaluate_sets(sets, methods, self.rates, out=self.out)
-        printed = {name: scores for (protocol, name), scores in paper.PRINTED.items() if protocol == self.protocol}
+        printed = {
+            name: scores for (protocol, name), scores in paper.PRINTED.items() if protocol == self.protocol
+        }
         text = stereo.sets_markdown(rows, printed=printed)
         if compared:
             text += "\n" + paper.falls([row for found in rows.values() for row in found], names=compared)
@@ -111,7 +115,9 @@ class Conditions(Pairs):
         names = self.only or tuple(conditions.CONDITIONS)
         unknown = [name for name in names if name not in conditions.CONDITIONS]
         if unknown:
-            raise ValueError(f"--only: no condition '{unknown[0]}': there are {', '.join(conditions.CONDITIONS)}")
+            raise ValueError(
+                f"--only: no condition '{unknown[0]}': there are {', '.join(conditions.CONDITIONS)}"
+            )
         pairs, network = self.pairs(), load_weights(self.weights)
         rows = conditions.evaluate_conditions(pairs, network, names, progress=options.progress("evaluating"))
         text = conditions.conditions_markdown(rows)
@@ -137,7 +143,9 @@ class Outside(Pairs):
 
         pairs = [pair for pair in self.pairs() if pair.disparity is not None]
         if not pairs:
-            raise ValueError(f"--half {self.half}: none of its pairs has a true disparity: give the other half")
+            raise ValueError(
+                f"--half {self.half}: none of its pairs has a true disparity: give the other half"
+            )
         shown = options.progress("evaluating")(pairs, len(pairs))
         text = outside_markdown(evaluate_outside(shown, load_weights(self.weights)))
         write_text(self.out / "outside.md", text)
@@ -179,11 +187,16 @@ class Certainty:
         if unknown:
             raise ValueError(f"--conditions: no condition '{unknown[0]}': there are {', '.join(CONDITIONS)}")
         writable(self.out, folder=True)
-        pairs, network = list(of_half(middlebury_pairs(self.middlebury), self.half)), load_weights(self.weights)
+        pairs, network = (
+            list(of_half(middlebury_pairs(self.middlebury), self.half)),
+            load_weights(self.weights),
+        )
         shown = options.progress("fusing")(pairs, len(pairs))
         found = list(certainty.judged(network, shown, names))
         if not found:
-            raise ValueError(f"--half {self.half}: none of its pairs has a true disparity: give the other half")
+            raise ValueError(
+                f"--half {self.half}: none of its pairs has a true disparity: give the other half"
+            )
         if self.fit:
             write_tensors(self.fit, certainty.widened(found).state_dict())
             held = certainty.held(found, certainty.by_thirds(found))
@@ -211,7 +224,9 @@ class OnScenes:
     """Folder for ablation.md, its figures and its numbers."""
 
     def comparing(self, fields: Iterable[str]) -> Comparing:
-        """The network, once it is known that its attention alone finds the points and that there are such fields."""
+        """The network, once it is known that its attention alone finds the points and that there are such
+        fields.
+        """
         from pat.networks.protocol import Comparing
         from pat.networks.weights import load_weights
 
@@ -224,7 +239,8 @@ class OnScenes:
         network: Network = load_weights(self.weights)
         if not isinstance(network, Comparing):
             raise ValueError(
-                f"--weights {self.weights}: this network matches without attention, too: `pat ablate` takes it"
+                f"--weights {self.weights}: this network matches without attention, too: `pat ablate` takes "
+                "it"
             )
         if network.betas not in (1, 3):
             wanted = "give some for one beta in colour, or for three with a band each"
@@ -239,10 +255,12 @@ class OnScenes:
 
 @dataclass
 class Sweeps(OnScenes):
-    """What calibration is worth as it gets wrong or the rig changes: one network, each field, the same scenes.
+    """What calibration is worth as it gets wrong or the rig changes: one network, each field, the same
+    scenes.
 
-    Curves of calibrated segments, images that are rectified and the result warped back, rows, a local window and all
-    of beta, on layered scenes with exact positions. Example: python -m experiments sweeps --sweeps rotation ahead
+    Curves of calibrated segments, images that are rectified and the result warped back, rows, a local window
+    and all of beta, on layered scenes with exact positions. Example: python -m experiments sweeps --sweeps
+    rotation ahead
     """
 
     sweeps: tuple[str, ...] = ()
@@ -253,7 +271,9 @@ class Sweeps(OnScenes):
     """Of the scenes."""
 
     def run(self) -> None:
-        """Write ablation.md, .json, .svg and .png, and print the table. Raises ValueError for a sweep that is none."""
+        """Write ablation.md, .json, .svg and .png, and print the table. Raises ValueError for a sweep that is
+        none.
+        """
         from pat.synthesis.photos import PhotoBank
 
         from .sweep_report import write_report
@@ -264,19 +284,25 @@ class Sweeps(OnScenes):
         rigs = list(points(self.sweeps or tuple(SWEEPS), hw=self.hw))
         bank = PhotoBank.load(*self.photos) if self.photos else None
         shown = options.progress("ablating")(rigs, len(rigs))
-        write_report(ablate(network, shown, fields, scenes=self.scenes, photos=bank, seed=self.seed), self.out)
+        write_report(
+            ablate(network, shown, fields, scenes=self.scenes, photos=bank, seed=self.seed), self.out
+        )
         self.say_written()
 
 
 @dataclass
 class Fields(OnScenes):
-    """Every field of the toolkit, with time and memory: unrectified scenes, rectified pairs, the same with F alone."""
+    """Every field of the toolkit, with time and memory: unrectified scenes, rectified pairs, the same with F
+    alone.
+    """
 
     middlebury: MaybePath = None
     """Folder of Middlebury's pairs with true disparity; those of the report half."""
 
     def run(self) -> None:
-        """Write ablation.md, .csv and peaks.png (where attention is largest in three pictures); print the table."""
+        """Write ablation.md, .csv and peaks.png (where attention is largest in three pictures); print the
+        table.
+        """
         from arraygeom.atomic import write_text
         from pat.data.pairs import middlebury_pairs
         from pat.evaluation.ablation import sample_photographs
@@ -310,7 +336,9 @@ class Fields(OnScenes):
 
 @dataclass
 class Patches:
-    """Draw the paper's patches of rendered scenes: recorded images, segments of some pixels, ground truth and depth."""
+    """Draw the paper's patches of rendered scenes: recorded images, segments of some pixels, ground truth and
+    depth.
+    """
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder written by `pat render`.")]
     out: Out = Path("out/patches.png")

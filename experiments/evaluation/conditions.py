@@ -1,7 +1,7 @@
 """Fusion under what real cameras do: other responses, exposures, noise, misalignment; by region, with depth.
 
-Each rectified colour pair is recorded under each condition: left as the mono alpha, right, reduced, as the colour
-beta. The ground truth is left in colour.
+Each rectified colour pair is recorded under each condition: left as the mono alpha, right, reduced, as the
+colour beta. The ground truth is left in colour.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ class Recording(NamedTuple):
 class Condition:
     """How a pair is recorded, with beta reduced `rate` times.
 
-    right: applied to the right image (C, H, W) before it is reduced; alpha: weights of red, green and blue in alpha;
-    beta: applied to beta; noise: of both cameras.
+    right: applied to the right image (C, H, W) before it is reduced; alpha: weights of red, green and blue in
+    alpha; beta: applied to beta; noise: of both cameras.
     """
 
     rate: int = 2
@@ -99,7 +99,9 @@ def _moved(rows: float = 0.0, degrees: float = 0.0) -> Callable[[Tensor], Tensor
     def moved(image: Tensor) -> Tensor:
         h, w = image.shape[-2:]
         c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-        y, x = torch.meshgrid(torch.arange(h) - (h - 1) / 2 - rows, torch.arange(w) - (w - 1) / 2, indexing="ij")
+        y, x = torch.meshgrid(
+            torch.arange(h) - (h - 1) / 2 - rows, torch.arange(w) - (w - 1) / 2, indexing="ij"
+        )
         columns = (c * x + s * y + (w - 1) / 2).clamp(0, w - 1)
         lines = (c * y - s * x + (h - 1) / 2).clamp(0, h - 1)
         where = torch.stack([columns, lines], -1).reshape(1, -1, 2)
@@ -146,8 +148,8 @@ CONDITIONS: dict[str, Condition] = {
 class ConditionRow(NamedTuple):
     """One method on one pair under one condition: PSNR by region (None: no such pixels), SSIM, and depth.
 
-    `end_point_error` (pixels) and `within_one` (shares of pixels whose truth is known: of all, of seen ones) are None
-    without a true disparity, or where the method gives none.
+    `end_point_error` (pixels) and `within_one` (shares of pixels whose truth is known: of all, of seen ones)
+    are None without a true disparity, or where the method gives none.
     """
 
     pair: str
@@ -160,13 +162,17 @@ class ConditionRow(NamedTuple):
 
 
 def methods_of(network: FusionNetwork, recording: Recording) -> dict[str, StereoMethod]:
-    """Those compared: classical, denoised first where there is noise, ours as it is and without corrections."""
+    """Those compared: classical, denoised first where there is noise, ours as it is and without
+    corrections.
+    """
     found: dict[str, StereoMethod] = {"classical": classical}
     level = recording.noise
     if level is None:
         found["classical, corrected"] = lambda a, b, d: corrected_classical(network, a, b, d)
     else:
-        found["denoised, classical"] = lambda a, b, d: classical(_non_local(a, level), _non_local(b, level), d)
+        found["denoised, classical"] = lambda a, b, d: classical(
+            _non_local(a, level), _non_local(b, level), d
+        )
     found["uncorrected"] = rectified_fusion(network, response="rec601", align=False)
     noisy: dict[str, Any] = {} if level is None else {"noise": {"alpha": level, "beta": level}}
     found["fusion"] = rectified_fusion(network, **noisy)
@@ -188,7 +194,9 @@ def corrected_classical(network: FusionNetwork, alpha: Tensor, beta: Tensor, max
 
 
 def classical(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
-    """The classical baseline, with the disparity of OpenCV's semi-global matching where that is consistent."""
+    """The classical baseline, with the disparity of OpenCV's semi-global matching where that is
+    consistent.
+    """
     image = classical_fusion(alpha, beta, max_disparity)
     enlarged = interpolate(beta[None], alpha.shape[1:], mode="bicubic", align_corners=False)[0].clamp(0, 1)
     return StereoResult(image, sgbm_disparity(alpha, luminance(enlarged), max_disparity))
@@ -203,7 +211,9 @@ def sgbm_disparity(
 
 
 def regions_of(pair: StereoPair, hw: tuple[int, int]) -> dict[str, Bool[Tensor, "h w"]]:
-    """Where left's pixels are seen in right, occluded there, beyond its left edge; and all but the left columns."""
+    """Where left's pixels are seen in right, occluded there, beyond its left edge; and all but the left
+    columns.
+    """
     h, w = hw
     found = {"whole": torch.ones(h, w, dtype=torch.bool)}
     found["cropped"] = torch.arange(w).expand(h, w) >= LEFT_CROP
@@ -212,13 +222,17 @@ def regions_of(pair: StereoPair, hw: tuple[int, int]) -> dict[str, Bool[Tensor, 
     value, known = (t[:h, :w] for t in pair.disparity)
     column = torch.arange(w) - value
     beyond = known & (column < -0.5)
-    nearest = torch.zeros(h, w).scatter_reduce(1, column.round().long().clamp(0, w - 1), value * known, "amax")
+    nearest = torch.zeros(h, w).scatter_reduce(
+        1, column.round().long().clamp(0, w - 1), value * known, "amax"
+    )
     hidden = nearest.gather(1, column.round().long().clamp(0, w - 1)) > value + 1
     return found | {"seen": known & ~beyond & ~hidden, "occluded": known & ~beyond & hidden, "beyond": beyond}
 
 
 def chroma_bound(task: MonoColourTask, rate: int) -> Float[Tensor, "3 h w"]:
-    """Left's own colours reduced and enlarged: what beta's resolution would allow if it stood where alpha stands."""
+    """Left's own colours reduced and enlarged: what beta's resolution would allow if it stood where alpha
+    stands.
+    """
     luma, chroma = to_luma_chroma(task.ground_truth)
     small = interpolate(chroma[None], scale_factor=1 / rate, mode="area")
     return from_luma_chroma(luma, interpolate(small, luma.shape[1:], mode="bicubic", align_corners=False)[0])
@@ -232,7 +246,9 @@ def evaluate_conditions(
     max_disparity: float = PAPER_DISPARITY,
     progress: Callable[[Iterable[StereoPair], int], Iterable[StereoPair]] = lambda pairs, total: pairs,
 ) -> list[ConditionRow]:
-    """Every method on every colour pair under every condition (see `CONDITIONS`). Raises KeyError for another name."""
+    """Every method on every colour pair under every condition (see `CONDITIONS`). Raises KeyError for another
+    name.
+    """
     chosen = {name: CONDITIONS[name] for name in conditions}
     rows = []
     for pair in progress(pairs, len(pairs)):
@@ -250,11 +266,19 @@ def evaluate_conditions(
 
 
 def _row(
-    pair: StereoPair, condition: str, method: str, result: StereoResult, truth: Tensor, regions: Mapping[str, Tensor]
+    pair: StereoPair,
+    condition: str,
+    method: str,
+    result: StereoResult,
+    truth: Tensor,
+    regions: Mapping[str, Tensor],
 ) -> ConditionRow:
     image = result.image.clamp(0, 1)
     error = (image - truth).square().mean(0)
-    psnr = {n: -10 * math.log10(max(float(error[at].mean()), 1e-12)) if at.any() else None for n, at in regions.items()}
+    psnr = {
+        n: -10 * math.log10(max(float(error[at].mean()), 1e-12)) if at.any() else None
+        for n, at in regions.items()
+    }
     depth = depth_errors(result.disparity, pair.disparity, regions)
     return ConditionRow(pair.name, condition, method, score(image, truth).ssim, psnr, *depth)
 
@@ -262,7 +286,8 @@ def _row(
 def depth_errors(
     found: Tensor | None, ground_truth: Disparity | None, regions: Mapping[str, Tensor]
 ) -> tuple[float | None, tuple[float, float] | None]:
-    """The end-point error, and the shares within a pixel: of all whose ground truth is known, and of those seen.
+    """The end-point error, and the shares within a pixel: of all whose ground truth is known, and of those
+    seen.
 
     A pixel of unknown disparity is not within one pixel, and is left out of the end-point error.
     """
@@ -317,7 +342,13 @@ def _by_region(rows: Sequence[ConditionRow]) -> str:
         found = [r for r in ideal if r.method == method]
         values = [[v for r in found if (v := r.psnr.get(region)) is not None] for region in REGIONS]
         lines.append([method, *(f"{np.mean(v):.2f}" if v else "" for v in values)])
-    names = ["whole", "seen by beta", "occluded", "beyond beta's edge", f"without the left {LEFT_CROP} columns"]
+    names = [
+        "whole",
+        "seen by beta",
+        "occluded",
+        "beyond beta's edge",
+        f"without the left {LEFT_CROP} columns",
+    ]
     return markdown_table(["PSNR", *names], lines)
 
 
@@ -331,7 +362,9 @@ def _depth(rows: Sequence[ConditionRow]) -> str:
         name = "OpenCV's SGBM" if method == "classical" else method
         rate = f"x{CONDITIONS[condition].rate}"
         lines.append([rate, name, f"{np.mean(errors):.2f} px", *(f"{share:.1f} %" for share in shares)])
-    return markdown_table(["beta", "", "end-point error", "within 1 px, of all", "of those that beta sees"], lines)
+    return markdown_table(
+        ["beta", "", "end-point error", "within 1 px, of all", "of those that beta sees"], lines
+    )
 
 
 Curves = Mapping[str, list[tuple[float, float]]]
@@ -351,7 +384,9 @@ def save_curves(plots: Mapping[str, Curves], path: Path, *, ylabel: str) -> None
 
 
 def save_condition_curves(rows: Sequence[ConditionRow], path: Path) -> None:
-    """A figure: mean PSNR against electrons at white, and against rows off, as far as these were evaluated."""
+    """A figure: mean PSNR against electrons at white, and against rows off, as far as these were
+    evaluated.
+    """
     known = {row.condition for row in rows}
     axes = {
         "electrons at white": {50: "50 electrons", 200: "200 electrons", 1000: "1000 electrons"},

@@ -1,7 +1,7 @@
 """Every field of the toolkit with one network whose only way to the other camera is the field.
 
-On rectified pairs with true disparity, where all fields are comparable; on the same with F alone; and on unrectified
-rigs of layered scenes with exact positions.
+On rectified pairs with true disparity, where all fields are comparable; on the same with F alone; and on
+unrectified rigs of layered scenes with exact positions.
 """
 
 from __future__ import annotations
@@ -63,8 +63,9 @@ class Case(NamedTuple):
 class FieldRow(NamedTuple):
     """One field on one case; `note` says why there are no figures, where there are none.
 
-    `peaks` is the share, of the pixels whose true position is known and in beta, whose largest weight is within a pixel
-    of it. `seconds` are the processor's, all threads together. `mebibytes` is by how much the process grew at most.
+    `peaks` is the share, of the pixels whose true position is known and in beta, whose largest weight is
+    within a pixel of it. `seconds` are the processor's, all threads together. `mebibytes` is by how much the
+    process grew at most.
     """
 
     kind: str
@@ -94,8 +95,8 @@ def fields_of(max_displacement: float) -> dict[str, ReceptiveField]:
 
 
 def rectified_cases(pairs: Iterable[StereoPair], *, rate: int = 2, linked: bool = False) -> Iterator[Case]:
-    """Pairs with true disparity, the right image reduced `rate` times and enlarged again; with F and H alone if
-    `linked`."""
+    """Pairs with true disparity, the right image reduced `rate` times and enlarged again; with F and H alone
+    if `linked`."""
     for pair in pairs:
         if pair.disparity is None:
             continue
@@ -128,7 +129,13 @@ def layered_cases(bank: PhotoBank, count: int, *, hw: tuple[int, int] = (96, 128
     for number in range(count):
         rig = rig_of(hw, ratio=(1.0, 1.25)[number % 2], ahead=(0.0, 30.0)[number // 2 % 2])
         pair = rig.pair(ALPHA, BETA)
-        yield Case("unrectified", f"scene {number}", pair, made(rig, bank, number), float(covering_displacement(pair)))
+        yield Case(
+            "unrectified",
+            f"scene {number}",
+            pair,
+            made(rig, bank, number),
+            float(covering_displacement(pair)),
+        )
 
 
 def evaluate_fields(
@@ -137,8 +144,8 @@ def evaluate_fields(
     *,
     fields: Callable[[float], Mapping[str, ReceptiveField]] = fields_of,
 ) -> list[FieldRow]:
-    """Every field on every case. The first is computed once before, so that what is loaded and compiled then is not
-    counted as its time and memory."""
+    """Every field on every case. The first is computed once before, so that what is loaded and compiled then
+    is not counted as its time and memory."""
     rows: list[FieldRow] = []
     for case in cases:
         chosen = fields(case.max_displacement)
@@ -166,8 +173,9 @@ def _row(network: Comparing, case: Case, name: str, field: ReceptiveField) -> Fi
 
 
 def drawn_peaks(network: Comparing, cases: Iterable[Case]) -> dict[str, Tensor]:
-    """Images (3, h, w) by title, four for each case: alpha, parallax against infinity in truth and by the peaks of
-    calibrated segments, in the same colours, and red where a known one is off by more than a pixel."""
+    """Images (3, h, w) by title, four for each case: alpha, parallax against infinity in truth and by the
+    peaks of calibrated segments, in the same colours, and red where a known one is off by more than a
+    pixel."""
     panels: dict[str, Tensor] = {}
     for case in cases:
         alpha, beta = case.scene.images[ALPHA], case.scene.images[BETA]
@@ -196,7 +204,9 @@ def fields_markdown(rows: Sequence[FieldRow]) -> str:
     parts = []
     for kind in distinct(row.kind for row in rows):
         some = [row for row in rows if row.kind == kind]
-        lines = [_line(name, [r for r in some if r.field == name]) for name in distinct(r.field for r in some)]
+        lines = [
+            _line(name, [r for r in some if r.field == name]) for name in distinct(r.field for r in some)
+        ]
         columns = [
             f"{kind} ({len(distinct(r.case for r in some))})",
             "PSNR",

@@ -1,4 +1,6 @@
-"""Disparities from elsewhere through the same fusion: those of OpenCV's SGBM, the true ones, and a rough prior."""
+"""Disparities from elsewhere through the same fusion: those of OpenCV's SGBM, the true ones, and a rough
+prior.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ class OutsideRow(NamedTuple):
     seconds: float
 
 
-def evaluate_outside(pairs: Iterable[StereoPair], network: FusionNetwork, *, rate: int = 2) -> list[OutsideRow]:
+def evaluate_outside(
+    pairs: Iterable[StereoPair], network: FusionNetwork, *, rate: int = 2
+) -> list[OutsideRow]:
     """Every source on every pair, all with true disparity, beta reduced `rate` times."""
     rows = []
     for pair in pairs:
@@ -65,7 +69,9 @@ def outside_markdown(rows: Sequence[OutsideRow]) -> str:
 FieldOf = Callable[[StereoPair, MonoColourTask], ReceptiveField | None]
 
 
-def _row(pair: StereoPair, task: MonoColourTask, network: FusionNetwork, source: str, field_of: FieldOf) -> OutsideRow:
+def _row(
+    pair: StereoPair, task: MonoColourTask, network: FusionNetwork, source: str, field_of: FieldOf
+) -> OutsideRow:
     hw = hw_of(task.alpha)
     rig = rectified_rig(hw, {"beta": hw_of(task.beta)}, PAPER_DISPARITY)
     began = time.perf_counter()
@@ -89,7 +95,9 @@ def _around(disparity: Float[Tensor, "h w"], known: Tensor, tolerance: float) ->
 def _sgbm(pair: StereoPair, task: MonoColourTask) -> ReceptiveField:
     hw = hw_of(task.alpha)
     beta = interpolate(luminance(task.beta)[None], hw, mode="bicubic", align_corners=False)[0].clamp(0, 1)
-    disparity, consistent = checked_disparity(to_bytes(task.alpha[0]), to_bytes(beta[0]), round(PAPER_DISPARITY))
+    disparity, consistent = checked_disparity(
+        to_bytes(task.alpha[0]), to_bytes(beta[0]), round(PAPER_DISPARITY)
+    )
     return _around(torch.from_numpy(disparity), torch.from_numpy(consistent), 0.0)
 
 

@@ -40,7 +40,9 @@ def read_rows(path: str | Path) -> list[Row]:
         found = json.loads(Path(path).read_text(encoding="utf-8"))
         if not isinstance(found, list):
             raise TypeError("wanted a list")
-        rows: list[dict[str, Any]] = [{k: math.nan if v is None else v for k, v in row.items()} for row in found]
+        rows: list[dict[str, Any]] = [
+            {k: math.nan if v is None else v for k, v in row.items()} for row in found
+        ]
         return [Row(**row) for row in rows]
     except (TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{path}: not the rows of an ablation ({error})") from None
@@ -83,7 +85,8 @@ def save_curves(rows: Sequence[Row], path: Path) -> Path:
 
 
 def curves(rows: Sequence[Row]) -> Figure:
-    """A column for each sweep, a row for each measure, a curve for each field; bars are 95 % intervals of the mean.
+    """A column for each sweep, a row for each measure, a curve for each field; bars are 95 % intervals of the
+    mean.
 
     PSNR is drawn as in `markdown`.
     """
@@ -109,7 +112,9 @@ def _draw(axis: Axes, rows: Sequence[Row], measure: str) -> None:
         means = np.array([np.mean(found[value]) for value in known])
         bounds = np.array([bootstrap_interval(found[value]) for value in known]).reshape(-1, 2)
         spread = np.abs(np.nan_to_num(bounds.T - means)) if len(known) else None
-        axis.errorbar(known, means, yerr=spread, label=field, marker="o", markersize=3, capsize=2, linewidth=1)
+        axis.errorbar(
+            known, means, yerr=spread, label=field, marker="o", markersize=3, capsize=2, linewidth=1
+        )
     axis.set_ylabel(MEASURES[measure][0], fontsize=8)
     axis.tick_params(labelsize=8)
     axis.grid(alpha=0.3)

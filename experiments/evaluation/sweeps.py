@@ -1,7 +1,8 @@
 """The ablation of calibration: the same network and scenes, each field, as one property of the rig changes.
 
-Scenes are layered photographs rendered for each rig, so that the true position of every pixel in beta is known. What
-a field is computed from may be another rig than the true one: that is a calibration which is wrong.
+Scenes are layered photographs rendered for each rig, so that the true position of every pixel in beta is
+known. What a field is computed from may be another rig than the true one: that is a calibration which is
+wrong.
 """
 
 from __future__ import annotations
@@ -74,7 +75,9 @@ class Point(NamedTuple):
 
 
 class RecordedScene(NamedTuple):
-    """Recorded images by name, alpha's view in colour, where its pixels are in beta (h, w, 2), which beta sees."""
+    """Recorded images by name, alpha's view in colour, where its pixels are in beta (h, w, 2), which beta
+    sees.
+    """
 
     images: dict[str, Tensor]
     ground_truth: Tensor
@@ -83,14 +86,16 @@ class RecordedScene(NamedTuple):
 
 
 class Result(NamedTuple):
-    """The fused image (3, H, W), and where attention is largest in beta as recorded, of each of its bands if the
-    network takes them one by one (bands, h, w, 2)."""
+    """The fused image (3, H, W), and where attention is largest in beta as recorded, of each of its bands if
+    the network takes them one by one (bands, h, w, 2)."""
 
     image: Tensor
     peak: Tensor
 
     def peaks(self, scene: RecordedScene) -> float:
-        """The share of the pixels that beta sees whose largest weight is within a pixel of the true position."""
+        """The share of the pixels that beta sees whose largest weight is within a pixel of the true
+        position.
+        """
         off = (self.peak - scene.position).norm(dim=-1)
         return float((off[:, scene.visible] <= 1).double().mean())
 
@@ -98,8 +103,8 @@ class Result(NamedTuple):
 class Row(NamedTuple):
     """One field on one scene of one rig.
 
-    `peaks` is the share of the pixels that beta sees whose largest weight is within a pixel of the true position.
-    `note` says why there are no figures, where there are none.
+    `peaks` is the share of the pixels that beta sees whose largest weight is within a pixel of the true
+    position. `note` says why there are no figures, where there are none.
     """
 
     sweep: str
@@ -124,15 +129,19 @@ class Way(Protocol):
 
 @dataclass(frozen=True)
 class Directly:
-    """The images as they are, beta resized to about alpha's angular resolution as `fuse` does it, with a field.
+    """The images as they are, beta resized to about alpha's angular resolution as `fuse` does it, with a
+    field.
 
-    Beta's border is repeated around it, as warped images repeat theirs: what beta does not see is half of the error.
+    Beta's border is repeated around it, as warped images repeat theirs: what beta does not see is half of the
+    error.
     """
 
     field: ReceptiveField
 
     def fuse(self, network: Comparing, rig: Rig, images: Mapping[str, Tensor]) -> Result:
-        """The network with the field of the pair. All of beta is searched as it is: enlarged it would not fit."""
+        """The network with the field of the pair. All of beta is searched as it is: enlarged it would not
+        fit.
+        """
         pair, beta = rig.pair(ALPHA, BETA), images[BETA]
         if isinstance(self.field, Dense):
             return fused(network, pair, images[ALPHA], beta, self.field)
@@ -143,7 +152,9 @@ class Directly:
         ratio = resolution_ratio(pair)
         if not 0.8 < ratio < 1.25:
             larger = (round(hw[0] / ratio), round(hw[1] / ratio))
-            beta = interpolate(beta, larger, mode="bicubic", align_corners=False, antialias=ratio > 1).clamp(0, 1)
+            beta = interpolate(beta, larger, mode="bicubic", align_corners=False, antialias=ratio > 1).clamp(
+                0, 1
+            )
             camera = camera.resize(larger)
         found = fused(network, Pair(pair.alpha, camera, pair.depth), images[ALPHA], beta[0], self.field)
         step = found.peak.new_tensor([hw[1] / camera.hw[1], hw[0] / camera.hw[0]])
@@ -161,7 +172,9 @@ class Resampled:
         level = rectified(rig, images)
         alpha, beta = (level.images[name] for name in (ALPHA, BETA))
         result = fused(network, level.rectification.pair, alpha, beta, self.field)
-        peaks = [level.back(one.movedim(-1, 0), interpolation="nearest").movedim(0, -1) for one in result.peak]
+        peaks = [
+            level.back(one.movedim(-1, 0), interpolation="nearest").movedim(0, -1) for one in result.peak
+        ]
         there = apply_homography(torch.linalg.inv(level.rectification.H_beta), torch.stack(peaks).double()).x
         return Result(level.back(result.image), there)
 
@@ -196,8 +209,8 @@ def ablate(
 ) -> list[Row]:
     """Each field on so many scenes of each rig; `rigs` by name, or points of sweeps (`points`).
 
-    A rig has two calibrated pinhole cameras, alpha first, and a depth range: its scenes lie in it. `fields` are fields,
-    one's own included, or ways. Raises ValueError for another kind of rig.
+    A rig has two calibrated pinhole cameras, alpha first, and a depth range: its scenes lie in it. `fields`
+    are fields, one's own included, or ways. Raises ValueError for another kind of rig.
     """
     given = [Point(name, 0.0, rig, rig) for name, rig in rigs.items()] if isinstance(rigs, Mapping) else rigs
     bank = photos or sample_photographs()
@@ -222,7 +235,12 @@ def _numbers(rig: Rig) -> bytes:
 
 
 def _row(
-    network: Comparing, point: Point, name: str, field: ReceptiveField | Way, number: int, scene: RecordedScene
+    network: Comparing,
+    point: Point,
+    name: str,
+    field: ReceptiveField | Way,
+    number: int,
+    scene: RecordedScene,
 ) -> Row:
     way = field if hasattr(field, "fuse") else Directly(field)
     began = time.perf_counter()
@@ -237,7 +255,9 @@ def _row(
 
 @torch.no_grad()
 def fused(network: Comparing, pair: Pair, alpha: Tensor, beta: Tensor, field: ReceptiveField) -> Result:
-    """The network on two images (C, H, W), whole; beta's bands are cameras of their own to one of several betas."""
+    """The network on two images (C, H, W), whole; beta's bands are cameras of their own to one of several
+    betas.
+    """
     betas = [beta[None]] if network.betas == 1 else list(beta[None].split(1, dim=1))
     on_grid = FieldOnGrid.of(field, pair, blocks=False)
     output, compared = network.compare(Inputs.of(alpha[None], betas, [on_grid] * len(betas)))
@@ -246,17 +266,22 @@ def fused(network: Comparing, pair: Pair, alpha: Tensor, beta: Tensor, field: Re
 
 
 def two(rig: Rig) -> Rig:
-    """The first two cameras, as alpha and beta. Raises ValueError unless they are calibrated, with a depth range."""
+    """The first two cameras, as alpha and beta. Raises ValueError unless they are calibrated, with a depth
+    range.
+    """
     first, second = rig.names[:2]
     cameras = rig.pair(first, second).cameras
     for name, camera in zip((first, second), cameras):
         if camera.distortion is not None:
             model = camera.distortion.model
             raise ValueError(
-                f"these scenes are made for pinholes and '{name}' has a lens ({model}): give scenes of your own to "
+                f"these scenes are made for pinholes and '{name}' has a lens ({model}): give scenes of your "
+                "own to "
                 "pat.evaluation.ablation.ablate"
             )
-    return Rig(dict(zip((ALPHA, BETA), cameras)), depth=tuple(float(d) for d in rig.pair(first, second).depth_range))
+    return Rig(
+        dict(zip((ALPHA, BETA), cameras)), depth=tuple(float(d) for d in rig.pair(first, second).depth_range)
+    )
 
 
 def made(rig: Rig, bank: PhotoBank, number: int, seed: int = 0) -> RecordedScene:
@@ -265,7 +290,9 @@ def made(rig: Rig, bank: PhotoBank, number: int, seed: int = 0) -> RecordedScene
     pair = rig.pair(ALPHA, BETA)
     near, far = (torch.full((1,), float(d), dtype=torch.float64) for d in pair.depth_range)
     cameras = [Camera(K=c.K[None], cam_from_world=Pose(c.R[None], c.t[None]), hw=c.hw) for c in pair.cameras]
-    batch = LayeredScenes(bank, RigDistribution(), hw=pair.alpha.hw, seed=seed).render(RigBatch(cameras, near, far), g)
+    batch = LayeredScenes(bank, RigDistribution(), hw=pair.alpha.hw, seed=seed).render(
+        RigBatch(cameras, near, far), g
+    )
     position, visible = seen_at(pair, *(depth[0].double() for depth in batch.depth))
     steps = [Noise(8000, 3), Clip(), Quantise(8)]
     images = {ALPHA: luminance(batch.images[0]), BETA: batch.images[1]}

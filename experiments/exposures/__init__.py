@@ -1,7 +1,8 @@
-"""Short exposure - long exposure: four mono cameras, three of them behind filters, each exposed for its own time.
+"""Short exposure - long exposure: four mono cameras, three of them behind filters, each exposed for its own
+time.
 
-Alpha has no filter. The filters pass 80 nm about 450, 550 and 600 nm: less than a third of alpha's light, which longer
-exposures make up for. The scene's surfaces are lit from very dark to very bright.
+Alpha has no filter. The filters pass 80 nm about 450, 550 and 600 nm: less than a third of alpha's light,
+which longer exposures make up for. The scene's surfaces are lit from very dark to very bright.
 """
 
 from __future__ import annotations
@@ -45,7 +46,9 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
         raw[name] = [record(seen, (Noise(ELECTRONS, READ), Clip()), stage.generator(name))[0]]
         if name != alpha:
             bands[name] = banded(light(stage, alpha), sensor.response)[0]
-    return SystemRecording(raw, [srgb_from_linear(torch.cat([bands[name] for name in rig.betas(alpha)]))], lights)
+    return SystemRecording(
+        raw, [srgb_from_linear(torch.cat([bands[name] for name in rig.betas(alpha)]))], lights
+    )
 
 
 def light(stage: SystemScene | RenderedScene, name: str) -> Tensor:

@@ -1,6 +1,8 @@
-"""High frame rate - low frame rate: a fast mono alpha, three slow cameras behind filters, and an object that moves.
+"""High frame rate - low frame rate: a fast mono alpha, three slow cameras behind filters, and an object that
+moves.
 
-No two clocks agree. Every frame of alpha gets colour from the slow frames nearest in time (`pat.fusion.sequence`).
+No two clocks agree. Every frame of alpha gets colour from the slow frames nearest in time
+(`pat.fusion.sequence`).
 """
 
 from __future__ import annotations
@@ -47,7 +49,9 @@ def lights(stage: SystemScene | RenderedScene) -> Mapping[str, Iterable[Tensor]]
     """The linear colours that each camera receives, frame by frame."""
     if isinstance(stage, RenderedScene):
         counts = {name: len(frames) for name, frames in stage.frames.items()}
-        return {name: [stage.light(name, i).clamp(0, 1) for i in range(count)] for name, count in counts.items()}
+        return {
+            name: [stage.light(name, i).clamp(0, 1) for i in range(count)] for name, count in counts.items()
+        }
     velocity, layer = object_velocity(stage)
 
     def layered(name: str) -> Iterator[Tensor]:
@@ -65,7 +69,9 @@ def frame_times(stage: SystemScene, name: str) -> list[float]:
 
 
 def object_velocity(stage: SystemScene) -> tuple[Tensor, int]:
-    """Metres a second in alpha's frame, and which layer moves: one that covers about a seventh of the image."""
+    """Metres a second in alpha's frame, and which layer moves: one that covers about a seventh of the
+    image.
+    """
     free = stage.shares() * (~stage.scene.solid[0])
     layer = int((free - 0.14).abs().argmin())
     depth = float(stage.seen(stage.alpha)[1].median())

@@ -31,7 +31,8 @@ DETAIL = (slice(300, 800), slice(600, 1200))
 def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], None]) -> SystemResult:
     """Fuse the seven frames with and without propagating colour; write images, a video and scores.md.
 
-    Frame 141 is taken to be simultaneous with slow frame 4, and the rates to be the paper's: offsets are not published.
+    Frame 141 is taken to be simultaneous with slow frame 4, and the rates to be the paper's: offsets are not
+    published.
     """
     say("fitting the lines of each pair to points seen in both images")
     array = fast_and_slow_array(folder)
@@ -59,7 +60,9 @@ def clocked(rig: Rig) -> Rig:
 
 
 def recorded_frames(folder: Path) -> dict[str, list[Tensor]]:
-    """The frames, taken to be linear, sRGB-encoded; alpha's brightest 0.5% in the first frame are brought to white."""
+    """The frames, taken to be linear, sRGB-encoded; alpha's brightest 0.5% in the first frame are brought to
+    white.
+    """
     raw = {FAST: [read_image(folder / SCENE / f"{i}.png") for i in FAST_FRAMES]}
     raw |= {name: [read_image(folder / SCENE / f"{name}_{i}.png") for i in SLOW_FRAMES] for name in SLOW}
     gains = {FAST: bright_gain(raw[FAST][0])}
@@ -68,7 +71,9 @@ def recorded_frames(folder: Path) -> dict[str, list[Tensor]]:
 
 def _table(fused: list[Frame], alone: list[Frame], greys: list[Tensor]) -> str:
     frames = {"each frame alone": alone, "colour propagated": fused}
-    rows = [(name, f"{1000 * flicker([f.image for f in found], greys):.2f}") for name, found in frames.items()]
+    rows = [
+        (name, f"{1000 * flicker([f.image for f in found], greys):.2f}") for name, found in frames.items()
+    ]
     return (
         f"{markdown_table(['', 'flicker x 1000'], rows)}\n"
         "Flicker is the mean change of chroma from frame to frame where nothing moves.\n"

@@ -1,5 +1,5 @@
-"""Training of features for matching: `python -m experiments.learned_matching.training RECIPE --photos DIR --stereo
-DIR`."""
+"""Training of features for matching: `python -m experiments.learned_matching.training RECIPE --photos DIR
+--stereo DIR`."""
 
 from __future__ import annotations
 

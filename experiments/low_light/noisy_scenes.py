@@ -1,4 +1,6 @@
-"""Layered scenes recorded in low light, denoised view by view and fused: what the joint denoiser learns from."""
+"""Layered scenes recorded in low light, denoised view by view and fused: what the joint denoiser learns
+from.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,9 @@ class NoisyScene(NamedTuple):
 
 
 def noise_levels(count: int, g: Generator) -> NoiseLevel:
-    """Random levels: 15 to 3,000 electrons at white and up to 5 of read noise, or 1 to 60 of 255 at any value."""
+    """Random levels: 15 to 3,000 electrons at white and up to 5 of read noise, or 1 to 60 of 255 at any
+    value.
+    """
     draw, light = torch.rand(4, count, 1, 1, 1, generator=g), bool(below(2, g))
     electrons, constant = 15 * 200 ** draw[0], (draw[2] < 0.3) & (not light)
     shot = torch.where(constant, 0.0, 1 / electrons)
@@ -78,9 +82,14 @@ def noisy(image: Tensor, level: NoiseLevel, g: Generator) -> tuple[Tensor, Tenso
 class NoisyScenes:
     """Windows of scenes by the number of the step: a pure function of it and the seed."""
 
-    def __init__(self, photos: PhotoBank, fusion: FusionNetwork, denoiser: LowLightNetwork, seed: int) -> None:
+    def __init__(
+        self, photos: PhotoBank, fusion: FusionNetwork, denoiser: LowLightNetwork, seed: int
+    ) -> None:
         self.fusion, self.denoiser, self.seed = fusion, denoiser, seed
-        rigs = (replace(RECTIFIED, resolutions=(1.0, 0.5, 0.5)), replace(GENERAL, resolutions=(1.0, 0.5, 0.5)))
+        rigs = (
+            replace(RECTIFIED, resolutions=(1.0, 0.5, 0.5)),
+            replace(GENERAL, resolutions=(1.0, 0.5, 0.5)),
+        )
         self.makers = [LayeredScenes(photos, rig, hw=HW, seed=seed) for rig in rigs]
 
     def steps(self, batch: int, side: int, *, start: int = 0) -> Iterator[NoisyScene]:

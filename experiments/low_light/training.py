@@ -1,7 +1,7 @@
 """Training of the denoisers: `python -m experiments.low_light.training --photos DIR --out runs/low-light`.
 
-First those of single views, on photographs with noise of random kind and level; then that of the fused image, on
-layered scenes that are recorded with such noise, denoised view by view, and fused.
+First those of single views, on photographs with noise of random kind and level; then that of the fused image,
+on layered scenes that are recorded with such noise, denoised view by view, and fused.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ VIEWS, FUSED = "views.safetensors", "best.safetensors"
 
 @dataclass(frozen=True)
 class DenoiserTraining:
-    """A recipe. The same command again continues a run that stopped; the result is that of an uninterrupted run."""
+    """A recipe. The same command again continues a run that stopped; the result is that of an uninterrupted
+    run.
+    """
 
     photos: tuple[Path, ...] = ()
     """Folders of photographs."""
@@ -94,7 +96,9 @@ Losses = Callable[[int], Iterator[Tensor]]
 """The loss of each step from a given one on, computed when it is asked for."""
 
 
-def view_losses(config: DenoiserTraining, bank: PhotoBank, network: LowLightNetwork, start: int) -> Iterator[Tensor]:
+def view_losses(
+    config: DenoiserTraining, bank: PhotoBank, network: LowLightNetwork, start: int
+) -> Iterator[Tensor]:
     """Of the denoisers of single views, on photographs."""
     for step in range(start, 2**62):
         g = generator_for(config.seed, "views", step)
@@ -154,7 +158,13 @@ def fit(config: DenoiserTraining, name: str, network: nn.Module, losses: Losses,
         if step % config.save == 0 or step == steps:
             print(f"{name}: step {step} of {steps}, mean loss {total / config.save:.4f}", flush=True)
             total = 0.0
-            facts = {"step": step, "best": 0.0, "minutes": 0.0, "done": step == steps, "recipe": _recipe(config)}
+            facts = {
+                "step": step,
+                "best": 0.0,
+                "minutes": 0.0,
+                "done": step == steps,
+                "recipe": _recipe(config),
+            }
             write_checkpoint(folder, collect(network, adam, average, facts))
     return average.module
 
@@ -167,7 +177,9 @@ def _restored(
     if former is None:
         return 0
     if former.facts["recipe"] != _recipe(config):
-        raise ValueError(f"{folder} holds a run of another recipe ({former.facts['recipe']}): give another --out")
+        raise ValueError(
+            f"{folder} holds a run of another recipe ({former.facts['recipe']}): give another --out"
+        )
     restore(former, network, adam, average)
     return int(former.facts["step"])
 

@@ -31,9 +31,9 @@ LOADED = 64
 class Patch:
     """The recorded images of a patch and their ground truth; one, or a batch of them.
 
-    `images` are encoded as the chains leave them (sRGB by default), by camera, alpha first; `rig` is that of those
-    images. `ground_truth` is alpha's ideal view in colour (sRGB, 0..1), and `depth` its depth in metres, both on the
-    grid that alpha had before its chain.
+    `images` are encoded as the chains leave them (sRGB by default), by camera, alpha first; `rig` is that of
+    those images. `ground_truth` is alpha's ideal view in colour (sRGB, 0..1), and `depth` its depth in
+    metres, both on the grid that alpha had before its chain.
     """
 
     images: dict[str, Float[Tensor, "*b _ _ _"]]
@@ -50,10 +50,10 @@ class Patch:
 class ScenePatches(Dataset[Patch]):
     """All patches of all scenes of a folder, degraded on the fly.
 
-    `chains` simulate each camera (see `default_chains`), `cases` are further degradations of alpha and of all betas,
-    all equally likely. Random numbers depend on `seed`, `epoch` and the patch alone. Scenes are cut on first use and
-    the latest are cached: shuffle with `SceneShuffle`. Raises ValueError for a folder without scenes; for a scene
-    that is incomplete, or of other sizes than the first, when it is read.
+    `chains` simulate each camera (see `default_chains`), `cases` are further degradations of alpha and of all
+    betas, all equally likely. Random numbers depend on `seed`, `epoch` and the patch alone. Scenes are cut on
+    first use and the latest are cached: shuffle with `SceneShuffle`. Raises ValueError for a folder without
+    scenes; for a scene that is incomplete, or of other sizes than the first, when it is read.
     """
 
     def __init__(
@@ -138,7 +138,9 @@ class SceneStacks:
 
 
 class SceneShuffle(Sampler[int]):
-    """A random order that reads each scene once: `mixed` scenes at a time, their patches shuffled together."""
+    """A random order that reads each scene once: `mixed` scenes at a time, their patches shuffled
+    together.
+    """
 
     def __init__(self, data: ScenePatches, *, mixed: int = 16):
         self.data, self.mixed = data, mixed

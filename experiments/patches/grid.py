@@ -1,8 +1,8 @@
 """Patches of rendered scenes: cut on the fly, reduced, each with the rig of its own windows.
 
-The paper's are 49 windows of 384x128 of every 2048x1536 view, reduced cubically to 96x32. Each camera's window has
-about alpha's angle of view, centred where the middle of alpha's window projects at the middle inverse depth of the
-rig's range (not at its true depth, which a network could exploit).
+The paper's are 49 windows of 384x128 of every 2048x1536 view, reduced cubically to 96x32. Each camera's
+window has about alpha's angle of view, centred where the middle of alpha's window projects at the middle
+inverse depth of the rig's range (not at its true depth, which a network could exploit).
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ class PatchGrid:
     def __post_init__(self) -> None:
         if min(*self.hw, *self.grid, self.reduce) < 1 or any(side % self.reduce for side in self.hw):
             raise ValueError(
-                f"patches: {self.hw[1]}x{self.hw[0]} pixels cannot be reduced {self.reduce} times: use a divisor"
+                f"patches: {self.hw[1]}x{self.hw[0]} pixels cannot be reduced {self.reduce} times: use a "
+                "divisor"
             )
 
     @classmethod
@@ -57,18 +58,23 @@ class PatchGrid:
         """(top, left) of each. Raises ValueError for an image that is smaller than a patch."""
         if hw[0] < self.hw[0] or hw[1] < self.hw[1]:
             raise ValueError(
-                f"patches of {self.hw[1]}x{self.hw[0]} do not fit into an image of {hw[1]}x{hw[0]}: give smaller ones"
+                f"patches of {self.hw[1]}x{self.hw[0]} do not fit into an image of {hw[1]}x{hw[0]}: give "
+                "smaller ones"
             )
         tops, lefts = (_evenly(whole - part, n) for whole, part, n in zip(hw, self.hw, self.grid))
         return [(top, left) for top in tops for left in lefts]
 
 
 def _evenly(room: int, count: int) -> list[int]:
-    return [round(room * (i + 0.5) / count) if count == 1 else round(room * i / (count - 1)) for i in range(count)]
+    return [
+        round(room * (i + 0.5) / count) if count == 1 else round(room * i / (count - 1)) for i in range(count)
+    ]
 
 
 class PatchStack(NamedTuple):
-    """All patches of a scene: linear RGB and depth (metres) by camera, and the batched cameras of those windows."""
+    """All patches of a scene: linear RGB and depth (metres) by camera, and the batched cameras of those
+    windows.
+    """
 
     rgb: dict[str, Float[Tensor, "n 3 _ _"]]
     depth: dict[str, Float[Tensor, "n _ _"]]
@@ -96,7 +102,8 @@ def cut(folder: Path, patches: PatchGrid, *, alpha: str) -> PatchStack:
         rgb={name: torch.stack([view.rgb for view in found[name]]) for name in rig.names},
         depth={name: torch.stack([view.depth for view in found[name]]) for name in rig.names},
         rig=rig.replace(
-            cameras={name: stack([view.camera for view in found[name]]) for name in rig.names}, depth=(near, far)
+            cameras={name: stack([view.camera for view in found[name]]) for name in rig.names},
+            depth=(near, far),
         ),
     )
 
@@ -104,12 +111,16 @@ def cut(folder: Path, patches: PatchGrid, *, alpha: str) -> PatchStack:
 Corners = list[tuple[int, int]]
 
 
-def _windows(cameras: dict[str, Camera], rig: Rig, alpha: str, patches: PatchGrid) -> dict[str, tuple[Corners, HW]]:
+def _windows(
+    cameras: dict[str, Camera], rig: Rig, alpha: str, patches: PatchGrid
+) -> dict[str, tuple[Corners, HW]]:
     """For each camera, the corners of its windows and their size."""
     corners = patches.corners(rig[alpha].hw)
     found = {alpha: (corners, patches.hw)}
     h, w = patches.hw
-    middles = torch.tensor([[left + (w - 1) / 2, top + (h - 1) / 2] for top, left in corners], dtype=torch.float64)
+    middles = torch.tensor(
+        [[left + (w - 1) / 2, top + (h - 1) / 2] for top, left in corners], dtype=torch.float64
+    )
     depth = middle_depth(*rig.pair(alpha, alpha).depth_range)
     X = cameras[alpha].unproject(middles, depth.expand(len(middles)).double())
     for name in rig.betas(alpha):
@@ -117,7 +128,10 @@ def _windows(cameras: dict[str, Camera], rig: Rig, alpha: str, patches: PatchGri
         hw = _beta_size(cameras[alpha], beta, patches)
         seen, _, valid = beta.project(X)
         centre = middles.new_tensor([(beta.hw[1] - 1) / 2, (beta.hw[0] - 1) / 2])
-        found[name] = [_corner(x, hw, beta.hw) for x in torch.where(valid[:, None], seen, centre).tolist()], hw
+        found[name] = (
+            [_corner(x, hw, beta.hw) for x in torch.where(valid[:, None], seen, centre).tolist()],
+            hw,
+        )
     return found
 
 
@@ -151,4 +165,6 @@ def same_cameras(one: Rig, other: Rig) -> None:
     sizes = [{name: f"{c.hw[1]}x{c.hw[0]}" for name, c in rig.cameras.items()} for rig in (one, other)]
     if sizes[0] != sizes[1]:
         shown = [", ".join(f"{name} {wh}" for name, wh in s.items()) for s in sizes]
-        raise ValueError(f"has images of other sizes than the first ({shown[1]}; first: {shown[0]}): one rig a folder")
+        raise ValueError(
+            f"has images of other sizes than the first ({shown[1]}; first: {shown[0]}): one rig a folder"
+        )

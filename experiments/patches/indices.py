@@ -1,9 +1,11 @@
-"""The paper's own index files: for every alpha pixel, the beta pixels that it attends to, precomputed on disk.
+"""The paper's own index files: for every alpha pixel, the beta pixels that it attends to, precomputed on
+disk.
 
-`xxs_ID.npy` holds rows and `yys_ID.npy` columns, or `xxs_ID_k.npy` and `yys_ID_k.npy` for the k-th of several betas:
-whole numbers (int16), counted from 0, one line for each alpha pixel, row by row, with n entries each, (h w, n).
-Their F was exported from MATLAB, whose pixels count from 1. How the paper fills lines with fewer than n pixels is not
-documented; here they repeat their first pixel, and lines without any hold -1. For comparison only.
+`xxs_ID.npy` holds rows and `yys_ID.npy` columns, or `xxs_ID_k.npy` and `yys_ID_k.npy` for the k-th of several
+betas: whole numbers (int16), counted from 0, one line for each alpha pixel, row by row, with n entries each,
+(h w, n). Their F was exported from MATLAB, whose pixels count from 1. How the paper fills lines with fewer
+than n pixels is not documented; here they repeat their first pixel, and lines without any hold -1. For
+comparison only.
 """
 
 from __future__ import annotations
@@ -35,21 +37,26 @@ def read_indices(folder: str | Path, name: str, hw: HW, *, beta: int | None = No
     rows, columns = (_read(file, hw) for file in index_files(folder, name, beta))
     if rows.shape != columns.shape:
         raise ValueError(
-            f"{folder}: rows of '{name}' have shape {rows.shape} and columns {columns.shape}: not of one field"
+            f"{folder}: rows of '{name}' have shape {rows.shape} and columns {columns.shape}: not of one "
+            "field"
         )
     xy = torch.from_numpy(np.stack([columns, rows], -1).astype(np.float32)).unflatten(0, hw)
     mask = (xy >= 0).all(-1)
     return Positions(torch.where(mask[..., None], xy, 0.0), mask)
 
 
-def write_indices(folder: str | Path, name: str, positions: Positions, *, beta: int | None = None) -> list[Path]:
+def write_indices(
+    folder: str | Path, name: str, positions: Positions, *, beta: int | None = None
+) -> list[Path]:
     """Write both files, each atomically; returns their paths.
 
     Raises ValueError for positions (h, w, n, 2) that are not whole pixels, or beyond what int16 holds.
     """
     xy, mask = positions.xy, positions.mask
     if xy.ndim != 4:
-        raise ValueError(f"index files need the field of every alpha pixel, (h, w, n, 2); got {tuple(xy.shape)}")
+        raise ValueError(
+            f"index files need the field of every alpha pixel, (h, w, n, 2); got {tuple(xy.shape)}"
+        )
     if not torch.equal(xy, xy.round()) or xy.abs().max() > np.iinfo(np.int16).max:
         raise ValueError("index files hold whole pixels up to 32767: use a field such as NearestVoxels")
     filled = torch.where(mask[..., None], xy, _first(xy, mask))
@@ -61,7 +68,9 @@ def write_indices(folder: str | Path, name: str, positions: Positions, *, beta: 
 
 
 def agreement(one: Positions, other: Positions) -> Float[Tensor, "h w"]:
-    """For each alpha pixel, how many pixels two fields have in common over how many either has (1 if none)."""
+    """For each alpha pixel, how many pixels two fields have in common over how many either has (1 if
+    none).
+    """
     a, b = (_keys(p) for p in (one, other))
     common = (a[..., :, None] == b[..., None, :]).any(-1) & (a >= 0)
     both = common.sum(-1)
@@ -91,7 +100,11 @@ def _read(file: Path, hw: HW) -> NDArray:
     except (ValueError, EOFError, OSError) as error:
         raise ValueError(f"{file}: not a NumPy file ({error})") from None
     if values.ndim != 2 or not np.issubdtype(values.dtype, np.integer):
-        raise ValueError(f"{file}: holds {values.dtype} of shape {values.shape}; wanted whole numbers, (h w, n)")
+        raise ValueError(
+            f"{file}: holds {values.dtype} of shape {values.shape}; wanted whole numbers, (h w, n)"
+        )
     if len(values) != hw[0] * hw[1]:
-        raise ValueError(f"{file}: has {len(values)} lines; an alpha of {hw[1]}x{hw[0]} pixels has {hw[0] * hw[1]}")
+        raise ValueError(
+            f"{file}: has {len(values)} lines; an alpha of {hw[1]}x{hw[0]} pixels has {hw[0] * hw[1]}"
+        )
     return values

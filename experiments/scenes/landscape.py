@@ -1,4 +1,5 @@
-"""A garden, a house and a wood under the sky, as a long lens sees them: what visible light and infrared tell apart.
+"""A garden, a house and a wood under the sky, as a long lens sees them: what visible light and infrared tell
+apart.
 
 Leaves and grass are bright in the near infrared and the sky is dark; dyes of cloth do not absorb there.
 """
@@ -12,7 +13,18 @@ from numpy.random import Generator
 
 from arraygeom.rig import Rig
 from pat.synthesis.furnish import seeded
-from pat.synthesis.scene import Light, Material, Object, Paint, Relief, Scene, Texture, TextureKind, Vec3, World
+from pat.synthesis.scene import (
+    Light,
+    Material,
+    Object,
+    Paint,
+    Relief,
+    Scene,
+    Texture,
+    TextureKind,
+    Vec3,
+    World,
+)
 
 from .props import arranged, ball, box, first_camera, lathed, paint, plain
 
@@ -21,7 +33,9 @@ WIDE = 5.6
 LEAVES = 0.55
 """Near infrared that leaves reflect."""
 
-_LIGHTS = (Light(kind="sun", power=3.0, direction=(0.55, 0.62, 0.6), rgb=(1.0, 0.94, 0.84), nir=1.1, size=0.01),)
+_LIGHTS = (
+    Light(kind="sun", power=3.0, direction=(0.55, 0.62, 0.6), rgb=(1.0, 0.94, 0.84), nir=1.1, size=0.01),
+)
 
 
 def landscape(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
@@ -33,11 +47,15 @@ def landscape(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
     objects = [*_ground(rng), *_washing(), *_fence(), *_house(), *_trees(rng), *_beds(rng)]
     distance = WIDE * float(camera.K[0, 0]) / camera.hw[1]
     sky = World((0.30, 0.47, 0.75), 0.16)
-    return arranged("landscape", seed, rig, objects, _LIGHTS, sky, aim=(0, -1.75, 0), distance=distance, down=1.5)
+    return arranged(
+        "landscape", seed, rig, objects, _LIGHTS, sky, aim=(0, -1.75, 0), distance=distance, down=1.5
+    )
 
 
 def _leafy(dark: Vec3, light: Vec3, scale: float, kind: TextureKind = "noise") -> Material:
-    paints = tuple(Paint(rgb, LEAVES * share) for rgb, share in ((dark, 0.5), (light, 1.0), (dark, 0.7), (light, 0.9)))
+    paints = tuple(
+        Paint(rgb, LEAVES * share) for rgb, share in ((dark, 0.5), (light, 1.0), (dark, 0.7), (light, 0.9))
+    )
     texture = Texture(kind=kind, paints=paints, scale=scale, grain=0.25)
     return Material(texture=texture, roughness=0.9, specular=0.05)
 
@@ -67,10 +85,20 @@ def _washing() -> Iterator[Object]:
     for side in (-2.45, 2.3):
         yield lathed(f"post {side}", (side, 0, 0), [(0, 2.1), (0.05, 2.1), (0.05, 0), (0, 0)], _BARK)
     yield box("line", (-0.07, -2.0, 0), (4.75, 0.012, 0.012), _WHITE)
-    dyes = ((0.55, 0.03, 0.03), (0.72, 0.70, 0.66), (0.03, 0.09, 0.38), (0.75, 0.50, 0.04), (0.02, 0.02, 0.025))
+    dyes = (
+        (0.55, 0.03, 0.03),
+        (0.72, 0.70, 0.66),
+        (0.03, 0.09, 0.38),
+        (0.75, 0.50, 0.04),
+        (0.02, 0.02, 0.025),
+    )
     x = -2.1
-    for i, (rgb, width, height) in enumerate(zip(dyes, (0.62, 0.95, 0.7, 0.55, 0.6), (0.85, 0.6, 0.95, 0.75, 1.05))):
-        checks = Texture(kind="checker", paints=(paint(*rgb), paint(*(min(1.6 * c + 0.02, 0.9) for c in rgb))), scale=9)
+    for i, (rgb, width, height) in enumerate(
+        zip(dyes, (0.62, 0.95, 0.7, 0.55, 0.6), (0.85, 0.6, 0.95, 0.75, 1.05))
+    ):
+        checks = Texture(
+            kind="checker", paints=(paint(*rgb), paint(*(min(1.6 * c + 0.02, 0.9) for c in rgb))), scale=9
+        )
         cloth = Material(texture=checks, roughness=0.95, specular=0.03)
         middle = (x + width / 2, -1.99 + height / 2, 0.02 * (-1) ** i)
         yield box(f"cloth{i}", middle, (width, height, 0.012), cloth, yaw=14 * (-1) ** i)
@@ -84,13 +112,21 @@ def _fence() -> Iterator[Object]:
             yield box(f"pale{i}", (x, -0.45, 6), (0.09, 0.9, 0.03), _WHITE)
     for side, middle in (("left", -3.5), ("right", 4.45)):
         for y in (-0.3, -0.7):
-            yield box(f"rail {side}{y}", (middle, y, 6.04), (6.6 if side == "left" else 6.5, 0.06, 0.03), _WHITE)
+            yield box(
+                f"rail {side}{y}", (middle, y, 6.04), (6.6 if side == "left" else 6.5, 0.06, 0.03), _WHITE
+            )
 
 
 def _house() -> Iterator[Object]:
-    paints = (paint(0.36, 0.13, 0.08, nir=0.42), paint(0.42, 0.17, 0.10, nir=0.45), paint(0.55, 0.5, 0.44, nir=0.55))
+    paints = (
+        paint(0.36, 0.13, 0.08, nir=0.42),
+        paint(0.42, 0.17, 0.10, nir=0.45),
+        paint(0.55, 0.5, 0.44, nir=0.55),
+    )
     brick = Material(texture=Texture(kind="brick", paints=paints, scale=4.0), roughness=0.9, specular=0.1)
-    tile = Texture(kind="brick", paints=(paint(0.16, 0.07, 0.05, nir=0.2), paint(0.22, 0.1, 0.07, nir=0.25)), scale=2.5)
+    tile = Texture(
+        kind="brick", paints=(paint(0.16, 0.07, 0.05, nir=0.2), paint(0.22, 0.1, 0.07, nir=0.25)), scale=2.5
+    )
     glass = plain(0.03, 0.04, 0.05, roughness=0.05, specular=0.8)
     x, z = -1.6, 24.0
     yield box("house", (x, -2.3, z + 3), (7.0, 4.6, 6), brick)

@@ -1,4 +1,6 @@
-"""Makes the sample array that ships in pat/data/sample: `python -m experiments.scenes.make_sample`; needs Blender."""
+"""Makes the sample array that ships in pat/data/sample: `python -m experiments.scenes.make_sample`; needs
+Blender.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ def sample_cameras() -> dict[str, Camera]:
     """A mono alpha and, 12 cm to its right and a little above, a wider colour camera, rotated and toed in."""
     rotation = rotation_from_vector(torch.tensor([0.6, -1.5, 2.0], dtype=torch.float64) * math.pi / 180)
     centre = torch.tensor([0.12, -0.03, 0.01], dtype=torch.float64)
-    mono = Camera(K=intrinsics(820.0, HW), cam_from_world=Pose.identity(), hw=HW, sensor=Sensor(response="mono"))
+    mono = Camera(
+        K=intrinsics(820.0, HW), cam_from_world=Pose.identity(), hw=HW, sensor=Sensor(response="mono")
+    )
     colour = Camera(
         K=intrinsics((460.0, 460.0), (360, 560), (284.0, 172.0)),
         cam_from_world=Pose.from_centre(rotation, centre),
@@ -46,7 +50,9 @@ def main(out: Path = SAMPLE, seed: int = 2, samples: int = 64) -> None:
     settings = RenderSettings(samples=samples, denoise="accurate", fast_light=False, bounces=4)
     with TemporaryDirectory() as folder:
         rendered = render(still_life(seed, rig), rig, Path(folder) / "scene", settings=settings)
-        ground_truth, seen = (srgb_from_linear(rendered.frame(name).rgb[None]).clamp(0, 1) for name in (ALPHA, BETA))
+        ground_truth, seen = (
+            srgb_from_linear(rendered.frame(name).rgb[None]).clamp(0, 1) for name in (ALPHA, BETA)
+        )
     mono = record(luminance(ground_truth), [Noise(8000, 3), Clip(), Quantise(8)], generator)
     colour = record(seen, [Noise(4000, 3), Clip(), Quantise(8)], generator)
     out.mkdir(parents=True, exist_ok=True)

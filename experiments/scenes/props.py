@@ -42,7 +42,8 @@ def arranged(
     distance: float,
     down: float,
 ) -> Scene:
-    """Objects and lights before the first camera of a rig: `aim` in the middle of its image, at a distance in metres.
+    """Objects and lights before the first camera of a rig: `aim` in the middle of its image, at a distance in
+    metres.
 
     The camera faces downwards by `down` degrees.
     """
@@ -75,7 +76,9 @@ def _placed(motion: Motion, pose: Pose) -> Motion:
 
 def _lit(light: Light, pose: Pose) -> Light:
     position, direction = (torch.tensor(v, dtype=pose.R.dtype) for v in (light.position, light.direction))
-    return replace(light, position=vec(pose.apply(position).numpy()), direction=vec((pose.R @ direction).numpy()))
+    return replace(
+        light, position=vec(pose.apply(position).numpy()), direction=vec((pose.R @ direction).numpy())
+    )
 
 
 def paint(*rgb: float, nir: float | None = None) -> Paint:
@@ -84,7 +87,9 @@ def paint(*rgb: float, nir: float | None = None) -> Paint:
     return Paint((r, g, b), max(0.5, r) if nir is None else nir)
 
 
-def plain(*rgb: float, roughness: float = 0.5, specular: float = 0.3, grain: float = 0.0, **more: float) -> Material:
+def plain(
+    *rgb: float, roughness: float = 0.5, specular: float = 0.3, grain: float = 0.0, **more: float
+) -> Material:
     """A surface of one colour; with `grain`, flecks of some millimetres."""
     texture = Texture(paints=(paint(*rgb),), scale=20.0, grain=grain)
     return Material(texture=texture, roughness=roughness, specular=specular, **more)
@@ -92,12 +97,19 @@ def plain(*rgb: float, roughness: float = 0.5, specular: float = 0.3, grain: flo
 
 def wood(dark: Vec3, light: Vec3, scale: float) -> Material:
     """Two tones of wood with a wavy grain, `scale` rings a metre."""
-    paints = (paint(*dark), paint(*light), paint(*(0.6 * d + 0.4 * v for d, v in zip(dark, light))), paint(*light))
+    paints = (
+        paint(*dark),
+        paint(*light),
+        paint(*(0.6 * d + 0.4 * v for d, v in zip(dark, light))),
+        paint(*light),
+    )
     texture = Texture(kind="wave", paints=paints, scale=scale, distortion=9.0, grain=0.12)
     return Material(texture=texture, roughness=0.35, specular=0.35)
 
 
-def box(name: str, middle: Vec3, extent: Vec3, material: Material, *, yaw: float = 0.0, roll: float = 0.0) -> Object:
+def box(
+    name: str, middle: Vec3, extent: Vec3, material: Material, *, yaw: float = 0.0, roll: float = 0.0
+) -> Object:
     """A box, rotated by degrees about the vertical and about the axis of view."""
     rotation = Rotation.from_euler("yz", (yaw, roll), degrees=True).as_rotvec()
     key = Key(position=middle, rotation=vec(rotation), extent=extent)
@@ -126,8 +138,12 @@ def lathed(name: str, foot: Vec3, profile: Profile, material: Material, *, euler
     return Object(name=name, shape="lathe", motion=Motion((key,)), material=material, profile=tuple(unit))
 
 
-def moved(items: Iterable[Object], name: str, to: Vec3, *, yaw: float = 0.0, size: float = 1.0) -> Iterator[Object]:
-    """Objects made about the origin, enlarged, rotated about the vertical by degrees and moved; names get a prefix."""
+def moved(
+    items: Iterable[Object], name: str, to: Vec3, *, yaw: float = 0.0, size: float = 1.0
+) -> Iterator[Object]:
+    """Objects made about the origin, enlarged, rotated about the vertical by degrees and moved; names get a
+    prefix.
+    """
     R = torch.from_numpy(Rotation.from_euler("y", yaw, degrees=True).as_matrix())
     pose = Pose(R, R.new_tensor(to))
     for item in items:
@@ -139,7 +155,9 @@ def moved(items: Iterable[Object], name: str, to: Vec3, *, yaw: float = 0.0, siz
 
 
 def on_path(item: Object, path: Sequence[tuple[float, Vec3]], spin: Vec3 = (0, 0, 0)) -> Object:
-    """The object along a path of times and positions, rotated meanwhile by `spin` (rotation vector, radians)."""
+    """The object along a path of times and positions, rotated meanwhile by `spin` (rotation vector,
+    radians).
+    """
     first, start = item.motion.keys[0], path[0][0]
     length = path[-1][0] - start
     keys = []

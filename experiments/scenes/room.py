@@ -21,7 +21,9 @@ _WHITE = plain(0.72, 0.70, 0.66, roughness=0.5)
 
 
 def furniture() -> Iterator[Object]:
-    """The table's legs, a cupboard under the shelf, a rug, an armchair, a chair, a lamp, pictures and a window."""
+    """The table's legs, a cupboard under the shelf, a rug, an armchair, a chair, a lamp, pictures and a
+    window.
+    """
     yield from _under_the_table()
     yield box("skirting", (0, FLOOR - 0.07, WALL - 0.005), (8, 0.14, 0.02), _WHITE)
     rug = _pattern("wave", (0.30, 0.045, 0.035), (0.42, 0.30, 0.17), 7.0, distortion=3.0)
@@ -49,10 +51,16 @@ def _under_the_table() -> Iterator[Object]:
     for i in range(4):
         x = -0.92 + 0.6 * i
         yield box(f"door{i}", (x, 0.46, SHELF - 0.004), (0.57, 0.54, 0.018), WALNUT)
-        yield ball(f"knob{i}", (x + (0.22 if i % 2 == 0 else -0.22), 0.42, SHELF - 0.03), (0.03, 0.03, 0.03), BRASS)
+        yield ball(
+            f"knob{i}", (x + (0.22 if i % 2 == 0 else -0.22), 0.42, SHELF - 0.03), (0.03, 0.03, 0.03), BRASS
+        )
     top = -1.145
-    yield box("carton", (-0.75, top - 0.13, SHELF + 0.15), (0.42, 0.26, 0.26), plain(0.36, 0.24, 0.13, grain=0.1))
-    yield box("case", (0.1, top - 0.07, SHELF + 0.15), (0.5, 0.14, 0.24), plain(0.05, 0.12, 0.11, grain=0.1), yaw=4)
+    yield box(
+        "carton", (-0.75, top - 0.13, SHELF + 0.15), (0.42, 0.26, 0.26), plain(0.36, 0.24, 0.13, grain=0.1)
+    )
+    yield box(
+        "case", (0.1, top - 0.07, SHELF + 0.15), (0.5, 0.14, 0.24), plain(0.05, 0.12, 0.11, grain=0.1), yaw=4
+    )
     urn = [(0.05, 0.34), (0.06, 0.34), (0.05, 0.3), (0.12, 0.22), (0.13, 0.14), (0.07, 0.0), (0, 0)]
     yield lathed("urn", (0.82, top, SHELF + 0.15), urn, plain(0.50, 0.20, 0.08, roughness=0.3))
 
@@ -66,7 +74,10 @@ def _armchair() -> Iterator[Object]:
         yield box(f"arm{side}", (0.36 * side, -0.4, -0.01), (0.13, 0.38, 0.72), cloth)
         yield lathed(f"foot{side}", (0.32 * side, 0, -0.3), [(0.03, 0.14), (0.015, 0), (0, 0)], WALNUT)
     yield ball(
-        "cushion", (0.03, -0.6, 0.2), (0.44, 0.4, 0.16), _pattern("checker", (0.7, 0.42, 0.04), (0.6, 0.5, 0.3), 9.0)
+        "cushion",
+        (0.03, -0.6, 0.2),
+        (0.44, 0.4, 0.16),
+        _pattern("checker", (0.7, 0.42, 0.04), (0.6, 0.5, 0.3), 9.0),
     )
 
 
@@ -80,7 +91,9 @@ def _chair() -> Iterator[Object]:
 
 
 def _floor_lamp() -> Iterator[Object]:
-    yield lathed("pole", (0, 0, 0), [(0, 1.55), (0.012, 1.55), (0.012, 0.03), (0.13, 0.02), (0.14, 0), (0, 0)], BRASS)
+    yield lathed(
+        "pole", (0, 0, 0), [(0, 1.55), (0.012, 1.55), (0.012, 0.03), (0.13, 0.02), (0.14, 0), (0, 0)], BRASS
+    )
     linen = Material(texture=Texture(paints=(paint(0.85, 0.66, 0.42),)), roughness=0.9, emission=0.4)
     yield lathed("shade", (0, -1.45, 0), [(0.14, 0.3), (0.142, 0.3), (0.21, 0.0), (0.208, 0.0)], linen)
 
@@ -88,13 +101,18 @@ def _floor_lamp() -> Iterator[Object]:
 def _pictures() -> Iterator[Object]:
     sea = ((0.03, 0.10, 0.22), (0.55, 0.60, 0.62), (0.20, 0.33, 0.40), (0.62, 0.42, 0.22))
     field = ((0.45, 0.33, 0.06), (0.10, 0.20, 0.05), (0.55, 0.48, 0.35), (0.30, 0.07, 0.04))
-    for i, (x, y, w, h, paints) in enumerate(((-2.2, -1.15, 0.95, 0.7, sea), (-1.55, -0.75, 0.4, 0.5, field))):
+    for i, (x, y, w, h, paints) in enumerate(
+        ((-2.2, -1.15, 0.95, 0.7, sea), (-1.55, -0.75, 0.4, 0.5, field))
+    ):
         yield box(f"frame{i}", (x, y, WALL - 0.01), (w, h, 0.03), WALNUT)
         yield box(f"mount{i}", (x, y, WALL - 0.013), (w - 0.07, h - 0.07, 0.03), _WHITE)
         colours = tuple(paint(*rgb) for rgb in paints)
         painted = Texture(kind="wave", paints=colours, scale=2.6, distortion=5.0, offset=(3.0 * i, 1.0, 2.0))
         yield box(
-            f"painting{i}", (x, y, WALL - 0.016), (w - 0.2, h - 0.2, 0.03), Material(texture=painted, roughness=0.6)
+            f"painting{i}",
+            (x, y, WALL - 0.016),
+            (w - 0.2, h - 0.2, 0.03),
+            Material(texture=painted, roughness=0.6),
         )
 
 
@@ -110,5 +128,7 @@ def _window() -> Iterator[Object]:
     for side in (-1, 1):
         for i in range(5):
             fold = [(0.055, 2.3), (0.055, 0.0), (0, 0)]
-            yield lathed(f"curtain{side}{i}", (side * (0.56 + 0.085 * i), 1.6, -0.09 - 0.02 * (i % 2)), fold, linen)
+            yield lathed(
+                f"curtain{side}{i}", (side * (0.56 + 0.085 * i), 1.6, -0.09 - 0.02 * (i % 2)), fold, linen
+            )
     yield box("rail", (0, -0.72, -0.1), (2.1, 0.025, 0.025), BRASS)

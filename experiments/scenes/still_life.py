@@ -1,7 +1,8 @@
-"""A room that a person would photograph: a table with a still life before a bookshelf, a window's light and a lamp.
+"""A room that a person would photograph: a table with a still life before a bookshelf, a window's light and a
+lamp.
 
-Everything is arranged in a frame of its own, metres: x right, y down, z away from the camera, the origin in the middle
-of the table's front part, on its top.
+Everything is arranged in a frame of its own, metres: x right, y down, z away from the camera, the origin in
+the middle of the table's front part, on its top.
 """
 
 from __future__ import annotations
@@ -38,39 +39,59 @@ BULB = 12.0
 def still_life(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
     """The room in front of a rig's first camera, level and at a distance that shows the still life whole.
 
-    `seed` draws the books. Where a camera sees much more than the table, there is a whole room. With `moving` seconds,
-    the ball is thrown through the image and takes so long. Raises ValueError if the rig has no calibrated camera.
+    `seed` draws the books. Where a camera sees much more than the table, there is a whole room. With `moving`
+    seconds, the ball is thrown through the image and takes so long. Raises ValueError if the rig has no
+    calibrated camera.
     """
     camera, rng = first_camera(rig), seeded("still-life", seed)
     objects = [*_furniture(), *_books(rng), *_plant(rng), *_pottery(), *_fruit(), *_toys(moving), *_lamp()]
     distance = VIEW * float(camera.K[0, 0]) / camera.hw[1]
-    if any(isinstance(c, Camera) and distance * c.hw[1] / float(c.K[0, 0]) > WIDE for c in rig.cameras.values()):
+    if any(
+        isinstance(c, Camera) and distance * c.hw[1] / float(c.K[0, 0]) > WIDE for c in rig.cameras.values()
+    ):
         objects += _room(rng)
     world = World((0.06, 0.065, 0.07), 0.06)
-    return arranged("still-life", seed, rig, objects, _LIGHTS, world, aim=AIM, distance=distance, down=DOWNWARDS)
+    return arranged(
+        "still-life", seed, rig, objects, _LIGHTS, world, aim=AIM, distance=distance, down=DOWNWARDS
+    )
 
 
 _LIGHTS = (
-    Light(kind="area", power=125, position=(-2.4, -1.7, -0.6), direction=(2.2, 1.4, 0.9), rgb=DAYLIGHT, size=1.3),
-    Light(kind="area", power=14, position=(1.8, -1.9, -1.6), direction=(-1.5, 1.5, 1.9), rgb=(1.0, 0.93, 0.85), size=1),
+    Light(
+        kind="area", power=125, position=(-2.4, -1.7, -0.6), direction=(2.2, 1.4, 0.9), rgb=DAYLIGHT, size=1.3
+    ),
+    Light(
+        kind="area",
+        power=14,
+        position=(1.8, -1.9, -1.6),
+        direction=(-1.5, 1.5, 1.9),
+        rgb=(1.0, 0.93, 0.85),
+        size=1,
+    ),
     Light(kind="point", power=1.7, position=(0.62, -0.36, 0.42), rgb=LAMPLIGHT, nir=1.8, size=0.03),
 )
 
-# Surfaces -------------------------------------------------------------------------------------------------------
+# Surfaces
+# -------------------------------------------------------------------------------------------------------
 
 
 _PLASTER = Material(
-    texture=Texture(kind="noise", paints=(paint(0.40, 0.43, 0.36), paint(0.47, 0.50, 0.42)), scale=7.0, grain=0.05),
+    texture=Texture(
+        kind="noise", paints=(paint(0.40, 0.43, 0.36), paint(0.47, 0.50, 0.42)), scale=7.0, grain=0.05
+    ),
     roughness=0.95,
     specular=0.05,
 )
 _CLOTH = Material(
-    texture=Texture(kind="checker", paints=(paint(0.62, 0.58, 0.50), paint(0.16, 0.25, 0.38)), scale=26.0, grain=0.1),
+    texture=Texture(
+        kind="checker", paints=(paint(0.62, 0.58, 0.50), paint(0.16, 0.25, 0.38)), scale=26.0, grain=0.1
+    ),
     roughness=0.95,
     specular=0.05,
 )
 
-# What is in the room --------------------------------------------------------------------------------------------
+# What is in the room
+# --------------------------------------------------------------------------------------------
 
 
 def _furniture() -> Iterator[Object]:
@@ -96,7 +117,13 @@ def _books(rng: Generator) -> Iterator[Object]:
         yield from _row_of_books(rng, f"book{row}", top, left, right)
     for i, colour in enumerate(_CLOTHBOUND[1:5]):
         y = -0.0125 + 0.14 - 0.02 - 0.036 * i
-        yield box(f"lying{i}", (0.72 + 0.01 * i, y, SHELF + 0.14), (0.27, 0.034, 0.19), plain(*colour), yaw=6 * i - 8)
+        yield box(
+            f"lying{i}",
+            (0.72 + 0.01 * i, y, SHELF + 0.14),
+            (0.27, 0.034, 0.19),
+            plain(*colour),
+            yaw=6 * i - 8,
+        )
 
 
 def _room(rng: Generator) -> Iterator[Object]:
@@ -120,7 +147,9 @@ def _book(rng: Generator, name: str, x: float, floor: float, wh: tuple[float, fl
     width, height = wh
     z = SHELF + 0.05 + float(rng.uniform(0, 0.03)) + 0.09
     colour = tuple(float(c * rng.uniform(0.7, 1.3)) for c in _CLOTHBOUND[int(rng.integers(len(_CLOTHBOUND)))])
-    yield box(name, (x, floor - height / 2, z), (width, height, 0.18), plain(*colour, roughness=0.6, grain=0.15))
+    yield box(
+        name, (x, floor - height / 2, z), (width, height, 0.18), plain(*colour, roughness=0.6, grain=0.15)
+    )
     bright = sum(colour) > 0.6
     label = plain(*((0.08, 0.05, 0.04) if bright else (0.62, 0.47, 0.20)), roughness=0.4)
     for part in sorted(rng.choice([0.12, 0.2, 0.35, 0.6, 0.8, 0.88], int(rng.integers(1, 4)), replace=False)):
@@ -131,7 +160,16 @@ def _book(rng: Generator, name: str, x: float, floor: float, wh: tuple[float, fl
 def _plant(rng: Generator) -> Iterator[Object]:
     clay, soil = plain(0.42, 0.15, 0.07, roughness=0.85, grain=0.15), plain(0.03, 0.02, 0.012, roughness=1.0)
     x, z = -0.52, 0.38
-    pot = [(0.0, 0.12), (0.083, 0.12), (0.083, 0.14), (0.098, 0.14), (0.098, 0.11), (0.09, 0.108), (0.07, 0), (0, 0)]
+    pot = [
+        (0.0, 0.12),
+        (0.083, 0.12),
+        (0.083, 0.14),
+        (0.098, 0.14),
+        (0.098, 0.11),
+        (0.09, 0.108),
+        (0.07, 0),
+        (0, 0),
+    ]
     yield lathed("pot", (x, 0, z), pot, clay)
     yield lathed("saucer", (x, 0, z), [(0, 0.008), (0.1, 0.012), (0.115, 0.02), (0.11, 0), (0, 0)], clay)
     yield ball("soil", (x, -0.118, z), (0.16, 0.012, 0.16), soil)
@@ -142,13 +180,17 @@ def _plant(rng: Generator) -> Iterator[Object]:
         tip = rotation.apply([0, -1, 0])
         green = (0.05 + 0.05 * float(rng.uniform()), 0.20 + 0.12 * float(rng.uniform()), 0.035)
         leaf = Material(
-            texture=Texture(kind="noise", paints=(_leafy(green), _leafy(tuple(1.35 * c for c in green))), scale=60.0),
+            texture=Texture(
+                kind="noise", paints=(_leafy(green), _leafy(tuple(1.35 * c for c in green))), scale=60.0
+            ),
             roughness=0.4,
             specular=0.4,
         )
         middle = np.array([x, -0.13, z]) + tip * length / 2
         blade = ball(f"leaf{i}", vec(middle), (0.035 + 0.02 * float(rng.uniform()), length, 0.004), leaf)
-        yield replace(blade, motion=Motion((replace(blade.motion.keys[0], rotation=vec(rotation.as_rotvec())),)))
+        yield replace(
+            blade, motion=Motion((replace(blade.motion.keys[0], rotation=vec(rotation.as_rotvec())),))
+        )
 
 
 def _leafy(rgb: Sequence[float]) -> Paint:
@@ -157,11 +199,31 @@ def _leafy(rgb: Sequence[float]) -> Paint:
 
 def _pottery() -> Iterator[Object]:
     glaze = {"roughness": 0.12, "specular": 0.6}
-    blue, white, red = (plain(*c, **glaze) for c in ((0.02, 0.09, 0.33), (0.72, 0.70, 0.64), (0.45, 0.03, 0.02)))
-    vase = [(0.022, 0.33), (0.03, 0.335), (0.032, 0.33), (0.024, 0.30), (0.024, 0.26), (0.075, 0.19), (0.085, 0.13)]
+    blue, white, red = (
+        plain(*c, **glaze) for c in ((0.02, 0.09, 0.33), (0.72, 0.70, 0.64), (0.45, 0.03, 0.02))
+    )
+    vase = [
+        (0.022, 0.33),
+        (0.03, 0.335),
+        (0.032, 0.33),
+        (0.024, 0.30),
+        (0.024, 0.26),
+        (0.075, 0.19),
+        (0.085, 0.13),
+    ]
     yield lathed("vase", (-0.24, 0, 0.52), [*vase, (0.05, 0.02), (0.05, 0), (0, 0)], blue)
-    bands = Texture(kind="wave", paints=(paint(0.72, 0.66, 0.5), paint(0.5, 0.2, 0.07)), scale=60.0, distortion=0.6)
-    jar = [(0, 0.235), (0.016, 0.235), (0.02, 0.22), (0.012, 0.205), (0.06, 0.19), (0.066, 0.18), (0.066, 0.17)]
+    bands = Texture(
+        kind="wave", paints=(paint(0.72, 0.66, 0.5), paint(0.5, 0.2, 0.07)), scale=60.0, distortion=0.6
+    )
+    jar = [
+        (0, 0.235),
+        (0.016, 0.235),
+        (0.02, 0.22),
+        (0.012, 0.205),
+        (0.06, 0.19),
+        (0.066, 0.18),
+        (0.066, 0.17),
+    ]
     jar += [(0.09, 0.15), (0.1, 0.09), (0.07, 0.005), (0.07, 0), (0, 0)]
     yield lathed("jar", (0.26, 0, 0.6), jar, Material(texture=bands, roughness=0.25, specular=0.5))
     mug = [(0.036, 0.012), (0.038, 0.095), (0.042, 0.097), (0.044, 0.092), (0.044, 0.008), (0.04, 0), (0, 0)]
@@ -170,7 +232,15 @@ def _pottery() -> Iterator[Object]:
     yield Object(name="handle", shape="torus", motion=Motion((key,)), material=white)
     coffee = plain(0.045, 0.02, 0.01, roughness=0.05, specular=0.6)
     yield ball("coffee", (0.36, -0.082, 0.1), (0.076, 0.003, 0.076), coffee)
-    bowl = [(0, 0.02), (0.06, 0.022), (0.115, 0.06), (0.128, 0.085), (0.133, 0.086), (0.133, 0.082), (0.1, 0.03)]
+    bowl = [
+        (0, 0.02),
+        (0.06, 0.022),
+        (0.115, 0.06),
+        (0.128, 0.085),
+        (0.133, 0.086),
+        (0.133, 0.082),
+        (0.1, 0.03),
+    ]
     yield lathed("bowl", (0.02, -0.004, 0.24), [*bowl, (0.055, 0.008), (0.055, 0), (0, 0)], red)
 
 
@@ -181,7 +251,15 @@ def _fruit() -> Iterator[Object]:
     apple = Material(texture=skin, roughness=0.2, specular=0.5)
     green = plain(0.28, 0.42, 0.04, roughness=0.2, specular=0.5, grain=0.1)
     lemon = plain(0.80, 0.60, 0.03, roughness=0.4, specular=0.4, grain=0.08)
-    round_ = [(0.0, 0.062), (0.008, 0.066), (0.03, 0.073), (0.042, 0.05), (0.034, 0.012), (0.014, 0.0), (0, 0.005)]
+    round_ = [
+        (0.0, 0.062),
+        (0.008, 0.066),
+        (0.03, 0.073),
+        (0.042, 0.05),
+        (0.034, 0.012),
+        (0.014, 0.0),
+        (0, 0.005),
+    ]
     for i, (x, z) in enumerate(((-0.045, 0.24), (0.035, 0.28), (0.03, 0.19))):
         yield ball(f"orange{i}", (x, -0.085, z), (0.082, 0.078, 0.082), orange, euler=(40 * i, 15, 70 * i))
     yield lathed("apple", (0.095, -0.05, 0.235), round_, apple, euler=(0, 0, 14))
@@ -192,9 +270,16 @@ def _fruit() -> Iterator[Object]:
 
 def _toys(moving: float) -> Iterator[Object]:
     colours = ((0.55, 0.03, 0.03), (0.03, 0.30, 0.08), (0.03, 0.10, 0.45), (0.75, 0.48, 0.03))
-    positions = ((0.56, -0.025, 0.13, 20), (0.63, -0.025, 0.2, -15), (0.585, -0.075, 0.16, 40), (0.49, -0.025, 0.22, 5))
+    positions = (
+        (0.56, -0.025, 0.13, 20),
+        (0.63, -0.025, 0.2, -15),
+        (0.585, -0.075, 0.16, 40),
+        (0.49, -0.025, 0.22, 5),
+    )
     for i, ((x, y, z, yaw), colour) in enumerate(zip(positions, colours)):
-        yield box(f"block{i}", (x, y, z), (0.05, 0.05, 0.05), plain(*colour, roughness=0.55, grain=0.1), yaw=yaw)
+        yield box(
+            f"block{i}", (x, y, z), (0.05, 0.05, 0.05), plain(*colour, roughness=0.55, grain=0.1), yaw=yaw
+        )
     stripes = Texture(kind="checker", paints=(paint(0.80, 0.60, 0.03), paint(0.05, 0.12, 0.45)), scale=13.0)
     surface = Material(texture=stripes, roughness=0.3, specular=0.4)
     toy = ball("ball", (-0.36, -0.05, 0.12), (0.1, 0.1, 0.1), surface)
@@ -204,15 +289,22 @@ def _toys(moving: float) -> Iterator[Object]:
 def _throw(duration: float) -> list[tuple[float, Vec3]]:
     """A throw from left to right before the shelf."""
     times = np.linspace(0, 1, 9)
-    return [(float(duration * t), (float(-0.5 + 0.95 * t), float(-0.3 - 0.36 * t * (1 - t)), 0.05)) for t in times]
+    return [
+        (float(duration * t), (float(-0.5 + 0.95 * t), float(-0.3 - 0.36 * t * (1 - t)), 0.05)) for t in times
+    ]
 
 
 def _lamp() -> Iterator[Object]:
-    shade = Material(texture=Texture(paints=(paint(0.85, 0.62, 0.36),)), roughness=0.9, specular=0.1, emission=0.62)
+    shade = Material(
+        texture=Texture(paints=(paint(0.85, 0.62, 0.36),)), roughness=0.9, specular=0.1, emission=0.62
+    )
     bulb = Material(texture=Texture(paints=(Paint(LAMPLIGHT, 1.0),)), emission=BULB)
     x, z = 0.62, 0.42
     yield lathed(
-        "lamp", (x, 0, z), [(0, 0.3), (0.008, 0.3), (0.008, 0.03), (0.03, 0.02), (0.08, 0.012), (0.08, 0)], BRASS
+        "lamp",
+        (x, 0, z),
+        [(0, 0.3), (0.008, 0.3), (0.008, 0.03), (0.03, 0.02), (0.08, 0.012), (0.08, 0)],
+        BRASS,
     )
     rim = [(0.072, 0.2), (0.074, 0.2), (0.14, 0.002), (0.142, 0.0), (0.138, 0.002)]
     yield lathed("shade", (x, -0.33, z), rim, shade)

@@ -1,7 +1,8 @@
-"""More of what cameras make of light than training needs: lenses, filters, bands, and chains of steps from files.
+"""More of what cameras make of light than training needs: lenses, filters, bands, and chains of steps from
+files.
 
-A chain is a list of steps, applied in order to images (B, C, H, W) with values 0..1. Light adds up in linear values
-only, so a chain for ordinary images begins with `DecodeSRGB()` and ends with `EncodeSRGB()`:
+A chain is a list of steps, applied in order to images (B, C, H, W) with values 0..1. Light adds up in linear
+values only, so a chain for ordinary images begins with `DecodeSRGB()` and ends with `EncodeSRGB()`:
 
     [DecodeSRGB(), Spectral("luminance"), DiscBlur(1.5), Noise(2000, 5), Clip(), EncodeSRGB(), Quantise(8)]
 

@@ -22,8 +22,8 @@ from pat.sensors import Step, generator_for
 class OpticalImage:
     """Images in a chain, with depth and camera of the same pixels where known.
 
-    `depth` in metres along the optical axis; `camera` with K of these pixels; `pixels` is A with x ~ A x_first
-    (float64).
+    `depth` in metres along the optical axis; `camera` with K of these pixels; `pixels` is A with x ~ A
+    x_first (float64).
     """
 
     image: Float[Tensor, "b c h w"]
@@ -126,9 +126,9 @@ def record_array(
 ) -> RecordedArray:
     """Each camera's chain on its images; cameras without one record the ideal image.
 
-    Each camera draws from its own generator, seeded by `seed` and its name, independently of the other cameras. The
-    rig's cameras are transformed as the steps transform the pixels. Raises ValueError for a camera that
-    the rig does not have.
+    Each camera draws from its own generator, seeded by `seed` and its name, independently of the other
+    cameras. The rig's cameras are transformed as the steps transform the pixels. Raises ValueError for a
+    camera that the rig does not have.
     """
     recorded = {}
     for name, image in images.items():

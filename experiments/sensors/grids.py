@@ -59,7 +59,8 @@ class Mosaic(Step):
 
 @dataclass(frozen=True)
 class Demosaic(Step):
-    """Colours from a raw image: bilinear (kornia; differentiable) or edge-aware (as raw images are developed).
+    """Colours from a raw image: bilinear (kornia; differentiable) or edge-aware (as raw images are
+    developed).
 
     The gradient of "edge-aware" is that of "bilinear".
     """
@@ -89,4 +90,6 @@ def _known(pattern: str) -> None:
 
 def _even(image: Tensor) -> None:
     if image.shape[-2] % 2 or image.shape[-1] % 2:
-        raise ValueError(f"a colour filter needs even sizes, got {image.shape[-1]}x{image.shape[-2]}: crop first")
+        raise ValueError(
+            f"a colour filter needs even sizes, got {image.shape[-1]}x{image.shape[-2]}: crop first"
+        )

@@ -39,13 +39,16 @@ STEPS |= {"linear": DecodeSRGB, "coded": EncodeSRGB}
 
 
 def read_chain(value: Any, where: str = "chain") -> tuple[Step, ...]:
-    """The steps of a list as YAML has it. Raises ValueError naming the entry (`where`), with the nearest name.
+    """The steps of a list as YAML has it. Raises ValueError naming the entry (`where`), with the nearest
+    name.
 
     >>> read_chain(["decode-srgb", {"noise": {"full_well": 8000, "read": 3}}, {"quantise": 12}])
     (DecodeSRGB(), Noise(full_well=8000.0, read=3.0, counts='gaussian'), Quantise(bits=12))
     """
     if not isinstance(value, list):
-        raise ValueError(f"{where}: wanted a list of steps, such as [decode-srgb, {{noise: {{full_well: 8000}}}}]")
+        raise ValueError(
+            f"{where}: wanted a list of steps, such as [decode-srgb, {{noise: {{full_well: 8000}}}}]"
+        )
     return tuple(_step(entry, f"{where}[{i}]") for i, entry in enumerate(value))
 
 
@@ -57,7 +60,9 @@ def read_chains(value: Any, where: str = "sensors") -> dict[str, tuple[Step, ...
 
 
 def _step(entry: Any, where: str) -> Step:
-    name, options = next(iter(entry.items())) if isinstance(entry, Mapping) and len(entry) == 1 else (entry, {})
+    name, options = (
+        next(iter(entry.items())) if isinstance(entry, Mapping) and len(entry) == 1 else (entry, {})
+    )
     if not isinstance(name, str):
         raise ValueError(f"{where}: is {entry!r}; wanted a step's name, or one name with its options")
     if name not in STEPS:

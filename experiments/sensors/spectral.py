@@ -62,17 +62,20 @@ class Exposure(Step):
 class Spectral(Step):
     """The image of a sensor with another spectral response, from an RGB or an RGB + NIR image.
 
-    "rgb" is the first three channels; "luminance" is Rec. 601 (0.299, 0.587, 0.114); "nir" is the fourth channel;
-    a `Band` or a `Curve` is one channel: the channels taken as Gaussians (`CHANNELS`), weighted by how much of
-    each the response collects, and scaled so that white stays white. An image does not hold a spectrum: this
-    approximation is right for greys and only plausible for colours. Beyond 700 nm it needs a NIR channel.
+    "rgb" is the first three channels; "luminance" is Rec. 601 (0.299, 0.587, 0.114); "nir" is the fourth
+    channel; a `Band` or a `Curve` is one channel: the channels taken as Gaussians (`CHANNELS`), weighted by
+    how much of each the response collects, and scaled so that white stays white. An image does not hold a
+    spectrum: this approximation is right for greys and only plausible for colours. Beyond 700 nm it needs a
+    NIR channel.
     """
 
     response: Literal["rgb", "luminance", "nir"] | Band | Curve
 
     def __post_init__(self) -> None:
         if self.response not in NAMES and not isinstance(self.response, Band | Curve):
-            raise ValueError(f'response must be "rgb", "luminance", "nir", a Band or a Curve, got {self.response!r}')
+            raise ValueError(
+                f'response must be "rgb", "luminance", "nir", a Band or a Curve, got {self.response!r}'
+            )
         if isinstance(self.response, Band) and self.response.width <= 0:
             raise ValueError(f"the width of a band must be positive, in nm; got {self.response.width:g}")
 
@@ -80,7 +83,9 @@ class Spectral(Step):
         """One channel, or three for "rgb"."""
         channels = image.shape[1]
         if channels not in (3, 4):
-            raise ValueError(f"a spectral response needs an image in RGB or RGB + NIR, got {channels} channels")
+            raise ValueError(
+                f"a spectral response needs an image in RGB or RGB + NIR, got {channels} channels"
+            )
         if self.response == "rgb":
             return image[:, :3]
         weights = image.new_tensor(self._weights(channels))
@@ -100,9 +105,11 @@ class Spectral(Step):
 
 
 def band_weights(band: Band, channels: int = 3) -> tuple[float, ...]:
-    """Weights of R, G, B (and NIR) that add up to 1, for a Gaussian of full width at half maximum `band.width`.
+    """Weights of R, G, B (and NIR) that add up to 1, for a Gaussian of full width at half maximum
+    `band.width`.
 
-    Raises ValueError for a band that lies beyond what the channels hold: 400 to 700 nm, or to 1000 nm with NIR.
+    Raises ValueError for a band that lies beyond what the channels hold: 400 to 700 nm, or to 1000 nm with
+    NIR.
 
     >>> [round(w, 2) for w in band_weights(Band(600, 40))]
     [0.77, 0.23, 0.0]
@@ -126,7 +133,9 @@ def curve_weights(curve: Curve, channels: int = 3) -> tuple[float, ...]:
     gaussians = [(-0.5 * ((wavelength - c) / s) ** 2).exp() / s for c, s in CHANNELS[:channels]]
     overlaps = [float(torch.trapezoid(response * g, wavelength)) for g in gaussians]
     if sum(overlaps) < 1e-6:
-        raise ValueError("the response curve collects no light of the image's channels: check its wavelengths, in nm")
+        raise ValueError(
+            "the response curve collects no light of the image's channels: check its wavelengths, in nm"
+        )
     return _shares(overlaps)
 
 

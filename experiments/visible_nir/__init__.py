@@ -1,8 +1,9 @@
 """Visible - near infrared: alpha sees 800 to 1000 nm, beta colours; the same materials differ in each.
 
-The weights were not trained on near infrared. Here each surface has a near-infrared reflectance of its own: the
-farthest (the sky) is dark, some are brighter than in visible light, in some the pattern is reversed. Distance hazes
-the visible image alone. The ground truth is alpha's brightness with the colour differences of beta at alpha's view.
+The weights were not trained on near infrared. Here each surface has a near-infrared reflectance of its own:
+the farthest (the sky) is dark, some are brighter than in visible light, in some the pattern is reversed.
+Distance hazes the visible image alone. The ground truth is alpha's brightness with the colour differences of
+beta at alpha's view.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     own, other = (hazed(*stage.seen(name)) for name in ("nir", "colour"))
     nir = record(infrared, (Noise(8_000, 4), Clip()), generator)
     colour = record(other, (Noise(6_000, 3), Clip()), generator)
-    ground_truth = from_luma_chroma(srgb_from_linear(infrared[0]), to_luma_chroma(srgb_from_linear(own[0]))[1])
+    ground_truth = from_luma_chroma(
+        srgb_from_linear(infrared[0]), to_luma_chroma(srgb_from_linear(own[0]))[1]
+    )
     return SystemRecording({"nir": [nir[0]], "colour": [colour[0]]}, [ground_truth.clamp(0, 1)])
 
 

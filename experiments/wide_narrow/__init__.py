@@ -1,7 +1,7 @@
 """Wide field - narrow field: a mono telephoto alpha, a wide colour camera behind a mosaic of filters.
 
-Beta has about a tenth of alpha's pixels on what both see, and one colour in each of those: every colour is propagated
-to up to 40 pixels. Alpha is focused at 7 m, beta at its hyperfocal distance.
+Beta has about a tenth of alpha's pixels on what both see, and one colour in each of those: every colour is
+propagated to up to 40 pixels. Alpha is focused at 7 m, beta at its hyperfocal distance.
 """
 
 from __future__ import annotations

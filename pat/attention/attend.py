@@ -1,4 +1,5 @@
-"""C3 attention as one operator: checks its inputs, brings the sampling locations into one form, picks a backend.
+"""C3 attention as one operator: checks its inputs, brings the sampling locations into one form, picks a
+backend.
 
 A sample counts if it is valid and lies on beta's area, [-0.5, W - 0.5] x [-0.5, H - 0.5] (to 1e-3 pixels).
 On that area the bilinear look-up takes coordinates clamped to the border's centres, and the nearest one
@@ -6,8 +7,8 @@ takes the pixel on whose area the position lies. An alpha pixel without a sample
 everywhere, and passes no gradient.
 
 Gradients reach query, key, value, bias and the geometry. With `nearest` the value and the peak have no
-gradient by the geometry (they are constant almost everywhere); position and spread do, as weighted means of the
-positions.
+gradient by the geometry (they are constant almost everywhere); position and spread do, as weighted means of
+the positions.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ CHUNK_SAMPLES = 2**22
 CHUNK_PIXELS = 2**18
 """How many segments a callable is asked for at a time."""
 LOCAL_SERVES = (
-    "nearest values, without statistics, bias and derivatives, of `Local` windows of odd size and whole spacing "
+    "nearest values, without statistics, bias and derivatives, of `Local` windows of odd size and whole "
+    "spacing "
     "in float32 images of one size on the CPU"
 )
 
@@ -70,23 +72,25 @@ def attend(
             are accumulated in float32. Under autocast all three are cast to its type (the geometry never is).
         key: features of beta that the query is compared with.
         value: features of beta that are returned.
-        locations: the search segments or sampling locations in beta of each alpha pixel: Segments or Positions
-            with the leading axes (Ha, Wa) or (B, Ha, Wa), or a function from (n, 2) alpha pixels (x, y) to
-            either, with the leading axes (n) or (B, n), which is called on one piece of alpha at a time and
-            again in backward, so that not all explicit positions exist at once. Or the field `Local`: windows, of
-            views of the same field of view; or `Dense`: all of beta, by `scaled_dot_product_attention`.
+        locations: the search segments or sampling locations in beta of each alpha pixel: Segments or
+            Positions with the leading axes (Ha, Wa) or (B, Ha, Wa), or a function from (n, 2) alpha pixels
+            (x, y) to either, with the leading axes (n) or (B, n), which is called on one piece of alpha at a
+            time and again in backward, so that not all explicit positions exist at once. Or the field
+            `Local`: windows, of views of the same field of view; or `Dense`: all of beta, by
+                `scaled_dot_product_attention`.
         samples: how many samples a segment has. None: one for each beta pixel of the longest valid one.
         interpolation: `bilinear` (differentiable in the geometry) or `nearest` (the paper's).
         bias: added to the scores; anything that broadcasts to (B, Ha, Wa, L).
         backend: `reference` (plain torch, differentiable any number of times and in forward mode), `cpu`,
             `triton`, `local` (windows alone, see `LOCAL_SERVES`; its output is channels-first in memory), or
             `auto`: `local` where that serves, or the compiled one of the tensors' device, with forward-mode
-            derivatives and gradients of gradients by the reference, or the reference if there is none. An explicit
-            compiled backend that cannot serve raises.
+            derivatives and gradients of gradients by the reference, or the reference if there is none. An
+            explicit compiled backend that cannot serve raises.
 
     Raises:
         ValueError: shapes, devices or options that do not fit together.
-        TypeError: not Segments or Positions; a mask that is not bool; dtypes that differ or are not supported.
+        TypeError: not Segments or Positions; a mask that is not bool; dtypes that differ or are not
+            supported.
         RuntimeError: an explicit backend that cannot serve.
         NotImplementedError: derivatives that an explicit backend does not have.
     """
@@ -104,11 +108,14 @@ def attend_with_statistics(
     bias: Tensor | None = None,
     backend: Backend = "auto",
 ) -> Attended:
-    """As `attend`, with the expected position of the match, the spread of the weights and the largest of them.
+    """As `attend`, with the expected position of the match, the spread of the weights and the largest of
+    them.
 
     The statistics are float32 (float64 for float64 inputs) and differentiable, too.
     """
-    return Attended(*_attend(query, key, value, locations, samples, interpolation, bias, backend, measured=True))
+    return Attended(
+        *_attend(query, key, value, locations, samples, interpolation, bias, backend, measured=True)
+    )
 
 
 def _attend(
@@ -168,9 +175,13 @@ def _check(query: Tensor, key: Tensor, value: Tensor, interpolation: str, backen
         raise ValueError(f"query, key and value must not be empty, got {shapes}")
     if not (query.dtype == key.dtype == value.dtype and query.dtype in DTYPES):
         names = ", ".join(str(t.dtype) for t in (query, key, value))
-        raise TypeError(f"query, key and value must be all float64, float32, bfloat16 or float16, got {names}")
+        raise TypeError(
+            f"query, key and value must be all float64, float32, bfloat16 or float16, got {names}"
+        )
     if not query.device == key.device == value.device:
-        raise ValueError(f"query, key and value are on {query.device}, {key.device} and {value.device}: move them")
+        raise ValueError(
+            f"query, key and value are on {query.device}, {key.device} and {value.device}: move them"
+        )
     if interpolation not in ("bilinear", "nearest"):
         raise ValueError(f"interpolation must be 'bilinear' or 'nearest', got {interpolation!r}")
     if backend not in get_args(Backend):
@@ -200,25 +211,39 @@ def _attend_dense(query: Tensor, key: Tensor, value: Tensor, stride: int, bias: 
 def sample_positions(locations: Locations, query: Tensor, samples: int | None) -> SamplePositions:
     """Segments or Positions in the one form that the backends take, in the precision that they count in."""
     if isinstance(locations, Segments):
-        points, mask, straight = torch.stack([locations.start, locations.end], -2), locations.valid[..., None], True
+        points, mask, straight = (
+            torch.stack([locations.start, locations.end], -2),
+            locations.valid[..., None],
+            True,
+        )
     elif isinstance(locations, Positions):
         points, mask, straight = locations.xy, locations.mask, False
         if samples not in (None, points.shape[-2]):
-            raise ValueError(f"samples is {samples}, but the positions given are {points.shape[-2]} a pixel: omit it")
+            raise ValueError(
+                f"samples is {samples}, but the positions given are {points.shape[-2]} a pixel: omit it"
+            )
         samples = points.shape[-2]
     else:
-        raise TypeError(f"locations must be Segments, Positions or a function that returns them, got {type(locations)}")
+        raise TypeError(
+            f"locations must be Segments, Positions or a function that returns them, got {type(locations)}"
+        )
     if mask.dtype != torch.bool:
-        raise TypeError(f"the locations' mask (valid) must be bool, got {mask.dtype}: compare it, as in mask > 0")
+        raise TypeError(
+            f"the locations' mask (valid) must be bool, got {mask.dtype}: compare it, as in mask > 0"
+        )
     if samples is None:
         samples = samples_for(Segments(points[..., 0, :], points[..., 1, :], mask[..., 0]))
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     b, _, ha, wa = query.shape
     if tuple(mask.shape[:-1]) not in ((ha, wa), (b, ha, wa), (1, ha, wa)):
-        raise ValueError(f"locations have the leading axes {tuple(mask.shape[:-1])}, want {(ha, wa)} or {(b, ha, wa)}")
+        raise ValueError(
+            f"locations have the leading axes {tuple(mask.shape[:-1])}, want {(ha, wa)} or {(b, ha, wa)}"
+        )
     if points.device != query.device:
-        raise ValueError(f"locations are on {points.device}, the features are on {query.device}: move one of them")
+        raise ValueError(
+            f"locations are on {points.device}, the features are on {query.device}: move one of them"
+        )
     if mask.dim() == 3:
         points, mask = points[None], mask[None]
     count_in = torch.float64 if query.dtype == torch.float64 else torch.float32
@@ -227,7 +252,9 @@ def sample_positions(locations: Locations, query: Tensor, samples: int | None) -
 
 def samples_for(segments: Segments) -> int:
     """Enough samples for one on each beta pixel of the longest valid segment."""
-    needs_numbers("the number of samples of the longest segment (give `samples`)", segments.start, segments.end)
+    needs_numbers(
+        "the number of samples of the longest segment (give `samples`)", segments.start, segments.end
+    )
     lengths = torch.where(segments.valid, segments.length.detach(), 0)
     return int(lengths.max().ceil()) + 1
 
@@ -258,7 +285,9 @@ def _missing(*tensors: Tensor | None) -> str:
     if torch.compiler.is_compiling():
         return ""
     under_way = transformations()
-    if "Jvp" in under_way or any(t is not None and forward_ad.unpack_dual(t).tangent is not None for t in tensors):
+    if "Jvp" in under_way or any(
+        t is not None and forward_ad.unpack_dual(t).tangent is not None for t in tensors
+    ):
         return "forward mode"
     return "gradients by torch.func (by torch.autograd it has)" if "Grad" in under_way else ""
 

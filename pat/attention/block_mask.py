@@ -10,14 +10,18 @@ from arraygeom.segments import Segments
 
 
 def segment_block_mask(segments: Segments, hw: HW, *, radius: float = 0.5, block: int = 128) -> BlockMask:
-    """For `flex_attention`: alpha's pixels (Ha, Wa), row by row, attend to beta's within `radius` px of their segment.
+    """For `flex_attention`: alpha's pixels (Ha, Wa), row by row, attend to beta's within `radius` px of their
+    segment.
 
-    `segments` (Ha, Wa) or, of a batch, (B, Ha, Wa); keys are beta's H W pixels, row by row. `block` is that of the
-    mask. A query without such a key gets zeros. `Segments.mask` is the same, dense, for scaled_dot_product_attention.
+    `segments` (Ha, Wa) or, of a batch, (B, Ha, Wa); keys are beta's H W pixels, row by row. `block` is that
+    of the mask. A query without such a key gets zeros. `Segments.mask` is the same, dense, for
+    scaled_dot_product_attention.
     """
     batch = segments.valid.shape[0] if segments.valid.ndim > 2 else None
     parts = (segments.start, segments.end, segments.valid)
-    starts, ends, valids = (part.reshape(batch or 1, -1, *part.shape[segments.valid.ndim :]) for part in parts)
+    starts, ends, valids = (
+        part.reshape(batch or 1, -1, *part.shape[segments.valid.ndim :]) for part in parts
+    )
     width = hw[1]
 
     def within(b: Tensor, h: Tensor, query: Tensor, key: Tensor) -> Tensor:

@@ -29,8 +29,9 @@ SCRATCH_TAPS = 2**20
 
 
 def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Values (b, dv, ha, wa), channels last; statistics (b, ha, wa, 4), of no length if not `measured`; log of
-    the sum of exponentials (b, ha, wa); nothing, where the GPU's has the samples of the largest weights."""
+    """Values (b, dv, ha, wa), channels last; statistics (b, ha, wa, 4), of no length if not `measured`; log
+    of the sum of exponentials (b, ha, wa); nothing, where the GPU's has the samples of the largest
+    weights."""
     query = inputs.query
     b, _, ha, wa = query.shape
     counted = accumulated(query)
@@ -44,13 +45,15 @@ def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Te
 
 
 def forward_local(query: Tensor, key: Tensor, value: Tensor, field: Local) -> Tensor:
-    """Values (b, dv, h, w), channels first, of windows of a whole number of pixels around the same pixel of a view of
-    the same size, the nearest look-up, float32."""
+    """Values (b, dv, h, w), channels first, of windows of a whole number of pixels around the same pixel of a
+    view of the same size, the nearest look-up, float32."""
     planes = [x.detach().contiguous().numpy() for x in (query, key, value)]
     out, step = np.empty_like(planes[2]), round(field.spacing)
     tops = range(0, out.shape[2], kernels.ROWS)
     images = [*zip(*planes, out)]
-    in_parallel([partial(kernels.attend_rows, *image, field.size, step, top) for image in images for top in tops])
+    in_parallel(
+        [partial(kernels.attend_rows, *image, field.size, step, top) for image in images for top in tops]
+    )
     return torch.from_numpy(out)
 
 
@@ -100,7 +103,9 @@ def backward(
     step = len(taps.tap_count)
     for first in range(0, b * ha * wa, step):
         last, here = min(first + step, b * ha * wa), taps._replace(first=first)
-        in_parallel([partial(kernels.backward, call, found, s, here, gradients) for s in _shares(first, last, call)])
+        in_parallel(
+            [partial(kernels.backward, call, found, s, here, gradients) for s in _shares(first, last, call)]
+        )
         in_parallel(
             [
                 *_channel_tasks(here, here.key_weight, last, call.query, d, key_out),

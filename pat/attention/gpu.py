@@ -1,14 +1,14 @@
 """C3 attention on GPUs, in Triton: one program for a few alpha pixels, channels along its lanes.
 
 Forward walks the samples once with a running softmax, backward once more for the gradients: the mean of the
-gradients by the weights, which all of them need, follows from forward's outputs (as in FlashAttention-2; Dao 2023,
-section 3.1). With the gradients g by the value, (a, b) by the position, s by the spread and k by the peak, a sample's
-weight has the gradient g.v + a x + b y + s |(x, y) - position|^2 / (2 spread) + k [it is the best]; the mean of this
-over the weights is g.out + (a, b).position + s spread / 2 + k peak.
+gradients by the weights, which all of them need, follows from forward's outputs (as in FlashAttention-2; Dao
+2023, section 3.1). With the gradients g by the value, (a, b) by the position, s by the spread and k by the
+peak, a sample's weight has the gradient g.v + a x + b y + s |(x, y) - position|^2 / (2 spread) + k [it is the
+best]; the mean of this over the weights is g.out + (a, b).position + s spread / 2 + k peak.
 
-Beta's gradients are added to with atomics: of float32, in no fixed order; or, if torch is asked for deterministic
-algorithms, of 64-bit fixed point numbers, whose sums do not depend on the order. `TRITON_INTERPRET=1`, set before the
-first import, runs the same code on the CPU, for tests.
+Beta's gradients are added to with atomics: of float32, in no fixed order; or, if torch is asked for
+deterministic algorithms, of 64-bit fixed point numbers, whose sums do not depend on the order.
+`TRITON_INTERPRET=1`, set before the first import, runs the same code on the CPU, for tests.
 """
 
 from __future__ import annotations
@@ -58,10 +58,15 @@ def backward(
     counted = accumulated(query)
     upstream = channels_last(cotangents[0])
     statistics, statistics_upstream = (
-        t.contiguous() if t.numel() else t.new_zeros(b, ha, wa, 4) for t in (saved[0], cotangents[1].to(counted))
+        t.contiguous() if t.numel() else t.new_zeros(b, ha, wa, 4)
+        for t in (saved[0], cotangents[1].to(counted))
     )
     fixed = torch.are_deterministic_algorithms_enabled()
-    scales = _scales(query, key, value, upstream, statistics_upstream) if fixed else query.new_ones(2, dtype=counted)
+    scales = (
+        _scales(query, key, value, upstream, statistics_upstream)
+        if fixed
+        else query.new_ones(2, dtype=counted)
+    )
     sums = torch.int64 if fixed else counted
     images = [t.new_zeros(b, *t.shape[2:], t.shape[1], dtype=sums) for t in (key, value)]
     query_out = query.new_empty(b, ha, wa, query.shape[1])
@@ -89,7 +94,9 @@ def backward(
     return tuple(t if want else t.new_empty(0) for t, want in zip(found, wanted))
 
 
-def _scales(query: Tensor, key: Tensor, value: Tensor, upstream: Tensor, statistics_upstream: Tensor) -> Tensor:
+def _scales(
+    query: Tensor, key: Tensor, value: Tensor, upstream: Tensor, statistics_upstream: Tensor
+) -> Tensor:
     """By which key's and value's gradients are multiplied so that their sums fit into fixed point.
 
     The weights of a pixel sum to 1, so that the gradients by its scores sum to no more than twice the
@@ -216,7 +223,9 @@ def _blended(image, pixel, across, below, u, v, channel, D, live, NEAREST, NUMBE
 
 @compiled
 def _places(pixels, alpha_pixels, height, width, PIXELS: tl.constexpr, SHARED):
-    """Some alpha pixels: their indices, which of them exist, where their geometry is, and beta's first pixel."""
+    """Some alpha pixels: their indices, which of them exist, where their geometry is, and beta's first
+    pixel.
+    """
     p = tl.program_id(0).to(tl.int64) * PIXELS + tl.arange(0, PIXELS)
     place = p % alpha_pixels if SHARED else p
     return p, p < pixels, place, p // alpha_pixels * height * width
@@ -224,8 +233,8 @@ def _places(pixels, alpha_pixels, height, width, PIXELS: tl.constexpr, SHARED):
 
 @compiled
 def _update(x, y, w, keep, mass, mean_x, mean_y, squared, NUMBER):
-    """Running sums with one more sample of weight w, after the earlier ones are multiplied by `keep`: mass, mean
-    position, and squared distances from it."""
+    """Running sums with one more sample of weight w, after the earlier ones are multiplied by `keep`: mass,
+    mean position, and squared distances from it."""
     mass = mass * keep + w
     share = tl.where(mass > 0, w / tl.where(mass > 0, mass, 1.0), 0.0).to(NUMBER)
     dx, dy = x - mean_x, y - mean_y
@@ -333,7 +342,9 @@ def _add_around(out, pixel, across, below, u, v, weight, x, channel, D, live, sc
 
 @compiled
 def _upstream(statistics, statistics_upstream, p, alive, NUMBER):
-    """Of some pixels: mean x and y, spread, peak, and the gradients by x, y and peak, and by the spread over it."""
+    """Of some pixels: mean x and y, spread, peak, and the gradients by x, y and peak, and by the spread over
+    it.
+    """
     mean_x = tl.load(statistics + 4 * p, mask=alive, other=0)
     mean_y = tl.load(statistics + 4 * p + 1, mask=alive, other=0)
     spread = tl.load(statistics + 4 * p + 2, mask=alive, other=0)
@@ -347,7 +358,9 @@ def _upstream(statistics, statistics_upstream, p, alive, NUMBER):
 
 
 @compiled
-def _weight(q, key, bias, p, alive, pixel, across, below, u, v, counts, lse, i, samples, c, D, NEAREST, BIASED, NUMBER):
+def _weight(
+    q, key, bias, p, alive, pixel, across, below, u, v, counts, lse, i, samples, c, D, NEAREST, BIASED, NUMBER
+):
     """Sample i's inner products with the key around, and its weight."""
     live = counts[:, None] & (c < D)[None, :]
     s0, s1, s2, s3 = _dots(q, key, pixel, across, below, c, D, live, NEAREST, NUMBER)
@@ -360,10 +373,16 @@ def _weight(q, key, bias, p, alive, pixel, across, below, u, v, counts, lse, i, 
 
 @compiled
 def _slope(v0, v1, v2, v3, u, v, x, y, is_best, mean, mean_x, mean_y, spread, peak, gx, gy, gpeak, pull):
-    """The gradient by a sample's weight, less its mean over the weights; `mean` is that of the values' part."""
+    """The gradient by a sample's weight, less its mean over the weights; `mean` is that of the values'
+    part.
+    """
     dx, dy = x - mean_x, y - mean_y
     slope = _blend(v0, v1, v2, v3, u, v) - mean + gx * dx + gy * dy
-    return slope + 0.5 * pull * (dx * dx + dy * dy - spread * spread) + gpeak * (tl.where(is_best, 1.0, 0.0) - peak)
+    return (
+        slope
+        + 0.5 * pull * (dx * dx + dy * dy - spread * spread)
+        + gpeak * (tl.where(is_best, 1.0, 0.0) - peak)
+    )
 
 
 @compiled
@@ -434,7 +453,9 @@ def _backward(
     lse = tl.where(alive, lse, 0.0)
     at_best = tl.load(best + p, mask=alive, other=0)
     mean = tl.sum(g * _rows(out, p, cv, DV, alive[:, None] & (cv < DV)[None, :], NUMBER), 1)
-    mean_x, mean_y, spread, peak, gx, gy, gpeak, pull = _upstream(statistics, statistics_upstream, p, alive, NUMBER)
+    mean_x, mean_y, spread, peak, gx, gy, gpeak, pull = _upstream(
+        statistics, statistics_upstream, p, alive, NUMBER
+    )
     key_scale, value_scale = tl.load(scales).to(tl.float64), tl.load(scales + 1).to(tl.float64)
     by_query = tl.zeros([PIXELS, D_BLOCK], NUMBER)
     x_start, y_start = tl.zeros([PIXELS], NUMBER), tl.zeros([PIXELS], NUMBER)
@@ -445,7 +466,25 @@ def _backward(
         pixel += first
         live, live_v = counts[:, None] & (c < D)[None, :], counts[:, None] & (cv < DV)[None, :]
         s0, s1, s2, s3, w = _weight(
-            q, key, bias, p, alive, pixel, across, below, u, v, counts, lse, i, samples, c, D, NEAREST, BIASED, NUMBER
+            q,
+            key,
+            bias,
+            p,
+            alive,
+            pixel,
+            across,
+            below,
+            u,
+            v,
+            counts,
+            lse,
+            i,
+            samples,
+            c,
+            D,
+            NEAREST,
+            BIASED,
+            NUMBER,
         )
         v0, v1, v2, v3 = _dots(g, value, pixel, across, below, cv, DV, live_v, NEAREST, NUMBER)
         by_score = w * _slope(
@@ -456,7 +495,9 @@ def _backward(
         _add_around(value_out, pixel, across, below, u, v, w, g, cv, DV, live_v, value_scale, NEAREST, FIXED)
         dx, dy = w * (gx + pull * (x - mean_x)), w * (gy + pull * (y - mean_y))
         if not NEAREST:
-            more_x, more_y = _by_position(s0, s1, s2, s3, v0, v1, v2, v3, u, v, x, y, w, by_score, height, width)
+            more_x, more_y = _by_position(
+                s0, s1, s2, s3, v0, v1, v2, v3, u, v, x, y, w, by_score, height, width
+            )
             dx, dy = dx + more_x, dy + more_y
         if WANTS_BIAS:
             tl.store(bias_out + p * samples + i, by_score, mask=counts)

@@ -1,5 +1,5 @@
-"""C3 attention as a formula: plain torch, any device, differentiable any number of times. Slow; the fast backends
-are tested against it.
+"""C3 attention as a formula: plain torch, any device, differentiable any number of times. Slow; the fast
+backends are tested against it.
 
 For the alpha pixel x with the query q, and its samples x_1 .. x_L in beta that count,
 
@@ -30,8 +30,8 @@ LEAST_DEVIATION = 1e-4
 
 
 class SamplePositions(NamedTuple):
-    """Sampling locations in one form: `points` (p, Ha, Wa, n, 2), `mask` (p, Ha, Wa, n or 1), p being 1 or the
-    batch.
+    """Sampling locations in one form: `points` (p, Ha, Wa, n, 2), `mask` (p, Ha, Wa, n or 1), p being 1 or
+    the batch.
 
     `straight` False: the n points are the samples. True: n is 2, start and end of a segment of `samples`
     samples.
@@ -52,8 +52,9 @@ class SamplePositions(NamedTuple):
 
 
 class AttentionInputs(NamedTuple):
-    """What is attended to and where: `query` (b, d, Ha, Wa), `key` (b, d, Hb, Wb) and `value` (b, dv, Hb, Wb) of one
-    dtype and device, the samples' positions, `bias` (b, Ha, Wa, l) or None, and whether look-ups are nearest."""
+    """What is attended to and where: `query` (b, d, Ha, Wa), `key` (b, d, Hb, Wb) and `value` (b, dv, Hb, Wb)
+    of one dtype and device, the samples' positions, `bias` (b, Ha, Wa, l) or None, and whether look-ups are
+    nearest."""
 
     query: Tensor
     key: Tensor
@@ -100,7 +101,9 @@ def attend(inputs: AttentionInputs) -> Attended:
 
 def _rows_at_once(query: Tensor, key: Tensor, value: Tensor, samples: int) -> int:
     """How many rows of alpha gather no more than `BAND_BYTES`."""
-    row_bytes = 2 * query.shape[0] * query.shape[3] * samples * (key.shape[-1] + value.shape[-1]) * key.element_size()
+    row_bytes = (
+        2 * query.shape[0] * query.shape[3] * samples * (key.shape[-1] + value.shape[-1]) * key.element_size()
+    )
     return max(1, BAND_BYTES // max(1, row_bytes))
 
 

@@ -1,8 +1,8 @@
-"""What a loss needs of C3 attention without its weights: the log of each pixel's sum of exponentials, the mean score
-along its segment, and the position of the largest weight.
+"""What a loss needs of C3 attention without its weights: the log of each pixel's sum of exponentials, the
+mean score along its segment, and the position of the largest weight.
 
-Nothing is gathered: memory is that of the query, the key and one image of alpha's size. The weight of a sample with
-the score s is exp(s - log_sum).
+Nothing is gathered: memory is that of the query, the key and one image of alpha's size. The weight of a
+sample with the score s is exp(s - log_sum).
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ SHARPENED = 1e4
 
 
 class Compared(NamedTuple):
-    """A query (B, D, Ha, Wa), and a key and a value (B, D, Hb, Wb), at `locations`, all as `attend` takes them."""
+    """A query (B, D, Ha, Wa), and a key and a value (B, D, Hb, Wb), at `locations`, all as `attend` takes
+    them.
+    """
 
     query: Tensor
     key: Tensor
@@ -78,7 +80,9 @@ def mean_score(compared: Compared) -> Float[Tensor, "b ha wa"]:
 
 @torch.no_grad()
 def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
-    """Where the largest weight is, (x, y) in beta's pixels; 0 where no sample counts. Of equal ones their mean."""
+    """Where the largest weight is, (x, y) in beta's pixels; 0 where no sample counts. Of equal ones their
+    mean.
+    """
     query, key, _, locations, samples, interpolation = compared
     sharp = query.float() * SHARPENED
     found = attend_with_statistics(
@@ -88,10 +92,14 @@ def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
 
 
 class _LogSum(Function):
-    """Its gradient by the query is the attended key; by the key, that of attended values with the query upstream."""
+    """Its gradient by the query is the attended key; by the key, that of attended values with the query
+    upstream.
+    """
 
     @staticmethod
-    def forward(ctx: Any, query: Tensor, key: Tensor, positions: reference.SamplePositions, nearest: bool) -> Tensor:
+    def forward(
+        ctx: Any, query: Tensor, key: Tensor, positions: reference.SamplePositions, nearest: bool
+    ) -> Tensor:
         ctx.inputs = AttentionInputs(query.detach(), key.detach(), key.detach(), positions, None, nearest)
         kernels = torch_op.compiled(chosen_backend("auto", query.device.type))
         value, statistics, total, best = kernels.forward(ctx.inputs, False)

@@ -1,8 +1,8 @@
 """The compiled backends as one operator of torch, `pat::attend`, with its gradient, `pat::attend_backward`.
 
 Both are registered with shapes and derivatives, so that torch.compile and autograd see through them. Saved
-for backward are the inputs, one log of a sum of exponentials per alpha pixel, and four statistics if asked. The
-gradient of the gradient is the reference's.
+for backward are the inputs, one log of a sum of exponentials per alpha pixel, and four statistics if asked.
+The gradient of the gradient is the reference's.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from pat.attention.reference import Attended, AttentionInputs, SamplePositions
 
 INPUTS = "Tensor query, Tensor key, Tensor value, Tensor points, Tensor mask, Tensor? bias"
 SAVED = (
-    "Tensor statistics, Tensor logsum, Tensor best, Tensor? out, Tensor value_cotangent, Tensor statistics_cotangent"
+    "Tensor statistics, Tensor logsum, Tensor best, Tensor? out, Tensor value_cotangent, Tensor "
+    "statistics_cotangent"
 )
 OPTIONS = "int samples, bool straight, bool nearest, bool measured, str backend, bool strict"
 
@@ -134,7 +135,9 @@ def _attend_backward(
 @_attend_backward.register_fake
 def _(query, key, value, points, mask, bias, statistics, logsum, *rest):
     wanted = rest[-1]
-    images = (_channels_last_like(t) if want else t.new_empty(0) for t, want in zip((query, key, value), wanted))
+    images = (
+        _channels_last_like(t) if want else t.new_empty(0) for t, want in zip((query, key, value), wanted)
+    )
     weights = (*logsum.shape, rest[2])
     return (
         *images,
@@ -186,7 +189,9 @@ def _differentiate_again(ctx, *cotangents):
     """The gradient of the gradient: the reference is run again, and its gradient differentiated."""
     samples, straight, nearest, measured, backend, strict, wanted = ctx.options
     if strict:
-        raise NotImplementedError(f"backend '{backend}' has no second-order gradients: ask for backend=\"reference\"")
+        raise NotImplementedError(
+            f"backend '{backend}' has no second-order gradients: ask for backend=\"reference\""
+        )
     saved = [_input_again(t) for t in ctx.saved_tensors]
     query, key, value, points, mask, bias, _, _, _, _, *upstream = saved
     inputs = [t for t, want in zip((query, key, value, points, bias), wanted) if want]
@@ -207,8 +212,8 @@ def _differentiate_again(ctx, *cotangents):
 
 
 def _input_again(t: Tensor | None) -> Tensor | None:
-    """An input of the reference: with a graph of its own, behind which is that of the tensor if a third order needs
-    it."""
+    """An input of the reference: with a graph of its own, behind which is that of the tensor if a third order
+    needs it."""
     if t is None or not t.is_floating_point():
         return t
     return t.view_as(t) if torch.is_grad_enabled() and t.requires_grad else t.detach().requires_grad_()

@@ -21,26 +21,33 @@ if TYPE_CHECKING:
 
 @dataclass
 class Align(Known):
-    """Align the images of an array: every camera's own values at the pixels of one, with masks; no fused image.
+    """Align the images of an array: every camera's own values at the pixels of one, with masks; no fused
+    image.
 
     Without a rig: pat align IMG_0000_*.TIF
     With one: pat align rig.yaml --alpha mono --image mono=a.png --image nir=b.tif --depth 2 20 --out out/
 
-    Values keep their recorded type and bits. Without a rig it is found from the tags of the images, or from the images,
-    and written to rig.yaml beside the result. With folders, or quoted patterns, frames are aligned one by one.
+    Values keep their recorded type and bits. Without a rig it is found from the tags of the images, or from
+    the images, and written to rig.yaml beside the result. With folders, or quoted patterns, frames are
+    aligned one by one.
     """
 
     spellings: ClassVar[Mapping[str, str]] = {"--rig": FIRST, "--to": "--alpha"}
 
     out: Out = Path("out")
-    """Folder for aligned.tif (all bands, with names and wavelengths), NAME_visibility.png (255 seen, 128 occluded, 0
-    beyond the edge), NAME_confidence.png, NAME_positions.npy, depth.tif, visibility.txt and index.html."""
+    """Folder for aligned.tif (all bands, with names and wavelengths), NAME_visibility.png (255 seen, 128
+    occluded, 0 beyond the edge), NAME_confidence.png, NAME_positions.npy, depth.tif, visibility.txt and
+    index.html."""
     interpolation: Literal["nearest", "bilinear", "cubic"] = "bilinear"
     """Between recorded values; nearest keeps them."""
     confidence: float = 0.5
-    """From which confidence on, 0 to 1, a camera counts as seeing a point: lower keeps more, with more mistakes."""
+    """From which confidence on, 0 to 1, a camera counts as seeing a point: lower keeps more, with more
+    mistakes.
+    """
     fill: Literal["none", "propagate"] = "none"
-    """Pixels that a camera does not see: none leaves them without a value, propagate takes the nearest value seen."""
+    """Pixels that a camera does not see: none leaves them without a value, propagate takes the nearest value
+    seen.
+    """
     separate: bool = False
     """Write a file of each camera, NAME.tif, instead of one of all bands."""
     positions: Literal["npy", "tif", "none"] = "npy"
@@ -122,7 +129,9 @@ class Align(Known):
                     correct=self.correct,
                     noise=settings.noise,
                 )
-            written = save_aligned(aligned, self.out, separate=self.separate, positions=self.positions, name=frame.name)
+            written = save_aligned(
+                aligned, self.out, separate=self.separate, positions=self.positions, name=frame.name
+            )
             if frame.found:
                 frame.recorded.save(self.out / "rig.yaml")
                 written.append(self.out / "rig.yaml")
@@ -137,8 +146,8 @@ class Align(Known):
 
 @dataclass(frozen=True)
 class _Frame:
-    """One frame to align: the rig of its developed images, that of its files, and those; `found` says that the rig was
-    found from the images. The name goes in front of the files'; empty for a single frame."""
+    """One frame to align: the rig of its developed images, that of its files, and those; `found` says that
+    the rig was found from the images. The name goes in front of the files'; empty for a single frame."""
 
     rig: Rig
     recorded: Rig

@@ -24,8 +24,8 @@ RenderedFolder = Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder 
 class Evaluate:
     """Compare alpha alone, the classical baseline and the fusion on stereo pairs: PSNR, SSIM, images.
 
-    The left image made grey is alpha, the right one, reduced, is beta, the left one in colour is the ground truth.
-    Example: pat evaluate --kitti data/kitti --middlebury data/middlebury
+    The left image made grey is alpha, the right one, reduced, is beta, the left one in colour is the ground
+    truth. Example: pat evaluate --kitti data/kitti --middlebury data/middlebury
     """
 
     kitti: MaybePath = None
@@ -73,7 +73,9 @@ class Evaluate:
         from ..evaluation.tables import write_csv
 
         write_text(self.out / "scores.md", text)
-        write_csv(self.out / "scores.csv", StereoRow._fields, [row for found in rows.values() for row in found])
+        write_csv(
+            self.out / "scores.csv", StereoRow._fields, [row for found in rows.values() for row in found]
+        )
         print(text, end="")
         say(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, images in {self.out}")
 
@@ -82,8 +84,8 @@ class Evaluate:
 class Ablate:
     """What calibration is worth: families of receptive fields compared by one network.
 
-    On layered scenes with exact positions, of unrectified rigs with focal lengths 1 to 3 times beta's; or on scenes of
-    your own rig. Example: pat ablate --rendered scenes --weights runs/mine/best.safetensors
+    On layered scenes with exact positions, of unrectified rigs with focal lengths 1 to 3 times beta's; or on
+    scenes of your own rig. Example: pat ablate --rendered scenes --weights runs/mine/best.safetensors
     """
 
     weights: Weights = "pat-supervised"
@@ -144,8 +146,8 @@ class Data:
 class Render:
     """Render many scenes of a rig for training: workers, retries, resuming, clusters.
 
-    Example: pat render config.yaml --scenes 900 --out data/ --workers 2. The same command again renders what is
-    missing. The file has at least `rig: rig.yaml`; see `pat.farm.job.RenderConfig`.
+    Example: pat render config.yaml --scenes 900 --out data/ --workers 2. The same command again renders what
+    is missing. The file has at least `rig: rig.yaml`; see `pat.farm.job.RenderConfig`.
     """
 
     config: Annotated[Positional[Path], arg(metavar="CONFIG")]
@@ -209,8 +211,8 @@ class Train:
 class Settings:
     """List the numbers that matching, fusion and networks were given: value, kind, and where each is from.
 
-    Kinds: *physics* follows from what is measured, *size* says how much is done at a time, *tuned* was chosen.
-    Example: pat settings --kind tuned
+    Kinds: *physics* follows from what is measured, *size* says how much is done at a time, *tuned* was
+    chosen. Example: pat settings --kind tuned
     """
 
     kind: Literal["physics", "size", "tuned", "all"] = "all"
@@ -224,7 +226,10 @@ class Settings:
 
         found = [s for s in all_settings(*self.rooms) if self.kind in ("all", s.kind)]
         for entry in found:
-            print(f"{entry.kind:8}{entry.algorithm.removesuffix('Settings')}.{entry.name} = {entry.value}  {entry.why}")
+            print(
+                f"{entry.kind:8}{entry.algorithm.removesuffix('Settings')}.{entry.name} = {entry.value}  "
+                f"{entry.why}"
+            )
         print(f"{sum(s.numbers for s in found)} numbers under {len(found)} names")
 
 
@@ -241,7 +246,9 @@ class Import:
     """Weights file to write."""
 
     def run(self) -> None:
-        """Write the weights. Raises FileNotFoundError or ValueError for a file that is not such a checkpoint."""
+        """Write the weights. Raises FileNotFoundError or ValueError for a file that is not such a
+        checkpoint.
+        """
         from ..networks.authors import read_authors
         from ..networks.paper import PAT
         from ..networks.weights import save_weights

@@ -25,8 +25,8 @@ BoardName = Annotated[str, arg(metavar="BOARD", help=BOARDS)]
 class Calibrate:
     """Calibrate a rig from photographs of a board, with a report of how good it is.
 
-    A folder for each camera, or file names like left01.jpg, right01.jpg; images of one moment have the same number.
-    Example: pat calibrate photos/ --board charuco:8x6:30mm -o rig.yaml
+    A folder for each camera, or file names like left01.jpg, right01.jpg; images of one moment have the same
+    number. Example: pat calibrate photos/ --board charuco:8x6:30mm -o rig.yaml
     """
 
     photos: Annotated[Positional[Path], arg(metavar="FOLDER")]
@@ -37,7 +37,9 @@ class Calibrate:
     out: Out = Path("rig.yaml")
     """The rig file; its report (.html) and covariance (.covariance.json) are written beside it."""
     camera: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=PATTERN")]] = ()
-    """Once for each camera, such as left='left*.jpg', where names of folders and files do not show the camera."""
+    """Once for each camera, such as left='left*.jpg', where names of folders and files do not show the
+    camera.
+    """
     lens: Literal[
         "auto",
         "brown-conrady",
@@ -52,15 +54,17 @@ class Calibrate:
         "thin-prism-fisheye",
         "none",
     ] = "brown-conrady"
-    """Lens model; from kannala-brandt on, they are for fisheyes. auto compares the first five, on held-out frames, and
-    takes the best supported."""
+    """Lens model; from kannala-brandt on, they are for fisheyes. auto compares the first five, on held-out
+    frames, and takes the best supported."""
     depth: Depth = None
     """Near and far bounds in metres of the scenes to come, written into the rig."""
     start: Annotated[Path | None, options.optional("RIG")] = None
-    """A rig known roughly, such as measured positions and nominal focal lengths: one image a camera is enough then."""
+    """A rig known roughly, such as measured positions and nominal focal lengths: one image a camera is enough
+    then.
+    """
     deviation: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=VALUE")]] = ()
-    """How well the start is known: position=0.0005 (m), rotation=3 (degrees), focal=0.02 (share of the focal length),
-    centre=0.01 (share of the width); these are the defaults."""
+    """How well the start is known: position=0.0005 (m), rotation=3 (degrees), focal=0.02 (share of the focal
+    length), centre=0.01 (share of the width); these are the defaults."""
     watch: bool = False
     """While images are taken: a page (.watch.html) with what was detected and which view would help most."""
 
@@ -71,7 +75,9 @@ class Calibrate:
         if not self.board:
             raise ValueError("which board is in the images? Give it, such as --board charuco:8x6:30mm")
         options.writable(self.out)
-        patterns = {name: str(pattern) for name, pattern in options.files_by_name(self.camera, "--camera").items()}
+        patterns = {
+            name: str(pattern) for name, pattern in options.files_by_name(self.camera, "--camera").items()
+        }
         if self.watch:
             self._watch(patterns)
         found = calibrate_photos(

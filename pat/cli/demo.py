@@ -13,11 +13,13 @@ from .options import Out, Weights, say
 
 @dataclass
 class Demo:
-    """Fuse a photograph and the sample array: image, depth and confidence of the photograph, a figure, a table.
+    """Fuse a photograph and the sample array: image, depth and confidence of the photograph, a figure, a
+    table.
 
-    The photograph is scikit-image's motorcycle: its left image as a mono camera's, its right one, reduced, as a colour
-    camera's. Both arrays are recorded as real cameras do (another response, a darker exposure, 300 electrons at
-    white), the rendered one as ideal cameras too; beside the fusion stands what is done without learning.
+    The photograph is scikit-image's motorcycle: its left image as a mono camera's, its right one, reduced, as
+    a colour camera's. Both arrays are recorded as real cameras do (another response, a darker exposure, 300
+    electrons at white), the rendered one as ideal cameras too; beside the fusion stands what is done without
+    learning.
     """
 
     out: Out = Path("out/demo")
@@ -45,9 +47,14 @@ class Demo:
         for name, recording in recordings.items():
             array = recording.array
             say(f"{name}: classical fusion")
-            methods = {"alpha alone": array.images[ALPHA].expand(3, -1, -1), **classical_methods(network, recording)}
+            methods = {
+                "alpha alone": array.images[ALPHA].expand(3, -1, -1),
+                **classical_methods(network, recording),
+            }
             say(f"{name}: fusion with the weights '{self.weights}'")
-            frame = fuse_with_progress(self.weights, array.rig, array.images, alpha=ALPHA, noise=recording.noise)
+            frame = fuse_with_progress(
+                self.weights, array.rig, array.images, alpha=ALPHA, noise=recording.noise
+            )
             methods["fusion"] = frame.image.clamp(0, 1)
             scores = {method: score(image, array.ground_truth) for method, image in methods.items()}
             columns[name] = {method: f"{psnr:.2f} / {ssim:.3f}" for method, (psnr, ssim) in scores.items()}
@@ -75,13 +82,17 @@ def table_of(columns: dict[str, dict[str, str]]) -> str:
     wide = max(map(len, methods)) + 2
     lines = [" " * wide + "".join(f"{name:>18s}" for name in columns)]
     for method in methods:
-        lines.append(f"{method:{wide}s}" + "".join(f"{scores.get(method, '-'):>18s}" for scores in columns.values()))
+        lines.append(
+            f"{method:{wide}s}" + "".join(f"{scores.get(method, '-'):>18s}" for scores in columns.values())
+        )
     return "\n".join([*lines, ""])
 
 
 @dataclass
 class WarmUp:
-    """Compile the kernels that `pat fuse` uses, once for this machine, so that no later command waits for it."""
+    """Compile the kernels that `pat fuse` uses, once for this machine, so that no later command waits for
+    it.
+    """
 
     def run(self) -> None:
         """Compile the kernels by fusing the sample array once: with noise, and as two betas with lenses."""
@@ -98,7 +109,9 @@ class WarmUp:
 
         options.say_when_compiling()
         sample, begin = load_sample(), time.monotonic()
-        colour = sample.rig["colour"].replace(distortion=Distortion("brown-conrady", torch.full((4,), -1e-3).double()))
+        colour = sample.rig["colour"].replace(
+            distortion=Distortion("brown-conrady", torch.full((4,), -1e-3).double())
+        )
         rig = sample.rig.with_camera("colour", colour).with_camera("second", colour)
         images = {**sample.images, "second": sample.images["colour"]}
         noise = dict.fromkeys(images, NoiseLevel.of_electrons(300))

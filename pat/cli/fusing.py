@@ -36,11 +36,11 @@ class Fuse(Known):
     Without a rig: pat fuse mono.png colour.png
     With one: pat fuse rig.yaml --alpha mono --image mono=a.png --image colour=b.png --depth 2 20 --out out/
 
-    Without a rig it is found from the images, and written to found_rig.yaml beside the result. Cameras are then
-    called as their files are. With folders, or patterns such as "mono=day1/m_*.png" (quoted), for the images,
-    frames are fused one by one, matched by names or by the numbers or times in them. With --sequence the cameras
-    need not be synchronised (frame_rate and time_offset in the rig): every frame of alpha gets colour from the
-    betas' frames nearest in time.
+    Without a rig it is found from the images, and written to found_rig.yaml beside the result. Cameras are
+    then called as their files are. With folders, or patterns such as "mono=day1/m_*.png" (quoted), for the
+    images, frames are fused one by one, matched by names or by the numbers or times in them. With --sequence
+    the cameras need not be synchronised (frame_rate and time_offset in the rig): every frame of alpha gets
+    colour from the betas' frames nearest in time.
     """
 
     spellings: ClassVar[Mapping[str, str]] = {
@@ -55,20 +55,20 @@ class Fuse(Known):
     """Without a rig: the focal length in pixels of a camera whose file does not state it."""
     out: Out = Path("out")
     """Folder for fused.png, confidence.png, depth.tif, depth_16.png (16 bits; 0 is unknown), depth.png,
-    depth_nearest.tif and depth_farthest.tif (the true depth is between them in 9 of 10 pixels), index.html (a page
-    that shows them) and view.yaml (the rig of the fused view)."""
+    depth_nearest.tif and depth_farthest.tif (the true depth is between them in 9 of 10 pixels), index.html (a
+    page that shows them) and view.yaml (the rig of the fused view)."""
     align: bool = True
     """Find how far the other cameras lie off their search segments, and put that right."""
     exposure: Annotated[Literal["auto", "keep"] | None, optional("{auto,keep}")] = None
-    """Brightness of the fused image: auto makes a dark or overexposed one as bright as a photograph; keep leaves it as
-    alpha has it. By default auto without a rig, and keep with one."""
+    """Brightness of the fused image: auto makes a dark or overexposed one as bright as a photograph; keep
+    leaves it as alpha has it. By default auto without a rig, and keep with one."""
     keep_alpha: bool = False
     """With --noise, leave alpha's values as recorded; always so if alpha has hardly any noise."""
     luminance: Literal["alpha", "mix", "beta"] = "alpha"
     """Whose brightness the fused image has: beta's, in alpha's detail, suits a near infrared alpha."""
     bits: Annotated[Literal[8, 16, 32] | None, optional("{8,16,32}")] = None
-    """Bits a channel of the fused image: 8 or 16 sRGB-encoded, or 32 for linear light as floats (tif, exr). By default
-    16 if an image has more than 8, else 8; 32 of exr."""
+    """Bits a channel of the fused image: 8 or 16 sRGB-encoded, or 32 for linear light as floats (tif, exr).
+    By default 16 if an image has more than 8, else 8; 32 of exr."""
     kind: Literal["png", "tif", "exr"] = "png"
     """Format of the fused image."""
     sequence: bool = False
@@ -82,15 +82,21 @@ class Fuse(Known):
     video: float = 25.0
     """Frames a second of the video of a sequence; 0 for none."""
     propagate: bool = True
-    """Propagate colour along motion between frames of a sequence; else each is fused by itself, and flickers."""
+    """Propagate colour along motion between frames of a sequence; else each is fused by itself, and flickers.
+    """
     resume: bool = False
-    """Fuse only frames that are not in --out yet, or whose images changed; of one frame, only unfinished tiles."""
+    """Fuse only frames that are not in --out yet, or whose images changed; of one frame, only unfinished
+    tiles.
+    """
     points: bool = False
     """Of a single frame, also write points.ply: the pixels of known depth as a coloured point cloud."""
     classical: bool = False
-    """Show the classical baseline (semi-global matching, warped colour) on that page, to compare; some seconds more."""
+    """Show the classical baseline (semi-global matching, warped colour) on that page, to compare; some
+    seconds more.
+    """
     on_error: Literal["stop", "skip"] = "stop"
-    """What to do when a frame cannot be fused (a corrupt image, a full disk): stop, or report it and go on."""
+    """What to do when a frame cannot be fused (a corrupt image, a full disk): stop, or report it and go on.
+    """
     workers: int = 1
     """Processes on this machine, for many frames."""
     scheduler: Annotated[str | None, optional("ADDRESS")] = None
@@ -98,14 +104,20 @@ class Fuse(Known):
     threads: Annotated[int | None, optional("INT")] = None
     """Threads in each process: by default 1 with several, else all cores."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """Of the network's convolutions: bfloat16 is faster where the processor has it, and changes PSNR by .003 dB."""
+    """Of the network's convolutions: bfloat16 is faster where the processor has it, and changes PSNR by .003
+    dB.
+    """
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Where a single frame is fused: auto takes CUDA where there is such a GPU."""
 
     def run(self) -> None:
-        """Check the options that can be checked at once, and fuse, with the rig that is given or one that is found."""
+        """Check the options that can be checked at once, and fuse, with the rig that is given or one that is
+        found.
+        """
         if self.bits not in {"png": (None, 8, 16), "tif": (None, 8, 16, 32), "exr": (None, 32)}[self.kind]:
-            raise ValueError(f"--bits {self.bits} --kind {self.kind}: png holds 8 or 16 bits, exr 32, tif any")
+            raise ValueError(
+                f"--bits {self.bits} --kind {self.kind}: png holds 8 or 16 bits, exr 32, tif any"
+            )
         if self.kind == "exr":
             from ..media.images import exr_writer
 
@@ -157,21 +169,29 @@ class Fuse(Known):
         cameras = camera_names(self.given)
         focal = options.numbers_by_name(self.focal, "--focal")
         if unknown := focal.keys() - cameras.keys():
-            raise ValueError(f"--focal: no camera '{min(unknown)}'; the images' names are {', '.join(cameras)}")
+            raise ValueError(
+                f"--focal: no camera '{min(unknown)}'; the images' names are {', '.join(cameras)}"
+            )
         noise = options.noise_of(self.noise)
         if isinstance(noise, dict) and (unknown := noise.keys() - cameras.keys()):
-            raise ValueError(f"--noise: no camera '{min(unknown)}'; the images' names are {', '.join(cameras)}")
+            raise ValueError(
+                f"--noise: no camera '{min(unknown)}'; the images' names are {', '.join(cameras)}"
+            )
         videos = [path for path in cameras.values() if path.suffix.lower() in options.VIDEO_SUFFIXES]
         if videos and len(videos) < len(cameras):
             others = [path for path in cameras.values() if path not in videos]
-            raise ValueError(f"{videos[0]} is a video and {others[0]} is not: give images alone, or videos alone")
+            raise ValueError(
+                f"{videos[0]} is a video and {others[0]} is not: give images alone, or videos alone"
+            )
         if not videos:
             return self._without_rig_from({name: find_images(path) for name, path in cameras.items()}, {})
         with TemporaryDirectory() as folder:
             self._without_rig_from(*frames_of_videos(cameras, Path(folder)))
 
     def _without_rig_from(self, files: dict[str, list[Path]], rates: Mapping[str, float]) -> None:
-        """Find the rig from the first image of each camera and fuse; `rates` are frames a second, of videos."""
+        """Find the rig from the first image of each camera and fuse; `rates` are frames a second, of
+        videos.
+        """
         from ..fusion.from_images import array_from_images
         from ..fusion.results import FOUND_RIG
         from ..networks.weights import load_weights
@@ -193,7 +213,9 @@ class Fuse(Known):
         rig = array.recorded
         for name, rate in rates.items():
             if name in rig.names:
-                rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate)))
+                rig = rig.with_camera(
+                    name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate))
+                )
         self.video = rates.get(array.alpha, self.video)
         self._many(rig, {name: files[name] for name in rig.names}, array.alpha)
         rig.save(self.out / FOUND_RIG)
@@ -221,7 +243,9 @@ class Fuse(Known):
         for name, rate in options.numbers_by_name(self.frame_rate, "--frame-rate").items():
             rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate)))
         for name, offset in options.numbers_by_name(self.time_offset, "--time-offset").items():
-            rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, time_offset=offset)))
+            rig = rig.with_camera(
+                name, rig[name].replace(sensor=replace(rig[name].sensor, time_offset=offset))
+            )
         return rig
 
     def _one(
@@ -234,8 +258,8 @@ class Fuse(Known):
         found: tuple[str, ...] | None = None,
         healing: Callable[[], Healed | None] = lambda: None,
     ) -> None:
-        """Fuse one frame. `found` is what was found out about the rig, if it was found from the images; `healing` gives
-        the rig healed by them, with which a frame is fused again."""
+        """Fuse one frame. `found` is what was found out about the rig, if it was found from the images;
+        `healing` gives the rig healed by them, with which a frame is fused again."""
         from arraygeom import Camera
         from arraygeom.atomic import sweep
 
@@ -244,7 +268,9 @@ class Fuse(Known):
         from ..support.locks import folder_lock
 
         if self.points and not isinstance(rig[alpha], Camera):
-            raise ValueError("--points needs a calibrated alpha, and the rig has only F for it: leave out --points")
+            raise ValueError(
+                "--points needs a calibrated alpha, and the rig has only F for it: leave out --points"
+            )
         begin, store = time.monotonic(), self.out / ".tiles"
         with folder_lock(self.out):
             sweep(self.out)
@@ -263,7 +289,14 @@ class Fuse(Known):
             points = rig[alpha] if self.points else None
             bands = band_names(frame, (name for name in rig.betas(alpha) if name in images))
             written = save_frame(
-                frame, self.out, bits=bits, kind=self.kind, view=view, rig=found_rig, points=points, bands=bands
+                frame,
+                self.out,
+                bits=bits,
+                kind=self.kind,
+                view=view,
+                rig=found_rig,
+                points=points,
+                bands=bands,
             )
             shutil.rmtree(store, ignore_errors=True)
             if said := describe_bands(frame, bands, self.kind):
@@ -335,7 +368,9 @@ class Fuse(Known):
         self._notes.append(line)
 
     def _classical(self, rig: Rig, images: Mapping[str, Tensor], alpha: str, gain: float) -> Tensor | None:
-        """The classical baseline as bright as the fused image; None, and a line, where the cameras do not allow it."""
+        """The classical baseline as bright as the fused image; None, and a line, where the cameras do not
+        allow it.
+        """
         from ..evaluation.baseline import classical_view
         from ..fusion.report import LONGEST
         from ..media.colour import exposed
@@ -353,7 +388,9 @@ class Fuse(Known):
         gain = exposure_gain(frame.image) if self.exposure == "auto" else 1.0
         if gain != 1:
             what = "dark" if gain > 1 else "overexposed"
-            self._note(f"exposure: light times {gain:.2f}, as the image is {what} (--exposure keep leaves it)")
+            self._note(
+                f"exposure: light times {gain:.2f}, as the image is {what} (--exposure keep leaves it)"
+            )
         return frame._replace(image=exposed(frame.image, gain)), gain
 
     def _many(self, rig: Rig, files: dict[str, list[Path]], alpha: str) -> None:
@@ -361,7 +398,11 @@ class Fuse(Known):
         from ..support.jobs import Workers, cores
 
         self.refuse_several()
-        single = {"--points": self.points, "--classical": self.classical, "--device cuda": self.device == "cuda"}
+        single = {
+            "--points": self.points,
+            "--classical": self.classical,
+            "--device cuda": self.device == "cuda",
+        }
         if named := [option for option, given in single.items() if given]:
             raise ValueError(f"{', '.join(named)}: for a single frame only: leave out for several")
         batch = Batch(
@@ -396,13 +437,15 @@ class Fuse(Known):
 def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> tuple[tuple[str, ...], bool]:
     """The images NAME=FILE of a rig's cameras, and whether the first argument is a rig. Imports no torch.
 
-    Images that follow a rig are of the cameras that their names say. Raises ValueError for arguments that do not go
-    together, FileNotFoundError for files that do not exist.
+    Images that follow a rig are of the cameras that their names say. Raises ValueError for arguments that do
+    not go together, FileNotFoundError for files that do not exist.
     """
     if given and (image or is_rig_file(given[0])):
         named = (*image, *(f"{path.stem}={path}" for path in given[1:]))
         if not named:
-            raise ValueError(f"{given[0]}: {options.NO_IMAGE}; if it is a rig, give --image NAME=FILE for each camera")
+            raise ValueError(
+                f"{given[0]}: {options.NO_IMAGE}; if it is a rig, give --image NAME=FILE for each camera"
+            )
         options.files_by_name(named)
         options.refuse_missing_rig(given[0])
         return named, True
@@ -411,7 +454,8 @@ def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> t
         raise ValueError(f"--image needs a rig: give --rig RIG, or the images alone: `pat {command} {files}`")
     if len(given) < 2:
         raise ValueError(
-            f"give two images or more, as `pat {command} mono.png colour.png`; or a rig, --alpha and each --image"
+            f"give two images or more, as `pat {command} mono.png colour.png`; or a rig, --alpha and each "
+            "--image"
         )
     for path in given:
         options.refuse_missing_image(path)
@@ -421,8 +465,8 @@ def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> t
 def files_by_camera(
     rig: Rig, alpha: str | None, given: Sequence[Path], image: Sequence[str]
 ) -> tuple[str, dict[str, list[Path]]]:
-    """Alpha's name, and the image files of each camera of a rig. Raises ValueError without alpha, for names that the
-    rig lacks, and for one image given twice."""
+    """Alpha's name, and the image files of each camera of a rig. Raises ValueError without alpha, for names
+    that the rig lacks, and for one image given twice."""
     from ..fusion.batch import find_images
 
     if alpha is None:
@@ -436,7 +480,9 @@ def files_by_camera(
 
 
 def is_rig_file(path: Path) -> bool:
-    """Whether a file is meant as a rig: neither a folder, nor a pattern, nor named as images and videos are."""
+    """Whether a file is meant as a rig: neither a folder, nor a pattern, nor named as images and videos
+    are.
+    """
     suffixes = options.IMAGE_SUFFIXES | options.VIDEO_SUFFIXES
     return not (any(c in path.name for c in "*?[") or path.suffix.lower() in suffixes or path.is_dir())
 
@@ -445,4 +491,6 @@ def refuse_equal_files(files: Mapping[str, Path]) -> None:
     """Raise ValueError if two cameras are given one file, or a copy of it."""
     for (a, first), (b, second) in combinations(files.items(), 2):
         if first.is_file() and second.is_file() and filecmp.cmp(first, second, shallow=False):
-            raise ValueError(f"the images of '{a}' and '{b}' are the same image, {second}: give each camera its own")
+            raise ValueError(
+                f"the images of '{a}' and '{b}' are the same image, {second}: give each camera its own"
+            )

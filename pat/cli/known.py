@@ -53,18 +53,25 @@ OUT_OF_RANGE = 0.9
 
 @dataclass
 class Known:
-    """What `pat fuse` and `pat align` are both given: an array, how to match its images, what is known of the scene."""
+    """What `pat fuse` and `pat align` are both given: an array, how to match its images, what is known of the
+    scene.
+    """
 
     given: Annotated[Positional[tuple[Path, ...]], arg(metavar="RIG|IMAGE IMAGE")] = ()
-    """Rig file of any known format (also: --rig RIG); or, without one, an image, folder or video of each camera."""
+    """Rig file of any known format (also: --rig RIG); or, without one, an image, folder or video of each
+    camera.
+    """
     alpha: Annotated[str | None, optional("NAME")] = None
-    """The camera whose view is wanted; without a rig by default the largest grey image. Of align also: --to."""
+    """The camera whose view is wanted; without a rig by default the largest grey image. Of align also: --to.
+    """
     image: Images = ()
     """With a rig: an image of each camera, once each; or NAME=FOLDER, or NAME=PATTERN."""
     depth: Depth = None
     """Near and far bounds in metres, instead of the rig's; far may be inf."""
     depth_map: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Depth of alpha's pixels, of a single frame: PFM, TIFF or PNG of 16 bits; matches are searched around it."""
+    """Depth of alpha's pixels, of a single frame: PFM, TIFF or PNG of 16 bits; matches are searched around
+    it.
+    """
     depth_scale: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
     """Metres of one unit of --depth-map; by default 1 of floats, and .001 of whole numbers."""
     depth_tolerance: float = 0.05
@@ -75,12 +82,15 @@ class Known:
     max_memory: Memory = None
     """Memory limit of the whole process, such as 4GiB; larger frames are done in tiles."""
     normalise_radiometry: bool = False
-    """First bring every beta to alpha's mean and contrast (other exposures, filters). Also: --match-levels."""
+    """First bring every beta to alpha's mean and contrast (other exposures, filters). Also: --match-levels.
+    """
     response: Annotated[str, arg(metavar="fit|rec601|R,G,B")] = "fit"
     """How a mono alpha weighs red, green and blue; fit: found from matches, with gain and gamma."""
-    noise: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=ELECTRONS[,READ]|estimate|none")]] = ()
-    """Low light: a camera's electrons at white and read noise in electrons, or estimate: views are denoised. A frame is
-    by default fused so where an image shows noise plainly."""
+    noise: UseAppendAction[
+        Annotated[tuple[str, ...], arg(metavar="NAME=ELECTRONS[,READ]|estimate|none")]
+    ] = ()
+    """Low light: a camera's electrons at white and read noise in electrons, or estimate: views are denoised.
+    A frame is by default fused so where an image shows noise plainly."""
     strict: bool = False
     """Write nothing, instead of warning, where the confidence says that the rig does not fit the images."""
     report: bool = True
@@ -158,7 +168,8 @@ class Known:
         if float(((known < near) | (known > far)).float().mean()) > OUT_OF_RANGE:
             low, high = known.quantile(torch.tensor([0.05, 0.95])).tolist()
             raise ValueError(
-                f"{self.depth_map}: holds {low:.3g} to {high:.3g} m, the rig's depth range is {near:g} to {far:g} m: "
+                f"{self.depth_map}: holds {low:.3g} to {high:.3g} m, the rig's depth range is {near:g} to "
+                f"{far:g} m: "
                 "state its unit with --depth-scale, or another range with --depth"
             )
         return AroundDepth(depth, self.depth_tolerance, view)
@@ -172,7 +183,9 @@ class Known:
 
         assert self.matches is not None
         fields = dict.fromkeys(rig.betas(alpha), field)
-        for names, points in read_matches(self.matches, files, {name: rig[name].hw for name in files}).items():
+        for names, points in read_matches(
+            self.matches, files, {name: rig[name].hw for name in files}
+        ).items():
             if alpha not in names:
                 continue
             (a, b) = (names, points) if names[0] == alpha else (names[::-1], points[::-1])

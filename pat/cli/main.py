@@ -54,7 +54,9 @@ def command_paths(group: Any = Pat, before: tuple[str, ...] = ()) -> Iterator[tu
 
 
 def main(arguments: list[str] | None = None, *, group: Any = Pat, prog: str = "pat") -> None:
-    """Run `pat`, or another group. Errors in what was given are one line on standard error, and exit status 2."""
+    """Run `pat`, or another group. Errors in what was given are one line on standard error, and exit status
+    2.
+    """
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
         try:
@@ -83,7 +85,11 @@ def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
     except (ValueError, OSError, FloatingPointError) as error:
         _fail(error, f"{error}", debug)
     except ImportError as error:
-        _fail(error, f"{error}" if "pip install" in f"{error}" else f"{error}: pip install 'arraygeom-pat[all]'", debug)
+        _fail(
+            error,
+            f"{error}" if "pip install" in f"{error}" else f"{error}: pip install 'arraygeom-pat[all]'",
+            debug,
+        )
     except MemoryError as error:
         _fail(error, "out of memory: give smaller images, or --max-memory where there is one", debug)
     except (RuntimeError, LookupError, ArithmeticError) as error:
@@ -98,7 +104,9 @@ def _fail(error: BaseException, text: str, debug: bool) -> NoReturn:
 
 
 def _command(arguments: list[str], group: Any, prog: str) -> Any:
-    """The command that arguments name, its options parsed. Raises ValueError for a command that does not exist."""
+    """The command that arguments name, its options parsed. Raises ValueError for a command that does not
+    exist.
+    """
     if "--tyro-print-completion" in arguments or "--tyro-write-completion" in arguments:
         return tyro.cli(_union(group), prog=prog, args=arguments)
     if "--version" in arguments:
@@ -130,8 +138,15 @@ def _help(path: str, group: Any) -> str:
         parts = {"commands": Pat.users, "for the development of networks": Pat.authors}
     lines = [f"usage: {path} COMMAND ...", "", _first_line(group)]
     for title, commands in parts.items():
-        lines += ["", f"{title}:", *(f"  {name:10s} {_first_line(command)}" for name, command in commands.items())]
-    lines += ["", f"`{path} COMMAND --help` explains a command's options; --debug shows an error's traceback."]
+        lines += [
+            "",
+            f"{title}:",
+            *(f"  {name:10s} {_first_line(command)}" for name, command in commands.items()),
+        ]
+    lines += [
+        "",
+        f"`{path} COMMAND --help` explains a command's options; --debug shows an error's traceback.",
+    ]
     return "\n".join([*lines, *(["`pat --version` prints the version."] if group is Pat else [])])
 
 
@@ -160,7 +175,10 @@ def _choices(given: str, option: str, choices: str) -> str:
 
 REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"^Error parsing (\S+): ", r"\1: "),
-    (r"no type matching (?:\{None\}\|)?\{(.+?)\} could be instantiated from \[(.*?)\].*", r"wanted \1, got \2"),
+    (
+        r"no type matching (?:\{None\}\|)?\{(.+?)\} could be instantiated from \[(.*?)\].*",
+        r"wanted \1, got \2",
+    ),
     (r"Could not find valid parse for arguments: \[(.*?)\].*", r"\1 does not fit"),
     (r"invalid literal for int\(\) with base 10: (.+)", r"\1 is not a whole number"),
     (r"could not convert string to float: (.+)", r"\1 is not a number"),
@@ -170,7 +188,10 @@ REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     ),
     (r"^Missing value for argument '(\S+)'.*", r"\1: give a value"),
     (r"^Missing from .+?: (\S+) (.+?) \(required\)", r"\1 is missing: \2"),
-    (r"^Unrecognized options: ([^-\s]\S*=\S+).*", r"\1: write the option before each, as in --image a=A --image b=B"),
+    (
+        r"^Unrecognized options: ([^-\s]\S*=\S+).*",
+        r"\1: write the option before each, as in --image a=A --image b=B",
+    ),
     (r"^Unrecognized options: ", r"unknown here: "),
     (r" Perhaps you meant: (\S+).*", r"; did you mean \1?"),
 )
@@ -195,10 +216,14 @@ def reworded(box: str) -> str:
     >>> reworded("╭─ Unrecognized options ──╮\\n│ Unrecognized options: --x │\\n╰─────╯")
     'unknown here: --x'
     """
-    lines = box.strip().splitlines()  # without a frame, where the terminal has no Unicode, the title is underlined
+    lines = (
+        box.strip().splitlines()
+    )  # without a frame, where the terminal has no Unicode, the title is underlined
     rows = [row.strip("│ ") for row in (lines[1:-1] if box.startswith("╭") else lines[2:])]
     said = [" ".join(text.split()) for text in re.split(r"[─-]{9,}", " ".join(rows))]
-    text = " ".join(part for i, part in enumerate(said) if part and (i == 0 or part.startswith("Perhaps you meant")))
+    text = " ".join(
+        part for i, part in enumerate(said) if part and (i == 0 or part.startswith("Perhaps you meant"))
+    )
     for pattern, words in REWORDED:
         text = re.sub(pattern, words, text)
     return text

@@ -1,6 +1,7 @@
 """Options that several commands share: their types and help, what NAME=VALUE means, and what is printed.
 
-Nothing here or in the modules of the commands imports torch before a command runs: `pat --help` is printed at once.
+Nothing here or in the modules of the commands imports torch before a command runs: `pat --help` is printed at
+once.
 """
 
 from __future__ import annotations
@@ -33,8 +34,12 @@ WEIGHT_NAMES = tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
 
 FIELD_NAMES = ("epipolar", "line", "homography", "rectified", "nearest", "local", "dense", "curved")
 """The keys of `arraygeom.fields.FIELDS`, whose import takes torch."""
-FIELD_HELP = f"Receptive field in the other cameras: {', '.join(FIELD_NAMES)}, or MODULE:OBJECT for your own; "
-FieldName = Annotated[str, arg(metavar="NAME|MODULE:OBJECT", help=f"{FIELD_HELP}auto takes what the rig allows.")]
+FIELD_HELP = (
+    f"Receptive field in the other cameras: {', '.join(FIELD_NAMES)}, or MODULE:OBJECT for your own; "
+)
+FieldName = Annotated[
+    str, arg(metavar="NAME|MODULE:OBJECT", help=f"{FIELD_HELP}auto takes what the rig allows.")
+]
 
 
 def response_of(text: str) -> Any:
@@ -51,7 +56,8 @@ def response_of(text: str) -> Any:
 
 
 def noise_of(texts: Iterable[str], *, by_default: bool = False) -> Any:
-    """The noise of `--noise estimate` or `--noise NAME=ELECTRONS[,READ]`; of none, None. Raises ValueError else.
+    """The noise of `--noise estimate` or `--noise NAME=ELECTRONS[,READ]`; of none, None. Raises ValueError
+    else.
 
     Without, None or, `by_default`, "auto": estimated where it shows plainly.
     """
@@ -64,7 +70,9 @@ def noise_of(texts: Iterable[str], *, by_default: bool = False) -> Any:
         return None if entries == ["none"] else "estimate"
     levels = []
     if {"estimate", "none"} & {*entries}:
-        raise ValueError(f"--noise: got {', '.join(entries)}: give estimate or none alone, or NAME=ELECTRONS of each")
+        raise ValueError(
+            f"--noise: got {', '.join(entries)}: give estimate or none alone, or NAME=ELECTRONS of each"
+        )
     for entry in entries:
         name, _, numbers = entry.partition("=")
         try:
@@ -86,7 +94,9 @@ def optional(metavar: str) -> Any:
     return arg(metavar=metavar, help_behavior_hint="")
 
 
-RigFile = Annotated[Positional[Path], arg(metavar="RIG", help="Rig file of any known format; also: --rig RIG.")]
+RigFile = Annotated[
+    Positional[Path], arg(metavar="RIG", help="Rig file of any known format; also: --rig RIG.")
+]
 Images = UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=FILE")]]
 Numbers = UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=NUMBER")]]
 Out = Annotated[Path, arg(metavar="PATH", aliases=["-o"])]
@@ -103,8 +113,8 @@ FIRST, LAST = "first", "last"
 def respelled(arguments: Iterable[str], command: Any) -> list[str]:
     """The arguments with the other `spellings` of a command's options replaced.
 
-    FIRST and LAST stand for the first and the last positional argument, whose value follows the option: a rig may
-    always be given so. Images that are positional arguments may stand anywhere.
+    FIRST and LAST stand for the first and the last positional argument, whose value follows the option: a rig
+    may always be given so. Images that are positional arguments may stand anywhere.
     """
     options = getattr(command, "__dataclass_fields__", {})
     spellings = ({"--rig": FIRST} if "rig" in options else {}) | getattr(command, "spellings", {})
@@ -148,7 +158,9 @@ def writable(out: Path, *, folder: bool = False) -> Path:
     Raises ValueError if it cannot be: a folder where a file is wanted, a file in its way, no permission.
     """
     if out.exists() and out.is_dir() != folder:
-        raise ValueError(f"--out: {out} is a {'folder: name a file in it' if out.is_dir() else 'file: name a folder'}")
+        raise ValueError(
+            f"--out: {out} is a {'folder: name a file in it' if out.is_dir() else 'file: name a folder'}"
+        )
     above = out if out.exists() else next(p for p in out.absolute().parents if p.exists())
     if above != out and not above.is_dir():
         raise ValueError(f"--out: {above} is a file, so {out} cannot be made: give another path")
@@ -167,7 +179,9 @@ def device_of(name: str) -> str:
     if torch.cuda.is_available():
         return "cuda"
     if name == "cuda":
-        raise ValueError("--device cuda: no CUDA device is available: leave it out, or install torch for CUDA")
+        raise ValueError(
+            "--device cuda: no CUDA device is available: leave it out, or install torch for CUDA"
+        )
     return "cpu"
 
 
@@ -194,13 +208,17 @@ NO_IMAGE = "is no image: images end in .png, .tif, .jpg and the like"
 
 
 def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> Rig:
-    """The rig of the first argument, which might have been meant as an image; with other depth bounds if given."""
+    """The rig of the first argument, which might have been meant as an image; with other depth bounds if
+    given.
+    """
     from arraygeom.io.source import UnknownRigFormat
 
     try:
         return load_rig(path, depth)
     except UnknownRigFormat:
-        raise ValueError(f"{path}: {NO_IMAGE}; nor is it a rig file (`pat rig convert --help` names formats)") from None
+        raise ValueError(
+            f"{path}: {NO_IMAGE}; nor is it a rig file (`pat rig convert --help` names formats)"
+        ) from None
 
 
 def refuse_missing_rig(path: Path) -> None:
@@ -235,16 +253,20 @@ def numbers_by_name(texts: Iterable[str], option: str) -> dict[str, float]:
 def read_images(rig: Rig, texts: Iterable[str], *, sized: bool = True) -> dict[str, Tensor]:
     """The images of `--image NAME=FILE` by camera.
 
-    Raises ValueError for a camera given twice, or not of the rig, and, if `sized`, for an image of another size.
+    Raises ValueError for a camera given twice, or not of the rig, and, if `sized`, for an image of another
+    size.
     """
     from ..media.images import read_image
 
     files = {rig.require(name): path for name, path in files_by_name(texts).items()}
-    return {name: read_image(path, name=name, hw=rig[name].hw if sized else None) for name, path in files.items()}
+    return {
+        name: read_image(path, name=name, hw=rig[name].hw if sized else None) for name, path in files.items()
+    }
 
 
 def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
-    """The images of `--image NAME=FILE`: the first of every camera is a frame, the second of every camera the next.
+    """The images of `--image NAME=FILE`: the first of every camera is a frame, the second of every camera the
+    next.
 
     Raises ValueError for cameras with unequal numbers of images.
     """
@@ -267,7 +289,9 @@ def _named_file(option: str, text: str) -> tuple[str, Path]:
         file = path or text
         if not Path(file).suffix:
             raise ValueError(f"{option}: '{text}' is not NAME=FILE")
-        raise ValueError(f"{option} {text}: which camera is it of? Give NAME=FILE, such as {Path(file).stem}={file}")
+        raise ValueError(
+            f"{option} {text}: which camera is it of? Give NAME=FILE, such as {Path(file).stem}={file}"
+        )
     return name, Path(path)
 
 
@@ -324,9 +348,11 @@ LINE_EVERY = 10.0
 
 @contextmanager
 def working(title: str) -> Iterator[Callable[[str], None]]:
-    """A block during which the terminal shows a title, the step that is done, and the seconds that have passed.
+    """A block during which the terminal shows a title, the step that is done, and the seconds that have
+    passed.
 
-    Gives a function that changes the title. Where there is no terminal, steps are lines, `LINE_EVERY` seconds apart.
+    Gives a function that changes the title. Where there is no terminal, steps are lines, `LINE_EVERY` seconds
+    apart.
     """
     import time
 
@@ -334,7 +360,12 @@ def working(title: str) -> Iterator[Callable[[str], None]]:
 
     from ..support.steps import steps_shown
 
-    columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), TextColumn("{task.fields[step]}")
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[step]}"),
+    )
     terminal, printed = console().is_terminal, time.monotonic()
     with Progress(*columns, console=console(), transient=True, disable=not terminal) as bar:
         task = bar.add_task(title, total=None, step="")

@@ -15,7 +15,20 @@ from tyro.conf import Positional, arg
 
 from . import options
 from .known import MatchesFile
-from .options import FIRST, LAST, Depth, FieldName, Images, MaybeOut, Numbers, Out, RigFile, load_rig, optional, say
+from .options import (
+    FIRST,
+    LAST,
+    Depth,
+    FieldName,
+    Images,
+    MaybeOut,
+    Numbers,
+    Out,
+    RigFile,
+    load_rig,
+    optional,
+    say,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -26,7 +39,9 @@ if TYPE_CHECKING:
 
 @dataclass
 class Show:
-    """Draw a rig, the search segments of some alpha pixels, and how far matched points lie from their lines."""
+    """Draw a rig, the search segments of some alpha pixels, and how far matched points lie from their
+    lines.
+    """
 
     rig: RigFile
     alpha: Annotated[str | None, optional("NAME")] = None
@@ -34,8 +49,9 @@ class Show:
     image: Images = ()
     """Images to draw on, if wanted; with two or more, points are matched in them."""
     out: Out = Path("out/show")
-    """Folder for rig.png (cameras in space; if calibrated), fields.png (search segments of some pixels) and, with
-    images, matches.png (patches around points matched in the images, and how far they lie from their lines)."""
+    """Folder for rig.png (cameras in space; if calibrated), fields.png (search segments of some pixels) and,
+    with images, matches.png (patches around points matched in the images, and how far they lie from their
+    lines)."""
 
     def run(self) -> None:
         """Write the drawings, and warn of a rig that does not fit the images."""
@@ -71,7 +87,9 @@ def warn_of_misfit(rig: Rig, images: Mapping[str, Tensor]) -> None:
 
 
 def matched_points(rig: Rig, alpha: str, images: Mapping[str, Tensor]) -> dict[str, tuple[Tensor, Tensor]]:
-    """Points of alpha and of each beta that shows enough of the same and that the rig relates to alpha, by beta."""
+    """Points of alpha and of each beta that shows enough of the same and that the rig relates to alpha, by
+    beta.
+    """
     from calib.images.matches import match_cameras
     from calib.images.residuals import related
 
@@ -85,7 +103,9 @@ def matched_points(rig: Rig, alpha: str, images: Mapping[str, Tensor]) -> dict[s
 
 
 def given_matches(path: Path | None, texts: Sequence[str], images: Mapping[str, Tensor]) -> Pairs | None:
-    """The matches of a file between images of cameras, which `--image NAME=FILE` gives; None without a file."""
+    """The matches of a file between images of cameras, which `--image NAME=FILE` gives; None without a
+    file.
+    """
     if path is None:
         return None
     from arraygeom.io.point_matches import read_matches
@@ -118,7 +138,9 @@ class Explore:
     """The camera to point in; by default the first with an image."""
     field: FieldName = "auto"
     weights: Annotated[str | None, arg(metavar="NAME|FILE", help_behavior_hint="")] = None
-    """A network of the paper whose attention is shown, such as pat-supervised; by default correlations of windows."""
+    """A network of the paper whose attention is shown, such as pat-supervised; by default correlations of
+    windows.
+    """
     save: Annotated[Path | None, optional("FILE.html")] = None
     """Write a page of one file that needs no server, and end."""
     port: int = 0
@@ -156,7 +178,9 @@ class Info:
     depth: Depth = None
     """Near and far bounds in metres, instead of the rig's."""
     alpha: Annotated[str | None, optional("NAME")] = None
-    """Only pairs with this alpha, the 50 nearest; by default all pairs, and of over 12 cameras those of the first."""
+    """Only pairs with this alpha, the 50 nearest; by default all pairs, and of over 12 cameras those of the
+    first.
+    """
     json: bool = False
     """Print JSON instead of tables."""
 
@@ -174,7 +198,10 @@ class Info:
         alpha = None if self.alpha is None else rig.require(self.alpha)
         if alpha is None and len(rig.names) > MOST_CAMERAS:
             alpha = rig.names[0]
-            say(f"pairs with alpha '{alpha}' and its nearest cameras, of {len(rig.names)}: --alpha NAME for others")
+            say(
+                f"pairs with alpha '{alpha}' and its nearest cameras, of {len(rig.names)}: --alpha NAME for "
+                "others"
+            )
         cameras, pairs = summarise_cameras(rig), summarise_pairs(rig, alpha)
         if self.json:
             document = {"cameras": [c._asdict() for c in cameras], "pairs": [p._asdict() for p in pairs]}
@@ -182,8 +209,12 @@ class Info:
         of_cameras = Table("camera", "pixels", "focal px", "view deg", "mm a pixel, near - far", box=None)
         for c in cameras:
             wh = f"{c.wh[0]}x{c.wh[1]}"
-            of_cameras.add_row(c.name, wh, _two(c.focal), _two(c.field_of_view, " x "), _two(c.footprint, " - "))
-        of_pairs = Table("alpha > beta", "baseline m", "rotation deg", "seen", "segment px, median - longest", box=None)
+            of_cameras.add_row(
+                c.name, wh, _two(c.focal), _two(c.field_of_view, " x "), _two(c.footprint, " - ")
+            )
+        of_pairs = Table(
+            "alpha > beta", "baseline m", "rotation deg", "seen", "segment px, median - longest", box=None
+        )
         of_pairs.add_column("depth step m, near - far")
         for p in pairs:
             seen = "" if p.seen is None else f"{p.seen:.0%}"
@@ -235,8 +266,8 @@ class Doctor:
     """Find the usual mistakes in a rig, by features matched between one image of each camera.
 
     Half-pixel and one-pixel shifts, R transposed, pose inverted, the centre given as t, OpenGL axes, order of
-    quaternions, radians taken for degrees, units, cameras swapped, images resized, cropped, rotated or mirrored
-    without the rig, x and y exchanged, distortion ignored, applied twice or with the wrong sign.
+    quaternions, radians taken for degrees, units, cameras swapped, images resized, cropped, rotated or
+    mirrored without the rig, x and y exchanged, distortion ignored, applied twice or with the wrong sign.
     Example: pat rig doctor rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
     """
 
@@ -247,8 +278,9 @@ class Doctor:
     """An image of each of two or more cameras."""
     matches: MatchesFile = None
     out: MaybeOut = None
-    """Rig file to write if a mistake is found: the repaired rig. Also: --fix. A former file is kept as NAME.old. Exit
-    status 4, and nothing is written, if several mistakes with different repairs explain the images as well."""
+    """Rig file to write if a mistake is found: the repaired rig. Also: --fix. A former file is kept as
+    NAME.old. Exit status 4, and nothing is written, if several mistakes with different repairs explain the
+    images as well."""
     json: bool = False
     """Print JSON instead of text."""
 
@@ -292,9 +324,9 @@ NEARER = 4.0
 class Refine:
     """Refine a rig by ordinary images of its cameras: matched points first, then the fusion's own error.
 
-    No rig is written unless held-out points come nearer to their epipolar lines, the changes agree with their standard
-    deviations, and depth does not become less certain. What happens to depth is printed and written into the file.
-    Example: pat rig refine rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
+    No rig is written unless held-out points come nearer to their epipolar lines, the changes agree with their
+    standard deviations, and depth does not become less certain. What happens to depth is printed and written
+    into the file. Example: pat rig refine rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
     """
 
     rig: RigFile
@@ -304,10 +336,12 @@ class Refine:
     """Rig file to write."""
     matches: MatchesFile = None
     free: tuple[str, ...] = ("rotation", "centre")
-    """Free parameters: rotation, translation, focal, centre (principal_point), distortion; or CAMERA.rotation. By
-    default, focal and translation too if that brings held-out points nearer."""
+    """Free parameters: rotation, translation, focal, centre (principal_point), distortion; or
+    CAMERA.rotation. By default, focal and translation too if that brings held-out points nearer."""
     sigma: Annotated[tuple[str, ...], arg(metavar="KIND=NUMBER")] = ()
-    """Standard deviation of a parameter before refinement: degrees, pixels; relative for translation and focal."""
+    """Standard deviation of a parameter before refinement: degrees, pixels; relative for translation and
+    focal.
+    """
     photometric: bool = True
     """Also minimise the fusion's own error, after that of the points."""
     force: bool = False
@@ -344,10 +378,15 @@ class Refine:
         if not found.accepted:
             refused = found.held_out[1].median < found.held_out[0].median / NEARER
             if not refused:
-                return say("no rig written" + (": --force writes it all the same" if found.objections else ""))
-            files = " ".join({text.partition("=")[0]: text.partition("=")[2] for text in self.image[::-1]}.values())
+                return say(
+                    "no rig written" + (": --force writes it all the same" if found.objections else "")
+                )
+            files = " ".join(
+                {text.partition("=")[0]: text.partition("=")[2] for text in self.image[::-1]}.values()
+            )
             say(
-                "no rig written, though points come far nearer to their lines: --force writes it all the same; or fuse "
+                "no rig written, though points come far nearer to their lines: --force writes it all the "
+                "same; or fuse "
                 f"without a rig: `pat fuse {files}`",
                 style="yellow",
             )
@@ -378,10 +417,14 @@ class RigFromImages:
         from ..media.images import read_image
 
         options.writable(self.out)
-        images = {name: read_image(path, name=name) for name, path in options.files_by_name(self.image).items()}
+        images = {
+            name: read_image(path, name=name) for name, path in options.files_by_name(self.image).items()
+        }
         with options.working("matching features and fitting lines"):
             focal = options.numbers_by_name(self.focal, "--focal")
-            found = rig_from_images(images, focal=focal, matches=given_matches(self.matches, self.image, images))
+            found = rig_from_images(
+                images, focal=focal, matches=given_matches(self.matches, self.image, images)
+            )
         print(found.as_text())
         found.rig.save(self.out)
         say(f"written: {self.out}")
@@ -391,8 +434,8 @@ class RigFromImages:
 class RigDiff:
     """Say whether a rig has moved: two calibrations of it compared by the pixels and depths that they say.
 
-    A motion of the whole rig is no difference. What is more than both calibrations' errors follows from the covariance
-    files that `pat calibrate` writes beside its rigs.
+    A motion of the whole rig is no difference. What is more than both calibrations' errors follows from the
+    covariance files that `pat calibrate` writes beside its rigs.
     Example: pat rig diff may.yaml october.yaml --out diff.png
     """
 
@@ -419,7 +462,9 @@ class RigDiff:
         a, b = load_rig(self.first), load_rig(self.second)
         depth = self.depth or (a.depth or b.depth)
         if depth is None:
-            raise ValueError("--depth: neither rig states between which depths it is used: give NEAR FAR in metres")
+            raise ValueError(
+                "--depth: neither rig states between which depths it is used: give NEAR FAR in metres"
+            )
         near, far = (float(bound) for bound in depth)
         beside = [path.with_suffix(".covariance.json") for path in (self.first, self.second)]
         covariances = [RigCovariance.load(path) if path.is_file() else None for path in beside]
@@ -431,7 +476,10 @@ class RigDiff:
                     style="yellow",
                 )
         if not any(covariances):
-            say("pat: warning: no covariance file beside the rigs: calibrate with `pat calibrate`", style="yellow")
+            say(
+                "pat: warning: no covariance file beside the rigs: calibrate with `pat calibrate`",
+                style="yellow",
+            )
         print(found.as_text())
         if self.image:
             print(self._on_images(a, b))
@@ -448,7 +496,10 @@ class RigDiff:
             pairs = given_matches(self.matches, self.image, images) or match_cameras(images)
         of_a, of_b = line_distances(a, pairs), line_distances(b, pairs)
         medians = float(of_a.abs().median()), float(of_b.abs().median())
-        text = f"on the images: {len(of_a)} points, {medians[0]:.2f} px from A's lines and {medians[1]:.2f} px from B's"
+        text = (
+            f"on the images: {len(of_a)} points, {medians[0]:.2f} px from A's lines and {medians[1]:.2f} "
+            "px from B's"
+        )
         closer = float((of_a.abs() < of_b.abs()).float().mean())
         if nearer(of_b, of_a):
             return f"{text}: A fits better, at {closer:.0%} of them"

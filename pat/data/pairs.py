@@ -99,16 +99,20 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
 
 
 def folder_pairs(root: str | Path, *, max_disparity: float = PAPER_DISPARITY) -> Iterator[StereoPair]:
-    """Every (near-)rectified pair under `root` whose names follow one of `LEFT_AND_RIGHT`, such as KITTI's."""
+    """Every (near-)rectified pair under `root` whose names follow one of `LEFT_AND_RIGHT`, such as
+    KITTI's.
+    """
     root = _folder(root)
     files = _some(_named(root), root)
     return (
-        StereoPair(_pair_name(root, left), read_image(left), read_image(right), max_disparity) for left, right in files
+        StereoPair(_pair_name(root, left), read_image(left), read_image(right), max_disparity)
+        for left, right in files
     )
 
 
 def pair_files(root: str | Path) -> list[PairFiles]:
-    """The files of every pair that `middlebury_pairs` and `folder_pairs` read, in order, without reading them.
+    """The files of every pair that `middlebury_pairs` and `folder_pairs` read, in order, without reading
+    them.
 
     Raises FileNotFoundError for no such folder, ValueError where there is no pair.
     """
@@ -163,7 +167,9 @@ def _right_of(left: Path, root: Path) -> list[Path]:
     if left.suffix.lower() not in IMAGE_SUFFIXES:
         return []
     before, inside = root.as_posix(), left.as_posix()[len(root.as_posix()) :]
-    rights = (Path(before + mark[1].join(inside.rsplit(mark[0], 1))) for mark in LEFT_AND_RIGHT if mark[0] in inside)
+    rights = (
+        Path(before + mark[1].join(inside.rsplit(mark[0], 1))) for mark in LEFT_AND_RIGHT if mark[0] in inside
+    )
     return [right for right in rights if right.is_file()][:1]
 
 

@@ -34,10 +34,14 @@ def scene_folders(root: str | Path) -> list[Path]:
     inside = root / "scenes" if (root / "scenes").is_dir() else root
     folders = sorted(f for f in inside.iterdir() if f.is_dir() and not f.name.startswith("."))
     if not any(is_rendered(f) for f in folders):
-        raise ValueError(f"{root}: holds no rendered scene: make some with 'pat render CONFIG --scenes N --out {root}'")
+        raise ValueError(
+            f"{root}: holds no rendered scene: make some with 'pat render CONFIG --scenes N --out {root}'"
+        )
     for folder in folders:
         if not is_rendered(folder):
-            raise ValueError(f"{folder}: is not a whole scene (no {RENDER_FILE}): remove it and run 'pat render' again")
+            raise ValueError(
+                f"{folder}: is not a whole scene (no {RENDER_FILE}): remove it and run 'pat render' again"
+            )
     return folders
 
 
@@ -48,7 +52,9 @@ def reading(folder: Path) -> Iterator[None]:
         yield
     except (OSError, ValueError, KeyError, EOFError, BadZipFile, TypeError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"{folder}: cannot be read ({reason}): remove it and run 'pat render' again") from None
+        raise ValueError(
+            f"{folder}: cannot be read ({reason}): remove it and run 'pat render' again"
+        ) from None
 
 
 def scene_rig(folder: Path) -> Rig:
@@ -58,7 +64,9 @@ def scene_rig(folder: Path) -> Rig:
 
 
 class RenderedView(NamedTuple):
-    """An image in linear light, the depth of its pixels (metres; NaN where the camera sees nothing), its camera."""
+    """An image in linear light, the depth of its pixels (metres; NaN where the camera sees nothing), its
+    camera.
+    """
 
     rgb: Float[Tensor, "3 h w"]
     depth: Float[Tensor, "h w"]
@@ -66,7 +74,9 @@ class RenderedView(NamedTuple):
 
 
 def read_view(folder: Path, name: str) -> RenderedView:
-    """The first frame of a camera, as rendered. Raises ValueError, naming the folder, for one that cannot be used."""
+    """The first frame of a camera, as rendered. Raises ValueError, naming the folder, for one that cannot be
+    used.
+    """
     with reading(folder):
         frame, camera = Rendered(folder).frame(name), Rendered(folder).rig[name]
     if not isinstance(camera, Camera):
@@ -74,7 +84,8 @@ def read_view(folder: Path, name: str) -> RenderedView:
     hw = (frame.depth.shape[-2], frame.depth.shape[-1])
     if hw != camera.hw or frame.rgb.shape[1:] != frame.depth.shape:
         raise ValueError(
-            f"{folder}: the image of '{name}' is {hw[1]}x{hw[0]}, its rig says {camera.hw[1]}x{camera.hw[0]}: "
+            f"{folder}: the image of '{name}' is {hw[1]}x{hw[0]}, its rig says "
+            f"{camera.hw[1]}x{camera.hw[0]}: "
             "remove it and run 'pat render' again"
         )
     return RenderedView(frame.rgb, frame.depth, camera.to(torch.float64))
@@ -96,7 +107,9 @@ def undistorted(view: RenderedView) -> RenderedView:
 
 
 def window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> RenderedView:
-    """A window of a view, reduced (or enlarged) to `hw`. Beyond the image its edge is repeated, without depth."""
+    """A window of a view, reduced (or enlarged) to `hw`. Beyond the image its edge is repeated, without
+    depth.
+    """
     rows, columns = (torch.arange(n) + start for n, start in zip(size, (top, left)))
     h, w = view.camera.hw
     inside = ((rows >= 0) & (rows < h))[:, None] & (columns >= 0) & (columns < w)
@@ -114,7 +127,9 @@ def reduced(rgb: Float[Tensor, "n c h w"], hw: HW) -> Float[Tensor, "n c h2 w2"]
 
 
 def reduced_depth(depth: Float[Tensor, "n h w"], hw: HW) -> Float[Tensor, "n h2 w2"]:
-    """Depth at the new pixels' centres: inverse depth interpolated on even surfaces, the nearest pixel's at edges."""
+    """Depth at the new pixels' centres: inverse depth interpolated on even surfaces, the nearest pixel's at
+    edges.
+    """
     old = (depth.shape[-2], depth.shape[-1])
     if old == hw:
         return depth

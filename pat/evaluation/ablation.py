@@ -1,7 +1,8 @@
 """What calibration is worth: one checkpoint, every family of receptive fields, on the same scenes.
 
-The paper's figure of calibrated against rectified as a tool. Scenes are layered photographs seen by unrectified rigs,
-alpha with a focal length 1 to 3 times beta's, rendered here; or rendered folders of one's own.
+The paper's figure of calibrated against rectified as a tool. Scenes are layered photographs seen by
+unrectified rigs, alpha with a focal length 1 to 3 times beta's, rendered here; or rendered folders of one's
+own.
 """
 
 from __future__ import annotations
@@ -65,7 +66,12 @@ from .tables import markdown_table, write_csv
 
 ALPHA, BETA = "alpha", "beta"
 RIGS = RigDistribution(
-    mode="general", parallax=(8.0, 60.0), focal_ratio=(1 / 3, 1.0), resolutions=(1.0,), rotation=3.0, decentring=0.05
+    mode="general",
+    parallax=(8.0, 60.0),
+    focal_ratio=(1 / 3, 1.0),
+    resolutions=(1.0,),
+    rotation=3.0,
+    decentring=0.05,
 )
 """Rigs of the layered scenes: beta's focal length is 1/3 to 1 of alpha's, in images of equal sizes."""
 DENSE_LIMIT = 2**31
@@ -106,7 +112,9 @@ class FieldFamily:
     warped: bool = False
 
     def fuse(self, network: FusionNetwork, rig: Rig, case: AblationCase, far: float) -> tuple[Tensor, Tensor]:
-        """Alpha's view fused (3, H, W), and its depth. Raises ValueError for a rig that cannot be rectified."""
+        """Alpha's view fused (3, H, W), and its depth. Raises ValueError for a rig that cannot be
+        rectified.
+        """
         if not self.warped:
             frame = fuse(network, rig, case.images, alpha=ALPHA, field=self.field(far))
             return frame.image, frame.depth
@@ -116,10 +124,11 @@ class FieldFamily:
 
 
 class AblationRow(NamedTuple):
-    """One family on one scene: scores of the image, and the error in beta of points at the depth found (pixels).
+    """One family on one scene: scores of the image, and the error in beta of points at the depth found
+    (pixels).
 
-    `within_one` is the share of pixels whose point is within one pixel of its true position in beta. `note` says why
-    there are no figures, where there are none.
+    `within_one` is the share of pixels whose point is within one pixel of its true position in beta. `note`
+    says why there are no figures, where there are none.
     """
 
     scene: str
@@ -134,7 +143,8 @@ class AblationRow(NamedTuple):
 
 @dataclass(frozen=True)
 class HorizontalDisplacement:
-    """The rectified assumption at its best: H is known, and with it position and scale; only lines are taken as rows.
+    """The rectified assumption at its best: H is known, and with it position and scale; only lines are taken
+    as rows.
 
     The segment is +-`disparity` pixels along x around H x.
     """
@@ -161,8 +171,14 @@ def families() -> dict[str, FieldFamily]:
         "local 5x5": FieldFamily(lambda disparity: Local()),
         "dense": FieldFamily(lambda disparity: Dense()),
     }
-    rotated = {f"rotated by {a:g} deg": FieldFamily(lambda disparity: Epipolar(), _rotated(a)) for a in (0.1, 0.3, 1.0)}
-    shifted = {f"centre off by {p:g} px": FieldFamily(lambda disparity: Epipolar(), _decentred(p)) for p in (1, 3, 10)}
+    rotated = {
+        f"rotated by {a:g} deg": FieldFamily(lambda disparity: Epipolar(), _rotated(a))
+        for a in (0.1, 0.3, 1.0)
+    }
+    shifted = {
+        f"centre off by {p:g} px": FieldFamily(lambda disparity: Epipolar(), _decentred(p))
+        for p in (1, 3, 10)
+    }
     return exact | rotated | shifted
 
 
@@ -178,7 +194,12 @@ def disparity(network: FusionNetwork, pair: Pair) -> float:
 
 
 def layered_cases(
-    count: int, *, photos: Sequence[Path] = (), hw: HW = (240, 320), rigs: RigDistribution = RIGS, seed: int = 0
+    count: int,
+    *,
+    photos: Sequence[Path] = (),
+    hw: HW = (240, 320),
+    rigs: RigDistribution = RIGS,
+    seed: int = 0,
 ) -> Iterator[AblationCase]:
     """Scenes of layered photographs (scikit-image's, if none are given), recorded with some noise."""
     bank = PhotoBank.load(*photos) if photos else sample_photographs()
@@ -214,14 +235,20 @@ def _rendered_case(name: str, folder: Path, g: Generator) -> AblationCase:
     return _recorded(name, rig, ground_truth, seen, frames[0].depth, g)
 
 
-def _recorded(name: str, rig: Rig, ground_truth: Tensor, seen: Tensor, depth: Tensor, g: Generator) -> AblationCase:
+def _recorded(
+    name: str, rig: Rig, ground_truth: Tensor, seen: Tensor, depth: Tensor, g: Generator
+) -> AblationCase:
     """The case of two ideal images: some noise, a depth range a little wider than the scene's."""
     known = depth[depth.isfinite()]
     steps = [Noise(8000, 3), Clip(), Quantise(8)]
     ideal = {ALPHA: luminance(ground_truth), BETA: seen}
     images = {name: record(scene[None], steps, g)[0] for name, scene in ideal.items()}
     return AblationCase(
-        name, rig.replace(depth=(float(known.min()) / 1.1, float(known.max()) * 1.1)), images, ground_truth, depth
+        name,
+        rig.replace(depth=(float(known.min()) / 1.1, float(known.max()) * 1.1)),
+        images,
+        ground_truth,
+        depth,
     )
 
 
@@ -241,9 +268,15 @@ def sample_photographs(*, count: int = 12, seed: int = 0) -> PhotoBank:
 
 
 def ablate(
-    network: FusionNetwork, cases: Iterable[AblationCase], *, out: Path, chosen: Mapping[str, FieldFamily] | None = None
+    network: FusionNetwork,
+    cases: Iterable[AblationCase],
+    *,
+    out: Path,
+    chosen: Mapping[str, FieldFamily] | None = None,
 ) -> list[AblationRow]:
-    """Every family on every case; ablation.md, ablation.csv and ablation.png (crops of some cases) go to `out`."""
+    """Every family on every case; ablation.md, ablation.csv and ablation.png (crops of some cases) go to
+    `out`.
+    """
     rows: list[AblationRow] = []
     panels: dict[str, Tensor] = {}
     for i, case in enumerate(track(cases, "ablating", disable=not sys.stderr.isatty())):
@@ -284,7 +317,8 @@ def _case(
 
 
 def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float, float]:
-    """Mean error in beta (pixels) of points at `depth` where it is known; the share of all that is within a pixel.
+    """Mean error in beta (pixels) of points at `depth` where it is known; the share of all that is within a
+    pixel.
 
     Whether beta sees the point or not: the reference is the projection at the true depth.
     """
@@ -316,17 +350,23 @@ def unsupported(network: FusionNetwork, field: ReceptiveField | None, rig: Rig) 
 
 
 def markdown(rows: Sequence[AblationRow]) -> str:
-    """One line a family: mean PSNR with its 95% bootstrap interval, SSIM, dB to calibrated, and by focal ratio."""
+    """One line a family: mean PSNR with its 95% bootstrap interval, SSIM, dB to calibrated, and by focal
+    ratio.
+    """
     bins = [f"ratio {low:g} to {high:g}" for low, high in pairwise(RATIOS)]
     columns = ["family", "PSNR", "SSIM", "against calibrated", *bins, "off, px", "within 1 px", ""]
     names = list(dict.fromkeys(row.family for row in rows))
     lines = [[name, *_cells([row for row in rows if row.family == name], rows)] for name in names]
     scenes = len({row.scene for row in rows})
     note = (
-        f"{scenes} scenes; the focal ratio is alpha's focal length over beta's. PSNR in dB, behind it a 95% interval.\n"
-        "Rectified, warped: both images are rectified by the calibration, and the result is warped back. The\n"
-        "rectified assumption takes lines of the images as they are for rows, and both images for the same field of\n"
-        "view; 'rows around H x' is given position and scale, and takes only the lines for rows. Off: mean error in\n"
+        f"{scenes} scenes; the focal ratio is alpha's focal length over beta's. PSNR in dB, behind it a 95% "
+        "interval.\n"
+        "Rectified, warped: both images are rectified by the calibration, and the result is warped back. "
+        "The\n"
+        "rectified assumption takes lines of the images as they are for rows, and both images for the same "
+        "field of\n"
+        "view; 'rows around H x' is given position and scale, and takes only the lines for rows. Off: mean "
+        "error in\n"
         "beta of points at the depth found.\n\n"
     )
     return note + markdown_table(columns, lines, align="l" + "r" * (len(columns) - 2) + "l")
@@ -343,13 +383,17 @@ def _cells(rows: Sequence[AblationRow], every: Sequence[AblationRow]) -> list[st
     groups = [[r.psnr for r in served if a <= r.ratio < b] for a, b in zip(RATIOS, (*RATIOS[1:-1], math.inf))]
     means = [f"{np.mean(g):.2f}" if g else "" for g in groups]
     note = "" if len(served) == len(rows) else f"{len(rows) - len(served)} scenes omitted"
-    error, within = (np.mean([getattr(row, name) for row in served]) for name in ("end_point_error", "within_one"))
+    error, within = (
+        np.mean([getattr(row, name) for row in served]) for name in ("end_point_error", "within_one")
+    )
     off = ["", ""] if math.isnan(error) else [f"{error:.2f}", f"{within:.1%}"]
     image = [f"{np.mean(psnr):.2f}{interval}", f"{np.mean(ssim):.4f}", f"{difference:+.2f}"]
     return [*image, *means, *off, note]
 
 
-def _crops(case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[AblationRow]) -> dict[str, Tensor]:
+def _crops(
+    case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[AblationRow]
+) -> dict[str, Tensor]:
     """Crops by title, where calibrated and rectified differ most; the PSNR is that of the whole image."""
     window = (slice(None), *_most_different(images, case.ground_truth))
     panels = {f"{case.name}: ground truth\nfocal ratio {case.ratio:.1f}": case.ground_truth[window]}
@@ -376,7 +420,9 @@ def _rotated(degrees: float) -> Callable[[Rig, Generator], Rig]:
 
     def assumed(rig: Rig, g: Generator) -> Rig:
         axis = torch.randn(3, generator=g, dtype=torch.float64)
-        rotation = Pose(rotation_from_vector(axis / axis.norm() * math.radians(degrees)), torch.zeros(3).double())
+        rotation = Pose(
+            rotation_from_vector(axis / axis.norm() * math.radians(degrees)), torch.zeros(3).double()
+        )
         beta = _camera(rig)
         return rig.with_camera(BETA, beta.replace(cam_from_world=rotation @ beta.cam_from_world))
 

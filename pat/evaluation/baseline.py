@@ -1,12 +1,13 @@
 """Mono + colour fusion without learning: the baseline that every evaluation reports.
 
 Semi-global matching (Hirschmüller 2008) of luminances, a left-right check, beta's colour differences warped
-to alpha, corrected by guided regression (He et al. 2013) on alpha's luminance, and diffused from pixels of high
-weight to those of low weight by edge-aware smoothing guided by alpha (Min et al. 2014). The result has alpha's
-luminance.
+to alpha, corrected by guided regression (He et al. 2013) on alpha's luminance, and diffused from pixels of
+high weight to those of low weight by edge-aware smoothing guided by alpha (Min et al. 2014). The result has
+alpha's luminance.
 
-The constants were tuned for the mean PSNR of real pairs with beta reduced 2x and 4x. There the usual last step,
-a guided filter over all warped colours, did worse: it diffuses colour over edges that luminance does not show.
+The constants were tuned for the mean PSNR of real pairs with beta reduced 2x and 4x. There the usual last
+step, a guided filter over all warped colours, did worse: it diffuses colour over edges that luminance does
+not show.
 """
 
 from __future__ import annotations
@@ -57,20 +58,26 @@ UNRECTIFIABLE = "the cameras look along the line between them: such a pair canno
 
 
 def classical_baseline(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Float[Tensor, "_ h w"]:
-    """`classical` with the one colour beta, or with each of the betas that record one band, bands concatenated."""
+    """`classical` with the one colour beta, or with each of the betas that record one band, bands
+    concatenated.
+    """
     betas = [name for name in rig.betas(alpha) if name in images]
     if images[betas[0]].shape[0] == 3:
         return classical(rig, images, alpha, betas[0])
     return torch.cat([classical(rig, images, alpha, name) for name in betas])
 
 
-def classical_view(rig: Rig, images: Mapping[str, Tensor], alpha: str, *, longest: int) -> Float[Tensor, "_ h w"]:
+def classical_view(
+    rig: Rig, images: Mapping[str, Tensor], alpha: str, *, longest: int
+) -> Float[Tensor, "_ h w"]:
     """`classical_baseline` at alpha's own view, reduced to at most `longest` pixels along its longer side.
 
     Raises ValueError for cameras that are not calibrated, and for those that cannot be rectified.
     """
     if names := [name for name in images if not isinstance(rig[name], Camera)]:
-        raise ValueError(f"{', '.join(names)}: not calibrated, and the classical baseline needs poses and depths")
+        raise ValueError(
+            f"{', '.join(names)}: not calibrated, and the classical baseline needs poses and depths"
+        )
     small = {name: reduced(image, longest).clamp(0, 1) for name, image in images.items()}
     for name, image in small.items():
         h, w = image.shape[-2:]
@@ -105,11 +112,13 @@ def classical_fusion(
 def classical_calibrated(
     alpha: Float[Tensor, "1 h w"], beta: Float[Tensor, "_ hb wb"], pair: Pair
 ) -> Float[Tensor, "_ h w"]:
-    """Beta's colours, or its one band, at alpha's view, for two pinhole cameras with any pose and a depth range.
+    """Beta's colours, or its one band, at alpha's view, for two pinhole cameras with any pose and a depth
+    range.
 
-    Both are rectified to one image plane with about alpha's resolution and matched there for depths near to far; the
-    colour differences (for one band: what beta has more than alpha) are warped back to alpha. Values 0..1. Raises
-    ValueError if 0 < near < far does not hold, for lenses, and for cameras that look along the line between them.
+    Both are rectified to one image plane with about alpha's resolution and matched there for depths near to
+    far; the colour differences (for one band: what beta has more than alpha) are warped back to alpha. Values
+    0..1. Raises ValueError if 0 < near < far does not hold, for lenses, and for cameras that look along the
+    line between them.
     """
     if pair.has_lens:
         raise ValueError("the classical baseline needs pinhole cameras: undistort the images first")
@@ -133,7 +142,8 @@ def classical_calibrated(
 
 
 def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Tensor, "c h w"]:
-    """scikit-image's non-local means for noise of a known standard deviation (Buades et al. 2005; Darbon et al. 2008).
+    """scikit-image's non-local means for noise of a known standard deviation (Buades et al. 2005; Darbon et
+    al. 2008).
 
     Patches of 5 x 5 pixels within 6 pixels, h = 0.8 deviations, as its documentation advises.
     """
@@ -141,7 +151,13 @@ def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Te
 
     given = image.movedim(0, -1).numpy()
     found = denoise_nl_means(
-        given, patch_size=5, patch_distance=6, h=0.8 * deviation, sigma=deviation, fast_mode=True, channel_axis=-1
+        given,
+        patch_size=5,
+        patch_distance=6,
+        h=0.8 * deviation,
+        sigma=deviation,
+        fast_mode=True,
+        channel_axis=-1,
     )
     return torch.from_numpy(np.ascontiguousarray(found.reshape(given.shape))).movedim(-1, 0).to(image)
 
@@ -158,12 +174,14 @@ class _Plane(NamedTuple):
 def _rectified_plane(pair: Pair, depth: tuple[float, float]) -> _Plane:
     """Both cameras rotated so that x runs along the baseline (Fusiello et al. 2000).
 
-    `arraygeom.rectify` rotates each camera half way (Bouguet) and keeps one image size: other pixels, and the figures
-    reported so far would change. Here the plane holds all of alpha at about its own resolution, and beta's principal
-    point is shifted so that disparities start at 0 whichever camera is on the left.
+    `arraygeom.rectify` rotates each camera half way (Bouguet) and keeps one image size: other pixels, and the
+    figures reported so far would change. Here the plane holds all of alpha at about its own resolution, and
+    beta's principal point is shifted so that disparities start at 0 whichever camera is on the left.
     """
     pose = pair.beta_from_alpha
-    K_alpha, K_beta, R, t = (x.detach().cpu().double().numpy() for x in (*(c.K for c in pair.cameras), pose.R, pose.t))
+    K_alpha, K_beta, R, t = (
+        x.detach().cpu().double().numpy() for x in (*(c.K for c in pair.cameras), pose.R, pose.t)
+    )
     hw = pair.alpha.hw
     rotation = _rectifying_rotation(R, t)
     focal = (K_alpha[0, 0] + K_alpha[1, 1]) / 2
@@ -172,7 +190,9 @@ def _rectified_plane(pair: Pair, depth: tuple[float, float]) -> _Plane:
     shift = -(rotation @ R.T @ t)[0] * focal / (np.array(depth) * [z.min(), z.max()])
     max_disparity = float(np.ptp(shift))
     K[:2, 2] = -corners.min(0) + [max_disparity, 0]
-    width, height = (int(side) for side in np.ceil(np.ptp(corners, axis=0) + np.array([max_disparity + 1, 1])))
+    width, height = (
+        int(side) for side in np.ceil(np.ptp(corners, axis=0) + np.array([max_disparity + 1, 1]))
+    )
     if width * height > 8 * hw[0] * (hw[1] + max_disparity):
         raise ValueError(UNRECTIFIABLE)
     K_shifted = K.copy()
@@ -206,7 +226,9 @@ def _project(H: NDArray, points: NDArray) -> tuple[NDArray[np.float64], NDArray[
 
 
 class _Correspondence(NamedTuple):
-    """Where the pixels of `mono` are in the other image, and whether and how consistently they are found there."""
+    """Where the pixels of `mono` are in the other image, and whether and how consistently they are found
+    there.
+    """
 
     columns: Image
     rows: Image
@@ -238,7 +260,9 @@ def checked_disparity(
     return ours, (np.abs(back - ours) <= CHECK) & (ours >= 0) & (columns - ours >= -0.5)
 
 
-def _warped_chroma(mono: Image, colours: Image, inside: Image, max_disparity: float, sharpness: float) -> Image:
+def _warped_chroma(
+    mono: Image, colours: Image, inside: Image, max_disparity: float, sharpness: float
+) -> Image:
     """Colour differences (R - Y, B - Y) of `colours` at `mono`'s pixels; both (h, w) on one rectified grid.
 
     `inside` is 1 where `colours` has content; `sharpness` is their resolution over mono's.
@@ -276,7 +300,13 @@ def raw_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_dispari
     """Semi-global matching, padded because OpenCV leaves `count` columns at the left without disparity."""
     count = 16 * int(np.ceil((min(max_disparity, left.shape[1]) + 1) / 16))
     matcher = cv2.StereoSGBM.create(
-        0, count, BLOCK, P1=8 * BLOCK**2, P2=32 * BLOCK**2, preFilterCap=31, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY
+        0,
+        count,
+        BLOCK,
+        P1=8 * BLOCK**2,
+        P2=32 * BLOCK**2,
+        preFilterCap=31,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
     padded = (cv2.copyMakeBorder(x, 0, 0, count, count, cv2.BORDER_REPLICATE) for x in (left, right))
     return matcher.compute(*padded)[:, count:-count].astype(np.float32) / 16
@@ -297,7 +327,8 @@ def _mean_and_deviation(plane: Image, weight: Image) -> tuple[float, float]:
 
 
 def _regressed(chroma: Image, luma: Image, residual: Image) -> Image:
-    """Chroma corrected along its local regression on luminance by the detail of alpha's luminance that beta's lacks.
+    """Chroma corrected along its local regression on luminance by the detail of alpha's luminance that beta's
+    lacks.
 
     This is the guided filter's linear model; it gives back the detail that beta lost by its resolution.
     """

@@ -1,4 +1,6 @@
-"""What `pat demo` fuses: a rendered scene and a photograph, ideal and as real cameras record them; and its figure."""
+"""What `pat demo` fuses: a rendered scene and a photograph, ideal and as real cameras record them; and its
+figure.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,10 @@ class DemoRecording(NamedTuple):
     def as_real_cameras(self) -> DemoRecording:
         """The same array with cameras of another response and exposure, in low light."""
         generator = Generator().manual_seed(0)
-        ideal = {ALPHA: luminance(self.array.ground_truth, RESPONSE), BETA: EXPOSURE * self.array.images[BETA]}
+        ideal = {
+            ALPHA: luminance(self.array.ground_truth, RESPONSE),
+            BETA: EXPOSURE * self.array.images[BETA],
+        }
         images = {name: NOISE.recorded(image[None], generator)[0] for name, image in ideal.items()}
         return DemoRecording(self.array._replace(images=images), dict.fromkeys(images, NOISE))
 
@@ -46,8 +51,8 @@ class DemoRecording(NamedTuple):
 def classical_methods(network: FusionNetwork, recording: DemoRecording) -> dict[str, Tensor]:
     """The classical fusion: plain; with alpha's response corrected; denoised first; and both.
 
-    The response is what our fusion finds in the denoised images; these are by non-local means that know the noise.
-    Plain alone where the cameras are ideal.
+    The response is what our fusion finds in the denoised images; these are by non-local means that know the
+    noise. Plain alone where the cameras are ideal.
     """
     rig, images = recording.array.rig, recording.array.images
     methods = {"classical": classical(rig, images, ALPHA, BETA)}
@@ -70,12 +75,16 @@ def classical_methods(network: FusionNetwork, recording: DemoRecording) -> dict[
 
 
 def save_demo_figure(panels: Mapping[str, Tensor], corner: tuple[int, int], path: Path) -> None:
-    """Images of one size, three in a row, and below each a window whose corner (row, column) is given, enlarged."""
+    """Images of one size, three in a row, and below each a window whose corner (row, column) is given,
+    enlarged.
+    """
     h, w = next(iter(panels.values())).shape[-2:]
     top, left = corner
     window = (..., slice(top, top + h // CROP), slice(left, left + w // CROP))
     drawn = draw_panels(panels, columns=3, width=16)
-    crops = draw_panels({f"{name}, {CROP} x": image[window] for name, image in panels.items()}, columns=3, width=16)
+    crops = draw_panels(
+        {f"{name}, {CROP} x": image[window] for name, image in panels.items()}, columns=3, width=16
+    )
     both = Image.new("RGB", (drawn.width, drawn.height + crops.height), "white")
     both.paste(drawn, (0, 0))
     both.paste(crops, (0, drawn.height))

@@ -33,12 +33,13 @@ def score(image: Float[Tensor, "_ _ _"], ground_truth: Float[Tensor, "_ _ _"]) -
     """PSNR over all channels, and the mean SSIM of the channels, by scikit-image; values 0..1.
 
     SSIM as in Wang et al. 2004: Gaussian window of sigma 1.5 (11 x 11), K1 = 0.01, K2 = 0.03, population
-    covariance. Nothing is clipped or rounded here. Raises ValueError if the shapes differ or a side is under 11
-    pixels.
+    covariance. Nothing is clipped or rounded here. Raises ValueError if the shapes differ or a side is under
+    11 pixels.
     """
     if image.shape != ground_truth.shape:
         raise ValueError(
-            f"the image is {tuple(image.shape)} and the ground truth {tuple(ground_truth.shape)}: give equal shapes"
+            f"the image is {tuple(image.shape)} and the ground truth {tuple(ground_truth.shape)}: give "
+            "equal shapes"
         )
     if min(image.shape[-2:]) < SSIM_WINDOW:
         raise ValueError(f"SSIM needs sides of {SSIM_WINDOW} pixels or more, got {tuple(image.shape[-2:])}")
@@ -46,7 +47,13 @@ def score(image: Float[Tensor, "_ _ _"], ground_truth: Float[Tensor, "_ _ _"]) -
     with np.errstate(divide="ignore"):
         psnr = -10 * np.log10(np.square(ours - theirs).mean())
     ssim = structural_similarity(
-        theirs, ours, data_range=1, channel_axis=0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
+        theirs,
+        ours,
+        data_range=1,
+        channel_axis=0,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
     )
     return Score(float(psnr), float(ssim))
 

@@ -36,7 +36,8 @@ class MonoColourTask(NamedTuple):
 
 
 def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
-    """Left as the grey alpha (Rec. 601) and as the ground truth in colour; right, reduced `rate` times, as beta.
+    """Left as the grey alpha (Rec. 601) and as the ground truth in colour; right, reduced `rate` times, as
+    beta.
 
     Rows and columns beyond the last multiple of `rate` are cut from the bottom and the right. Raises
     ValueError for a grey pair, and for images of unequal sizes.
@@ -49,13 +50,17 @@ def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
             "the mono + colour protocol needs equal sizes"
         )
     ground_truth = cut_to_multiple(pair.left, rate)
-    return MonoColourTask(luminance(ground_truth), reduce_by(cut_to_multiple(pair.right, rate), rate), ground_truth)
+    return MonoColourTask(
+        luminance(ground_truth), reduce_by(cut_to_multiple(pair.right, rate), rate), ground_truth
+    )
 
 
 def reduce_by(image: Float[Tensor, "c h w"], rate: int) -> Float[Tensor, "c hr wr"]:
     """The mean of each `rate` x `rate` block, as a sensor with larger pixels sees it."""
     if rate < 1 or any(side % rate for side in image.shape[1:]):
-        raise ValueError(f"cannot reduce {tuple(image.shape[1:])} by {rate}: give a rate that divides both sides")
+        raise ValueError(
+            f"cannot reduce {tuple(image.shape[1:])} by {rate}: give a rate that divides both sides"
+        )
     return avg_pool2d(image, rate)
 
 
@@ -78,7 +83,9 @@ class StereoResult(NamedTuple):
 
 
 StereoMethod = Callable[[Tensor, Tensor, float], Tensor | StereoResult]
-"""(alpha (1, H, W), beta (3, Hb, Wb), max_disparity in alpha pixels) -> a colour image (3, H, W), 0..1, or more."""
+"""(alpha (1, H, W), beta (3, Hb, Wb), max_disparity in alpha pixels) -> a colour image (3, H, W), 0..1, or
+more.
+"""
 
 
 def alpha_alone(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
@@ -104,8 +111,8 @@ def rectified_fusion(
 ) -> StereoMethod:
     """`fuse` with a network as a method, alpha on the left: segments are rows, `max_disparity` pixels long.
 
-    With `bands` each channel of beta is a camera. `field` is another field than rows of that length. Other options go
-    to `fuse`.
+    With `bands` each channel of beta is a camera. `field` is another field than rows of that length. Other
+    options go to `fuse`.
     """
 
     def fused(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:

@@ -1,4 +1,6 @@
-"""The fair contender of calibrated segments: both images warped to rows, fused there, and the result warped back."""
+"""The fair contender of calibrated segments: both images warped to rows, fused there, and the result warped
+back.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from arraygeom import Pair, Rectification, Rig, apply_homography, intrinsics, pi
 from arraygeom.pixels import HW, product
 
 LARGEST = 6.0
-"""A canvas of more than so many times alpha's pixels is refused: a camera nearly ahead stretches it without bound."""
+"""A canvas of more than so many times alpha's pixels is refused: a camera nearly ahead stretches it without
+bound.
+"""
 
 
 class Warped(NamedTuple):
@@ -24,7 +28,9 @@ class Warped(NamedTuple):
     rectification: Rectification
     original: Pair
 
-    def back(self, image: Float[Tensor, "c h w"], *, interpolation: str = "bicubic") -> Float[Tensor, "c ha wa"]:
+    def back(
+        self, image: Float[Tensor, "c h w"], *, interpolation: str = "bicubic"
+    ) -> Float[Tensor, "c ha wa"]:
         """An image of the canvas at alpha's pixels."""
         return warped(image, self.rectification.H_alpha, self.original.alpha.hw, interpolation=interpolation)
 
@@ -39,8 +45,8 @@ class Warped(NamedTuple):
 def rectified(rig: Rig, images: Mapping[str, Tensor]) -> Warped:
     """The first two cameras of a rig and their images (C, H, W), with epipolar lines as rows.
 
-    The canvas holds all of alpha, with alpha's focal length: nothing of alpha is lost but what resampling costs.
-    Raises ValueError where the pair cannot be rectified, or not onto a canvas of sensible size.
+    The canvas holds all of alpha, with alpha's focal length: nothing of alpha is lost but what resampling
+    costs. Raises ValueError where the pair cannot be rectified, or not onto a canvas of sensible size.
     """
     first, second = rig.names[:2]
     pair = rig.pair(first, second)
@@ -48,7 +54,9 @@ def rectified(rig: Rig, images: Mapping[str, Tensor]) -> Warped:
     views = (first, found.H_alpha), (second, found.H_beta)
     canvas = found.pair.alpha.hw
     made = {name: warped(images[name], torch.linalg.inv(H), canvas).clamp(0, 1) for name, H in views}
-    level = Rig(dict(zip((first, second), found.pair.cameras)), depth=tuple(float(d) for d in pair.depth_range))
+    level = Rig(
+        dict(zip((first, second), found.pair.cameras)), depth=tuple(float(d) for d in pair.depth_range)
+    )
     return Warped(level, made, found, pair)
 
 
@@ -60,13 +68,17 @@ def whole_alpha(pair: Pair) -> Rectification:
     corners = torch.tensor([[-0.5, -0.5], [w - 0.5, -0.5], [-0.5, h - 0.5], [w - 0.5, h - 0.5]]).to(alpha.K)
     rays = product(rough.R_alpha, alpha.rays(corners)[0][..., None])[..., 0]
     if not bool((rays[..., 2] > 0).all()):
-        raise ValueError("the baseline is too near an optical axis: part of alpha lies behind the rectified image")
+        raise ValueError(
+            "the baseline is too near an optical axis: part of alpha lies behind the rectified image"
+        )
     focal = alpha.K[:2, :2].det().abs().sqrt()
     x = focal * rays[..., :2] / rays[..., 2:]
     low, high = x.amin(0), x.amax(0)
     columns, rows = (int(n) for n in (high - low).ceil())
     if rows * columns > LARGEST * h * w:
-        raise ValueError(f"the baseline is near an optical axis: the rectified image has {columns}x{rows} pixels")
+        raise ValueError(
+            f"the baseline is near an optical axis: the rectified image has {columns}x{rows} pixels"
+        )
     return rectify(pair, K=intrinsics(focal, (h, w), tuple(-low - 0.5)), hw=(rows, columns))
 
 

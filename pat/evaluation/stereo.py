@@ -31,8 +31,8 @@ DATA_SETS: dict[str, Callable[[Path], Iterable[StereoPair]]] = {
 class StereoRow(NamedTuple):
     """Scores of one method on one pair with beta reduced `rate` times.
 
-    `end_point_error` (pixels) and `within_one` (share of the pixels with a true disparity) are None where the true
-    disparity is not known or the method gives none.
+    `end_point_error` (pixels) and `within_one` (share of the pixels with a true disparity) are None where the
+    true disparity is not known or the method gives none.
     """
 
     pair: str
@@ -56,7 +56,11 @@ class StereoSummary(NamedTuple):
 
 
 def evaluate_sets(
-    sets: Mapping[str, Iterable[StereoPair]], methods: Mapping[str, StereoMethod], rates: Sequence[int], *, out: Path
+    sets: Mapping[str, Iterable[StereoPair]],
+    methods: Mapping[str, StereoMethod],
+    rates: Sequence[int],
+    *,
+    out: Path,
 ) -> dict[str, list[StereoRow]]:
     """`evaluate_pairs` on data sets by name: rows by set, a strip of images a pair in out/set."""
     return {name: evaluate_pairs(pairs, methods, rates, images=out / name) for name, pairs in sets.items()}
@@ -73,15 +77,17 @@ def evaluate_pairs(
     """Each method's scores on each pair at each rate: whole frames, values clipped to 0..1 and not rounded.
 
     `max_disparity`, in alpha's pixels, is the same for all (the paper's: 120 / rate pixels of beta). With
-    `images`, a folder, a strip for each pair and rate goes there: beta enlarged, each method, the ground truth.
-    Raises ValueError naming the method and the pair if a result differs in shape from the ground truth or is not
-    finite.
+    `images`, a folder, a strip for each pair and rate goes there: beta enlarged, each method, the ground
+    truth. Raises ValueError naming the method and the pair if a result differs in shape from the ground truth
+    or is not finite.
     """
     rows = []
     for pair in track(pairs, "evaluating", disable=not sys.stderr.isatty()):
         for rate in rates:
             task = mono_colour_task(pair, rate)
-            results = {name: _result(name, method, pair, task, max_disparity) for name, method in methods.items()}
+            results = {
+                name: _result(name, method, pair, task, max_disparity) for name, method in methods.items()
+            }
             rows += [_row(pair, rate, name, result, task.ground_truth) for name, result in results.items()]
             if images:
                 write_image(images / f"{pair.name.replace('/', '-')}_x{rate}.png", _strip(task, results))
@@ -103,10 +109,14 @@ PrintedScores = Mapping[int, tuple[float, float]]
 def sets_markdown(
     rows: Mapping[str, Sequence[StereoRow]], *, printed: Mapping[str, PrintedScores] = {}, depth: bool = True
 ) -> str:
-    """`markdown` of each data set under its name, followed by `structure_kept` and, with `depth`, its errors."""
+    """`markdown` of each data set under its name, followed by `structure_kept` and, with `depth`, its
+    errors.
+    """
     parts = []
     for name, found in rows.items():
-        parts += [f"#### {name}\n\n{markdown(found, printed=printed.get(name, {}))}\n{structure_kept(found)}\n"]
+        parts += [
+            f"#### {name}\n\n{markdown(found, printed=printed.get(name, {}))}\n{structure_kept(found)}\n"
+        ]
         parts += [errors] if depth and (errors := depth_markdown(found)) else []
     return "\n".join(parts)
 
@@ -127,7 +137,8 @@ def _table(rows: Sequence[StereoRow], printed: tuple[float, float] | None = None
     means = {summary.method: _mean_cell(summary) for summary in summarise(rows)}
     columns = [f"beta reduced {rows[0].rate}x" if rows[0].rate > 1 else "beta as it is", *methods]
     lines = [
-        [pair, *(scores.get((pair, method), "") for method in methods)] for pair in distinct(row.pair for row in rows)
+        [pair, *(scores.get((pair, method), "") for method in methods)]
+        for pair in distinct(row.pair for row in rows)
     ]
     lines.append(["**mean**", *(means[method] for method in methods)])
     if printed:
@@ -144,11 +155,15 @@ def _mean_cell(summary: StereoSummary) -> str:
 
 
 def depth_markdown(rows: Sequence[StereoRow]) -> str:
-    """Errors of depth where it is known: end-point error in pixels / share within one pixel. Empty if nowhere."""
+    """Errors of depth where it is known: end-point error in pixels / share within one pixel. Empty if
+    nowhere.
+    """
     known = [row for row in rows if row.end_point_error is not None]
     if not known:
         return ""
-    columns = [(m, r) for m in distinct(row.method for row in known) for r in distinct(row.rate for row in known)]
+    columns = [
+        (m, r) for m in distinct(row.method for row in known) for r in distinct(row.rate for row in known)
+    ]
     groups = {key: [row for row in known if (row.method, row.rate) == key] for key in columns}
     lines = [
         [pair, *(_depth_cell([row for row in groups[key] if row.pair == pair]) for key in columns)]
@@ -161,7 +176,9 @@ def depth_markdown(rows: Sequence[StereoRow]) -> str:
 def _depth_cell(rows: Sequence[StereoRow]) -> str:
     if not rows:
         return ""
-    error, within = (float(np.mean([getattr(row, name) for row in rows])) for name in ("end_point_error", "within_one"))
+    error, within = (
+        float(np.mean([getattr(row, name) for row in rows])) for name in ("end_point_error", "within_one")
+    )
     return f"{error:.2f} px / {within:.1%}"
 
 
@@ -169,7 +186,9 @@ def structure_kept(rows: Sequence[StereoRow]) -> str:
     """One line: on which pairs, if any, the SSIM of the fusion is below that of alpha alone."""
     ssim = {(row.pair, row.rate, row.method): row.ssim for row in rows}
     cases = [(pair, rate) for pair, rate, name in ssim if name == "fusion"]
-    lost = [f"{pair} {rate}x" for pair, rate in cases if ssim[pair, rate, "fusion"] < ssim[pair, rate, "alpha"]]
+    lost = [
+        f"{pair} {rate}x" for pair, rate in cases if ssim[pair, rate, "fusion"] < ssim[pair, rate, "alpha"]
+    ]
     kept = f"SSIM of fusion is at least that of alpha in {len(cases) - len(lost)} of {len(cases)} cases"
     return f"{kept}; **below it**: {', '.join(lost)}." if lost else f"{kept}."
 
@@ -182,7 +201,8 @@ def _result(
     image = result.image.detach().cpu()
     if image.shape != task.ground_truth.shape:
         raise ValueError(
-            f"{name} on {pair.name}: gave {tuple(image.shape)}, wanted an image {tuple(task.ground_truth.shape)}"
+            f"{name} on {pair.name}: gave {tuple(image.shape)}, wanted an image "
+            f"{tuple(task.ground_truth.shape)}"
         )
     if not image.isfinite().all():
         raise ValueError(f"{name} on {pair.name}: gave NaN or infinite values")
@@ -196,7 +216,9 @@ def _row(pair: StereoPair, rate: int, method: str, result: StereoResult, ground_
     return StereoRow(pair.name, rate, method, *score(result.image, ground_truth), *errors)
 
 
-def disparity_errors(found: Float[Tensor, "h w"], ground_truth: Disparity) -> tuple[float | None, float | None]:
+def disparity_errors(
+    found: Float[Tensor, "h w"], ground_truth: Disparity
+) -> tuple[float | None, float | None]:
     """Mean error of `found` where both are known, and the share of known ground truth that is within a pixel.
 
     The ground truth may be larger by what was cut off at the bottom and the right.

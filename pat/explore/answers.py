@@ -33,9 +33,9 @@ DEFAULTS: Controls = {
     "moved": {},
     "clicked": None,
 }
-"""The rig as it is. baseline and focal are factors, rotation is in degrees about the betas' y axes, lens is added to
-their k1, `moved` are steps (right, forward) in alpha's axes by beta, metres; near and far are metres. `clicked` is a
-beta and a pixel of it, whose match becomes alpha's pixel."""
+"""The rig as it is. baseline and focal are factors, rotation is in degrees about the betas' y axes, lens is
+added to their k1, `moved` are steps (right, forward) in alpha's axes by beta, metres; near and far are
+metres. `clicked` is a beta and a pixel of it, whose match becomes alpha's pixel."""
 WIDEST = 640
 """Pixels of the longer side of an image that is shown."""
 FARTHEST = 1000.0
@@ -45,7 +45,9 @@ SHIPPED = "pat-supervised"
 
 
 def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any]:
-    """The pixel, its depth, and each beta's samples, weights and match; `error` or `problem` where there are none."""
+    """The pixel, its depth, and each beta's samples, weights and match; `error` or `problem` where there are
+    none.
+    """
     try:
         return _answer(scene, alpha, controls)
     except (ValueError, TypeError, KeyError) as error:
@@ -62,7 +64,9 @@ def _answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, A
     betas: dict[str, Any] = {name: {"problem": text} for name, text in report.problems.items()}
     betas |= {name: drawn(beta) for name, beta in report.betas.items()}
     if controls["second"] != "none":
-        other = inspect_pixel(scene, explorer_state(scene.rig, alpha, {**controls, "field": controls["second"]}))
+        other = inspect_pixel(
+            scene, explorer_state(scene.rig, alpha, {**controls, "field": controls["second"]})
+        )
         for name, beta in betas.items():
             problem = other.problems.get(name)
             beta["second"] = {"problem": problem} if problem else drawn(other.betas[name])
@@ -77,7 +81,9 @@ def _answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, A
 
 
 def clicked(scene: ExplorerScene, alpha: str, controls: Controls) -> tuple[Controls, list[Any]]:
-    """The controls with alpha's pixel that matches the clicked one of a beta, and that one's samples in alpha."""
+    """The controls with alpha's pixel that matches the clicked one of a beta, and that one's samples in
+    alpha.
+    """
     name, column, row = controls["clicked"]
     x = image_pixel(column, row, scene.rig[name].hw)
     found = inspect_pixel(scene, explorer_state(scene.rig, alpha, controls).replace(alpha=name, x=x))
@@ -90,11 +96,15 @@ def clicked(scene: ExplorerScene, alpha: str, controls: Controls) -> tuple[Contr
 
 
 def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
-    """The rig with every calibrated beta moved, rotated about its centre, of another focal length and lens."""
+    """The rig with every calibrated beta moved, rotated about its centre, of another focal length and
+    lens.
+    """
     own, cameras = rig[alpha], dict(rig.cameras)
     if all(controls[name] == DEFAULTS[name] for name in ("baseline", "rotation", "focal", "lens", "moved")):
         return rig
-    turn = rotation_from_vector(torch.tensor([0.0, math.radians(controls["rotation"]), 0.0], dtype=torch.float64))
+    turn = rotation_from_vector(
+        torch.tensor([0.0, math.radians(controls["rotation"]), 0.0], dtype=torch.float64)
+    )
     for name in rig.betas(alpha):
         beta = rig[name]
         if not (isinstance(beta, Camera) and isinstance(own, Camera)):
@@ -160,7 +170,9 @@ def drawn(beta: BetaReport) -> dict[str, Any]:
 
 
 def top_view(rig: Rig, alpha: str) -> list[dict[str, Any]]:
-    """The cameras from above, in alpha's axes: each one's centre (right, forward) and where it looks; metres."""
+    """The cameras from above, in alpha's axes: each one's centre (right, forward) and where it looks;
+    metres.
+    """
     own = rig[alpha]
     if not isinstance(own, Camera):
         return []
@@ -215,7 +227,8 @@ def shown_cameras(scene: ExplorerScene, alpha: str) -> list[dict[str, Any]]:
     """Name, width, height and image of alpha and of every beta with an image, in this order."""
     names = [alpha, *(n for n in scene.rig.betas(alpha) if n in scene.images)]
     return [
-        {"name": n, "hw": list(scene.rig[n].hw), "src": data_url(scene.images[n]), "alpha": n == alpha} for n in names
+        {"name": n, "hw": list(scene.rig[n].hw), "src": data_url(scene.images[n]), "alpha": n == alpha}
+        for n in names
     ]
 
 

@@ -56,13 +56,16 @@ class Explorer:
     def save(self, path: str | Path, columns: int = GRID) -> None:
         """Write a page of one file that needs neither a kernel nor a network.
 
-        For calibrated pinholes it computes any pixel and the rig's sliders itself, for the field and weights that are
-        chosen by default; for others it has the answers for a grid of `columns` of alpha's pixels, and no sliders.
+        For calibrated pinholes it computes any pixel and the rig's sliders itself, for the field and weights
+        that are chosen by default; for others it has the answers for a grid of `columns` of alpha's pixels,
+        and no sliders.
         """
         values = {**self.values(), "choices": []}
         if self.scene is not None and is_pinhole(self.scene.rig) and self.usual:
             values["ranges"] = [found for found in values["ranges"] if found[0] != "lens"]
-            write_text(path, page(values, f"asksPinholes({json.dumps(geometry(self.scene.rig, self.alpha))})"))
+            write_text(
+                path, page(values, f"asksPinholes({json.dumps(geometry(self.scene.rig, self.alpha))})")
+            )
         else:
             values["ranges"] = []
             write_text(path, page(values, f"asksGrid({json.dumps(self.grid(columns))})"))
@@ -95,7 +98,12 @@ def is_pinhole(rig: Rig) -> bool:
 def geometry(rig: Rig, alpha: str) -> dict[str, Any]:
     """The cameras in numbers, for the page's own computation."""
     cameras = {
-        name: {"K": camera.K.tolist(), "R": camera.R.tolist(), "centre": camera.centre.tolist(), "hw": list(camera.hw)}
+        name: {
+            "K": camera.K.tolist(),
+            "R": camera.R.tolist(),
+            "centre": camera.centre.tolist(),
+            "hw": list(camera.hw),
+        }
         for name, camera in rig.cameras.items()
         if isinstance(camera, Camera)
     }
@@ -143,7 +151,9 @@ def opened(
     except ValueError as error:
         return Explorer(None, "", {**DEFAULTS, "x": [0, 0]}, str(error))
     h, w = rig[alpha].hw
-    return Explorer(scene, alpha, {**DEFAULTS, "weights": weights, **controls, "x": list(x or (w // 2, h // 2))})
+    return Explorer(
+        scene, alpha, {**DEFAULTS, "weights": weights, **controls, "x": list(x or (w // 2, h // 2))}
+    )
 
 
 def checked(rig: Rig, images: Mapping[str, Tensor] | None, alpha: str | None) -> tuple[ExplorerScene, str]:
@@ -166,9 +176,11 @@ DEEPEST = 20.0
 
 
 def checkered_room(rig: Rig, alpha: str) -> dict[str, Float[Tensor, "1 h w"]]:
-    """Every camera's image (1, h, w) of a box whose back wall is far and whose side walls alpha sees from near on.
+    """Every camera's image (1, h, w) of a box whose back wall is far and whose side walls alpha sees from
+    near on.
 
-    Squares differ in brightness, so that each has one match. Raises ValueError for a rig without poses or depth range.
+    Squares differ in brightness, so that each has one match. Raises ValueError for a rig without poses or
+    depth range.
     """
     cameras = {name: view for name, view in rig.cameras.items() if isinstance(view, Camera)}
     if len(cameras) < len(rig.cameras) or rig.depth is None:

@@ -1,9 +1,10 @@
 """The explorer's computation: one alpha pixel and a state of the controls in, everything that is drawn out.
 
-Only one pixel is computed, so that an answer takes milliseconds whatever the images' size; no widget is used here. The
-weights are those of C3 attention: of a network, or with the simplest features, luminance in a window around each point,
-of mean zero and length one, so that scores are normalised correlations. Windows of beta are warped by the rough
-homography, so that cameras of other focal lengths and orientations compare the same patch.
+Only one pixel is computed, so that an answer takes milliseconds whatever the images' size; no widget is used
+here. The weights are those of C3 attention: of a network, or with the simplest features, luminance in a
+window around each point, of mean zero and length one, so that scores are normalised correlations. Windows of
+beta are warped by the rough homography, so that cameras of other focal lengths and orientations compare the
+same patch.
 """
 
 from __future__ import annotations
@@ -53,8 +54,8 @@ WINDOWS = "windows"
 class ExplorerState:
     """Values of the controls.
 
-    `x` is alpha's pixel. `near` and `far` (metres) replace the rig's; None keeps them. `weights` are by windows, or by
-    a network of that name.
+    `x` is alpha's pixel. `near` and `far` (metres) replace the rig's; None keeps them. `weights` are by
+    windows, or by a network of that name.
     """
 
     alpha: str
@@ -83,10 +84,10 @@ class MatchOffset(NamedTuple):
 class BetaReport(NamedTuple):
     """Sampling locations in one beta for the pixel, and the match.
 
-    xy: samples in beta's pixels; `valid` marks those in the image. ends: start and end where the field is a segment.
-    weight: of each sample, 1 in all. depth: of each sample in metres, NaN where there is none.
-    value: beta's image, weighted. peak: the largest weight. offset: how far the images' own match lies from the line,
-    None without a segment or a clear match.
+    xy: samples in beta's pixels; `valid` marks those in the image. ends: start and end where the field is a
+    segment. weight: of each sample, 1 in all. depth: of each sample in metres, NaN where there is none.
+    value: beta's image, weighted. peak: the largest weight. offset: how far the images' own match lies from
+    the line, None without a segment or a clear match.
     """
 
     xy: Float[Tensor, "l 2"]
@@ -112,7 +113,8 @@ class PixelReport(NamedTuple):
 class ExplorerScene:
     """A rig and its images (C, H, W); fields of one's own and networks by name.
 
-    The luminances that windows compare are computed once, and so are a network's features when it is first asked.
+    The luminances that windows compare are computed once, and so are a network's features when it is first
+    asked.
     """
 
     rig: Rig
@@ -129,8 +131,12 @@ class ExplorerScene:
             hw = self.rig[name].hw
             if tuple(image.shape[1:]) != hw:
                 got, wanted = f"{image.shape[2]}x{image.shape[1]}", f"{hw[1]}x{hw[0]}"
-                raise ValueError(f"the image of '{name}' is {got}, the rig says {wanted}: give the right image")
-            self.guides[name] = (luminance(image) if image.shape[0] == 3 else image.mean(0, keepdim=True))[None]
+                raise ValueError(
+                    f"the image of '{name}' is {got}, the rig says {wanted}: give the right image"
+                )
+            self.guides[name] = (luminance(image) if image.shape[0] == 3 else image.mean(0, keepdim=True))[
+                None
+            ]
 
     def with_rig(self, rig: Rig) -> ExplorerScene:
         """The same images with a rig that was moved."""
@@ -179,7 +185,8 @@ SIZED: dict[str, Callable[[Pair, Tensor], ReceptiveField]] = {
 }
 """Families whose extent is that of the depth range at a pixel, or follows from the images' size."""
 FAMILIES = ("auto", *FIELDS)
-"""Names of the fields: `auto` is the default field, which `pat fuse` uses. A state takes MODULE:OBJECT, too."""
+"""Names of the fields: `auto` is the default field, which `pat fuse` uses. A state takes MODULE:OBJECT, too.
+"""
 
 
 def chosen_field(pair: Pair, family: str, x: Float[Tensor, "1 2"]) -> ReceptiveField:
@@ -203,13 +210,16 @@ def with_depths(rig: Rig, state: ExplorerState) -> Rig:
     if rig.depth is None and (state.near is None or state.far is None):
         raise ValueError("the rig has no depth range: give near and far, both")
     near, far = rig.depth or (None, None)
-    return rig.replace(depth=(near if state.near is None else state.near, far if state.far is None else state.far))
+    return rig.replace(
+        depth=(near if state.near is None else state.near, far if state.far is None else state.far)
+    )
 
 
 def inspect_pixel(scene: ExplorerScene, state: ExplorerState) -> PixelReport:
     """The report on the state's pixel in every beta that has an image.
 
-    Raises ValueError for a rig that the state makes impossible. Errors that concern one beta go to `problems`.
+    Raises ValueError for a rig that the state makes impossible. Errors that concern one beta go to
+    `problems`.
     """
     rig = with_depths(scene.rig, state)
     betas: dict[str, BetaReport] = {}
@@ -233,7 +243,9 @@ def pixel_of(state: ExplorerState) -> Float[Tensor, "1 2"]:
 
 
 def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerState) -> BetaReport:
-    """The pixel's samples in one beta, their weights and depths. Raises ValueError where the field does not fit."""
+    """The pixel's samples in one beta, their weights and depths. Raises ValueError where the field does not
+    fit.
+    """
     x = pixel_of(state)
     field = scene.fields.get(state.family) or chosen_field(pair, state.family, x)
     found = field(pair, x)
@@ -279,7 +291,8 @@ def match_offset(
 ) -> MatchOffset | None:
     """The images' own match near the segment, by the correlation of windows around both pixels.
 
-    Unlike the samples it may lie beside the line, and does if the rig is off. None where nothing matches clearly.
+    Unlike the samples it may lie beside the line, and does if the rig is off. None where nothing matches
+    clearly.
     """
     xy, weight = samples
     if ends is None or not bool((weight > 0).any()) or float((ends[1] - ends[0]).norm()) < 1e-6:
@@ -303,7 +316,9 @@ def match_offset(
         return None
     if other < own + BETTER:
         return MatchOffset(on_line, 0.0, own)
-    return MatchOffset(beside, distance, other) if distance < ACROSS else None  # at the edge it would be better beyond
+    return (
+        MatchOffset(beside, distance, other) if distance < ACROSS else None
+    )  # at the edge it would be better beyond
 
 
 def ends_of(found: Segments | Positions) -> Float[Tensor, "2 2"] | None:
@@ -340,7 +355,9 @@ def correlations(
 
 def jacobian(pair: Pair, x: Float[Tensor, "1 2"]) -> Float[Tensor, "2 2"]:
     """The Jacobian at x of the rough transfer to beta; the identity where there is none."""
-    ends = torch.cat([x, x + x.new_tensor([[0.5, 0.0], [0.0, 0.5]]), x - x.new_tensor([[0.5, 0.0], [0.0, 0.5]])])
+    ends = torch.cat(
+        [x, x + x.new_tensor([[0.5, 0.0], [0.0, 0.5]]), x - x.new_tensor([[0.5, 0.0], [0.0, 0.5]])]
+    )
     transformed, valid = rough_transfer(pair, ends)
     return (transformed[1:3] - transformed[3:5]).T if bool(valid.all()) else torch.eye(2, dtype=x.dtype)
 
@@ -387,19 +404,25 @@ def joint_depth(betas: Mapping[str, BetaReport]) -> float:
     return total / inverse if inverse > 0 else math.nan
 
 
-def sampled(image: Float[Tensor, "1 c h w"], x: Float[Tensor, "*l 2"], extended: bool = False) -> Float[Tensor, "c *l"]:
+def sampled(
+    image: Float[Tensor, "1 c h w"], x: Float[Tensor, "*l 2"], extended: bool = False
+) -> Float[Tensor, "c *l"]:
     """The image's values at positions, in their precision; the image is not copied."""
     return sample(image, x[None].to(image), extended=extended).values[0].to(x)
 
 
-def fused_colour(scene: ExplorerScene, betas: Mapping[str, BetaReport], state: ExplorerState) -> Float[Tensor, "c"]:
+def fused_colour(
+    scene: ExplorerScene, betas: Mapping[str, BetaReport], state: ExplorerState
+) -> Float[Tensor, "c"]:
     """Alpha's luminance with the colour differences of the betas in colour, each weighted by its peak."""
     own = sampled(scene.guides[state.alpha], pixel_of(state))[:, 0]
     coloured = [s for s in betas.values() if len(s.value) == 3 and s.peak > 0]
     if not coloured:
         return own
     weights = sum(s.peak for s in coloured)
-    difference = sum((s.peak / weights) * (s.value - luminance(s.value[:, None, None]).reshape(1)) for s in coloured)
+    difference = sum(
+        (s.peak / weights) * (s.value - luminance(s.value[:, None, None]).reshape(1)) for s in coloured
+    )
     return own + difference
 
 

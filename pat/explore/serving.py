@@ -28,9 +28,9 @@ class _Server(ThreadingHTTPServer):
 def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
     """Serve the explorer to this machine alone until interrupted; port 0 takes a free one.
 
-    Requests for other host names than this machine's, or from pages of other origins, are refused: a foreign page whose
-    name is made to resolve to this machine must not read the images. Raises ValueError for a port that is none or
-    in use.
+    Requests for other host names than this machine's, or from pages of other origins, are refused: a foreign
+    page whose name is made to resolve to this machine must not read the images. Raises ValueError for a port
+    that is none or in use.
     """
     check_port(port)
     page = explorer.served_page().encode()  # computes once what the first answer would wait for
@@ -45,7 +45,9 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
 
         def do_POST(self) -> None:
             length = self.headers.get("Content-Length", "")
-            if not (self._is_own() and self.path == "/answer" and length.isdigit() and int(length) <= LARGEST):
+            if not (
+                self._is_own() and self.path == "/answer" and length.isdigit() and int(length) <= LARGEST
+            ):
                 self._refuse()
                 return
             try:
@@ -60,11 +62,15 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
         def _is_own(self) -> bool:
             hosts = [f"{name}:{self.server.server_port}" for name in OWN_NAMES]  # type: ignore[attr-defined]
             origin = self.headers.get("Origin")
-            return self.headers.get("Host") in hosts and (origin is None or origin.partition("://")[2] in hosts)
+            return self.headers.get("Host") in hosts and (
+                origin is None or origin.partition("://")[2] in hosts
+            )
 
         def _refuse(self) -> None:
             own = self._is_own()
-            self._send(404 if own else 403, "text/plain", b"nothing here\n" if own else b"for localhost alone\n")
+            self._send(
+                404 if own else 403, "text/plain", b"nothing here\n" if own else b"for localhost alone\n"
+            )
 
         def _send(self, status: int, kind: str, body: bytes) -> None:
             self.send_response(status)

@@ -63,11 +63,12 @@ def explore(
     Args:
         images: (C, H, W) by camera name; without any a checkered room is shown.
         alpha: its name, by default the first camera with an image; x: its pixel, by default the middle.
-        network: whose attention is shown: a network of the paper, or weights such as "pat-supervised"; without one,
-            correlations of windows.
+        network: whose attention is shown: a network of the paper, or weights such as "pat-supervised";
+            without one, correlations of windows.
         fields: fields of one's own by name, which can then be chosen.
-        controls: where the controls start: `field` and `second` (names of fields), `weights`, `near` and `far`
-            (metres), `baseline` and `focal` (factors), `rotation` (degrees), `lens` (added to k1), `moved` (metres).
+        controls: where the controls start: `field` and `second` (names of fields), `weights`, `near` and
+            `far` (metres), `baseline` and `focal` (factors), `rotation` (degrees), `lens` (added to k1),
+            `moved` (metres).
 
     What is wrong with the input is said in the widget. Raises TypeError for an unknown argument.
     """

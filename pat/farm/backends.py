@@ -40,15 +40,17 @@ class Renderer(Protocol):
     """Renders scenes of one job."""
 
     def render(self, seed: int, out: Path) -> SceneCheck:
-        """Render the scene of a seed into the folder `out`, which it makes, and check it. Raises ValueError."""
+        """Render the scene of a seed into the folder `out`, which it makes, and check it. Raises
+        ValueError.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)
 class LayeredSettings:
     """Layered scenes: the first camera of the rig is alpha.
 
-    `photos` are folders of images (none: patterns alone), reduced to `edge` pixels; `layers` bounds the number of
-    planes; `oversampling` samples a pixel along each axis.
+    `photos` are folders of images (none: patterns alone), reduced to `edge` pixels; `layers` bounds the
+    number of planes; `oversampling` samples a pixel along each axis.
     """
 
     photos: tuple[Path, ...] = ()
@@ -83,7 +85,9 @@ class BlenderSettings:
 
     def __post_init__(self) -> None:
         if (self.generator == "photographs") != (self.photos is not None):
-            raise ValueError("the generator 'photographs' needs a folder `photos`, and only that one takes it")
+            raise ValueError(
+                "the generator 'photographs' needs a folder `photos`, and only that one takes it"
+            )
         if ":" not in self.generator:
             generator_named(self.generator)
         self.render_settings()
@@ -153,7 +157,9 @@ def rig_from_alpha(rig: Rig) -> RigBatch:
         if not isinstance(camera, Camera):
             raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")
         if camera.distortion is not None:
-            raise ValueError(f"camera '{name}' has a lens model, layered scenes have none: use Blender, or omit it")
+            raise ValueError(
+                f"camera '{name}' has a lens model, layered scenes have none: use Blender, or omit it"
+            )
     if rig.depth is None:
         raise ValueError("the rig has no depth range: add `depth: [near, far]` in metres to its file")
     near, far = (float(d) for d in rig.depth)

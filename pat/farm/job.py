@@ -1,7 +1,7 @@
 """Many scenes rendered: a file that says what, and the job that makes those that are missing.
 
-The folder of a job holds `manifest.yaml` (what is rendered, by which versions) and `scenes/000012/` (scene 12; that the
-folder exists means that it is complete). `.work` holds unfinished scenes.
+The folder of a job holds `manifest.yaml` (what is rendered, by which versions) and `scenes/000012/` (scene
+12; that the folder exists means that it is complete). `.work` holds unfinished scenes.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ RESERVE = 64 << 20
 
 @dataclass(frozen=True, kw_only=True)
 class RetryLimits:
-    """A scene may take `timeout` seconds; one that its check refuses is made from the next seed, `refusals` times."""
+    """A scene may take `timeout` seconds; one that its check refuses is made from the next seed, `refusals`
+    times.
+    """
 
     timeout: float = 900.0
     refusals: int = 20
@@ -92,9 +94,13 @@ class RenderConfig:
         """The same with paths made absolute, as seen from a folder. Raises ValueError for missing ones."""
         photos = tuple(folder / p for p in self.layered.photos)
         blender = (
-            self.blender if self.blender.photos is None else replace(self.blender, photos=folder / self.blender.photos)
+            self.blender
+            if self.blender.photos is None
+            else replace(self.blender, photos=folder / self.blender.photos)
         )
-        config = replace(self, rig=folder / self.rig, layered=replace(self.layered, photos=photos), blender=blender)
+        config = replace(
+            self, rig=folder / self.rig, layered=replace(self.layered, photos=photos), blender=blender
+        )
         needed = [config.rig, *(photos if self.backend == "layered" else ())]
         needed += [blender.photos] if self.backend == "blender" and blender.photos else []
         for path in needed:
@@ -114,7 +120,9 @@ class RenderConfig:
         return rig
 
     def renderer(self) -> Renderer:
-        """A renderer that is ready. Raises ValueError for a rig that it cannot render, or if a library is missing."""
+        """A renderer that is ready. Raises ValueError for a rig that it cannot render, or if a library is
+        missing.
+        """
         return self.settings.renderer(self.load_rig(), self.check)
 
     def scene_bytes(self) -> float:
@@ -167,10 +175,11 @@ def render(
     scheduler: str | None = None,
     console: Console | None = None,
 ) -> JobReport:
-    """Render what is missing of `scenes` scenes into the folder `out`, by `workers` processes or a Dask scheduler's.
+    """Render what is missing of `scenes` scenes into the folder `out`, by `workers` processes or a Dask
+    scheduler's.
 
-    Raises ValueError for what cannot be rendered, more scenes than the disk holds, or a folder in use or of another
-    configuration; JobError if the job cannot go on.
+    Raises ValueError for what cannot be rendered, more scenes than the disk holds, or a folder in use or of
+    another configuration; JobError if the job cannot go on.
     """
     if scenes < 1 or workers < 1:
         raise ValueError(f"give at least one scene and one worker, got --scenes {scenes} --workers {workers}")
@@ -233,13 +242,16 @@ def check_space(root: Path, scenes: int, scene_bytes: float) -> None:
     if scenes and need > free:
         fits = max(int((free - RESERVE) / scene_bytes), 0)
         raise ValueError(
-            f"{scenes} more scenes of about {scene_bytes / 1e6:.1f} MB need {need / 1e9:.1f} GB and {root} has "
-            f"{free / 1e9:.1f} GB free: {fits} would fit; free space, ask for fewer --scenes, or another --out"
+            f"{scenes} more scenes of about {scene_bytes / 1e6:.1f} MB need {need / 1e9:.1f} GB and {root} "
+            "has "
+            f"{free / 1e9:.1f} GB free: {fits} would fit; free space, ask for fewer --scenes, or another "
+            "--out"
         )
 
 
 def make_scene(config_text: str, work: Path, scene: Path, index: int) -> None:
-    """The task of a scene: rendered from the first seed that the self-check accepts, and published as a whole.
+    """The task of a scene: rendered from the first seed that the self-check accepts, and published as a
+    whole.
 
     Raises ValueError for one that is refused again and again, JobError if no scene can be made.
     """
@@ -313,13 +325,17 @@ def summarise(root: Path) -> str:
     rig = scene_rig(folders[0])
     size = sum(file.stat().st_size for folder in folders for file in folder.iterdir())
     sizes = ", ".join(f"{name} {c.hw[1]}x{c.hw[0]}" for name, c in rig.cameras.items())
-    text = f"{len(folders)} scenes of {sizes}; {size / 1e6 / len(folders):.2f} MB each, {size / 1e9:.2f} GB in all"
+    text = (
+        f"{len(folders)} scenes of {sizes}; {size / 1e6 / len(folders):.2f} MB each, {size / 1e9:.2f} GB "
+        "in all"
+    )
     facts = [json.loads((f / FACTS).read_text(encoding="utf-8")) for f in folders if (f / FACTS).is_file()]
     if not facts:
         return text
     seconds, cpu = (median(f[key] for f in facts) for key in ("seconds", "cpu_seconds"))
     memory, refused = max(f["memory_mb"] for f in facts), sum(f["attempt"] for f in facts)
     return (
-        f"{text}\na scene took {seconds:.1f} s, {cpu:.1f} s of a core (medians); workers had up to {memory:.0f} MB; "
+        f"{text}\na scene took {seconds:.1f} s, {cpu:.1f} s of a core (medians); workers had up to "
+        f"{memory:.0f} MB; "
         f"{refused} seeds were refused by the check"
     )

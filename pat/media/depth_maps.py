@@ -38,9 +38,9 @@ VERTEX = np.dtype([("X", "<f4", 3), ("colour", "u1", 3)])
 def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = None) -> Float[Tensor, "h w"]:
     """Depth z in metres (H, W), float32; NaN where it is not positive and finite.
 
-    `scale` is metres of one unit of the file: by default 1 of float files, and of whole numbers what a depth_16.png
-    from `pat fuse` states, else `MILLIMETRE`. Raises FileNotFoundError, and ValueError for what is no depth map, or has
-    another size than `hw`.
+    `scale` is metres of one unit of the file: by default 1 of float files, and of whole numbers what a
+    depth_16.png from `pat fuse` states, else `MILLIMETRE`. Raises FileNotFoundError, and ValueError for what
+    is no depth map, or has another size than `hw`.
     """
     path = Path(path)
     if not path.is_file():
@@ -50,11 +50,15 @@ def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = 
     else:
         planes = read_recorded(path)
         if len(planes) != 1:
-            raise ValueError(f"{path}: has {len(planes)} channels, a depth map has one: give depth, not its picture")
+            raise ValueError(
+                f"{path}: has {len(planes)} channels, a depth map has one: give depth, not its picture"
+            )
         values = planes[0]
     if hw is not None and values.shape != tuple(hw):
         (h, w), (height, width) = values.shape, hw
-        raise ValueError(f"{path}: is {w}x{h}, alpha's image is {width}x{height}: give the depth of alpha's pixels")
+        raise ValueError(
+            f"{path}: is {w}x{h}, alpha's image is {width}x{height}: give the depth of alpha's pixels"
+        )
     if values.dtype == np.uint8:
         raise ValueError(f"{path}: has 8 bits, too few for depth: give PFM, float TIFF, or PNG of 16 bits")
     if scale is None:
@@ -67,7 +71,9 @@ def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = 
 
 
 def _pfm(path: Path) -> NDArray[np.float32]:
-    """A grey PFM file: text "Pf", width and height, scale (negative: little-endian), then rows from the bottom up."""
+    """A grey PFM file: text "Pf", width and height, scale (negative: little-endian), then rows from the
+    bottom up.
+    """
     content = path.read_bytes()
     head = re.match(rb"Pf\s+(\d+)\s+(\d+)\s+(-?[0-9.eE+-]+)\s", content)
     if head is None:
@@ -86,10 +92,14 @@ def _stated_scale(path: Path) -> float | None:
     return None if said is None else 1 / float(said[1])
 
 
-def write_points(path: Path, camera: Camera, depth: Float[Tensor, "h w"], image: Float[Tensor, "c h w"]) -> int:
-    """Write the pixels of known depth as a coloured point cloud (binary PLY), atomically; returns their number.
+def write_points(
+    path: Path, camera: Camera, depth: Float[Tensor, "h w"], image: Float[Tensor, "c h w"]
+) -> int:
+    """Write the pixels of known depth as a coloured point cloud (binary PLY), atomically; returns their
+    number.
 
-    Coordinates are the camera's: x right, y down, z ahead, in the unit of the depth. An image of one band is grey.
+    Coordinates are the camera's: x right, y down, z ahead, in the unit of the depth. An image of one band is
+    grey.
     """
     known = depth.isfinite()
     x = pixel_grid(camera.hw, dtype=torch.float64)[known]

@@ -62,7 +62,9 @@ TITLE, GAP = 28, 10
 """Pixels above and beside each panel."""
 
 
-def draw_panels(panels: Mapping[str, Float[Tensor, "_ _ _"]], *, columns: int, width: float = 10.0) -> Image.Image:
+def draw_panels(
+    panels: Mapping[str, Float[Tensor, "_ _ _"]], *, columns: int, width: float = 10.0
+) -> Image.Image:
     """One image, `width` times 110 pixels wide, of images by title, row by row, each scaled to its column.
 
     By Pillow: matplotlib takes a second and a half to import and draw as much.

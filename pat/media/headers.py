@@ -1,4 +1,6 @@
-"""What the head of an image file states: its size before anything is decoded, its orientation, its focal length."""
+"""What the head of an image file states: its size before anything is decoded, its orientation, its focal
+length.
+"""
 
 from __future__ import annotations
 
@@ -31,10 +33,11 @@ _FILES: dict[bytes, Any] = {b"\xff\xd8": JpegImageFile, b"RI": WebPImageFile, b"
 
 
 class ImageHeader(NamedTuple):
-    """(height, width) as stored, the orientation tag (1 to 8; 1 without one), and the bits a value of a TIFF, PNG or
-    PNM file (else 0).
+    """(height, width) as stored, the orientation tag (1 to 8; 1 without one), and the bits a value of a TIFF,
+    PNG or PNM file (else 0).
 
-    `tag` is where a TIFF file has its orientation: byte offset and struct format; None without one, and in other files.
+    `tag` is where a TIFF file has its orientation: byte offset and struct format; None without one, and in
+    other files.
     """
 
     hw: HW
@@ -73,8 +76,14 @@ def _png(content: bytes) -> ImageHeader:
 def _pnm(content: bytes) -> ImageHeader | None:
     """By hand: Pillow does not state the bits."""
     gap = rb"(?:\s|#[^\n]*\n)+"
-    found = re.match(rb"P[1-6]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})\s(?:\s*(\d{1,5})\s)?", content[:4096])
-    return ImageHeader((int(found[2]), int(found[1])), bits=16 if int(found[3] or 0) > 255 else 8) if found else None
+    found = re.match(
+        rb"P[1-6]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})\s(?:\s*(\d{1,5})\s)?", content[:4096]
+    )
+    return (
+        ImageHeader((int(found[2]), int(found[1])), bits=16 if int(found[3] or 0) > 255 else 8)
+        if found
+        else None
+    )
 
 
 def _tiff(content: bytes) -> ImageHeader | None:

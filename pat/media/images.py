@@ -54,22 +54,24 @@ def read_image(
     hw: HW | None = None,
     orientation: Literal["apply", "ignore"] = "apply",
 ) -> Float[Tensor, "c h w"]:
-    """The image in a PNG, TIFF, JPEG, PNM, BMP, WebP or HEIC file: grey (1, H, W) or RGB (3, H, W), float32, 0..1.
+    """The image in a PNG, TIFF, JPEG, PNM, BMP, WebP or HEIC file: grey (1, H, W) or RGB (3, H, W), float32,
+    0..1.
 
-    HEIC, which needs the extra `heic`, has 8 bits here and is rotated as its own header says. Raw files of cameras
-    (DNG and others), which need the extra `raw`, are developed to sRGB by LibRaw. An image of 8 bits with another
-    colour profile is converted to sRGB, with a warning; its profile is ignored with `orientation="ignore"`, and so are
-    those of images of 16 bits.
+    HEIC, which needs the extra `heic`, has 8 bits here and is rotated as its own header says. Raw files of
+    cameras (DNG and others), which need the extra `raw`, are developed to sRGB by LibRaw. An image of 8 bits
+    with another colour profile is converted to sRGB, with a warning; its profile is ignored with
+    `orientation="ignore"`, and so are those of images of 16 bits.
     8-bit values are divided by 255 and 16-bit ones by 65535, or by 2^bits - 1: a 12-bit camera that stores
-    0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value need nothing. Float files
-    must hold 0..1. A wholly opaque alpha channel is dropped. `name` (such as a camera's) goes in front of messages.
+    0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value need nothing. Float
+    files must hold 0..1. A wholly opaque alpha channel is dropped. `name` (such as a camera's) goes in front
+    of messages.
 
     An orientation tag (EXIF, TIFF) is applied, with a warning, as viewers and OpenCV's `imread` do; with
-    `orientation="ignore"` the pixels are as stored, as raw images need it. `hw` is the expected (height, width), which
-    is compared before anything is decoded.
+    `orientation="ignore"` the pixels are as stored, as raw images need it. `hw` is the expected (height,
+    width), which is compared before anything is decoded.
 
-    Raises FileNotFoundError for a missing file, ValueError for one that is not a usable image, has another size than
-    expected, or is larger than `MOST_PIXELS` where no size is.
+    Raises FileNotFoundError for a missing file, ValueError for one that is not a usable image, has another
+    size than expected, or is larger than `MOST_PIXELS` where no size is.
     """
     label = f"{name}: {path}" if name else f"{path}"
     planes, packed = _planes(Path(path), label, hw, orientation)
@@ -83,7 +85,8 @@ def read_recorded(
     hw: HW | None = None,
     orientation: Literal["apply", "ignore"] = "apply",
 ) -> NDArray[Any]:
-    """The values (C, H, W) of an image file in its own type and counts; else, and in what it raises, as `read_image`.
+    """The values (C, H, W) of an image file in its own type and counts; else, and in what it raises, as
+    `read_image`.
 
     Those that a TIFF file packs into less than 16 bits are as its camera counted them.
     """
@@ -92,7 +95,9 @@ def read_recorded(
     return np.ascontiguousarray(planes >> (16 - packed) if packed else planes)
 
 
-def _planes(path: Path, label: str, hw: HW | None, orientation: Literal["apply", "ignore"]) -> tuple[NDArray, int]:
+def _planes(
+    path: Path, label: str, hw: HW | None, orientation: Literal["apply", "ignore"]
+) -> tuple[NDArray, int]:
     """The values (C, H, W) as OpenCV reads them, upright, and the bits of packed ones (else 0)."""
     if not path.is_file():
         raise FileNotFoundError(f"{label}: no such image: check the path")
@@ -121,16 +126,18 @@ def write_image(
 ) -> None:
     """Write a grey or RGB image atomically, in the format its name ends in (.png, .tif, .jpg, .exr).
 
-    8 and 16 bits are rounded, after values are clipped to 0..1; 32 bits (.tif and .exr only) keep floats as they are.
-    With `profile`, PNG and JPEG files in colour say by an ICC profile that they are sRGB.
+    8 and 16 bits are rounded, after values are clipped to 0..1; 32 bits (.tif and .exr only) keep floats as
+    they are. With `profile`, PNG and JPEG files in colour say by an ICC profile that they are sRGB.
     An .exr file needs the extra `synthesis`. Raises ValueError for
-    an image with another number of channels or with values that are not finite (allowed with `unknown`, for maps of 32
-    bits in which some pixels are not known), and for a format that cannot hold it.
+    an image with another number of channels or with values that are not finite (allowed with `unknown`, for
+    maps of 32 bits in which some pixels are not known), and for a format that cannot hold it.
     """
     path = Path(path)
     planes = image.detach().cpu().numpy()
     if planes.shape[0] not in (1, 3):
-        raise ValueError(f"{path}: an image has 1 or 3 channels, got {planes.shape[0]}: write channels one by one")
+        raise ValueError(
+            f"{path}: an image has 1 or 3 channels, got {planes.shape[0]}: write channels one by one"
+        )
     if not (unknown and bits == 32) and not np.isfinite(planes).all():
         raise ValueError(f"{path}: the image to write has NaN or infinite values")
     if path.suffix.lower() == ".exr":
@@ -155,7 +162,8 @@ def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
         import pillow_heif
     except ImportError:
         raise ValueError(
-            f"{label}: reading HEIC needs the package pillow-heif: pip install 'arraygeom-pat[heic]', or save it as PNG"
+            f"{label}: reading HEIC needs the package pillow-heif: pip install 'arraygeom-pat[heic]', or "
+            "save it as PNG"
         ) from None
     problem = f"{label}: not a HEIC image that can be read (%s): save it as PNG"
     try:
@@ -171,16 +179,21 @@ def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
 
 
 def _png_of_raw(path: Path, label: str) -> bytes:
-    """A camera's raw file, developed to sRGB in 16 bits with the camera's white balance and upright, as a PNG file."""
+    """A camera's raw file, developed to sRGB in 16 bits with the camera's white balance and upright, as a PNG
+    file.
+    """
     try:
         import rawpy
     except ImportError:
         raise ValueError(
-            f"{label}: reading raw files needs the package rawpy: pip install 'arraygeom-pat[raw]', or save it as TIFF"
+            f"{label}: reading raw files needs the package rawpy: pip install 'arraygeom-pat[raw]', or save "
+            "it as TIFF"
         ) from None
     try:
         with rawpy.imread(str(path)) as raw:
-            colours = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=16, gamma=(2.4, 12.92))
+            colours = raw.postprocess(
+                use_camera_wb=True, no_auto_bright=True, output_bps=16, gamma=(2.4, 12.92)
+            )
     except (rawpy.LibRawError, OSError) as error:
         raise ValueError(f"{label}: not a raw file that can be read ({error}): save it as TIFF") from None
     return cv2.imencode(".png", colours[..., ::-1])[1].tobytes()
@@ -203,11 +216,14 @@ def _applied(header: ImageHeader, orientation: str, label: str) -> int:
 
 def _check_header(got: HW, wanted: HW | None, label: str) -> None:
     if wanted is None and got[0] * got[1] > MOST_PIXELS:
-        raise ValueError(f"{label}: is {got[1]}x{got[0]}, more than {MOST_PIXELS / 1e6:.0f} million pixels: reduce it")
+        raise ValueError(
+            f"{label}: is {got[1]}x{got[0]}, more than {MOST_PIXELS / 1e6:.0f} million pixels: reduce it"
+        )
     if wanted is not None and got != wanted:
         (h, w), (wanted_h, wanted_w) = got, wanted
         raise ValueError(
-            f"{label}: is {w}x{h}, the rig says {wanted_w}x{wanted_h}: resize the rig, or give the right image"
+            f"{label}: is {w}x{h}, the rig says {wanted_w}x{wanted_h}: resize the rig, or give the right "
+            "image"
         )
 
 
@@ -222,7 +238,8 @@ def _upright(values: NDArray, orientation: int) -> NDArray:
 
 
 def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, int]:
-    """The values as stored, and how many bits a value has in a TIFF file that packs them into less than 16; else 0.
+    """The values as stored, and how many bits a value has in a TIFF file that packs them into less than 16;
+    else 0.
 
     OpenCV shifts packed values up to 16 bits.
     """
@@ -263,7 +280,9 @@ def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray | None
 
 
 def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | None:
-    """What OpenCV makes of an image file; None for what is none, or has a side under `least` or too many pixels."""
+    """What OpenCV makes of an image file; None for what is none, or has a side under `least` or too many
+    pixels.
+    """
     content = path.read_bytes()
     header = image_header(content)
     if header is None or min(header.hw) < least or header.hw[0] * header.hw[1] > MOST_PIXELS:
@@ -278,7 +297,9 @@ def _opaque(values: NDArray, label: str) -> NDArray:
         raise ValueError(f"{label}: has {values.shape[2]} channels: give a grey (1) or RGB (3) image")
     full = np.iinfo(values.dtype).max if np.issubdtype(values.dtype, np.integer) else 1.0
     if (values[..., 3] != full).any():
-        raise ValueError(f"{label}: has an alpha channel with transparent pixels: flatten it and save it without alpha")
+        raise ValueError(
+            f"{label}: has an alpha channel with transparent pixels: flatten it and save it without alpha"
+        )
     return values[..., :3]
 
 
@@ -301,13 +322,16 @@ def _counts(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArr
     own = packed or 8 * planes.itemsize
     white = 2 ** (bits or own) - 1
     if bits and bits > own:
-        raise ValueError(f"{label}: has {own} bits a value, the rig says {bits}: correct 'bits', or give the raw file")
+        raise ValueError(
+            f"{label}: has {own} bits a value, the rig says {bits}: correct 'bits', or give the raw file"
+        )
     planes = planes >> (16 - packed) if packed else planes
     largest = int(planes.max())
     if own == 16 and not bits and 0 < largest < 2 ** max(FEW_BITS):
         needed = next(n for n in FEW_BITS if largest < 2**n)
         warn(
-            f"{label}: has 16 bits a value, and none above {largest}, so it is nearly black: if its camera counts to "
+            f"{label}: has 16 bits a value, and none above {largest}, so it is nearly black: if its camera "
+            "counts to "
             f"{2**needed - 1}, state `bits: {needed}` in the rig file"
         )
     if largest > white:

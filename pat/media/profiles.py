@@ -1,4 +1,6 @@
-"""Colour profiles (ICC): images are converted to sRGB when they are read, and say that they are sRGB when written."""
+"""Colour profiles (ICC): images are converted to sRGB when they are read, and say that they are sRGB when
+written.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ def srgb_profile() -> bytes:
 
 
 def in_srgb(values: NDArray, content: bytes, label: str) -> NDArray:
-    """Values (H, W) or (H, W, 3; blue first) of the image file `content`, converted to sRGB if it has another profile.
+    """Values (H, W) or (H, W, 3; blue first) of the image file `content`, converted to sRGB if it has another
+    profile.
 
     Warns that they were; or that they were not, for 16 bits and for profiles that cannot be used.
     """

@@ -1,7 +1,7 @@
 """Raw camera images -> images to fuse, by the rig's counts, filter pattern, exposure and encoding.
 
-Images to fuse are sRGB-encoded, on alpha's scale of light: where exposures and gains are known, a surface has one
-value in all of them. Ordinary images, which the rig describes no further, are unchanged.
+Images to fuse are sRGB-encoded, on alpha's scale of light: where exposures and gains are known, a surface has
+one value in all of them. Ordinary images, which the rig describes no further, are unchanged.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from arraygeom.chunks import chunked
 from .colour import linear_from_srgb, luminance, srgb_from_linear
 
 
-def develop(image: Float[Tensor, "c h w"], sensor: Sensor, *, like: Sensor | None = None) -> Float[Tensor, "c2 h w"]:
+def develop(
+    image: Float[Tensor, "c h w"], sensor: Sensor, *, like: Sensor | None = None
+) -> Float[Tensor, "c2 h w"]:
     """The image sRGB-encoded: black level subtracted, demosaiced, light on `like`'s scale.
 
     `image` holds counts over 2^bits - 1. Values are at least 0, and exceed 1 where the light is
@@ -60,7 +62,9 @@ def developed_rig(rig: Rig, names: Iterable[str]) -> Rig:
     return rig
 
 
-def as_bright(image: Float[Tensor, "3 h w"], alpha: Float[Tensor, "1 h w"], sensor: Sensor) -> Float[Tensor, "3 h w"]:
+def as_bright(
+    image: Float[Tensor, "3 h w"], alpha: Float[Tensor, "1 h w"], sensor: Sensor
+) -> Float[Tensor, "3 h w"]:
     """The fused image with alpha's luminance of light, if alpha's camera measured that (`LIGHT`).
 
     Fusion gives an image whose sRGB values have alpha's as their luma. Here all three are shifted by the same
@@ -72,11 +76,15 @@ def as_bright(image: Float[Tensor, "3 h w"], alpha: Float[Tensor, "1 h w"], sens
 
 
 def _missing(image: Tensor, light: Tensor) -> Tensor:
-    """The shift of sRGB values that gives this luminance of light; Newton's method on a convex function, from above."""
+    """The shift of sRGB values that gives this luminance of light; Newton's method on a convex function, from
+    above.
+    """
     shift = torch.zeros_like(light)
     for _ in range(4):
         value = image + shift
-        slope = torch.where(value <= 0.04045, 1 / 12.92, 2.4 / 1.055 * ((value.clamp(min=0) + 0.055) / 1.055) ** 1.4)
+        slope = torch.where(
+            value <= 0.04045, 1 / 12.92, 2.4 / 1.055 * ((value.clamp(min=0) + 0.055) / 1.055) ** 1.4
+        )
         shift = shift - (luminance(linear_from_srgb(value)) - light) / luminance(slope)
     return shift
 
@@ -84,8 +92,8 @@ def _missing(image: Tensor, light: Tensor) -> Tensor:
 def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h w"]:
     """Colours of a raw image behind a colour filter mosaic, interpolated along edges (OpenCV, in 16 bits).
 
-    Red and blue are green plus the median of their differences from it over 3x3 pixels (Freeman, US patent 4,724,395):
-    false-colour fringes at fine detail would otherwise be propagated to alpha.
+    Red and blue are green plus the median of their differences from it over 3x3 pixels (Freeman, US patent
+    4,724,395): false-colour fringes at fine detail would otherwise be propagated to alpha.
     """
     code = getattr(cv2, f"COLOR_Bayer{pattern}2RGB_EA")
     counts = np.rint(raw[0].clamp(0, 1).cpu().numpy().astype(np.float64) * 65535).astype(np.uint16)
@@ -97,7 +105,9 @@ def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h 
 
 
 def light_of(sensor: Sensor, like: Sensor) -> float:
-    """The value (1 is white) that `sensor` records, in grey or green, of light that is 1 on `like`'s scale."""
+    """The value (1 is white) that `sensor` records, in grey or green, of light that is 1 on `like`'s
+    scale.
+    """
     return 1 / _light(sensor, like)[1]
 
 

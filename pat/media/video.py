@@ -22,8 +22,8 @@ from .colour import to_bytes
 def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, rate: float = 25.0) -> None:
     """Write images (grey or RGB, sRGB values, clipped to 0..1) as H.264 (.mp4, .mkv), atomically.
 
-    An odd last row or column is left out: 4:2:0 has none. Raises ValueError for no frames, frames of different sizes,
-    and other suffixes.
+    An odd last row or column is left out: 4:2:0 has none. Raises ValueError for no frames, frames of
+    different sizes, and other suffixes.
     """
     path = Path(path)
     if path.suffix.lower() not in (".mp4", ".mkv"):

@@ -23,11 +23,11 @@ CURVE = 65
 SMOOTHED = 7
 """Side of the window over which the signal is averaged, pixels."""
 SIDE, GROUPS, FEWEST = 12, 16, 40
-"""Of blocks in which noise is estimated: their side in pixels, the groups of about equal value, and the least size of
-these."""
+"""Of blocks in which noise is estimated: their side in pixels, the groups of about equal value, and the least
+size of these."""
 SMOOTHEST, SHARE = 0.05, 0.677
-"""The quantile of the variances in a group that is taken, and what that is of the variance of white noise (from
-40,000 blocks of it)."""
+"""The quantile of the variances in a group that is taken, and what that is of the variance of white noise
+(from 40,000 blocks of it)."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,8 @@ class NoiseLevel:
         """The noise of a camera that counts so many electrons at white, with a read noise in electrons."""
         if not electrons >= 1:
             raise ValueError(
-                f"noise: electrons at white must be 1 or more, such as 200, got {electrons:g}: state how many a pixel "
+                f"noise: electrons at white must be 1 or more, such as 200, got {electrons:g}: state how "
+                "many a pixel "
                 "counts at white, not a standard deviation, or have the noise estimated"
             )
         return cls(1 / electrons, read / electrons, added_to)
@@ -64,9 +65,9 @@ class NoiseLevel:
     def estimated(cls, image: Float[Tensor, "1 c h w"]) -> NoiseLevel:
         """The noise level of an sRGB image with white noise, from its smoothest parts, by brightness.
 
-        Blocks in which a second difference varies least hold noise alone; noise of light or of values is taken, as
-        it fits. Noise that a demosaicing, a resampling or a codec has smoothed is underestimated; an image that has
-        fine texture everywhere seems noisier than it is.
+        Blocks in which a second difference varies least hold noise alone; noise of light or of values is
+        taken, as it fits. Noise that a demosaicing, a resampling or a codec has smoothed is underestimated;
+        an image that has fine texture everywhere seems noisier than it is.
         """
         if min(image.shape[-2:]) < SIDE + 2:
             return cls()
@@ -81,25 +82,32 @@ class NoiseLevel:
         linear = self.added_to == "light"
         light = linear_from_srgb(image) if linear else image
         shot = torch.as_tensor(self.shot).to(light)
-        counted = torch.poisson((light.clamp(min=0) / shot.clamp(min=1e-9)).clamp(max=1e7), generator=generator) * shot
+        counted = (
+            torch.poisson((light.clamp(min=0) / shot.clamp(min=1e-9)).clamp(max=1e7), generator=generator)
+            * shot
+        )
         light = torch.where(shot > 1e-7, counted, light) + self.read * normal(light.shape, light, generator)
         return srgb_from_linear(light.clamp(0, 1)) if linear else light.clamp(0, 1)
 
     def deviation(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """The standard deviation of a noisy sRGB image's values, by the mean of the image around each pixel."""
+        """The standard deviation of a noisy sRGB image's values, by the mean of the image around each
+        pixel.
+        """
         _, mean, deviation = self._curves(image)
         return _interpolated(_smoothed(image), mean, deviation)
 
     def unbiased(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """A noisy image whose mean around each pixel is that of the ideal image.
 
-        Light clipped at black is too bright in the mean, and encoded light that is not clipped too dark: with 50
-        electrons at white by up to 0.05 and 0.03. No denoiser that averages values sees that.
+        Light clipped at black is too bright in the mean, and encoded light that is not clipped too dark: with
+        50 electrons at white by up to 0.05 and 0.03. No denoiser that averages values sees that.
         """
         value, mean, _ = self._curves(image)
         return image + _interpolated(_smoothed(_smoothed(image)), mean, value - mean)
 
-    def _curves(self, like: Tensor) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"], Float[Tensor, "b n"]]:
+    def _curves(
+        self, like: Tensor
+    ) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"], Float[Tensor, "b n"]]:
         """Ideal values, and the mean and the deviation of what is recorded of each; noise taken as normal."""
         value = torch.linspace(0, 1, CURVE, device=like.device).to(like)
         normal = torch.special.ndtri((torch.arange(CURVE, device=like.device).to(like) + 0.5) / CURVE)
@@ -126,7 +134,9 @@ def _smoothed(image: Tensor) -> Tensor:
 
 
 def _smoothest(image: Float[Tensor, "1 c h w"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """Values, and the variance of the noise there: of the blocks of about each value those that vary least."""
+    """Values, and the variance of the noise there: of the blocks of about each value those that vary
+    least.
+    """
     inner = image[..., 1:-1, 1:-1]
     rough = avg_pool2d((image.diff(n=2, dim=-1).diff(n=2, dim=-2) / 6).square(), SIDE)
     mean, empty = avg_pool2d(inner, SIDE), avg_pool2d((inner <= 0).to(inner), SIDE)
@@ -138,11 +148,19 @@ def _smoothest(image: Float[Tensor, "1 c h w"]) -> tuple[Float[Tensor, " n"], Fl
     return torch.stack([*values, mean.new_zeros(())])[:-1], torch.stack([*variances, mean.new_zeros(())])[:-1]
 
 
-def _fitted(added_to: AddedTo, value: Float[Tensor, " n"], variance: Float[Tensor, " n"]) -> tuple[NoiseLevel, float]:
+def _fitted(
+    added_to: AddedTo, value: Float[Tensor, " n"], variance: Float[Tensor, " n"]
+) -> tuple[NoiseLevel, float]:
     """The level by least squares of relative errors, and its mean squared logarithmic error."""
     signal = linear_from_srgb(value) if added_to == "light" else value
-    slope = (srgb_from_linear(signal * 1.01 + 1e-4) - value) / (0.01 * signal + 1e-4) if added_to == "light" else 1.0
-    design = torch.stack([signal, torch.ones_like(signal)], -1) * (slope**2 / variance.clamp(min=1e-10))[:, None]
+    slope = (
+        (srgb_from_linear(signal * 1.01 + 1e-4) - value) / (0.01 * signal + 1e-4)
+        if added_to == "light"
+        else 1.0
+    )
+    design = (
+        torch.stack([signal, torch.ones_like(signal)], -1) * (slope**2 / variance.clamp(min=1e-10))[:, None]
+    )
     from scipy.optimize import nnls  # here, as it takes long to import
 
     (shot, read), _ = nnls(design.numpy(), np.ones(len(value)))

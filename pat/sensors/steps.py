@@ -25,7 +25,9 @@ class Step(ABC):
         """The images after the step."""
 
 
-def record(image: Float[Tensor, "b c h w"], steps: Sequence[Step], generator: Generator) -> Float[Tensor, "b c2 h2 w2"]:
+def record(
+    image: Float[Tensor, "b c h w"], steps: Sequence[Step], generator: Generator
+) -> Float[Tensor, "b c2 h2 w2"]:
     """The images after the steps, applied in order."""
     for step in steps:
         image = step.apply(image, generator)
@@ -65,9 +67,9 @@ class GaussianBlur(Step):
 class Resample(Step):
     """Another number of pixels for the same field of view: c' = (c + 0.5) s - 0.5.
 
-    `to` is a factor (sizes are rounded, and the factor along each axis is what they give) or a (height, width).
-    "area" is what a sensor with larger pixels records: it keeps the mean of the image exactly. "bicubic" is
-    the usual antialiased resize with a = -0.5.
+    `to` is a factor (sizes are rounded, and the factor along each axis is what they give) or a (height,
+    width). "area" is what a sensor with larger pixels records: it keeps the mean of the image exactly.
+    "bicubic" is the usual antialiased resize with a = -0.5.
     """
 
     to: float | HW
@@ -117,7 +119,8 @@ class Noise(Step):
     def __post_init__(self) -> None:
         if self.full_well <= 0 or self.read < 0:
             raise ValueError(
-                f"noise: wanted full_well > 0 and read >= 0 electrons, got {self.full_well:g} and {self.read:g}"
+                f"noise: wanted full_well > 0 and read >= 0 electrons, got {self.full_well:g} and "
+                f"{self.read:g}"
             )
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
@@ -157,8 +160,8 @@ class Quantise(Step):
 class Jitter(Step):
     """A random gain, gamma and white balance for each image, clipped to 0..1.
 
-    The logarithms of gain, gamma and of each channel's balance are normal with these standard deviations. Meant
-    for sRGB-encoded values.
+    The logarithms of gain, gamma and of each channel's balance are normal with these standard deviations.
+    Meant for sRGB-encoded values.
     """
 
     gain: float = 0.05
@@ -167,7 +170,9 @@ class Jitter(Step):
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         b, c = image.shape[:2]
-        gain = self.gain * normal((b, 1), image, generator) + self.normalisation * normal((b, c), image, generator)
+        gain = self.gain * normal((b, 1), image, generator) + self.normalisation * normal(
+            (b, c), image, generator
+        )
         gamma = self.gamma * normal((b, 1, 1, 1), image, generator)
         return (image.clamp(min=1e-6) ** gamma.exp() * gain.exp()[..., None, None]).clamp(0, 1)
 
@@ -239,7 +244,9 @@ def augment(
     cases: Sequence[DegradationCase],
     generator: Generator,
 ) -> Pairs:
-    """Degrade each pair of a batch by one of the cases, all equally likely. Sizes must come out as they went in."""
+    """Degrade each pair of a batch by one of the cases, all equally likely. Sizes must come out as they went
+    in.
+    """
     drawn = torch.randint(len(cases), (len(alpha),), generator=generator, device=generator.device)
     alpha, beta = alpha.clone(), beta.clone()
     for i, case in enumerate(cases):

@@ -9,8 +9,8 @@ from pathlib import Path
 def files_below(folder: str | Path, within: frozenset[str] = frozenset()) -> list[Path]:
     """All regular files in a folder and in those within it, behind symbolic links too, sorted.
 
-    Links that lead back to a folder that they are `within` (real paths) are not followed. Folders that cannot be read
-    hold nothing, as for `Path.rglob`.
+    Links that lead back to a folder that they are `within` (real paths) are not followed. Folders that cannot
+    be read hold nothing, as for `Path.rglob`.
     """
     real = os.path.realpath(folder)
     if real in within:

@@ -1,8 +1,9 @@
-"""Many tasks in many processes: each writes a file or a folder atomically, and is not repeated if that is there.
+"""Many tasks in many processes: each writes a file or a folder atomically, and is not repeated if that is
+there.
 
-In this process, in others on this machine, or on the workers of a Dask scheduler. If a process is killed, another one
-repeats the task it was running; a job that is killed as a whole and started again does only what is missing. Torch is
-imported only where tasks run.
+In this process, in others on this machine, or on the workers of a Dask scheduler. If a process is killed,
+another one repeats the task it was running; a job that is killed as a whole and started again does only what
+is missing. Torch is imported only where tasks run.
 """
 
 from __future__ import annotations
@@ -24,7 +25,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from arraygeom.warned import warn
 
@@ -50,7 +58,9 @@ class Task(NamedTuple):
 
 
 class TaskOutcome(NamedTuple):
-    """The error of a task in one line, or None; its warnings, the last of them the error if a filter made it so."""
+    """The error of a task in one line, or None; its warnings, the last of them the error if a filter made it
+    so.
+    """
 
     makes: Path
     error: str | None
@@ -59,7 +69,9 @@ class TaskOutcome(NamedTuple):
 
 @dataclass
 class JobReport:
-    """Files made, files that were there already, the error of each task that failed, and who warned of what."""
+    """Files made, files that were there already, the error of each task that failed, and who warned of
+    what.
+    """
 
     made: list[Path] = field(default_factory=list)
     kept: list[Path] = field(default_factory=list)
@@ -67,7 +79,9 @@ class JobReport:
     warned: dict[str, list[Path]] = field(default_factory=dict)
 
     def warn(self, outcome: TaskOutcome, about: str) -> None:
-        """Pass on the warnings of a task, one of each kind: texts that differ in numbers alone are of one kind."""
+        """Pass on the warnings of a task, one of each kind: texts that differ in numbers alone are of one
+        kind.
+        """
         for warning in outcome.warnings:
             kind = re.sub(r"[\d.]+", "", f"{type(warning).__name__}: {warning}")
             files = self.warned.setdefault(kind, [])
@@ -79,7 +93,9 @@ class JobReport:
     def __str__(self) -> str:
         warned = {file for files in self.warned.values() for file in files}
         further = {"there already": self.kept, "failed": self.failed, "with warnings": warned}
-        return ", ".join([f"{len(self.made)} made", *(f"{len(n)} {what}" for what, n in further.items() if n)])
+        return ", ".join(
+            [f"{len(self.made)} made", *(f"{len(n)} {what}" for what, n in further.items() if n)]
+        )
 
 
 class JobError(ValueError):
@@ -90,10 +106,10 @@ class JobError(ValueError):
 class Workers:
     """Where tasks run.
 
-    `scheduler` is the address of a Dask scheduler ("tcp://host:8786"); without, `count` processes on this machine, or
-    this process itself for 1, unless tasks are to be kept `apart`, as what crashes or hangs. `threads` are torch's in
-    each: results are identical to the bit for the same number. A task of a process of its own may take `timeout`
-    seconds.
+    `scheduler` is the address of a Dask scheduler ("tcp://host:8786"); without, `count` processes on this
+    machine, or this process itself for 1, unless tasks are to be kept `apart`, as what crashes or hangs.
+    `threads` are torch's in each: results are identical to the bit for the same number. A task of a process
+    of its own may take `timeout` seconds.
     """
 
     count: int = 1
@@ -118,8 +134,8 @@ def run_tasks(
 ) -> JobReport:
     """Run all tasks; with `resume`, only those whose file is missing. Without, such files are removed first.
 
-    An error of a task (ValueError, OSError) is reported with its file's name and the task skipped, or it stops the
-    job: then JobError is raised, and what is made stays. A task's own JobError always stops it.
+    An error of a task (ValueError, OSError) is reported with its file's name and the task skipped, or it
+    stops the job: then JobError is raised, and what is made stays. A task's own JobError always stops it.
     """
     if not resume:
         for task in tasks:
@@ -131,7 +147,9 @@ def run_tasks(
     console = console or Console(stderr=True)
     here = workers.count == 1 and not workers.apart
     run = _on_dask if workers.scheduler else _in_this_process if here else _in_processes
-    for outcome in followed(run(left, workers), title=title, total=len(tasks), done=len(there), console=console):
+    for outcome in followed(
+        run(left, workers), title=title, total=len(tasks), done=len(there), console=console
+    ):
         if outcome.error is None:
             report.made.append(outcome.makes)
             report.warn(outcome, named[outcome.makes])
@@ -148,8 +166,12 @@ LINE_EVERY = 30.0
 """Seconds between lines of progress where there is no terminal."""
 
 
-def followed(outcomes: Iterable[T], *, title: str, total: int, done: int = 0, console: Console) -> Iterator[T]:
-    """The outcomes as they come, their number shown: as a bar on a terminal, elsewhere as a line now and then."""
+def followed(
+    outcomes: Iterable[T], *, title: str, total: int, done: int = 0, console: Console
+) -> Iterator[T]:
+    """The outcomes as they come, their number shown: as a bar on a terminal, elsewhere as a line now and
+    then.
+    """
     printed = time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     further = (TimeRemainingColumn(), TextColumn("{task.fields[status]}"))
@@ -230,7 +252,10 @@ class _Process:
                 if died is not None:
                     died.join()
                     code = died.exitcode
-                    error = f"its process died ({signal.Signals(-code).name if code < 0 else f'exit status {code}'})"
+                    error = (
+                        "its process died "
+                        f"({signal.Signals(-code).name if code < 0 else f'exit status {code}'})"
+                    )
                 continue
             if outcome is None:
                 self.end()
@@ -246,7 +271,9 @@ class _Process:
         if self.process is None:
             spawn = get_context("spawn")
             self.pipe, theirs = spawn.Pipe()
-            self.process = spawn.Process(target=_serve, args=(theirs, self.workers.threads, os.getpid()), daemon=True)
+            self.process = spawn.Process(
+                target=_serve, args=(theirs, self.workers.threads, os.getpid()), daemon=True
+            )
             self.process.start()
             theirs.close()
         self.pipe.send(task)
@@ -287,7 +314,8 @@ AHEAD = 4
 
 
 def _on_dask(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
-    """Outcomes as they come; Dask repeats what a dead worker was running, and what kills several is an outcome too.
+    """Outcomes as they come; Dask repeats what a dead worker was running, and what kills several is an
+    outcome too.
 
     Raises ValueError without Dask or scheduler.
     """

@@ -1,4 +1,6 @@
-"""One command at a time in a folder of results, and folders that cannot be written to found before the work."""
+"""One command at a time in a folder of results, and folders that cannot be written to found before the
+work.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +21,12 @@ OWNER = ".lock.json"
 
 @contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Make the folder, and keep other commands out of it until the block ends; one left empty is removed again.
+    """Make the folder, and keep other commands out of it until the block ends; one left empty is removed
+    again.
 
-    The lock is a file locked by the system, and process and host are in another beside it: that of a process of this
-    host which is gone counts for nothing. Raises ValueError for a folder that another command holds, or that cannot
-    be written to.
+    The lock is a file locked by the system, and process and host are in another beside it: that of a process
+    of this host which is gone counts for nothing. Raises ValueError for a folder that another command holds,
+    or that cannot be written to.
     """
     made = _make(folder)
     try:
@@ -69,7 +72,9 @@ def _locked(folder: Path) -> BaseFileLock:
         lock.release()
         raise _in_use(folder, owner, f"wait for it, or remove {owner_file} if it has ended")
     try:
-        owner_file.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}), encoding="utf-8")
+        owner_file.write_text(
+            json.dumps({"pid": os.getpid(), "host": socket.gethostname()}), encoding="utf-8"
+        )
     except OSError as error:
         lock.release()
         raise _unusable(folder, error) from None
@@ -93,5 +98,9 @@ def _in_use(folder: Path, owner: dict[str, object], advice: str) -> ValueError:
 def _unusable(folder: Path, error: OSError) -> ValueError:
     at = Path(error.filename) if error.filename else folder
     blocked = next((path for path in (folder, *folder.parents) if path.exists() and not path.is_dir()), None)
-    reason = f"{blocked} is a file" if blocked else f"{at.parent if at.name in (LOCK, OWNER) else at}: {error.strerror}"
+    reason = (
+        f"{blocked} is a file"
+        if blocked
+        else f"{at.parent if at.name in (LOCK, OWNER) else at}: {error.strerror}"
+    )
     return ValueError(f"{folder}: cannot write there ({reason}): give another folder")

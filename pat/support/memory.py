@@ -37,8 +37,9 @@ _keeps = False
 
 
 def keep_freed() -> None:
-    """Keep freed memory for later use: glibc returns large blocks at once, and an eighth of the time of fusing a frame
-    goes into getting them again. Of the whole process: for commands and workers, which are ours."""
+    """Keep freed memory for later use: glibc returns large blocks at once, and an eighth of the time of
+    fusing a frame goes into getting them again. Of the whole process: for commands and workers, which are
+    ours."""
     options = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if options is not None:
         for option, value in ((M_TRIM_THRESHOLD, 2**31 - 1), (M_MMAP_MAX, 0), (M_ARENA_MAX, 1)):
@@ -48,13 +49,15 @@ def keep_freed() -> None:
 
 
 def planned(limit: float | None, memory: float, *, large: bool) -> float | None:
-    """The limit; for a large task what it is planned to take, if that is less: freed memory that is kept (`keep_freed`)
-    comes on top, half as much again for a frame of 12 megapixels."""
+    """The limit; for a large task what it is planned to take, if that is less: freed memory that is kept
+    (`keep_freed`) comes on top, half as much again for a frame of 12 megapixels."""
     return min(memory, limit or memory) if large and _keeps else limit
 
 
 def give_back() -> None:
-    """Return freed memory to the system: glibc keeps some 300 MiB after a tile, which the next may not fit."""
+    """Return freed memory to the system: glibc keeps some 300 MiB after a tile, which the next may not
+    fit.
+    """
     if sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim:
@@ -68,8 +71,8 @@ _LIMIT: ContextVar[float | None] = ContextVar("limit", default=None)
 
 @contextmanager
 def limited(limit: float | None) -> Iterator[None]:
-    """Within this, `how_many_fit` knows how many bytes the process may take in all, and freed memory is returned to the
-    system when the process comes near that; None: no limit."""
+    """Within this, `how_many_fit` knows how many bytes the process may take in all, and freed memory is
+    returned to the system when the process comes near that; None: no limit."""
     before, done = _LIMIT.get(), Event()
     token = _LIMIT.set(limit)
     if limit is not None and limit != before:
@@ -82,7 +85,9 @@ def limited(limit: float | None) -> Iterator[None]:
 
 
 def _return_near(most: float, done: Event) -> None:
-    """Return freed memory whenever the process has more than `most` bytes; less often while that does not help."""
+    """Return freed memory whenever the process has more than `most` bytes; less often while that does not
+    help.
+    """
     near = False
     while not done.wait(5 * EVERY if near else EVERY):
         near = resident() > most
@@ -109,7 +114,9 @@ def how_many_fit(nbytes: float) -> int | None:
 
 
 def peak_memory(pid: int | str = "self") -> float | None:
-    """Peak resident bytes of a process, by default of this one; None where the system does not say (Linux does)."""
+    """Peak resident bytes of a process, by default of this one; None where the system does not say (Linux
+    does).
+    """
     line = re.search(r"VmHWM:\s+(\d+) kB", _text(Path(f"/proc/{pid}/status")))
     return None if line is None else float(line[1]) * 2**10
 

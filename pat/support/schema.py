@@ -21,7 +21,11 @@ def to_document(value: Any, *, defaults: bool = False) -> Any:
     """
     if dataclasses.is_dataclass(value):
         entries = {f: getattr(value, f.name) for f in dataclasses.fields(value)}
-        return {f.name: to_document(v, defaults=defaults) for f, v in entries.items() if defaults or not _default(f, v)}
+        return {
+            f.name: to_document(v, defaults=defaults)
+            for f, v in entries.items()
+            if defaults or not _default(f, v)
+        }
     if isinstance(value, tuple | list):
         return [to_document(v, defaults=defaults) for v in value]
     if isinstance(value, dict):
@@ -46,7 +50,9 @@ def read_yaml(path: str | Path) -> Any:
 
 
 def parse_yaml(text: str | bytes, name: str) -> Any:
-    """The content of a YAML text, UTF-8. Raises ValueError naming `name` and the line for one that is not YAML."""
+    """The content of a YAML text, UTF-8. Raises ValueError naming `name` and the line for one that is not
+    YAML.
+    """
     import yaml
 
     from arraygeom.safe_yaml import load_yaml, yaml_problem

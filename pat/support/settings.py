@@ -1,7 +1,7 @@
 """The numbers that an algorithm was given: each with its kind, and where it is from, in a frozen dataclass.
 
-*physics*: follows from what is measured or from the recording; *size*: how much is done at a time, changes no result
-worth speaking of; *tuned*: chosen on images, which are named.
+*physics*: follows from what is measured or from the recording; *size*: how much is done at a time, changes no
+result worth speaking of; *tuned*: chosen on images, which are named.
 """
 
 from __future__ import annotations
@@ -53,7 +53,9 @@ def listed(settings: Any) -> Iterator[SettingEntry]:
     """The entries of an algorithm's settings, in their order. Raises ValueError for one without a kind."""
     name = type(settings).__name__
     for entry in fields(settings):
-        yield SettingEntry(name, entry.name, getattr(settings, entry.name), _kind(name, entry), entry.metadata["why"])
+        yield SettingEntry(
+            name, entry.name, getattr(settings, entry.name), _kind(name, entry), entry.metadata["why"]
+        )
 
 
 def _kind(algorithm: str, entry: Field[Any]) -> Kind:
@@ -64,10 +66,16 @@ def _kind(algorithm: str, entry: Field[Any]) -> Kind:
 
 
 def all_settings(*rooms: str) -> list[SettingEntry]:
-    """The entries of all settings of these packages, such as "pat.matching", in the order of their modules."""
+    """The entries of all settings of these packages, such as "pat.matching", in the order of their
+    modules.
+    """
     found: dict[str, Any] = {}
     for room in rooms:
         for module in iter_modules(import_module(room).__path__, f"{room}."):
             values = vars(import_module(module.name)).values()
-            found |= {type(v).__name__: v for v in values if is_dataclass(v) and type(v).__name__.endswith("Settings")}
+            found |= {
+                type(v).__name__: v
+                for v in values
+                if is_dataclass(v) and type(v).__name__.endswith("Settings")
+            }
     return [entry for settings in found.values() for entry in listed(settings)]

@@ -1,6 +1,7 @@
 """The steps of long work, shown as they begin.
 
-Modules say them to their loggers, at level INFO: `logging.basicConfig(level=logging.INFO)` shows them in a script.
+Modules say them to their loggers, at level INFO: `logging.basicConfig(level=logging.INFO)` shows them in a
+script.
 """
 
 from __future__ import annotations

@@ -14,7 +14,9 @@ from torch import Tensor
 from arraygeom.atomic import write_atomically
 
 
-def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
+def write_tensors(
+    path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None
+) -> None:
     """Write tensors atomically, with a digest of them (`undamaged`) beside the metadata.
 
     Raises OSError that names the file if that fails, on a full disk for instance.
@@ -32,7 +34,9 @@ DIGEST = "digest"
 
 
 def digest(tensors: Mapping[str, Tensor]) -> str:
-    """A digest of names, shapes and bytes: a file in which a bit has changed is still a valid safetensors file."""
+    """A digest of names, shapes and bytes: a file in which a bit has changed is still a valid safetensors
+    file.
+    """
     total = hashlib.blake2b(digest_size=16)
     for name, tensor in sorted(tensors.items()):
         total.update(f"{name} {tuple(tensor.shape)} {tensor.dtype};".encode())
@@ -41,5 +45,7 @@ def digest(tensors: Mapping[str, Tensor]) -> str:
 
 
 def undamaged(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bool:
-    """Whether the tensors of a file are those that were written; also for files of before there were digests."""
+    """Whether the tensors of a file are those that were written; also for files of before there were
+    digests.
+    """
     return DIGEST not in metadata or metadata[DIGEST] == digest(tensors)

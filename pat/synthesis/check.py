@@ -24,12 +24,12 @@ from .rendered import RenderedFrame, depth_between
 class CheckLimits:
     """What a rendered scene must keep to.
 
-    `error` bounds the 95th percentile, in pixels, of how far a point that both of two views see misses its pixel on
-    the way there and back by both depths; `shift` bounds the displacement, in pixels, of the predicted
-    colours; `contradicted` the share of points where a view looks through a surface
-    that another one sees. `dark` and `bright` bound the share of pixels below 0.004 and above 1 in all colours.
-    `texture` is the least share of 8x8 patches with contrast above 2 %, `overlap` the least share of a view's
-    pixels that some other view sees.
+    `error` bounds the 95th percentile, in pixels, of how far a point that both of two views see misses its
+    pixel on the way there and back by both depths; `shift` bounds the displacement, in pixels, of the
+    predicted colours; `contradicted` the share of points where a view looks through a surface
+    that another one sees. `dark` and `bright` bound the share of pixels below 0.004 and above 1 in all
+    colours. `texture` is the least share of 8x8 patches with contrast above 2 %, `overlap` the least share of
+    a view's pixels that some other view sees.
     """
 
     error: float = 0.02
@@ -56,10 +56,17 @@ class SceneCheck:
 
     def to_document(self) -> dict[str, Any]:
         """For a file: `accepted`, `reasons`, `views`, `pairs`."""
-        return {"accepted": self.accepted, "reasons": list(self.reasons), "views": self.views, "pairs": self.pairs}
+        return {
+            "accepted": self.accepted,
+            "reasons": list(self.reasons),
+            "views": self.views,
+            "pairs": self.pairs,
+        }
 
 
-def check_views(rig: Rig, frames: Mapping[str, RenderedFrame], limits: CheckLimits | None = None) -> SceneCheck:
+def check_views(
+    rig: Rig, frames: Mapping[str, RenderedFrame], limits: CheckLimits | None = None
+) -> SceneCheck:
     """Check one frame of every camera against each other and against the limits.
 
     Pairs of frames of different times are left out.
@@ -67,7 +74,10 @@ def check_views(rig: Rig, frames: Mapping[str, RenderedFrame], limits: CheckLimi
     limits = limits or CheckLimits()
     views = {name: view_figures(frame) for name, frame in frames.items()}
     together = [(a, b) for a, b in permutations(frames, 2) if frames[a].time == frames[b].time]
-    pairs = {f"{a} > {b}": pair_figures(_camera(rig, a), frames[a], _camera(rig, b), frames[b]) for a, b in together}
+    pairs = {
+        f"{a} > {b}": pair_figures(_camera(rig, a), frames[a], _camera(rig, b), frames[b])
+        for a, b in together
+    }
     reasons = [r for name, figures in views.items() for r in _view_reasons(name, figures, limits)]
     reasons += [r for name, figures in pairs.items() for r in _pair_reasons(name, figures, limits)]
     reasons += _overlap_reasons(pairs, {a for a, _ in together}, limits)
@@ -102,11 +112,11 @@ def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
 def pair_figures(alpha: Camera, here: RenderedFrame, beta: Camera, there: RenderedFrame) -> dict[str, float]:
     """How well alpha's depth predicts beta's view, at up to 200,000 pixels.
 
-    `inside` is the share of alpha's pixels whose points are on beta's image; of all, `visible` are seen there,
-    `hidden` lie behind something nearer, `contradicted` in front of what beta records. Points beside an edge in beta
-    are none of these. `median`, `p95` and `p99` of the error on visible points are in alpha's pixels. `colour` is the
-    median difference of their colours, relative to their brightness, `shift` how many pixels one image is displaced
-    against the other by all of these differences together.
+    `inside` is the share of alpha's pixels whose points are on beta's image; of all, `visible` are seen
+    there, `hidden` lie behind something nearer, `contradicted` in front of what beta records. Points beside
+    an edge in beta are none of these. `median`, `p95` and `p99` of the error on visible points are in alpha's
+    pixels. `colour` is the median difference of their colours, relative to their brightness, `shift` how many
+    pixels one image is displaced against the other by all of these differences together.
     """
     alpha, beta = alpha.to(dtype=torch.float64), beta.to(dtype=torch.float64)
     x, depth, index = _chosen(here, 200_000)
@@ -130,7 +140,9 @@ def pair_figures(alpha: Camera, here: RenderedFrame, beta: Camera, there: Render
         "contradicted": (clean & ~visible & ~nearer).sum() / total,
     }
     if visible.any():
-        figures |= dict(zip(("median", "p95", "p99"), error[visible].quantile(error.new_tensor([0.5, 0.95, 0.99]))))
+        figures |= dict(
+            zip(("median", "p95", "p99"), error[visible].quantile(error.new_tensor([0.5, 0.95, 0.99])))
+        )
         figures["colour"], figures["shift"] = _compared(here, x[visible], there, target[visible])
     return _rounded(figures)
 
@@ -183,7 +195,9 @@ def _pair_reasons(name: str, figures: Mapping[str, float], limits: CheckLimits) 
         yield f"{name}: {figures['contradicted']:.1%} of the points are seen through"
 
 
-def _overlap_reasons(pairs: Mapping[str, Mapping[str, float]], names: set[str], limits: CheckLimits) -> list[str]:
+def _overlap_reasons(
+    pairs: Mapping[str, Mapping[str, float]], names: set[str], limits: CheckLimits
+) -> list[str]:
     """Views of which no other view sees enough."""
     best = {n: max(f["visible"] for p, f in pairs.items() if p.startswith(f"{n} > ")) for n in sorted(names)}
     return [

@@ -17,7 +17,20 @@ from arraygeom.camera import Camera
 from arraygeom.pixels import coarse_grid
 from arraygeom.rig import Rig
 
-from .scene import Key, Light, Material, Motion, Object, Relief, Scene, Shape, Texture, TextureKind, Vec3, World
+from .scene import (
+    Key,
+    Light,
+    Material,
+    Motion,
+    Object,
+    Relief,
+    Scene,
+    Shape,
+    Texture,
+    TextureKind,
+    Vec3,
+    World,
+)
 
 DEPTHS = (2.0, 20.0)
 """Near and far, metres, of scenes for rigs without a depth range."""
@@ -73,7 +86,9 @@ class Setting:
         return self.cameras[int(self.rng.integers(len(self.cameras)))]
 
     def nearest(self, X: NDArray) -> float:
-        """The least depth at which a camera can see a point; to cameras that it is not before, the distance."""
+        """The least depth at which a camera can see a point; to cameras that it is not before, the
+        distance.
+        """
         distances = np.linalg.norm(self.centres - X, axis=1)
         depths = [float(c.cam_from_world.apply(c.K.new_tensor(X)[None])[0, 2]) for c in self.cameras]
         return float(min(z if z > 0.3 * d else d for z, d in zip(depths, distances)))
@@ -96,7 +111,9 @@ def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -
             objects.append(item)
     walls = Material(texture=surface(setting, 0.8 * setting.far, _WALLS), roughness=0.9, specular=0.1)
     key = Key(
-        position=vec(room.centre), rotation=vec(Rotation.from_matrix(room.R).as_rotvec()), extent=vec(room.extent)
+        position=vec(room.centre),
+        rotation=vec(Rotation.from_matrix(room.R).as_rotvec()),
+        extent=vec(room.extent),
     )
     objects.append(Object(name="room", shape="room", motion=Motion((key,)), material=walls))
     return Scene(
@@ -109,7 +126,8 @@ def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -
     )
 
 
-# The room and its lights ----------------------------------------------------------------------------------------
+# The room and its lights
+# ----------------------------------------------------------------------------------------
 
 
 def _room(setting: Setting) -> _Room:
@@ -120,10 +138,16 @@ def _room(setting: Setting) -> _Room:
     local = (setting.centres - setting.centres[0]) @ R
     back = local[:, 2].min() - 2 * setting.near
     rays = [_rays(c) for c in setting.cameras]
-    half = np.tan(_half_view(setting.cameras)) * rng.uniform(0.5, 0.9, 2) * setting.far + np.abs(local[:, :2]).max()
+    half = (
+        np.tan(_half_view(setting.cameras)) * rng.uniform(0.5, 0.9, 2) * setting.far
+        + np.abs(local[:, :2]).max()
+    )
     front = setting.far
     for _ in range(30):
-        centre, extent = np.array([0, 0, (front + back) / 2]), np.array([2 * half[0], 2 * half[1], front - back])
+        centre, extent = (
+            np.array([0, 0, (front + back) / 2]),
+            np.array([2 * half[0], 2 * half[1], front - back]),
+        )
         room = _Room(R, setting.centres[0] + R @ centre, extent)
         nearest, farthest = _wall_depths(room, setting.cameras, rays)
         if farthest <= 0.98 * setting.far and nearest >= setting.near:
@@ -143,7 +167,8 @@ def _rays(camera: Camera) -> NDArray:
 def _half_view(cameras: Sequence[Camera]) -> NDArray:
     """Half the widest view across and down, radians."""
     angles = [
-        [math.atan(n / 2 / float(f)) for n, f in zip((c.hw[1], c.hw[0]), c.K[:2, :2].abs().amax(1))] for c in cameras
+        [math.atan(n / 2 / float(f)) for n, f in zip((c.hw[1], c.hw[0]), c.K[:2, :2].abs().amax(1))]
+        for c in cameras
     ]
     return np.max(angles, axis=0)
 
@@ -161,7 +186,9 @@ def _wall_depths(room: _Room, cameras: Sequence[Camera], rays: Sequence[NDArray]
 
 
 def _lights(setting: Setting, room: _Room) -> tuple[Light, ...]:
-    """Two to four lamps beside and above the cameras, and perhaps a sun; together about as bright everywhere."""
+    """Two to four lamps beside and above the cameras, and perhaps a sun; together about as bright
+    everywhere.
+    """
     rng = setting.rng
     count = int(rng.integers(2, 5))
     shares = rng.dirichlet(np.full(count, 3.0)) * _IRRADIANCE * rng.uniform(0.8, 1.2)
@@ -170,7 +197,9 @@ def _lights(setting: Setting, room: _Room) -> tuple[Light, ...]:
     if rng.uniform() < 0.6:
         direction = room.R @ np.array([rng.uniform(-1, 1), rng.uniform(0.2, 1), rng.uniform(0.3, 1)])
         lights.append(
-            _tinted(rng, Light(kind="sun", power=float(rng.uniform(0.8, 2)), direction=vec(direction), size=0.05))
+            _tinted(
+                rng, Light(kind="sun", power=float(rng.uniform(0.8, 2)), direction=vec(direction), size=0.05)
+            )
         )
     return tuple(lights)
 
@@ -182,7 +211,9 @@ def _lamp(setting: Setting, room: _Room, target: NDArray, irradiance: float) -> 
     if rng.uniform() < 0.5:
         size = float(rng.uniform(0.05, 0.2) * room.extent.min())
         power, direction = irradiance * math.pi * squared, vec(target - where)
-        return _tinted(rng, Light(kind="area", power=power, position=vec(where), direction=direction, size=size))
+        return _tinted(
+            rng, Light(kind="area", power=power, position=vec(where), direction=direction, size=size)
+        )
     power, size = irradiance * 4 * math.pi * squared, float(rng.uniform(0.01, 0.03) * room.extent.min())
     return _tinted(rng, Light(kind="point", power=power, position=vec(where), size=size))
 
@@ -193,31 +224,42 @@ def _tinted(rng: Generator, light: Light) -> Light:
     return replace(light, rgb=(1 + warmth, 1.0, 1 - warmth), nir=1 + 2 * max(warmth, 0.0))
 
 
-# Objects --------------------------------------------------------------------------------------------------------
+# Objects
+# --------------------------------------------------------------------------------------------------------
 
 
-def _object(setting: Setting, room: _Room, others: list[Object], surface: Surface, moving: float) -> Object | None:
+def _object(
+    setting: Setting, room: _Room, others: list[Object], surface: Surface, moving: float
+) -> Object | None:
     """A shape at a random place in view, or None if the drawn position is unsuitable."""
     rng, camera = setting.rng, setting.camera()
     depth = float(1 / rng.uniform(1 / (0.75 * setting.far), 1 / (1.25 * setting.near)))
     centre = setting.ahead(camera, rng.uniform(-0.95, 0.95, 2), depth)
-    view = depth * min(n / 2 / float(f) for n, f in zip((camera.hw[1], camera.hw[0]), camera.K[:2, :2].abs().amax(1)))
+    view = depth * min(
+        n / 2 / float(f) for n, f in zip((camera.hw[1], camera.hw[0]), camera.K[:2, :2].abs().amax(1))
+    )
     radius = float(min(view * rng.uniform(0.2, 0.55), 0.85 * (setting.nearest(centre) - setting.near)))
     if not radius > 0.05 * view or not room.holds(centre, 0.4 * radius) or _crowded(centre, radius, others):
         return None
     shape = _SHAPES[int(rng.integers(len(_SHAPES)))]
     extent = _extent(rng, shape, radius)
     relief = _relief(rng, extent) if rng.uniform() < 0.4 else None
-    key = Key(position=vec(centre), rotation=vec(Rotation.random(random_state=rng).as_rotvec()), extent=vec(extent))
+    key = Key(
+        position=vec(centre), rotation=vec(Rotation.random(random_state=rng).as_rotvec()), extent=vec(extent)
+    )
     material = _material(rng, surface(setting, depth, _PATTERNS), setting.metres(depth, 1))
     keys = (key,) if moving == 0 else _path(setting, key, radius, moving)
-    return Object(name=f"{shape}{len(others) + 1}", shape=shape, motion=Motion(keys), material=material, relief=relief)
+    return Object(
+        name=f"{shape}{len(others) + 1}", shape=shape, motion=Motion(keys), material=material, relief=relief
+    )
 
 
 def _crowded(centre: NDArray, radius: float, others: list[Object]) -> bool:
     """Whether much of the object would be inside another one."""
     keys = [o.motion.keys[0] for o in others]
-    return any(np.linalg.norm(centre - k.position) < 0.5 * (radius + np.linalg.norm(k.extent) / 2) for k in keys)
+    return any(
+        np.linalg.norm(centre - k.position) < 0.5 * (radius + np.linalg.norm(k.extent) / 2) for k in keys
+    )
 
 
 def _extent(rng: Generator, shape: Shape, radius: float) -> NDArray:
@@ -238,15 +280,24 @@ def _relief(rng: Generator, extent: NDArray) -> Relief:
 
 
 def _path(setting: Setting, start: Key, radius: float, duration: float) -> tuple[Key, ...]:
-    """Four keys, evenly spaced: steps up to its size, rotations up to 60 degrees, a fifth longer or shorter."""
+    """Four keys, evenly spaced: steps up to its size, rotations up to 60 degrees, a fifth longer or
+    shorter.
+    """
     rng, keys = setting.rng, [start]
     for k in range(1, 4):
         position = np.asarray(keys[-1].position) + rng.normal(size=3) * 0.4 * radius
         if setting.nearest(position) - 1.2 * radius < setting.near:
             position = np.asarray(keys[-1].position)
-        rotation = Rotation.from_rotvec(np.radians(rng.uniform(-35, 35, 3))) * Rotation.from_rotvec(keys[-1].rotation)
+        rotation = Rotation.from_rotvec(np.radians(rng.uniform(-35, 35, 3))) * Rotation.from_rotvec(
+            keys[-1].rotation
+        )
         extent = np.asarray(start.extent) * rng.uniform(0.8, 1.2, 3)
-        key = Key(position=vec(position), rotation=vec(rotation.as_rotvec()), extent=vec(extent), time=k * duration / 3)
+        key = Key(
+            position=vec(position),
+            rotation=vec(rotation.as_rotvec()),
+            extent=vec(extent),
+            time=k * duration / 3,
+        )
         keys.append(key)
     return tuple(keys)
 

@@ -27,8 +27,8 @@ from .scene import Paint, Scene, Texture, TextureKind, Vec3
 def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
     """The paper's scenes: 10 to 20 shapes with patterns in a room, within the depths of the rig.
 
-    With `moving` seconds, objects move, rotate and stretch along random paths for so long. The same seed and rig
-    give the same scene. Raises ValueError if the rig has no calibrated camera.
+    With `moving` seconds, objects move, rotate and stretch along random paths for so long. The same seed and
+    rig give the same scene. Raises ValueError if the rig has no calibrated camera.
     """
     return furnished("abstract", seed, rig, _pattern, moving)
 
@@ -36,8 +36,8 @@ def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
 def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0) -> Scene:
     """Scenes like those of `abstract`, with the images under a folder on all surfaces.
 
-    Images that are black in large parts are used only if there are no others. Raises ValueError if the folder holds
-    no images.
+    Images that are black in large parts are used only if there are no others. Raises ValueError if the folder
+    holds no images.
     """
     files = _images(Path(folder))
 
@@ -46,13 +46,16 @@ def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0)
         width = setting.metres(depth, rng.uniform(150, 400))
         paint = Paint((tint, tint, tint), float(rng.uniform(0.8, 1.0)))
         shift = (float(rng.uniform()), float(rng.uniform()), 0.0)
-        return Texture(kind="image", image=_bright_one(rng, files), scale=1 / width, paints=(paint,), offset=shift)
+        return Texture(
+            kind="image", image=_bright_one(rng, files), scale=1 / width, paints=(paint,), offset=shift
+        )
 
     return furnished("photographs", seed, rig, image, moving)
 
 
 def generator_named(name: str) -> Callable[..., Scene]:
-    """ "abstract", "photographs", or one's own, called with a seed, a rig and `moving` seconds, as "module:function".
+    """ "abstract", "photographs", or one's own, called with a seed, a rig and `moving` seconds, as
+    "module:function".
 
     Raises ValueError for a name that is neither.
     """
@@ -65,7 +68,8 @@ def generator_named(name: str) -> Callable[..., Scene]:
     return imported(name, "generator")  # type: ignore[no-any-return]
 
 
-# Surfaces -------------------------------------------------------------------------------------------------------
+# Surfaces
+# -------------------------------------------------------------------------------------------------------
 
 
 def _pattern(setting: Setting, depth: float, kinds: tuple[TextureKind, ...]) -> Texture:
@@ -101,7 +105,11 @@ def _near_infrared(rng: Generator, rgb: Vec3) -> float:
     kind = rng.choice(["dye", "pigment", "soot"], p=[0.5, 0.4, 0.1])
     if kind == "dye":
         return float(rng.uniform(0.45, 0.8))
-    return float(rng.uniform(0.03, 0.1)) if kind == "soot" else float(np.clip(r * rng.uniform(0.8, 1.2), 0.02, 0.9))
+    return (
+        float(rng.uniform(0.03, 0.1))
+        if kind == "soot"
+        else float(np.clip(r * rng.uniform(0.8, 1.2), 0.02, 0.9))
+    )
 
 
 @lru_cache(maxsize=8)

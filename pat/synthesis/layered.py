@@ -51,8 +51,8 @@ class ArrayBatch:
 class LayeredScenes:
     """A source of training samples.
 
-    `layers` bounds the number of planes in a scene, both ends included. All randomness comes from the generator
-    given to `sample` (on the CPU, whatever the device) and from `seed`, which makes the outlines.
+    `layers` bounds the number of planes in a scene, both ends included. All randomness comes from the
+    generator given to `sample` (on the CPU, whatever the device) and from `seed`, which makes the outlines.
     """
 
     def __init__(
@@ -82,8 +82,8 @@ class LayeredScenes:
     def render(self, rigs: RigBatch, generator: Generator, *, oversampling: int = 1) -> ArrayBatch:
         """Random scenes seen by given rigs, whose first view is alpha and the world frame.
 
-        A view with fewer pixels a radian than alpha is rendered at about alpha's and averaged down by area, as a
-        coarser sensor would; `oversampling` asks for more than that.
+        A view with fewer pixels a radian than alpha is rendered at about alpha's and averaged down by area,
+        as a coarser sensor would; `oversampling` asks for more than that.
         """
         layers = draw_layers(rigs, self.layers, self.photos, len(self.outlines), generator)
         factors = [oversampling * _oversampling(rigs.cameras[0], v) for v in rigs.cameras]
@@ -129,9 +129,13 @@ class LayeredScenes:
         return q, opacity * in_front
 
     def _shade(self, layers: Layers, camera: Camera, front: _Front) -> Tensor:
-        """The image (B, 3, h, w): the two foremost layers of each pixel, mixed by the opacity of the first."""
+        """The image (B, 3, h, w): the two foremost layers of each pixel, mixed by the opacity of the
+        first.
+        """
         H = (layers.texel_from_plane @ plane_from_camera(layers, camera)).float().to(self.device)
-        colour = self._colours(layers, H, camera.hw, front.first, torch.ones_like(front.opacity, dtype=torch.bool))
+        colour = self._colours(
+            layers, H, camera.hw, front.first, torch.ones_like(front.opacity, dtype=torch.bool)
+        )
         edge = front.opacity < 1 - _FAINT
         behind = self._colours(layers, H, camera.hw, front.second, edge)
         colour[:, edge] = torch.lerp(behind, colour[:, edge], front.opacity[edge])
@@ -170,7 +174,9 @@ _CHUNK = 1 << 16
 
 @dataclass(frozen=True)
 class _Front:
-    """At each pixel the two foremost layers, the opacity of the first, and the main one with its inverse depth."""
+    """At each pixel the two foremost layers, the opacity of the first, and the main one with its inverse
+    depth.
+    """
 
     first: Tensor
     second: Tensor
@@ -190,7 +196,9 @@ def plane_from_camera(layers: Layers, camera: Camera) -> Float[Tensor, "b l 3 3"
 
 
 def _steps(distance: Tensor) -> Tensor:
-    """How much a distance changes from a pixel to the next, so that edges get one pixel wide from any angle."""
+    """How much a distance changes from a pixel to the next, so that edges get one pixel wide from any
+    angle.
+    """
     x = torch.nn.functional.pad(distance.diff(dim=-1).abs(), (1, 1))
     y = torch.nn.functional.pad(distance.diff(dim=-2).abs(), (0, 0, 1, 1))
     x, y = torch.maximum(x[..., 1:], x[..., :-1]), torch.maximum(y[..., 1:, :], y[..., :-1, :])

@@ -27,9 +27,9 @@ _GRAZING = 0.04
 class Layers:
     """The layers (B, L) of a batch of scenes, in float64 on the CPU.
 
-    A layer is the plane Z = 1 of its own frame, `plane_from_world`, where (X, Y) in metres are positions on it. It
-    covers all of that plane if `solid`, else the inside of an outline, which lives on [-1, 1]^2. Textures are
-    sampled at texels and their colours (r, g, b, 1) multiplied by `colour`.
+    A layer is the plane Z = 1 of its own frame, `plane_from_world`, where (X, Y) in metres are positions on
+    it. It covers all of that plane if `solid`, else the inside of an outline, which lives on [-1, 1]^2.
+    Textures are sampled at texels and their colours (r, g, b, 1) multiplied by `colour`.
     """
 
     plane_from_world: Pose
@@ -42,11 +42,13 @@ class Layers:
     colour: Float[Tensor, "b l 3 4"]
 
 
-def draw_layers(rigs: RigBatch, count: tuple[int, int], photos: PhotoBank, shapes: int, generator: Generator) -> Layers:
+def draw_layers(
+    rigs: RigBatch, count: tuple[int, int], photos: PhotoBank, shapes: int, generator: Generator
+) -> Layers:
     """Random layers in front of the first view of the rigs, between the rigs' near and far depths.
 
-    Layer 0 is the background. In half of the scenes layer 1 is a ground (or a ceiling), in a quarter layer 2 is a
-    wall; the others are things with outlines. In one scene in eight all lie within 5 % of one depth.
+    Layer 0 is the background. In half of the scenes layer 1 is a ground (or a ceiling), in a quarter layer 2
+    is a wall; the others are things with outlines. In one scene in eight all lie within 5 % of one depth.
     """
     g = generator
     shape = len(rigs.near), count[1]
@@ -56,7 +58,9 @@ def draw_layers(rigs: RigBatch, count: tuple[int, int], photos: PhotoBank, shape
     metres_per_pixel = 1 / (planes.inverse_depth * rigs.cameras[0].K[:, :1, 0])
     texture, texel_from_plane = _texture(R, metres_per_pixel, planes.facing, photos, g)
     return Layers(
-        plane_from_world=Pose(R, R.new_tensor([0, 0, 1]) - matvec(R, planes.ray / planes.inverse_depth[..., None])),
+        plane_from_world=Pose(
+            R, R.new_tensor([0, 0, 1]) - matvec(R, planes.ray / planes.inverse_depth[..., None])
+        ),
         present=(torch.arange(shape[1]) < number) & (planes.facing > _GRAZING),
         solid=planes.solid,
         outline=torch.randint(shapes, shape, generator=g),
@@ -133,7 +137,9 @@ def _normals(shape: tuple[int, int], g: Generator) -> Tensor:
 
 
 def _inverse_depths(rigs: RigBatch, shape: tuple[int, int], g: Generator) -> Tensor:
-    """At the anchors: even in disparity or in the logarithm of depth, background farthest, one scene in eight flat."""
+    """At the anchors: even in disparity or in the logarithm of depth, background farthest, one scene in eight
+    flat.
+    """
     B = shape[0]
     low, high = 1 / rigs.far[:, None], 1 / rigs.near[:, None]
     where = uniform((0, 1), shape, g)
@@ -204,7 +210,9 @@ def _texture(
     texture = torch.where(torch.rand(shape, generator=g) < 0.5, photo, other)
     s = log_uniform((0.5, 3.0), shape, g) / metres_per_pixel
     angle = torch.where(torch.rand(shape, generator=g) < 0.8, 0.1, 3.0) * _randn(shape, g)
-    A = _affine(_upright(R) + angle, s * (torch.randint(2, shape, generator=g) * 2 - 1), s * facing.clamp(min=0.1))
+    A = _affine(
+        _upright(R) + angle, s * (torch.randint(2, shape, generator=g) * 2 - 1), s * facing.clamp(min=0.1)
+    )
     A[..., :2, 2] = uniform((0, 1), (*shape, 2), g) * photos.wh.cpu()[texture, 0]
     return texture, A
 
@@ -217,7 +225,8 @@ _YCC_FROM_RGB = torch.tensor(
 def _paint(shape: tuple[int, int], g: Generator) -> Tensor:
     """Affine colour maps (B, L, 3, 4) of the textures: contrast, brightness, hue, saturation and tint.
 
-    Half of the layers keep their hue; one in eight is nearly plain. The hue of the rest is independent of luminance.
+    Half of the layers keep their hue; one in eight is nearly plain. The hue of the rest is independent of
+    luminance.
     """
     natural = torch.rand(shape, generator=g) < 0.5
     plain = torch.rand(shape, generator=g) < 0.125

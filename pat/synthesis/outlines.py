@@ -19,8 +19,8 @@ _BORDER = 2 * _FINE // SIDE
 def outlines(count: int, seed: int) -> Float[Tensor, "count 1 side side"]:
     """Signed distance to the outline, positive inside, on the square [-1, 1]^2 (whose side has length 2).
 
-    The outer border is always outside, so that clamping positions to the square is safe. Made once a process: not to
-    be written to.
+    The outer border is always outside, so that clamping positions to the square is safe. Made once a process:
+    not to be written to.
     """
     rng = np.random.default_rng(seed)
     makers = (_blob, _polygon, _cloud, _rods, _fence, _branches, _box)
@@ -78,7 +78,9 @@ def _box(rng: np.random.Generator) -> np.ndarray:
 def _cloud(rng: np.random.Generator) -> np.ndarray:
     """Thresholded noise inside a disc: foliage, holes, islands."""
     n = int(rng.integers(4, 14))
-    noise = cv2.resize(rng.normal(0, 1, (n, n)).astype(np.float32), (_FINE, _FINE), interpolation=cv2.INTER_CUBIC)
+    noise = cv2.resize(
+        rng.normal(0, 1, (n, n)).astype(np.float32), (_FINE, _FINE), interpolation=cv2.INTER_CUBIC
+    )
     y, x = np.mgrid[-1 : 1 : _FINE * 1j, -1 : 1 : _FINE * 1j]
     return (noise + 2 * (0.75 - np.hypot(x, y)) > 0.2).astype(np.uint8)
 
@@ -103,7 +105,9 @@ def _branches(rng: np.random.Generator) -> np.ndarray:
     return mask
 
 
-def _grow(mask: np.ndarray, rng: np.random.Generator, at: np.ndarray, angle: float, length: float, width: int) -> None:
+def _grow(
+    mask: np.ndarray, rng: np.random.Generator, at: np.ndarray, angle: float, length: float, width: int
+) -> None:
     if width < 5:
         return
     end = at + length * np.array([np.cos(angle), np.sin(angle)])

@@ -1,4 +1,6 @@
-"""Textures that photographs lack: smooth shades, repeated patterns, and colour that is independent of luminance."""
+"""Textures that photographs lack: smooth shades, repeated patterns, and colour that is independent of
+luminance.
+"""
 
 from __future__ import annotations
 
@@ -91,7 +93,11 @@ def _dots(rng: np.random.Generator) -> np.ndarray:
 def _cloud(rng: np.random.Generator) -> np.ndarray:
     """Noise of several octaves, its colours independent of one another."""
     octaves = [
-        cv2.resize(rng.normal(0, 1, (2**k, 2**k, 3)).astype(np.float32), (_SIDE, _SIDE), interpolation=cv2.INTER_CUBIC)
+        cv2.resize(
+            rng.normal(0, 1, (2**k, 2**k, 3)).astype(np.float32),
+            (_SIDE, _SIDE),
+            interpolation=cv2.INTER_CUBIC,
+        )
         * rng.uniform(0.4, 0.9) ** k
         for k in range(1, 8)
     ]

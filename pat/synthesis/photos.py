@@ -27,8 +27,9 @@ _MULTIPLE = 2 ** (LEVELS - 1)
 class PhotoBank:
     """Textures of any sizes with their pyramids, on one device.
 
-    Each side is cropped to a multiple of 32, so that every level is an exact 2x area average of the one below.
-    `len(bank)` textures; `photos` of them, the first, are photographs and the others patterns made from a seed.
+    Each side is cropped to a multiple of 32, so that every level is an exact 2x area average of the one
+    below. `len(bank)` textures; `photos` of them, the first, are photographs and the others patterns made
+    from a seed.
     """
 
     def __init__(self, images: Iterable[np.ndarray], *, photos: int | None = None):
@@ -52,7 +53,8 @@ class PhotoBank:
         seed: int = 0,
         choose: Callable[[int], bool] = lambda i: True,
     ) -> PhotoBank:
-        """All images under the folders, colour or grey, reduced to `max_edge` pixels, and patterns beside them.
+        """All images under the folders, colour or grey, reduced to `max_edge` pixels, and patterns beside
+        them.
 
         `cache` names an .npz file that is written on the first call and read
         on later ones; it is not checked against the folders. `choose` selects images by number, to hold
@@ -83,7 +85,8 @@ class PhotoBank:
     def lookup(
         self, texture: Int[Tensor, " n"], xy: Float[Tensor, "n 2"], level: Float[Tensor, " n"]
     ) -> Float[Tensor, "3 n"]:
-        """Colours 0..1 at pixels (x, y) of the textures (first centre (0, 0)), trilinear in position and level.
+        """Colours 0..1 at pixels (x, y) of the textures (first centre (0, 0)), trilinear in position and
+        level.
 
         `level` is log2 of the distance between samples in pixels of the full texture: at 0 the full image is
         read, at 1 its 2x reduction, whose pixel (0, 0) lies at (0.5, 0.5) of the full one.
@@ -98,7 +101,9 @@ class PhotoBank:
         high = self._bilinear(index + 1, half_pixel * (0.5 * scale) - 0.5)
         return torch.lerp(low, high, weight)
 
-    def window(self, texture: int, level: int, xy: tuple[int, int], side: int) -> Float[Tensor, "3 side side"]:
+    def window(
+        self, texture: int, level: int, xy: tuple[int, int], side: int
+    ) -> Float[Tensor, "3 side side"]:
         """A square of a texture at one level, its first pixel at (x, y), repeated by mirroring."""
         w, h = self.wh[texture, level].tolist()
         x, y = (_mirrored(start + torch.arange(side), torch.tensor(n)) for start, n in zip(xy, (w, h)))
@@ -131,7 +136,9 @@ def _mirrored(i: Tensor, n: Tensor) -> Tensor:
 
 
 def read_photographs(folders: tuple[str | Path, ...], max_edge: int) -> list[np.ndarray]:
-    """RGB bytes of all images under the folders, reduced to `max_edge` pixels. Raises ValueError if there is none."""
+    """RGB bytes of all images under the folders, reduced to `max_edge` pixels. Raises ValueError if there is
+    none.
+    """
     paths = sorted(p for folder in folders for p in files_below(folder) if p.suffix.lower() in PHOTO_SUFFIXES)
     images = [_reduced(p, max_edge) for p in map(_decoded, paths) if p is not None]
     if not images:

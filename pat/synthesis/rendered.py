@@ -1,7 +1,7 @@
 """A rendered scene on disk: images and ground truth of every camera, its rig, its description, its check.
 
-A folder holds `rig.yaml` (the rig as rendered), `scene.yaml`, `render.json` (settings, versions, frames, check) and
-one `<camera>-<frame>.npz` for every frame of every camera, with the arrays of `Frame` by name.
+A folder holds `rig.yaml` (the rig as rendered), `scene.yaml`, `render.json` (settings, versions, frames,
+check) and one `<camera>-<frame>.npz` for every frame of every camera, with the arrays of `Frame` by name.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ RENDER_FILE = "render.json"
 class RenderedFrame:
     """One image and its ground truth, at the pixels' centres.
 
-    `rgb` is linear radiance (stored as float16, 1 is white by intent, brighter is possible), `nir` that of the near
-    infrared. `depth` is z in metres (float32), infinite where nothing is. `index` is 0 where nothing is, else the
-    object's number in the scene plus one. Pixels that a lens does not see have `depth` NaN and index 0.
+    `rgb` is linear radiance (stored as float16, 1 is white by intent, brighter is possible), `nir` that of
+    the near infrared. `depth` is z in metres (float32), infinite where nothing is. `index` is 0 where nothing
+    is, else the object's number in the scene plus one. Pixels that a lens does not see have `depth` NaN and
+    index 0.
     """
 
     time: float
@@ -79,7 +80,10 @@ class Rendered:
         """One frame of a camera, as float32 (index: int64)."""
         entry = self.about["frames"][self.rig.require(camera)][number]
         with np.load(self.folder / entry["file"]) as arrays:
-            tensors = {k: torch.from_numpy(arrays[k].astype(np.int64 if k == "index" else np.float32)) for k in arrays}
+            tensors = {
+                k: torch.from_numpy(arrays[k].astype(np.int64 if k == "index" else np.float32))
+                for k in arrays
+            }
         return RenderedFrame(time=entry["time"], **tensors)
 
 
@@ -113,16 +117,22 @@ def is_rendered(folder: str | Path) -> bool:
 
 
 UNEVEN = 0.001
-"""Interpolation is off by an eighth of this where it is allowed: a hundredth of a pixel at a disparity of 80."""
+"""Interpolation is off by an eighth of this where it is allowed: a hundredth of a pixel at a disparity of 80.
+"""
 
 
 def depth_between(
-    depth: Float[Tensor, "h w"], index: Int[Tensor, "h w"], x: Float[Tensor, "*n 2"], *, uneven: float = UNEVEN
+    depth: Float[Tensor, "h w"],
+    index: Int[Tensor, "h w"],
+    x: Float[Tensor, "*n 2"],
+    *,
+    uneven: float = UNEVEN,
 ) -> tuple[Float[Tensor, "*n"], Bool[Tensor, "*n"]]:
-    """Depth at positions (x, y), and whether the four pixels around are of one object, without step or crease.
+    """Depth at positions (x, y), and whether the four pixels around are of one object, without step or
+    crease.
 
-    Inverse depth is interpolated, which is exact on planes. Infinite depths stay infinite. More than `uneven` counts
-    as a step or crease: how far, relatively, an inverse depth is from the middle of its neighbours'.
+    Inverse depth is interpolated, which is exact on planes. Infinite depths stay infinite. More than `uneven`
+    counts as a step or crease: how far, relatively, an inverse depth is from the middle of its neighbours'.
     """
     inverse = torch.where(depth.isfinite(), 1 / depth, 0.0).to(x)
     layers = torch.stack([inverse, index.to(x), *(b.to(x) for b in _creases(inverse, uneven))])[None]
@@ -135,7 +145,9 @@ def depth_between(
 
 
 def _creases(inverse: Float[Tensor, "h w"], uneven: float) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
-    """Creases and steps of inverse depth, along rows and along columns. Between two such pixels there is an edge."""
+    """Creases and steps of inverse depth, along rows and along columns. Between two such pixels there is an
+    edge.
+    """
     across, down = torch.zeros_like(inverse, dtype=torch.bool), torch.zeros_like(inverse, dtype=torch.bool)
     across[:, 1:-1] = inverse.diff(n=2, dim=1).abs() > uneven * inverse[:, 1:-1]
     down[1:-1] = inverse.diff(n=2, dim=0).abs() > uneven * inverse[1:-1]

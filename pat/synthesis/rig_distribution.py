@@ -16,14 +16,14 @@ class RigDistribution:
       that x_beta = s (x_alpha - disparity) up to the half pixel) or "general".
     - `parallax`: displacement of the nearest depth against infinity, in alpha's pixels; sets the baseline.
     - `near` in metres and `depth_ratio` = far / near.
-    - `frame`: width of the whole image as a multiple of alpha's, which is a patch of it; `focal`: focal length
-      as a multiple of that width.
-    - `resolutions`: beta's pixels a radian over alpha's and its size over alpha's; one is drawn for each camera
-      of a batch.
+    - `frame`: width of the whole image as a multiple of alpha's, which is a patch of it; `focal`: focal
+      length as a multiple of that width.
+    - `resolutions`: beta's pixels a radian over alpha's and its size over alpha's; one is drawn for each
+      camera of a batch.
     - `alpha`, rectified only: whether alpha is the left camera, the right, or either (one draw a rig).
     - general only: `focal_ratio` (on top of the resolution), `rotation` in degrees about a random axis,
-      `toe_in` (how far betas rotate towards a point of the scene: 0 parallel, 1 wholly), `decentring` (how far
-      beta's patch misses alpha's, as a fraction of its size).
+      `toe_in` (how far betas rotate towards a point of the scene: 0 parallel, 1 wholly), `decentring` (how
+      far beta's patch misses alpha's, as a fraction of its size).
     """
 
     mode: Literal["rectified", "general"] = "rectified"

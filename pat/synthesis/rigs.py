@@ -22,7 +22,9 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class RigBatch:
-    """The cameras, alpha first, each batched (B), and the depths (metres, from alpha) where scenes should be."""
+    """The cameras, alpha first, each batched (B), and the depths (metres, from alpha) where scenes should
+    be.
+    """
 
     cameras: list[Camera]
     near: Float[Tensor, " b"]
@@ -64,7 +66,9 @@ def _rectified_beta(rigs: RigDistribution, alpha: Camera, near: Tensor, far: Ten
     side = {"left": torch.ones_like(drawn), "right": -torch.ones_like(drawn), "either": drawn}[rigs.alpha]
     t = torch.zeros_like(alpha.t)
     t[:, 0] = -side * _baseline(rigs, alpha, near, g)
-    return alpha.replace(cam_from_world=Pose(alpha.R, t)).resize(scaled(alpha.hw, one_of(rigs.resolutions, g)))
+    return alpha.replace(cam_from_world=Pose(alpha.R, t)).resize(
+        scaled(alpha.hw, one_of(rigs.resolutions, g))
+    )
 
 
 def _general_beta(rigs: RigDistribution, alpha: Camera, near: Tensor, far: Tensor, g: Generator) -> Camera:

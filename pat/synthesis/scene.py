@@ -1,8 +1,8 @@
 """A scene apart from any renderer: objects, materials, lights and motions, as frozen values that serialise.
 
 The world is the rig's: metres, and whatever directions the rig's `cam_from_world` give it. Radians, seconds.
-Colours are linear reflectances and radiances of red, green and blue (Rec. 709 primaries), with one of the near
-infrared beside them.
+Colours are linear reflectances and radiances of red, green and blue (Rec. 709 primaries), with one of the
+near infrared beside them.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ class Texture:
     """How paints are laid on a surface.
 
     Patterns live in the object's own coordinates in metres and have about `scale` features a metre; `offset`
-    shifts them, `distortion` (0 to some) makes them irregular, `grain` (0..1) lays fine noise over them. They run
-    through the `paints` in order. An "image" is a file (sRGB) whose width covers 1 / `scale` metres of the surface
-    and which repeats beyond; it is multiplied by the first paint's colour. Its near infrared is its red plus
-    1.5 times by how much green exceeds red and blue (leaves), times the paint's.
+    shifts them, `distortion` (0 to some) makes them irregular, `grain` (0..1) lays fine noise over them. They
+    run through the `paints` in order. An "image" is a file (sRGB) whose width covers 1 / `scale` metres of
+    the surface and which repeats beyond; it is multiplied by the first paint's colour. Its near infrared is
+    its red plus 1.5 times by how much green exceeds red and blue (leaves), times the paint's.
     """
 
     kind: TextureKind = "plain"
@@ -62,8 +62,8 @@ class Texture:
 class Material:
     """A surface: its texture and how it shines.
 
-    `roughness`, `specular`, `metallic` and `transmission` are 0..1 as in Disney's principled model; `bump` metres
-    of relief follow the texture in shading only; `emission` makes the surface shine its paint, unlit.
+    `roughness`, `specular`, `metallic` and `transmission` are 0..1 as in Disney's principled model; `bump`
+    metres of relief follow the texture in shading only; `emission` makes the surface shine its paint, unlit.
     """
 
     texture: Texture = field(default_factory=Texture)
@@ -92,7 +92,9 @@ class ObjectPose(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Key:
-    """Where an object is at a time: position of its middle, rotation vector (radians), extent along its own axes."""
+    """Where an object is at a time: position of its middle, rotation vector (radians), extent along its own
+    axes.
+    """
 
     position: Vec3
     rotation: Vec3 = (0.0, 0.0, 0.0)
@@ -149,9 +151,9 @@ class Relief:
 class Object:
     """A shape with a material, and perhaps a relief.
 
-    A "room" is a cube seen from inside; it casts no shadow. A "lathe" is the surface that `profile` sweeps around the
-    y axis: from its top, pairs of a radius (0..0.5) and a y (-0.5..0.5). Object `i` of a scene has the index i + 1 in
-    rendered index images.
+    A "room" is a cube seen from inside; it casts no shadow. A "lathe" is the surface that `profile` sweeps
+    around the y axis: from its top, pairs of a radius (0..0.5) and a y (-0.5..0.5). Object `i` of a scene has
+    the index i + 1 in rendered index images.
     """
 
     name: str
@@ -163,15 +165,17 @@ class Object:
 
     def __post_init__(self) -> None:
         if (self.shape == "lathe") != (len(self.profile) > 1):
-            raise ValueError(f"'{self.name}': a lathe, and nothing else, needs a profile of two points or more")
+            raise ValueError(
+                f"'{self.name}': a lathe, and nothing else, needs a profile of two points or more"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Light:
     """A light. `power` is in watts ("sun": watts a square metre), for each of the colours times that colour.
 
-    `direction` is where an area light or a sun shines to. `size` is the side of an area light or the radius of a
-    point light in metres, and the angle of a sun in radians.
+    `direction` is where an area light or a sun shines to. `size` is the side of an area light or the radius
+    of a point light in metres, and the angle of a sun in radians.
     """
 
     kind: Literal["area", "sun", "point"]

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from .scene import Object, Relief, Shape, Vec3
 
 Patch = Callable[[NDArray, NDArray], tuple[NDArray, NDArray, NDArray]]
-"""(s, t) in 0..1 to (x, y, z) on the shape that fills [-0.5, 0.5]^3. Seen from outside, s is right where t is down."""
+"""(s, t) in 0..1 to (x, y, z) on the shape that fills [-0.5, 0.5]^3. Seen from outside, s is right where t is
+down.
+"""
 
 TORUS = 0.3
 """Radius of a torus's tube over that of its outline."""
@@ -27,8 +29,9 @@ _MOST_CELLS = 96
 class Mesh(NamedTuple):
     """Corners of quadrilaterals, and where each corner is on an image laid on the surface.
 
-    `vertices` are metres in the object's frame, at the extent of its first key. `faces` go counter-clockwise seen
-    from outside; one of three corners has its last index twice. `uv` (metres, x right, y down) is by face and corner.
+    `vertices` are metres in the object's frame, at the extent of its first key. `faces` go counter-clockwise
+    seen from outside; one of three corners has its last index twice. `uv` (metres, x right, y down) is by
+    face and corner.
     """
 
     vertices: Float[NDArray, "v 3"]
@@ -106,7 +109,9 @@ def _lengths(points: NDArray) -> tuple[float, float]:
 
 def _welded(loose: Mesh, extent: NDArray) -> Mesh:
     """Corners that coincide made one, and faces without area gone."""
-    _, first, new = np.unique(np.round(loose.vertices / extent, 6), axis=0, return_index=True, return_inverse=True)
+    _, first, new = np.unique(
+        np.round(loose.vertices / extent, 6), axis=0, return_index=True, return_inverse=True
+    )
     faces, uv = _triangles_last(new.reshape(-1)[loose.faces], loose.uv)
     keep = np.array([len(set(f)) >= 3 for f in faces.tolist()])
     return Mesh(loose.vertices[first], faces[keep], uv[keep])
@@ -135,7 +140,9 @@ def _noise(points: NDArray, seed: int) -> NDArray:
     """Smooth noise in -1..1 with features about 1 across: plane waves of random directions."""
     waves, rng = 24, np.random.default_rng(seed)
     direction = rng.normal(size=(waves, 3))
-    direction *= (2 * np.pi * rng.uniform(0.35, 0.8, (waves, 1))) / np.linalg.norm(direction, axis=1, keepdims=True)
+    direction *= (2 * np.pi * rng.uniform(0.35, 0.8, (waves, 1))) / np.linalg.norm(
+        direction, axis=1, keepdims=True
+    )
     total = np.cos(points @ direction.T + rng.uniform(0, 2 * np.pi, waves)).sum(1)
     return np.tanh(total / math.sqrt(waves / 2) / 1.5)
 
@@ -181,7 +188,11 @@ def _lathe(profile: tuple[tuple[float, float], ...]) -> _Surface:
     def patch(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         at, azimuth = t * (len(radii) - 1), 2 * np.pi * s
         radius = np.interp(at, np.arange(len(radii)), radii)
-        return radius * np.cos(azimuth), np.interp(at, np.arange(len(radii)), heights), radius * np.sin(azimuth)
+        return (
+            radius * np.cos(azimuth),
+            np.interp(at, np.arange(len(radii)), heights),
+            radius * np.sin(azimuth),
+        )
 
     return _Surface(patch, (_ROUND, len(radii) - 1))
 

@@ -1,8 +1,10 @@
-"""Attention supervised by geometry: where the true position is known, the weights along the segment are a classifier.
+"""Attention supervised by geometry: where the true position is known, the weights along the segment are a
+classifier.
 
-For an alpha pixel whose point beta sees at a true position between the samples l and l + 1 of its segment, a share u
-of the way, the loss is the cross-entropy of the weights against (1 - u) at l and u at l + 1. For a pixel whose
-point beta does not see, it is that against equal weights: a search that finds nothing says so by a small peak.
+For an alpha pixel whose point beta sees at a true position between the samples l and l + 1 of its segment, a
+share u of the way, the loss is the cross-entropy of the weights against (1 - u) at l and u at l + 1. For a
+pixel whose point beta does not see, it is that against equal weights: a search that finds nothing says so by
+a small peak.
 """
 
 from __future__ import annotations
@@ -20,11 +22,14 @@ from pat.attention.scores import Compared, log_sum, mean_score
 UNSEEN = 0.1
 """Weight of pixels that beta does not see, against 1 of those it sees. Tuned on nothing."""
 OFF = 1.5
-"""A true position farther than this from its segment, in samples along it or pixels across it, is no target."""
+"""A true position farther than this from its segment, in samples along it or pixels across it, is no target.
+"""
 
 
 class Target(NamedTuple):
-    """The two samples (x, y) around a true position, the share of the second, and whether it is on the segment."""
+    """The two samples (x, y) around a true position, the share of the second, and whether it is on the
+    segment.
+    """
 
     first: Float[Tensor, "b h w 2"]
     second: Float[Tensor, "b h w 2"]
@@ -41,11 +46,13 @@ def attention_loss(
 ) -> Tensor:
     """Mean cross-entropy over betas, of every `stride`-th row and column of alpha; nothing is gathered.
 
-    `position` (x, y in beta's pixels) is (0, 0) where it is not known, `visible` whether beta sees the point there.
+    `position` (x, y in beta's pixels) is (0, 0) where it is not known, `visible` whether beta sees the point
+    there.
     """
     part = (slice(None), slice(None, None, stride), slice(None, None, stride))
     losses = [
-        _of_beta(one.strided(stride), where[part], seen[part]) for one, where, seen in zip(compared, position, visible)
+        _of_beta(one.strided(stride), where[part], seen[part])
+        for one, where, seen in zip(compared, position, visible)
     ]
     return torch.stack(losses).mean()
 

@@ -39,7 +39,9 @@ class Checkpoint(NamedTuple):
     facts: dict[str, Any]
 
 
-def collect(network: nn.Module, optimiser: Optimizer, average: AveragedModel, facts: Mapping[str, Any]) -> Checkpoint:
+def collect(
+    network: nn.Module, optimiser: Optimizer, average: AveragedModel, facts: Mapping[str, Any]
+) -> Checkpoint:
     """The state of a run."""
     tensors = {f"network/{k}": v for k, v in network.state_dict().items()}
     tensors |= {f"average/{k}": v for k, v in average.state_dict().items()}
@@ -56,14 +58,18 @@ def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer, av
         parts.setdefault(part, {})[rest] = tensor
     wrong = misfit(network, parts["network"]) or misfit(average, parts["average"])
     if wrong:
-        raise ValueError(f"the checkpoint belongs to another network ({wrong}): give its own recipe, or another --out")
+        raise ValueError(
+            f"the checkpoint belongs to another network ({wrong}): give its own recipe, or another --out"
+        )
     network.load_state_dict(parts["network"])
     average.load_state_dict(parts["average"])
     optimiser.load_state_dict(optimiser.state_dict() | {"state": _state(parts["optimiser"], optimiser)})
 
 
 def _state(tensors: Mapping[str, Tensor], optimiser: Optimizer) -> dict[int, dict[str, Tensor]]:
-    """An optimiser's state by the number of its parameter. Raises ValueError if it is not of such parameters."""
+    """An optimiser's state by the number of its parameter. Raises ValueError if it is not of such
+    parameters.
+    """
     shapes = [tuple(p.shape) for group in optimiser.param_groups for p in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
@@ -103,7 +109,8 @@ def newest_checkpoint(folder: Path) -> Checkpoint | None:
     if files and found is None:
         names = ", ".join(path.name for path in files)
         raise ValueError(
-            f"{folder}: no checkpoint there can be read ({names}), so this run cannot continue: restore one of them "
+            f"{folder}: no checkpoint there can be read ({names}), so this run cannot continue: restore one "
+            "of them "
             "from a copy, or remove these files to begin again at step 0, or give another --out"
         )
     return found
@@ -125,14 +132,18 @@ def read_checkpoint(path: Path) -> Checkpoint | None:
 
 
 def _are_facts(facts: object) -> bool:
-    if not isinstance(facts, dict) or not all(type(facts.get(name)) in kinds for name, kinds in FACTS.items()):
+    if not isinstance(facts, dict) or not all(
+        type(facts.get(name)) in kinds for name, kinds in FACTS.items()
+    ):
         return False
     return facts["step"] >= 0 and 0 <= facts["minutes"] < LONGEST and not math.isnan(facts["best"])
 
 
 def _files(folder: Path) -> list[Path]:
     """Checkpoints, newest first."""
-    return sorted((p for p in folder.glob("step-*.safetensors") if re.fullmatch(r"step-\d+", p.stem)), reverse=True)
+    return sorted(
+        (p for p in folder.glob("step-*.safetensors") if re.fullmatch(r"step-\d+", p.stem)), reverse=True
+    )
 
 
 def _no_room(folder: Path, step: int, tensors: Mapping[str, Tensor], error: Exception) -> str:
@@ -141,6 +152,7 @@ def _no_room(folder: Path, step: int, tensors: Mapping[str, Tensor], error: Exce
     last = next((f"the last good one, {p}, is intact" for p in _files(folder)), "there is no older one")
     reason = " ".join(str(error).split())
     return (
-        f"the checkpoint of step {step} ({wanted:.0f} MiB) could not be written to {folder} ({free:.0f} MiB free): "
+        f"the checkpoint of step {step} ({wanted:.0f} MiB) could not be written to {folder} ({free:.0f} MiB "
+        "free): "
         f"{reason}; {last}: make room and give the same command again"
     )

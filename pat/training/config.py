@@ -51,7 +51,8 @@ class RecordingConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """A recipe. A step sees `groups` times `batch` scenes; there are `steps` steps, or as many as fit into `minutes`.
+    """A recipe. A step sees `groups` times `batch` scenes; there are `steps` steps, or as many as fit into
+    `minutes`.
 
     Raises ValueError for inconsistent values.
     """
@@ -76,7 +77,8 @@ class TrainConfig:
     loss: Literal["psnr", "psnr-ssim", "mse"] = "psnr-ssim"
     """On the image: minus the mean PSNR, with or without SSIM, or the mean squared error."""
     attention: float = 0.0
-    """Weight of the cross-entropy of PAT's attention against the true position, beside the loss on the image."""
+    """Weight of the cross-entropy of PAT's attention against the true position, beside the loss on the image.
+    """
     rate: float = 8e-4
     """Learning rate of Adam."""
     momenta: tuple[float, float] = (0.9, 0.99)
@@ -151,7 +153,9 @@ class TrainConfig:
                 raise ValueError(f"{name} is a share of the batches, 0 to 1, got {share:g}")
             if bool(share) != bool(folders):
                 found = "there is no folder" if share else f"{folders[0]} is given"
-                raise ValueError(f"{name} is {share:g} and {found}: give both `{name}` and `{name}_from`, or neither")
+                raise ValueError(
+                    f"{name} is {share:g} and {found}: give both `{name}` and `{name}_from`, or neither"
+                )
         total = self.rendered + self.pairs + self.measured
         if total > 1:
             raise ValueError(f"rendered, pairs and measured are shares of the batches, {total:g} in all")
@@ -169,7 +173,9 @@ def load_config(name: str | Path) -> TrainConfig:
     """
     path = next((p for p in (RECIPES / f"{name}.yaml", Path(name)) if p.is_file()), None)
     if path is None:
-        raise FileNotFoundError(f"no recipe '{name}' (it is a file or a name of the package){near(name, recipes())}")
+        raise FileNotFoundError(
+            f"no recipe '{name}' (it is a file or a name of the package){near(name, recipes())}"
+        )
     return parse_config(path.read_text(encoding="utf-8"), str(path))
 
 
@@ -215,7 +221,8 @@ def command_line(arguments: list[str]) -> TrainConfig:
         prog="pat train [RECIPE]",
         description=(
             "Train weights on scenes made from photographs while training. RECIPE is a YAML file or one of "
-            f"{', '.join(recipes())}; the options below change it. The same command again continues a run that "
+            f"{', '.join(recipes())}; the options below change it. The same command again continues a run "
+            "that "
             "stopped. On N processors: torchrun --nproc_per_node N -m pat train RECIPE --groups N"
         ),
         default=base,

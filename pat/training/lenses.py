@@ -31,14 +31,17 @@ def through_lenses(
     *,
     lost: float = 0.0,
 ) -> Sampled:
-    """Images distorted by a random lens, one for each pinhole, passed to `recorded`, and undistorted to the pinholes.
+    """Images distorted by a random lens, one for each pinhole, passed to `recorded`, and undistorted to the
+    pinholes.
 
-    Where the lens saw nothing, up to the share `lost` on each side, an image repeats its edge and is not valid.
+    Where the lens saw nothing, up to the share `lost` on each side, an image repeats its edge and is not
+    valid.
     """
     pinholes = [cameras[i].to("cpu", torch.float64) for i in range(len(images))]
     lenses = [lens_over(pinhole, g, lost) for pinhole in pinholes]
     distorted = [
-        resampled(p, pinhole, lens, extended=True).values for p, pinhole, lens in zip(images.cpu(), pinholes, lenses)
+        resampled(p, pinhole, lens, extended=True).values
+        for p, pinhole, lens in zip(images.cpu(), pinholes, lenses)
     ]
     seen = recorded(torch.cat(distorted).clamp(0, 1).to(images.device)).cpu()
     back = [resampled(p, lens, pinhole, extended=True) for p, lens, pinhole in zip(seen, lenses, pinholes)]
@@ -47,7 +50,9 @@ def through_lenses(
 
 
 def lens_over(pinhole: Camera, g: Generator, lost: float = 0.0) -> Camera:
-    """A camera with a random lens and as many pixels, that covers the pinhole's view but for the lost borders."""
+    """A camera with a random lens and as many pixels, that covers the pinhole's view but for the lost
+    borders.
+    """
     x = border(pinhole)
     rays, _ = pinhole.rays(x)
     widest = float(rays[..., :2].square().sum(-1).max())
@@ -82,8 +87,8 @@ MOST = 4
 class Spectra(NamedTuple):
     """C bands for each of a batch: mixtures of red, green and blue, each with its own gamma and contrast.
 
-    mixture: (B, C, 3), rows add up to 1. gamma, low, high: (B, C), the band is low where the mixture is 0 and high
-    where it is 1; low is above high for bands that are dark where others are bright.
+    mixture: (B, C, 3), rows add up to 1. gamma, low, high: (B, C), the band is low where the mixture is 0 and
+    high where it is 1; low is above high for bands that are dark where others are bright.
     """
 
     mixture: Tensor

@@ -36,9 +36,10 @@ EARLY = 16
 def train(config: TrainConfig) -> Path:
     """Train with the receptive field that the configuration names; returns the file of the best weights.
 
-    In `config.out`: best.safetensors, config.yaml, log.jsonl (a line for each validation), steps.csv (a line for
-    each step), images/ and checkpoints/. If that folder holds the same run, interrupted, it continues: with
-    `steps` the result is that of an uninterrupted run, bit for bit; with `minutes` the time spent counts.
+    In `config.out`: best.safetensors, config.yaml, log.jsonl (a line for each validation), steps.csv (a line
+    for each step), images/ and checkpoints/. If that folder holds the same run, interrupted, it continues:
+    with `steps` the result is that of an uninterrupted run, bit for bit; with `minutes` the time spent
+    counts.
 
     Raises FloatingPointError if a loss or a gradient is not finite, naming the sample, the batch saved beside
     the weights; OSError if a checkpoint cannot be written; ValueError for a folder with another run, or one
@@ -107,7 +108,9 @@ class Run:
             self._advance(given, done)
             if self.step % self.config.validate == 0 or done >= 1:
                 self._validate()
-            elif self.watch and EARLY <= self.step < self.config.validate and self.step & (self.step - 1) == 0:
+            elif (
+                self.watch and EARLY <= self.step < self.config.validate and self.step & (self.step - 1) == 0
+            ):
                 self.watch.show(self.averaged, self.validation, self.step)
             if self.step % self.config.save == 0 or done >= 1:
                 self._save(done=done >= 1)
@@ -159,7 +162,9 @@ class Run:
         if self.watch:
             self.watch.flush()
             facts = {"step": self.step, "best": self.best, "minutes": self._minutes(), "done": done}
-            state = collect(self.network, self.adam, self.average, facts | {"recipe": config_text(self.config)})
+            state = collect(
+                self.network, self.adam, self.average, facts | {"recipe": config_text(self.config)}
+            )
             write_checkpoint(self.config.out / CHECKPOINTS, state)
 
     def _minutes(self) -> float:
@@ -206,13 +211,16 @@ def shape(config: TrainConfig, step: int, done: float) -> float:
 
 
 def new_network(config: TrainConfig) -> Network:
-    """The network of a recipe, with the weights it starts from. Raises ValueError if those are another network's."""
+    """The network of a recipe, with the weights it starts from. Raises ValueError if those are another
+    network's.
+    """
     network = next(made for made, of in NETWORKS.values() if type(config.network) is of)(config.network)
     if config.start is not None:
         weights = load_weights(config.start)
         if type(weights) is not type(network) or weights.config != config.network:
             raise ValueError(
-                f"start: {config.start} holds a {type(weights).__name__} of {weights.config}, the recipe is for a "
+                f"start: {config.start} holds a {type(weights).__name__} of {weights.config}, the recipe is "
+                "for a "
                 f"{type(network).__name__} of {config.network}: give its own recipe, or leave `start` out"
             )
         network.load_state_dict(weights.state_dict())
@@ -229,7 +237,9 @@ def finite(objective: Objective, given: Sample) -> bool:
 
 
 def save_sample(given: Sample, path: Path, *, facts: dict[str, str]) -> None:
-    """All tensors of a group of samples: alpha, ground truth, and beta, position, visible of each beta by number."""
+    """All tensors of a group of samples: alpha, ground truth, and beta, position, visible of each beta by
+    number.
+    """
     tensors = {"alpha": given.alpha, "ground_truth": given.ground_truth}
     for name in ("betas", "position", "visible"):
         tensors |= {f"{name}/{i}": t for i, t in enumerate(getattr(given, name))}
@@ -237,7 +247,9 @@ def save_sample(given: Sample, path: Path, *, facts: dict[str, str]) -> None:
 
 
 def former_run(config: TrainConfig) -> Checkpoint | None:
-    """The last checkpoint of the same run, if there is one. Raises ValueError if the folder holds another run."""
+    """The last checkpoint of the same run, if there is one. Raises ValueError if the folder holds another
+    run.
+    """
     checkpoint = newest_checkpoint(config.out / CHECKPOINTS)
     if checkpoint is None:
         return None

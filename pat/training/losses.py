@@ -11,7 +11,14 @@ from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits, ms
 
 from pat.attention.scores import Compared, peak_position
 from pat.networks.guided import BetaEstimate
-from pat.networks.protocol import Comparing, Explaining, FusionNetwork, FusionOutput, fused_at_once, matched_for
+from pat.networks.protocol import (
+    Comparing,
+    Explaining,
+    FusionNetwork,
+    FusionOutput,
+    fused_at_once,
+    matched_for,
+)
 from pat.networks.weights import Network
 
 from .attention_loss import attention_loss
@@ -38,7 +45,9 @@ def structure_loss(image: Tensor, ground_truth: Tensor) -> Tensor:
 
 IMAGE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "psnr": image_loss,
-    "psnr-ssim": lambda image, ground_truth: image_loss(image, ground_truth) + structure_loss(image, ground_truth),
+    "psnr-ssim": lambda image, ground_truth: (
+        image_loss(image, ground_truth) + structure_loss(image, ground_truth)
+    ),
     "mse": mse_loss,
 }
 
@@ -49,7 +58,9 @@ class Objective(nn.Module):
     def __init__(self, network: Network, loss: str, *, attention: float = 0.0) -> None:
         super().__init__()
         if attention and not isinstance(network, Comparing):
-            raise ValueError(f"attention: {type(network).__name__} has no attention to supervise: leave it at 0")
+            raise ValueError(
+                f"attention: {type(network).__name__} has no attention to supervise: leave it at 0"
+            )
         self.network = network
         self.image_loss = IMAGE_LOSSES[loss]
         self.attention = attention
@@ -73,7 +84,9 @@ def explained(network: FusionNetwork, given: Sample) -> tuple[FusionOutput, list
 
 
 def match_loss(seen: list[BetaEstimate], given: Sample) -> Tensor:
-    """Position error where beta sees the point, pixels, and error of the confidence; 0 without ground truth."""
+    """Position error where beta sees the point, pixels, and error of the confidence; 0 without ground
+    truth.
+    """
     total = given.ground_truth.new_zeros(())
     for match, ground_truth, visible in zip(seen, given.position, given.visible):
         off = (match.attended - ground_truth.movedim(-1, 1)).abs().sum(1)
@@ -87,8 +100,8 @@ def match_loss(seen: list[BetaEstimate], given: Sample) -> Tensor:
 def validation(network: FusionNetwork, samples: list[Sample]) -> dict[str, float]:
     """Mean PSNR, and the share of visible pixels matched within 1.5 pixels (NaN without ground truth).
 
-    Of networks that are `Comparing` also `peaks`, the share of them where the largest weight is within a pixel of the
-    true position.
+    Of networks that are `Comparing` also `peaks`, the share of them where the largest weight is within a
+    pixel of the true position.
     """
     psnr, near, peaks = [], [], []
     for given in samples:

@@ -1,4 +1,6 @@
-"""Stereo pairs with the true disparity of both images as training samples: images, depth and occlusion are known."""
+"""Stereo pairs with the true disparity of both images as training samples: images, depth and occlusion are
+known.
+"""
 
 from __future__ import annotations
 
@@ -56,14 +58,20 @@ class MeasuredPairs(PairCrops):
         return replace(batch_of, depth=[d.to(self.device) for d in depth])
 
     def _cut(self, i: int, g: Generator) -> tuple[Tensor, Tensor, Tensor, Tensor, float, float]:
-        """Alpha, beta, their disparities, 1 where alpha is left and -1 where it is right, the largest disparity."""
+        """Alpha, beta, their disparities, 1 where alpha is left and -1 where it is right, the largest
+        disparity.
+        """
         pair, (h, w) = self._read(i), self.hw
         hw = pair.left.shape[1:]
         times = 1 + below(min(REDUCED, hw[0] // h, hw[1] // w), g)
         top, left = (below(whole - times * n + 1, g) for whole, n in zip(hw, self.hw))
         rows, columns = slice(top, top + times * h), slice(left, left + times * w)
-        images = [reduced(p[None, :, rows, columns], self.hw)[0].clamp(max=1) for p in (pair.left, pair.right)]
-        cut = (d[rows, columns][::times, ::times] / times for d in (pair.left_disparity, pair.right_disparity))
+        images = [
+            reduced(p[None, :, rows, columns], self.hw)[0].clamp(max=1) for p in (pair.left, pair.right)
+        ]
+        cut = (
+            d[rows, columns][::times, ::times] / times for d in (pair.left_disparity, pair.right_disparity)
+        )
         near, far = cut
         largest = pair.largest / times
         if below(2, g):
@@ -72,7 +80,9 @@ class MeasuredPairs(PairCrops):
 
 
 class Measured(NamedTuple):
-    """Two images (3, H, W), their disparities (H, W) in pixels, 0 where not known, and the largest there can be."""
+    """Two images (3, H, W), their disparities (H, W) in pixels, 0 where not known, and the largest there can
+    be.
+    """
 
     left: Tensor
     right: Tensor
@@ -85,13 +95,18 @@ def read_measured(pair: PairFiles) -> Measured:
     """The images and disparities of a pair."""
     left, right = (read_image(path)[0] * 255 for path in disparity_files(pair))
     scale = 255 / pair.max_disparity
-    return Measured(read_image(pair.left), read_image(pair.right), left / scale, right / scale, pair.max_disparity)
+    return Measured(
+        read_image(pair.left), read_image(pair.right), left / scale, right / scale, pair.max_disparity
+    )
 
 
 def disparity_files(pair: PairFiles) -> tuple[Path, Path]:
     """Of the left and of the right image. Raises ValueError where one is missing."""
     for layout in MIDDLEBURY.values():
-        files = [pair.left.with_name(name) for name in (layout.ground_truth, COUNTERPART.get(layout.ground_truth, "-"))]
+        files = [
+            pair.left.with_name(name)
+            for name in (layout.ground_truth, COUNTERPART.get(layout.ground_truth, "-"))
+        ]
         if pair.left.name == layout.left and all(file.is_file() for file in files):
             return files[0], files[1]
     raise ValueError(

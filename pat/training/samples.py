@@ -1,9 +1,10 @@
-"""Samples made while training: layered scenes from photographs, seen by random rigs, recorded by random cameras.
+"""Samples made while training: layered scenes from photographs, seen by random rigs, recorded by random
+cameras.
 
 A share of them may come from rendered scenes, and from stereo pairs.
 
-The samples of a step are a pure function of the seed and the number of the step, so that a run continues where it
-stopped, and processes share a step without communication.
+The samples of a step are a pure function of the seed and the number of the step, so that a run continues
+where it stopped, and processes share a step without communication.
 """
 
 from __future__ import annotations
@@ -124,7 +125,9 @@ class SampleSource:
         self.config, self.seed, self.field, self.folders = config, seed, field, folders or {}
         kinds = {"rectified": config.rectified_rigs, "general": config.general_rigs}
         self.makers = {
-            (kind, betas): LayeredScenes(photos, replace(rigs, betas=betas), hw=config.hw, seed=seed, device=device)
+            (kind, betas): LayeredScenes(
+                photos, replace(rigs, betas=betas), hw=config.hw, seed=seed, device=device
+            )
             for kind, rigs in kinds.items()
             for betas in (1, 3)
             if photos is not None
@@ -160,7 +163,8 @@ class SampleSource:
 
 
 def made_ahead(samples: Iterator[list[Sample]], network: FusionNetwork) -> Iterator[list[Sample]]:
-    """The samples, with their matches: those of the next step are made, and matched, while a step is computed.
+    """The samples, with their matches: those of the next step are made, and matched, while a step is
+    computed.
 
     They do not depend on the network's weights, so that results are the same.
     """
@@ -234,7 +238,9 @@ def degraded(
     field: ReceptiveField = Epipolar(),  # noqa: B008
     recording: RecordingConfig = RecordingConfig(),  # noqa: B008
 ) -> Sample:
-    """Recorded images of a scene: alpha grey, betas in colour (or a band each), enlarged to alpha's resolution."""
+    """Recorded images of a scene: alpha grey, betas in colour (or a band each), enlarged to alpha's
+    resolution.
+    """
     images, alone = _banded(scene, g, recording.spectral), len(scene.images) == 2
     ideal, grey, cameras = images[0], luminance(scene.images[0]), scene.cameras
     alpha = recorded(grey, cameras[0], g, recording).values
@@ -264,8 +270,12 @@ def _banded(scene: ArrayBatch, g: Generator, spectral: float) -> list[Tensor]:
     return [spectra.of(image) for image in scene.images]
 
 
-def recorded(image: Tensor, camera: Camera, g: Generator, recording: RecordingConfig, *, lost: float = 0.0) -> Sampled:
-    """The recorded image, perhaps distorted by a lens and undistorted, up to `lost` of it missing on each side."""
+def recorded(
+    image: Tensor, camera: Camera, g: Generator, recording: RecordingConfig, *, lost: float = 0.0
+) -> Sampled:
+    """The recorded image, perhaps distorted by a lens and undistorted, up to `lost` of it missing on each
+    side.
+    """
 
     def record_here(image: Tensor) -> Tensor:
         return record(image, steps(g, recording), g)
@@ -289,7 +299,9 @@ def steps(g: Generator, recording: RecordingConfig) -> list[Step]:
 
 
 def pair_of(scene: ArrayBatch, beta: int, g: Generator) -> Pair:
-    """The batch of pairs (alpha, beta), beta at alpha's resolution, with bounds looser than the scenes' own."""
+    """The batch of pairs (alpha, beta), beta at alpha's resolution, with bounds looser than the scenes'
+    own.
+    """
     near, far = scene.depth_range.double().unbind(-1)
     loose = torch.rand(2, len(near), generator=g, dtype=torch.float64).to(near.device)
     depth = near / (1 + 0.6 * loose[0]), torch.where(loose[1] < 0.5, torch.inf, far * (1 + 2 * loose[1]))
@@ -298,18 +310,23 @@ def pair_of(scene: ArrayBatch, beta: int, g: Generator) -> Pair:
 
 
 def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
-    """The pairs with beta rotated at random so that points move by about `pixels`, root mean square, on each axis."""
+    """The pairs with beta rotated at random so that points move by about `pixels`, root mean square, on each
+    axis.
+    """
     if pixels == 0:
         return pair
     alpha, beta = pair.cameras
     drawn = torch.randn(len(beta.K), 3, generator=g, dtype=torch.float64).to(beta.K)
     rotation = rotation_from_vector(drawn * pixels / beta.K[:, :1, 0])
-    moved: Camera = beta.replace(cam_from_world=Pose(rotation, torch.zeros_like(beta.t)) @ beta.cam_from_world)
+    moved: Camera = beta.replace(
+        cam_from_world=Pose(rotation, torch.zeros_like(beta.t)) @ beta.cam_from_world
+    )
     return Pair(alpha, moved, pair.depth)
 
 
 def transfer(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions of alpha's pixels in beta (B, h, w, 2), and whether beta sees the same surface there (B, h, w).
+    """Positions of alpha's pixels in beta (B, h, w, 2), and whether beta sees the same surface there (B, h,
+    w).
 
     Pixels without depth (NaN) are not visible, and at (0, 0).
     """
@@ -331,7 +348,10 @@ def alone(given: Sample, i: int) -> Sample:
     def one(parts: Sequence[Tensor]) -> list[Tensor]:
         return [part if len(part) == 1 else part[i : i + 1] for part in parts]
 
-    (alpha, ground_truth), on_grid = one([given.alpha, given.ground_truth]), [f.of_one(i) for f in given.fields]
+    (alpha, ground_truth), on_grid = (
+        one([given.alpha, given.ground_truth]),
+        [f.of_one(i) for f in given.fields],
+    )
     return Sample(alpha, one(given.betas), on_grid, ground_truth, one(given.position), one(given.visible))
 
 

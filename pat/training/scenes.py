@@ -1,7 +1,7 @@
 """Rendered scenes as training samples: a random window of any camera as alpha, of any others as betas.
 
-Folders hold the output of `pat render`. Scenes may differ in their rigs and image sizes; images of cameras with a lens
-model are undistorted as `pat fuse` does it.
+Folders hold the output of `pat render`. Scenes may differ in their rigs and image sizes; images of cameras
+with a lens model are undistorted as `pat fuse` does it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,15 @@ from arraygeom.batching import stack
 from arraygeom.camera import Camera
 from arraygeom.pixels import HW, pixel_grid
 from arraygeom.rig import Rig
-from pat.data.windows import RenderedView, pinhole_of, read_view, scene_folders, scene_rig, undistorted, window
+from pat.data.windows import (
+    RenderedView,
+    pinhole_of,
+    read_view,
+    scene_folders,
+    scene_rig,
+    undistorted,
+    window,
+)
 from pat.media.colour import srgb_image
 from pat.sensors import generator_for
 from pat.synthesis.layered import ArrayBatch
@@ -69,8 +77,8 @@ class Crops:
 class RenderedCrops(Crops):
     """Random windows of the rendered scenes in folders.
 
-    Raises ValueError for a folder without scenes or with an incomplete one, for a scene of one camera, and for
-    one of which no image is as large as `hw`; when it is read, for one whose images cannot be read.
+    Raises ValueError for a folder without scenes or with an incomplete one, for a scene of one camera, and
+    for one of which no image is as large as `hw`; when it is read, for one whose images cannot be read.
     """
 
     def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
@@ -79,7 +87,9 @@ class RenderedCrops(Crops):
         rigs = [scene_rig(folder) for folder in self.folders]
         self.names = [rig.names for rig in rigs]
         self.alphas = [large_enough(folder, rig, self.hw) for folder, rig in zip(self.folders, rigs)]
-        self._view = lru_cache(3 * ACTIVE)(lambda scene, name: undistorted(read_view(self.folders[scene], name)))
+        self._view = lru_cache(3 * ACTIVE)(
+            lambda scene, name: undistorted(read_view(self.folders[scene], name))
+        )
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
         """Windows of group `number`, of the scenes active then.
@@ -127,7 +137,9 @@ def chosen(found: list[T], choose: Callable[[int], bool], what: str) -> list[T]:
     """Those chosen by their number. Raises ValueError if none is."""
     items = [item for i, item in enumerate(found) if choose(i)]
     if not items:
-        raise ValueError(f"{what}: {len(found)} are too few to learn from some and to hold others out: give more")
+        raise ValueError(
+            f"{what}: {len(found)} are too few to learn from some and to hold others out: give more"
+        )
     return items
 
 
@@ -136,11 +148,15 @@ def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
     sizes = {name: pinhole_of(c).hw for name, c in rig.cameras.items() if isinstance(c, Camera)}
     count = len(rig.names)
     if len(sizes) < max(count, 2):
-        raise ValueError(f"{folder}: has {len(sizes)} calibrated cameras of {count}: all must be, two at least")
+        raise ValueError(
+            f"{folder}: has {len(sizes)} calibrated cameras of {count}: all must be, two at least"
+        )
     names = [name for name, size in sizes.items() if size[0] >= hw[0] and size[1] >= hw[1]]
     if not names:
         listed = ", ".join(f"{name} {w}x{h}" for name, (h, w) in sizes.items())
-        raise ValueError(f"{folder}: no image is as large as the samples, {hw[1]}x{hw[0]} ({listed}): lower `hw`")
+        raise ValueError(
+            f"{folder}: no image is as large as the samples, {hw[1]}x{hw[0]} ({listed}): lower `hw`"
+        )
     return names
 
 
@@ -175,7 +191,9 @@ def finite_window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> 
     """A `window` whose infinite depths are replaced by those of a distance `SKY`."""
     cut = window(view, top, left, size, hw)
     rays, _ = cut.camera.rays(pixel_grid(hw, dtype=torch.float64))
-    return cut._replace(depth=torch.where(cut.depth.isposinf(), (SKY / rays.norm(dim=-1)).to(cut.depth), cut.depth))
+    return cut._replace(
+        depth=torch.where(cut.depth.isposinf(), (SKY / rays.norm(dim=-1)).to(cut.depth), cut.depth)
+    )
 
 
 def bounds(depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b 2"]:
@@ -191,7 +209,9 @@ def batched(drawn: Sequence[Sequence[RenderedView]], device: str) -> ArrayBatch:
     images = [srgb_image(torch.stack([v.rgb for v in same])).to(device) for same in views]
     depth = [torch.stack([v.depth for v in same]).to(device) for same in views]
     cameras = [
-        stack([in_frame_of(alpha.camera, v.camera) for alpha, v in zip(views[0], same)]).to(device, torch.float32)
+        stack([in_frame_of(alpha.camera, v.camera) for alpha, v in zip(views[0], same)]).to(
+            device, torch.float32
+        )
         for same in views
     ]
     return ArrayBatch(images, depth, cameras, bounds(depth[0]))

@@ -1,7 +1,8 @@
-"""Stereo pairs as training samples: a random window of one image as alpha and ground truth, of the other as beta.
+"""Stereo pairs as training samples: a random window of one image as alpha and ground truth, of the other as
+beta.
 
-Their depth is not known, so the loss is on the image alone. Their cameras are assumed: rectified, a metre apart, with
-the pair's range of disparities.
+Their depth is not known, so the loss is on the image alone. Their cameras are assumed: rectified, a metre
+apart, with the pair's range of disparities.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ REDUCED = 2
 class PairCrops(Crops):
     """Random windows of the rectified stereo pairs in folders.
 
-    Raises ValueError for a folder without pairs, for a pair whose images differ in size, are not in colour or are
-    smaller than `hw`; when it is read, for an image that cannot be read.
+    Raises ValueError for a folder without pairs, for a pair whose images differ in size, are not in colour or
+    are smaller than `hw`; when it is read, for an image that cannot be read.
     """
 
     def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
@@ -42,7 +43,9 @@ class PairCrops(Crops):
         self.pairs = chosen(found, choose, f"stereo pairs of {', '.join(map(str, roots))}")
         for pair in self.pairs:
             check_pair(pair, self.hw)
-        self._images = lru_cache(ACTIVE)(lambda i: (read_image(self.pairs[i].left), read_image(self.pairs[i].right)))
+        self._images = lru_cache(ACTIVE)(
+            lambda i: (read_image(self.pairs[i].left), read_image(self.pairs[i].right))
+        )
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
         """Windows of group `number`, of the pairs active then. Several betas are of the same camera.
@@ -72,11 +75,15 @@ class PairCrops(Crops):
 def assumed_cameras(
     images: list[Tensor], side: Float[Tensor, " b"], disparity: Float[Tensor, " b"], device: str
 ) -> ArrayBatch:
-    """The images, alpha first, with cameras a metre apart that put the nearest points `disparity` pixels apart."""
+    """The images, alpha first, with cameras a metre apart that put the nearest points `disparity` pixels
+    apart.
+    """
     batch, _, h, w = images[0].shape
     K = intrinsics(float(w), (h, w)).expand(batch, 3, 3)
     t = torch.zeros(batch, 3, dtype=torch.float64)
-    alpha = Camera(K=K, cam_from_world=Pose(torch.eye(3, dtype=torch.float64).expand(batch, 3, 3), t), hw=(h, w))
+    alpha = Camera(
+        K=K, cam_from_world=Pose(torch.eye(3, dtype=torch.float64).expand(batch, 3, 3), t), hw=(h, w)
+    )
     beta = alpha.replace(cam_from_world=Pose(alpha.R, torch.stack([-side, t[:, 1], t[:, 2]], -1)))
     betas = [beta.resize((p.shape[-2], p.shape[-1])) for p in images[1:]]
     cameras = [camera.to(device, torch.float32) for camera in (alpha, *betas)]
@@ -90,12 +97,15 @@ def check_pair(pair: PairFiles, hw: HW) -> None:
     left, right = _header(pair.left), _header(pair.right)
     if left != right:
         raise ValueError(
-            f"{pair.left} is {_described(left)} and {pair.right.name} {_described(right)}: pairs must be alike"
+            f"{pair.left} is {_described(left)} and {pair.right.name} {_described(right)}: pairs must be "
+            "alike"
         )
     if left[2] == 1:
         raise ValueError(f"{pair.left} is grey: pairs to train on must be in colour")
     if left[0] < hw[0] or left[1] < hw[1]:
-        raise ValueError(f"{pair.left} is {_described(left)}, smaller than the samples, {hw[1]}x{hw[0]}: lower `hw`")
+        raise ValueError(
+            f"{pair.left} is {_described(left)}, smaller than the samples, {hw[1]}x{hw[0]}: lower `hw`"
+        )
 
 
 def _header(file: Path) -> tuple[int, int, int]:
@@ -104,7 +114,9 @@ def _header(file: Path) -> tuple[int, int, int]:
         with Image.open(file) as image:
             return image.height, image.width, 1 if image.mode[0] in "1LIF" else 3
     except (OSError, UnidentifiedImageError):
-        raise ValueError(f"{file}: not an image that can be read: give a whole PNG, TIFF or JPEG file") from None
+        raise ValueError(
+            f"{file}: not an image that can be read: give a whole PNG, TIFF or JPEG file"
+        ) from None
 
 
 def _described(header: tuple[int, int, int]) -> str:

@@ -10,7 +10,14 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -58,7 +65,12 @@ class Watch:
         self.steps.write(f"{step},{loss!r},{norm!r},{rate!r}\n")
         self.bar.update(self.task, completed=min(done, 1.0), step=step, loss=loss, speed=speed)
         if self.board and step % 10 == 0:
-            for name, value in {"loss": loss, "gradient": norm, "rate": rate, "scenes a second": speed}.items():
+            for name, value in {
+                "loss": loss,
+                "gradient": norm,
+                "rate": rate,
+                "scenes a second": speed,
+            }.items():
                 self.board.add_scalar(name, value, step)
 
     def validated(self, facts: Mapping[str, float]) -> None:
@@ -93,7 +105,9 @@ class Watch:
 
 @torch.no_grad()
 def contact_sheet(network: FusionNetwork, samples: list[Sample]) -> Float[Tensor, "3 _ _"]:
-    """One row for the first scene of each group: beta (three bands, or one), alpha, fused, ground truth, confidence."""
+    """One row for the first scene of each group: beta (three bands, or one), alpha, fused, ground truth,
+    confidence.
+    """
     return torch.cat([_row(network, given) for given in samples], -2).cpu()
 
 
@@ -110,7 +124,9 @@ def _row(network: FusionNetwork, given: Sample) -> Tensor:
 
 def _keep_lines(path: Path, step: int, step_of: Any, *, header: str = "") -> None:
     """Remove the lines of steps after `step`, and a last line cut short."""
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)[bool(header) :] if path.is_file() else []
+    lines = (
+        path.read_text(encoding="utf-8").splitlines(keepends=True)[bool(header) :] if path.is_file() else []
+    )
     earlier = [line for line in lines if line.endswith("\n") and step_of(line) <= step]
     write_text(path, header + "".join(earlier))
 

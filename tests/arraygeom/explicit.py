@@ -1,4 +1,6 @@
-"""Explicit projection in numpy, float64: what fields are held against. No code is shared with the packages."""
+"""Explicit projection in numpy, float64: what fields are held against. No code is shared with the
+packages.
+"""
 
 import numpy as np
 
@@ -26,7 +28,9 @@ def on_image(camera, x: np.ndarray, margin: float = 0.0) -> np.ndarray:
 
 
 def beta_points(pair, rays: np.ndarray, inverse_depth: np.ndarray) -> np.ndarray:
-    """Points of alpha's rays (n, 3) of z = 1 at inverse depths (m), in beta's frame over their depth: (n, m, 3)."""
+    """Points of alpha's rays (n, 3) of z = 1 at inverse depths (m), in beta's frame over their depth: (n, m,
+    3).
+    """
     R, t = (v.detach().double().numpy() for v in (pair.beta_from_alpha.R, pair.beta_from_alpha.t))
     return (rays @ R.T)[:, None] + inverse_depth[None, :, None] * t
 
@@ -41,7 +45,9 @@ def _brown(c: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     x, y = xy.T
     u = x * x + y * y
     g = (1 + u * (k1 + u * (k2 + u * k3))) / (1 + u * (k4 + u * (k5 + u * k6)))
-    out = np.stack([x * g + 2 * p1 * x * y + p2 * (u + 2 * x * x), y * g + p1 * (u + 2 * y * y) + 2 * p2 * x * y], -1)
+    out = np.stack(
+        [x * g + 2 * p1 * x * y + p2 * (u + 2 * x * x), y * g + p1 * (u + 2 * y * y) + 2 * p2 * x * y], -1
+    )
     r = np.concatenate([np.linspace(0, 3, 30001), np.geomspace(3, 1000, 30001)[1:]])
     v = r * r
     radius = r * (1 + v * (k1 + v * (k2 + v * k3))) / (1 + v * (k4 + v * (k5 + v * k6)))

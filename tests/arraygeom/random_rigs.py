@@ -36,8 +36,26 @@ class Drawn:
 
 
 KINDS = (
-    *("ordinary", "ordinary", "no baseline", "identical", "forward", "backward", "looking back", "near is far"),
-    *("far is infinite", "tiny baseline", "long baseline", "narrow", "wide", "tiny image", "quarter turn", "skewed"),
+    *(
+        "ordinary",
+        "ordinary",
+        "no baseline",
+        "identical",
+        "forward",
+        "backward",
+        "looking back",
+        "near is far",
+    ),
+    *(
+        "far is infinite",
+        "tiny baseline",
+        "long baseline",
+        "narrow",
+        "wide",
+        "tiny image",
+        "quarter turn",
+        "skewed",
+    ),
     *("on the epipole", "sideways", "anywhere"),
 )
 
@@ -82,7 +100,9 @@ def _motion(rng: np.random.Generator, kind: str) -> tuple[np.ndarray, np.ndarray
     if kind in ("no baseline", "narrow"):
         return w * (kind != "narrow"), c * (kind == "narrow")
     if kind in ("forward", "backward"):
-        return 0.2 * w, np.array([0.1 * c[0], 0.1 * c[1], (1 if kind == "forward" else -1) * rng.uniform(0.1, 2)])
+        return 0.2 * w, np.array(
+            [0.1 * c[0], 0.1 * c[1], (1 if kind == "forward" else -1) * rng.uniform(0.1, 2)]
+        )
     if kind == "looking back":
         return np.array([0, math.pi, 0]) + 0.1 * w, c + np.array([0, 0, rng.uniform(0, 6)])
     if kind == "sideways":
@@ -104,7 +124,8 @@ def _lens(rng: np.random.Generator) -> ag.Distortion | None:
 
 def _moved_world(rng: np.random.Generator) -> ag.Pose:
     return ag.Pose(
-        ag.rotation_from_vector(torch.from_numpy(rng.uniform(-3, 3, 3))), torch.from_numpy(rng.uniform(-3, 3, 3))
+        ag.rotation_from_vector(torch.from_numpy(rng.uniform(-3, 3, 3))),
+        torch.from_numpy(rng.uniform(-3, 3, 3)),
     )
 
 
@@ -112,7 +133,9 @@ def _in_world(camera: ag.Camera, world: ag.Pose) -> ag.Camera:
     return camera.replace(cam_from_world=camera.cam_from_world @ world)
 
 
-def _pixels(rng: np.random.Generator, kind: str, alpha: ag.Camera, beta: ag.Camera) -> tuple[np.ndarray, np.ndarray]:
+def _pixels(
+    rng: np.random.Generator, kind: str, alpha: ag.Camera, beta: ag.Camera
+) -> tuple[np.ndarray, np.ndarray]:
     """Whole pixels and others, alpha's corners, and the epipole where it is in front."""
     h, w = alpha.hw
     x = rng.uniform([0, 0], [w - 1, h - 1], (PIXELS, 2))
@@ -130,7 +153,8 @@ def _pixels(rng: np.random.Generator, kind: str, alpha: ag.Camera, beta: ag.Came
     return explicit.pixels_of(alpha, rays)[0], rays
 
 
-# What is asserted ---------------------------------------------------------------------------------------------
+# What is asserted
+# ---------------------------------------------------------------------------------------------
 
 
 def check(one: Drawn, dtype: torch.dtype) -> None:
@@ -145,7 +169,9 @@ def check(one: Drawn, dtype: torch.dtype) -> None:
 
 
 def fields_of(one: Drawn) -> list[tuple[str, Any, float | None, float | None]]:
-    """Name, field, and the depths between which it has to hold every point that beta sees (None: not checked so)."""
+    """Name, field, and the depths between which it has to hold every point that beta sees (None: not checked
+    so).
+    """
     near, far = (float(d) for d in one.rig.depth)
     # Not by a half: whether a corner moved onto the very edge of the image is inside is up to rounding.
     step = torch.full((2, *one.pair.alpha.hw), 0.4)
@@ -186,11 +212,17 @@ def _finite(name: str, found: Any) -> None:
         assert value.dtype == torch.bool or bool(value.isfinite().all()), f"{name}.{f.name} is not finite"
 
 
-def _holds_what_is_seen(name: str, one: Drawn, found: Any, near: float, far: float, dtype: torch.dtype) -> None:
-    """Every point of a ray that beta sees is at the segment, and the segment's ends are at points that it sees."""
+def _holds_what_is_seen(
+    name: str, one: Drawn, found: Any, near: float, far: float, dtype: torch.dtype
+) -> None:
+    """Every point of a ray that beta sees is at the segment, and the segment's ends are at points that it
+    sees.
+    """
     pair, (w_far, w_near) = one.pair, (1 / far, 1 / near)
     # Even in inverse depth, and in its logarithm: near a camera that the ray passes pixels change quickest.
-    w = np.concatenate([np.linspace(w_far, w_near, DEPTHS), np.geomspace(max(w_far, 1e-6), max(w_near, 1e-6), DEPTHS)])
+    w = np.concatenate(
+        [np.linspace(w_far, w_near, DEPTHS), np.geomspace(max(w_far, 1e-6), max(w_near, 1e-6), DEPTHS)]
+    )
     X = explicit.beta_points(pair, one.rays, np.sort(w))
     ratio = X[..., 2]
     xy, seen = explicit.pixels_of(pair.beta, X.reshape(-1, 3))
@@ -211,7 +243,9 @@ def _holds_what_is_seen(name: str, one: Drawn, found: Any, near: float, far: flo
             line = start[i] if across else np.stack([start[i], last[i]])
             off = _distance(xy[i][must[i]], line, across)
             slack = _slack(name, line) + blur[i][must[i]] + (SHORTEST if name == "Widened" else 0.0)
-            assert (off <= slack).all(), f"{name}: {one.kind}: pixel {i}: {off.max()} px off, {slack[off.argmax()]}"
+            assert (off <= slack).all(), (
+                f"{name}: {one.kind}: pixel {i}: {off.max()} px off, {slack[off.argmax()]}"
+            )
         elif valid[i] and not may[i].any() and not name.startswith("Widened"):
             # Between two of the explicit depths, perhaps: then the segment is short.
             gap = np.linalg.norm(np.diff(xy[i], axis=0), axis=-1)
@@ -271,15 +305,21 @@ def _explicit_lists(one: Drawn, dtype: torch.dtype) -> None:
         foot = centre - (line[:2] @ centre + line[2]) * line[:2]
         if displaced.valid[i]:
             for end in (displaced.start[i].numpy(), displaced.end[i].numpy()):
-                assert abs(line[:2] @ end + line[2]) < 1e-5, f"HomographyDisplacement: {one.kind}: off its line"
+                assert abs(line[:2] @ end + line[2]) < 1e-5, (
+                    f"HomographyDisplacement: {one.kind}: off its line"
+                )
                 assert np.linalg.norm(end - foot) < 5 + 1e-5, f"HomographyDisplacement: {one.kind}: too far"
         else:
             walk = foot + np.linspace(-4.9, 4.9, 50)[:, None] * [-line[1], line[0]]
-            assert not explicit.on_image(pair.beta, walk, 0.01).any(), f"HomographyDisplacement: {one.kind}: missed"
+            assert not explicit.on_image(pair.beta, walk, 0.01).any(), (
+                f"HomographyDisplacement: {one.kind}: missed"
+            )
         _nearest_pixels(one.kind, nearest.xy[i].numpy()[nearest.mask[i].numpy()], centre, line, (h, w))
 
 
-def _nearest_pixels(kind: str, found: np.ndarray, centre: np.ndarray, line: np.ndarray, hw: tuple[int, int]) -> None:
+def _nearest_pixels(
+    kind: str, found: np.ndarray, centre: np.ndarray, line: np.ndarray, hw: tuple[int, int]
+) -> None:
     """The 24 whole pixels nearest the line in a window of 17 x 17, where rounding does not decide."""
     around = np.round(centre)
     if (np.abs(centre - np.floor(centre) - 0.5) < 1e-6).any():
@@ -290,7 +330,9 @@ def _nearest_pixels(kind: str, found: np.ndarray, centre: np.ndarray, line: np.n
     assert len(found) == min(24, len(grid)), f"NearestVoxels: {kind}: {len(found)} pixels"
     if len(found):
         mine = np.sort(np.abs(found @ line[:2] + line[2]))
-        assert np.abs(mine - np.sort(distance)[: len(mine)]).max() < 2e-3, f"NearestVoxels: {kind}: not the nearest"
+        assert np.abs(mine - np.sort(distance)[: len(mine)]).max() < 2e-3, (
+            f"NearestVoxels: {kind}: not the nearest"
+        )
         assert len(np.unique(found, axis=0)) == len(found), f"NearestVoxels: {kind}: a pixel twice"
 
 
@@ -304,7 +346,9 @@ def _gradients(one: Drawn, dtype: torch.dtype) -> None:
             continue
         slopes = torch.autograd.grad(ends, [x, *changes.values()], allow_unused=True)
         for parameter, slope in zip(["pixels", *changes], slopes):
-            assert slope is None or bool(slope.isfinite().all()), f"{name}: {one.kind}: gradient of {parameter}"
+            assert slope is None or bool(slope.isfinite().all()), (
+                f"{name}: {one.kind}: gradient of {parameter}"
+            )
 
 
 def check_variants(one: Drawn, other: Drawn) -> None:
@@ -320,13 +364,16 @@ def check_variants(one: Drawn, other: Drawn) -> None:
             _same(f"{name}: {one.kind}: autocast", field(fresh, x), expected)
     if one.pair.has_lens or other.pair.has_lens or one.kind == "tiny image" or other.kind == "tiny image":
         return
-    other_rig = ag.Rig({n: other.rig[n].replace(hw=one.rig[n].hw) for n in one.rig.names}, depth=other.rig.depth)
+    other_rig = ag.Rig(
+        {n: other.rig[n].replace(hw=one.rig[n].hw) for n in one.rig.names}, depth=other.rig.depth
+    )
     batch = ag.stack([one.rig, other_rig]).pair("alpha", "beta")
     pixels = torch.from_numpy(np.stack([one.x, other.x]))
     for name, field, *_ in fields_of(one):
         found = field(batch, pixels)
         for i, (rig, kind) in enumerate(((one.rig, one.kind), (other_rig, other.kind))):
-            # At the epipole (the last pixel) and with hardly any baseline, the direction of the line is up to rounding.
+            # At the epipole (the last pixel) and with hardly any baseline, the direction of the line is up to
+            # rounding.
             n = PIXELS - (kind == "on the epipole" and name in BY_LINES)
             tolerance = 1e-4 if kind == "tiny baseline" and name in BY_LINES else 1e-6
             alone = field(rig.pair("alpha", "beta"), pixels[i])
@@ -344,4 +391,6 @@ BY_LINES = ("HomographyDisplacement", "NearestVoxels")
 def _same(name: str, found: Any, expected: Any, tolerance: float = 0.0) -> None:
     for f in dataclasses.fields(expected):
         a, b = getattr(found, f.name), getattr(expected, f.name)
-        torch.testing.assert_close(a.expand_as(b), b, atol=tolerance, rtol=tolerance, msg=lambda m: f"{name}: {m}")
+        torch.testing.assert_close(
+            a.expand_as(b), b, atol=tolerance, rtol=tolerance, msg=lambda m: f"{name}: {m}"
+        )

@@ -14,12 +14,16 @@ def uniform(g: torch.Generator, low: float, high: float, *shape: int) -> Tensor:
     return low + (high - low) * torch.rand(shape, generator=g, dtype=torch.float64)
 
 
-def random_camera(g: torch.Generator, hw: tuple[int, int], *, turn: float = 0.25, baseline: float = 0.4) -> Camera:
+def random_camera(
+    g: torch.Generator, hw: tuple[int, int], *, turn: float = 0.25, baseline: float = 0.4
+) -> Camera:
     """A camera near the origin that looks roughly ahead, of about 60 degrees."""
     focal = (hw[1] * float(uniform(g, 0.7, 1.1)), hw[1] * float(uniform(g, 0.7, 1.1)))
     centre = (hw[1] * float(uniform(g, 0.4, 0.6)), hw[0] * float(uniform(g, 0.4, 0.6)))
     R = rotation_from_vector(uniform(g, -turn, turn, 3))
-    return Camera(K=intrinsics(focal, hw, centre), cam_from_world=Pose(R, uniform(g, -baseline, baseline, 3)), hw=hw)
+    return Camera(
+        K=intrinsics(focal, hw, centre), cam_from_world=Pose(R, uniform(g, -baseline, baseline, 3)), hw=hw
+    )
 
 
 def random_rig(seed: int, *, near: float = 1.5, far: float = 10.0, **camera: float) -> Rig:
@@ -39,7 +43,9 @@ def scene_points(rig: Rig, n: int = 200, *, seed: int = 0) -> Tensor:
     return alpha.unproject(x, 1 / inverse)
 
 
-def two_cameras(R: Tensor | None = None, centre: tuple[float, float, float] = (0.0, 0.0, 0.0), **rig: object) -> Rig:
+def two_cameras(
+    R: Tensor | None = None, centre: tuple[float, float, float] = (0.0, 0.0, 0.0), **rig: object
+) -> Rig:
     """Alpha in the world's frame, beta turned by R with its centre where told; both of 90 degrees."""
     K = intrinsics(32.0, (48, 64))
     R = torch.eye(3, dtype=torch.float64) if R is None else R

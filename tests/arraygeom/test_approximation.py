@@ -38,7 +38,9 @@ def test_fitted_homography_is_scipys_least_squares():
     x, y = noisy_points()
     H = fit_homography(x, y)
     ours = (H / H[2, 2]).numpy().ravel()[:8]
-    best = optimize.least_squares(residual, ours, args=(x, y), x_scale=np.abs(ours), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    best = optimize.least_squares(
+        residual, ours, args=(x, y), x_scale=np.abs(ours), xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
     cost = 0.5 * np.square(residual(ours, x, y)).sum()
     assert cost == pytest.approx(best.cost, rel=1e-9)
 

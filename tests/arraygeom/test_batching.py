@@ -43,7 +43,17 @@ def each(seed: int) -> list:
     segments = sampling_locations(Epipolar(), straight, torch.rand(3, 2, dtype=F64) * 40)
     view = LensView(hw=(4, 6), K=intrinsics(3.0 + seed, (4, 6)), distortion=lens(0.1))
     return [
-        *(View(hw=(4, 6)), view, rig["beta"], lens(0.1 * seed), rig["alpha"].cam_from_world, link, pair, rig, segments),
+        *(
+            View(hw=(4, 6)),
+            view,
+            rig["beta"],
+            lens(0.1 * seed),
+            rig["alpha"].cam_from_world,
+            link,
+            pair,
+            rig,
+            segments,
+        ),
         *(
             segments.positions(5),
             dataclasses.replace(straight, link=link),
@@ -157,9 +167,18 @@ def test_gradients_reach_stacked_items():
         ([], "nothing to stack"),
         ([random_rig(1)["alpha"], random_rig(1)["beta"]], r"Camera.hw: \(48, 64\) and \(40, 60\) differ"),
         ([random_rig(1), random_rig(1).replace(depth=None)], "Rig.depth: some are NoneType and tuple"),
-        ([random_rig(1), Rig({"alpha": random_rig(1)["alpha"]}, (1, 2))], "Rig.cameras: alpha, beta and alpha differ"),
-        ([lens(1), Distortion("kannala-brandt", torch.zeros(4, dtype=F64))], "brown-conrady and kannala-brandt differ"),
-        ([lens(1), Distortion("brown-conrady", torch.zeros(5, dtype=F64))], r"Distortion.coefficients: shapes \("),
+        (
+            [random_rig(1), Rig({"alpha": random_rig(1)["alpha"]}, (1, 2))],
+            "Rig.cameras: alpha, beta and alpha differ",
+        ),
+        (
+            [lens(1), Distortion("kannala-brandt", torch.zeros(4, dtype=F64))],
+            "brown-conrady and kannala-brandt differ",
+        ),
+        (
+            [lens(1), Distortion("brown-conrady", torch.zeros(5, dtype=F64))],
+            r"Distortion.coefficients: shapes \(",
+        ),
         ([lens(1), random_rig(1)], "some are Distortion and Rig"),
     ],
 )
@@ -180,7 +199,9 @@ def test_a_rig_in_one_line():
     rig = Rig({"mono": camera, "colour": colour}, depth=(2, 5))
     assert repr(rig) == "Rig: mono 741x497 f=999, colour 741x497 f=999 rgb; baseline 19.3 cm; 2-5 m"
     assert repr(rig.replace(depth=(2, torch.inf))).endswith("2 m to infinity")
-    nir = colour.replace(sensor=Sensor(response=Band(850.0, 40.0)), distortion=lens(0.1), K=intrinsics(2.0, (497, 741)))
+    nir = colour.replace(
+        sensor=Sensor(response=Band(850.0, 40.0)), distortion=lens(0.1), K=intrinsics(2.0, (497, 741))
+    )
     three = rig.with_camera("nir", nir.replace(cam_from_world=Pose(camera.R, 3 * t)))
     assert repr(three) == (
         "Rig: mono 741x497 f=999, colour 741x497 f=999 rgb, nir 741x497 f=2 brown-conrady 850+-20 nm; "

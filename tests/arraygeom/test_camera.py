@@ -34,7 +34,9 @@ def points_ahead(camera: Camera, n: int = 50) -> torch.Tensor:
 def test_projection_is_opencvs(seed):
     c = camera(seed)
     X = points_ahead(c)
-    expected = cv2.projectPoints(X.numpy(), cv2.Rodrigues(c.R.numpy())[0], c.t.numpy(), c.K.numpy(), None)[0][:, 0]
+    expected = cv2.projectPoints(X.numpy(), cv2.Rodrigues(c.R.numpy())[0], c.t.numpy(), c.K.numpy(), None)[0][
+        :, 0
+    ]
     projected = c.project(X)
     np.testing.assert_allclose(projected.x.numpy(), expected, atol=1e-9)
     assert projected.valid.all()
@@ -50,7 +52,9 @@ def test_unprojection_inverts_projection(seed):
 
 def test_points_behind_are_invalid_and_finite_with_their_gradients():
     c = camera()
-    X = c.cam_from_world.inverse().apply(torch.tensor([[0.1, 0, -1], [0.1, 0, 0], [0, 0, 1]], dtype=torch.float64))
+    X = c.cam_from_world.inverse().apply(
+        torch.tensor([[0.1, 0, -1], [0.1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+    )
     X.requires_grad_()
     projected = c.project(X)
     projected.x.sum().backward()
@@ -68,7 +72,9 @@ def test_projections_stay_the_same_point_of_the_actual_image(change):
     changed = CHANGES[change](c)
     changed_image = {
         "smaller": lambda: torch.nn.functional.interpolate(image, (20, 31), mode="area"),
-        "larger": lambda: torch.nn.functional.interpolate(image, (100, 130), mode="bilinear", align_corners=False),
+        "larger": lambda: torch.nn.functional.interpolate(
+            image, (100, 130), mode="bilinear", align_corners=False
+        ),
         "cropped": lambda: image[..., 6:38, 18:50],
         "padded": lambda: torch.nn.functional.pad(image, (7, 9, 4, 8)),
         "turned": lambda: torch.rot90(image, 1, (-2, -1)),

@@ -128,7 +128,9 @@ def of_port(X):
     for _ in range(80):
         angle = (low + high) / 2
         in_glass, in_water = (np.arcsin(np.sin(angle) / PORT[n]) for n in ("glass", "water"))
-        reached = PORT["distance"] * np.tan(angle) + PORT["thickness"] * np.tan(in_glass) + depth * np.tan(in_water)
+        reached = (
+            PORT["distance"] * np.tan(angle) + PORT["thickness"] * np.tan(in_glass) + depth * np.tan(in_water)
+        )
         low, high = np.where(reached < radius, angle, low), np.where(reached < radius, high, angle)
     return X[:, :2] / radius[:, None] * np.tan(low)[:, None], depth > 0
 
@@ -142,10 +144,14 @@ def of_splines(X, *, spacing, order, pinhole):
     counts = np.array([8, 7])
     at = u / np.array(spacing) + (counts - 1) / 2
     margin = (order - 1) / 2
-    inside = some & (at >= margin).all(1) & (at <= counts - 1 - margin).all(1) & (X[:, 2] > 0 if pinhole else True)
+    inside = (
+        some & (at >= margin).all(1) & (at <= counts - 1 - margin).all(1) & (X[:, 2] > 0 if pinhole else True)
+    )
     clipped = np.clip(at, margin, counts - 1 - margin - 1e-9)
     weights = [
-        spline.design_matrix(clipped[:, i], np.arange(counts[i] + order + 1) - (order + 1) / 2, order).toarray()
+        spline.design_matrix(
+            clipped[:, i], np.arange(counts[i] + order + 1) - (order + 1) / 2, order
+        ).toarray()
         for i in range(2)
     ]
     moved = np.einsum("nx,ny,yxc->nc", *weights, KNOTS.numpy())
@@ -214,7 +220,9 @@ def test_the_default_field_passes_through_every_point(alpha, beta):
     assert isinstance(field, Curved)
     (ray, seen), start = pair.cameras[0].rays(x), pair.cameras[0].ray_origins(x)
     along = wanted / ray.norm(dim=-1) if field.bounds == "distance" else (wanted - start[:, 2]) / ray[:, 2]
-    there = pair.cameras[1].project(pair.cameras[0].cam_from_world.inverse().apply(start + along[:, None] * ray))
+    there = pair.cameras[1].project(
+        pair.cameras[0].cam_from_world.inverse().apply(start + along[:, None] * ray)
+    )
     visible = seen & there.valid & pair.beta.contains(there.x)
     assert int(visible.sum()) > 2
     found = Curved(256, bounds=field.bounds)(pair, x)
@@ -264,7 +272,9 @@ def test_what_a_model_lacks_is_said():
 
     with pytest.raises(ValueError, match="has to be central"):
         FlatPort(lens=Orthographic(), **{n: number(v) for n, v in PORT.items()})
-    assert {"equirectangular", "orthographic", "polynomial-fisheye", "rolling-shutter", "flat-port"} <= {*CAMERA_MODELS}
+    assert {"equirectangular", "orthographic", "polynomial-fisheye", "rolling-shutter", "flat-port"} <= {
+        *CAMERA_MODELS
+    }
 
 
 def test_a_file_that_lacks_a_number_of_its_model_says_which(tmp_path):

@@ -1,4 +1,6 @@
-"""Lens models of other tools against those tools' own formulas, written in plain numpy, and against themselves."""
+"""Lens models of other tools against those tools' own formulas, written in plain numpy, and against
+themselves.
+"""
 
 import math
 
@@ -17,8 +19,8 @@ cv2 = Oracle("cv2")
 
 
 def double_sphere(X, xi, alpha):
-    """Usenko et al. 2018, equations 40 to 42. Valid: in the cone of the second sphere, where the radius rises; their
-    cone about the axis (w2) is a little wider or narrower."""
+    """Usenko et al. 2018, equations 40 to 42. Valid: in the cone of the second sphere, where the radius
+    rises; their cone about the axis (w2) is a little wider or narrower."""
     x, y, z = X.T
     d1 = np.sqrt(x**2 + y**2 + z**2)
     d2 = np.sqrt(x**2 + y**2 + (xi * d1 + z) ** 2)
@@ -91,7 +93,10 @@ def polynomial_fisheye(X, k2, k3, k4):
 FORMULAS = {
     "double-sphere": (double_sphere, [(-0.2, 0.57), (0.3, 0.4), (-0.6, 0.9), (0.0, 0.0)]),
     "extended-unified": (extended_unified, [(0.6, 1.1), (0.4, 0.9), (1.0, 1.0), (0.0, 2.0)]),
-    "unified": (unified, [(0.9, -0.1, 0.02, 1e-3, -2e-3), (1.7, -0.2, 0.05, 0, 0), (0.0, 0.1, 0.0, 0.0, 1e-3)]),
+    "unified": (
+        unified,
+        [(0.9, -0.1, 0.02, 1e-3, -2e-3), (1.7, -0.2, 0.05, 0, 0), (0.0, 0.1, 0.0, 0.0, 1e-3)],
+    ),
     "fov": (fov, [(0.9,), (1.6,), (1e-4,)]),
     "thin-prism-fisheye": (
         thin_prism_fisheye,
@@ -123,7 +128,9 @@ def test_every_model_is_tested_and_has_names_and_sizes_for_refinement():
 
 @pytest.mark.parametrize(("model", "c"), CASES)
 def test_the_tools_own_formula(model, c):
-    """Where both are valid; and directions at which the formula is, and we are not, are few and at the very border."""
+    """Where both are valid; and directions at which the formula is, and we are not, are few and at the very
+    border.
+    """
     X = directions() * torch.linspace(0.1, 30, 3000)[:, None]
     if model not in BEHIND:
         X = X[X[:, 2] > 0.02 * X.norm(dim=-1)]
@@ -132,7 +139,9 @@ def test_the_tools_own_formula(model, c):
     assert not (valid.numpy() & ~seen).any()
     radius = np.linalg.norm(expected, axis=-1)
     missed = seen & ~valid.numpy()
-    if model == "thin-prism-fisheye" or (model == "unified" and any(c[1:])):  # the polynomials turn back somewhere
+    if model == "thin-prism-fisheye" or (
+        model == "unified" and any(c[1:])
+    ):  # the polynomials turn back somewhere
         assert missed.mean() < 0.35
     else:
         assert (radius[missed] > 300).all() or missed.mean() < 0.002
@@ -176,7 +185,9 @@ def test_round_trips(model, c, dtype):
 
 @pytest.mark.parametrize(("model", "c"), CASES)
 def test_every_pixel_has_one_ray_or_is_not_valid(model, c):
-    """From pixels of a wide area: what is valid comes back, what is not stays finite, and both have gradients."""
+    """From pixels of a wide area: what is valid comes back, what is not stays finite, and both have
+    gradients.
+    """
     xy_d = (torch.rand(2000, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 0.5) * 8
     xy_d[0], xy_d[1] = torch.nan, torch.inf
     xy_d.requires_grad_()
@@ -193,7 +204,9 @@ def test_every_pixel_has_one_ray_or_is_not_valid(model, c):
 
 @pytest.mark.parametrize(("model", "c"), CASES)
 def test_gradients_are_finite_everywhere(model, c):
-    X = torch.cat([directions(300), torch.tensor([[0, 0, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [0, -1e-200, -1]])])
+    X = torch.cat(
+        [directions(300), torch.tensor([[0, 0, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [0, -1e-200, -1]])]
+    )
     X = X.double().requires_grad_()
     coefficients = torch.tensor(c, dtype=torch.float64, requires_grad=True)
     xy_d, valid = lens(model, coefficients).project(X)
@@ -206,7 +219,9 @@ def test_gradients_are_finite_everywhere(model, c):
 
 @pytest.mark.parametrize(("model", "c"), CASES)
 def test_derivatives(model, c):
-    X = torch.tensor([[0.2, -0.1, 1.0], [0.5, 0.6, 0.9], [1e-3, 0.0, 2.0]], dtype=torch.float64, requires_grad=True)
+    X = torch.tensor(
+        [[0.2, -0.1, 1.0], [0.5, 0.6, 0.9], [1e-3, 0.0, 2.0]], dtype=torch.float64, requires_grad=True
+    )
     low = torch.tensor(c, dtype=torch.float64)
     at_bound = model != "thin-prism-fisheye" and model != "scaramuzza" and any(v in (0.0, 1.0) for v in c)
     coefficients = low.clone().requires_grad_(not at_bound)
@@ -266,10 +281,14 @@ def test_coefficients_that_are_no_lens_see_nothing(model, c):
 
 @pytest.mark.parametrize(("model", "c"), CASES)
 def test_curved_fields_hold_the_points_that_beta_sees(model, c):
-    """Points along rays of alpha, projected explicitly with the tool's formula, lie at the field's positions."""
+    """Points along rays of alpha, projected explicitly with the tool's formula, lie at the field's
+    positions.
+    """
     view = {"hw": (60, 80), "distortion": lens(model, c)}
     K = intrinsics(24.0, (60, 80))
-    beta = Pose.from_centre(torch.eye(3, dtype=torch.float64), torch.tensor([0.4, 0.1, 0.0], dtype=torch.float64))
+    beta = Pose.from_centre(
+        torch.eye(3, dtype=torch.float64), torch.tensor([0.4, 0.1, 0.0], dtype=torch.float64)
+    )
     rig = Rig(
         {
             "alpha": Camera(K=K, cam_from_world=Pose.identity(), **view),

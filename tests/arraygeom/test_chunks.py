@@ -65,7 +65,9 @@ def test_parts_lie_in_memory_as_the_whole_would():
 @pytest.mark.parametrize("axis", [-2, (-2, -1)])
 def test_gradients_pass_through(axis):
     image, scale = IMAGE[:1, :1, :6, :5].clone().requires_grad_(), torch.tensor(0.7).double().requires_grad_()
-    assert gradcheck(lambda x, s: chunked(lambda part: blurred(part * s), x, rows=2, halo=2, axis=axis), (image, scale))
+    assert gradcheck(
+        lambda x, s: chunked(lambda part: blurred(part * s), x, rows=2, halo=2, axis=axis), (image, scale)
+    )
 
 
 def test_transformations_pass_through():

@@ -148,7 +148,9 @@ def test_degenerate_rigs_give_finite_values_and_gradients(lens, centre, turned):
     changes = rig.parameters(free=["*.rotation", "*.translation", "*.focal", "*.centre", "depth.near"])
     for dtype in (torch.float32, torch.float64):
         p = sampling_locations(
-            Curved(16), rig.perturbed(changes).pair("alpha", "beta"), pixel_grid((48, 64), dtype=dtype)[::4, 1::4]
+            Curved(16),
+            rig.perturbed(changes).pair("alpha", "beta"),
+            pixel_grid((48, 64), dtype=dtype)[::4, 1::4],
         )
         assert p.xy.isfinite().all()
         slopes = torch.autograd.grad(p.xy.sum(), list(changes.values()), allow_unused=True)

@@ -43,18 +43,29 @@ def test_deep_nesting_never_reaches_opencv(text, tmp_path):
 
 def test_a_matrix_that_claims_a_size_takes_no_memory(tmp_path):
     pytest.importorskip("cv2")
-    text = "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 20000\n   cols: 20000\n   dt: d\n   data: [1]\n"
+    text = (
+        "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 20000\n   cols: 20000\n   dt: d\n   "
+        "data: [1]\n"
+    )
     (tmp_path / "a.yml").write_text(text)
     with pytest.raises(RigFileError, match="cameraMatrix"):
         read_rig(tmp_path / "a.yml", format="opencv")
 
 
 def struct_file(path: Path, *, compressed: bool) -> bytes:
-    camera = {"IntrinsicMatrix": np.array([[800.0, 0, 0], [0, 800, 0], [320, 200, 1]]), "ImageSize": [400.0, 640.0]}
+    camera = {
+        "IntrinsicMatrix": np.array([[800.0, 0, 0], [0, 800, 0], [320, 200, 1]]),
+        "ImageSize": [400.0, 640.0],
+    }
     camera["RadialDistortion"] = np.array([0.1, 0.01])
     pair = {"CameraParameters1": camera, "CameraParameters2": camera, "WorldUnits": "mm"}
     pair |= {"RotationOfCamera2": np.eye(3), "TranslationOfCamera2": np.array([-100.0, 0, 0])}
-    others = {"empty": np.zeros((0, 3)), "cells": np.array([1, "b"], object), "z": np.array([1 + 2j]), "t": ["a", "bc"]}
+    others = {
+        "empty": np.zeros((0, 3)),
+        "cells": np.array([1, "b"], object),
+        "z": np.array([1 + 2j]),
+        "t": ["a", "bc"],
+    }
     pytest.importorskip("scipy.io").savemat(path, {"s": pair, **others}, do_compression=compressed)
     return path.read_bytes()
 
@@ -70,7 +81,9 @@ def test_damaged_mat_files_are_read_or_refused(compressed, tmp_path):
     for seed in range(200):
         source, content = random.Random(seed), bytearray(whole)
         for _ in range(source.choice([1, 1, 2, 4, 8])):
-            content[source.randrange(128, len(content))] = source.choice([0, 255, 127, 1, source.randrange(256)])
+            content[source.randrange(128, len(content))] = source.choice(
+                [0, 255, 127, 1, source.randrange(256)]
+            )
         path.write_bytes(content[: source.choice([len(content), source.randrange(len(content))])])
         try:
             Rig.load(path)
@@ -136,7 +149,8 @@ def test_a_megabyte_of_repeated_entries_is_refused_at_once(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "camera", [f"size: [640, 480], K: {[[1 / 3] * 3, [2 / 3] * 3, ['x'] * 3]}", f"size: {[1 / 3] * 3 + ['x'] * 900}"]
+    "camera",
+    [f"size: [640, 480], K: {[[1 / 3] * 3, [2 / 3] * 3, ['x'] * 3]}", f"size: {[1 / 3] * 3 + ['x'] * 900}"],
 )
 def test_a_message_shows_a_value_in_short(camera, tmp_path):
     with pytest.raises(RigFileError) as caught:

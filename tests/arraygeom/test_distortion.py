@@ -18,7 +18,12 @@ cv2 = Oracle("cv2")
 
 FOCAL = 1000.0
 BROWN = [-0.3, 0.12, 1e-3, -2e-3, -0.02, 0.01, 0.02, -3e-3, 1e-3, -2e-3, 1.5e-3, 7e-4, 0.03, -0.05]
-FISHEYES = [[0.05, -0.01, 0.003, -0.0005], [0.0, 0, 0, 0], [-0.04, -0.009, 0.009, -0.004], [0.3, 0.2, 0.1, 0.05]]
+FISHEYES = [
+    [0.05, -0.01, 0.003, -0.0005],
+    [0.0, 0, 0, 0],
+    [-0.04, -0.009, 0.009, -0.004],
+    [0.3, 0.2, 0.1, 0.05],
+]
 COUNTS = [4, 5, 8, 12, 14]
 
 
@@ -128,7 +133,9 @@ def test_past_the_turn_is_invalid_and_bounded():
 
 
 def test_a_second_rise_is_not_valid():
-    """k1 = -1, k2 = 0.3: falls between r^2 = 0.46 and 1.4 and rises again beyond; only the first rise counts."""
+    """k1 = -1, k2 = 0.3: falls between r^2 = 0.46 and 1.4 and rises again beyond; only the first rise
+    counts.
+    """
     d = Distortion("brown-conrady", torch.tensor([-1, 0.3, 0, 0], dtype=torch.float64))
     _, valid = d.distort(torch.tensor([[0.6, 0.0], [1.0, 0.0], [2.0, 0.0]], dtype=torch.float64))
     assert valid.tolist() == [True, False, False]
@@ -150,7 +157,9 @@ def test_tangential_fold_is_invalid():
 
 
 def test_points_behind_a_perspective_camera_are_invalid():
-    X = torch.tensor([[0.1, 0.1, 1], [0.1, 0.1, 0], [0.1, 0.1, -1], [0, 0, 0], [1, 0, 1e-9]], dtype=torch.float64)
+    X = torch.tensor(
+        [[0.1, 0.1, 1], [0.1, 0.1, 0], [0.1, 0.1, -1], [0, 0, 0], [1, 0, 1e-9]], dtype=torch.float64
+    )
     xy_d, valid = brown().project(X)
     assert valid.tolist() == [True, False, False, False, False]
     assert bool(xy_d.isfinite().all())
@@ -233,7 +242,9 @@ def test_fisheye_derivatives_beyond_90_degrees():
 
 @pytest.mark.parametrize("d", [brown(), fisheye(FISHEYES[0])], ids=lambda d: d.model)
 def test_gradients_are_finite_where_points_are_not_valid(d):
-    X = torch.tensor([[0, 0, -1], [0, 0, 0], [50, 0, 1e-3], [1, 1, -1], [torch.nan, 0, 1]], dtype=torch.float64)
+    X = torch.tensor(
+        [[0, 0, -1], [0, 0, 0], [50, 0, 1e-3], [1, 1, -1], [torch.nan, 0, 1]], dtype=torch.float64
+    )
     c = d.coefficients.clone().requires_grad_()
     lens, X = Distortion(d.model, c), X.requires_grad_()
     xy_d, _ = lens.project(X)
@@ -282,7 +293,9 @@ def test_what_does_not_exist_is_refused():
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_the_inverse_of_any_fisheye_is_right_or_invalid(dtype):
-    """Newton's steps inside a bracket can cycle: 5 of 3,000 such lenses were off by up to 1.8 rad, and valid."""
+    """Newton's steps inside a bracket can cycle: 5 of 3,000 such lenses were off by up to 1.8 rad, and
+    valid.
+    """
     g = torch.Generator().manual_seed(0)
     k = (torch.rand(3000, 4, generator=g, dtype=torch.float64) * 2 - 1) * 0.05
     lenses = Distortion("kannala-brandt", k.to(dtype))

@@ -1,4 +1,6 @@
-"""Halves, huge numbers, empty sets, lenses that are none, epipoles, caches: right formulas, awkward numbers."""
+"""Halves, huge numbers, empty sets, lenses that are none, epipoles, caches: right formulas, awkward
+numbers.
+"""
 
 import dataclasses
 
@@ -50,8 +52,12 @@ def bent() -> Rig:
     return Rig({name: rig[name].replace(distortion=LENS) for name in rig.names}, depth=rig.depth)
 
 
-LENSES = {name: Distortion(name, torch.full((counts[0],), 0.01)) for name, counts in COEFFICIENT_COUNTS.items()}
-LENSES |= {name: model.to(torch.float32) for name, (model, _) in MODELS.items() if model.central and name != "own"}
+LENSES = {
+    name: Distortion(name, torch.full((counts[0],), 0.01)) for name, counts in COEFFICIENT_COUNTS.items()
+}
+LENSES |= {
+    name: model.to(torch.float32) for name, (model, _) in MODELS.items() if model.central and name != "own"
+}
 
 
 @pytest.mark.parametrize("model", LENSES)
@@ -129,7 +135,9 @@ def test_alpha_is_left_right_or_either():
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_there_is_no_line_on_the_epipole_nor_of_zero(dtype):
-    F = torch.tensor([[0.0, -1e-3, 0.02], [1e-3, 0, -0.031], [-0.02, 0.031, 0]], dtype=dtype)  # [e]x: e at (31, 20)
+    F = torch.tensor(
+        [[0.0, -1e-3, 0.02], [1e-3, 0, -0.031], [-0.02, 0.031, 0]], dtype=dtype
+    )  # [e]x: e at (31, 20)
     views = {"a": View(hw=(48, 64)), "b": View(hw=(40, 60))}
     pair = Rig(views, links={("a", "b"): Link(F)}).pair("a", "b")
     nothing = Rig(views, links={("a", "b"): Link(torch.zeros_like(F))}).pair("a", "b")
@@ -144,7 +152,10 @@ def test_there_is_no_line_on_the_epipole_nor_of_zero(dtype):
 @pytest.mark.parametrize("lens", ["brown-conrady", "kannala-brandt"])
 def test_gradients_of_curves_by_betas_lens_are_those_of_differences(lens):
     """Of the function as it is computed: where its nodes lie depends on the lens too."""
-    rig, c = random_rig(2), LENS.coefficients if lens == "brown-conrady" else torch.tensor([0.05, -0.01, 2e-3, -1e-3])
+    rig, c = (
+        random_rig(2),
+        LENS.coefficients if lens == "brown-conrady" else torch.tensor([0.05, -0.01, 2e-3, -1e-3]),
+    )
     x, c = WHOLE.double().reshape(-1, 2), c.double()
 
     def positions(c):
@@ -160,7 +171,9 @@ def test_gradients_of_curves_by_betas_lens_are_those_of_differences(lens):
 
 
 def test_a_displacement_follows_its_pair():
-    """Steps in place, inference mode and export do not leave a former answer, nor one that gradients cannot use."""
+    """Steps in place, inference mode and export do not leave a former answer, nor one that gradients cannot
+    use.
+    """
     rig = pinholes()
     K = rig["beta"].K.clone()
     pair = dataclasses.replace(rig.pair("alpha", "beta"), beta=rig["beta"].replace(K=K))
@@ -221,7 +234,9 @@ def in_utm(rig: Rig) -> Rig:
 
 @pytest.mark.parametrize("rig", [pinholes(), bent()], ids=["pinholes", "lenses"])
 def test_rigs_in_map_coordinates_are_right_or_refused(rig):
-    """To a hundredth of a pixel in float64, whatever the pixels' type; float32 would hold the poses to half a metre."""
+    """To a hundredth of a pixel in float64, whatever the pixels' type; float32 would hold the poses to half a
+    metre.
+    """
     here, there = (r.pair("alpha", "beta") for r in (rig, in_utm(rig)))
     for dtype in (F64, torch.float32):
         x = torch.tensor([[20.0, 12.0], [31.0, 25.0]], dtype=dtype)
@@ -232,11 +247,15 @@ def test_rigs_in_map_coordinates_are_right_or_refused(rig):
             assert float((one.xy - other.xy).abs().max()) < 0.01
         assert x.dtype == one.xy.dtype
     X = torch.tensor([[0.1, 0.2, 4.0]], dtype=F64)
-    pixels = [torch.stack([c.project(X + FAR_ORIGIN).x for c in there.cameras]).to(t) for t in (F64, torch.float32)]
+    pixels = [
+        torch.stack([c.project(X + FAR_ORIGIN).x for c in there.cameras]).to(t) for t in (F64, torch.float32)
+    ]
     for x in pixels:
         assert float((triangulate(there.cameras, x).X - FAR_ORIGIN - X).abs().max()) < 1e-3
     single = in_utm(rig).to(torch.float32).pair("alpha", "beta")
-    with pytest.raises(ValueError, match=r"m from the origin, which float32 holds to 0\.[3-6] m: give float64"):
+    with pytest.raises(
+        ValueError, match=r"m from the origin, which float32 holds to 0\.[3-6] m: give float64"
+    ):
         default_field(single)(single, torch.tensor([[20.0, 12.0]]))
     camera = there.cameras[0]
     with pytest.raises(ValueError, match="put the origin near the cameras"):

@@ -117,7 +117,9 @@ def test_depth_of_a_point_beside_the_track_is_that_of_its_foot():
     pair = rig.pair("alpha", "beta")
     lines = epipolar_lines(pair.fundamental, x_alpha)
     path = track(pair.alpha.K, pair.beta.K, pair.beta_from_alpha, x_alpha)
-    torch.testing.assert_close(depth_from_track(path, x_beta + 3 * lines[:, :2]).depth, depth, rtol=1e-7, atol=0)
+    torch.testing.assert_close(
+        depth_from_track(path, x_beta + 3 * lines[:, :2]).depth, depth, rtol=1e-7, atol=0
+    )
 
 
 def test_the_deviation_of_depth_is_what_moving_the_point_gives():
@@ -135,7 +137,9 @@ def test_the_deviation_of_depth_is_what_moving_the_point_gives():
 
     g = torch.Generator().manual_seed(0)
     noise = 0.05 * torch.randn(20000, 1, 2, generator=g, dtype=torch.float64)
-    spread = depth_from_track(track(pair.alpha.K, pair.beta.K, pair.beta_from_alpha, x_alpha[:5]), x_beta[:5] + noise)
+    spread = depth_from_track(
+        track(pair.alpha.K, pair.beta.K, pair.beta_from_alpha, x_alpha[:5]), x_beta[:5] + noise
+    )
     torch.testing.assert_close(spread.depth.std(0), 50 * stated[:5], rtol=0.05, atol=0)
 
 
@@ -195,7 +199,9 @@ def test_clipped_segments_hold_all_that_is_visible_and_no_more(seed, turn):
     assert (fraction[visible] >= -1e-6).all()
     assert (fraction <= length.square() + 1e-6)[visible].all()
     off = (
-        xy - segments.start - (fraction / length.square().clamp(min=1e-9))[..., None] * (segments.end - segments.start)
+        xy
+        - segments.start
+        - (fraction / length.square().clamp(min=1e-9))[..., None] * (segments.end - segments.start)
     )
     long = length.expand(visible.shape) > 1e-3
     assert off[visible & long].abs().max() < 1e-6 if (visible & long).any() else True

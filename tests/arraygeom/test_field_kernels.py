@@ -78,7 +78,9 @@ def test_where_a_gradient_is_asked_for_the_formulas_are_used():
     assert x.grad.abs().max() > 1
 
 
-@pytest.mark.parametrize("field", [NearestVoxels(24, 12), NearestVoxels(96, 80), NearestVoxels(200, 5)], ids=repr)
+@pytest.mark.parametrize(
+    "field", [NearestVoxels(24, 12), NearestVoxels(96, 80), NearestVoxels(200, 5)], ids=repr
+)
 @pytest.mark.parametrize("seed", range(3))
 def test_nearest_pixels_are_those_of_the_readable_form(field, seed, monkeypatch):
     pair = random_rig(seed, turn=0.4).pair("alpha", "beta")

@@ -49,7 +49,8 @@ def by_link(pair: Pair) -> Pair:
     return Pair(View(hw=pair.alpha.hw), View(hw=pair.beta.hw), None, link)
 
 
-# ------------------------------------------------------------------ they hold what is seen, and are on the line
+# ------------------------------------------------------------------ they hold what is seen, and are on the
+# line
 
 
 @pytest.mark.parametrize("field", STRAIGHT, ids=ids)
@@ -125,7 +126,8 @@ def test_the_covering_displacement_covers_and_is_the_least():
     assert ends.max() == pytest.approx(disparity.item(), abs=1e-9)
 
 
-# --------------------------------------------------------------------------------------- rectified, local, dense
+# --------------------------------------------------------------------------------------- rectified, local,
+# dense
 
 
 @pytest.mark.parametrize("side", ["left", "right", "either"])
@@ -133,7 +135,9 @@ def test_rectified_runs(side):
     pair = Pair(View(hw=(4, 20)), View(hw=(4, 20)))
     x = torch.tensor([[10.0, 2.0], [3.0, 0.0]])
     s = Rectified(5.0, alpha_is=side)(pair, x)
-    expected = {"left": [(5, 10), (-0.5, 3)], "right": [(15, 10), (8, 3)], "either": [(5, 15), (-0.5, 8)]}[side]
+    expected = {"left": [(5, 10), (-0.5, 3)], "right": [(15, 10), (8, 3)], "either": [(5, 15), (-0.5, 8)]}[
+        side
+    ]
     assert s.start[:, 0].tolist() == [e[0] for e in expected]
     assert s.end[:, 0].tolist() == [e[1] for e in expected]
     assert s.start[:, 1].tolist() == [2.0, 0.0]
@@ -166,7 +170,8 @@ def test_local_and_dense_sample_where_they_say():
     assert Dense(4)(pair, x).xy[0].tolist() == pixel_grid(pair.beta.hw)[::4, ::4].reshape(-1, 2).tolist()
 
 
-# ------------------------------------------------------------------------------------------------ nearest voxels
+# ------------------------------------------------------------------------------------------------ nearest
+# voxels
 
 
 def pixel_by_pixel(line: np.ndarray, centre: np.ndarray, hw: tuple[int, int], count: int, window: int) -> set:
@@ -179,7 +184,9 @@ def pixel_by_pixel(line: np.ndarray, centre: np.ndarray, hw: tuple[int, int], co
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("field", [NearestVoxels(24, 12), NearestVoxels(96, 80), NearestVoxels(200, 5)], ids=ids)
+@pytest.mark.parametrize(
+    "field", [NearestVoxels(24, 12), NearestVoxels(96, 80), NearestVoxels(200, 5)], ids=ids
+)
 def test_nearest_voxels_are_those_found_pixel_by_pixel(field, seed):
     pair = pair_of(random_rig(seed, turn=0.4))
     x = pixel_grid(pair.alpha.hw, dtype=torch.float64)[3::14, 5::16].reshape(-1, 2)
@@ -187,7 +194,9 @@ def test_nearest_voxels_are_those_found_pixel_by_pixel(field, seed):
     lines = epipolar_lines(pair.fundamental, x)
     centre, placed = apply_homography(pair.homography, x)
     for i in range(len(x)):
-        expected = pixel_by_pixel(lines[i].numpy(), centre[i].numpy(), pair.beta.hw, field.count, field.window)
+        expected = pixel_by_pixel(
+            lines[i].numpy(), centre[i].numpy(), pair.beta.hw, field.count, field.window
+        )
         expected = expected if placed[i] else []
         found = positions.xy[i][positions.mask[i]]
         assert len({tuple(p) for p in found.tolist()}) == len(found) == len(expected)
@@ -208,7 +217,8 @@ def test_nearest_voxels_take_ties_by_row():
     assert sorted(found.xy[0].tolist()) == [[float(c), 4.0] for c in range(9)]
 
 
-# -------------------------------------------------------------------------------------------- shapes and batches
+# -------------------------------------------------------------------------------------------- shapes and
+# batches
 
 
 @pytest.mark.parametrize("field", ALL, ids=ids)
@@ -235,7 +245,9 @@ def batch_of(rigs: list[Rig]) -> Rig:
     return Rig({n: stacked(n) for n in rigs[0].names}, depth=depth)
 
 
-@pytest.mark.parametrize("field", [Epipolar(), EpipolarLine(), HomographyDisplacement(8.0), Local(3)], ids=ids)
+@pytest.mark.parametrize(
+    "field", [Epipolar(), EpipolarLine(), HomographyDisplacement(8.0), Local(3)], ids=ids
+)
 def test_batched_rigs_agree_with_single_ones(field):
     rigs = [random_rig(i, near=1.0 + i) for i in range(3)]
     together = sampling_locations(field, pair_of(batch_of(rigs)))
@@ -270,12 +282,15 @@ def test_lenses_and_missing_calibration_are_refused():
         sampling_locations(Epipolar(), pair_of(random_rig(1).replace(depth=None)))
 
 
-# ----------------------------------------------------------------------------------------------------- gradients
+# -----------------------------------------------------------------------------------------------------
+# gradients
 
 
 def geometry(rig: Rig) -> list[torch.Tensor]:
     """Everything a calibrated pair is made of: K, rotation vector, t of both cameras, near and far."""
-    numbers = [v for c in (rig["alpha"], rig["beta"]) for v in (c.K, torch.zeros(3, dtype=torch.float64), c.t)]
+    numbers = [
+        v for c in (rig["alpha"], rig["beta"]) for v in (c.K, torch.zeros(3, dtype=torch.float64), c.t)
+    ]
     return [v.detach().clone().requires_grad_() for v in (*numbers, *rig.depth)]
 
 
@@ -298,7 +313,11 @@ def test_gradients_in_every_rig_parameter(field):
     numbers = geometry(rig)
     assert ends(field, rig, x, numbers).numel() >= 8
     assert torch.autograd.gradcheck(
-        lambda *n: ends(field, rig, x, n), numbers, atol=1e-4, rtol=1e-4, fast_mode=field == HomographyDisplacement()
+        lambda *n: ends(field, rig, x, n),
+        numbers,
+        atol=1e-4,
+        rtol=1e-4,
+        fast_mode=field == HomographyDisplacement(),
     )
 
 
@@ -323,7 +342,8 @@ def test_gradients_of_an_uncalibrated_pair():
     assert torch.autograd.gradcheck(found, inputs, atol=1e-4, rtol=1e-4)
 
 
-# ----------------------------------------------------------------------------------------------- degenerate rigs
+# ----------------------------------------------------------------------------------------------- degenerate
+# rigs
 
 
 INFINITE = float("inf")
@@ -340,7 +360,9 @@ DEGENERATE = {
     "beta beyond the scene": two_cameras(centre=(0, 0, 20.0)),
     "beta among the scene": two_cameras(centre=(0.2, 0, 3.0), depth=(0.5, INFINITE)),
     "looking away": two_cameras(half_rotation()),
-    "sideways": two_cameras(rotation_from_vector(torch.tensor([0.0, 1.4, 0], dtype=torch.float64)), centre=(1.0, 0, 1)),
+    "sideways": two_cameras(
+        rotation_from_vector(torch.tensor([0.0, 1.4, 0], dtype=torch.float64)), centre=(1.0, 0, 1)
+    ),
     "far is infinite": two_cameras(centre=(0.3, 0.1, 0), depth=(0.5, INFINITE)),
 }
 
@@ -352,7 +374,9 @@ def test_degenerate_rigs_give_finite_values_and_gradients(case, field, dtype):
     rig = DEGENERATE[case].to(dtype)
     names = ["*.rotation", "*.translation", "*.focal", "*.centre", "depth.near"]
     changes = rig.parameters(free=names)
-    found = sampling_locations(field, pair_of(rig.perturbed(changes)), pixel_grid((48, 64), dtype=dtype)[::2, 1::2])
+    found = sampling_locations(
+        field, pair_of(rig.perturbed(changes)), pixel_grid((48, 64), dtype=dtype)[::2, 1::2]
+    )
     values = [v for v in vars(found).values() if v.dtype.is_floating_point]
     assert all(v.isfinite().all() for v in values)
     total = sum(v.sum() for v in values)
@@ -376,7 +400,9 @@ def test_pure_rotation_samples_a_point():
     rig = DEGENERATE["pure rotation"]
     s = segments_of("pure rotation")
     assert s.length.max() < 1e-4
-    seen = rig["beta"].project(rig["alpha"].unproject(pixel_grid((48, 64), dtype=torch.float64), torch.ones(48, 64)))
+    seen = rig["beta"].project(
+        rig["alpha"].unproject(pixel_grid((48, 64), dtype=torch.float64), torch.ones(48, 64))
+    )
     inside = seen.valid & rig["beta"].contains(seen.x)
     assert torch.equal(s.valid, inside)
     torch.testing.assert_close(s.start[inside], seen.x[inside].float(), atol=1e-3, rtol=0)
@@ -411,13 +437,16 @@ def test_opposing_cameras_see_only_what_is_between_them():
     assert s.valid.any()
     x = pixel_grid((48, 64), dtype=torch.float64)
     for depth, visible in ((1.0, True), (4.0, True), (6.0, False)):
-        seen = rig["beta"].project(rig["alpha"].unproject(x, torch.full((48, 64), depth, dtype=torch.float64)))
+        seen = rig["beta"].project(
+            rig["alpha"].unproject(x, torch.full((48, 64), depth, dtype=torch.float64))
+        )
         inside = seen.valid & rig["beta"].contains(seen.x)
         assert bool(inside.any()) is visible
         assert s.valid[inside].all()
 
 
-# ---------------------------------------------------------------------------------------- float32 against float64
+# ---------------------------------------------------------------------------------------- float32 against
+# float64
 
 
 def disturbed(rig: Rig, case: int, g: torch.Generator) -> Rig:
@@ -439,7 +468,9 @@ def disturbed(rig: Rig, case: int, g: torch.Generator) -> Rig:
 
 
 def larger(rig: Rig, margin: float) -> Pair:
-    """The pair with beta's image wider by a margin on all sides (in as many pixels), where rounding decides."""
+    """The pair with beta's image wider by a margin on all sides (in as many pixels), where rounding
+    decides.
+    """
     h, w = rig["beta"].hw
     sx, sy = w / (w + 2 * margin), h / (h + 2 * margin)
     A = [[sx, 0, (0.5 + margin) * sx - 0.5], [0, sy, (0.5 + margin) * sy - 0.5], [0, 0, 1]]

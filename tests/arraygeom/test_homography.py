@@ -16,7 +16,11 @@ def scene() -> dict[str, torch.Tensor]:
     def rand(*shape: int) -> torch.Tensor:
         return torch.rand(*shape, generator=g, dtype=torch.float64) - 0.5
 
-    K = torch.tensor([[400.0, 0, 150], [0, 420, 110], [0, 0, 1]], dtype=torch.float64).expand(2, 5, 3, 3).clone()
+    K = (
+        torch.tensor([[400.0, 0, 150], [0, 420, 110], [0, 0, 1]], dtype=torch.float64)
+        .expand(2, 5, 3, 3)
+        .clone()
+    )
     K[1, :, 0, 0] += 300 * rand(5)
     rotations = np.stack([cv2.Rodrigues(0.3 * v.numpy())[0] for v in rand(5, 3)])
     normal = torch.tensor([0.0, 0, 1], dtype=torch.float64) + 0.4 * rand(5, 3)

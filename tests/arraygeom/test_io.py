@@ -82,8 +82,13 @@ def test_single_cameras(file):
 
 
 def test_kitti_rectified():
-    """P1 = K [I | t] with t = (-0.5, 0.01, 0.02): -338 = -0.5 * 700 + 0.02 * 600, 10.4 = 0.01 * 700 + 0.02 * 170."""
-    for file, options in (("kitti_calib.txt", {"hw": (370, 1240)}), ("calib_cam_to_cam.txt", {"format": "kitti"})):
+    """P1 = K [I | t] with t = (-0.5, 0.01, 0.02): -338 = -0.5 * 700 + 0.02 * 600, 10.4 = 0.01 * 700 + 0.02 *
+    170.
+    """
+    for file, options in (
+        ("kitti_calib.txt", {"hw": (370, 1240)}),
+        ("calib_cam_to_cam.txt", {"format": "kitti"}),
+    ):
         rig = read_rig(FIXTURES / file, **options)
         assert rig.names == ("cam0", "cam1")
         assert rig["cam0"].t.tolist() == [0, 0, 0]
@@ -203,7 +208,9 @@ def test_conventions_are_stated():
 def camera(seed: int, lens: Distortion | None = None, hw: tuple[int, int] = (480, 640), **fields) -> Camera:
     generator = torch.Generator().manual_seed(seed)
     u = torch.rand(10, dtype=torch.float64, generator=generator)
-    K = torch.tensor([[400 + u[0], 0, 320 + u[1]], [0, 410 + u[2], 240 - u[3]], [0, 0, 1]], dtype=torch.float64)
+    K = torch.tensor(
+        [[400 + u[0], 0, 320 + u[1]], [0, 410 + u[2], 240 - u[3]], [0, 0, 1]], dtype=torch.float64
+    )
     pose = Pose(rotation_from_vector(6 * u[4:7] - 3), u[7:10] / 3)
     return Camera(K=K, cam_from_world=pose, hw=hw, distortion=lens, **fields)
 
@@ -239,7 +246,10 @@ def assert_same(a: Camera, b: Camera) -> None:
 def test_write_then_read(format, tmp_path):
     kinds = LENSES[: HOLDS[format]]
     rig = Rig({f"view {i}": camera(i, kind, (480 + i, 640)) for i, kind in enumerate(kinds)})
-    path = tmp_path / {"native": "rig.yaml", "colmap": "model", "nerfstudio": "t.json", "kalibr": "chain.yaml"}[format]
+    path = (
+        tmp_path
+        / {"native": "rig.yaml", "colmap": "model", "nerfstudio": "t.json", "kalibr": "chain.yaml"}[format]
+    )
     write_rig(rig, path, format=format)
     assert recognise(path) == format
     again = read_rig(path)
@@ -301,7 +311,13 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path):
 
 def test_what_cameras_record_comes_back(tmp_path):
     raw = Sensor(
-        response="rgb", coding="linear", bayer="GBRG", bits=12, black_level=64.0, exposure=0.0018, gain=(1.9, 1.0, 1.4)
+        response="rgb",
+        coding="linear",
+        bayer="GBRG",
+        bits=12,
+        black_level=64.0,
+        exposure=0.0018,
+        gain=(1.9, 1.0, 1.4),
     )
     slow = Sensor(frame_rate=30.0, time_offset=-0.004, gain=2.5)
     rig = Rig({"raw": View(hw=(4, 6), sensor=raw), "slow": View(hw=(4, 6), sensor=slow)})
@@ -353,7 +369,9 @@ def test_an_image_upside_down_survives_the_native_file(tmp_path):
 def test_lenses_of_uncalibrated_cameras_come_back(tmp_path):
     lens = Distortion("brown-conrady", torch.tensor([-0.05, 0.01, 1e-3, -2e-3], dtype=torch.float64))
     views = {
-        "a": LensView(hw=(400, 640), K=intrinsics(320.0, (400, 640)), distortion=lens, sensor=Sensor(response="rgb")),
+        "a": LensView(
+            hw=(400, 640), K=intrinsics(320.0, (400, 640)), distortion=lens, sensor=Sensor(response="rgb")
+        ),
         "b": View(hw=(400, 640)),
     }
     F = torch.tensor([[0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
@@ -372,13 +390,19 @@ def test_lenses_of_uncalibrated_cameras_come_back(tmp_path):
 def test_a_lens_without_focal_length_states_its_scale(tmp_path):
     path = tmp_path / "rig.yaml"
     text = "first_pixel_centre: 1\ncameras:\n  a:\n    size: [640, 400]\n    distortion: "
-    path.write_text(text + "{model: brown-conrady, coefficients: [0.1, 0, 0, 0], scale: 320, centre: [321, 201]}\n")
+    path.write_text(
+        text + "{model: brown-conrady, coefficients: [0.1, 0, 0, 0], scale: 320, centre: [321, 201]}\n"
+    )
     view = Rig.load(path)["a"]
     assert isinstance(view, LensView)
     assert not isinstance(view, Camera)
-    assert view.distort(torch.tensor([640.0, 200.0], dtype=torch.float64))[0].tolist() == pytest.approx([672, 200])
+    assert view.distort(torch.tensor([640.0, 200.0], dtype=torch.float64))[0].tolist() == pytest.approx(
+        [672, 200]
+    )
     path.write_text(text + "{model: brown-conrady, coefficients: [0.1, 0, 0, 0]}\n")
-    with pytest.raises(RigFileError, match=r"cameras\.a\.distortion: is of a camera without 'focal'.*`scale`"):
+    with pytest.raises(
+        RigFileError, match=r"cameras\.a\.distortion: is of a camera without 'focal'.*`scale`"
+    ):
         Rig.load(path)
     path.write_text(text + "{model: brown-conrady, coefficients: [0.1, 0, 0, 0], scale: -3}\n")
     with pytest.raises(RigFileError, match=r"distortion\.scale: is -3; a scale is positive"):

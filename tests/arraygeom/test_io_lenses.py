@@ -1,4 +1,6 @@
-"""Rig files with wide lenses: pixels of world points against each tool's own formula, in numpy and its own pixels."""
+"""Rig files with wide lenses: pixels of world points against each tool's own formula, in numpy and its own
+pixels.
+"""
 
 import json
 
@@ -85,13 +87,19 @@ def test_mrcals_sphere(tmp_path):
 
 REALSENSE = {
     "Modified Brown Conrady": ("-0.2  \t0.1  \t0  \t0  \t0.01", "brown-conrady", [-0.2, 0.1, 0, 0, 0.01]),
-    "Kannala Brandt4": ("0.1  \t-0.02  \t0.003  \t-0.004  \t0", "kannala-brandt", [0.1, -0.02, 0.003, -0.004]),
+    "Kannala Brandt4": (
+        "0.1  \t-0.02  \t0.003  \t-0.004  \t0",
+        "kannala-brandt",
+        [0.1, -0.02, 0.003, -0.004],
+    ),
 }
 
 
 @pytest.mark.parametrize(("kind", "case"), REALSENSE.items(), ids=list(REALSENSE))
 def test_realsenses_other_lenses(kind, case, tmp_path):
-    """Fisheyes are printed with a fifth number; without tangential terms the modified model is the plain one."""
+    """Fisheyes are printed with a fifth number; without tangential terms the modified model is the plain
+    one.
+    """
     text = (FIXTURES / "realsense.txt").read_text().replace("-0.2  \t0.1  \t0.001  \t-0.002  \t0", case[0])
     (tmp_path / "camera.txt").write_text(
         text.replace("404\n  Distortion: \tBrown Conrady", f"404\n  Distortion: \t{kind}")
@@ -108,7 +116,10 @@ def test_zeds_rows_are_those_that_the_makers_code_makes():
     R1, R2, P1, P2 = cv2.stereoRectify(K[0], ZED_C[0], K[1], ZED_C[1], (1280, 720), R, t)[:4]
     rows = [
         cv2.undistortPoints(pixels(rig, name, POINTS)[:, None], *camera)[:, 0, 1]
-        for name, camera in (("left", (K[0], ZED_C[0], None, R1, P1)), ("right", (K[1], ZED_C[1], None, R2, P2)))
+        for name, camera in (
+            ("left", (K[0], ZED_C[0], None, R1, P1)),
+            ("right", (K[1], ZED_C[1], None, R2, P2)),
+        )
     ]
     np.testing.assert_allclose(*rows, atol=0.01)
     assert rig["right"].centre[0] == pytest.approx(0.12, abs=1e-3)
@@ -188,7 +199,11 @@ def test_metashape():
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('<calibration type="fisheye"', '<calibration type="equisolid_fisheye"', "type 'equisolid_fisheye'; frame and"),
+        (
+            '<calibration type="fisheye"',
+            '<calibration type="equisolid_fisheye"',
+            "type 'equisolid_fisheye'; frame and",
+        ),
         ("<p2>-0.002</p2>", "<p2>-0.002</p2><p3>0.1</p3>", "optimise the cameras without them"),
         ("<f>500</f>", "", "sensor 0: has no f"),
         ("<f>500</f>", "<f>five</f>", "sensor 0 f: holds something other than numbers"),
@@ -241,7 +256,11 @@ def bouguet_pixels(X, fc, cc, alpha, kc):
     return np.stack([fc[0] * (xd + alpha * yd) + cc[0], fc[1] * yd + cc[1]], -1)
 
 
-BOUGUET = {"fc": [[800.0], [802.0]], "cc": [[320.5], [238.0]], "kc": [[-0.2], [0.1], [0.001], [-0.002], [0.01]]}
+BOUGUET = {
+    "fc": [[800.0], [802.0]],
+    "cc": [[320.5], [238.0]],
+    "kc": [[-0.2], [0.1], [0.001], [-0.002], [0.01]],
+}
 
 
 def test_bouguets_results(tmp_path):
@@ -267,8 +286,12 @@ def test_bouguets_results(tmp_path):
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     R = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
     right = POINTS @ R.T + [-0.1, 0.002, 0.001]
-    np.testing.assert_allclose(pixels(rig, "right", POINTS), bouguet_pixels(right, *flat[:2], 0.0, flat[2]), atol=1e-9)
-    savemat(tmp_path / "Calib_Results.mat", {**BOUGUET, "alpha_c": 0.0, "nx": 640, "ny": 480, "KK": np.eye(3)})
+    np.testing.assert_allclose(
+        pixels(rig, "right", POINTS), bouguet_pixels(right, *flat[:2], 0.0, flat[2]), atol=1e-9
+    )
+    savemat(
+        tmp_path / "Calib_Results.mat", {**BOUGUET, "alpha_c": 0.0, "nx": 640, "ny": 480, "KK": np.eye(3)}
+    )
     one = read_rig(tmp_path / "Calib_Results.mat")
     assert (one.names, one["camera"].hw) == (("camera",), (480, 640))
     np.testing.assert_allclose(
@@ -287,7 +310,15 @@ def test_a_rotation_vector_of_no_rotation(tmp_path):
 
 def test_nerfstudios_fisheye(tmp_path):
     """OPENCV_FISHEYE is Kannala-Brandt's; pixels with the first centre at 0.5, OpenGL axes, camera->world."""
-    fields = {"camera_model": "OPENCV_FISHEYE", "fl_x": 300, "fl_y": 301, "cx": 320, "cy": 240, "w": 640, "h": 480}
+    fields = {
+        "camera_model": "OPENCV_FISHEYE",
+        "fl_x": 300,
+        "fl_y": 301,
+        "cx": 320,
+        "cy": 240,
+        "w": 640,
+        "h": 480,
+    }
     fields |= {"k1": 0.05, "k2": -0.01, "k3": 0.003, "k4": -5e-4}
     matrix = [[1, 0, 0, 0.1], [0, -1, 0, 0.2], [0, 0, -1, 0.3], [0, 0, 0, 1]]
     fields["frames"] = [{"file_path": "a.png", "transform_matrix": matrix}]
@@ -297,7 +328,9 @@ def test_nerfstudios_fisheye(tmp_path):
     theta = np.arctan2(r, X[:, 2])
     radius = theta * (1 + 0.05 * theta**2 - 0.01 * theta**4 + 0.003 * theta**6 - 5e-4 * theta**8)
     expected = X[:, :2] / r[:, None] * radius[:, None] * [300, 301] + [319.5, 239.5]
-    np.testing.assert_allclose(pixels(read_rig(tmp_path / "transforms.json"), "a.png", POINTS), expected, atol=1e-9)
+    np.testing.assert_allclose(
+        pixels(read_rig(tmp_path / "transforms.json"), "a.png", POINTS), expected, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -319,7 +352,12 @@ def test_nerfstudios_fisheye(tmp_path):
             "RAD_TAN_THIN_PRISM_FISHEYE",
             "line 4: has model RAD_TAN.*calibrate with one of",
         ),
-        ("matlab_fisheye.json", "[300.0, ", "[-300.0, ", "MappingCoefficients: begins with -300; it is positive"),
+        (
+            "matlab_fisheye.json",
+            "[300.0, ",
+            "[-300.0, ",
+            "MappingCoefficients: begins with -300; it is positive",
+        ),
         ("matlab_fisheye.json", "[300.0, ", "[", "MappingCoefficients: has 3 numbers, wanted 4"),
     ],
 )

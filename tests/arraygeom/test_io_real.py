@@ -146,7 +146,10 @@ def test_syntim_agrees_with_photographs(shared_data):
     for scene in ("BalMire", "Color", "Sigraph", "Serfaty"):
         images = [next(iter(sorted(folder.glob(f"{scene}{side}_O*.png")))) for side in (0, 1)]
         rig = read_rig(folder / f"cam_{scene}_g")
-        pair = [rig[name].resize(cv2.imread(str(image)).shape[:2]) for name, image in zip(("left", "right"), images)]
+        pair = [
+            rig[name].resize(cv2.imread(str(image)).shape[:2])
+            for name, image in zip(("left", "right"), images)
+        ]
         found.append(float(epipolar_errors(*pair, *matches(*images)).median()))
     assert 0.3 < np.median(found) < 1.2, found
 

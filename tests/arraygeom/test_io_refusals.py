@@ -20,7 +20,9 @@ FIXTURES = Path(__file__).parent / "fixtures"
 
 
 TEXTS = sorted(
-    f for f in FIXTURES.rglob("*") if f.is_file() and f.name not in ("README.md", "frames.txt", "points3D.txt")
+    f
+    for f in FIXTURES.rglob("*")
+    if f.is_file() and f.name not in ("README.md", "frames.txt", "points3D.txt")
 )
 IDS = [str(f.relative_to(FIXTURES)) for f in TEXTS]
 
@@ -70,7 +72,9 @@ def formats(file: Path) -> str:
 
 @pytest.mark.parametrize("file", TEXTS, ids=IDS)
 def test_truncated_files(file, tmp_path):
-    """Cut anywhere: an error in one line, or a rig if what is left is a whole file; never another exception."""
+    """Cut anywhere: an error in one line, or a rig if what is left is a whole file; never another
+    exception.
+    """
     text, format, messages = file.read_bytes(), formats(file), []
     for cut in np.linspace(0, len(text) - 1, 25).astype(int):
         path = copied(file, tmp_path, text[:cut])
@@ -122,7 +126,8 @@ def refusal_of_folder(folder: Path) -> str:
     return str(caught.value)
 
 
-# In every file: camera b's focal length, its name in the messages, and its rotation's or quaternion's first number.
+# In every file: camera b's focal length, its name in the messages, and its rotation's or quaternion's first
+# number.
 FOCAL = {
     "a.cameramodel": "500",
     "cam_syntim_g": "500.000000",
@@ -195,18 +200,43 @@ def test_rotations(name, change, tmp_path):
 
 
 OTHER_MAKERS = {
-    "a circle": ("luxonis.json", '"toCameraSocket": -1', '"toCameraSocket": 1', "the chain of extrinsics is a circle"),
+    "a circle": (
+        "luxonis.json",
+        '"toCameraSocket": -1',
+        '"toCameraSocket": 1',
+        "the chain of extrinsics is a circle",
+    ),
     "in metres": (
         "luxonis.json",
         '"toCameraSocket": 2,',
         '"toCameraSocket": 2, "lengthUnit": 0,',
         r"lengthUnit: is 0; centi",
     ),
-    "a sphere": ("luxonis.json", '"cameraType": 0', '"cameraType": 2', r"cameraType: is 2; perspective \(0\)"),
-    "alone": ("luxonis.json", '"toCameraSocket": 2', '"toCameraSocket": -1', "CAM_C: is related to no camera"),
-    "splines": ("mrcal/b.cameramodel", "OPENCV4", "SPLINED_STEREOGRAPHIC_order=3", "use mrcal-convert-lensmodel"),
+    "a sphere": (
+        "luxonis.json",
+        '"cameraType": 0',
+        '"cameraType": 2',
+        r"cameraType: is 2; perspective \(0\)",
+    ),
+    "alone": (
+        "luxonis.json",
+        '"toCameraSocket": 2',
+        '"toCameraSocket": -1',
+        "CAM_C: is related to no camera",
+    ),
+    "splines": (
+        "mrcal/b.cameramodel",
+        "OPENCV4",
+        "SPLINED_STEREOGRAPHIC_order=3",
+        "use mrcal-convert-lensmodel",
+    ),
     "few knots": ("splined_cubic.cameramodel", "Nx=7", "Nx=8", "intrinsics: has 88 numbers, wanted 100"),
-    "no knots": ("splined_cubic.cameramodel", "Nx=7_Ny=6", "Nx=42_Ny=1", "lensmodel: knots are .* 4 or more to a side"),
+    "no knots": (
+        "splined_cubic.cameramodel",
+        "Nx=7_Ny=6",
+        "Nx=42_Ny=1",
+        "lensmodel: knots are .* 4 or more to a side",
+    ),
     "wide": ("splined_cubic.cameramodel", "x_deg=140", "x_deg=400", "spacing is that of knots"),
     "old splines": ("lensboy.json", '"4.0.3"', '"2.1.0"', "lensboy-version: is 2; splines from version 3"),
     "remapped": ("lensboy.json", '"pinhole_splined"', '"pinhole_remapped"', "type: is 'pinhole_remapped'"),
@@ -224,15 +254,35 @@ OTHER_MAKERS = {
         "404\n  Distortion: \tModified ",
         "without tangential terms",
     ),
-    "unrelated": ("realsense.txt", 'To\t  "Color"', 'To\t  "Gyro"', "Color: has no extrinsic from or to Depth"),
-    "no width": ("realsense.txt", "Width:      \t640", "Width:      \tmany", "Depth Width, Height: holds something"),
+    "unrelated": (
+        "realsense.txt",
+        'To\t  "Color"',
+        'To\t  "Gyro"',
+        "Color: has no extrinsic from or to Depth",
+    ),
+    "no width": (
+        "realsense.txt",
+        "Width:      \t640",
+        "Width:      \tmany",
+        "Depth Width, Height: holds something",
+    ),
     "mirrored": ("realsense.txt", "   0.8              0   ", "   0.9              0   ", "not a rotation"),
-    "no focal": ("zed.conf", "RIGHT_CAM_HD]\nfx=698", "RIGHT_CAM_HD]\nfx=", "RIGHT_CAM_HD: has 3 numbers, wanted 4"),
+    "no focal": (
+        "zed.conf",
+        "RIGHT_CAM_HD]\nfx=698",
+        "RIGHT_CAM_HD]\nfx=",
+        "RIGHT_CAM_HD: has 3 numbers, wanted 4",
+    ),
     "no baseline": ("zed.conf", "Baseline=119.905", "", "STEREO: has no baseline"),
     "no convergence": ("zed.conf", "CV_HD=0.007", "CV_HD=", "STEREO RX, CV, RZ: has 2 numbers, wanted 3"),
     "twice": ("zed.conf", "RX_HD", "CV_HD", "is not an INI file"),
     "too few": ("mrcal/b.cameramodel", "-0.2, 0.1, ", "", "intrinsics: has 6 numbers, wanted 8"),
-    "a call": ("mrcal/b.cameramodel", "'icam_intrinsics': 0", "'x': print('run')", "is not a dictionary of numbers"),
+    "a call": (
+        "mrcal/b.cameramodel",
+        "'icam_intrinsics': 0",
+        "'x': print('run')",
+        "is not a dictionary of numbers",
+    ),
     "cut": ("mrcal/b.cameramodel", "    'icam_intrinsics': 0,\n}", "", "is the file whole"),
 }
 
@@ -305,10 +355,25 @@ def test_unstated_sizes_warn():
 def test_what_is_not_supported_says_so(tmp_path):
     for name, old, new, words in (
         ("kalibr.yaml", "radtan", "wide", "cam1.distortion_model: is 'wide'; supported for pinhole: radtan"),
-        ("kalibr.yaml", "camera_model: pinhole", "camera_model: tele", "camera_model: is 'tele'; supported: pinhole"),
+        (
+            "kalibr.yaml",
+            "camera_model: pinhole",
+            "camera_model: tele",
+            "camera_model: is 'tele'; supported: pinhole",
+        ),
         ("kalibr.yaml", "cam1:", "cam2:", "the chain has a gap"),
-        ("colmap/cameras.txt", "PINHOLE", "WIDE", "line 4: has model WIDE, which is not read: calibrate with one of"),
-        ("colmap/cameras.txt", "\n7 OPENCV", "\n8 OPENCV", "camera 7: is used by an image or a rig and not defined"),
+        (
+            "colmap/cameras.txt",
+            "PINHOLE",
+            "WIDE",
+            "line 4: has model WIDE, which is not read: calibrate with one of",
+        ),
+        (
+            "colmap/cameras.txt",
+            "\n7 OPENCV",
+            "\n8 OPENCV",
+            "camera 7: is used by an image or a rig and not defined",
+        ),
         ("transforms.json", '"OPENCV"', '"EQUIRECTANGULAR"', "camera_model: is EQUIRECTANGULAR; supported"),
         ("middlebury.txt", "doffs=40", "doffs=-40", "doffs: is -40, which is not the difference"),
         ("ros/left.yaml", "plumb_bob", "omni", "distortion_model: is 'omni'; supported"),

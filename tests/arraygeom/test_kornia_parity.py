@@ -94,7 +94,9 @@ def cases(points: int, dtype: torch.dtype = F64) -> dict[str, Parity]:
         "fundamental matrix": Parity(
             lambda K: up_to_scale(fundamental_matrix(K, beta.K, pair.beta_from_alpha)),
             lambda K: up_to_scale(
-                epipolar.fundamental_from_projections(projection(alpha.replace(K=K))[None], projection(beta)[None])[0]
+                epipolar.fundamental_from_projections(
+                    projection(alpha.replace(K=K))[None], projection(beta)[None]
+                )[0]
             ),
             alpha.K,
             1e-7,
@@ -104,11 +106,15 @@ def cases(points: int, dtype: torch.dtype = F64) -> dict[str, Parity]:
             lambda H: apply_homography(H, x_alpha).x, lambda H: transform_points(H[None], x_alpha[None])[0], H
         ),
         "projection": Parity(
-            lambda X: alpha.project_local(X).x, lambda X: project_points(X, alpha.K), alpha.cam_from_world.apply(X)
+            lambda X: alpha.project_local(X).x,
+            lambda X: project_points(X, alpha.K),
+            alpha.cam_from_world.apply(X),
         ),
         "unprojection": Parity(
             lambda x: torch.cat(alpha.rays(x)[:1]) * 2.0,
-            lambda x: unproject_points(x, torch.full((len(x), 1), 2.0, dtype=dtype), alpha.K.expand(len(x), 3, 3)),
+            lambda x: unproject_points(
+                x, torch.full((len(x), 1), 2.0, dtype=dtype), alpha.K.expand(len(x), 3, 3)
+            ),
             x_alpha,
         ),
         "exp of a rotation": Parity(rotation_from_vector, lambda w: So3.exp(w).matrix(), vectors),
@@ -117,7 +123,9 @@ def cases(points: int, dtype: torch.dtype = F64) -> dict[str, Parity]:
         ),
         "inverse pose": Parity(
             lambda w: alpha.cam_from_world.perturbed(w).inverse().t,
-            lambda w: Se3(So3.from_matrix(rotation_from_vector(w) @ alpha.R), alpha.t).inverse().matrix()[:3, 3],
+            lambda w: (
+                Se3(So3.from_matrix(rotation_from_vector(w) @ alpha.R), alpha.t).inverse().matrix()[:3, 3]
+            ),
             0.1 * vectors[0],
             1e-8,
         ),
@@ -266,21 +274,33 @@ def test_lenses_are_kornias_camera_models(name):
     lens, camera = MODELS[name]
     camera = camera.replace(distortion=lens)
     theirs = to_kornia_model(camera)
-    X = torch.rand(40, 3, dtype=F64, generator=torch.Generator().manual_seed(0)) - 0.5 + torch.tensor([0, 0, 2.0])
+    X = (
+        torch.rand(40, 3, dtype=F64, generator=torch.Generator().manual_seed(0))
+        - 0.5
+        + torch.tensor([0, 0, 2.0])
+    )
     back = Camera.from_kornia(theirs, cam_from_world=camera.cam_from_world)
     params = theirs.params.clone().requires_grad_()
-    kinds = {4: "ORTHOGRAPHIC" if name == "parallel" else "PINHOLE", 8: "KANNALA_BRANDT_K3", 12: "BROWN_CONRADY"}
+    kinds = {
+        4: "ORTHOGRAPHIC" if name == "parallel" else "PINHOLE",
+        8: "KANNALA_BRANDT_K3",
+        12: "BROWN_CONRADY",
+    }
     free = KorniaModel(ImageSize(*camera.hw), CameraModelType[kinds[len(params)]], params)
     expected = free.project(Vector3(X)).data
     found = from_kornia_model(free, camera.cam_from_world).project_local(X)
     assert bool(found.valid.all())
     torch.testing.assert_close(found.x, expected, rtol=0, atol=1e-9)
-    slopes = [torch.autograd.grad(x.square().sum(), params, retain_graph=True)[0] for x in (found.x, expected)]
+    slopes = [
+        torch.autograd.grad(x.square().sum(), params, retain_graph=True)[0] for x in (found.x, expected)
+    ]
     torch.testing.assert_close(*slopes, rtol=1e-9, atol=1e-6)
     rays, _ = back.rays(found.x.detach())
     if name != "parallel":
         near = theirs.unproject(Vector2(found.x.detach()), torch.ones(40, dtype=F64)).data
-        torch.testing.assert_close(rays / rays[:, 2:], near, rtol=0, atol=1e-3)  # theirs stops after 5 or 10 steps
+        torch.testing.assert_close(
+            rays / rays[:, 2:], near, rtol=0, atol=1e-3
+        )  # theirs stops after 5 or 10 steps
         torch.testing.assert_close(rays / rays[:, 2:], X / X[:, 2:], rtol=0, atol=1e-9)
     if name != "four":
         assert back == camera

@@ -1,4 +1,6 @@
-"""Random lenses beyond their folds: answers without a flag are right. The table of docs/lenses.md, smaller."""
+"""Random lenses beyond their folds: answers without a flag are right. The table of docs/lenses.md,
+smaller.
+"""
 
 import numpy as np
 import pytest
@@ -18,7 +20,11 @@ def test_no_answer_without_a_flag_is_wrong(name):
 
 
 @pytest.mark.parametrize(
-    "c", [(-0.439, 0.051, 0.003, 0.008, 0.02, 0, 0, 0), (-0.476, 0.036, -0.003, 0.005, 0.03, -0.04, -0.029, 0.006)]
+    "c",
+    [
+        (-0.439, 0.051, 0.003, 0.008, 0.02, 0, 0, 0),
+        (-0.476, 0.036, -0.003, 0.005, 0.03, -0.04, -0.029, 0.006),
+    ],
 )
 def test_past_a_fold_in_a_dip_of_the_slope_nothing_is_valid(c):
     """Tangential terms fold the image where the radial slope is least; further out it looks right again."""

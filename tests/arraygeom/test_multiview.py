@@ -95,7 +95,9 @@ def test_a_warp_is_kornias():
 
 
 def test_a_warp_through_a_lens_sees_what_is_there():
-    """Beta's image of a plane painted in world coordinates, warped by the plane's depth, is alpha's image of it."""
+    """Beta's image of a plane painted in world coordinates, warped by the plane's depth, is alpha's image of
+    it.
+    """
     rig = bent_rig()
     pair = rig.pair("alpha", "beta")
     depths = {}
@@ -169,7 +171,9 @@ def test_depth_maps_that_agree_are_fused():
     noisy["alpha"][10:20, 10:20] *= 1.3
     noisy["alpha"][0, 0] = torch.nan
     found = consistent_depth(rig, noisy, "alpha")
-    shared = warp(rig.pair("alpha", "beta"), torch.ones(1, 1, 40, 60, dtype=F64), depths["alpha"][None]).valid[0]
+    shared = warp(
+        rig.pair("alpha", "beta"), torch.ones(1, 1, 40, 60, dtype=F64), depths["alpha"][None]
+    ).valid[0]
     wrong = torch.zeros_like(shared)
     wrong[10:20, 10:20], wrong[0, 0] = True, True
     assert not found.valid[wrong].any()

@@ -1,7 +1,14 @@
 import pytest
 import torch
 
-from arraygeom.pixels import coarse_grid, map_homogeneous, pixel_grid, resize_matrix, rot90_matrix, shift_matrix
+from arraygeom.pixels import (
+    coarse_grid,
+    map_homogeneous,
+    pixel_grid,
+    resize_matrix,
+    rot90_matrix,
+    shift_matrix,
+)
 
 
 def blob(hw: tuple[int, int], x: float, y: float, *, sigma: float = 2.0) -> torch.Tensor:
@@ -24,14 +31,18 @@ def moved(A: torch.Tensor, x: float, y: float) -> torch.Tensor:
 def test_rotating_follows_the_actual_pixels(k):
     image = blob((40, 60), 21.3, 14.7)
     turned = torch.rot90(image, k, (-2, -1))
-    torch.testing.assert_close(centroid(turned), moved(rot90_matrix((40, 60), k), 21.3, 14.7), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        centroid(turned), moved(rot90_matrix((40, 60), k), 21.3, 14.7), atol=1e-6, rtol=0
+    )
 
 
 @pytest.mark.parametrize("new", [(20, 30), (10, 30), (40, 20)])
 def test_resizing_by_area_follows_the_actual_pixels(new):
     image = blob((40, 60), 29.3, 18.7, sigma=3.5)
     smaller = torch.nn.functional.interpolate(image, new, mode="area")
-    torch.testing.assert_close(centroid(smaller), moved(resize_matrix((40, 60), new), 29.3, 18.7), atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        centroid(smaller), moved(resize_matrix((40, 60), new), 29.3, 18.7), atol=1e-3, rtol=0
+    )
 
 
 def test_enlarging_follows_the_actual_pixels():

@@ -11,17 +11,24 @@ from arraygeom.io.point_matches import MAX_IMAGES, read_matches
 
 FILES = {"mono": Path("photos/a.png"), "colour": Path("photos/b.png")}
 SIZES = {"mono": (60, 80), "colour": (50, 70)}
-POINTS = np.array([[1.0, 2.0], [30.5, 40.25], [79.0, 59.0]]), np.array([[3.0, 4.0], [20.0, 21.0], [69.0, 49.0]])
+POINTS = (
+    np.array([[1.0, 2.0], [30.5, 40.25], [79.0, 59.0]]),
+    np.array([[3.0, 4.0], [20.0, 21.0], [69.0, 49.0]]),
+)
 
 
 def database(path, *, verified=True, first="a.png"):
-    """A COLMAP database (its documentation's tables): pixels from .5, numbers of keypoints in another order."""
+    """A COLMAP database (its documentation's tables): pixels from .5, numbers of keypoints in another
+    order.
+    """
     with sqlite3.connect(path) as file:
         file.execute("CREATE TABLE images (image_id INTEGER, name TEXT)")
         file.execute("CREATE TABLE keypoints (image_id INTEGER, rows INTEGER, cols INTEGER, data BLOB)")
         for table in ("matches", "two_view_geometries"):
             file.execute(f"CREATE TABLE {table} (pair_id INTEGER, rows INTEGER, cols INTEGER, data BLOB)")
-        for number, (name, points) in enumerate(((f"set/{first}", POINTS[0]), ("set/b.png", POINTS[1][::-1])), 1):
+        for number, (name, points) in enumerate(
+            ((f"set/{first}", POINTS[0]), ("set/b.png", POINTS[1][::-1])), 1
+        ):
             six = np.concatenate([points + 0.5, np.zeros((len(points), 4))], 1).astype(np.float32)
             file.execute("INSERT INTO images VALUES (?, ?)", (number, name))
             file.execute("INSERT INTO keypoints VALUES (?, ?, 6, ?)", (number, len(points), six.tobytes()))

@@ -98,7 +98,9 @@ def test_a_camera_looks_at_its_target():
     pose = Pose.look_at(centre, target, down=down)
     torch.testing.assert_close(pose.centre, centre)
     there = pose.apply(target)
-    torch.testing.assert_close(there, torch.nn.functional.pad((target - centre).norm(dim=-1)[:, None], (2, 0)))
+    torch.testing.assert_close(
+        there, torch.nn.functional.pad((target - centre).norm(dim=-1)[:, None], (2, 0))
+    )
     y = pose.apply(centre + down)
     assert y[:, 0].abs().max() < 1e-9
     assert (y[:, 1] > 0).all()
@@ -111,7 +113,9 @@ def test_a_camera_looks_at_its_target():
 
 def test_poses_go_through_matrices_quaternions_and_kornias_se3():
     g = torch.Generator().manual_seed(1)
-    pose = Pose(rotation_from_vector(torch.randn(7, 3, generator=g, dtype=torch.float64)), torch.randn(7, 3).double())
+    pose = Pose(
+        rotation_from_vector(torch.randn(7, 3, generator=g, dtype=torch.float64)), torch.randn(7, 3).double()
+    )
     X = torch.randn(7, 3, generator=g, dtype=torch.float64)
     homogeneous = torch.cat([X, torch.ones(7, 1)], -1)
     torch.testing.assert_close((pose.matrix @ homogeneous[..., None])[:, :3, 0], pose.apply(X))

@@ -43,8 +43,22 @@ from arraygeom.pixels import pixel_grid
 from tests.arraygeom.rigs import random_rig, scene_points, two_cameras
 
 FIELDS = [
-    *(Epipolar(), EpipolarLine(), HomographyDisplacement(8.0), HomographyDisplacement(), Rectified(20.0), Rectified()),
-    *(NearestVoxels(24, 12), Local(3), Dense(4), Curved(16), ThroughLenses(Epipolar(), 16), Widened(Epipolar(), 2, 3)),
+    *(
+        Epipolar(),
+        EpipolarLine(),
+        HomographyDisplacement(8.0),
+        HomographyDisplacement(),
+        Rectified(20.0),
+        Rectified(),
+    ),
+    *(
+        NearestVoxels(24, 12),
+        Local(3),
+        Dense(4),
+        Curved(16),
+        ThroughLenses(Epipolar(), 16),
+        Widened(Epipolar(), 2, 3),
+    ),
     Widened(Epipolar(), along=3),
     Moved(Epipolar(), torch.full((2, 48, 64), 0.25)),
 ]
@@ -94,7 +108,9 @@ def test_points_of_whole_pixels_are_those_of_floats(dtype):
         lambda x, y, d: to_grid(x, (48, 64)),
         lambda x, y, d: sample(torch.ones(1, 1, 20, 20), x[None]),
     ):
-        torch.testing.assert_close(ask(x.to(dtype), y.to(dtype), depth.to(dtype)), ask(x, y, depth), equal_nan=True)
+        torch.testing.assert_close(
+            ask(x.to(dtype), y.to(dtype), depth.to(dtype)), ask(x, y, depth), equal_nan=True
+        )
 
 
 def test_numbers_of_a_rig_are_not_made_integers():
@@ -151,13 +167,17 @@ def test_cameras_of_several_types_are_those_of_the_widest(field):
 
     for name in rig.names:
         one = rig.with_camera(name, mixed(rig[name]))
-        assert_alike(field(one.pair("alpha", "beta"), x), field(wide.pair("alpha", "beta"), x), atol=2e-4, rtol=1e-5)
+        assert_alike(
+            field(one.pair("alpha", "beta"), x), field(wide.pair("alpha", "beta"), x), atol=2e-4, rtol=1e-5
+        )
 
 
 def test_points_of_several_types():
     rig = random_rig(1)
     camera, X = rig["alpha"].replace(K=rig["alpha"].K.float()), scene_points(rig)
-    torch.testing.assert_close(camera.project(X.float()).x.double(), rig["alpha"].project(X).x, atol=1e-3, rtol=1e-5)
+    torch.testing.assert_close(
+        camera.project(X.float()).x.double(), rig["alpha"].project(X).x, atol=1e-3, rtol=1e-5
+    )
     F = fundamental_matrix(camera.K, rig["beta"].K, rig.pair("alpha", "beta").beta_from_alpha)
     torch.testing.assert_close(F, rig.pair("alpha", "beta").fundamental, atol=1e-6, rtol=1e-4)
 
@@ -266,7 +286,9 @@ def test_a_lens_of_zeros_is_no_lens(tmp_path):
     (tmp_path / "mono.yaml").write_text(ZERO)
     assert Rig.load(tmp_path / "mono.yaml")["mono"].distortion is None
     zero = Distortion("brown-conrady", torch.zeros(5, dtype=torch.float64))
-    random_rig(1).with_camera("beta", random_rig(1)["beta"].replace(distortion=zero)).save(tmp_path / "rig.yaml")
+    random_rig(1).with_camera("beta", random_rig(1)["beta"].replace(distortion=zero)).save(
+        tmp_path / "rig.yaml"
+    )
     assert Rig.load(tmp_path / "rig.yaml")["beta"].distortion is None
 
 

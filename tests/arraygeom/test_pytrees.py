@@ -14,7 +14,10 @@ LENS = Distortion("brown-conrady", torch.tensor([-0.1, 0.02, 1e-3, -5e-4], dtype
 PLAIN = random_rig(1)
 BENT = PLAIN.with_camera("alpha", PLAIN["alpha"].replace(distortion=LENS, sensor=Sensor("mono", bits=12)))
 LINKED = Rig(
-    {"a": View(hw=(4, 6), sensor=Sensor(Band(550.0, 80.0))), "b": LensView(hw=(4, 6), K=torch.eye(3), distortion=LENS)},
+    {
+        "a": View(hw=(4, 6), sensor=Sensor(Band(550.0, 80.0))),
+        "b": LensView(hw=(4, 6), K=torch.eye(3), distortion=LENS),
+    },
     links={("a", "b"): Link(torch.eye(3))},
     name="two",
 )
@@ -28,7 +31,9 @@ def test_rigs_are_pytrees(rig):
     assert pytree.tree_unflatten(leaves, spec) == rig
     assert pytree.tree_flatten(rig.replace())[1] == spec
     doubled = pytree.tree_map(lambda t: 2 * t, rig)
-    assert [torch.equal(b, 2 * a) for a, b in zip(leaves, pytree.tree_leaves(doubled))] == [True] * len(leaves)
+    assert [torch.equal(b, 2 * a) for a, b in zip(leaves, pytree.tree_leaves(doubled))] == [True] * len(
+        leaves
+    )
     assert pytree.tree_map(lambda t: None, rig).names == rig.names
     paths = [pytree.keystr(path) for path, _ in pytree.tree_flatten_with_path(rig)[0]]
     assert len(set(paths)) == len(leaves)

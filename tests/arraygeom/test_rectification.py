@@ -85,7 +85,9 @@ def test_differentiable_in_the_rig():
         done = rectify(Pair(pair.alpha, pair.beta.replace(K=K, cam_from_world=pose), pair.depth))
         return done.H_alpha, done.H_beta
 
-    inputs = [v.detach().clone().requires_grad_() for v in (torch.zeros(3).double(), pair.beta.t, pair.beta.K)]
+    inputs = [
+        v.detach().clone().requires_grad_() for v in (torch.zeros(3).double(), pair.beta.t, pair.beta.K)
+    ]
     assert torch.autograd.gradcheck(maps, inputs, atol=1e-4)
 
 
@@ -94,7 +96,8 @@ def test_rotations_there_and_back():
         w = torch.tensor(w, dtype=torch.float64)
         torch.testing.assert_close(rotation_vector(rotation_from_vector(w)), w, atol=1e-12, rtol=0)
     a, b = (
-        torch.nn.functional.normalize(torch.tensor(v, dtype=torch.float64), dim=0) for v in ([1.0, 2, 3], [-1.0, 1, 1])
+        torch.nn.functional.normalize(torch.tensor(v, dtype=torch.float64), dim=0)
+        for v in ([1.0, 2, 3], [-1.0, 1, 1])
     )
     torch.testing.assert_close(rotation_to(a, b) @ a, b)
 

@@ -58,7 +58,9 @@ def test_the_chosen_pose_is_opencvs():
 def test_gradients_batches_and_float32():
     pairs = [seen(seed) for seed in (1, 2)]
     n = min(len(x) for _, x, _ in pairs)
-    F, K, L = (torch.stack(part) for part in zip(*((p.fundamental, p.alpha.K, p.beta.K) for p, _, _ in pairs)))
+    F, K, L = (
+        torch.stack(part) for part in zip(*((p.fundamental, p.alpha.K, p.beta.K) for p, _, _ in pairs))
+    )
     x, y = (torch.stack([pair[i][:n] for pair in pairs]) for i in (1, 2))
     both = relative_pose(F, K, L, x, y).beta_from_alpha
     poses = [relative_pose(F[i], K[i], L[i], x[i], y[i]).beta_from_alpha for i in range(2)]

@@ -18,7 +18,9 @@ def bundle(noise: float = 0.3, n: int = 12) -> tuple[Rig, torch.Tensor, torch.Te
     cameras = array_of(3)
     X, x = seen_points(cameras, n, noise=noise)
     rig = Rig(dict(zip("abc", cameras)))
-    changes = {name: 0.003 * torch.randn_like(zero) for name, zero in rig.parameters(free=["*.rotation"]).items()}
+    changes = {
+        name: 0.003 * torch.randn_like(zero) for name, zero in rig.parameters(free=["*.rotation"]).items()
+    }
     return rig.perturbed(changes), X, x
 
 
@@ -52,9 +54,15 @@ def test_adjustment_reaches_scipys_optimum():
         v = torch.from_numpy(v)
         parts = v[: sum(sizes)].split(sizes)
         moved = rig.perturbed({n: p.reshape(s) for (n, s), p in zip(names.items(), parts)})
-        return reprojection_residuals(list(moved.cameras.values()), v[sum(sizes) :].reshape(-1, 3), x).flatten().numpy()
+        return (
+            reprojection_residuals(list(moved.cameras.values()), v[sum(sizes) :].reshape(-1, 3), x)
+            .flatten()
+            .numpy()
+        )
 
-    best = optimize.least_squares(residuals, np.r_[np.zeros(sum(sizes)), X.flatten().numpy()], xtol=1e-14, ftol=1e-14)
+    best = optimize.least_squares(
+        residuals, np.r_[np.zeros(sum(sizes)), X.flatten().numpy()], xtol=1e-14, ftol=1e-14
+    )
     assert abs(float(found.cost[-1]) / (2 * best.cost) - 1) < 1e-6
     assert (found.cost.diff() <= 1e-9 * found.cost[0]).all()
     torch.testing.assert_close(found.X.flatten().numpy(), best.x[sum(sizes) :], atol=1e-4, rtol=0)

@@ -98,7 +98,12 @@ def test_an_optimiser_finds_a_disturbed_camera_and_stays_on_the_manifold():
 def test_patterns_choose_parameters():
     rig = random_rig(0)
     assert set(rig.parameters(free=["beta.*"])) == {f"beta.{p}" for p in EVERYTHING}
-    assert set(rig.parameters(free=["*.focal", "depth.*"])) == {"alpha.focal", "beta.focal", "depth.near", "depth.far"}
+    assert set(rig.parameters(free=["*.focal", "depth.*"])) == {
+        "alpha.focal",
+        "beta.focal",
+        "depth.near",
+        "depth.far",
+    }
     assert all(v.requires_grad and not v.any() for v in rig.parameters(free=["*"]).values())
 
 

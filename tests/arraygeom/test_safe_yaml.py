@@ -29,12 +29,20 @@ ROS = "camera_matrix:\n  data: 1\ndistortion_model: none\n"
 @pytest.mark.parametrize("head", [NATIVE, KALIBR, ROS])
 @pytest.mark.parametrize(
     "attack",
-    [bomb(), "deep: " + "[" * 100_000, "deep: " + "{a: " * 100_000, "self: &a [*a]", "long: [" + "1," * 2_000_000],
+    [
+        bomb(),
+        "deep: " + "[" * 100_000,
+        "deep: " + "{a: " * 100_000,
+        "self: &a [*a]",
+        "long: [" + "1," * 2_000_000,
+    ],
 )
 def test_rig_files_that_would_grow_are_refused_at_once(head, attack, tmp_path):
     (tmp_path / "rig.yaml").write_text(head + attack)
     start = time.process_time()
-    with pytest.raises(RigFileError, match=r"line \d+.*(aliases repeat|nested more than|more than 500,000|alias \*a)"):
+    with pytest.raises(
+        RigFileError, match=r"line \d+.*(aliases repeat|nested more than|more than 500,000|alias \*a)"
+    ):
         Rig.load(tmp_path / "rig.yaml")
     assert time.process_time() - start < 4
 
@@ -82,10 +90,16 @@ def test_values_that_cannot_be_read_are_yaml_errors(value):
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        (f"depth: [1, 2]\ncameras: {{a: {CAMERA}}}\ndepth: [1, 20]\n", "'depth' occurs twice, in lines 1 and 3"),
+        (
+            f"depth: [1, 2]\ncameras: {{a: {CAMERA}}}\ndepth: [1, 20]\n",
+            "'depth' occurs twice, in lines 1 and 3",
+        ),
         (f"cameras:\n  a: {CAMERA}\n  a: {CAMERA}\n", "'a' occurs twice, in lines 2 and 3"),
         (f"cameras:\n  1: {CAMERA}\n  '1': {CAMERA}\n", "'1' occurs twice, in lines 2 and 3"),
-        ("cameras:\n  a: {size: [1000000, 4], focal: 80}\n", r"cameras.a.size: is 1000000 x 4; images of up to 65535"),
+        (
+            "cameras:\n  a: {size: [1000000, 4], focal: 80}\n",
+            r"cameras.a.size: is 1000000 x 4; images of up to 65535",
+        ),
         ("cameras:\n  a: {size: [60000, 60000]}\n", r"cameras.a.size: is 60000 x 60000"),
         (
             f"cameras: {{a: {CAMERA}, b: {CAMERA}}}\nlinks:\n"
@@ -101,6 +115,10 @@ def test_native_files_say_nothing_twice(text, problem, tmp_path):
 
 
 def test_there_is_one_loader_of_yaml():
-    texts = {path: path.read_text() for room in ("arraygeom", "pat", "calib") for path in (ROOT / room).rglob("*.py")}
+    texts = {
+        path: path.read_text()
+        for room in ("arraygeom", "pat", "calib")
+        for path in (ROOT / room).rglob("*.py")
+    }
     users = [p.name for p, text in texts.items() if "safe_load(" in text or "yaml.load(" in text]
     assert users == ["safe_yaml.py"]

@@ -96,7 +96,9 @@ def test_every_task_has_torch_in_its_own_thread_alone(two_threads, alone):
     assert born == [2]
 
 
-@pytest.mark.parametrize("of", [{}, {"dilation": 8, "padding": 8}, {"padding": 0}, {"stride": 2}, {"groups": 4}])
+@pytest.mark.parametrize(
+    "of", [{}, {"dilation": 8, "padding": 8}, {"padding": 0}, {"stride": 2}, {"groups": 4}]
+)
 @pytest.mark.parametrize("channels_last", [False, True])
 def test_convolutions_in_strips_are_the_same_to_the_bit(two_threads, monkeypatch, of, channels_last):
     conv = torch.nn.Conv2d(16, 16, 3, **{"padding": 1, **of})

@@ -44,7 +44,9 @@ def test_two_views_are_opencvs():
     _, x = seen_points(cameras)
     P = [(c.K @ torch.cat([c.R, c.t[:, None]], 1)).numpy() for c in cameras]
     homogeneous = cv2.triangulatePoints(*P, *(v.T.numpy().copy() for v in x))
-    np.testing.assert_allclose(triangulate(cameras, x).X.numpy(), (homogeneous[:3] / homogeneous[3]).T, atol=1e-8)
+    np.testing.assert_allclose(
+        triangulate(cameras, x).X.numpy(), (homogeneous[:3] / homogeneous[3]).T, atol=1e-8
+    )
 
 
 def test_with_noise_it_is_nearly_the_least_reprojection_error():
@@ -106,7 +108,9 @@ def test_gradients():
         moved = cameras[0].replace(cam_from_world=type(cameras[0].cam_from_world)(cameras[0].R, t))
         return triangulate([moved, *cameras[1:]], x).X
 
-    assert torch.autograd.gradcheck(points, [x.requires_grad_(), cameras[0].t.clone().requires_grad_()], atol=1e-5)
+    assert torch.autograd.gradcheck(
+        points, [x.requires_grad_(), cameras[0].t.clone().requires_grad_()], atol=1e-5
+    )
 
 
 def test_wrong_numbers_of_views_are_refused():
@@ -126,7 +130,9 @@ def test_depth_and_its_deviation_along_a_field(model):
     found = depth_of(pair, x[0], x[1], sigma)
     assert found.valid.all()
     torch.testing.assert_close(found.depth, depth, atol=1e-6, rtol=0)
-    ends = [cameras[1].project(cameras[0].unproject(x[0], depth + s * found.deviation)).x for s in (0.5, -0.5)]
+    ends = [
+        cameras[1].project(cameras[0].unproject(x[0], depth + s * found.deviation)).x for s in (0.5, -0.5)
+    ]
     moved = (ends[0] - ends[1]).norm(dim=-1)
     torch.testing.assert_close(moved, sigma, rtol=1e-3, atol=0)
 
@@ -187,7 +193,9 @@ def test_batched_cameras_are_a_loop():
 
 
 def test_two_noisy_views_are_opencvs_optimal_triangulation():
-    """`correctMatches` (Hartley & Zisserman, section 12.5), then linear; its polynomial's roots are good to 1e-4 m."""
+    """`correctMatches` (Hartley & Zisserman, section 12.5), then linear; its polynomial's roots are good to
+    1e-4 m.
+    """
     cameras = array_of(2)
     _, x = seen_points(cameras, noise=0.5)
     pair = Pair(*cameras)

@@ -1,4 +1,6 @@
-"""Pinhole views: OpenCV's maps are the oracle, there and back is the image, nothing of the view is left out."""
+"""Pinhole views: OpenCV's maps are the oracle, there and back is the image, nothing of the view is left
+out.
+"""
 
 import math
 
@@ -6,7 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Camera, Distortion, LensView, Pose, intrinsics, pinhole_view, resampled, rotation_from_vector
+from arraygeom import (
+    Camera,
+    Distortion,
+    LensView,
+    Pose,
+    intrinsics,
+    pinhole_view,
+    resampled,
+    rotation_from_vector,
+)
 from arraygeom.undistortion import pixels_between
 from tests.oracles import Oracle
 
@@ -22,7 +33,9 @@ LENSES = {
 def camera(model, focal=110.0):
     lens = Distortion(model, torch.tensor(LENSES[model], dtype=torch.float64))
     K = intrinsics((focal, focal * 1.02), HW, (81.0, 58.0))
-    pose = Pose(rotation_from_vector(torch.tensor([0.1, 0.3, -0.2]).double()), torch.tensor([0.2, 0, 1]).double())
+    pose = Pose(
+        rotation_from_vector(torch.tensor([0.1, 0.3, -0.2]).double()), torch.tensor([0.2, 0, 1]).double()
+    )
     return Camera(K=K, cam_from_world=pose, hw=HW, distortion=lens)
 
 

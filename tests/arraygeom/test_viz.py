@@ -49,7 +49,9 @@ def test_pixels_beyond_the_lens_are_moved_inside():
 
 def test_fields_are_drawn_at_their_sampling_locations():
     rig = random_rig(1)
-    figure = viz.draw_fields(rig, "alpha", X, images={"alpha": torch.rand(3, 48, 64), "beta": np.zeros((40, 60))})
+    figure = viz.draw_fields(
+        rig, "alpha", X, images={"alpha": torch.rand(3, 48, 64), "beta": np.zeros((40, 60))}
+    )
     assert len(png(figure)) > 1000
     segments = sampling_locations(Epipolar(), rig.pair("alpha", "beta"), X)
     drawn = [line.get_xydata() for line in figure.axes[1].lines if len(line.get_xydata()) == 1]

@@ -44,4 +44,7 @@ def test_checks_are_off_by_one_flag_and_within_transformations():
         Pose(twice, torch.zeros(3))
     with unchecked():
         assert torch.equal(Pose(twice, torch.zeros(3)).R, twice)
-    assert torch.func.vmap(lambda R: Pose(R, torch.zeros(3)).apply(torch.ones(3)))(twice[None]).shape == (1, 3)
+    assert torch.func.vmap(lambda R: Pose(R, torch.zeros(3)).apply(torch.ones(3)))(twice[None]).shape == (
+        1,
+        3,
+    )

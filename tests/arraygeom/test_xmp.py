@@ -40,11 +40,12 @@ def image_of(
     parts = [f'Camera:{k}="{v}"' for k, v in list(tags.items())[::2]]
     parts += [f'drone-dji:{k}="{v}"' for k, v in (dji or {}).items()]
     lists = [
-        f"<Camera:{k}><rdf:Seq>{''.join(f'<rdf:li>{p}</rdf:li>' for p in v.split(','))}</rdf:Seq></Camera:{k}>"
+        f"<Camera:{k}><rdf:Seq><rdf:li>{v.replace(',', '</rdf:li><rdf:li>')}</rdf:li></rdf:Seq></Camera:{k}>"
         for k, v in list(tags.items())[1::2]
     ]
     xmp = (
-        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF '
+        'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
         '<rdf:Description xmlns:Camera="http://pix4d.com/camera/1.0/" '
         f'xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" {" ".join(parts)}>{"".join(lists)}'
         "</rdf:Description></rdf:RDF></x:xmpmeta>"
@@ -77,14 +78,18 @@ def test_a_fisheye_is_the_makers_formula(tmp_path):
     r = X[:, :2].norm(dim=-1)
     theta = 2 / math.pi * torch.atan2(r, X[:, 2])
     rho = theta + 0.0096 * theta**2 - 0.1455 * theta**3
-    expected = 1660 * rho[:, None] * X[:, :2] / r[:, None] + PER_MM * torch.tensor([2.4, 1.8], dtype=torch.float64)
+    expected = 1660 * rho[:, None] * X[:, :2] / r[:, None] + PER_MM * torch.tensor(
+        [2.4, 1.8], dtype=torch.float64
+    )
     assert (camera.project(X).x - expected).abs().max() < 1e-9
     assert camera.sensor.response == Band(660.0, 40.0)
     assert camera.sensor.black_level == 4001
     assert camera.sensor.exposure == pytest.approx(0.003)
 
 
-@pytest.mark.parametrize("focal", [{"PerspectiveFocalLength": "5.5"}, {"PerspectiveFocalLength": str(5.5 * PER_MM)}])
+@pytest.mark.parametrize(
+    "focal", [{"PerspectiveFocalLength": "5.5"}, {"PerspectiveFocalLength": str(5.5 * PER_MM)}]
+)
 def test_focal_lengths_are_in_millimetres_or_pixels(tmp_path, focal):
     camera = Rig.load(image_of(tmp_path / "IMG_1.tif", {**PERSPECTIVE, **focal}))["nir"]
     assert float(camera.K[0, 0]) == pytest.approx(5.5 * PER_MM)
@@ -101,7 +106,8 @@ def test_rig_relatives_are_from_the_camera_to_the_rig_and_translations_its_centr
 
 def test_tags_are_of_the_stored_pixels_and_the_rig_of_upright_ones(tmp_path):
     stored, rotated = (
-        Rig.load(image_of(tmp_path / f"{name}.tif", FISHEYE, orientation=n))["red"] for name, n in (("a", 1), ("b", 3))
+        Rig.load(image_of(tmp_path / f"{name}.tif", FISHEYE, orientation=n))["red"]
+        for name, n in (("a", 1), ("b", 3))
     )
     X = torch.tensor([0.3, -0.2, 1.0], dtype=torch.float64)
     last = torch.tensor([1279.0, 959.0], dtype=torch.float64)
@@ -115,7 +121,10 @@ def test_missing_translations_are_said(tmp_path):
 
 
 def test_dewarp_data(tmp_path):
-    data = {"DewarpData": "2022-01-01;2200,2201,10,-5,0.01,-0.02,0.001,-0.002,0.03", "CalibratedOpticalCenterX": "640"}
+    data = {
+        "DewarpData": "2022-01-01;2200,2201,10,-5,0.01,-0.02,0.001,-0.002,0.03",
+        "CalibratedOpticalCenterX": "640",
+    }
     camera = Rig.load(image_of(tmp_path / "DJI_1.tif", {}, dji=data))["1"]
     assert camera.K[:2].tolist() == [[2200, 0, 650], [0, 2201, 475]]
     assert camera.distortion.coefficients.tolist() == [0.01, -0.02, 0.001, -0.002, 0.03]

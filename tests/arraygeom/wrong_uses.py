@@ -112,7 +112,9 @@ WRONG: dict[str, Callable[[], Any]] = {
     "hw with channels": lambda: camera(hw=(3, *HW)),
     "hw 0": lambda: camera(hw=(0, 64)),
     "hw not whole": lambda: camera(hw=(48.5, 64)),
-    "K and pose of batches unlike": lambda: camera(K=K.expand(2, 3, 3), cam_from_world=Pose(EYE.expand(3, 3, 3), ZERO)),
+    "K and pose of batches unlike": lambda: camera(
+        K=K.expand(2, 3, 3), cam_from_world=Pose(EYE.expand(3, 3, 3), ZERO)
+    ),
     "distortion a tensor": lambda: camera(distortion=torch.zeros(5)),
     "sensor a word": lambda: camera(sensor="mono"),
     "unknown lens": lambda: lens("opencv", [0.0, 0, 0, 0]),
@@ -160,7 +162,8 @@ WRONG: dict[str, Callable[[], Any]] = {
 SILENT = {
     "pixels (y, x)": "pixels inside of the image",
     "pixels normalised": "pixels inside of the image",
-    "first pixel at (0.5, 0.5)": "a principal point half a pixel off is no farther off than lenses are mounted",
+    "first pixel at (0.5, 0.5)": "a principal point half a pixel off is no farther off than lenses are "
+    "mounted",
     "R transposed, by a little": "a small rotation is as likely as its inverse",
 }
 """Wrong uses of which nothing is said, and why."""

@@ -1,7 +1,7 @@
 """Time and memory of `pat align` beside `pat fuse`: `python -m tests.benchmarks.bench_align`.
 
-The sample array enlarged: alpha of 1280x800 with four betas, and of 12 megapixels with one beta within 4 GiB. Each
-command in a process of its own; seconds are of the processor, memory is the largest resident.
+The sample array enlarged: alpha of 1280x800 with four betas, and of 12 megapixels with one beta within 4 GiB.
+Each command in a process of its own; seconds are of the processor, memory is the largest resident.
 """
 
 from __future__ import annotations
@@ -26,14 +26,27 @@ def measured(command: str, folder: Path, limit: str | None) -> list[str]:
     names = Rig.load(folder / "rig.yaml").names
     images = [word for name in names for word in ("--image", f"{name}={folder / f'{name}.png'}")]
     cap = [] if limit is None else ["--max-memory", limit]
-    words = [sys.executable, "-m", "pat", command, str(folder / "rig.yaml"), *images, "--out", str(folder / command)]
+    words = [
+        sys.executable,
+        "-m",
+        "pat",
+        command,
+        str(folder / "rig.yaml"),
+        *images,
+        "--out",
+        str(folder / command),
+    ]
     begin = time.monotonic()
     process = subprocess.Popen([*words, "--alpha", names[0], *cap], stdout=subprocess.DEVNULL)
     most = watch_peak(process.pid)
     _, status, used = os.wait4(process.pid, 0)
     if status:
         raise SystemExit(f"pat {command} failed (wait status {status})")
-    return [f"{used.ru_utime + used.ru_stime:.0f}", f"{time.monotonic() - begin:.0f}", f"{most() / 2**30:.2f}"]
+    return [
+        f"{used.ru_utime + used.ru_stime:.0f}",
+        f"{time.monotonic() - begin:.0f}",
+        f"{most() / 2**30:.2f}",
+    ]
 
 
 def main() -> None:
@@ -44,7 +57,9 @@ def main() -> None:
         with TemporaryDirectory() as folder:
             scene(Path(folder), width, height, betas)
             for command in ("fuse", "align"):
-                rows.append([title, f"pat {command}", limit or "none", *measured(command, Path(folder), limit)])
+                rows.append(
+                    [title, f"pat {command}", limit or "none", *measured(command, Path(folder), limit)]
+                )
                 print(rows[-1], file=sys.stderr)
     print(markdown_table(["alpha", "command", "limit", "s, processor", "s", "GiB"], rows), end="")
 

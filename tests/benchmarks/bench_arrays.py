@@ -1,9 +1,11 @@
-"""Several colour betas about a mono alpha: rendered scenes of five cameras, fused with one, two and four of the betas.
+"""Several colour betas about a mono alpha: rendered scenes of five cameras, fused with one, two and four of
+the betas.
 
-    pat render arrays.yaml --scenes 4 --out arrays      # for each generator, with the rig that `--rig FILE` writes
-    python -m tests.benchmarks.bench_arrays arrays/* --out tests/benchmarks/RESULTS_arrays.md
+    pat render arrays.yaml --scenes 4 --out arrays      # for each generator, with the rig that `--rig FILE`
+    writes python -m tests.benchmarks.bench_arrays arrays/* --out tests/benchmarks/RESULTS_arrays.md
 
-Alpha is the luma of what its camera sees, each beta is reduced 2x; the figure is PSNR (dB) against alpha's colours.
+Alpha is the luma of what its camera sees, each beta is reduced 2x; the figure is PSNR (dB) against alpha's
+colours.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ def array() -> Rig:
     """The rig that is rendered."""
     alpha = Camera(K=intrinsics(430.0, (288, 416)), cam_from_world=Pose.identity(), hw=(288, 416))
     betas = {
-        n: alpha.replace(cam_from_world=Pose(alpha.R, alpha.t.new_tensor([-x, -y, 0]))) for n, (x, y) in CENTRES.items()
+        n: alpha.replace(cam_from_world=Pose(alpha.R, alpha.t.new_tensor([-x, -y, 0])))
+        for n, (x, y) in CENTRES.items()
     }
     return Rig({"alpha": alpha, **betas}, depth=(1.0, 8.0))
 
@@ -43,7 +46,9 @@ def scores(network: FusionNetwork, folder: Path) -> list[float]:
     h, w = (n - n % 2 for n in rig["alpha"].hw)
     seen = {name: srgb_image(read_view(folder, name).rgb.float())[:, :h, :w] for name in ("alpha", *CENTRES)}
     rig = rig.replace(cameras={name: rig[name].crop(0, 0, (h, w)) for name in seen})
-    images = {"alpha": luminance(seen["alpha"])} | {n: reduced(seen[n][None], (h // 2, w // 2))[0] for n in CENTRES}
+    images = {"alpha": luminance(seen["alpha"])} | {
+        n: reduced(seen[n][None], (h // 2, w // 2))[0] for n in CENTRES
+    }
     for name in CENTRES:
         rig = rig.resize(name, (h // 2, w // 2))
     found = []

@@ -5,7 +5,8 @@ The compiled backend of each device runs against two usual ways to do the same: 
 every position, matmul, softmax, matmul; (b) the same with `grid_sample`. Each measurement is a process of its
 own, so that its peak memory is its own; the machine's float32 matmul rate and copy bandwidth are measured in
 the same run. All repeat while it takes little time; the table has medians with the spread (fastest to
-slowest). `--device cuda` measures a GPU only, `--quick` leaves the large sizes out; neither writes RESULTS.md.
+slowest). `--device cuda` measures a GPU only, `--quick` leaves the large sizes out; neither writes
+RESULTS.md.
 """
 
 from __future__ import annotations
@@ -44,12 +45,16 @@ def field(ha: int, wa: int, samples: int, device: str) -> Segments:
     y, x = torch.meshgrid(torch.arange(ha).float(), torch.arange(wa).float(), indexing="ij")
     length = min(samples - 1, wa - 1)
     slope = min(0.06, (ha - 5) / length)
-    start = torch.stack([(x - length).clamp(0, wa - 1 - length), (y + 0.3).clamp(0, ha - 2 - slope * length)], -1)
+    start = torch.stack(
+        [(x - length).clamp(0, wa - 1 - length), (y + 0.3).clamp(0, ha - 2 - slope * length)], -1
+    )
     end = start + torch.tensor([length, slope * length])
     return Segments(start.to(device), end.to(device), torch.ones(ha, wa, dtype=torch.bool, device=device))
 
 
-def index_everything(q: Tensor, k: Tensor, v: Tensor, segments: Segments, samples: int, interpolation: str) -> Tensor:
+def index_everything(
+    q: Tensor, k: Tensor, v: Tensor, segments: Segments, samples: int, interpolation: str
+) -> Tensor:
     """(a): (b, d, h, w, l) keys and values, nearest, from images that lie channels first, as they usually
     do."""
     x, y = _pixels(k, segments, samples)
@@ -73,7 +78,9 @@ def _pixels(k: Tensor, segments: Segments, samples: int) -> tuple[Tensor, Tensor
     return xy[..., 0].clamp(0, k.shape[3] - 1), xy[..., 1].clamp(0, k.shape[2] - 1)
 
 
-def grid_sampled(q: Tensor, k: Tensor, v: Tensor, segments: Segments, samples: int, interpolation: str) -> Tensor:
+def grid_sampled(
+    q: Tensor, k: Tensor, v: Tensor, segments: Segments, samples: int, interpolation: str
+) -> Tensor:
     """(b): the same with `grid_sample`, nearest or bilinear."""
     b, _, ha, wa = q.shape
     xy = segments.positions(samples).xy.reshape(1, ha * wa, samples, 2)
@@ -147,7 +154,9 @@ def features(ha: int, wa: int, d: int, dtype: torch.dtype, device: str) -> Tenso
 
 def _warm(run, device: str, dtype: torch.dtype, job: dict) -> None:
     """Compiles what has to be, on a small image."""
-    q, k, v = (torch.randn(1, job["d"], 8, 8, dtype=dtype, device=device, requires_grad=True) for _ in range(3))
+    q, k, v = (
+        torch.randn(1, job["d"], 8, 8, dtype=dtype, device=device, requires_grad=True) for _ in range(3)
+    )
     out = run(q, k, v, field(8, 8, 4, device), 4, job["interpolation"])
     if job["backward"]:
         out.sum().backward()
@@ -228,7 +237,10 @@ SMALL, LARGE, WHOLE = (128, 256), (256, 512), (3036, 4024)
 def jobs(device: str, quick: bool) -> list[dict]:
     """What is measured; (a) and (b) where they fit."""
     fast = "cpu" if device == "cpu" else "triton"
-    own, plain = [(fast, "nearest"), (fast, "bilinear")], [("reference", "nearest"), ("reference", "bilinear")]
+    own, plain = (
+        [(fast, "nearest"), (fast, "bilinear")],
+        [("reference", "nearest"), ("reference", "bilinear")],
+    )
     both = (False, True)
     if device == "cuda":
         methods = [*BASELINES, *own] if torch.cuda.is_available() else own[:1]
@@ -276,7 +288,11 @@ def obstacle(entry: dict) -> str | None:
         return None
     gathered = entry["ha"] * entry["wa"] * entry["samples"] * entry["d"] * DTYPES[entry["dtype"]].itemsize
     needed, free = gathered * (2 + 3 * entry["backward"]), _free(entry["device"])
-    return f"needs {needed / GIB:.0f} GiB, {free / GIB:.0f} are free: not measured" if needed > 0.9 * free else None
+    return (
+        f"needs {needed / GIB:.0f} GiB, {free / GIB:.0f} are free: not measured"
+        if needed > 0.9 * free
+        else None
+    )
 
 
 def _free(device: str) -> int:
@@ -290,7 +306,12 @@ def _free(device: str) -> int:
 def name(entry: dict) -> tuple[str, str, str, str]:
     """By which an entry is known in the table."""
     shape = f"{entry['wa']}x{entry['ha']}, {entry['samples']}, {entry['dtype']}"
-    return shape, "forward + backward" if entry["backward"] else "forward", entry["method"], entry["interpolation"]
+    return (
+        shape,
+        "forward + backward" if entry["backward"] else "forward",
+        entry["method"],
+        entry["interpolation"],
+    )
 
 
 def row(entry: dict, done: dict, rates: dict, bandwidth: float) -> str:
@@ -338,7 +359,13 @@ def table(device: str, *, quick: bool) -> list[str]:
     """Measures everything on a device, printing as it goes."""
     here = device == "cpu" or torch.cuda.is_available()
     rates, bandwidth = (_rates(device), copy_bandwidth(device)) if here else ({False: 1.0, True: 1.0}, 1.0)
-    machine = f"{torch.get_num_threads()} threads" if device == "cpu" else torch.cuda.get_device_name() if here else ""
+    machine = (
+        f"{torch.get_num_threads()} threads"
+        if device == "cpu"
+        else torch.cuda.get_device_name()
+        if here
+        else ""
+    )
     limits = (
         f"{machine}: float32 matmul {rates[False] / 1e12:.3f} TFLOP/s (one thread {rates[True] / 1e12:.3f}), "
         f"copy {bandwidth / 1e9:.1f} GB/s (read and written)."
@@ -363,7 +390,13 @@ def bars(done: dict, rates: dict) -> list[str]:
     """What was asked for, of the CPU, against what was measured."""
 
     def get(
-        what: str, backward: bool, method: str, interpolation: str = "nearest", hw=LARGE, samples=80, dtype="float32"
+        what: str,
+        backward: bool,
+        method: str,
+        interpolation: str = "nearest",
+        hw=LARGE,
+        samples=80,
+        dtype="float32",
     ):
         entry = job("cpu", method, interpolation, *hw, samples, backward, dtype=dtype)
         return done.get(name(entry), {}).get(what, math.nan)
@@ -375,8 +408,18 @@ def bars(done: dict, rates: dict) -> list[str]:
     flops = 4 * LARGE[0] * LARGE[1] * 80 * 64
     whole = [get(what, False, "cpu", hw=WHOLE, dtype="bfloat16") for what in ("peak", "unit", "time")]
     asked = [
-        ("nearest forward, times faster than (a)", get("time", False, "index") / own[False, "nearest"], ">=", 80),
-        ("nearest forward + backward, times faster", get("time", True, "index") / own[True, "nearest"], ">=", 45),
+        (
+            "nearest forward, times faster than (a)",
+            get("time", False, "index") / own[False, "nearest"],
+            ">=",
+            80,
+        ),
+        (
+            "nearest forward + backward, times faster",
+            get("time", True, "index") / own[True, "nearest"],
+            ">=",
+            45,
+        ),
         ("nearest forward, of the matmul rate", flops / own[False, "nearest"] / rates[False], ">=", 0.3),
         ("the same with one thread, of one thread's rate", flops / one["nearest"] / rates[True], ">=", 0.3),
         ("bilinear forward, times nearest", own[False, "bilinear"] / own[False, "nearest"], "<=", 2),
@@ -431,8 +474,10 @@ def write(path: Path, lines: list[str], end: str) -> None:
         "# Attention, measured",
         "",
         f"{date.today()}, torch {torch.__version__}, {platform.machine()}. {end} D = 64, channels last. "
-        "(a) is `index`, (b) is `grid_sample`; 'faster' and 'leaner' are ratios of time and of extra peak memory; "
-        "4 floating-point operations a sample and channel in forward, 12 with backward; least traffic is Q, K, V and "
+        "(a) is `index`, (b) is `grid_sample`; 'faster' and 'leaner' are ratios of time and of extra peak "
+        "memory; "
+        "4 floating-point operations a sample and channel in forward, 12 with backward; least traffic is Q, "
+        "K, V and "
         "out once, twice with backward. Written by `make bench`.",
         *lines,
     ]

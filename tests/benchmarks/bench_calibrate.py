@@ -2,8 +2,8 @@
 
     python -m tests.benchmarks.bench_calibrate --boards out/boards --out tests/benchmarks/RESULTS_calibrate.md
 
-Rendered photographs are those of `python -m tests.calib.rendered --out out/boards`. A table without its data is left
-out, and says so. Seconds are of the whole, finding the board included, of all cores together.
+Rendered photographs are those of `python -m tests.calib.rendered --out out/boards`. A table without its data
+is left out, and says so. Seconds are of the whole, finding the board included, of all cores together.
 """
 
 from __future__ import annotations
@@ -65,7 +65,9 @@ def bumblebee_pairs(data: Path) -> Iterator[Figure]:
     published = read_rig(folder / "stereo.yaml", scale=1e-3)
     names = ("left", "right")
     theirs = float(epipolar_errors(published, found.views)[names].mean())
-    yield Figure("Bumblebee2: mean epipolar error", f"{found.epipolar[names].mean():.3f} px", "at most 0.08 px")
+    yield Figure(
+        "Bumblebee2: mean epipolar error", f"{found.epipolar[names].mean():.3f} px", "at most 0.08 px"
+    )
     yield Figure("of the published rig, same corners", f"{theirs:.3f} px", "")
     if names in found.held_out:
         yield Figure("on frames held out", f"{found.held_out[names].mean():.3f} px", "")
@@ -75,11 +77,15 @@ def bumblebee_pairs(data: Path) -> Iterator[Figure]:
     ours, theirs_ = (rig.pair(*names).beta_from_alpha for rig in (found.rig, published))
     turn = np.degrees(np.arccos(np.clip((float((ours.R * theirs_.R).sum()) - 1) / 2, -1, 1)))
     yield Figure(
-        "baseline against published", f"{100 * float(ours.t.norm() / theirs_.t.norm() - 1):+.2f} %", "agreement"
+        "baseline against published",
+        f"{100 * float(ours.t.norm() / theirs_.t.norm() - 1):+.2f} %",
+        "agreement",
     )
     told = found.deviations()
     deviation = np.degrees(np.hypot(told["right.rotation.0"], told["right.rotation.1"]))
-    yield Figure("rotation against published", f"{turn:.2f} degrees (own deviation {deviation:.2f})", "agreement")
+    yield Figure(
+        "rotation against published", f"{turn:.2f} degrees (own deviation {deviation:.2f})", "agreement"
+    )
     yield Figure("seconds", f"{seconds:.0f}", "")
 
 
@@ -97,7 +103,9 @@ def tracks(data: Path) -> Iterator[Figure]:
     problem, start = fifteen_cameras(data).problem, time.process_time()
     found = adjust(problem)
     rms, seconds = rms_and_mean(found.problem)[0], time.process_time() - start
-    yield Figure("15 cameras, free points: RMS", f"{rms:.4f} px in {seconds:.0f} s", f"at most {FIFTEEN_RMS:.4f}, 60 s")
+    yield Figure(
+        "15 cameras, free points: RMS", f"{rms:.4f} px in {seconds:.0f} s", f"at most {FIFTEEN_RMS:.4f}, 60 s"
+    )
     problem, start = caliscope(data).problem, time.process_time()
     posed = {name: np.arange(15) < (6 if i else 0) for i, name in enumerate(problem.cameras)}
     rms = rms_and_mean(adjust(replace(problem, free=posed), rounds=0).problem)[0]
@@ -131,7 +139,9 @@ def rendered(boards: Path) -> Iterator[Figure]:
     yield Figure("noise of corners", f"{noise} px", "")
     yield Figure("worst rotation", f"{degrees:.4f} degrees", "at most 0.02")
     yield Figure("worst position", f"{1e3 * metres:.3f} mm", "at most 0.2")
-    yield Figure("worst parameter", f"{np.abs(relative).max():.2f} deviations ({found.fit.names[worst]})", "at most 3")
+    yield Figure(
+        "worst parameter", f"{np.abs(relative).max():.2f} deviations ({found.fit.names[worst]})", "at most 3"
+    )
     yield Figure("chi-square of all parameters", f"{square:.0f} of {len(errors)}", "")
     yield Figure("seconds", f"{seconds:.0f}", "")
 

@@ -1,11 +1,12 @@
 """How often `pat rig doctor` names the right mistake, over real rigs and images: a table of confusions.
 
-    python -m tests.benchmarks.bench_doctor --data ../shared/data --cases 10 --out tests/benchmarks/RESULTS_doctor.md
+    python -m tests.benchmarks.bench_doctor --data ../shared/data --cases 10 --out
+    tests/benchmarks/RESULTS_doctor.md
 
-A case is a real pair and a random mistake made with its rig or its images. One that is no more than the rig's own
-misfit is drawn again: where lines move by less than 0.1 px, or by less than 3 times what the rig was off before, a
-mistake cannot be distinguished from the drift of a rig. Shifts of a pixel or half of one are drawn only for rigs that
-fit their own images to 0.17 px.
+A case is a real pair and a random mistake made with its rig or its images. One that is no more than the rig's
+own misfit is drawn again: where lines move by less than 0.1 px, or by less than 3 times what the rig was off
+before, a mistake cannot be distinguished from the drift of a rig. Shifts of a pixel or half of one are drawn
+only for rigs that fit their own images to 0.17 px.
 """
 
 from __future__ import annotations
@@ -143,7 +144,9 @@ def lens(rig: Rig, images: Images, g: Random) -> Made:
         return on_cameras(rig, rig.names, lambda c: c.replace(distortion=None)), images
     if way == 1:
         return on_cameras(
-            rig, rig.names, lambda c: c.replace(distortion=Distortion(c.distortion.model, -c.distortion.coefficients))
+            rig,
+            rig.names,
+            lambda c: c.replace(distortion=Distortion(c.distortion.model, -c.distortion.coefficients)),
         ), images
     return rig, {name: undistorted(rig, name, image) for name, image in images.items()}
 
@@ -249,7 +252,10 @@ def main() -> None:
     text = confusions(options.data, cases=options.cases, seed=options.seed, kinds=options.only)
     print(text)
     if options.out:
-        note = f"{options.cases} random cases of each mistake (seed {options.seed}) with real rigs and their images."
+        note = (
+            f"{options.cases} random cases of each mistake (seed {options.seed}) with real rigs and "
+            "their images."
+        )
         write_text(options.out, f"# Which remedies the doctor names\n\n{note}\n\n{text}")
 
 

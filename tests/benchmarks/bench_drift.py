@@ -1,12 +1,14 @@
-"""What `pat rig refine` does to depth when a rig has drifted: simulated rigs, and real pairs with published rigs.
+"""What `pat rig refine` does to depth when a rig has drifted: simulated rigs, and real pairs with published
+rigs.
 
     python -m tests.benchmarks.bench_drift --draws 3 --out tests/benchmarks/RESULTS_drift.md
 
-Depth is the median relative error of the matched points' depth, against that of the true (simulated) or published
-(real) rig, of the drifted rig and of the refined one. *1 px* is the relative depth that one pixel of disparity is worth
-(median): published rigs are 0.5 to 1.2 px off their images, so that their depth is good to about as much. *said* is the
-change of depth that refine prints. *+* before the distance from the lines: the result was accepted.
-Lens mistakes are made with the real pairs' both cameras: their distortion left out, or k1 off.
+Depth is the median relative error of the matched points' depth, against that of the true (simulated) or
+published (real) rig, of the drifted rig and of the refined one. *1 px* is the relative depth that one pixel
+of disparity is worth (median): published rigs are 0.5 to 1.2 px off their images, so that their depth is good
+to about as much. *said* is the change of depth that refine prints. *+* before the distance from the lines:
+the result was accepted. Lens mistakes are made with the real pairs' both cameras: their distortion left out,
+or k1 off.
 """
 
 from __future__ import annotations
@@ -33,7 +35,16 @@ from tests.calib.real import RealPair, bumblebee, syntim
 from tests.calib.simulated import simulated_matches, simulated_rig
 
 REAL = ("Serfaty", "BatInria", "Color", "Poly", "Money", "SmRub", "BalMouss", "TableSTV")
-DRIFTS = ("nothing", "focal +2 %", "rotation .1", "rotation .3", "rotation 1", "centre 5 px", "centre 15 px", "swapped")
+DRIFTS = (
+    "nothing",
+    "focal +2 %",
+    "rotation .1",
+    "rotation .3",
+    "rotation 1",
+    "centre 5 px",
+    "centre 15 px",
+    "swapped",
+)
 LENSES = ("lens left out", "k1 +.05", "k1 +.2", "k1 -.1")
 
 
@@ -53,10 +64,14 @@ def drifted(rig: Rig, kind: str, g: np.random.Generator) -> Rig:
 
 
 def with_lens_mistake(rig: Rig, kind: str) -> Rig | None:
-    """The rig without its distortion, or with another k1 of every camera; None if it has no distortion to leave out."""
+    """The rig without its distortion, or with another k1 of every camera; None if it has no distortion to
+    leave out.
+    """
     if kind == "lens left out":
         bare = {name: camera.replace(distortion=None) for name, camera in rig.cameras.items()}
-        return rig.replace(cameras=bare) if any(c.distortion is not None for c in rig.cameras.values()) else None
+        return (
+            rig.replace(cameras=bare) if any(c.distortion is not None for c in rig.cameras.values()) else None
+        )
     some = {
         name: camera.replace(
             distortion=camera.distortion or Distortion("brown-conrady", torch.zeros(5, dtype=torch.float64))
@@ -99,12 +114,23 @@ def summary(what: str, rows: Sequence[Row]) -> str:
     """How many of the rows were accepted, and how much worse that made depth."""
     worse = [100 * (row.after - row.before) for row in rows if row.accepted]
     return (
-        f"\n{what}: {len(worse)} of {len(rows)} accepted, which increases depth's error by {max(worse):.1f} points at "
+        f"\n{what}: {len(worse)} of {len(rows)} accepted, which increases depth's error by {max(worse):.1f} "
+        "points at "
         f"most, by more than one in {sum(points > 1 for points in worse)} cases."
     )
 
 
-HEAD = ["rig", "drift", "px before", "px after", "depth before", "depth after", "said", "stated", "objections"]
+HEAD = [
+    "rig",
+    "drift",
+    "px before",
+    "px after",
+    "depth before",
+    "depth after",
+    "said",
+    "stated",
+    "objections",
+]
 
 
 def simulated(draws: int) -> Iterator[str]:
@@ -127,7 +153,9 @@ def real(data: Path, draws: int) -> Iterator[str]:
     rows = [found for pair in pairs(data) for found in _real_pair(pair, draws)]
     yield from (found.line for found in rows)
     yield summary("Real pairs", rows)
-    yield summary("Of those, lens mistakes", [found for found in rows if found.line.split(" | ")[1] in LENSES])
+    yield summary(
+        "Of those, lens mistakes", [found for found in rows if found.line.split(" | ")[1] in LENSES]
+    )
 
 
 def pairs(data: Path) -> Iterator[RealPair]:
@@ -157,8 +185,13 @@ def main() -> None:
     options = parser.parse_args()
     cv2.setRNGSeed(0)
     torch.set_num_threads(1)
-    tables = {"simulated": lambda: simulated(options.draws), "real": lambda: real(options.data, options.draws)}
-    print_tables("Depth of drifted rigs after refinement", (tables[name]() for name in options.only), options.out)
+    tables = {
+        "simulated": lambda: simulated(options.draws),
+        "real": lambda: real(options.data, options.draws),
+    }
+    print_tables(
+        "Depth of drifted rigs after refinement", (tables[name]() for name in options.only), options.out
+    )
 
 
 if __name__ == "__main__":

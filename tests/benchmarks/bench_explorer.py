@@ -2,8 +2,9 @@
 
     python -m tests.benchmarks.bench_explorer [--points 40] [--out tests/benchmarks/RESULTS_explorer.md]
 
-The sample array in headless Chromium: as a saved page, as `pat explore` serves it, and in JupyterLab where that is
-installed; with attention by windows and by a network's own features. Median and 90th percentile, milliseconds.
+The sample array in headless Chromium: as a saved page, as `pat explore` serves it, and in JupyterLab where
+that is installed; with attention by windows and by a network's own features. Median and 90th percentile,
+milliseconds.
 """
 
 from __future__ import annotations
@@ -74,10 +75,14 @@ def browser() -> Iterator[Any]:
 @contextmanager
 def server(command: list[str], folder: Path) -> Iterator[str]:
     """The address that a server prints once it answers."""
-    process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    process = subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     assert process.stdout is not None
     try:
-        yield next(found[0] for line in process.stdout if (found := re.search(r"http://(localhost|127)\S+", line)))
+        yield next(
+            found[0] for line in process.stdout if (found := re.search(r"http://(localhost|127)\S+", line))
+        )
     finally:
         process.kill()
         process.communicate()
@@ -85,7 +90,9 @@ def server(command: list[str], folder: Path) -> Iterator[str]:
 
 def times(driver: Any, points: int) -> list[float]:
     """Milliseconds of each point, once the explorer is drawn."""
-    drawn = "const c = document.querySelector('canvas[data-camera=mono]'); return c && c.parentElement.innerText"
+    drawn = (
+        "const c = document.querySelector('canvas[data-camera=mono]'); return c && c.parentElement.innerText"
+    )
     end = time.monotonic() + 180
     while "depth" not in (driver.execute_script(drawn) or ""):
         if time.monotonic() > end:
@@ -103,7 +110,9 @@ def measured(driver: Any, points: int) -> Iterator[tuple[str, str, list[float]]]
         explore(sample.rig, sample.images).save(folder / "saved.html")
         driver.get((folder / "saved.html").as_uri())
         yield "a saved page", "windows", times(driver, points)
-        images = [word for camera in ("mono", "colour") for word in ("--image", f"{camera}={SAMPLE / camera}.png")]
+        images = [
+            word for camera in ("mono", "colour") for word in ("--image", f"{camera}={SAMPLE / camera}.png")
+        ]
         for network in NETWORKS:
             chosen = [] if network == "windows" else ["--weights", network]
             command = [
@@ -134,7 +143,15 @@ def in_jupyter(driver: Any, folder: Path, network: str, points: int) -> list[flo
         "nbformat_minor": 5,
     }
     (folder / "explorer.ipynb").write_text(json.dumps(notebook))
-    command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root", "--ServerApp.token=", "--port=8899"]
+    command = [
+        sys.executable,
+        "-m",
+        "jupyterlab",
+        "--no-browser",
+        "--allow-root",
+        "--ServerApp.token=",
+        "--port=8899",
+    ]
     with server(command, folder) as address:
         base = address.split("/lab")[0].split("/tree")[0].rstrip("/")
         driver.get(f"{base}/lab/tree/explorer.ipynb")
@@ -156,7 +173,13 @@ def rows(points: int) -> Iterator[str]:
     yield from markdown_header(["in", "attention by", "points", "median, ms", "90 %, ms"]).splitlines()
     with browser() as driver:
         for where, network, found in measured(driver, points):
-            cells = where, network, str(len(found)), f"{median(found):.0f}", f"{quantiles(found, n=10)[-1]:.0f}"
+            cells = (
+                where,
+                network,
+                str(len(found)),
+                f"{median(found):.0f}",
+                f"{quantiles(found, n=10)[-1]:.0f}",
+            )
             yield markdown_row(list(cells))
 
 

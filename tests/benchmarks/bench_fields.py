@@ -1,8 +1,8 @@
 """Fields for all pixels of a 1280 x 800 alpha against three betas, beside the pixel-by-pixel construction.
 
-Run as `python -m tests.benchmarks.bench_fields`. Median and range of five runs, float32, two threads. The baseline
-is what the paper's own code does for each pixel and beta: the line, the distances of the pixels of a window
-about H x, and the 96 nearest, in numpy; timed on a sample of pixels and scaled to all.
+Run as `python -m tests.benchmarks.bench_fields`. Median and range of five runs, float32, two threads. The
+baseline is what the paper's own code does for each pixel and beta: the line, the distances of the pixels of a
+window about H x, and the 96 nearest, in numpy; timed on a sample of pixels and scaled to all.
 """
 
 from __future__ import annotations
@@ -42,7 +42,9 @@ SAMPLE = 500
 def pairs(lens: Distortion | None = None) -> list[Pair]:
     """One alpha and three betas about 10 cm apart, turned by a degree or two."""
     K = intrinsics(900.0, HW)
-    places = torch.tensor([[0, 0, 0], [0.1, 0.02, 0], [-0.1, 0.01, 0.03], [0.02, 0.12, -0.02]], dtype=torch.float64)
+    places = torch.tensor(
+        [[0, 0, 0], [0.1, 0.02, 0], [-0.1, 0.01, 0.03], [0.02, 0.12, -0.02]], dtype=torch.float64
+    )
     cameras = [
         Camera(K=K, cam_from_world=Pose.from_centre(rotation_from_vector(0.3 * p), p), hw=HW, distortion=lens)
         for p in places
@@ -91,7 +93,10 @@ def main() -> None:
     sample = torch.from_numpy(g.uniform(0, [HW[1] - 1, HW[0] - 1], (SAMPLE, 2)).round()).float()
     whole = pixel_grid(HW)
     pixels = HW[0] * HW[1]
-    print(f"{'field':36} {'pixels':>8} {'median s':>9} {'range s':>15} {'s, all pixels':>14} {'us/pixel/beta':>14}")
+    print(
+        f"{'field':36} {'pixels':>8} {'median s':>9} {'range s':>15} {'s, all pixels':>14} "
+        f"{'us/pixel/beta':>14}"
+    )
 
     def report(name: str, seconds: tuple[float, float, float], n: int) -> None:
         median, low, high = seconds
@@ -114,7 +119,11 @@ def main() -> None:
     field("NearestVoxels(96, 80), sample", NearestVoxels(), straight, sample)
     field("Curved(96), lenses, sample", Curved(), curved, sample)
     points = sample.numpy()
-    report("pixel by pixel (numpy), sample", timed(lambda: [pixel_by_pixel(p, points[:200]) for p in straight]), 200)
+    report(
+        "pixel by pixel (numpy), sample",
+        timed(lambda: [pixel_by_pixel(p, points[:200]) for p in straight]),
+        200,
+    )
 
 
 if __name__ == "__main__":

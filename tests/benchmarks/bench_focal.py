@@ -1,10 +1,12 @@
-"""Focal lengths found from two images alone, of pairs whose cameras are known, against the one that is assumed.
+"""Focal lengths found from two images alone, of pairs whose cameras are known, against the one that is
+assumed.
 
     python -m tests.benchmarks.bench_focal --out tests/benchmarks/RESULTS_focal.md
 
-Images with rectangular pixels are resized until those are square. *True*: of the longer side of the image. *Assumed*,
-*fitted*: their errors. *Deviation*: of the fitted one, as stated; that of the prior is 50 %. It is found if that is at
-most 25 %, if it is three of its deviations from the one assumed, and if held-out points are nearer to their lines.
+Images with rectangular pixels are resized until those are square. *True*: of the longer side of the image.
+*Assumed*, *fitted*: their errors. *Deviation*: of the fitted one, as stated; that of the prior is 50 %. It is
+found if that is at most 25 %, if it is three of its deviations from the one assumed, and if held-out points
+are nearer to their lines.
 """
 
 from __future__ import annotations
@@ -57,7 +59,9 @@ def with_square_pixels(pair: RealPair) -> RealPair:
 
 
 def row(pair: RealPair) -> list[str]:
-    images = {name: scaled(image, min(MATCHED / max(image.shape[-2:]), 1.0)) for name, image in pair.images.items()}
+    images = {
+        name: scaled(image, min(MATCHED / max(image.shape[-2:]), 1.0)) for name, image in pair.images.items()
+    }
     pair = with_square_pixels(RealPair(pair.name, resized_rig(pair.rig, images), images))
     alpha, beta = pair.images
     true, longest = float(_camera(pair, alpha).K[0, 0]), max(pair.images[alpha].shape[-2:])
@@ -72,7 +76,13 @@ def row(pair: RealPair) -> list[str]:
     points = str(len(found.matches[names].alpha))
     if fit is None:
         return [*cells, points, "", "", "mirrored, or of unlike sizes"]
-    return [*cells, points, f"{fit.length / true - 1:+.0%}", f"{fit.deviation:.0%}", "found" if fit.found else ""]
+    return [
+        *cells,
+        points,
+        f"{fit.length / true - 1:+.0%}",
+        f"{fit.deviation:.0%}",
+        "found" if fit.found else "",
+    ]
 
 
 def _camera(pair: RealPair, name: str) -> Camera:

@@ -1,11 +1,11 @@
 """Measures fusing a whole frame: `python -m tests.benchmarks.bench_fuse [--scale 0.5] [--threads 2]`.
 
-The array "wide field - narrow field" at a part of its size, with smooth random images: seconds of the matching and of
-the network, what part of the latter convolutions take, and at what rate, beside the rate of this machine's matrix
-products with as many threads in the same run. `--full-runs` instead fuses the rendered frame of 4024x3036 under caps
-(`--caps 4GiB 8GiB 2GiB`; `python -m experiments systems run wide-narrow --full --max-memory ...`), in 4 to 6
-minutes of a core each on a machine that does nothing else, and compares what comes out. Prints figures and puts them
-into
+The array "wide field - narrow field" at a part of its size, with smooth random images: seconds of the
+matching and of the network, what part of the latter convolutions take, and at what rate, beside the rate of
+this machine's matrix products with as many threads in the same run. `--full-runs` instead fuses the rendered
+frame of 4024x3036 under caps (`--caps 4GiB 8GiB 2GiB`; `python -m experiments systems run wide-narrow --full
+--max-memory ...`), in 4 to 6 minutes of a core each on a machine that does nothing else, and compares what
+comes out. Prints figures and puts them into
 tests/benchmarks/RESULTS_fuse.md, each in its section, beside those that were there.
 """
 
@@ -99,7 +99,8 @@ def measure(scale: float) -> dict[str, str]:
         "semi-global matching": f"{matching:.2f} s",
         "network": f"{fusing:.2f} s",
         "both, of 4024x3036 in one piece": f"{(matching + fusing) * 4024 * 3036 / (hw[0] * hw[1]):.0f} s",
-        "convolutions in the network": f"{convolving:.2f} s, {convolving / sum(own_times.values()):.0%} of its time",
+        "convolutions in the network": f"{convolving:.2f} s, {convolving / sum(own_times.values()):.0%} of "
+        "its time",
         "rate of the convolutions": f"{flops / convolving / 1e9:.0f} GFLOP/s",
         "rate of matrix products": f"{rate:.0f} GFLOP/s ({SIDE} squared)",
         "the one to the other": f"{flops / convolving / 1e9 / rate:.0%}",
@@ -107,7 +108,9 @@ def measure(scale: float) -> dict[str, str]:
 
 
 def full_run(cap: str, out: Path) -> str:
-    """The frame at full size under a cap: scores, plan, memory, time, and how it differs from those under others."""
+    """The frame at full size under a cap: scores, plan, memory, time, and how it differs from those under
+    others.
+    """
     before, threads = os.getloadavg()[0], os.environ.get("OMP_NUM_THREADS", "all")
     table = run_system("wide-narrow", out, full=True, max_memory=cap).table
     lines = [table, f"Threads: {threads}. Load {before:.1f} before, {os.getloadavg()[0]:.1f} after.", ""]
@@ -118,7 +121,8 @@ def full_run(cap: str, out: Path) -> str:
         if file.is_file():
             off = (own - read_image(file)).abs()
             lines.append(
-                f"Differs from that under {other} by at most {float(off.max()):.1e}, mean {float(off.mean()):.1e}."
+                f"Differs from that under {other} by at most {float(off.max()):.1e}, mean "
+                f"{float(off.mean()):.1e}."
             )
     return "\n".join(lines)
 

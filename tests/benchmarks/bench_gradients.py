@@ -2,9 +2,10 @@
 
     python -m tests.benchmarks.bench_gradients [DEGREES ...]
 
-A window of the layered sample array; colour is rotated by so many degrees about its x axis (across the baseline) or y
-axis (along it). The error is the mean squared one of the fused image, the depth the mean inverse depth where confidence
-exceeds .7; differences are over .1 degrees either way, the median of pixels for depth.
+A window of the layered sample array; colour is rotated by so many degrees about its x axis (across the
+baseline) or y axis (along it). The error is the mean squared one of the fused image, the depth the mean
+inverse depth where confidence exceeds .7; differences are over .1 degrees either way, the median of pixels
+for depth.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ def rows(degrees: float) -> list[str]:
     made = []
     for name, axis in AXES.items():
 
-        def fused(angle: Tensor, axis: tuple[float, ...] = axis, **options: bool) -> tuple[Tensor, Tensor, Tensor]:
+        def fused(
+            angle: Tensor, axis: tuple[float, ...] = axis, **options: bool
+        ) -> tuple[Tensor, Tensor, Tensor]:
             moved = rig.perturbed({"colour.rotation": angle * torch.tensor(axis, dtype=torch.float64)})
             frame = fuse(network, moved, images, alpha="mono", align=False, **options)
             return (frame.image - truth).square().mean(), 1 / frame.depth, frame.confidence.detach()
@@ -40,7 +43,9 @@ def rows(degrees: float) -> list[str]:
         error, inverse, confidence = fused(angle, differentiable=True)
         around = [fused(angle.detach() + s) for s in (-STEP, STEP)]
         likely = (torch.stack([confidence, *(a[2] for a in around)]) > 0.7).all(0)
-        slopes = [torch.autograd.grad(v, angle, retain_graph=True)[0] for v in (error, inverse[likely].mean())]
+        slopes = [
+            torch.autograd.grad(v, angle, retain_graph=True)[0] for v in (error, inverse[likely].mean())
+        ]
         changes = [(around[1][0] - around[0][0]) / (2 * STEP)]
         changes.append((around[1][1] - around[0][1])[likely].median() / (2 * STEP))
         cells = [f"{float(v):.3g}" for pair in zip(slopes, changes) for v in pair]

@@ -1,8 +1,9 @@
-"""Sixty kinds of input of `pat fuse`: `python -m tests.benchmarks.bench_inputs [--data ../shared/data] [--only WORD]`.
+"""Sixty kinds of input of `pat fuse`: `python -m tests.benchmarks.bench_inputs [--data ../shared/data]
+[--only WORD]`.
 
-Of each its exit status, whether there is depth, the mean confidence and the memory by which the process grew at most.
-Lines are printed as they are measured, and put into the table of tests/benchmarks/RESULTS_inputs.md. Exit status 1 if
-one is not as is expected.
+Of each its exit status, whether there is depth, the mean confidence and the memory by which the process grew
+at most. Lines are printed as they are measured, and put into the table of tests/benchmarks/RESULTS_inputs.md.
+Exit status 1 if one is not as is expected.
 """
 
 from __future__ import annotations
@@ -46,8 +47,18 @@ class Came(NamedTuple):
     def row(self, kind: Kind) -> list[str]:
         """Of the table."""
         confidence = "" if self.status == 2 else f"{self.confidence:.2f}"
-        wanted = "" if self.as_wanted(kind) else f" (expected: {kind.status}, {'depth' if kind.depth else 'no depth'})"
-        return [kind.name + wanted, str(self.status), "yes" if self.depth else "no", confidence, f"{self.peak:.0f}"]
+        wanted = (
+            ""
+            if self.as_wanted(kind)
+            else f" (expected: {kind.status}, {'depth' if kind.depth else 'no depth'})"
+        )
+        return [
+            kind.name + wanted,
+            str(self.status),
+            "yes" if self.depth else "no",
+            confidence,
+            f"{self.peak:.0f}",
+        ]
 
 
 def what_came(kind: Kind, folder: Path) -> Came:
@@ -64,7 +75,10 @@ def what_came(kind: Kind, folder: Path) -> Came:
 
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said), warnings.catch_warnings():
         status, peak = with_peak(fused)
-    maps = [cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in sorted((folder / "out").glob("*confidence.png"))]
+    maps = [
+        cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        for file in sorted((folder / "out").glob("*confidence.png"))
+    ]
     confidence = float(maps[0].mean() / 255) if maps else 0.0
     depth = any((folder / "out").glob("*depth.tif"))
     lines = said.getvalue().strip().splitlines() or [""]
@@ -91,9 +105,13 @@ class Bench:
             wrong += not came.as_wanted(kind)
             line = markdown_table(COLUMNS, [came.row(kind)]).splitlines()[-1]
             print(line if came.as_wanted(kind) else f"{line}\n{came.said}", flush=True)
-            known = {key: text for key, text in known.items() if not key.startswith(f"| {kind.name} (expected")}
+            known = {
+                key: text for key, text in known.items() if not key.startswith(f"| {kind.name} (expected")
+            }
             known[f"| {kind.name}"] = line
-            RESULTS.write_text("\n".join([*markdown_table(COLUMNS, []).splitlines()[:2], *known.values()]) + "\n")
+            RESULTS.write_text(
+                "\n".join([*markdown_table(COLUMNS, []).splitlines()[:2], *known.values()]) + "\n"
+            )
         return int(wrong > 0)
 
 

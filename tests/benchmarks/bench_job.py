@@ -1,13 +1,14 @@
-"""The main job as a command: `python -m tests.benchmarks.bench_job [--quick] [--runs 3] [--against CHECKOUT]`.
+"""The main job as a command: `python -m tests.benchmarks.bench_job [--quick] [--runs 3] [--against
+CHECKOUT]`.
 
-`pat fuse` as a process, from nothing to written files: the sample, 1280x800 with one and three betas, 4024x3036 under
-caps of memory; with kernels compiled before (warm), and with an empty cache (cold). Beside it, in turn in the same run,
-processes that read the same files and write an image by the classical baseline, and by OpenCV's SGBM, WLS and warp;
-and `pat fuse` of another checkout, such as that of an older commit. Then the first second (`pat --help`, `pat warm-up`
-with an empty cache, `pat demo` after it), and forty frames from folders, by
-local workers and by a Dask cluster. The images are the sample array's, enlarged.
-Prints figures, and puts them into tests/benchmarks/RESULTS_job.md; some 15 minutes on two cores, twice that with
-another checkout. `--quick`: 1280x800 with one beta only, cold once and warm once, nothing written.
+`pat fuse` as a process, from nothing to written files: the sample, 1280x800 with one and three betas,
+4024x3036 under caps of memory; with kernels compiled before (warm), and with an empty cache (cold). Beside
+it, in turn in the same run, processes that read the same files and write an image by the classical baseline,
+and by OpenCV's SGBM, WLS and warp; and `pat fuse` of another checkout, such as that of an older commit. Then
+the first second (`pat --help`, `pat warm-up` with an empty cache, `pat demo` after it), and forty frames from
+folders, by local workers and by a Dask cluster. The images are the sample array's, enlarged.
+Prints figures, and puts them into tests/benchmarks/RESULTS_job.md; some 15 minutes on two cores, twice that
+with another checkout. `--quick`: 1280x800 with one beta only, cold once and warm once, nothing written.
 """
 
 from __future__ import annotations
@@ -69,8 +70,8 @@ MANY = QUICK[0].name
 
 
 def run(command: Sequence[str], cache: Path, root: Path = ROOT) -> Run:
-    """Run a command in a checkout, numba's cache in a folder. Raises RuntimeError if it fails; low confidence, as the
-    blur of enlarged images gives, is no failure."""
+    """Run a command in a checkout, numba's cache in a folder. Raises RuntimeError if it fails; low
+    confidence, as the blur of enlarged images gives, is no failure."""
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
     begin = time.perf_counter()
     with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as errors:
@@ -82,7 +83,9 @@ def run(command: Sequence[str], cache: Path, root: Path = ROOT) -> Run:
             stream.seek(0)
         lines = out.read().splitlines()
         if process.returncode not in (0, LowConfidenceWarning.exit_status):
-            raise RuntimeError(f"{' '.join(command)} ended with {process.returncode}:\n{errors.read()[-2000:]}")
+            raise RuntimeError(
+                f"{' '.join(command)} ended with {process.returncode}:\n{errors.read()[-2000:]}"
+            )
     printed = [json.loads(line) for line in lines if line.startswith("{")]
     return Run(wall, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024.0, printed[-1] if printed else {})
 
@@ -107,8 +110,8 @@ def scenes(cases: Sequence[Case], work: Path) -> Iterator[tuple[Case, Path]]:
 def measured(
     case: Case, folder: Path, work: Path, runs: int, *, others: bool, old: Path | None
 ) -> dict[str, list[Run]]:
-    """Runs by the way to fuse. Beside others the first of each fills the cache and is not counted; without, kernels are
-    there by then."""
+    """Runs by the way to fuse. Beside others the first of each fills the cache and is not counted; without,
+    kernels are there by then."""
     fuse = fuse_arguments(case, folder, work / "out")
     ways = {"pat fuse": [*PAT, "fuse", *fuse]}
     if old:
@@ -119,7 +122,9 @@ def measured(
     for i in range(runs + others):
         for way, command in ways.items():
             try:
-                one = run(command, work / ("old" if way == "old" else "warm"), old if old and way == "old" else ROOT)
+                one = run(
+                    command, work / ("old" if way == "old" else "warm"), old if old and way == "old" else ROOT
+                )
             except RuntimeError as error:
                 if way != "old":
                     raise
@@ -151,8 +156,8 @@ def first_second(work: Path, runs: int, root: Path) -> list[list[str]]:
 
 
 def many_frames(case: Case, folder: Path, work: Path, one: float, root: Path) -> Iterator[list[str]]:
-    """Lines of the table of `FRAMES` frames from folders by as many workers as there are cores, and by a Dask cluster
-    of as many; `one` is the seconds of a process that fuses one of them."""
+    """Lines of the table of `FRAMES` frames from folders by as many workers as there are cores, and by a Dask
+    cluster of as many; `one` is the seconds of a process that fuses one of them."""
     names = ["mono", *(f"colour{i + 1}" for i in range(case.betas))]
     for name in names:
         frames = work / f"frames{case.wh[0]}" / name
@@ -162,7 +167,16 @@ def many_frames(case: Case, folder: Path, work: Path, one: float, root: Path) ->
                 (frames / f"{i:03d}.png").symlink_to(folder / f"{name}.png")
     images = [word for name in names for word in ("--image", f"{name}={work / f'frames{case.wh[0]}' / name}")]
     workers = len(os.sched_getaffinity(0))
-    command = [*PAT, "fuse", str(folder / "rig.yaml"), "--alpha", "mono", *images, "--out", tempfile.mkdtemp(dir=work)]
+    command = [
+        *PAT,
+        "fuse",
+        str(folder / "rig.yaml"),
+        "--alpha",
+        "mono",
+        *images,
+        "--out",
+        tempfile.mkdtemp(dir=work),
+    ]
     cache = work / ("warm" if root == ROOT else "old")
     found = run([*command, "--workers", str(workers)], cache, root)
     same = f"{60 / one:.1f}"
@@ -180,7 +194,9 @@ def cluster(work: Path, workers: int, cache: Path, root: Path) -> Iterator[str]:
     quiet: dict[str, Any] = {"cwd": root, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     quiet["env"] = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(root)}
     given = ["--scheduler-file", str(file)]
-    scheduler = subprocess.Popen([*dask, "scheduler", "--port", "0", "--dashboard-address", ":0", *given], **quiet)
+    scheduler = subprocess.Popen(
+        [*dask, "scheduler", "--port", "0", "--dashboard-address", ":0", *given], **quiet
+    )
     many = ["--nworkers", str(workers), "--nthreads", "1", "--memory-limit", "0", "--no-dashboard"]
     both = [scheduler, subprocess.Popen([*dask, "worker", *many, *given], **quiet)]
     try:
@@ -224,7 +240,19 @@ def stages_row(case: Case, found: dict[str, list[Run]]) -> list[str]:
 
 
 STAGE_NAMES = (
-    *("import", "read", "views", "field", "plan", "pre-pass", "matching", "attention", "network", "depth", "write"),
+    *(
+        "import",
+        "read",
+        "views",
+        "field",
+        "plan",
+        "pre-pass",
+        "matching",
+        "attention",
+        "network",
+        "depth",
+        "write",
+    ),
     "rest",
 )
 COLUMNS = (
@@ -276,7 +304,8 @@ def main() -> None:
         f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores, {threads} threads; "
         f"load {load:.1f} before, {os.getloadavg()[0]:.1f} after;\n"
         f"medians of {runs} runs (4024x3036: one), in turn with the others.\n\n"
-        f"{table(COLUMNS, rows)}\nWhere the time goes: share of the seconds, and seconds of a core. Each part without "
+        f"{table(COLUMNS, rows)}\nWhere the time goes: share of the seconds, and seconds of a core. Each "
+        "part without "
         f"those within it.\n\n{table(('', *STAGE_NAMES), stages)}"
     )
     if first:

@@ -1,9 +1,11 @@
-"""A job of forty frames: how fast, and what it survives. `python -m tests.benchmarks.bench_jobs [--frames 40]`.
+"""A job of forty frames: how fast, and what it survives. `python -m tests.benchmarks.bench_jobs [--frames
+40]`.
 
-Forty images of the sample array, each a little brighter, fused by `pat fuse`: with one and with two workers; with a
-worker killed (kill -9) in the middle; with the whole command killed and begun again; with a corrupt image, and one
-that disappears under way; and onto a disk that fills up (a small tmpfs, where mounting is allowed). Every image of
-every run is compared, byte for byte, with that of the first run. Exits with 1 if anything differs.
+Forty images of the sample array, each a little brighter, fused by `pat fuse`: with one and with two workers;
+with a worker killed (kill -9) in the middle; with the whole command killed and begun again; with a corrupt
+image, and one that disappears under way; and onto a disk that fills up (a small tmpfs, where mounting is
+allowed). Every image of every run is compared, byte for byte, with that of the first run. Exits with 1 if
+anything differs.
 """
 
 from __future__ import annotations
@@ -54,7 +56,17 @@ class Job:
     def start(self, out: Path, *more: str) -> subprocess.Popen:
         """`pat fuse` of all frames."""
         images = [text for name in ("mono", "colour") for text in ("--image", f"{name}={self.folder / name}")]
-        line = [sys.executable, "-m", "pat", "fuse", "--rig", self.folder / "rig.yaml", "--alpha", "mono", *images]
+        line = [
+            sys.executable,
+            "-m",
+            "pat",
+            "fuse",
+            "--rig",
+            self.folder / "rig.yaml",
+            "--alpha",
+            "mono",
+            *images,
+        ]
         run = [str(part) for part in (*line, "--out", out, "--threads", "1", *more)]
         log = out.with_suffix(".log").open("a")
         return subprocess.Popen(run, stdout=log, stderr=log, start_new_session=True, cwd=ROOT)
@@ -111,7 +123,11 @@ def kill_a_worker(job: Job) -> str:
     out = job.folder / "killed_worker"
     process = job.start(out, "--workers", "2")
     wait_for(process, lambda: count(out) >= job.frames // 3)
-    workers = [p for p in psutil.Process(process.pid).children(recursive=True) if "spawn_main" in " ".join(p.cmdline())]
+    workers = [
+        p
+        for p in psutil.Process(process.pid).children(recursive=True)
+        if "spawn_main" in " ".join(p.cmdline())
+    ]
     max(workers, key=lambda p: sum(p.cpu_times()[:2])).kill()
     there = count(out)
     job.expect(process.wait() == 0, f"killed worker: {job.said(out)[-200:]}")
@@ -130,7 +146,9 @@ def kill_the_command(job: Job) -> str:
     job.expect(0 < len(before) < job.frames, f"killed command: {len(before)} frames were there")
     job.expect(job.start(out, "--workers", "2", "--resume").wait() == 0, f"resumed: {job.said(out)[-200:]}")
     after = {p.name: p.stat().st_mtime_ns for p in out.glob("*_fused.png")}
-    job.expect(all(after[name] == when for name, when in before.items()), "resumed: finished frames were made again")
+    job.expect(
+        all(after[name] == when for name, when in before.items()), "resumed: finished frames were made again"
+    )
     job.compare(out, "killed command")
     return f"the command killed after {len(before)} frames and resumed: {count(out)} frames, the same bits"
 
@@ -156,7 +174,10 @@ def bad_images(job: Job) -> str:
     done = job.start(out, "--resume").wait() == 0
     job.expect(done, f"mended: {job.said(out)[-200:]}")
     job.compare(out, "mended")
-    return f"stopped at the corrupt image, or skipped it and the vanished one: {job.frames - 2} right; mended: all"
+    return (
+        f"stopped at the corrupt image, or skipped it and the vanished one: {job.frames - 2} right; "
+        "mended: all"
+    )
 
 
 def full_disk(job: Job) -> str:
@@ -200,7 +221,9 @@ def main() -> None:
     given = parser.parse_args()
     print(f"{os.cpu_count()} cores, load before: {os.getloadavg()[0]:.1f}", flush=True)
     with tempfile.TemporaryDirectory() as folder:
-        wrong = run(Path(folder), frames=given.frames, scale=given.scale, say=lambda text: print(text, flush=True))
+        wrong = run(
+            Path(folder), frames=given.frames, scale=given.scale, say=lambda text: print(text, flush=True)
+        )
     print("\n".join(wrong) or "nothing wrong")
     sys.exit(bool(wrong))
 

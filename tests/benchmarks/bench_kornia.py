@@ -2,11 +2,12 @@
 
 Run as `python -m tests.benchmarks.bench_kornia [table] [calls]`; it writes both, or one, into docs/kornia.md.
 
-The value's difference is the largest over all entries, float64, relative to the largest entry. The gradient's error is
-each library's own, of a random cotangent, against central differences of its own values; second derivatives have to be
-finite. Under autocast to bfloat16 (float32 given) and with everything in float16 errors are against float64, relative
-to the largest entry. Times are of forward and backward in float64 on one thread, for 20,000 points, median of several
-runs, kornia's divided by ours. Kornia's functions are counted as they are called from our code, by a profiler.
+The value's difference is the largest over all entries, float64, relative to the largest entry. The gradient's
+error is each library's own, of a random cotangent, against central differences of its own values; second
+derivatives have to be finite. Under autocast to bfloat16 (float32 given) and with everything in float16
+errors are against float64, relative to the largest entry. Times are of forward and backward in float64 on one
+thread, for 20,000 points, median of several runs, kornia's divided by ours. Kornia's functions are counted as
+they are called from our code, by a profiler.
 """
 
 from __future__ import annotations
@@ -106,7 +107,11 @@ def table() -> str:
             name,
             f"{value_difference(case):.0e}",
             *(f"{gradient_error(f, case.at):.0e}" for f in case[:2]),
-            *(low_precision(name, side, dtype) for dtype in (torch.float32, torch.float16) for side in (0, 1)),
+            *(
+                low_precision(name, side, dtype)
+                for dtype in (torch.float32, torch.float16)
+                for side in (0, 1)
+            ),
             f"{time_ratio(large[name]):.1f}",
         ]
         lines.append(f"| {' | '.join(cells)} |")
@@ -138,7 +143,11 @@ def counts() -> str:
     """Which of kornia's functions our operators call, and which `fuse`."""
     calls = {name: kornia_calls(partial(o.f, o.x)) for name, o in OPERATORS.items()}
     every = set().union(*calls.values(), kornia_calls(convert))
-    lines = [f"{sum(map(bool, calls.values()))} of {len(calls)} operators call {len(every)} of kornia's functions:", ""]
+    lines = [
+        f"{sum(map(bool, calls.values()))} of {len(calls)} operators call {len(every)} of kornia's "
+        "functions:",
+        "",
+    ]
     lines += [f"- `{name}`" for name in sorted(every)]
     return "\n".join([*lines, "", f"`fuse` calls {len(kornia_calls(fused))} of them."])
 

@@ -1,14 +1,16 @@
-"""Every lens model beside OpenCV, kornia and pycolmap: wrong answers, error, derivatives, vmap, time; docs/lenses.md.
+"""Every lens model beside OpenCV, kornia and pycolmap: wrong answers, error, derivatives, vmap, time;
+docs/lenses.md.
 
     python -m tests.benchmarks.bench_lenses [--lenses 1000] [--models NAME ...] [--write]
 
-1,000 random lenses of each model, 100 directions each, f = 1000 px, float64. The truth is the model's formula, written
-here in numpy, along the path from the axis to the direction: a lens is followed until its image folds (its Jacobian no
-longer keeps orientation). `project` is wrong where an answer that is not flagged is more than .1 px off, or is given
-beyond the fold, where the pixel is another direction's. `unproject` is asked for the pixels of directions before the
-fold, and elsewhere for some beyond all that the lens can show; it is wrong where the formula does not lead from its
-answer back to the pixel within .1 px, or from beyond the fold. Missed: a direction before the fold, or its pixel,
-flagged as not valid. A library's flag is its own, or NaN, infinity, or OpenCV's -1000000.
+1,000 random lenses of each model, 100 directions each, f = 1000 px, float64. The truth is the model's
+formula, written here in numpy, along the path from the axis to the direction: a lens is followed until its
+image folds (its Jacobian no longer keeps orientation). `project` is wrong where an answer that is not flagged
+is more than .1 px off, or is given beyond the fold, where the pixel is another direction's. `unproject` is
+asked for the pixels of directions before the fold, and elsewhere for some beyond all that the lens can show;
+it is wrong where the formula does not lead from its answer back to the pixel within .1 px, or from beyond the
+fold. Missed: a direction before the fold, or its pixel, flagged as not valid. A library's flag is its own, or
+NaN, infinity, or OpenCV's -1000000.
 """
 
 from __future__ import annotations
@@ -46,7 +48,9 @@ K = np.diag([FOCAL, FOCAL, 1.0])
 
 
 class Family(NamedTuple):
-    """A model: coefficients from a generator, its formula of c (n, k) and X (n, 3), the widest angle that is asked."""
+    """A model: coefficients from a generator, its formula of c (n, k) and X (n, 3), the widest angle that is
+    asked.
+    """
 
     draw: Callable[[np.random.Generator], list[float]]
     formula: Callable[[Any, Array], Array]
@@ -59,7 +63,11 @@ def polynomials(c: Any, x: Array, y: Array) -> Array:
     u = x * x + y * y
     radial = (1 + u * (k1 + u * (k2 + u * k3))) / (1 + u * (k4 + u * (k5 + u * k6)))
     return np.stack(
-        [x * radial + 2 * p1 * x * y + p2 * (u + 2 * x * x), y * radial + p1 * (u + 2 * y * y) + 2 * p2 * x * y], -1
+        [
+            x * radial + 2 * p1 * x * y + p2 * (u + 2 * x * x),
+            y * radial + p1 * (u + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        -1,
     )
 
 
@@ -125,17 +133,22 @@ WIDE = math.radians(80)
 FAMILIES = {
     "brown-conrady": Family(
         lambda g: (
-            spread(g, 0.5, 0.2, 0.01, 0.01, 0.05) + (spread(g, 0.2, 0.1, 0.02) if g.random() < 0.5 else [0.0] * 3)
+            spread(g, 0.5, 0.2, 0.01, 0.01, 0.05)
+            + (spread(g, 0.2, 0.1, 0.02) if g.random() < 0.5 else [0.0] * 3)
         ),
         lambda c, X: polynomials(c, *flat(X)),
         math.radians(60),
     ),
     "kannala-brandt": Family(lambda g: spread(g, 0.2, 0.1, 0.05, 0.02), fisheye, WIDE),
-    "thin-prism-fisheye": Family(lambda g: spread(g, 0.2, 0.1, 0.01, 0.01, 0.05, 0.02, 0.01, 0.01), prism, WIDE),
+    "thin-prism-fisheye": Family(
+        lambda g: spread(g, 0.2, 0.1, 0.01, 0.01, 0.05, 0.02, 0.01, 0.01), prism, WIDE
+    ),
     "fov": Family(lambda g: [float(g.uniform(0.3, 2.0))], fov, WIDE),
     "unified": Family(lambda g: [float(g.uniform(0, 2)), *spread(g, 0.3, 0.1, 0.01, 0.01)], unified, WIDE),
     "extended-unified": Family(lambda g: [float(g.uniform(0, 1)), float(g.uniform(0.5, 2))], extended, WIDE),
-    "double-sphere": Family(lambda g: [float(g.uniform(-0.8, 0.8)), float(g.uniform(0, 1))], double_sphere, WIDE),
+    "double-sphere": Family(
+        lambda g: [float(g.uniform(-0.8, 0.8)), float(g.uniform(0, 1))], double_sphere, WIDE
+    ),
     "polynomial-fisheye": Family(
         lambda g: spread(g, 0.2, 0.2, 0.1),
         lambda c, X: by_angle(X, lambda t: t + c[0] * t**2 + c[1] * t**3 + c[2] * t**4),
@@ -156,14 +169,18 @@ def before_fold(family: Family, c: Array, angle: Array) -> NDArray[np.bool_]:
     for share in np.linspace(1 / STEPS, 1, STEPS):
         at = share * angle
         with np.errstate(all="ignore"):
-            middle, right, down = (family.formula(c.T, direction(at + step)) for step in ([0, 0], [h, 0], [0, h]))
+            middle, right, down = (
+                family.formula(c.T, direction(at + step)) for step in ([0, 0], [h, 0], [0, h])
+            )
         (a, b), (p, q) = ((right - middle) / h).T, ((down - middle) / h).T
         kept &= (a * q - b * p > 0) & (a + q > 0)
     return kept
 
 
 class Drawn(NamedTuple):
-    """Lenses c (l, k); directions (l p, 3), their pixels and whether they are before the fold; pixels to unproject."""
+    """Lenses c (l, k); directions (l p, 3), their pixels and whether they are before the fold; pixels to
+    unproject.
+    """
 
     c: Array
     X: Array
@@ -176,7 +193,10 @@ def drawn(name: str, lenses: int) -> Drawn:
     family, rng = FAMILIES[name], np.random.default_rng(0)
     c = np.array([family.draw(rng) for _ in range(lenses)])
     each = np.repeat(c, POINTS, 0)
-    around, theta = rng.uniform(0, 2 * np.pi, len(each)), family.widest * np.sqrt(rng.uniform(0, 1, len(each)))
+    around, theta = (
+        rng.uniform(0, 2 * np.pi, len(each)),
+        family.widest * np.sqrt(rng.uniform(0, 1, len(each))),
+    )
     angle = theta[:, None] * np.stack([np.cos(around), np.sin(around)], -1)
     X, seen = direction(angle), before_fold(family, each, angle)
     with np.errstate(all="ignore"):
@@ -188,7 +208,9 @@ def drawn(name: str, lenses: int) -> Drawn:
 
 
 class Library(NamedTuple):
-    """Of all points at once: lenses c (l, k) with X (l, p, 3) to pixels, and pixels (l, p, 2) to directions."""
+    """Of all points at once: lenses c (l, k) with X (l, p, 3) to pixels, and pixels (l, p, 2) to
+    directions.
+    """
 
     project: Callable[[Array, Array], Answer]
     unproject: Callable[[Array, Array], Answer]
@@ -243,7 +265,9 @@ def opencv(name: str) -> Library | None:
     if name == "unified":
         return Library(
             one_by_one(
-                lambda c, X: cv2.omnidir.projectPoints(X[:, None], ZERO, ZERO, K, c[0], c[1:])[0].reshape(-1, 2)
+                lambda c, X: cv2.omnidir.projectPoints(X[:, None], ZERO, ZERO, K, c[0], c[1:])[0].reshape(
+                    -1, 2
+                )
             ),
             one_by_one(
                 lambda c, x: homogeneous(
@@ -313,7 +337,9 @@ def angles(X: Array) -> Array:
 
 
 def counted(name: str, library: Library, lenses: Drawn) -> list[str]:
-    """Wrong and missed of project and of unproject, and the median and 99th percentile of the error elsewhere, px."""
+    """Wrong and missed of project and of unproject, and the median and 99th percentile of the error
+    elsewhere, px.
+    """
     family, each, shape = FAMILIES[name], np.repeat(lenses.c, POINTS, 0), (len(lenses.c), POINTS)
     with np.errstate(all="ignore"):
         pixels, valid = library.project(lenses.c, lenses.X.reshape(*shape, 3))
@@ -357,7 +383,9 @@ def timed(library: Library, lenses: Drawn) -> list[str]:
 
 
 def derivatives(name: str, library: str) -> list[str]:
-    """Whether second derivatives are right (against differences of first ones), and vmap over points and lenses."""
+    """Whether second derivatives are right (against differences of first ones), and vmap over points and
+    lenses.
+    """
     if library not in ("arraygeom", "kornia"):
         return ["none", "none"]
     rng = np.random.default_rng(1)
@@ -368,12 +396,16 @@ def derivatives(name: str, library: str) -> list[str]:
         if library == "arraygeom":
             lens = own(name, c)
             ray = lens.unproject(x)[0]
-            return ray[..., :2] / ray[..., 2:] + lens.project(torch.nn.functional.pad(x, (0, 1), value=1.0))[0]
+            return (
+                ray[..., :2] / ray[..., 2:] + lens.project(torch.nn.functional.pad(x, (0, 1), value=1.0))[0]
+            )
         return _kornia_maps(name, x, c)
 
     answers = []
     try:
-        ok = torch.autograd.gradgradcheck(there_and_back, (x.clone().requires_grad_(), c.clone().requires_grad_()))
+        ok = torch.autograd.gradgradcheck(
+            there_and_back, (x.clone().requires_grad_(), c.clone().requires_grad_())
+        )
         answers.append("right" if ok else "wrong")
     except Exception:
         answers.append("wrong")
@@ -435,13 +467,22 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--lenses", type=int, default=1000)
     parser.add_argument("--write", action="store_true", help="put the table into docs/lenses.md")
-    parser.add_argument("--models", nargs="*", default=list(FAMILIES), help="some of them; the others' rows stay")
+    parser.add_argument(
+        "--models", nargs="*", default=list(FAMILIES), help="some of them; the others' rows stay"
+    )
     given = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    made = ["| " + " | ".join(row) + " |" for row in (HEAD, ["---"] * len(HEAD), *rows(given.models, given.lenses))]
+    made = [
+        "| " + " | ".join(row) + " |"
+        for row in (HEAD, ["---"] * len(HEAD), *rows(given.models, given.lenses))
+    ]
     if given.write:
         page = PAGE.read_text()
         block = page[page.index("<!-- lenses:begin -->") : page.index("<!-- lenses:end -->")]
-        kept = [line for line in block.splitlines() if line[2:].split(" ")[0] in set(FAMILIES) - set(given.models)]
-        PAGE.write_text(with_block(page, "lenses", "\n".join([*made[:2], *sorted([*made[2:], *kept], key=_place)])))
+        kept = [
+            line for line in block.splitlines() if line[2:].split(" ")[0] in set(FAMILIES) - set(given.models)
+        ]
+        PAGE.write_text(
+            with_block(page, "lenses", "\n".join([*made[:2], *sorted([*made[2:], *kept], key=_place)]))
+        )

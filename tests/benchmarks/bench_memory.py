@@ -1,9 +1,9 @@
 """Memory of the command: `python -m tests.benchmarks.bench_memory [--megapixels 12 24] [--only NAME]`.
 
-`pat fuse` as a process, report page included: what its plan says, the resident memory that it has at most, and the
-limit that it is to keep. The images are the sample array's, enlarged, through lenses or not, with a rig or without.
-Each line is printed as it is measured, and put into the table of tests/benchmarks/RESULTS_memory.md. On two cores some
-five minutes for 4 megapixels, an hour in all.
+`pat fuse` as a process, report page included: what its plan says, the resident memory that it has at most,
+and the limit that it is to keep. The images are the sample array's, enlarged, through lenses or not, with a
+rig or without. Each line is printed as it is measured, and put into the table of
+tests/benchmarks/RESULTS_memory.md. On two cores some five minutes for 4 megapixels, an hour in all.
 """
 
 from __future__ import annotations
@@ -47,12 +47,16 @@ class Case:
         scene = folder / f"{self.megapixels}{'lens' if self.lens else ''}"
         if not scene.exists():
             sides = map(str, SIDES[self.megapixels])
-            subprocess.run([*PARTS, "scene", str(scene), *sides, "4", *["-0.05"] * self.lens], cwd=ROOT, check=True)
+            subprocess.run(
+                [*PARTS, "scene", str(scene), *sides, "4", *["-0.05"] * self.lens], cwd=ROOT, check=True
+            )
         return scene
 
     def arguments(self, scene: Path, out: Path) -> list[str]:
         """`pat fuse`'s own."""
-        files = {name: scene / f"{name}.png" for name in ("mono", *(f"colour{i + 1}" for i in range(self.betas)))}
+        files = {
+            name: scene / f"{name}.png" for name in ("mono", *(f"colour{i + 1}" for i in range(self.betas)))
+        }
         given = [str(file) for file in files.values()]
         if self.rig:
             given = [str(scene / "rig.yaml"), "--alpha", "mono"]
@@ -91,7 +95,14 @@ class Measured(NamedTuple):
         """A line of the table."""
         gib = [f"{value / 2**30:.2f}" for value in (self.plan, self.peak)]
         limit = "" if case.limit is None else f"{size_of(case.limit) / 2**30:.2f}"
-        return [str(case.megapixels), case.name, limit, *gib, f"{self.plan / self.peak:.2f}", f"{self.seconds:.0f}"]
+        return [
+            str(case.megapixels),
+            case.name,
+            limit,
+            *gib,
+            f"{self.plan / self.peak:.2f}",
+            f"{self.seconds:.0f}",
+        ]
 
 
 def size_of(limit: str) -> float:

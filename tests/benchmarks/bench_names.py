@@ -1,13 +1,14 @@
-"""What `pat rig doctor` calls mistakes, drifts and healthy rigs, and what its repair does to depth: a confusion table.
+"""What `pat rig doctor` calls mistakes, drifts and healthy rigs, and what its repair does to depth: a
+confusion table.
 
     python -m tests.benchmarks.bench_names --draws 20 --out tests/benchmarks/RESULTS_names.md
 
-Simulated rigs of wide and narrow field, and with --real eleven real pairs and their published rigs (--tune: eleven
-others); a mistake is made with the rig. Of real pairs only gross mistakes that can be observed count: points lie
-farther from their lines by 0.5 px and three times, or most of them behind the cameras or outside the depth range.
-*as good*: the right name is one of several that are said to explain the points as well. *worse*: a wrong name whose
-repair has a larger error of depth than the rig had, or lies farther from the points. The mistakes of images (another
-size, cropped, rotated) are in `bench_doctor`.
+Simulated rigs of wide and narrow field, and with --real eleven real pairs and their published rigs (--tune:
+eleven others); a mistake is made with the rig. Of real pairs only gross mistakes that can be observed count:
+points lie farther from their lines by 0.5 px and three times, or most of them behind the cameras or outside
+the depth range. *as good*: the right name is one of several that are said to explain the points as well.
+*worse*: a wrong name whose repair has a larger error of depth than the rig had, or lies farther from the
+points. The mistakes of images (another size, cropped, rotated) are in `bench_doctor`.
 """
 
 from __future__ import annotations
@@ -40,16 +41,32 @@ from tests.calib.simulated import simulated_matches, simulated_rig
 
 Random = np.random.Generator
 DRIFTED = "drifted"
-REAL = ("SYNTIM Color", "SYNTIM Serfaty", "SYNTIM BatInria", "SYNTIM TableSTV", "SYNTIM SmRub", "Bumblebee2 chair01")
+REAL = (
+    "SYNTIM Color",
+    "SYNTIM Serfaty",
+    "SYNTIM BatInria",
+    "SYNTIM TableSTV",
+    "SYNTIM SmRub",
+    "Bumblebee2 chair01",
+)
 REAL += ("Bumblebee2 stones01", "KITTI 03/000000", "Middlebury 2006_third/Cloth1", "Hilti 0", "Lund 1-3")
-TUNE = ("SYNTIM Poly", "SYNTIM Billet", "SYNTIM Money", "Bumblebee2 chair02", "Bumblebee2 thing01", "KITTI object")
+TUNE = (
+    "SYNTIM Poly",
+    "SYNTIM Billet",
+    "SYNTIM Money",
+    "Bumblebee2 chair02",
+    "Bumblebee2 thing01",
+    "KITTI object",
+)
 TUNE += ("Middlebury 2006_third/Midd1", "Hilti 2", "Lund 4-6", "fox 0001-0009", "fox 0073-0077")
 SHIFTS = ("1-based, one", "1-based, both")
 """Too small to be gross, and drifts to the eye."""
 
 
 class Mistake(NamedTuple):
-    """Its name ("nothing" for drifts and healthy rigs), and how it is made; lens: with rigs that have one only."""
+    """Its name ("nothing" for drifts and healthy rigs), and how it is made; lens: with rigs that have one
+    only.
+    """
 
     kind: str
     make: Callable[[Rig, Random], Rig]
@@ -93,7 +110,9 @@ def half_size(rig: Rig, g: Random) -> Rig:
 
 
 def mirrored(rig: Rig, g: Random) -> Rig:
-    return on_pixels(rig, [str(g.choice(rig.names))], lambda _, view: rotated_view(view, "mirrored left to right"))
+    return on_pixels(
+        rig, [str(g.choice(rig.names))], lambda _, view: rotated_view(view, "mirrored left to right")
+    )
 
 
 def drift(kind: str) -> Callable[[Rig, Random], Rig]:
@@ -131,7 +150,9 @@ MISTAKES = {
     "xyzw as wxyz": Mistake("order of quaternions", posed(lambda R, t: reordered(Pose(R, t), (1, 2, 3, 0)))),
     "degrees": Mistake("degrees and radians", posed(lambda R, t: Pose(turned(R, 180 / math.pi), t))),
     "radians": Mistake("degrees and radians", posed(lambda R, t: Pose(turned(R, math.pi / 180), t))),
-    "depth range": Mistake("depth range", lambda rig, g: rig.replace(depth=tuple(6 * float(d) for d in rig.depth))),
+    "depth range": Mistake(
+        "depth range", lambda rig, g: rig.replace(depth=tuple(6 * float(d) for d in rig.depth))
+    ),
 }
 
 
@@ -159,13 +180,17 @@ class Judge:
 
 
 def observable(case: Case, bad: Rig) -> bool:
-    """Whether images can show a gross mistake of a rig: more than its own misfit, or points where nothing is seen."""
+    """Whether images can show a gross mistake of a rig: more than its own misfit, or points where nothing is
+    seen.
+    """
     given, wrong = (median_off(rig, case.matches) for rig in (case.rig, bad))
     return wrong > max(given + 0.5, 3 * given) or share_outside(bad, case.matches) > 0.5
 
 
 def judged(mistake: Mistake, case: Case, bad: Rig) -> Outcome:
-    """The outcome: right, drifted, as good (the doctor says so of the true name), wrong, worse, false alarm."""
+    """The outcome: right, drifted, as good (the doctor says so of the true name), wrong, worse, false
+    alarm.
+    """
     sizes = {name: camera.hw for name, camera in case.rig.cameras.items()}
     found = diagnose_matches(bad, sizes, case.matches)
     name = found.named.kind
@@ -179,7 +204,9 @@ def judged(mistake: Mistake, case: Case, bad: Rig) -> Outcome:
         return "false alarm", found
     if mistake.kind in [r.kind for r in found.equal]:
         return "as good", found
-    return ("worse" if after > before + 1e-3 or found.after.misfit > found.before.misfit + 0.05 else "wrong"), found
+    return (
+        "worse" if after > before + 1e-3 or found.after.misfit > found.before.misfit + 0.05 else "wrong"
+    ), found
 
 
 def simulated_case(field: str, count: int, g: Random, *, lens: bool) -> Case:
@@ -192,7 +219,10 @@ def real_cases(data: Path, names: Sequence[str]) -> Iterator[tuple[str, Case]]:
         if pair.name in names:
             rig = Rig({name: pair.rig[name] for name in pair.images})
             matches = match_cameras(pair.images)
-            yield pair.name, Case(rig.replace(depth=seen_depths(rig.pair(*rig.names), matches[rig.names])), matches)
+            yield (
+                pair.name,
+                Case(rig.replace(depth=seen_depths(rig.pair(*rig.names), matches[rig.names])), matches),
+            )
 
 
 def table(cases: dict[str, Callable[[Random, bool], Case]], draws: int, *, observed: bool) -> Iterator[str]:
@@ -211,12 +241,19 @@ def table(cases: dict[str, Callable[[Random, bool], Case]], draws: int, *, obser
                 if mistake.lens and case.rig[case.rig.names[0]].distortion is None:
                     continue
                 bad = mistake.make(case.rig, g)
-                if observed and mistake.kind != "nothing" and what not in SHIFTS and not observable(case, bad):
+                if (
+                    observed
+                    and mistake.kind != "nothing"
+                    and what not in SHIFTS
+                    and not observable(case, bad)
+                ):
                     continue
                 outcome, found = judge(mistake, case, bad)
                 outcomes[outcome] += 1
                 names[found.named.kind] += 1
-                gross["drift" if mistake.kind == "nothing" else "small" if what in SHIFTS else "gross", outcome] += 1
+                gross[
+                    "drift" if mistake.kind == "nothing" else "small" if what in SHIFTS else "gross", outcome
+                ] += 1
                 if outcome in ("worse", "wrong", "false alarm"):
                     notes.append(f"{label}, {what}, draw {draw}: {outcome}: {found.verdict}")
             if outcomes:
@@ -249,7 +286,9 @@ def main() -> None:
             for f in ("wide", "narrow")
         }
     print_tables(
-        "What the doctor names", [table(cases, options.draws, observed=options.real or options.tune)], options.out
+        "What the doctor names",
+        [table(cases, options.draws, observed=options.real or options.tune)],
+        options.out,
     )
 
 

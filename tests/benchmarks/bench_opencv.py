@@ -1,12 +1,14 @@
 """Boards calibrated here and by OpenCV 5, with the same detected points, judged on frames that neither used.
 
-    ENV/bin/python -m tests.benchmarks.bench_opencv --boards out/boards --out tests/benchmarks/RESULTS_opencv.md
+    ENV/bin/python -m tests.benchmarks.bench_opencv --boards out/boards --out
+    tests/benchmarks/RESULTS_opencv.md
 
-ENV is an environment of its own with opencv-contrib-python-headless 5, which needs NumPy 2, and what else the project
-depends on. Rendered photographs are those of `python -m tests.calib.rendered --out out/boards`; a set without its
-folder is left out. Frames are held out in five parts. Points of all pairs of cameras count: their distance from the
-lines of the other camera's, in undistorted pixels. Lenses have OpenCV's first five terms. *Parts refused*: in so many
-of the five there was an error in place of a rig, and their points do not count. *Seconds*: of all cores together.
+ENV is an environment of its own with opencv-contrib-python-headless 5, which needs NumPy 2, and what else the
+project depends on. Rendered photographs are those of `python -m tests.calib.rendered --out out/boards`; a set
+without its folder is left out. Frames are held out in five parts. Points of all pairs of cameras count: their
+distance from the lines of the other camera's, in undistorted pixels. Lenses have OpenCV's first five terms.
+*Parts refused*: in so many of the five there was an error in place of a rig, and their points do not count.
+*Seconds*: of all cores together.
 """
 
 from __future__ import annotations
@@ -61,8 +63,8 @@ def here(views: Views, board: Board) -> Rig:
 def multiview(views: Views, board: Board) -> Rig:
     """`calibrateMultiview` of OpenCV 5, from each camera's `calibrateCamera`.
 
-    Points that a camera did not detect spoil its result, and all frames must have as many: each has the points that all
-    its cameras share, without cameras that share too few, some of them repeated.
+    Points that a camera did not detect spoil its result, and all frames must have as many: each has the
+    points that all its cameras share, without cameras that share too few, some of them repeated.
     """
     frames = [_common(views, key) for key in dict.fromkeys(key for v in views.values() for key in v.seen)]
     most = max(len(ids) for ids, _ in frames)
@@ -89,7 +91,9 @@ def _common(views: Views, key: FrameKey) -> tuple[np.ndarray, dict[str, Detectio
     seen = {name: v.seen[key] for name, v in views.items() if key in v.seen}
     while len(ids := reduce(np.intersect1d, (d.ids for d in seen.values()))) < FEWEST:
         del seen[min(seen, key=lambda name: len(seen[name].ids))]
-    return ids, {n: Detection(ids, d.x[np.argsort(d.ids)][np.isin(np.sort(d.ids), ids)]) for n, d in seen.items()}
+    return ids, {
+        n: Detection(ids, d.x[np.argsort(d.ids)][np.isin(np.sort(d.ids), ids)]) for n, d in seen.items()
+    }
 
 
 def stereo(views: Views, board: Board) -> Rig:
@@ -118,7 +122,9 @@ def _rig(views: Views, Ks, lenses, Rs, ts) -> Rig:
     cameras = {}
     for (name, v), K, lens, R, t in zip(views.items(), Ks, lenses, Rs, ts):
         R = cv2.Rodrigues(R)[0] if np.size(R) == 3 else R
-        K, R, t, lens = (torch.from_numpy(np.array(value, float)) for value in (K, R, np.ravel(t), np.ravel(lens)))
+        K, R, t, lens = (
+            torch.from_numpy(np.array(value, float)) for value in (K, R, np.ravel(t), np.ravel(lens))
+        )
         cameras[name] = Camera(
             hw=v.hw, K=K, cam_from_world=Pose(R, t), distortion=Distortion("brown-conrady", lens[:5])
         )
@@ -126,7 +132,9 @@ def _rig(views: Views, Ks, lenses, Rs, ts) -> Rig:
 
 
 class HeldOut(NamedTuple):
-    """Distances (pixels) of held-out points by rigs calibrated without them; in how many parts there is none."""
+    """Distances (pixels) of held-out points by rigs calibrated without them; in how many parts there is
+    none.
+    """
 
     errors: Float[np.ndarray, " n"]
     refused: int
@@ -154,7 +162,9 @@ def held_out(calibrated: Calibrator, views: Views, board: Board) -> HeldOut:
 
 
 def rows(data: Path, boards: Path) -> Iterator[str]:
-    yield markdown_header(["boards", "frames", "calibrated by", "median px", "mean px", "parts refused", "seconds"])
+    yield markdown_header(
+        ["boards", "frames", "calibrated by", "median px", "mean px", "parts refused", "seconds"]
+    )
     for name, views, board in sets(data, boards):
         frames = len(set().union(*(v.seen for v in views.values())))
         by: dict[str, Calibrator] = {"calib": here, "calibrateMultiview": multiview}

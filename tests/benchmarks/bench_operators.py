@@ -1,11 +1,13 @@
-"""Operators of several views beside OpenCV, kornia, pycolmap and SciPy: value, gradient, time; docs/lenses.md.
+"""Operators of several views beside OpenCV, kornia, pycolmap and SciPy: value, gradient, time;
+docs/lenses.md.
 
     python -m tests.benchmarks.bench_operators [--write]
 
-Values: the largest difference of the two, relative to the largest value, on what both have; of noisy triangulation (one
-pixel, points at 3 to 6 m) each one's own median error against the true point, mm. Gradients: ours against central
-differences, relative; "none" where the library has none. Times are of processor time for 2,000 points or one image of
-240 x 320, float64, one thread, theirs divided by ours: above 1, arraygeom is faster.
+Values: the largest difference of the two, relative to the largest value, on what both have; of noisy
+triangulation (one pixel, points at 3 to 6 m) each one's own median error against the true point, mm.
+Gradients: ours against central differences, relative; "none" where the library has none. Times are of
+processor time for 2,000 points or one image of 240 x 320, float64, one thread, theirs divided by ours: above
+1, arraygeom is faster.
 """
 
 from __future__ import annotations
@@ -67,7 +69,9 @@ def rig_of(lens: Any = None, cameras: int = 2) -> Rig:
     return Rig(made, depth=(3.0, 6.0))
 
 
-X = torch.cat([torch.rand(N, 2, dtype=F64, generator=G) * 2 - 1, 3 + 3 * torch.rand(N, 1, dtype=F64, generator=G)], 1)
+X = torch.cat(
+    [torch.rand(N, 2, dtype=F64, generator=G) * 2 - 1, 3 + 3 * torch.rand(N, 1, dtype=F64, generator=G)], 1
+)
 NOISE = torch.randn(2, N, 2, dtype=F64, generator=G)
 PINHOLES = rig_of()
 BROWN = rig_of(Distortion("brown-conrady", vector(-0.1, 0.02, 1e-3, -5e-4)))
@@ -169,15 +173,25 @@ def triangulations() -> Iterator[Row]:
         return (found[:3] / found[3]).T
 
     slope = f"{gradient_error(lambda v: points_of(BROWN, v.reshape(2, 20, 2)), bent[:, :20].flatten()):.0e}"
-    value = f"true points {apart(points_of(BROWN, bent), X)}, theirs {apart(torch.as_tensor(undistorted()), X)}"
+    value = (
+        f"true points {apart(points_of(BROWN, bent), X)}, theirs {apart(torch.as_tensor(undistorted()), X)}"
+    )
     yield Row(
-        "triangulate, lenses", "OpenCV", value, slope, "none", ratio(lambda: points_of(BROWN, bent), undistorted, 3)
+        "triangulate, lenses",
+        "OpenCV",
+        value,
+        slope,
+        "none",
+        ratio(lambda: points_of(BROWN, bent), undistorted, 3),
     )
     for name, model in NOT_CENTRAL.items():
         rig = rig_of(model)
         x = seen(rig)
-        slope = f"{gradient_error(lambda v, rig=rig: points_of(rig, v.reshape(2, 20, 2)), x[:, :20].flatten()):.0e}"
-        yield Row(f"triangulate, {name}", "no other", f"true points {apart(points_of(rig, x), X)}", slope, "", "")
+        error = gradient_error(lambda v, rig=rig: points_of(rig, v.reshape(2, 20, 2)), x[:, :20].flatten())
+        slope = f"{error:.0e}"
+        yield Row(
+            f"triangulate, {name}", "no other", f"true points {apart(points_of(rig, x), X)}", slope, "", ""
+        )
 
 
 def poses() -> Iterator[Row]:
@@ -214,7 +228,10 @@ def images() -> Iterator[Row]:
     def swept(picture: np.ndarray = picture) -> np.ndarray:
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         return np.stack(
-            [cv2.warpPerspective(picture, pair.homography_at(d).numpy(), HW[::-1], flags=flags) for d in planes]
+            [
+                cv2.warpPerspective(picture, pair.homography_at(d).numpy(), HW[::-1], flags=flags)
+                for d in planes
+            ]
         )
 
     found = plane_sweep(pair, image, planes)
@@ -234,7 +251,9 @@ def images() -> Iterator[Row]:
 def adjustment() -> Iterator[Row]:
     rig, points = rig_of(cameras=3), X[:100]
     cameras = list(rig.cameras.values())
-    x = torch.stack([c.project(points).x for c in cameras]) + 0.3 * torch.randn(3, 100, 2, dtype=F64, generator=G)
+    x = torch.stack([c.project(points).x for c in cameras]) + 0.3 * torch.randn(
+        3, 100, 2, dtype=F64, generator=G
+    )
     free = ["camera 1.rotation", "camera 2.rotation", "camera 2.translation"]
     zeros = rig.parameters(free=free)
     sizes = [v.numel() for v in zeros.values()]
@@ -242,14 +261,22 @@ def adjustment() -> Iterator[Row]:
     def cost(v: np.ndarray) -> np.ndarray:
         p = torch.from_numpy(v)
         moved = rig.perturbed(dict(zip(zeros, p[: sum(sizes)].split(sizes))))
-        return reprojection_residuals(list(moved.cameras.values()), p[sum(sizes) :].reshape(-1, 3), x).flatten().numpy()
+        return (
+            reprojection_residuals(list(moved.cameras.values()), p[sum(sizes) :].reshape(-1, 3), x)
+            .flatten()
+            .numpy()
+        )
 
     def theirs() -> Any:
-        return least_squares(cost, np.concatenate([np.zeros(sum(sizes)), points.flatten().numpy()]), method="trf")
+        return least_squares(
+            cost, np.concatenate([np.zeros(sum(sizes)), points.flatten().numpy()]), method="trf"
+        )
 
     ours = bundle_adjusted(rig, points, x, free=free)
     value = f"cost, relative {float(ours.cost[-1]) / (2 * theirs().cost) - 1:+.0e}"
-    slope = gradient_error(lambda v: bundle_adjusted(rig, points, v.reshape(3, 100, 2), free=free).X, x.flatten())
+    slope = gradient_error(
+        lambda v: bundle_adjusted(rig, points, v.reshape(3, 100, 2), free=free).X, x.flatten()
+    )
     times = ratio(lambda: bundle_adjusted(rig, points, x, free=free), theirs, 1)
     yield Row("bundle adjustment, 309 numbers", "SciPy", value, f"{slope:.0e}", "none", times)
     c = np.array([-0.1, 0.02, 1e-3, -5e-4])
@@ -262,12 +289,22 @@ def adjustment() -> Iterator[Row]:
     slope = gradient_error(lambda v: camera.project(v.reshape(-1, 3)).x, X[:20].flatten())
     times = ratio(lambda: camera.project(X), projected)
     yield Row(
-        "projection through a lens", "OpenCV", apart(camera.project(X).x, projected()), f"{slope:.0e}", "none", times
+        "projection through a lens",
+        "OpenCV",
+        apart(camera.project(X).x, projected()),
+        f"{slope:.0e}",
+        "none",
+        times,
     )
     rays = world_rays(camera, camera.project(X).x)
     away = torch.linalg.cross(X, rays.direction).sub(rays.plucker[:, 3:]).norm(dim=-1).max()
     yield Row(
-        "rays, Pluecker coordinates", "no other", f"true points off their rays by {float(away):.0e} m", "", "", ""
+        "rays, Pluecker coordinates",
+        "no other",
+        f"true points off their rays by {float(away):.0e} m",
+        "",
+        "",
+        "",
     )
 
 

@@ -1,7 +1,8 @@
 """Measures reading rendered scenes: `python -m tests.benchmarks.bench_patches`.
 
-One layered scene of the paper's size (two views of 2048x1536) is rendered, then cut into the paper's 49 patches and
-recorded by the default chains. Seconds of a core for a patch, to compare with those of a training step.
+One layered scene of the paper's size (two views of 2048x1536) is rendered, then cut into the paper's 49
+patches and recorded by the default chains. Seconds of a core for a patch, to compare with those of a training
+step.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ def rig() -> Rig:
     cameras = {
         name: Camera(
             K=intrinsics(1800.0, hw),
-            cam_from_world=Pose(torch.eye(3, dtype=torch.float64), torch.tensor([x, 0, 0], dtype=torch.float64)),
+            cam_from_world=Pose(
+                torch.eye(3, dtype=torch.float64), torch.tensor([x, 0, 0], dtype=torch.float64)
+            ),
             hw=hw,
             sensor=Sensor(response="mono" if name == "mono" else "rgb"),
         )
@@ -52,8 +55,14 @@ def main() -> None:
             data[i]
         recording = time.process_time() - begin
     count = PatchGrid().count
-    print(f"a scene takes {size:.1f} MB of disk; reading it and cutting its {count} patches {cutting:.2f} s of a core")
-    print(f"a patch: {1000 * cutting / count:.1f} ms to read and cut, {1000 * recording / count:.1f} ms to record")
+    print(
+        f"a scene takes {size:.1f} MB of disk; reading it and cutting its {count} patches {cutting:.2f} s "
+        "of a core"
+    )
+    print(
+        f"a patch: {1000 * cutting / count:.1f} ms to read and cut, {1000 * recording / count:.1f} ms to "
+        "record"
+    )
 
 
 if __name__ == "__main__":

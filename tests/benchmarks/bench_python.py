@@ -1,10 +1,11 @@
-"""From Python as from the command line, beside other processes or not: seconds of a frame once all is imported.
+"""From Python as from the command line, beside other processes or not: seconds of a frame once all is
+imported.
 
     python -m tests.benchmarks.bench_python [--busy 3] [--frames 4] [--against FOLDER]
 
-A notebook imports torch first, without `OMP_WAIT_POLICY`; the command sets it to PASSIVE. `--against` measures another
-checkout in turn with this one. Other processes are loops of Python's, as many as `--busy`. The table goes to
-tests/benchmarks/RESULTS_python.md.
+A notebook imports torch first, without `OMP_WAIT_POLICY`; the command sets it to PASSIVE. `--against`
+measures another checkout in turn with this one. Other processes are loops of Python's, as many as `--busy`.
+The table goes to tests/benchmarks/RESULTS_python.md.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ warnings.simplefilter("ignore")
 sample, network = load_sample(), load_weights("mono-colour")
 rig, images = sample.rig, {{}}
 for name, image in sample.images.items():
-    images[name] = torch.nn.functional.interpolate(image[None], scale_factor={scale}, mode="bicubic")[0].clamp(0, 1)
+    image = torch.nn.functional.interpolate(image[None], scale_factor={scale}, mode="bicubic")[0]
+    images[name] = image.clamp(0, 1)
     rig = rig.resize(name, tuple(images[name].shape[1:]))
 for i in range({frames} + 1):
     begin = time.monotonic()
@@ -69,7 +71,13 @@ class Bench:
                     for label, folder in checkouts.items():
                         load = f"{os.getloadavg()[0]:.0f}"
                         took = [self.seconds(folder, policy, scale) for policy in POLICIES.values()]
-                        cells = [label + size, str(busy), load, *(f"{t:.2f}" for t in took), f"{took[0] / took[1]:.2f}"]
+                        cells = [
+                            label + size,
+                            str(busy),
+                            load,
+                            *(f"{t:.2f}" for t in took),
+                            f"{took[0] / took[1]:.2f}",
+                        ]
                         rows.append(cells)
                         print(markdown_table(COLUMNS, [cells]).splitlines()[-1], flush=True)
             finally:
@@ -82,7 +90,9 @@ class Bench:
         plain = {k: v for k, v in os.environ.items() if not k.startswith("OMP_")}
         environment = {**plain, **policy, "PYTHONPATH": str(folder)}
         command = [sys.executable, "-c", FRAME.format(frames=self.frames, scale=scale)]
-        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            command, cwd=folder, env=environment, capture_output=True, text=True, check=True
+        )
         return median(map(float, done.stdout.split()[1:]))
 
 

@@ -2,9 +2,9 @@
 
     python -m tests.benchmarks.bench_recipe --photos ~/images
 
-Every variant is trained from nothing on the same samples, for the same few steps, and validated on the same held-out
-scenes. The base is trained with several seeds (of its weights and of its samples): a difference within their range
-says nothing. Seconds are of the processor, on one thread, making the samples included.
+Every variant is trained from nothing on the same samples, for the same few steps, and validated on the same
+held-out scenes. The base is trained with several seeds (of its weights and of its samples): a difference
+within their range says nothing. Seconds are of the processor, on one thread, making the samples included.
 """
 
 from __future__ import annotations
@@ -119,7 +119,11 @@ class Bench:
         config = variant.of(self.base)
         sources = self._source(config, self.bank, config.seed + 1), lambda count: self.held_out[:1]
         alone = nullcontext() if variant.matching else patch.object(losses, "match_loss", unmatched)
-        with tempfile.TemporaryDirectory() as folder, patch.object(loop, "scenes", lambda *_, **__: sources), alone:
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            patch.object(loop, "scenes", lambda *_, **__: sources),
+            alone,
+        ):
             began = time.process_time()
             best = loop.train(replace(config, out=Path(folder)))
             seconds = (time.process_time() - began) / config.steps
@@ -138,7 +142,10 @@ def unmatched(seen: object, given: Sample) -> torch.Tensor:
 def lines(args: Args) -> Iterator[str]:
     bench = Bench(args)
     h, w = args.hw
-    yield f"mono-colour-small, {args.steps} steps of {args.batch} scenes of {h} x {w}, from nothing; one thread."
+    yield (
+        f"mono-colour-small, {args.steps} steps of {args.batch} scenes of {h} x {w}, from nothing; one "
+        "thread."
+    )
     yield f"Validated on {args.examined * args.batch} scenes of photographs held out.\n"
     yield markdown_header(["variant", "PSNR, dB", "to the base", "matched within 1.5 px", "seconds a step"])
     seeds: list[float] = []
@@ -146,7 +153,12 @@ def lines(args: Args) -> Iterator[str]:
         found = bench.trained(variant)
         if number < SEEDS:
             seeds.append(found.psnr)
-        figures = f"{found.psnr:.2f}", f"{found.psnr - seeds[0]:+.2f}", f"{found.matched:.1%}", f"{found.seconds:.2f}"
+        figures = (
+            f"{found.psnr:.2f}",
+            f"{found.psnr - seeds[0]:+.2f}",
+            f"{found.matched:.1%}",
+            f"{found.seconds:.2f}",
+        )
         yield markdown_row([variant.name, *figures])
     span = f"{min(seeds):.2f} to {max(seeds):.2f} dB"
     yield f"\nThe base with {SEEDS} seeds: {span}: differences of that size say nothing."

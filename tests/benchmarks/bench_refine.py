@@ -2,10 +2,10 @@
 
     python -m tests.benchmarks.bench_refine --draws 3 --out tests/benchmarks/RESULTS_refine.md
 
-Every camera is rotated by 0.3 degrees and its principal point moved by 5 px, in random directions. Distances are
-medians over held-out points, from their lines, in pixels of beta. *of points* is their distance from the lines of
-an F fitted by MAGSAC++ to all points: a lower bound. *of the rig* is the rest, root mean square of the nearest 85%
-of the points: their distance without that from this F.
+Every camera is rotated by 0.3 degrees and its principal point moved by 5 px, in random directions. Distances
+are medians over held-out points, from their lines, in pixels of beta. *of points* is their distance from the
+lines of an F fitted by MAGSAC++ to all points: a lower bound. *of the rig* is the rest, root mean square of
+the nearest 85% of the points: their distance without that from this F.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ def worse(rig: Rig, g: torch.Generator) -> Rig:
     """Every camera rotated by 0.3 degrees, its principal point moved by 5 px."""
     changes = rig.parameters(free=["*.rotation", "*.centre"])
     drawn = {k: torch.randn(v.shape, generator=g, dtype=torch.float64) for k, v in changes.items()}
-    return rig.perturbed({k: v / v.norm() * (TURN if k.endswith("rotation") else MOVE) for k, v in drawn.items()})
+    return rig.perturbed(
+        {k: v / v.norm() * (TURN if k.endswith("rotation") else MOVE) for k, v in drawn.items()}
+    )
 
 
 def median(values: Tensor) -> float:
@@ -54,8 +56,13 @@ def median(values: Tensor) -> float:
 
 
 def real_pairs(data: Path, draws: int, g: torch.Generator) -> Iterator[str]:
-    yield markdown_header(["real pair", "points", "of points", "as published", "made worse", "refined", "of the rig"])
-    for pair in (*syntim(data, ("Serfaty", "BatInria", "Billet", "SmRub", "Money", "Color", "Poly")), *bumblebee(data)):
+    yield markdown_header(
+        ["real pair", "points", "of points", "as published", "made worse", "refined", "of the rig"]
+    )
+    for pair in (
+        *syntim(data, ("Serfaty", "BatInria", "Billet", "SmRub", "Money", "Color", "Poly")),
+        *bumblebee(data),
+    ):
         names = tuple(pair.images)
         rig = Rig({name: pair.rig[name] for name in names})
         matches = match_cameras(pair.images)
@@ -86,8 +93,12 @@ def _span(values: list[float]) -> str:
 
 
 def fast_and_slow(data: Path) -> Iterator[str]:
-    """F as published; as `pat rig refine` and `pat rig start` leave it, which find lenses; of the points' own."""
-    yield markdown_header(["fast + slow", "points held out", "published F", "F of all points", "refined", "started"])
+    """F as published; as `pat rig refine` and `pat rig start` leave it, which find lenses; of the points'
+    own.
+    """
+    yield markdown_header(
+        ["fast + slow", "points held out", "published F", "F of all points", "refined", "started"]
+    )
     folder = data / "hfr_lfr"
     files = {FAST: folder / SCENE / f"{FAST_FRAME}.png"}
     files |= {name: folder / SCENE / f"{name}_{SLOW_FRAME}.png" for name in SLOW}
@@ -107,9 +118,19 @@ def fast_and_slow(data: Path) -> Iterator[str]:
 
 
 def rendered_rigs(draws: int, g: torch.Generator, scenes: Path | None) -> Iterator[str]:
-    """The sample array and scenes rendered before: their rigs are the truth, and so are the colours at alpha's view."""
+    """The sample array and scenes rendered before: their rigs are the truth, and so are the colours at
+    alpha's view.
+    """
     yield markdown_header(
-        ["rendered", "draw", "true rig", "made worse", "by points", "and by the fusion's error", "from images alone"]
+        [
+            "rendered",
+            "draw",
+            "true rig",
+            "made worse",
+            "by points",
+            "and by the fusion's error",
+            "from images alone",
+        ]
     )
     network, sample = load_weights("mono-colour"), load_sample()
     found = rendered_cases(scenes) if scenes else ()
@@ -117,9 +138,9 @@ def rendered_rigs(draws: int, g: torch.Generator, scenes: Path | None) -> Iterat
     for case in chain([ours], found):
 
         def psnr(rig: Rig, case: AblationCase = case) -> float:
-            return score(fuse(network, rig, case.images, alpha=case.rig.names[0]).image.clamp(0, 1), case.ground_truth)[
-                0
-            ]
+            return score(
+                fuse(network, rig, case.images, alpha=case.rig.names[0]).image.clamp(0, 1), case.ground_truth
+            )[0]
 
         true, alone = psnr(case.rig), psnr(rig_from_images(case.images).rig)
         for draw in range(1, draws + 1):
@@ -139,7 +160,9 @@ def by_photometry(draws: int, g: torch.Generator) -> Iterator[str]:
     for draw in range(1, draws + 1):
         fit = RefinementProblem.of(worse(sample.rig, g), FREE, frames=[points])
         near = uninformed(fit)._replace(z=0.8 * fit.solve().z)
-        found, _ = polish(fit, near._replace(directions=0.1 * near.directions), [sample.images], attend_with_statistics)
+        found, _ = polish(
+            fit, near._replace(directions=0.1 * near.directions), [sample.images], attend_with_statistics
+        )
         off = [median(line_distances(fit.after(z), {names: true})) for z in (near.z, found.z)]
         yield markdown_row([f"draw {draw}", f"{off[0]:.2f} px", f"{off[1]:.2f} px"])
 
@@ -160,7 +183,9 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--draws", type=int, default=3)
     parser.add_argument("--only", nargs="*", choices=["array", "rendered", "photometry", "real"])
-    parser.add_argument("--scenes", type=Path, help="a folder of scenes rendered by pat render, two cameras each")
+    parser.add_argument(
+        "--scenes", type=Path, help="a folder of scenes rendered by pat render, two cameras each"
+    )
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     cv2.setRNGSeed(0)

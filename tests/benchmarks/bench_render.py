@@ -1,9 +1,10 @@
 """Measures rendering by Blender through the farm: `python -m tests.benchmarks.bench_render`, some 12 minutes.
 
-Scenes of two views of 512x384 with the fast preset, and the first of the same scenes without its speed settings (full
-light, the denoiser at its default), by two workers in one run: scenes an hour, seconds and seconds of a core a scene,
-and the memory of each worker from scene to scene, none of them being replaced. Prints tables and writes them to
-tests/benchmarks/RENDERING.md. Seconds of a core are what to compare where the machine does other work, too.
+Scenes of two views of 512x384 with the fast preset, and the first of the same scenes without its speed
+settings (full light, the denoiser at its default), by two workers in one run: scenes an hour, seconds and
+seconds of a core a scene, and the memory of each worker from scene to scene, none of them being replaced.
+Prints tables and writes them to tests/benchmarks/RENDERING.md. Seconds of a core are what to compare where
+the machine does other work, too.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ def rig() -> Rig:
     hw = (384, 512)
     right = Pose(torch.eye(3, dtype=torch.float64), torch.tensor([-0.1, 0, 0], dtype=torch.float64))
     poses = {"left": Pose.identity(), "right": right}
-    cameras = {name: Camera(K=intrinsics(450.0, hw), cam_from_world=pose, hw=hw) for name, pose in poses.items()}
+    cameras = {
+        name: Camera(K=intrinsics(450.0, hw), cam_from_world=pose, hw=hw) for name, pose in poses.items()
+    }
     return Rig(cameras, depth=(2.0, 20.0))
 
 
@@ -61,11 +64,15 @@ def speed(name: str, facts: list[dict[str, Any]], seconds: float | None, workers
     """A row: scenes, scenes an hour by the clock (if it was theirs) and by their own seconds, and those."""
     each, cores = (mean(f[key] for f in facts) for key in ("seconds", "cpu_seconds"))
     whole = f"{3600 * len(facts) / seconds:.0f}" if seconds else ""
-    return markdown_row([name, len(facts), whole, f"{3600 * workers / each:.0f}", f"{each:.2f}", f"{cores:.2f}"])
+    return markdown_row(
+        [name, len(facts), whole, f"{3600 * workers / each:.0f}", f"{each:.2f}", f"{cores:.2f}"]
+    )
 
 
 def memory(facts: list[dict[str, Any]]) -> list[str]:
-    """A row for each worker: MB after some of its scenes, and what a scene adds by a straight line from the 5th on."""
+    """A row for each worker: MB after some of its scenes, and what a scene adds by a straight line from the
+    5th on.
+    """
     rows = []
     for process in sorted({f["process"] for f in facts}):
         used = [f["memory_mb"] for f in facts if f["process"] == process]
@@ -85,8 +92,10 @@ def report(scenes: int, slow_scenes: int, workers: int) -> str:
     names = list(SETTINGS)
     return "\n".join(
         [
-            f"`python -m tests.benchmarks.bench_render`: {workers} workers on {os.cpu_count()} cores, load before "
-            f"{load:.1f}; two views of 512x384; {refused} seeds were refused by the check and cost time, too.",
+            f"`python -m tests.benchmarks.bench_render`: {workers} workers on {os.cpu_count()} cores, load "
+            "before "
+            f"{load:.1f}; two views of 512x384; {refused} seeds were refused by the check and cost time, "
+            "too.",
             "",
             markdown_header(
                 ["", "scenes", "an hour, all counted", "an hour, by s a scene", "s a scene", "core s a scene"]
@@ -97,7 +106,9 @@ def report(scenes: int, slow_scenes: int, workers: int) -> str:
             "",
             "MB of each worker after its scenes, none replaced:",
             "",
-            markdown_header(["scenes", "1st", "5th", "10th", "25th", "last", "most", "a scene adds"], align="r"),
+            markdown_header(
+                ["scenes", "1st", "5th", "10th", "25th", "last", "most", "a scene adds"], align="r"
+            ),
             *memory(fast),
             "",
         ]
@@ -118,10 +129,14 @@ def main() -> None:
     """Print the tables and keep them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, default=100)
-    parser.add_argument("--slow-scenes", type=int, default=4, help="how many of them without the speed settings")
+    parser.add_argument(
+        "--slow-scenes", type=int, default=4, help="how many of them without the speed settings"
+    )
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("RENDERING.md"))
-    parser.add_argument("--paper", action="store_true", help="only one scene with the paper's preset, 15 minutes")
+    parser.add_argument(
+        "--paper", action="store_true", help="only one scene with the paper's preset, 15 minutes"
+    )
     given = parser.parse_args()
     if given.paper:
         return print(paper())

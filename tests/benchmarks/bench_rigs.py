@@ -1,10 +1,11 @@
-"""What random rigs in training are worth: weights trained on one rig and on random ones, on rigs of many kinds.
+"""What random rigs in training are worth: weights trained on one rig and on random ones, on rigs of many
+kinds.
 
     python -m tests.benchmarks.bench_rigs --single runs/mono-colour-single-rig/best.safetensors
 
-Rigs differ in how hard they are, so what counts is how far weights stay ahead of the classical baseline, on the same
-scenes: `lost` is how much less that is than on the rig that the single-rig recipe was trained on. Scenes whose cameras
-look along their baseline are left out, because nothing rectifies them.
+Rigs differ in how hard they are, so what counts is how far weights stay ahead of the classical baseline, on
+the same scenes: `lost` is how much less that is than on the rig that the single-rig recipe was trained on.
+Scenes whose cameras look along their baseline are left out, because nothing rectifies them.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ from pat.synthesis.rig_distribution import RigDistribution
 from pat.training.config import load_config
 
 SINGLE = load_config("mono-colour-single-rig").rectified_rigs
-GENERAL = replace(SINGLE, mode="general", focal_ratio=(1.0, 1.0), rotation=0.0, toe_in=(0.0, 0.0), decentring=0.0)
+GENERAL = replace(
+    SINGLE, mode="general", focal_ratio=(1.0, 1.0), rotation=0.0, toe_in=(0.0, 0.0), decentring=0.0
+)
 RIGS: dict[str, RigDistribution] = {
     "the single rig": SINGLE,
     "twice the baseline": replace(SINGLE, parallax=(80.0, 80.0)),
@@ -58,18 +61,29 @@ class Args:
 
 
 def ahead(networks: dict[str, FusionNetwork], case: AblationCase) -> dict[str, float] | None:
-    """By how many dB each is ahead of the classical baseline; and the baseline's PSNR. None if nothing rectifies."""
+    """By how many dB each is ahead of the classical baseline; and the baseline's PSNR. None if nothing
+    rectifies.
+    """
     try:
         base = score(classical(case.rig, case.images, ALPHA, BETA), case.ground_truth).psnr
     except ValueError:
         return None
-    fused = {name: fuse(net, case.rig, case.images, alpha=ALPHA).image.clamp(0, 1) for name, net in networks.items()}
-    return {"classical": base} | {name: score(image, case.ground_truth).psnr - base for name, image in fused.items()}
+    fused = {
+        name: fuse(net, case.rig, case.images, alpha=ALPHA).image.clamp(0, 1)
+        for name, net in networks.items()
+    }
+    return {"classical": base} | {
+        name: score(image, case.ground_truth).psnr - base for name, image in fused.items()
+    }
 
 
 def lines(args: Args, networks: dict[str, FusionNetwork]) -> Iterator[str]:
-    yield f"{args.scenes} layered scenes of 240 x 320 a row; PSNR in dB, ahead of classical; [95% interval].\n"
-    yield markdown_header(["rig", "classical", *(cell for name in networks for cell in (f"{name} rigs", "lost"))])
+    yield (
+        f"{args.scenes} layered scenes of 240 x 320 a row; PSNR in dB, ahead of classical; [95% interval].\n"
+    )
+    yield markdown_header(
+        ["rig", "classical", *(cell for name in networks for cell in (f"{name} rigs", "lost"))]
+    )
     reference: dict[str, float] = {}
     for kind, rigs in RIGS.items():
         cases = layered_cases(args.scenes, photos=args.photos, rigs=rigs, seed=7)

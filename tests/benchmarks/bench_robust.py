@@ -1,10 +1,11 @@
-"""Board calibration with wrong corners: errors in stated standard deviations over many draws of simulated corners.
+"""Board calibration with wrong corners: errors in stated standard deviations over many draws of simulated
+corners.
 
     python -m tests.benchmarks.bench_robust --draws 200 --out tests/benchmarks/RESULTS_robust.md
 
-Two cameras, 14 frames, corners good to 0.1 px; a share of them lies up to 40 px elsewhere. *chi-square* is that of all
-estimated parameters per degree of freedom (mean and largest of the draws), 1 if the stated covariance is right.
-*refused*: draws that raise an error.
+Two cameras, 14 frames, corners good to 0.1 px; a share of them lies up to 40 px elsewhere. *chi-square* is
+that of all estimated parameters per degree of freedom (mean and largest of the draws), 1 if the stated
+covariance is right. *refused*: draws that raise an error.
 """
 
 from __future__ import annotations
@@ -68,7 +69,15 @@ def judged(share: float, draw: int) -> Draw:
 
 
 def rows(draws: range, shares: Sequence[float]) -> Iterator[str]:
-    columns = ("wrong corners", "draws", "worst error, sigma", "beyond 5 sigma", "chi-square", "RMS px", "refused")
+    columns = (
+        "wrong corners",
+        "draws",
+        "worst error, sigma",
+        "beyond 5 sigma",
+        "chi-square",
+        "RMS px",
+        "refused",
+    )
     yield markdown_header(columns)
     notes = []
     for share in shares:
@@ -80,7 +89,12 @@ def rows(draws: range, shares: Sequence[float]) -> Iterator[str]:
                 notes.append(f"{share:.0%} draw {draw}: {error}")
         beyond = [f"{share:.0%} draw {i}: {d.worst:.1f} sigma" for i, d in found.items() if d.worst > 5]
         worst, squares, rms = (np.array(column) for column in zip(*found.values()))
-        cells = f"{worst.max():.1f}", len(beyond), f"{squares.mean():.2f}, {squares.max():.2f}", f"{rms.max():.3f}"
+        cells = (
+            f"{worst.max():.1f}",
+            len(beyond),
+            f"{squares.mean():.2f}, {squares.max():.2f}",
+            f"{rms.max():.3f}",
+        )
         yield markdown_row([f"{share:.0%}", len(draws), *cells, len(draws) - len(found)])
         notes += beyond
         notes += [f"{share:.0%} draw {i}: RMS {d.rms:.2f} px" for i, d in found.items() if d.rms > 3 * NOISE]

@@ -1,9 +1,11 @@
-"""Stated standard deviations against the jackknife on real boards: each frame is left out, and all is fitted again.
+"""Stated standard deviations against the jackknife on real boards: each frame is left out, and all is fitted
+again.
 
     python -m tests.benchmarks.bench_sigma --out tests/benchmarks/RESULTS_sigma.md
 
-*stated / jackknife*: of all free parameters, the median, and the share within 30 %. A jackknife over a dozen frames is
-itself good to some 20 %. *raised*: the largest factor by which `calibrate` raised what the corners' noise alone gives.
+*stated / jackknife*: of all free parameters, the median, and the share within 30 %. A jackknife over a dozen
+frames is itself good to some 20 %. *raised*: the largest factor by which `calibrate` raised what the corners'
+noise alone gives.
 """
 
 from __future__ import annotations
@@ -26,7 +28,10 @@ from tests.benchmarks.printed import data_and_out, print_tables
 def sets(data: Path) -> Iterator[tuple[str, Calibration]]:
     """The real sets of boards, calibrated."""
     boards = data / "calibration"
-    for folder, board in (("opencv_stereo", "chessboard:9x6:25mm"), ("bumblebee2_chess", "chessboard:4x6:30mm")):
+    for folder, board in (
+        ("opencv_stereo", "chessboard:9x6:25mm"),
+        ("bumblebee2_chess", "chessboard:4x6:30mm"),
+    ):
         known = parse_board(board)
         yield folder, calibrate(collect_folder(boards / folder, known).views, known)
     known = parse_board("chessboard:4x7:60mm")
@@ -61,7 +66,17 @@ def difference(a: BundleProblem, b: BundleProblem) -> np.ndarray:
 
 def rows(data: Path) -> Iterator[str]:
     yield markdown_header(
-        ["boards", "frames", "RMS px", "parameters", "stated / jackknife", "within 30 %", "f", "raised", "shape"]
+        [
+            "boards",
+            "frames",
+            "RMS px",
+            "parameters",
+            "stated / jackknife",
+            "within 30 %",
+            "f",
+            "raised",
+            "shape",
+        ]
     )
     notes = []
     for name, found in sets(data):

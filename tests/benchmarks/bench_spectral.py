@@ -2,8 +2,8 @@
 
     python -m tests.benchmarks.bench_spectral --photos DIR
 
-Layered scenes of photographs that training holds out. The classical baseline sees red, green and blue at one place as
-one colour image, and all other bands one by one. Table 2 on real pairs is `python -m
+Layered scenes of photographs that training holds out. The classical baseline sees red, green and blue at one
+place as one colour image, and all other bands one by one. Table 2 on real pairs is `python -m
 experiments evaluate --protocol table2`.
 """
 
@@ -73,7 +73,9 @@ def cases(args: Args, places: int, random: int) -> Iterator[tuple[Rig, dict[str,
             name: seen[place][:, i : i + 1] for i, (name, place) in enumerate(at.items())
         }
         near, far = (float(d) for d in made.depth_range[0])
-        rig = Rig({"alpha": cameras[0]} | {name: cameras[place] for name, place in at.items()}, depth=(near, far))
+        rig = Rig(
+            {"alpha": cameras[0]} | {name: cameras[place] for name, place in at.items()}, depth=(near, far)
+        )
         steps = [Noise(8000, 3), Clip(), Quantise(8)]
         yield rig, {name: record(p, steps, g)[0] for name, p in images.items()}, seen[0][0]
 
@@ -103,7 +105,9 @@ def row(args: Args, networks: dict[str, FusionNetwork], places: int, random: int
 
 def main(args: Args) -> None:
     networks = {name: load_weights(name) for name in args.weights}
-    print(f"{args.scenes} layered scenes of {HW[1]} x {HW[0]}, betas of half the resolution; mean PSNR / SSIM\n")
+    print(
+        f"{args.scenes} layered scenes of {HW[1]} x {HW[0]}, betas of half the resolution; mean PSNR / SSIM\n"
+    )
     print(markdown_header(["bands", "classical", *networks]))
     for kind, (places, random) in KINDS.items():
         print(markdown_row([kind, *row(args, networks, places, random)]), flush=True)

@@ -2,10 +2,10 @@
 
     python -m tests.benchmarks.bench_start --out tests/benchmarks/RESULTS_start.md
 
-Its makers state the positions (a grid of 40 mm), focal length and size of the sensor, and the print says "30 mm". With
-positions stated to 0.5 mm the rig is what a user gets; stated to 5 mm it shows what the boards alone say of them.
-*scene*: median distance of points matched in the images of a scene, which are not used, from their lines, pixels, for
-the pairs with most points (median and worst pair).
+Its makers state the positions (a grid of 40 mm), focal length and size of the sensor, and the print says "30
+mm". With positions stated to 0.5 mm the rig is what a user gets; stated to 5 mm it shows what the boards
+alone say of them. *scene*: median distance of points matched in the images of a scene, which are not used,
+from their lines, pixels, for the pairs with most points (median and worst pair).
 """
 
 from __future__ import annotations
@@ -45,7 +45,15 @@ def scene_matches(folder: Path) -> dict[tuple[str, str], PointMatches]:
 
 
 def rows(folder: Path) -> Iterator[str]:
-    head = "positions stated", "RMS px", "baselines off by, mm", "their sigma, mm", "f", "scene px", "worst pair"
+    head = (
+        "positions stated",
+        "RMS px",
+        "baselines off by, mm",
+        "their sigma, mm",
+        "f",
+        "scene px",
+        "worst pair",
+    )
     yield markdown_header(list(head))
     matches = scene_matches(folder)
     for position in (5e-4, 5e-3):
@@ -72,7 +80,9 @@ def main() -> None:
     torch.set_num_threads(1)
     cv2.setRNGSeed(0)
     print_tables(
-        "An array from one image of a board by each camera", [rows(options.data / "nine_band_array")], options.out
+        "An array from one image of a board by each camera",
+        [rows(options.data / "nine_band_array")],
+        options.out,
     )
 
 

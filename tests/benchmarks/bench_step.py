@@ -1,8 +1,9 @@
 """A step of training at the paper's size, beside the authors' way: `python -m tests.benchmarks.bench_step`.
 
-D = 64, patches of 96x32, batch 32, 96 positions a pixel, forward, backward and Adam. The authors' way gathers every key
-and value by lists of indices (index, matmul, softmax, matmul); all else is the same network. Both take the batch in
-parts of 4, as 32 at once would gather 5 GB. Seconds of the process on one thread, the ways in turn, medians and ranges.
+D = 64, patches of 96x32, batch 32, 96 positions a pixel, forward, backward and Adam. The authors' way gathers
+every key and value by lists of indices (index, matmul, softmax, matmul); all else is the same network. Both
+take the batch in parts of 4, as 32 at once would gather 5 GB. Seconds of the process on one thread, the ways
+in turn, medians and ranges.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ def gathered(network: PAT, alpha: Tensor, beta: Tensor, index: Tensor) -> Tensor
     return network.post(torch.cat([own, attended], 1))
 
 
-def step(network: PAT, adam: torch.optim.Adam, images: list[Tensor], fuse: Callable[[Tensor, Tensor], Tensor]) -> float:
+def step(
+    network: PAT, adam: torch.optim.Adam, images: list[Tensor], fuse: Callable[[Tensor, Tensor], Tensor]
+) -> float:
     """Seconds of one step."""
     began = time.process_time()
     adam.zero_grad()
@@ -52,7 +55,9 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=3)
-    parser.add_argument("--profile", action="store_true", help="Also the operators that take most of a step of ours.")
+    parser.add_argument(
+        "--profile", action="store_true", help="Also the operators that take most of a step of ours."
+    )
     options = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)

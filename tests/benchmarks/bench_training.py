@@ -2,11 +2,11 @@
 
     python -m tests.benchmarks.bench_training
 
-The official way reads for every sample the stored list of the positions where each pixel looks, and materialises
-keys and values there (index, matmul, softmax, matmul). Ours makes the field while training and never gathers. The
-network, the samples and the positions (96 nearest pixels, the paper's) are the same for both. Times are seconds of
-the processor of this process, on one thread, so that other work on the machine matters little: median (least to
-most) of the repeats.
+The official way reads for every sample the stored list of the positions where each pixel looks, and
+materialises keys and values there (index, matmul, softmax, matmul). Ours makes the field while training and
+never gathers. The network, the samples and the positions (96 nearest pixels, the paper's) are the same for
+both. Times are seconds of the processor of this process, on one thread, so that other work on the machine
+matters little: median (least to most) of the repeats.
 """
 
 from __future__ import annotations
@@ -62,7 +62,9 @@ def timed(work: Callable[[], object], repeats: int) -> Times:
 
 
 class Materialised(nn.Module):
-    """The attention engine of the paper's network the official way: positions from files, everything gathered."""
+    """The attention engine of the paper's network the official way: positions from files, everything
+    gathered.
+    """
 
     def __init__(self, engine: nn.Module, files: list[Path]) -> None:
         super().__init__()
@@ -71,14 +73,19 @@ class Materialised(nn.Module):
     def forward(self, own: Tensor, others: list[Tensor], looks: object) -> list[Attended]:
         e, index = self.engine, torch.from_numpy(np.stack([np.load(f) for f in self.files]))
         query = e.query(e.before(own))
-        return [materialised(query, key(e.before(f)), value(f), index) for f, key, value in zip(others, e.key, e.value)]
+        return [
+            materialised(query, key(e.before(f)), value(f), index)
+            for f, key, value in zip(others, e.key, e.value)
+        ]
 
 
 def materialised(query: Tensor, key: Tensor, value: Tensor, index: Tensor) -> Attended:
     """Index, matmul, softmax, matmul; index (B, H W, L) counts pixels of beta, negative ones do not count."""
     b, d, h, w = query.shape
     flat = index.clamp(min=0).reshape(b, 1, -1)
-    keys, values = (x.flatten(2).gather(2, flat.expand(-1, d, -1)).view(b, d, h * w, -1) for x in (key, value))
+    keys, values = (
+        x.flatten(2).gather(2, flat.expand(-1, d, -1)).view(b, d, h * w, -1) for x in (key, value)
+    )
     scores = torch.einsum("bdn,bdnl->bnl", query.flatten(2), keys).masked_fill(index < 0, -torch.inf)
     weights = scores.softmax(-1).nan_to_num(0.0)
     out = torch.einsum("bnl,bdnl->bdn", weights, values).view(b, d, h, w)
@@ -121,13 +128,18 @@ def papers_network(batch: int, repeats: int) -> None:
         official.network.engine = Materialised(official.network.engine, stored(given, Path(folder)))
         agree = (official(given) - ours(given)).abs().item()
         rows = {
-            "official: stored lists, materialised": timed(lambda: step(official, given, adam(official)), repeats),
+            "official: stored lists, materialised": timed(
+                lambda: step(official, given, adam(official)), repeats
+            ),
             "ours: the same positions made on the fly": timed(lambda: step(ours, given, adam(ours)), repeats),
-            "ours: epipolar segments made on the fly": timed(lambda: step(along, straight, adam(along)), repeats),
+            "ours: epipolar segments made on the fly": timed(
+                lambda: step(along, straight, adam(along)), repeats
+            ),
         }
     scenes = timed(lambda: list(islice(made.steps([0], start=int(time.time_ns() % 1000)), 1)), repeats)
     print(
-        f"\nThe paper's network, {batch} samples of {config.hw[1]} x {config.hw[0]}; the losses differ by {agree:.1e}\n"
+        f"\nThe paper's network, {batch} samples of {config.hw[1]} x {config.hw[0]}; the losses differ by "
+        f"{agree:.1e}\n"
     )
     for name, times in rows.items():
         print(f"{name:42s} {times}  {batch / times.median:6.2f} samples/s")
@@ -147,7 +159,10 @@ def attention(objective: Objective, given: Sample, straight: Sample, repeats: in
         attend(q, k, v, one.fields[0].at, samples=None, interpolation="nearest").square().sum().backward()
 
     print("\nof which attention and where to look, forward and backward:")
-    print(f"  official      {timed(lambda: materialised(q, k, v, index).value.square().sum().backward(), repeats)}")
+    print(
+        "  official      "
+        f"{timed(lambda: materialised(q, k, v, index).value.square().sum().backward(), repeats)}"
+    )
     print(f"  ours, nearest {timed(lambda: ours(given), repeats)}")
     print(f"  ours, along   {timed(lambda: ours(straight), repeats)}")
     print(f"  field of nearest pixels alone  {timed(lambda: given.fields[0].at(x), repeats)}")
@@ -186,7 +201,10 @@ def adam(objective: Objective) -> torch.optim.Optimizer:
 
 
 def main(
-    batch: int = 2, repeats: int = 3, paper: bool = True, names: tuple[str, ...] = ("mono-colour", "mono-colour-small")
+    batch: int = 2,
+    repeats: int = 3,
+    paper: bool = True,
+    names: tuple[str, ...] = ("mono-colour", "mono-colour-small"),
 ) -> None:
     """Measure and print: the paper's network if `paper`, and those of ours that are named."""
     torch.set_num_threads(1)

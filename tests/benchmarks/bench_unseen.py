@@ -1,11 +1,13 @@
-"""Colour where beta does not see: each way to fill alone, the choice of the network, and the best choice there is.
+"""Colour where beta does not see: each way to fill alone, the choice of the network, and the best choice
+there is.
 
     python -m tests.benchmarks.bench_unseen DATA [--half report] [--out tests/benchmarks/RESULTS_unseen.md]
 
-PSNR (dB) by region, mean over Middlebury's pairs of one half of `experiments/evaluation/halves.yaml` in the folder
-DATA, beta reduced 2x. The best choice is made with the ground truth, for each block of 16x16 pixels. The second table
-is of the network's choice by the distance from what beta sees: *strength* is the factor of the true chroma that is
-nearest to the chroma filled in, the *gains* are over alpha's grey image, of pairs with 500 such pixels.
+PSNR (dB) by region, mean over Middlebury's pairs of one half of `experiments/evaluation/halves.yaml` in the
+folder DATA, beta reduced 2x. The best choice is made with the ground truth, for each block of 16x16 pixels.
+The second table is of the network's choice by the distance from what beta sees: *strength* is the factor of
+the true chroma that is nearest to the chroma filled in, the *gains* are over alpha's grey image, of pairs
+with 500 such pixels.
 """
 
 from __future__ import annotations
@@ -56,13 +58,17 @@ def filled_by(network: GuidedPAT, fill: int | None) -> None:
 
     def alone(self: GuidedPAT, own: Encoded, estimate: BetaEstimate) -> Tensor:
         chosen = one_hot(torch.tensor(fill), 1 + FILLS).to(estimate.choice)[:, None, None]
-        return GuidedPAT._unseen(self, own, estimate._replace(choice=(1e4 * chosen).expand_as(estimate.choice)))
+        return GuidedPAT._unseen(
+            self, own, estimate._replace(choice=(1e4 * chosen).expand_as(estimate.choice))
+        )
 
     vars(network)["_unseen"] = MethodType(alone, network)
 
 
 def images_of(network: GuidedPAT, pair: StereoPair) -> tuple[dict[str, Tensor], Tensor]:
-    """The fused images by the way of filling, with the classical one, and the ground truth; (3, H, W) each."""
+    """The fused images by the way of filling, with the classical one, and the ground truth; (3, H, W)
+    each.
+    """
     task = mono_colour_task(pair, 2)
     given = task.alpha, task.beta, PAPER_DISPARITY
     found = {"classical": classical_fusion(*given)}
@@ -83,16 +89,23 @@ def best(images: list[Tensor], truth: Tensor) -> Tensor:
 
 
 class Unseen(NamedTuple):
-    """What is filled in at some pixels of a pair: the gain over grey in dB, and how strong the colours are."""
+    """What is filled in at some pixels of a pair: the gain over grey in dB, and how strong the colours
+    are.
+    """
 
     gain: float
     strength: float
 
 
 def by_distance(
-    image: Float[Tensor, "3 h w"], truth: Float[Tensor, "3 h w"], seen: Bool[Tensor, "h w"], known: Bool[Tensor, "h w"]
+    image: Float[Tensor, "3 h w"],
+    truth: Float[Tensor, "3 h w"],
+    seen: Bool[Tensor, "h w"],
+    known: Bool[Tensor, "h w"],
 ) -> dict[int, Unseen]:
-    """What is filled in at the known pixels that are not seen, by the lower bound of their distance from seen ones."""
+    """What is filled in at the known pixels that are not seen, by the lower bound of their distance from seen
+    ones.
+    """
     distance = torch.from_numpy(distance_transform_edt(~seen.numpy()))
     luma, chroma = to_luma_chroma(truth)
     filled = to_luma_chroma(image)[1]
@@ -136,7 +149,9 @@ def by_fill(found: dict[str, list[dict[str, float]]]) -> Iterator[str]:
 
 
 def by_distances(found: dict[int, list[Unseen]]) -> Iterator[str]:
-    yield from markdown_header(["pixels from what beta sees", "pairs", "strength", "gain", "least gain"]).splitlines()
+    yield from markdown_header(
+        ["pixels from what beta sees", "pairs", "strength", "gain", "least gain"]
+    ).splitlines()
     for (low, rows), high in zip(found.items(), (*DISTANCES[1:], math.inf)):
         if rows:
             label = f"over {low}" if high == math.inf else f"{low} to {high}"

@@ -1,4 +1,5 @@
-"""What each of the shipped networks costs: parameters, operations of its convolutions, seconds of a processor.
+"""What each of the shipped networks costs: parameters, operations of its convolutions, seconds of a
+processor.
 
 python -m tests.benchmarks.bench_weights
 """
@@ -23,7 +24,10 @@ def main() -> None:
     torch.set_num_threads(1)
     g = torch.Generator().manual_seed(0)
     alpha, beta = torch.rand(1, *HW, generator=g), torch.rand(3, HW[0] // 2, HW[1] // 2, generator=g)
-    print(f"{HW[1]} x {HW[0]} pixels, one thread; seconds of the processor: median (least to most) of {REPEATS}\n")
+    print(
+        f"{HW[1]} x {HW[0]} pixels, one thread; seconds of the processor: median (least to most) of "
+        f"{REPEATS}\n"
+    )
     print(markdown_header(["weights", "parameters", "GFLOP", "seconds"]))
     for path in sorted(SHIPPED.glob("*.safetensors")):
         network = load_weights(path)

@@ -1,7 +1,7 @@
 """Some sixty kinds of input of `pat fuse`, made of real images at small size: what `bench_inputs` measures.
 
-The images are of a folder of data that is not in this repository (its README names them); each kind writes its files to
-a folder of its own and gives the command's arguments.
+The images are of a folder of data that is not in this repository (its README names them); each kind writes
+its files to a folder of its own and gives the command's arguments.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ class Kind(NamedTuple):
 
 def small(source: Path, target: Path, *, grey: bool = False, side: int = SIDE, deep: bool = False) -> Path:
     """The image reduced to its longer side, in grey and with 16 bits if asked; its format is the target's."""
-    image = cv2.imread(str(source), cv2.IMREAD_ANYDEPTH | (cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_ANYCOLOR))
+    image = cv2.imread(
+        str(source), cv2.IMREAD_ANYDEPTH | (cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_ANYCOLOR)
+    )
     factor = min(side / max(image.shape[:2]), 1.0)
     hw = [max(round(n * factor), 16) for n in image.shape[:2]]
     image = cv2.resize(image, hw[::-1], interpolation=cv2.INTER_AREA)
@@ -49,7 +51,9 @@ def small(source: Path, target: Path, *, grey: bool = False, side: int = SIDE, d
     return target
 
 
-def pair(alpha: Path, beta: Path, folder: Path, *, suffix: str = ".png", more: Sequence[str] = (), **how: int) -> list:
+def pair(
+    alpha: Path, beta: Path, folder: Path, *, suffix: str = ".png", more: Sequence[str] = (), **how: int
+) -> list:
     """Two images, alpha in grey unless `colour`."""
     grey = not how.pop("colour", False)
     side = {"alpha": how.pop("alpha_side", SIDE), "beta": how.pop("beta_side", SIDE)}
@@ -68,9 +72,15 @@ def found_pairs(data: Path) -> Iterator[tuple[str, Path, Path]]:
     for name in ("Color", "Poly", "Tordu"):
         yield f"syntim {name}", *(data / f"syntim/{name}{i}_OG0.png" for i in (0, 1))
     for name in ("chair01", "stones01", "thing01"):
-        yield f"bumblebee {name}", *(data / f"bumblebee2_scenes/{name}_{side}.jpg" for side in ("left", "right"))
+        yield (
+            f"bumblebee {name}",
+            *(data / f"bumblebee2_scenes/{name}_{side}.jpg" for side in ("left", "right")),
+        )
     for name in ("00001", "00053"):
-        yield f"mono and colour {name}", *(data / f"real_mono_colour/{side}/{name}.png" for side in ("mono", "colour"))
+        yield (
+            f"mono and colour {name}",
+            *(data / f"real_mono_colour/{side}/{name}.png" for side in ("mono", "colour")),
+        )
     yield "street (KITTI)", *(data / f"kitti/object_StereoRCNN/{side}.png" for side in ("left", "right"))
     yield "table (2014)", *(data / f"pairs/PlaytableP/im{i}.png" for i in (0, 1))
     yield "in the wild", *(data / f"pairs/wild/{side}.png" for side in ("left", "right"))
@@ -116,7 +126,9 @@ def kinds(data: Path) -> Iterator[Kind]:
     yield Kind("rig turned by a degree", partial(kitti, data, 1.0, 1.0))
     yield Kind("rig, baseline's sign wrong", partial(kitti, data, 0.0, -1.0), 3)
     yield Kind("rig, light field of nine", partial(light_field, data, ()))
-    yield Kind("rig, light field, bits and tif", partial(light_field, data, ["--bits", "16", "--kind", "tif"]))
+    yield Kind(
+        "rig, light field, bits and tif", partial(light_field, data, ["--bits", "16", "--kind", "tif"])
+    )
     yield Kind("rig of another size", partial(other_size, data), 2, False)
 
 
@@ -205,7 +217,9 @@ def single_bands(alpha: Path, beta: Path, names: Sequence[str], folder: Path) ->
 
 def nine_bands(data: Path, folder: Path) -> list:
     """Nine cameras of a band each."""
-    return [small(file, folder / file.name) for file in sorted((data / "nine_band_array/scene").glob("*.png"))]
+    return [
+        small(file, folder / file.name) for file in sorted((data / "nine_band_array/scene").glob("*.png"))
+    ]
 
 
 def tagged(source: Path, pattern: str, folder: Path) -> list:
@@ -251,14 +265,19 @@ def kitti_rig(degrees: float, sign: float) -> Rig:
     K = intrinsics(721.5377, (375, 1242), (609.5593, 172.854))
     turn = rotation_from_vector(torch.tensor([0.3, 1.0, 0.3], dtype=torch.float64) * degrees * np.pi / 180)
     one = Camera(K=K, cam_from_world=Pose.identity(), hw=(375, 1242))
-    other = Camera(K=K, cam_from_world=Pose(turn, torch.tensor([-0.5327 * sign, 0, 0]).double()), hw=(375, 1242))
+    other = Camera(
+        K=K, cam_from_world=Pose(turn, torch.tensor([-0.5327 * sign, 0, 0]).double()), hw=(375, 1242)
+    )
     return Rig({"left": one, "right": other}, depth=(4.0, 80.0))
 
 
 def kitti(data: Path, degrees: float, sign: float, folder: Path) -> list:
     """The street with that rig, twice the usual size: it is wide."""
     files = {side: data / f"kitti/object_StereoRCNN/{side}.png" for side in ("left", "right")}
-    images = {side: small(file, folder / f"{side}.png", grey=side == "left", side=640) for side, file in files.items()}
+    images = {
+        side: small(file, folder / f"{side}.png", grey=side == "left", side=640)
+        for side, file in files.items()
+    }
     return with_rig(kitti_rig(degrees, sign), images, "left", folder)
 
 
@@ -272,7 +291,9 @@ def light_field(data: Path, more: Sequence[str], folder: Path) -> list:
             cameras[name] = Camera(
                 K=intrinsics(500, (512, 512)), cam_from_world=Pose(Pose.identity().R, t), hw=(512, 512)
             )
-            images[name] = small(source / f"{name}.png", folder / f"{name}.png", grey=name == "row4_col4", side=256)
+            images[name] = small(
+                source / f"{name}.png", folder / f"{name}.png", grey=name == "row4_col4", side=256
+            )
     return [*with_rig(Rig(cameras, depth=(1.2, 60.0)), images, "row4_col4", folder), *more]
 
 

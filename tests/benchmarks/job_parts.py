@@ -1,8 +1,9 @@
-"""What `bench_job` starts, each part in a process of its own: `python -m tests.benchmarks.job_parts PART ...`.
+"""What `bench_job` starts, each part in a process of its own: `python -m tests.benchmarks.job_parts PART
+...`.
 
-`scene`: the sample array enlarged to any size, with several copies of the colour camera, through lenses or not.
-`classical`, `opencv`: other ways to the same image, from files to a file. `stages`: `pat fuse` with the time of its
-parts printed as JSON.
+`scene`: the sample array enlarged to any size, with several copies of the colour camera, through lenses or
+not. `classical`, `opencv`: other ways to the same image, from files to a file. `stages`: `pat fuse` with the
+time of its parts printed as JSON.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ STAGES = {
 
 
 def scene(folder: Path, width: int, height: int, betas: int, k1: float = 0.0) -> None:
-    """Rig and images: the sample array's, enlarged; `betas` copies of its colour camera, which differ by a pixel.
+    """Rig and images: the sample array's, enlarged; `betas` copies of its colour camera, which differ by a
+    pixel.
 
     With `k1`, as through lenses of that first radial coefficient.
     """
@@ -52,7 +54,9 @@ def scene(folder: Path, width: int, height: int, betas: int, k1: float = 0.0) ->
         camera = rig[name].resize(hw)
         if k1:
             straight, values = camera, torch.from_numpy(image).movedim(-1, 0).float()
-            camera = straight.replace(distortion=Distortion("brown-conrady", torch.tensor([k1, 0, 0, 0]).double()))
+            camera = straight.replace(
+                distortion=Distortion("brown-conrady", torch.tensor([k1, 0, 0, 0]).double())
+            )
             seen = resampled(values, straight, camera, extended=True).values[0]
             image = seen.clamp(0, 255).round().byte().movedim(0, -1).numpy().copy()
         for i, copy in enumerate([name] if name == ALPHA else [f"{name}{i + 1}" for i in range(betas)]):
@@ -80,8 +84,8 @@ def classical(folder: Path, out: Path) -> None:
 
 
 def opencv(folder: Path, out: Path) -> None:
-    """What one writes with OpenCV alone: SGBM on rectified images, its weighted least squares filter, beta warped to
-    alpha, alpha as the luma of the result."""
+    """What one writes with OpenCV alone: SGBM on rectified images, its weighted least squares filter, beta
+    warped to alpha, alpha as the luma of the result."""
     import cv2
     import numpy as np
 
@@ -101,7 +105,9 @@ def opencv(folder: Path, out: Path) -> None:
     back = cv2.ximgproc.createRightMatcher(matcher)
     smoother = cv2.ximgproc.createDisparityWLSFilter(matcher)
     grey = cv2.cvtColor(right, cv2.COLOR_BGR2GRAY)
-    disparity = smoother.filter(matcher.compute(left, grey), left, None, back.compute(grey, left)) / np.float32(16)
+    disparity = smoother.filter(
+        matcher.compute(left, grey), left, None, back.compute(grey, left)
+    ) / np.float32(16)
     rows, columns = np.mgrid[: wh[1], : wh[0]].astype(np.float32)
     warped = cv2.remap(right, columns - disparity, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     warped = cv2.warpPerspective(warped, np.linalg.inv(found.H_alpha.numpy()), wh, flags=cv2.INTER_CUBIC)
@@ -116,7 +122,8 @@ def opencv(folder: Path, out: Path) -> None:
 class Clock:
     """Seconds by part, of the wall and of cores: of the innermost part that is running in the main thread.
 
-    What other threads compute meanwhile counts as that part's, too: torch's, and the comparison of rig and images.
+    What other threads compute meanwhile counts as that part's, too: torch's, and the comparison of rig and
+    images.
     """
 
     def __init__(self) -> None:

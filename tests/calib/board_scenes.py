@@ -15,7 +15,15 @@ def tensor(*values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-def camera(focal, hw, centre=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0), lens=(), model="brown-conrady", offset=(3.0, -2.0)):
+def camera(
+    focal,
+    hw,
+    centre=(0.0, 0.0, 0.0),
+    turn=(0.0, 0.0, 0.0),
+    lens=(),
+    model="brown-conrady",
+    offset=(3.0, -2.0),
+):
     """A camera at `centre` in the world, rotated by a rotation vector in degrees."""
     middle = (hw[1] - 1) / 2 + offset[0], (hw[0] - 1) / 2 + offset[1]
     pose = Pose.from_centre(rotation_from_vector(torch.deg2rad(tensor(*turn))), tensor(*centre))
@@ -29,10 +37,18 @@ def four_cameras() -> Rig:
         {
             "mono": camera(1150.0, (720, 960), lens=(-0.12, 0.03, 0.0005, -0.0003, 0.0)),
             "colour": camera(
-                (760.0, 764.0), (480, 640), (0.18, 0.02, 0.0), (0.5, -4.0, 0.8), (-0.25, 0.08, -0.0006, 0.0004, 0.0)
+                (760.0, 764.0),
+                (480, 640),
+                (0.18, 0.02, 0.0),
+                (0.5, -4.0, 0.8),
+                (-0.25, 0.08, -0.0006, 0.0004, 0.0),
             ),
-            "nir": camera(600.0, (480, 640), (-0.15, 0.0, 0.03), (-1.0, 3.0, -0.4), (-0.3, 0.12, 0.0, 0.0, 0.0)),
-            "wide": camera(420.0, (480, 640), (0.03, -0.2, 0.01), (-4.0, 0.0, 2.0), (-0.2, 0.05, 0.0, 0.0, 0.0)),
+            "nir": camera(
+                600.0, (480, 640), (-0.15, 0.0, 0.03), (-1.0, 3.0, -0.4), (-0.3, 0.12, 0.0, 0.0, 0.0)
+            ),
+            "wide": camera(
+                420.0, (480, 640), (0.03, -0.2, 0.01), (-4.0, 0.0, 2.0), (-0.2, 0.05, 0.0, 0.0, 0.0)
+            ),
         }
     )
 
@@ -98,7 +114,15 @@ def errors_of(fit, rig):
         K = (camera_found.K - ground_truth.K).numpy()
         lenses = [c.distortion.coefficients for c in (camera_found, ground_truth) if c.distortion is not None]
         lens = lenses[0] - lenses[1] if lenses else torch.zeros(0)
-        values = [*turn, *(camera_found.t - ground_truth.t).numpy(), K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.numpy()]
+        values = [
+            *turn,
+            *(camera_found.t - ground_truth.t).numpy(),
+            K[0, 0],
+            K[1, 1],
+            K[0, 2],
+            K[1, 2],
+            *lens.numpy(),
+        ]
         entries = [f"{name}.{entry}" for entry in parameter_names(camera_found)]
         found += [v for v, entry in zip(values, entries) if entry in fit.names]
     return np.array(found)
@@ -107,7 +131,9 @@ def errors_of(fit, rig):
 def pose_errors(fit, rig):
     """The largest error of orientations (degrees) and of optical centres (metres)."""
     degrees = [
-        np.degrees(np.linalg.norm(errors_of(fit, rig)[[fit.names.index(f"{n}.rotation.{i}") for i in range(3)]]))
+        np.degrees(
+            np.linalg.norm(errors_of(fit, rig)[[fit.names.index(f"{n}.rotation.{i}") for i in range(3)]])
+        )
         for n in list(fit.problem.cameras)[1:]
     ]
     metres = [float((c.centre - rig[n].centre).norm()) for n, c in fit.problem.cameras.items()]

@@ -15,7 +15,19 @@ from arraygeom import Camera, Pose, Rig, intrinsics
 from arraygeom.io import read_rig
 from pat.media.images import read_image
 
-SYNTIM = ("Color", "Serfaty", "Poly", "BatInria", "BatSynt", "Billet", "Cube", "Jallut", "LaMire", "Money", "Sigraph")
+SYNTIM = (
+    "Color",
+    "Serfaty",
+    "Poly",
+    "BatInria",
+    "BatSynt",
+    "Billet",
+    "Cube",
+    "Jallut",
+    "LaMire",
+    "Money",
+    "Sigraph",
+)
 SYNTIM += ("TableSTV", "Tordu", "Aout", "BalMouss", "SmRub", "CubeR", "Lego")
 BUMBLEBEE = ("chair01", "chair02", "stones01", "thing01")
 MIDDLEBURY = {"2006_third/Cloth1": 3, "2006_third/Midd1": 3, "2006_half/Wood2": 2, "2005_half/Reindeer": 2}
@@ -61,7 +73,9 @@ def kitti(data: Path) -> Iterator[RealPair]:
     folder = data / "kitti" / "odometry_03_gray_stereo" / "sequences" / "03"
     rig = read_rig(folder / "calib.txt")
     for frame in ("000000", "000003"):
-        yield named(f"KITTI 03/{frame}", rig, {f"cam{i}": folder / f"image_{i}" / f"{frame}.png" for i in (0, 1)})
+        yield named(
+            f"KITTI 03/{frame}", rig, {f"cam{i}": folder / f"image_{i}" / f"{frame}.png" for i in (0, 1)}
+        )
     folder = data / "kitti" / "object_StereoRCNN"
     files = {"cam2": folder / "left.png", "cam3": folder / "right.png"}
     yield named("KITTI object", read_rig(folder / "calib.txt"), files)
@@ -91,7 +105,9 @@ def lund(data: Path) -> Iterator[RealPair]:
     folder = data / "rigs" / "colmap_lund_door"
     rig = read_rig(folder / "colmap_ground_truth")
     for a, b in ((1, 3), (4, 6), (8, 11)):
-        yield named(f"Lund {a}-{b}", rig, {f"DSC_{i:04d}.JPG": folder / "images" / f"DSC_{i:04d}.JPG" for i in (a, b)})
+        yield named(
+            f"Lund {a}-{b}", rig, {f"DSC_{i:04d}.JPG": folder / "images" / f"DSC_{i:04d}.JPG" for i in (a, b)}
+        )
 
 
 def fox(data: Path) -> Iterator[RealPair]:
@@ -107,7 +123,9 @@ def ball(data: Path) -> Iterator[RealPair]:
     folder = data / "rigs" / "pycalib_gopro15" / "mvs"
     cameras, files = {}, {f"cam{i}": folder / f"cam{i}.png" for i in (0, 1, 2, 3)}
     for name, file in files.items():
-        numbers = {k: torch.tensor(v).double() for k, v in json.loads(file.with_suffix(".json").read_text()).items()}
+        numbers = {
+            k: torch.tensor(v).double() for k, v in json.loads(file.with_suffix(".json").read_text()).items()
+        }
         hw = tuple(read_image(file).shape[1:])
         cameras[name] = Camera(K=numbers["K"], cam_from_world=Pose(numbers["R"], numbers["t"]), hw=hw)
     for a, b in (("cam1", "cam2"), ("cam2", "cam3")):

@@ -2,10 +2,10 @@
 
     python -m tests.calib.rendered --out out/boards
 
-renders them (some minutes on one core; needs `make synthesis`), as a folder of PNG images for each camera with the
-true rig beside them. Four cameras of different sizes, focal lengths and lenses stand 0.2 m apart and look at about
-2 m. The board is at 0.9 to 2.6 m, tilted by up to 40 degrees, so that every camera has it near, at its corners and
-in its middle.
+renders them (some minutes on one core; needs `make synthesis`), as a folder of PNG images for each camera
+with the true rig beside them. Four cameras of different sizes, focal lengths and lenses stand 0.2 m apart and
+look at about 2 m. The board is at 0.9 to 2.6 m, tilted by up to 40 degrees, so that every camera has it near,
+at its corners and in its middle.
 """
 
 from __future__ import annotations
@@ -36,16 +36,26 @@ def rig() -> Rig:
         {
             "mono": camera(1200.0, (768, 1024), lens=(-0.12, 0.03, 0.0005, -0.0003, 0.0)),
             "colour": camera(
-                (900.0, 903.0), (600, 800), (0.2, 0.02, 0.0), (0.5, -4.0, 0.8), (-0.2, 0.06, -0.0006, 0.0004, 0.0)
+                (900.0, 903.0),
+                (600, 800),
+                (0.2, 0.02, 0.0),
+                (0.5, -4.0, 0.8),
+                (-0.2, 0.06, -0.0006, 0.0004, 0.0),
             ),
-            "nir": camera(750.0, (600, 800), (-0.15, 0.0, 0.03), (-1.0, 3.0, -0.4), (-0.25, 0.08, 0.0, 0.0, 0.0)),
-            "wide": camera(540.0, (576, 768), (0.03, -0.2, 0.01), (-4.0, 0.0, 2.0), (-0.2, 0.05, 0.0, 0.0, 0.0)),
+            "nir": camera(
+                750.0, (600, 800), (-0.15, 0.0, 0.03), (-1.0, 3.0, -0.4), (-0.25, 0.08, 0.0, 0.0, 0.0)
+            ),
+            "wide": camera(
+                540.0, (576, 768), (0.03, -0.2, 0.01), (-4.0, 0.0, 2.0), (-0.2, 0.05, 0.0, 0.0, 0.0)
+            ),
         }
     )
 
 
 def board_poses(cameras: Rig, count: int = POSES, *, seed: int = 0) -> list[Pose]:
-    """`world_from_board`: in front of each camera in turn, at a random position, visible to the others too."""
+    """`world_from_board`: in front of each camera in turn, at a random position, visible to the others
+    too.
+    """
     random = np.random.default_rng(seed)
     found: list[Pose] = []
     while len(found) < count:

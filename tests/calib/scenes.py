@@ -27,7 +27,9 @@ def unlike_pair(*, lens: bool = False) -> Rig:
     """Two cameras with nothing in common: other sizes, focal lengths, principal points, rotated, apart."""
     first = Camera(
         K=intrinsics((300.0, 310.0), HW, (170.0, 110.0)),
-        cam_from_world=Pose.from_centre(rotation_from_vector(vector(0.1, -0.2, 0.05)), vector(0.3, 0.1, -0.2)),
+        cam_from_world=Pose.from_centre(
+            rotation_from_vector(vector(0.1, -0.2, 0.05)), vector(0.3, 0.1, -0.2)
+        ),
         hw=HW,
         distortion=Distortion("brown-conrady", vector(-0.45, 0.15, 0.0, 0.0005)) if lens else None,
     )
@@ -55,8 +57,12 @@ def uninformed(fit: RefinementProblem) -> Solution:
     return Solution(z, torch.ones(n, dtype=torch.bool), covariance, covariance, z)
 
 
-def seen_points(rig, *, count=200, near=2.0, far=6.0, noise=0.15, seed=0) -> dict[tuple[str, str], PointMatches]:
-    """Points of the first two cameras, between two depths and in both images, good to `noise` pixels in beta."""
+def seen_points(
+    rig, *, count=200, near=2.0, far=6.0, noise=0.15, seed=0
+) -> dict[tuple[str, str], PointMatches]:
+    """Points of the first two cameras, between two depths and in both images, good to `noise` pixels in
+    beta.
+    """
     g = torch.Generator().manual_seed(seed)
     (a, alpha), (b, beta) = list(rig.cameras.items())[:2]
     h, w = alpha.hw

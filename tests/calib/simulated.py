@@ -1,4 +1,6 @@
-"""Simulated rigs of wide and narrow field and the points matched in their images, with noise and wrong matches."""
+"""Simulated rigs of wide and narrow field and the points matched in their images, with noise and wrong
+matches.
+"""
 
 from __future__ import annotations
 
@@ -51,9 +53,17 @@ def _towards(direction: np.ndarray) -> Tensor:
 
 
 def simulated_matches(
-    rig: Rig, field: str, g: np.random.Generator, *, count: int = 250, noise: float = NOISE, wrong: float = WRONG
+    rig: Rig,
+    field: str,
+    g: np.random.Generator,
+    *,
+    count: int = 250,
+    noise: float = NOISE,
+    wrong: float = WRONG,
 ) -> dict[tuple[str, str], PointMatches]:
-    """Matched points of every two neighbouring cameras of a true rig; wrong ones lie some pixels across the lines."""
+    """Matched points of every two neighbouring cameras of a true rig; wrong ones lie some pixels across the
+    lines.
+    """
     names = rig.names
     found = {}
     for a, b in combinations(names, 2):
@@ -63,7 +73,14 @@ def simulated_matches(
 
 
 def _pair_matches(
-    rig: Rig, names: tuple[str, str], field: str, g: np.random.Generator, *, count: int, noise: float, wrong: float
+    rig: Rig,
+    names: tuple[str, str],
+    field: str,
+    g: np.random.Generator,
+    *,
+    count: int,
+    noise: float,
+    wrong: float,
 ) -> PointMatches:
     alpha, beta = (rig[name] for name in names)
     h, w = alpha.hw
@@ -74,5 +91,7 @@ def _pair_matches(
     seen = valid & beta.contains(y) & x.isfinite().all(-1)
     x, y = x[seen][:count], y[seen][:count]
     is_wrong = torch.from_numpy(g.uniform(size=len(x)) < wrong)
-    off = torch.from_numpy(np.where(is_wrong[:, None], g.uniform(-5, 5, (len(x), 2)), g.normal(0, noise, (len(x), 2))))
+    off = torch.from_numpy(
+        np.where(is_wrong[:, None], g.uniform(-5, 5, (len(x), 2)), g.normal(0, noise, (len(x), 2)))
+    )
     return PointMatches(x + torch.from_numpy(g.normal(0, noise, (len(x), 2))), y + off)

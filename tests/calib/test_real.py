@@ -21,7 +21,9 @@ from tests.calib.rendered import BOARD, photograph
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["resized", "rotated or mirrored", "cameras swapped", "pose inverted", "distortion"])
+@pytest.mark.parametrize(
+    "kind", ["resized", "rotated or mirrored", "cameras swapped", "pose inverted", "distortion"]
+)
 def test_mistakes_with_a_stereo_head_are_named(shared_data, kind):
     (pair, *_) = bumblebee(shared_data, ("chair01",))
     rig, images = MISTAKES[kind](pair.rig, pair.images, np.random.default_rng(3))
@@ -40,7 +42,9 @@ def test_the_rig_of_another_experiment_is_found_out(shared_data):
 
 @pytest.mark.slow
 def test_a_published_rig_that_does_not_fit_is_given_no_name(shared_data):
-    """A shift by a pixel brings SYNTIM's SmRub nearer to its images, but does not explain them to their noise."""
+    """A shift by a pixel brings SYNTIM's SmRub nearer to its images, but does not explain them to their
+    noise.
+    """
     (pair,) = syntim(shared_data, ("SmRub",))
     rig, matches = Rig({name: pair.rig[name] for name in pair.images}), match_cameras(pair.images)
     rig = rig.replace(depth=seen_depths(rig.pair(*rig.names), matches[rig.names]))

@@ -50,7 +50,8 @@ def fifteen_cameras(data: Path) -> Tracks:
     cameras, pixels = list(rig.cameras.values()), torch.from_numpy(x)
     points = triangulate(cameras, pixels, seen=torch.from_numpy(seen), residual=torch.inf).X.numpy()
     observations = {
-        name: Observations(np.flatnonzero(s), np.zeros((s.sum(), 3)), p[s]) for name, s, p in zip(rig.names, seen, x)
+        name: Observations(np.flatnonzero(s), np.zeros((s.sum(), 3)), p[s])
+        for name, s, p in zip(rig.names, seen, x)
     }
     return Tracks(rig, free_points(rig.cameras, points, observations))
 
@@ -68,7 +69,9 @@ def caliscope(data: Path) -> Tracks:
         if (key := (row["sync_index"], row["keypoint_id"])) in index:
             seen[f"cam{row['cam_id']}"].append((index[key], float(row["img_loc_x"]), float(row["img_loc_y"])))
     observations = {
-        name: Observations(np.array([i for i, _, _ in s]), np.zeros((len(s), 3)), np.array([[x, y] for _, x, y in s]))
+        name: Observations(
+            np.array([i for i, _, _ in s]), np.zeros((len(s), 3)), np.array([[x, y] for _, x, y in s])
+        )
         for name, s in seen.items()
     }
     return Tracks(rig, free_points(rig.cameras, np.array(list(corners.values())), observations))
@@ -81,7 +84,9 @@ def caliscope_views(data: Path) -> dict[str, BoardViews]:
         corner = int(row["keypoint_id"]), float(row["img_loc_x"]), float(row["img_loc_y"])
         found.setdefault(f"cam{row['cam_id']}", {}).setdefault(int(row["sync_index"]), []).append(corner)
     return {
-        name: BoardViews((720, 1280), {k: _detection(corners) for k, corners in frames.items() if len(corners) >= 6})
+        name: BoardViews(
+            (720, 1280), {k: _detection(corners) for k, corners in frames.items() if len(corners) >= 6}
+        )
         for name, frames in sorted(found.items())
     }
 

@@ -30,7 +30,9 @@ def texture(hw=HW, seed=0):
 
 
 def moved(image, x, y):
-    return cv2.warpAffine(image, np.float32([[1, 0, x], [0, 1, y]]), image.shape[::-1], borderMode=cv2.BORDER_REFLECT)
+    return cv2.warpAffine(
+        image, np.float32([[1, 0, x], [0, 1, y]]), image.shape[::-1], borderMode=cv2.BORDER_REFLECT
+    )
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -40,7 +42,9 @@ def test_offsets_are_those_of_the_image(sign):
     other = moved(own, 1.3, -0.6)
     other = other if sign > 0 else 255 - other
     reach = PATCH + SEARCH
-    x = np.stack(np.meshgrid(np.arange(reach, HW[1] - reach, 9), np.arange(reach, HW[0] - reach, 9)), -1).reshape(-1, 2)
+    x = np.stack(
+        np.meshgrid(np.arange(reach, HW[1] - reach, 9), np.arange(reach, HW[0] - reach, 9)), -1
+    ).reshape(-1, 2)
     offsets, like = local_offsets(own, other, x)
     assert np.median(np.abs(offsets - np.hypot(1.3, 0.6))) < 0.1
     assert np.median(like) > 0.9

@@ -17,7 +17,9 @@ from pat.matching.certainty import MEASURED
 
 
 def judged(pair, power=2.0, condition="ideal", count=4000):
-    """Matches right with this power of their first number, whose errors are then up to a pixel, else up to 9."""
+    """Matches right with this power of their first number, whose errors are then up to a pixel, else up to
+    9.
+    """
     g = torch.Generator().manual_seed(sum(map(ord, pair + condition)))
     numbers = torch.rand(count, MEASURED, generator=g)
     draw, size = torch.rand(2, count, generator=g)
@@ -60,7 +62,9 @@ def test_intervals_are_wider_where_pairs_are_not_alike():
 
 
 def test_conditions_are_summed_up_for_themselves():
-    found = [judged(name, power, condition) for name in "ab" for condition, power in (("ideal", 1.0), ("x8", 3.0))]
+    found = [
+        judged(name, power, condition) for name in "ab" for condition, power in (("ideal", 1.0), ("x8", 3.0))
+    ]
     network = fitted([one for one in found if one.condition == "ideal"], steps=300)
     shown = held(found, lambda one: Stated.by(network, one.numbers))
     assert list(shown) == ["ideal", "x8", "all"]
@@ -69,7 +73,9 @@ def test_conditions_are_summed_up_for_themselves():
 
 
 def test_error_of_calibration_is_that_of_the_definition():
-    found = Reliability.of(torch.tensor([0.1, 0.1, 0.9, 0.9]), torch.tensor([True, False, True, True]), bins=2)
+    found = Reliability.of(
+        torch.tensor([0.1, 0.1, 0.9, 0.9]), torch.tensor([True, False, True, True]), bins=2
+    )
     assert found.stated.tolist() == pytest.approx([0.1, 0.9])
     assert found.right.tolist() == [0.5, 1.0]
     assert found.error == pytest.approx(0.5 * 0.4 + 0.5 * 0.1)

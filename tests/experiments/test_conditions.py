@@ -31,9 +31,19 @@ def pair(name="pair", hw=(64, 96), disparity=8):
 
 
 def test_halves_are_distinguished_by_whole_parts_of_names():
-    names = ["2006_third/Wood1", "2006_third/Wood2", "2005_half/Bowling1x", "train/0001", "x/2006_third/Cloth1"]
+    names = [
+        "2006_third/Wood1",
+        "2006_third/Wood2",
+        "2005_half/Bowling1x",
+        "train/0001",
+        "x/2006_third/Cloth1",
+    ]
     pairs = [pair(name) for name in names]
-    assert [p.name for p in of_half(pairs, "tune")] == ["2006_third/Wood1", "train/0001", "x/2006_third/Cloth1"]
+    assert [p.name for p in of_half(pairs, "tune")] == [
+        "2006_third/Wood1",
+        "train/0001",
+        "x/2006_third/Cloth1",
+    ]
     assert [p.name for p in of_half(pairs, "report")] == ["2006_third/Wood2", "2005_half/Bowling1x"]
     assert len(list(of_half(pairs, "all"))) == 5
 
@@ -60,7 +70,10 @@ def test_random_conditions_depend_on_the_pair_alone():
 
 def test_fewer_electrons_are_noisier():
     p = pair()
-    errors = [(CONDITIONS[f"{n} electrons"].recorded(p).task.alpha - luminance(p.left)).std() for n in (1000, 200, 50)]
+    errors = [
+        (CONDITIONS[f"{n} electrons"].recorded(p).task.alpha - luminance(p.left)).std()
+        for n in (1000, 200, 50)
+    ]
     assert errors[0] < errors[1] < errors[2]
 
 
@@ -77,7 +90,10 @@ def test_regions_of_a_square_before_a_wall():
 
 def test_every_method_is_scored_under_every_condition(tmp_path):
     rows = evaluate_conditions(
-        [pair()], load_weights("mono-colour-small"), ["ideal", "rows off 1 px", "rows off 3 px"], max_disparity=16.0
+        [pair()],
+        load_weights("mono-colour-small"),
+        ["ideal", "rows off 1 px", "rows off 3 px"],
+        max_disparity=16.0,
     )
     ours = [row for row in rows if row.method == "fusion"]
     assert [row.condition for row in ours] == ["ideal", "rows off 1 px", "rows off 3 px"]

@@ -1,4 +1,6 @@
-"""Every field in one table: cases say where points are, fields that cannot serve are named, others are scored."""
+"""Every field in one table: cases say where points are, fields that cannot serve are named, others are
+scored.
+"""
 
 from __future__ import annotations
 
@@ -33,9 +35,13 @@ HW, SHIFT = (32, 48), 5
 
 @pytest.fixture(scope="module")
 def pair() -> StereoPair:
-    """A smooth picture and the same, shifted: the disparity is 5 everywhere, and not known in the first rows."""
+    """A smooth picture and the same, shifted: the disparity is 5 everywhere, and not known in the first
+    rows.
+    """
     g = torch.Generator().manual_seed(0)
-    wide = torch.nn.functional.interpolate(torch.rand(1, 3, 8, 14, generator=g), size=(32, 53), mode="bicubic")[0]
+    wide = torch.nn.functional.interpolate(
+        torch.rand(1, 3, 8, 14, generator=g), size=(32, 53), mode="bicubic"
+    )[0]
     wide = wide.clamp(0, 1)
     valid = torch.ones(HW, dtype=torch.bool)
     valid[:2] = False
@@ -90,7 +96,10 @@ def test_what_cannot_serve_is_named(network, pair):
     large = case._replace(
         scene=case.scene._replace(images={ALPHA: torch.rand(1, 200, 200), BETA: torch.rand(3, 200, 200)})
     )
-    assert "left out" in evaluate_fields(network, [large], fields=lambda max_displacement: {"dense": Dense()})[0].note
+    assert (
+        "left out"
+        in evaluate_fields(network, [large], fields=lambda max_displacement: {"dense": Dense()})[0].note
+    )
 
 
 def test_a_network_of_several_betas_gets_a_band_each(pair):
@@ -100,7 +109,9 @@ def test_a_network_of_several_betas_gets_a_band_each(pair):
     alpha, beta = case.scene.images[ALPHA], case.scene.images[BETA]
     found = fused(four, case.pair, alpha, beta, Epipolar())
     on_grid = FieldOnGrid.of(Epipolar(), case.pair)
-    wanted, compared = four.compare(Inputs.of(alpha[None], [band[None, None] for band in beta], [on_grid] * 3))
+    wanted, compared = four.compare(
+        Inputs.of(alpha[None], [band[None, None] for band in beta], [on_grid] * 3)
+    )
     torch.testing.assert_close(found.image, wanted.image[0])
     assert found.peak.shape == (3, *HW, 2)
     for band, one in enumerate(compared):
@@ -127,6 +138,9 @@ def test_drawn_peaks_are_red_where_the_table_counts_them_wrong(network, pair):
 def test_weights_for_two_bands_are_refused_at_once(tmp_path, capsys):
     save_weights(PAT(PATConfig(betas=2, in_channels=1, dim=8)), tmp_path / "two.safetensors")
     with pytest.raises(SystemExit) as stop:
-        main(["fields", "--weights", str(tmp_path / "two.safetensors"), "--out", str(tmp_path)], group=Experiments)
+        main(
+            ["fields", "--weights", str(tmp_path / "two.safetensors"), "--out", str(tmp_path)],
+            group=Experiments,
+        )
     assert stop.value.code == 2
     assert "they are for 2 betas: give some for one beta in colour, or for three" in capsys.readouterr().err

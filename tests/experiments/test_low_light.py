@@ -14,7 +14,12 @@ def test_both_parts_are_trained(tmp_path):
     for name in ("astronaut", "coffee"):
         (tmp_path / "photos" / f"{name}.png").symlink_to(f"{data_dir}/{name}.png")
     config = DenoiserTraining(
-        photos=(tmp_path / "photos",), out=tmp_path / "out", steps=(2, 1), batch=2, side=32, precision="float32"
+        photos=(tmp_path / "photos",),
+        out=tmp_path / "out",
+        steps=(2, 1),
+        batch=2,
+        side=32,
+        precision="float32",
     )
     made = load_denoiser(train_denoiser(config))
     found = made.band(torch.rand(1, 1, 32, 32), torch.full((1, 1, 32, 32), 0.1))

@@ -100,7 +100,12 @@ def only_query(label, seen=True):
     place = labels.long()
     there = torch.ones(1, 1, 8, dtype=torch.bool)
     return Queries(
-        torch.zeros(1, 1, dtype=torch.long), torch.tensor([[label]]), torch.tensor([[seen]]), labels, place, there
+        torch.zeros(1, 1, dtype=torch.long),
+        torch.tensor([[label]]),
+        torch.tensor([[seen]]),
+        labels,
+        place,
+        there,
     )
 
 

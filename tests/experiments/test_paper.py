@@ -70,14 +70,20 @@ def test_falls_are_means_and_extremes():
 def without_reference(pairs):
     """How much each control costs, by the weights of the package, at the least of some pairs; dB."""
     network = load_weights("mono-colour")
-    rows = evaluate_pairs(pairs, {"fusion": rectified_fusion(network), **controls(network)}, [2], max_disparity=80)
+    rows = evaluate_pairs(
+        pairs, {"fusion": rectified_fusion(network), **controls(network)}, [2], max_disparity=80
+    )
     psnr = {(row.pair, row.method): row.psnr for row in rows}
-    return {name: min(psnr[p.name, "fusion"] - psnr[p.name, name] for p in pairs) for name in controls(network)}
+    return {
+        name: min(psnr[p.name, "fusion"] - psnr[p.name, name] for p in pairs) for name in controls(network)
+    }
 
 
 def test_controls_fall_on_a_real_pair(shared_data):
     pair = next(p for p in middlebury_pairs(shared_data / "middlebury") if p.name.endswith("Flowerpots"))
-    crop = replace(pair, left=pair.left[:, 80:240, 100:340], right=pair.right[:, 80:240, 100:340], disparity=None)
+    crop = replace(
+        pair, left=pair.left[:, 80:240, 100:340], right=pair.right[:, 80:240, 100:340], disparity=None
+    )
     assert min(without_reference([crop]).values()) > 2
 
 

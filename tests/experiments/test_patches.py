@@ -36,7 +36,10 @@ SMALL = PatchGrid(hw=(32, 48), grid=(2, 3), reduce=2)
 def make_rig(width: int = 128) -> Rig:
     turned = rotation_from_vector(torch.tensor([0.005, 0.02, 0.01]).double())
     mono = Camera(
-        K=intrinsics(130.0, (96, width)), cam_from_world=Pose.identity(), hw=(96, width), sensor=Sensor("mono")
+        K=intrinsics(130.0, (96, width)),
+        cam_from_world=Pose.identity(),
+        hw=(96, width),
+        sensor=Sensor("mono"),
     )
     colour = Camera(
         K=intrinsics((100.0, 104.0), (80, 112)),
@@ -124,7 +127,9 @@ def test_segments_of_a_batch_contain_the_true_points(rendered):
     assert batch.images["mono"].shape == (6, 1, 16, 24)
     pair = batch.rig.pair("mono", "colour")
     (where,) = batch.on_grid(Epipolar())
-    X = pair.cameras[0].unproject(torch.tensor([12.0, 8.0]).double().expand(6, 1, 2), batch.depth[:, 8:9, 12].double())
+    X = pair.cameras[0].unproject(
+        torch.tensor([12.0, 8.0]).double().expand(6, 1, 2), batch.depth[:, 8:9, 12].double()
+    )
     found = where.at(torch.tensor([[12.0, 8.0]]))
     seen = pair.cameras[1].project(X).x[:, 0].float()
     inside = found.valid[:, 0] & pair.beta.contains(seen)
@@ -150,7 +155,8 @@ def test_cases_degrade_alpha_or_the_betas(rendered):
     data = ScenePatches(rendered, patches=SMALL, chains={}, cases=cases)
     plain = ScenePatches(rendered, patches=SMALL, chains={})
     changed = [
-        tuple(not torch.equal(data[i].images[n], plain[i].images[n]) for n in ("mono", "colour")) for i in range(18)
+        tuple(not torch.equal(data[i].images[n], plain[i].images[n]) for n in ("mono", "colour"))
+        for i in range(18)
     ]
     assert set(changed) == {(True, False), (False, True)}
 

@@ -1,4 +1,6 @@
-"""Scenes as one would photograph them: whole in the first image, lit from above, a room around a wide camera."""
+"""Scenes as one would photograph them: whole in the first image, lit from above, a room around a wide
+camera.
+"""
 
 import pytest
 import torch

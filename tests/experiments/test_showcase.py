@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Camera, Pose, Rig, apply_homography, epipolar_distance, intrinsics, plane_homography, shift_origin
+from arraygeom import (
+    Camera,
+    Pose,
+    Rig,
+    apply_homography,
+    epipolar_distance,
+    intrinsics,
+    plane_homography,
+    shift_origin,
+)
 from arraygeom import rotation_from_vector as rotation
 from experiments.__main__ import Experiments
 from experiments.showcase import SLOW, SYNTIM, published_matrices, showcase
@@ -33,7 +42,9 @@ def texture(hw, seed=0):
 def moved(image, H, hw):
     """The image in another camera, x' ~ H x."""
     planes = np.ascontiguousarray(image.movedim(0, -1).numpy())
-    warped = cv2.warpPerspective(planes, np.asarray(H), hw[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    warped = cv2.warpPerspective(
+        planes, np.asarray(H), hw[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+    )
     return torch.from_numpy(np.atleast_3d(warped)).movedim(-1, 0).clamp(0, 1)
 
 
@@ -132,7 +143,14 @@ def shown(data, tmp_path_factory):
 def test_every_case_has_its_table_and_its_figure(shown):
     text, out = shown
     assert (out / "showcase.md").read_text() == text
-    for expected in ("#### kitti", "#### middlebury", "#### flickr1024", "| Serfaty |", "| cam3 |", "SSIM of fusion"):
+    for expected in (
+        "#### kitti",
+        "#### middlebury",
+        "#### flickr1024",
+        "| Serfaty |",
+        "| cam3 |",
+        "SSIM of fusion",
+    ):
         assert expected in text
     figures = [line[line.index("(") + 1 : -1] for line in text.splitlines() if line.startswith("![")]
     assert figures == ["syntim_Serfaty.png", "fast_slow.png"]
@@ -242,8 +260,14 @@ def test_evaluate_says_what_is_wrong(arguments, complaint, tmp_path, capsys):
             ["evaluate", "--kitti", ".", "--without-rig", "--protocol", "table2"],
             "--without-rig needs --protocol table1",
         ),
-        (["conditions", "--kitti", ".", "--only", "dusk"], "--only: no condition 'dusk': there are ideal, x1"),
-        (["conditions", "--kitti", "DATA/kitti", "--half", "tune"], "--half tune: no pair belongs to that half"),
+        (
+            ["conditions", "--kitti", ".", "--only", "dusk"],
+            "--only: no condition 'dusk': there are ideal, x1",
+        ),
+        (
+            ["conditions", "--kitti", "DATA/kitti", "--half", "tune"],
+            "--half tune: no pair belongs to that half",
+        ),
         (["outside", "--kitti", "DATA/kitti"], "none of its pairs has a true disparity"),
         (["certainty", "--middlebury", ".", "--conditions", "dusk"], "--conditions: no condition 'dusk'"),
     ],
@@ -257,7 +281,16 @@ def test_the_tables_commands_say_what_is_wrong(arguments, complaint, data, tmp_p
 
 
 def test_the_papers_figures_are_beside_ours(data, tmp_path, capsys):
-    arguments = ["evaluate", "--kitti", str(data / "kitti"), "--rates", "2", "--controls", "--out", str(tmp_path)]
+    arguments = [
+        "evaluate",
+        "--kitti",
+        str(data / "kitti"),
+        "--rates",
+        "2",
+        "--controls",
+        "--out",
+        str(tmp_path),
+    ]
     main([*arguments, "--weights", "mono-colour-small"], group=Experiments)
     printed = capsys.readouterr().out
     assert printed == (tmp_path / "scores.md").read_text()

@@ -1,4 +1,6 @@
-"""Sweeps of calibration: rigs are off by what they say, scenes are exact, one's own field runs, reports are read."""
+"""Sweeps of calibration: rigs are off by what they say, scenes are exact, one's own field runs, reports are
+read.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,18 @@ from arraygeom import Epipolar, pixel_grid, sample
 from arraygeom.epipolar import epipolar_distance
 from experiments.__main__ import Experiments
 from experiments.evaluation.sweep_report import markdown, read_rows, write_report
-from experiments.evaluation.sweeps import ALPHA, BETA, SWEEPS, Resampled, Row, ablate, made, point, points, seen_at
+from experiments.evaluation.sweeps import (
+    ALPHA,
+    BETA,
+    SWEEPS,
+    Resampled,
+    Row,
+    ablate,
+    made,
+    point,
+    points,
+    seen_at,
+)
 from pat.cli.main import main
 from pat.evaluation.ablation import sample_photographs
 from pat.networks.configs import PATConfig
@@ -36,7 +49,9 @@ def network() -> PAT:
 
 @pytest.mark.parametrize("sweep", [*SWEEPS])
 def test_scenes_are_exact_for_every_rig(sweep, bank):
-    """Beta at the true positions is alpha's ground truth where beta sees the point, and not where it does not."""
+    """Beta at the true positions is alpha's ground truth where beta sees the point, and not where it does
+    not.
+    """
     # Beta's wider view is coarser, and a larger turn of the lens blurs: the first values are enough.
     scene = made(point(sweep, SWEEPS[sweep][1][1], hw=HW).rig, bank, 0)
     seen = sample(scene.images[BETA][None], scene.position[None].float()).values[0]
@@ -98,7 +113,9 @@ def test_ones_own_field_on_ones_own_rig(network, bank):
 
 
 def test_what_was_resampled_comes_back(network, bank):
-    """A network that returns alpha: its picture survives both resamplings, and so do the positions of the matches."""
+    """A network that returns alpha: its picture survives both resamplings, and so do the positions of the
+    matches.
+    """
 
     class Identity:
         betas = 1
@@ -146,7 +163,9 @@ def made_up() -> list[Row]:
 
 def test_reports_are_written_and_read_back(tmp_path):
     write_report(made_up(), tmp_path)
-    assert {p.name for p in tmp_path.iterdir()} == {f"ablation.{kind}" for kind in ("md", "json", "svg", "png")}
+    assert {p.name for p in tmp_path.iterdir()} == {
+        f"ablation.{kind}" for kind in ("md", "json", "svg", "png")
+    }
     back = read_rows(tmp_path / "ablation.json")
     assert repr(back) == repr(made_up())
     ElementTree.parse(tmp_path / "ablation.svg")

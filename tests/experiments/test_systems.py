@@ -1,4 +1,6 @@
-"""The four arrays: rigs are the paper's, recordings are files as cameras write them, fusion improves on alpha."""
+"""The four arrays: rigs are the paper's, recordings are files as cameras write them, fusion improves on
+alpha.
+"""
 
 import math
 import re
@@ -50,7 +52,9 @@ def test_an_unknown_system_is_named(capsys):
 
 def test_a_scale_makes_the_reduced_size_smaller_and_leaves_the_full_one():
     system = load_system("exposures")
-    sizes = [system.sized(full, scale=scale)["alpha"].hw for full, scale in ((False, 1), (False, 0.5), (True, 0.5))]
+    sizes = [
+        system.sized(full, scale=scale)["alpha"].hw for full, scale in ((False, 1), (False, 0.5), (True, 0.5))
+    ]
     assert sizes == [(320, 512), (160, 256), (800, 1280)]
 
 
@@ -104,7 +108,10 @@ def test_a_mosaic_is_undone_by_its_pattern():
     rgb = torch.rand(3, 1, 1).expand(3, 12, 14)
     for pattern in ("RGGB", "GBRG"):
         torch.testing.assert_close(
-            demosaiced(Mosaic(pattern).apply(rgb[None], torch.Generator())[0], pattern), rgb, atol=1e-4, rtol=0
+            demosaiced(Mosaic(pattern).apply(rgb[None], torch.Generator())[0], pattern),
+            rgb,
+            atol=1e-4,
+            rtol=0,
         )
 
 
@@ -115,7 +122,9 @@ def test_recordings_are_files_as_cameras_write_them(tiny, tmp_path):
     assert read_image(files["nir"]).max() <= 1023 / 65535
     assert ViewFiles(rig, files, alpha="nir")["nir"].max() > 0.3
     assert {p.name for p in result.written} >= {"figure.png", "scores.md", "fused.png", "view.yaml"}
-    rows = {line.split("|")[1].strip(): line.split("|")[2] for line in result.table.splitlines() if "|" in line}
+    rows = {
+        line.split("|")[1].strip(): line.split("|")[2] for line in result.table.splitlines() if "|" in line
+    }
     assert float(rows["fusion"]) > float(rows["alpha alone"]) + 2
 
 

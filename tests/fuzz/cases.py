@@ -1,4 +1,6 @@
-"""What is damaged, and what is asked of it: rigs of all formats, images, weights, checkpoints, covariance files."""
+"""What is damaged, and what is asked of it: rigs of all formats, images, weights, checkpoints, covariance
+files.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,10 @@ def damaged(seed: Seed, number: int, folder: Path) -> Path:
         shutil.copytree(seed.file.parent, home)
     else:
         home.mkdir(parents=True)
-    text = seed.file.suffix not in (".bin", ".mat", ".safetensors", ".npz") and seed.kind not in ("image", "video")
+    text = seed.file.suffix not in (".bin", ".mat", ".safetensors", ".npz") and seed.kind not in (
+        "image",
+        "video",
+    )
     path = home / seed.file.name
     if source.random() < NO_FILE:
         path.unlink(missing_ok=True)
@@ -111,7 +116,10 @@ def rig_seeds(folder: Path) -> Iterator[Seed]:
 def _matlab(folder: Path) -> Iterator[Seed]:
     from scipy.io import savemat
 
-    camera = {"IntrinsicMatrix": np.array([[800.0, 0, 0], [0, 800, 0], [320, 200, 1]]), "ImageSize": [400.0, 640.0]}
+    camera = {
+        "IntrinsicMatrix": np.array([[800.0, 0, 0], [0, 800, 0], [320, 200, 1]]),
+        "ImageSize": [400.0, 640.0],
+    }
     camera["RadialDistortion"] = np.array([0.1, 0.01])
     pair = {"CameraParameters1": camera, "CameraParameters2": camera, "WorldUnits": "mm"}
     pair |= {"RotationOfCamera2": np.eye(3), "TranslationOfCamera2": np.array([-100.0, 0, 0])}
@@ -120,7 +128,11 @@ def _matlab(folder: Path) -> Iterator[Seed]:
     fisheye |= {"DistortionCenter": [321.5, 239.25], "StretchMatrix": np.eye(2)}
     bouguet = {"om": [0.01, 0.1, -0.02], "T": [-100.0, 2, 1], "nx": 640.0, "ny": 480.0}
     for side in ("left", "right"):
-        bouguet |= {f"fc_{side}": [800.0, 802], f"cc_{side}": [320.5, 238], f"kc_{side}": [-0.2, 0.1, 0, 0, 0.01]}
+        bouguet |= {
+            f"fc_{side}": [800.0, 802],
+            f"cc_{side}": [320.5, 238],
+            f"kc_{side}": [-0.2, 0.1, 0, 0, 0.01],
+        }
     for name, variables in (("pair", {"s": pair}), ("fisheye", {"s": fisheye}), ("bouguet", bouguet)):
         savemat(folder / f"{name}.mat", variables)
         yield Seed("rig", f"{name} .mat", folder / f"{name}.mat")
@@ -133,7 +145,9 @@ def _colmap_binary(folder: Path) -> Iterator[Seed]:
     cameras = struct.pack("<QIiQQ4d", 2, 1, 1, 640, 480, 500, 510, 320, 240)
     cameras += struct.pack("<IiQQ8d", 7, 4, 640, 480, 400, 404, 310.75, 245.25, -0.2, 0.1, 0.001, -0.002)
     images = (
-        struct.pack("<QI7dI", 2, 1, 1, 0, 0, 0, 0, 0, 0, 1) + b"a/0001.png\0" + struct.pack("<QddQ", 1, 111.5, 180.2, 1)
+        struct.pack("<QI7dI", 2, 1, 1, 0, 0, 0, 0, 0, 0, 1)
+        + b"a/0001.png\0"
+        + struct.pack("<QddQ", 1, 111.5, 180.2, 1)
     )
     images += struct.pack("<I7dI", 2, *q, 7) + b"b/0001.png\0" + struct.pack("<Q", 0)
     folder.mkdir(parents=True, exist_ok=True)
@@ -185,7 +199,10 @@ def image_seeds(folder: Path) -> Iterator[Seed]:
             file = folder / f"{label}{suffix if label == 'colour' else suffix.replace('ppm', 'pgm')}"
             cv2.imwrite(str(file), values)
             yield Seed("image", name, file)
-    for name, values in (("16.png", smooth.astype(np.uint16) * 257), ("32.tif", (smooth / 255).astype(np.float32))):
+    for name, values in (
+        ("16.png", smooth.astype(np.uint16) * 257),
+        ("32.tif", (smooth / 255).astype(np.float32)),
+    ):
         cv2.imwrite(str(folder / name), values)
         yield Seed("image", "png 16" if name.endswith("png") else "tiff 32", folder / name)
     for name, content in more_images(smooth).items():
@@ -311,7 +328,9 @@ def use_checkpoint(path: Path, _: random.Random) -> str:
         return "refused" if "\n" not in str(error) else f"message: {error}"
     facts = found.facts
     whole = (
-        isinstance(facts["step"], int) and isinstance(facts["minutes"], float | int) and isinstance(facts["done"], bool)
+        isinstance(facts["step"], int)
+        and isinstance(facts["minutes"], float | int)
+        and isinstance(facts["done"], bool)
     )
     return "read" if whole else f"facts of other types: {facts}"
 

@@ -60,7 +60,25 @@ EXTREMES = (
     ),
 )
 VALUES: tuple[Any, ...] = (
-    *(None, True, False, 0, -1, 1, 2, 1e308, -1e308, 1e-308, float("nan"), float("inf"), 10**20, 2**31, 1e76, 1e9, 3.5),
+    *(
+        None,
+        True,
+        False,
+        0,
+        -1,
+        1,
+        2,
+        1e308,
+        -1e308,
+        1e-308,
+        float("nan"),
+        float("inf"),
+        10**20,
+        2**31,
+        1e76,
+        1e9,
+        3.5,
+    ),
     *(
         "",
         "a",
@@ -209,7 +227,12 @@ def deepen(source: random.Random, content: bytes) -> bytes:
         b"%c: &%c [%s]\n" % (c + 1, c + 1, b",".join([b"*%c" % c] * 9)) for c in range(ord("a"), ord("i"))
     )
     depth = source.choice([60, 3000])
-    pieces = [b"[" * depth + b"]" * depth, b"{a: " * depth + b"}" * depth, b"[" + b"0," * 100_000 + b"0]", b"9" * 5000]
+    pieces = [
+        b"[" * depth + b"]" * depth,
+        b"{a: " * depth + b"}" * depth,
+        b"[" + b"0," * 100_000 + b"0]",
+        b"9" * 5000,
+    ]
     if source.randrange(4) == 0:
         return bomb + content if source.randrange(2) else content + b"\n" + bomb
     piece = source.choice(pieces)
@@ -223,7 +246,9 @@ def repeat_keys(source: random.Random, content: bytes) -> bytes:
         return content
     chosen = source.choice(keys)
     some = b"".join(b'"%d": 0, ' % i for i in range(source.choice([1, 30_000])))
-    return content[: chosen.start()] + source.choice([chosen[0] + b" 0, ", some * 2]) + content[chosen.start() :]
+    return (
+        content[: chosen.start()] + source.choice([chosen[0] + b" 0, ", some * 2]) + content[chosen.start() :]
+    )
 
 
 def half_character(source: random.Random, content: bytes) -> bytes:
@@ -238,7 +263,11 @@ def structure(source: random.Random, content: bytes, suffix: str) -> bytes:
     if b"&" in content:  # aliases may stand for more than can be walked through
         return number(source, content)
     try:
-        document = json.loads(content) if suffix == ".json" else yaml.load(content.replace(b"%YAML:1.0", b""), LOADER)
+        document = (
+            json.loads(content)
+            if suffix == ".json"
+            else yaml.load(content.replace(b"%YAML:1.0", b""), LOADER)
+        )
         nodes = list(_nodes(document))
     except Exception:
         return number(source, content)

@@ -1,4 +1,6 @@
-"""Damage to files that are made of pieces: chunks of PNG and WebP, segments of JPEG, boxes of MP4, entries of TIFF."""
+"""Damage to files that are made of pieces: chunks of PNG and WebP, segments of JPEG, boxes of MP4, entries of
+TIFF.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Damaged files of every kind, each in a process of its own with 4 GiB and 10 s; the table of docs/fuzzing.md.
+"""Damaged files of every kind, each in a process of its own with 4 GiB and 10 s; the table of
+docs/fuzzing.md.
 
     python -m tests.fuzz.run [--only rig] [--share 0.1] [--out docs/fuzzing.md]
 
@@ -101,7 +102,9 @@ def warm_up(seeds: list[Seed], check: Check, folder: Path) -> None:
             else:
                 home.mkdir(parents=True)
                 shutil.copy(seed.file, home)
-            check(home if seed.whole_folder and seed.kind == "rig" else home / seed.file.name, random.Random(i))
+            check(
+                home if seed.whole_folder and seed.kind == "rig" else home / seed.file.name, random.Random(i)
+            )
 
 
 def keep(case: Case, home: Path, log: Path) -> None:
@@ -127,7 +130,8 @@ def table_rows(kind: str, cases: list[Case]) -> list[str]:
         counts = [sum(o.verdict == v for o in found) for v in ("read", "refused")]
         worst = f"{max(o.seconds for o in found):.1f} s | {max(o.peak for o in found) / 2**20:.0f} MiB"
         rows.append(
-            f"| {kind} | {format} | {len(found)} | {counts[0]} | {counts[1]} | {len(found) - sum(counts)} | {worst} |"
+            f"| {kind} | {format} | {len(found)} | {counts[0]} | {counts[1]} | {len(found) - sum(counts)} | "
+            f"{worst} |"
         )
     return rows
 

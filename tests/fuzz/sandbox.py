@@ -24,7 +24,8 @@ WAITING = 12
 
 
 class Outcome(NamedTuple):
-    """How a case ended: "read", "refused" or what went wrong, its last line, seconds of a core, peak resident bytes.
+    """How a case ended: "read", "refused" or what went wrong, its last line, seconds of a core, peak resident
+    bytes.
 
     What the child holds from its parent is not counted in the peak.
     """
@@ -36,7 +37,8 @@ class Outcome(NamedTuple):
 
 
 def ended(case: Callable[[], str], log: Path) -> Outcome:
-    """Run a case that returns "read" or "refused" (or anything else: a fault) in a child with 4 GiB and 10 s of a core.
+    """Run a case that returns "read" or "refused" (or anything else: a fault) in a child with 4 GiB and 10 s
+    of a core.
 
     A traceback, a signal and a time-out are faults. What the case prints goes to `log`.
     """

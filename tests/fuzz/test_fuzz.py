@@ -29,12 +29,15 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits of proce
 
 
 @pytest.mark.parametrize(
-    ("kind", "count"), [("rig", 19), ("image", 20), ("video", 4), ("weights", 4), ("checkpoint", 4), ("covariance", 4)]
+    ("kind", "count"),
+    [("rig", 19), ("image", 20), ("video", 4), ("weights", 4), ("checkpoint", 4), ("covariance", 4)],
 )
 def test_damaged_files_are_read_or_refused(kind, count, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found = faults_of(kind, count, first=10_000)
-    assert [(c.seed, c.number, c.outcome) for c in found if c.outcome.verdict not in ("read", "refused")] == []
+    assert [
+        (c.seed, c.number, c.outcome) for c in found if c.outcome.verdict not in ("read", "refused")
+    ] == []
     assert any(c.outcome.verdict == "refused" for c in found)
 
 
@@ -60,8 +63,8 @@ def test_the_sandbox_sees(case, verdict, tmp_path, monkeypatch):
 
 
 def measured(log: Path) -> bool:
-    """Whether 200 MiB are measured. The most of some measurements: what the system takes of the parent's memory
-    meanwhile lowers one."""
+    """Whether 200 MiB are measured. The most of some measurements: what the system takes of the parent's
+    memory meanwhile lowers one."""
     case = partial(sandbox.ended, lambda: "read" if len(bytearray(200 << 20)) else "", log)
     return 190 << 20 < max(case().peak for _ in range(5)) < 230 << 20
 
@@ -170,7 +173,9 @@ def test_a_checkpoint_of_another_network_or_optimiser_is_refused(tmp_path):
         restore(checkpoint._replace(tensors=tensors), *cases.training())
     for name in ("optimiser/x/exp_avg", "optimiser/0/exp_avg", "optimiser/99/step"):
         with pytest.raises(ValueError, match="to another optimiser"):
-            restore(checkpoint._replace(tensors=checkpoint.tensors | {name: torch.ones(3)}), *cases.training())
+            restore(
+                checkpoint._replace(tensors=checkpoint.tensors | {name: torch.ones(3)}), *cases.training()
+            )
 
 
 @pytest.mark.parametrize("kind", ["image", "video", "weights", "checkpoint", "covariance"])
@@ -200,11 +205,17 @@ def test_numbers_that_no_camera_has_are_refused(old, new, tmp_path):
 
 
 @pytest.mark.parametrize(("cameras", "distorted"), [(100, True), (1000, False)])
-def test_rigs_of_many_cameras_are_read_and_summarised_within_seconds(cameras, distorted, tmp_path, monkeypatch):
+def test_rigs_of_many_cameras_are_read_and_summarised_within_seconds(
+    cameras, distorted, tmp_path, monkeypatch
+):
     """The tests' own checks of shapes take half of it; of so many, not every pair is described."""
     monkeypatch.setattr(sandbox, "SECONDS", 15 if distorted else 30)
-    lens = ", distortion: {model: brown-conrady, coefficients: [-0.1, 0.02, 0.001, 0.001]}" if distorted else ""
-    entries = (f"  c{i}: {{size: [64, 48], focal: 50, translation: [{i}, 0, 0]{lens}}}" for i in range(cameras))
+    lens = (
+        ", distortion: {model: brown-conrady, coefficients: [-0.1, 0.02, 0.001, 0.001]}" if distorted else ""
+    )
+    entries = (
+        f"  c{i}: {{size: [64, 48], focal: 50, translation: [{i}, 0, 0]{lens}}}" for i in range(cameras)
+    )
     text = "\n".join(["format: arraygeom-rig 1", "depth: [1, 10]", "cameras:", *entries])
     rig, model = tmp_path / "rig.yaml", tmp_path / "model"
     rig.write_text(text)
@@ -213,13 +224,17 @@ def test_rigs_of_many_cameras_are_read_and_summarised_within_seconds(cameras, di
         ("convert", rig, model, "--write-as", "colmap"),
         ("convert", model, tmp_path / "again.yaml"),
     ):
-        outcome = sandbox.ended(lambda command=command: cases.command("rig", *map(str, command)), tmp_path / "log")
+        outcome = sandbox.ended(
+            lambda command=command: cases.command("rig", *map(str, command)), tmp_path / "log"
+        )
         assert outcome.verdict == "read", outcome
 
 
 def test_a_rig_of_huge_images_is_summarised_within_seconds(tmp_path):
     rig = (Path(cases.__file__).parent / "native.yaml").read_text()
     (tmp_path / "rig.yaml").write_text(rig.replace("size: [640, 400]", "size: [65535, 16384]"))
-    outcome = sandbox.ended(lambda: cases.command("rig", "info", str(tmp_path / "rig.yaml")), tmp_path / "log")
+    outcome = sandbox.ended(
+        lambda: cases.command("rig", "info", str(tmp_path / "rig.yaml")), tmp_path / "log"
+    )
     assert outcome.verdict == "read"
     assert outcome.peak < 2**30

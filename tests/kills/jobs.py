@@ -77,7 +77,13 @@ def batch_job(folder: Path, *more: str, name: str = "batch") -> Job:
     """Several frames, each as its own files. Those that were there are kept."""
 
     def arguments(out: Path) -> list[str]:
-        return [*_fuse(folder), *_images(folder, "", "many"), "--out", str(out), *(more or ("--threads", "1"))]
+        return [
+            *_fuse(folder),
+            *_images(folder, "", "many"),
+            "--out",
+            str(out),
+            *(more or ("--threads", "1")),
+        ]
 
     return Job(name, arguments, _frames_of, _frames_mixed, again=("--resume",), kept=_times)
 
@@ -130,7 +136,9 @@ def _frames_mixed(out: Path, versions: list[dict[str, bytes]]) -> list[str]:
     """The files of each frame are of one making."""
     found, faults = _frames_of(out), []
     for frame in {name.rsplit("_", 1)[0] for name in found}:
-        parts = [{n: c for n, c in files.items() if n.rsplit("_", 1)[0] == frame} for files in (found, *versions)]
+        parts = [
+            {n: c for n, c in files.items() if n.rsplit("_", 1)[0] == frame} for files in (found, *versions)
+        ]
         faults += mixed(parts[0], parts[1:], f"{frame}_fused.png")
     return faults
 
@@ -151,7 +159,9 @@ def training_job(folder: Path) -> Job:
 
 
 def _run_of(out: Path) -> dict[str, bytes]:
-    """The numbers of each step, validations without their time, and the tensors of weights and last checkpoint."""
+    """The numbers of each step, validations without their time, and the tensors of weights and last
+    checkpoint.
+    """
     checkpoint = newest_checkpoint(out / "checkpoints")
     assert checkpoint is not None
     found = {name: tensor.numpy().tobytes() for name, tensor in checkpoint.tensors.items()}
@@ -176,16 +186,30 @@ def calibration_job(folder: Path) -> Job:
     photos = folder / "board"
     if not photos.exists():
         lens = (-0.2, 0.05, 0, 0, 0)
-        cameras = {"a": camera(330.0, (240, 320), lens=lens), "b": camera(280.0, (220, 300), (0.15, 0, 0), (0, -6, 1))}
+        cameras = {
+            "a": camera(330.0, (240, 320), lens=lens),
+            "b": camera(280.0, (220, 300), (0.15, 0, 0), (0, -6, 1)),
+        }
         boards = board_poses(6, depth=(0.8, 1.2), spread=0.1)
         for name, c in cameras.items():
             (photos / name).mkdir(parents=True)
             for i in range(6):
-                image = photograph(c, c.cam_from_world @ Pose(boards.R[i], boards.t[i]), parse_board(BOARD), dpi=60)
+                image = photograph(
+                    c, c.cam_from_world @ Pose(boards.R[i], boards.t[i]), parse_board(BOARD), dpi=60
+                )
                 cv2.imwrite(str(photos / name / f"{i}.png"), image)
 
     def arguments(lens: str) -> Callable[[Path], list[str]]:
-        return lambda out: ["calibrate", str(photos), "--board", BOARD, "--lens", lens, "-o", str(out / "rig.yaml")]
+        return lambda out: [
+            "calibrate",
+            str(photos),
+            "--board",
+            BOARD,
+            "--lens",
+            lens,
+            "-o",
+            str(out / "rig.yaml"),
+        ]
 
     def faults(out: Path, versions: list[dict[str, bytes]]) -> list[str]:
         return mixed(files_of(out), versions, "rig.yaml")
@@ -208,19 +232,29 @@ def rendering_job(folder: Path, backend: str = "layered", scenes: int = 4) -> Jo
 
     def compared(out: Path) -> dict[str, bytes]:
         made = files_of(out / "scenes")
-        return {name: content for name, content in made.items() if not name.endswith(("farm.json", "render.json"))}
+        return {
+            name: content for name, content in made.items() if not name.endswith(("farm.json", "render.json"))
+        }
 
     def faults(out: Path, versions: list[dict[str, bytes]]) -> list[str]:
         found, wrong = compared(out), []
         for scene in {name.partition("/")[0] for name in found}:
-            here, right = ({n: c for n, c in files.items() if n.startswith(scene)} for files in (found, versions[0]))
+            here, right = (
+                {n: c for n, c in files.items() if n.startswith(scene)} for files in (found, versions[0])
+            )
             wrong += [] if here == right else [f"not whole: scene {scene}"]
         return wrong
 
     def kept(out: Path) -> dict[str, int]:
         return {path.name: path.stat().st_mtime_ns for path in (out / "scenes").glob("*")}
 
-    return Job("rendering" if backend == "layered" else "rendering by Blender", arguments, compared, faults, kept=kept)
+    return Job(
+        "rendering" if backend == "layered" else "rendering by Blender",
+        arguments,
+        compared,
+        faults,
+        kept=kept,
+    )
 
 
 def all_jobs(folder: Path) -> Iterator[Job]:

@@ -33,10 +33,10 @@ WAYS = ("moment", "write", "cut", "worker")
 class Job(NamedTuple):
     """A command that writes to a folder.
 
-    `arguments` of `pat`, for a folder; `again`, those that a killed command is continued with. `compared`: what has to
-    be the same in the end, as bytes by name. `faults`: what is wrong with a folder whose command was killed, given the
-    contents that are right. `kept`: files that must not be made again, by the time they were written. `former`: the
-    arguments of a command that has already written to the folder.
+    `arguments` of `pat`, for a folder; `again`, those that a killed command is continued with. `compared`:
+    what has to be the same in the end, as bytes by name. `faults`: what is wrong with a folder whose command
+    was killed, given the contents that are right. `kept`: files that must not be made again, by the time they
+    were written. `former`: the arguments of a command that has already written to the folder.
     """
 
     name: str
@@ -49,7 +49,9 @@ class Job(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """A job that nobody killed: its contents, those of the former command, its seconds, writes, and largest file."""
+    """A job that nobody killed: its contents, those of the former command, its seconds, writes, and largest
+    file.
+    """
 
     contents: dict[str, bytes]
     former: Path | None
@@ -100,7 +102,9 @@ def started(arguments: list[str], log: Path, announced: Path | None = None) -> i
 
 
 def status_of(child: int, seconds: float | None = None) -> int | None:
-    """The exit status of a process (negative: the signal that ended it), None if it runs on after some seconds."""
+    """The exit status of a process (negative: the signal that ended it), None if it runs on after some
+    seconds.
+    """
     end = time.monotonic() + (WAITING if seconds is None else seconds)
     while True:
         found, status = os.waitpid(child, os.WNOHANG)
@@ -142,7 +146,9 @@ def reference(job: Job, folder: Path) -> Reference:
     seconds = min(seconds, time.monotonic() - begin_slow)  # the first may have compiled kernels
     contents = job.compared(whole)
     if job.compared(slow) != contents:
-        raise AssertionError(f"{job.name}: two runs that nobody killed differ: {_different(job, slow, contents)}")
+        raise AssertionError(
+            f"{job.name}: two runs that nobody killed differ: {_different(job, slow, contents)}"
+        )
     largest = max(file.stat().st_size for file in whole.rglob("*") if file.is_file())
     writes = len(announced.read_text().splitlines())
     return Reference(contents, former, [contents, *versions], seconds, writes, largest)
@@ -175,7 +181,9 @@ def killed(job: Job, right: Reference, folder: Path, *, way: str, kills: int, se
     return Killed(done, finished, [f"{job.name}, {way}: {fault}" for fault in faults])
 
 
-def _one_kill(arguments: list[str], right: Reference, folder: Path, way: str, rng: np.random.Generator) -> bool:
+def _one_kill(
+    arguments: list[str], right: Reference, folder: Path, way: str, rng: np.random.Generator
+) -> bool:
     """Run a command and kill it; False if it ended before."""
     announced = folder / "announced"
     announced.unlink(missing_ok=True)
@@ -263,7 +271,8 @@ def files_of(out: Path) -> dict[str, bytes]:
 
 
 def mixed(found: dict[str, bytes], versions: list[dict[str, bytes]], last: str) -> list[str]:
-    """What is wrong with files that belong together: some are torn, or not of the making of the one written last.
+    """What is wrong with files that belong together: some are torn, or not of the making of the one written
+    last.
 
     Where there is no last one yet, the others only have to be whole.
     """
@@ -271,7 +280,11 @@ def mixed(found: dict[str, bytes], versions: list[dict[str, bytes]], last: str) 
     if torn or last not in found:
         return [f"torn: {name}" for name in torn]
     made = [right for right in versions if right.get(last) == found[last]]
-    return [] if any(found == right for right in made) else [f"beside {last} are files of another making, or missing"]
+    return (
+        []
+        if any(found == right for right in made)
+        else [f"beside {last} are files of another making, or missing"]
+    )
 
 
 # Dask's scheduler -------------------------------------------------------------------------------------------
@@ -307,7 +320,9 @@ def dask_cluster(folder: Path) -> Iterator[tuple[str, subprocess.Popen]]:
 
 
 def scheduler_killed(job: Job, right: Reference, folder: Path, *, kills: int, seed: int = 0) -> Killed:
-    """Kill the scheduler under a command, which has to end with one line, and continue with another scheduler."""
+    """Kill the scheduler under a command, which has to end with one line, and continue with another
+    scheduler.
+    """
     rng = np.random.default_rng([seed, len(WAYS)])
     out, faults = folder / f"{job.name}-scheduler", []
     for _ in range(kills):

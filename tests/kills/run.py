@@ -1,4 +1,5 @@
-"""Commands killed at random moments, inside writes, with their workers and schedulers; the table of docs/kills.md.
+"""Commands killed at random moments, inside writes, with their workers and schedulers; the table of
+docs/kills.md.
 
     python -m tests.kills.run [--only fuse] [--share 0.5] [--out docs/kills.md]
 
@@ -71,7 +72,10 @@ class Kills:
         print("\n".join([table(rows), *faults, f"{(time.monotonic() - begin) / 60:.0f} minutes"]))
         if self.out is not None:
             document = self.out.read_text()
-            write_text(self.out, with_block(document, "kills", table(rows_of(document) | rows if self.only else rows)))
+            write_text(
+                self.out,
+                with_block(document, "kills", table(rows_of(document) | rows if self.only else rows)),
+            )
         return int(bool(faults))
 
     def _kill(self, job: Job, folder: Path) -> dict[str, Killed]:
@@ -88,7 +92,10 @@ class Kills:
 
 def table(rows: dict[str, str]) -> str:
     """Rows by job, in Markdown."""
-    head = [f"| job | {' | '.join(COLUMNS.values())} | compared | faults |", f"|---|{'---:|' * (len(COLUMNS) + 2)}"]
+    head = [
+        f"| job | {' | '.join(COLUMNS.values())} | compared | faults |",
+        f"|---|{'---:|' * (len(COLUMNS) + 2)}",
+    ]
     return "\n".join([*head, *(rows[name] for name in COUNTS if name in rows)])
 
 

@@ -1,4 +1,6 @@
-"""An array of two cameras before layered photographs: harder than the sample array, on which bounds were set."""
+"""An array of two cameras before layered photographs: harder than the sample array, on which bounds were
+set.
+"""
 
 from pathlib import Path
 

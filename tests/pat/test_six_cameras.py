@@ -69,7 +69,11 @@ def rig_of(name: str) -> Rig:
     """Two of the cameras in the room: beta beside alpha, or around the ball, as parallel rays need."""
     model, focal = SIX[name]
     R = rotation_from_vector(number(0.0, 0.12 if name == "telecentric" else -0.01, 0.0))
-    t = number(0.0, 0.0, 2.5) - R @ number(0.0, 0.0, 2.5) if name == "telecentric" else number(-0.25, 0.01, 0.0)
+    t = (
+        number(0.0, 0.0, 2.5) - R @ number(0.0, 0.0, 2.5)
+        if name == "telecentric"
+        else number(-0.25, 0.01, 0.0)
+    )
     poses = Pose.identity(), Pose(R, t)
     cameras = [Camera(K=intrinsics(focal, HW), cam_from_world=p, hw=HW, distortion=model) for p in poses]
     return Rig(dict(zip(("alpha", "beta"), cameras)), depth=(1.3, 5.3 if name in WHOLE else 3.2))
@@ -132,7 +136,10 @@ def test_no_flag_of_100_000_points_is_wrong(name):
     found = camera.project(torch.from_numpy(X))
     assert int((on != (found.valid & camera.contains(found.x)).numpy()).sum()) == 0
     assert np.abs(found.x.numpy() - x)[on].max() < 1e-8
-    assert sum(bool(line.strip()) for line in inspect.getsource(type(camera.distortion)).splitlines()) == LINES[name]
+    assert (
+        sum(bool(line.strip()) for line in inspect.getsource(type(camera.distortion)).splitlines())
+        == LINES[name]
+    )
 
 
 @pytest.mark.parametrize("name", SIX)
@@ -193,7 +200,9 @@ def test_what_cannot_serve_says_what_is_missing(name, tmp_path):
             depth_of(pair, x, x)
 
 
-@pytest.mark.parametrize("name", [n if n == "telecentric" else pytest.param(n, marks=pytest.mark.slow) for n in SIX])
+@pytest.mark.parametrize(
+    "name", [n if n == "telecentric" else pytest.param(n, marks=pytest.mark.slow) for n in SIX]
+)
 def test_pictures(name, tmp_path):
     rig = rig_of(name)
     images, truth = recorded(rig)
@@ -203,7 +212,9 @@ def test_pictures(name, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         frame = fuse(network, rig, images, alpha="alpha")
-    alone, fused = (score(i.clamp(0, 1), truth).psnr for i in (images["alpha"].expand(3, -1, -1), frame.image))
+    alone, fused = (
+        score(i.clamp(0, 1), truth).psnr for i in (images["alpha"].expand(3, -1, -1), frame.image)
+    )
     error = float(((frame.depth - wanted) / wanted).abs().nanmedian())
     print(f"{name}: {alone:.2f} dB alone, {fused:.2f} fused, depth off by {error:.1%}")
     assert fused > alone + 4

@@ -84,7 +84,9 @@ def attention(run: Callable[..., Tensor], of: str) -> Operator:
 
 def measured(*given: Tensor, **options: object) -> Tensor:
     found = attend_with_statistics(*given, **options)  # type: ignore[arg-type]
-    return torch.cat([found.value.flatten(), found.position.flatten(), found.deviation.flatten(), found.peak.flatten()])
+    return torch.cat(
+        [found.value.flatten(), found.position.flatten(), found.deviation.flatten(), found.peak.flatten()]
+    )
 
 
 def cpu(*given: Tensor, **options: object) -> Tensor:
@@ -96,11 +98,15 @@ W = vector(0.01, -0.02, 0.005, 0.03, -0.01, 0.02)
 GEOMETRY = {
     "apply_homography": Operator(lambda x: ag.apply_homography(MAP, pixels(x)).x, X),
     "epipolar_lines": Operator(lambda x: ag.epipolar_lines(PAIR.fundamental, pixels(x)), X),
-    "epipolar_distance": Operator(lambda x: ag.epipolar_distance(PAIR.fundamental, pixels(x), pixels(x) + 1), X),
+    "epipolar_distance": Operator(
+        lambda x: ag.epipolar_distance(PAIR.fundamental, pixels(x), pixels(x) + 1), X
+    ),
     "epipoles": Operator(lambda w: ag.epipoles(moved_pair(w).fundamental)[1].square(), W),
     "essential_matrix": Operator(lambda w: ag.essential_matrix(moved_pair(w).beta_from_alpha), W),
     "fundamental_matrix": Operator(lambda w: moved_pair(w).fundamental * 1e3, W),
-    "infinite_homography": Operator(lambda w: ag.infinite_homography(A.K, B.K, ag.rotation_from_vector(w[:3])), W),
+    "infinite_homography": Operator(
+        lambda w: ag.infinite_homography(A.K, B.K, ag.rotation_from_vector(w[:3])), W
+    ),
     "homography_at": Operator(lambda w: moved_pair(w).homography_at(vector(3.0)[0]), W),
     "plane_homography": Operator(lambda w: _of_plane(moved_pair(w).beta_from_alpha), W),
     "rectify": Operator(lambda w: ag.rectify(moved_pair(w)).H_beta, W),

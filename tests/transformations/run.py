@@ -2,7 +2,8 @@
 
     python -m tests.transformations.run [--out docs/transformations.md]
 
-An answer is held against central differences, a loop, or the operator itself; it is right, or one error of ours.
+An answer is held against central differences, a loop, or the operator itself; it is right, or one error of
+ours.
 """
 
 from __future__ import annotations

@@ -28,8 +28,12 @@ def test_attention(operator, transformation):
 
 
 def whole_graphs(operators: list[str]) -> dict[str, str]:
-    """The verdicts of compilation, by a process without the tests' own checks of shapes, which Dynamo cannot trace."""
-    text = f"from tests.transformations.run import verdict\nfor o in {operators}: print(verdict(o, 'compile'))"
+    """The verdicts of compilation, by a process without the tests' own checks of shapes, which Dynamo cannot
+    trace.
+    """
+    text = (
+        f"from tests.transformations.run import verdict\nfor o in {operators}: print(verdict(o, 'compile'))"
+    )
     found = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
     return dict(zip(operators, found.stdout.splitlines(), strict=True))
 

@@ -2,9 +2,10 @@
 
     python -m tests.wheel.run [--python PYTHON ...] [--lowest] [--torch 2.13.0] [--folder out/wheel] [--keep]
 
-An sdist is built of the tree and the wheel of the sdist. For each interpreter an environment is made, with the newest
-dependencies that constraints.txt allows and, with --lowest, with the oldest that pyproject.toml allows; an environment
-with `arraygeom` alone is made for the first. Only the standard library is used. Exit status 1 if anything fails.
+An sdist is built of the tree and the wheel of the sdist. For each interpreter an environment is made, with
+the newest dependencies that constraints.txt allows and, with --lowest, with the oldest that pyproject.toml
+allows; an environment with `arraygeom` alone is made for the first. Only the standard library is used. Exit
+status 1 if anything fails.
 """
 
 from __future__ import annotations
@@ -47,9 +48,13 @@ IMPORTS = {"import arraygeom": "import arraygeom", "import pat": "import pat", "
 
 def main() -> int:
     """Build, install, use; print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--python", nargs="+", default=[sys.executable], help="interpreters")
-    parser.add_argument("--lowest", action="store_true", help="the oldest dependencies too, with the first interpreter")
+    parser.add_argument(
+        "--lowest", action="store_true", help="the oldest dependencies too, with the first interpreter"
+    )
     parser.add_argument("--torch", help="this version of torch everywhere (where one build can be had)")
     parser.add_argument("--folder", type=Path, default=ROOT / "out" / "wheel")
     parser.add_argument("--keep", action="store_true", help="keep the environments")
@@ -58,7 +63,10 @@ def main() -> int:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     wheel, geometry = built(folder)
-    print(f"{wheel.name}: {wheel.stat().st_size / 1e6:.2f} MB; {geometry.name}: {geometry.stat().st_size / 1e3:.0f} kB")
+    print(
+        f"{wheel.name}: {wheel.stat().st_size / 1e6:.2f} MB; {geometry.name}: "
+        f"{geometry.stat().st_size / 1e3:.0f} kB"
+    )
     print("\n| Python | dependencies | " + " | ".join([*STEPS, *IMPORTS]) + " |")
     print("| --- | --- |" + " ---: |" * (len(STEPS) + len(IMPORTS)), flush=True)
     cases = [(python, "newest") for python in given.python] + [(given.python[0], "lowest")] * given.lowest
@@ -84,13 +92,23 @@ def built(folder: Path) -> tuple[Path, Path]:
 def used(folder: Path, wheel: Path, python: str, which: str, torch: str | None, keep: bool) -> bool:
     """Install the wheel and let it do its work; one row of the table."""
     here = environment(folder / "environment", python)
-    version = subprocess.run([here / "python", "-c", "import sys; print(sys.version.split()[0])"], capture_output=True)
+    version = subprocess.run(
+        [here / "python", "-c", "import sys; print(sys.version.split()[0])"], capture_output=True
+    )
     row = f"| {version.stdout.decode().strip()} | {which} | "
     try:
         limits = folder / "constraints.txt"
         text = (ROOT / "constraints.txt").read_text() if which == "newest" else lowest(torch)
         limits.write_text(text)
-        call(here, "pip", "install", "--constraint", limits, *([f"torch=={torch}"] if torch else ["torch"]), wheel)
+        call(
+            here,
+            "pip",
+            "install",
+            "--constraint",
+            limits,
+            *([f"torch=={torch}"] if torch else ["torch"]),
+            wheel,
+        )
         work = folder / "work"
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir()
@@ -98,7 +116,9 @@ def used(folder: Path, wheel: Path, python: str, which: str, torch: str | None, 
             shutil.copy(ROOT / "pat" / "data" / "sample" / name, work)
         (work / "explore.py").write_text(EXPLORE)
         times = [timed(here, step.split(), work) for step in STEPS.values()]
-        times += [min(timed(here, ["python", "-c", code], work) for _ in range(3)) for code in IMPORTS.values()]
+        times += [
+            min(timed(here, ["python", "-c", code], work) for _ in range(3)) for code in IMPORTS.values()
+        ]
         print(row + " | ".join(f"{seconds:.1f} s" for seconds in times) + " |", flush=True)
         return True
     except subprocess.CalledProcessError as error:
@@ -118,7 +138,10 @@ def geometry_alone(folder: Path, wheel: Path, python: str, torch: str | None, ke
         shutil.copy(ROOT / "pat" / "data" / "sample" / "rig.yaml", folder)
         seconds = timed(here, ["python", "-c", GEOMETRY], folder)
         packages = call(here, "python", "-m", "pip", "list", "--format=freeze").split()
-        print(f"\narraygeom alone: {seconds:.1f} s, with {len(packages)} packages: {' '.join(packages)}", flush=True)
+        print(
+            f"\narraygeom alone: {seconds:.1f} s, with {len(packages)} packages: {' '.join(packages)}",
+            flush=True,
+        )
         more = [name for name in packages if re.match("(opencv|scipy|numba|pillow|arraygeom-pat)", name)]
         return bool(packages) and not more
     except subprocess.CalledProcessError as error:
@@ -130,7 +153,9 @@ def geometry_alone(folder: Path, wheel: Path, python: str, torch: str | None, ke
 
 
 def lowest(torch: str | None) -> str:
-    """The last patches of the oldest versions that pyproject.toml allows; without torch where a version is given."""
+    """The last patches of the oldest versions that pyproject.toml allows; without torch where a version is
+    given.
+    """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     pinned = [re.sub(r">=(\d+)$", r">=\1.0", requirement) for requirement in project["dependencies"]]
     pinned = [re.sub(">=(.*)", r"==\1.*", requirement) for requirement in pinned]
@@ -147,12 +172,22 @@ def environment(folder: Path, python: str) -> Path:
 def call(commands: Path, command: str, *words: str | Path, cwd: Path | None = None) -> str:
     """What a command of an environment prints. Raises subprocess.CalledProcessError with it."""
     if command == "pip":
-        line = [commands / "python", "-m", "pip", words[0], "--quiet", "--disable-pip-version-check", *words[1:]]
+        line = [
+            commands / "python",
+            "-m",
+            "pip",
+            words[0],
+            "--quiet",
+            "--disable-pip-version-check",
+            *words[1:],
+        ]
     else:
         line = [commands / command, *words]
     line = [str(word) for word in line]
     without = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")}
-    done = subprocess.run(line, cwd=cwd, env=without, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    done = subprocess.run(
+        line, cwd=cwd, env=without, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     if done.returncode:
         raise subprocess.CalledProcessError(done.returncode, " ".join(line), done.stdout)
     return done.stdout

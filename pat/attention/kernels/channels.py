@@ -187,8 +187,8 @@ _weighted_sum_1 = _weighted_sum(1, 4, NARROW)
 
 @compiled
 def block_products(pixels, counts, x, rows, image, channels, out):
-    """`inner_products` for the pixels of a block. Neighbours touch much the same pixels of beta: at a few of those in
-    turn, which then lie in the first cache."""
+    """`inner_products` for the pixels of a block. Neighbours touch much the same pixels of beta: at a few of
+    those in turn, which then lie in the first cache."""
     for t in range(0, _most(counts, pixels), CHUNK):
         for i in range(pixels):
             last = min(t + CHUNK, of(counts, i)[0])
@@ -224,8 +224,8 @@ def scatter(taps, weights, last, x, channels, first_channel, last_channel, out):
     """out[row, c] += weight x[pixel, c] for all taps of the alpha pixels taps.first .. last: those of a block
     in turn, as in `block_products`.
 
-    `weights` is a column of `taps`. One caller owns the channels first_channel .. last_channel, so the order of
-    additions, and with it every bit, is the same however many callers share the work.
+    `weights` is a column of `taps`. One caller owns the channels first_channel .. last_channel, so the order
+    of additions, and with it every bit, is the same however many callers share the work.
     """
     taps, (weights, x, out) = pointers(taps), pointers((weights, x, out))
     for first in range(0, last - taps.first, BLOCK):

@@ -15,7 +15,17 @@ from numba.extending import intrinsic, models, register_model
 
 from arraygeom.compiled import compiled, separate_cache
 
-__all__ = ["LANES", "NARROW", "Code", "Vector", "accumulated", "compiled", "instruction", "row_of", "separate_cache"]
+__all__ = [
+    "LANES",
+    "NARROW",
+    "Code",
+    "Vector",
+    "accumulated",
+    "compiled",
+    "instruction",
+    "row_of",
+    "separate_cache",
+]
 
 LANES = 16
 NARROW = 8
@@ -52,7 +62,9 @@ def row_of(vector, n):
 
 
 class Code:
-    """Emits instructions. `kinds` are numba's types of the intrinsic's arguments, `result` that of its value."""
+    """Emits instructions. `kinds` are numba's types of the intrinsic's arguments, `result` that of its
+    value.
+    """
 
     def __init__(self, context, builder, kinds, result):
         self.context, self.builder, self.kinds, self.result = context, builder, kinds, result
@@ -132,8 +144,9 @@ def _constants(lanes):
 
 
 def instruction(result):
-    """Decorates a function (code, *values) that emits the code of an intrinsic; `result` makes its type from those of
-    the arguments. Arguments annotated `index` are 64-bit; those annotated `literal` are numbers at compile time."""
+    """Decorates a function (code, *values) that emits the code of an intrinsic; `result` makes its type from
+    those of the arguments. Arguments annotated `index` are 64-bit; those annotated `literal` are numbers at
+    compile time."""
 
     def decorate(emit):
         """numba's intrinsic of the function's name, typed by its annotations."""
@@ -145,7 +158,10 @@ def instruction(result):
             taken = [types.intp if note == "index" else kind for note, kind in zip(notes, kinds)]
 
             def code(context, builder, signature, args):
-                values = [kind.literal_value if note == "literal" else a for note, kind, a in zip(notes, kinds, args)]
+                values = [
+                    kind.literal_value if note == "literal" else a
+                    for note, kind, a in zip(notes, kinds, args)
+                ]
                 out = inspect.unwrap(emit)(Code(context, builder, kinds, given), *values)
                 return context.get_dummy_value() if out is None else out
 

@@ -43,14 +43,19 @@ Block = namedtuple("Block", [name for name, _, _ in LAYOUT])  # type: ignore[mis
 
 
 def block_scratch(samples: int, channels: int, number: np.dtype) -> Block:
-    """Room for a block: an array (BLOCK, length) for each line of `LAYOUT`, what belongs to a pixel side by side."""
+    """Room for a block: an array (BLOCK, length) for each line of `LAYOUT`, what belongs to a pixel side by
+    side.
+    """
     lengths = {"pixel": 1, "sample": samples + LANES, "tap": 4 * samples + 2 * LANES, "channel": channels}
     ends = {"integer": 0, "number": 0}
     slices = []
     for _, kind, each in LAYOUT:
         slices.append(slice(ends[kind], ends[kind] + lengths[each]))
         ends[kind] = slices[-1].stop
-    rooms = {kind: np.empty((BLOCK, ends[kind]), dtype) for kind, dtype in (("integer", np.int32), ("number", number))}
+    rooms = {
+        kind: np.empty((BLOCK, ends[kind]), dtype)
+        for kind, dtype in (("integer", np.int32), ("number", number))
+    }
     return Block(*(rooms[kind][:, part] for (_, kind, _), part in zip(LAYOUT, slices)))
 
 
@@ -73,7 +78,9 @@ class Geometry(NamedTuple):
 
 
 class Call(NamedTuple):
-    """The inputs of a call: images, geometry, bias (if `biased`), and the channels of the query and the value."""
+    """The inputs of a call: images, geometry, bias (if `biased`), and the channels of the query and the
+    value.
+    """
 
     query: Any
     key: Any
@@ -86,8 +93,8 @@ class Call(NamedTuple):
 
 
 class Share(NamedTuple):
-    """Work of one of several callers: pieces of `size` of the alpha pixels first .. last, drawn from a common counter,
-    with scratch of its own."""
+    """Work of one of several callers: pieces of `size` of the alpha pixels first .. last, drawn from a common
+    counter, with scratch of its own."""
 
     first: int
     last: int
@@ -127,8 +134,8 @@ class Gradients(NamedTuple):
 
 
 class TapList(NamedTuple):
-    """What backward leaves for `scatter`, for each of the alpha pixels from `first` on: the number of its taps, their
-    rows, and their weights in the gradients of key and value."""
+    """What backward leaves for `scatter`, for each of the alpha pixels from `first` on: the number of its
+    taps, their rows, and their weights in the gradients of key and value."""
 
     first: int
     tap_count: Any
@@ -183,7 +190,9 @@ def _tuple(code, kind, parts):
 
 @instruction(_pointed)
 def pointers(code, arrays):
-    """A tuple with pointers for flat arrays and a `Column` for arrays of two axes, in tuples within it, too."""
+    """A tuple with pointers for flat arrays and a `Column` for arrays of two axes, in tuples within it,
+    too.
+    """
     return _point(code, code.kinds[0], arrays)
 
 

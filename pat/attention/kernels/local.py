@@ -1,7 +1,7 @@
 """Attention of each pixel to a window around it, for images that lie channels first.
 
-A sample is the same step away from every pixel, so that work on one is work on a whole row of pixels side by side:
-inner products with it, and its share of the mean.
+A sample is the same step away from every pixel, so that work on one is work on a whole row of pixels side by
+side: inner products with it, and its share of the mean.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ LOWEST = np.finfo(np.float32).min
 
 @compiled(nogil=True, cache=True, fastmath={"contract"})
 def attend_rows(query, key, value, out, size, spacing, top):
-    """`ROWS` rows of `out`, from `top` on, of one image (channels, h, w): the mean of the values at `size` x `size`
-    pixels, `spacing` apart, by the softmax of inner products. What is outside the image does not count."""
+    """`ROWS` rows of `out`, from `top` on, of one image (channels, h, w): the mean of the values at `size` x
+    `size` pixels, `spacing` apart, by the softmax of inner products. What is outside the image does not
+    count."""
     channels, height, width = query.shape
     scores = np.empty((size * size, -(-width // LANES) * LANES), np.float32)
     total = np.empty(scores.shape[1], np.float32)
@@ -52,8 +53,8 @@ def attend_rows(query, key, value, out, size, spacing, top):
 
 @compiled
 def _sampled(t, y, size, spacing, height, width):
-    """The row of sample t of the pixels in row y, the first of these for which it is in the image, the end of these,
-    and how far it is to the right."""
+    """The row of sample t of the pixels in row y, the first of these for which it is in the image, the end of
+    these, and how far it is to the right."""
     row, step = y + (t // size - size // 2) * spacing, (t % size - size // 2) * spacing
     first, last = max(0, -step), min(width, width - step)
     if row < 0 or row >= height or first >= last:
@@ -63,7 +64,9 @@ def _sampled(t, y, size, spacing, height, width):
 
 @compiled
 def _exponentiate(rows, shape):
-    """From scores (samples, pixels) to exp(score - the largest of the pixel), in the same place, and their sums."""
+    """From scores (samples, pixels) to exp(score - the largest of the pixel), in the same place, and their
+    sums.
+    """
     scores, total = rows
     for x in range(0, shape[1], LANES):
         top, mass = splat(LOWEST), splat(np.float32(0))

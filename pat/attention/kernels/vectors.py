@@ -72,13 +72,17 @@ def load_one(code, array, i: index):
 @instruction(lambda array, i, n, lanes: row_of(Vector(accumulated(array), lanes.literal_value), n))
 def load_row(code, array, i: index, n: literal, lanes: literal):
     """n vectors of so many lanes from an index on."""
-    return code.pack([code.get_wide(code.kinds[0], array, code.offset(i, k * lanes), lanes) for k in range(n)])
+    return code.pack(
+        [code.get_wide(code.kinds[0], array, code.offset(i, k * lanes), lanes) for k in range(n)]
+    )
 
 
 @instruction(lambda array, starts, i: row_of(Vector(accumulated(array), NARROW), starts.count))
 def gather_row(code, array, starts, i: index):
     """The narrow vector at an index from each of some starts on."""
-    return code.pack([code.get_wide(code.kinds[0], array, code.add(start, i), NARROW) for start in code.parts(starts)])
+    return code.pack(
+        [code.get_wide(code.kinds[0], array, code.add(start, i), NARROW) for start in code.parts(starts)]
+    )
 
 
 @instruction(_nothing)
@@ -122,7 +126,9 @@ def dot_row(code, row, array, i: index):
 
 @instruction(lambda weights, rows, t, image, channels, c, totals, n: totals)
 def fma_taps(code, weights, rows, t: index, image, channels: index, c: index, totals, n: literal):
-    """Adds, for each group k of n vectors of `totals`, weights[t + k] times the row at image[rows[t + k], c]."""
+    """Adds, for each group k of n vectors of `totals`, weights[t + k] times the row at image[rows[t + k],
+    c].
+    """
     vectors = code.parts(totals)
     lanes = vectors[0].type.count
     for k in range(0, len(vectors), n):
@@ -252,7 +258,9 @@ FOURS, PAIRS = (
 
 
 def _transpose(code, a, b, c, d):
-    (ab_low, ab_high), (cd_low, cd_high) = ([code.shuffle(p, q, how) for how in FOURS] for p, q in ((a, b), (c, d)))
+    (ab_low, ab_high), (cd_low, cd_high) = (
+        [code.shuffle(p, q, how) for how in FOURS] for p, q in ((a, b), (c, d))
+    )
     return [code.shuffle(p, q, how) for p, q in ((ab_low, cd_low), (ab_high, cd_high)) for how in PAIRS]
 
 
@@ -276,8 +284,8 @@ def _side_by_side(code, parts):
 
 @instruction(_nothing)
 def add_fours(code, array, starts, i: index, a, b, c, d):
-    """Adds the numbers of four vectors to array[start + k], k from 0 to 3, for the `LANES` starts at an index,
-    in their order. By twos: what the next start touches is the second two of this one."""
+    """Adds the numbers of four vectors to array[start + k], k from 0 to 3, for the `LANES` starts at an
+    index, in their order. By twos: what the next start touches is the second two of this one."""
     fours = _transpose(code, a, b, c, d)
     for k in range(LANES):
         start = code.at(starts, code.offset(i, k))

@@ -274,7 +274,9 @@ def _image(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene) -> Any:
     node = nodes.new("TexImage", image=image, extension="MIRROR")
     w, h = 1 / texture.scale, image.size[1] / image.size[0] / texture.scale
     onto = (1 / w, -1 / h, 0), (texture.offset[0], 1 + texture.offset[1], 0)
-    nodes.give(node.inputs["Vector"], nodes.vector("MULTIPLY_ADD", nodes.new("TexCoord").outputs["UV"], *onto))
+    nodes.give(
+        node.inputs["Vector"], nodes.vector("MULTIPLY_ADD", nodes.new("TexCoord").outputs["UV"], *onto)
+    )
     rgb = node.outputs["Color"]
     infrared = nodes.vector("SUBTRACT", _infrared(nodes, rgb), rgb)
     mix = nodes.vector("MULTIPLY_ADD", infrared, (0, 0, 0), rgb)

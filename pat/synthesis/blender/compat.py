@@ -34,7 +34,10 @@ def load() -> Any:
 def _not_installed(version: tuple[int, int]) -> str:
     if version in ((3, 11), (3, 13)):
         return f"rendering needs Blender as a Python module: {INSTALL}"
-    return f"rendering needs Blender as a Python module, which exists for {PYTHONS}; this is {version[0]}.{version[1]}"
+    return (
+        f"rendering needs Blender as a Python module, which exists for {PYTHONS}; this is "
+        f"{version[0]}.{version[1]}"
+    )
 
 
 def new_scene(bpy: Any) -> Any:
@@ -53,7 +56,9 @@ def use_nodes(item: Any) -> None:
 
 
 def write_layers(scene: Any) -> None:
-    """Make renders go to one multi-layer float EXR file, of one part: several fail if pixels are not square (5.0)."""
+    """Make renders go to one multi-layer float EXR file, of one part: several fail if pixels are not square
+    (5.0).
+    """
     images = scene.render.image_settings
     if hasattr(images, "media_type"):
         images.media_type = "MULTI_LAYER_IMAGE"

@@ -53,7 +53,8 @@ class Lens(NamedTuple):
         )
 
     def depth(self, depth: Float[Tensor, "h1 w1"], index: Int[Tensor, "h1 w1"]) -> Float[Tensor, "h2 w2"]:
-        """Depth along the exact rays, exact on planes: beside edges the nearest pixel's surface is extrapolated.
+        """Depth along the exact rays, exact on planes: beside edges the nearest pixel's surface is
+        extrapolated.
 
         NaN where nothing is seen.
         """
@@ -86,11 +87,15 @@ def _gentlest(inverse: Float[Tensor, "h w"], dim: int) -> Float[Tensor, "h w"]:
 
 
 def lens_for(camera: View, name: str) -> Lens:
-    """The lens of a camera of a rig. Raises ValueError, naming the camera, for one that cannot be rendered."""
+    """The lens of a camera of a rig. Raises ValueError, naming the camera, for one that cannot be
+    rendered.
+    """
     if not isinstance(camera, Camera):
         raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")
     if camera.K.ndim != 2:
-        raise ValueError(f"camera '{name}' is batched over {tuple(camera.K.shape[:-2])}: render one rig at a time")
+        raise ValueError(
+            f"camera '{name}' is batched over {tuple(camera.K.shape[:-2])}: render one rig at a time"
+        )
     camera = camera.to(dtype=torch.float64, device="cpu")
     upright = _upright(camera, name)
     if camera.distortion is None:
@@ -99,7 +104,9 @@ def lens_for(camera: View, name: str) -> Lens:
 
 
 def _upright(camera: Camera, name: str) -> Camera:
-    """The same pinhole with K upper triangular: K = K' Q with a rotation Q about the optical axis, part of the pose."""
+    """The same pinhole with K upper triangular: K = K' Q with a rotation Q about the optical axis, part of
+    the pose.
+    """
     K = camera.K
     angle = torch.atan2(K[1, 0], K[1, 1])
     c, s = angle.cos(), angle.sin()
@@ -108,11 +115,14 @@ def _upright(camera: Camera, name: str) -> Camera:
     K = K @ Q.T
     if abs(float(K[0, 1])) > 1e-9 * float(K[0, 0].abs()):
         raise ValueError(
-            f"camera '{name}' has skew (K[0, 1] = {float(K[0, 1]):.4g}), which Blender's cameras cannot have: "
+            f"camera '{name}' has skew (K[0, 1] = {float(K[0, 1]):.4g}), which Blender's cameras cannot "
+            "have: "
             "set it to 0, or calibrate without skew"
         )
     if not (K[0, 0] > 0 and K[1, 1] > 0):
-        raise ValueError(f"camera '{name}' mirrors its image (K has determinant below 0): flip the image instead")
+        raise ValueError(
+            f"camera '{name}' mirrors its image (K has determinant below 0): flip the image instead"
+        )
     K = K.clone()
     K[0, 1] = K[1, 0] = 0
     return camera.replace(K=K, cam_from_world=Pose(Q @ camera.R, Q @ camera.t), distortion=None)
@@ -123,11 +133,14 @@ def _wide(camera: Camera, upright: Camera, name: str) -> Lens:
     rays, valid = camera.rays(pixel_grid(camera.hw, dtype=torch.float64))
     rays = rays @ (upright.R @ camera.R.T).T
     if not valid.any():
-        raise ValueError(f"camera '{name}': its lens model is not valid for any pixel; check the coefficients")
+        raise ValueError(
+            f"camera '{name}': its lens model is not valid for any pixel; check the coefficients"
+        )
     angle = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])[valid].max()
     if angle > WIDEST:
         raise ValueError(
-            f"camera '{name}' sees {math.degrees(angle):.0f} degrees off its axis; a plane image covers at most "
+            f"camera '{name}' sees {math.degrees(angle):.0f} degrees off its axis; a plane image covers at "
+            "most "
             f"{math.degrees(WIDEST):.0f}: crop the camera"
         )
     plane = rays[..., :2] / rays[..., 2:].clamp(min=1e-6)
@@ -135,14 +148,18 @@ def _wide(camera: Camera, upright: Camera, name: str) -> Lens:
     low, high = (f * plane[valid].amin(0)).floor() - _MARGIN, (f * plane[valid].amax(0)).ceil() + _MARGIN
     w, h = (int(n) for n in high - low + 1)
     if w * h > _MOST_PIXELS:
-        raise ValueError(f"camera '{name}': its lens needs an undistorted image of {w}x{h} pixels: crop the camera")
+        raise ValueError(
+            f"camera '{name}': its lens needs an undistorted image of {w}x{h} pixels: crop the camera"
+        )
     K = torch.tensor([[f, 0, -float(low[0])], [0, f, -float(low[1])], [0, 0, 1]], dtype=torch.float64)
     x = map_homogeneous(K[:2], plane)
     return Lens(upright.replace(K=K, hw=(h, w)), x, valid)
 
 
 def _finest(plane: Float[Tensor, "h w 2"], valid: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
-    """The focal length at which neighbouring pixels of the lens are at least one pixel apart nearly everywhere."""
+    """The focal length at which neighbouring pixels of the lens are at least one pixel apart nearly
+    everywhere.
+    """
     across, down = plane.diff(dim=1).norm(dim=-1), plane.diff(dim=0).norm(dim=-1)
     steps = torch.cat([across[valid[:, 1:] & valid[:, :-1]], down[valid[1:] & valid[:-1]]])
     return 1 / steps.quantile(0.1) if len(steps) < 1e6 else 1 / steps.kthvalue(len(steps) // 10).values

@@ -12,10 +12,11 @@ from ..check import CheckLimits
 class RenderSettings:
     """What is rendered, and how well.
 
-    `width` resizes the rig so that its widest image has that many pixels; None leaves it as it is. `infrared` makes
-    an image of the near infrared beside that of colours. `duration` seconds are rendered at each camera's own frame
-    rate and time offset; 0 renders one frame a camera. `threads` of 0 uses all cores. `limits` are what the self-check
-    holds the first frames to. `device` "auto" takes a GPU where one is usable.
+    `width` resizes the rig so that its widest image has that many pixels; None leaves it as it is. `infrared`
+    makes an image of the near infrared beside that of colours. `duration` seconds are rendered at each
+    camera's own frame rate and time offset; 0 renders one frame a camera. `threads` of 0 uses all cores.
+    `limits` are what the self-check holds the first frames to. `device` "auto" takes a GPU where one is
+    usable.
     """
 
     width: int | None = None
@@ -31,7 +32,8 @@ class RenderSettings:
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> RenderSettings:
-        """ "fast" (512 pixels wide, 8 samples, quick denoising and light) or "paper" (2048 wide, more of each).
+        """ "fast" (512 pixels wide, 8 samples, quick denoising and light) or "paper" (2048 wide, more of
+        each).
 
         Raises ValueError for another name.
         """

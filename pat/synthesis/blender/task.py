@@ -53,7 +53,8 @@ def render(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Re
 def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Rendered:
     """Render a scene into the folder `out`, atomically, in this process, which imports bpy.
 
-    Raises ValueError for what cannot be rendered (one line: skew, a camera inside an object, a missing library).
+    Raises ValueError for what cannot be rendered (one line: skew, a camera inside an object, a missing
+    library).
     """
     out = Path(out)
     if out.exists():
@@ -112,7 +113,8 @@ def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
         for item in scene.objects:
             if inside(item, centre, shot.time):
                 raise ValueError(
-                    f"camera '{shot.camera}' is inside the object '{item.name}' at {shot.time:g} s: move one of them"
+                    f"camera '{shot.camera}' is inside the object '{item.name}' at {shot.time:g} s: move "
+                    "one of them"
                 )
 
 
@@ -122,7 +124,9 @@ def take(studio: Studio, lens: Lens, shot: Shot) -> RenderedFrame:
     index = found[compat.index_name(found)].round().int()
     depth = torch.where(found["Depth.Z"] < NOTHING, found["Depth.Z"], torch.inf)
     if not (index > 0).any():
-        raise ValueError(f"camera '{shot.camera}' sees nothing of the scene at {shot.time:g} s: rotate it or move it")
+        raise ValueError(
+            f"camera '{shot.camera}' sees nothing of the scene at {shot.time:g} s: rotate it or move it"
+        )
     nir = None
     if studio.settings.infrared:
         nir = lens.resampled(studio.channels(lens.pinhole, shot.time, "nir")["Combined.R"][None])

@@ -1,4 +1,6 @@
-"""Uncertainty of projection, halves of the frames, proposed views, lens models, the page for watching a folder."""
+"""Uncertainty of projection, halves of the frames, proposed views, lens models, the page for watching a
+folder.
+"""
 
 from dataclasses import replace
 
@@ -44,7 +46,10 @@ def test_lenses_that_there_are_not():
 def test_an_adjustment_that_goes_on_is_said(found):
     """It was known, and read by nobody."""
     going = "the adjustment has not come to rest"
-    assert [going in " ".join(misfit_notes(replace(found.fit, converged=c))) for c in (True, False)] == [False, True]
+    assert [going in " ".join(misfit_notes(replace(found.fit, converged=c))) for c in (True, False)] == [
+        False,
+        True,
+    ]
 
 
 def test_projections_are_off_by_what_is_said(found):
@@ -55,7 +60,9 @@ def test_projections_are_off_by_what_is_said(found):
     parts = []
     for points in (torch.from_numpy(known.seen), X):
         off = true.project_local(points).x - known.camera.project_local(points).x
-        parts.append((off.numpy().ravel(), camera_jacobian(known.camera, points.numpy())[..., :6].reshape(-1, 6)))
+        parts.append(
+            (off.numpy().ravel(), camera_jacobian(known.camera, points.numpy())[..., :6].reshape(-1, 6))
+        )
     (at_boards, pose), (off, by_pose) = parts
     off = off - by_pose @ np.linalg.lstsq(pose, at_boards, rcond=None)[0]
     off = np.linalg.norm(off.reshape(-1, 2), axis=1)
@@ -72,7 +79,9 @@ def test_points_far_beyond_the_boards_are_less_certain(found):
 
 def test_halves_are_compared_only_where_boards_were_seen():
     """Boards in the middle of the image: nothing is said of its corners, where the lens is extrapolated."""
-    fit = calibrate(see(Rig({"cam": TRUE}), board_poses(10, spread=0.05, depth=(1.6, 2.4)), noise=0.2), BOARD).fit
+    fit = calibrate(
+        see(Rig({"cam": TRUE}), board_poses(10, spread=0.05, depth=(1.6, 2.4)), noise=0.2), BOARD
+    ).fit
     x, _ = half_difference(fit, 1.5)["cam"]
     seen = fit.problem.seen["cam"].x
     assert 20 < len(x) < 200
@@ -114,7 +123,10 @@ def test_fisheyes_of_each_model_are_found(lens):
         assert [note for note in found.notes if "xi" in note]
     else:
         assert len(found.fit.names) == 4 + len(coefficients), "all of them are determined"
-        assert np.abs(errors_of(found.fit, Rig({"a": true})) / np.sqrt(found.fit.covariance.diagonal())).max() < 4
+        assert (
+            np.abs(errors_of(found.fit, Rig({"a": true})) / np.sqrt(found.fit.covariance.diagonal())).max()
+            < 4
+        )
 
 
 @pytest.mark.parametrize("lens", ["omni", "double-sphere", "extended-unified", "thin-prism-fisheye"])
@@ -126,7 +138,10 @@ def test_one_fisheye_by_another_model(lens):
 
 
 def test_halves_differ_by_no_more_than_their_uncertainty(found):
-    (x, off), (_, deviation) = half_difference(found.fit, 1.5)["cam"], uncertainty(intrinsics_of(found.fit, "cam"), 1.5)
+    (x, off), (_, deviation) = (
+        half_difference(found.fit, 1.5)["cam"],
+        uncertainty(intrinsics_of(found.fit, "cam"), 1.5),
+    )
     assert len(x) == len(off)
     assert 0.3 < np.median(np.linalg.norm(off, axis=1)) / np.median(deviation) < 6
 
@@ -160,7 +175,12 @@ def test_tilts_are_named_by_the_edge_that_is_nearer():
 def test_the_simplest_of_equal_lenses_is_advised():
     g = np.random.default_rng(0)
     base = g.uniform(0.9, 1.1, 20)
-    errors = {"none": 4 * base, "brown-conrady": base + g.normal(0, 1e-3, 20), "rational": base, "tilted": 1.2 * base}
+    errors = {
+        "none": 4 * base,
+        "brown-conrady": base + g.normal(0, 1e-3, 20),
+        "rational": base,
+        "tilted": 1.2 * base,
+    }
     assert LensComparison(errors).advised == "brown-conrady"
     assert LensComparison({**errors, "rational": 0.8 * base}).advised == "rational"
     assert "brown-conrady 1.0" in LensComparison(errors).advice
@@ -178,7 +198,10 @@ def test_a_lens_that_sees_the_board_behind_it_gives_no_pose():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("lens", "advised"),
-    [((-0.2, 0.05, 0.0, 0.0, 0.0), "brown-conrady"), ((-2.0, 1.5, 0.001, -0.001, 0.05, -1.6, 1.2, 0.1), "rational")],
+    [
+        ((-0.2, 0.05, 0.0, 0.0, 0.0), "brown-conrady"),
+        ((-2.0, 1.5, 0.001, -0.001, 0.05, -1.6, 1.2, 0.1), "rational"),
+    ],
 )
 def test_the_lens_that_the_images_support_is_advised(lens, advised):
     views = see(
@@ -199,7 +222,9 @@ def test_rational_lenses_are_fitted():
 
 
 def test_no_board_is_mistaken_for_its_mirror_image_by_a_poor_start():
-    """From a camera with one radial term a board near the corner was seen from the other side for good: 5.7 px."""
+    """From a camera with one radial term a board near the corner was seen from the other side for good: 5.7
+    px.
+    """
     true = camera(420.0, (480, 640), lens=(-2.0, 1.5, 0.001, -0.001, 0.05, -1.6, 1.2, 0.1))
     views = see(Rig({"c": true}), board_poses(12, seed=5, spread=0.7, depth=(0.6, 1.6)), noise=0.05)
     assert calibrate(views, BOARD).rms < 0.15

@@ -42,7 +42,10 @@ def test_tags_are_printed_as_kalibr_prints_them():
     per_metre = figure.dpi / 0.0254
     left, top = GRID.points[GRID.corners[0][0], :2] + GRID.gap + 0.012
     centres = (np.arange(6) + 2.5) * GRID.tag / 10
-    rows, columns = np.rint((top + centres) * per_metre).astype(int), np.rint((left + centres) * per_metre).astype(int)
+    rows, columns = (
+        np.rint((top + centres) * per_metre).astype(int),
+        np.rint((left + centres) * per_metre).astype(int),
+    )
     white = canvas[np.ix_(rows, columns)] > 127
     assert (white.ravel() == [bool(CODE >> (35 - i) & 1) for i in range(36)]).all()
     assert top > GRID.points[:, 1].max() - GRID.tag

@@ -46,7 +46,9 @@ from tests.calib.tracks import (
 
 
 def shaken(problem, size, seed=0):
-    """The problem with all that is free moved: by `size` times 0.01 rad, 0.01 m, 5 px, 0.02 of a coefficient."""
+    """The problem with all that is free moved: by `size` times 0.01 rad, 0.01 m, 5 px, 0.02 of a
+    coefficient.
+    """
     random = np.random.default_rng(seed)
     cameras = {}
     for (name, c), mask in zip(problem.cameras.items(), all_free(problem.cameras, lens=2).values()):
@@ -76,14 +78,18 @@ def small():
     ],
 )
 def test_derivatives_are_those_of_finite_differences(lens, model):
-    c = camera((520.0, 530.0), (480, 640), (0.1, -0.2, 0.3), (4.0, -9.0, 70.0), lens, model or "brown-conrady")
+    c = camera(
+        (520.0, 530.0), (480, 640), (0.1, -0.2, 0.3), (4.0, -9.0, 70.0), lens, model or "brown-conrady"
+    )
     X = np.random.default_rng(0).normal((0.0, 0.1, 2.0), (0.4, 0.3, 0.3), (40, 3))
     found = camera_jacobian(c, X)
     for i, name in enumerate(parameter_names(c)):
         step = torch.zeros(found.shape[-1], dtype=torch.float64)
         step[i] = 1e-6
         ends = [changed(c, s * step).project(torch.from_numpy(X)).x.numpy() for s in (1, -1)]
-        assert np.abs((ends[0] - ends[1]) / 2e-6 - found[..., i]).max() < 1e-5 * (1 + np.abs(found[..., i]).max()), name
+        assert np.abs((ends[0] - ends[1]) / 2e-6 - found[..., i]).max() < 1e-5 * (
+            1 + np.abs(found[..., i]).max()
+        ), name
 
 
 def test_derivatives_of_boards(small):
@@ -110,7 +116,9 @@ def test_perfect_corners_recover_the_ground_truth():
 
 
 def test_the_least_squares_are_scipys(small):
-    """The same minimum and the same covariance as a general solver finds without Schur complement or autodiff."""
+    """The same minimum and the same covariance as a general solver finds without Schur complement or
+    autodiff.
+    """
     _, _, problem = small
     fit = adjust(problem)
     count = len(fit.names)
@@ -177,12 +185,16 @@ def test_fixed_numbers_stay_bit_identical(small):
     fit, started = adjust(started, rounds=1), started.cameras
     assert torch.equal(fit.problem.cameras["mono"].R, started["mono"].R)
     assert torch.equal(fit.problem.cameras["colour"].K.diagonal(), started["colour"].K.diagonal())
-    assert torch.equal(fit.problem.cameras["colour"].distortion.coefficients, started["colour"].distortion.coefficients)
+    assert torch.equal(
+        fit.problem.cameras["colour"].distortion.coefficients, started["colour"].distortion.coefficients
+    )
 
 
 @pytest.mark.slow
 def test_the_covariance_is_true():
-    """Thirty draws of noise: squared errors in units of the covariance are chi-square, and so is each number's."""
+    """Thirty draws of noise: squared errors in units of the covariance are chi-square, and so is each
+    number's.
+    """
     rig, boards = four_cameras(), board_poses(24)
     squares, relative, worst = [], [], []
     for draw in range(30):
@@ -195,7 +207,14 @@ def test_the_covariance_is_true():
     count = len(error)
     low, high = chi2.ppf([0.001, 0.999], 30 * count)
     print(
-        "chi-square", np.sum(squares), "of", 30 * count, "worst", np.abs(relative).max(), "poses", np.max(worst, axis=0)
+        "chi-square",
+        np.sum(squares),
+        "of",
+        30 * count,
+        "worst",
+        np.abs(relative).max(),
+        "poses",
+        np.max(worst, axis=0),
     )
     assert low < np.sum(squares) < high
     assert 0.9 < np.sqrt(np.mean(np.square(relative))) < 1.1
@@ -229,7 +248,9 @@ def test_caliscopes_tracks_fit_better_than_published(shared_data):
 
 @pytest.mark.slow
 def test_caliscopes_corners_through_all_of_calibrate(shared_data):
-    """Boards that are rigid, cameras that are not quite synchronised, nothing known before: at most its own RMS."""
+    """Boards that are rigid, cameras that are not quite synchronised, nothing known before: at most its own
+    RMS.
+    """
     found = calibrate(caliscope_views(shared_data), parse_board(CALISCOPE_BOARD))
     print("rms", found.rms)
     assert found.rms < CALISCOPE_RMS

@@ -56,7 +56,9 @@ def test_corners_return_from_a_pixel_off(text):
     assert np.median(off) < 0.3 * np.median(np.linalg.norm(by_gradients - ground_truth, axis=1))
 
 
-@pytest.mark.parametrize(("change", "pixels"), [(lambda v: 255 * (v / 255) ** 0.4, 0.04), (lambda v: 255 - v, 0.012)])
+@pytest.mark.parametrize(
+    ("change", "pixels"), [(lambda v: 255 * (v / 255) ** 0.4, 0.04), (lambda v: 255 - v, 0.012)]
+)
 def test_gamma_and_inversion_hardly_move_corners(change, pixels):
     grey, ground_truth, p = seen("chessboard:9x6:25mm", noise=0.0)
     found, good = refine_corners(change(grey.astype(float)).round().astype(np.uint8), ground_truth, p)

@@ -1,4 +1,6 @@
-"""Finding boards: exact under perspective and lens, in dim, inverted and 16-bit images; why they are not found."""
+"""Finding boards: exact under perspective and lens, in dim, inverted and 16-bit images; why they are not
+found.
+"""
 
 from functools import cache
 
@@ -63,7 +65,10 @@ def test_points_are_where_the_lens_puts_them(text, pixels):
         (
             "dim and noisy",
             lambda g: (
-                (g * 0.06 + np.random.default_rng(0).normal(8, 0.7, g.shape)).round().clip(0, 255).astype(np.uint8)
+                (g * 0.06 + np.random.default_rng(0).normal(8, 0.7, g.shape))
+                .round()
+                .clip(0, 255)
+                .astype(np.uint8)
             ),
         ),
         ("12 of 16 bits", lambda g: g.astype(np.uint16) * 16),
@@ -75,7 +80,10 @@ def test_images_of_odd_cameras(text, name, change):
     found = detect(to_grey(change(grey)), board)
     assert found is not None, name
     reference = detect(grey, board)
-    assert np.sqrt(((found.x - reference.x[np.searchsorted(reference.ids, found.ids)]) ** 2).sum(1).mean()) < 0.25
+    assert (
+        np.sqrt(((found.x - reference.x[np.searchsorted(reference.ids, found.ids)]) ** 2).sum(1).mean())
+        < 0.25
+    )
 
 
 def test_a_part_of_a_charuco_board_is_enough():

@@ -1,4 +1,6 @@
-"""Markers at known positions as a target: their file, their detection, and rigs from one image of each camera."""
+"""Markers at known positions as a target: their file, their detection, and rigs from one image of each
+camera.
+"""
 
 import cv2
 import numpy as np
@@ -37,7 +39,8 @@ def seen(board, count=1, noise=0.1):
     vectors = torch.zeros(count, 3, dtype=torch.float64)
     shift = torch.linspace(0, 0.2, count, dtype=torch.float64)[:, None]
     poses = Pose(
-        torch.eye(3, dtype=torch.float64).expand(count, 3, 3), vectors + shift + vectors.new_tensor([0, 0, 2.2])
+        torch.eye(3, dtype=torch.float64).expand(count, 3, 3),
+        vectors + shift + vectors.new_tensor([0, 0, 2.2]),
     )
     poses = poses.perturbed(
         rotation=torch.linspace(-0.5, 0.5, count, dtype=torch.float64)[:, None] * vectors.new_ones(3)
@@ -82,7 +85,9 @@ def test_centres_and_corners_of_markers_are_found(tmp_path):
         H, _ = cv2.findHomography(
             np.array([[20, 20], [139, 20], [139, 139], [20, 139]], float), squares[number].astype(float)
         )
-        cv2.warpPerspective(marker, H, (640, 480), image, borderMode=cv2.BORDER_TRANSPARENT, flags=cv2.INTER_LINEAR)
+        cv2.warpPerspective(
+            marker, H, (640, 480), image, borderMode=cv2.BORDER_TRANSPARENT, flags=cv2.INTER_LINEAR
+        )
     board = parse_board(str(written(tmp_path, in_a_room(6))))
     found = detect(image, board)
     assert found.ids.tolist() == list(range(6))

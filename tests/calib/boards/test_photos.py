@@ -35,7 +35,10 @@ def test_keys(stems, keys):
     assert frame_keys(stems) == keys
 
 
-@given(st.lists(st.integers(0, 9999), min_size=2, max_size=12, unique=True), st.sampled_from(["cam2_", "x", "a-1-"]))
+@given(
+    st.lists(st.integers(0, 9999), min_size=2, max_size=12, unique=True),
+    st.sampled_from(["cam2_", "x", "a-1-"]),
+)
 def test_numbers_come_back_whatever_is_around_them(numbers, name):
     assert frame_keys([f"{name}{n:03d}_raw8" for n in numbers]) == numbers
 
@@ -134,8 +137,13 @@ def test_orientation_tags_are_applied_and_have_to_be_the_same(suffix, tmp_path):
 
 def test_a_photograph_that_states_too_many_pixels_is_not_decoded(tmp_path):
     """A head of 30000 x 30000 pixels: refused by what it states, although OpenCV would try."""
-    parts = [(b"IHDR", struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)), (b"IDAT", zlib.compress(bytes(100)))]
-    chunks = [struct.pack(">I", len(d)) + kind + d + struct.pack(">I", zlib.crc32(kind + d)) for kind, d in parts]
+    parts = [
+        (b"IHDR", struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)),
+        (b"IDAT", zlib.compress(bytes(100))),
+    ]
+    chunks = [
+        struct.pack(">I", len(d)) + kind + d + struct.pack(">I", zlib.crc32(kind + d)) for kind, d in parts
+    ]
     for i in range(2):
         (tmp_path / f"a0{i}.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
     with pytest.raises(ValueError, match=r"a00\.png.*900000000"):

@@ -12,7 +12,13 @@ from calib.boards.report import report_html
 from calib.boards.rig import calibrate
 from calib.boards.solve import calibrate_single, many_wrong
 from calib.boards.target import parse_board
-from calib.boards.uncertainty import RigCovariance, beta_covariance, jackknife, rig_covariance, with_disagreement
+from calib.boards.uncertainty import (
+    RigCovariance,
+    beta_covariance,
+    jackknife,
+    rig_covariance,
+    with_disagreement,
+)
 from calib.boards.validation import FOLDS
 from tests.benchmarks.bench_robust import drawn
 from tests.calib.board_scenes import BOARD, board_poses, camera, errors_of, four_cameras, see, tensor
@@ -66,7 +72,9 @@ def test_the_covariance_says_how_far_predictions_are_off(pair, found):
     for r in (rig, found.rig):
         a, b = r.pair("mono", "colour").cameras
         both.append(
-            b.project(a.unproject(torch.from_numpy(x), torch.full((len(x),), 2.0, dtype=torch.float64))).x.numpy()
+            b.project(
+                a.unproject(torch.from_numpy(x), torch.full((len(x),), 2.0, dtype=torch.float64))
+            ).x.numpy()
         )
     difference = both[1] - both[0]
     spread = beta_covariance(found.rig, covariance, "mono", "colour", x, 2.0)
@@ -111,7 +119,11 @@ def test_chessboards_that_are_numbered_from_either_end(pair):
     }
     views = {
         n: BoardViews(
-            v.hw, {k: Detection(turn[d.ids], d.x) if n == "colour" and k % 3 == 1 else d for k, d in v.seen.items()}
+            v.hw,
+            {
+                k: Detection(turn[d.ids], d.x) if n == "colour" and k % 3 == 1 else d
+                for k, d in v.seen.items()
+            },
         )
         for n, v in whole.items()
     }
@@ -129,7 +141,9 @@ def test_a_chessboard_detected_a_square_off_is_left_out(pair):
         points = CHESS.points + np.array([0.06, 0, 0])
 
     off = see(rig, boards, Shifted, noise=0.1)["colour"].seen
-    key = next(k for k, d in views["colour"].seen.items() if len(d.ids) == len(off[k].ids) == len(CHESS.points))
+    key = next(
+        k for k, d in views["colour"].seen.items() if len(d.ids) == len(off[k].ids) == len(CHESS.points)
+    )
     views["colour"] = BoardViews(views["colour"].hw, {**views["colour"].seen, key: off[key]})
     result = calibrate(views, CHESS)
     assert result.rms < 0.2
@@ -164,7 +178,8 @@ def test_cameras_that_share_no_frame_are_refused(pair):
 
 def test_sets_a_frame_late_are_refused(pair):
     late = {
-        name: BoardViews(v.hw, {k + (name == "colour"): d for k, d in v.seen.items()}) for name, v in pair[2].items()
+        name: BoardViews(v.hw, {k + (name == "colour"): d for k, d in v.seen.items()})
+        for name, v in pair[2].items()
     }
     with pytest.raises(ValueError, match=r"mono and colour.*colour is 1 frame late"):
         calibrate(late, BOARD)
@@ -223,7 +238,9 @@ def test_unobservable_parameters_are_fixed():
 
 
 def test_a_poorly_constrained_camera_stays_plausible():
-    """Four boards in the middle, hardly tilted, corners to half a pixel: square pixels, a middle in the middle."""
+    """Four boards in the middle, hardly tilted, corners to half a pixel: square pixels, a middle in the
+    middle.
+    """
     true = camera(900.0, (480, 640), lens=(-0.1, 0.0, 0.0, 0.0, 0.0))
     views = see(Rig({"cam": true}), board_poses(4, tilt=18.0, depth=(1.3, 1.6), spread=0.02), noise=0.5)
     found = calibrate_single("cam", views["cam"], BOARD, final=False).problem.cameras["cam"]
@@ -235,7 +252,9 @@ def test_fisheyes():
     rig = Rig(
         {
             "a": camera(240.0, (480, 640), lens=(0.02, -0.01, 0.003, -0.001), model="kannala-brandt"),
-            "b": camera(260.0, (480, 640), (0.2, 0, 0), (0, -5, 0), (0.03, -0.01, 0.0, 0.0), "kannala-brandt"),
+            "b": camera(
+                260.0, (480, 640), (0.2, 0, 0), (0, -5, 0), (0.03, -0.01, 0.0, 0.0), "kannala-brandt"
+            ),
         }
     )
     boards = board_poses(10, depth=(0.4, 0.9), spread=0.7)
@@ -253,7 +272,8 @@ def test_coverage_names_what_is_missing():
     assert found.depths == pytest.approx((2.0, 2.0))
     assert found.tilts[1] == pytest.approx(0, abs=1e-6)
     assert [m.split(" (")[0].split(":")[0] for m in found.missing] == [
-        "no points at the top left, top, top right, left, right, bottom left, bottom, bottom right of the image",
+        "no points at the top left, top, top right, left, right, bottom left, bottom, bottom right of the "
+        "image",
         "boards at one depth only",
         "boards tilted by 0 degrees at most",
     ]
@@ -296,7 +316,9 @@ def test_a_board_that_bends_raises_the_deviations():
 
 @pytest.mark.parametrize(("frames", "raised"), [(4, 3.0), (7, 1.0)])
 def test_deviations_that_few_frames_cannot_check_are_raised(frames, raised):
-    """Of a real pair, baselines from three frames were up to 6.8 stated deviations off, and nothing said so."""
+    """Of a real pair, baselines from three frames were up to 6.8 stated deviations off, and nothing said
+    so.
+    """
     found = calibrate(see(pair_rig(), board_poses(frames, spread=0.2), noise=0.05), BOARD)
     assert found.raised == raised
     assert any("too few to check standard deviations" in note for note in found.notes) == (raised > 1)
@@ -317,7 +339,8 @@ def test_frames_that_disagree_about_the_focal_lengths_raise_those_alone(found, m
 
 @pytest.mark.parametrize("part", [0, 2])
 def test_small_boards_around_the_centre_do_not_lead_the_start_astray(shared_data, part):
-    """Four fifths of a real recording: without part 0, aspect ratio and k2 ran off (4,227 by 937 px): "all parallel".
+    """Four fifths of a real recording: without part 0, aspect ratio and k2 ran off (4,227 by 937 px): "all
+    parallel".
 
     So did one of 96 random subsets of its cameras' boards.
     """

@@ -1,4 +1,6 @@
-"""`pat rig diff`: simulated recalibrations of a rig that moved and of one that did not, and what is refused."""
+"""`pat rig diff`: simulated recalibrations of a rig that moved and of one that did not, and what is
+refused.
+"""
 
 import math
 from itertools import pairwise
@@ -44,7 +46,9 @@ def compared(one, other):
 
 
 def shares(rig, count):
-    """Of so many recalibrations of a rig that did not move and of one that did, what share is said to be so."""
+    """Of so many recalibrations of a rig that did not move and of one that did, what share is said to be
+    so.
+    """
     fits = [recalibrated(rig, seed) for seed in range(count + 1)]
     same = [not compared(*pair).significance.moved for pair in pairwise(fits)]
     moved = [compared(fits[i], recalibrated(turned(rig, i), 10_000 + i)).significance for i in range(count)]
@@ -59,14 +63,21 @@ def test_a_few_recalibrations(rig):
 def test_two_hundred_recalibrations(rig, capsys):
     same, moved = shares(rig, 200)
     with capsys.disabled():
-        print(f"\nunchanged rigs said to be the same: {same:.1%}; rotated by .05 degrees said to be moved: {moved:.1%}")
+        print(
+            f"\nunchanged rigs said to be the same: {same:.1%}; rotated by .05 degrees said to be moved: "
+            f"{moved:.1%}"
+        )
     assert same >= 0.95
     assert moved >= 0.95
 
 
 def test_a_motion_of_the_whole_rig_is_no_difference(rig):
-    world = Pose(rotation_from_vector(torch.tensor([0.3, -0.2, 0.5]).double()), torch.tensor([1.0, 2.0, -0.5]).double())
-    cameras = {n: c.replace(cam_from_world=c.cam_from_world @ world.inverse()) for n, c in rig.cameras.items()}
+    world = Pose(
+        rotation_from_vector(torch.tensor([0.3, -0.2, 0.5]).double()), torch.tensor([1.0, 2.0, -0.5]).double()
+    )
+    cameras = {
+        n: c.replace(cam_from_world=c.cam_from_world @ world.inverse()) for n, c in rig.cameras.items()
+    }
     found = rig_difference(rig, Rig(cameras), depth=DEPTH)
     assert max(np.abs(camera.change).max() for camera in found.cameras.values()) < 1e-6
     assert torch.allclose(found.motion.matrix, world.matrix, atol=1e-8)
@@ -75,9 +86,13 @@ def test_a_motion_of_the_whole_rig_is_no_difference(rig):
 
 def row_of_five(rig):
     """Five cameras alike in two rows."""
-    centres = torch.tensor([[0.0, 0, 0], [0.2, 0, 0], [0.4, 0, 0], [0, 0.2, 0], [0.2, 0.2, 0]], dtype=torch.float64)
+    centres = torch.tensor(
+        [[0.0, 0, 0], [0.2, 0, 0], [0.4, 0, 0], [0, 0.2, 0], [0.2, 0.2, 0]], dtype=torch.float64
+    )
     R = torch.eye(3, dtype=torch.float64)
-    return Rig({f"c{i}": rig["mono"].replace(cam_from_world=Pose.from_centre(R, c)) for i, c in enumerate(centres)})
+    return Rig(
+        {f"c{i}": rig["mono"].replace(cam_from_world=Pose.from_centre(R, c)) for i, c in enumerate(centres)}
+    )
 
 
 @pytest.mark.parametrize("name", ["c0", "c4"])
@@ -142,7 +157,9 @@ def test_without_deviations_there_is_no_verdict(files, capsys):
 
 
 def test_images_say_which_rig_fits(tmp_path, capsys):
-    """The sample's images fit its rig, not one with a camera turned by .3 degrees, whichever is given first."""
+    """The sample's images fit its rig, not one with a camera turned by .3 degrees, whichever is given
+    first.
+    """
     rig = Rig.load(SAMPLE / "rig.yaml")
     pose = rig["colour"].cam_from_world.perturbed(
         6 * TURN * torch.tensor([1.0, 0, 0]).double(), torch.zeros(3).double()
@@ -177,16 +194,24 @@ def test_mistakes_are_named(files, capsys, one, other, message):
 
 def test_derivatives_are_those_of_the_difference(rig):
     """Of the second rig's parameters in its own world, which is turned and shifted, by differences."""
-    world = Pose(rotation_from_vector(torch.tensor([0.3, -0.2, 0.5]).double()), torch.tensor([1.0, 2.0, -0.5]).double())
-    other = Rig({n: c.replace(cam_from_world=c.cam_from_world @ world.inverse()) for n, c in rig.cameras.items()})
-    X = rig["nir"].unproject(torch.tensor([[100.0, 80], [500, 400]]).double(), torch.tensor([1.5, 3.0]).double())
+    world = Pose(
+        rotation_from_vector(torch.tensor([0.3, -0.2, 0.5]).double()), torch.tensor([1.0, 2.0, -0.5]).double()
+    )
+    other = Rig(
+        {n: c.replace(cam_from_world=c.cam_from_world @ world.inverse()) for n, c in rig.cameras.items()}
+    )
+    X = rig["nir"].unproject(
+        torch.tensor([[100.0, 80], [500, 400]]).double(), torch.tensor([1.5, 3.0]).double()
+    )
     part = _projections(rig, other, world, "nir", X.numpy())
     for i, entry in enumerate(parameter_names(other["nir"])):
         step = torch.zeros(len(parameter_names(other["nir"])), dtype=torch.float64)
         step[i] = 1e-6
         moved = other.with_camera("nir", changed(other["nir"], step))
         by_step = (_projections(rig, moved, world, "nir", X.numpy()).change - part.change) / 1e-6
-        assert np.allclose(part.jacobians[1][..., i], by_step, rtol=1e-3, atol=1e-3 * abs(by_step).max()), entry
+        assert np.allclose(part.jacobians[1][..., i], by_step, rtol=1e-3, atol=1e-3 * abs(by_step).max()), (
+            entry
+        )
     for i in range(6):
         step = torch.zeros(6, dtype=torch.float64)
         step[i] = 1e-6

@@ -1,4 +1,6 @@
-"""`pat calibrate` on photographs: real sets with the published accuracy, mistakes in one line with nothing written."""
+"""`pat calibrate` on photographs: real sets with the published accuracy, mistakes in one line with nothing
+written.
+"""
 
 import shutil
 
@@ -132,7 +134,9 @@ def test_videos(mine, without_report):
     for name in ("a", "b"):
         images = [cv2.imread(str(p)) for p in sorted((mine / name).iterdir())]
         shutil.rmtree(mine / name)
-        video = cv2.VideoWriter(str(mine / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5, images[0].shape[1::-1])
+        video = cv2.VideoWriter(
+            str(mine / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5, images[0].shape[1::-1]
+        )
         video.set(cv2.VIDEOWRITER_PROP_QUALITY, 98)
         for image in images:
             video.write(image)
@@ -143,7 +147,8 @@ def test_videos(mine, without_report):
 
 @pytest.mark.slow
 def test_photographs_of_four_cameras(tmp_path):
-    """Through prints, lenses, noise and detector: ground truth within 3.5 deviations for each of some 50 parameters.
+    """Through prints, lenses, noise and detector: ground truth within 3.5 deviations for each of some 50
+    parameters.
 
     Sixteen boards and corners good to 0.1 px know the poses to about 0.1 degree and half a millimetre.
     """
@@ -160,7 +165,15 @@ def test_photographs_of_four_cameras(tmp_path):
     error = errors_of(result.fit, rig) / np.sqrt(result.fit.covariance.diagonal())
     degrees, metres = pose_errors(result.fit, rig)
     print(
-        result.rms, result.fit.sigma, "worst", np.abs(error).max(), "degrees", degrees, "metres", metres, result.notes
+        result.rms,
+        result.fit.sigma,
+        "worst",
+        np.abs(error).max(),
+        "degrees",
+        degrees,
+        "metres",
+        metres,
+        result.notes,
     )
     print(dict(zip(result.fit.names, error.round(2))))
     assert np.abs(error).max() < 3.5
@@ -190,7 +203,9 @@ def test_opencvs_pairs(shared_data, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_bumblebees_pairs(shared_data, tmp_path, capsys):
-    """Epipolar error 0.08 px at most, where the published stereo.yaml has 0.05 on the same corners; and its numbers."""
+    """Epipolar error 0.08 px at most, where the published stereo.yaml has 0.05 on the same corners; and its
+    numbers.
+    """
     folder = shared_data / "calibration/bumblebee2_chess"
     main(["calibrate", str(folder), "--board", "chessboard:4x6:30mm", "-o", str(tmp_path / "rig.yaml")])
     assert float(capsys.readouterr().out.split("Epipolar error ")[1].split()[0]) <= 0.08
@@ -200,7 +215,9 @@ def test_bumblebees_pairs(shared_data, tmp_path, capsys):
     ours, theirs = (r.pair("left", "right").beta_from_alpha for r in (rig, published))
     assert float(ours.t.norm()) == pytest.approx(float(theirs.t.norm()), rel=0.003)
     print("rotated by", float((ours.R - theirs.R).norm()) / 2**0.5)
-    assert float((ours.R - theirs.R).norm()) / 2**0.5 < np.radians(0.35), "eleven small boards know it to 0.1 degrees"
+    assert float((ours.R - theirs.R).norm()) / 2**0.5 < np.radians(0.35), (
+        "eleven small boards know it to 0.1 degrees"
+    )
 
 
 @pytest.mark.slow
@@ -231,14 +248,21 @@ def test_action_cameras(camera_name, focal, shared_data):
 
 NARROW = {
     "opencv_stereo": ({"cam": "left*.jpg"}, "chessboard:9x6:25mm", "omni", 0.16),
-    "pose2sim_4cam/intrinsics": ({"cam": "int_cam01_img/*.jpg"}, "chessboard:4x7:60mm", "kannala-brandt", 0.14),
+    "pose2sim_4cam/intrinsics": (
+        {"cam": "int_cam01_img/*.jpg"},
+        "chessboard:4x7:60mm",
+        "kannala-brandt",
+        0.14,
+    ),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("folder", NARROW)
 def test_narrow_lenses_by_models_of_fisheyes(shared_data, folder):
-    """They ask for an xi of omni below its bound, 0; and from a fisheye's focal length OpenCV finds no poses."""
+    """They ask for an xi of omni below its bound, 0; and from a fisheye's focal length OpenCV finds no
+    poses.
+    """
     patterns, board, lens, wanted = NARROW[folder]
     board = parse_board(board)
     views = collect_folder(shared_data / "calibration" / folder, board, patterns=patterns).views

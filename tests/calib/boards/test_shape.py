@@ -1,4 +1,6 @@
-"""Boards that are bent or stretched: found, modelled, said; flat ones stay flat; frames that do not fit are named."""
+"""Boards that are bent or stretched: found, modelled, said; flat ones stay flat; frames that do not fit are
+named.
+"""
 
 import re
 from dataclasses import replace
@@ -61,10 +63,19 @@ def test_a_cylinder_keeps_the_lengths_on_it():
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        (CYLINDER, r"the board is bent: its middle lies 1\d\.\d+ ± .* mm in front of its edges \(radius 2.0\d m\)"),
-        ((0.003, 0.0, 0.0, 0.0), r"the board is stretched: squares are 0\.[23]\d ± .* % longer down than across"),
+        (
+            CYLINDER,
+            r"the board is bent: its middle lies 1\d\.\d+ ± .* mm in front of its edges \(radius 2.0\d m\)",
+        ),
+        (
+            (0.003, 0.0, 0.0, 0.0),
+            r"the board is stretched: squares are 0\.[23]\d ± .* % longer down than across",
+        ),
         ((0.0, -0.1, 0.0, 0.0), r"the board is bent: its middle lies [23]\.\d+ ± .* mm behind"),
-        ((0.25, 0.0, 0.0, 0.0), r"the board is stretched: squares are 2[45]\.\d+ ± .* % longer down than across"),
+        (
+            (0.25, 0.0, 0.0, 0.0),
+            r"the board is stretched: squares are 2[45]\.\d+ ± .* % longer down than across",
+        ),
     ],
 )
 def test_shapes_are_found_modelled_and_said(values, said):
@@ -141,7 +152,11 @@ def test_leaving_a_frame_out_keeps_the_others():
 def test_a_rendered_cylinder_is_recovered():
     """A board bent about 2 m, and printed 0.3 % too long, by photographs of it."""
     board, c = parse_board("charuco:9x7:40mm"), camera(700.0, (480, 640), lens=(-0.2, 0.05, 0, 0, 0))
-    shape, poses, seen = shaped([0.003, 0.5, 0.0, 0.0], board), board_poses(14, depth=(0.5, 0.9), spread=0.1), {}
+    shape, poses, seen = (
+        shaped([0.003, 0.5, 0.0, 0.0], board),
+        board_poses(14, depth=(0.5, 0.9), spread=0.1),
+        {},
+    )
     for i in range(14):
         middle = poses.R[i] @ torch.from_numpy(board.points.mean(0) - BOARD.points.mean(0))
         pose = Pose(poses.R[i], poses.t[i] - middle)

@@ -1,4 +1,6 @@
-"""Photographs of boards that were never printed: corners at their projections, and the rig recovered from them."""
+"""Photographs of boards that were never printed: corners at their projections, and the rig recovered from
+them.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,6 @@
-"""Calibration from a rig known roughly: what images leave open keeps near it, with the deviations that were stated."""
+"""Calibration from a rig known roughly: what images leave open keeps near it, with the deviations that were
+stated.
+"""
 
 import re
 import shutil
@@ -28,7 +30,9 @@ STATED = StartDeviations(position=1e-3, rotation=1.0, focal=0.02, centre=0.01)
 def four() -> Rig:
     """Cameras of one kind on a square of 80 mm, all parallel, at nominal values."""
     corners = [(x, y, 0.0) for y in (0.0, 0.08) for x in (0.0, 0.08)]
-    return Rig({f"c{i}": camera(1400.0, (480, 640), corner, offset=(0.0, 0.0)) for i, corner in enumerate(corners)})
+    return Rig(
+        {f"c{i}": camera(1400.0, (480, 640), corner, offset=(0.0, 0.0)) for i, corner in enumerate(corners)}
+    )
 
 
 def drawn(start: Rig, seed: int) -> Rig:
@@ -49,12 +53,18 @@ def one_board(seed: int) -> Pose:
 
 
 def test_the_stated_deviations_hold():
-    """One image of each camera: errors of all parameters in stated deviations, over rigs drawn around the start."""
+    """One image of each camera: errors of all parameters in stated deviations, over rigs drawn around the
+    start.
+    """
     errors = []
     for seed in range(6):
         rig = drawn(four(), seed)
         found = calibrate(
-            see(rig, one_board(seed), noise=0.1, seed=seed), BOARD, lens="none", start=four(), deviations=STATED
+            see(rig, one_board(seed), noise=0.1, seed=seed),
+            BOARD,
+            lens="none",
+            start=four(),
+            deviations=STATED,
         )
         errors.append(errors_of(found.fit, rig) / np.sqrt(found.fit.covariance.diagonal()))
         assert len(errors[-1]) == 40
@@ -80,7 +90,9 @@ def test_what_one_board_leaves_open_is_said():
 
 def test_a_wrong_start_is_named():
     wrong = four().perturbed({"c2.focal": torch.full((2,), 250.0, dtype=torch.float64)})
-    found = calibrate(see(four(), one_board(0), noise=0.1), BOARD, lens="none", start=wrong, deviations=STATED)
+    found = calibrate(
+        see(four(), one_board(0), noise=0.1), BOARD, lens="none", start=wrong, deviations=STATED
+    )
     assert any(note.startswith("c2: far from the start: focal length") for note in found.notes)
 
 
@@ -120,7 +132,14 @@ def photos(tmp_path):
 
 
 def test_one_photograph_of_each_camera(photos, capsys):
-    command = ["calibrate", str(photos / "photos"), "--board", "charuco:9x7:60mm", "-o", str(photos / "rig.yaml")]
+    command = [
+        "calibrate",
+        str(photos / "photos"),
+        "--board",
+        "charuco:9x7:60mm",
+        "-o",
+        str(photos / "rig.yaml"),
+    ]
     main([*command, "--start", str(photos / "start.yaml"), "--deviation", "position=0.001"])
     said = capsys.readouterr().out
     assert "2 cameras, 1 frames" in said
@@ -174,6 +193,7 @@ def test_the_nine_band_array(shared_data):
     assert np.abs(off).max() < 5e-4
     assert found.rms < 0.11
     images = {
-        name: read_image(shared_data / "nine_band_array" / "scene" / f"{name}.png") for name in ("Cam-3", "Cam-6")
+        name: read_image(shared_data / "nine_band_array" / "scene" / f"{name}.png")
+        for name in ("Cam-3", "Cam-6")
     }
     assert float(line_distances(found.rig, match_cameras(images)).abs().median()) < 0.25

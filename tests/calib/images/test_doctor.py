@@ -52,7 +52,9 @@ MISTAKES = {
     "centre as t": each(posed(lambda p: Pose(p.R, -p.R.T @ p.t))),
     "OpenGL axes": one(posed(lambda p: Pose(OPENGL @ p.R, OPENGL @ p.t))),
     "order of quaternions": each(posed(lambda p: Pose.from_quaternion(p.quaternion[[3, 0, 1, 2]], p.t))),
-    "degrees and radians": each(posed(lambda p: Pose(rotation_from_vector(rotation_vector(p.R).deg2rad()), p.t))),
+    "degrees and radians": each(
+        posed(lambda p: Pose(rotation_from_vector(rotation_vector(p.R).deg2rad()), p.t))
+    ),
     "cameras swapped": lambda rig: swap(rig, *rig.names),
     "units": each(posed(lambda p: Pose(p.R, 1000 * p.t))),
     "x and y exchanged": each(lambda c: c.replace(K=TRANSPOSE @ c.K @ TRANSPOSE)),
@@ -100,7 +102,9 @@ def test_a_drifted_rig_is_not_given_a_name(field, draw):
     assert found.repaired is bad
 
 
-@pytest.mark.parametrize("words", ["x and y exchanged in focal lengths", "K of all cameras is for images 1.33"])
+@pytest.mark.parametrize(
+    "words", ["x and y exchanged in focal lengths", "K of all cameras is for images 1.33"]
+)
 def test_a_drift_that_a_mistake_would_explain_is_not_named(words):
     """The smallest drift that leaves the points on their lines once the remedy is applied too."""
     g = np.random.default_rng([2, 77])
@@ -161,7 +165,9 @@ def test_nothing_is_wrong(lens):
         ("ignored", lambda c: c.replace(distortion=None)),
         (
             "wrong sign",
-            lambda c: c.replace(distortion=dataclasses.replace(c.distortion, coefficients=-c.distortion.coefficients)),
+            lambda c: c.replace(
+                distortion=dataclasses.replace(c.distortion, coefficients=-c.distortion.coefficients)
+            ),
         ),
     ],
 )
@@ -175,7 +181,9 @@ def test_wrong_distortion_is_named(words, change):
 
 def test_distortion_applied_twice_is_named():
     straight = unlike_pair()
-    curved = {n: c.replace(distortion=unlike_pair(lens=True)[n].distortion) for n, c in straight.cameras.items()}
+    curved = {
+        n: c.replace(distortion=unlike_pair(lens=True)[n].distortion) for n, c in straight.cameras.items()
+    }
     found = diagnose_matches(straight.replace(cameras=curved), sizes(straight), seen_points(straight))
     assert "undistorted already" in found.named.words
     assert found.repaired["first"].distortion is None
@@ -206,7 +214,10 @@ def test_nothing_is_certain_where_repairs_of_equal_lines_give_other_depths():
     """The right camera sees 3 px to one side: an inverted pose is not quite the same as images swapped."""
     rig = rectified_pair().perturbed({"right.centre": vector(3, 0)})
     found = diagnose_matches(each(posed(Pose.inverse))(rig), sizes(rig), seen_points(rig))
-    assert {"pose inverted", "cameras swapped"} <= {found.named.kind, *(remedy.kind for remedy in found.equal)}
+    assert {"pose inverted", "cameras swapped"} <= {
+        found.named.kind,
+        *(remedy.kind for remedy in found.equal),
+    }
     assert not found.certain
 
 
@@ -267,7 +278,17 @@ def test_command_line(tmp_path, capsys):
     assert (tmp_path / "rig.yaml").read_text() == (tmp_path / "fixed.yaml").read_text()
     assert "likely mistake" not in (tmp_path / "rig.yaml.old").read_text()
     assert Rig.load(tmp_path / "rig.yaml.old")["right"].t[0] > 0
-    main(["rig", "doctor", str(tmp_path / "fixed.yaml"), *files, "--json", "--fix", str(tmp_path / "none.yaml")])
+    main(
+        [
+            "rig",
+            "doctor",
+            str(tmp_path / "fixed.yaml"),
+            *files,
+            "--json",
+            "--fix",
+            str(tmp_path / "none.yaml"),
+        ]
+    )
     captured = capsys.readouterr()
     assert json.loads(captured.out)["healthy"]
     assert "no rig written" in captured.err
@@ -284,7 +305,9 @@ def test_points_whose_equations_are_singular_are_invalid():
     rig = simulated_rig("wide", 2, g)
     (names, matches), *_ = simulated_matches(rig, "wide", g).items()
     cameras = [
-        camera.replace(cam_from_world=Pose(rotation_from_vector(torch.rad2deg(rotation_vector(camera.R))), camera.t))
+        camera.replace(
+            cam_from_world=Pose(rotation_from_vector(torch.rad2deg(rotation_vector(camera.R))), camera.t)
+        )
         for camera in rig.pair(*names).cameras
     ]
     assert not triangulate(cameras, torch.stack(list(matches))).valid.all()

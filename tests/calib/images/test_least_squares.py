@@ -6,7 +6,10 @@ from calib.images.least_squares import JoinedResiduals, jacobian
 
 
 def parts(z):
-    return [z[0] * torch.arange(3.0).double() + z[1] ** 2, torch.sin(z[2:3] * torch.arange(1, 5).double()) * z[0]]
+    return [
+        z[0] * torch.arange(3.0).double() + z[1] ** 2,
+        torch.sin(z[2:3] * torch.arange(1, 5).double()) * z[0],
+    ]
 
 
 def test_derivatives_part_by_part_are_those_of_the_whole():

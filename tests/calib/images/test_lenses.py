@@ -38,19 +38,28 @@ def pair(k1: float) -> Rig:
     turn = rotation_from_vector(torch.deg2rad(vector(1, -6, 2)))
     poses = Pose.identity(), Pose.from_centre(turn, vector(0.5, 0.05, 0.0))
     lens = Distortion("brown-conrady", vector(k1, 0.2 * k1**2, 0, 0))
-    cameras = [Camera(K=intrinsics(f, HW), cam_from_world=p, hw=HW, distortion=lens) for f, p in zip((700, 650), poses)]
+    cameras = [
+        Camera(K=intrinsics(f, HW), cam_from_world=p, hw=HW, distortion=lens)
+        for f, p in zip((700, 650), poses)
+    ]
     return Rig(dict(zip(NAMES, cameras)))
 
 
 def lenses(rig: Rig) -> set[str]:
-    return {name for name, view in rig.cameras.items() if isinstance(view, LensView) and view.distortion is not None}
+    return {
+        name
+        for name, view in rig.cameras.items()
+        if isinstance(view, LensView) and view.distortion is not None
+    }
 
 
 def matches(rig, *, count=400, noise=0.05, wrong=True) -> dict[tuple[str, str], PointMatches]:
     """Points at 2 to 7 m, one in twenty wrong."""
     (names, (x, y)), *_ = seen_points(rig, count=count, near=2.0, far=7.0, noise=noise).items()
     if wrong:
-        y[::20] += 4 * torch.randn(len(y), 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)[::20]
+        y[::20] += (
+            4 * torch.randn(len(y), 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)[::20]
+        )
     return {names: PointMatches(x, y)}
 
 
@@ -125,7 +134,9 @@ def test_the_doctor_takes_lenses_of_uncalibrated_cameras_as_they_are():
 
 
 def test_the_fusions_error_sees_through_lenses():
-    """The rectified pair behind a lens, known by F alone: its error is least for the true lens, and says which way."""
+    """The rectified pair behind a lens, known by F alone: its error is least for the true lens, and says
+    which way.
+    """
     images = rectified_images()
     rig = rectified_pair()
     F = rig.pair("left", "right").fundamental
@@ -158,9 +169,20 @@ def test_the_papers_array_through_the_commands(shared_data, tmp_path, capsys):
         files[name] = folder / SCENE / f"{name}_{SLOW_FRAME}.png"
         links[FAST, name] = Link(F)
     images = {name: read_image(file) for name, file in files.items()}
-    Rig({n: View(hw=tuple(p.shape[1:])) for n, p in images.items()}, links=links).save(tmp_path / "published.yaml")
+    Rig({n: View(hw=tuple(p.shape[1:])) for n, p in images.items()}, links=links).save(
+        tmp_path / "published.yaml"
+    )
     arguments = [f"--image={name}={file}" for name, file in files.items()]
-    main(["rig", "refine", str(tmp_path / "published.yaml"), *arguments, "--out", str(tmp_path / "better.yaml")])
+    main(
+        [
+            "rig",
+            "refine",
+            str(tmp_path / "published.yaml"),
+            *arguments,
+            "--out",
+            str(tmp_path / "better.yaml"),
+        ]
+    )
     assert "F does not fit without lens distortion" in capsys.readouterr().out
     main(["rig", "start", *arguments, "--out", str(tmp_path / "started.yaml")])
     points = match_cameras(images)

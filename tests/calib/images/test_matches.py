@@ -7,7 +7,15 @@ import torch
 
 from arraygeom import Camera, Pose, Rig, apply_homography, epipolar_lines, intrinsics, rotation_from_vector
 from calib.images import matches
-from calib.images.matches import ENOUGH, PointMatches, fit_link, line_distance, match_points, near_lines, seen_depths
+from calib.images.matches import (
+    ENOUGH,
+    PointMatches,
+    fit_link,
+    line_distance,
+    match_points,
+    near_lines,
+    seen_depths,
+)
 from tests.calib.scenes import texture
 
 HW = (240, 320)
@@ -98,9 +106,13 @@ def test_depths_need_points_that_fit():
 def test_features_are_matched_as_by_opencv():
     rng = np.random.default_rng(0)
     b = rng.integers(0, 256, (700, 128)).astype(np.float32)
-    a = np.concatenate([b[rng.permutation(700)[:300]] + rng.integers(-30, 30, (300, 128)), b[:50] / 2]).clip(0, 255)
+    a = np.concatenate([b[rng.permutation(700)[:300]] + rng.integers(-30, 30, (300, 128)), b[:50] / 2]).clip(
+        0, 255
+    )
     a = np.rint(a).astype(np.float32)
     found = matches._nearest(a, b).tolist()
     pairs = cv2.BFMatcher().knnMatch(a, b, k=2)
-    assert found == [m.trainIdx if m.distance < matches.RATIO * second.distance else -1 for m, second in pairs]
+    assert found == [
+        m.trainIdx if m.distance < matches.RATIO * second.distance else -1 for m, second in pairs
+    ]
     assert 250 < sum(i >= 0 for i in found) < len(a)

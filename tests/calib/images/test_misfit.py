@@ -35,7 +35,9 @@ def test_points_behind_the_cameras_and_wrong_units_are_named():
     right = rig["right"]
     for factor in (-1.0, 1000.0):
         pose = Pose(right.R, right.t * factor)
-        wrong = rig.with_camera("right", right.replace(cam_from_world=pose)).replace(depth=rig.depth or (0.5, 50.0))
+        wrong = rig.with_camera("right", right.replace(cam_from_world=pose)).replace(
+            depth=rig.depth or (0.5, 50.0)
+        )
         found = find_misfit(wrong, images)
         assert found is not None
         assert found.outside > 0.9
@@ -50,7 +52,9 @@ def test_a_depth_range_without_the_scene_is_named_with_the_scenes_depth():
         found = find_misfit(rig.replace(depth=depth), images)
         assert found is not None
         assert found.outside > 0.9
-        said = re.search(r"the depth range excludes the scene, which is ([\d.]+) to ([\d.]+) m away", found.text)
+        said = re.search(
+            r"the depth range excludes the scene, which is ([\d.]+) to ([\d.]+) m away", found.text
+        )
         assert said is not None, found.text
         assert 1.5 < float(said[1]) < float(said[2]) < 8
         assert ("metres taken for centimetres" in found.text) == units
@@ -98,5 +102,7 @@ def test_too_few_points_of_observable_depth_are_no_share():
 
 def test_what_a_comparison_needs_is_imported_fast():
     code = "import sys, calib.images.misfit; print(*sys.modules)"
-    modules = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    modules = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout.split()
     assert {"scipy.stats", "scipy.spatial", "kornia"}.isdisjoint(modules)

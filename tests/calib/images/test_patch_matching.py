@@ -1,4 +1,6 @@
-"""Matched points by patches: to a few hundredths of a pixel, whatever brightness does; and left alone where wrong."""
+"""Matched points by patches: to a few hundredths of a pixel, whatever brightness does; and left alone where
+wrong.
+"""
 
 import cv2
 import numpy as np
@@ -16,7 +18,9 @@ RANDOM = np.random.default_rng(0)
 def warped(hw=(240, 320)):
     """An image and how a second camera sees it: y = A x + shift, darker and flatter, with noise."""
     image = (texture(hw, seed=3)[0].numpy() * 255).astype(np.float32)
-    there = cv2.warpAffine(image, np.c_[A, SHIFT], hw[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    there = cv2.warpAffine(
+        image, np.c_[A, SHIFT], hw[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+    )
     images = image, 0.6 * there + 20
     return [(p + RANDOM.normal(0, 0.7, hw)).round().clip(0, 255).astype(np.uint8) for p in images]
 
@@ -56,7 +60,9 @@ def test_matches_are_better_for_it():
 
 
 def test_deviations_distinguish_good_points_from_bad_ones():
-    """Points without texture have large ones, those that nothing fits infinite ones; others are as off as they say."""
+    """Points without texture have large ones, those that nothing fits infinite ones; others are as off as
+    they say.
+    """
     alpha, beta = warped()
     flat = [np.where(np.arange(320) < 160, p, (p * 0.04 + 120).astype(np.uint8)) for p in (alpha, beta)]
     noisy = [(p + RANDOM.normal(0, 0.7, p.shape)).round().clip(0, 255).astype(np.uint8) for p in flat]
@@ -66,6 +72,11 @@ def test_deviations_distinguish_good_points_from_bad_ones():
     left = (x[:, 0] < 140) & (ground_truth[:, 0] < 140) & np.isfinite(found.deviation)
     right = (x[:, 0] > 180) & (ground_truth[:, 0] > 180)
     assert np.median(found.deviation[right]) > 4 * np.median(found.deviation[left])
-    assert np.median(np.linalg.norm(found.y - ground_truth, axis=1)[left]) < 3 * np.median(found.deviation[left])
+    assert np.median(np.linalg.norm(found.y - ground_truth, axis=1)[left]) < 3 * np.median(
+        found.deviation[left]
+    )
     alike, *_ = warped()
-    assert np.isinf(refine_points(alike, alike[::-1], x, x, np.tile(np.eye(2), (60, 1, 1))).deviation).mean() > 0.9
+    assert (
+        np.isinf(refine_points(alike, alike[::-1], x, x, np.tile(np.eye(2), (60, 1, 1))).deviation).mean()
+        > 0.9
+    )

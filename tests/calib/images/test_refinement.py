@@ -58,13 +58,17 @@ def test_a_perturbed_rig_returns(lens):
 
 
 def small_drift() -> tuple[Rig, Rig]:
-    """A pair of narrow field, its second camera rotated by 0.1 degrees about its vertical axis and its horizontal."""
+    """A pair of narrow field, its second camera rotated by 0.1 degrees about its vertical axis and its
+    horizontal.
+    """
     rig = simulated_rig("narrow", 2, np.random.default_rng(5))
     return rig, rig.perturbed({"c1.rotation": vector(0.0012, 0.0012, 0)})
 
 
 def test_depth_that_points_do_not_determine_stays():
-    """The rotation about the vertical hardly moves a line: what is determined returns, depth stays as it was."""
+    """The rotation about the vertical hardly moves a line: what is determined returns, depth stays as it
+    was.
+    """
     rig, bad = small_drift()
     points = simulated_matches(rig, "narrow", np.random.default_rng(6))
     found = refine_matches(bad, [points])
@@ -156,7 +160,9 @@ def test_several_frames_hold_a_whole_one_out():
     frames = [seen_points(rig, count=100, seed=seed) for seed in range(3)]
     found = refine_matches(worse(rig), frames, force=True)
     assert found.held_out[0].points == 100
-    assert sum(len(m.alpha) for m in RefinementProblem.of(rig, ["rotation"], frames=frames).used.values()) == 200
+    assert (
+        sum(len(m.alpha) for m in RefinementProblem.of(rig, ["rotation"], frames=frames).used.values()) == 200
+    )
     assert found.accepted
 
 
@@ -172,7 +178,9 @@ def test_what_images_do_not_determine_is_unobservable_and_named():
 
 
 def test_translations_are_freed_where_points_demand_it():
-    """What no turn and no shift of the principal points explains; where they do, the baseline stays as it is."""
+    """What no turn and no shift of the principal points explains; where they do, the baseline stays as it
+    is.
+    """
     rig = unlike_pair()
     exact = seen_points(rig, noise=0.0, seed=1)
     moved = rig.perturbed({"second.translation": vector(0, 0.006, 0.012)})
@@ -187,7 +195,9 @@ def test_translations_are_freed_where_points_demand_it():
 
 def test_a_tight_prior_holds():
     rig = unlike_pair()
-    found = refine_matches(worse(rig), [seen_points(rig)], sigma={"centre": 1e-4, "rotation": math.radians(1)})
+    found = refine_matches(
+        worse(rig), [seen_points(rig)], sigma={"centre": 1e-4, "rotation": math.radians(1)}
+    )
     assert any("centre" in name for name in found.unobservable)
     assert not any("centre" in change.name for change in found.changes)
 
@@ -211,7 +221,9 @@ def test_held_out_points_reject_a_fit_to_wrong_points():
 def test_deviations_are_those_of_repeated_draws():
     """Of rigs that drifted in every parameter, by the prior: the error over the draws is the stated one."""
     rig, errors = rectified_pair(), []
-    parameters = free_parameters(rig, rig.names, free=["right.rotation", "right.translation", "*.focal", "*.centre"])
+    parameters = free_parameters(
+        rig, rig.names, free=["right.rotation", "right.translation", "*.focal", "*.centre"]
+    )
     for seed in range(6):
         g = torch.Generator().manual_seed(seed)
         z = 0.7 * torch.randn(sum(len(u.sigma) for u in parameters), generator=g, dtype=torch.float64)
@@ -242,7 +254,8 @@ def test_derivatives_are_those_of_finite_differences(lens):
         step = torch.zeros_like(z)
         step[k] = 1e-4
         ends = [
-            epipolar_residuals(apply_change(rig, given, z + s * step).pair(*names), points).sampson for s in (1, -1)
+            epipolar_residuals(apply_change(rig, given, z + s * step).pair(*names), points).sampson
+            for s in (1, -1)
         ]
         difference = (ends[0] - ends[1]) / 2e-4
         near_zero = fixed.sampson.abs() < 3
@@ -281,7 +294,10 @@ def test_photometric_error_is_least_for_the_true_rig():
     assert min(errors, key=errors.get) == 0.0
     change = torch.zeros(2, dtype=torch.float64, requires_grad=True)
     left, _ = photometric_errors(
-        rig.perturbed({"right.centre": change + vector(0, 0.7)}), views, ("left", "right"), attend_with_statistics
+        rig.perturbed({"right.centre": change + vector(0, 0.7)}),
+        views,
+        ("left", "right"),
+        attend_with_statistics,
     )
     (slope,) = torch.autograd.grad(left.square().sum(), change)
     assert slope[1] > 0
@@ -361,12 +377,16 @@ def test_depth_that_is_lost_counts_as_changed():
 
 
 def test_poses_do_not_stand_in_for_lenses():
-    """Wrong lenses were explained by other poses, with which depth changed; a rotation is not explained by lenses."""
+    """Wrong lenses were explained by other poses, with which depth changed; a rotation is not explained by
+    lenses.
+    """
     g = np.random.default_rng([0, 2, 4])
     rig = simulated_rig("wide", 2, g)
     matches = simulated_matches(rig, "wide", g)
     lens = Distortion("brown-conrady", torch.tensor([0.2, 0.0, 0.0, 0.0], dtype=torch.float64))
-    bent = rig.replace(cameras={name: camera.replace(distortion=lens) for name, camera in rig.cameras.items()})
+    bent = rig.replace(
+        cameras={name: camera.replace(distortion=lens) for name, camera in rig.cameras.items()}
+    )
     found = refine_matches(bent, [matches])
     assert not found.accepted
     assert ["other lenses" in objection for objection in found.objections] == [True]
@@ -383,13 +403,17 @@ def test_poses_do_not_stand_in_for_lenses():
     ],
 )
 def test_depth_does_not_change_for_nothing(shared_data, name, kind, seed):
-    """Real pairs' depth changed by 2.3 % or more, 4 to 76 times what its deviation fell by, and was worse for it."""
+    """Real pairs' depth changed by 2.3 % or more, 4 to 76 times what its deviation fell by, and was worse for
+    it.
+    """
     (pair,) = syntim(shared_data, (name,))
     matches = match_cameras(pair.images)
     rig = Rig({name: pair.rig[name] for name in pair.images})
     lens = kind.startswith("k1")
     bad = (
-        with_lens_mistake(rig, kind) if lens else drifted(rig, kind, np.random.default_rng([seed, DRIFTS.index(kind)]))
+        with_lens_mistake(rig, kind)
+        if lens
+        else drifted(rig, kind, np.random.default_rng([seed, DRIFTS.index(kind)]))
     )
     assert bad is not None
     found = refine_matches(bad, [matches])
@@ -397,7 +421,9 @@ def test_depth_does_not_change_for_nothing(shared_data, name, kind, seed):
 
 
 def test_depth_changes_far_where_it_is_known(shared_data):
-    """A real pair's second camera turned by a degree: depth changes by six times what its deviation falls by."""
+    """A real pair's second camera turned by a degree: depth changes by six times what its deviation falls
+    by.
+    """
     (pair,) = (pair for pair in bumblebee(shared_data, ("chair01",)) if pair.name.endswith("chair01"))
     matches = match_cameras(pair.images)
     rig = Rig({name: pair.rig[name] for name in pair.images})

@@ -28,7 +28,9 @@ def calibrated_from(rig: Rig, matches: PointMatches, **focal: float) -> RefinedP
     return self_calibrated(rig.cameras, link, matches, focal=focal)
 
 
-@pytest.mark.parametrize(("make", "focal"), [(rectified_pair, {}), (unlike_pair, {"first": 305.0, "second": 332.0})])
+@pytest.mark.parametrize(
+    ("make", "focal"), [(rectified_pair, {}), (unlike_pair, {"first": 305.0, "second": 332.0})]
+)
 def test_lines_are_as_good_as_with_the_calibration(make, focal):
     rig = make()
     names = rig.names
@@ -53,7 +55,9 @@ def test_pose_and_bounds_are_found_with_the_focal_lengths():
 
 
 def test_a_start_whose_baseline_vanishes_is_left_out(monkeypatch):
-    """Matches do not determine the baseline's length: from a wrong start it shrank to nothing (Cloth3 of 2006)."""
+    """Matches do not determine the baseline's length: from a wrong start it shrank to nothing (Cloth3 of
+    2006).
+    """
     rig = rectified_pair()
     (matches,) = seen_points(rig, noise=0.1, near=2.0, far=6.0).values()
     refine, calls = self_calibration.refine_matches, []
@@ -116,7 +120,9 @@ def test_dense_matches_follow_from_a_depth_map():
 def test_pairs_are_joined_at_their_scales():
     pair = rectified_pair()
     other = Rig({"left": pair["left"], "up": pair["right"]}, depth=(3.0, 9.0))
-    rig = joined({"right": RefinedPair(pair, 1, 0.0), "up": RefinedPair(other, 1, 0.0)}, {"right": 1.0, "up": 0.5})
+    rig = joined(
+        {"right": RefinedPair(pair, 1, 0.0), "up": RefinedPair(other, 1, 0.0)}, {"right": 1.0, "up": 0.5}
+    )
     assert rig.names == ("left", "right", "up")
     assert torch.allclose(rig["up"].t, 0.5 * rig["right"].t)
     assert [float(bound) for bound in rig.depth] == [1.5, 8.0]
@@ -125,7 +131,9 @@ def test_pairs_are_joined_at_their_scales():
 def test_points_that_one_smooth_map_moves_have_no_parallax():
     """Two lenses at one place had a depth, by how they differ."""
     one = rectified_pair()["left"]
-    turned = Pose(rotation_from_vector(torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64)), torch.zeros(3).double())
+    turned = Pose(
+        rotation_from_vector(torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64)), torch.zeros(3).double()
+    )
     lens = Distortion("brown-conrady", torch.tensor([-0.05, 0.01, 0.0, 0.0], dtype=torch.float64))
     rig = Rig({"left": one, "right": one.replace(cam_from_world=turned, distortion=lens)})
     (seen,) = seen_points(rig, noise=0.1, near=1.6, far=7.0).values()

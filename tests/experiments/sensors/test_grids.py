@@ -55,12 +55,16 @@ def test_demosaicing_moves_nothing(pattern, method):
 def test_bilinear_agrees_with_opencv():
     image = torch.rand(1, 3, 40, 60, generator=generator(), dtype=torch.float64)
     raw = record(image, [Mosaic("RGGB")], generator()).image
-    wanted = cv2.cvtColor((raw[0, 0].numpy() * 65535).round().astype(np.uint16), cv2.COLOR_BayerRGGB2RGB) / 65535
+    wanted = (
+        cv2.cvtColor((raw[0, 0].numpy() * 65535).round().astype(np.uint16), cv2.COLOR_BayerRGGB2RGB) / 65535
+    )
     back = record(raw, [Demosaic("RGGB")], generator()).image[0].movedim(0, -1).numpy()
     np.testing.assert_allclose(back[2:-2, 2:-2], wanted[2:-2, 2:-2], atol=1e-4)
 
 
-@pytest.mark.parametrize("steps", [[Mosaic("GRBG"), Demosaic("GRBG")], [Crop(1, 2, (3, 4))]], ids=["mosaic", "crop"])
+@pytest.mark.parametrize(
+    "steps", [[Mosaic("GRBG"), Demosaic("GRBG")], [Crop(1, 2, (3, 4))]], ids=["mosaic", "crop"]
+)
 def test_gradients_in_the_image(steps):
     image = torch.rand(1, 3, 4, 6, generator=generator(), dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: record(x, steps, generator()).image, image)
@@ -86,7 +90,9 @@ CHAINS = {
 }
 
 
-@pytest.mark.parametrize("lens", [None, Distortion("brown-conrady", torch.tensor([-0.1, 0.02, 0.0, 0.0]).double())])
+@pytest.mark.parametrize(
+    "lens", [None, Distortion("brown-conrady", torch.tensor([-0.1, 0.02, 0.0, 0.0]).double())]
+)
 @pytest.mark.parametrize("chain", CHAINS)
 def test_points_are_found_where_the_rig_of_the_recorded_images_projects_them(chain, lens):
     """Soft dots are drawn where 3-D points project in the ideal images of two cameras, then recorded."""
@@ -94,7 +100,9 @@ def test_points_are_found_where_the_rig_of_the_recorded_images_projects_them(cha
         rotation_from_vector(torch.tensor([0.02, -0.05, 0.1]).double()), torch.tensor([0.1, 0.02, 0]).double()
     )
     cameras = {
-        "left": Camera(K=intrinsics(90.0, (64, 96)), cam_from_world=Pose.identity(), hw=(64, 96), distortion=lens),
+        "left": Camera(
+            K=intrinsics(90.0, (64, 96)), cam_from_world=Pose.identity(), hw=(64, 96), distortion=lens
+        ),
         "right": Camera(K=intrinsics((85.0, 80.0), (70, 90)), cam_from_world=turned, hw=(70, 90)),
     }
     rig = Rig(cameras, depth=(1, 5))
@@ -124,7 +132,9 @@ def _found(image: torch.Tensor) -> torch.Tensor:
 
 def test_each_camera_draws_for_itself():
     """A camera more, or another order, changes no other camera's noise."""
-    rig = Rig({n: Camera(K=intrinsics(90.0, (8, 8)), cam_from_world=Pose.identity(), hw=(8, 8)) for n in "abc"})
+    rig = Rig(
+        {n: Camera(K=intrinsics(90.0, (8, 8)), cam_from_world=Pose.identity(), hw=(8, 8)) for n in "abc"}
+    )
     images = {n: torch.full((1, 1, 8, 8), 0.5) for n in "abc"}
     chains = {n: [Noise(100.0)] for n in "abc"}
     three = record_array(images, rig, chains, seed=1).images

@@ -151,7 +151,9 @@ def test_vignetting_is_centred_on_the_principal_point():
     assert divmod(int(seen.argmax()), HW[1]) == (10, 20)
 
 
-@pytest.mark.parametrize("step", [MotionBlur(1.0, (2.3, -1.1)), Vignetting((-0.3, 0.1)), GaussianBlur(1.0)], ids=str)
+@pytest.mark.parametrize(
+    "step", [MotionBlur(1.0, (2.3, -1.1)), Vignetting((-0.3, 0.1)), GaussianBlur(1.0)], ids=str
+)
 def test_gradients_in_the_image(step):
     image = torch.rand(1, 2, 6, 8, generator=generator(), dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: record(x, [step], generator()).image, image)

@@ -36,7 +36,11 @@ blue:
 
 
 def test_former_names_of_the_srgb_conversions_are_read():
-    assert read_chain(["linear", "coded"]) == read_chain(["decode-srgb", "encode-srgb"]) == (DecodeSRGB(), EncodeSRGB())
+    assert (
+        read_chain(["linear", "coded"])
+        == read_chain(["decode-srgb", "encode-srgb"])
+        == (DecodeSRGB(), EncodeSRGB())
+    )
 
 
 def test_a_file_says_what_each_camera_does():
@@ -66,7 +70,10 @@ def test_a_chain_from_a_file_runs():
     ("text", "words"),
     [
         ("[{nois: {full_well: 3}}]", r"chain\[0\]: no step is called 'nois'; did you mean 'noise'"),
-        ("[linear, {noise: {fullwell: 3}}]", r"chain\[1\].noise.fullwell: unknown key; did you mean 'full_well'"),
+        (
+            "[linear, {noise: {fullwell: 3}}]",
+            r"chain\[1\].noise.fullwell: unknown key; did you mean 'full_well'",
+        ),
         ("[{noise: {read: 3}}]", r"full_well: missing"),
         ("[{noise: {full_well: many}}]", r"noise.full_well: is 'many'; wanted a number"),
         ("[{noise: {full_well: -3}}]", r"full_well > 0"),

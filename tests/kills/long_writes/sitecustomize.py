@@ -1,7 +1,8 @@
 """Writes that take long: Python imports this file when it starts, where its folder is on PYTHONPATH.
 
-Before a file counts as being on the disk (`os.fsync`), it is emptied and written once more in pieces with pauses, and a
-line in the file that LONG_WRITES names says that this begins. Who reads that line can kill the process inside a write.
+Before a file counts as being on the disk (`os.fsync`), it is emptied and written once more in pieces with
+pauses, and a line in the file that LONG_WRITES names says that this begins. Who reads that line can kill the
+process inside a write.
 """
 
 from __future__ import annotations

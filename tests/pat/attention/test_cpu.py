@@ -63,7 +63,8 @@ def test_more_samples_and_channels_than_are_processed_at_once(interpolation, d, 
 def test_16_bit_inputs_are_accumulated_in_float32(dtype):
     tensors, options = random_case(3, dtype=torch.float32)
     stored = {
-        n: t.detach().to(dtype).requires_grad_() if n in ("query", "key", "value") else t for n, t in tensors.items()
+        n: t.detach().to(dtype).requires_grad_() if n in ("query", "key", "value") else t
+        for n, t in tensors.items()
     }
     exact = {n: t.detach().float().requires_grad_() for n, t in stored.items()}
     found = call(attend_with_statistics, stored, options, backend="cpu")
@@ -112,7 +113,9 @@ def test_any_number_of_threads_gives_the_same_bits(interpolation):
             results.append(
                 (
                     out,
-                    *torch.autograd.grad(out.square().sum(), inputs[: 3 if interpolation == "nearest" else 5]),
+                    *torch.autograd.grad(
+                        out.square().sum(), inputs[: 3 if interpolation == "nearest" else 5]
+                    ),
                 )
             )
     finally:
@@ -134,7 +137,10 @@ def test_without_statistics_the_values_and_their_gradients_are_the_same(seed):
 def test_gradcheck_also_twice():
     tensors, options = random_case(21)
     options["interpolation"] = "bilinear"
-    small = {n: t.detach()[:, :2].requires_grad_() if n in ("query", "key", "value") else t for n, t in tensors.items()}
+    small = {
+        n: t.detach()[:, :2].requires_grad_() if n in ("query", "key", "value") else t
+        for n, t in tensors.items()
+    }
 
     def run(*values, backend="auto"):
         return tuple(call(attend_with_statistics, dict(zip(small, values)), options, backend=backend))
@@ -159,7 +165,9 @@ def test_pixels_without_samples_give_and_pass_zeros(backend, interpolation):
     mask = torch.ones(3, 3, 2, dtype=torch.bool)
     mask[1, 1] = False
     mask[2, 2] = True
-    out = attend_with_statistics(q, key, value, Positions(xy, mask), interpolation=interpolation, backend=backend)
+    out = attend_with_statistics(
+        q, key, value, Positions(xy, mask), interpolation=interpolation, backend=backend
+    )
     assert all(t.abs().max() == 0 for t in out)
     grads = torch.autograd.grad(
         [t for t in out if t.requires_grad],
@@ -208,7 +216,8 @@ def test_the_operator_passes_torchs_own_checks(measured):
     points = (torch.rand(2, 3, 5, 2, 2) * 4).requires_grad_()
     mask = torch.rand(2, 3, 5, 1) > 0.3
     torch.library.opcheck(
-        torch.ops.pat.attend.default, (q, key, value, points, mask, None, 4, True, False, measured, "cpu", False)
+        torch.ops.pat.attend.default,
+        (q, key, value, points, mask, None, 4, True, False, measured, "cpu", False),
     )
 
 
@@ -231,5 +240,7 @@ def test_processes_that_compile_at_once_do_not_take_each_others_code(tmp_path):
     for reader in (first, Entry()):
         assert reader._cache_file.load("float32") in (None, "code of float32")
         assert reader._cache_file.load("float64") in (None, "code of float64")
-    first._cache_file._save_index({"float32": first._cache_file._data_name(1)})  # its index was the last to be written
+    first._cache_file._save_index(
+        {"float32": first._cache_file._data_name(1)}
+    )  # its index was the last to be written
     assert Entry()._cache_file.load("float32") == "code of float32"

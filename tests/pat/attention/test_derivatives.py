@@ -44,7 +44,9 @@ def third_order(backend: str):
 
 
 DERIVATIVES = {
-    "jvp": lambda backend: jvp(function_of_query(backend)[0], *((t,) for t in function_of_query(backend)[1:]))[1],
+    "jvp": lambda backend: jvp(
+        function_of_query(backend)[0], *((t,) for t in function_of_query(backend)[1:])
+    )[1],
     "jacfwd": lambda backend: jacfwd(function_of_query(backend)[0])(function_of_query(backend)[1]),
     "dual": tangent,
     "hvp": product_with_hessian,

@@ -43,7 +43,8 @@ def test_equals_the_reference(seed, deterministic):
 def test_16_bit_inputs_are_accumulated_in_float32(dtype):
     tensors, options = moved(*random_case(3, dtype=torch.float32))
     stored = {
-        n: t.detach().to(dtype).requires_grad_() if n in ("query", "key", "value") else t for n, t in tensors.items()
+        n: t.detach().to(dtype).requires_grad_() if n in ("query", "key", "value") else t
+        for n, t in tensors.items()
     }
     exact = {n: t.detach().float().requires_grad_() for n, t in stored.items()}
     found = call(attend_with_statistics, stored, options, backend="triton")

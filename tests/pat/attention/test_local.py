@@ -19,7 +19,9 @@ def features(hw=(20, 30), dtype=torch.float32, batch=2):
 @pytest.mark.parametrize("hw", [(5, 9), (2 * ROWS + 3, 40)])
 def test_it_gives_what_the_others_give(hw, field, backend):
     query, key, value = features(hw)
-    wanted = attend(query.double(), 5 * key.double(), value.double(), field, interpolation="nearest", backend=backend)
+    wanted = attend(
+        query.double(), 5 * key.double(), value.double(), field, interpolation="nearest", backend=backend
+    )
     found = attend(query, 5 * key, value, field, interpolation="nearest", backend="local")
     torch.testing.assert_close(found.double(), wanted, rtol=1e-5, atol=1e-5)
 

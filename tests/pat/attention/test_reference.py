@@ -25,7 +25,11 @@ def by_hand(q, key, value, xy, counts):
         upper = (1 - u) * image[:, y0, x0] + u * image[:, y0, x1]
         return (1 - v) * upper + v * ((1 - u) * image[:, y1, x0] + u * image[:, y1, x1])
 
-    seen = [(x, y) for (x, y), c in zip(xy.tolist(), counts) if c and -0.5 <= x <= w - 0.5 and -0.5 <= y <= h - 0.5]
+    seen = [
+        (x, y)
+        for (x, y), c in zip(xy.tolist(), counts)
+        if c and -0.5 <= x <= w - 0.5 and -0.5 <= y <= h - 0.5
+    ]
     if not seen:
         return torch.zeros(value.shape[0], dtype=value.dtype), (0.0, 0.0), 0.0, 0.0
     mass = [math.exp(float(q @ at(key, x, y))) for x, y in seen]
@@ -38,14 +42,18 @@ def by_hand(q, key, value, xy, counts):
 
 def test_equals_a_loop_by_hand():
     torch.manual_seed(0)
-    q, key, value = (torch.randn(1, d, h, w, dtype=torch.float64) for d, h, w in ((3, 4, 5), (3, 6, 7), (2, 6, 7)))
+    q, key, value = (
+        torch.randn(1, d, h, w, dtype=torch.float64) for d, h, w in ((3, 4, 5), (3, 6, 7), (2, 6, 7))
+    )
     xy = torch.rand(4, 5, 6, 2, dtype=torch.float64) * 9 - 1
     mask = torch.rand(4, 5, 6) > 0.3
     mask[0, 0] = False
     out = attend_with_statistics(q, key, value, Positions(xy, mask), backend="reference")
     for y in range(4):
         for x in range(5):
-            seen, position, spread, peak = by_hand(q[0, :, y, x], key[0], value[0], xy[y, x], mask[y, x].tolist())
+            seen, position, spread, peak = by_hand(
+                q[0, :, y, x], key[0], value[0], xy[y, x], mask[y, x].tolist()
+            )
             torch.testing.assert_close(out.value[0, :, y, x], seen)
             torch.testing.assert_close(out.position[0, :, y, x], torch.tensor(position, dtype=torch.float64))
             assert out.deviation[0, y, x].item() == pytest.approx(spread)
@@ -70,7 +78,9 @@ def test_border_pixels_reach_half_a_pixel_out():
     x = torch.tensor([-0.502, -0.4995, 2.4995, 2.502])
     field = Positions(torch.stack([x, 0 * x], -1)[None, :, None], torch.ones(1, 4, 1, dtype=torch.bool))
     for interpolation in ("bilinear", "nearest"):
-        out = attend(torch.ones(1, 1, 1, 4), key, value, field, interpolation=interpolation, backend="reference")
+        out = attend(
+            torch.ones(1, 1, 1, 4), key, value, field, interpolation=interpolation, backend="reference"
+        )
         assert out.flatten().tolist() == [0, 1, 3, 0]
 
 

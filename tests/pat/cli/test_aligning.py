@@ -53,7 +53,16 @@ def test_files(folder, counts, capsys):  # noqa: F811
 
 def test_options(folder, counts):  # noqa: F811
     """Filled, nearest, a file of each camera, positions as TIFF; no page."""
-    options = ["--fill", "propagate", "--interpolation", "nearest", "--separate", "--positions", "tif", "--no-report"]
+    options = [
+        "--fill",
+        "propagate",
+        "--interpolation",
+        "nearest",
+        "--separate",
+        "--positions",
+        "tif",
+        "--no-report",
+    ]
     out = align(folder, counts, *options, "--no-correct", "--response", "rec601")
     values = tifffile.imread(out / "colour.tif")
     recorded = cv2.imread(str(counts / "colour.png"), cv2.IMREAD_UNCHANGED)[..., ::-1].transpose(2, 0, 1)
@@ -111,10 +120,16 @@ def capture(tmp_path):
             "is of another serial number than the image of 'green' (B2, A1): give images of one capture",
         ),
         ({"taken": "2018:04:13 09:00:00"}, "is of another time than the image of 'green'"),
-        ({"second": {**FISHEYE, "RigTranslations": "12.5,0,0"}}, "RigTranslations: is [12.5, 0.0, 0.0], and metres"),
+        (
+            {"second": {**FISHEYE, "RigTranslations": "12.5,0,0"}},
+            "RigTranslations: is [12.5, 0.0, 0.0], and metres",
+        ),
         ({"second": {**PERSPECTIVE, "PrincipalPoint": "24,18"}}, "was it cropped or resized?"),
         ({"hw": (300, 400)}, "was it cropped or resized?"),
-        ({"second": {k: v for k, v in FISHEYE.items() if k != "FisheyeAffineMatrix"}}, "FisheyeAffineMatrix: is not"),
+        (
+            {"second": {k: v for k, v in FISHEYE.items() if k != "FisheyeAffineMatrix"}},
+            "FisheyeAffineMatrix: is not",
+        ),
     ],
 )
 @pytest.mark.filterwarnings("ignore::arraygeom.io.RigFileWarning")

@@ -39,7 +39,12 @@ def cut_sample(folder, hw):
 
 
 def arguments(folder, **changes):
-    given = {"rig": folder / "rig.yaml", "alpha": "mono", "mono": folder / "mono.png", "colour": folder / "colour.png"}
+    given = {
+        "rig": folder / "rig.yaml",
+        "alpha": "mono",
+        "mono": folder / "mono.png",
+        "colour": folder / "colour.png",
+    }
     given |= changes
     images = [a for name in ("mono", "colour") for a in ("--image", f"{name}={given[name]}")]
     extra = given.get("extra", [])
@@ -117,11 +122,20 @@ def test_mistakes_are_one_line_and_leave_nothing(changes, message, small, capsys
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (lambda rig: rig["cameras"]["mono"].update(focl=3), "cameras.mono.focl: unknown key; did you mean 'focal'"),
-        (lambda rig: rig["cameras"]["mono"].update(rotation=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]), "not a rotation"),
+        (
+            lambda rig: rig["cameras"]["mono"].update(focl=3),
+            "cameras.mono.focl: unknown key; did you mean 'focal'",
+        ),
+        (
+            lambda rig: rig["cameras"]["mono"].update(rotation=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]),
+            "not a rotation",
+        ),
         (lambda rig: rig.update(depth=[20, 2]), "depth: is [20, 2] m; wanted [near, far]"),
         (lambda rig: rig["cameras"]["mono"].pop("size"), "cameras.mono.size"),
-        (lambda rig: rig["cameras"]["colour"].update(position=[100, 0, 0], translation=[0, 0, 0]), "keep one"),
+        (
+            lambda rig: rig["cameras"]["colour"].update(position=[100, 0, 0], translation=[0, 0, 0]),
+            "keep one",
+        ),
     ],
 )
 def test_rig_mistakes_name_the_entry(edit, message, small, capsys):
@@ -152,7 +166,16 @@ def test_images_with_an_alpha_channel_or_nan(small, capsys):
 
 
 def test_show_draws_the_rig_and_its_fields(small):
-    main(["show", str(small / "rig.yaml"), "--image", f"mono={small / 'mono.png'}", "--out", str(small / "out")])
+    main(
+        [
+            "show",
+            str(small / "rig.yaml"),
+            "--image",
+            f"mono={small / 'mono.png'}",
+            "--out",
+            str(small / "out"),
+        ]
+    )
     assert sorted(p.name for p in (small / "out").iterdir()) == ["fields.png", "rig.png"]
     main(["rig", "show", str(small / "rig.yaml"), "--alpha", "colour", "--out", str(small / "again")])
     assert (small / "again" / "fields.png").is_file()
@@ -208,7 +231,9 @@ def test_rig_info_as_json(small, capsys):
     assert [camera["name"] for camera in told["cameras"]] == ["mono", "colour"]
     assert told["pairs"][0]["baseline"] == pytest.approx(0.1241, abs=1e-3)
     main(["rig", "info", str(small / "rig.yaml"), "--json", "--alpha", "colour"])
-    assert [(p["alpha"], p["beta"]) for p in json.loads(capsys.readouterr().out)["pairs"]] == [("colour", "mono")]
+    assert [(p["alpha"], p["beta"]) for p in json.loads(capsys.readouterr().out)["pairs"]] == [
+        ("colour", "mono")
+    ]
 
 
 def test_rig_info_of_many_cameras_describes_the_pairs_of_one(tmp_path, capsys):
@@ -216,7 +241,9 @@ def test_rig_info_of_many_cameras_describes_the_pairs_of_one(tmp_path, capsys):
     (tmp_path / "rig.yaml").write_text(f"format: arraygeom-rig 1\ncameras:\n{cameras}\n")
     main(["rig", "info", str(tmp_path / "rig.yaml"), "--json"])
     out, error = capsys.readouterr()
-    assert [(p["alpha"], p["beta"]) for p in json.loads(out)["pairs"]] == [("c0", f"c{i}") for i in range(1, 51)]
+    assert [(p["alpha"], p["beta"]) for p in json.loads(out)["pairs"]] == [
+        ("c0", f"c{i}") for i in range(1, 51)
+    ]
     assert "pairs with alpha 'c0' and its nearest cameras, of 60: --alpha NAME for others" in error
 
 
@@ -232,7 +259,9 @@ def test_an_interruption_is_one_line_and_status_130(monkeypatch, capsys):
 
 
 def test_explore_says_what_is_missing(small, capsys):
-    told = fails(["explore", str(small / "rig.yaml"), "--image", f"mono={small / 'mono.png'}", "--no-browser"], capsys)
+    told = fails(
+        ["explore", str(small / "rig.yaml"), "--image", f"mono={small / 'mono.png'}", "--no-browser"], capsys
+    )
     assert "at least one beta" in told
 
 
@@ -266,7 +295,19 @@ def test_a_camera_given_twice_is_refused_everywhere(command, small, capsys):
 def test_other_names_given_twice(small, capsys):
     twice = ["--frame-rate", "mono=30", "--frame-rate", "mono=25"]
     assert "--frame-rate: 'mono' is given twice" in fails([*arguments(small), *twice], capsys)
-    sigma = ["rig", "refine", "--rig", "r.yaml", "-o", "x.yaml", "--image", "a=b", "--sigma", "focal=1", "focal=2"]
+    sigma = [
+        "rig",
+        "refine",
+        "--rig",
+        "r.yaml",
+        "-o",
+        "x.yaml",
+        "--image",
+        "a=b",
+        "--sigma",
+        "focal=1",
+        "focal=2",
+    ]
     assert "no such rig file" in fails(sigma, capsys)
     sigma[3] = str(small / "rig.yaml")
     assert "--sigma: 'focal' is given twice" in fails(sigma, capsys)
@@ -344,7 +385,9 @@ def wrong(small) -> None:
     """The rig with the sign of its baseline changed."""
     rig = Rig.load(small / "rig.yaml")
     pose = rig["colour"].cam_from_world
-    rig.with_camera("colour", rig["colour"].replace(cam_from_world=Pose(pose.R, -pose.t))).save(small / "rig.yaml")
+    rig.with_camera("colour", rig["colour"].replace(cam_from_world=Pose(pose.R, -pose.t))).save(
+        small / "rig.yaml"
+    )
 
 
 def test_a_rig_that_does_not_fit_ends_with_status_3_and_strict_writes_nothing(tmp_path, capsys):
@@ -399,11 +442,15 @@ def test_bands_that_the_weights_do_not_make_are_refused_with_which_to_take(small
 
 def test_an_alpha_in_colour_and_a_beta_without_are_said(small, capsys):
     shutil.copy(small / "colour.png", small / "mono.png")
-    write_image(small / "colour.png", read_image(small / "colour.png").mean(0, keepdim=True).expand(3, -1, -1))
+    write_image(
+        small / "colour.png", read_image(small / "colour.png").mean(0, keepdim=True).expand(3, -1, -1)
+    )
     with contextlib.suppress(SystemExit):
         main(arguments(small))
     text = " ".join(capsys.readouterr().err.split())
-    assert "warning: the image of alpha, 'mono', is in colour: colours come from the betas, its own only" in text
+    assert (
+        "warning: the image of alpha, 'mono', is in colour: colours come from the betas, its own only" in text
+    )
     assert "warning: the image of 'colour' has three equal bands" in text
 
 

@@ -71,7 +71,9 @@ def test_what_the_post_hides_is_occluded(folder):
     rig = Rig.load(folder / "rig.yaml")
     images = {name: read_image(folder / f"{name}.png") for name in rig.names}
     depth = torch.from_numpy(tifffile.imread(folder / "depth.tif"))
-    view = aligned(rig, images, alpha="mono", correct=False, field=AroundDepth(depth, 0.02, rig["mono"]))["colour"]
+    view = aligned(rig, images, alpha="mono", correct=False, field=AroundDepth(depth, 0.02, rig["mono"]))[
+        "colour"
+    ]
     hidden = slice(ON_POST.start - (NEAR - FAR), ON_POST.start)
     assert (view.visibility[:, hidden][:, 2:-2] == OCCLUDED).mean() > 0.9
     assert view.valid[:, ON_POST].mean() > 0.9

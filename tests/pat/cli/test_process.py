@@ -68,7 +68,18 @@ def test_help_lists_users_tools_before_authors_tools(capsys):
         main([])
     text = capsys.readouterr().out
     lines = [line.split()[0] for line in text.splitlines() if line.startswith("  ")]
-    assert lines == ["fuse", "align", "show", "explore", "calibrate", "board", "rig", "demo", "warm-up", *Pat.authors]
+    assert lines == [
+        "fuse",
+        "align",
+        "show",
+        "explore",
+        "calibrate",
+        "board",
+        "rig",
+        "demo",
+        "warm-up",
+        *Pat.authors,
+    ]
     assert all(len(line) <= 120 for line in text.splitlines())
 
 
@@ -85,7 +96,13 @@ REFUSED = {
     ("fuse", "--wieghts", "x"): "unknown here: --wieghts, x; did you mean --weights?",
     ("fuse", "--workers", "x"): "--workers: 'x' is not a whole number",
     ("fuse", "--alpha"): "--alpha: give a value",
-    ("fuse", "r", "--image", "a=A", "b=B"): "b=B: write the option before each, as in --image a=A --image b=B",
+    (
+        "fuse",
+        "r",
+        "--image",
+        "a=A",
+        "b=B",
+    ): "b=B: write the option before each, as in --image a=A --image b=B",
     ("evaluate", "--rates", "x"): "--rates: 'x' does not fit",
     ("rig", "convert", "a"): "OUT is missing: File or folder to write; also: --out OUT.",
 }
@@ -103,10 +120,16 @@ def test_what_the_parser_refuses_is_one_line(words, capsys):
     [
         (["fuse", "no.yaml", "--image", "a=b.png"], "no.yaml: no such rig file"),
         (["rig", "info", "no.yaml"], "no.yaml: no such rig file"),
-        (["fuse", "--image", "a=LICENSE", "b=README.md"], "b=README.md: no such rig file: if it is an image, write"),
+        (
+            ["fuse", "--image", "a=LICENSE", "b=README.md"],
+            "b=README.md: no such rig file: if it is an image, write",
+        ),
         (["fuse", "no.png", "nothing.png"], "no.png: no such image"),
         (["align", "no.png", "nothing.png"], "no.png: no such image"),
-        (["fuse", "--image", "mono.png", "--image", "c=b.png"], "the images alone: `pat fuse mono.png b.png`"),
+        (
+            ["fuse", "--image", "mono.png", "--image", "c=b.png"],
+            "the images alone: `pat fuse mono.png b.png`",
+        ),
         (["fues"], "did you mean 'fuse'"),
     ],
 )
@@ -145,8 +168,14 @@ def test_commands_that_do_not_exist(capsys):
 @pytest.mark.parametrize(
     ("error", "said"),
     [
-        (ImportError("drawing needs matplotlib: pip install 'arraygeom-pat[plots]'"), "matplotlib: pip install"),
-        (ModuleNotFoundError("No module named 'dask'"), "No module named 'dask': pip install 'arraygeom-pat[all]'"),
+        (
+            ImportError("drawing needs matplotlib: pip install 'arraygeom-pat[plots]'"),
+            "matplotlib: pip install",
+        ),
+        (
+            ModuleNotFoundError("No module named 'dask'"),
+            "No module named 'dask': pip install 'arraygeom-pat[all]'",
+        ),
     ],
 )
 def test_a_package_that_is_not_installed_is_one_line(error, said, monkeypatch, capsys):
@@ -182,8 +211,12 @@ runpy.run_module("pat", run_name="__main__")
 
 
 def test_threads_that_wait_sleep():
-    """Spinning, two threads took twice the core seconds beside another process; what the user sets is kept."""
-    code = "import os\nfrom pat.__main__ import main\ntry: main()\nfinally: print(os.environ['OMP_WAIT_POLICY'])"
+    """Spinning, two threads took twice the core seconds beside another process; what the user sets is
+    kept.
+    """
+    code = (
+        "import os\nfrom pat.__main__ import main\ntry: main()\nfinally: print(os.environ['OMP_WAIT_POLICY'])"
+    )
     for given, wanted in (({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")):
         others = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
         line = [sys.executable, "-c", code, "--help"]

@@ -55,7 +55,9 @@ def folder(halved, tmp_path_factory):
     for name, image in halved[1].items():
         write_image(folder / f"{name}.png", image)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("pat.fusion.from_images.MATCHED", 300)  # the images are larger, as photographs are than 1600
+        patched.setattr(
+            "pat.fusion.from_images.MATCHED", 300
+        )  # the images are larger, as photographs are than 1600
         main(["fuse", str(folder / "colour.png"), str(folder / "mono.png"), "-o", str(folder / "out")])
     return folder
 
@@ -105,7 +107,17 @@ def test_the_rig_that_was_found_serves_the_next_command(folder):
     assert rig.names == ("mono", "colour")
     assert all(isinstance(camera, Camera) for camera in rig.cameras.values())
     images = [str(folder / f"{name}.png") for name in rig.names]
-    main(["fuse", str(folder / "out" / "found_rig.yaml"), *images, "--alpha", "mono", "-o", str(folder / "next")])
+    main(
+        [
+            "fuse",
+            str(folder / "out" / "found_rig.yaml"),
+            *images,
+            "--alpha",
+            "mono",
+            "-o",
+            str(folder / "next"),
+        ]
+    )
     again, first = (read_image(folder / out / "fused.png") for out in ("next", "out"))
     assert float((again - first).abs().max()) <= 2 / 255
     assert all(" baselines" in (folder / out / "index.html").read_text() for out in ("next", "out"))
@@ -134,7 +146,11 @@ def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, c
     mono, colour = folder / "mono.png", folder / "colour.png"
     noise = np.random.default_rng(0).integers(0, 255, (200, 320, 3), np.uint8)
     ramp = np.tile(np.linspace(0, 255, 320, dtype=np.uint8), (200, 1))
-    files = {"other": cv2.GaussianBlur(noise, (0, 0), 2), "flat": np.full((200, 320, 3), 90, np.uint8), "ramp": ramp}
+    files = {
+        "other": cv2.GaussianBlur(noise, (0, 0), 2),
+        "flat": np.full((200, 320, 3), 90, np.uint8),
+        "ramp": ramp,
+    }
     for name, values in files.items():
         cv2.imwrite(str(tmp_path / f"{name}.png"), values)
     write_video(tmp_path / "clip.mp4", [torch.rand(3, 32, 32)])
@@ -154,7 +170,9 @@ def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, c
     for names, message in cases.items():
         assert message in fails([mono, *(tmp_path / name for name in names), *out], capsys)
         assert not (tmp_path / "out").exists()
-    assert "no camera 'tele'; the images' names are mono, colour" in fails([mono, colour, "--alpha", "tele"], capsys)
+    assert "no camera 'tele'; the images' names are mono, colour" in fails(
+        [mono, colour, "--alpha", "tele"], capsys
+    )
     for noise, said in {
         "mono=-5": "must be 1 or more, such as 200, got -5",
         "tele=100": "--noise: no camera 'tele'",
@@ -182,9 +200,19 @@ def test_what_does_not_go_with_a_rig_or_with_many_frames_is_refused(folder, tmp_
         images += ["--image", f"{name}={tmp_path / name}"]
     given = [folder / "out" / "found_rig.yaml", "--alpha", "mono", *images, "-o", tmp_path / "out"]
     rig = folder / "out" / "found_rig.yaml"
-    stray = [rig, "--alpha", "mono", tmp_path / "mono" / "0.png", folder / "colour.png", "-o", tmp_path / "out"]
+    stray = [
+        rig,
+        "--alpha",
+        "mono",
+        tmp_path / "mono" / "0.png",
+        folder / "colour.png",
+        "-o",
+        tmp_path / "out",
+    ]
     assert "0.png: no camera of the rig has its name: give --image NAME=" in fails(stray, capsys)
-    assert "--points, --classical: for a single frame only" in fails([*given, "--points", "--classical"], capsys)
+    assert "--points, --classical: for a single frame only" in fails(
+        [*given, "--points", "--classical"], capsys
+    )
     assert not (tmp_path / "out").exists()
 
 
@@ -249,7 +277,16 @@ def test_a_wrong_rig_is_refused_before_the_work_with_the_doctors_verdict(
     images = [f"--image={name}={folder / name}.png" for name in rig.names]
     with pytest.raises(SystemExit) as stop:
         main(
-            ["fuse", str(tmp_path / "wrong.yaml"), "--alpha", "mono", *images, "--strict", "-o", str(tmp_path / "out")]
+            [
+                "fuse",
+                str(tmp_path / "wrong.yaml"),
+                "--alpha",
+                "mono",
+                *images,
+                "--strict",
+                "-o",
+                str(tmp_path / "out"),
+            ]
         )
     assert stop.value.code == 3
     text = " ".join(capsys.readouterr().err.split())
@@ -300,7 +337,10 @@ def test_a_focal_length_that_points_determine_is_used_and_said(halved, monkeypat
     _, images, _ = halved
     images = {name: image[..., :360, :480] for name, image in images.items()}
     monkeypatch.setattr("pat.fusion.from_images.MATCHED", 300)
-    same = {name: image[..., : images["mono"].shape[-2], : images["mono"].shape[-1]] for name, image in images.items()}
+    same = {
+        name: image[..., : images["mono"].shape[-2], : images["mono"].shape[-1]]
+        for name, image in images.items()
+    }
     fit = SimpleNamespace(length=250.0, deviation=0.07)
     monkeypatch.setattr("pat.fusion.from_images.common_focal_length", lambda *given: fit)
     lines = []

@@ -56,7 +56,9 @@ def test_cases_are_unrectified_rigs_that_see_the_same_scene(case):
 def test_every_family_is_there():
     names = list(families())
     assert names[0] == "calibrated"
-    assert {"rectified assumption", "homography + displacement", "nearest voxels", "local 5x5", "dense"} <= {*names}
+    assert {"rectified assumption", "homography + displacement", "nearest voxels", "local 5x5", "dense"} <= {
+        *names
+    }
     assert sum(name.startswith(("rotated by", "centre off")) for name in names) == 6
 
 
@@ -76,7 +78,9 @@ def test_perturbed_rigs_are_off_by_what_they_say(case):
 
 def test_unsupported_families_are_named_and_the_rest_is_ordered(case, tmp_path):
     chosen = {name: family for name, family in families().items() if name in CHOSEN}
-    rows = {row.family: row for row in ablate(load_weights("mono-colour"), [case], out=tmp_path, chosen=chosen)}
+    rows = {
+        row.family: row for row in ablate(load_weights("mono-colour"), [case], out=tmp_path, chosen=chosen)
+    }
     assert rows["local 5x5"].note == rows["dense"].note == ""
     calibrated = rows["calibrated"].psnr
     assert calibrated > rows["rectified assumption"].psnr + 1

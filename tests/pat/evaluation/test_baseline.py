@@ -14,7 +14,9 @@ from pat.media.colour import luminance, to_luma_chroma
 def patches(height=96, width=160, *, seed=0):
     """A smooth colour image with texture that can be matched, away from black and white."""
     rng = np.random.default_rng(seed)
-    coarse = cv2.resize(rng.random((8, 12, 3)).astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
+    coarse = cv2.resize(
+        rng.random((8, 12, 3)).astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC
+    )
     grain = cv2.GaussianBlur(rng.random((height, width)).astype(np.float32), (0, 0), 1.5) - 0.5
     image = 0.25 + 0.5 * coarse.clip(0, 1) + 0.5 * grain[..., None]
     return torch.from_numpy(image.clip(0, 1)).permute(2, 0, 1).contiguous()

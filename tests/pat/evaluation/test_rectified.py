@@ -1,4 +1,6 @@
-"""Images warped to rows and back: the canvas holds alpha, depth comes back exactly, what cannot be is said."""
+"""Images warped to rows and back: the canvas holds alpha, depth comes back exactly, what cannot be is
+said.
+"""
 
 import pytest
 import torch

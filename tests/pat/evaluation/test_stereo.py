@@ -91,7 +91,9 @@ def test_tables_hold_every_row(tmp_path):
     write_csv(tmp_path / "t.csv", StereoRow._fields, ROWS)
     with (tmp_path / "t.csv").open() as file:
         again = [
-            StereoRow(r["pair"], int(r["rate"]), r["method"], float(r["psnr"]), float(r["ssim"]), *depth_errors(r))
+            StereoRow(
+                r["pair"], int(r["rate"]), r["method"], float(r["psnr"]), float(r["ssim"]), *depth_errors(r)
+            )
             for r in csv.DictReader(file)
         ]
     assert again == ROWS
@@ -110,7 +112,9 @@ def test_tables_hold_every_row(tmp_path):
 
 
 class Matcher:
-    """A network that finds every pixel `disparity` to the left, and gives the mean of beta's bands as confidence."""
+    """A network that finds every pixel `disparity` to the left, and gives the mean of beta's bands as
+    confidence.
+    """
 
     halo, beta_halo, multiple, equal_resolution, joins_bands = 0, 2, 1, True, "no"
     bands, uses_matches, keeps_luminance = None, False, False
@@ -130,11 +134,15 @@ class Matcher:
             - torch.tensor([self.disparity, 0.0])[:, None, None]
         )
         sure = torch.ones_like(alpha[:, 0])
-        return FusionOutput(alpha.expand(-1, 3, -1, -1), [grid] * len(betas), [sure] * len(betas), [sure] * len(betas))
+        return FusionOutput(
+            alpha.expand(-1, 3, -1, -1), [grid] * len(betas), [sure] * len(betas), [sure] * len(betas)
+        )
 
 
 def test_depth_is_compared_where_it_is_known():
-    """A constant disparity of 5 against a truth of 5 on the left half, 8 on the right, unknown in the first row."""
+    """A constant disparity of 5 against a truth of 5 on the left half, 8 on the right, unknown in the first
+    row.
+    """
     (pair,) = pairs(1)
     value = torch.full((16, 24), 5.0)
     value[:, 12:] = 8

@@ -78,7 +78,9 @@ def test_depths_are_those_of_the_samples(scene, sample):
     near, far = (float(d) for d in sample.rig.depth)
     assert float(report.depth[0]) == pytest.approx(near, rel=1e-6)
     assert float(report.depth[-1]) == pytest.approx(far, rel=1e-6)
-    again = depth_of(sample.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]]).double(), report.xy[5:6])
+    again = depth_of(
+        sample.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]]).double(), report.xy[5:6]
+    )
     assert float(report.depth[5]) == pytest.approx(float(again.depth))
 
 
@@ -116,7 +118,9 @@ def test_lenses_are_followed(scene, sample):
     has_lens = ExplorerScene(sample.rig.with_camera("colour", camera), sample.images)
     report = inspect_pixel(has_lens, state()).betas["colour"]
     assert report.ends is None
-    found = Curved(256)(has_lens.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]], dtype=torch.float64))
+    found = Curved(256)(
+        has_lens.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]], dtype=torch.float64)
+    )
     torch.testing.assert_close(report.xy, found.xy[0])
 
 
@@ -129,7 +133,9 @@ def test_cameras_known_by_F_or_by_size_alone(sample):
         assert not report.problems
         assert report.betas["colour"].depth.isnan().all()
         assert math.isnan(report.depth)
-    problem = inspect_pixel(ExplorerScene(Rig(views), sample.images), state(family="epipolar")).problems["colour"]
+    problem = inspect_pixel(ExplorerScene(Rig(views), sample.images), state(family="epipolar")).problems[
+        "colour"
+    ]
     assert "calibrat" in problem
 
 
@@ -176,7 +182,9 @@ def test_a_moved_rig_puts_the_match_off_the_line_by_as_much_as_it_says():
     assert here is not None
     assert here.distance < 0.3
     for angle in (0.003, -0.006):
-        moved = sample.rig.perturbed({"colour.rotation": torch.tensor([angle, 0.0, 0.0], dtype=torch.float64)})
+        moved = sample.rig.perturbed(
+            {"colour.rotation": torch.tensor([angle, 0.0, 0.0], dtype=torch.float64)}
+        )
         report = inspect_pixel(scene.with_rig(moved), state)
         off = report.betas["colour"].offset
         assert off is not None
@@ -185,4 +193,6 @@ def test_a_moved_rig_puts_the_match_off_the_line_by_as_much_as_it_says():
         true = float(epipolar_distance(F, x, here.position[None]).abs())
         assert true > 1
         assert abs(off.distance - true) < 0.3
-    assert inspect_pixel(scene, state.replace(x=(560.0, 60.0))).betas["colour"].offset is None  # without texture
+    assert (
+        inspect_pixel(scene, state.replace(x=(560.0, 60.0))).betas["colour"].offset is None
+    )  # without texture

@@ -23,7 +23,9 @@ EXPLORE = ["explore", str(SAMPLE / "rig.yaml"), *IMAGES, "--no-browser"]
 def server():
     command = [sys.executable, "-m", "pat", *EXPLORE]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    heard = partial(signal.signal, signal.SIGINT, signal.default_int_handler)  # also if the tests run in the background
+    heard = partial(
+        signal.signal, signal.SIGINT, signal.default_int_handler
+    )  # also if the tests run in the background
     process = subprocess.Popen(command, cwd=ROOT, preexec_fn=heard, **pipes)
     yield process, re.search(r"http://localhost:(\d+)", process.stdout.readline())[1]
     process.kill()
@@ -43,7 +45,12 @@ def test_foreign_hosts_are_refused_whatever_their_origin_and_ctrl_c_is_quiet(ser
     process, port = server
     for host in (f"localhost:{port}", f"127.0.0.1:{port}"):
         assert status(port, "/", Host=host) == 200
-    for host in (f"evil.example:{port}", "evil.example", f"localhost.evil.example:{port}", f"xlocalhost:{port}"):
+    for host in (
+        f"evil.example:{port}",
+        "evil.example",
+        f"localhost.evil.example:{port}",
+        f"xlocalhost:{port}",
+    ):
         for path in ("/", "/answer", "/elsewhere"):
             assert status(port, path, Host=host) == 403
         assert status(port, "/answer", b"{}", Host=host, Origin=f"http://{host}") == 403
@@ -71,4 +78,7 @@ def test_a_port_in_use_is_one_line(server, capsys):
     with pytest.raises(SystemExit) as stop:
         main([*EXPLORE, "--port", port])
     assert stop.value.code == 2
-    assert capsys.readouterr().err == f"pat: --port {port}: Address already in use: give another, or 0 for a free one\n"
+    assert (
+        capsys.readouterr().err
+        == f"pat: --port {port}: Address already in use: give another, or 0 for a free one\n"
+    )

@@ -32,7 +32,9 @@ def small_rig(baseline=0.1, names=("a", "b")):
     K = torch.tensor([[90.0, 0, 59.5], [0, 90.0, 39.5], [0, 0, 1]], dtype=torch.float64)
     eye = torch.eye(3, dtype=torch.float64)
     centres = [torch.tensor([i * baseline, 0, 0], dtype=torch.float64) for i in range(len(names))]
-    cameras = {n: Camera(K=K, cam_from_world=Pose.from_centre(eye, c), hw=(80, 120)) for n, c in zip(names, centres)}
+    cameras = {
+        n: Camera(K=K, cam_from_world=Pose.from_centre(eye, c), hw=(80, 120)) for n, c in zip(names, centres)
+    }
     return Rig(cameras, depth=(1.0, 8.0))
 
 
@@ -90,7 +92,9 @@ def test_fields_of_ones_own_and_networks_are_chosen():
 
 
 def test_a_networks_weights_are_its_attention():
-    """Against what the network itself computes for all pixels of the sample, small, beta at alpha's resolution."""
+    """Against what the network itself computes for all pixels of the sample, small, beta at alpha's
+    resolution.
+    """
     sample, network = load_sample(), load_weights("pat-supervised")
     rig, images = sample.rig, {}
     for name, image in sample.images.items():
@@ -137,7 +141,9 @@ def driver():
 
 
 def captions(driver):
-    return driver.execute_script("return [...document.querySelectorAll('figcaption')].map(c => c.textContent)")
+    return driver.execute_script(
+        "return [...document.querySelectorAll('figcaption')].map(c => c.textContent)"
+    )
 
 
 def until(driver, true, seconds=60):
@@ -210,12 +216,15 @@ def test_what_is_wrong_is_drawn_in_the_saved_page(driver, tmp_path):
     until(driver, lambda told: "one camera" in told[0])
     yellow = """const canvas = document.querySelector('canvas');
         const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
-        return data.filter((red, i) => i % 4 == 0 && red > 200 && data[i + 1] > 150 && data[i + 2] < 120).length"""
+        const yellow = (red, i) => i % 4 == 0 && red > 200 && data[i + 1] > 150 && data[i + 2] < 120;
+        return data.filter(yellow).length"""
     assert driver.execute_script(yellow) > 50
 
 
 def test_the_served_page_in_a_browser(driver, tmp_path):
-    """`pat explore`: points, slides, chooses, clicks a beta, drags a camera, keys; and how long an answer takes."""
+    """`pat explore`: points, slides, chooses, clicks a beta, drags a camera, keys; and how long an answer
+    takes.
+    """
     small_rig(baseline=0.2).save(tmp_path / "rig.yaml")
     command = [sys.executable, "-m", "pat", "explore", str(tmp_path / "rig.yaml"), "--no-browser"]
     server = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
@@ -239,13 +248,15 @@ def test_the_served_page_in_a_browser(driver, tmp_path):
         until(driver, lambda told: told[0] != before[0])
         before = captions(driver)
         top = driver.find_element("css selector", "canvas.top")
-        webdriver.ActionChains(driver).move_to_element_with_offset(top, 75, 45).click_and_hold().move_by_offset(
-            0, -20
-        ).release().perform()
+        webdriver.ActionChains(driver).move_to_element_with_offset(
+            top, 75, 45
+        ).click_and_hold().move_by_offset(0, -20).release().perform()
         until(driver, lambda told: told[1] != before[1])
         driver.set_script_timeout(60)
         milliseconds = driver.execute_async_script(TIMES)
-        assert sorted(milliseconds)[len(milliseconds) // 2] < 1000  # far more than it takes: machines are shared
+        assert (
+            sorted(milliseconds)[len(milliseconds) // 2] < 1000
+        )  # far more than it takes: machines are shared
         assert all("localhost" in name for name in resources(driver))
     finally:
         server.kill()

@@ -58,7 +58,9 @@ def times(out: Path) -> dict[str, int]:
 def children(pid: int) -> list[int]:
     """The processes that render for a command."""
     try:
-        found = [int(c) for t in Path(f"/proc/{pid}/task").iterdir() for c in (t / "children").read_text().split()]
+        found = [
+            int(c) for t in Path(f"/proc/{pid}/task").iterdir() for c in (t / "children").read_text().split()
+        ]
         return [c for c in found if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
     except OSError:
         return []
@@ -72,7 +74,9 @@ def wait_until(condition) -> None:
 
 
 def test_a_job_is_rendered_killed_and_resumed(config, tmp_path, capfd):
-    """The first run loses a worker and then is killed itself, and its worker with it; the second makes the rest."""
+    """The first run loses a worker and then is killed itself, and its worker with it; the second makes the
+    rest.
+    """
     out = tmp_path / "data"
     command = [sys.executable, "-m", "pat", "render", str(config), "--out", str(out), "--scenes", "40"]
     parent = subprocess.Popen(command, stderr=subprocess.DEVNULL)
@@ -112,7 +116,10 @@ def test_shards_and_dask_make_the_same(config, tmp_path, backend):
     from distributed import LocalCluster
 
     write(config, backend=backend, blender={"settings": {"width": 96, "samples": 2}})
-    chosen, whole, parts, dask = RenderConfig.load(config), *(tmp_path / name for name in ("whole", "parts", "dask"))
+    chosen, whole, parts, dask = (
+        RenderConfig.load(config),
+        *(tmp_path / name for name in ("whole", "parts", "dask")),
+    )
     assert len(render(chosen, scenes=4, out=whole, workers=2).made) == 4
     assert [len(render(chosen, scenes=4, out=parts, shard=Shard(i, 2)).made) for i in (1, 2)] == [2, 2]
     with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
@@ -152,8 +159,14 @@ def fails(arguments, capfd) -> str:
         ({"limits": {"timeout": -1}}, "limits: timeout must be above 0"),
         ({"rig": "rg.yaml"}, "rg.yaml: no such file or folder"),
         ({"layered": {"photos": ["images"]}}, "images: no such file or folder"),
-        ({"blender": {"generator": "photographs"}}, "blender: the generator 'photographs' needs a folder `photos`"),
-        ({"blender": {"generator": "still-life"}}, "blender: no generator is called 'still-life': use abstract,"),
+        (
+            {"blender": {"generator": "photographs"}},
+            "blender: the generator 'photographs' needs a folder `photos`",
+        ),
+        (
+            {"blender": {"generator": "still-life"}},
+            "blender: no generator is called 'still-life': use abstract,",
+        ),
         (
             {"backend": "blender", "blender": {"generator": "experiments.scenes:no"}},
             "the generator 'experiments.scenes:no' cannot be imported",
@@ -170,7 +183,9 @@ def test_typos_are_one_line(config, tmp_path, capfd, changes, words):
 
 def test_other_mistakes_are_one_line(config, tmp_path, capfd):
     out = tmp_path / "data"
-    assert "no.yaml: no such file" in fails(["render", tmp_path / "no.yaml", "--scenes", 2, "--out", out], capfd)
+    assert "no.yaml: no such file" in fails(
+        ["render", tmp_path / "no.yaml", "--scenes", 2, "--out", out], capfd
+    )
     assert "is not i/n" in fails(["render", config, "--scenes", 2, "--out", out, "--shard", "3/2"], capfd)
     assert "at least one scene" in fails(["render", config, "--scenes", 0, "--out", out], capfd)
     (tmp_path / "rig.yaml").write_text("cameras: {mono: {size: [8, 8]}}")

@@ -1,4 +1,6 @@
-"""align: recorded values at alpha's pixels, of any type, through lenses and rotations; files; what is refused."""
+"""align: recorded values at alpha's pixels, of any type, through lenses and rotations; files; what is
+refused.
+"""
 
 import numpy as np
 import pytest
@@ -54,7 +56,9 @@ def test_positions_are_of_the_recorded_image(lens, turns):
     found = align(rig, images, alpha="mono", correct=False)
     view = found["nir"]
     y, x = np.mgrid[: HW[0], : HW[1]]
-    X = rig["mono"].unproject(torch.from_numpy(np.stack([x, y], -1).astype(float)), torch.full(HW, DEPTH).double())
+    X = rig["mono"].unproject(
+        torch.from_numpy(np.stack([x, y], -1).astype(float)), torch.full(HW, DEPTH).double()
+    )
     expected = rig["nir"].project(X).x.numpy()
     inner = (slice(12, -12), slice(30, -12))
     off = np.linalg.norm(view.positions - expected, axis=-1)[inner]
@@ -72,10 +76,16 @@ def test_values_are_samples_of_what_was_recorded(interpolation, kind):
     counts = np.rint(20000 + 20000 * images["nir"].numpy()).astype(np.uint16)
     for recorded in (counts, counts.astype(np.float32)):
         own = {"mono": images["mono"], "nir": recorded}
-        view = align(rig, images, alpha="mono", recorded=own, interpolation=interpolation, correct=False)["nir"]
+        view = align(rig, images, alpha="mono", recorded=own, interpolation=interpolation, correct=False)[
+            "nir"
+        ]
         assert view.values.dtype == recorded.dtype
         where = torch.from_numpy(np.nan_to_num(view.positions)).double()[None]
-        taken = sample(torch.from_numpy(recorded.astype(np.float64))[None], where, interpolation=kind).values[0].numpy()
+        taken = (
+            sample(torch.from_numpy(recorded.astype(np.float64))[None], where, interpolation=kind)
+            .values[0]
+            .numpy()
+        )
         error = np.abs(view.values.astype(float) - taken)[:, view.valid]
         assert error.max() <= (0.5 if recorded.dtype == np.uint16 else 1e-6 * 40000)
         if interpolation == "nearest":
@@ -178,7 +188,9 @@ def test_ndvi_is_of_light_where_the_sensors_are_stated():
     facts = {"mono": (Band(660.0, 40.0), 100.0, 0.01, 2.0), "nir": (Band(840.0, 40.0), 300.0, 0.04, 1.0)}
     cameras, counts = {}, {}
     for name, (band, black, exposure, gain) in facts.items():
-        sensor = Sensor(response=band, coding="linear", bits=16, black_level=black, exposure=exposure, gain=gain)
+        sensor = Sensor(
+            response=band, coding="linear", bits=16, black_level=black, exposure=exposure, gain=gain
+        )
         cameras[name] = rig[name].replace(sensor=sensor)
         counts[name] = np.rint(black + images[name].numpy() * 1e6 * exposure * gain).astype(np.uint16)
     stated = rig.replace(cameras=cameras)

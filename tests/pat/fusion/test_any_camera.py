@@ -28,14 +28,20 @@ MODELS = {
     "rolling shutter": (RollingShutter(**MOTION), 180.0),
     "port": (FlatPort(**{n: number(v) for n, v in PORT.items()}), 180.0),
 }
-SLOW = [pytest.param(n, marks=pytest.mark.slow) for n in ("fisheye", "equirectangular", "rolling shutter", "port")]
+SLOW = [
+    pytest.param(n, marks=pytest.mark.slow) for n in ("fisheye", "equirectangular", "rolling shutter", "port")
+]
 
 
 @pytest.mark.parametrize("name", ["orthographic", *SLOW])
 def test_a_camera_of_any_model_is_fused(name):
     model, focal = MODELS[name]
     R = rotation_from_vector(number(0.0, 0.12 if name == "orthographic" else -0.01, 0.0))
-    t = number(0.0, 0.0, 2.5) - R @ number(0.0, 0.0, 2.5) if name == "orthographic" else number(-0.25, 0.01, 0.0)
+    t = (
+        number(0.0, 0.0, 2.5) - R @ number(0.0, 0.0, 2.5)
+        if name == "orthographic"
+        else number(-0.25, 0.01, 0.0)
+    )
     poses = Pose.identity(), Pose(R, t)
     cameras = [Camera(K=intrinsics(focal, HW), cam_from_world=p, hw=HW, distortion=model) for p in poses]
     wide = name in ("fisheye", "equirectangular")
@@ -44,7 +50,9 @@ def test_a_camera_of_any_model_is_fused(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         frame = fuse(load_weights("mono-colour"), rig, images, alpha="alpha")
-    alone, fused = (score(i.clamp(0, 1), truth).psnr for i in (images["alpha"].expand(3, -1, -1), frame.image))
+    alone, fused = (
+        score(i.clamp(0, 1), truth).psnr for i in (images["alpha"].expand(3, -1, -1), frame.image)
+    )
     assert fused > alone + 4
     X, distance = hit(cameras[0], pixel_grid(HW, dtype=torch.float64))
     wanted = distance if wide else X[..., 2]

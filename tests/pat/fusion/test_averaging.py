@@ -18,7 +18,9 @@ def two_colours(deviation=0.02):
     red = torch.where(torch.arange(64) < 32, 0.1, -0.1)
     chroma = torch.stack([red, -red])[:, None].expand(2, 48, 64)
     luma = 0.5 + 0.02 * torch.rand(1, 48, 64, generator=generator_for(0))
-    return (from_luma_chroma(luma, chroma + noise_of(chroma.shape, s, d)) for s, d in ((1, 0.0), (1, deviation)))
+    return (
+        from_luma_chroma(luma, chroma + noise_of(chroma.shape, s, d)) for s, d in ((1, 0.0), (1, deviation))
+    )
 
 
 def directly(guide, values, scale, reach, step):
@@ -34,7 +36,9 @@ def directly(guide, values, scale, reach, step):
     for dy in range(-reach, reach + 1, step):
         for dx in range(-reach, reach + 1, step):
             around = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1)]
-            squares = [(at(g, y + dy, x + dx) - at(g, y, x)).square().mean(0, keepdim=True) for y, x in around]
+            squares = [
+                (at(g, y + dy, x + dx) - at(g, y, x)).square().mean(0, keepdim=True) for y, x in around
+            ]
             weight = (-sum(squares) / 9 / scale**2).exp()
             sums, weights = sums + weight * at(v, dy, dx), weights + weight
     return sums / weights
@@ -44,7 +48,9 @@ def directly(guide, values, scale, reach, step):
 def test_means_are_as_defined(hw, reach, step):
     guide, values = (0.5 + noise_of((3, *hw), s, 0.05) for s in (0, 1))
     sums, weights = sums_of_alike(guide, values, 0.1, reach, step)
-    torch.testing.assert_close((sums / weights).double(), directly(guide, values, 0.1, reach, step), atol=2e-3, rtol=0)
+    torch.testing.assert_close(
+        (sums / weights).double(), directly(guide, values, 0.1, reach, step), atol=2e-3, rtol=0
+    )
 
 
 def test_images_smaller_than_what_is_around_them_are_mirrored():

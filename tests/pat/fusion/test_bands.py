@@ -71,7 +71,9 @@ def test_bands_keep_their_own_values_where_levels_are_matched():
 
 
 def test_bands_are_files_by_name_with_their_confidences(tmp_path):
-    frame = Frame(torch.rand(3, 6, 8), torch.full((6, 8), torch.nan), *torch.rand(2, 6, 8), torch.rand(3, 6, 8).half())
+    frame = Frame(
+        torch.rand(3, 6, 8), torch.full((6, 8), torch.nan), *torch.rand(2, 6, 8), torch.rand(3, 6, 8).half()
+    )
     written = save_frame(frame, tmp_path, bands=["red", "nir", "edge"])
     assert {path.name for path in written} == {"fused.png", "confidence.png"} | {
         f"{kind}_{name}.png" for kind in ("fused", "confidence") for name in ("red", "nir", "edge")
@@ -102,7 +104,9 @@ def test_one_band_that_matches_badly_is_no_wrong_rig():
 
 
 def test_plain_noise_names_the_option_that_it_needs():
-    image = torch.nn.functional.interpolate(torch.rand(1, 1, 16, 16), size=(200, 200), mode="bicubic").clamp(0, 1)
+    image = torch.nn.functional.interpolate(torch.rand(1, 1, 16, 16), size=(200, 200), mode="bicubic").clamp(
+        0, 1
+    )
     noisy = NoiseLevel.of_electrons(60, 2).recorded(image, torch.Generator().manual_seed(0))
     assert noise_advice(Inputs(image, ())) == ""
     assert "try `--noise estimate`" in noise_advice(Inputs(noisy, ()))
@@ -116,9 +120,22 @@ def test_sixteen_bits_are_written_for_sixteen(tmp_path):
         deep = name == "a"
         values = (image[0].numpy() * (65535 if deep else 255)).round().astype(np.uint16 if deep else np.uint8)
         cv2.imwrite(str(tmp_path / f"{name}.png"), values)
-    given = [str(tmp_path / "rig.yaml"), *(str(tmp_path / f"{name}.png") for name in images), "--alpha", "mono"]
+    given = [
+        str(tmp_path / "rig.yaml"),
+        *(str(tmp_path / f"{name}.png") for name in images),
+        "--alpha",
+        "mono",
+    ]
     for extra, kind in (([], np.uint16), (["--bits", "8"], np.uint8)):
-        rest = ["--weights", "mono-spectral", "--no-report", "--no-align", "-o", str(tmp_path / "out"), *extra]
+        rest = [
+            "--weights",
+            "mono-spectral",
+            "--no-report",
+            "--no-align",
+            "-o",
+            str(tmp_path / "out"),
+            *extra,
+        ]
         main(["fuse", *given, *rest])
         for name in ("fused", "fused_a", "fused_b"):
             assert cv2.imread(str(tmp_path / "out" / f"{name}.png"), cv2.IMREAD_UNCHANGED).dtype == kind

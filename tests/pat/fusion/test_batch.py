@@ -1,4 +1,6 @@
-"""Many frames and sequences on disk: resumed to the same bits, whole files only, one bad image costs one frame."""
+"""Many frames and sequences on disk: resumed to the same bits, whole files only, one bad image costs one
+frame.
+"""
 
 import errno
 import json
@@ -49,7 +51,9 @@ def batch(material, out, **options) -> Batch:
     files = {name: find_images(material / name) for name in ("fast", "slow")}
     if not options.get("sequence"):
         files["slow"] = [files["slow"][0]] * len(files["fast"])
-    of_frames = {entry.name: options.pop(entry.name) for entry in fields(FuseSettings) if entry.name in options}
+    of_frames = {
+        entry.name: options.pop(entry.name) for entry in fields(FuseSettings) if entry.name in options
+    }
     options = {"weights": str(material / "tiny.safetensors"), "files": files, **options}
     options["settings"] = FuseSettings(**of_frames)
     return Batch(rig=Rig.load(material / "rig.yaml"), alpha="fast", out=out, **options)
@@ -61,7 +65,9 @@ def contents(out: Path) -> dict[str, bytes]:
 
 def test_images_are_found_in_the_order_of_their_numbers(material, tmp_path):
     assert [p.name for p in find_images(material / "fast")] == [f"fast_{i}.png" for i in range(8, 15)]
-    assert [p.name for p in find_images(f"{material}/fast/*_1?.png")] == [f"fast_{i}.png" for i in range(10, 15)]
+    assert [p.name for p in find_images(f"{material}/fast/*_1?.png")] == [
+        f"fast_{i}.png" for i in range(10, 15)
+    ]
     with pytest.raises(FileNotFoundError, match="mono: "):
         find_images(tmp_path, name="mono")
 
@@ -91,7 +97,9 @@ def test_a_stopped_sequence_is_resumed_to_the_same_bits(material, tmp_path, monk
 
 
 def test_other_settings_are_not_mixed_in(material, tmp_path):
-    batch(material, tmp_path / "out", files={n: find_images(material / n)[:1] for n in ("fast", "slow")}).run()
+    batch(
+        material, tmp_path / "out", files={n: find_images(material / n)[:1] for n in ("fast", "slow")}
+    ).run()
     with pytest.raises(ValueError, match=r"settings.yaml: "):
         batch(material, tmp_path / "out", match_levels=True).run(resume=True)
 
@@ -147,7 +155,16 @@ def test_a_full_disk_leaves_whole_files_only(material, tmp_path, monkeypatch):
 
 def test_the_command_line_fuses_a_sequence(material, tmp_path, capsys):
     images = [a for name in ("fast", "slow") for a in ("--image", f"{name}={material / name}")]
-    given = ["fuse", "--rig", str(material / "rig.yaml"), "--alpha", "fast", *images, "--out", str(tmp_path / "out")]
+    given = [
+        "fuse",
+        "--rig",
+        str(material / "rig.yaml"),
+        "--alpha",
+        "fast",
+        *images,
+        "--out",
+        str(tmp_path / "out"),
+    ]
     given += ["--weights", str(material / "tiny.safetensors"), "--sequence", "--bits", "16"]
     main(given)
     assert read_image(tmp_path / "out" / "fast_14_fused.png").shape == (3, *moving.HW)
@@ -209,7 +226,9 @@ def test_one_command_at_a_time_writes_to_a_folder(material, tmp_path, monkeypatc
 
 def test_a_colour_file_of_a_raw_camera_is_refused_in_sequences_too(material, tmp_path):
     job = batch(material, tmp_path, sequence=True)
-    raw = job.rig.with_camera("slow", job.rig["slow"].replace(sensor=replace(job.rig["slow"].sensor, bayer="RGGB")))
+    raw = job.rig.with_camera(
+        "slow", job.rig["slow"].replace(sensor=replace(job.rig["slow"].sensor, bayer="RGGB"))
+    )
     with pytest.raises(JobError, match=r"slow: .*slow_8.png: .*RGGB"):
         replace(job, rig=raw).run()
 

@@ -52,7 +52,9 @@ def psnr(network, sample, images, **options):
 
 
 def with_beta_rotated(rig, degrees):
-    """The rig with beta's stated rotation off about its x axis: every point is off by about as many pixels."""
+    """The rig with beta's stated rotation off about its x axis: every point is off by about as many
+    pixels.
+    """
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     wrong = torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]], dtype=rig[BETA].R.dtype)
     pose = rig[BETA].cam_from_world
@@ -138,7 +140,9 @@ def test_a_misalignment_is_recovered():
     """Along rows, beta one pixel lower on the left and two on the right."""
     g = torch.Generator().manual_seed(0)
     h, w = 120, 160
-    texture = torch.nn.functional.interpolate(torch.rand(1, 1, 40, 50, generator=g), size=(h, w), mode="bicubic")[0, 0]
+    texture = torch.nn.functional.interpolate(
+        torch.rand(1, 1, 40, 50, generator=g), size=(h, w), mode="bicubic"
+    )[0, 0]
     y, x = torch.meshgrid(torch.arange(h).float(), torch.arange(w).float(), indexing="ij")
     true = Misalignment(1.5 / w, 1.0 / w, 0.0)
     position = torch.stack([x, y], -1)

@@ -1,4 +1,6 @@
-"""Each file is read and developed once, each field evaluated once for every pixel: whole frames, tiles, sequences."""
+"""Each file is read and developed once, each field evaluated once for every pixel: whole frames, tiles,
+sequences.
+"""
 
 from collections import Counter
 
@@ -26,11 +28,15 @@ SMALL = {"widths": (8, 8, 8, 8)}
 
 def rig_of(names, *, lens=False, places=None, **sensor):
     """Alpha first, the others 10 cm times their place to the right of it."""
-    distortion = Distortion("brown-conrady", torch.tensor([-0.05, 0, 0, 0], dtype=torch.float64)) if lens else None
+    distortion = (
+        Distortion("brown-conrady", torch.tensor([-0.05, 0, 0, 0], dtype=torch.float64)) if lens else None
+    )
     alpha = Camera(K=intrinsics(100.0, HW), cam_from_world=Pose.identity(), hw=HW, distortion=distortion)
     steps = places or range(len(names))
     moved = {n: Pose(alpha.R, alpha.t.new_tensor([-0.1 * i, 0, 0])) for n, i in zip(names, steps)}
-    return Rig({n: alpha.replace(cam_from_world=p, sensor=Sensor(**sensor)) for n, p in moved.items()}, depth=(1, 8))
+    return Rig(
+        {n: alpha.replace(cam_from_world=p, sensor=Sensor(**sensor)) for n, p in moved.items()}, depth=(1, 8)
+    )
 
 
 def smooth(channels, seed):
@@ -58,7 +64,8 @@ def reads(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("bands", "lens", "places"), [((1, 3), False, None), ((1, 3), True, None), ((1, 1, 1, 1), True, [0, 1, 1, 2])]
+    ("bands", "lens", "places"),
+    [((1, 3), False, None), ((1, 3), True, None), ((1, 1, 1, 1), True, [0, 1, 1, 2])],
 )
 def test_each_file_is_read_and_developed_once(bands, lens, places, reads, tmp_path):
     torch.manual_seed(0)
@@ -66,7 +73,9 @@ def test_each_file_is_read_and_developed_once(bands, lens, places, reads, tmp_pa
     rig, files = rig_of(names, lens=lens, places=places), {n: tmp_path / f"{n}.png" for n in names}
     for i, (name, channels) in enumerate(zip(names, bands)):
         write_image(files[name], smooth(channels, i))
-    network = BandwisePAT(BandwisePATConfig(**SMALL)) if len(bands) > 2 else GuidedPAT(GuidedPATConfig(**SMALL))
+    network = (
+        BandwisePAT(BandwisePATConfig(**SMALL)) if len(bands) > 2 else GuidedPAT(GuidedPATConfig(**SMALL))
+    )
     images = ViewFiles(rig, files, alpha="a")
     frame = fuse(network.eval(), images.developed, images, alpha="a", match_levels=True)
     assert frame.image.shape == (3, *HW)
@@ -131,7 +140,10 @@ def test_views_name_what_is_wrong():
         (images | {"b": images["b"][:, :-1]}, "the image of 'b' is 96x63, the rig says 96x64"),
         (images | {"b": images["b"] * torch.nan}, "NaN or infinite"),
         (images | {"b": images["b"] * 255}, r"the image of 'b' has values up to 2\d\d.*: divide them"),
-        (images | {"b": (images["b"] * 255).to(torch.uint8)}, r"'b' is uint8 of shape \(3, 64, 96\): wanted float32"),
+        (
+            images | {"b": (images["b"] * 255).to(torch.uint8)},
+            r"'b' is uint8 of shape \(3, 64, 96\): wanted float32",
+        ),
         (images | {"a": images["a"].half()}, "'a' is float16 of shape"),
         (images | {"a": images["a"][0]}, r"'a' is float32 of shape \(64, 96\): wanted float32 \(C, H, W\)"),
     ):

@@ -64,7 +64,9 @@ def test_depth_of_low_confidence_is_that_of_the_background_beside_it(step):
     wanted[0, 2] = torch.nan
     if step[1]:
         depth, confidence, wanted = depth.mT, confidence.mT, wanted.mT
-    torch.testing.assert_close(background_filled(depth, confidence, fields_along(step)), wanted, equal_nan=True)
+    torch.testing.assert_close(
+        background_filled(depth, confidence, fields_along(step)), wanted, equal_nan=True
+    )
 
 
 @pytest.mark.parametrize("other", [[-4.0, 0.0], [0.0, 4.0]])

@@ -57,13 +57,15 @@ def test_a_rotation_is_recovered_from_images_alone(cropped):
 
 
 def test_depths_follow_a_rotation_along_the_segments(cropped):
-    """Colour turned about its y axis: matches stay where they are in its image, depths change. A constant position
-    along the segment would move the match instead."""
+    """Colour turned about its y axis: matches stay where they are in its image, depths change. A constant
+    position along the segment would move the match instead."""
     rig, images, _ = cropped
     network = load_weights("mono-colour")
 
     def fused(angle: torch.Tensor, **options):
-        turned = rig.perturbed({"colour.rotation": angle * torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)})
+        turned = rig.perturbed(
+            {"colour.rotation": angle * torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)}
+        )
         return fuse(network, turned, images, alpha="mono", align=False, **options)
 
     step = math.radians(0.1)

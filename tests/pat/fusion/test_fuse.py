@@ -71,7 +71,9 @@ def network_of(kind: str):
 
 
 def texture(channels: int, hw: tuple[int, int]) -> torch.Tensor:
-    """Blobs of some pixels: in float32 positions at 1000 pixels are rounded to 6e-5, and noise would show that."""
+    """Blobs of some pixels: in float32 positions at 1000 pixels are rounded to 6e-5, and noise would show
+    that.
+    """
     g = torch.Generator().manual_seed(0)
     rough = torch.rand(1, channels, hw[0] // 5, hw[1] // 5, generator=g)
     return torch.nn.functional.interpolate(rough, hw, mode="bicubic", align_corners=False)[0].clamp(0, 1)
@@ -113,7 +115,10 @@ def test_matching_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
     assert sample.rig["mono"].hw[0] * sample.rig["mono"].hw[1] > 150_000
     pieces = fuse(network, sample.rig, images, alpha="mono")
     ground_truth = sample.ground_truth
-    assert score(pieces.image.clamp(0, 1), ground_truth).psnr > score(whole.image.clamp(0, 1), ground_truth).psnr - 0.1
+    assert (
+        score(pieces.image.clamp(0, 1), ground_truth).psnr
+        > score(whole.image.clamp(0, 1), ground_truth).psnr - 0.1
+    )
     off = (pieces.image - whole.image).abs().amax(0)
     assert (off > 0.005).float().mean() < 2.5e-3
     hw = sample.rig["mono"].hw
@@ -126,7 +131,9 @@ def test_matching_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
 @pytest.mark.slow
 @pytest.mark.parametrize("folder", ["kitti", "flickr1024/train"])
 def test_halos_are_wide_enough_for_the_weights(folder, shared_data):
-    """Tiles of real images equal the whole with the weights that are shipped, but for the rounding of positions."""
+    """Tiles of real images equal the whole with the weights that are shipped, but for the rounding of
+    positions.
+    """
     pair, network = next(folder_pairs(shared_data / folder)), load_weights("mono-colour")
     images = {"left": luminance(pair.left), "right": pair.right}
     rig = Rig({name: View(hw=image.shape[1:]) for name, image in images.items()})
@@ -246,7 +253,9 @@ def test_resolution_ratio_is_that_of_pixels_an_angle():
 
 
 def test_colour_comes_from_where_the_field_says():
-    """A red half and a blue half: each alpha pixel gets the colour of its own side, from a turned beta too."""
+    """A red half and a blue half: each alpha pixel gets the colour of its own side, from a turned beta
+    too.
+    """
     hw = (64, 96)
     rig = rig_of(hw, hw, focal=100.0, beta_focal=100.0)
     g = torch.Generator().manual_seed(0)
@@ -255,7 +264,9 @@ def test_colour_comes_from_where_the_field_says():
     network = network_of("GuidedPAT")
     torch.nn.init.zeros_(network.head.last.weight)
     torch.nn.init.zeros_(network.head.last.bias)
-    upright = fuse(network, rig, {"mono": ground_truth, "colour": ground_truth}, alpha="mono", depth=(5, 20)).image
+    upright = fuse(
+        network, rig, {"mono": ground_truth, "colour": ground_truth}, alpha="mono", depth=(5, 20)
+    ).image
     turned = fuse(
         network,
         rig.rot90("colour", 1),
@@ -365,7 +376,9 @@ LENSES = {"mono": [0.9, 0.0, 0.0, 0.0], "colour": [-0.6, 0.2, 0.005, 0.0]}
 
 @pytest.mark.parametrize("with_lens", [("colour",), ("mono", "colour")])
 def test_lenses_are_seen_through(with_lens):
-    """The sample array behind lenses: the same colours at alpha's own, bent pixels, and alpha's detail untouched."""
+    """The sample array behind lenses: the same colours at alpha's own, bent pixels, and alpha's detail
+    untouched.
+    """
     sample = load_sample()
     rig, images, network = (
         sample.rig.crop("mono", 80, 160, (240, 320)),
@@ -418,7 +431,9 @@ def test_a_rotated_beta_is_brought_upright():
     images = {"mono": texture(1, (60, 80)), "colour": texture(3, (60, 80))}
     network = network_of("GuidedPAT")
     upright = fuse(network, rig, images, alpha="mono")
-    turned = fuse(network, rig.rot90("colour", 3), images | {"colour": images["colour"].rot90(3, (1, 2))}, alpha="mono")
+    turned = fuse(
+        network, rig.rot90("colour", 3), images | {"colour": images["colour"].rot90(3, (1, 2))}, alpha="mono"
+    )
     assert (upright.image - turned.image).abs().max() < 1e-4
 
 
@@ -437,7 +452,8 @@ def test_real_lenses(shared_data):
         no_lens = no_lens.with_camera(name, rig[name].replace(distortion=None))
     ignored = fuse(network, no_lens, images, alpha="left", depth=depth)
     grey, seen, blind = (
-        score(p.clamp(0, 1), left).psnr for p in (luminance(left).expand(3, -1, -1), frame.image, ignored.image)
+        score(p.clamp(0, 1), left).psnr
+        for p in (luminance(left).expand(3, -1, -1), frame.image, ignored.image)
     )
     assert seen > grey + 4
     assert seen > blind + 0.8

@@ -86,7 +86,15 @@ def test_a_right_rig_is_left_as_it_is(material):
 def test_a_refusal_of_refine_has_a_status_of_its_own_and_says_what_to_do(material, capsys):
     folder, _ = material
     images = [f"--image={name}={folder / name}.png" for name in ("mono", "colour")]
-    given = ["rig", "refine", str(folder / "rough.yaml"), *images, "--no-photometric", "-o", str(folder / "x.yaml")]
+    given = [
+        "rig",
+        "refine",
+        str(folder / "rough.yaml"),
+        *images,
+        "--no-photometric",
+        "-o",
+        str(folder / "x.yaml"),
+    ]
     with pytest.raises(SystemExit) as stop:
         main(given)
     assert stop.value.code == 4

@@ -99,7 +99,9 @@ def test_alphas_values_are_kept(network, given):
 
 
 def test_tiles_are_denoised_as_the_whole(network, fused, monkeypatch):
-    """But for coefficients at the threshold and blocks equally alike: rounding chooses, and then a match may differ."""
+    """But for coefficients at the threshold and blocks equally alike: rounding chooses, and then a match may
+    differ.
+    """
     _, images, noise = in_low_light(200, load_sample)
     view, level = images[ALPHA][None, :, 120:280], noise[ALPHA]
     views = view, level.deviation(view)
@@ -124,24 +126,33 @@ def test_a_distorted_alpha_is_denoised_too(network):
     lens = Distortion("brown-conrady", torch.tensor([-0.05, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
     rig = sample.rig.with_camera(ALPHA, sample.rig[ALPHA].replace(distortion=lens))
     frame = fuse(network, rig, images, alpha=ALPHA, noise=noise)
-    recorded, found = (float((x - x.roll(1, -1)).square().mean()) for x in (images[ALPHA], luminance(frame.image)))
+    recorded, found = (
+        float((x - x.roll(1, -1)).square().mean()) for x in (images[ALPHA], luminance(frame.image))
+    )
     assert frame.image.shape == sample.ground_truth.shape
     assert found < 0.5 * recorded
 
 
 def test_noisy_bands_at_one_position_are_joined():
-    """As one beta of three bands; in the rig's order, and nearer to the ground truth than if fused as recorded."""
+    """As one beta of three bands; in the rig's order, and nearer to the ground truth than if fused as
+    recorded.
+    """
     sample, images, noise = in_low_light(200, load_sample)
     cameras = {ALPHA: sample.rig[ALPHA], **dict.fromkeys(("r", "g", "b"), sample.rig[BETA])}
     rig = Rig(cameras, depth=sample.rig.depth).crop(ALPHA, 100, 200, (160, 200))
     for name in "rgb":
         rig = rig.crop(name, 90, 140, (140, 200))
-    seen = {ALPHA: images[ALPHA][:, 100:260, 200:400], **dict(zip("rgb", images[BETA][:, 90:230, 140:340].split(1)))}
+    seen = {
+        ALPHA: images[ALPHA][:, 100:260, 200:400],
+        **dict(zip("rgb", images[BETA][:, 90:230, 140:340].split(1))),
+    }
     noise = {ALPHA: noise[ALPHA], **dict.fromkeys("rgb", noise[BETA])}
     network = load_weights("mono-spectral")
     recorded, quiet = (fuse(network, rig, seen, alpha=ALPHA, noise=n).image for n in (None, noise))
     wanted = sample.ground_truth[:, 100:260, 200:400]
-    one, other = ([score(i[None].clamp(0, 1), w[None]).psnr for i, w in zip(x, wanted)] for x in (recorded, quiet))
+    one, other = (
+        [score(i[None].clamp(0, 1), w[None]).psnr for i, w in zip(x, wanted)] for x in (recorded, quiet)
+    )
     assert all(after > before + 2 for before, after in zip(one, other))
 
 
@@ -164,7 +175,9 @@ def test_noise_stated_far_beyond_what_the_image_shows_is_said():
         warnings.simplefilter("error")
         denoised_views(Views.of(sample.rig, images, alpha=ALPHA), noise)
     wrong = {ALPHA: NoiseLevel.of_electrons(2)}
-    with pytest.warns(UserWarning, match=f"noise of '{ALPHA}': a standard deviation of .* is stated, its image shows"):
+    with pytest.warns(
+        UserWarning, match=f"noise of '{ALPHA}': a standard deviation of .* is stated, its image shows"
+    ):
         denoised_views(Views.of(sample.rig, sample.images, alpha=ALPHA), wrong)
 
 

@@ -26,7 +26,9 @@ def page(tmp_path_factory):
     depth[:, :40] = torch.nan
     frame = Frame(sample.ground_truth, depth, torch.linspace(0, 1, h)[:, None].expand(h, w), 0.1 / depth)
     baseline = classical_view(sample.rig, sample.images, "mono", longest=h)
-    facts = Facts(("weights: <mono> & more",), ("the rig may be wrong: check it",), 12.0, 2.0**30, classical=baseline)
+    facts = Facts(
+        ("weights: <mono> & more",), ("the rig may be wrong: check it",), 12.0, 2.0**30, classical=baseline
+    )
     path = tmp_path_factory.mktemp("report") / "index.html"
     return write_report(path, frame, sample.images, sample.rig, "mono", facts)
 
@@ -88,7 +90,9 @@ def test_slider_and_overlays_work_in_a_browser(page):
         driver.find_element("css selector", "#left option:nth-child(3)").click()
         assert run(shown.replace("SIDE", "left")) == ["classical"]
         clipped = run("return getComputedStyle(document.querySelector('.layer.left')).clipPath")
-        assert float(re.findall(r"[\d.]+(?=%)", clipped)[0]) == pytest.approx(100 - float(boundary[:-1]), abs=0.01)
+        assert float(re.findall(r"[\d.]+(?=%)", clipped)[0]) == pytest.approx(
+            100 - float(boundary[:-1]), abs=0.01
+        )
         assert len(driver.get_screenshot_as_png()) > 20_000
         assert driver.get_log("browser") == []
     finally:
@@ -100,13 +104,19 @@ def test_the_classical_layer_is_at_alphas_own_pixels(lens):
     sample, rig = load_sample(), load_sample().rig
     if lens is not None:
         rig = rig.with_camera(
-            "mono", rig["mono"].replace(distortion=Distortion("brown-conrady", torch.tensor(lens, dtype=torch.float64)))
+            "mono",
+            rig["mono"].replace(
+                distortion=Distortion("brown-conrady", torch.tensor(lens, dtype=torch.float64))
+            ),
         )
     found = classical_view(rig, sample.images, "mono", longest=320)
     small = reduced(sample.ground_truth, 320)
     assert found.shape == small.shape
     if lens is None:
-        assert score(found, small).psnr > score(reduced(sample.images["mono"], 320).expand(3, -1, -1), small).psnr + 8
+        assert (
+            score(found, small).psnr
+            > score(reduced(sample.images["mono"], 320).expand(3, -1, -1), small).psnr + 8
+        )
     else:
         assert float((found.mean(0) - reduced(sample.images["mono"], 320)[0]).abs().median()) < 0.05
 

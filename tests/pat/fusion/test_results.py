@@ -66,7 +66,9 @@ def test_depth_in_16_bits_says_its_scale(tmp_path):
 def test_fused_images_say_that_they_are_srgb(tmp_path):
     save_frame(frame_of(3), tmp_path)
     with Image.open(tmp_path / "fused.png") as image:
-        assert "sRGB" in ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(BytesIO(image.info["icc_profile"])))
+        assert "sRGB" in ImageCms.getProfileDescription(
+            ImageCms.ImageCmsProfile(BytesIO(image.info["icc_profile"]))
+        )
     read_image(tmp_path / "fused.png")  # without a warning
 
 
@@ -80,4 +82,6 @@ def test_unknown_depth_is_nan_in_the_file_as_in_memory(tmp_path):
     depth = torch.tensor([[1.5, torch.nan, 3.0], [torch.nan, 2.0, 0.5]])
     frame = Frame(torch.rand(3, 2, 3), depth, *torch.rand(2, 2, 3))
     assert tmp_path / "depth.tif" in save_frame(frame, tmp_path)
-    torch.testing.assert_close(torch.from_numpy(tifffile.imread(tmp_path / "depth.tif")), depth, equal_nan=True)
+    torch.testing.assert_close(
+        torch.from_numpy(tifffile.imread(tmp_path / "depth.tif")), depth, equal_nan=True
+    )

@@ -15,8 +15,12 @@ def blurred(image: torch.Tensor, blur: float) -> torch.Tensor:
     return torch.from_numpy(cv2.GaussianBlur(image[0, 0].numpy(), (0, 0), blur))[None, None]
 
 
-def beside(scene: torch.Tensor, disparity: int, width: int = 192) -> tuple[torch.Tensor, torch.Tensor, list[Segments]]:
-    """Two images of a flat scene (1, 1, H, W), `disparity` pixels apart, and the segments of alpha, on the left."""
+def beside(
+    scene: torch.Tensor, disparity: int, width: int = 192
+) -> tuple[torch.Tensor, torch.Tensor, list[Segments]]:
+    """Two images of a flat scene (1, 1, H, W), `disparity` pixels apart, and the segments of alpha, on the
+    left.
+    """
     alpha, beta = scene[..., :width], scene[..., disparity : disparity + width]
     view = View(hw=(alpha.shape[-2], width))
     look = lazily(Rectified(64.0), Pair(view, view))
@@ -26,7 +30,11 @@ def beside(scene: torch.Tensor, disparity: int, width: int = 192) -> tuple[torch
         segments = look(x.reshape(-1, 2))
         shape = (1, *x.shape[:-1])
         found.append(
-            Segments(segments.start.reshape(*shape, 2), segments.end.reshape(*shape, 2), segments.valid.reshape(shape))
+            Segments(
+                segments.start.reshape(*shape, 2),
+                segments.end.reshape(*shape, 2),
+                segments.valid.reshape(shape),
+            )
         )
     return alpha, beta, found
 

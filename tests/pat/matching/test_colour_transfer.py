@@ -49,9 +49,9 @@ def test_a_match_has_the_detail_that_beta_lost():
     """One view for both cameras: a fifth or more of the error of colour that beta's blur made is gone."""
     coarse = torch.rand(1, 1, 12, 16, generator=torch.Generator().manual_seed(2))
     alpha = coarse.repeat_interleave(4, -1).repeat_interleave(4, -2)
-    ground_truth = alpha * torch.tensor([1.3, 1.0, 0.4]).view(1, 3, 1, 1) - torch.tensor([0.0, 0.1, 0.2]).view(
-        1, 3, 1, 1
-    )
+    ground_truth = alpha * torch.tensor([1.3, 1.0, 0.4]).view(1, 3, 1, 1) - torch.tensor(
+        [0.0, 0.1, 0.2]
+    ).view(1, 3, 1, 1)
     beta = torch.cat([blurred(band, 1.0) for band in ground_truth.split(1, 1)], 1)
     here = in_place((48, 64))
     left, lost = (e[..., 6:-6, 6:-6].abs().mean() for e in chroma_errors(alpha, beta, ground_truth, here))
@@ -67,7 +67,9 @@ def test_of_a_beta_far_less_sharp_more_around_a_pixel_says_what_detail_it_lost(m
     left = []
     for factor in (SETTINGS.radius_of_blur, 0.0):
         monkeypatch.setattr(warped, "SETTINGS", replace(SETTINGS, radius_of_blur=factor))
-        left.append(chroma_errors(alpha, beta, ground_truth, in_place((96, 128)))[0][..., 8:-8, 8:-8].abs().mean())
+        left.append(
+            chroma_errors(alpha, beta, ground_truth, in_place((96, 128)))[0][..., 8:-8, 8:-8].abs().mean()
+        )
     assert left[0] < 0.9 * left[1]
 
 
@@ -85,7 +87,8 @@ def test_colour_that_does_not_follow_brightness_is_left_alone():
     """Red and green change places where brightness does not show it, beside edges of brightness."""
     g = torch.Generator().manual_seed(5)
     fine, other = (
-        torch.rand(1, 1, 24, 32, generator=g).round().repeat_interleave(4, -1).repeat_interleave(4, -2) for _ in "ab"
+        torch.rand(1, 1, 24, 32, generator=g).round().repeat_interleave(4, -1).repeat_interleave(4, -2)
+        for _ in "ab"
     )
     alpha = 0.35 + 0.3 * fine
     other = other.roll((2, 2), (-1, -2)) - 0.5
@@ -97,7 +100,9 @@ def test_colour_that_does_not_follow_brightness_is_left_alone():
 
 
 def test_colour_at_matches_does_not_hang_on_what_the_other_image_shows_elsewhere():
-    """Alpha alone sees something dark on the left: whole images have other levels, what both see has the same."""
+    """Alpha alone sees something dark on the left: whole images have other levels, what both see has the
+    same.
+    """
     scene = faint(1, contrast=0.1, blur=3.0)
     scene[..., :48] -= 0.35
     tint = torch.tensor([1.0, 0.6, 0.3]).view(1, 3, 1, 1)
@@ -115,7 +120,9 @@ def test_a_match_of_other_brightness_has_less_weight():
 
 
 def test_a_match_of_one_band_has_alphas_detail_even_if_the_band_is_inverted():
-    """One view for both cameras: what alpha sees bright the band sees dark, and without alpha it is blurred."""
+    """One view for both cameras: what alpha sees bright the band sees dark, and without alpha it is
+    blurred.
+    """
     g = torch.Generator().manual_seed(2)
     coarse, fine = (torch.rand(1, 1, 96 // s, 128 // s, generator=g) for s in (32, 4))
     alpha = 0.7 * enlarged(coarse, 32) + 0.3 * enlarged(fine, 4)
@@ -133,7 +140,9 @@ def test_colour_is_as_bright_as_alpha_where_betas_lens_is_dark():
     alpha = faint(2, contrast=0.1, blur=2.0)[..., :128]
     ground_truth = alpha * tint
     beta = ground_truth * torch.linspace(1, 0.5, 128)
-    wrong, darker = (e[..., 64:].abs().mean() for e in chroma_errors(alpha, beta, ground_truth, in_place((64, 128))))
+    wrong, darker = (
+        e[..., 64:].abs().mean() for e in chroma_errors(alpha, beta, ground_truth, in_place((64, 128)))
+    )
     assert wrong < 0.6 * darker
 
 
@@ -154,7 +163,9 @@ def test_an_alpha_in_the_infrared_gives_no_detail():
     infrared = faint(9, contrast=0.12, blur=1.5)[..., :128]
     found = semi_global_matching(infrared, luminance(beta), beta, *in_place((64, 128)))
     chroma = [image - luminance(image) for image in (found.bands, beta)]
-    assert (chroma[0] - chroma[1]).abs().mean() < 0.3 * (chroma[1] - chroma[1].mean((2, 3), keepdim=True)).abs().mean()
+    assert (chroma[0] - chroma[1]).abs().mean() < 0.3 * (
+        chroma[1] - chroma[1].mean((2, 3), keepdim=True)
+    ).abs().mean()
 
 
 def noisy_scene(noise: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -180,6 +191,8 @@ def test_texture_and_lost_detail_are_no_noise():
     blurry, g = blurred(alpha, 1.0), torch.Generator().manual_seed(7)
     ones = torch.ones_like(alpha)
     assert float(colour_noise(blurry - alpha, alpha, ones)) == 0
-    found = [float(colour_noise(n * torch.randn(alpha.shape, generator=g), alpha, ones)) for n in (0.02, 0.04)]
+    found = [
+        float(colour_noise(n * torch.randn(alpha.shape, generator=g), alpha, ones)) for n in (0.02, 0.04)
+    ]
     assert found[1] == pytest.approx(4 * found[0], rel=0.3)
     assert colour_noise(alpha, alpha, 0 * ones).tolist() == [[[[0.0]]]]

@@ -31,7 +31,9 @@ def flat():
     camera = Camera(K=intrinsics(float(W), (H, W)), cam_from_world=Pose.identity(), hw=(H, W))
     beside = camera.replace(cam_from_world=Pose(camera.R, camera.t.new_tensor([-BASELINE, 0.0, 0.0])))
     noise = torch.rand(1, 3, H // 2, (W + 16) // 2, generator=torch.Generator().manual_seed(0))
-    wall = torch.nn.functional.interpolate(noise, size=(H, W + 16), mode="bicubic", align_corners=False)[0].clamp(0, 1)
+    wall = torch.nn.functional.interpolate(noise, size=(H, W + 16), mode="bicubic", align_corners=False)[
+        0
+    ].clamp(0, 1)
     images = {"mono": luminance(wall[..., :W]), "colour": wall[..., 6 : 6 + W]}
     return Rig({"mono": camera, "colour": beside}, depth=(2.0, 50.0)), images
 

@@ -33,7 +33,10 @@ def network():
 def smooth_texture(seed, hw):
     g = torch.Generator().manual_seed(seed)
     coarse, fine = (torch.rand(1, 3, hw[0] // n, hw[1] // n, generator=g) for n in (16, 4))
-    parts = [torch.nn.functional.interpolate(t, size=hw, mode="bicubic", align_corners=False) for t in (coarse, fine)]
+    parts = [
+        torch.nn.functional.interpolate(t, size=hw, mode="bicubic", align_corners=False)
+        for t in (coarse, fine)
+    ]
     return (0.7 * parts[0] + 0.3 * parts[1])[0].clamp(0, 1)
 
 
@@ -82,7 +85,9 @@ def test_of_betas_of_equal_confidence_that_as_bright_as_alpha_counts_more(networ
     one, other = network.explain(inputs, match(inputs))[1]
     bright, dark = (
         e._replace(
-            colour=torch.full_like(e.colour, v), logit=torch.ones_like(e.logit), likeness=torch.full_like(e.likeness, v)
+            colour=torch.full_like(e.colour, v),
+            logit=torch.ones_like(e.logit),
+            likeness=torch.full_like(e.likeness, v),
         )
         for e, v in ((one, 1.0), (other, 0.0))
     )
@@ -178,7 +183,8 @@ def test_uncalibrated_colour_cameras_are_fused_too(network, scene):
 
     rig, images, _ = scene
     links = {
-        ("mono", n): Link(rig.pair("mono", n).fundamental, rig.pair("mono", n).homography) for n in ("left", "right")
+        ("mono", n): Link(rig.pair("mono", n).fundamental, rig.pair("mono", n).homography)
+        for n in ("left", "right")
     }
     known = Rig({n: Known(hw=rig[n].hw) for n in rig.cameras}, links=links)
     frame = fuse(network, known, images, alpha="mono")
@@ -187,7 +193,9 @@ def test_uncalibrated_colour_cameras_are_fused_too(network, scene):
 
 
 def test_the_depth_buffer_finds_what_is_hidden():
-    """A near point and a far one at one pixel of beta: the far one is hidden by as much as their disparities differ."""
+    """A near point and a far one at one pixel of beta: the far one is hidden by as much as their disparities
+    differ.
+    """
     hw = (4, 8)
     pair = Rig({"a": camera(0.0), "b": camera(1.0)}).pair("a", "b")
     y, x = torch.meshgrid(torch.arange(4.0), torch.arange(8.0), indexing="ij")
@@ -212,12 +220,17 @@ def test_the_depth_buffer_finds_what_is_hidden():
 
 
 def test_a_band_unlike_alpha_is_matched_through_one_that_is_like_it():
-    """Bright where alpha is dark and where it is bright, so that neither its sign nor its edges tell the depth."""
+    """Bright where alpha is dark and where it is bright, so that neither its sign nor its edges tell the
+    depth.
+    """
 
     def unlike(image):
         return (2 * luminance(image) - 1).abs().clamp(0, 1)
 
-    network, near = load_weights("mono-spectral"), {"alone": {}, "with": {"left": luminance(seen_from(-0.25))}}
+    network, near = (
+        load_weights("mono-spectral"),
+        {"alone": {}, "with": {"left": luminance(seen_from(-0.25))}},
+    )
     cameras = {"mono": camera(0.0), "right": camera(0.25), "left": camera(-0.25)}
     images = {"mono": luminance(seen_from(0.0)), "right": unlike(seen_from(0.25))}
     found = {}
@@ -229,12 +242,15 @@ def test_a_band_unlike_alpha_is_matched_through_one_that_is_like_it():
 
 
 def test_betas_whose_lengths_do_not_fit_agree_all_the_same(network, scene):
-    """As cameras that are found by pairs: the right one is thought to be farther away, so its depths are too large."""
+    """As cameras that are found by pairs: the right one is thought to be farther away, so its depths are too
+    large.
+    """
     _, images, ground_truth = scene
     cameras = {"mono": camera(0.0), "left": camera(-0.25), "right": camera(0.25)}
     wrong = cameras | {"right": camera(0.4)}
     true, found = (
-        fuse(network, Rig(c, depth=(NEAR, 2 * FAR)), images, alpha="mono").image.clamp(0, 1) for c in (cameras, wrong)
+        fuse(network, Rig(c, depth=(NEAR, 2 * FAR)), images, alpha="mono").image.clamp(0, 1)
+        for c in (cameras, wrong)
     )
     assert score(found, ground_truth).psnr > score(true, ground_truth).psnr - 0.5
     inputs = frame_inputs(network, Views.of(Rig(wrong, depth=(NEAR, 2 * FAR)), images, alpha="mono")).inputs

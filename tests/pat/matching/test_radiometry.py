@@ -21,7 +21,9 @@ def combined(image, weights=WEIGHTS):
     return (image * torch.as_tensor(weights).to(image)[:, None, None]).sum(-3, keepdim=True)
 
 
-@pytest.mark.parametrize("response", [Response(torch.tensor(WEIGHTS).double()), stated_response((0.1, 0.5, 0.6))])
+@pytest.mark.parametrize(
+    "response", [Response(torch.tensor(WEIGHTS).double()), stated_response((0.1, 0.5, 0.6))]
+)
 def test_neutral_stays_neutral_and_luma_becomes_what_alpha_sees(response):
     image = torch.rand(2, 3, 8, 9, dtype=torch.float64)
     applied = response.of_beta(image)
@@ -48,7 +50,9 @@ def test_a_response_is_recovered_from_colourful_points(weights, gamma):
 
 def test_grey_points_leave_rec601():
     g = torch.Generator().manual_seed(0)
-    x = (torch.rand(1, 4000, generator=g) * 0.9 + 0.05).expand(3, -1) + 0.005 * torch.randn(3, 4000, generator=g)
+    x = (torch.rand(1, 4000, generator=g) * 0.9 + 0.05).expand(3, -1) + 0.005 * torch.randn(
+        3, 4000, generator=g
+    )
     assert fit(x, x.mean(0) + 0.01 * torch.randn(4000, generator=g)).is_rec601
 
 
@@ -74,11 +78,15 @@ def points_of_one_hue():
     """Warm surfaces, light and dark, whose hue varies a little."""
     g = torch.Generator().manual_seed(0)
     value = torch.rand(4000, generator=g) * 0.8 + 0.15
-    return torch.tensor([0.95, 0.65, 0.3])[:, None] * value * (1 + 0.03 * torch.randn(3, 4000, generator=g)), g
+    return torch.tensor([0.95, 0.65, 0.3])[:, None] * value * (
+        1 + 0.03 * torch.randn(3, 4000, generator=g)
+    ), g
 
 
 def test_in_one_hue_weights_of_a_sensor_are_preferred_to_a_small_gain_and_a_large_gain_to_weights_of_none():
-    """Both explain alpha there; weights of sum 1 then leave beta's exposure, which is the truth if gains are equal."""
+    """Both explain alpha there; weights of sum 1 then leave beta's exposure, which is the truth if gains are
+    equal.
+    """
     x, g = points_of_one_hue()
     noise = 0.01 * torch.randn(4000, generator=g)
     for weights in ((0.33, 0.39, 0.28), (0.65, 0.3, 0.05)):
@@ -93,7 +101,9 @@ def test_in_one_hue_weights_of_a_sensor_are_preferred_to_a_small_gain_and_a_larg
 
 
 def test_in_one_hue_what_no_sensor_does_is_light():
-    """Warm surfaces are darker to an unfiltered sensor than Rec. 601's luma: a little brighter they are by light."""
+    """Warm surfaces are darker to an unfiltered sensor than Rec. 601's luma: a little brighter they are by
+    light.
+    """
     x, g = points_of_one_hue()
     noise = 0.01 * torch.randn(4000, generator=g)
     assert fit(x, 1.08 * luminance(x[:, None])[0, 0] + noise).is_rec601
@@ -103,7 +113,9 @@ def test_in_one_hue_what_no_sensor_does_is_light():
 
 
 def test_light_that_differs_by_object_is_not_taken_for_other_weights():
-    """Four materials, each up to 2 % brighter or darker in the other view, of an alpha that sees another exposure."""
+    """Four materials, each up to 2 % brighter or darker in the other view, of an alpha that sees another
+    exposure.
+    """
     g = torch.Generator().manual_seed(0)
     colours = torch.tensor([[0.7, 0.6, 0.5], [0.3, 0.45, 0.6], [0.6, 0.3, 0.3], [0.35, 0.5, 0.3]]).T
     material = torch.randint(4, (4000,), generator=g)
@@ -115,7 +127,9 @@ def test_light_that_differs_by_object_is_not_taken_for_other_weights():
 
 
 def test_leaves_lit_more_brightly_are_not_taken_for_a_sensor_of_green_alone(monkeypatch):
-    """Green is darker to an unfiltered sensor than Rec. 601's luma; weights of .7 green would explain it brighter."""
+    """Green is darker to an unfiltered sensor than Rec. 601's luma; weights of .7 green would explain it
+    brighter.
+    """
     g = torch.Generator().manual_seed(0)
     colours, light = torch.tensor([[0.3, 0.6, 0.2], [0.6, 0.4, 0.25]]).T, torch.tensor([1.08, 1.0])
     material = torch.randint(2, (4000,), generator=g)
@@ -136,12 +150,17 @@ def test_a_gamma_needs_a_range_of_brightness():
     x = torch.tensor([0.2, 0.16, 0.12])[:, None] * (1 + 0.1 * torch.rand(4000, generator=g))
     level = (x[0] - x[0].min()) / (x[0].max() - x[0].min())
     assert (
-        fit(x, (0.97 + 0.02 * level) * luminance(x[:, None])[0, 0] + 0.0005 * torch.randn(4000, generator=g)).gamma == 1
+        fit(
+            x, (0.97 + 0.02 * level) * luminance(x[:, None])[0, 0] + 0.0005 * torch.randn(4000, generator=g)
+        ).gamma
+        == 1
     )
 
 
 def test_fusion_of_another_response():
-    """Taken for Rec. 601, the colours of this alpha are several dB off; with its response stated they are not."""
+    """Taken for Rec. 601, the colours of this alpha are several dB off; with its response stated they are
+    not.
+    """
     sample, network = load_sample(), load_weights("mono-colour-small")
     images = {ALPHA: combined(sample.ground_truth), BETA: sample.images[BETA]}
 

@@ -64,12 +64,16 @@ def sampled_at(pair: Pair, step: int) -> Segments:
 
 
 def plane_seen(pair: Pair, depth: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Alpha and beta images (1, 1, H, W) of a textured plane that faces alpha, and its pixels' places in beta."""
+    """Alpha and beta images (1, 1, H, W) of a textured plane that faces alpha, and its pixels' places in
+    beta.
+    """
     rough = torch.rand(1, 1, 40, 60, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
 
     def texture(X):
         at = (X[..., :2] / depth * torch.tensor([0.6, 0.9]))[None]
-        return torch.nn.functional.grid_sample(rough, at, mode="bicubic", padding_mode="reflection", align_corners=True)
+        return torch.nn.functional.grid_sample(
+            rough, at, mode="bicubic", padding_mode="reflection", align_corners=True
+        )
 
     x = pixel_grid(HW, dtype=torch.float64).reshape(-1, 2)
     X = pair.alpha.unproject(x, torch.full((len(x),), depth, dtype=torch.float64))
@@ -182,7 +186,9 @@ def test_a_batch_is_its_images_one_by_one():
 def test_no_segment_is_nothing_found():
     x = torch.zeros(1, 32, 48, 2)
     nowhere = [Segments(v, v, torch.zeros(v.shape[:-1], dtype=torch.bool)) for v in (x, x[:, ::2, ::2])]
-    found = semi_global_matching(torch.rand(1, 1, 32, 48), torch.rand(1, 1, 32, 48), torch.rand(1, 3, 32, 48), *nowhere)
+    found = semi_global_matching(
+        torch.rand(1, 1, 32, 48), torch.rand(1, 1, 32, 48), torch.rand(1, 3, 32, 48), *nowhere
+    )
     assert found.disparity.abs().max() == 0
     assert found.diffused.isfinite().all()
 
@@ -209,7 +215,9 @@ def test_the_sharper_of_two_images_is_blurred_whichever_it_is():
 
 
 def test_parts_are_balanced_as_the_whole_is():
-    """The right half is darker and softer than the left: by themselves the halves would be treated otherwise."""
+    """The right half is darker and softer than the left: by themselves the halves would be treated
+    otherwise.
+    """
     alpha = torch.rand(1, 1, 60, 80, generator=torch.Generator().manual_seed(0))
     alpha[..., 40:] = 0.3 * blurred(alpha, 2.0)[..., 40:]
     beta = 0.5 * blurred(alpha, 1.0) + 0.2
@@ -219,13 +227,17 @@ def test_parts_are_balanced_as_the_whole_is():
     assert abs(float(level.std() - alpha.std())) < 1e-5
     assert normalisation.blurs[0] != [0.0]
     assert torch.equal(normalisation.normalised(beta[..., 40:]), level[..., 40:])
-    sharp, part = (normalisation.equally_sharp(a, b) for a, b in ((alpha, level), (alpha[..., 40:], level[..., 40:])))
+    sharp, part = (
+        normalisation.equally_sharp(a, b) for a, b in ((alpha, level), (alpha[..., 40:], level[..., 40:]))
+    )
     assert torch.allclose(part[0][..., 20:], sharp[0][..., 60:], atol=1e-6)
     assert Normalisation.of(alpha[..., 40:], beta[..., 40:]).blurs != normalisation.blurs
 
 
 def test_what_lies_beyond_the_edge_of_beta_is_not_sought_within_it():
-    """Where beta ends, 40 columns of alpha are unseen: most are known as such, and matches beside them are right."""
+    """Where beta ends, 40 columns of alpha are unseen: most are known as such, and matches beside them are
+    right.
+    """
     alpha, beta, segments = beside(faint(0, contrast=0.03, blur=4.0), 40)
     noise = 0.01 * torch.randn(2, *alpha.shape, generator=torch.Generator().manual_seed(9))
     found = semi_global_matching(alpha + noise[0], beta + noise[1], beta + noise[1], *segments)

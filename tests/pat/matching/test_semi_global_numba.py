@@ -69,7 +69,9 @@ def slow_aggregate(costs, guide, labels):
 def views():
     """Planes of alpha, those of beta, and segments that leave beta, or end, or are none."""
     rng = np.random.default_rng(0)
-    own, other = ((rng.random(hw, np.float32), rng.integers(0, 2**48, hw).astype(np.uint64)) for hw in (HW, BETA))
+    own, other = (
+        (rng.random(hw, np.float32), rng.integers(0, 2**48, hw).astype(np.uint64)) for hw in (HW, BETA)
+    )
     end = rng.uniform(0, 8, (*HW, 2)).astype(np.float32)
     angle = rng.uniform(0, 2 * np.pi, HW)
     along = np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
@@ -82,7 +84,9 @@ def flat(planes):
     return tuple(plane.ravel() for plane in planes)
 
 
-@pytest.mark.parametrize(("runs", "count", "spread"), [(1, 6, 0), (1, 19, 0), (1, 16, 3), (2, 5, 4), (2, 4, 9)])
+@pytest.mark.parametrize(
+    ("runs", "count", "spread"), [(1, 6, 0), (1, 19, 0), (1, 16, 3), (2, 5, 4), (2, 4, 9)]
+)
 def test_costs_are_those_of_their_slow_twin(views, runs, count, spread):
     own, other, segments = views
     first = windows(np.random.default_rng(1), runs, count, spread)

@@ -15,7 +15,10 @@ WEIGHTS = torch.tensor([0.3, 0.6, 0.1])
 
 def texture(bands: int, hw: tuple[int, int], seed: int = 0) -> torch.Tensor:
     g = torch.Generator().manual_seed(seed)
-    coarse, fine = torch.rand(1, bands, 8, 12, generator=g), torch.rand(1, 1, hw[0] // 2, hw[1] // 2, generator=g)
+    coarse, fine = (
+        torch.rand(1, bands, 8, 12, generator=g),
+        torch.rand(1, 1, hw[0] // 2, hw[1] // 2, generator=g),
+    )
     parts = [interpolate(x, hw, mode="bicubic", align_corners=False) for x in (coarse, fine)]
     return (0.7 * parts[0] + 0.3 * parts[1]).clamp(0, 1)
 
@@ -28,17 +31,24 @@ def test_the_combination_is_that_of_least_squares_around_each_pixel():
     """NumPy's, of what bands and alpha have beyond their means in squares of 33 pixels."""
     bands = texture(3, (48, 64))
     drift = torch.linspace(0, 0.2, 64).expand(1, 1, 48, 64)
-    alpha = seen_in(bands) + 0.05 + 0.01 * torch.randn(1, 1, 48, 64, generator=torch.Generator().manual_seed(1))
+    alpha = (
+        seen_in(bands) + 0.05 + 0.01 * torch.randn(1, 1, 48, 64, generator=torch.Generator().manual_seed(1))
+    )
     mix = SpectralMix.fitted(bands, alpha + drift, torch.ones_like(alpha))
     local = [(p - box_mean(p, 16)).flatten(2)[0].double().numpy() for p in (bands, alpha + drift)]
     expected = np.linalg.lstsq(local[0].T, local[1][0], rcond=None)[0]
-    assert np.abs(mix.weights[0].numpy() / np.sum(mix.weights[0].numpy()) - expected / expected.sum()).max() < 0.01
+    assert (
+        np.abs(mix.weights[0].numpy() / np.sum(mix.weights[0].numpy()) - expected / expected.sum()).max()
+        < 0.01
+    )
     assert abs(float(mix.weights.sum()) - 1) < 0.03
     assert abs(float((mix.of(bands) - alpha - drift).mean())) < 1e-3
 
 
 def test_slopes_are_those_of_detail_whatever_materials_do():
-    """Where the second band is bright the first is dark, and both have the same pattern; the third has none."""
+    """Where the second band is bright the first is dark, and both have the same pattern; the third has
+    none.
+    """
     g = torch.Generator().manual_seed(0)
     pattern, left = 0.2 * torch.rand(48, 64, generator=g), torch.zeros(48, 64)
     left[:, :32] = 0.5

@@ -22,12 +22,16 @@ def test_runs_hold_what_is_nearby_and_do_not_overlap(half):
     assert (high >= low + SETTINGS.run).all()
     for value in np.unique(half):
         beside = np.abs(np.arange(12) // 2 - np.flatnonzero(half[0] == value)[:, None]).min(0) <= 2
-        held = [(first <= value) & (value < first + SETTINGS.run) for first in (low[:, beside], high[:, beside])]
+        held = [
+            (first <= value) & (value < first + SETTINGS.run) for first in (low[:, beside], high[:, beside])
+        ]
         assert (held[0] | held[1]).all()
 
 
 def scene() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, Segments, Segments]:
-    """A square before a wall, edges between the blocks of half the size; alpha, beta, disparity, segments, blocks."""
+    """A square before a wall, edges between the blocks of half the size; alpha, beta, disparity, segments,
+    blocks.
+    """
     g = torch.Generator().manual_seed(0)
     wall, square = torch.rand(H, W + 64, generator=g), torch.rand(BOX[0].stop - BOX[0].start, 51, generator=g)
     images = []

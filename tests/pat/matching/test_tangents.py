@@ -49,11 +49,15 @@ def test_tangents_touch_their_curve_at_the_match():
     assert float((slope - 2 * 0.05 * -2).abs().quantile(0.9)) < 0.06
 
 
-@pytest.mark.parametrize("field", [NearestVoxels(), Local(9), Dense(stride=24)], ids=lambda f: type(f).__name__)
+@pytest.mark.parametrize(
+    "field", [NearestVoxels(), Local(9), Dense(stride=24)], ids=lambda f: type(f).__name__
+)
 def test_sets_are_fused_and_said_to_have_no_order(field):
     s = middle_of_sample()
     with pytest.warns(UserWarning, match="without an order"):
-        frame = fuse(load_weights("mono-colour"), s.rig, s.images, alpha=ALPHA, field=field, response="rec601")
+        frame = fuse(
+            load_weights("mono-colour"), s.rig, s.images, alpha=ALPHA, field=field, response="rec601"
+        )
     assert bool(frame.image.isfinite().all())
 
 

@@ -110,7 +110,9 @@ def test_half_a_image_is_refused(tmp_path):
 def planar_tiff(**options) -> bytes:
     """A TIFF file with a plane of its own for each colour, all of 200."""
     file = io.BytesIO()
-    tifffile.imwrite(file, np.full((3, 60, 80), 200, np.uint8), photometric="rgb", planarconfig="separate", **options)
+    tifffile.imwrite(
+        file, np.full((3, 60, 80), 200, np.uint8), photometric="rgb", planarconfig="separate", **options
+    )
     return file.getvalue()
 
 
@@ -215,7 +217,10 @@ def test_a_file_system_that_is_read_only_is_said_of_the_file_itself(tmp_path, mo
 
     for name in ("write_text", "unlink"):
         monkeypatch.setattr(Path, name, refuse)
-    with pytest.raises(OSError, match="Read-only") as caught, write_atomically(tmp_path / "a.txt") as temporary:
+    with (
+        pytest.raises(OSError, match="Read-only") as caught,
+        write_atomically(tmp_path / "a.txt") as temporary,
+    ):
         temporary.write_text("a")
     assert caught.value.filename == str(tmp_path / "a.txt")
 
@@ -283,7 +288,13 @@ def test_orientation_does_not_depend_on_the_type_of_values(tmp_path, kind):
 
 def png_that_claims(width: int, height: int) -> bytes:
     head = struct.pack(">II5B", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + b"IHDR" + head + struct.pack(">I", zlib.crc32(b"IHDR" + head))
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + struct.pack(">I", 13)
+        + b"IHDR"
+        + head
+        + struct.pack(">I", zlib.crc32(b"IHDR" + head))
+    )
 
 
 def test_the_size_is_compared_before_anything_is_decoded(tmp_path, monkeypatch):

@@ -1,4 +1,6 @@
-"""Colour profiles: other ones are converted to sRGB when an image is read, with a warning; raw files need an extra."""
+"""Colour profiles: other ones are converted to sRGB when an image is read, with a warning; raw files need an
+extra.
+"""
 
 import sys
 import time
@@ -26,7 +28,11 @@ def profile_of(primaries: tuple[float, ...]) -> bytes:
         for k in range(3):
             value = round(primaries[3 * k + i] * 65536)
             content[at + 8 + 4 * k : at + 12 + 4 * k] = value.to_bytes(4, "big", signed=True)
-    return bytes(content).replace(b"sRGB", b"wide").replace("sRGB".encode("utf-16-be"), "wide".encode("utf-16-be"))
+    return (
+        bytes(content)
+        .replace(b"sRGB", b"wide")
+        .replace("sRGB".encode("utf-16-be"), "wide".encode("utf-16-be"))
+    )
 
 
 DISPLAY_P3 = (0.5151, 0.2920, 0.1571, 0.2412, 0.6922, 0.0666, -0.0011, 0.0419, 0.7841)

@@ -80,13 +80,17 @@ def test_exposures_and_gains_are_brought_to_alphas():
     alpha, scene = Sensor(exposure=0.01), light(channels=3, white=0.2)
     wide = Sensor(exposure=0.04, gain=(0.5, 1.0, 0.8), coding="linear")
     recorded = scene * 4 * torch.tensor([0.5, 1.0, 0.8])[:, None, None]
-    torch.testing.assert_close(develop(recorded, wide, like=alpha), srgb_from_linear(scene), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        develop(recorded, wide, like=alpha), srgb_from_linear(scene), atol=1e-5, rtol=0
+    )
     srgb = Sensor(exposure=0.02, gain=2.0)
     torch.testing.assert_close(
         develop(srgb_from_linear(4 * scene), srgb, like=alpha), srgb_from_linear(scene), atol=1e-5, rtol=0
     )
     no_exposure = Sensor(gain=2.0, coding="linear")
-    torch.testing.assert_close(develop(2 * scene, no_exposure, like=alpha), srgb_from_linear(scene), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        develop(2 * scene, no_exposure, like=alpha), srgb_from_linear(scene), atol=1e-5, rtol=0
+    )
 
 
 def test_ordinary_images_pass_unchanged():
@@ -97,7 +101,11 @@ def test_ordinary_images_pass_unchanged():
 @pytest.mark.parametrize(
     ("sensor", "values", "message"),
     [
-        (Sensor(bits=10), np.full((1, *HW), 1024, np.uint16), r"a: .*values up to 1024, the rig says 10 bits"),
+        (
+            Sensor(bits=10),
+            np.full((1, *HW), 1024, np.uint16),
+            r"a: .*values up to 1024, the rig says 10 bits",
+        ),
         (Sensor(bits=12), np.zeros((1, *HW), np.uint8), "has 8 bits a value, the rig says 12"),
         (Sensor(bayer="RGGB"), np.zeros((3, *HW), np.uint8), "in colour, and the rig says raw RGGB"),
         (Sensor(), np.zeros((1, 48, 60), np.uint8), "is 60x48, the rig says 64x48"),
@@ -122,14 +130,20 @@ def test_exr_is_written_and_holds_the_floats(tmp_path):
 
 
 def test_a_image_is_as_bright_as_the_light_that_alpha_measured():
-    """The right chroma on alpha's values is too bright where colours are strong; then it is the truth again."""
+    """The right chroma on alpha's values is too bright where colours are strong; then it is the truth
+    again.
+    """
     linear = light() ** torch.tensor([1.0, 3.0, 0.5]).view(3, 1, 1)
     ground_truth, alpha = srgb_from_linear(linear), srgb_from_linear(luminance(linear))
     fused = ground_truth - luminance(ground_truth) + alpha
     assert (fused - ground_truth).abs().max() > 0.02
     measured = developed(Sensor(response="mono", coding="linear"))
     assert (as_bright(fused, alpha, measured) - ground_truth).abs().max() < 1e-4
-    for unknown in (Sensor(response="mono"), Sensor(response="nir", coding="linear"), Sensor(coding="linear")):
+    for unknown in (
+        Sensor(response="mono"),
+        Sensor(response="nir", coding="linear"),
+        Sensor(coding="linear"),
+    ):
         assert as_bright(fused, alpha, developed(unknown)) is fused
 
 
@@ -138,6 +152,11 @@ def test_a_mosaic_makes_little_false_colour():
     grey = torch.rand(1, 1, 24, 32, generator=torch.Generator().manual_seed(1))
     image = torch.nn.functional.interpolate(grey, HW, mode="bicubic", align_corners=False)[0].clamp(0, 1)
     raw = mosaic(image.expand(3, -1, -1), "RGGB")
-    plain = cv2.demosaicing((raw[0].numpy() * 65535).round().astype(np.uint16), cv2.COLOR_BayerRGGB2RGB_EA) / 65535
-    plain, ours = (np.abs(rgb - rgb[1:2]).mean() for rgb in (plain.transpose(2, 0, 1), demosaiced(raw, "RGGB").numpy()))
+    plain = (
+        cv2.demosaicing((raw[0].numpy() * 65535).round().astype(np.uint16), cv2.COLOR_BayerRGGB2RGB_EA)
+        / 65535
+    )
+    plain, ours = (
+        np.abs(rgb - rgb[1:2]).mean() for rgb in (plain.transpose(2, 0, 1), demosaiced(raw, "RGGB").numpy())
+    )
     assert ours < 0.7 * plain

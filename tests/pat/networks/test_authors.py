@@ -1,4 +1,6 @@
-"""The authors' checkpoints: their own outputs to 1e-9, their files read, and everything else refused in a line."""
+"""The authors' checkpoints: their own outputs to 1e-9, their files read, and everything else refused in a
+line.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +61,11 @@ def listed(positions: torch.Tensor, width: int) -> FieldOnGrid:
 
 def save(path: Path, state: dict[str, torch.Tensor], **more) -> Path:
     """A checkpoint as their train.py saves it: names of DataParallel, psnr a number of numpy's."""
-    content = {"epoch": 31, "state_dict": {f"module.{k}": v for k, v in state.items()}, "psnr": np.float64(29.5)}
+    content = {
+        "epoch": 31,
+        "state_dict": {f"module.{k}": v for k, v in state.items()},
+        "psnr": np.float64(29.5),
+    }
     torch.save(content | more, path)
     return path
 
@@ -126,7 +132,9 @@ def test_our_fields_give_what_their_formula_gives_at_the_same_pixels(case, field
 
 
 def _pixels_of(field, pair: Pair, pixel: torch.Tensor, samples: int) -> torch.Tensor:
-    """The pixels (n, 2) of beta that a field names for one of alpha's; short segments repeat some, and each counts."""
+    """The pixels (n, 2) of beta that a field names for one of alpha's; short segments repeat some, and each
+    counts.
+    """
     found = field(pair, pixel[None])
     if isinstance(found, Positions):
         return found.xy[0][found.mask[0]]

@@ -38,7 +38,9 @@ def test_permuting_betas_of_one_band_permutes_the_output_bands(network):
     order = [2, 0, 1, 3]
     with torch.no_grad():
         first = fused_at_once(network, Inputs.of(alpha, bands, fields))
-        second = fused_at_once(network, Inputs.of(alpha, [bands[i] for i in order], [fields[i] for i in order]))
+        second = fused_at_once(
+            network, Inputs.of(alpha, [bands[i] for i in order], [fields[i] for i in order])
+        )
     assert first.image.shape == (2, 4, *HW)
     assert torch.equal(second.image, first.image[:, order])
     assert all(torch.equal(second.confidence[k], first.confidence[i]) for k, i in enumerate(order))

@@ -43,7 +43,8 @@ def directly(image, expected, guide, deviation, threshold):
     n, (h, w) = RADIUS + SIDE, image.shape[1:]
     margins = [(0, 0), (n, n + SIDE), (n, n + SIDE)]
     seen, known, alike, noise = (
-        np.pad(t.double().numpy(), margins, mode="symmetric") for t in (image, expected, guide, deviation.square())
+        np.pad(t.double().numpy(), margins, mode="symmetric")
+        for t in (image, expected, guide, deviation.square())
     )
     total, weights = np.zeros_like(seen), np.zeros_like(seen)
     for y in range(n - SIDE + STEP, n + h, STEP):
@@ -54,11 +55,14 @@ def directly(image, expected, guide, deviation, threshold):
             places = places[:ALIKE]
             for c in range(len(image)):
                 blocks, model = (
-                    to_groups(np.stack([t[c, i : i + SIDE, j : j + SIDE] for i, j in places])) for t in (seen, known)
+                    to_groups(np.stack([t[c, i : i + SIDE, j : j + SIDE] for i, j in places]))
+                    for t in (seen, known)
                 )
                 variance = np.mean([noise[c, i + 4, j + 4] for i, j in places])
                 share = blocks**2 > threshold**2 * variance if threshold else model**2 / (model**2 + variance)
-                blocks = idctn(np.einsum("nm,mij->nij", HADAMARD.T, blocks * share), axes=(1, 2), norm="ortho")
+                blocks = idctn(
+                    np.einsum("nm,mij->nij", HADAMARD.T, blocks * share), axes=(1, 2), norm="ortho"
+                )
                 weight = WINDOW / (variance + 1e-8) / (1 + np.square(1.0 * share).sum())
                 for (i, j), block in zip(places, blocks):
                     total[c, i : i + SIDE, j : j + SIDE] += weight * block
@@ -70,7 +74,8 @@ def directly(image, expected, guide, deviation, threshold):
 @pytest.mark.parametrize("threshold", [0.0, 2.9])
 def test_is_as_defined(threshold):
     clean = torch.rand(2, 21, 26, generator=generator_for(5))
-    # In sixteenths: exact sums, so that of blocks equally alike, such as mirrored ones, both choose the first.
+    # In sixteenths: exact sums, so that of blocks equally alike, such as mirrored ones, both choose the
+    # first.
     guide = torch.randint(17, (1, 21, 26), generator=generator_for(6)) / 16
     image, deviation = clean + noise_of(clean.shape, 7, 0.05), 0.05 + 0.02 * clean
     found = collaboratively_filtered(image, clean, guide, deviation, threshold=threshold)
@@ -106,7 +111,9 @@ def test_images_of_a_batch_are_refined_one_by_one():
     deviation = torch.stack([torch.full((3, 48, 64), d) for d in (0.05, 0.1)])
     together = refined(images, images, deviation)
     for i in range(2):
-        assert torch.equal(together[i : i + 1], refined(images[i : i + 1], images[i : i + 1], deviation[i : i + 1]))
+        assert torch.equal(
+            together[i : i + 1], refined(images[i : i + 1], images[i : i + 1], deviation[i : i + 1])
+        )
 
 
 def test_luma_is_drawn_to_what_alpha_recorded():

@@ -47,7 +47,11 @@ def denoised(part, electrons):
     ideal = luminance(ideal) if part == "band" else ideal
     level = NoiseLevel.of_electrons(electrons, 2)
     recorded = level.recorded(ideal, generator_for(0, part, electrons))
-    return ideal, recorded, getattr(load_denoiser(), part)(level.unbiased(recorded), level.deviation(recorded))
+    return (
+        ideal,
+        recorded,
+        getattr(load_denoiser(), part)(level.unbiased(recorded), level.deviation(recorded)),
+    )
 
 
 def test_results_over_flips_are_flipped_as_the_images_are():
@@ -55,7 +59,9 @@ def test_results_over_flips_are_flipped_as_the_images_are():
     network, image = torch.nn.Conv2d(1, 1, 3, padding=1), torch.rand(1, 1, 6, 7)
     for axes in ((-1,), (-2,)):
         assert not torch.allclose(network(image.flip(axes)), network(image).flip(axes), atol=1e-2)
-        torch.testing.assert_close(over_flips(network, image.flip(axes)), over_flips(network, image).flip(axes))
+        torch.testing.assert_close(
+            over_flips(network, image.flip(axes)), over_flips(network, image).flip(axes)
+        )
 
 
 def test_a_fused_image_takes_the_betas_brightness_as_its_own():

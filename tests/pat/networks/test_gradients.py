@@ -93,7 +93,9 @@ def test_a_rotation_is_recovered_by_optimising_through_attention_alone():
     optimiser = torch.optim.Rprop([angle], lr=math.radians(0.13), etas=(0.3, 1.01))
     for _ in range(10):
         optimiser.zero_grad()
-        turned = rig.perturbed({"colour.rotation": angle * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)})
+        turned = rig.perturbed(
+            {"colour.rotation": angle * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)}
+        )
         frame = fuse(supervised, turned, images, alpha="mono", align=False, differentiable=True)
         (frame.image - sample.ground_truth[window]).square().mean().backward()
         optimiser.step()

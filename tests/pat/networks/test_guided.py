@@ -39,7 +39,9 @@ def test_luminance_is_alphas():
 
 
 def test_three_filtered_cameras_serve_as_one():
-    """The same colours from three cameras in one place, up to what their guides (bands, not luminance) say."""
+    """The same colours from three cameras in one place, up to what their guides (bands, not luminance)
+    say.
+    """
     torch.manual_seed(0)
     network = lively(GuidedPAT(SMALL))
     alpha, grey = torch.rand(1, 1, *HW), torch.rand(1, 1, *HW)
@@ -74,7 +76,9 @@ def test_gradients_reach_the_rig():
     fused = fused_at_once(
         network,
         Inputs.of(
-            torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [FieldOnGrid.of(Epipolar(), Pair(camera, beta, depth))]
+            torch.rand(1, 1, *HW),
+            [torch.rand(1, 3, *HW)],
+            [FieldOnGrid.of(Epipolar(), Pair(camera, beta, depth))],
         ),
     )
     fused.image.square().sum().backward()
@@ -112,7 +116,9 @@ def test_colour_counts_more_where_brightness_is_alike():
     beta = torch.full((1, 3, *HW), 0.5)
     alike, unlike = (
         network.explain(inputs, matched_for(network, inputs))[1][0]
-        for inputs in (Inputs.of(torch.full((1, 1, *HW), value), [beta], [rectified()]) for value in (0.5, 0.9))
+        for inputs in (
+            Inputs.of(torch.full((1, 1, *HW), value), [beta], [rectified()]) for value in (0.5, 0.9)
+        )
     )
     inside = (..., slice(16, 40))
     assert (alike.likeness[inside] > 0.99).all()
@@ -122,7 +128,9 @@ def test_colour_counts_more_where_brightness_is_alike():
 
 
 def test_features_are_as_exact_as_the_image_and_positions_more(monkeypatch):
-    """Features in float64 took a sixth of the time of a tile, and a sixth of its memory, for 2e-6 of the image."""
+    """Features in float64 took a sixth of the time of a tile, and a sixth of its memory, for 2e-6 of the
+    image.
+    """
     asked, attend = [], guided.attend_with_statistics
 
     def noted(query, key, value, window, **options):

@@ -1,5 +1,5 @@
-"""Peak memory with several betas, measured in processes of their own: it is what is counted, and hardly grows with
-their number."""
+"""Peak memory with several betas, measured in processes of their own: it is what is counted, and hardly grows
+with their number."""
 
 import json
 import subprocess
@@ -57,7 +57,9 @@ def found_in(inputs):
 
 
 def growth(work):
-    """Bytes by which the peak exceeds what the process had; the least of several runs, the first not counted."""
+    """Bytes by which the peak exceeds what the process had; the least of several runs, the first not
+    counted.
+    """
     least = float("inf")
     for i in range(REPEATS + 1):
         give_back()
@@ -80,10 +82,16 @@ def bytes_of_a_tile(betas):
     """Over those that are counted."""
     network, frame = frame_of(SIDE, betas)
     tile, matches = Tile(TILE, TILE), found_in(frame.inputs)
-    return growth(lambda: fuse_tile(network, frame, matches, tile)) / working_memory(network, frame.inputs, tile)
+    return growth(lambda: fuse_tile(network, frame, matches, tile)) / working_memory(
+        network, frame.inputs, tile
+    )
 
 
-MEASURED = {"agree": (bytes_to_agree, 3), "tile of 1": (bytes_of_a_tile, 1), "tile of 3": (bytes_of_a_tile, 3)}
+MEASURED = {
+    "agree": (bytes_to_agree, 3),
+    "tile of 1": (bytes_of_a_tile, 1),
+    "tile of 3": (bytes_of_a_tile, 3),
+}
 
 
 @pytest.fixture(scope="module")
@@ -97,15 +105,15 @@ def measured():
 
 
 def test_agreement_takes_little_more_than_its_result(measured):
-    """Disparity and facts, 7 bytes for each beta, and what is computed on the way. In float64 for the whole image it
-    was 460 bytes a pixel."""
+    """Disparity and facts, 7 bytes for each beta, and what is computed on the way. In float64 for the whole
+    image it was 460 bytes a pixel."""
     assert measured["agree"] < 220
 
 
 @pytest.mark.parametrize("betas", [1, 3])
 def test_a_tile_takes_what_is_counted(betas, measured):
-    """Not more, or a limit is exceeded, and not much less, or tiles are small for nothing. Some more if what is freed
-    goes back late."""
+    """Not more, or a limit is exceeded, and not much less, or tiles are small for nothing. Some more if what
+    is freed goes back late."""
     assert 0.55 < measured[f"tile of {betas}"] < 1.25
 
 

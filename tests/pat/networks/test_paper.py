@@ -36,7 +36,15 @@ def test_the_default_is_the_papers():
     assert (config.dim, config.scale, config.residual, config.interpolation) == (64, 1, False, "nearest")
     network = PAT()
     assert [type(m).__name__ for m in network.features] == [
-        *("Conv2d", "LeakyReLU", "ResidualBlock", "ResidualASPP", "ResidualBlock", "ResidualASPP", "ResidualBlock"),
+        *(
+            "Conv2d",
+            "LeakyReLU",
+            "ResidualBlock",
+            "ResidualASPP",
+            "ResidualBlock",
+            "ResidualASPP",
+            "ResidualBlock",
+        ),
     ]
     assert sum(type(m).__name__ == "ResidualBlock" for m in network.post) == 4
 
@@ -86,7 +94,9 @@ def test_four_inputs_a_band_each_give_the_colours():
 
     def psnr(bands: str) -> float:
         taken = {"mono": mono} | dict(zip(bands, images["colour"].split(1)))
-        return score(fuse(load_weights("pat-supervised-4"), four, taken, alpha="mono").image.clamp(0, 1), truth).psnr
+        return score(
+            fuse(load_weights("pat-supervised-4"), four, taken, alpha="mono").image.clamp(0, 1), truth
+        ).psnr
 
     assert psnr("rgb") > score(mono.expand(3, -1, -1), truth).psnr + 5
     assert psnr("bgr") < psnr("rgb") - 5

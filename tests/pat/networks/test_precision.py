@@ -15,7 +15,14 @@ def test_bfloat16_changes_the_image_little_and_something(monkeypatch):
     sample = load_sample()
     images = {name: sample.images[name] for name in sample.rig.names}
     exact, rounded = (
-        fuse(load_weights("mono-colour", precision=p), sample.rig, images, alpha="mono", align=False, response="rec601")
+        fuse(
+            load_weights("mono-colour", precision=p),
+            sample.rig,
+            images,
+            alpha="mono",
+            align=False,
+            response="rec601",
+        )
         for p in ("float32", "bfloat16")
     )
     apart = (exact.image - rounded.image).abs()

@@ -133,7 +133,9 @@ def test_weights_that_are_not_finite_are_refused(tmp_path, bad):
 
 def test_weights_of_integers_are_refused(tmp_path):
     network = PAT(PATConfig(dim=8))
-    state = {name: torch.zeros_like(tensor, dtype=torch.int32) for name, tensor in network.state_dict().items()}
+    state = {
+        name: torch.zeros_like(tensor, dtype=torch.int32) for name, tensor in network.state_dict().items()
+    }
     weights_file(tmp_path / "w.safetensors", dataclasses.asdict(network.config), "PAT", state)
     with pytest.raises(ValueError, match="holds something other than finite numbers"):
         load_weights(tmp_path / "w.safetensors")

@@ -23,7 +23,9 @@ def test_recorded_noise_has_the_stated_deviation(name, value):
     assert float(recorded.std()) == pytest.approx(stated, rel=0.05)
 
 
-@pytest.mark.parametrize(("name", "value", "bias"), [("50 electrons", 0.05, 0.048), ("50 electrons", 0.25, -0.029)])
+@pytest.mark.parametrize(
+    ("name", "value", "bias"), [("50 electrons", 0.05, 0.048), ("50 electrons", 0.25, -0.029)]
+)
 def test_the_bias_of_clipped_and_encoded_noise_is_removed(name, value, bias):
     recorded = LEVELS[name].recorded(torch.full((1, 1, 200, 200), value), generator_for(0, name, value))
     assert float(recorded.mean()) - value == pytest.approx(bias, abs=0.004)
@@ -67,7 +69,12 @@ def test_the_level_is_estimated_from_an_image(name):
 
 def test_an_image_without_noise_or_without_content_has_none():
     assert (
-        float(NoiseLevel.estimated(torch.full((1, 1, 64, 64), 0.5)).deviation(torch.full((1, 1, 8, 8), 0.5)).max()) == 0
+        float(
+            NoiseLevel.estimated(torch.full((1, 1, 64, 64), 0.5))
+            .deviation(torch.full((1, 1, 8, 8), 0.5))
+            .max()
+        )
+        == 0
     )
     assert NoiseLevel.estimated(torch.zeros(1, 3, 64, 64)) == NoiseLevel()
     assert NoiseLevel.estimated(torch.rand(1, 1, 8, 8)) == NoiseLevel()

@@ -184,7 +184,14 @@ def test_jitter_changes_each_image_by_about_what_is_asked():
     "step",
     [
         *(DecodeSRGB(), EncodeSRGB(), Exposure(1.7), Spectral("luminance"), Spectral(Band(560, 50))),
-        *(BoxBlur(3), GaussianBlur(0.8), DiscBlur(1.3), Resample(0.5), Resample((5, 9)), Resample(2.0, "bicubic")),
+        *(
+            BoxBlur(3),
+            GaussianBlur(0.8),
+            DiscBlur(1.3),
+            Resample(0.5),
+            Resample((5, 9)),
+            Resample(2.0, "bicubic"),
+        ),
         *(Noise(500, 3), Jitter()),
     ],
     ids=lambda s: type(s).__name__,
@@ -211,7 +218,9 @@ def test_the_four_cases_are_equally_likely_and_do_what_they_say():
     alpha, beta = noise_image(400, 1, 8, 16), noise_image(400, 3, 8, 16)
     pairs = augment(alpha, beta, paper_cases(), generator())
     assert (torch.bincount(pairs.case, minlength=4) - 100).abs().max() < 35
-    changed = torch.stack([(a != b).flatten(1).any(1) for a, b in ((pairs.alpha, alpha), (pairs.beta, beta))], 1)
+    changed = torch.stack(
+        [(a != b).flatten(1).any(1) for a, b in ((pairs.alpha, alpha), (pairs.beta, beta))], 1
+    )
     wanted = torch.tensor([[True, False], [False, True], [False, True], [False, True]])
     assert torch.equal(changed, wanted[pairs.case])
     for case, steps in ((1, [BoxBlur(5)]), (2, [Resample(0.5, "bicubic"), Resample(2.0, "bicubic"), Clip()])):

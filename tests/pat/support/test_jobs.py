@@ -1,4 +1,6 @@
-"""Tasks: once each, resumed, in other processes with the same results; killed workers and commands lose nothing."""
+"""Tasks: once each, resumed, in other processes with the same results; killed workers and commands lose
+nothing.
+"""
 
 import os
 import re
@@ -107,14 +109,24 @@ def test_a_killed_worker_loses_nothing(tmp_path):
 
 @pytest.mark.slow
 def test_a_killed_command_is_resumed_to_the_same_bits(material, tmp_path):  # noqa: F811
-    """Forty frames with two workers, everything killed with SIGKILL in the middle, begun again with --resume."""
+    """Forty frames with two workers, everything killed with SIGKILL in the middle, begun again with
+    --resume.
+    """
     (tmp_path / "fast").mkdir()
     (tmp_path / "slow").mkdir()
     for i in range(40):
         os.link(material / "fast" / f"fast_{8 + i % 7}.png", tmp_path / "fast" / f"f{i}.png")
         os.link(material / "slow" / f"slow_{8 + i % 2}.png", tmp_path / "slow" / f"s{i}.png")
     images = [a for name in ("fast", "slow") for a in ("--image", f"{name}={tmp_path / name}")]
-    given = ["--rig", material / "rig.yaml", "--alpha", "fast", "--weights", material / "tiny.safetensors", *images]
+    given = [
+        "--rig",
+        material / "rig.yaml",
+        "--alpha",
+        "fast",
+        "--weights",
+        material / "tiny.safetensors",
+        *images,
+    ]
     run = "import sys; from pat.cli.main import main\nif __name__ == '__main__': main(sys.argv[1:])"
     (tmp_path / "run.py").write_text(run)
 

@@ -38,7 +38,10 @@ def holder(tmp_path):
 
 def test_a_folder_is_one_commands_until_that_is_gone(holder, tmp_path):
     out = tmp_path / "out"
-    wanted = rf"out: another command is writing there \(process {holder.pid} on {socket.gethostname()}\): wait for it"
+    wanted = (
+        rf"out: another command is writing there \(process {holder.pid} on {socket.gethostname()}\): "
+        rf"wait for it"
+    )
     with pytest.raises(ValueError, match=wanted), folder_lock(out):
         pass
     assert (out / LOCK).is_file()

@@ -17,7 +17,11 @@ class SomeSettings:
 
 def test_entries_have_value_kind_and_reason():
     found = [(s.name, s.value, s.kind, s.why, s.numbers) for s in listed(SomeSettings(c=5))]
-    assert found == [("a", 1.0, "physics", "light", 1), ("b", (2, 3), "tuned", "pairs", 2), ("c", 5, "size", "rows", 1)]
+    assert found == [
+        ("a", 1.0, "physics", "light", 1),
+        ("b", (2, 3), "tuned", "pairs", 2),
+        ("c", 5, "size", "rows", 1),
+    ]
 
 
 def test_a_number_without_a_kind_is_refused():

@@ -23,8 +23,8 @@ class Sheet:
     """A ChArUco board of (columns, rows) squares, printed in black on white with a margin (metres); without
     markers (0) a chessboard.
 
-    Its frame has the origin at the outer corner of the first square, x along the columns, y along the rows, z away
-    from the viewer (as OpenCV's).
+    Its frame has the origin at the outer corner of the first square, x along the columns, y along the rows, z
+    away from the viewer (as OpenCV's).
     """
 
     squares: tuple[int, int]
@@ -40,7 +40,9 @@ class Sheet:
 
     @property
     def inner_corners(self) -> np.ndarray:
-        """The corners between squares (n, 3) in the board's frame, metres, row by row (as OpenCV numbers them)."""
+        """The corners between squares (n, 3) in the board's frame, metres, row by row (as OpenCV numbers
+        them).
+        """
         columns, rows = self.squares
         y, x = np.mgrid[1:rows, 1:columns] * self.square
         return np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
@@ -62,7 +64,8 @@ class Sheet:
 
 
 def board_scene(poses: Sequence[Pose], sheet: Sheet, image: Path) -> Scene:
-    """A board that is at the k-th pose (world_from_board) at the time of k seconds; its drawing is written to `image`.
+    """A board that is at the k-th pose (world_from_board) at the time of k seconds; its drawing is written to
+    `image`.
 
     Render it with cameras of one frame a second for as many seconds as there are poses.
     """
@@ -73,7 +76,9 @@ def board_scene(poses: Sequence[Pose], sheet: Sheet, image: Path) -> Scene:
     for k, pose in enumerate(poses):
         R, t = pose.R.numpy(), pose.t.numpy()
         rotation = vec(Rotation.from_matrix(R).as_rotvec())
-        keys.append(Key(position=vec(R @ middle + t), rotation=rotation, extent=(width, height, 1.0), time=float(k)))
+        keys.append(
+            Key(position=vec(R @ middle + t), rotation=rotation, extent=(width, height, 1.0), time=float(k))
+        )
     ink = Texture(kind="image", image=str(image), scale=1 / width, paints=(Paint((0.85, 0.85, 0.85), 0.85),))
     plane = Object(
         name="board", shape="plane", motion=Motion(tuple(keys)), material=Material(texture=ink, specular=0.1)

@@ -29,7 +29,10 @@ def unlike_cameras(width: int = 64) -> Rig:
         "shifted": Camera(K=shifted, cam_from_world=posed((1, -4, 5), (0.3, 0.05, 0.1)), hw=(w, h)),
         "turned": Camera(K=turned, cam_from_world=posed((-2, 1, 0), (0, -0.2, 0)), hw=(w, h)),
         "distorted": Camera(
-            K=intrinsics(0.6 * w, (h, w)), cam_from_world=posed((0, 2, -1), (-0.25, 0, 0)), hw=(h, w), distortion=LENS
+            K=intrinsics(0.6 * w, (h, w)),
+            cam_from_world=posed((0, 2, -1), (-0.25, 0, 0)),
+            hw=(h, w),
+            distortion=LENS,
         ),
     }
     return Rig(cameras, depth=(2.0, 12.0))
@@ -37,7 +40,10 @@ def unlike_cameras(width: int = 64) -> Rig:
 
 def thing(shape: str, position: Vec3, **changes: object) -> Object:
     """A shape of one metre with a checked surface."""
-    fields = {"rotation": changes.pop("rotation", (0.3, 0.5, 0.2)), "extent": changes.pop("extent", (1.0, 1.0, 1.0))}
+    fields = {
+        "rotation": changes.pop("rotation", (0.3, 0.5, 0.2)),
+        "extent": changes.pop("extent", (1.0, 1.0, 1.0)),
+    }
     paints = (Paint((0.7, 0.3, 0.1), 0.2), Paint((0.1, 0.4, 0.5), 0.8))
     surface = Material(texture=Texture(kind="checker", scale=5.0, paints=paints, grain=0.2))
     motion = Motion((Key(position=position, **fields),))
@@ -48,7 +54,10 @@ def room_scene() -> Scene:
     """A sphere, a dented cube and a torus in a room of 8 x 6 x 12 metres around the origin."""
     walls = Material(
         texture=Texture(
-            kind="noise", scale=3.0, grain=0.3, paints=(Paint((0.6, 0.5, 0.4), 0.5), Paint((0.2, 0.2, 0.3), 0.3))
+            kind="noise",
+            scale=3.0,
+            grain=0.3,
+            paints=(Paint((0.6, 0.5, 0.4), 0.5), Paint((0.2, 0.2, 0.3), 0.3)),
         )
     )
     objects = (

@@ -31,8 +31,9 @@ class Across(NamedTuple):
 def transferred(batch: ArrayBatch, alpha: int = 0, beta: int = 1, *, tolerance: float = 0.01) -> Across:
     """Follow every pixel of view `alpha` into view `beta` by its depth.
 
-    Visible means on beta's image and as far from beta as the surface recorded there, to the relative `tolerance`.
-    Inverse depth is interpolated, which is exact on planes; points beside an edge in beta count as not visible.
+    Visible means on beta's image and as far from beta as the surface recorded there, to the relative
+    `tolerance`. Inverse depth is interpolated, which is exact on planes; points beside an edge in beta count
+    as not visible.
     """
     a, b = batch.cameras[alpha], batch.cameras[beta]
     grid = pixel_grid(a.hw, device=batch.images[alpha].device).flatten(0, 1).expand(len(a.K), -1, 2)
@@ -41,14 +42,18 @@ def transferred(batch: ArrayBatch, alpha: int = 0, beta: int = 1, *, tolerance: 
     same = (seen.values[:, 3] * depth - 1).abs() < tolerance
     visible = in_front & seen.valid & same
     h, w = a.hw
-    return Across(x.unflatten(1, (h, w)), visible.unflatten(1, (h, w)), seen.values[:, :3].unflatten(2, (h, w)))
+    return Across(
+        x.unflatten(1, (h, w)), visible.unflatten(1, (h, w)), seen.values[:, :3].unflatten(2, (h, w))
+    )
 
 
 @pytest.fixture(scope="module")
 def smooth() -> PhotoBank:
     """Textures without fine detail, so that differences between views are due to geometry alone."""
     rng = np.random.default_rng(0)
-    return PhotoBank([cv2.GaussianBlur(p, (0, 0), 5) for i, p in enumerate(patterns(rng, 40)) if i % 5 in (0, 4)])
+    return PhotoBank(
+        [cv2.GaussianBlur(p, (0, 0), 5) for i, p in enumerate(patterns(rng, 40)) if i % 5 in (0, 4)]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +66,9 @@ def draw(bank: PhotoBank, rigs: RigDistribution, batch: int = 4, seed: int = 0) 
 
 
 def mean_shift(batch: ArrayBatch) -> torch.Tensor:
-    """Least-squares displacement (x, y), in alpha's pixels, of beta's colours against alpha's, off the outlines."""
+    """Least-squares displacement (x, y), in alpha's pixels, of beta's colours against alpha's, off the
+    outlines.
+    """
     across = transferred(batch)
     dy, dx = torch.gradient(batch.images[0], dim=(-2, -1))
     difference = across.image - batch.images[0]
@@ -84,7 +91,9 @@ def test_depth_and_cameras_predict_the_other_view(smooth, mode, resolution):
 @pytest.mark.parametrize("mode", ["rectified", "general"])
 @pytest.mark.parametrize("resolution", [1.0, 0.5, 0.25])
 def test_no_shift_between_views_of_different_resolution(smooth, mode, resolution):
-    batch = draw(smooth, RigDistribution(mode=mode, resolutions=(resolution,), focal_ratio=(0.8, 1.25)), 12, 3)
+    batch = draw(
+        smooth, RigDistribution(mode=mode, resolutions=(resolution,), focal_ratio=(0.8, 1.25)), 12, 3
+    )
     assert mean_shift(batch).abs().max() < 0.02
 
 
@@ -139,9 +148,13 @@ def test_a_given_rig_keeps_its_cameras(rich):
     K = intrinsics(300.0, (60, 90))[None]
     still = Pose(torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64))
     turned = Pose(
-        rotation_from_vector(torch.tensor([[0.02, -0.03, 0.1]]).double()), torch.tensor([[0.2, 0.1, 0]]).double()
+        rotation_from_vector(torch.tensor([[0.02, -0.03, 0.1]]).double()),
+        torch.tensor([[0.2, 0.1, 0]]).double(),
     )
-    cameras = [Camera(K=K, cam_from_world=still, hw=(60, 90)), Camera(K=K * 1.0, cam_from_world=turned, hw=(50, 80))]
+    cameras = [
+        Camera(K=K, cam_from_world=still, hw=(60, 90)),
+        Camera(K=K * 1.0, cam_from_world=turned, hw=(50, 80)),
+    ]
     rig = RigBatch(cameras, torch.tensor([2.0]).double(), torch.tensor([10.0]).double())
     scenes = LayeredScenes(rich, RigDistribution(), hw=HW)
     batch = scenes.render(rig, torch.Generator().manual_seed(0), oversampling=2)

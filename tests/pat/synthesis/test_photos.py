@@ -9,7 +9,10 @@ from pat.synthesis.photos import PhotoBank
 @pytest.fixture(scope="module")
 def images() -> list[np.ndarray]:
     rng = np.random.default_rng(0)
-    return [rng.integers(0, 256, (64, 96, 3), dtype=np.uint8), rng.integers(0, 256, (70, 32, 3), dtype=np.uint8)]
+    return [
+        rng.integers(0, 256, (64, 96, 3), dtype=np.uint8),
+        rng.integers(0, 256, (70, 32, 3), dtype=np.uint8),
+    ]
 
 
 def seen_values(bank: PhotoBank, texture: int, xy: list[list[float]], level: float) -> np.ndarray:

@@ -8,7 +8,13 @@ from pat.synthesis.scene import Key, Motion, Relief, Scene, Shape
 from pat.synthesis.shapes import inside, mesh
 from tests.pat.synthesis.scenes import room_scene, thing
 
-VOLUMES = {"cube": 1.0, "sphere": np.pi / 6, "cylinder": np.pi / 4, "cone": np.pi / 12, "torus": np.pi**2 * 0.35 * 0.15}
+VOLUMES = {
+    "cube": 1.0,
+    "sphere": np.pi / 6,
+    "cylinder": np.pi / 4,
+    "cone": np.pi / 12,
+    "torus": np.pi**2 * 0.35 * 0.15,
+}
 SOLIDS = [s for s in get_args(Shape) if s not in ("plane", "room", "lathe")]
 
 
@@ -40,7 +46,11 @@ def test_a_scene_comes_back_from_its_file(tmp_path):
 )
 def test_a_mistake_in_a_scene_file_is_named(old, new, said):
     text = room_scene().to_yaml()
-    text = text if old in text else text.replace("[1.2, 0.3, 1.2]", "\n        - 1.2\n        - 0.3\n        - 1.2")
+    text = (
+        text
+        if old in text
+        else text.replace("[1.2, 0.3, 1.2]", "\n        - 1.2\n        - 0.3\n        - 1.2")
+    )
     assert old in text
     with pytest.raises(ValueError, match=said):
         Scene.from_yaml(text.replace(old, new, 1), "my.yaml")

@@ -19,7 +19,9 @@ def short_run(folder: Path, **changes) -> TrainConfig:
     if not photos.exists():
         g = Generator().manual_seed(0)
         for i in range(4):
-            smooth = torch.nn.functional.interpolate(torch.rand(1, 3, 12, 16, generator=g), (96, 128), mode="bilinear")
+            smooth = torch.nn.functional.interpolate(
+                torch.rand(1, 3, 12, 16, generator=g), (96, 128), mode="bilinear"
+            )
             write_image(photos / f"{i}.png", smooth[0])
     given = {"network": SMALL, "steps": 8, "batch": 2, "groups": 2, "hw": (32, 48), "rate": 1e-2, "warmup": 2}
     given |= {"validate": 4, "save": 3, "held_out": 4, "average": 5, "cache": folder / "cache.npz"}

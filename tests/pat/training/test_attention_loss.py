@@ -59,8 +59,12 @@ def test_what_is_unknown_or_off_the_segment_does_not_count():
     query, key, position, _ = random()
     visible = torch.ones(1, *HW, dtype=torch.bool)
     unknown = attention_loss([compared(query, key)], [torch.zeros_like(position)], [~visible], stride=1)
-    beside = attention_loss([compared(query, key)], [position + torch.tensor([0.0, 2.0])], [visible], stride=1)
-    beyond = attention_loss([compared(query, key)], [rows().end + torch.tensor([3.0, 0.0])], [visible], stride=1)
+    beside = attention_loss(
+        [compared(query, key)], [position + torch.tensor([0.0, 2.0])], [visible], stride=1
+    )
+    beyond = attention_loss(
+        [compared(query, key)], [rows().end + torch.tensor([3.0, 0.0])], [visible], stride=1
+    )
     assert unknown == beside == beyond == 0
 
 

@@ -20,7 +20,9 @@ from pat.training.config import (
 
 
 def test_written_and_read_back(tmp_path):
-    config = TrainConfig(photos=(Path("a"), Path("b")), network=PATConfig(dim=8), minutes=3.5, cache=Path("c.npz"))
+    config = TrainConfig(
+        photos=(Path("a"), Path("b")), network=PATConfig(dim=8), minutes=3.5, cache=Path("c.npz")
+    )
     save_config(config, tmp_path / "c.yaml")
     assert load_config(tmp_path / "c.yaml") == config
     assert parse_config(config_text(TrainConfig())) == TrainConfig()
@@ -48,7 +50,10 @@ def test_the_papers_recipes_are_the_papers():
         ("batchs: 4", "c: batchs: unknown key; did you mean 'batch'?"),
         ("recording: {gian: 1}", "c: recording.gian: unknown key; did you mean 'gain'?"),
         ("network: {kind: PAT, dimm: 8}", "c: network.dimm: unknown key; did you mean 'dim'?"),
-        ("network: {kind: Pat}", "c: network.kind: no network 'Pat'; known here: PAT, GuidedPAT, BandwisePAT"),
+        (
+            "network: {kind: Pat}",
+            "c: network.kind: no network 'Pat'; known here: PAT, GuidedPAT, BandwisePAT",
+        ),
         ("network: 3", "c: network: wanted entries such as kind: GuidedPAT, got 3"),
         ("batch: four", "c: batch: is 'four'; wanted a whole number"),
         ("batch: 4.5", "c: batch: is 4.5; wanted a whole number"),
@@ -80,7 +85,16 @@ def test_numbers_as_people_write_them():
 def test_the_command_line_goes_over_the_recipe(tmp_path):
     save_config(TrainConfig(batch=6, network=GuidedPATConfig(taps=9)), tmp_path / "c.yaml")
     config = command_line(
-        [str(tmp_path / "c.yaml"), "--rate", "1e-3", "--network.window", "3", "--general-rigs.focal-ratio", "1", "3"]
+        [
+            str(tmp_path / "c.yaml"),
+            "--rate",
+            "1e-3",
+            "--network.window",
+            "3",
+            "--general-rigs.focal-ratio",
+            "1",
+            "3",
+        ]
     )
     assert (config.batch, config.rate, config.network.taps, config.network.window) == (6, 1e-3, 9, 3.0)
     assert config.general_rigs.focal_ratio == (1, 3)

@@ -101,7 +101,9 @@ def test_a_run_leaves_what_it_says(whole):
     assert len(list((whole.out / "checkpoints").iterdir())) == 2
     again = load_weights(whole.out / "best.safetensors").state_dict()
     assert train(whole) == whole.out / "best.safetensors"
-    assert all(torch.equal(v, again[k]) for k, v in load_weights(whole.out / "best.safetensors").state_dict().items())
+    assert all(
+        torch.equal(v, again[k]) for k, v in load_weights(whole.out / "best.safetensors").state_dict().items()
+    )
 
 
 @pytest.mark.parametrize(
@@ -185,7 +187,9 @@ def test_two_processes_are_as_one(run, folder, whole, monkeypatch):
 
 def test_forty_steps_learn(folder):
     """From nothing, on scenes of three photographs: better on the fourth, and more of it matched."""
-    config = short_run(folder, out=folder / "learns", steps=40, batch=1, groups=1, rate=3e-3, validate=20, save=50)
+    config = short_run(
+        folder, out=folder / "learns", steps=40, batch=1, groups=1, rate=3e-3, validate=20, save=50
+    )
     train(config)
     before = validation(new_network(config).eval(), list(scenes(config)[1](8)))
     log = [json.loads(line) for line in (config.out / "log.jsonl").read_text().splitlines()]
@@ -224,7 +228,9 @@ def test_a_sample_that_is_not_finite_is_named_and_saved(folder, whole, monkeypat
 
 
 def test_no_room_for_a_checkpoint(folder, whole, monkeypatch):
-    """The system refuses to write, as on a full disk; the older checkpoint stays, and the run can go on from it."""
+    """The system refuses to write, as on a full disk; the older checkpoint stays, and the run can go on from
+    it.
+    """
     config = replace(whole, out=folder / "full")
     stopped(config, 5, monkeypatch)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -259,14 +265,19 @@ def test_starting_from_weights(folder, whole):
 
 def test_no_photographs(folder, whole):
     (folder / "empty").mkdir()
-    for photos, message in (((folder / "empty",), "no image found under"), ((), "no photographs: give `photos`")):
+    for photos, message in (
+        ((folder / "empty",), "no image found under"),
+        ((), "no photographs: give `photos`"),
+    ):
         with pytest.raises(ValueError, match=message):
             train(replace(whole, photos=photos, cache=None, out=folder / "none"))
 
 
 def test_the_papers_network_trains_on_nearest_pixels(folder, whole):
     network = PATConfig(dim=4)
-    config = replace(whole, network=network, loss="mse", field="nearest", out=folder / "paper", steps=2, filtered=0.0)
+    config = replace(
+        whole, network=network, loss="mse", field="nearest", out=folder / "paper", steps=2, filtered=0.0
+    )
     assert load_weights(train(config)).config == network
 
 
@@ -293,7 +304,8 @@ def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_again(folder, wh
     assert newest_checkpoint(config.out / "checkpoints").facts["step"] == 3
     header = int.from_bytes(older.read_bytes()[:8], "little")
     older.write_bytes(
-        older.read_bytes()[: 8 + header].replace(b'\\"step\\"', b'\\"stop\\"') + older.read_bytes()[8 + header :]
+        older.read_bytes()[: 8 + header].replace(b'\\"step\\"', b'\\"stop\\"')
+        + older.read_bytes()[8 + header :]
     )
     log = (config.out / "log.jsonl").read_bytes()
     with pytest.raises(ValueError, match=r"step-00000006.*step-00000003"):

@@ -25,7 +25,9 @@ def pair(tmp_path_factory):
     folder = tmp_path_factory.mktemp("2006_third") / "made"
     folder.mkdir()
     r = np.random.RandomState(0)
-    behind, front = (np.kron(r.randint(0, 256, (24, 40, 3)), np.ones((2, 2, 1))).astype(np.uint8) for _ in range(2))
+    behind, front = (
+        np.kron(r.randint(0, 256, (24, 40, 3)), np.ones((2, 2, 1))).astype(np.uint8) for _ in range(2)
+    )
     for image, disparity, shift in (("view1.png", "disp1.png", 0), ("view5.png", "disp5.png", 1)):
         pixels, known = np.roll(behind, -shift * FAR, 1), np.full(behind.shape[:2], 3 * FAR, np.uint8)
         square = slice(12, 36), slice(30 - shift * NEAR, 54 - shift * NEAR)
@@ -46,7 +48,12 @@ def test_true_positions_are_where_beta_shows_the_same(pair):
         there = sample(made.betas[0], made.position[0].float()).values
         off = (there - made.ground_truth).abs().amax(1)
         known = (made.position[0] != 0).any(-1)
-        occluded = known & ~made.visible[0] & (made.position[0][..., 0] >= 0) & (made.position[0][..., 0] < HW[1] - 1)
+        occluded = (
+            known
+            & ~made.visible[0]
+            & (made.position[0][..., 0] >= 0)
+            & (made.position[0][..., 0] < HW[1] - 1)
+        )
         assert (off[made.visible[0]] < 0.02).float().mean() > 0.99
         assert not made.visible[0][~known].any()
         shown, hidden = shown + int(made.visible[0].sum()), hidden + int(occluded.sum())
@@ -77,7 +84,10 @@ def test_a_recipe_takes_its_batches_from_them(pair):
         ("measured: 0.5", "give both `measured` and `measured_from`"),
         ("measured_from: [a]", "give both `measured` and `measured_from`"),
         ("attention: -1", "attention must be 0 or more"),
-        ("{measured: 0.6, measured_from: [a], pairs: 0.6, pairs_from: [b]}", "shares of the batches, 1.2 in all"),
+        (
+            "{measured: 0.6, measured_from: [a], pairs: 0.6, pairs_from: [b]}",
+            "shares of the batches, 1.2 in all",
+        ),
     ],
 )
 def test_recipes_that_cannot_be_are_refused(text, message):

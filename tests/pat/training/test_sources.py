@@ -1,4 +1,6 @@
-"""Rendered scenes, stereo pairs and lenses as sources of samples: what they give, and what is wrong with them."""
+"""Rendered scenes, stereo pairs and lenses as sources of samples: what they give, and what is wrong with
+them.
+"""
 
 import json
 import math
@@ -34,7 +36,15 @@ from pat.training.lenses import lens_over, through_lenses
 from pat.training.loop import new_network, train
 from pat.training.losses import explained, match_loss, validation
 from pat.training.samples import degraded, pair_of, plan, scenes, transfer
-from pat.training.scenes import ACTIVE, GROUPS_PER_EXCHANGE, SKY, RenderedCrops, active_items, batched, finite_window
+from pat.training.scenes import (
+    ACTIVE,
+    GROUPS_PER_EXCHANGE,
+    SKY,
+    RenderedCrops,
+    active_items,
+    batched,
+    finite_window,
+)
 from pat.training.stereo import PairCrops
 
 from .runs import losses, short_run
@@ -79,7 +89,9 @@ def stereo(folder, *, count: int = 4, hw: tuple[int, int] = (80, 120), disparity
     """Pairs cut from wide smooth images: what left has at x, right has at x - disparity."""
     for i in range(count):
         coarse = torch.rand(1, 3, hw[0] // 6, hw[1] // 6, generator=generator(i))
-        wide = torch.nn.functional.interpolate(coarse, (hw[0], hw[1] + disparity), mode="bicubic").clamp(0, 1)[0]
+        wide = torch.nn.functional.interpolate(coarse, (hw[0], hw[1] + disparity), mode="bicubic").clamp(
+            0, 1
+        )[0]
         write_image(folder / f"{i}_L.png", wide[:, :, :-disparity])
         write_image(folder / f"{i}_R.png", wide[:, :, disparity:])
     return folder
@@ -95,7 +107,9 @@ def test_without_these_sources_steps_are_what_they_were():
 
 
 def test_shares_are_shares():
-    config = TrainConfig(rendered=0.3, rendered_from=(Path("a"),), pairs=0.2, pairs_from=(Path("b"),), reuse=1.0)
+    config = TrainConfig(
+        rendered=0.3, rendered_from=(Path("a"),), pairs=0.2, pairs_from=(Path("b"),), reuse=1.0
+    )
     kinds = [p.kind for p in islice(plan(config, 0), 2000)]
     assert kinds.count("rendered") / 2000 == pytest.approx(0.3, abs=0.03)
     assert kinds.count("pairs") / 2000 == pytest.approx(0.2, abs=0.03)
@@ -108,7 +122,10 @@ def test_shares_are_shares():
         ("rendered: 1.5", "rendered is a share of the batches, 0 to 1, got 1.5"),
         ("rendered: 0.5", "rendered is 0.5 and there is no folder: give both `rendered` and `rendered_from`"),
         ("pairs_from: a", "pairs is 0 and a is given: give both"),
-        ("{rendered: 0.7, rendered_from: a, pairs: 0.7, pairs_from: [b]}", "shares of the batches, 1.4 in all"),
+        (
+            "{rendered: 0.7, rendered_from: a, pairs: 0.7, pairs_from: [b]}",
+            "shares of the batches, 1.4 in all",
+        ),
     ],
 )
 def test_what_is_wrong_with_shares(text, message):
@@ -135,7 +152,9 @@ def test_all_items_are_drawn_equally_often():
 
 
 def through(root):
-    """Put lenses in front of two cameras of every scene: their images distorted, nothing known beyond the old ones."""
+    """Put lenses in front of two cameras of every scene: their images distorted, nothing known beyond the old
+    ones.
+    """
     for folder in (root / "scenes").iterdir():
         source = Rendered(folder)
         rig = source.rig
@@ -160,9 +179,9 @@ def test_true_depth_says_where_alphas_pixels_are_in_beta(lenses, broken):
     for number in range(4):
         given = degraded(crops.sample(4, generator(number), number=number), generator(), recording=EXACT)
         assert given.position[0].isfinite().all()
-        found = sample(given.betas[0], given.position[0].to(given.ground_truth).flatten(1, 2)).values.unflatten(
-            2, (32, 48)
-        )
+        found = sample(
+            given.betas[0], given.position[0].to(given.ground_truth).flatten(1, 2)
+        ).values.unflatten(2, (32, 48))
         for image, collected in ((given.ground_truth, seen), (given.ground_truth.roll(3, -1), moved)):
             collected.append((found - image).abs().mean(1)[given.visible[0]].quantile(0.8))
         visible.append(given.visible[0].float().mean())
@@ -195,7 +214,9 @@ def test_windows_reach_beyond_images():
     assert torch.equal(beyond.depth.isfinite().nonzero().amin(0), torch.tensor([1, 0]))
     assert beyond.depth.isfinite().sum() == 4 * 3
     X = torch.tensor([0.3, -0.2, 2.0]).double()
-    torch.testing.assert_close(beyond.camera.project(X).x, camera.project(X).x - torch.tensor([3.0, -1.0]).double())
+    torch.testing.assert_close(
+        beyond.camera.project(X).x, camera.project(X).x - torch.tensor([3.0, -1.0]).double()
+    )
 
 
 def test_any_camera_is_alpha_and_betas_are_others(rendered):
@@ -219,7 +240,9 @@ def test_samples_of_scenes_depend_on_their_number_alone(rendered):
     one, other = (crops.sample(2, generator(9), number=7) for crops in (used, fresh))
     assert all(
         torch.equal(a, b)
-        for a, b in zip(one.images + one.depth + [one.cameras[0].K], other.images + other.depth + [other.cameras[0].K])
+        for a, b in zip(
+            one.images + one.depth + [one.cameras[0].K], other.images + other.depth + [other.cameras[0].K]
+        )
     )
 
 
@@ -230,7 +253,9 @@ def test_the_sky_is_seen_by_both_at_infinity():
     K = intrinsics(60.0, (32, 48))
     cameras = [Camera(K=K, cam_from_world=pose, hw=(32, 48)) for pose in (Pose.identity(), beta)]
     sky = torch.full((32, 48), torch.inf)
-    views = [finite_window(RenderedView(torch.rand(3, 32, 48), sky, c), 0, 0, (32, 48), (32, 48)) for c in cameras]
+    views = [
+        finite_window(RenderedView(torch.rand(3, 32, 48), sky, c), 0, 0, (32, 48), (32, 48)) for c in cameras
+    ]
     batch = batched([views], "cpu")
     assert batch.depth_range.max() <= SKY
     position, visible = transfer(pair_of(batch, 1, generator()), batch.depth[0], batch.depth[1])
@@ -249,7 +274,9 @@ def test_what_is_wrong_with_scenes(broken, tmp_path):
 
     (tmp_path / "empty").mkdir()
     assert "holds no rendered scene" in said(tmp_path / "empty")
-    assert "000000: no image is as large as the samples, 256x128 (mono 128x96, wide 112x80" in said(broken, (128, 256))
+    assert "000000: no image is as large as the samples, 256x128 (mono 128x96, wide 112x80" in said(
+        broken, (128, 256)
+    )
     assert "4 are too few to learn from some and to hold others out" in said(broken, choose=lambda i: i > 10)
     scene = broken / "scenes" / "000002"
     rig = Rig.load(scene / "rig.yaml")
@@ -285,7 +312,9 @@ def test_a_pairs_cameras_put_what_one_shows_where_the_other_shows_it(tmp_path):
         reductions |= set((120 / (48 / near)).round().int().tolist())
         depth = (near * 120 / 6)[:, None, None].expand(3, 32, 48)
         where, _ = transfer(pair_of(batch, 1, generator()), depth, depth)
-        found = sample(given.betas[0], where.to(given.ground_truth).flatten(1, 2)).values.unflatten(2, (32, 48))
+        found = sample(given.betas[0], where.to(given.ground_truth).flatten(1, 2)).values.unflatten(
+            2, (32, 48)
+        )
         assert (found - given.ground_truth)[..., 8:-8].abs().max() < 0.03
         assert (given.betas[0] - given.ground_truth)[..., 8:-8].abs().max() > 0.1
         torch.testing.assert_close(given.alpha, luminance(given.ground_truth), atol=0.003, rtol=0)
@@ -365,7 +394,11 @@ def scene():
 def test_a_lens_sees_all_that_the_pinhole_sees_but_for_what_is_lost(mode):
     strengths = []
     for seed in range(6):
-        pinhole = random_rigs(replace(RIGS, mode=mode), 1, (48, 64), generator(seed)).cameras[1][0].to(torch.float64)
+        pinhole = (
+            random_rigs(replace(RIGS, mode=mode), 1, (48, 64), generator(seed))
+            .cameras[1][0]
+            .to(torch.float64)
+        )
         lens = lens_over(pinhole, generator(seed))
         rays, valid = pinhole.rays(torch.tensor([[0.0, 0.0], [63, 0], [0, 47], [63, 47], [30, 20]]).double())
         x = lens.project_local(rays)
@@ -404,7 +437,12 @@ def test_what_a_lens_lost_is_not_visible(scene):
 def mixed(rendered, tmp_path_factory):
     """A run on all sources, never stopped."""
     folder = tmp_path_factory.mktemp("mixed")
-    sources = {"rendered": 0.5, "rendered_from": (rendered,), "pairs": 0.5, "pairs_from": (stereo(folder / "pairs"),)}
+    sources = {
+        "rendered": 0.5,
+        "rendered_from": (rendered,),
+        "pairs": 0.5,
+        "pairs_from": (stereo(folder / "pairs"),),
+    }
     cheap = {
         "network": PATConfig(dim=4),
         "filtered": 0.0,
@@ -415,7 +453,9 @@ def mixed(rendered, tmp_path_factory):
         "photos": (),
         "cache": None,
     }
-    config = replace(short_run(folder), **sources, **cheap, recording=RecordingConfig(lens=0.5), out=folder / "whole")
+    config = replace(
+        short_run(folder), **sources, **cheap, recording=RecordingConfig(lens=0.5), out=folder / "whole"
+    )
     train(config)
     return config
 
@@ -445,5 +485,7 @@ def test_two_processes_on_all_sources_are_as_one(mixed):
 def test_photographs_are_not_needed_where_everything_comes_from_folders(mixed):
     learn, examine = scenes(mixed)
     assert len(list(learn(3))) == 3
-    assert {str(f) for f in learn.folders["rendered"].folders}.isdisjoint(map(str, examine.folders["rendered"].folders))
+    assert {str(f) for f in learn.folders["rendered"].folders}.isdisjoint(
+        map(str, examine.folders["rendered"].folders)
+    )
     assert set(learn.folders["pairs"].pairs).isdisjoint(examine.folders["pairs"].pairs)

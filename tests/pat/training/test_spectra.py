@@ -37,7 +37,9 @@ def test_some_are_inverted_and_some_of_one_colour():
 
 def test_samples_have_random_bands_in_ground_truth_and_beta_alike(tmp_path):
     config = short_run(tmp_path)
-    config = replace(config, recording=replace(config.recording, spectral=1.0, paper=0.0, ideal=True, noise=0.0))
+    config = replace(
+        config, recording=replace(config.recording, spectral=1.0, paper=0.0, ideal=True, noise=0.0)
+    )
     counts = set()
     for given in scenes(replace(config, filtered=0.3))[0](12):
         counts.add(tuple(beta.shape[1] for beta in given.betas))

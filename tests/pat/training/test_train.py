@@ -24,10 +24,19 @@ def config(tmp_path_factory):
     folder = tmp_path_factory.mktemp("photos")
     g = Generator().manual_seed(0)
     for i in range(4):
-        smooth = torch.nn.functional.interpolate(torch.rand(1, 3, 12, 16, generator=g), (96, 128), mode="bilinear")
+        smooth = torch.nn.functional.interpolate(
+            torch.rand(1, 3, 12, 16, generator=g), (96, 128), mode="bilinear"
+        )
         write_image(folder / f"{i}.png", smooth[0])
     return TrainConfig(
-        photos=(folder,), out=folder / "run", network=SMALL, steps=12, batch=2, hw=(32, 48), validate=6, held_out=4
+        photos=(folder,),
+        out=folder / "run",
+        network=SMALL,
+        steps=12,
+        batch=2,
+        hw=(32, 48),
+        validate=6,
+        held_out=4,
     )
 
 
@@ -49,7 +58,11 @@ def test_positions_lie_on_the_segments(config):
     for given in learn(3):
         for field, position, visible in zip(given.fields, given.position, given.visible):
             h, w = visible.shape[1:]
-            x = torch.stack(torch.meshgrid(torch.arange(w), torch.arange(h), indexing="xy"), -1).float().reshape(-1, 2)
+            x = (
+                torch.stack(torch.meshgrid(torch.arange(w), torch.arange(h), indexing="xy"), -1)
+                .float()
+                .reshape(-1, 2)
+            )
             segments = field.at(x)
             nearest = segments.at(segments.fraction(position.reshape(len(position), -1, 2)).clamp(0, 1))
             off = (nearest - position.reshape(len(position), -1, 2)).norm(dim=-1)
@@ -95,7 +108,11 @@ def test_degradation_keeps_the_ground_truth_in_colour(config):
     from pat.synthesis.rig_distribution import RigDistribution
     from pat.training.samples import photographs
 
-    scene = LayeredScenes(photographs(config)[0], RigDistribution(), hw=(32, 48)).sample(2, Generator().manual_seed(1))
+    scene = LayeredScenes(photographs(config)[0], RigDistribution(), hw=(32, 48)).sample(
+        2, Generator().manual_seed(1)
+    )
     given = degraded(scene, Generator().manual_seed(2))
     ideal = scene.images[0]
-    assert (given.ground_truth - luminance(given.ground_truth) - (ideal - luminance(ideal))).abs().max() < 1e-5
+    assert (
+        given.ground_truth - luminance(given.ground_truth) - (ideal - luminance(ideal))
+    ).abs().max() < 1e-5

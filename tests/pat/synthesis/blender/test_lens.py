@@ -38,7 +38,9 @@ def test_a_lens_is_resampled_from_a_pinhole_that_covers_it(model):
     camera = RIG["distorted"]
     if model == "fisheye":
         coefficients = torch.tensor([-0.02, 0.004, -0.001, 0.0002], dtype=torch.float64)
-        camera = camera.replace(distortion=Distortion(KANNALA_BRANDT, coefficients), K=intrinsics(35.0, camera.hw))
+        camera = camera.replace(
+            distortion=Distortion(KANNALA_BRANDT, coefficients), K=intrinsics(35.0, camera.hw)
+        )
     lens = lens_for(camera, "c")
     h, w = lens.pinhole.hw
     assert lens.valid.all()
@@ -61,7 +63,9 @@ def test_depth_across_edges_is_of_one_side():
 
 
 def test_what_the_lens_cannot_see_is_marked():
-    folding = dataclasses.replace(RIG["distorted"].distortion, coefficients=torch.tensor([-1.0, 0, 0, 0]).double())
+    folding = dataclasses.replace(
+        RIG["distorted"].distortion, coefficients=torch.tensor([-1.0, 0, 0, 0]).double()
+    )
     lens = lens_for(RIG["distorted"].replace(distortion=folding), "distorted")
     assert not lens.valid.all()
     depth = lens.depth(torch.full(lens.pinhole.hw, 3.0), torch.ones(lens.pinhole.hw, dtype=torch.int32))
@@ -72,7 +76,10 @@ def test_what_the_lens_cannot_see_is_marked():
 @pytest.mark.parametrize(
     ("camera", "said"),
     [
-        (RIG["oblong"].replace(K=RIG["oblong"].K + torch.tensor([[0, 0.5, 0], [0, 0, 0], [0, 0, 0]])), "has skew"),
+        (
+            RIG["oblong"].replace(K=RIG["oblong"].K + torch.tensor([[0, 0.5, 0], [0, 0, 0], [0, 0, 0]])),
+            "has skew",
+        ),
         (RIG["oblong"].replace(K=RIG["oblong"].K * torch.tensor([[-1.0], [1], [1]])), "mirrors its image"),
         (View(hw=(48, 64)), "not calibrated"),
         (RIG["distorted"].replace(K=RIG["distorted"].K[None]), "is batched"),

@@ -53,7 +53,9 @@ def test_another_version_of_python_is_refused(monkeypatch):
 
 
 def test_missing_libraries_are_named_with_the_packages_that_bring_them(monkeypatch):
-    without(monkeypatch, ImportError("libX11.so.6: cannot open shared object file: No such file or directory"))
+    without(
+        monkeypatch, ImportError("libX11.so.6: cannot open shared object file: No such file or directory")
+    )
     with pytest.raises(ValueError, match=r"libX11.so.6.* apt-get install -y libx11-6 .* libgl1$"):
         compat.load()
 

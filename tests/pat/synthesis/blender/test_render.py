@@ -32,7 +32,10 @@ def glowing(name: str, motion: Motion, shape: str = "plane", brightness: float =
     """A surface that shines evenly and reflects nothing."""
     black = Texture(paints=(Paint((1.0, 1.0, 1.0), 1.0),))
     return Object(
-        name=name, shape=shape, motion=motion, material=Material(texture=black, emission=brightness, specular=0.0)
+        name=name,
+        shape=shape,
+        motion=motion,
+        material=Material(texture=black, emission=brightness, specular=0.0),
     )
 
 
@@ -46,7 +49,9 @@ def spread(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 def single(width: int = 64, focal: float = 100.0, **sensor: float) -> Rig:
     K = intrinsics(focal, (width * 3 // 4, width))
-    return Rig({"a": Camera(K=K, cam_from_world=posed(), hw=(width * 3 // 4, width), sensor=Sensor(**sensor))})
+    return Rig(
+        {"a": Camera(K=K, cam_from_world=posed(), hw=(width * 3 // 4, width), sensor=Sensor(**sensor))}
+    )
 
 
 def test_a_tiny_scene_is_true_in_unlike_cameras(worker, tmp_path):
@@ -126,7 +131,8 @@ def fiducials(camera: Camera, count: int = 12) -> list[Object]:
         size = 9 * depth / float(camera.K[:2, :2].abs().max())
         found.append(
             glowing(
-                f"square{k}", Motion((Key(position=tuple(X.tolist()), rotation=tuple(turn), extent=(size, size, 1.0)),))
+                f"square{k}",
+                Motion((Key(position=tuple(X.tolist()), rotation=tuple(turn), extent=(size, size, 1.0)),)),
             )
         )
     return found
@@ -136,7 +142,9 @@ def predicted_centre(camera: Camera, square: Object) -> torch.Tensor:
     """Where arraygeom sees the square's light: the centroid of its outline, projected point by point."""
     side = torch.linspace(-0.5, 0.5, 101, dtype=torch.float64)[:-1]
     low = torch.full_like(side, -0.5)
-    outline = torch.cat([torch.stack(p, -1) for p in ((side, low), (-low, side), (-side, -low), (low, -side))])
+    outline = torch.cat(
+        [torch.stack(p, -1) for p in ((side, low), (-low, side), (-side, -low), (low, -side))]
+    )
     X = torch.nn.functional.pad(outline, (0, 1)) @ torch.from_numpy(square.motion.at(0).matrix[:3, :3]).T
     a = camera.project(X + torch.from_numpy(square.motion.at(0).position)).x
     b = a.roll(-1, 0)
@@ -150,7 +158,9 @@ def test_fiducials_are_where_arraygeom_projects_them(worker, tmp_path, name):
     camera = unlike_cameras(128)[name]
     squares = fiducials(camera)
     rig = Rig({name: camera})
-    done = worker.render(Scene(objects=tuple(squares)), rig, tmp_path / "x", settings=replaced(CLEAN, samples=256))
+    done = worker.render(
+        Scene(objects=tuple(squares)), rig, tmp_path / "x", settings=replaced(CLEAN, samples=256)
+    )
     light = done.frame(name).rgb.mean(0)
     errors = []
     for square in squares:
@@ -217,7 +227,11 @@ def test_twenty_scenes_of_four_unlike_cameras(worker, tmp_path):
 @pytest.mark.slow
 def test_leaves_and_skin_are_unlike_their_luminance_in_near_infrared(worker, tmp_path):
     """Leaves are dark green and bright in the near infrared, skin is brighter than its luminance."""
-    leaf, skin, soot = Paint((0.05, 0.12, 0.03), 0.5), Paint((0.45, 0.25, 0.17), 0.6), Paint((0.04, 0.04, 0.04), 0.04)
+    leaf, skin, soot = (
+        Paint((0.05, 0.12, 0.03), 0.5),
+        Paint((0.45, 0.25, 0.17), 0.6),
+        Paint((0.04, 0.04, 0.04), 0.04),
+    )
     strips = [
         Object(
             name=name,
@@ -228,11 +242,15 @@ def test_leaves_and_skin_are_unlike_their_luminance_in_near_infrared(worker, tmp
         for name, paint, x in (("leaf", leaf, -1.0), ("skin", skin, 0.0), ("soot", soot, 1.0))
     ]
     scene = Scene(objects=tuple(strips), lights=(Light(kind="sun", power=float(np.pi), direction=(0, 0, 1)),))
-    done = worker.render(scene, single(60, 50.0), tmp_path / "x", settings=replaced(CLEAN, samples=4, infrared=True))
+    done = worker.render(
+        scene, single(60, 50.0), tmp_path / "x", settings=replaced(CLEAN, samples=4, infrared=True)
+    )
     frame = done.frame("a")
     for index, paint in enumerate((leaf, skin, soot), 1):
         here = (frame.index == index) & (pixel_grid((45, 60))[..., 1] - 22 < 8)
-        torch.testing.assert_close(frame.rgb[:, here].median(1).values, torch.tensor(paint.rgb), rtol=0.03, atol=2e-3)
+        torch.testing.assert_close(
+            frame.rgb[:, here].median(1).values, torch.tensor(paint.rgb), rtol=0.03, atol=2e-3
+        )
         assert frame.nir[0, here].median() == pytest.approx(paint.nir, rel=0.03)
 
 
