@@ -40,8 +40,7 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def write_together(folder: str | Path, *, last: str, stale: Iterable[str] = ()) -> Iterator[Path]:
-    """A temporary folder inside `folder` to write files to that belong together, the one named `last` among
-    them.
+    """A temporary folder inside `folder` for files that belong together, the one named `last` among them.
 
     They replace those of the same names when the block ends without error: the former last one is removed
     first, then those named `stale`, and the new last one comes last, so where it is, the others are of the
@@ -67,8 +66,7 @@ def write_together(folder: str | Path, *, last: str, stale: Iterable[str] = ()) 
 
 
 def sweep(folder: Path, stem: str | None = None) -> None:
-    """Remove the temporary files and folders of killed processes from a folder; or only those of files of one
-    stem.
+    """Remove temporary files and folders of killed processes from a folder; or only those of files of a stem.
 
     Those of safetensors, which writes to a file of its own first, are among the former.
     """

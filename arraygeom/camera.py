@@ -159,9 +159,7 @@ class LensView(View):
         return self.distortion.unproject(normalised)
 
     def ray_origins(self, x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*m 3"]:
-        """Where the rays of pixels start, metres in the camera's frame: its origin, unless its model is not
-        central.
-        """
+        """Where rays of pixels start, metres in the camera's frame: its origin, unless it is not central."""
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:
             return torch.zeros_like(to_homogeneous(normalised))
@@ -169,9 +167,7 @@ class LensView(View):
 
     @property
     def has_pinhole_view(self) -> bool:
-        """Whether it is a pinhole, has a `Distortion` or a model whose rays meet, all within 75 degrees of
-        the axis.
-        """
+        """Whether it has no lens, a `Distortion` or a central model; all within 75 degrees of the axis."""
         if isinstance(self.distortion, Distortion | None):
             return True
         if not self.distortion.central or traced():

@@ -20,9 +20,7 @@ from .tracing import followed
 T = TypeVar("T")
 
 LARGEST_SIDE, MOST_PIXELS = 65_535, 2**30
-"""A size beyond these bounds is more likely a damaged number than an image (the largest sensors have 4e8
-pixels).
-"""
+"""A size beyond these is more likely a damaged number than an image (the largest sensors have 4e8 pixels)."""
 ROUNDED = 1e-3
 """Numbers in text files are rounded: up to this much of R R^T - I, or in the last row of K, is rounding."""
 SINGULAR = 1e-9
@@ -55,9 +53,7 @@ def checking() -> bool:
 
 
 def check_numbers(value: Any, shape: tuple[int, ...], what: str) -> Tensor:
-    """The value, detached, if it is a tensor of finite numbers (\\*b, \\*shape). Raises TypeError or
-    ValueError.
-    """
+    """The value, detached, if a tensor of finite numbers (\\*b, \\*shape). Raises TypeError or ValueError."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{what} is a {type(value).__name__}: give a tensor of {_shape(shape)} numbers")
     if not value.is_floating_point():

@@ -1,6 +1,4 @@
-"""A large thing in parts: boxes of an image with halos, and functions that are called for one part after the
-other.
-"""
+"""A large thing in parts: boxes of an image with halos, and functions called for one part after the other."""
 
 from __future__ import annotations
 

@@ -92,8 +92,7 @@ def is_kept(entry: Any, signature: Any) -> bool:
 
 
 def renew_with(entry: Any, sources: Iterable[Path]) -> None:
-    """Let numba's cache of an entry point be renewed when any of these files changes, not when its own does
-    alone."""
+    """Let numba's cache of an entry point be renewed when any of these files changes, not its own alone."""
     if (file := cache_file(entry)) is not None:
         text = b"".join(path.read_bytes() for path in sorted(sources))
         file._source_stamp = hashlib.sha256(text).hexdigest()

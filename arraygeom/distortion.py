@@ -193,9 +193,7 @@ class Distortion(LensModel):
 
     @property
     def squared_limit(self) -> float:
-        """Up to where one lens is valid: a squared normalised radius (Brown-Conrady), or angle
-        (Kannala-Brandt).
-        """
+        """Up to where it is valid: a squared normalised radius (Brown-Conrady) or angle (Kannala-Brandt)."""
         c = self.coefficients.detach()
         return float(once(fisheye_limit if self.model == KANNALA_BRANDT else brown_limit, c))
 

@@ -63,9 +63,7 @@ def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Float
 
 
 SMALLEST_SQUARE = 1e-30
-"""A line F x whose (x, y) part is smaller than this, squared and with the largest entry of F at 1, is no
-line.
-"""
+"""A line F x is none if its (x, y) part, squared, F's largest entry being 1, is smaller than this."""
 
 
 def epipoles(F: Float[Tensor, "*b 3 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 3"]]:
@@ -92,9 +90,7 @@ class Track(NamedTuple):
     b: Float[Tensor, "*m 3"]
 
     def at(self, w: Float[Tensor, "*n"]) -> Float[Tensor, "*n 2"]:
-        """Beta's pixels at inverse depths; where the point is not in front of beta the value is finite
-        only.
-        """
+        """Beta's pixels at inverse depths; where a point is not in front of beta the value is only finite."""
         P = self.a + w[..., None] * self.b
         z = P[..., 2:]
         return P[..., :2] / torch.where(z > FRONT, z, 1.0)
@@ -118,8 +114,7 @@ def track(
 def segments_between(
     track: Track, near: Float[Tensor, "*b"], far: Float[Tensor, "*b"], beta_hw: HW
 ) -> Segments:
-    """The part of each track between the depths `near` and `far` (metres; far may be inf) inside beta's
-    image.
+    """The part of each track between depths `near` and `far` (metres; far may be inf) inside beta's image.
 
     Clipped to the image's area and to the front of beta, in closed form (`clipped`).
     """
@@ -149,8 +144,7 @@ def clipped(
     *,
     in_front: bool = True,
 ) -> Clipped:
-    """The part of each track within `limits` (x low, y low, x high, y high; None: everywhere) and in front of
-    beta.
+    """The part of each track in `limits` (x low, y low, x high, y high; None: everywhere), in front of beta.
 
     With s going from 0 at far to 1 at near in proportion to inverse depth, every limit is linear in s with a
     slope that is one number for the whole image.
@@ -172,9 +166,7 @@ def clipped(
 
 
 HIGHEST = 1e30
-"""Inverse depths (1/m) count as no more than this, so that their products with a baseline in pixels are
-finite.
-"""
+"""Inverse depths (1/m) count as no more than this: their products with a baseline in pixels stay finite."""
 
 
 def _limited(
@@ -204,9 +196,7 @@ def _place(P: tuple[Tensor, ...], D: tuple[Tensor, ...], s: Tensor, valid: Tenso
 
 
 def beside(v: Tensor, ndim: int, trailing: int = 0) -> Tensor:
-    """A value for each rig of a batch (*b, and `trailing` axes), with axes of length 1 for its pixels: `ndim`
-    axes.
-    """
+    """A value for each rig of a batch (*b, `trailing` axes), 1-long axes for its pixels: `ndim` axes."""
     if v.ndim == trailing:
         return v
     batch = v.ndim - trailing

@@ -12,9 +12,7 @@ from typing import Any
 
 @contextmanager
 def needs(extra: str, purpose: str) -> Iterator[None]:
-    """Around the import of an optional module: raises ImportError in one line that names the extra to
-    install.
-    """
+    """Around an optional module's import: raises ImportError in one line that names the extra to install."""
     try:
         yield
     except ImportError as error:
@@ -23,9 +21,7 @@ def needs(extra: str, purpose: str) -> Iterator[None]:
 
 
 def imported(name: str, what: str) -> Any:
-    """The "module:object" of a user, looked for from here too. Raises ValueError, which says what it was to
-    be.
-    """
+    """A user's "module:object", looked for from here too. Raises ValueError, which says what it was to be."""
     module, _, attribute = name.partition(":")
     try:
         sys.path.insert(0, str(Path.cwd()))

@@ -59,9 +59,7 @@ def _eight(lens: LensModel) -> Tensor:
 
 
 def from_kornia_model(model: CameraModel, cam_from_world: Pose | None = None) -> Camera:
-    """The camera of a kornia camera model, of one or of a batch, at a pose (the world's origin by
-    default).
-    """
+    """The camera of a kornia camera model, one or a batch, at a pose (the world's origin by default)."""
     from kornia.sensors.camera.distortion_model import BrownConradyTransform, KannalaBrandtK3Transform
     from kornia.sensors.camera.projection_model import OrthographicProjection
 

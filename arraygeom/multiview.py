@@ -1,6 +1,4 @@
-"""What cameras see of each other: rays in the world, images warped by depth, plane sweeps, depth maps that
-agree.
-"""
+"""What cameras see of each other: rays in the world, depth warps, plane sweeps, depth maps that agree."""
 
 from __future__ import annotations
 
@@ -80,8 +78,7 @@ def plane_sweep(
     *,
     interpolation: Interpolation = "bilinear",
 ) -> Sampled:
-    """Beta's image warped to alpha by planes z = depth in alpha's frame: values (B, C, D, Ha, Wa) and
-    validity.
+    """Beta's image warped to alpha by planes z = depth, alpha's frame: values (B, C, D, Ha, Wa), validity.
 
     Of any cameras: through lenses too, where planes are no homographies. Depths are metres.
     """
@@ -91,9 +88,7 @@ def plane_sweep(
 
 
 def _in_beta(pair: Pair, depth: Tensor, x: Tensor | None = None) -> Projected:
-    """Where beta sees alpha's pixels (all of them, or x (*n, 2)) at depths (*b, *d, *n); a batch's axes come
-    first.
-    """
+    """Where beta sees alpha's pixels (all, or x (*n, 2)) at depths (*b, *d, *n); a batch's axes first."""
     alpha, beta = pair.cameras
     depth = floating(depth)
     x = pixel_grid(alpha.hw, dtype=depth.dtype, device=depth.device) if x is None else x
@@ -109,9 +104,7 @@ def _in_beta(pair: Pair, depth: Tensor, x: Tensor | None = None) -> Projected:
 
 
 class ConsistentDepth(NamedTuple):
-    """Depth of alpha's pixels (metres; the mean of the views that agree), how many others agree, and
-    validity.
-    """
+    """Depth of alpha's pixels (metres; mean of the views that agree), how many others agree, validity."""
 
     depth: Float[Tensor, "h w"]
     views: Int[Tensor, "h w"]

@@ -29,9 +29,7 @@ def pixel_grid(
 def pixel_coordinates(
     hw: HW, *, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """x and y of the centres of all pixels of an image: views of a row and of a column, which take no
-    memory.
-    """
+    """x and y of the centres of all pixels of an image: views of a row and a column, which take no memory."""
     rows, columns = (torch.arange(n, dtype=dtype, device=device) for n in hw)
     x, y = torch.meshgrid(columns, rows, indexing="xy")
     return x, y
@@ -66,9 +64,7 @@ def rot90_matrix(hw: HW, quarter_turns: int) -> Float[Tensor, "3 3"]:
 
 
 def floating(x: Real[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Pixels in float32 or float64: integers and half precision, which holds no pixel position, become
-    float32.
-    """
+    """Pixels in float32 or float64: integers and half precision, which hold no position, become float32."""
     return x.to(torch.promote_types(x.dtype, torch.float32))
 
 
@@ -95,9 +91,7 @@ def product(A: Float[Tensor, "*b i j"], B: Float[Tensor, "*c j k"]) -> Float[Ten
 
 
 def broadcasts(batch: Sequence[int], points: Sequence[int]) -> bool:
-    """Whether axes of points begin with those of a batch, or with axes of length 1 (on either side) in their
-    place.
-    """
+    """Whether axes of points begin with a batch's, or axes of length 1 (on either side) in their place."""
     return len(points) >= len(batch) and all(a == b or 1 in (a, b) for a, b in zip(batch, points))
 
 

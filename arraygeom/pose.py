@@ -57,8 +57,7 @@ class Pose(Batched):
         *,
         down: Float[Tensor, "*b 3"] | None = None,
     ) -> Pose:
-        """`cam_from_world` of a camera at `centre` whose optical axis meets `target`, and whose y is towards
-        `down`.
+        """`cam_from_world` of a camera at `centre` whose optical axis meets `target`, with y towards `down`.
 
         All in world coordinates (metres); down is (0, 1, 0) unless given: that of a world with z upwards is
         (0, 0, -1). Raises ValueError where down is along the axis, or the target at the centre.
@@ -98,9 +97,7 @@ class Pose(Batched):
 
     @property
     def quaternion(self) -> Float[Tensor, "*b 4"]:
-        """Of the rotation: (w, x, y, z), unit length, the sign as it comes (q and -q are the same
-        rotation).
-        """
+        """Of the rotation: (w, x, y, z), unit length, any sign (q and -q are the same rotation)."""
         from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
         return rotation_matrix_to_quaternion(self.R)
@@ -111,9 +108,7 @@ class Pose(Batched):
         return cls.from_matrix(pose.matrix())
 
     def to_kornia(self) -> Se3:
-        """The same as kornia's `Se3`, which keeps the rotation as a quaternion: R comes back but for
-        rounding.
-        """
+        """The same as kornia's `Se3`, which keeps a quaternion as rotation: R comes back but for rounding."""
         from kornia.geometry.liegroup import Se3, So3
         from kornia.geometry.quaternion import Quaternion
 
@@ -207,8 +202,7 @@ def rotation_vector(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 
 
 def in_float64(function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
-    """A function of small matrices computed in float64, which neither autocast nor TF32 lowers; their own
-    type again.
+    """A function of small matrices computed in float64, untouched by autocast and TF32; their type again.
 
     Matrices are given the same batch axes.
     """

@@ -21,8 +21,7 @@ STEP = 1e-5
 def projection_slopes(
     camera: Camera, X: Float[Tensor, "*n 3"], distance: Float[Tensor, "*n"]
 ) -> tuple[Projected, Float[Tensor, "*n 2 3"]]:
-    """Where a float64 camera sees world points, and dx / dX in pixels a metre: of any lens, by central
-    differences.
+    """Where a float64 camera sees world points, and dx / dX, pixels a metre: any lens, central differences.
 
     `distance` is the points' from the camera, metres. Differentiable as often as `Camera.project` is.
     """
@@ -41,9 +40,7 @@ def reprojection_residuals(
     *,
     seen: Bool[Tensor, "v *n"] | None = None,
 ) -> Float[Tensor, "v *n 2"]:
-    """Pixels x minus where the cameras see the world points X; zero where a point is not `seen` or cannot
-    be.
-    """
+    """Pixels x minus where the cameras see the world points X; zero where one is not `seen` or cannot be."""
     projected = [camera.project(X) for camera in cameras]
     used = torch.stack([p.valid for p in projected])
     used = used if seen is None else used & seen
@@ -51,9 +48,7 @@ def reprojection_residuals(
 
 
 class Bundle(NamedTuple):
-    """The adjusted rig and points (n, 3), and the sum of squared residuals (steps + 1) from the first on,
-    pixels^2.
-    """
+    """The adjusted rig, points (n, 3), and sums of squared residuals (steps + 1) from the first, pixels^2."""
 
     rig: Rig
     X: Float[Tensor, "n 3"]
@@ -70,8 +65,7 @@ def bundle_adjusted(
     steps: int = 10,
     damping: float = 1e-3,
 ) -> Bundle:
-    """The rig and the points of least reprojection error: Levenberg-Marquardt with the points eliminated
-    (Schur).
+    """The rig and points of least reprojection error: Levenberg-Marquardt, the points eliminated (Schur).
 
     `x` are the points' pixels in the rig's cameras, in its order; `free` is as for `Rig.parameters`. In
     float64. A step that does not lower the cost is not made, and the next is damped tenfold. Gradients follow

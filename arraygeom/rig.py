@@ -118,8 +118,7 @@ class Pair(Batched):
 
     @property
     def fundamental(self) -> Float[Tensor, "*b 3 3"]:
-        """F with x_beta^T F x_alpha = 0, from the cameras or as given; between undistorted pixels through
-        lenses.
+        """F with x_beta^T F x_alpha = 0, from cameras or as given; between undistorted pixels through lenses.
 
         0 where the cameras' baseline is no more than the rounding of their poses.
 
@@ -340,9 +339,7 @@ class Rig(Batched):
         return self.with_camera(name, self[name].transformed(A, hw)).replace(links=links)
 
     def scaled(self, factor: float) -> Rig:
-        """The rig with all lengths (translations, the depth range) times a positive factor: in another unit,
-        say.
-        """
+        """The rig with all lengths (translations, depth range) times a positive factor: another unit, say."""
         cameras = {
             name: view.replace(cam_from_world=Pose(view.R, view.t * factor))
             if isinstance(view, Camera)
@@ -456,9 +453,7 @@ def _view(name: str, camera: Any) -> View:
 
 
 def depth_range(near: Any, far: Any) -> Depths:
-    """(near, far) as tensors, numbers in float64. Raises ValueError unless 0 < near <= far (where they are
-    known).
-    """
+    """(near, far) as tensors, numbers in float64. Raises ValueError unless 0 < near <= far (where known)."""
     bounds = [
         d if isinstance(d, Tensor) else torch.tensor(float(d), dtype=torch.float64) for d in (near, far)
     ]
@@ -476,9 +471,7 @@ def _shown(d: Tensor) -> str:
 
 
 def focal_positions(K: Tensor) -> Tensor:
-    """The positions of fx and fy in K, with their signs: the diagonal, or for a rotated image the other
-    one.
-    """
+    """Positions of fx and fy in K, with their signs: the diagonal, or for a rotated image the other one."""
     block = K.detach()[..., :2, :2]
     largest = block.abs() == block.abs().amax(-2, keepdim=True)
     return torch.where(largest, block.sign(), 0.0)

@@ -1,5 +1,4 @@
-"""Weighted least squares: linear, with a prior or without, the same where some values may be wrong, and
-nonlinear.
+"""Weighted least squares: linear, with or without a prior, the same if values may be wrong, and nonlinear.
 
 Wrong values are down-weighted by iteratively reweighted least squares (Holland and Welsch 1977).
 `terms` (k, n) are what k coefficients are multiplied with in each of n values.

@@ -11,8 +11,7 @@ from .tracing import followed, traced
 
 
 def first_root(coefficients: Tensor) -> Tensor:
-    """The smallest positive root of 1 + a_1 u + ... + a_n u^n, infinity if there is none, 0 if an a is not
-    finite.
+    """Smallest positive root of 1 + a_1 u + ... + a_n u^n; infinity if none, 0 if an a is not finite.
 
     `coefficients` (*b, n + 1) starts with the 1. The roots are the inverses of those of the reversed
     polynomial, which is monic, so a leading coefficient of 0 needs no care: eigenvalues of its companion.

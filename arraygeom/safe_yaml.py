@@ -1,5 +1,4 @@
-"""YAML and JSON from files of unknown origin: bounded in nesting, YAML in size and aliases, without repeated
-keys.
+"""YAML and JSON of unknown origin: bounded in nesting, YAML in size and aliases, no repeated keys.
 
 The one loader of each in the project. Both build plain values only, so nothing in a file can run code.
 """

@@ -83,9 +83,7 @@ class Segments(Batched):
         return Positions(xy, self.valid[..., None].expand(xy.shape[:-1]))
 
     def distance(self, xy: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
-        """Pixels from points to their segments, to an end beyond it; infinite where the segment is not
-        valid.
-        """
+        """Pixels from points to their segments, to an end beyond it; infinite where those are not valid."""
         u = self.fraction(xy).clamp(0, 1)
         squared = (xy - self.at(u)).square().sum(-1)
         distance = torch.where(squared > 0, torch.where(squared > 0, squared, 1.0).sqrt(), 0.0)
@@ -119,9 +117,7 @@ def clip_to_image(start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: 
 def fractions_on_image(
     start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: HW
 ) -> tuple[Float[Tensor, "*n"], Float[Tensor, "*n"]]:
-    """From which to which fraction (0 at start, 1 at end) each segment is on the image: low > high where
-    nowhere.
-    """
+    """The fractions (0 start, 1 end) between which each segment is on the image: low > high where nowhere."""
     low, high = torch.zeros_like(start[..., 0]), torch.ones_like(start[..., 0])
     for a, b, limit in zip(start.unbind(-1), end.unbind(-1), (hw[1] - 0.5, hw[0] - 0.5)):
         moves = b - a
@@ -142,9 +138,7 @@ def _on_image(start: Tensor, end: Tensor, s: Tensor, valid: Tensor, hw: HW) -> T
 
 
 FLAT = 1e-6
-"""A limit of the image that moves by less than this along a whole segment, in pixels, is either inside or
-not.
-"""
+"""An image limit that moves by less than this along a whole segment, in pixels, is either inside or not."""
 
 
 def sample_fractions(samples: int, *, like: Tensor) -> Float[Tensor, "l"]:

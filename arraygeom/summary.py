@@ -18,9 +18,7 @@ from .text import angle
 
 
 class CameraSummary(NamedTuple):
-    """One camera. `field_of_view` is (across, down) in degrees; footprints are millimetres a pixel at near
-    and far.
-    """
+    """One camera. `field_of_view` (across, down), degrees; footprints: millimetres a pixel, near and far."""
 
     name: str
     wh: tuple[int, int]
@@ -59,9 +57,7 @@ def summarise_cameras(rig: Rig) -> list[CameraSummary]:
 
 
 def summarise_pairs(rig: Rig, alpha: str | None = None) -> list[PairSummary]:
-    """One summary for each ordered pair of calibrated cameras, or of one alpha and its `MOST_BETAS` nearest
-    betas.
-    """
+    """A summary for each ordered pair of calibrated cameras, or one alpha and its `MOST_BETAS` nearest."""
     cameras = {n: c for n, c in rig.cameras.items() if isinstance(c, Camera)}
     if alpha is None:
         return [_pair(a, b, rig.pair(a, b)) for a in cameras for b in cameras if a != b]
@@ -110,9 +106,7 @@ def _pair(alpha: str, beta: str, pair: Pair) -> PairSummary:
 
 
 def _segments(pair: Pair) -> tuple[float, tuple[float, float] | None]:
-    """Share of alpha's pixels with a segment, and its (median, largest) length; of every fourth pixel, or
-    fewer.
-    """
+    """Share of alpha's pixels with a segment, its (median, largest) length; of each fourth pixel or fewer."""
     h, w = pair.alpha.hw
     field, most = (Curved(64), MOST_PIXELS // 16) if pair.has_lens else (Epipolar(), MOST_PIXELS)
     step = max(4, math.ceil(math.sqrt(h * w / most)))

@@ -74,8 +74,6 @@ def share_text(mask: Tensor) -> str:
 
 
 def short(value: object) -> str:
-    """A value in a message: its numbers with four digits, and no more than its first 60 characters, in
-    ASCII.
-    """
+    """A value in a message: numbers with four digits, no more than its first 60 characters, in ASCII."""
     text = re.sub(r"-?\d+\.\d{4,}(?:e[-+]\d+)?", lambda number: f"{float(number[0]):.4g}", ascii(value))
     return text if len(text) <= 60 else f"{text[:57]}..."

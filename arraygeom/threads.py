@@ -38,8 +38,7 @@ def threads() -> int:
 
 @contextmanager
 def torch_in_one_thread() -> Iterator[None]:
-    """Let torch's own loops run in the calling thread alone, while `in_parallel` takes as many `threads` as
-    before.
+    """Let torch's own loops run in the calling thread alone; `in_parallel` takes as many `threads` as before.
 
     For work that is mostly in compiled loops, beside which torch's own threads spin between short loops:
     without this a frame of 640x400 took twice the time of the cores where other processes wanted them.

@@ -7,23 +7,18 @@ from torch import Tensor
 
 
 def traced() -> bool:
-    """Whether within `torch.compile` or `torch.func.vmap`: all branches are computed there, and loops to
-    their end.
-    """
+    """Whether within `torch.compile` or `torch.func.vmap`: all branches are computed, loops to their end."""
     return torch.compiler.is_compiling() or "Vmap" in transformations()
 
 
 def followed() -> bool:
-    """Whether torch has to see each operation: it compiles, traces or transforms, or hands operations to a
-    mode.
-    """
+    """Whether torch has to see each operation: it compiles, traces, transforms, or hands them to a mode."""
     compiled_or_traced = torch.compiler.is_compiling() or torch.jit.is_tracing()
     return bool(compiled_or_traced or torch._C._len_torch_dispatch_stack() or transformations())
 
 
 def needs_numbers(what: str, *given: Tensor) -> None:
-    """Say why a call cannot be traced: it breaks the graph of `torch.compile`, which is an error with
-    `fullgraph`.
+    """Say why a call cannot be traced: it breaks `torch.compile`'s graph, an error with `fullgraph`.
 
     Raises NotImplementedError for tensors that `torch.func.vmap` has batched.
     """

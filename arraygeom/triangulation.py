@@ -138,9 +138,7 @@ class _Sight(NamedTuple):
 
 
 class _Chart(NamedTuple):
-    """Points by p = (a, b, w): `origin` + `scale` (a u + b v + d) / w; `axes` (*n, 3, 3) has the columns u,
-    v, d.
-    """
+    """Points p = (a, b, w): `origin` + `scale` (a u + b v + d) / w; `axes` (*n, 3, 3) has columns u, v, d."""
 
     origin: Tensor
     axes: Tensor
@@ -172,9 +170,7 @@ class _NormalEquations(NamedTuple):
 def _sighted(
     cameras: Sequence[Camera], x: Tensor, seen: Tensor | None
 ) -> tuple[list[_Sight], _Chart, Tensor]:
-    """What is seen of each point, the chart of its first view, and where in it the rays meet in least
-    squares.
-    """
+    """What is seen of each point, its first view's chart, and where in it the rays meet in least squares."""
     centres, directions, usable = (
         torch.stack(part) for part in zip(*(world_rays(c, p) for c, p in zip(cameras, x)))
     )
@@ -228,6 +224,4 @@ def _normal_equations(sights: Sequence[_Sight], chart: _Chart, p: Tensor) -> _No
 
 
 LEAST_DETERMINANT = 1e-18
-"""Of the normal equations, their largest diagonal entry at 1: inverse distance is known 1e-9 as well as
-directions.
-"""
+"""Of normal equations, largest diagonal entry 1: inverse distance is known 1e-9 as well as directions."""

@@ -25,8 +25,7 @@ AT_ONCE = 1 << 18
 
 
 def pinhole_view(camera: AnyLensView, *, widest: float = WIDEST) -> AnyLensView:
-    """The camera without its lens, large enough for all that the old image shows up to `widest` radians off
-    axis.
+    """The camera without its lens, large enough for all the old image shows up to `widest` radians off axis.
 
     Same position, orientation and K but for the principal point: pixels in the middle keep their size. Links
     follow by `rig.transformed(name, view.K @ camera.K^-1, view.hw)`. Raises ValueError for a batch of
@@ -54,8 +53,7 @@ def pinhole_view(camera: AnyLensView, *, widest: float = WIDEST) -> AnyLensView:
 def pixels_between(
     source: LensView, target: LensView, x: Float[Tensor, "h w 2"] | None = None
 ) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
-    """For pixels x of `target`, by default all, their positions in the co-located `source`, and whether
-    `source` sees them. Float64."""
+    """Positions of `target`'s pixels x (default: all) in the co-located `source`, which it sees. Float64."""
     if x is None:
         return _by_rows(lambda x: pixels_between(source, target, x), target.hw, axis=0)
     source, target = source.to(torch.float64), target.to(torch.float64)
@@ -67,9 +65,7 @@ def pixels_between(
 
 
 def _by_rows(function: Callable[[Tensor], Any], hw: HW, *, axis: int) -> Any:
-    """What a function makes of an image's pixels (h, w, 2), some rows at a time: it takes some 300 bytes a
-    pixel.
-    """
+    """What a function makes of an image's pixels (h, w, 2), some rows at a time: some 300 bytes a pixel."""
     x, y = pixel_coordinates(hw, dtype=torch.float64)
     rows = max(AT_ONCE // hw[1], 1)
     return chunked(lambda x, y: function(torch.stack([x, y], -1)), x, y, rows=rows, axis=axis)
@@ -78,8 +74,7 @@ def _by_rows(function: Callable[[Tensor], Any], hw: HW, *, axis: int) -> Any:
 def recorded_pixels(
     x: Float[Tensor, "*n 2"], now: View, recorded: LensView
 ) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-    """Pixels of a view without its lens, cropped, resized or rotated, in the image as recorded; which it can
-    show.
+    """Pixels of a view without its lens, cropped, resized or rotated, in the recorded image; which it shows.
 
     K of both views says how pixels were changed: x ~ K_now K_recorded^-1 x_recorded but for the lens.
     """
@@ -105,9 +100,7 @@ def _between(recorded: LensView, now: View) -> Float[Tensor, "3 3"]:
 
 
 def with_pixels(rig: Rig) -> Rig:
-    """The rig whose views all have a K, the identity if they are not calibrated: it follows every change of
-    pixels.
-    """
+    """The rig whose views all have a K, the identity if not calibrated: it follows all changes of pixels."""
     for name, view in rig.cameras.items():
         if not isinstance(view, LensView):
             eye = torch.eye(3, dtype=torch.float64)
@@ -123,8 +116,7 @@ def resampled(
     interpolation: Interpolation = "bicubic",
     extended: bool = False,
 ) -> Sampled:
-    """The image that `target`, co-located with `source`, would have recorded: values (1, C, H, W) and
-    validity.
+    """The image that `target`, co-located with `source`, would have recorded: values (1, C, H, W), validity.
 
     Where `source` sees nothing values are 0, or if `extended` those of its nearest pixel; they are not valid.
     The baseline between the two is ignored; uncalibrated views count as having the same orientation.

@@ -182,17 +182,14 @@ def draw_sampling_locations(axes: Axes, field: ReceptiveField, pair: Pair, x: Fl
 
 
 class NearLine(NamedTuple):
-    """The part of an epipolar line (a curve, through a lens) around a point of beta, and the point's
-    distance.
-    """
+    """The part of an epipolar line (a curve, through a lens) around a point of beta, the point's distance."""
 
     curve: Float[Tensor, "n p 2"]
     distance: Float[Tensor, " n"]
 
 
 def near_line(pair: Pair, x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], half: float) -> NearLine:
-    """The lines of alpha's points x where they pass y, `half` pixels to either side. Pixels of the images as
-    recorded.
+    """Lines of alpha's points x where they pass y, `half` pixels to each side. Pixels of images as recorded.
 
     Distances are from the nearest point of the line. NaN where a lens has no ray.
     """
@@ -214,8 +211,7 @@ def draw_matches(
     matches: Mapping[str, tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2"]]],
     images: Mapping[str, Any],
 ) -> Figure:
-    """Patches around points matched between alpha and each beta, spread over alpha's image, and the lines
-    they miss.
+    """Patches around points matched between alpha and each beta, spread over alpha, and the lines they miss.
 
     Above, alpha's patch, 18 pixels to either side of the point; below, beta's around the match, with the line
     that the rig gives to alpha's point and the distance in pixels. `matches` holds points (x, y) of alpha and

@@ -11,9 +11,7 @@ from typing import Any
 
 
 def _lazy(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """A package's `__getattr__` that imports functions from modules on first use: OpenCV and matplotlib load
-    slowly.
-    """
+    """A package's `__getattr__` that imports functions on first use: OpenCV and matplotlib load slowly."""
 
     def get(name: str) -> Any:
         if name not in modules:

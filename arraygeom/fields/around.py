@@ -22,8 +22,7 @@ from .straight import pinhole_track, require_pinholes
 
 @dataclass(frozen=True, eq=False)
 class AroundDepth:
-    """The segment between depth / (1 + tolerance) and depth * (1 + tolerance) of a known depth map; needs
-    calibration.
+    """The segment from depth / (1 + tolerance) to depth * (1 + tolerance) of a known map; needs calibration.
 
     `depth` (H, W) is z in metres at the pixels of `view`, alpha as it was recorded (None: the pair's alpha,
     without a lens). Where it is not positive and finite, the segment is that between the pair's depth bounds.
@@ -79,9 +78,7 @@ class AroundMatches:
 
     @classmethod
     def from_disparity(cls, disparity: Float[Tensor, "h w"], tolerance: float = 1.0) -> AroundMatches:
-        """Of a rectified pair with alpha on the left: the point at x is at x - disparity in beta; NaN if
-        unknown.
-        """
+        """Of a rectified pair, alpha left: the point at x is at x - disparity in beta; NaN if unknown."""
         grid = pixel_grid((disparity.shape[0], disparity.shape[1]), dtype=disparity.dtype)
         return cls(torch.stack([grid[..., 0] - disparity, grid[..., 1]], -1), tolerance)
 
@@ -95,9 +92,7 @@ class AroundMatches:
         views: tuple[LensView, LensView] | None = None,
         field: ReceptiveField | None = None,
     ) -> AroundMatches:
-        """Of points (x, y) of an alpha of size `hw` and the same points in beta; each is known in 3 x 3
-        pixels.
-        """
+        """Of points (x, y) of an alpha of size `hw` and the same in beta; each is known in 3 x 3 pixels."""
         positions = torch.full((*hw, 2), torch.nan, dtype=torch.float32)
         column, row = alpha.round().long().unbind(-1)
         displacement = (beta - alpha).float()
@@ -144,8 +139,7 @@ def _check_size(plane: Tensor, view: LensView | None) -> None:
 
 
 def _at_nearest(plane: Tensor, x: Float[Tensor, "*n 2"], now: View, recorded: LensView | None) -> Tensor:
-    """The values (H, W, ...) of the recorded pixels nearest to pixels `x` of alpha as it is now; no
-    gradients.
+    """Values (H, W, ...) of the recorded pixels nearest to pixels `x` of alpha as it is now; no gradients.
 
     Between two pixels of different depth there is no depth: values are not interpolated.
     """

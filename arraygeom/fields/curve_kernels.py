@@ -1,5 +1,4 @@
-"""The compiled loops of `Curved`: what its readable form in `curved.py` computes, in float64, a pixel at a
-time.
+"""Compiled loops of `Curved`: what its readable form in `curved.py` computes, in float64, pixel by pixel.
 
 Each in one thread and without Python's lock. Imported when first needed.
 """
@@ -54,9 +53,7 @@ def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, 
 
 @compiled(inline="always")
 def _shares(first, last, wide, u, s):
-    """What share of `last` there is in the points at fractions u: evenly in undistorted pixels, or in
-    angle.
-    """
+    """The share of `last` in the points at fractions u: evenly in undistorted pixels, or in angle."""
     if not wide:
         z0, z1 = first[2], last[2]
         for i in range(len(u)):
@@ -109,8 +106,7 @@ def _project(first, last, s, lens, x, y, seen):
 
 @compiled(inline="always")
 def _brown(c, limit, x, y, seen):
-    """Normalised points become distorted ones, and those that are not valid unseen;
-    `distortion._brown_distort` without a tilt."""
+    """Distorted normalised points, invalid ones unseen; `distortion._brown_distort` without a tilt."""
     farthest = 0.0
     for i in range(len(x)):
         farthest = max(farthest, x[i] * x[i] + y[i] * y[i])

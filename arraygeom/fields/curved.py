@@ -31,8 +31,7 @@ from .straight import Epipolar
 
 @dataclass(frozen=True)
 class Curved:
-    """Depth samples through the lens models: `samples` positions from near to far, evenly spaced in beta's
-    pixels.
+    """Depth samples through lens models: `samples` positions, near to far, evenly spaced in beta's pixels.
 
     Needs a calibrated pair; without lenses it is `Epipolar` sampled. The part of each ray that can be on
     beta's image is clipped in closed form, followed at `nodes` points (even in undistorted pixels, or in
@@ -93,9 +92,7 @@ class ThroughLenses:
         check_above(1, whole=True, samples=self.samples)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
-        """Positions (*n, samples, 2) in beta's own pixels. Raises ValueError for a batch of rigs with
-        lenses.
-        """
+        """Positions (*n, samples, 2), beta's pixels. Raises ValueError for a batch of rigs with lenses."""
         alpha, beta = (_Straight.of(view) for view in (pair.alpha, pair.beta))
         link = None if pair.link is None else pair.link.transformed(alpha.A, beta.A)
         straight = dataclasses.replace(pair, alpha=alpha.pinhole, beta=beta.pinhole, link=link)
@@ -109,9 +106,7 @@ class ThroughLenses:
 
 
 class _Straight(NamedTuple):
-    """A view, the same without its lens, and A which takes the undistorted pixels of the one to those of the
-    other.
-    """
+    """A view, the same without its lens, and A from the undistorted pixels of the one to the other's."""
 
     view: View
     pinhole: View
@@ -148,9 +143,7 @@ def _onto_edge(xy: Tensor, hw: HW, margin: float) -> tuple[Tensor, Tensor]:
 
 
 WIDE = math.tan(math.radians(75))
-"""A lens whose image reaches further than this from the axis, in undistorted focal lengths, is followed by
-angle.
-"""
+"""A lens that sees further than this from the axis, in undistorted focal lengths, is followed by angle."""
 
 
 class RayCurve(NamedTuple):
@@ -169,9 +162,7 @@ class RayCurve(NamedTuple):
 
     @classmethod
     def of(cls, pair: Pair, near: Tensor, far: Tensor, x: Tensor, bounds: str = "depth") -> RayCurve:
-        """The curves of alpha's pixels x (*n, 2) from near to far (metres), as far as beta's image may show
-        them.
-        """
+        """Curves of alpha's pixels x (*n, 2), near to far (metres), as far as beta's image may show them."""
         pose = pair.beta_from_alpha.to(x.dtype)
         alpha, beta = (c.to(x.dtype) for c in pair.cameras)
         start, rays, ahead = _lines(alpha, x, bounds)
@@ -206,9 +197,7 @@ class RayCurve(NamedTuple):
 
     @property
     def compilable(self) -> bool:
-        """Whether a compiled loop can follow the curve: on the CPU, of one pair, and no gradient is asked
-        for.
-        """
+        """Whether a compiled loop can follow the curve: on the CPU, of one pair, no gradient asked for."""
         lens = self.beta.distortion
         numbers = [self.first, self.last, self.beta.K, *([] if lens is None else [lens.coefficients])]
         free = torch.is_grad_enabled() and any(t.requires_grad for t in numbers)
@@ -238,9 +227,7 @@ class RayCurve(NamedTuple):
         )
 
     def at(self, fraction: Tensor) -> tuple[Tensor, Tensor]:
-        """Beta's pixels (*n, l, 2) at fractions (*n, l) of the way from first to last, and which it can
-        see.
-        """
+        """Beta's pixels (*n, l, 2) at fractions (*n, l) of the way first to last, and which it can see."""
         weights = self._weights_in_angle(fraction) if self.wide else self._weights_in_pixels(fraction)
         s = (weights[1] / (weights[0] + weights[1]))[..., None]
         X = torch.lerp(self.first[..., None, :], self.last[..., None, :], s)
@@ -260,9 +247,7 @@ class RayCurve(NamedTuple):
         return torch.lerp(first, last, s)
 
     def _weights_in_pixels(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """How much of first and of last there is in the point whose pixel, without the lens, is a fraction u
-        along.
-        """
+        """Shares of first and of last in the point whose pixel, without the lens, is a fraction u along."""
         lens = self.beta.distortion
         parallel = lens is not None and not lens.central and lens.even == "distance"
         ends = self.inverse if parallel else (self.first[..., 2], self.last[..., 2])
@@ -282,9 +267,7 @@ class RayCurve(NamedTuple):
 
 
 REMOTE = 1e-5
-"""Inverse metres that count as infinity for a beta whose rays do not meet: there a point is not only a
-direction.
-"""
+"""Inverse metres of infinity to a beta whose rays do not meet: there a point is not only a direction."""
 
 
 def _lines(alpha: Camera, x: Tensor, bounds: str) -> tuple[Tensor | None, Tensor, Tensor]:
@@ -333,8 +316,7 @@ TINY = 1e-24
 
 
 def undistorted_limits(camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
-    """(x low, y low, x high, y high) of a lens's image in normalised undistorted points, (*b) each, 2 %
-    wider.
+    """(x low, y low, x high, y high) of a lens's image, normalised undistorted points, (*b) each, 2 % wider.
 
     None if it reaches 75 degrees off axis, or over the range of its lens, and where numbers cannot decide
     (`traced`).
@@ -364,9 +346,7 @@ def _each(M: Tensor, v: Tensor) -> Tensor:
 
 
 class Pieces(NamedTuple):
-    """The visible part of each piece of a polyline of m + 1 nodes: from `first` to `last` (0..1), `length`
-    pixels.
-    """
+    """The visible part of each of a polyline's m pieces: from `first` to `last` (0..1), `length` pixels."""
 
     first: Float[Tensor, "*n m"]
     last: Float[Tensor, "*n m"]
@@ -390,9 +370,7 @@ def visible_pieces(nodes: Float[Tensor, "*n k 2"], seen: Tensor, hw: HW, longest
 
 
 def along_pieces(pieces: Pieces, u: Float[Tensor, "l"]) -> Float[Tensor, "*n l"]:
-    """Where on the whole polyline (0 at the first node, 1 at the last) fractions u of the visible length
-    are.
-    """
+    """Where on the whole polyline (first node 0, last 1) fractions u of the visible length are."""
     first, last, length = pieces
     ends = length.cumsum(-1)
     wanted = u * ends[..., -1:]

@@ -1,6 +1,4 @@
-"""The default field of a pair, and fields by name: the one policy that fusion, drawings and refinement
-share.
-"""
+"""The default field of a pair, and fields by name: one policy for fusion, drawings and refinement."""
 
 from __future__ import annotations
 
@@ -87,9 +85,7 @@ def _through_lenses(field: ReceptiveField, pair: Pair, samples: int = 96, nodes:
 
 
 def natural_bounds(pair: Pair) -> Literal["depth", "distance"]:
-    """Of what the depth range of a pair is: the distance along the ray where alpha sees 90 degrees off
-    axis.
-    """
+    """What a pair's depth range is of: the distance along the ray where alpha sees 90 degrees off axis."""
     alpha = pair.cameras[0]
     if alpha.distortion is None or not alpha.distortion.sees_behind or traced():
         return "depth"

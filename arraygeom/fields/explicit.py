@@ -40,9 +40,7 @@ class NearestVoxels:
         check_above(0, whole=True, window=self.window)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
-        """Positions (*n, count, 2), in beta's pixels. Not differentiable: pixels are whole. Not for
-        lenses.
-        """
+        """Positions (*n, count, 2), beta's pixels. Not differentiable: pixels are whole. Not for lenses."""
         require_straight(pair)
         x = floating(x)
         with torch.no_grad():
@@ -128,9 +126,7 @@ TIE = 1e-3
 
 @dataclass(frozen=True)
 class Local:
-    """A `size` x `size` window around H x, `spacing` pixels between samples; from H only (the CNN-like
-    case).
-    """
+    """A `size` x `size` window around H x, `spacing` pixels between samples; H only (the CNN-like case)."""
 
     size: int = 5
     spacing: float = 1.0

@@ -27,8 +27,7 @@ _CHUNK = 1 << 18
 
 @dataclass(frozen=True)
 class FieldOnGrid:
-    """The search segments of every pixel of alpha, in float64: 33 bytes a pixel, and 8 for its share of a
-    block.
+    """Search segments of every pixel of alpha, in float64: 33 bytes a pixel, and 8 for its share of a block.
 
     Float32 would round positions by up to 3e-5 px, which is enough to change which of two equally good
     matches is taken: 7e-4 in the fused image. Those of a large grid are stored as float32 (17 bytes)
@@ -50,8 +49,7 @@ class FieldOnGrid:
     def of(
         cls, field: ReceptiveField, pair: Pair, *, hw: HW | None = None, blocks: bool = True
     ) -> FieldOnGrid:
-        """Evaluate the field of a pair on alpha's pixels, with about one sample a pixel of the longest
-        segment.
+        """Evaluate a pair's field on alpha's pixels, with about one sample a pixel of the longest segment.
 
         `hw` is the size of the grid if it is not alpha's, as for images that are padded at the bottom and the
         right.
@@ -77,8 +75,7 @@ class FieldOnGrid:
         return replace(found, blocks=found.of_blocks(BLOCK))
 
     def of_blocks(self, side: int) -> Segments:
-        """The segments of the centres of blocks of `side` x `side` pixels of the grid, (B or 1, H / side, W /
-        side).
+        """Segments of centres of blocks of `side` x `side` pixels of the grid, (B or 1, H / side, W / side).
 
         Raises ValueError for a field of explicit positions.
         """
@@ -88,9 +85,7 @@ class FieldOnGrid:
         return _on_grid(self.at, (h // side, w // side), side, self.straight.start.device)
 
     def displaced(self, step: Callable[[Segments, Tensor], Tensor]) -> FieldOnGrid:
-        """A straight field with its segments moved by a step that depends on them and on alpha's pixels (*n,
-        2).
-        """
+        """A straight field, segments moved by a step that depends on them and on alpha's pixels (*n, 2)."""
 
         def moved(found: SamplingLocations, x: Tensor) -> Segments:
             assert isinstance(found, Segments)
@@ -109,9 +104,7 @@ class FieldOnGrid:
         return replace(self, at=lambda x: moved(self.at(x), x), pixels=grid(self.straight, 1), blocks=blocks)
 
     def any_valid(self, hw: HW) -> bool:
-        """Whether any of alpha's h x w pixels has somewhere to look in beta; every eighth row and column
-        counts.
-        """
+        """Whether any of alpha's h x w pixels may look into beta; every eighth row and column counts."""
         h, w = hw
         if self.pixels is not None:
             return bool(self.pixels.valid[..., :h:8, :w:8].any())
@@ -140,9 +133,7 @@ class FieldOnGrid:
         return sum(t.nbytes for part in parts for t in (part.start, part.end, part.valid))
 
     def cut(self, box: Box, shift: tuple[int, int] = (0, 0)) -> FieldOnGrid:
-        """The field of alpha's pixels in a box (of even sides), for a beta whose first pixel was at `shift`
-        (x, y).
-        """
+        """The field of alpha's pixels in a box (even sides), for a beta that began at `shift` (x, y)."""
         top, _, left, _ = box
 
         def at(x: Tensor) -> SamplingLocations:

@@ -1,6 +1,4 @@
-"""Compiled loops of the explicit fields, each in one thread and without Python's lock. Imported when first
-needed.
-"""
+"""Compiled loops of explicit fields, each in one thread, without Python's lock. Imported when needed."""
 
 from __future__ import annotations
 
@@ -16,8 +14,7 @@ MORE = 1.15
 
 @compiled(nogil=True, cache=True, error_model="numpy")
 def nearest_pixels(first, last, line, centre, usable, window, tie, hw, xy, mask):
-    """The pixels of the window about the centre that are nearest to the line, for pixels `first` to `last` of
-    alpha.
+    """The pixels of the window about the centre nearest to the line, for pixels `first` to `last` of alpha.
 
     Out come xy (n, count, 2), the nearest first, and mask (n, count). `line` (n, 3) and `centre` (n, 2) are
     of the type in which distances are computed; `tie` is by how much a pixel counts as farther than the one
@@ -79,9 +76,7 @@ def _collect(line, at_centre, x, y, window, tie, hw, limit, keys, pixels):
 
 @compiled(inline="always")
 def _sort(keys, n, limit, order, begins, buckets, found):
-    """The order of keys in 0 .. limit, and `found`, the keys in that order: into buckets, then by
-    insertion.
-    """
+    """The order of keys in 0 .. limit, and `found`, keys in that order: into buckets, then by insertion."""
     scale = keys.dtype.type(BUCKETS / limit)
     begins[:] = 0
     for i in range(n):

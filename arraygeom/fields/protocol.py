@@ -26,9 +26,7 @@ class ReceptiveField(Protocol):
     """The search segment or sampling locations in beta of each alpha pixel."""
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
-        """Segments or positions in beta's pixels, for alpha's pixels x. Differentiable in the pair's
-        numbers.
-        """
+        """Segments or positions in beta's pixels, of alpha's pixels x. Differentiable in a pair's numbers."""
         ...
 
 
@@ -82,9 +80,7 @@ PIECE = 1 << 12
 
 
 def segments_by_rows(f: Callable[[Tensor], Segments], pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
-    """f over pixels, some rows of the first axis after the batch's at a time; f must answer for each pixel
-    alone.
-    """
+    """f over pixels, some rows of the first axis after the batch's at once; f must take each pixel alone."""
     axis = len(pair.batch_shape)
     if x.ndim <= axis + 1:
         return f(x)

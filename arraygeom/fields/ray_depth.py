@@ -1,6 +1,4 @@
-"""From positions in beta back to depth, for any cameras: along the curve that the pair's rays have in
-beta.
-"""
+"""From positions in beta back to depth, any cameras: along the curve that the pair's rays have in beta."""
 
 from __future__ import annotations
 
@@ -67,9 +65,7 @@ def ray_depth(
 
 
 def _inverse_depth_per_pixel(curve: RayCurve, fraction: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:
-    """How much inverse depth a pixel of beta along the curve is worth, by differences over a part of the
-    curve.
-    """
+    """How much inverse depth a pixel of beta along the curve is worth, by differences over a part of it."""
     ends = torch.cat([(fraction + step).clamp(0, 1) for step in (-PART, PART)], -1)
     xy, _ = curve.at(ends)
     pixels = (xy[:, 1] - xy[:, 0]).norm(dim=-1)
@@ -77,9 +73,7 @@ def _inverse_depth_per_pixel(curve: RayCurve, fraction: Float[Tensor, "n 1"]) ->
 
 
 def rough_transfer(pair: Pair, x: Real[Tensor, "n 2"]) -> TransformedPoints:
-    """Pixels of alpha in beta, roughly: by the pair's homography, or the middle of the curves of other
-    cameras.
-    """
+    """Pixels of alpha in beta, roughly: by the pair's homography, or the middle of other cameras' curves."""
     if pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view:
         return apply_homography(pair.homography.detach().to(x), x)
     with torch.no_grad():

@@ -120,8 +120,7 @@ class HomographyDisplacement:
 
 
 def covering_displacement(pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> Float[Tensor, "*b"]:
-    """The displacement from H x that reaches both near and far for every pixel of x, pixels of beta; one for
-    each rig.
+    """The displacement from H x that reaches near and far for every pixel x, pixels of beta; one a rig.
 
     Of depth-bounded segments as beta's image clips them; 0 if there are none. Without x: for all of alpha's
     pixels. Raises ValueError for an uncalibrated pair.
@@ -143,8 +142,7 @@ def _squared_reach(pair: Pair, x: Tensor) -> Tensor:
 
 
 def _widest(pair: Pair) -> Tensor:
-    """The alpha pixel (*b, 1, 2) that needs the largest displacement: searched once a pair, and anew when it
-    changes.
+    """The alpha pixel (*b, 1, 2) of the largest displacement: searched once a pair, anew when it changes.
 
     Nothing is kept of a trace, nor as a tensor of inference mode, which no gradient could use later.
     """
@@ -173,8 +171,7 @@ SIDES = Literal["left", "right", "either"]
 
 @dataclass(frozen=True)
 class Rectified:
-    """A horizontal run of up to `max_disparity` pixels of beta; from nothing but the two sizes (the PAM
-    case).
+    """A horizontal run of up to `max_disparity` pixels of beta, from the two sizes alone (the PAM case).
 
     Alpha is the "left" or the "right" camera of a rectified pair ("either": the run goes both ways). Without
     `max_disparity`, the whole row.

@@ -56,9 +56,7 @@ class Widened:
         return self._band(found, pair.beta.hw)
 
     def _evaluated(self, pair: Pair, x: Tensor) -> SamplingLocations:
-        """The field about beta's image too, as far as it may be brought in; fields of sizes alone on the
-        image.
-        """
+        """The field about beta's image too, as far as it may be brought in; of sizes alone on the image."""
         margin = math.ceil(self.across + self.along)
         if margin == 0 or not _follows_beta(self.field, pair):
             return self.field(pair, x)
@@ -100,9 +98,7 @@ class Widened:
 
 
 def _follows_beta(field: ReceptiveField, pair: Pair) -> bool:
-    """Whether the field of a beta that is padded is the same in its pixels: it is by F or calibration, not by
-    sizes.
-    """
+    """Whether a padded beta's field is the same in its pixels: by F or calibration it is, by sizes not."""
     if isinstance(field, ThroughLenses | Moved):
         return _follows_beta(field.field, pair)
     if isinstance(field, HomographyDisplacement):

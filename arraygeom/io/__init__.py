@@ -137,8 +137,7 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
 
 
 def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
-    """Write a rig atomically. Formats of several files make a folder, the last of them once the others are
-    there.
+    """Write a rig atomically. Formats of several files make a folder, the last of them once others are there.
 
     What a format leaves out of the rig (all but the native one: the depth range, links, what a sensor
     records) is named by one RigFileWarning. Raises ValueError for an unknown format, for a rig that the
@@ -190,9 +189,7 @@ def _left_out(rig: Rig, format: str) -> str:
 
 
 SMALLEST_FOCAL, LARGEST_NUMBER = 1e-3, 1e9
-"""Bounds of focal lengths (pixels), of all of K, and of translations (metres). Beyond them pixels lose their
-digits.
-"""
+"""Bounds of focal lengths (pixels), all of K, translations (metres). Beyond them pixels lose their digits."""
 
 
 def _check_magnitudes(path: Path, rig: Rig) -> None:

@@ -31,9 +31,7 @@ def calibrated(rig: Rig, format: str) -> list[tuple[str, Camera]]:
 def focal_and_centre(
     name: str, camera: Camera, *, first_pixel: float = 0.0
 ) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy with the first pixel's centre at `first_pixel`. Raises ValueError if K has other
-    entries.
-    """
+    """fx, fy, cx, cy, the first pixel's centre at `first_pixel`. Raises ValueError if K has other entries."""
     (fx, skew, cx), (other, fy, cy) = camera.K[:2].tolist()
     if skew != 0 or other != 0:
         raise ValueError(

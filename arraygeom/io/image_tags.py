@@ -20,9 +20,7 @@ _TYPES = {1: "B", 2: "c", 3: "H", 4: "I", 5: "II", 9: "i", 10: "ii", 11: "f", 12
 
 
 class ImageTags(NamedTuple):
-    """Size, TIFF and EXIF fields by their numbers, XMP tags by namespace and name (lists joined by
-    commas).
-    """
+    """Size, TIFF and EXIF fields by number, XMP tags by namespace and name (lists joined by commas)."""
 
     hw: HW
     fields: dict[int, tuple[Any, ...]]

@@ -112,9 +112,7 @@ def _camera(source: RigSource, name: str, fields: dict[str, Any], pose: Pose) ->
 def _lens(
     source: RigSource, name: str, camera: str, before: list[float], fields: dict[str, Any]
 ) -> Distortion | None:
-    """The lens of a camera model and a distortion model; `before` are the numbers before the focal
-    lengths.
-    """
+    """The lens of a camera model and a distortion model; `before` are the numbers before focal lengths."""
     model, entry = fields.get("distortion_model", "none"), f"{name}.distortion_coeffs"
     if model not in LENSES[camera]:
         known = ", ".join(LENSES[camera])

@@ -1,5 +1,4 @@
-"""MAT-files of version 5, walked before scipy reads them: scipy trusts their lengths, and a damaged one can
-crash it.
+"""MAT-files of version 5, walked before scipy, which trusts their lengths: a damaged one can crash it.
 
 Layout: "MAT-File Format" (MathWorks). A header of 128 bytes, then elements of a tag (type, bytes) and data,
 padded to 8 bytes; a matrix is an element whose data are elements again: flags, dimensions, name, contents.
@@ -34,9 +33,7 @@ class _Element(NamedTuple):
 
 
 def load_variables(source: RigSource) -> dict[str, Any]:
-    """The variables of a .mat file that consist of structs, cells, text and numbers, by name. Raises
-    RigFileError.
-    """
+    """The variables of a .mat file made of structs, cells, text and numbers, by name. Raises RigFileError."""
     data = source.content()
     if not data:
         raise source.fail(None, "is empty")

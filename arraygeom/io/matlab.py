@@ -1,5 +1,4 @@
-"""MATLAB's stereoParameters and cameraParameters: the struct (`toStruct`) saved to .mat, or as JSON
-(`jsonencode`).
+"""MATLAB's stereoParameters and cameraParameters: the struct (`toStruct`) in .mat, or JSON (`jsonencode`).
 
 Source convention: pixels with the first centre at 1 (shift -1); OpenCV-like axes; lengths in `WorldUnits`, by
 default millimetres. The old names are of row vectors (x2 = x1 R + t, [x y 1] ~ X K): `IntrinsicMatrix` and
@@ -175,9 +174,7 @@ def _pose(source: RigSource, fields: dict[str, Any]) -> Pose:
 
 
 def _check_fundamental(source: RigSource, F: Tensor, one: Camera, two: Camera) -> None:
-    """Points that both pinholes see have to be on the lines of F as stated, which is of pixels counted from
-    1.
-    """
+    """Points both pinholes see have to be on the lines of F as stated, which is of pixels counted from 1."""
     h, w = one.hw
     x = pixel_grid((4, 4), dtype=torch.float64).reshape(-1, 2) * torch.tensor([w / 4, h / 4])
     baseline = two.centre.norm()

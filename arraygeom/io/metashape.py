@@ -1,5 +1,4 @@
-"""Cameras exported by Agisoft Metashape as XML (its own format): every aligned image is a camera, named by
-its label.
+"""Cameras as Agisoft Metashape exports them in XML: every aligned image is a camera, named by its label.
 
 Source convention: pixels with the first centre at 0.5 (shift -0.5), the principal point cx, cy off the
 image's middle; OpenCV axes; `transform` is camera->chunk, inverted; the world is the chunk's frame, in the

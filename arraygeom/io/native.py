@@ -182,9 +182,7 @@ class _Document(RigSource):
         return LensView(hw=view.hw, sensor=view.sensor, K=K, distortion=lens)
 
     def K(self, entry: str, fields: Mapping[str, Any], hw: tuple[int, int], scale: str = "focal") -> Tensor:
-        """The intrinsic matrix as stated, or from `scale` (focal lengths, for a calibrated camera) and
-        centre.
-        """
+        """The intrinsic matrix as stated, or by `scale` (a calibrated camera's focal lengths) and centre."""
         if "K" in fields:
             K = self.numbers(fields["K"], (3, 3), f"{entry}.K")
             if K[2].tolist() != [0, 0, 1] or K[:2, :2].det().abs() < 1e-9:

@@ -62,8 +62,7 @@ def read(source: RigSource) -> Rig:
 
 
 def write(rig: Rig) -> str | dict[str, str]:
-    """One camera as a file; two as `intrinsics.yml` and `extrinsics.yml` of a folder, the world becoming
-    camera 1.
+    """One camera as a file; two as `intrinsics.yml`, `extrinsics.yml` in a folder, the world as camera 1.
 
     Raises ValueError for more cameras, and for what the format cannot hold.
     """

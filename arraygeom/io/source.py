@@ -126,9 +126,7 @@ class RigSource:
         raise self.fail(entry or None, f"has no {' or '.join(keys)}")
 
     def numbers(self, value: Any, shape: tuple[int, ...] | None, entry: str) -> Tensor:
-        """Finite numbers as a float64 tensor of a shape (any order of nesting that has as many), or a
-        vector.
-        """
+        """Finite numbers as a float64 tensor of a shape (any nesting that has as many), or a vector."""
         tensor = float64_of(value)
         if tensor is None:
             raise self.fail(entry, f"holds something other than numbers: {short(value)}")
@@ -248,9 +246,7 @@ class RigSource:
         return quaternion_to_rotation_matrix(q / q.norm())
 
     def brown_conrady(self, value: Any, entry: str) -> Distortion | None:
-        """A lens from OpenCV's coefficients, padded with zeros to a number that the model has; none if all
-        are 0.
-        """
+        """A lens from OpenCV's coefficients, zero-padded to a number the model has; none if all are 0."""
         c = self.numbers([] if value is None else value, None, entry)
         if not c.any():
             return None
@@ -267,9 +263,7 @@ class RigSource:
         return Distortion(KANNALA_BRANDT, torch.nn.functional.pad(c, (0, 4 - c.numel())))
 
     def lens(self, model: str, coefficients: Any, entry: str) -> Distortion | None:
-        """A lens of any model; of other models than the two above from all coefficients, within the model's
-        bounds.
-        """
+        """A lens of any model; others than the two above from all coefficients, within the model's bounds."""
         if model in (BROWN_CONRADY, KANNALA_BRANDT):
             return (self.brown_conrady if model == BROWN_CONRADY else self.kannala_brandt)(
                 coefficients, entry
@@ -295,9 +289,7 @@ class RigSource:
 
 
 def float64_of(value: Any) -> Tensor | None:
-    """Numbers, nested in lists or not, as a float64 tensor; None for what holds anything else, such as true
-    or text.
-    """
+    """Numbers, nested in lists or not, as a float64 tensor; None for anything else, such as true or text."""
     if _has_truth(value):
         return None
     try:

@@ -1,5 +1,4 @@
-"""The tags of the images of one capture: Pix4D's `Camera:` (MicaSense, Parrot Sequoia, senseFly) and
-`drone-dji`.
+"""Tags of the images of one capture: Pix4D's `Camera:` (MicaSense, Parrot Sequoia, senseFly), `drone-dji`.
 
 A file is one image; the others of its capture are those beside it whose names differ in what follows the last
 "_".
@@ -42,9 +41,7 @@ CONVENTION = (
 SUFFIXES = (".tif", ".tiff", ".jpg", ".jpeg")
 VIGNETTING = "VignettingPolynomial", "VignettingPolynomial2D"
 IN_PIXELS = 100.0
-"""A focal length above is in pixels: no lens of these cameras has so many millimetres, and no image so few
-pixels.
-"""
+"""A focal length above is in pixels: no lens of these has so many millimetres, no image so few pixels."""
 LONGEST_TRANSLATION = 1.0
 """Metres between cameras of one body; what is longer is in another unit."""
 BLACK_LEVEL, EXPOSURE, ISO, ISO_SPEED, TAKEN, SERIAL = 50714, 0x829A, 0x8827, 0x8833, 0x9003, 0xA431
@@ -79,9 +76,7 @@ def capture_of(path: Path) -> list[Path]:
 
 
 def named_by_band(paths: Sequence[Path]) -> dict[str, Path]:
-    """Images by the names of their bands; where those are not given, by what follows the last "_" of the
-    files'.
-    """
+    """Images by the names of their bands; where not given, by what follows the last "_" of the files'."""
     bands = []
     for path in paths:
         tags = image_tags(path)
@@ -104,8 +99,7 @@ def states_cameras(paths: Sequence[Path]) -> bool:
 
 
 def rig_of_images(files: Mapping[str, Path]) -> Rig:
-    """The rig of the images of one capture, by camera. Without translations in the tags all cameras are at
-    one point.
+    """The rig of one capture's images, by camera. Without translations in the tags all are at one point.
 
     Warns of what the tags do not state. Raises RigFileError for images without tags, of several captures or
     bodies, and for numbers that no camera has.

@@ -1,5 +1,4 @@
-"""The factory calibration of a ZED camera, `SN12345.conf`: an INI file with the pair at each of its
-resolutions.
+"""A ZED camera's factory calibration, `SN12345.conf`: an INI file with the pair at each resolution.
 
 Source convention, as the maker's own rectification reads it (zed-open-capture, `calibration.hpp`): pixels
 with the first centre at 0 (shift 0); OpenCV axes; lenses of OpenCV, fisheye ones where there is a k4 and no
@@ -68,9 +67,7 @@ def read(source: RigSource) -> Rig:
 
 
 def _pose(source: RigSource, stereo: Mapping[str, str], name: str) -> Pose:
-    """Of the right camera, whose points are R X + t. The offsets have been written for all resolutions at
-    once too.
-    """
+    """Of the right camera: points are R X + t. Offsets have been written for all resolutions at once too."""
     rotation = [source.get(stereo, f"{key}_{name}", "STEREO") for key in ("rx", "cv", "rz")]
     baseline = source.get(stereo, "baseline", "STEREO")
     offsets = [stereo.get(f"{key}_{name}", stereo.get(key, "0")) for key in ("ty", "tz")]

@@ -17,8 +17,7 @@ from .model import CameraModel, beside_points
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
-    """The angle theta from the axis goes to the radius theta + k2 theta^2 + k3 theta^3 + ...: odd and even
-    powers.
+    """The angle theta from the axis goes to the radius theta + k2 theta^2 + k3 theta^3 + ...: all powers.
 
     Without coefficients it is the equidistant fisheye. `widest` is the angle, radians, up to which the lens
     was calibrated, at most pi; where the radius stops increasing it ends before.

@@ -1,5 +1,4 @@
-"""Other wide-angle models: each a radial map of the direction, for two of them followed by Brown-Conrady's
-polynomials.
+"""Other wide-angle models: radial maps of the direction, two of them then by Brown-Conrady's polynomials.
 
 Directions are limited to the cone that the model reaches; those outside count as on its border, and are not
 valid.
@@ -97,9 +96,7 @@ def _sound(kind: _Model, c: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def _border(kind: _Model, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The squared radius that ends the model's range, sine and cosine of its angle: float64 on the CPU, (*b,
-    1..).
-    """
+    """Squared radius at the end of the model's range, its angle's sine and cosine: float64, CPU (*b, 1..)."""
     c = c.detach().to("cpu", torch.float64)
     limit = kind.limit(c).clamp(max=WIDEST**2) * (1 - MARGIN)
     ray = unit(kind.unproject(c, torch.stack([limit.sqrt(), torch.zeros_like(limit)], -1)))
@@ -241,9 +238,7 @@ def _(c: Tensor, angle: Tensor) -> Tensor:
 
 
 def _scaramuzza_limit(c: Tensor) -> Tensor:
-    """The squared radius up to which the angle rises: depth - r depth' = 1 - b2 r^2 - 2 b3 r^3 - 3 b4 r^4 >
-    0.
-    """
+    """Squared radius up to which the angle rises: depth - r depth' = 1 - b2 r^2 - 2 b3 r^3 - 3 b4 r^4 > 0."""
     b = c.detach().to("cpu", torch.float64)
     one, none = torch.ones_like(b[..., :1]), torch.zeros_like(b[..., :1])
     return first_root(torch.cat([one, none, -b * b.new_tensor([1.0, 2.0, 3.0])], -1)).square()

@@ -58,8 +58,7 @@ def polynomial_product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> list[Ten
 
 @torch.no_grad()
 def once(bound: Callable[[Tensor], Tensor], c: Tensor) -> Tensor:
-    """A bound of lenses by their coefficients (*b, n), which is computed once for copies of one lens, made by
-    `expand`.
+    """A bound of lenses by coefficients (*b, n), computed once for copies of one lens made by `expand`.
 
     It is remembered for the lenses that were asked for last, unless torch has to see how it is computed.
     """

@@ -124,9 +124,7 @@ class CameraModel(LensModel):
 
 
 def beside_points(number: Tensor, points: Tensor, axes: int = 0) -> Tensor:
-    """A model's number (*b, and `axes` of its own) for points (*b, ..., k): axes of length 1 for the
-    points'.
-    """
+    """A model's number (*b, and `axes` of its own) for points (*b, ..., k): 1-long axes for the points'."""
     batch = number.ndim - axes
     own = number.shape[batch:]
     return number.to(points).reshape((*number.shape[:batch], *[1] * (points.ndim - 1 - batch), *own))

@@ -26,9 +26,7 @@ SETTLED = 64
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Orthographic(CameraModel, name="orthographic"):
-    """Parallel rays along the axis, as of a telecentric lens: (x, y) are metres, the focal length pixels a
-    metre.
-    """
+    """Parallel rays along the axis, as of a telecentric lens: (x, y) metres, focal length pixels a metre."""
 
     central: ClassVar[bool] = False
     even: ClassVar[Literal["pixels", "distance"]] = "distance"
@@ -184,8 +182,7 @@ def _cross(w: Tensor, v: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class FlatPort(BehindModel, name="flat-port"):
-    """A camera in air that looks into water through a flat pane of glass, which is at right angles to its
-    axis.
+    """A camera in air that looks into water through a flat pane of glass, at right angles to its axis.
 
     distance: from the camera's centre to the pane, metres. thickness: of the pane, metres. glass, water:
     their refractive indices, at least 1 (Treibitz, Schechner, Kunz and Singh 2012).

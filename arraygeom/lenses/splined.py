@@ -1,6 +1,4 @@
-"""Lenses by a smooth surface of B-splines in place of a formula: any lens, and each sensor's own
-unevenness.
-"""
+"""Lenses by a smooth surface of B-splines, not a formula: any lens, and each sensor's own unevenness."""
 
 from __future__ import annotations
 
@@ -110,16 +108,12 @@ class Splined(CameraModel, name="splined"):
         return solve_in_plane(self._displaced, start, xy, within, rounding=SOLVED / 8, steps=steps)
 
     def _off(self, u: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        """Which stereographic points are not those of points of the image plane, where they are, and the
-        Jacobian.
-        """
+        """Which stereographic points are no points of the image plane, where the others are, the Jacobian."""
         there, jacobian = self._displaced(u)
         return norm(there - xy) >= SOLVED * torch.finfo(xy.dtype).eps * (1 + norm(xy)), there, jacobian
 
     def _within(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Stereographic points, those outside at the border of what the knots (and the base) cover; which are
-        not.
-        """
+        """Stereographic points, outer ones at the border of what knots (and base) cover; which are out."""
         spacing = beside_points(self.spacing, u, 1).detach()
         ny, nx = self.knots.shape[-3:-1]
         margin = 0.5 * (self.order - 1) + NEARLY

@@ -109,9 +109,7 @@ def _missing(found: Coverage) -> list[str]:
 
 
 class NextView(NamedTuple):
-    """A view of the board that would help, in words, and the median uncertainty (pixels) with and without
-    it.
-    """
+    """A board's view that would help, in words; the median uncertainty (pixels) with and without it."""
 
     text: str
     before: float
@@ -157,9 +155,7 @@ def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarra
 
 
 def _gain(known: Intrinsics, X: np.ndarray) -> np.ndarray | None:
-    """The information of a view on the free intrinsics, its pose unknown; None if hardly any of it is
-    visible.
-    """
+    """A view's information on the free intrinsics, its pose unknown; None if hardly any of it is visible."""
     seen = known.camera.project_local(torch.from_numpy(X))
     inside = (seen.valid & known.camera.contains(seen.x)).numpy()
     if inside.sum() < 0.6 * len(X) or not inside.any():

@@ -48,8 +48,7 @@ class Board(ABC):
 
     @cached_property
     def symmetries(self) -> tuple[Int[np.ndarray, " n"], ...]:
-        """The renumberings of the points under rotations of the board, the identity first; it alone with
-        markers.
+        """Renumberings of points under rotations of the board, the identity first; it alone with markers.
 
         A detector may number the points in any of these ways: colours do not disambiguate them, as they are
         inverted in some images (near infrared).
@@ -87,9 +86,7 @@ class Board(ABC):
 
     @property
     def offset(self) -> float:
-        """Distance of the first point from the upper and the left edge of the print without its margin,
-        metres.
-        """
+        """The first point's distance from the print's upper and left edge without its margin, metres."""
         return self.spacing
 
     @abstractmethod
@@ -99,8 +96,7 @@ class Board(ABC):
 
 @dataclass(frozen=True)
 class MarkedBoard(Board):
-    """A board whose points are identified individually: a part of it is enough, its orientation is
-    unambiguous.
+    """A board whose points are identified individually: a part is enough, its orientation unambiguous.
 
     first: the number of its first marker.
     """
@@ -174,8 +170,7 @@ class Charuco(MarkedBoard):
 
 @dataclass(frozen=True)
 class AprilGrid(MarkedBoard):
-    """Kalibr's grid of AprilTags; `columns` x `rows` counts the corners of all tags, `spacing` is twice the
-    gap.
+    """Kalibr's grid of AprilTags; `columns` x `rows` counts all tags' corners, `spacing` is twice the gap.
 
     tag: side of a tag, metres; border: black bits around its code. Tags are numbered row by row from below.
     """
@@ -208,9 +203,7 @@ class AprilGrid(MarkedBoard):
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Width and height of the print without its margin, metres: the small squares at the tags'
-        corners.
-        """
+        """Width and height of the print without its margin, metres: the small squares at tags' corners."""
         width, height = (float(v) + 2 * self.gap for v in self.points[:, :2].max(0))
         return width, height
 
@@ -269,9 +262,7 @@ class Boards(Board):
 
 @dataclass(frozen=True)
 class Circles(Board):
-    """Black circles on white, in rows; in an asymmetric grid every other row is shifted by half their
-    distance.
-    """
+    """Black circles on white in rows; in an asymmetric grid every other row is off by half their distance."""
 
     asymmetric: bool = False
 

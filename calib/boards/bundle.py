@@ -34,9 +34,7 @@ ROBUST = 3.0
 POSE = 6
 """Parameters of a board: a rotation vector about the world's axes and a translation."""
 TYPICAL_FOCAL_ERROR, TYPICAL_CENTRE_ERROR = 0.1, 0.1
-"""Likewise of the error of a guessed focal length, as a share of it, and of the principal point, of the
-width.
-"""
+"""Likewise of the error of a guessed focal length, as a share of it, and principal point, of the width."""
 CENTRE_DEVIATION, ASPECT_DEVIATION = 0.03, 0.01
 """Standard deviations of the principal point about the centre (share of the width), and of the aspect ratio.
 """
@@ -140,9 +138,7 @@ class BundleProblem:
         )
 
     def stepped(self, change: Float[np.ndarray, " c"], boards: Float[np.ndarray, "b 6"]) -> BundleProblem:
-        """The problem after a change of its free parameters, the deformations' last, and of the boards'
-        poses.
-        """
+        """The problem after a change of its free parameters, deformations' last, and of the boards' poses."""
         cameras, at = {}, 0
         for name, camera in self.cameras.items():
             full = np.zeros(len(self.free[name]))
@@ -273,9 +269,7 @@ def linearised(problem: BundleProblem) -> dict[str, Linearised]:
 
 
 def _by_pose(problem: BundleProblem, name: str) -> Float[np.ndarray, "n 3 6"]:
-    """Derivatives of a camera's points in the world by the poses of their boards, exp(w) R and the
-    translation.
-    """
+    """Derivatives of a camera's points in the world by their boards' poses, exp(w) R and the translation."""
     x, y, z = problem.rotated(name).T
     o, one = np.zeros_like(x), np.ones_like(x)
     rows = [[o, z, -y, one, o, o], [-z, o, x, o, one, o], [y, -x, o, o, o, one]]
@@ -315,9 +309,7 @@ class NormalEquations:
         return change, boards
 
     def information(self) -> Array:
-        """The inverse covariance (c, c) of the camera parameters, marginalised over the boards and
-        deformations.
-        """
+        """Inverse covariance (c, c) of the camera parameters, marginalised over boards and deformations."""
         S, _, _ = self.reduced(0.0)
         c = len(S) - self.shapes
         return S[:c, :c] - S[:c, c:] @ np.linalg.solve(S[c:, c:], S[c:, :c])
@@ -410,9 +402,7 @@ def changed(camera: Camera, change: torch.Tensor) -> Camera:
 
 
 def camera_jacobian(camera: Camera, X: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 p"]:
-    """Derivatives of the pixels of world points with respect to the camera, in the order of
-    `parameter_names`.
-    """
+    """Derivatives of the pixels of world points by the camera, in the order of `parameter_names`."""
     return linear_projection(camera, X)[1]
 
 
@@ -444,9 +434,7 @@ def linear_projection(
 
 
 def with_default(camera: Camera, entry: str) -> tuple[Camera, str]:
-    """The camera with a principal point's entry at the centre, or a lens's term without effect; and that in
-    words.
-    """
+    """The camera, a principal point's entry central, or a lens's term without effect; that in words."""
     kind, index = entry.split(".")[0], int(entry.split(".")[1])
     if kind == "centre":
         K = camera.K.clone()
@@ -465,8 +453,7 @@ def with_default(camera: Camera, entry: str) -> tuple[Camera, str]:
 
 
 class CameraPrior(NamedTuple):
-    """A normal prior of a camera's parameters: mean and inverse covariance, in the order of
-    `parameter_names`.
+    """A normal prior of a camera's parameters: mean, inverse covariance, in `parameter_names`'s order.
 
     pose: the mean of its pose, whose entries are a rotation vector about the camera's axes and the optical
     centre in the world (not the translation), metres. Without it, the entries of the pose are zero.
@@ -477,9 +464,7 @@ class CameraPrior(NamedTuple):
     pose: Pose | None = None
 
     def equations(self, camera: Camera) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
-        """The prior's part of the normal equations: inverse covariance and negative gradient by each
-        parameter.
-        """
+        """The prior's part of the normal equations: inverse covariance, negative gradient, by parameter."""
         derivatives = np.eye(len(self.mean))
         if self.pose is not None:
             derivatives[3:6, :6] = camera.cam_from_world.centre_jacobian.numpy()

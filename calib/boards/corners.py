@@ -199,9 +199,7 @@ def _initial_model(values: Array, x: Array, root: Array, d: Array, e: Array) -> 
 
 
 def _linearised(values: Array, model: CornerModel, normal: Array, d: Array, e: Array) -> tuple[Array, Array]:
-    """Residuals (n, m) and derivatives of the model by a step (n, m, 5), at distances d and e from the
-    edges.
-    """
+    """Residuals (n, m), derivatives of the model by a step (n, m, 5), at distances d and e from the edges."""
     _, _, b, blur = model
     S, T = (erf(v / (2**0.5 * blur)) for v in (d, e))
     by_d, by_e = (b * (2 / np.pi) ** 0.5 / blur * np.exp(-((v / blur) ** 2) / 2) for v in (d, e))

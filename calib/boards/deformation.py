@@ -92,9 +92,7 @@ class BoardDeformation:
 
 
 class Curvature(NamedTuple):
-    """How far the middle lies off the plane of two opposite edges, metres; radius, metres; towards the
-    cameras.
-    """
+    """How far the middle is off two opposite edges' plane, metres; radius, metres; towards the cameras."""
 
     depth: float
     radius: float
@@ -118,9 +116,7 @@ def fewest_frames(count: int) -> int:
 def is_significant(
     values: Float[np.ndarray, " s"], covariance: Float[np.ndarray, "s s"], frames: int
 ) -> bool:
-    """Whether shapes differ from flat ones by more than the jackknife over frames explains (Hotelling's
-    test).
-    """
+    """Whether shapes differ from flat by more than the jackknife over frames explains (Hotelling's test)."""
     from scipy.stats import f as f_distribution  # here, as it takes half a second to import
 
     count = len(values)

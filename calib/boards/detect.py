@@ -30,9 +30,7 @@ FEWEST_KNOWN = 6
 ENOUGH = 0.6
 """Share of a board's corners that must fit the corner model, else all are refined by gradients."""
 LARGEST_MISFIT = 0.35
-"""Largest median distance (in spacings) of the points from a smoothly distorted grid: beyond it, a false
-detection.
-"""
+"""Largest median distance (spacings) of points from a smoothly distorted grid: beyond, a false detection."""
 SMALL = 640
 """Width to which images are reduced to identify the board they show."""
 OTHER_DICTIONARIES = ("4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000", "aruco_original", "apriltag_36h11")

@@ -1,6 +1,4 @@
-"""One camera from its own images: Zhang's method by OpenCV, then all observable parameters; lens models
-compared.
-"""
+"""One camera from its images: Zhang's method by OpenCV, then all observable parameters; lenses compared."""
 
 from __future__ import annotations
 
@@ -149,9 +147,7 @@ def projection_errors(
 
 
 def near_homography(found: Detection, board: Board) -> Detection:
-    """The points that a homography of the board fits (least median of squares), apart from the lens's
-    distortion.
-    """
+    """Points that a homography of the board fits (least median of squares), but for the lens's distortion."""
     if len(found.ids) < FEWEST_POINTS or not board.flat:
         return found
     plane = board.points[found.ids, :2]
@@ -184,9 +180,7 @@ def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Cam
 
 
 def _with_model(camera: Camera, model: str) -> Camera:
-    """A fisheye's camera with another lens model of nearly the same rays: its focal length and two terms are
-    fitted.
-    """
+    """A fisheye's camera by another lens model of nearly the same rays: focal length, two terms fitted."""
     plain = np.array(MODELS[model].harmless)
     h, w = camera.hw
     grid = np.stack(np.meshgrid(np.linspace(0, w - 1, 16), np.linspace(0, h - 1, 12)), -1).reshape(-1, 2)
@@ -261,9 +255,7 @@ def _pinhole(views: BoardViews, board: Board, count: int) -> OpenCVSolution:
 
 
 def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarray:
-    """K with square pixels and a central principal point by a linear camera of one view (Hartley & Zisserman
-    7.1).
-    """
+    """K, square pixels, central principal point, by a linear camera of one view (Hartley & Zisserman 7.1)."""
     X, x = view[0].astype(np.float64), view[1][:, 0].astype(np.float64)
     if len(X) < FEWEST_POINTS:
         return np.array(intrinsics(float(max(hw)), hw))
@@ -278,9 +270,7 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
 
 
 def _fisheye(views: BoardViews, board: Board) -> OpenCVSolution:
-    """From the focal length of half a sphere, or, where OpenCV then finds no poses, from one of a narrow
-    view.
-    """
+    """From the focal length of half a sphere, or, if OpenCV then finds no poses, of a narrow view."""
     if not board.flat:
         raise ValueError(
             "fisheyes need a flat board to start from: points of known position give pinhole cameras"

@@ -52,9 +52,7 @@ Photos = Mapping[str, Mapping[FrameKey, Photo]]
 
 
 def to_grey(image: np.ndarray) -> Grey:
-    """An image (H, W) or (H, W, 3) in grey, 8 bits; one that is dim or of 16 bits is stretched to all of
-    them.
-    """
+    """An image (H, W) or (H, W, 3) in grey, 8 bits; if dim or of 16 bits it is stretched to all of them."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
     low, high = np.percentile(grey[::4, ::4], (0.5, 99.5))
     if grey.dtype == np.uint8 and high - low > 100:
@@ -84,9 +82,7 @@ def find_photos(folder: Path, *, patterns: Mapping[str, str] | None = None) -> P
 
 
 def _of_one_moment(photos: dict[str, dict[FrameKey, Photo]]) -> Photos:
-    """Cameras with one image each took it at the same moment: numbers in the files' names are those of
-    cameras.
-    """
+    """Cameras with one image each took it at the same moment: numbers in the files' names are cameras'."""
     keys = {key for moments in photos.values() for key in moments}
     if len(keys) == 1 or any(len(moments) > 1 for moments in photos.values()):
         return photos
@@ -94,8 +90,7 @@ def _of_one_moment(photos: dict[str, dict[FrameKey, Photo]]) -> Photos:
 
 
 def frame_keys(stems: list[str]) -> list[FrameKey]:
-    """What distinguishes the images of one camera: the part of the names that differs, as a number if it is
-    one.
+    """What tells the images of one camera apart: the part of the names that differs, a number if it is one.
 
     >>> frame_keys(["cam01_08_int", "cam01_09_int", "cam01_10_int"])
     [8, 9, 10]
@@ -160,9 +155,7 @@ def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
 
 
 def _check_orientations(name: str, files: list[Path]) -> None:
-    """Tags are applied, so images of one camera that were stored alike would otherwise be rotated
-    differently.
-    """
+    """Tags are applied: images of one camera stored alike would otherwise be rotated differently."""
     first: dict[int, Path] = {}
     for file in files:
         first.setdefault(_orientation(file), file)
@@ -174,8 +167,7 @@ def _check_orientations(name: str, files: list[Path]) -> None:
 
 
 def _orientation(file: Path) -> int:
-    """The EXIF orientation, 1 if there is none or the file cannot be read, which is reported when it is
-    decoded.
+    """The EXIF orientation, 1 if there is none or the file is unreadable, which is reported on decoding.
 
     Raises ValueError for a file that states more pixels than any camera has, before anything is decoded.
     """

@@ -83,8 +83,7 @@ def start_prior(camera: Camera, deviations: StartDeviations) -> CameraPrior:
 
 
 def initial_rig(singles: Mapping[str, Solved], board: Board) -> InitialRig:
-    """Poses of all cameras and boards from pairs, along the tree whose edges have most corners; the first is
-    the world.
+    """Poses of all cameras and boards from pairs, along the tree of most corners; the first is the world.
 
     Raises ValueError if cameras are not connected by shared frames, or if the frames of a pair contradict
     each other: images that are mirrored, or not of the same moments.
@@ -106,8 +105,7 @@ def rig_near_start(
     lens: Mapping[str, Lens],
     deviations: StartDeviations,
 ) -> InitialRig:
-    """Cameras at the start's positions, rotated so that they agree on the boards, and the boards in the
-    start's world.
+    """Cameras at the start's positions, rotated to agree on the boards, and boards in the start's world.
 
     The camera with most images keeps its orientation. Raises ValueError if the start has no such camera, or
     one of another size, or if a camera shares no moment with another.
@@ -133,9 +131,7 @@ def rig_near_start(
 
 
 def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) -> Camera:
-    """A camera of a start, with a lens. Raises ValueError if it is missing or differs in size from the
-    images.
-    """
+    """A camera of a start, with a lens. Raises ValueError if it is missing or its size is not the images'."""
     camera = start.cameras.get(name)
     if not isinstance(camera, Camera):
         raise ValueError(
@@ -226,9 +222,7 @@ def symmetry_poses(board: Board) -> list[Pose]:
 def _prediction_errors(
     a: CalibratedViews, b: CalibratedViews, a_from_b: Pose, keys: Iterable[FrameKey], board: Board
 ) -> np.ndarray:
-    """By frame: the median distance in a's image from the points predicted by b's board pose, best
-    numbering.
-    """
+    """By frame: the median distance in a's image from points predicted by b's board pose, best numbering."""
     detections, poses = zip(*((a.views.seen[key], b.poses[key]) for key in keys))
     counts = [len(d.ids) for d in detections]
     points = torch.from_numpy(board.points)
@@ -270,9 +264,7 @@ def _along_tree(
 
 
 def consistent_boards(cameras: Sequence[CalibratedViews], poses: dict[str, Pose], board: Board) -> InitialRig:
-    """Board poses from the camera most others agree with, and the other cameras' numbering made
-    consistent.
-    """
+    """Board poses from the camera most others agree with, other cameras' numbering made consistent."""
     boards: dict[FrameKey, Pose] = {}
     seen: dict[str, dict[FrameKey, Detection]] = {c.name: {} for c in cameras}
     left_out = []

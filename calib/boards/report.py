@@ -1,6 +1,4 @@
-"""The report of a calibration: one HTML file with tables and figures: the rig, residuals, coverage,
-uncertainty.
-"""
+"""A calibration's report: one HTML file with tables and figures: rig, residuals, coverage, uncertainty."""
 
 from __future__ import annotations
 
@@ -129,9 +127,7 @@ def html_page(parts: Iterable[str], title: str, further: str = "") -> str:
 
 
 def by_cameras(notes: Iterable[str]) -> list[str]:
-    """Notes such as "left: no points at the top", with the same text as one: "left, right: no points at the
-    top".
-    """
+    """Notes such as "left: no points at the top", equal ones as one: "left, right: no points at the top"."""
     names: dict[str, list[str]] = {}
     for note in notes:
         name, between, text = note.partition(": ")
@@ -312,9 +308,7 @@ def draw_by_image(calibration: Calibration) -> Figure:
 
 
 def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figure:
-    """One camera: observed points; the median residual of each part of the image, magnified; their
-    scatter.
-    """
+    """One camera: observed points; median residuals of parts of the image, magnified; their scatter."""
     seen, r = calibration.fit.problem.seen[name], calibration.fit.problem.residuals()[name]
     hw = calibration.views[name].hw
     figure = Figure(
@@ -357,9 +351,7 @@ def _draw_field(axes: Any, x: np.ndarray, r: np.ndarray, hw: tuple[int, int]) ->
 
 
 def draw_uncertainty(calibration: Calibration, at: tuple[float, float]) -> Figure:
-    """By beta (rows) and depth (columns): the deviation of the predicted pixel, over the first camera's
-    image.
-    """
+    """By beta (rows) and depth (columns): the predicted pixel's deviation, over the first camera's image."""
     covariance = rig_covariance(calibration.fit)
     assert covariance is not None
     alpha, *betas = calibration.views
@@ -405,9 +397,7 @@ def _extent(hw: tuple[int, int]) -> tuple[float, float, float, float]:
 
 
 def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figure:
-    """A row per camera: uncertainty of projection at two depths, and the difference between halves of the
-    frames.
-    """
+    """A row per camera: uncertainty of projection at two depths, and how halves of the frames differ."""
     names = list(calibration.views)
     figure = Figure(figsize=(10.4, 2.5 * len(names) + 0.3), layout="constrained")
     halves = half_difference(calibration.fit, float(np.mean(depths)))
@@ -445,9 +435,7 @@ def _map(
 def draw_worst_images(
     calibration: Calibration, detected: Mapping[str, BoardViews], photos: Photos
 ) -> Figure | None:
-    """The images with most points left out or largest residuals: points used, left out (red), residuals
-    enlarged.
-    """
+    """Images with most points left out or largest residuals: points (red: left out), residuals enlarged."""
     chosen = _worst(calibration, detected)
     if not chosen:
         return None

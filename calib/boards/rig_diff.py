@@ -1,5 +1,4 @@
-"""Whether a rig has moved: two calibrations of the same cameras compared by what they say of pixels and
-depths.
+"""Whether a rig has moved: two calibrations of the same cameras compared by their pixels and depths.
 
 Gauge: the whole rig may have been set up elsewhere, so the projections compared are those after the one rigid
 motion of space that brings all cameras' pixels together best, in least squares, over a grid of pixels at
@@ -212,9 +211,7 @@ def _points(camera: Camera, other: Camera, depth: tuple[float, float]) -> Grid:
 
 
 class _Part(NamedTuple):
-    """One camera: differences (n, 2), derivatives by the motion (2 n, 6), and by both cameras' parameters (n,
-    2, p).
-    """
+    """One camera: differences (n, 2), derivatives by motion (2 n, 6), by both cameras' numbers (n, 2, p)."""
 
     name: str
     cameras: tuple[Camera, Camera]
@@ -252,9 +249,7 @@ def _same_lens(a: Camera, b: Camera) -> bool:
 
 
 def _best_motion(a: Rig, b: Rig, grids: Mapping[str, Grid]) -> Pose:
-    """From the world of the first rig to that of the second: least squares of all pixels, by Gauss and
-    Newton.
-    """
+    """From the first rig's world to the second's: least squares of all pixels, by Gauss and Newton."""
     first = a.names[0]
     motion = b[first].cam_from_world.inverse() @ a[first].cam_from_world
     for _ in range(ITERATIONS):
@@ -280,9 +275,7 @@ def _tested(
     parts: list[_Part],
     names: tuple[str, ...],
 ) -> Significance:
-    """The difference in the directions in which the calibrations' errors move pixels, in standard
-    deviations.
-    """
+    """The difference in directions in which calibrations' errors move pixels, in standard deviations."""
     U, s, _ = np.linalg.svd(spread, full_matrices=False)
     counts = s > LEAST * np.sqrt(len(change) / 2)
     U, s = U[:, counts], s[counts]
@@ -350,9 +343,7 @@ def _of(sigma: np.ndarray, digits: int) -> str:
 
 
 def draw_difference(found: RigDifference) -> Figure:
-    """How far two rigs' pixels differ, at the nearest and the farthest depth, and depths by each pair, in
-    percent.
-    """
+    """How far two rigs' pixels differ, at nearest and farthest depth, and depths by each pair, in percent."""
     panels = []
     for name, camera in found.cameras.items():
         for depth in (camera.depth.min(), camera.depth.max()):

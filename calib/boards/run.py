@@ -1,6 +1,4 @@
-"""From a folder of images to files: a calibration, or a page of guidance that follows while they are
-taken.
-"""
+"""From a folder of images to files: a calibration, or a page of guidance while they are taken."""
 
 from __future__ import annotations
 

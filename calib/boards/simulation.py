@@ -59,8 +59,7 @@ def simulate_photos(
 
 
 def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
-    """Random `world_from_board` (a batch) with the board's centre visible in every camera, at several depths
-    and tilts.
+    """Random `world_from_board` (a batch), boards' centres seen by every camera, at several depths and tilts.
 
     Raises ValueError if there are too few such poses.
     """

@@ -1,5 +1,4 @@
-"""Bundle adjustment of a calibration: which parameters the images determine, how boards are shaped, what is
-left out.
+"""Bundle adjustment of a calibration: what images determine, how boards are shaped, what is left out.
 
 Gauss-Newton with Marquardt's damping (Triggs et al. 2000).
 """
@@ -75,8 +74,7 @@ MANY_WRONG = 0.34
 def calibrate_single(
     name: str, views: BoardViews, board: Board, *, lens: Lens = "brown-conrady", final: bool = True
 ) -> Solved:
-    """One camera's intrinsics and lens from its own images. Raises ValueError, with advice, where they do not
-    suffice.
+    """A camera's intrinsics and lens from its images. Raises ValueError, with advice, if they do not suffice.
 
     Unless `final`, a poorly constrained focal length is accepted, as other cameras will add constraints.
     """
@@ -139,9 +137,7 @@ def solve_inliers(
     rounds: int = ROUNDS,
     final: bool = True,
 ) -> Solved:
-    """`solve` in some rounds, each without those of the `detected` points that the one before shows to be
-    outliers.
-    """
+    """`solve` in some rounds, each without the `detected` points that the one before shows to be outliers."""
     solved = solve(initial, board, final=final)
     for _ in range(rounds - 1):
         views = {name: near_fit(solved, name, v, board) for name, v in detected.items()}
@@ -156,8 +152,7 @@ def solve_inliers(
 
 
 def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, list[str]]:
-    """The problem with every unobservable parameter of a lens or principal point fixed at its default, and
-    notes.
+    """The problem, unobservable parameters of lenses and principal points fixed at defaults, and notes.
 
     The worst is fixed first. Once the fit is `final`, raises ValueError where a focal length is unobservable.
     """
@@ -188,9 +183,7 @@ def _equal(a: Masks, b: Masks) -> bool:
 
 
 def _relative_information(problem: BundleProblem) -> np.ndarray:
-    """The inverse covariance of the free parameters in units of their typical sizes, by pixels and stated
-    priors.
-    """
+    """Inverse covariance of the free parameters in units of typical sizes, by pixels and stated priors."""
     sizes = np.concatenate(
         [typical_sizes(camera)[problem.free[name]] for name, camera in problem.cameras.items()]
     )
@@ -200,9 +193,7 @@ def _relative_information(problem: BundleProblem) -> np.ndarray:
 
 
 def _worst(candidates: list[tuple[str, int]], information: np.ndarray) -> int | None:
-    """The parameter whose deviation is the largest share of its typical size, if too large; focal lengths
-    last.
-    """
+    """The parameter with the largest deviation by its typical size, if too large; focal lengths last."""
     covariance = np.linalg.inv(information + np.eye(len(candidates)))
     shares = np.sqrt(np.maximum(covariance.diagonal(), 0))
     order = np.array([2 if i >= 8 else 1 if i >= 6 else 0 for _, i in candidates]) * (shares > UNOBSERVABLE)
@@ -211,8 +202,7 @@ def _worst(candidates: list[tuple[str, int]], information: np.ndarray) -> int | 
 
 
 def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
-    """The solution with the boards' deformations as unknowns if the points show them and frames agree on
-    them.
+    """The solution with boards' deformations as unknowns if the points show them and frames agree on them.
 
     Where frames are too few to agree, the loss must fall by half.
     """
@@ -264,9 +254,7 @@ def readjusted(problem: BundleProblem) -> BundleProblem:
 
 
 def noise(problem: BundleProblem, parameters: int) -> dict[str, float]:
-    """A robust estimate of each camera's noise along x or y, pixels, given the number of fitted
-    parameters.
-    """
+    """A robust estimate of each camera's noise in x or y, pixels, given the number of fitted parameters."""
     residuals = problem.residuals()
     numbers = 2 * sum(len(r) for r in residuals.values())
     left = numbers / max(numbers - parameters, 0.1 * numbers)
@@ -334,9 +322,7 @@ def near_fit(solved: Solved, name: str, views: BoardViews, board: Board) -> Boar
 
 
 class FrameMisfit(NamedTuple):
-    """A frame that a camera does not fit: its residuals, and those of the camera's median frame (RMS,
-    pixels).
-    """
+    """A frame a camera does not fit: its residuals, and those of the camera's median frame (RMS, pixels)."""
 
     camera: str
     frame: FrameKey
@@ -416,9 +402,7 @@ def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solv
 
 
 def _wrong_images(solved: Solved, alone: Mapping[str, float]) -> list[tuple[str, FrameKey]]:
-    """Images so far off that their camera would be refused, one of a moment, unless they are many of a
-    camera's.
-    """
+    """Images so far off that their camera would be refused, one of a moment, unless many are one camera's."""
     found = dict[FrameKey, str]()
     for misfit in misfits(solved):
         if misfit.rms > _refused_from(alone[misfit.camera]):
@@ -464,9 +448,7 @@ def _inconsistent_cameras(solved: Solved, alone: Mapping[str, float]) -> str:
 
 
 def _as_prior(name: str, alone: Solved) -> CameraPrior:
-    """The single calibration of a camera as a prior of its intrinsics; none for parameters that were
-    fixed.
-    """
+    """A camera's single calibration as a prior of its intrinsics; none for parameters that were fixed."""
     camera = alone.problem.cameras[name]
     entries = parameter_names(camera)
     free = [entries.index(entry.removeprefix(f"{name}.")) for entry in alone.names]

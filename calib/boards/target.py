@@ -219,8 +219,7 @@ def _smallest_dictionary(text: str, name: str, markers: int) -> str:
 
 
 def _known_points(text: str) -> KnownPoints:
-    """The points of a CSV file `targets.csv`, or `targets.csv:5x5_100` with its markers' dictionary (4x4 by
-    default).
+    """Points of a CSV file `targets.csv`, or `targets.csv:5x5_100` with their dictionary (4x4 by default).
 
     Columns id, x, y, z (metres) for markers' centres, or id, corner (0 to 3), x, y, z. Raises ValueError.
     """
@@ -278,9 +277,7 @@ def page_of(board: Board, *, margin: float = 0.012) -> tuple[float, float]:
 
 
 def smallest_paper(page: tuple[float, float]) -> str | None:
-    """The smallest sheet that a page (millimetres) fits on, upright or across; None if none is large
-    enough.
-    """
+    """The smallest sheet a page (millimetres) fits on, upright or across; None if none is large enough."""
     fitting = [name for name, paper in PAPERS.items() if all(a <= b for a, b in zip(sorted(page), paper))]
     return fitting[0] if fitting else None
 
@@ -295,8 +292,7 @@ def page_note(board: Board) -> str:
 
 
 def draw_board(board: Board, *, margin: float = 0.012, paper: str | None = None) -> Figure:
-    """The board as a figure whose size in inches is its true size, with a white margin (metres) and a ruler
-    below.
+    """The board as a figure whose size in inches is the true one, with a white margin (metres), ruler below.
 
     Saved as PDF or SVG it prints at true size; the ruler serves to check it. On a sheet of `paper` ("A4") it
     is in the middle. Raises ValueError if it does not fit there.

@@ -1,5 +1,4 @@
-"""How uncertain a rig is: the covariance of its parameters, in a file beside the rig's, and what follows from
-it.
+"""How uncertain a rig is: its parameters' covariance, in a file beside the rig's, and what follows from it.
 
 A camera's pose and its lens can stand for one another: what is compared are the pixels of points at a
 distance, after the small motion of the camera that fits them best (as in mrcal's projection uncertainty and
@@ -138,8 +137,7 @@ def baseline_deviation(rig: Mapping[str, Camera], a: str, b: str, covariance: Ri
 
 
 class Intrinsics(NamedTuple):
-    """A camera in its own frame, the covariance of its free intrinsics, which they are, and its noise in
-    pixels.
+    """A camera in its own frame, its free intrinsics, their covariance, and its noise in pixels.
 
     seen: some of the board points that it observed, in its frame.
     """
@@ -179,9 +177,7 @@ def grid_points(camera: Camera, depth: float) -> tuple[Float[np.ndarray, "n 2"],
 
 
 def uncertainty(known: Intrinsics, depth: float) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Standard deviations (pixels, worst direction) of the projection of points at a depth (metres), over the
-    image.
-    """
+    """Standard deviations (pixels, worst direction) of projections at a depth (metres), over the image."""
     x, change = moved_pixels(known, depth)
     return x, worst_deviation(change @ known.covariance @ change.swapaxes(-1, -2))
 
@@ -204,9 +200,7 @@ def moved_pixels(known: Intrinsics, depth: float) -> tuple[np.ndarray, np.ndarra
 
 
 def compensation(by_pose: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """The motion (6, f) of a camera by whose derivatives (m, 2, 6) pixels move like (m, 2, f), by least
-    squares.
-    """
+    """The motion (6, f) of a camera whose derivatives (m, 2, 6) move pixels like (m, 2, f), least squares."""
     return np.asarray(
         np.linalg.lstsq(by_pose.reshape(-1, 6), moved.reshape(len(by_pose) * 2, -1), rcond=None)[0]
     )
@@ -269,9 +263,7 @@ def jackknife(problem: BundleProblem) -> Jackknife:
 
 
 def _clustered(total: Array, H: Array, g: Array) -> Array:
-    """The covariance by the slopes g (b, c) of frames, each scaled by (1 - its share H of the
-    information)^(-1/2).
-    """
+    """Covariance by the slopes g (b, c) of frames, each times (1 - its share H of the information)^(-1/2)."""
     scale = 1 / np.sqrt(total.diagonal())
     whiten = np.linalg.inv(np.linalg.cholesky(total * scale * scale[:, None])) * scale
     share, axes = np.linalg.eigh(whiten @ H @ whiten.T)
@@ -283,8 +275,7 @@ def _clustered(total: Array, H: Array, g: Array) -> Array:
 def with_disagreement(
     solved: Solved, extents: list[tuple[float, float]], *, unchecked: bool = False
 ) -> Solved:
-    """The solution with its covariance raised if frames disagree considerably; with notes on that and on the
-    boards.
+    """The solution, its covariance raised if frames disagree considerably; notes on that and on the boards.
 
     Where frames are too few to tell, it is raised by `UNCHECKED` if it is of such frames alone (`unchecked`).
 

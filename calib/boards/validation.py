@@ -1,6 +1,4 @@
-"""How well a calibration predicts: epipolar errors, frames held out, lens models compared by those, and
-notes.
-"""
+"""How well a calibration predicts: epipolar errors, held-out frames, lens models compared by those, notes."""
 
 from __future__ import annotations
 
@@ -50,9 +48,7 @@ EQUAL = 0.01
 def epipolar_errors(
     rig: Rig, views: Mapping[str, BoardViews]
 ) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
-    """By pair: distances in undistorted pixels from beta's points to the lines of alpha's, and the
-    reverse.
-    """
+    """By pair: distances in undistorted pixels from beta's points to alpha's lines, and the reverse."""
     found = {}
     for a, b in combinations(views, 2):
         xa, xb = _common(views[a], views[b])
@@ -108,8 +104,7 @@ def held_out_errors(
 
 
 def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """By camera: pixels (n, 2) near board points of both halves, and how far (n, 2) projections of their fits
-    differ.
+    """By camera: pixels (n, 2) near points of both halves, how far (n, 2) projections of their fits differ.
 
     Halves are every other frame; elsewhere a lens model is extrapolated. Empty if there are too few frames.
     """
@@ -139,9 +134,7 @@ def _difference(a: Camera, b: Camera, X: np.ndarray) -> Float[np.ndarray, "n 2"]
 
 @dataclass(frozen=True)
 class LensComparison:
-    """Mean square errors of a coordinate (pixels^2) of each frame by each model that can be fitted without
-    it.
-    """
+    """Mean square errors of a coordinate (pixels^2) of each frame by each model that fits without it."""
 
     errors: Mapping[Lens, Float[np.ndarray, " f"]]
 
@@ -151,9 +144,7 @@ class LensComparison:
 
     @property
     def advised(self) -> Lens:
-        """The model with fewest coefficients that predicts as well as the best, to a standard error or one
-        percent.
-        """
+        """The model with fewest coefficients that predicts like the best, to a standard error or 1 %."""
         if not self.errors:
             return "brown-conrady"
         best = min(self.errors, key=self.rms)
@@ -204,9 +195,7 @@ def _compared(name: str, views: BoardViews, board: Board) -> LensComparison:
 
 
 def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"]:
-    """Mean squares of the frames held `out` by a camera fitted to the others, their boards' poses fitted to
-    them.
-    """
+    """Mean squares of frames held `out` by a camera fitted to the others, board poses fitted to them."""
     fitted, judged = readjusted(problem.of_boards(~out)), problem.of_boards(out)
     (name,) = fitted.cameras
     if fitted.deformation is not None and judged.deformation is not None:
@@ -228,9 +217,7 @@ def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"
 def left_out_notes(
     detected: Mapping[str, BoardViews], singles: Mapping[str, Solved], solved: Solved
 ) -> Iterator[str]:
-    """Notes on images and points that cameras were calibrated without, by themselves (`singles`) and
-    together.
-    """
+    """Notes on images and points cameras were calibrated without, by themselves (`singles`) and together."""
     for name, v in detected.items():
         used = singles[name].views[name]
         if rejected := [str(key) for key in v.seen if key not in used.seen]:
