@@ -71,8 +71,7 @@ def invert_increasing(
 
 
 PATIENCE = 12
-"""Iterations after which a step of Newton that is not half the one before is replaced by halving the bracket.
-"""
+"""Iterations after which a Newton step not half the one before is replaced by halving the bracket."""
 
 
 PlaneMap = Callable[[Tensor], tuple[Tensor, Sequence[Tensor]]]

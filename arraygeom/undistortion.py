@@ -18,8 +18,7 @@ from .sampling import Interpolation, Sampled, sample
 from .tracing import needs_numbers
 
 WIDEST = math.radians(62)
-"""How far off axis a pinhole view reaches: there it stretches outwards 4.5 times what it does in its middle.
-"""
+"""How far off axis a pinhole view reaches: there it stretches outwards 4.5 times as much as in the middle."""
 AT_ONCE = 1 << 18
 """Pixels that are resampled at once."""
 

@@ -94,8 +94,7 @@ class SystemsRun:
     it.
     """
     photos: MaybePath = None
-    """Folder of photographs for the layers' surfaces; by default patterns and images that scikit-image ships.
-    """
+    """Folder of photographs for layers' surfaces; by default patterns and images scikit-image ships."""
     recording: MaybePath = None
     """For fast-slow: the paper's own frames in place of a rendered scene, a folder with pillow_1 and the
     matrices.
@@ -104,8 +103,7 @@ class SystemsRun:
     """Folder for the results; by default out/systems/NAME."""
     weights: Weights = "mono-colour"
     max_memory: Memory = None
-    """Memory limit of fusing, such as 4GiB; a single frame is then fused in a process of its own, measured.
-    """
+    """Memory limit of fusing, such as 4GiB; a single frame is then fused in its own process, measured."""
 
     def run(self) -> None:
         """Print the scores, and the expected ones where they are of the same settings."""

@@ -311,8 +311,7 @@ class LensNumbers(NamedTuple):
 
 
 TINY = 1e-24
-"""Two rays of which the squared sine, times their squared lengths, is smaller than this have one direction.
-"""
+"""Two rays whose squared sine, times their squared lengths, is smaller than this have one direction."""
 
 
 def undistorted_limits(camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:

@@ -48,8 +48,7 @@ BLACK_LEVEL, EXPOSURE, ISO, ISO_SPEED, TAKEN, SERIAL = 50714, 0x829A, 0x8827, 0x
 NORTH, LATITUDE, EAST, LONGITUDE = 1, 2, 3, 4
 """GPS tags: the hemispheres' letters, and degrees, minutes and seconds."""
 SAME_PLACE = 1e-3
-"""Degrees of latitude or longitude, some 100 m, by which images of one capture may differ: receivers wander.
-"""
+"""Degrees of latitude or longitude, some 100 m, images of one capture may differ by: receivers wander."""
 RESOLUTION_X, RESOLUTION_Y, RESOLUTION_UNIT = 0xA20E, 0xA20F, 0xA210
 ORIENTATION, QUARTER_TURNS = 274, {1: 0, 3: 2, 6: 3, 8: 1}
 """EXIF's orientations, and the quarter turns counter-clockwise that put them upright."""

@@ -21,8 +21,7 @@ SUPPORT = {2: 3, 3: 4}
 STEPS, MOST = 6, 30
 """Of Newton for all points, and for those that six do not suffice for."""
 NEARLY = 1e-6
-"""A knot's spacing from the last whole one, and of the squared sine from 90 degrees: the border is left out.
-"""
+"""A knot's spacing from the last whole one, and squared sine from 90 degrees: the border is left out."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

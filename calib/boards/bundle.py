@@ -36,8 +36,7 @@ POSE = 6
 TYPICAL_FOCAL_ERROR, TYPICAL_CENTRE_ERROR = 0.1, 0.1
 """Likewise of the error of a guessed focal length, as a share of it, and principal point, of the width."""
 CENTRE_DEVIATION, ASPECT_DEVIATION = 0.03, 0.01
-"""Standard deviations of the principal point about the centre (share of the width), and of the aspect ratio.
-"""
+"""Standard deviations of the principal point about the centre (share of the width), and of aspect ratio."""
 Array = np.ndarray
 Masks = Mapping[str, Bool[np.ndarray, "_"]]
 """By camera, which of its parameters are meant, in the order of `parameter_names`."""

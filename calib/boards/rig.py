@@ -61,7 +61,7 @@ class Calibration:
 
     @cached_property
     def held_out(self) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
-        """By pair: epipolar errors (pixels) of all frames, each by a rig without it; empty if too few."""
+        """By pair: epipolar errors (pixels) of all frames, each by a rig of the others; empty if too few."""
         return held_out_errors(self.fit, self.views)
 
     def deviations(self) -> dict[str, float]:

@@ -1,5 +1,4 @@
-"""What a change of a rig does to depth, and which directions of change the points determine well enough to
-make it.
+"""What a rig's change does to depth, and which directions of change points determine well enough to make it.
 
 Epipolar distances hardly change under some rotations and shifts that change depth much (a rotation about the
 vertical and a shift of the principal point move points along their lines). The points' depth is therefore
@@ -128,8 +127,7 @@ def log_depths(
 
 
 class DepthModes(NamedTuple):
-    """Modes of the points' depth: z is a sum of uncorrelated parts, each of which changes depth in its own
-    pattern.
+    """Modes of the points' depth: z is a sum of uncorrelated parts, each changing depth in its own pattern.
 
     root: columns, one a mode; z = root a. a: the modes' changes in posterior standard deviations.
     deviation, prior: the relative deviation of depth by each mode (rms over the points), posterior and prior;

@@ -68,9 +68,7 @@ EXPLAINED, ROUGHLY = (2 * HEALTHY_MISFIT, 0.06), 0.9
 """A mistake explains the points if no more than so many pixels, or that share of the misfit, are left; pixels
 of those whose remedy is approximate."""
 SAME_DEPTH, SAME_DISTANCE = 1e-3, 1e-3
-"""Rigs are the same in which depths (relative) and distances from lines (pixels) differ by less, in the
-median.
-"""
+"""Rigs are the same whose depths (relative) and distances from lines (pixels) differ by less, in median."""
 LEAST_NOISE = 0.05
 """Lower bound of the points' noise, pixels."""
 FEW = 10
@@ -338,8 +336,7 @@ def _mirrors(rig: Rig, names: tuple[str, str]) -> bool:
 
 
 class PointObservations(NamedTuple):
-    """All points of all pairs (n) under several rigs (k): signed distance in pixels from the line, depth, in
-    front.
+    """All points of all pairs (n) under several rigs (k): signed pixels from the line, depth, in front.
 
     Unobservable depths are NaN.
     """
@@ -374,8 +371,7 @@ def _observe_pair(pairs: Sequence[Pair], matches: PointMatches) -> PointObservat
 
 
 def _inliers(rig: Rig, tried: Sequence[Remedy], off: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
-    """The points consistent with some pose of the cameras, and their mean square distance then, in square
-    pixels.
+    """The points consistent with some pose of the cameras, their mean square distance then, square pixels.
 
     The pose is free, so only the lens matters: the best explanation that changes it is used.
     """
@@ -457,8 +453,7 @@ def _corner_radius(camera: Camera) -> float:
 
 
 def _degrees(rig: Rig, pairs: Pairs) -> list[Remedy]:
-    """Rotation vectors in degrees, taken for radians, with the whole turns, which are lost, that suit the
-    points best.
+    """Rotation vectors in degrees, taken for radians, with the lost whole turns that suit points best.
 
     Not where a drift may be what turned the cameras.
     """

@@ -1,5 +1,4 @@
-"""How well matched points support a rig that may have drifted a little: the evidence of a mistake against
-mere drift.
+"""How well matched points support a rig that may have drifted: the evidence of a mistake against mere drift.
 
 The residuals are normal with the noise of the points, plus a drift of the cameras whose prior deviations are
 those of `parameters.SIGMA` times a scale, plus what lens models leave (`systematic_modes`); to first order in
@@ -85,9 +84,7 @@ class DriftEvidence:
         return found
 
     def by(self, used: Bool[Tensor, " n"]) -> float:
-        """The cost by other points, of this drift or of the best by them to first order, whichever is
-        better.
-        """
+        """The cost by other points, of this drift or of the best by them to first order: the better."""
         return min(self._at(z, used) for z in (self.z, self._refitted(used)))
 
     def _refitted(self, used: Bool[Tensor, " n"]) -> Tensor:
@@ -103,8 +100,7 @@ class DriftEvidence:
 
 
 class _Drift(NamedTuple):
-    """Residuals r + J z + B b of normal z, of deviation `scale`, and b: -2 log evidence, and its log
-    determinant.
+    """Residuals r + J z + B b; z normal, of deviation `scale`, and b: -2 log evidence, its log determinant.
 
     z: the most probable one.
     """

@@ -41,8 +41,7 @@ POINTS = 500
 LARGEST_DEVIATION = 0.25
 """A focal length is found if its relative standard deviation is no larger than this,"""
 SIGNIFICANT = 3.0
-"""if it differs from the one assumed by this many, and if held-out points are nearer to their lines with it.
-"""
+"""if it differs from the one assumed by this many, and if held-out points are nearer their lines with it."""
 BEHIND = 0.5
 """Share of points that may lie behind a camera: of mirrored poses all do."""
 
@@ -193,9 +192,7 @@ class FocalFit:
 
     @cached_property
     def deviation(self) -> float:
-        """Relative, of the focal length: that of the points' noise, or of a jackknife over parts of the
-        image.
-        """
+        """Relative, of the focal length: by the points' noise, or a jackknife over parts of the image."""
         residuals, z = self.views.residuals, self.z
         covariance = posterior_covariance(residuals, z)
         groups = parts_of(self.views.hw, self.views.points.alpha)
@@ -204,9 +201,7 @@ class FocalFit:
         return float(self.views.sigma[0] * torch.maximum(covariance[0, 0], jackknife).sqrt())
 
     def is_nearer(self) -> bool:
-        """Whether points are nearer to their lines than with the focal length assumed, by fits that held them
-        out.
-        """
+        """Whether points are nearer to lines than by the focal length assumed, in fits that held them out."""
         points, part = self.views.points, held_out_parts(self.views.points)
         distances = torch.zeros(2, len(part), dtype=torch.float64)
         for held_out in range(HELD_OUT):

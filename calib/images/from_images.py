@@ -115,9 +115,7 @@ def rig_from_images(
 def _fundamental(
     matches: PointMatches, K: Tensor | None, K_beta: Tensor | None
 ) -> tuple[Tensor, float, bool]:
-    """F of all points; the median distance of held-out points if fitted to the rest; whether by focal
-    lengths.
-    """
+    """F of all points; held-out points' median distance if fitted to the rest; whether by focal lengths."""
     (used,), (held_out,) = (list(part.values()) for part in split([{("", ""): matches}]))
     fits: dict[bool, Callable[[PointMatches], Tensor]] = {False: fit_fundamental}
     if K is not None and K_beta is not None:

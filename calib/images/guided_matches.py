@@ -27,8 +27,7 @@ PATCH = 20
 ALIKE = 0.4
 """The least squared correlation of patches that match."""
 DISTINCT = 0.9
-"""A second peak's squared correlation is at most this share of the first's, as in Lowe's ratio test (2004).
-"""
+"""A second peak's squared correlation is at most this share of the first's, like Lowe's ratio test (2004)."""
 PEAK = 3
 """Pixels around a peak that are part of it."""
 
@@ -41,8 +40,7 @@ def guided_matches(
     window: int,
     shown: tuple[Bool[Tensor, "h w"], Bool[Tensor, "hb wb"]],
 ) -> PointMatches:
-    """Corners of alpha with the patch most like theirs within `window` pixels of where a homography puts them
-    in beta.
+    """Corners of alpha with the patch most like theirs in `window` pixels of a homography's place in beta.
 
     Images are to be alike in scale and orientation. `shown` says what of each image a camera recorded.
     """
@@ -71,9 +69,7 @@ def _most_alike(
     there: NDArray[np.float64],
     window: int,
 ) -> NDArray[np.float64] | None:
-    """The position in beta of the patch that is most like that around a pixel; None where none is clearly
-    so.
-    """
+    """The position in beta of the patch most like that around a pixel; None where none is clearly so."""
     (column, row), (left, top) = (np.rint(p).astype(int) for p in (x, there - window))
     patch = own[row - PATCH : row + PATCH + 1, column - PATCH : column + PATCH + 1]
     first, last = np.maximum([left, top], PATCH), np.array([left, top]) + 2 * window

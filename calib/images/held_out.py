@@ -57,9 +57,7 @@ def median_off(rig: Rig, pairs: Pairs) -> float:
 def split(
     frames: Sequence[Pairs],
 ) -> tuple[dict[tuple[str, str], PointMatches], dict[tuple[str, str], PointMatches]]:
-    """Points to use and points to hold out: whole frames if there are several, else squares of alpha's
-    image.
-    """
+    """Points to use and points to hold out: whole frames if several, else squares of alpha's image."""
     if len(frames) > 1:
         held_out = max(1, len(frames) // HELD_OUT)
         return _joined(frames[:-held_out]), _joined(frames[-held_out:])

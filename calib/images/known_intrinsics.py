@@ -1,5 +1,4 @@
-"""Where the cameras of one body are, whose lenses and, roughly, orientations are known: from one image of
-each.
+"""Where cameras of one body are, lenses and, roughly, orientations known: from one image of each.
 
 The tags of many multispectral cameras state everything but translations. With orientations known, every match
 says that one triple product with the baseline is zero: all pairs together give all centres, up to one scale
@@ -26,17 +25,11 @@ from .refinement import refine_matches
 from .self_calibration import depth_bounds
 
 WINDOW = 0.09
-"""Largest displacement between images of parallel views, as a share of the longer side: 15 mm at .15 m, 60
-degrees.
-"""
+"""Largest displacement between parallel views, as a share of the longer side: 15 mm at .15 m, 60 degrees."""
 NEAR = 4.0
-"""Points this many pixels from the line of a baseline are consistent with it: orientations are known to .2
-degrees.
-"""
+"""Points this many pixels from a baseline's line are consistent with it: orientations are known to .2 deg."""
 SHARE = 0.4
-"""A baseline counts with which at least this share of a pair's matches is consistent: of wrong ones up to .3
-are.
-"""
+"""A baseline counts if at least this share of a pair's matches agrees with it: of wrong ones up to .3 do."""
 TRIALS = 500
 """Directions of each baseline that are tried (Fischler and Bolles 1981)."""
 SIGMA = {"rotation": math.radians(0.5), "translation": 0.3}
@@ -173,9 +166,7 @@ def _fit(rig: Rig, near: Mapping[tuple[str, str], PointMatches], name: str) -> t
 
 
 def _depths(rig: Rig, alpha: str, near: Mapping[tuple[str, str], PointMatches]) -> tuple[float, float]:
-    """The range of depths that all pairs' points have, extended. Raises ValueError for points without
-    parallax.
-    """
+    """The range of depths that all pairs' points have, extended. Raises ValueError without parallax."""
     found = []
     for (a, b), matches in near.items():
         bounds = depth_bounds(Rig({name: rig[name] for name in (a, b)}), matches)

@@ -1,5 +1,4 @@
-"""The most probable parameters given residuals and a normal prior: damped Gauss-Newton, reweighted for
-Cauchy's loss.
+"""Most probable parameters by residuals and a normal prior: damped Gauss-Newton, reweighted to Cauchy's loss.
 
 Parameters are in units of their prior standard deviations, so that the prior's covariance is 1. The first
 ones are free; the rest are considered: uncertain, so that they explain what they may, but they never change
@@ -40,8 +39,7 @@ Residuals = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class JoinedResiduals:
-    """Residuals of several parts, such as pairs of cameras, each of which depends on some of the parameters
-    only.
+    """Residuals of several parts, such as pairs of cameras, each depending on some of the parameters only.
 
     Derivatives by the others, which are 0, are not computed.
     """
@@ -54,8 +52,7 @@ class JoinedResiduals:
 
 
 class Solution(NamedTuple):
-    """The free parameters z, which of them were observable, and their covariance, in units of the prior's
-    deviations.
+    """The free parameters z, which of them were observable, and their covariance, in prior deviations.
 
     directions: (n, m), z is a sum of these columns; along the others the images do not determine it. full:
     the most probable values of free and considered parameters without that restriction. gained: the variance
@@ -101,8 +98,7 @@ def shifts_left_out(
     count: int,
     kept: Bool[Tensor, " k"] | None = None,
 ) -> Float[Tensor, "g n"]:
-    """The changes of those parameters that are `kept`, all unless stated, without the residuals of one of the
-    groups.
+    """Changes of those parameters `kept`, all unless stated, without the residuals of one of the groups.
 
     Groups are 0 to g - 1. To first order, from the most probable z on.
     """

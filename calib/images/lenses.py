@@ -45,9 +45,7 @@ def _no_distortion() -> Distortion:
 
 
 def with_lens_of(camera: Camera, view: LensView) -> Camera:
-    """A pinhole camera with the lens of a view of the same centre, whose terms are in units of another
-    length.
-    """
+    """A pinhole camera with the lens of a view of the same centre, its terms in units of another length."""
     assert isinstance(view.distortion, Distortion)
     factor = float(camera.K[0, 0] / view.K[0, 0])
     powers = factor ** view.distortion.coefficients.new_tensor([2, 4, 1, 1])

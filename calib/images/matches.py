@@ -32,9 +32,7 @@ MATCHED_AT_ONCE = 1024
 ENOUGH = 20
 """Least number of consistent matches for any conclusion."""
 LOCALISED = 1 / 3
-"""Standard deviation of a matched point, pixels, by which its depth is known or not: the middle of the bounds
-below.
-"""
+"""A matched point's standard deviation, pixels, for its depth to be known: the middle of the bounds below."""
 LOCALISATION_BOUNDS = (0.15, 0.2, 0.3, np.inf)
 """Bounds of the standard deviation of points, pixels, estimated from the residuals of patches around them."""
 WELL_LOCALISED = 40
@@ -128,9 +126,7 @@ def _match(a: SiftFeatures, b: SiftFeatures) -> PointMatches:
 
 
 def _well_localised(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """The best localised points, by the first bound that leaves `WELL_LOCALISED` of them; all, if none
-    does.
-    """
+    """The best localised points, by the first bound that leaves `WELL_LOCALISED` of them; or else all."""
     for bound in LOCALISATION_BOUNDS:
         if (kept := deviation < bound).sum() >= WELL_LOCALISED:
             return kept
@@ -197,9 +193,7 @@ def _agreeing(a: SiftFeatures, b: SiftFeatures, image: Tensor) -> PointMatches:
 
 
 def agreeing(matches: PointMatches) -> PointMatches:
-    """The matches that some fundamental matrix puts within `AGREE` pixels of their lines; none if there are
-    few.
-    """
+    """Matches that some fundamental matrix puts within `AGREE` pixels of their lines; none if few."""
     if len(matches.alpha) >= ENOUGH:
         with suppress(ValueError):
             return near_lines(matches, fit_fundamental(matches), within=AGREE)
@@ -207,9 +201,7 @@ def agreeing(matches: PointMatches) -> PointMatches:
 
 
 def agreeing_pairs(given: Pairs) -> dict[tuple[str, str], PointMatches]:
-    """The consistent matches of pairs that have enough, of matches from elsewhere. Raises ValueError if none
-    has.
-    """
+    """Consistent matches of pairs that have enough, from elsewhere. Raises ValueError if none has."""
     found = {names: agreeing(matches) for names, matches in given.items()}
     kept = {names: matches for names, matches in found.items() if len(matches.alpha) >= ENOUGH}
     if not kept:
@@ -256,9 +248,7 @@ def fit_link(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float = 
 
 
 def with_map(pair: Pair, matches: PointMatches) -> FittedLink:
-    """The pair's F, unchanged, with a rough map of the points near their lines. Raises ValueError for too
-    few.
-    """
+    """The pair's F, unchanged, with a rough map of points near their lines. Raises ValueError if too few."""
     F = pair.fundamental
     return _with_rough_map(near_lines(undistort_matches(pair, matches), F, within=3), F)
 
@@ -273,8 +263,7 @@ def _with_rough_map(matches: PointMatches, F: Tensor) -> FittedLink:
 
 
 def rough_map(matches: PointMatches, F: Float[Tensor, "3 3"]) -> tuple[Float[Tensor, "3 3"], float]:
-    """A similarity centred on the points along their lines, and the distance that contains 98% of them,
-    pixels.
+    """A similarity centred on the points along their lines, and the distance containing 98% of them, pixels.
 
     By RANSAC, then shifted along the mean direction of the lines.
     """
@@ -294,8 +283,7 @@ def undistort_matches(pair: Pair, matches: PointMatches) -> PointMatches:
 
 
 def seen_depths(pair: Pair, matches: PointMatches) -> tuple[float, float]:
-    """Depth bounds of the matched points, metres in front of alpha: 0.9 of the nearest to 1.25 of the
-    farthest.
+    """Depth bounds of matched points, metres in front of alpha: 0.9 of the nearest to 1.25 of the farthest.
 
     Nearest and farthest without the outermost 2% of the points. Raises ValueError for fewer than 20 points in
     front.

@@ -18,16 +18,13 @@ from .residuals import match_depths, own_distance, related
 LARGEST_SIDE = 1000
 """Images are reduced to this many pixels..."""
 ROUGH_SIDE = 500
-"""... but first to this many: a rig that fits then is not compared again. That takes a quarter of the time.
-"""
+"""... but first to this many: a rig that fits then is not compared again. That takes a fourth of the time."""
 MOST_CAMERAS = 4
 BADLY, OF_OWN = 1.5, 3.0
 """A rig fits badly whose points lie farther from their lines than this, in pixels of the reduced images
 (median), and than this many times their distance from the lines of an F fitted to them."""
 OUTSIDE = 0.5
-"""And a rig is wrong that has more than this share of the points behind the cameras or outside its depth
-range...
-"""
+"""And a rig is wrong with more than this share of points behind the cameras or outside its depth range..."""
 BEYOND = 1.5
 """... by more than this factor."""
 FEW = 10
@@ -55,8 +52,7 @@ def misfit_warning(rig: Rig, images: Images) -> str | None:
 
 
 def find_misfit(rig: Rig, images: Images) -> Misfit | None:
-    """What is wrong if the rig fits one image (C, H, W) of each of two or more of its cameras badly; else
-    None.
+    """What is wrong if the rig fits one image (C, H, W) of each of two or more cameras badly; else None.
 
     None too where nothing can be said: too few matched points, images of another size, cameras that are not
     related.
@@ -90,9 +86,7 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
 
 
 class _Compared(NamedTuple):
-    """Matched points of reduced images: their median distance from their lines (pixels), and
-    `share_outside`.
-    """
+    """Matched points of reduced images: median distance from their lines (pixels), and `share_outside`."""
 
     rig: Rig
     pairs: Pairs
@@ -106,9 +100,7 @@ def _scale(images: Mapping[str, Tensor], largest: int) -> float:
 
 
 def _compared(rig: Rig, images: Mapping[str, Tensor], largest: int) -> _Compared | None:
-    """Points matched between images whose sides are reduced to that many pixels at most; None if they are too
-    few.
-    """
+    """Points matched between images with sides reduced to so many pixels at most; None if too few."""
     reduced = {}
     for name, image in images.items():
         h, w = image.shape[1:]

@@ -20,9 +20,7 @@ SIGMA = {"rotation": math.radians(0.5), "translation": 0.01, "focal": 0.01, "cen
 """Default standard deviations: radians, a share of the longest baseline, a share of the focal length, pixels
 of the principal point, and a share of `typical_coefficients`."""
 LARGEST_CHANGE = 4.0
-"""Prior standard deviations by which a parameter may change: beyond, the rig is not the one that the prior is
-of.
-"""
+"""Prior standard deviations by which a parameter may change: beyond, the rig is not the prior's."""
 UNCERTAIN = ("rotation", "translation", "focal", "centre")
 """Kinds of parameters that are uncertain even where they are not free."""
 ALIASES = {"principal_point": "centre", "focal_length": "focal"}
@@ -71,8 +69,7 @@ class FreeParameter:
 def free_parameters(
     rig: Rig, names: Sequence[str], *, free: Iterable[str], sigma: Mapping[str, float] | None = None
 ) -> list[FreeParameter]:
-    """The free parameters of some cameras, the first of which keeps its pose: only relative poses are
-    observable.
+    """The free parameters of some cameras, the first keeping its pose: only relative poses are observable.
 
     `free` holds kinds ("rotation", "translation", "focal", "centre" or "principal_point", "distortion"), or
     patterns over "camera.kind". `sigma` overrides the standard deviations of `SIGMA` by kind. A link between
@@ -104,8 +101,7 @@ def free_parameters(
 def considered_parameters(
     rig: Rig, names: Sequence[str], free: Sequence[FreeParameter], *, sigma: Mapping[str, float] | None = None
 ) -> list[FreeParameter]:
-    """The poses, focal lengths and principal points of these cameras that are not free but uncertain all the
-    same.
+    """These cameras' poses, focal lengths and principal points that are not free but uncertain all the same.
 
     Their uncertainty counts, but they are not changed.
     """
@@ -170,9 +166,7 @@ def _longest_baseline(rig: Rig) -> float:
 
 
 def _perturbed_link(link: Link, value: Tensor | None, rig: Rig, names: tuple[str, str]) -> Link:
-    """F after seven small changes: rotations of both sets of singular vectors, and of its second singular
-    value.
-    """
+    """F after seven small changes: rotations of both sets of singular vectors, the second singular value."""
     if value is None:
         return link
     A, B = (_to_unit(rig[name].hw).to(link.F) for name in names)

@@ -47,9 +47,7 @@ def refine_points(
     y: Float[np.ndarray, "n 2"],
     beta_from_alpha: Float[np.ndarray, "n 2 2"],
 ) -> RefinedPoints:
-    """Refine `y` for points `x` of alpha, from rough maps between their neighbourhoods; unchanged where
-    rejected.
-    """
+    """Refine `y` for points `x` of alpha, by rough maps between neighbourhoods; unchanged where rejected."""
     if not len(x):
         return RefinedPoints(y, np.zeros(0))
     step = np.maximum(1.0, 1 / np.sqrt(np.abs(np.linalg.det(beta_from_alpha))))[:, None, None]

@@ -46,9 +46,7 @@ PIXELS = 6000
 SHARPNESS = 20.0
 """The inner product of two equal descriptors."""
 WINDOW = 9
-"""Values are relative to the mean and the deviation in windows this wide, for invariance to exposure and
-filters.
-"""
+"""Values are relative to mean and deviation in windows this wide, for invariance to exposure and filters."""
 EVEN = 0.02
 """Deviations below this, of images in 0..1, are noise."""
 

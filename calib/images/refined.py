@@ -38,9 +38,7 @@ class LineStatistics(NamedTuple):
 
 
 class PhotometricResult(NamedTuple):
-    """The photometric error on held-out pixels before and after its minimisation, and whether that was
-    accepted.
-    """
+    """The photometric error on held-out pixels before and after its minimisation, and whether accepted."""
 
     before: float
     after: float

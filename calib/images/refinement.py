@@ -101,8 +101,7 @@ def refine(
     force: bool = False,
     matches: Sequence[Pairs] | None = None,
 ) -> Refinement:
-    """Refine a rig by points matched in frames, each with an image of every camera; or by given `matches` of
-    them.
+    """Refine a rig by points matched in frames, each an image of every camera; or by given `matches` of them.
 
     The first camera that has images keeps its pose. `free` and `sigma` are those of
     `parameters.free_parameters`; F of links is always free, and views known by F alone are given lenses if
@@ -180,9 +179,7 @@ def fitted(
 
 
 def _at_its_best(fit: RefinementProblem, solution: Solution) -> bool:
-    """Whether held-out points of calibrated cameras are as near to their lines as to those of an F fitted to
-    them.
-    """
+    """Whether held-out points of calibrated cameras are as near to their lines as to those of their own F."""
     if fit.rig.links:
         return False
     rig = fit.after(solution.z)
@@ -191,9 +188,7 @@ def _at_its_best(fit: RefinementProblem, solution: Solution) -> bool:
 
 @dataclass(frozen=True)
 class RefinementProblem:
-    """A rig, its free parameters, those that are uncertain though not free, and the points used and held
-    out.
-    """
+    """A rig, its free parameters, those uncertain though not free, and the points used and held out."""
 
     rig: Rig
     parameters: tuple[FreeParameter, ...]
@@ -224,9 +219,7 @@ class RefinementProblem:
         return cls(rig, tuple(parameters), used, held_out, tuple(considered))
 
     def after(self, z: Float[Tensor, " n"]) -> Rig:
-        """The rig after a change of z, in standard deviations; of the considered parameters too if z has
-        them.
-        """
+        """The rig after a change of z, in standard deviations; of considered parameters too if z has them."""
         given = (*self.parameters, *self.considered)[: len(self.parameters) if len(z) == self.count else None]
         return apply_change(self.rig, given, z)
 
@@ -316,9 +309,7 @@ class RefinementProblem:
         return solution._replace(z=full[: self.count])
 
     def report(self, solution: Solution, *, force: bool = False) -> Refinement:
-        """The changes by a solution, and whether the held-out points, the prior and depth's uncertainty
-        support it.
-        """
+        """A solution's changes, and whether held-out points, the prior and depth's uncertainty support it."""
         refined = self.after(solution.z)
         before, after = (line_distances(rig, self.held_out) for rig in (self.rig, refined))
         held_out = line_statistics(before), line_statistics(after)
@@ -522,8 +513,7 @@ def _changes(parameters: Sequence[FreeParameter], solution: Solution) -> Iterabl
 
 
 def _kept(parameters: Sequence[FreeParameter], solution: Solution) -> Iterable[str]:
-    """As many parameters as there are combinations that keep their values: those with the largest part in
-    them.
+    """As many parameters as combinations that keep their values: those with the largest part in them.
 
     They are the same for any basis of these combinations: pivots of an orthogonal decomposition.
     """

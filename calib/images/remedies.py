@@ -37,8 +37,7 @@ TRANSPOSE = torch.eye(3, dtype=torch.float64)[[1, 0, 2]]
 
 @dataclass(frozen=True)
 class Remedy:
-    """A possible mistake: its kind ("resized", "units", ...), its description in words, and the change that
-    undoes it.
+    """A possible mistake: its kind ("resized", "units", ...), description, and the change that undoes it.
 
     approximate: the change holds numbers that were estimated, and undoes it roughly.
     small: a drift of a calibrated camera's principal point does the same.

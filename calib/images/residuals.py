@@ -33,9 +33,7 @@ class EpipolarResiduals(NamedTuple):
 
 
 class MatchDepths(NamedTuple):
-    """Depth in alpha (metres) of matched points, whether they are in front of both cameras, and
-    observable.
-    """
+    """Depth in alpha (metres) of matched points, whether in front of both cameras, and observable."""
 
     depth: Float[Tensor, "*b n"]
     front: Bool[Tensor, "*b n"]
@@ -69,9 +67,7 @@ def residuals_and_depths(pair: Pair, matches: PointMatches) -> tuple[EpipolarRes
 
 
 def match_depths(pair: Pair, matches: PointMatches) -> MatchDepths | None:
-    """Depths where the rays are closest to each other, differentiable in the rig; None for uncalibrated
-    pairs.
-    """
+    """Depths where rays are closest to each other, differentiable in the rig; None for uncalibrated pairs."""
     if not pair.calibrated or pair.link is not None:
         return None
     (a, b), _, valid = _rays(pair, *_for_each(pair, matches))
@@ -149,9 +145,7 @@ def _depths(pair: Pair, a: Tensor, b: Tensor, valid: Tensor) -> MatchDepths:
 
 
 def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
-    """Those of the pairs that the rig relates: calibrated ones and those with an F. Raises ValueError if
-    none.
-    """
+    """Those of the pairs the rig relates: calibrated ones and those with an F. Raises ValueError if none."""
     found = {
         names: m
         for names, m in pairs.items()
@@ -208,9 +202,7 @@ def _rays(pair: Pair, x: Tensor, y: Tensor) -> tuple[tuple[Tensor, Tensor], Tens
 
 
 def own_distance(rig: Rig, pairs: Pairs) -> float:
-    """How near points can be to any lines: median distance, undistorted pixels, from those of an F fitted to
-    them.
-    """
+    """How near points can be to any lines: median distance, undistorted pixels, from those of their own F."""
     found = []
     for names, matches in pairs.items():
         undistorted = undistort_matches(rig.pair(*names), matches)

@@ -1,5 +1,4 @@
-"""Calibrated pairs from images alone: focal lengths as given or assumed, poses and the rest from matched
-points.
+"""Calibrated pairs from images alone: focal lengths given or assumed, poses and the rest from matches.
 
 Points determine the epipolar lines, and those are as good as with a calibration. They do not determine the
 scale of the scene, and focal lengths only poorly: depths are multiples of the baseline, and proportional to
@@ -97,8 +96,7 @@ class RefinedPair(NamedTuple):
 def self_calibrated(
     views: Mapping[str, View], link: Link, matches: PointMatches, *, focal: Mapping[str, float]
 ) -> RefinedPair | None:
-    """Two cameras (alpha, beta) whose epipolar lines are those of `link`, as nearly as can be; None for
-    points without parallax.
+    """Alpha and beta, with epipolar lines as near `link`'s as can be; None for points without parallax.
 
     Alpha is at the origin with the principal point in the middle, and the baseline is 1. `focal` has focal
     lengths in pixels, by camera; others are assumed. Cameras have the lenses of their views; the pair then is
@@ -143,8 +141,7 @@ def self_calibrated(
 
 
 def has_parallax(matches: PointMatches, hw: HW) -> bool:
-    """Whether points of alpha, an image of this size, move in a way that lenses and a rotation do not
-    explain.
+    """Whether points of alpha, an image of this size, move as lenses and a rotation do not explain.
 
     Those move all points by one smooth map, here a cubic one as radial distortion is; so does a plane, whose
     depths two images of unknown lenses do not determine.
@@ -195,8 +192,7 @@ UNSCALED = "found from images: lengths are multiples of the baseline, not metres
 
 
 def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig:
-    """One rig of pairs with the same alpha, by beta; each pair's lengths times its scale. Its name is
-    `UNSCALED`.
+    """One rig of pairs with one alpha, by beta; each pair's lengths times its scale. Named `UNSCALED`.
 
     The depth range is that of all pairs.
     """
@@ -269,9 +265,7 @@ def _focal_lengths(views: Mapping[str, View], link: Link, focal: Mapping[str, fl
 def initial_poses(
     matches: PointMatches, link: Link, K: Float[Tensor, "3 3"], K_beta: Float[Tensor, "3 3"]
 ) -> list[Pose]:
-    """Poses of beta, with baselines of 1, from which to fit: of parallel axes, by F, and by an essential
-    matrix.
-    """
+    """Poses of beta, baselines of 1, from which to fit: parallel axes, by F, by an essential matrix."""
     return [*_lateral_poses(matches, _upright(link), K, K_beta), *_poses(matches, link.F, K, K_beta)]
 
 
@@ -289,9 +283,7 @@ def _poses(matches: PointMatches, F: Tensor, K: Tensor, K_beta: Tensor) -> list[
 
 
 def _upright(link: Link) -> Float[Tensor, "3 3"]:
-    """The rotation about the axis, in steps of 90 degrees, by which beta's image is rotated against
-    alpha's.
-    """
+    """The rotation about the axis, in steps of 90 degrees, of beta's image against alpha's."""
     H = torch.eye(3) if link.H is None else link.H
     steps = round(math.atan2(float(H[1, 0] / H[2, 2]), float(H[0, 0] / H[2, 2])) / (math.pi / 2))
     return rotation_from_vector(torch.tensor([0.0, 0.0, steps * math.pi / 2], dtype=torch.float64))

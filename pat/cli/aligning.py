@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Align(Known):
-    """Align the images of an array: every camera's own values at the pixels of one, with masks; no fused
-    image.
+    """Align an array's images: every camera's own values at the pixels of one, with masks; no fused image.
 
     Without a rig: pat align IMG_0000_*.TIF
     With one: pat align rig.yaml --alpha mono --image mono=a.png --image nir=b.tif --depth 2 20 --out out/
@@ -41,13 +40,9 @@ class Align(Known):
     interpolation: Literal["nearest", "bilinear", "cubic"] = "bilinear"
     """Between recorded values; nearest keeps them."""
     confidence: float = 0.5
-    """From which confidence on, 0 to 1, a camera counts as seeing a point: lower keeps more, with more
-    mistakes.
-    """
+    """Confidence, 0 to 1, from which a camera counts as seeing a point: lower keeps more, more mistakes."""
     fill: Literal["none", "propagate"] = "none"
-    """Pixels that a camera does not see: none leaves them without a value, propagate takes the nearest value
-    seen.
-    """
+    """Pixels a camera does not see: none leaves them without a value, propagate takes the nearest seen."""
     separate: bool = False
     """Write a file of each camera, NAME.tif, instead of one of all bands."""
     positions: Literal["npy", "tif", "none"] = "npy"

@@ -246,9 +246,7 @@ class Import:
     """Weights file to write."""
 
     def run(self) -> None:
-        """Write the weights. Raises FileNotFoundError or ValueError for a file that is not such a
-        checkpoint.
-        """
+        """Write the weights. Raises FileNotFoundError or ValueError for a file that is no such checkpoint."""
         from ..networks.authors import read_authors
         from ..networks.paper import PAT
         from ..networks.weights import save_weights

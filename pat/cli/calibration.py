@@ -37,9 +37,7 @@ class Calibrate:
     out: Out = Path("rig.yaml")
     """The rig file; its report (.html) and covariance (.covariance.json) are written beside it."""
     camera: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=PATTERN")]] = ()
-    """Once for each camera, such as left='left*.jpg', where names of folders and files do not show the
-    camera.
-    """
+    """Once a camera, such as left='left*.jpg', where names of folders and files do not show the camera."""
     lens: Literal[
         "auto",
         "brown-conrady",
@@ -59,9 +57,7 @@ class Calibrate:
     depth: Depth = None
     """Near and far bounds in metres of the scenes to come, written into the rig."""
     start: Annotated[Path | None, options.optional("RIG")] = None
-    """A rig known roughly, such as measured positions and nominal focal lengths: one image a camera is enough
-    then.
-    """
+    """A rig known roughly, such as measured positions, nominal focal lengths: one image a camera will do."""
     deviation: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=VALUE")]] = ()
     """How well the start is known: position=0.0005 (m), rotation=3 (degrees), focal=0.02 (share of the focal
     length), centre=0.01 (share of the width); these are the defaults."""

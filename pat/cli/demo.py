@@ -13,8 +13,7 @@ from .options import Out, Weights, say
 
 @dataclass
 class Demo:
-    """Fuse a photograph and the sample array: image, depth and confidence of the photograph, a figure, a
-    table.
+    """Fuse a photograph and the sample array: image, depth, confidence of the photograph, a figure, a table.
 
     The photograph is scikit-image's motorcycle: its left image as a mono camera's, its right one, reduced, as
     a colour camera's. Both arrays are recorded as real cameras do (another response, a darker exposure, 300
@@ -90,9 +89,7 @@ def table_of(columns: dict[str, dict[str, str]]) -> str:
 
 @dataclass
 class WarmUp:
-    """Compile the kernels that `pat fuse` uses, once for this machine, so that no later command waits for
-    it.
-    """
+    """Compile the kernels `pat fuse` uses, once for this machine, so that no later command waits for it."""
 
     def run(self) -> None:
         """Compile the kernels by fusing the sample array once: with noise, and as two betas with lenses."""

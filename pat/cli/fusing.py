@@ -82,21 +82,15 @@ class Fuse(Known):
     video: float = 25.0
     """Frames a second of the video of a sequence; 0 for none."""
     propagate: bool = True
-    """Propagate colour along motion between frames of a sequence; else each is fused by itself, and flickers.
-    """
+    """Propagate colour along motion between frames of a sequence; else each is fused alone, and flickers."""
     resume: bool = False
-    """Fuse only frames that are not in --out yet, or whose images changed; of one frame, only unfinished
-    tiles.
-    """
+    """Fuse only frames not in --out yet, or whose images changed; of one frame, only unfinished tiles."""
     points: bool = False
     """Of a single frame, also write points.ply: the pixels of known depth as a coloured point cloud."""
     classical: bool = False
-    """Show the classical baseline (semi-global matching, warped colour) on that page, to compare; some
-    seconds more.
-    """
+    """Show the classical baseline (semi-global matching, warped colour) on that page; seconds more."""
     on_error: Literal["stop", "skip"] = "stop"
-    """What to do when a frame cannot be fused (a corrupt image, a full disk): stop, or report it and go on.
-    """
+    """What to do if a frame cannot be fused (a corrupt image, a full disk): stop, or report it and go on."""
     workers: int = 1
     """Processes on this machine, for many frames."""
     scheduler: Annotated[str | None, optional("ADDRESS")] = None
@@ -104,16 +98,12 @@ class Fuse(Known):
     threads: Annotated[int | None, optional("INT")] = None
     """Threads in each process: by default 1 with several, else all cores."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """Of the network's convolutions: bfloat16 is faster where the processor has it, and changes PSNR by .003
-    dB.
-    """
+    """Of the network's convolutions: bfloat16 is faster if the processor has it, PSNR changes by .003 dB."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Where a single frame is fused: auto takes CUDA where there is such a GPU."""
 
     def run(self) -> None:
-        """Check the options that can be checked at once, and fuse, with the rig that is given or one that is
-        found.
-        """
+        """Check the options that can be checked at once, and fuse, with the rig that is given or found."""
         if self.bits not in {"png": (None, 8, 16), "tif": (None, 8, 16, 32), "exr": (None, 32)}[self.kind]:
             raise ValueError(
                 f"--bits {self.bits} --kind {self.kind}: png holds 8 or 16 bits, exr 32, tif any"
@@ -189,9 +179,7 @@ class Fuse(Known):
             self._without_rig_from(*frames_of_videos(cameras, Path(folder)))
 
     def _without_rig_from(self, files: dict[str, list[Path]], rates: Mapping[str, float]) -> None:
-        """Find the rig from the first image of each camera and fuse; `rates` are frames a second, of
-        videos.
-        """
+        """Find the rig from each camera's first image and fuse; `rates` are frames a second, of videos."""
         from ..fusion.from_images import array_from_images
         from ..fusion.results import FOUND_RIG
         from ..networks.weights import load_weights
@@ -368,9 +356,7 @@ class Fuse(Known):
         self._notes.append(line)
 
     def _classical(self, rig: Rig, images: Mapping[str, Tensor], alpha: str, gain: float) -> Tensor | None:
-        """The classical baseline as bright as the fused image; None, and a line, where the cameras do not
-        allow it.
-        """
+        """The classical baseline, bright as the fused image; None, and a line, if cameras do not allow it."""
         from ..evaluation.baseline import classical_view
         from ..fusion.report import LONGEST
         from ..media.colour import exposed
@@ -480,9 +466,7 @@ def files_by_camera(
 
 
 def is_rig_file(path: Path) -> bool:
-    """Whether a file is meant as a rig: neither a folder, nor a pattern, nor named as images and videos
-    are.
-    """
+    """Whether a file is meant as a rig: neither folder nor pattern, nor named as images and videos are."""
     suffixes = options.IMAGE_SUFFIXES | options.VIDEO_SUFFIXES
     return not (any(c in path.name for c in "*?[") or path.suffix.lower() in suffixes or path.is_dir())
 

@@ -53,25 +53,18 @@ OUT_OF_RANGE = 0.9
 
 @dataclass
 class Known:
-    """What `pat fuse` and `pat align` are both given: an array, how to match its images, what is known of the
-    scene.
-    """
+    """What `pat fuse` and `pat align` both get: an array, ways to match its images, facts of the scene."""
 
     given: Annotated[Positional[tuple[Path, ...]], arg(metavar="RIG|IMAGE IMAGE")] = ()
-    """Rig file of any known format (also: --rig RIG); or, without one, an image, folder or video of each
-    camera.
-    """
+    """Rig file of any known format (also: --rig RIG); or, without, image, folder or video of each camera."""
     alpha: Annotated[str | None, optional("NAME")] = None
-    """The camera whose view is wanted; without a rig by default the largest grey image. Of align also: --to.
-    """
+    """The camera whose view is wanted; without a rig, by default the largest grey image. Align: also --to."""
     image: Images = ()
     """With a rig: an image of each camera, once each; or NAME=FOLDER, or NAME=PATTERN."""
     depth: Depth = None
     """Near and far bounds in metres, instead of the rig's; far may be inf."""
     depth_map: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Depth of alpha's pixels, of a single frame: PFM, TIFF or PNG of 16 bits; matches are searched around
-    it.
-    """
+    """Depth of alpha's pixels, of one frame: PFM, TIFF or 16-bit PNG; matches are searched around it."""
     depth_scale: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
     """Metres of one unit of --depth-map; by default 1 of floats, and .001 of whole numbers."""
     depth_tolerance: float = 0.05
@@ -82,8 +75,7 @@ class Known:
     max_memory: Memory = None
     """Memory limit of the whole process, such as 4GiB; larger frames are done in tiles."""
     normalise_radiometry: bool = False
-    """First bring every beta to alpha's mean and contrast (other exposures, filters). Also: --match-levels.
-    """
+    """First bring each beta to alpha's mean, contrast (other exposures, filters). Also: --match-levels."""
     response: Annotated[str, arg(metavar="fit|rec601|R,G,B")] = "fit"
     """How a mono alpha weighs red, green and blue; fit: found from matches, with gain and gamma."""
     noise: UseAppendAction[

@@ -54,9 +54,7 @@ def command_paths(group: Any = Pat, before: tuple[str, ...] = ()) -> Iterator[tu
 
 
 def main(arguments: list[str] | None = None, *, group: Any = Pat, prog: str = "pat") -> None:
-    """Run `pat`, or another group. Errors in what was given are one line on standard error, and exit status
-    2.
-    """
+    """Run `pat`, or another group. Errors in what was given: a line on standard error and exit status 2."""
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
         try:
@@ -104,9 +102,7 @@ def _fail(error: BaseException, text: str, debug: bool) -> NoReturn:
 
 
 def _command(arguments: list[str], group: Any, prog: str) -> Any:
-    """The command that arguments name, its options parsed. Raises ValueError for a command that does not
-    exist.
-    """
+    """The command that arguments name, options parsed. Raises ValueError for one that does not exist."""
     if "--tyro-print-completion" in arguments or "--tyro-write-completion" in arguments:
         return tyro.cli(_union(group), prog=prog, args=arguments)
     if "--version" in arguments:

@@ -56,8 +56,7 @@ def response_of(text: str) -> Any:
 
 
 def noise_of(texts: Iterable[str], *, by_default: bool = False) -> Any:
-    """The noise of `--noise estimate` or `--noise NAME=ELECTRONS[,READ]`; of none, None. Raises ValueError
-    else.
+    """The noise of `--noise estimate` or `--noise NAME=ELECTRONS[,READ]`; none: None. Raises ValueError.
 
     Without, None or, `by_default`, "auto": estimated where it shows plainly.
     """
@@ -208,9 +207,7 @@ NO_IMAGE = "is no image: images end in .png, .tif, .jpg and the like"
 
 
 def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> Rig:
-    """The rig of the first argument, which might have been meant as an image; with other depth bounds if
-    given.
-    """
+    """The rig of the first argument, perhaps meant as an image; with other depth bounds if given."""
     from arraygeom.io.source import UnknownRigFormat
 
     try:
@@ -265,8 +262,7 @@ def read_images(rig: Rig, texts: Iterable[str], *, sized: bool = True) -> dict[s
 
 
 def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
-    """The images of `--image NAME=FILE`: the first of every camera is a frame, the second of every camera the
-    next.
+    """Images of `--image NAME=FILE`: the first of every camera make a frame, the second ones the next.
 
     Raises ValueError for cameras with unequal numbers of images.
     """
@@ -348,8 +344,7 @@ LINE_EVERY = 10.0
 
 @contextmanager
 def working(title: str) -> Iterator[Callable[[str], None]]:
-    """A block during which the terminal shows a title, the step that is done, and the seconds that have
-    passed.
+    """A block while the terminal shows a title, the present step, and the seconds that have passed.
 
     Gives a function that changes the title. Where there is no terminal, steps are lines, `LINE_EVERY` seconds
     apart.

@@ -39,9 +39,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Show:
-    """Draw a rig, the search segments of some alpha pixels, and how far matched points lie from their
-    lines.
-    """
+    """Draw a rig, search segments of some alpha pixels, and how far matched points lie from their lines."""
 
     rig: RigFile
     alpha: Annotated[str | None, optional("NAME")] = None
@@ -87,9 +85,7 @@ def warn_of_misfit(rig: Rig, images: Mapping[str, Tensor]) -> None:
 
 
 def matched_points(rig: Rig, alpha: str, images: Mapping[str, Tensor]) -> dict[str, tuple[Tensor, Tensor]]:
-    """Points of alpha and of each beta that shows enough of the same and that the rig relates to alpha, by
-    beta.
-    """
+    """Points of alpha and each beta that shows enough of the same and the rig relates to alpha, by beta."""
     from calib.images.matches import match_cameras
     from calib.images.residuals import related
 
@@ -103,9 +99,7 @@ def matched_points(rig: Rig, alpha: str, images: Mapping[str, Tensor]) -> dict[s
 
 
 def given_matches(path: Path | None, texts: Sequence[str], images: Mapping[str, Tensor]) -> Pairs | None:
-    """The matches of a file between images of cameras, which `--image NAME=FILE` gives; None without a
-    file.
-    """
+    """The matches of a file between the cameras' images of `--image NAME=FILE`; None without a file."""
     if path is None:
         return None
     from arraygeom.io.point_matches import read_matches
@@ -138,9 +132,7 @@ class Explore:
     """The camera to point in; by default the first with an image."""
     field: FieldName = "auto"
     weights: Annotated[str | None, arg(metavar="NAME|FILE", help_behavior_hint="")] = None
-    """A network of the paper whose attention is shown, such as pat-supervised; by default correlations of
-    windows.
-    """
+    """A network of the paper whose attention to show, as pat-supervised; else correlations of windows."""
     save: Annotated[Path | None, optional("FILE.html")] = None
     """Write a page of one file that needs no server, and end."""
     port: int = 0
@@ -178,9 +170,7 @@ class Info:
     depth: Depth = None
     """Near and far bounds in metres, instead of the rig's."""
     alpha: Annotated[str | None, optional("NAME")] = None
-    """Only pairs with this alpha, the 50 nearest; by default all pairs, and of over 12 cameras those of the
-    first.
-    """
+    """Only pairs with this alpha, the 50 nearest; by default all, and of over 12 cameras the first's."""
     json: bool = False
     """Print JSON instead of tables."""
 
@@ -339,9 +329,7 @@ class Refine:
     """Free parameters: rotation, translation, focal, centre (principal_point), distortion; or
     CAMERA.rotation. By default, focal and translation too if that brings held-out points nearer."""
     sigma: Annotated[tuple[str, ...], arg(metavar="KIND=NUMBER")] = ()
-    """Standard deviation of a parameter before refinement: degrees, pixels; relative for translation and
-    focal.
-    """
+    """Standard deviation of a parameter before refinement: degrees, pixels; translation, focal relative."""
     photometric: bool = True
     """Also minimise the fusion's own error, after that of the points."""
     force: bool = False

@@ -99,9 +99,7 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
 
 
 def folder_pairs(root: str | Path, *, max_disparity: float = PAPER_DISPARITY) -> Iterator[StereoPair]:
-    """Every (near-)rectified pair under `root` whose names follow one of `LEFT_AND_RIGHT`, such as
-    KITTI's.
-    """
+    """Every (near-)rectified pair under `root`, names following one of `LEFT_AND_RIGHT`, such as KITTI's."""
     root = _folder(root)
     files = _some(_named(root), root)
     return (
@@ -111,8 +109,7 @@ def folder_pairs(root: str | Path, *, max_disparity: float = PAPER_DISPARITY) ->
 
 
 def pair_files(root: str | Path) -> list[PairFiles]:
-    """The files of every pair that `middlebury_pairs` and `folder_pairs` read, in order, without reading
-    them.
+    """The files of every pair `middlebury_pairs` and `folder_pairs` read, in order, without reading them.
 
     Raises FileNotFoundError for no such folder, ValueError where there is no pair.
     """

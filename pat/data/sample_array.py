@@ -22,9 +22,7 @@ ALPHA, BETA = "mono", "colour"
 
 
 class SampleArray(NamedTuple):
-    """A mono alpha and a colour beta of different focal lengths and poses, and alpha's view in true
-    colour.
-    """
+    """A mono alpha and a colour beta of different focal length and pose, and alpha's view in true colour."""
 
     rig: Rig
     images: dict[str, Tensor]

@@ -64,9 +64,7 @@ def scene_rig(folder: Path) -> Rig:
 
 
 class RenderedView(NamedTuple):
-    """An image in linear light, the depth of its pixels (metres; NaN where the camera sees nothing), its
-    camera.
-    """
+    """An image in linear light, its pixels' depth (metres; NaN where the camera sees nothing), its camera."""
 
     rgb: Float[Tensor, "3 h w"]
     depth: Float[Tensor, "h w"]
@@ -74,9 +72,7 @@ class RenderedView(NamedTuple):
 
 
 def read_view(folder: Path, name: str) -> RenderedView:
-    """The first frame of a camera, as rendered. Raises ValueError, naming the folder, for one that cannot be
-    used.
-    """
+    """A camera's first frame, as rendered. Raises ValueError, naming the folder, for one of no use."""
     with reading(folder):
         frame, camera = Rendered(folder).frame(name), Rendered(folder).rig[name]
     if not isinstance(camera, Camera):
@@ -107,9 +103,7 @@ def undistorted(view: RenderedView) -> RenderedView:
 
 
 def window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> RenderedView:
-    """A window of a view, reduced (or enlarged) to `hw`. Beyond the image its edge is repeated, without
-    depth.
-    """
+    """A window of a view, reduced (or enlarged) to `hw`. Beyond the image its edge repeats, without depth."""
     rows, columns = (torch.arange(n) + start for n, start in zip(size, (top, left)))
     h, w = view.camera.hw
     inside = ((rows >= 0) & (rows < h))[:, None] & (columns >= 0) & (columns < w)
@@ -127,9 +121,7 @@ def reduced(rgb: Float[Tensor, "n c h w"], hw: HW) -> Float[Tensor, "n c h2 w2"]
 
 
 def reduced_depth(depth: Float[Tensor, "n h w"], hw: HW) -> Float[Tensor, "n h2 w2"]:
-    """Depth at the new pixels' centres: inverse depth interpolated on even surfaces, the nearest pixel's at
-    edges.
-    """
+    """Depth at the new pixels' centres: inverse depth interpolated on even surfaces, the nearest at edges."""
     old = (depth.shape[-2], depth.shape[-1])
     if old == hw:
         return depth

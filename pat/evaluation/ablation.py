@@ -112,9 +112,7 @@ class FieldFamily:
     warped: bool = False
 
     def fuse(self, network: FusionNetwork, rig: Rig, case: AblationCase, far: float) -> tuple[Tensor, Tensor]:
-        """Alpha's view fused (3, H, W), and its depth. Raises ValueError for a rig that cannot be
-        rectified.
-        """
+        """Alpha's view fused (3, H, W), its depth. Raises ValueError for a rig that cannot be rectified."""
         if not self.warped:
             frame = fuse(network, rig, case.images, alpha=ALPHA, field=self.field(far))
             return frame.image, frame.depth
@@ -124,8 +122,7 @@ class FieldFamily:
 
 
 class AblationRow(NamedTuple):
-    """One family on one scene: scores of the image, and the error in beta of points at the depth found
-    (pixels).
+    """One family on one scene: scores of the image, error in beta of points at the depth found (pixels).
 
     `within_one` is the share of pixels whose point is within one pixel of its true position in beta. `note`
     says why there are no figures, where there are none.
@@ -143,8 +140,7 @@ class AblationRow(NamedTuple):
 
 @dataclass(frozen=True)
 class HorizontalDisplacement:
-    """The rectified assumption at its best: H is known, and with it position and scale; only lines are taken
-    as rows.
+    """The rectified assumption at its best: H known, so position and scale; only lines are taken as rows.
 
     The segment is +-`disparity` pixels along x around H x.
     """
@@ -274,9 +270,7 @@ def ablate(
     out: Path,
     chosen: Mapping[str, FieldFamily] | None = None,
 ) -> list[AblationRow]:
-    """Every family on every case; ablation.md, ablation.csv and ablation.png (crops of some cases) go to
-    `out`.
-    """
+    """Every family on every case; ablation.md, .csv and .png (crops of some cases) go to `out`."""
     rows: list[AblationRow] = []
     panels: dict[str, Tensor] = {}
     for i, case in enumerate(track(cases, "ablating", disable=not sys.stderr.isatty())):
@@ -317,8 +311,7 @@ def _case(
 
 
 def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float, float]:
-    """Mean error in beta (pixels) of points at `depth` where it is known; the share of all that is within a
-    pixel.
+    """Mean error in beta (pixels) of points at `depth` where known; the share of all within a pixel.
 
     Whether beta sees the point or not: the reference is the projection at the true depth.
     """
@@ -350,9 +343,7 @@ def unsupported(network: FusionNetwork, field: ReceptiveField | None, rig: Rig) 
 
 
 def markdown(rows: Sequence[AblationRow]) -> str:
-    """One line a family: mean PSNR with its 95% bootstrap interval, SSIM, dB to calibrated, and by focal
-    ratio.
-    """
+    """One line a family: mean PSNR, its 95% bootstrap interval, SSIM, dB to calibrated, by focal ratio."""
     bins = [f"ratio {low:g} to {high:g}" for low, high in pairwise(RATIOS)]
     columns = ["family", "PSNR", "SSIM", "against calibrated", *bins, "off, px", "within 1 px", ""]
     names = list(dict.fromkeys(row.family for row in rows))

@@ -58,9 +58,7 @@ UNRECTIFIABLE = "the cameras look along the line between them: such a pair canno
 
 
 def classical_baseline(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Float[Tensor, "_ h w"]:
-    """`classical` with the one colour beta, or with each of the betas that record one band, bands
-    concatenated.
-    """
+    """`classical` with the one colour beta, or with each beta that records one band, bands concatenated."""
     betas = [name for name in rig.betas(alpha) if name in images]
     if images[betas[0]].shape[0] == 3:
         return classical(rig, images, alpha, betas[0])
@@ -112,8 +110,7 @@ def classical_fusion(
 def classical_calibrated(
     alpha: Float[Tensor, "1 h w"], beta: Float[Tensor, "_ hb wb"], pair: Pair
 ) -> Float[Tensor, "_ h w"]:
-    """Beta's colours, or its one band, at alpha's view, for two pinhole cameras with any pose and a depth
-    range.
+    """Beta's colours, or its one band, at alpha's view, for two pinholes with any pose and a depth range.
 
     Both are rectified to one image plane with about alpha's resolution and matched there for depths near to
     far; the colour differences (for one band: what beta has more than alpha) are warped back to alpha. Values
@@ -142,8 +139,7 @@ def classical_calibrated(
 
 
 def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Tensor, "c h w"]:
-    """scikit-image's non-local means for noise of a known standard deviation (Buades et al. 2005; Darbon et
-    al. 2008).
+    """scikit-image's non-local means for noise of known deviation (Buades et al. 2005; Darbon et al. 2008).
 
     Patches of 5 x 5 pixels within 6 pixels, h = 0.8 deviations, as its documentation advises.
     """
@@ -226,9 +222,7 @@ def _project(H: NDArray, points: NDArray) -> tuple[NDArray[np.float64], NDArray[
 
 
 class _Correspondence(NamedTuple):
-    """Where the pixels of `mono` are in the other image, and whether and how consistently they are found
-    there.
-    """
+    """Where `mono`'s pixels are in the other image, and whether and how consistently they are found there."""
 
     columns: Image
     rows: Image
@@ -327,8 +321,7 @@ def _mean_and_deviation(plane: Image, weight: Image) -> tuple[float, float]:
 
 
 def _regressed(chroma: Image, luma: Image, residual: Image) -> Image:
-    """Chroma corrected along its local regression on luminance by the detail of alpha's luminance that beta's
-    lacks.
+    """Chroma corrected along its local regression on luminance by the detail of alpha that beta's lacks.
 
     This is the guided filter's linear model; it gives back the detail that beta lost by its resolution.
     """

@@ -1,6 +1,4 @@
-"""What `pat demo` fuses: a rendered scene and a photograph, ideal and as real cameras record them; and its
-figure.
-"""
+"""What `pat demo` fuses: a rendered scene and a photograph, ideal and as cameras record them; its figure."""
 
 from __future__ import annotations
 
@@ -75,9 +73,7 @@ def classical_methods(network: FusionNetwork, recording: DemoRecording) -> dict[
 
 
 def save_demo_figure(panels: Mapping[str, Tensor], corner: tuple[int, int], path: Path) -> None:
-    """Images of one size, three in a row, and below each a window whose corner (row, column) is given,
-    enlarged.
-    """
+    """Images of one size, three in a row, below each a window with a given corner (row, column), enlarged."""
     h, w = next(iter(panels.values())).shape[-2:]
     top, left = corner
     window = (..., slice(top, top + h // CROP), slice(left, left + w // CROP))

@@ -36,8 +36,7 @@ class MonoColourTask(NamedTuple):
 
 
 def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
-    """Left as the grey alpha (Rec. 601) and as the ground truth in colour; right, reduced `rate` times, as
-    beta.
+    """Left as grey alpha (Rec. 601) and as ground truth in colour; right, reduced `rate` times, as beta.
 
     Rows and columns beyond the last multiple of `rate` are cut from the bottom and the right. Raises
     ValueError for a grey pair, and for images of unequal sizes.
@@ -83,9 +82,7 @@ class StereoResult(NamedTuple):
 
 
 StereoMethod = Callable[[Tensor, Tensor, float], Tensor | StereoResult]
-"""(alpha (1, H, W), beta (3, Hb, Wb), max_disparity in alpha pixels) -> a colour image (3, H, W), 0..1, or
-more.
-"""
+"""(alpha (1, H, W), beta (3, Hb, Wb), max_disparity in alpha pixels) -> colours (3, H, W), 0..1 or more."""
 
 
 def alpha_alone(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:

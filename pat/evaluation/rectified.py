@@ -1,6 +1,4 @@
-"""The fair contender of calibrated segments: both images warped to rows, fused there, and the result warped
-back.
-"""
+"""The fair contender of calibrated segments: images warped to rows, fused there, the result warped back."""
 
 from __future__ import annotations
 
@@ -15,9 +13,7 @@ from arraygeom import Pair, Rectification, Rig, apply_homography, intrinsics, pi
 from arraygeom.pixels import HW, product
 
 LARGEST = 6.0
-"""A canvas of more than so many times alpha's pixels is refused: a camera nearly ahead stretches it without
-bound.
-"""
+"""A canvas of more times alpha's pixels is refused: a camera nearly ahead stretches it without bound."""
 
 
 class Warped(NamedTuple):

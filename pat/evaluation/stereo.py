@@ -109,9 +109,7 @@ PrintedScores = Mapping[int, tuple[float, float]]
 def sets_markdown(
     rows: Mapping[str, Sequence[StereoRow]], *, printed: Mapping[str, PrintedScores] = {}, depth: bool = True
 ) -> str:
-    """`markdown` of each data set under its name, followed by `structure_kept` and, with `depth`, its
-    errors.
-    """
+    """`markdown` of each data set under its name, then `structure_kept` and, with `depth`, its errors."""
     parts = []
     for name, found in rows.items():
         parts += [
@@ -155,9 +153,7 @@ def _mean_cell(summary: StereoSummary) -> str:
 
 
 def depth_markdown(rows: Sequence[StereoRow]) -> str:
-    """Errors of depth where it is known: end-point error in pixels / share within one pixel. Empty if
-    nowhere.
-    """
+    """Errors of known depth: end-point error in pixels / share within one pixel. Empty if none is known."""
     known = [row for row in rows if row.end_point_error is not None]
     if not known:
         return ""

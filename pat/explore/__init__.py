@@ -1,5 +1,4 @@
-"""The explorer: point at a pixel of alpha and see its segment, samples and match in every beta, and move the
-rig.
+"""The explorer: point at a pixel of alpha, see its segment, samples and match in every beta, move the rig.
 
 `explore(rig, images)` is a widget for a cell of a notebook (extra `explore`), `pat explore rig.yaml --image
 ...` the same in a page; neither needs a network. `inspect_pixel` does the computation.

@@ -45,9 +45,7 @@ SHIPPED = "pat-supervised"
 
 
 def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any]:
-    """The pixel, its depth, and each beta's samples, weights and match; `error` or `problem` where there are
-    none.
-    """
+    """The pixel, its depth, each beta's samples, weights and match; `error` or `problem` where none."""
     try:
         return _answer(scene, alpha, controls)
     except (ValueError, TypeError, KeyError) as error:
@@ -81,9 +79,7 @@ def _answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, A
 
 
 def clicked(scene: ExplorerScene, alpha: str, controls: Controls) -> tuple[Controls, list[Any]]:
-    """The controls with alpha's pixel that matches the clicked one of a beta, and that one's samples in
-    alpha.
-    """
+    """The controls with alpha's pixel that matches a beta's clicked one, and that one's samples in alpha."""
     name, column, row = controls["clicked"]
     x = image_pixel(column, row, scene.rig[name].hw)
     found = inspect_pixel(scene, explorer_state(scene.rig, alpha, controls).replace(alpha=name, x=x))
@@ -96,9 +92,7 @@ def clicked(scene: ExplorerScene, alpha: str, controls: Controls) -> tuple[Contr
 
 
 def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
-    """The rig with every calibrated beta moved, rotated about its centre, of another focal length and
-    lens.
-    """
+    """The rig, every calibrated beta moved, rotated about its centre, of another focal length and lens."""
     own, cameras = rig[alpha], dict(rig.cameras)
     if all(controls[name] == DEFAULTS[name] for name in ("baseline", "rotation", "focal", "lens", "moved")):
         return rig
@@ -170,9 +164,7 @@ def drawn(beta: BetaReport) -> dict[str, Any]:
 
 
 def top_view(rig: Rig, alpha: str) -> list[dict[str, Any]]:
-    """The cameras from above, in alpha's axes: each one's centre (right, forward) and where it looks;
-    metres.
-    """
+    """The cameras from above, in alpha's axes: each centre (right, forward) and where it looks; metres."""
     own = rig[alpha]
     if not isinstance(own, Camera):
         return []

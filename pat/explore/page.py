@@ -176,8 +176,7 @@ DEEPEST = 20.0
 
 
 def checkered_room(rig: Rig, alpha: str) -> dict[str, Float[Tensor, "1 h w"]]:
-    """Every camera's image (1, h, w) of a box whose back wall is far and whose side walls alpha sees from
-    near on.
+    """Every camera's image (1, h, w) of a box, its back wall far, its side walls seen by alpha from near on.
 
     Squares differ in brightness, so that each has one match. Raises ValueError for a rig without poses or
     depth range.

@@ -185,8 +185,7 @@ SIZED: dict[str, Callable[[Pair, Tensor], ReceptiveField]] = {
 }
 """Families whose extent is that of the depth range at a pixel, or follows from the images' size."""
 FAMILIES = ("auto", *FIELDS)
-"""Names of the fields: `auto` is the default field, which `pat fuse` uses. A state takes MODULE:OBJECT, too.
-"""
+"""Names of the fields: `auto` is the default, which `pat fuse` uses. A state takes MODULE:OBJECT, too."""
 
 
 def chosen_field(pair: Pair, family: str, x: Float[Tensor, "1 2"]) -> ReceptiveField:
@@ -243,9 +242,7 @@ def pixel_of(state: ExplorerState) -> Float[Tensor, "1 2"]:
 
 
 def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerState) -> BetaReport:
-    """The pixel's samples in one beta, their weights and depths. Raises ValueError where the field does not
-    fit.
-    """
+    """A pixel's samples in one beta, their weights, depths. Raises ValueError if the field does not fit."""
     x = pixel_of(state)
     field = scene.fields.get(state.family) or chosen_field(pair, state.family, x)
     found = field(pair, x)

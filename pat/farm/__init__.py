@@ -1,3 +1,1 @@
-"""Many scenes rendered: what is to be rendered, the renderers, and the job that makes those that are
-missing.
-"""
+"""Many scenes rendered: what is to be rendered, the renderers, and the job that makes what is missing."""

@@ -40,9 +40,7 @@ class Renderer(Protocol):
     """Renders scenes of one job."""
 
     def render(self, seed: int, out: Path) -> SceneCheck:
-        """Render the scene of a seed into the folder `out`, which it makes, and check it. Raises
-        ValueError.
-        """
+        """Render the scene of a seed into the folder `out`, made here, and check it. Raises ValueError."""
 
 
 @dataclass(frozen=True, kw_only=True)

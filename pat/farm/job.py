@@ -45,9 +45,7 @@ RESERVE = 64 << 20
 
 @dataclass(frozen=True, kw_only=True)
 class RetryLimits:
-    """A scene may take `timeout` seconds; one that its check refuses is made from the next seed, `refusals`
-    times.
-    """
+    """A scene may take `timeout` seconds; if its check refuses, the next seed is taken, `refusals` times."""
 
     timeout: float = 900.0
     refusals: int = 20
@@ -120,9 +118,7 @@ class RenderConfig:
         return rig
 
     def renderer(self) -> Renderer:
-        """A renderer that is ready. Raises ValueError for a rig that it cannot render, or if a library is
-        missing.
-        """
+        """A ready renderer. Raises ValueError for a rig it cannot render, or if a library is missing."""
         return self.settings.renderer(self.load_rig(), self.check)
 
     def scene_bytes(self) -> float:
@@ -175,8 +171,7 @@ def render(
     scheduler: str | None = None,
     console: Console | None = None,
 ) -> JobReport:
-    """Render what is missing of `scenes` scenes into the folder `out`, by `workers` processes or a Dask
-    scheduler's.
+    """Render what is missing of `scenes` scenes into folder `out`, by `workers` processes or Dask's.
 
     Raises ValueError for what cannot be rendered, more scenes than the disk holds, or a folder in use or of
     another configuration; JobError if the job cannot go on.
@@ -250,8 +245,7 @@ def check_space(root: Path, scenes: int, scene_bytes: float) -> None:
 
 
 def make_scene(config_text: str, work: Path, scene: Path, index: int) -> None:
-    """The task of a scene: rendered from the first seed that the self-check accepts, and published as a
-    whole.
+    """The task of a scene: rendered from the first seed the self-check accepts, published as a whole.
 
     Raises ValueError for one that is refused again and again, JobError if no scene can be made.
     """

@@ -1,5 +1,4 @@
-"""Each beta's own values at alpha's pixels, with where they are seen: what fusion finds on its way, and no
-fused image.
+"""Each beta's own values at alpha's pixels, and where they are seen: as fusion finds them, no fused image.
 
 Values are those that the cameras recorded, resampled once, at sub-pixel positions: no luminance of alpha and
 no colour of a network is in them.
@@ -48,8 +47,7 @@ Fill = Literal["none", "propagate"]
 INTERPOLATIONS: dict[str, Interpolation] = {"nearest": "nearest", "bilinear": "bilinear", "cubic": "bicubic"}
 
 OUTSIDE, OCCLUDED, SEEN = 0, 1, 2
-"""Visibility of alpha's pixels in a beta: beyond its edge; occluded, or without a match of enough confidence;
-seen."""
+"""Visibility of alpha's pixels in a beta: beyond its edge; occluded or unmatched (low confidence); seen."""
 
 LEAST_CONFIDENCE = 0.5
 """Confidence from which a point counts as seen: that it is, and at this position, is likelier than not. As
@@ -99,8 +97,7 @@ class AlignedView:
 
 @dataclass(frozen=True)
 class Aligned(Mapping[str, AlignedView]):
-    """All cameras' own values at the pixels of one of them: a mapping of names to views, that of `alpha`
-    first.
+    """All cameras' own values at the pixels of one: a mapping of names to views, that of `alpha` first.
 
     depth: (H, W), float32, metres along alpha's axis; NaN where no calibrated beta sees the point.
     """
@@ -378,8 +375,7 @@ def _in_type(values: NDArray[np.float64], dtype: Any) -> NDArray[Any]:
 
 
 def filled(values: NDArray[Any], valid: NDArray[np.bool_], fill: Fill) -> NDArray[Any]:
-    """Values (C, H, W) with 0, of floats NaN, where they are not valid; or with those of the nearest valid
-    pixel."""
+    """Values (C, H, W) with 0, floats NaN, where not valid; or with those of the nearest valid pixel."""
     if fill == "none" or not valid.any():
         nothing = np.nan if np.issubdtype(values.dtype, np.floating) else 0
         return np.where(valid, values, np.asarray(nothing, values.dtype))

@@ -120,8 +120,7 @@ def _shares(aligned: Aligned) -> str:
 def write_bands(
     path: Path, values: NDArray[Any], bands: Sequence[str], wavelengths: Sequence[float | None]
 ) -> None:
-    """Write bands (C, H, W) as one TIFF file in their own type, with names and wavelengths (nanometres) for
-    GIS."""
+    """Write bands (C, H, W) as one TIFF in their type, with names and wavelengths (nanometres) for GIS."""
     items = []
     for i, (band, wave) in enumerate(zip(bands, wavelengths, strict=True)):
         items.append(f'<Item name="DESCRIPTION" sample="{i}" role="description">{escape(band)}</Item>')

@@ -1,5 +1,4 @@
-"""A page that shows aligned bands: any two under a slider, composites of them, and what a camera does not
-see."""
+"""A page showing aligned bands: any two under a slider, composites, and what a camera does not see."""
 
 from __future__ import annotations
 
@@ -54,8 +53,7 @@ def write_aligned_page(path: Path, aligned: Aligned, rig: Rig, facts: Facts) -> 
 
 
 def shown_layers(aligned: Aligned, rig: Rig | None = None) -> dict[str, Float[Tensor, "_ h w"]]:
-    """Each camera's bands, stretched; composites and NDVI (see `ndvi`) where wavelengths allow them; depth if
-    known."""
+    """Each camera's bands, stretched; composites and NDVI (see `ndvi`) if wavelengths allow; known depth."""
     layers = {}
     for name, view in aligned.items():
         bands = [_stretched(band, view.valid) for band in view.values]

@@ -1,5 +1,4 @@
-"""Means over pixels whose surroundings are alike: non-local means (Buades et al. 2005) guided by another
-image.
+"""Means over pixels with alike surroundings: non-local means (Buades et al. 2005) guided by another image.
 
 What a network makes of noisy views still has some of their noise. Pixels that are alike in its image are
 averaged in it, and then what betas recorded there.
@@ -53,8 +52,7 @@ def averaged_with_alike(
     confidence: Float[Tensor, "1 h w"],
     deviation: float,
 ) -> Float[Tensor, "3 h w"]:
-    """An image with the mean colour of what is alike near each pixel: of its own, and of that recorded by
-    beta.
+    """An image with the mean colour of what is alike near each pixel: of its own, and of beta's recorded.
 
     Luma stays. `beta` are its values at alpha's pixels, to be used as far as `confidence` says, with noise of
     this standard deviation in the mean.

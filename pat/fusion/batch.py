@@ -1,5 +1,4 @@
-"""Many frames, and sequences, from folders to a folder: what `pat fuse` does with more than one image a
-camera.
+"""Many frames, and sequences, from folders to a folder: `pat fuse` with more than one image a camera.
 
 Every frame is a task of its own that leaves its image last; `settings.yaml` beside the images says what they
 were made with, and a job is resumed with the same settings only; `inputs.json` says from which images, and
@@ -116,8 +115,7 @@ class Batch:
 
     @property
     def inputs(self) -> dict[str, str]:
-        """A digest of the names, sizes and times of the images each frame is made from: all of them in a
-        sequence."""
+        """A digest of names, sizes and times of the images each frame is made from: all, in a sequence."""
         stamps = {name: [_stamp(file) for file in files] for name, files in self.files.items()}
         if self.sequence:
             return dict.fromkeys(self.names, _digest(stamps))
@@ -173,8 +171,7 @@ class Batch:
         return report
 
     def _begin(self, resume: bool) -> None:
-        """Write the settings and what the frames are made from; or, to resume, compare them with those of
-        before.
+        """Write the settings and what frames are made from; or, to resume, compare them with those before.
 
         Frames whose images are not those of before are removed.
         """
@@ -197,8 +194,7 @@ class Batch:
         write_text(self.out / KEYS / PLAN, self.to_json())
 
     def to_json(self) -> str:
-        """The batch as text for the processes that fuse its frames. Raises ValueError for a field of one's
-        own."""
+        """The batch as text for processes that fuse its frames. Raises ValueError for one's own field."""
         entries = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
         entries["rig"] = rig_text(self.rig)
         entries["files"] = {name: [str(file) for file in files] for name, files in self.files.items()}
@@ -291,8 +287,7 @@ def noise_document(noise: Noise | None) -> str | dict[str, Any] | None:
 
 
 def field_document(field: ReceptiveField | None) -> dict[str, Any] | None:
-    """A field as its class's name and entries. Raises ValueError for other fields than the families of
-    arraygeom."""
+    """A field as class name and entries. Raises ValueError for fields of other families than arraygeom's."""
     if field is None:
         return None
     if FIELD_CLASSES.get(type(field).__name__) is not type(field):
@@ -356,8 +351,7 @@ def _network(weights: str, precision: Precision) -> Network:
 
 
 def find_images(text: str | Path, *, name: str = "") -> list[Path]:
-    """The images of a folder, of a pattern such as "a/mono_*.png", or one file; numbers in names count as
-    numbers.
+    """The images of a folder, a pattern such as "a/mono_*.png", or one file; numbers in names count as such.
 
     Raises FileNotFoundError if there is none.
     """

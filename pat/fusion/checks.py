@@ -19,8 +19,7 @@ from .results import Frame
 
 LOW_CONFIDENCE = 0.25
 UNFIT_CONFIDENCE = 0.16
-"""Mean confidences, where all views overlap, below which one is warned, and below which a rig is taken for
-wrong.
+"""Mean confidences, where all views overlap, below which one is warned, and a rig is taken for wrong.
 
 Measured on Middlebury's tune half: with the sign of the baseline changed, or beta turned upside down, 36
 pairs had .05 to .24, 32 of them below .16; the same with the right rig .61 to .88, with beta reduced eight
@@ -82,8 +81,7 @@ def confidence_checked(*, strict: bool) -> Iterator[None]:
 
 
 def overlap_confidences(frame: Frame, inputs: FrameInputs) -> list[float]:
-    """The mean confidence, or that of each band, where the segments of all betas are valid; NaN if that is
-    nowhere."""
+    """The mean confidence, or each band's, where all betas' segments are valid; NaN if that is nowhere."""
     h, w = inputs.hw
     overlap = torch.ones(inputs.hw, dtype=torch.bool, device=frame.confidence.device)
     for beta in inputs.inputs.betas:

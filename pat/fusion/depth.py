@@ -48,8 +48,7 @@ DEVIATIONS = 1.645
 def _within(
     where: Float[Tensor, "n 2"], segments: Segments, which: Bool[Tensor, "h w"]
 ) -> Float[Tensor, "n 2"]:
-    """Positions of some of alpha's pixels, those beyond an end of their segment moved along it to that
-    end."""
+    """Positions of some of alpha's pixels, moved along their segment to its end if beyond it."""
     h, w = which.shape
     start, end, valid = (t[0, :h, :w][which] for t in (segments.start, segments.end, segments.valid))
     start, end = start.to(where), end.to(where)

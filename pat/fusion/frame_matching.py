@@ -1,5 +1,4 @@
-"""Which image files of several cameras are of one frame: by their names, their numbers or times in these, or
-in order.
+"""Which image files of cameras are of one frame: by their names, numbers or times in these, or in order.
 
 A camera that missed a frame would else shift all that follow.
 """
@@ -106,8 +105,7 @@ def _endings(files: Files) -> Keys | None:
 
 
 def _numbers(files: Files) -> Keys | None:
-    """The numbers in names that differ between a camera's files; of one number, times that are nearly equal
-    are equal.
+    """Numbers in names that differ between a camera's files; of one, times that are nearly equal are equal.
 
     None where two files of a camera have the same, or some have other numbers of numbers.
     """

@@ -51,8 +51,7 @@ class ImageFiles:
 
 
 class CachedFrames:
-    """Frames, of which those asked for last are cached, up to `CACHED` bytes: neighbours in time need them
-    again."""
+    """Frames, those asked for last cached, up to `CACHED` bytes: neighbours in time need them again."""
 
     def __init__(self, frames: Frames) -> None:
         self.frames = frames

@@ -183,8 +183,7 @@ def _tagged_rig(files: Mapping[str, Path], note: Say) -> Rig | None:
 
 @stage()
 def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple[Rig, list[str]]:
-    """The rig of tags with translations and depths by the images, and the cameras that match; alpha comes
-    first."""
+    """The rig of tags with translations and depths by the images, the cameras that match; alpha first."""
     straight, pinhole = without_lenses(Rig({name: tagged[name] for name in images}), images)
     shown = {name: pixels_between(tagged[name], straight[name])[1][None].float() for name in images}
     lengths = {name: float(straight[name].K[0, 0]) for name in images}
@@ -328,8 +327,7 @@ def _calibrated(
 def _refined(
     pair: RefinedPair, images: Images, network: Network, links: Mapping[tuple[str, str], Link]
 ) -> tuple[RefinedPair, Frame]:
-    """The pair refined by the matches of a fusion at reduced size, unless it has one of these links; and
-    that."""
+    """The pair refined by a fusion's matches at reduced size, unless it has one of these links; and that."""
     alpha, beta = pair.rig.names
     factor = min(COARSE / max(images[alpha].shape[-2:]), 1.0)
     small = {name: scaled(images[name], factor) for name in (alpha, beta)}

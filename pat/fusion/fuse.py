@@ -36,8 +36,7 @@ from .views import Views
 LOG = logging.getLogger(__name__)
 
 ImageSources = Mapping[str, str | Path | Tensor] | Sequence[str | Path]
-"""An image file, or a tensor (C, H, W) in 0..1, of each camera by name; or files alone, which name their
-cameras."""
+"""An image file or tensor (C, H, W) in 0..1 of each camera by name; or files alone, which name cameras."""
 Progress = Callable[[Iterable[Tile], int], Iterable[Tile]]
 """Wraps the tiles (and their number) to show how far the work is, as `rich.progress.track` does."""
 
@@ -95,8 +94,7 @@ def fuse(
     matcher: Matcher = match,
     **changes: Any,
 ) -> Frame:
-    """Fuse one frame at the view of camera `alpha`: `fuse(network, rig, images, alpha=...)`, or
-    `fuse(images)`.
+    """Fuse one frame at camera `alpha`'s view: `fuse(network, rig, images, alpha=...)`, or `fuse(images)`.
 
     Images alone are files, or files or tensors by camera; their rig and the weights are found as by `pat
     fuse` (`pat.fusion.from_images.array_from_images`, which also gives them), and depths are multiples of the
@@ -247,8 +245,7 @@ def corrections_of(
     settings: FuseSettings = FuseSettings(),
     **changes: Any,
 ) -> Corrections:
-    """What `fuse` finds and puts right before it fuses; give it to `fuse` for other frames of the same
-    cameras.
+    """What `fuse` finds and corrects before it fuses; give it to `fuse` for other frames of the same cameras.
 
     Arguments and errors are as of `fuse`.
     """

@@ -1,5 +1,4 @@
-"""A rig that its images contradict: said, and healed for them where they determine it far better than the
-file does."""
+"""A rig its images contradict: said, and healed for them if they determine it far better than the file."""
 
 from __future__ import annotations
 
@@ -45,8 +44,7 @@ class Healed(NamedTuple):
 
 
 def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
-    """The rig healed by its images, where they say clearly more; else None, and a warning if it fits them
-    badly.
+    """The rig healed by its images, if they say clearly more; else None, and a warning if it fits them badly.
 
     By a `LowConfidenceWarning` if it is wrong: mistaken by the doctor's verdict, or points are where nothing
     is seen.

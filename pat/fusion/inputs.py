@@ -1,5 +1,4 @@
-"""From views to what a network is given: padded images, and each field evaluated once for every pixel of
-alpha."""
+"""From views to a network's inputs: padded images, each field evaluated once for every pixel of alpha."""
 
 from __future__ import annotations
 
@@ -63,8 +62,7 @@ class Placement(NamedTuple):
 
 
 class FrameInputs(NamedTuple):
-    """A network's inputs, padded to whole multiples; how each beta is placed; alpha's size without
-    padding."""
+    """A network's inputs, padded to whole multiples; each beta's place; alpha's size without padding."""
 
     inputs: Inputs
     placements: list[Placement]
@@ -72,8 +70,7 @@ class FrameInputs(NamedTuple):
 
 
 def check_bands(network: FusionNetwork, views: Views) -> None:
-    """Refuse betas whose bands are not those that the network makes; warn of those whose three bands are
-    equal.
+    """Refuse betas whose bands are not what the network makes; warn of those whose three are equal.
 
     Raises ValueError that says which weights to take.
     """
@@ -106,8 +103,7 @@ def _refuse_bands(network: FusionNetwork, views: Views) -> None:
 def prepared(
     network: FusionNetwork, views: Views, steps: Sequence[FusionStep]
 ) -> tuple[FrameInputs, list[Undo]]:
-    """The network's inputs after these steps, and how the frame is taken back to the views, the last step
-    first.
+    """The network's inputs after these steps, and how a frame is taken back to the views, last step first.
 
     Raises ValueError as `frame_inputs`.
     """

@@ -79,8 +79,7 @@ def shipped_denoiser() -> LowLightNetwork:
 
 @dataclass(frozen=True)
 class LowLight:
-    """Views as given, without noise, and those that had some: (1, C, H, W) by camera, as recorded but
-    unbiased.
+    """Views as given, without noise, and those that had some: (1, C, H, W) by camera, recorded but unbiased.
 
     If no view had noise, nothing is asked of them, and they are without images. `seconds` is what denoising
     took.
@@ -102,8 +101,7 @@ class LowLight:
         return f"noise shows plainly and is removed: {', '.join(found)}; --noise none leaves it"
 
     def kept(self, hw: HW, betas: int) -> float:
-        """Bytes that are held until the frame of this size is corrected: the views, and where its pixels are
-        in each beta."""
+        """Bytes held until the frame of this size is corrected: views, its pixels' places in each beta."""
         if not self.noisy:
             return 0.0
         images = [*self.given.images.values(), *self.views.images.values()]

@@ -70,8 +70,7 @@ def with_alpha_detail(frame: Frame, alpha: Float[Tensor, "1 h w"]) -> Frame:
 
 
 def with_own_colours(frame: Frame, own: Float[Tensor, "3 h w"]) -> Frame:
-    """A fused frame whose chroma is alpha's own where confidence is low, as the betas' cameras show such
-    colours.
+    """A fused frame, chroma alpha's own where confidence is low, as the betas' cameras show such colours.
 
     Luminance stays. How the betas show alpha's colours is found where they see the same points.
     """

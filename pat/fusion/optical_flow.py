@@ -33,8 +33,7 @@ SETTINGS = FlowSettings()
 
 
 class Flow(NamedTuple):
-    """Motion of each pixel from one frame to another: (2, H, W) pixels in x and y, and its weight (H, W), 0
-    to 1."""
+    """Motion of each pixel between two frames: (2, H, W) pixels in x and y, its weight (H, W), 0 to 1."""
 
     step: Float[Tensor, "2 h w"]
     weight: Float[Tensor, "h w"]

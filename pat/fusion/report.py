@@ -53,8 +53,7 @@ class Facts(NamedTuple):
 def write_report(
     path: Path, frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig: Rig, alpha: str, facts: Facts
 ) -> Path:
-    """Write the page atomically: images side by side under a slider, overlays, the rig, figures. Returns the
-    path.
+    """Write the page atomically: images under a slider, overlays, the rig, figures. Returns the path.
 
     `images` are alpha's and the betas'; the page needs no other file and no network.
     """
@@ -133,8 +132,7 @@ def _all_of(texts: Mapping[str, Callable[[], str]]) -> dict[str, str]:
 
 
 def rig_drawing(rig: Rig, alpha: str) -> str:
-    """The calibrated cameras from above as an inline SVG: x to the right, z upwards; empty if there are
-    none."""
+    """The calibrated cameras from above as an inline SVG: x to the right, z upwards; empty without any."""
     cameras = {name: camera for name, camera in rig.cameras.items() if isinstance(camera, Camera)}
     if not cameras:
         return ""

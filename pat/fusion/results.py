@@ -130,14 +130,12 @@ def picture_of(image: Float[Tensor, "c h w"]) -> Float[Tensor, "d h w"]:
 
 
 def depth_scale(near: float) -> float:
-    """Counts a metre in a depth image of 16 bits: the power of ten with which `near` is at most a twentieth
-    of them."""
+    """Counts a metre in a 16-bit depth image: the power of ten with which `near` is at most a twentieth."""
     return 10.0 ** math.floor(math.log10(MOST / 20 / near))
 
 
 def write_depth(path: Path, depth: Float[Tensor, "h w"], *, near: float | None = None) -> float:
-    """Write depth as a PNG file of 16 bits; returns its counts a metre, by `near` (metres; else the nearest
-    depth).
+    """Write depth as a 16-bit PNG; returns its counts a metre, by `near` (metres; else the nearest depth).
 
     The scale is in the file's text chunk "Description". 0 is unknown, 65535 that far or farther.
     """
@@ -189,8 +187,7 @@ class Frame(NamedTuple):
 
     @property
     def depth_interval(self) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-        """The nearest and the farthest depth (metres; infinite too) between which the true one is in 9 of 10
-        pixels."""
+        """The nearest and farthest depth (metres; infinite too) around the true one in 9 of 10 pixels."""
         inverse = 1 / self.depth
         farthest = inverse - self.half_width
         beyond = farthest <= 0

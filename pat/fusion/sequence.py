@@ -107,8 +107,7 @@ class SequenceFusion:
         return self.recorded(i) if self.settings.keep_alpha else self.grey(i)
 
     def alone(self, i: int) -> Frame:
-        """The frame fused by itself with the betas nearest in time, motion or not: what warping is compared
-        with."""
+        """The frame fused alone with the betas nearest in time, motion or not: to compare warping with."""
         return self._fused(i, self.timeline.at(i), {}, alone=True)
 
     def colour(self, key: KeyFrame) -> KeyColour:
@@ -220,8 +219,7 @@ class SequenceFusion:
 
     @cached_property
     def _noise(self) -> Mapping[str, NoiseLevel] | None:
-        """The noise of each camera, stated or estimated once, near the middle; None if views are not
-        denoised."""
+        """The noise of each camera, stated or estimated once, near the middle; None without denoising."""
         noise = self.settings.noise
         if not isinstance(noise, str):
             return noise
@@ -266,8 +264,7 @@ class SequenceFusion:
         )
 
     def _normalised(self, name: str, image: Tensor, i: int) -> Tensor:
-        """Beta's image with alpha's mean and deviation over several key frames, so that it does not
-        flicker."""
+        """Beta's image with alpha's mean and deviation over several key frames, so as not to flicker."""
         keys = self.timeline.key_frames()
         nearest = min(range(len(keys)), key=lambda k: abs(keys[k].alpha - i))
         around = keys[max(nearest - SETTINGS.neighbours, 0) : nearest + SETTINGS.neighbours + 1]
@@ -276,8 +273,7 @@ class SequenceFusion:
 
 
 class KeyContribution(NamedTuple):
-    """One key frame's contribution to a frame: how near it is in time (0 to 1), and its colour warped
-    there."""
+    """A key frame's contribution to a frame: how near it is in time (0 to 1), its colour warped there."""
 
     nearness: float
     added: Tensor

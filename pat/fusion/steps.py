@@ -102,12 +102,10 @@ class Undistort:
 
 @dataclass(frozen=True)
 class LinearLuminance:
-    """The result as bright as alpha's camera saw it, if that measured the luminance of light
-    (`as_bright`)."""
+    """The result as bright as alpha's camera saw it, if it measured the luminance of light (`as_bright`)."""
 
     def do(self, views: Views) -> Done:
-        """Leave the views as they are; undone, a frame in the colours of RGB betas is made as bright as
-        alpha."""
+        """Leave the views as they are; undone, a frame in RGB betas' colours is made as bright as alpha."""
         own, sensor = views.own, views.rig[views.alpha].sensor
         if sensor.response != LIGHT or 3 not in [views.images[name].shape[0] for name in views.betas]:
             return Done(views, _as_it_is)
@@ -130,8 +128,7 @@ class Upright:
 
 @dataclass(frozen=True)
 class EqualResolution:
-    """Betas at about alpha's angular resolution where the views meet, without large parts that alpha cannot
-    see."""
+    """Betas at about alpha's angular resolution where views meet, less large parts alpha cannot see."""
 
     network: FusionNetwork
 
@@ -142,8 +139,7 @@ class EqualResolution:
         return Done(views, _as_it_is)
 
     def _cropped(self, views: Views, name: str) -> Views:
-        """A calibrated beta without what no search segment touches, if that is much: it would be enlarged for
-        nothing.
+        """A calibrated beta less what no search segment touches, if much: it would be enlarged for nothing.
 
         Not where the field may depend on the images' sizes.
         """
@@ -191,8 +187,7 @@ class Radiometry:
 
 @dataclass(frozen=True)
 class JoinBands:
-    """Betas that differ at most in their sensors as one of several bands; undone, bands are in the rig's
-    order."""
+    """Betas that differ at most in sensors as one of several bands; undone, bands in the rig's order."""
 
     which: JoinsBands
 
@@ -241,8 +236,7 @@ def _band_order(names: Sequence[str], groups: Sequence[Sequence[str]], bands: Ma
 
 
 def without_lenses(rig: Rig, images: Images) -> tuple[Rig, dict[str, Tensor]]:
-    """The rig and its images with pinhole views in place of cameras with lenses; see
-    `arraygeom.pinhole_view`."""
+    """The rig and its images with pinhole views, not cameras with lenses; see `arraygeom.pinhole_view`."""
     straight = dict(images)
     for name, image in images.items():
         camera = rig[name]
@@ -317,8 +311,7 @@ def _resized(views: Views, name: str) -> Views:
 
 
 def at_alphas_resolution(image: Float[Tensor, "c h w"], pair: Pair) -> Float[Tensor, "c h2 w2"]:
-    """Beta's image with pixels of about the size of alpha's where the views meet; as it is where they nearly
-    are."""
+    """Beta's image with pixels of about alpha's size where the views meet; as it is if they nearly are."""
     scale, (h, w) = resolution_ratio(pair), pair.beta.hw
     if 0.8 < scale < 1.25:
         return image
@@ -328,8 +321,7 @@ def at_alphas_resolution(image: Float[Tensor, "c h w"], pair: Pair) -> Float[Ten
 
 
 def resolution_ratio(pair: Pair) -> float:
-    """Pixels of beta to a pixel of alpha, by the pair's rough homography at the middle of alpha; 1 if
-    undefined."""
+    """Pixels of beta to one of alpha, by the pair's rough homography at alpha's middle; 1 if undefined."""
     steps = _steps_in_beta(pair)
     area = 0.0 if steps is None else abs(float(torch.linalg.det(steps)))
     return math.sqrt(area) if area > 0 else 1.0
@@ -345,8 +337,7 @@ def quarter_turns(pair: Pair) -> int:
 
 
 def _steps_in_beta(pair: Pair) -> Float[Tensor, "2 2"] | None:
-    """What a pixel to the right and one down from the middle of alpha are in beta, by the pair's rough
-    homography."""
+    """What a pixel right and one down from alpha's middle are in beta, by the pair's rough homography."""
     h, w = pair.alpha.hw
     middle = torch.tensor([[(w - 1) / 2, (h - 1) / 2]], dtype=torch.float64)
     steps = torch.cat([middle, middle + torch.tensor([[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)])

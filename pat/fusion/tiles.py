@@ -47,8 +47,7 @@ PROBE = (192, 512)
 ESTIMATED = 4_000_000
 """Alpha's pixels from which the time is estimated: smaller frames take seconds, and so does estimating."""
 LARGE = 16 * PROBE[0] ** 2
-"""Alpha's pixels from which a piece is fused to know the memory of matches, and the planned memory is kept
-to."""
+"""Alpha's pixels from which a piece is fused to learn matches' memory, and planned memory is kept to."""
 PROBED = 1 / 40
 """The part of alpha that the piece is between these."""
 
@@ -86,8 +85,7 @@ def plan_frame(
     after: float = 0.0,
     kept: float = 0.0,
 ) -> Plan:
-    """The tiles under a limit of memory (bytes); with `estimate`, the time of a large frame by fusing a
-    piece.
+    """The tiles under a limit of memory (bytes); with `estimate`, a large frame's time by fusing a piece.
 
     `before` is the share of the frame's work that is done beforehand, by which the time is longer, and
     `after` are seconds that follow. `stored` says that finished tiles are stored on disk until all are there.
@@ -112,8 +110,7 @@ def plan_frame(
 def tiles_within(
     network: FusionNetwork, frame: FrameInputs, limit: float | None, held: float = 0.0, matching: float = 0.0
 ) -> list[Tile]:
-    """The tiles with the least work (their halos overlap) of which none takes more than `limit` without
-    `held` bytes.
+    """The tiles with least work (halos overlap) of which none takes more than `limit` without `held` bytes.
 
     One tile if the whole frame does not. Raises ValueError if not even tiles of 64 pixels fit, or matching,
     which takes `matching` bytes, does not.
@@ -141,8 +138,7 @@ def tiles_within(
 
 
 def working_memory(network: FusionNetwork, inputs: Inputs, tile: Tile) -> float:
-    """Bytes that a tile takes: those for its part of alpha and for the part of each beta that its segments
-    touch."""
+    """Bytes of a tile: those for its part of alpha and the part of each beta that its segments touch."""
     betas = [area(inputs.touched(beta, tile.outer, 16)) for beta in inputs.betas]
     return network.working_bytes(area(tile.outer), betas)
 
@@ -249,8 +245,7 @@ def _fused(
 
 
 def _by_band(output: FusionOutput, part: Inputs) -> Tensor:
-    """The confidence of each band (C, h, w) as float16, where each is another beta's; else none, (0, h,
-    w)."""
+    """Each band's confidence (C, h, w) as float16, if each is another beta's; else none, (0, h, w)."""
     bands = [beta.image.shape[1] for beta in part.betas]
     if len(bands) == 1 or sum(bands) != output.image.shape[1]:
         return output.image[0, :0].half()

@@ -10,8 +10,7 @@ from arraygeom import Rig
 
 
 class KeyFrame(NamedTuple):
-    """A frame of alpha that gets colour from betas: its number, and for each beta that of the frame nearest
-    in time."""
+    """A frame of alpha that betas colour: its number, and for each beta that of the frame nearest in time."""
 
     alpha: int
     betas: dict[str, int]
@@ -19,8 +18,7 @@ class KeyFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class Timeline:
-    """When the frames of a sequence were recorded: camera `name`'s frame i at time_offset + i / frame_rate,
-    seconds.
+    """When a sequence's frames were recorded: `name`'s frame i at time_offset + i / frame_rate, seconds.
 
     Raises ValueError for a camera without a frame rate, or without frames.
     """
@@ -66,8 +64,7 @@ class Timeline:
         return 1 / min(max(self.rate(name) for name in self.betas), self.rate(self.alpha))
 
     def key_frames(self) -> list[KeyFrame]:
-        """The key frames: for each frame of the fastest beta the nearest of alpha, if that is within half an
-        interval.
+        """Key frames: for each of the fastest beta the nearest of alpha, if that is within half an interval.
 
         Raises ValueError if there is none: then the recordings do not overlap.
         """

@@ -25,8 +25,7 @@ Fields = Mapping[str, ReceptiveField | None]
 
 @dataclass(frozen=True)
 class Views:
-    """What is fused: images (C, H, W) by camera, the rig that describes them, the camera alpha, the betas'
-    fields."""
+    """What is fused: images (C, H, W) by camera, the rig that describes them, alpha, the betas' fields."""
 
     rig: Rig
     images: Mapping[str, Tensor]
@@ -86,8 +85,7 @@ class Views:
 
 
 LARGEST_VALUE = 32.0
-"""Of an image in 0..1: developed ones of a short exposure exceed 1, and those of 8 bits have values to
-255."""
+"""Of an image in 0..1: developed short exposures exceed 1, and those of 8 bits have values to 255."""
 
 
 def is_in_colour(image: Float[Tensor, "c h w"]) -> bool:

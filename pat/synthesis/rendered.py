@@ -117,8 +117,7 @@ def is_rendered(folder: str | Path) -> bool:
 
 
 UNEVEN = 0.001
-"""Interpolation is off by an eighth of this where it is allowed: a hundredth of a pixel at a disparity of 80.
-"""
+"""Where allowed, interpolation is off by an eighth of this: a hundredth of a pixel at a disparity of 80."""
 
 
 def depth_between(

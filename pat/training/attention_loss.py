@@ -22,8 +22,7 @@ from pat.attention.scores import Compared, log_sum, mean_score
 UNSEEN = 0.1
 """Weight of pixels that beta does not see, against 1 of those it sees. Tuned on nothing."""
 OFF = 1.5
-"""A true position farther than this from its segment, in samples along it or pixels across it, is no target.
-"""
+"""A true position farther than this from its segment, in samples along or pixels across it, is no target."""
 
 
 class Target(NamedTuple):

@@ -77,8 +77,7 @@ class TrainConfig:
     loss: Literal["psnr", "psnr-ssim", "mse"] = "psnr-ssim"
     """On the image: minus the mean PSNR, with or without SSIM, or the mean squared error."""
     attention: float = 0.0
-    """Weight of the cross-entropy of PAT's attention against the true position, beside the loss on the image.
-    """
+    """Weight of the cross-entropy of PAT's attention to the true position, beside the loss on the image."""
     rate: float = 8e-4
     """Learning rate of Adam."""
     momenta: tuple[float, float] = (0.9, 0.99)
