@@ -1,5 +1,4 @@
-"""C3 attention as one operator: checks its inputs, brings the sampling locations into one form, picks a
-backend.
+"""C3 attention as one operator: checks inputs, brings sampling locations into one form, picks a backend.
 
 A sample counts if it is valid and lies on beta's area, [-0.5, W - 0.5] x [-0.5, H - 0.5] (to 1e-3 pixels).
 On that area the bilinear look-up takes coordinates clamped to the border's centres, and the nearest one
@@ -108,8 +107,7 @@ def attend_with_statistics(
     bias: Tensor | None = None,
     backend: Backend = "auto",
 ) -> Attended:
-    """As `attend`, with the expected position of the match, the spread of the weights and the largest of
-    them.
+    """As `attend`, with the match's expected position, the spread of the weights and the largest of them.
 
     The statistics are float32 (float64 for float64 inputs) and differentiable, too.
     """

@@ -10,8 +10,7 @@ from arraygeom.segments import Segments
 
 
 def segment_block_mask(segments: Segments, hw: HW, *, radius: float = 0.5, block: int = 128) -> BlockMask:
-    """For `flex_attention`: alpha's pixels (Ha, Wa), row by row, attend to beta's within `radius` px of their
-    segment.
+    """For `flex_attention`: alpha's pixels (Ha, Wa), row by row, attend to beta's in `radius` px of segments.
 
     `segments` (Ha, Wa) or, of a batch, (B, Ha, Wa); keys are beta's H W pixels, row by row. `block` is that
     of the mask. A query without such a key gets zeros. `Segments.mask` is the same, dense, for

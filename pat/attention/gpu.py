@@ -223,9 +223,7 @@ def _blended(image, pixel, across, below, u, v, channel, D, live, NEAREST, NUMBE
 
 @compiled
 def _places(pixels, alpha_pixels, height, width, PIXELS: tl.constexpr, SHARED):
-    """Some alpha pixels: their indices, which of them exist, where their geometry is, and beta's first
-    pixel.
-    """
+    """Some alpha pixels: their indices, which exist, where their geometry is, and beta's first pixel."""
     p = tl.program_id(0).to(tl.int64) * PIXELS + tl.arange(0, PIXELS)
     place = p % alpha_pixels if SHARED else p
     return p, p < pixels, place, p // alpha_pixels * height * width
@@ -342,9 +340,7 @@ def _add_around(out, pixel, across, below, u, v, weight, x, channel, D, live, sc
 
 @compiled
 def _upstream(statistics, statistics_upstream, p, alive, NUMBER):
-    """Of some pixels: mean x and y, spread, peak, and the gradients by x, y and peak, and by the spread over
-    it.
-    """
+    """Of some pixels: mean x, y, spread, peak; the gradients by x, y and peak, and by spread over it."""
     mean_x = tl.load(statistics + 4 * p, mask=alive, other=0)
     mean_y = tl.load(statistics + 4 * p + 1, mask=alive, other=0)
     spread = tl.load(statistics + 4 * p + 2, mask=alive, other=0)
@@ -373,9 +369,7 @@ def _weight(
 
 @compiled
 def _slope(v0, v1, v2, v3, u, v, x, y, is_best, mean, mean_x, mean_y, spread, peak, gx, gy, gpeak, pull):
-    """The gradient by a sample's weight, less its mean over the weights; `mean` is that of the values'
-    part.
-    """
+    """The gradient by a sample's weight, less its mean over weights; `mean` is that of the values' part."""
     dx, dy = x - mean_x, y - mean_y
     slope = _blend(v0, v1, v2, v3, u, v) - mean + gx * dx + gy * dy
     return (

@@ -30,8 +30,7 @@ LEAST_DEVIATION = 1e-4
 
 
 class SamplePositions(NamedTuple):
-    """Sampling locations in one form: `points` (p, Ha, Wa, n, 2), `mask` (p, Ha, Wa, n or 1), p being 1 or
-    the batch.
+    """Sampling locations in one form: `points` (p, Ha, Wa, n, 2), `mask` (p, Ha, Wa, n or 1), p 1 or batch.
 
     `straight` False: the n points are the samples. True: n is 2, start and end of a segment of `samples`
     samples.
@@ -135,8 +134,7 @@ def _band(inputs: AttentionInputs) -> Attended:
 
 
 def on_image(xy: Tensor, *, hw: tuple[int, int] | torch.Size) -> Tensor:
-    """Whether (..., 2) points lie on the image's area, which reaches half a pixel beyond the border's
-    centres."""
+    """Whether (..., 2) points lie on the image's area, half a pixel beyond the border's centres."""
     last = xy.new_tensor([hw[1] - 0.5, hw[0] - 0.5]) + EDGE_SLACK
     return ((xy >= -0.5 - EDGE_SLACK) & (xy <= last)).all(-1)
 
@@ -159,8 +157,7 @@ def _bilinear(image: Tensor, xy: Tensor) -> Tensor:
 
 
 def _cell(c: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The two pixels around a coordinate on an axis of n pixels, and the fraction (..., 1) of the way
-    between."""
+    """The two pixels around a coordinate on an axis of n pixels, and the fraction (..., 1) between them."""
     c = c.clamp(0, n - 1)
     lower = c.detach().floor().clamp(max=max(n - 2, 0))
     index = lower.long()

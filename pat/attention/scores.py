@@ -26,9 +26,7 @@ SHARPENED = 1e4
 
 
 class Compared(NamedTuple):
-    """A query (B, D, Ha, Wa), and a key and a value (B, D, Hb, Wb), at `locations`, all as `attend` takes
-    them.
-    """
+    """A query (B, D, Ha, Wa), key and value (B, D, Hb, Wb), at `locations`, all as `attend` takes them."""
 
     query: Tensor
     key: Tensor
@@ -80,9 +78,7 @@ def mean_score(compared: Compared) -> Float[Tensor, "b ha wa"]:
 
 @torch.no_grad()
 def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
-    """Where the largest weight is, (x, y) in beta's pixels; 0 where no sample counts. Of equal ones their
-    mean.
-    """
+    """Where the largest weight is, (x, y) in beta's pixels; 0 if no sample counts. Equal ones: their mean."""
     query, key, _, locations, samples, interpolation = compared
     sharp = query.float() * SHARPENED
     found = attend_with_statistics(
@@ -92,9 +88,7 @@ def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
 
 
 class _LogSum(Function):
-    """Its gradient by the query is the attended key; by the key, that of attended values with the query
-    upstream.
-    """
+    """Its gradient by the query: the attended key; by the key: that of attended values, query upstream."""
 
     @staticmethod
     def forward(

@@ -212,8 +212,7 @@ def _differentiate_again(ctx, *cotangents):
 
 
 def _input_again(t: Tensor | None) -> Tensor | None:
-    """An input of the reference: with a graph of its own, behind which is that of the tensor if a third order
-    needs it."""
+    """The reference's input, with its own graph; behind it the tensor's if a third order needs it."""
     if t is None or not t.is_floating_point():
         return t
     return t.view_as(t) if torch.is_grad_enabled() and t.requires_grad else t.detach().requires_grad_()

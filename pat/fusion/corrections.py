@@ -105,8 +105,7 @@ class Corrections:
 def corrections_for(
     network: FusionNetwork, frame: FrameInputs, response: Given, *, align: bool
 ) -> Corrections:
-    """What is to be put right for a network: for one without matches nothing is looked for. Raises as
-    `find_corrections`."""
+    """What to correct for a network: for one without matches nothing. Raises as `find_corrections`."""
     if network.uses_matches:
         return find_corrections(frame, response, align=align)
     return Corrections(_given(response, frame.inputs))

@@ -1,5 +1,4 @@
-"""Beta's bands at alpha's view, by the matches: as bright as alpha, with its detail, and diffused to where
-they are not seen."""
+"""Beta's bands at alpha's view by matches: bright as alpha, with its detail, diffused where not seen."""
 
 from __future__ import annotations
 
@@ -113,8 +112,7 @@ def transferred(inputs: Inputs, found: Matches) -> Matches:
 
 
 def _transferred_piece(piece: Inputs, found: Matches, sharing: Sequence[bool]) -> list[Tensor]:
-    """The diffused colour that betas share, if any do, that of each other beta, and each beta's bands minus
-    alpha."""
+    """The diffused colour betas share, if any do, each other beta's, and each beta's bands minus alpha."""
     alpha = piece.alpha
     alone = [transferred_bands(alpha, *one) for one in zip(piece.betas, found.betas)]
     shared = []
@@ -214,8 +212,7 @@ def match_weight(
 
 
 def likeness(unlike: Float[Tensor, "b 1 h w"], scale: float) -> Float[Tensor, "b 1 h w"]:
-    """1 where two images have the same brightness around a pixel, 1 / e where they differ by `scale`
-    there."""
+    """1 where two images are equally bright around a pixel, 1 / e where they differ by `scale` there."""
     unlike = avg_pool2d(unlike.abs(), 3, 1, 1, count_include_pad=False)
     return torch.exp(-(unlike / scale).square())
 
@@ -244,8 +241,7 @@ def colour_noise(
 
 
 def _without_noise(colour: Tensor, brightness: Tensor, noise: Tensor) -> Tensor:
-    """Colour (B, C, H, W) nearer to its local regression on brightness, the more of what is beside it is
-    noise (Lee 1980)."""
+    """Colour (B, C, H, W) nearer its local regression on brightness, the noisier the rest (Lee 1980)."""
     local = LocalMoments.within(SETTINGS.detail_radius, colour, brightness)
     slope = local.slope(SETTINGS.floor)
     fitted = local.bands + slope * (brightness - local.image)
@@ -263,8 +259,7 @@ def _each_detailed(colour: Tensor, brightness: Tensor, alpha: Tensor, radii: Seq
 def _detailed(
     colour: Tensor, brightness: Tensor, alpha: Tensor, radius: int = SETTINGS.detail_radius
 ) -> Tensor:
-    """Colour (B, C, H, W) moved along its local regression on brightness by what alpha's brightness has
-    beyond it."""
+    """Colour (B, C, H, W) moved along its local regression on brightness by what alpha's has beyond it."""
     return colour + local_slope(colour, brightness, radius) * SETTINGS.detail(alpha - brightness)
 
 

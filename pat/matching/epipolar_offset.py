@@ -1,5 +1,4 @@
-"""How far beta's points lie across their search segments: a camera that has moved a little since its
-calibration.
+"""How far beta's points lie off their search segments: a camera that moved a little since its calibration.
 
 The displacement across the segments is modelled as affine in alpha's pixels: a shift, a rotation about the
 optical axis, another angle of view. It is fitted robustly to displacements of small windows (Lucas and Kanade
@@ -30,8 +29,7 @@ Image = NDArray[Any]
 
 @dataclass(frozen=True)
 class AlignmentSettings:
-    """Lengths are in pixels of the images that are given, brightness is 0 to 1. Middlebury is its tune
-    half."""
+    """Lengths are pixels of the images given, brightness is 0 to 1. Middlebury is its tune half."""
 
     blur: float = tuned(1.5, "Middlebury: standard deviation of the blur before gradients")
     radius: int = tuned(7, "Middlebury: of the windows, to either side")

@@ -1,5 +1,4 @@
-"""What is matched and fused: alpha's image, and for each beta its image and the field of alpha's pixels in
-it."""
+"""What is matched and fused: alpha's image, and each beta's image and field of alpha's pixels in it."""
 
 from __future__ import annotations
 
@@ -127,8 +126,7 @@ class Inputs:
         )
 
     def touched(self, beta: Beta, box: Box, step: int = 2) -> Box:
-        """The part of a beta that the segments of every `step`-th pixel of a box of alpha touch, with the
-        halo."""
+        """The part of a beta the segments of every `step`-th pixel of a box of alpha touch, with the halo."""
         hw = beta.image.shape[-2], beta.image.shape[-1]
         return box_around(_ends_in(beta.field, box, step), hw, self.beta_halo, self.multiple)
 
@@ -147,8 +145,7 @@ def track_in(
     scale: float,
     offset: tuple[float, float],
 ) -> Callable[[Tensor], Track]:
-    """The tracks of pixels that are those of `whole(x)` in alpha, in pixels of beta times a scale, plus an
-    offset."""
+    """Tracks of pixels that are those of `whole(x)` in alpha, in pixels of beta times a scale plus offset."""
 
     def changed(v: Tensor) -> Tensor:
         return torch.cat([scale * v[..., :2] + v.new_tensor(offset) * v[..., 2:], v[..., 2:]], -1)
@@ -164,8 +161,7 @@ def ends_of(found: Segments | Positions) -> Float[Tensor, "n 2"]:
 
 
 def box_around(points: Float[Tensor, "n 2"], hw: HW, halo: int, multiple: int) -> Box:
-    """The part of an image around points (x, y), with a halo, its corners at whole multiples or the image's
-    end."""
+    """The part of an image around points (x, y), with a halo, corners at whole multiples or the end."""
     if not len(points):
         return 0, multiple, 0, multiple
     low, high = points.amin(0) - halo, points.amax(0) + halo

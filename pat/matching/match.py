@@ -1,5 +1,4 @@
-"""The door of this room: `match` says where the pixels of alpha are in each beta, and what the betas show
-there."""
+"""The door of this room: `match` says where alpha's pixels are in each beta, and what betas show there."""
 
 from __future__ import annotations
 
@@ -42,8 +41,7 @@ class MatchSettings:
 SETTINGS = MatchSettings()
 
 Matcher = Callable[[Inputs], Matches]
-"""What `fuse` asks for matches of inputs whose sides are whole multiples of `inputs.multiple`: `match`, or
-your own."""
+"""What `fuse` asks for matches of inputs, sides whole multiples of `inputs.multiple`: `match` or yours."""
 
 
 def match(inputs: Inputs) -> Matches:
@@ -60,8 +58,7 @@ def match(inputs: Inputs) -> Matches:
 
 @torch.no_grad()
 def located(inputs: Inputs) -> Matches:
-    """Where alpha's pixels are in each beta, without colours; of several calibrated betas, where all
-    agree."""
+    """Where alpha's pixels are in each beta, no colours; of several calibrated betas, where all agree."""
     alone = Matches(tuple(located_in_one(one) for one in inputs.by_beta))
     return agreed(inputs, with_certainty(alone)) if inputs.can_agree else alone
 

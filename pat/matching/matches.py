@@ -58,8 +58,7 @@ class BetaMatches:
         return self.bands, self.diffused
 
     def positions(self, segments: Segments, hw: HW) -> tuple[Float[Tensor, "b h w 2"], Bool[Tensor, "b h w"]]:
-        """The matches in a beta of this size (x, y), by the segments of alpha's pixels; whether they are on
-        it."""
+        """Matches in a beta of this size (x, y), by segments of alpha's pixels; whether they are on it."""
         where = matches(segments, self.disparity, beyond_edge=True)
         return where, segments.valid & on_image(where, hw)
 

@@ -72,13 +72,11 @@ SETTINGS = MultiviewSettings()
 
 
 STRIP = 1 << 16
-"""Alpha's pixels that are compared at a time, in rows: what is computed on the way stays in a core's
-cache."""
+"""Alpha's pixels compared at a time, in rows: what is computed on the way stays in a core's cache."""
 
 
 class Ambiguity(NamedTuple):
-    """What may be between inverse depths that two betas give to alpha's pixels: own = scale other + plane (x,
-    y, 1).
+    """What two betas' inverse depths of alpha's pixels may differ by: own = scale other + plane (x, y, 1).
 
     As far as it is known from the images alone, the geometry of two views is known up to this (Hartley,
     Zisserman 2004, chapter 10). Cameras that were found by pairs do not agree on depth but by it.
@@ -110,8 +108,7 @@ class MatchedBeta:
     def of(
         cls, beta: Beta, found: BetaMatches, rows: tuple[int, int], ambiguity: Ambiguity = NO_AMBIGUITY
     ) -> MatchedBeta:
-        """Of a beta with a track and its own matches, at some of alpha's rows: from an even one to an even
-        one."""
+        """Of a beta with a track and its own matches, at some rows of alpha: from an even to an even one."""
         top, bottom = rows
         pixels, disparity = beta.field.straight, found.disparity[0, 0, top:bottom]
         start, end = (x[0, top:bottom].double() for x in (pixels.start, pixels.end))
@@ -172,8 +169,7 @@ class MatchedBeta:
         buffer.scatter_reduce_(0, self._index(inverse_depth).flatten(), inverse_depth.flatten(), "amax")
 
     def hidden(self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
-        """By how many pixels the nearest point seen at the same pixel of beta differs; infinite outside the
-        image."""
+        """By how many pixels the nearest point at the same pixel of beta differs; infinite off the image."""
         index = self._index(inverse_depth)
         (x, y), (u, v) = self._seen(buffer[index]), self._seen(inverse_depth)
         apart = torch.hypot(x - u, y - v)  # not along the segments: around a known depth they may be points
@@ -241,8 +237,7 @@ def agreed(inputs: Inputs, matches: Matches) -> Matches:
 
 
 def ambiguities(inputs: Inputs, found: Sequence[BetaMatches]) -> list[Ambiguity]:
-    """Of each beta against the one whose matches tell most: none, unless clearly more pixels agree with
-    one."""
+    """Of each beta against that whose matches tell most: none unless clearly more pixels agree with one."""
     step = max(inputs.hw[0] // SETTINGS.sampled_rows // FINE, 1) * FINE
     rows = [(top, top + FINE) for top in range(0, inputs.hw[0], step)]
     sampled = [_Sampled.of(inputs.betas[i], found[i], rows) for i in range(len(found))]

@@ -90,8 +90,7 @@ def mean_moments(images: Iterable[Float[Tensor, "c h w"]]) -> Moments:
 def explained_share(
     image: Float[Tensor, "b 1 h w"], of: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 1 1"]:
-    """The share of one image's variance that another explains where the weight is, 0 if one is the other's
-    negative.
+    """The share of one image's variance another explains where weighted, 0 if one is the other's negative.
 
     Small for an alpha in the near infrared: its detail says little of visible colours.
     """
@@ -106,8 +105,7 @@ def _weighted_mean(image: Tensor, weight: Tensor) -> Float[Tensor, "*b 1 1 1"]:
 
 
 class ComparedViews(NamedTuple):
-    """Alpha and what of beta is compared with it, (B, 1, ., .), equally bright and sharp; alpha in 8 bits (B,
-    h, w)."""
+    """Alpha and beta for comparison, (B, 1, ., .), equally bright and sharp; alpha in 8 bits (B, h, w)."""
 
     alpha: Tensor
     beta: Tensor

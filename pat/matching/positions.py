@@ -44,8 +44,7 @@ def matches(
     beyond_edge: bool = False,
     extent: Extent | None = None,
 ) -> Float[Tensor, "b h w 2"]:
-    """Where the alpha pixels of segments (B or 1, H, W) have their matches `disparity` from the ends, beta's
-    pixels.
+    """Where alpha pixels of segments (B or 1, H, W) match, `disparity` from the ends, in beta's pixels.
 
     Disparity may be at half the size. Not beyond the segments' near ends, unless `beyond_edge`. `extent` is
     the segments', if it is known.

@@ -171,8 +171,7 @@ Given = Literal["fit", "rec601"] | tuple[float, float, float] | Response
 
 
 def stated_response(weights: Sequence[float]) -> Response:
-    """The response of an alpha that is weights . beta. Raises ValueError unless these are three, none
-    negative."""
+    """The response of an alpha that is weights . beta. Raises ValueError unless three, none negative."""
     values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
     if values.shape != (3,) or not bool((values >= 0).all() & (values.sum() > 0) & values.isfinite().all()):
         raise ValueError(
@@ -213,8 +212,7 @@ def fit(
 
 
 class _Fit(NamedTuple):
-    """`counts` is what the square of each point's residual counts, in 1 / variance of independent
-    observations."""
+    """`counts`: what the square of each point's residual counts, 1 / variance of independent observations."""
 
     weights: Float[Tensor, "3"]
     counts: Float[Tensor, " n"]
@@ -223,8 +221,7 @@ class _Fit(NamedTuple):
 
 
 def _best_gamma(x: Tensor, y: Tensor) -> tuple[float, _Fit]:
-    """1, or the gamma that explains alpha clearly better; of several the one with the most plausible
-    response."""
+    """1, or the gamma that explains alpha clearly better; of several, that of the most plausible response."""
     trials = {gamma: _weighted_fit(x**gamma, y) for gamma in SETTINGS.gammas}
     least = min(trial.error for trial in trials.values())
     if least > SETTINGS.better * trials[1.0].error:
@@ -251,8 +248,7 @@ def _plausible(slopes: Tensor, terms: Tensor) -> bool:
 
 
 def _shading(x: Tensor, y: Tensor, terms: Tensor) -> Float[Tensor, "5"]:
-    """Coefficients of the logarithm of alpha over what explains it, by least squares with the fit's
-    weights."""
+    """Coefficients of alpha's logarithm over what explains it, by least squares with the fit's weights."""
     slopes = terms.new_zeros(len(terms))
     design = torch.cat([terms, torch.ones_like(terms[:1])])
     for _ in range(3):

@@ -69,8 +69,7 @@ CONSISTENT, DISPARITY_FILL = HALF_SIZE.consistent, HALF_SIZE.fill
 
 
 class HalfSizeMatches(NamedTuple):
-    """Matches at half the size: `disparity` (B, 1, H / 2, W / 2) in pixels of beta; facts as of
-    `BetaMatches`."""
+    """Matches at half size: `disparity` (B, 1, H / 2, W / 2) in pixels of beta; facts as of `BetaMatches`."""
 
     disparity: Tensor
     facts: Tensor
@@ -114,8 +113,7 @@ class _Geometry(NamedTuple):
 
 
 def matched_at_half_size(views: ComparedViews, blocks: Segments) -> HalfSizeMatches:
-    """Matches of views at half the size; `blocks` are the segments of their pixels, in those of the whole
-    beta."""
+    """Matches of views at half size; `blocks`: the segments of their pixels, in those of the whole beta."""
     own, other = views.alpha, views.beta
     geometry = geometry_of(blocks, len(own), (FINE * other.shape[-2], FINE * other.shape[-1]))
     del blocks
@@ -124,8 +122,7 @@ def matched_at_half_size(views: ComparedViews, blocks: Segments) -> HalfSizeMatc
 
 
 def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int = FINE) -> _Geometry:
-    """In pixels of a beta that is so many times smaller. An invalid segment's length is negative: it has no
-    pixel.
+    """In pixels of a beta so many times smaller. An invalid segment's length is negative: it has no pixel.
 
     Segments that start beyond the centres of beta's outermost pixels may have been cut there.
     """
@@ -219,8 +216,7 @@ def flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
 
 
 def _boxes(hw: Sequence[int], along: NDArray, labels: int, settings: SemiGlobalSettings) -> list[tuple]:
-    """Blocks with their margins: as high as an image with few costs, else longer along the segments than
-    across."""
+    """Blocks and margins: as high as an image with few costs, else longer along the segments than across."""
     side, margin = settings.block, settings.margin
     if hw[0] * (side + 2 * margin) * labels <= settings.most_costs:
         return list(inner_and_outer(hw, margin, hw[0], side))

@@ -1,5 +1,4 @@
-"""The compiled loops of `pat.matching.semi_global`, each on one image, in one thread and without Python's
-lock.
+"""Compiled loops of `pat.matching.semi_global`, each on one image, in one thread, without Python's lock.
 
 Each pixel has one or two *runs* of `count` consecutive labels, which begin at `first` (h, w, runs) and do not
 overlap. Costs and sums of a run are in lanes, of which those after the last label mean nothing: a single run
@@ -34,8 +33,7 @@ MOST_BEYOND = np.float32(0.3)
 ONE = np.float32(1.0)
 HALF = np.float32(0.5)
 PARTS = 16
-"""Sums of costs are whole numbers of a 16th, of 16 bits: twice as many as floats go through memory in the
-same time."""
+"""Sums of costs are whole 16ths in 16 bits: twice as many as floats go through memory in the same time."""
 WALL = np.int16(30000)
 """More than a sum of costs along a path can be, in parts."""
 
@@ -66,8 +64,7 @@ def _count_within(length, first, count):
 
 @compiled(nogil=True, cache=True)
 def costs(own, other, first, count, end, along, length, cut, rows, columns, out):
-    """Cost of alpha's pixel and beta's at each label: out (h, w, runs, lanes). `own` and `other` are flat
-    planes of `cost`.
+    """Cost of alpha's pixel and beta's by label: out (h, w, runs, lanes). `own`, `other`: flat `cost` planes.
 
     The label l lies l pixels from `end` along the unit vectors `along`; those beyond `length` are nowhere,
     or, where it is beta's edge that cuts the segment, not seen.
@@ -187,16 +184,14 @@ def _least(code, path):
 
 @compiled(inline="always")
 def _jumps(own, other, small, large, out):
-    """The penalties of labels that differ by more than one, between pixels of alpha's brightness; in
-    parts."""
+    """Penalties of labels that differ by more than one, between pixels of alpha's brightness; in parts."""
     for i in range(len(own)):
         out[i] = np.int16(max(small + ONE, large / (ONE + abs(own[i] - other[i]) / EDGE)) * PARTS + HALF)
 
 
 @compiled(nogil=True, cache=True)
 def aggregate(cost, guide, first, count, small, large, total):
-    """The sum over eight paths of semi-global matching (Hirschmüller 2008), in parts: total (h, w, runs,
-    lanes), int16.
+    """Sum over eight semi-global paths (Hirschmüller 2008), in parts: total (h, w, runs, lanes), int16.
 
     Penalties of neighbours whose labels differ by one (small), and by more (large, where alpha shows no
     edge).
@@ -397,8 +392,7 @@ def _lowest(costs, first, last):
 
 @compiled(inline="always")
 def _rounding(end, along, label):
-    """How far along its segment a label's pixel of beta, to which its position is rounded, is from that
-    position."""
+    """How far along its segment a label's pixel of beta, its rounded position, is from that position."""
     x, y = end[0] + label * along[0], end[1] + label * along[1]
     return (np.floor(x + HALF) - x) * along[0] + (np.floor(y + HALF) - y) * along[1]
 

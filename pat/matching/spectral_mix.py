@@ -57,8 +57,7 @@ SETTINGS = MixSettings()
 
 
 class SpectralMix(NamedTuple):
-    """The combination of C bands that is most like alpha, for each of a batch: offset + sum of weights times
-    bands.
+    """The combination of C bands most like alpha, for each of a batch: offset + sum of weights times bands.
 
     slopes: (B, C), by how much each band rises where the combination rises by 1 from one pixel to the next;
         less if that explains alpha badly.
@@ -130,8 +129,7 @@ def _mix(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def _combination(x: Tensor, y: Tensor, weight: Tensor) -> RobustFit:
-    """Weights (C) with which bands x (C, n) make y (n), both about 0; drawn to equal ones. The second time
-    without outliers."""
+    """Weights (C) by which bands x (C, n) make y (n), both about 0, drawn to equal; then without outliers."""
     share, mean = weight / weight.sum(), x.mean(0)
     scale = (share @ y.square()).sqrt() / (share @ mean.square()).sqrt().clamp(min=1e-3)
     equal = scale.expand(len(x)) / len(x)
@@ -148,8 +146,7 @@ def _combination(x: Tensor, y: Tensor, weight: Tensor) -> RobustFit:
 
 
 def _beyond_local_mean(planes: Tensor, weight: Tensor) -> Tensor:
-    """Planes (c, h, w) less their weighted mean in wide squares: light and lenses differ between views,
-    slowly."""
+    """Planes (c, h, w) less their weighted mean in wide squares: light and lenses of views differ, slowly."""
     radius = max(planes.shape[-2:]) // SETTINGS.wide
     return planes - (box_mean((planes * weight)[None], radius) / box_mean(weight[None], radius))[0]
 
@@ -160,8 +157,7 @@ def _mean_around(planes: Tensor, radius: int) -> Tensor:
 
 
 def _smooth_misfit(rest: Tensor, share: Tensor) -> Tensor:
-    """Root mean square of the rest (1, h, w) averaged around each pixel: errors of matches, at edges, average
-    out."""
+    """Root mean square of the rest (1, h, w) around each pixel: matches' errors, at edges, average out."""
     total = _mean_around(share, SETTINGS.smooth).clamp(min=1e-12)
     smooth = _mean_around(share * rest, SETTINGS.smooth) / total
     return (share * smooth.square()).sum().sqrt()

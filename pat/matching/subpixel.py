@@ -1,5 +1,4 @@
-"""Where alpha's pixels are in beta: semi-global matching at half the size, then at full size over few labels
-around it.
+"""Where alpha's pixels are in beta: semi-global matching at half size, then at full size over few labels.
 
 At half the size an object's edge is some two pixels off and a slope is in steps. Here each pixel chooses, at
 full size, between labels around the least and around the greatest disparity of its neighbourhood at half the
@@ -34,8 +33,7 @@ FULL_SIZE = SemiGlobalSettings(
     jump=80.0,
     margin=48,
 )
-"""Penalties chosen on Middlebury's pairs of the tune half; half the size, where a label is two pixels, has
-others."""
+"""Penalties chosen on Middlebury's tune half; half the size, where a label is two pixels, has others."""
 
 
 @dataclass(frozen=True)
@@ -114,8 +112,7 @@ def _following(alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaMatches:
 def with_gradients(
     views: ComparedViews, segments: Segments, disparity: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 h w"]:
-    """The same disparity, with the gradients of where brightness along the segments agrees best around each
-    pixel.
+    """The same disparity, with gradients of where brightness along the segments agrees best at each pixel.
 
     By the implicit function theorem: there the least squares' step is zero, and stays so if the match moves
     by as much as images and segments move the step.

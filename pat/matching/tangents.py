@@ -1,5 +1,4 @@
-"""Fields of explicit positions for networks that sample segments: the tangents of their curves at a first
-match.
+"""Fields of explicit positions for networks that sample segments: their curves' tangents at a first match.
 
 Where a pixel's positions follow each other along a curve they are labels like those of a segment: semi-global
 matching at half the size finds one, among neighbours that agree. Positions without an order (a window, the
@@ -53,8 +52,7 @@ AT_ONCE = 1 << 21
 def along_tangents(
     alpha: Float[Tensor, "1 1 h w"], guide: Float[Tensor, "1 1 hb wb"], field: FieldOnGrid, name: str = "beta"
 ) -> FieldOnGrid:
-    """A field of positions of one rig as segments through its matches in the one beta; sides of images are
-    even.
+    """One rig's field of positions as segments through its matches in the one beta; images' sides are even.
 
     Warns of positions that have no order. The label of each pixel is a constant; positions keep their
     gradients.
@@ -216,8 +214,7 @@ def _tangents(found: Positions, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]
 
 
 def _around(found: Chosen, guide: NDArray[np.uint8]) -> Segments:
-    """Segments along x around positions that were chosen alone, which a median makes agree with their
-    neighbours."""
+    """Segments along x around positions chosen alone, which a median makes agree with their neighbours."""
     xy = found.xy.detach().float().numpy()
     smooth = np.stack([cv2.medianBlur(np.ascontiguousarray(xy[..., i]), 5) for i in range(2)], -1)
     middle = torch.from_numpy(smooth).to(found.xy)

@@ -19,9 +19,7 @@ REC709 = (0.2126, 0.7152, 0.0722)
 def luminance(
     rgb: Float[Tensor, "*b 3 h w"], weights: tuple[float, float, float] = REC601
 ) -> Float[Tensor, "*b 1 h w"]:
-    """Rec. 601 luma of sRGB values, 0.299 R + 0.587 G + 0.114 B, as MATLAB's rgb2gray and OpenCV; or other
-    weights.
-    """
+    """Rec. 601 luma of sRGB, .299 R + .587 G + .114 B, as MATLAB's rgb2gray and OpenCV; or other weights."""
     red, green, blue = (weight * plane for weight, plane in zip(weights, rgb.split(1, -3)))
     return red + green + blue
 
@@ -50,9 +48,7 @@ def luminance_of(image: Float[Tensor, "_ h w"]) -> Float[Tensor, "_ h w"]:
 
 
 def linear_from_srgb(values: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Linear light of sRGB-encoded values (IEC 61966-2-1); the linear part of the curve continues below
-    zero.
-    """
+    """Linear light of sRGB-encoded values (IEC 61966-2-1); the curve's linear part continues below zero."""
     toe = values <= 0.04045
     return torch.where(toe, values / 12.92, ((torch.where(toe, 0.5, values) + 0.055) / 1.055) ** 2.4)
 
@@ -83,9 +79,7 @@ WANTED = 0.8
 
 
 def exposure_gain(image: Float[Tensor, "c h w"]) -> float:
-    """The factor of linear light that brings a dark or an overexposed image to a sensible brightness; 1 for
-    others.
-    """
+    """The factor of linear light that makes a dark or overexposed image sensibly bright; 1 for others."""
     light = linear_from_srgb(luminance_of(image).mean(0)).flatten()
     brightest = float(light[:: max(light.numel() // 100_000, 1)].quantile(BRIGHT))
     if ORDINARY[0] <= brightest <= ORDINARY[1] or brightest <= 1e-4:

@@ -71,9 +71,7 @@ def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = 
 
 
 def _pfm(path: Path) -> NDArray[np.float32]:
-    """A grey PFM file: text "Pf", width and height, scale (negative: little-endian), then rows from the
-    bottom up.
-    """
+    """A grey PFM file: "Pf", width and height, scale (negative: little-endian), rows from the bottom up."""
     content = path.read_bytes()
     head = re.match(rb"Pf\s+(\d+)\s+(\d+)\s+(-?[0-9.eE+-]+)\s", content)
     if head is None:
@@ -95,8 +93,7 @@ def _stated_scale(path: Path) -> float | None:
 def write_points(
     path: Path, camera: Camera, depth: Float[Tensor, "h w"], image: Float[Tensor, "c h w"]
 ) -> int:
-    """Write the pixels of known depth as a coloured point cloud (binary PLY), atomically; returns their
-    number.
+    """Write the pixels of known depth as a coloured point cloud (binary PLY), atomically; returns how many.
 
     Coordinates are the camera's: x right, y down, z ahead, in the unit of the depth. An image of one band is
     grey.

@@ -1,6 +1,4 @@
-"""What the head of an image file states: its size before anything is decoded, its orientation, its focal
-length.
-"""
+"""What an image file's head states: its size before anything is decoded, orientation, focal length."""
 
 from __future__ import annotations
 
@@ -33,8 +31,7 @@ _FILES: dict[bytes, Any] = {b"\xff\xd8": JpegImageFile, b"RI": WebPImageFile, b"
 
 
 class ImageHeader(NamedTuple):
-    """(height, width) as stored, the orientation tag (1 to 8; 1 without one), and the bits a value of a TIFF,
-    PNG or PNM file (else 0).
+    """Stored (height, width), orientation tag (1 to 8; else 1), bits a value of TIFF, PNG, PNM (else 0).
 
     `tag` is where a TIFF file has its orientation: byte offset and struct format; None without one, and in
     other files.

@@ -54,8 +54,7 @@ def read_image(
     hw: HW | None = None,
     orientation: Literal["apply", "ignore"] = "apply",
 ) -> Float[Tensor, "c h w"]:
-    """The image in a PNG, TIFF, JPEG, PNM, BMP, WebP or HEIC file: grey (1, H, W) or RGB (3, H, W), float32,
-    0..1.
+    """The image in a PNG, TIFF, JPEG, PNM, BMP, WebP or HEIC: grey (1, H, W) or RGB (3, H, W), float32, 0..1.
 
     HEIC, which needs the extra `heic`, has 8 bits here and is rotated as its own header says. Raw files of
     cameras (DNG and others), which need the extra `raw`, are developed to sRGB by LibRaw. An image of 8 bits
@@ -85,8 +84,7 @@ def read_recorded(
     hw: HW | None = None,
     orientation: Literal["apply", "ignore"] = "apply",
 ) -> NDArray[Any]:
-    """The values (C, H, W) of an image file in its own type and counts; else, and in what it raises, as
-    `read_image`.
+    """Values (C, H, W) of an image file in its own type and counts; else, and in errors, as `read_image`.
 
     Those that a TIFF file packs into less than 16 bits are as its camera counted them.
     """
@@ -179,9 +177,7 @@ def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
 
 
 def _png_of_raw(path: Path, label: str) -> bytes:
-    """A camera's raw file, developed to sRGB in 16 bits with the camera's white balance and upright, as a PNG
-    file.
-    """
+    """A camera's raw file as PNG: developed to sRGB in 16 bits with the camera's white balance, upright."""
     try:
         import rawpy
     except ImportError:
@@ -238,8 +234,7 @@ def _upright(values: NDArray, orientation: int) -> NDArray:
 
 
 def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, int]:
-    """The values as stored, and how many bits a value has in a TIFF file that packs them into less than 16;
-    else 0.
+    """Values as stored, and the bits of a value in a TIFF file that packs them into less than 16; else 0.
 
     OpenCV shifts packed values up to 16 bits.
     """
@@ -280,9 +275,7 @@ def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray | None
 
 
 def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | None:
-    """What OpenCV makes of an image file; None for what is none, or has a side under `least` or too many
-    pixels.
-    """
+    """What OpenCV makes of an image file; None if it is none, has a side under `least` or too many pixels."""
     content = path.read_bytes()
     header = image_header(content)
     if header is None or min(header.hw) < least or header.hw[0] * header.hw[1] > MOST_PIXELS:

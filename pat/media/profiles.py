@@ -1,6 +1,4 @@
-"""Colour profiles (ICC): images are converted to sRGB when they are read, and say that they are sRGB when
-written.
-"""
+"""Colour profiles (ICC): images are converted to sRGB when read, and say that they are sRGB when written."""
 
 from __future__ import annotations
 
@@ -28,8 +26,7 @@ def srgb_profile() -> bytes:
 
 
 def in_srgb(values: NDArray, content: bytes, label: str) -> NDArray:
-    """Values (H, W) or (H, W, 3; blue first) of the image file `content`, converted to sRGB if it has another
-    profile.
+    """Values (H, W) or (H, W, 3; blue first) of image file `content`, made sRGB if its profile is another.
 
     Warns that they were; or that they were not, for 16 bits and for profiles that cannot be used.
     """

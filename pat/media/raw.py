@@ -76,9 +76,7 @@ def as_bright(
 
 
 def _missing(image: Tensor, light: Tensor) -> Tensor:
-    """The shift of sRGB values that gives this luminance of light; Newton's method on a convex function, from
-    above.
-    """
+    """The shift of sRGB values giving this luminance of light; Newton on a convex function, from above."""
     shift = torch.zeros_like(light)
     for _ in range(4):
         value = image + shift
@@ -105,9 +103,7 @@ def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h 
 
 
 def light_of(sensor: Sensor, like: Sensor) -> float:
-    """The value (1 is white) that `sensor` records, in grey or green, of light that is 1 on `like`'s
-    scale.
-    """
+    """The value (1 is white) that `sensor` records, grey or green, of light that is 1 on `like`'s scale."""
     return 1 / _light(sensor, like)[1]
 
 

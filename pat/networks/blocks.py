@@ -30,8 +30,7 @@ class ResidualBlock(nn.Module):
 
 
 class ResidualASPP(nn.Module):
-    """Three groups of atrous convolutions (dilations 1, 4, 8), each fused by 1x1 and added (Wang et al.
-    2019)."""
+    """Three atrous groups (dilations 1, 4, 8), each fused by 1x1 convolution and added (Wang et al. 2019)."""
 
     def __init__(self, dim: int, dilations: tuple[int, ...] = (1, 4, 8)) -> None:
         super().__init__()
@@ -60,8 +59,7 @@ def conv(inputs: int, outputs: int, *, stride: int = 1) -> nn.Sequential:
 
 
 def channels_last(x: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d h w"]:
-    """The same with the channels beside each other in memory: convolutions on the CPU take about half the
-    time."""
+    """The same, channels beside each other in memory: convolutions on the CPU take about half the time."""
     return x.contiguous(memory_format=torch.channels_last)
 
 
@@ -71,8 +69,7 @@ def plain(x: Tensor) -> bool:
 
 
 def stacked(*parts: Float[Tensor, "b _ _ _"]) -> Float[Tensor, "b d h w"]:
-    """The channels of all parts, `channels_last`. Of parts of twice the size the 2x2 pixels become channels,
-    as by `pixel_unshuffle`."""
+    """All parts' channels, `channels_last`; 2x2 pixels of parts twice the size as in `pixel_unshuffle`."""
     h, w = (min(part.shape[side] for part in parts) for side in (-2, -1))
     if not all(map(plain, parts)):
         same = (part if part.shape[-1] == w else pixel_unshuffle(part, 2) for part in parts)

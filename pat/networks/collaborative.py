@@ -1,5 +1,4 @@
-"""Noise taken out of groups of alike blocks, as by BM3D (Dabov et al. 2007), beginning with a network's
-estimate.
+"""Noise taken out of groups of alike blocks, like BM3D (Dabov et al. 2007), from a network's estimate.
 
 Blocks of 8 x 8 pixels are stacked with those most alike near them. A cosine transform of each and a Hadamard
 transform over the stack gather what they have in common in few coefficients, and noise spreads over all of
@@ -100,8 +99,7 @@ def _filtered(estimate: Tensor, recorded: Tensor, deviation: Tensor, guide: Tens
 def luma_refined(
     image: Float[Tensor, "3 h w"], alpha: Float[Tensor, "1 h w"], deviation: Float[Tensor, "1 h w"]
 ) -> Float[Tensor, "3 h w"]:
-    """An RGB image whose luma is corrected by alpha as it was recorded, with noise of this standard
-    deviation."""
+    """An RGB image, its luma corrected by alpha as recorded, with noise of this standard deviation."""
     luma = luminance(image)
     found = wiener_filtered(alpha, luma, deviation, _guide(luma, alpha))
     return image + (1 - KEPT) * (found - luma)
@@ -117,8 +115,7 @@ def wiener_filtered(
     deviation: Float[Tensor, "c h w"],
     guide: Float[Tensor, "g h w"],
 ) -> Float[Tensor, "c h w"]:
-    """An image without white noise of this standard deviation; `expected` is an estimate of what it is
-    without it."""
+    """An image without white noise of this standard deviation; `expected` estimates it without noise."""
     return collaboratively_filtered(image, expected, guide, deviation, threshold=0.0)
 
 
@@ -177,8 +174,7 @@ WINDOW = np.outer(np.kaiser(SIDE, 2.0), np.kaiser(SIDE, 2.0)).astype(np.float32)
 
 @compiled(nogil=True, cache=True, fastmath=True)
 def find_alike(guide, top, found):
-    """Fill `found` (rows, columns, ALIKE, 2) with the displacements (y, x) of the blocks most alike each
-    block.
+    """Fill `found` (rows, columns, ALIKE, 2) with displacements (y, x) of the blocks most alike each one.
 
     Block (r, k) begins at pixel (STEP (top + r), STEP k), RADIUS pixels inside; the first found is itself.
     """
@@ -250,8 +246,7 @@ def group_transform(blocks):
 
 @compiled(nogil=True, cache=True, fastmath=True)
 def filter_groups(image, expected, variance, top, found, cosines, window, threshold, out):
-    """Add to `out` (2, c, rows, w), from the first row of blocks: every filtered block, weighted, and the
-    weights."""
+    """Add to `out` (2, c, rows, w), from its first row of blocks: filtered blocks, weighted, and weights."""
     rows, columns = found.shape[:2]
     seen = np.empty((SIDE * SIDE, ALIKE), np.float32)
     known = np.empty((SIDE * SIDE, ALIKE), np.float32)

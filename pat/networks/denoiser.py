@@ -1,5 +1,4 @@
-"""Networks that remove noise of a known level: from one image, and from a fused image with the help of every
-view."""
+"""Networks removing noise of a known level: from one image, and from a fused one with every view's help."""
 
 from __future__ import annotations
 
@@ -41,8 +40,7 @@ OPPONENT = ((3**-0.5, 3**-0.5, 3**-0.5), (2**-0.5, 0.0, -(2**-0.5)), (6**-0.5, -
 
 @dataclass(frozen=True)
 class DenoiserConfig:
-    """Widths at 1/2, 1/4 and 1/8 of the size: of the network for one band, for three, and for the fused
-    image."""
+    """Widths at 1/2, 1/4 and 1/8 size: the networks' for one band, for three, and for the fused image."""
 
     band: tuple[int, int, int] = (24, 32, 32)
     colour: tuple[int, int, int] = (32, 32, 32)
@@ -63,8 +61,7 @@ class NoisyView(NamedTuple):
 
 
 class Denoising(nn.Module):
-    """An image minus its noise, estimated in units of a standard deviation: where that is 0 it stays as it
-    is."""
+    """An image minus its noise, estimated in units of a standard deviation: at 0 it stays as it is."""
 
     def __init__(self, bands: int, widths: tuple[int, int, int], *, further: int = 0) -> None:
         super().__init__()
@@ -163,8 +160,7 @@ class LowLightNetwork(nn.Module):
 
 
 def over_flips(network: Callable[..., Tensor], *images: Float[Tensor, "b _ h w"]) -> Tensor:
-    """The mean of a network's results on the images as they are and flipped: its own errors differ, and
-    average out."""
+    """The mean of a network's results on images as they are and flipped: its own errors average out."""
     total: Tensor | float = 0.0
     for axes in ((), (-1,), (-2,), (-2, -1)):
         total = total + network(*(image.flip(axes) for image in images)).flip(axes)

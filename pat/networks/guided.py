@@ -107,8 +107,7 @@ class BetaEstimate(NamedTuple):
         return (self.logit + unlike + (alike - unlike) * self.likeness).sigmoid()
 
     def beyond(self, base: Float[Tensor, "b c h w"], band: int) -> BetaEstimate:
-        """One band alone, counted from a base instead of from alpha; `base` (B, C, H, W) is bands minus
-        alpha."""
+        """One band, counted from a base instead of from alpha; `base` (B, C, H, W) is bands minus alpha."""
         of = slice(band, band + 1)
         return self._replace(
             colour=(self.colour - base)[:, of], diffused=(self.diffused - base[:, None])[:, :, of]
@@ -123,8 +122,7 @@ class Encoded(NamedTuple):
 
 
 class GuidedPAT(nn.Module):
-    """Betas whose bands, in order, are the output's: three cameras with filters, or any number of RGB
-    cameras.
+    """Betas whose bands, in order, are the output's: three filtered cameras, or any number in RGB.
 
     Other betas beside those with all bands help to find depth.
 
@@ -158,14 +156,12 @@ class GuidedPAT(nn.Module):
             self.head = Head(4 * (1 + 3 * c.bands) + 2 * w2, c.head_dim, c.bands)
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
-        """In the head; or around attention, which comes for one beta after the other; and the estimates of
-        others."""
+        """In the head; or around attention, one beta after the other, and the estimates of others."""
         most = max(betas, default=0)
         return max(350.0 * alpha, 145.0 * alpha + 100.0 * most) + 130.0 * alpha * max(len(betas) - 1, 0)
 
     def _in_parts(self, inputs: Inputs) -> bool:
-        """Whether each beta has some of the bands, in order; else those with all of them show the same
-        colours."""
+        """Whether each beta has some bands, in order; else those with all of them show the same colours."""
         return (
             all(beta.image.shape[1] != self.config.bands for beta in inputs.betas) or len(inputs.betas) == 1
         )
@@ -255,8 +251,7 @@ class GuidedPAT(nn.Module):
         return self.confidence(stacked(enlarge(context), own.half, matched, facts))
 
     def _key(self, features: Encoded) -> Tensor:
-        """What queries and keys are at full size; the channels are beside each other, as attention wants
-        them."""
+        """What queries and keys are at full size; channels beside each other, as attention wants them."""
         weight, bias = (
             p.unflatten(0, (-1, 2, 2)).movedim(0, 2).flatten(0, 2) for p in self.fine_key.parameters()
         )
@@ -281,8 +276,7 @@ def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]
 
 
 def combined(estimates: Sequence[BetaEstimate]) -> BetaEstimate:
-    """The estimate of several betas with the same bands: what each shows, weighted by its odds of being
-    right.
+    """The estimate of several betas of the same bands: what each shows, weighted by its odds of being right.
 
     Beside depth's edges one beta may show another surface and be as confident as the others: its brightness
     tells.
@@ -323,8 +317,7 @@ class ConfidenceHead(nn.Sequential):
 
 
 class Propagation(nn.Module):
-    """C3 attention of alpha to itself: each pixel takes colour from similar pixels of high weight in 7 x 7
-    around it.
+    """C3 attention of alpha to itself: each pixel takes colour from similar ones of high weight in 7 x 7.
 
     The logarithm of the weight is added to the scores as one more channel of the keys. Without training all
     pixels are equally similar, and this is a normalised convolution.
@@ -353,8 +346,7 @@ class Propagation(nn.Module):
 def window_around(
     disparity: Float[Tensor, "b 1 h w"], segments: Segments, window: float, extent: Extent | None = None
 ) -> Segments:
-    """The parts of segments (B or 1, 2 h, 2 w) up to `window` pixels from the match at `disparity` from their
-    end."""
+    """Parts of segments (B or 1, 2 h, 2 w) up to `window` pixels from a match `disparity` from the end."""
     extent = extent or Extent.of(segments)
     middle, step = matches(segments, disparity, extent=extent), window * extent.towards
     return Segments(middle + step, middle - step, segments.valid.expand(middle.shape[:-1]))

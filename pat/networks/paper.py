@@ -26,8 +26,7 @@ from .configs import PATConfig
 from .protocol import FusionOutput, JoinsBands
 
 SURROUNDINGS, FLOOR = 9, 0.01
-"""Side of the windows that `normalised` takes means over, pixels, and the contrast below which it adds
-none."""
+"""Side of `normalised`'s windows for means, pixels, and the contrast below which it adds none."""
 
 
 class QueryAndKey(NamedTuple):
@@ -62,8 +61,7 @@ class PAT(nn.Module):
 
     @classmethod
     def from_authors(cls, path: str | Path) -> PAT:
-        """The network of one of the authors' checkpoints (best.pth.tar), ready for use; see
-        `read_authors`."""
+        """The network of one of the authors' checkpoints (best.pth.tar), ready to use; see `read_authors`."""
         read = read_authors(path)
         network = cls(read.config)
         network.load_state_dict(read.state)
@@ -123,8 +121,7 @@ class PAT(nn.Module):
 
 
 def normalised(image: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
-    """The image less its mean in windows of 9x9 pixels, over its standard deviation there, with a floor of
-    .01."""
+    """The image less its mean in 9x9 pixels, over its standard deviation there, with a floor of .01."""
     mean, squares = (
         nn.functional.avg_pool2d(x, SURROUNDINGS, 1, SURROUNDINGS // 2, count_include_pad=False)
         for x in (image, image * image)

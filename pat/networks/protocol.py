@@ -70,8 +70,7 @@ class FusionNetwork(Protocol):
     the order of the bands matters), or all."""
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
-        """Memory that fusing so many pixels of alpha with so many of each beta takes, beside the inputs,
-        measured."""
+        """Memory to fuse so many pixels of alpha with so many of each beta, beside the inputs, measured."""
         ...
 
     def __call__(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
@@ -90,8 +89,7 @@ class Explaining(Protocol):
 
 @runtime_checkable
 class Comparing(Protocol):
-    """A network with C3 attention over the segments of its inputs, which training can supervise by
-    geometry."""
+    """A network with C3 attention over its inputs' segments, which training can supervise by geometry."""
 
     betas: int
     """The number it is made for: one in all bands, or several with a band each."""

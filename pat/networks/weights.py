@@ -90,8 +90,7 @@ def convolutions(network: nn.Module) -> list[nn.Module]:
 
 
 def load_denoiser(path: str | Path = DENOISER) -> LowLightNetwork:
-    """The network that removes noise: the shipped one, or that of a weights file. Raises as
-    `load_weights`."""
+    """The network that removes noise: the shipped one, or a weights file's. Raises as `load_weights`."""
     return _load(Path(path), DENOISERS)
 
 
@@ -126,8 +125,7 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
 
 
 def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
-    """The first tensor that is missing, too many, or of another shape than the network's; empty if all
-    fit."""
+    """The first tensor missing, too many, or of another shape than the network's; empty if all fit."""
     return _misfit(network, {k: tuple(v.shape) for k, v in state.items()})
 
 

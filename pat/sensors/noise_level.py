@@ -23,8 +23,7 @@ CURVE = 65
 SMOOTHED = 7
 """Side of the window over which the signal is averaged, pixels."""
 SIDE, GROUPS, FEWEST = 12, 16, 40
-"""Of blocks in which noise is estimated: their side in pixels, the groups of about equal value, and the least
-size of these."""
+"""Of blocks to estimate noise in: their side in pixels, the groups of about equal value, the least size."""
 SMOOTHEST, SHARE = 0.05, 0.677
 """The quantile of the variances in a group that is taken, and what that is of the variance of white noise
 (from 40,000 blocks of it)."""
@@ -90,9 +89,7 @@ class NoiseLevel:
         return srgb_from_linear(light.clamp(0, 1)) if linear else light.clamp(0, 1)
 
     def deviation(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """The standard deviation of a noisy sRGB image's values, by the mean of the image around each
-        pixel.
-        """
+        """A noisy sRGB image's standard deviation of values, by the mean of the image around each pixel."""
         _, mean, deviation = self._curves(image)
         return _interpolated(_smoothed(image), mean, deviation)
 
@@ -134,9 +131,7 @@ def _smoothed(image: Tensor) -> Tensor:
 
 
 def _smoothest(image: Float[Tensor, "1 c h w"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """Values, and the variance of the noise there: of the blocks of about each value those that vary
-    least.
-    """
+    """Values, and the noise's variance there: of the blocks of about each value those that vary least."""
     inner = image[..., 1:-1, 1:-1]
     rough = avg_pool2d((image.diff(n=2, dim=-1).diff(n=2, dim=-2) / 6).square(), SIDE)
     mean, empty = avg_pool2d(inner, SIDE), avg_pool2d((inner <= 0).to(inner), SIDE)

@@ -244,9 +244,7 @@ def augment(
     cases: Sequence[DegradationCase],
     generator: Generator,
 ) -> Pairs:
-    """Degrade each pair of a batch by one of the cases, all equally likely. Sizes must come out as they went
-    in.
-    """
+    """Degrade each pair of a batch by one of the cases, all equally likely. Sizes must not change."""
     drawn = torch.randint(len(cases), (len(alpha),), generator=generator, device=generator.device)
     alpha, beta = alpha.clone(), beta.clone()
     for i, case in enumerate(cases):

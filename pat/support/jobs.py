@@ -1,5 +1,4 @@
-"""Many tasks in many processes: each writes a file or a folder atomically, and is not repeated if that is
-there.
+"""Many tasks in many processes: each writes a file or folder atomically, not again if that is there.
 
 In this process, in others on this machine, or on the workers of a Dask scheduler. If a process is killed,
 another one repeats the task it was running; a job that is killed as a whole and started again does only what
@@ -58,9 +57,7 @@ class Task(NamedTuple):
 
 
 class TaskOutcome(NamedTuple):
-    """The error of a task in one line, or None; its warnings, the last of them the error if a filter made it
-    so.
-    """
+    """A task's error in one line, or None; its warnings, the last being the error if a filter made it so."""
 
     makes: Path
     error: str | None
@@ -69,9 +66,7 @@ class TaskOutcome(NamedTuple):
 
 @dataclass
 class JobReport:
-    """Files made, files that were there already, the error of each task that failed, and who warned of
-    what.
-    """
+    """Files made, files already there, the error of each task that failed, and who warned of what."""
 
     made: list[Path] = field(default_factory=list)
     kept: list[Path] = field(default_factory=list)
@@ -79,9 +74,7 @@ class JobReport:
     warned: dict[str, list[Path]] = field(default_factory=dict)
 
     def warn(self, outcome: TaskOutcome, about: str) -> None:
-        """Pass on the warnings of a task, one of each kind: texts that differ in numbers alone are of one
-        kind.
-        """
+        """Pass on a task's warnings, one of each kind: texts that differ in numbers alone are of one kind."""
         for warning in outcome.warnings:
             kind = re.sub(r"[\d.]+", "", f"{type(warning).__name__}: {warning}")
             files = self.warned.setdefault(kind, [])
@@ -169,9 +162,7 @@ LINE_EVERY = 30.0
 def followed(
     outcomes: Iterable[T], *, title: str, total: int, done: int = 0, console: Console
 ) -> Iterator[T]:
-    """The outcomes as they come, their number shown: as a bar on a terminal, elsewhere as a line now and
-    then.
-    """
+    """The outcomes as they come, counted: as a bar on a terminal, elsewhere as a line now and then."""
     printed = time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     further = (TimeRemainingColumn(), TextColumn("{task.fields[status]}"))
@@ -314,8 +305,7 @@ AHEAD = 4
 
 
 def _on_dask(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
-    """Outcomes as they come; Dask repeats what a dead worker was running, and what kills several is an
-    outcome too.
+    """Outcomes as they come; Dask repeats what dead workers were running; what kills several is one too.
 
     Raises ValueError without Dask or scheduler.
     """

@@ -1,6 +1,4 @@
-"""One command at a time in a folder of results, and folders that cannot be written to found before the
-work.
-"""
+"""One command at a time in a folder of results; folders that cannot be written to, found before the work."""
 
 from __future__ import annotations
 
@@ -21,8 +19,7 @@ OWNER = ".lock.json"
 
 @contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Make the folder, and keep other commands out of it until the block ends; one left empty is removed
-    again.
+    """Make the folder, and keep other commands out until the block ends; if left empty it is removed again.
 
     The lock is a file locked by the system, and process and host are in another beside it: that of a process
     of this host which is gone counts for nothing. Raises ValueError for a folder that another command holds,

@@ -55,9 +55,7 @@ def planned(limit: float | None, memory: float, *, large: bool) -> float | None:
 
 
 def give_back() -> None:
-    """Return freed memory to the system: glibc keeps some 300 MiB after a tile, which the next may not
-    fit.
-    """
+    """Return freed memory to the system: glibc keeps some 300 MiB after a tile; the next may not fit."""
     if sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim:
@@ -85,9 +83,7 @@ def limited(limit: float | None) -> Iterator[None]:
 
 
 def _return_near(most: float, done: Event) -> None:
-    """Return freed memory whenever the process has more than `most` bytes; less often while that does not
-    help.
-    """
+    """Return freed memory when a process has more than `most` bytes; less often while it does not help."""
     near = False
     while not done.wait(5 * EVERY if near else EVERY):
         near = resident() > most
@@ -114,9 +110,7 @@ def how_many_fit(nbytes: float) -> int | None:
 
 
 def peak_memory(pid: int | str = "self") -> float | None:
-    """Peak resident bytes of a process, by default of this one; None where the system does not say (Linux
-    does).
-    """
+    """Peak resident bytes of a process, by default this; None if the system does not say (Linux does)."""
     line = re.search(r"VmHWM:\s+(\d+) kB", _text(Path(f"/proc/{pid}/status")))
     return None if line is None else float(line[1]) * 2**10
 

@@ -50,9 +50,7 @@ def read_yaml(path: str | Path) -> Any:
 
 
 def parse_yaml(text: str | bytes, name: str) -> Any:
-    """The content of a YAML text, UTF-8. Raises ValueError naming `name` and the line for one that is not
-    YAML.
-    """
+    """The content of a YAML text, UTF-8. Raises ValueError naming `name` and the line if it is not YAML."""
     import yaml
 
     from arraygeom.safe_yaml import load_yaml, yaml_problem

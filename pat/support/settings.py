@@ -66,9 +66,7 @@ def _kind(algorithm: str, entry: Field[Any]) -> Kind:
 
 
 def all_settings(*rooms: str) -> list[SettingEntry]:
-    """The entries of all settings of these packages, such as "pat.matching", in the order of their
-    modules.
-    """
+    """The entries of all settings of these packages, such as "pat.matching", in their modules' order."""
     found: dict[str, Any] = {}
     for room in rooms:
         for module in iter_modules(import_module(room).__path__, f"{room}."):

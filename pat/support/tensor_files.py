@@ -34,9 +34,7 @@ DIGEST = "digest"
 
 
 def digest(tensors: Mapping[str, Tensor]) -> str:
-    """A digest of names, shapes and bytes: a file in which a bit has changed is still a valid safetensors
-    file.
-    """
+    """A digest of names, shapes and bytes: with a bit changed a file is still a valid safetensors file."""
     total = hashlib.blake2b(digest_size=16)
     for name, tensor in sorted(tensors.items()):
         total.update(f"{name} {tuple(tensor.shape)} {tensor.dtype};".encode())
@@ -45,7 +43,5 @@ def digest(tensors: Mapping[str, Tensor]) -> str:
 
 
 def undamaged(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bool:
-    """Whether the tensors of a file are those that were written; also for files of before there were
-    digests.
-    """
+    """Whether a file's tensors are those that were written; also for files from before there were digests."""
     return DIGEST not in metadata or metadata[DIGEST] == digest(tensors)

@@ -86,9 +86,7 @@ class Setting:
         return self.cameras[int(self.rng.integers(len(self.cameras)))]
 
     def nearest(self, X: NDArray) -> float:
-        """The least depth at which a camera can see a point; to cameras that it is not before, the
-        distance.
-        """
+        """The least depth at which a camera can see a point; to cameras it is not before, the distance."""
         distances = np.linalg.norm(self.centres - X, axis=1)
         depths = [float(c.cam_from_world.apply(c.K.new_tensor(X)[None])[0, 2]) for c in self.cameras]
         return float(min(z if z > 0.3 * d else d for z, d in zip(depths, distances)))
@@ -186,9 +184,7 @@ def _wall_depths(room: _Room, cameras: Sequence[Camera], rays: Sequence[NDArray]
 
 
 def _lights(setting: Setting, room: _Room) -> tuple[Light, ...]:
-    """Two to four lamps beside and above the cameras, and perhaps a sun; together about as bright
-    everywhere.
-    """
+    """Two to four lamps beside and above the cameras, perhaps a sun; together about as bright everywhere."""
     rng = setting.rng
     count = int(rng.integers(2, 5))
     shares = rng.dirichlet(np.full(count, 3.0)) * _IRRADIANCE * rng.uniform(0.8, 1.2)
@@ -280,9 +276,7 @@ def _relief(rng: Generator, extent: NDArray) -> Relief:
 
 
 def _path(setting: Setting, start: Key, radius: float, duration: float) -> tuple[Key, ...]:
-    """Four keys, evenly spaced: steps up to its size, rotations up to 60 degrees, a fifth longer or
-    shorter.
-    """
+    """Four keys, evenly spaced: steps up to its size, rotations to 60 degrees, a fifth longer or shorter."""
     rng, keys = setting.rng, [start]
     for k in range(1, 4):
         position = np.asarray(keys[-1].position) + rng.normal(size=3) * 0.4 * radius

@@ -54,8 +54,7 @@ def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0)
 
 
 def generator_named(name: str) -> Callable[..., Scene]:
-    """ "abstract", "photographs", or one's own, called with a seed, a rig and `moving` seconds, as
-    "module:function".
+    """ "abstract", "photographs", or one's own "module:function", called with seed, rig, `moving` seconds.
 
     Raises ValueError for a name that is neither.
     """

@@ -129,9 +129,7 @@ class LayeredScenes:
         return q, opacity * in_front
 
     def _shade(self, layers: Layers, camera: Camera, front: _Front) -> Tensor:
-        """The image (B, 3, h, w): the two foremost layers of each pixel, mixed by the opacity of the
-        first.
-        """
+        """The image (B, 3, h, w): each pixel's two foremost layers, mixed by the opacity of the first."""
         H = (layers.texel_from_plane @ plane_from_camera(layers, camera)).float().to(self.device)
         colour = self._colours(
             layers, H, camera.hw, front.first, torch.ones_like(front.opacity, dtype=torch.bool)
@@ -174,9 +172,7 @@ _CHUNK = 1 << 16
 
 @dataclass(frozen=True)
 class _Front:
-    """At each pixel the two foremost layers, the opacity of the first, and the main one with its inverse
-    depth.
-    """
+    """At each pixel the two foremost layers, the first's opacity, and the main one with its inverse depth."""
 
     first: Tensor
     second: Tensor
@@ -196,9 +192,7 @@ def plane_from_camera(layers: Layers, camera: Camera) -> Float[Tensor, "b l 3 3"
 
 
 def _steps(distance: Tensor) -> Tensor:
-    """How much a distance changes from a pixel to the next, so that edges get one pixel wide from any
-    angle.
-    """
+    """How much a distance changes from pixel to pixel, so that edges get one pixel wide from any angle."""
     x = torch.nn.functional.pad(distance.diff(dim=-1).abs(), (1, 1))
     y = torch.nn.functional.pad(distance.diff(dim=-2).abs(), (0, 0, 1, 1))
     x, y = torch.maximum(x[..., 1:], x[..., :-1]), torch.maximum(y[..., 1:, :], y[..., :-1, :])

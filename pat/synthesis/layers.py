@@ -137,9 +137,7 @@ def _normals(shape: tuple[int, int], g: Generator) -> Tensor:
 
 
 def _inverse_depths(rigs: RigBatch, shape: tuple[int, int], g: Generator) -> Tensor:
-    """At the anchors: even in disparity or in the logarithm of depth, background farthest, one scene in eight
-    flat.
-    """
+    """At the anchors: even in disparity or log depth, background farthest, one scene in eight flat."""
     B = shape[0]
     low, high = 1 / rigs.far[:, None], 1 / rigs.near[:, None]
     where = uniform((0, 1), shape, g)

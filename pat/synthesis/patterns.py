@@ -1,6 +1,4 @@
-"""Textures that photographs lack: smooth shades, repeated patterns, and colour that is independent of
-luminance.
-"""
+"""Textures that photographs lack: smooth shades, repeated patterns, colour independent of luminance."""
 
 from __future__ import annotations
 

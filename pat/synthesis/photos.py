@@ -53,8 +53,7 @@ class PhotoBank:
         seed: int = 0,
         choose: Callable[[int], bool] = lambda i: True,
     ) -> PhotoBank:
-        """All images under the folders, colour or grey, reduced to `max_edge` pixels, and patterns beside
-        them.
+        """All images under the folders, colour or grey, reduced to `max_edge` pixels, and patterns beside.
 
         `cache` names an .npz file that is written on the first call and read
         on later ones; it is not checked against the folders. `choose` selects images by number, to hold
@@ -85,8 +84,7 @@ class PhotoBank:
     def lookup(
         self, texture: Int[Tensor, " n"], xy: Float[Tensor, "n 2"], level: Float[Tensor, " n"]
     ) -> Float[Tensor, "3 n"]:
-        """Colours 0..1 at pixels (x, y) of the textures (first centre (0, 0)), trilinear in position and
-        level.
+        """Colours 0..1 at the textures' pixels (x, y) (first centre (0, 0)), trilinear in position and level.
 
         `level` is log2 of the distance between samples in pixels of the full texture: at 0 the full image is
         read, at 1 its 2x reduction, whose pixel (0, 0) lies at (0.5, 0.5) of the full one.
@@ -136,9 +134,7 @@ def _mirrored(i: Tensor, n: Tensor) -> Tensor:
 
 
 def read_photographs(folders: tuple[str | Path, ...], max_edge: int) -> list[np.ndarray]:
-    """RGB bytes of all images under the folders, reduced to `max_edge` pixels. Raises ValueError if there is
-    none.
-    """
+    """RGB bytes of all images under the folders, reduced to `max_edge` pixels. Raises ValueError for none."""
     paths = sorted(p for folder in folders for p in files_below(folder) if p.suffix.lower() in PHOTO_SUFFIXES)
     images = [_reduced(p, max_edge) for p in map(_decoded, paths) if p is not None]
     if not images:

@@ -127,8 +127,7 @@ def depth_between(
     *,
     uneven: float = UNEVEN,
 ) -> tuple[Float[Tensor, "*n"], Bool[Tensor, "*n"]]:
-    """Depth at positions (x, y), and whether the four pixels around are of one object, without step or
-    crease.
+    """Depth at positions (x, y), whether the four pixels around are of one object, no step or crease.
 
     Inverse depth is interpolated, which is exact on planes. Infinite depths stay infinite. More than `uneven`
     counts as a step or crease: how far, relatively, an inverse depth is from the middle of its neighbours'.
@@ -144,9 +143,7 @@ def depth_between(
 
 
 def _creases(inverse: Float[Tensor, "h w"], uneven: float) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
-    """Creases and steps of inverse depth, along rows and along columns. Between two such pixels there is an
-    edge.
-    """
+    """Creases and steps of inverse depth, along rows and columns. Between two such pixels is an edge."""
     across, down = torch.zeros_like(inverse, dtype=torch.bool), torch.zeros_like(inverse, dtype=torch.bool)
     across[:, 1:-1] = inverse.diff(n=2, dim=1).abs() > uneven * inverse[:, 1:-1]
     down[1:-1] = inverse.diff(n=2, dim=0).abs() > uneven * inverse[1:-1]

@@ -22,9 +22,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class RigBatch:
-    """The cameras, alpha first, each batched (B), and the depths (metres, from alpha) where scenes should
-    be.
-    """
+    """Cameras, alpha first, each batched (B), and the depths (metres, from alpha) where scenes should be."""
 
     cameras: list[Camera]
     near: Float[Tensor, " b"]

@@ -92,9 +92,7 @@ class ObjectPose(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Key:
-    """Where an object is at a time: position of its middle, rotation vector (radians), extent along its own
-    axes.
-    """
+    """Where an object is at a time: middle's position, rotation vector (radians), extent along its axes."""
 
     position: Vec3
     rotation: Vec3 = (0.0, 0.0, 0.0)

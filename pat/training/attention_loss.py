@@ -1,5 +1,4 @@
-"""Attention supervised by geometry: where the true position is known, the weights along the segment are a
-classifier.
+"""Attention supervised by geometry: if the true position is known, weights along the segment classify.
 
 For an alpha pixel whose point beta sees at a true position between the samples l and l + 1 of its segment, a
 share u of the way, the loss is the cross-entropy of the weights against (1 - u) at l and u at l + 1. For a
@@ -26,9 +25,7 @@ OFF = 1.5
 
 
 class Target(NamedTuple):
-    """The two samples (x, y) around a true position, the share of the second, and whether it is on the
-    segment.
-    """
+    """Two samples (x, y) around a true position, the share of the second, whether it is on the segment."""
 
     first: Float[Tensor, "b h w 2"]
     second: Float[Tensor, "b h w 2"]

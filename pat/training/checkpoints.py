@@ -67,9 +67,7 @@ def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer, av
 
 
 def _state(tensors: Mapping[str, Tensor], optimiser: Optimizer) -> dict[int, dict[str, Tensor]]:
-    """An optimiser's state by the number of its parameter. Raises ValueError if it is not of such
-    parameters.
-    """
+    """An optimiser's state by its parameters' numbers. Raises ValueError if it is not of such parameters."""
     shapes = [tuple(p.shape) for group in optimiser.param_groups for p in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():

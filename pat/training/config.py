@@ -51,8 +51,7 @@ class RecordingConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """A recipe. A step sees `groups` times `batch` scenes; there are `steps` steps, or as many as fit into
-    `minutes`.
+    """A recipe. A step sees `groups` times `batch` scenes; there are `steps` steps, or what `minutes` allow.
 
     Raises ValueError for inconsistent values.
     """

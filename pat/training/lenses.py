@@ -31,8 +31,7 @@ def through_lenses(
     *,
     lost: float = 0.0,
 ) -> Sampled:
-    """Images distorted by a random lens, one for each pinhole, passed to `recorded`, and undistorted to the
-    pinholes.
+    """Images distorted by a random lens, one a pinhole, passed to `recorded`, undistorted to the pinholes.
 
     Where the lens saw nothing, up to the share `lost` on each side, an image repeats its edge and is not
     valid.
@@ -50,9 +49,7 @@ def through_lenses(
 
 
 def lens_over(pinhole: Camera, g: Generator, lost: float = 0.0) -> Camera:
-    """A camera with a random lens and as many pixels, that covers the pinhole's view but for the lost
-    borders.
-    """
+    """A camera with a random lens, as many pixels, that covers the pinhole's view but for lost borders."""
     x = border(pinhole)
     rays, _ = pinhole.rays(x)
     widest = float(rays[..., :2].square().sum(-1).max())

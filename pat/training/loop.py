@@ -211,9 +211,7 @@ def shape(config: TrainConfig, step: int, done: float) -> float:
 
 
 def new_network(config: TrainConfig) -> Network:
-    """The network of a recipe, with the weights it starts from. Raises ValueError if those are another
-    network's.
-    """
+    """A recipe's network, with the weights it starts from. Raises ValueError if those are another's."""
     network = next(made for made, of in NETWORKS.values() if type(config.network) is of)(config.network)
     if config.start is not None:
         weights = load_weights(config.start)
@@ -237,9 +235,7 @@ def finite(objective: Objective, given: Sample) -> bool:
 
 
 def save_sample(given: Sample, path: Path, *, facts: dict[str, str]) -> None:
-    """All tensors of a group of samples: alpha, ground truth, and beta, position, visible of each beta by
-    number.
-    """
+    """A group's sample tensors: alpha, ground truth, and beta, position, visible of each beta by number."""
     tensors = {"alpha": given.alpha, "ground_truth": given.ground_truth}
     for name in ("betas", "position", "visible"):
         tensors |= {f"{name}/{i}": t for i, t in enumerate(getattr(given, name))}
@@ -247,9 +243,7 @@ def save_sample(given: Sample, path: Path, *, facts: dict[str, str]) -> None:
 
 
 def former_run(config: TrainConfig) -> Checkpoint | None:
-    """The last checkpoint of the same run, if there is one. Raises ValueError if the folder holds another
-    run.
-    """
+    """The same run's last checkpoint, if there is one. Raises ValueError if the folder holds another run."""
     checkpoint = newest_checkpoint(config.out / CHECKPOINTS)
     if checkpoint is None:
         return None

@@ -84,9 +84,7 @@ def explained(network: FusionNetwork, given: Sample) -> tuple[FusionOutput, list
 
 
 def match_loss(seen: list[BetaEstimate], given: Sample) -> Tensor:
-    """Position error where beta sees the point, pixels, and error of the confidence; 0 without ground
-    truth.
-    """
+    """Error of position where beta sees the point, pixels, and of confidence; 0 without ground truth."""
     total = given.ground_truth.new_zeros(())
     for match, ground_truth, visible in zip(seen, given.position, given.visible):
         off = (match.attended - ground_truth.movedim(-1, 1)).abs().sum(1)

@@ -1,6 +1,4 @@
-"""Stereo pairs with the true disparity of both images as training samples: images, depth and occlusion are
-known.
-"""
+"""Stereo pairs, true disparity of both images, as training samples: images, depth, occlusion are known."""
 
 from __future__ import annotations
 
@@ -58,9 +56,7 @@ class MeasuredPairs(PairCrops):
         return replace(batch_of, depth=[d.to(self.device) for d in depth])
 
     def _cut(self, i: int, g: Generator) -> tuple[Tensor, Tensor, Tensor, Tensor, float, float]:
-        """Alpha, beta, their disparities, 1 where alpha is left and -1 where it is right, the largest
-        disparity.
-        """
+        """Alpha, beta, their disparities, 1 where alpha is left, -1 where right, the largest disparity."""
         pair, (h, w) = self._read(i), self.hw
         hw = pair.left.shape[1:]
         times = 1 + below(min(REDUCED, hw[0] // h, hw[1] // w), g)
@@ -80,9 +76,7 @@ class MeasuredPairs(PairCrops):
 
 
 class Measured(NamedTuple):
-    """Two images (3, H, W), their disparities (H, W) in pixels, 0 where not known, and the largest there can
-    be.
-    """
+    """Two images (3, H, W), their disparities (H, W), pixels, 0 if not known, and the largest possible."""
 
     left: Tensor
     right: Tensor

@@ -28,9 +28,7 @@ class Process:
         return self.rank == 0
 
     def share(self, groups: int) -> list[int]:
-        """The groups of a step that are this process's. Raises ValueError where they cannot be distributed
-        evenly.
-        """
+        """This process's groups of a step. Raises ValueError where they cannot be distributed evenly."""
         if groups % self.count:
             raise ValueError(
                 f"{groups} groups cannot be shared by {self.count} processes: give --groups a multiple"

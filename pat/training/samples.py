@@ -1,5 +1,4 @@
-"""Samples made while training: layered scenes from photographs, seen by random rigs, recorded by random
-cameras.
+"""Samples made in training: layered scenes from photographs, seen by random rigs, recorded by random cameras.
 
 A share of them may come from rendered scenes, and from stereo pairs.
 
@@ -163,8 +162,7 @@ class SampleSource:
 
 
 def made_ahead(samples: Iterator[list[Sample]], network: FusionNetwork) -> Iterator[list[Sample]]:
-    """The samples, with their matches: those of the next step are made, and matched, while a step is
-    computed.
+    """Samples with matches: those of the next step are made, and matched, while a step is computed.
 
     They do not depend on the network's weights, so that results are the same.
     """
@@ -238,9 +236,7 @@ def degraded(
     field: ReceptiveField = Epipolar(),  # noqa: B008
     recording: RecordingConfig = RecordingConfig(),  # noqa: B008
 ) -> Sample:
-    """Recorded images of a scene: alpha grey, betas in colour (or a band each), enlarged to alpha's
-    resolution.
-    """
+    """Recorded images of a scene: alpha grey, betas in colour (or one band), at alpha's resolution."""
     images, alone = _banded(scene, g, recording.spectral), len(scene.images) == 2
     ideal, grey, cameras = images[0], luminance(scene.images[0]), scene.cameras
     alpha = recorded(grey, cameras[0], g, recording).values
@@ -273,9 +269,7 @@ def _banded(scene: ArrayBatch, g: Generator, spectral: float) -> list[Tensor]:
 def recorded(
     image: Tensor, camera: Camera, g: Generator, recording: RecordingConfig, *, lost: float = 0.0
 ) -> Sampled:
-    """The recorded image, perhaps distorted by a lens and undistorted, up to `lost` of it missing on each
-    side.
-    """
+    """The recorded image, perhaps distorted by a lens and undistorted; up to `lost` missing on each side."""
 
     def record_here(image: Tensor) -> Tensor:
         return record(image, steps(g, recording), g)
@@ -299,9 +293,7 @@ def steps(g: Generator, recording: RecordingConfig) -> list[Step]:
 
 
 def pair_of(scene: ArrayBatch, beta: int, g: Generator) -> Pair:
-    """The batch of pairs (alpha, beta), beta at alpha's resolution, with bounds looser than the scenes'
-    own.
-    """
+    """The batch of pairs (alpha, beta), beta at alpha's resolution, bounds looser than the scenes' own."""
     near, far = scene.depth_range.double().unbind(-1)
     loose = torch.rand(2, len(near), generator=g, dtype=torch.float64).to(near.device)
     depth = near / (1 + 0.6 * loose[0]), torch.where(loose[1] < 0.5, torch.inf, far * (1 + 2 * loose[1]))
@@ -310,9 +302,7 @@ def pair_of(scene: ArrayBatch, beta: int, g: Generator) -> Pair:
 
 
 def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
-    """The pairs with beta rotated at random so that points move by about `pixels`, root mean square, on each
-    axis.
-    """
+    """The pairs, betas rotated at random, points moving by about `pixels`, root mean square, on each axis."""
     if pixels == 0:
         return pair
     alpha, beta = pair.cameras
@@ -325,8 +315,7 @@ def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
 
 
 def transfer(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions of alpha's pixels in beta (B, h, w, 2), and whether beta sees the same surface there (B, h,
-    w).
+    """Positions of alpha's pixels in beta (B, h, w, 2); whether beta sees the same surface there (B, h, w).
 
     Pixels without depth (NaN) are not visible, and at (0, 0).
     """

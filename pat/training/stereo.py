@@ -1,5 +1,4 @@
-"""Stereo pairs as training samples: a random window of one image as alpha and ground truth, of the other as
-beta.
+"""Stereo pairs as training samples: a random window of an image as alpha and truth, of the other as beta.
 
 Their depth is not known, so the loss is on the image alone. Their cameras are assumed: rectified, a metre
 apart, with the pair's range of disparities.
@@ -75,9 +74,7 @@ class PairCrops(Crops):
 def assumed_cameras(
     images: list[Tensor], side: Float[Tensor, " b"], disparity: Float[Tensor, " b"], device: str
 ) -> ArrayBatch:
-    """The images, alpha first, with cameras a metre apart that put the nearest points `disparity` pixels
-    apart.
-    """
+    """The images, alpha first, cameras a metre apart that put the nearest points `disparity` pixels apart."""
     batch, _, h, w = images[0].shape
     K = intrinsics(float(w), (h, w)).expand(batch, 3, 3)
     t = torch.zeros(batch, 3, dtype=torch.float64)

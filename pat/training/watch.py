@@ -105,9 +105,7 @@ class Watch:
 
 @torch.no_grad()
 def contact_sheet(network: FusionNetwork, samples: list[Sample]) -> Float[Tensor, "3 _ _"]:
-    """One row for the first scene of each group: beta (three bands, or one), alpha, fused, ground truth,
-    confidence.
-    """
+    """A row for the first scene of each group: beta (three bands or one), alpha, fused, truth, confidence."""
     return torch.cat([_row(network, given) for given in samples], -2).cpu()
 
 

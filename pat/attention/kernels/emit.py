@@ -62,9 +62,7 @@ def row_of(vector, n):
 
 
 class Code:
-    """Emits instructions. `kinds` are numba's types of the intrinsic's arguments, `result` that of its
-    value.
-    """
+    """Emits instructions. `kinds` are numba's types of the intrinsic's arguments, `result` its value's."""
 
     def __init__(self, context, builder, kinds, result):
         self.context, self.builder, self.kinds, self.result = context, builder, kinds, result

@@ -43,9 +43,7 @@ Block = namedtuple("Block", [name for name, _, _ in LAYOUT])  # type: ignore[mis
 
 
 def block_scratch(samples: int, channels: int, number: np.dtype) -> Block:
-    """Room for a block: an array (BLOCK, length) for each line of `LAYOUT`, what belongs to a pixel side by
-    side.
-    """
+    """Room for a block: an array (BLOCK, length) for each line of `LAYOUT`, a pixel's values side by side."""
     lengths = {"pixel": 1, "sample": samples + LANES, "tap": 4 * samples + 2 * LANES, "channel": channels}
     ends = {"integer": 0, "number": 0}
     slices = []
@@ -78,9 +76,7 @@ class Geometry(NamedTuple):
 
 
 class Call(NamedTuple):
-    """The inputs of a call: images, geometry, bias (if `biased`), and the channels of the query and the
-    value.
-    """
+    """A call's inputs: images, geometry, bias (if `biased`), and the channels of query and value."""
 
     query: Any
     key: Any
@@ -190,9 +186,7 @@ def _tuple(code, kind, parts):
 
 @instruction(_pointed)
 def pointers(code, arrays):
-    """A tuple with pointers for flat arrays and a `Column` for arrays of two axes, in tuples within it,
-    too.
-    """
+    """A tuple, pointers for flat arrays and a `Column` for arrays of two axes, in tuples within it, too."""
     return _point(code, code.kinds[0], arrays)
 
 

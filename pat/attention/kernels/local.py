@@ -64,9 +64,7 @@ def _sampled(t, y, size, spacing, height, width):
 
 @compiled
 def _exponentiate(rows, shape):
-    """From scores (samples, pixels) to exp(score - the largest of the pixel), in the same place, and their
-    sums.
-    """
+    """From scores (samples, pixels) to exp(score - the pixel's largest), in place, and their sums."""
     scores, total = rows
     for x in range(0, shape[1], LANES):
         top, mass = splat(LOWEST), splat(np.float32(0))

@@ -126,9 +126,7 @@ def dot_row(code, row, array, i: index):
 
 @instruction(lambda weights, rows, t, image, channels, c, totals, n: totals)
 def fma_taps(code, weights, rows, t: index, image, channels: index, c: index, totals, n: literal):
-    """Adds, for each group k of n vectors of `totals`, weights[t + k] times the row at image[rows[t + k],
-    c].
-    """
+    """Adds, for each group k of n vectors of `totals`, weights[t + k] times the row image[rows[t + k], c]."""
     vectors = code.parts(totals)
     lanes = vectors[0].type.count
     for k in range(0, len(vectors), n):

@@ -56,9 +56,7 @@ def use_nodes(item: Any) -> None:
 
 
 def write_layers(scene: Any) -> None:
-    """Make renders go to one multi-layer float EXR file, of one part: several fail if pixels are not square
-    (5.0).
-    """
+    """Make renders one multi-layer float EXR file, one part: several fail if pixels are not square (5.0)."""
     images = scene.render.image_settings
     if hasattr(images, "media_type"):
         images.media_type = "MULTI_LAYER_IMAGE"

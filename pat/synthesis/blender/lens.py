@@ -53,8 +53,7 @@ class Lens(NamedTuple):
         )
 
     def depth(self, depth: Float[Tensor, "h1 w1"], index: Int[Tensor, "h1 w1"]) -> Float[Tensor, "h2 w2"]:
-        """Depth along the exact rays, exact on planes: beside edges the nearest pixel's surface is
-        extrapolated.
+        """Depth along exact rays, exact on planes: beside edges the nearest pixel's surface is extrapolated.
 
         NaN where nothing is seen.
         """
@@ -87,9 +86,7 @@ def _gentlest(inverse: Float[Tensor, "h w"], dim: int) -> Float[Tensor, "h w"]:
 
 
 def lens_for(camera: View, name: str) -> Lens:
-    """The lens of a camera of a rig. Raises ValueError, naming the camera, for one that cannot be
-    rendered.
-    """
+    """The lens of a rig's camera. Raises ValueError, naming the camera, for one that cannot be rendered."""
     if not isinstance(camera, Camera):
         raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")
     if camera.K.ndim != 2:
@@ -104,9 +101,7 @@ def lens_for(camera: View, name: str) -> Lens:
 
 
 def _upright(camera: Camera, name: str) -> Camera:
-    """The same pinhole with K upper triangular: K = K' Q with a rotation Q about the optical axis, part of
-    the pose.
-    """
+    """The same pinhole, K upper triangular: K = K' Q, Q a rotation about the optical axis, in the pose."""
     K = camera.K
     angle = torch.atan2(K[1, 0], K[1, 1])
     c, s = angle.cos(), angle.sin()
@@ -157,9 +152,7 @@ def _wide(camera: Camera, upright: Camera, name: str) -> Lens:
 
 
 def _finest(plane: Float[Tensor, "h w 2"], valid: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
-    """The focal length at which neighbouring pixels of the lens are at least one pixel apart nearly
-    everywhere.
-    """
+    """The focal length at which neighbouring lens pixels are a pixel or more apart nearly everywhere."""
     across, down = plane.diff(dim=1).norm(dim=-1), plane.diff(dim=0).norm(dim=-1)
     steps = torch.cat([across[valid[:, 1:] & valid[:, :-1]], down[valid[1:] & valid[:-1]]])
     return 1 / steps.quantile(0.1) if len(steps) < 1e6 else 1 / steps.kthvalue(len(steps) // 10).values

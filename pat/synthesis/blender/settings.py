@@ -32,8 +32,7 @@ class RenderSettings:
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> RenderSettings:
-        """ "fast" (512 pixels wide, 8 samples, quick denoising and light) or "paper" (2048 wide, more of
-        each).
+        """ "fast" (512 pixels wide, 8 samples, quick denoising and light) or "paper" (2048, more of each).
 
         Raises ValueError for another name.
         """

@@ -101,9 +101,7 @@ class Studio:
     # One image -----------------------------------------------------------------------------------------
 
     def _aim(self, camera: Camera) -> None:
-        """Blender's camera as ours, 36 units wide whatever the true sensor: Blender refuses less than 1
-        mm.
-        """
+        """Blender's camera as ours, 36 units wide whatever the sensor: Blender refuses less than 1 mm."""
         data, render = self.camera.data, self.blender.render
         (h, w), K = camera.hw, camera.K
         fx, fy = float(K[0, 0]), float(K[1, 1])
