@@ -38,9 +38,7 @@ class Readme:
 
 
 def with_block(text: str, name: str, content: str) -> str:
-    """The text with the block of that name replaced. Raises ValueError if its marks are not there once, in
-    order.
-    """
+    """The text, that block replaced. Raises ValueError if its marks are not there once, in order."""
     begin, end = (f"<!-- {name}:{which} -->" for which in ("begin", "end"))
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
         raise ValueError(f"the document needs one {begin} and, after it, one {end}")

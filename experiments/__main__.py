@@ -1,6 +1,4 @@
-"""`python -m experiments COMMAND ...`: the paper's four arrays, fusion of real images, tables of the
-documentation.
-"""
+"""`python -m experiments COMMAND ...`: the paper's arrays, fusion of real images, the docs' tables."""
 
 from __future__ import annotations
 
@@ -19,9 +17,7 @@ from .evaluation import commands
 
 @dataclass
 class Showcase:
-    """Fuse real images: stereo pairs, calibrated pairs that are not rectified, the paper's fast + slow
-    array.
-    """
+    """Fuse real images: stereo pairs, calibrated pairs not rectified, the paper's fast + slow array."""
 
     data: Path
     """Folder with kitti, middlebury, flickr1024, syntim and hfr_lfr."""
@@ -40,9 +36,7 @@ class Showcase:
 
 @dataclass
 class Alignment:
-    """Measure how well bands are aligned, beside a homography: stereo pairs as bands, multispectral
-    cameras.
-    """
+    """Measure how well bands are aligned, beside a homography: stereo as bands, multispectral cameras."""
 
     data: Path = Path("data")
     """Folder with middlebury, multispectral and nine_band_array."""
@@ -90,15 +84,11 @@ class SystemsRun:
     full: bool = False
     """At the full size of the paper's cameras; by default reduced, minutes on two cores."""
     scene: Literal["layered", "rendered"] = "layered"
-    """Photographs on planes; or a still life (a landscape for visible-nir) rendered with Blender, as one sees
-    it.
-    """
+    """Photographs on planes; or a still life (visible-nir: landscape) rendered by Blender, as one sees it."""
     photos: MaybePath = None
     """Folder of photographs for layers' surfaces; by default patterns and images scikit-image ships."""
     recording: MaybePath = None
-    """For fast-slow: the paper's own frames in place of a rendered scene, a folder with pillow_1 and the
-    matrices.
-    """
+    """For fast-slow: the paper's frames, not a rendered scene: a folder with pillow_1 and the matrices."""
     out: MaybeOut = None
     """Folder for the results; by default out/systems/NAME."""
     weights: Weights = "mono-colour"

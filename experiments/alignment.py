@@ -1,5 +1,4 @@
-"""How well bands are aligned: beside a homography, on stereo pairs as bands and on real multispectral
-cameras.
+"""How well bands are aligned: beside a homography, on stereo pairs as bands and multispectral cameras.
 
 A patch counts around a corner of alpha's image that the alignment says the beta sees (with true disparity:
 and whose patch it does see), if it can be located: its best match within some pixels of where the alignment,
@@ -94,9 +93,7 @@ MEDIANS = "median", "median_homography"
 
 
 class AlignmentScene(NamedTuple):
-    """What is aligned: a rig, developed images, recorded values, alpha, and alpha's true disparity if it is
-    known.
-    """
+    """What is aligned: rig, developed images, recorded values, alpha, its true disparity if it is known."""
 
     name: str
     rig: Rig
@@ -116,8 +113,7 @@ def evaluate_alignment(
     min_confidence: float = LEAST_CONFIDENCE,
     each: Callable[[str], None] = lambda line: None,
 ) -> str:
-    """Align the scenes of these names (see `SCENES`) below `data`; write alignment.md and figures. Returns
-    the text.
+    """Align the scenes of these names (`SCENES`) below `data`; write alignment.md, figures. Returns the text.
 
     Raises ValueError for a name that there is not, FileNotFoundError for missing images.
     """
@@ -260,9 +256,7 @@ def _peak(found: NDArray[Any], best: Sequence[Any], axis: int) -> float:
 def by_homography(
     scene: AlignmentScene, name: str, straight: Rig, pinhole: Mapping[str, Tensor]
 ) -> Float[np.ndarray, "h w 2"]:
-    """Where alpha's recorded pixels are in a beta's recorded image by the homography of images without
-    lenses.
-    """
+    """Where alpha's recorded pixels are in beta's recorded image by the homography of lensless images."""
     alpha = scene.alpha
     own, other = (shown_band(pinhole[n].numpy()) for n in (alpha, name))
     H = torch.from_numpy(ecc_homography(own, other))
@@ -271,8 +265,7 @@ def by_homography(
 
 
 def ecc_homography(own: NDArray[np.uint8], other: NDArray[np.uint8]) -> Float[np.ndarray, "3 3"]:
-    """The homography from `own` to `other` by enhanced correlation (Evangelidis and Psarakis 2008) of
-    gradients.
+    """The homography `own` to `other` by enhanced correlation (Evangelidis, Psarakis 2008) of gradients.
 
     It starts from a translation by phase correlation, or from none; no level may lower the correlation.
     """
@@ -325,9 +318,7 @@ def patch_mean(plane: NDArray[Any], x: NDArray[Any]) -> Float[np.ndarray, " n"]:
 
 
 def sampling_error(view: Any, values: NDArray[Any]) -> float:
-    """The largest difference of an aligned view's values from samples of what was recorded, rounded if they
-    are.
-    """
+    """An aligned view's largest difference from samples of what was recorded, rounded if those are."""
     where = torch.from_numpy(view.positions[view.valid]).double()[None]
     taken = sample(torch.from_numpy(values.astype(np.float64))[None], where).values[0].numpy()
     if np.issubdtype(values.dtype, np.integer):
@@ -379,9 +370,7 @@ def _line(row: AlignmentRow) -> list[str]:
 
 
 def middlebury_scenes(data: Path) -> Iterator[AlignmentScene]:
-    """Green of the left image and red and blue of the right one: three cameras of one band, of the report
-    half.
-    """
+    """Green of the left image, red and blue of the right: three one-band cameras, of the report half."""
     for pair in of_half(middlebury_pairs(data / "middlebury"), "report"):
         if pair.disparity is not None and len(pair.left) == 3 and pair.left.shape == pair.right.shape:
             yield _as_bands(pair, pair.disparity)

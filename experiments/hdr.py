@@ -19,14 +19,11 @@ from pat.media.raw import light_of
 WHITE = 0.97
 """Values from here on count as saturated."""
 READ_NOISE = 1.5e-3
-"""Variance of the read noise over the shot noise at white, for weighting exposures: typical of machine
-vision.
-"""
+"""Variance of read noise over shot noise at white, for weighting exposures: typical of machine vision."""
 
 
 def merged(frame: Frame, rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]], alpha: str) -> Frame:
-    """The fused frame with brightness from all cameras, sRGB-encoded, above 1 where alpha's white is
-    exceeded.
+    """The fused frame, brightness from all cameras, sRGB-encoded, above 1 where alpha's white is exceeded.
 
     Betas, one band each, are sampled at the frame's depth. Alpha's value is predicted as a weighted sum of
     the bands that are not saturated, fitted where no camera is; it is averaged with alpha's own value by the
@@ -113,8 +110,7 @@ class DynamicRange(NamedTuple):
 def usable_range(
     measured: Float[Tensor, "*n"], ground_truth: Float[Tensor, "*n"], *, within: float = 0.25
 ) -> DynamicRange:
-    """The widest run of half-stops of true light in which an image's median relative error is at most
-    `within`.
+    """Widest run of half-stops of true light in which an image's median relative error is at most `within`.
 
     Raises ValueError if there is none.
     """

@@ -14,8 +14,7 @@ Result = TypeVar("Result")
 
 
 def watch_peak(pid: int, *, every: float = 0.2) -> Callable[[], float]:
-    """Watch a process until it ends; the returned function waits for that and gives its peak resident bytes,
-    or 0.
+    """Watch a process until it ends; the function returned waits for that, gives peak resident bytes or 0.
 
     `wait4` would count what the parent had resident when it started the process.
     """

@@ -42,9 +42,7 @@ class RenderedScene:
         return purpose_generator(self.seed, purpose)
 
     def light(self, name: str, frame: int = 0) -> Float[Tensor, "1 3 h w"]:
-        """The linear light that a camera receives in a frame; more than 1 is brighter than paper in the
-        window.
-        """
+        """The linear light a camera receives in a frame; over 1 is brighter than paper in the window."""
         return self.frames[name][frame].rgb[None]
 
     def infrared(self, name: str) -> Float[Tensor, "1 1 h w"]:

@@ -43,8 +43,7 @@ SCENE, FAST_FRAME, SLOW_FRAME = "pillow_1", "141", "4"
 
 
 def showcase(data: Path, out: Path, weights: str = "mono-colour", rates: Sequence[int] = (2, 4)) -> str:
-    """Fuse the images in `data`; write showcase.md, figures and rig files into `out`. Returns showcase.md's
-    text.
+    """Fuse the images in `data`; write showcase.md, figures, rig files to `out`. Returns showcase.md's text.
 
     Raises FileNotFoundError or ValueError naming what is missing, before any work where possible.
     """
@@ -84,9 +83,7 @@ def _pairs(network: FusionNetwork, data: Path, out: Path, rates: Sequence[int]) 
 
 
 class SyntimScene(NamedTuple):
-    """A calibrated pair, left and right, with the depth range of the points that both see, and its images in
-    colour.
-    """
+    """A calibrated pair, left, right, the depth range that both see points in, and its images in colour."""
 
     name: str
     rig: Rig
@@ -145,9 +142,7 @@ def _syntim_image(folder: Path, scene: str, side: int) -> Tensor:
 
 
 class FastSlowArray(NamedTuple):
-    """The fast + slow array at one instant: rig, images, the link fitted to each pair, and a table of the
-    fits.
-    """
+    """The fast + slow array at one instant: rig, images, the link fitted to each pair, a table of fits."""
 
     rig: Rig
     images: dict[str, Tensor]
@@ -212,9 +207,7 @@ def fast_and_slow_array(folder: Path) -> FastSlowArray:
 
 
 def published_matrices(file: Path) -> dict[str, Float[Tensor, "3 3"]]:
-    """F of the fast camera and each slow one, in our pixels; the file counts from 1. Raises ValueError naming
-    it.
-    """
+    """F of fast and each slow camera, in our pixels; the file counts from 1. Raises ValueError naming it."""
     try:
         matrices = json.loads(file.read_text())["pillow"]
         return {
@@ -228,9 +221,7 @@ def published_matrices(file: Path) -> dict[str, Float[Tensor, "3 3"]]:
 
 
 def transformed(array: FastSlowArray) -> Float[Tensor, "3 h w"]:
-    """The slow images at alpha's view by their rough homographies, as red, green and blue normalised to
-    alpha.
-    """
+    """Slow images at alpha's view by rough homographies, as red, green, blue normalised to alpha."""
     alpha = array.images[FAST]
     x = pixel_grid((alpha.shape[1], alpha.shape[2]))
     bands = []

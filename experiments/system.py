@@ -176,9 +176,7 @@ def recorded(
     photos: Path | None,
     say: Callable[[str], None],
 ) -> tuple[SystemRecording, dict[str, list[Path]]]:
-    """The recording of the system's scene, and its files; rendered unless it was before with the same
-    settings.
-    """
+    """The recording of the system's scene, its files; rendered unless done with the same settings."""
     module, cache = system.module, out / "recorded.safetensors"
     key = f"{system.name}, {scene}, seed {module.SEED}, textures {photos or 'our own'}\n{rig_text(rig)}"
     if cache.is_file():
@@ -415,9 +413,7 @@ def _ranges(
 def _permuted(
     network: FusionNetwork, rig: Rig, images: Mapping[str, Tensor], alpha: str, frame: Frame
 ) -> list[str]:
-    """How far a fusion with the betas in another order differs from the same fusion with its bands
-    reordered.
-    """
+    """How a fusion with betas in another order differs from the same fusion with bands reordered."""
     betas = rig.betas(alpha)
     order = [2, 0, 1]
     permuted = rig.replace(cameras={n: rig[n] for n in (alpha, *(betas[i] for i in order))})

@@ -1,6 +1,4 @@
-"""Run the notebooks in place, outputs kept: python notebooks/run.py [FILE ...]. Files are written
-atomically.
-"""
+"""Run notebooks in place, keeping outputs: python notebooks/run.py [FILE ...]. Written atomically."""
 
 from __future__ import annotations
 
@@ -16,9 +14,7 @@ HERE = Path(__file__).parent
 
 
 def execute(notebook: nbformat.NotebookNode, folder: Path) -> nbformat.NotebookNode:
-    """The notebook with its outputs, run in `folder` with this checkout's packages. Raises nbclient's
-    errors.
-    """
+    """The notebook with its outputs, run in `folder` with this checkout's packages. Raises as nbclient."""
     patience = {
         "timeout": 1800,
         "startup_timeout": 600,

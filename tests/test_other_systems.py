@@ -1,6 +1,4 @@
-"""What Windows has not (fcntl, resource, a process's pwd) is not needed to import the packages or to fuse
-images.
-"""
+"""What Windows lacks (fcntl, resource, a process's pwd) is not needed to import the packages or to fuse."""
 
 import os
 import subprocess

@@ -8,9 +8,7 @@ LISTED = Path(__file__).with_name("public_names.txt")
 
 
 def public(path: Path) -> list[str]:
-    """What a module offers: its `__all__`, else what it defines without an underscore; not what it
-    imports.
-    """
+    """What a module offers: `__all__`, or what it defines without an underscore; not what it imports."""
     tree = ast.parse(path.read_text())
     names: list[str] = []
     for node in tree.body:

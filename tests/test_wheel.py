@@ -1,6 +1,4 @@
-"""What is in the wheel is enough: `pat demo` runs from it in an empty folder. `make wheel` also installs it
-afresh.
-"""
+"""The wheel's content is enough: `pat demo` runs from it in an empty folder. `make wheel` installs it too."""
 
 import os
 import subprocess

@@ -18,25 +18,19 @@ import jaxtyping
 from beartype import BeartypeConf, beartype
 
 of_types = beartype(conf=BeartypeConf(is_pep484_tower=True, violation_type=TypeError))
-"""beartype, taking an int where a float is asked for, as PEP 484 does; as jaxtyping's, its errors are
-TypeErrors.
-"""
+"""beartype, taking an int for a float, as PEP 484 does; as jaxtyping's, its errors are TypeErrors."""
 WITH_ARGUMENTS = jaxtyping.jaxtyped
 """jaxtyping's own, which also knows axes named after arguments, as "h*{factor}"."""
 ARRAY = type(jaxtyping.Float[Any, ""])
 """The class of the types of arrays."""
 AS_JAXTYPING = ARRAY.__instancecheck_str__
-"""What is wrong with a value for such a type, in words; empty if nothing is. With axes as those of the call
-before.
-"""
+"""What is wrong with a value for a type, in words; empty if nothing. Axes as those of the call before."""
 ORDINARY = re.compile(r"\*?[A-Za-z_]\w*|\d+|\.\.\.")
 """An axis that is a name, a number, or any number of axes."""
 
 
 class Calls(threading.local):
-    """For each call that is being checked in a thread the sizes of its axes by name; None: jaxtyping knows
-    them.
-    """
+    """For each call checked in a thread the sizes of its axes by name; None: jaxtyping knows them."""
 
     def __init__(self) -> None:
         self.sizes: list[dict[str, Any] | None] = []
@@ -64,9 +58,7 @@ def jaxtyped(fn: Any = None, *, typechecker: Any = None) -> Any:
 
 
 def checked(fn: Callable) -> Callable:
-    """The function with its arguments and its result checked: types, and the sizes of axes against each
-    other.
-    """
+    """The function, arguments and result checked: types, and the sizes of axes against each other."""
     if any("{" in str(hint) for hint in fn.__annotations__.values()):
         return with_axes(WITH_ARGUMENTS(fn, typechecker=of_types), ours=False)
     written = fn.__annotations__

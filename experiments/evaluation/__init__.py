@@ -1,3 +1,1 @@
-"""The tables of the documentation: the paper's protocols, conditions, certainty, sweeps of calibration, every
-field.
-"""
+"""The documentation's tables: the paper's protocols, conditions, certainty, calibration sweeps, fields."""

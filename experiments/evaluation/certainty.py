@@ -53,9 +53,7 @@ class Judged(NamedTuple):
 
 
 class Stated(NamedTuple):
-    """What is stated of pixels (n): the probability that the match is right, the half-width of the
-    interval.
-    """
+    """What is stated of pixels (n): the probability that the match is right, the interval's half-width."""
 
     probability: Float[Tensor, " n"]
     half_width: Float[Tensor, " n"]
@@ -172,9 +170,7 @@ def widened(found: Sequence[Judged], *, steps: int = STEPS) -> CertaintyNetwork:
 
 
 class Held(NamedTuple):
-    """How it held under a condition: the stated probability, and the share of true positions in the
-    intervals.
-    """
+    """How it held in a condition: the stated probability, the share of true positions in intervals."""
 
     stated: Reliability
     covered: float

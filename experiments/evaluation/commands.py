@@ -224,9 +224,7 @@ class OnScenes:
     """Folder for ablation.md, its figures and its numbers."""
 
     def comparing(self, fields: Iterable[str]) -> Comparing:
-        """The network, once it is known that its attention alone finds the points and that there are such
-        fields.
-        """
+        """The network, once its attention alone is known to find the points and such fields to exist."""
         from pat.networks.protocol import Comparing
         from pat.networks.weights import load_weights
 
@@ -255,8 +253,7 @@ class OnScenes:
 
 @dataclass
 class Sweeps(OnScenes):
-    """What calibration is worth as it gets wrong or the rig changes: one network, each field, the same
-    scenes.
+    """What calibration is worth as it gets wrong or the rig changes: one network, each field, same scenes.
 
     Curves of calibrated segments, images that are rectified and the result warped back, rows, a local window
     and all of beta, on layered scenes with exact positions. Example: python -m experiments sweeps --sweeps
@@ -271,9 +268,7 @@ class Sweeps(OnScenes):
     """Of the scenes."""
 
     def run(self) -> None:
-        """Write ablation.md, .json, .svg and .png, and print the table. Raises ValueError for a sweep that is
-        none.
-        """
+        """Write ablation.md, .json, .svg, .png; print the table. Raises ValueError for an unknown sweep."""
         from pat.synthesis.photos import PhotoBank
 
         from .sweep_report import write_report
@@ -292,17 +287,13 @@ class Sweeps(OnScenes):
 
 @dataclass
 class Fields(OnScenes):
-    """Every field of the toolkit, with time and memory: unrectified scenes, rectified pairs, the same with F
-    alone.
-    """
+    """Every field of the toolkit, with time and memory: unrectified, rectified, the same with F alone."""
 
     middlebury: MaybePath = None
     """Folder of Middlebury's pairs with true disparity; those of the report half."""
 
     def run(self) -> None:
-        """Write ablation.md, .csv and peaks.png (where attention is largest in three pictures); print the
-        table.
-        """
+        """Write ablation.md, .csv, peaks.png (attention's maxima in three pictures); print the table."""
         from arraygeom.atomic import write_text
         from pat.data.pairs import middlebury_pairs
         from pat.evaluation.ablation import sample_photographs
@@ -336,9 +327,7 @@ class Fields(OnScenes):
 
 @dataclass
 class Patches:
-    """Draw the paper's patches of rendered scenes: recorded images, segments of some pixels, ground truth and
-    depth.
-    """
+    """Draw the paper's patches of rendered scenes: recorded images, some segments, true colours and depth."""
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder written by `pat render`.")]
     out: Out = Path("out/patches.png")

@@ -162,9 +162,7 @@ class ConditionRow(NamedTuple):
 
 
 def methods_of(network: FusionNetwork, recording: Recording) -> dict[str, StereoMethod]:
-    """Those compared: classical, denoised first where there is noise, ours as it is and without
-    corrections.
-    """
+    """Those compared: classical, denoised first if there is noise, ours as it is and without corrections."""
     found: dict[str, StereoMethod] = {"classical": classical}
     level = recording.noise
     if level is None:
@@ -194,9 +192,7 @@ def corrected_classical(network: FusionNetwork, alpha: Tensor, beta: Tensor, max
 
 
 def classical(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
-    """The classical baseline, with the disparity of OpenCV's semi-global matching where that is
-    consistent.
-    """
+    """The classical baseline, disparity by OpenCV's semi-global matching where that is consistent."""
     image = classical_fusion(alpha, beta, max_disparity)
     enlarged = interpolate(beta[None], alpha.shape[1:], mode="bicubic", align_corners=False)[0].clamp(0, 1)
     return StereoResult(image, sgbm_disparity(alpha, luminance(enlarged), max_disparity))
@@ -211,9 +207,7 @@ def sgbm_disparity(
 
 
 def regions_of(pair: StereoPair, hw: tuple[int, int]) -> dict[str, Bool[Tensor, "h w"]]:
-    """Where left's pixels are seen in right, occluded there, beyond its left edge; and all but the left
-    columns.
-    """
+    """Where left's pixels are seen in right, occluded, beyond its left edge; and all but left columns."""
     h, w = hw
     found = {"whole": torch.ones(h, w, dtype=torch.bool)}
     found["cropped"] = torch.arange(w).expand(h, w) >= LEFT_CROP
@@ -230,9 +224,7 @@ def regions_of(pair: StereoPair, hw: tuple[int, int]) -> dict[str, Bool[Tensor, 
 
 
 def chroma_bound(task: MonoColourTask, rate: int) -> Float[Tensor, "3 h w"]:
-    """Left's own colours reduced and enlarged: what beta's resolution would allow if it stood where alpha
-    stands.
-    """
+    """Left's own colours reduced, then enlarged: what beta's resolution would allow if it stood at alpha."""
     luma, chroma = to_luma_chroma(task.ground_truth)
     small = interpolate(chroma[None], scale_factor=1 / rate, mode="area")
     return from_luma_chroma(luma, interpolate(small, luma.shape[1:], mode="bicubic", align_corners=False)[0])
@@ -246,9 +238,7 @@ def evaluate_conditions(
     max_disparity: float = PAPER_DISPARITY,
     progress: Callable[[Iterable[StereoPair], int], Iterable[StereoPair]] = lambda pairs, total: pairs,
 ) -> list[ConditionRow]:
-    """Every method on every colour pair under every condition (see `CONDITIONS`). Raises KeyError for another
-    name.
-    """
+    """Every method on every colour pair under every condition (`CONDITIONS`). Raises KeyError for others."""
     chosen = {name: CONDITIONS[name] for name in conditions}
     rows = []
     for pair in progress(pairs, len(pairs)):
@@ -286,8 +276,7 @@ def _row(
 def depth_errors(
     found: Tensor | None, ground_truth: Disparity | None, regions: Mapping[str, Tensor]
 ) -> tuple[float | None, tuple[float, float] | None]:
-    """The end-point error, and the shares within a pixel: of all whose ground truth is known, and of those
-    seen.
+    """The end-point error, and shares within a pixel: of all with known ground truth, and of those seen.
 
     A pixel of unknown disparity is not within one pixel, and is left out of the end-point error.
     """
@@ -384,9 +373,7 @@ def save_curves(plots: Mapping[str, Curves], path: Path, *, ylabel: str) -> None
 
 
 def save_condition_curves(rows: Sequence[ConditionRow], path: Path) -> None:
-    """A figure: mean PSNR against electrons at white, and against rows off, as far as these were
-    evaluated.
-    """
+    """A figure: mean PSNR against electrons at white, and against rows off, as far as evaluated."""
     known = {row.condition for row in rows}
     axes = {
         "electrons at white": {50: "50 electrons", 200: "200 electrons", 1000: "1000 electrons"},

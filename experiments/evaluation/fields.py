@@ -95,8 +95,7 @@ def fields_of(max_displacement: float) -> dict[str, ReceptiveField]:
 
 
 def rectified_cases(pairs: Iterable[StereoPair], *, rate: int = 2, linked: bool = False) -> Iterator[Case]:
-    """Pairs with true disparity, the right image reduced `rate` times and enlarged again; with F and H alone
-    if `linked`."""
+    """Pairs with true disparity, the right reduced `rate` times and enlarged; F and H alone if `linked`."""
     for pair in pairs:
         if pair.disparity is None:
             continue

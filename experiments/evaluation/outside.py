@@ -1,6 +1,4 @@
-"""Disparities from elsewhere through the same fusion: those of OpenCV's SGBM, the true ones, and a rough
-prior.
-"""
+"""Disparities from elsewhere through the same fusion: OpenCV's SGBM's, the true ones, a rough prior."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The paper's own tables: its protocols, its printed figures, its code's fields, and controls that must score
-less.
+"""The paper's own tables: its protocols, printed figures, its code's fields, controls that must score less.
 
 `table1` is mono + colour (its Table 1). `table2` is mono + three bands (its Table 2): the bands of right are
 three cameras, each of one channel.
@@ -42,9 +41,7 @@ PRINTED = {
     ("table2", "flickr1024"): {2: (25.55, 0.8714), 4: (24.00, 0.8493)},
     ("table2", "kitti"): {2: (28.77, 0.8955), 4: (28.13, 0.8903)},
 }
-"""PSNR and SSIM of fusion as the paper prints them, by protocol, data set and rate; on its own choice of
-images.
-"""
+"""PSNR and SSIM of fusion as the paper prints them, by protocol, data set, rate; on its choice of images."""
 
 
 def halved(pair: StereoPair) -> StereoPair:
@@ -64,8 +61,7 @@ def halved(pair: StereoPair) -> StereoPair:
 
 @dataclass(frozen=True)
 class AuthorsRows:
-    """The rows of the paper's test loader: `arange(j - 80, j)` in column j, and columns 0 to 79 in the first
-    80.
+    """Rows of the paper's test loader: `arange(j - 80, j)` in column j; columns 0 to 79 in the first 80.
 
     The pixel itself, zero disparity, is not among them.
     """
@@ -86,9 +82,7 @@ class AuthorsRows:
 
 @dataclass(frozen=True)
 class ShuffledField:
-    """A field in which each alpha pixel has the segment of another one: the same segments, wrongly
-    assigned.
-    """
+    """A field in which each alpha pixel has another one's segment: the same segments, wrongly assigned."""
 
     field: ReceptiveField
     seed: int = 0
@@ -103,9 +97,7 @@ class ShuffledField:
 
 
 def controls(network: FusionNetwork, *, bands: bool = False) -> dict[str, StereoMethod]:
-    """A fusion that uses beta must score less with each: no beta (zeros), beta of another scene, shuffled
-    fields.
-    """
+    """What fusion that uses beta must lose by: no beta (zeros), beta of another scene, shuffled fields."""
     other = read_image(SAMPLE / f"{BETA}.png")[None]
     fusion = rectified_fusion(network, bands=bands)
 
@@ -137,9 +129,7 @@ def with_found_rig(network: Network) -> StereoMethod:
 
 
 def falls(rows: Sequence[StereoRow], *, method: str = "fusion", names: Iterable[str]) -> str:
-    """A line for each of `names`: its mean PSNR against that of `method`, and the extremes over the
-    images.
-    """
+    """A line for each of `names`: its mean PSNR against `method`'s, and the extremes over the images."""
     psnr = {(row.pair, row.rate, row.method): row.psnr for row in rows}
     lines = []
     for name in names:

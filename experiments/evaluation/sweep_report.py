@@ -85,8 +85,7 @@ def save_curves(rows: Sequence[Row], path: Path) -> Path:
 
 
 def curves(rows: Sequence[Row]) -> Figure:
-    """A column for each sweep, a row for each measure, a curve for each field; bars are 95 % intervals of the
-    mean.
+    """A column a sweep, a row a measure, a curve a field; bars are 95 % intervals of the mean.
 
     PSNR is drawn as in `markdown`.
     """

@@ -75,9 +75,7 @@ class Point(NamedTuple):
 
 
 class RecordedScene(NamedTuple):
-    """Recorded images by name, alpha's view in colour, where its pixels are in beta (h, w, 2), which beta
-    sees.
-    """
+    """Recorded images by name, alpha's colour view, its pixels' places in beta (h, w, 2), which beta sees."""
 
     images: dict[str, Tensor]
     ground_truth: Tensor
@@ -93,9 +91,7 @@ class Result(NamedTuple):
     peak: Tensor
 
     def peaks(self, scene: RecordedScene) -> float:
-        """The share of the pixels that beta sees whose largest weight is within a pixel of the true
-        position.
-        """
+        """The share of pixels beta sees whose largest weight is within a pixel of the true position."""
         off = (self.peak - scene.position).norm(dim=-1)
         return float((off[:, scene.visible] <= 1).double().mean())
 
@@ -129,8 +125,7 @@ class Way(Protocol):
 
 @dataclass(frozen=True)
 class Directly:
-    """The images as they are, beta resized to about alpha's angular resolution as `fuse` does it, with a
-    field.
+    """Images as they are, beta resized to about alpha's angular resolution as `fuse` does, with a field.
 
     Beta's border is repeated around it, as warped images repeat theirs: what beta does not see is half of the
     error.
@@ -139,9 +134,7 @@ class Directly:
     field: ReceptiveField
 
     def fuse(self, network: Comparing, rig: Rig, images: Mapping[str, Tensor]) -> Result:
-        """The network with the field of the pair. All of beta is searched as it is: enlarged it would not
-        fit.
-        """
+        """The network with the pair's field. All of beta is searched as it is: enlarged it would not fit."""
         pair, beta = rig.pair(ALPHA, BETA), images[BETA]
         if isinstance(self.field, Dense):
             return fused(network, pair, images[ALPHA], beta, self.field)
@@ -255,9 +248,7 @@ def _row(
 
 @torch.no_grad()
 def fused(network: Comparing, pair: Pair, alpha: Tensor, beta: Tensor, field: ReceptiveField) -> Result:
-    """The network on two images (C, H, W), whole; beta's bands are cameras of their own to one of several
-    betas.
-    """
+    """The network on two whole images (C, H, W); beta's bands are cameras to one of several betas."""
     betas = [beta[None]] if network.betas == 1 else list(beta[None].split(1, dim=1))
     on_grid = FieldOnGrid.of(field, pair, blocks=False)
     output, compared = network.compare(Inputs.of(alpha[None], betas, [on_grid] * len(betas)))
@@ -266,9 +257,7 @@ def fused(network: Comparing, pair: Pair, alpha: Tensor, beta: Tensor, field: Re
 
 
 def two(rig: Rig) -> Rig:
-    """The first two cameras, as alpha and beta. Raises ValueError unless they are calibrated, with a depth
-    range.
-    """
+    """The first two cameras: alpha, beta. Raises ValueError unless calibrated, with a depth range."""
     first, second = rig.names[:2]
     cameras = rig.pair(first, second).cameras
     for name, camera in zip((first, second), cameras):

@@ -1,5 +1,4 @@
-"""Short exposure - long exposure: four mono cameras, three of them behind filters, each exposed for its own
-time.
+"""Short exposure - long exposure: four mono cameras, three behind filters, each exposed for its own time.
 
 Alpha has no filter. The filters pass 80 nm about 450, 550 and 600 nm: less than a third of alpha's light,
 which longer exposures make up for. The scene's surfaces are lit from very dark to very bright.

@@ -1,5 +1,4 @@
-"""High frame rate - low frame rate: a fast mono alpha, three slow cameras behind filters, and an object that
-moves.
+"""High frame rate - low frame rate: a fast mono alpha, three slow filtered cameras, an object that moves.
 
 No two clocks agree. Every frame of alpha gets colour from the slow frames nearest in time
 (`pat.fusion.sequence`).
@@ -69,9 +68,7 @@ def frame_times(stage: SystemScene, name: str) -> list[float]:
 
 
 def object_velocity(stage: SystemScene) -> tuple[Tensor, int]:
-    """Metres a second in alpha's frame, and which layer moves: one that covers about a seventh of the
-    image.
-    """
+    """Metres a second in alpha's frame, and which layer moves: one of about a seventh of the image."""
     free = stage.shares() * (~stage.scene.solid[0])
     layer = int((free - 0.14).abs().argmin())
     depth = float(stage.seen(stage.alpha)[1].median())

@@ -60,9 +60,7 @@ def clocked(rig: Rig) -> Rig:
 
 
 def recorded_frames(folder: Path) -> dict[str, list[Tensor]]:
-    """The frames, taken to be linear, sRGB-encoded; alpha's brightest 0.5% in the first frame are brought to
-    white.
-    """
+    """The frames, taken as linear, sRGB-encoded; alpha's brightest 0.5% in the first are brought to white."""
     raw = {FAST: [read_image(folder / SCENE / f"{i}.png") for i in FAST_FRAMES]}
     raw |= {name: [read_image(folder / SCENE / f"{name}_{i}.png") for i in SLOW_FRAMES] for name in SLOW}
     gains = {FAST: bright_gain(raw[FAST][0])}

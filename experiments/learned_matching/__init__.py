@@ -1,3 +1,1 @@
-"""Learned features for matching, trained but not better than census in the same pipeline:
-docs/matching.md.
-"""
+"""Learned features for matching, trained, no better than census in the same pipeline: docs/matching.md."""

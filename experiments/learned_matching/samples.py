@@ -148,8 +148,7 @@ class MatchingScenes:
 
 
 def tune_stereo(folder: Path, aside: Sequence[str], *, kept_aside: bool = False) -> list[StereoPair]:
-    """Middlebury's pairs of the tune half with true disparity, without those whose names end in one
-    of `aside`, or these alone."""
+    """Middlebury's tune pairs with true disparity: without names ending in one of `aside`, or these alone."""
     pairs = of_half(middlebury_pairs(folder), "tune")
     return [pair for pair in pairs if pair.name.endswith(tuple(aside)) == kept_aside]
 

@@ -37,8 +37,7 @@ UNSEEN = ("out", "cache", "save", "validate", "photos", "stereo")
 
 @dataclass(frozen=True)
 class FeatureTraining:
-    """A recipe. The same command again continues a run that stopped; the result is that of an uninterrupted
-    run."""
+    """A recipe. The same command continues a run that stopped; its result is an uninterrupted run's."""
 
     photos: tuple[Path, ...] = ()
     """Folders of photographs: the textures of layered scenes."""

@@ -1,6 +1,4 @@
-"""Layered scenes recorded in low light, denoised view by view and fused: what the joint denoiser learns
-from.
-"""
+"""Layered scenes in low light, denoised view by view and fused: what the joint denoiser learns from."""
 
 from __future__ import annotations
 
@@ -62,9 +60,7 @@ class NoisyScene(NamedTuple):
 
 
 def noise_levels(count: int, g: Generator) -> NoiseLevel:
-    """Random levels: 15 to 3,000 electrons at white and up to 5 of read noise, or 1 to 60 of 255 at any
-    value.
-    """
+    """Random levels: 15 to 3,000 electrons at white, up to 5 of read noise, or 1 to 60 of 255 anywhere."""
     draw, light = torch.rand(4, count, 1, 1, 1, generator=g), bool(below(2, g))
     electrons, constant = 15 * 200 ** draw[0], (draw[2] < 0.3) & (not light)
     shot = torch.where(constant, 0.0, 1 / electrons)

@@ -38,9 +38,7 @@ VIEWS, FUSED = "views.safetensors", "best.safetensors"
 
 @dataclass(frozen=True)
 class DenoiserTraining:
-    """A recipe. The same command again continues a run that stopped; the result is that of an uninterrupted
-    run.
-    """
+    """A recipe. The same command continues a run that stopped; its result is an uninterrupted run's."""
 
     photos: tuple[Path, ...] = ()
     """Folders of photographs."""

@@ -138,9 +138,7 @@ class SceneStacks:
 
 
 class SceneShuffle(Sampler[int]):
-    """A random order that reads each scene once: `mixed` scenes at a time, their patches shuffled
-    together.
-    """
+    """A random order that reads each scene once: `mixed` scenes at a time, patches shuffled together."""
 
     def __init__(self, data: ScenePatches, *, mixed: int = 16):
         self.data, self.mixed = data, mixed

@@ -72,9 +72,7 @@ def _evenly(room: int, count: int) -> list[int]:
 
 
 class PatchStack(NamedTuple):
-    """All patches of a scene: linear RGB and depth (metres) by camera, and the batched cameras of those
-    windows.
-    """
+    """A scene's patches: linear RGB and depth (metres) by camera, and the batched cameras of the windows."""
 
     rgb: dict[str, Float[Tensor, "n 3 _ _"]]
     depth: dict[str, Float[Tensor, "n _ _"]]

@@ -1,5 +1,4 @@
-"""The paper's own index files: for every alpha pixel, the beta pixels that it attends to, precomputed on
-disk.
+"""The paper's index files: for every alpha pixel, the beta pixels it attends to, precomputed on disk.
 
 `xxs_ID.npy` holds rows and `yys_ID.npy` columns, or `xxs_ID_k.npy` and `yys_ID_k.npy` for the k-th of several
 betas: whole numbers (int16), counted from 0, one line for each alpha pixel, row by row, with n entries each,
@@ -68,9 +67,7 @@ def write_indices(
 
 
 def agreement(one: Positions, other: Positions) -> Float[Tensor, "h w"]:
-    """For each alpha pixel, how many pixels two fields have in common over how many either has (1 if
-    none).
-    """
+    """For each alpha pixel, how many pixels two fields share over how many either has (1 if none)."""
     a, b = (_keys(p) for p in (one, other))
     common = (a[..., :, None] == b[..., None, :]).any(-1) & (a >= 0)
     both = common.sum(-1)

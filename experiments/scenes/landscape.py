@@ -1,5 +1,4 @@
-"""A garden, a house and a wood under the sky, as a long lens sees them: what visible light and infrared tell
-apart.
+"""A garden, a house, a wood under the sky, through a long lens: what visible light and infrared tell apart.
 
 Leaves and grass are bright in the near infrared and the sky is dark; dyes of cloth do not absorb there.
 """

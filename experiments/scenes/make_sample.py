@@ -1,6 +1,4 @@
-"""Makes the sample array that ships in pat/data/sample: `python -m experiments.scenes.make_sample`; needs
-Blender.
-"""
+"""Makes the sample array in pat/data/sample: `python -m experiments.scenes.make_sample`; needs Blender."""
 
 from __future__ import annotations
 

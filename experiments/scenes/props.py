@@ -42,8 +42,7 @@ def arranged(
     distance: float,
     down: float,
 ) -> Scene:
-    """Objects and lights before the first camera of a rig: `aim` in the middle of its image, at a distance in
-    metres.
+    """Objects and lights before a rig's first camera: `aim` in the middle of its image, a distance in metres.
 
     The camera faces downwards by `down` degrees.
     """
@@ -141,9 +140,7 @@ def lathed(name: str, foot: Vec3, profile: Profile, material: Material, *, euler
 def moved(
     items: Iterable[Object], name: str, to: Vec3, *, yaw: float = 0.0, size: float = 1.0
 ) -> Iterator[Object]:
-    """Objects made about the origin, enlarged, rotated about the vertical by degrees and moved; names get a
-    prefix.
-    """
+    """Objects made about the origin, enlarged, turned about the vertical by degrees, moved; a name prefix."""
     R = torch.from_numpy(Rotation.from_euler("y", yaw, degrees=True).as_matrix())
     pose = Pose(R, R.new_tensor(to))
     for item in items:
@@ -155,9 +152,7 @@ def moved(
 
 
 def on_path(item: Object, path: Sequence[tuple[float, Vec3]], spin: Vec3 = (0, 0, 0)) -> Object:
-    """The object along a path of times and positions, rotated meanwhile by `spin` (rotation vector,
-    radians).
-    """
+    """The object on a path of times and positions, rotated meanwhile by `spin` (rotation vector, radians)."""
     first, start = item.motion.keys[0], path[0][0]
     length = path[-1][0] - start
     keys = []

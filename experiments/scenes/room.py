@@ -21,9 +21,7 @@ _WHITE = plain(0.72, 0.70, 0.66, roughness=0.5)
 
 
 def furniture() -> Iterator[Object]:
-    """The table's legs, a cupboard under the shelf, a rug, an armchair, a chair, a lamp, pictures and a
-    window.
-    """
+    """The table's legs, a cupboard under the shelf, rug, armchair, chair, lamp, pictures and window."""
     yield from _under_the_table()
     yield box("skirting", (0, FLOOR - 0.07, WALL - 0.005), (8, 0.14, 0.02), _WHITE)
     rug = _pattern("wave", (0.30, 0.045, 0.035), (0.42, 0.30, 0.17), 7.0, distortion=3.0)

@@ -1,5 +1,4 @@
-"""A room that a person would photograph: a table with a still life before a bookshelf, a window's light and a
-lamp.
+"""A room one would photograph: a table with a still life before a bookshelf, a window's light and a lamp.
 
 Everything is arranged in a frame of its own, metres: x right, y down, z away from the camera, the origin in
 the middle of the table's front part, on its top.

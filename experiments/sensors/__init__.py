@@ -1,5 +1,4 @@
-"""More of what cameras make of light than training needs: lenses, filters, bands, and chains of steps from
-files.
+"""More that cameras make of light than training needs: lenses, filters, bands, chains of steps from files.
 
 A chain is a list of steps, applied in order to images (B, C, H, W) with values 0..1. Light adds up in linear
 values only, so a chain for ordinary images begins with `DecodeSRGB()` and ends with `EncodeSRGB()`:

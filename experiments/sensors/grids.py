@@ -59,8 +59,7 @@ class Mosaic(Step):
 
 @dataclass(frozen=True)
 class Demosaic(Step):
-    """Colours from a raw image: bilinear (kornia; differentiable) or edge-aware (as raw images are
-    developed).
+    """Colours from a raw image: bilinear (kornia; differentiable) or edge-aware (as raws are developed).
 
     The gradient of "edge-aware" is that of "bilinear".
     """

@@ -21,9 +21,7 @@ from .chain import LitStep, OpticalImage
 
 @dataclass(frozen=True)
 class DiscBlur(Step):
-    """Uniform defocus by a round aperture: the mean over a disc, its radius in pixels, its rim one pixel
-    soft.
-    """
+    """Uniform defocus by a round aperture: the mean over a disc, radius in pixels, its rim a pixel soft."""
 
     radius: float | Tensor
 
@@ -61,9 +59,7 @@ class Defocus(LitStep):
         return replace(light, image=self._diffused(light.image, diameter / 2, float((fy / fx).mean())))
 
     def _diffused(self, image: Tensor, radius: Tensor, aspect: float) -> Tensor:
-        """Bins of signed radii (near is positive), from the farthest to the nearest, each over those
-        before.
-        """
+        """Bins of signed radii (near: positive), from the farthest to the nearest, each over those before."""
         levels = _levels(float(radius.detach().min()), float(radius.detach().max()))
         bins = torch.bucketize(radius.detach(), radius.new_tensor(levels[1:-1]), right=True)
         seen, cover = torch.zeros_like(image), torch.zeros_like(image[:, :1])
@@ -98,9 +94,7 @@ def circle_of_confusion(
 
 
 def _levels(low: float, high: float) -> list[float]:
-    """Signed radii that cover [low, high]: half a pixel apart near zero, an eighth of themselves farther
-    off.
-    """
+    """Signed radii covering [low, high]: half a pixel apart near zero, an eighth of themselves beyond."""
     radii = [0.0]
     while radii[-1] <= max(-low, high):
         radii.append(max(radii[-1] + 0.5, radii[-1] * 1.125))
@@ -112,8 +106,7 @@ def _levels(low: float, high: float) -> list[float]:
 
 @dataclass(frozen=True)
 class MotionBlur(Step):
-    """The mean over the time the shutter is open, `shutter` seconds, centred on the moment of the sharp
-    image.
+    """The mean over the time the shutter is open, `shutter` seconds, about the moment of the sharp image.
 
     Everything moves with `velocity` (x, y) in pixels a second. The border is replicated.
     """
@@ -136,8 +129,7 @@ class MotionBlur(Step):
 
 @dataclass(frozen=True)
 class Vignetting(LitStep):
-    """Less light towards the corners: gain 1 + a r^2 + b r^4 + c r^6, with r = 1 half a diagonal from the
-    centre.
+    """Less light in the corners: gain 1 + a r^2 + b r^4 + c r^6, r = 1 half a diagonal from the centre.
 
     The centre is the camera's principal point if the camera is given to `record`, else the image's middle,
     and the diagonal is that of the image. `natural` multiplies by cos^4 of the ray's angle, which needs the

@@ -39,8 +39,7 @@ STEPS |= {"linear": DecodeSRGB, "coded": EncodeSRGB}
 
 
 def read_chain(value: Any, where: str = "chain") -> tuple[Step, ...]:
-    """The steps of a list as YAML has it. Raises ValueError naming the entry (`where`), with the nearest
-    name.
+    """The steps of a list as YAML has it. Raises ValueError naming the entry (`where`), the nearest name.
 
     >>> read_chain(["decode-srgb", {"noise": {"full_well": 8000, "read": 3}}, {"quantise": 12}])
     (DecodeSRGB(), Noise(full_well=8000.0, read=3.0, counts='gaussian'), Quantise(bits=12))

@@ -105,8 +105,7 @@ class Spectral(Step):
 
 
 def band_weights(band: Band, channels: int = 3) -> tuple[float, ...]:
-    """Weights of R, G, B (and NIR) that add up to 1, for a Gaussian of full width at half maximum
-    `band.width`.
+    """Weights of R, G, B (and NIR) of sum 1, for a Gaussian of full width at half maximum `band.width`.
 
     Raises ValueError for a band that lies beyond what the channels hold: 400 to 700 nm, or to 1000 nm with
     NIR.

@@ -1,6 +1,4 @@
-"""Explicit projection in numpy, float64: what fields are held against. No code is shared with the
-packages.
-"""
+"""Explicit projection in numpy, float64: what fields are held against. Shares no code with the packages."""
 
 import numpy as np
 
@@ -28,9 +26,7 @@ def on_image(camera, x: np.ndarray, margin: float = 0.0) -> np.ndarray:
 
 
 def beta_points(pair, rays: np.ndarray, inverse_depth: np.ndarray) -> np.ndarray:
-    """Points of alpha's rays (n, 3) of z = 1 at inverse depths (m), in beta's frame over their depth: (n, m,
-    3).
-    """
+    """Points of alpha's rays (n, 3), z = 1, at inverse depths (m), in beta's frame over depth: (n, m, 3)."""
     R, t = (v.detach().double().numpy() for v in (pair.beta_from_alpha.R, pair.beta_from_alpha.t))
     return (rays @ R.T)[:, None] + inverse_depth[None, :, None] * t
 

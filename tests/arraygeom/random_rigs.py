@@ -169,9 +169,7 @@ def check(one: Drawn, dtype: torch.dtype) -> None:
 
 
 def fields_of(one: Drawn) -> list[tuple[str, Any, float | None, float | None]]:
-    """Name, field, and the depths between which it has to hold every point that beta sees (None: not checked
-    so).
-    """
+    """Name, field, and the depths between which it must hold each point beta sees (None: not checked so)."""
     near, far = (float(d) for d in one.rig.depth)
     # Not by a half: whether a corner moved onto the very edge of the image is inside is up to rounding.
     step = torch.full((2, *one.pair.alpha.hw), 0.4)
@@ -215,9 +213,7 @@ def _finite(name: str, found: Any) -> None:
 def _holds_what_is_seen(
     name: str, one: Drawn, found: Any, near: float, far: float, dtype: torch.dtype
 ) -> None:
-    """Every point of a ray that beta sees is at the segment, and the segment's ends are at points that it
-    sees.
-    """
+    """Every point of a ray that beta sees is at the segment, and the segment's ends are at points it sees."""
     pair, (w_far, w_near) = one.pair, (1 / far, 1 / near)
     # Even in inverse depth, and in its logarithm: near a camera that the ray passes pixels change quickest.
     w = np.concatenate(

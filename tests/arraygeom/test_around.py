@@ -1,6 +1,4 @@
-"""Fields around a known depth or known matches: where the segments are, also as views change before
-fusion.
-"""
+"""Fields around known depth or matches: where the segments are, also as views change before fusion."""
 
 import math
 

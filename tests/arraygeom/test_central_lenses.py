@@ -1,6 +1,4 @@
-"""Lens models of other tools against those tools' own formulas, written in plain numpy, and against
-themselves.
-"""
+"""Other tools' lens models against those tools' own formulas, written in plain numpy, and themselves."""
 
 import math
 
@@ -128,9 +126,7 @@ def test_every_model_is_tested_and_has_names_and_sizes_for_refinement():
 
 @pytest.mark.parametrize(("model", "c"), CASES)
 def test_the_tools_own_formula(model, c):
-    """Where both are valid; and directions at which the formula is, and we are not, are few and at the very
-    border.
-    """
+    """Where both are valid; directions where the formula is and we are not: few, at the very border."""
     X = directions() * torch.linspace(0.1, 30, 3000)[:, None]
     if model not in BEHIND:
         X = X[X[:, 2] > 0.02 * X.norm(dim=-1)]
@@ -185,9 +181,7 @@ def test_round_trips(model, c, dtype):
 
 @pytest.mark.parametrize(("model", "c"), CASES)
 def test_every_pixel_has_one_ray_or_is_not_valid(model, c):
-    """From pixels of a wide area: what is valid comes back, what is not stays finite, and both have
-    gradients.
-    """
+    """Pixels of a wide area: what is valid comes back, what is not stays finite, both have gradients."""
     xy_d = (torch.rand(2000, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 0.5) * 8
     xy_d[0], xy_d[1] = torch.nan, torch.inf
     xy_d.requires_grad_()
@@ -281,9 +275,7 @@ def test_coefficients_that_are_no_lens_see_nothing(model, c):
 
 @pytest.mark.parametrize(("model", "c"), CASES)
 def test_curved_fields_hold_the_points_that_beta_sees(model, c):
-    """Points along rays of alpha, projected explicitly with the tool's formula, lie at the field's
-    positions.
-    """
+    """Points on rays of alpha, projected explicitly by the tool's formula, lie at the field's positions."""
     view = {"hw": (60, 80), "distortion": lens(model, c)}
     K = intrinsics(24.0, (60, 80))
     beta = Pose.from_centre(

@@ -133,9 +133,7 @@ def test_past_the_turn_is_invalid_and_bounded():
 
 
 def test_a_second_rise_is_not_valid():
-    """k1 = -1, k2 = 0.3: falls between r^2 = 0.46 and 1.4 and rises again beyond; only the first rise
-    counts.
-    """
+    """k1 = -1, k2 = 0.3: falls between r^2 = 0.46 and 1.4, rises again beyond; only the first rise counts."""
     d = Distortion("brown-conrady", torch.tensor([-1, 0.3, 0, 0], dtype=torch.float64))
     _, valid = d.distort(torch.tensor([[0.6, 0.0], [1.0, 0.0], [2.0, 0.0]], dtype=torch.float64))
     assert valid.tolist() == [True, False, False]
@@ -293,9 +291,7 @@ def test_what_does_not_exist_is_refused():
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_the_inverse_of_any_fisheye_is_right_or_invalid(dtype):
-    """Newton's steps inside a bracket can cycle: 5 of 3,000 such lenses were off by up to 1.8 rad, and
-    valid.
-    """
+    """Newton's steps in a bracket can cycle: 5 of 3,000 such lenses were off by up to 1.8 rad, and valid."""
     g = torch.Generator().manual_seed(0)
     k = (torch.rand(3000, 4, generator=g, dtype=torch.float64) * 2 - 1) * 0.05
     lenses = Distortion("kannala-brandt", k.to(dtype))

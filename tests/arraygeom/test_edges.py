@@ -1,6 +1,4 @@
-"""Halves, huge numbers, empty sets, lenses that are none, epipoles, caches: right formulas, awkward
-numbers.
-"""
+"""Halves, huge numbers, empty sets, no lenses, epipoles, caches: right formulas, awkward numbers."""
 
 import dataclasses
 
@@ -171,9 +169,7 @@ def test_gradients_of_curves_by_betas_lens_are_those_of_differences(lens):
 
 
 def test_a_displacement_follows_its_pair():
-    """Steps in place, inference mode and export do not leave a former answer, nor one that gradients cannot
-    use.
-    """
+    """Steps in place, inference mode, export leave no former answer, nor one that gradients cannot use."""
     rig = pinholes()
     K = rig["beta"].K.clone()
     pair = dataclasses.replace(rig.pair("alpha", "beta"), beta=rig["beta"].replace(K=K))
@@ -234,9 +230,7 @@ def in_utm(rig: Rig) -> Rig:
 
 @pytest.mark.parametrize("rig", [pinholes(), bent()], ids=["pinholes", "lenses"])
 def test_rigs_in_map_coordinates_are_right_or_refused(rig):
-    """To a hundredth of a pixel in float64, whatever the pixels' type; float32 would hold the poses to half a
-    metre.
-    """
+    """To a hundredth of a pixel in float64, whatever pixels are; float32 would hold poses to half a metre."""
     here, there = (r.pair("alpha", "beta") for r in (rig, in_utm(rig)))
     for dtype in (F64, torch.float32):
         x = torch.tensor([[20.0, 12.0], [31.0, 25.0]], dtype=dtype)

@@ -468,9 +468,7 @@ def disturbed(rig: Rig, case: int, g: torch.Generator) -> Rig:
 
 
 def larger(rig: Rig, margin: float) -> Pair:
-    """The pair with beta's image wider by a margin on all sides (in as many pixels), where rounding
-    decides.
-    """
+    """The pair, beta's image wider by a margin on all sides (in whole pixels), where rounding decides."""
     h, w = rig["beta"].hw
     sx, sy = w / (w + 2 * margin), h / (h + 2 * margin)
     A = [[sx, 0, (0.5 + margin) * sx - 0.5], [0, sy, (0.5 + margin) * sy - 0.5], [0, 0, 1]]

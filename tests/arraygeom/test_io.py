@@ -82,9 +82,7 @@ def test_single_cameras(file):
 
 
 def test_kitti_rectified():
-    """P1 = K [I | t] with t = (-0.5, 0.01, 0.02): -338 = -0.5 * 700 + 0.02 * 600, 10.4 = 0.01 * 700 + 0.02 *
-    170.
-    """
+    """P1 = K [I | t], t = (-.5, .01, .02): -338 = -.5 * 700 + .02 * 600, 10.4 = .01 * 700 + .02 * 170."""
     for file, options in (
         ("kitti_calib.txt", {"hw": (370, 1240)}),
         ("calib_cam_to_cam.txt", {"format": "kitti"}),

@@ -1,6 +1,4 @@
-"""Rig files with wide lenses: pixels of world points against each tool's own formula, in numpy and its own
-pixels.
-"""
+"""Rig files with wide lenses: world points' pixels against each tool's own formula, in numpy, its pixels."""
 
 import json
 
@@ -97,9 +95,7 @@ REALSENSE = {
 
 @pytest.mark.parametrize(("kind", "case"), REALSENSE.items(), ids=list(REALSENSE))
 def test_realsenses_other_lenses(kind, case, tmp_path):
-    """Fisheyes are printed with a fifth number; without tangential terms the modified model is the plain
-    one.
-    """
+    """Fisheyes are printed with a fifth number; without tangential terms the modified is the plain one."""
     text = (FIXTURES / "realsense.txt").read_text().replace("-0.2  \t0.1  \t0.001  \t-0.002  \t0", case[0])
     (tmp_path / "camera.txt").write_text(
         text.replace("404\n  Distortion: \tBrown Conrady", f"404\n  Distortion: \t{kind}")

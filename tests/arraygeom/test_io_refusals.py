@@ -72,9 +72,7 @@ def formats(file: Path) -> str:
 
 @pytest.mark.parametrize("file", TEXTS, ids=IDS)
 def test_truncated_files(file, tmp_path):
-    """Cut anywhere: an error in one line, or a rig if what is left is a whole file; never another
-    exception.
-    """
+    """Cut anywhere: an error in one line, or a rig if a whole file is left; never another exception."""
     text, format, messages = file.read_bytes(), formats(file), []
     for cut in np.linspace(0, len(text) - 1, 25).astype(int):
         path = copied(file, tmp_path, text[:cut])

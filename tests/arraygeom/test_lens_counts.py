@@ -1,6 +1,4 @@
-"""Random lenses beyond their folds: answers without a flag are right. The table of docs/lenses.md,
-smaller.
-"""
+"""Random lenses beyond their folds: unflagged answers are right. The table of docs/lenses.md, smaller."""
 
 import numpy as np
 import pytest

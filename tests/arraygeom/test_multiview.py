@@ -95,9 +95,7 @@ def test_a_warp_is_kornias():
 
 
 def test_a_warp_through_a_lens_sees_what_is_there():
-    """Beta's image of a plane painted in world coordinates, warped by the plane's depth, is alpha's image of
-    it.
-    """
+    """Beta's image of a plane painted in world coordinates, warped by its depth, is alpha's image of it."""
     rig = bent_rig()
     pair = rig.pair("alpha", "beta")
     depths = {}

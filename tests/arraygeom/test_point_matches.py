@@ -18,9 +18,7 @@ POINTS = (
 
 
 def database(path, *, verified=True, first="a.png"):
-    """A COLMAP database (its documentation's tables): pixels from .5, numbers of keypoints in another
-    order.
-    """
+    """A COLMAP database (by its documentation): pixels from .5, numbers of keypoints in another order."""
     with sqlite3.connect(path) as file:
         file.execute("CREATE TABLE images (image_id INTEGER, name TEXT)")
         file.execute("CREATE TABLE keypoints (image_id INTEGER, rows INTEGER, cols INTEGER, data BLOB)")

@@ -43,9 +43,7 @@ def test_several_columns_are_solved_for_at_once():
 
 
 def test_a_prior_is_as_many_further_values():
-    """A coefficient of standard deviation d about 0 is a value 0 of that deviation, beside those of deviation
-    1.
-    """
+    """A coefficient of standard deviation d about 0 is a value 0 of that deviation, beside those of 1."""
     terms, values, weight = measured()
     rows = torch.cat([terms, torch.eye(3).double()], 1), torch.cat([values, torch.zeros(3)])
     expected = least_squares(*rows, torch.cat([weight, torch.tensor([4.0, 9.0, 16.0]).double()]))
@@ -75,9 +73,7 @@ def test_wrong_values_hardly_count(weights):
 
 
 def test_a_prior_may_depend_on_the_coefficients():
-    """A hundredth of each coefficient, about 0: as that of the coefficients that are found, wherever one
-    starts.
-    """
+    """A hundredth of each coefficient, about 0: as of the coefficients found, wherever one starts."""
     terms, values, _ = measured()
 
     def prior(c: torch.Tensor) -> torch.Tensor:

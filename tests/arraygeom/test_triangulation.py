@@ -193,9 +193,7 @@ def test_batched_cameras_are_a_loop():
 
 
 def test_two_noisy_views_are_opencvs_optimal_triangulation():
-    """`correctMatches` (Hartley & Zisserman, section 12.5), then linear; its polynomial's roots are good to
-    1e-4 m.
-    """
+    """`correctMatches` (Hartley & Zisserman 12.5), then linear; its polynomial's roots are good to 1e-4 m."""
     cameras = array_of(2)
     _, x = seen_points(cameras, noise=0.5)
     pair = Pair(*cameras)

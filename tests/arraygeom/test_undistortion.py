@@ -1,6 +1,4 @@
-"""Pinhole views: OpenCV's maps are the oracle, there and back is the image, nothing of the view is left
-out.
-"""
+"""Pinhole views: OpenCV's maps as oracle, there and back is the image, nothing of the view left out."""
 
 import math
 

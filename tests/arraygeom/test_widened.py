@@ -128,9 +128,7 @@ def test_samples_that_do_not_count_turn_no_tangent():
 
 @pytest.mark.parametrize("field", [Epipolar(), Curved(64), ThroughLenses(Epipolar(), 64)], ids=repr)
 def test_lines_beside_the_image_are_brought_in(field):
-    """Cameras that differ by a shift of the principal point: lines of alpha's first rows pass above
-    beta's.
-    """
+    """Cameras differing by a shift of the principal point: lines of alpha's first rows pass above beta's."""
     rig = two_cameras(centre=(0.2, 0.0, 0.0))
     rig = rig.with_camera("beta", rig["beta"].crop(2, 0, (46, 64)))
     pair = rig.pair("alpha", "beta")

@@ -1,5 +1,4 @@
-"""Several colour betas about a mono alpha: rendered scenes of five cameras, fused with one, two and four of
-the betas.
+"""Several colour betas about a mono alpha: rendered scenes of five cameras, fused with one, two, four betas.
 
     pat render arrays.yaml --scenes 4 --out arrays      # for each generator, with the rig that `--rig FILE`
     writes python -m tests.benchmarks.bench_arrays arrays/* --out tests/benchmarks/RESULTS_arrays.md

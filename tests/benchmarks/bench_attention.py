@@ -55,8 +55,7 @@ def field(ha: int, wa: int, samples: int, device: str) -> Segments:
 def index_everything(
     q: Tensor, k: Tensor, v: Tensor, segments: Segments, samples: int, interpolation: str
 ) -> Tensor:
-    """(a): (b, d, h, w, l) keys and values, nearest, from images that lie channels first, as they usually
-    do."""
+    """(a): (b, d, h, w, l) keys and values, nearest, from images with channels first, as they usually are."""
     x, y = _pixels(k, segments, samples)
     keys, values = (t.contiguous()[:, :, y, x] for t in (k, v))
     weight = torch.einsum("bdhw,bdhwl->bhwl", q, keys).softmax(-1)
@@ -143,8 +142,7 @@ def measure(job: dict) -> dict:
 
 
 def features(ha: int, wa: int, d: int, dtype: torch.dtype, device: str) -> Tensor:
-    """Random ones, channels last; rows repeat every 256, or making them would take longer than what is
-    measured."""
+    """Random, channels last; rows repeat every 256: making them would take longer than what is measured."""
     some = torch.randn(min(ha, 256), wa, d, dtype=dtype, device=device)
     out = torch.empty(1, ha, wa, d, dtype=dtype, device=device)
     for top in range(0, ha, len(some)):

@@ -1,5 +1,4 @@
-"""What `pat rig refine` does to depth when a rig has drifted: simulated rigs, and real pairs with published
-rigs.
+"""What `pat rig refine` does to depth if a rig has drifted: simulated rigs, real pairs with published ones.
 
     python -m tests.benchmarks.bench_drift --draws 3 --out tests/benchmarks/RESULTS_drift.md
 
@@ -64,9 +63,7 @@ def drifted(rig: Rig, kind: str, g: np.random.Generator) -> Rig:
 
 
 def with_lens_mistake(rig: Rig, kind: str) -> Rig | None:
-    """The rig without its distortion, or with another k1 of every camera; None if it has no distortion to
-    leave out.
-    """
+    """The rig without distortion, or with another k1 for every camera; None if there is none to leave out."""
     if kind == "lens left out":
         bare = {name: camera.replace(distortion=None) for name, camera in rig.cameras.items()}
         return (

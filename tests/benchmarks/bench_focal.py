@@ -1,5 +1,4 @@
-"""Focal lengths found from two images alone, of pairs whose cameras are known, against the one that is
-assumed.
+"""Focal lengths from two images alone, of pairs whose cameras are known, against the assumed ones.
 
     python -m tests.benchmarks.bench_focal --out tests/benchmarks/RESULTS_focal.md
 

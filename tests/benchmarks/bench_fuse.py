@@ -108,9 +108,7 @@ def measure(scale: float) -> dict[str, str]:
 
 
 def full_run(cap: str, out: Path) -> str:
-    """The frame at full size under a cap: scores, plan, memory, time, and how it differs from those under
-    others.
-    """
+    """The frame at full size under a cap: scores, plan, memory, time, and difference from other caps."""
     before, threads = os.getloadavg()[0], os.environ.get("OMP_NUM_THREADS", "all")
     table = run_system("wide-narrow", out, full=True, max_memory=cap).table
     lines = [table, f"Threads: {threads}. Load {before:.1f} before, {os.getloadavg()[0]:.1f} after.", ""]

@@ -1,5 +1,4 @@
-"""Sixty kinds of input of `pat fuse`: `python -m tests.benchmarks.bench_inputs [--data ../shared/data]
-[--only WORD]`.
+"""60 inputs of `pat fuse`: `python -m tests.benchmarks.bench_inputs [--data ../shared/data] [--only WORD]`.
 
 Of each its exit status, whether there is depth, the mean confidence and the memory by which the process grew
 at most. Lines are printed as they are measured, and put into the table of tests/benchmarks/RESULTS_inputs.md.

@@ -1,5 +1,4 @@
-"""The main job as a command: `python -m tests.benchmarks.bench_job [--quick] [--runs 3] [--against
-CHECKOUT]`.
+"""The main job, a command: `python -m tests.benchmarks.bench_job [--quick] [--runs 3] [--against CHECKOUT]`.
 
 `pat fuse` as a process, from nothing to written files: the sample, 1280x800 with one and three betas,
 4024x3036 under caps of memory; with kernels compiled before (warm), and with an empty cache (cold). Beside

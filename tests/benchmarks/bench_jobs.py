@@ -1,5 +1,4 @@
-"""A job of forty frames: how fast, and what it survives. `python -m tests.benchmarks.bench_jobs [--frames
-40]`.
+"""A job of forty frames: speed, and what it survives. `python -m tests.benchmarks.bench_jobs [--frames 40]`.
 
 Forty images of the sample array, each a little brighter, fused by `pat fuse`: with one and with two workers;
 with a worker killed (kill -9) in the middle; with the whole command killed and begun again; with a corrupt

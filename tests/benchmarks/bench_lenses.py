@@ -1,5 +1,4 @@
-"""Every lens model beside OpenCV, kornia and pycolmap: wrong answers, error, derivatives, vmap, time;
-docs/lenses.md.
+"""Lens models beside OpenCV, kornia, pycolmap: wrong answers, error, derivatives, vmap, time; docs/lenses.md.
 
     python -m tests.benchmarks.bench_lenses [--lenses 1000] [--models NAME ...] [--write]
 
@@ -48,9 +47,7 @@ K = np.diag([FOCAL, FOCAL, 1.0])
 
 
 class Family(NamedTuple):
-    """A model: coefficients from a generator, its formula of c (n, k) and X (n, 3), the widest angle that is
-    asked.
-    """
+    """A model: coefficients by a generator, its formula of c (n, k) and X (n, 3), the widest angle asked."""
 
     draw: Callable[[np.random.Generator], list[float]]
     formula: Callable[[Any, Array], Array]
@@ -178,9 +175,7 @@ def before_fold(family: Family, c: Array, angle: Array) -> NDArray[np.bool_]:
 
 
 class Drawn(NamedTuple):
-    """Lenses c (l, k); directions (l p, 3), their pixels and whether they are before the fold; pixels to
-    unproject.
-    """
+    """Lenses c (l, k); directions (l p, 3), their pixels, whether before the fold; pixels to unproject."""
 
     c: Array
     X: Array
@@ -208,9 +203,7 @@ def drawn(name: str, lenses: int) -> Drawn:
 
 
 class Library(NamedTuple):
-    """Of all points at once: lenses c (l, k) with X (l, p, 3) to pixels, and pixels (l, p, 2) to
-    directions.
-    """
+    """Of all points: lenses c (l, k) with X (l, p, 3) to pixels, and pixels (l, p, 2) to directions."""
 
     project: Callable[[Array, Array], Answer]
     unproject: Callable[[Array, Array], Answer]
@@ -337,9 +330,7 @@ def angles(X: Array) -> Array:
 
 
 def counted(name: str, library: Library, lenses: Drawn) -> list[str]:
-    """Wrong and missed of project and of unproject, and the median and 99th percentile of the error
-    elsewhere, px.
-    """
+    """Wrong and missed of project and unproject; median and 99th percentile of the error elsewhere, px."""
     family, each, shape = FAMILIES[name], np.repeat(lenses.c, POINTS, 0), (len(lenses.c), POINTS)
     with np.errstate(all="ignore"):
         pixels, valid = library.project(lenses.c, lenses.X.reshape(*shape, 3))
@@ -383,9 +374,7 @@ def timed(library: Library, lenses: Drawn) -> list[str]:
 
 
 def derivatives(name: str, library: str) -> list[str]:
-    """Whether second derivatives are right (against differences of first ones), and vmap over points and
-    lenses.
-    """
+    """Whether second derivatives are right (by differences of first ones), and vmap over points, lenses."""
     if library not in ("arraygeom", "kornia"):
         return ["none", "none"]
     rng = np.random.default_rng(1)

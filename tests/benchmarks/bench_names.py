@@ -1,5 +1,4 @@
-"""What `pat rig doctor` calls mistakes, drifts and healthy rigs, and what its repair does to depth: a
-confusion table.
+"""What `pat rig doctor` calls mistakes, drifts, healthy rigs, its repair does to depth: a confusion table.
 
     python -m tests.benchmarks.bench_names --draws 20 --out tests/benchmarks/RESULTS_names.md
 
@@ -64,9 +63,7 @@ SHIFTS = ("1-based, one", "1-based, both")
 
 
 class Mistake(NamedTuple):
-    """Its name ("nothing" for drifts and healthy rigs), and how it is made; lens: with rigs that have one
-    only.
-    """
+    """Its name ("nothing": drifts, healthy rigs), and how it is made; lens: with rigs that have one only."""
 
     kind: str
     make: Callable[[Rig, Random], Rig]
@@ -180,17 +177,13 @@ class Judge:
 
 
 def observable(case: Case, bad: Rig) -> bool:
-    """Whether images can show a gross mistake of a rig: more than its own misfit, or points where nothing is
-    seen.
-    """
+    """Whether images can show a rig's gross mistake: more than its own misfit, or points where none is."""
     given, wrong = (median_off(rig, case.matches) for rig in (case.rig, bad))
     return wrong > max(given + 0.5, 3 * given) or share_outside(bad, case.matches) > 0.5
 
 
 def judged(mistake: Mistake, case: Case, bad: Rig) -> Outcome:
-    """The outcome: right, drifted, as good (the doctor says so of the true name), wrong, worse, false
-    alarm.
-    """
+    """Outcome: right, drifted, as good (the doctor says so of the true name), wrong, worse, false alarm."""
     sizes = {name: camera.hw for name, camera in case.rig.cameras.items()}
     found = diagnose_matches(bad, sizes, case.matches)
     name = found.named.kind

@@ -132,9 +132,7 @@ def _rig(views: Views, Ks, lenses, Rs, ts) -> Rig:
 
 
 class HeldOut(NamedTuple):
-    """Distances (pixels) of held-out points by rigs calibrated without them; in how many parts there is
-    none.
-    """
+    """Distances (pixels) of held-out points by rigs calibrated without them; in how many parts is none."""
 
     errors: Float[np.ndarray, " n"]
     refused: int

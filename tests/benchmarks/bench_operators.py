@@ -1,5 +1,4 @@
-"""Operators of several views beside OpenCV, kornia, pycolmap and SciPy: value, gradient, time;
-docs/lenses.md.
+"""Multiview operators beside OpenCV, kornia, pycolmap, SciPy: value, gradient, time; docs/lenses.md.
 
     python -m tests.benchmarks.bench_operators [--write]
 

@@ -1,5 +1,4 @@
-"""From Python as from the command line, beside other processes or not: seconds of a frame once all is
-imported.
+"""From Python as from the command line, beside other processes or not: seconds a frame once imported.
 
     python -m tests.benchmarks.bench_python [--busy 3] [--frames 4] [--against FOLDER]
 

@@ -93,9 +93,7 @@ def _span(values: list[float]) -> str:
 
 
 def fast_and_slow(data: Path) -> Iterator[str]:
-    """F as published; as `pat rig refine` and `pat rig start` leave it, which find lenses; of the points'
-    own.
-    """
+    """F as published; as `pat rig refine` and `start` leave it, which find lenses; of the points' own."""
     yield markdown_header(
         ["fast + slow", "points held out", "published F", "F of all points", "refined", "started"]
     )
@@ -118,9 +116,7 @@ def fast_and_slow(data: Path) -> Iterator[str]:
 
 
 def rendered_rigs(draws: int, g: torch.Generator, scenes: Path | None) -> Iterator[str]:
-    """The sample array and scenes rendered before: their rigs are the truth, and so are the colours at
-    alpha's view.
-    """
+    """The sample array and scenes rendered before: rigs, and colours at alpha's view, are the truth."""
     yield markdown_header(
         [
             "rendered",

@@ -70,9 +70,7 @@ def speed(name: str, facts: list[dict[str, Any]], seconds: float | None, workers
 
 
 def memory(facts: list[dict[str, Any]]) -> list[str]:
-    """A row for each worker: MB after some of its scenes, and what a scene adds by a straight line from the
-    5th on.
-    """
+    """A row for each worker: MB after some scenes, what a scene adds by a straight line from the 5th on."""
     rows = []
     for process in sorted({f["process"] for f in facts}):
         used = [f["memory_mb"] for f in facts if f["process"] == process]

@@ -1,5 +1,4 @@
-"""What random rigs in training are worth: weights trained on one rig and on random ones, on rigs of many
-kinds.
+"""What random rigs are worth in training: weights from one rig and from random ones, on many kinds.
 
     python -m tests.benchmarks.bench_rigs --single runs/mono-colour-single-rig/best.safetensors
 
@@ -61,9 +60,7 @@ class Args:
 
 
 def ahead(networks: dict[str, FusionNetwork], case: AblationCase) -> dict[str, float] | None:
-    """By how many dB each is ahead of the classical baseline; and the baseline's PSNR. None if nothing
-    rectifies.
-    """
+    """By how many dB each leads the classical baseline; and its PSNR. None if nothing rectifies."""
     try:
         base = score(classical(case.rig, case.images, ALPHA, BETA), case.ground_truth).psnr
     except ValueError:

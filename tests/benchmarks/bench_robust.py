@@ -1,5 +1,4 @@
-"""Board calibration with wrong corners: errors in stated standard deviations over many draws of simulated
-corners.
+"""Board calibration with wrong corners: errors in stated deviations over many draws of simulated corners.
 
     python -m tests.benchmarks.bench_robust --draws 200 --out tests/benchmarks/RESULTS_robust.md
 

@@ -1,5 +1,4 @@
-"""Stated standard deviations against the jackknife on real boards: each frame is left out, and all is fitted
-again.
+"""Stated standard deviations against the jackknife on real boards: without each frame, all is fitted again.
 
     python -m tests.benchmarks.bench_sigma --out tests/benchmarks/RESULTS_sigma.md
 

@@ -62,9 +62,7 @@ def timed(work: Callable[[], object], repeats: int) -> Times:
 
 
 class Materialised(nn.Module):
-    """The attention engine of the paper's network the official way: positions from files, everything
-    gathered.
-    """
+    """The paper network's attention engine the official way: positions from files, everything gathered."""
 
     def __init__(self, engine: nn.Module, files: list[Path]) -> None:
         super().__init__()

@@ -1,5 +1,4 @@
-"""Colour where beta does not see: each way to fill alone, the choice of the network, and the best choice
-there is.
+"""Colour where beta does not see: each way to fill alone, the network's choice, the best choice possible.
 
     python -m tests.benchmarks.bench_unseen DATA [--half report] [--out tests/benchmarks/RESULTS_unseen.md]
 
@@ -66,9 +65,7 @@ def filled_by(network: GuidedPAT, fill: int | None) -> None:
 
 
 def images_of(network: GuidedPAT, pair: StereoPair) -> tuple[dict[str, Tensor], Tensor]:
-    """The fused images by the way of filling, with the classical one, and the ground truth; (3, H, W)
-    each.
-    """
+    """Fused images by the way of filling, with the classical one, and ground truth; (3, H, W) each."""
     task = mono_colour_task(pair, 2)
     given = task.alpha, task.beta, PAPER_DISPARITY
     found = {"classical": classical_fusion(*given)}
@@ -89,9 +86,7 @@ def best(images: list[Tensor], truth: Tensor) -> Tensor:
 
 
 class Unseen(NamedTuple):
-    """What is filled in at some pixels of a pair: the gain over grey in dB, and how strong the colours
-    are.
-    """
+    """What is filled in at some pixels of a pair: the gain over grey in dB, how strong the colours are."""
 
     gain: float
     strength: float
@@ -103,9 +98,7 @@ def by_distance(
     seen: Bool[Tensor, "h w"],
     known: Bool[Tensor, "h w"],
 ) -> dict[int, Unseen]:
-    """What is filled in at the known pixels that are not seen, by the lower bound of their distance from seen
-    ones.
-    """
+    """What is filled in at known unseen pixels, by the lower bound of their distance from seen ones."""
     distance = torch.from_numpy(distance_transform_edt(~seen.numpy()))
     luma, chroma = to_luma_chroma(truth)
     filled = to_luma_chroma(image)[1]

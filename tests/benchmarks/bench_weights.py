@@ -1,5 +1,4 @@
-"""What each of the shipped networks costs: parameters, operations of its convolutions, seconds of a
-processor.
+"""What each shipped network costs: parameters, operations of its convolutions, seconds of a processor.
 
 python -m tests.benchmarks.bench_weights
 """

@@ -1,5 +1,4 @@
-"""What `bench_job` starts, each part in a process of its own: `python -m tests.benchmarks.job_parts PART
-...`.
+"""What `bench_job` starts, each part a process of its own: `python -m tests.benchmarks.job_parts PART ...`.
 
 `scene`: the sample array enlarged to any size, with several copies of the colour camera, through lenses or
 not. `classical`, `opencv`: other ways to the same image, from files to a file. `stages`: `pat fuse` with the
@@ -33,8 +32,7 @@ STAGES = {
 
 
 def scene(folder: Path, width: int, height: int, betas: int, k1: float = 0.0) -> None:
-    """Rig and images: the sample array's, enlarged; `betas` copies of its colour camera, which differ by a
-    pixel.
+    """Rig and images: the sample array's, enlarged; `betas` copies of its colour camera, a pixel apart.
 
     With `k1`, as through lenses of that first radial coefficient.
     """

@@ -16,9 +16,7 @@ def data_and_out(description: str) -> argparse.Namespace:
 
 
 def print_tables(title: str, tables: Iterable[Iterable[str]], out: Path | None) -> None:
-    """Print the rows of each table as they come, with a blank line between tables; write them to `out` if
-    given.
-    """
+    """Print each table's rows as they come, a blank line between tables; write them to `out` if given."""
     lines: list[str] = []
     for table in tables:
         for row in table:

@@ -53,9 +53,7 @@ def rig() -> Rig:
 
 
 def board_poses(cameras: Rig, count: int = POSES, *, seed: int = 0) -> list[Pose]:
-    """`world_from_board`: in front of each camera in turn, at a random position, visible to the others
-    too.
-    """
+    """`world_from_board`: before each camera in turn, at a random position, visible to the others too."""
     random = np.random.default_rng(seed)
     found: list[Pose] = []
     while len(found) < count:

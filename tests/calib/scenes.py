@@ -60,9 +60,7 @@ def uninformed(fit: RefinementProblem) -> Solution:
 def seen_points(
     rig, *, count=200, near=2.0, far=6.0, noise=0.15, seed=0
 ) -> dict[tuple[str, str], PointMatches]:
-    """Points of the first two cameras, between two depths and in both images, good to `noise` pixels in
-    beta.
-    """
+    """Points of the first two cameras between two depths, in both images, good to `noise` pixels in beta."""
     g = torch.Generator().manual_seed(seed)
     (a, alpha), (b, beta) = list(rig.cameras.items())[:2]
     h, w = alpha.hw

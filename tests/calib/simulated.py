@@ -1,6 +1,4 @@
-"""Simulated rigs of wide and narrow field and the points matched in their images, with noise and wrong
-matches.
-"""
+"""Simulated rigs of wide and narrow field, the points matched in their images, with noise, wrong ones."""
 
 from __future__ import annotations
 
@@ -61,9 +59,7 @@ def simulated_matches(
     noise: float = NOISE,
     wrong: float = WRONG,
 ) -> dict[tuple[str, str], PointMatches]:
-    """Matched points of every two neighbouring cameras of a true rig; wrong ones lie some pixels across the
-    lines.
-    """
+    """Matched points of neighbouring cameras of a true rig; wrong ones lie some pixels across the lines."""
     names = rig.names
     found = {}
     for a, b in combinations(names, 2):

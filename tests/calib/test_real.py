@@ -42,9 +42,7 @@ def test_the_rig_of_another_experiment_is_found_out(shared_data):
 
 @pytest.mark.slow
 def test_a_published_rig_that_does_not_fit_is_given_no_name(shared_data):
-    """A shift by a pixel brings SYNTIM's SmRub nearer to its images, but does not explain them to their
-    noise.
-    """
+    """A pixel's shift brings SYNTIM's SmRub nearer to its images, but does not explain them to noise."""
     (pair,) = syntim(shared_data, ("SmRub",))
     rig, matches = Rig({name: pair.rig[name] for name in pair.images}), match_cameras(pair.images)
     rig = rig.replace(depth=seen_depths(rig.pair(*rig.names), matches[rig.names]))

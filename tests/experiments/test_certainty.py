@@ -17,9 +17,7 @@ from pat.matching.certainty import MEASURED
 
 
 def judged(pair, power=2.0, condition="ideal", count=4000):
-    """Matches right with this power of their first number, whose errors are then up to a pixel, else up to
-    9.
-    """
+    """Matches right with this power of their first number; errors then up to a pixel, else up to 9."""
     g = torch.Generator().manual_seed(sum(map(ord, pair + condition)))
     numbers = torch.rand(count, MEASURED, generator=g)
     draw, size = torch.rand(2, count, generator=g)

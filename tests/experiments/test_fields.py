@@ -1,6 +1,4 @@
-"""Every field in one table: cases say where points are, fields that cannot serve are named, others are
-scored.
-"""
+"""Every field in one table: cases say where points are, unfit fields are named, others are scored."""
 
 from __future__ import annotations
 
@@ -35,9 +33,7 @@ HW, SHIFT = (32, 48), 5
 
 @pytest.fixture(scope="module")
 def pair() -> StereoPair:
-    """A smooth picture and the same, shifted: the disparity is 5 everywhere, and not known in the first
-    rows.
-    """
+    """A smooth picture and itself shifted: the disparity is 5 everywhere, not known in the first rows."""
     g = torch.Generator().manual_seed(0)
     wide = torch.nn.functional.interpolate(
         torch.rand(1, 3, 8, 14, generator=g), size=(32, 53), mode="bicubic"

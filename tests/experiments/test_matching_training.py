@@ -1,5 +1,4 @@
-"""Training of features for matching: matches that are exact, a loss that wants them, runs that continue
-exactly."""
+"""Training of features for matching: exact matches, a loss that wants them, runs that continue exactly."""
 
 import csv
 

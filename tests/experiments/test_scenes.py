@@ -1,6 +1,4 @@
-"""Scenes as one would photograph them: whole in the first image, lit from above, a room around a wide
-camera.
-"""
+"""Scenes as one would photograph them: whole in the first image, lit from above, a room around wide ones."""
 
 import pytest
 import torch

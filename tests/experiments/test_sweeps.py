@@ -1,6 +1,4 @@
-"""Sweeps of calibration: rigs are off by what they say, scenes are exact, one's own field runs, reports are
-read.
-"""
+"""Sweeps of calibration: rigs are off as they say, scenes exact, one's own field runs, reports are read."""
 
 from __future__ import annotations
 
@@ -49,9 +47,7 @@ def network() -> PAT:
 
 @pytest.mark.parametrize("sweep", [*SWEEPS])
 def test_scenes_are_exact_for_every_rig(sweep, bank):
-    """Beta at the true positions is alpha's ground truth where beta sees the point, and not where it does
-    not.
-    """
+    """Beta at the true positions is alpha's ground truth where it sees the point, and only there."""
     # Beta's wider view is coarser, and a larger turn of the lens blurs: the first values are enough.
     scene = made(point(sweep, SWEEPS[sweep][1][1], hw=HW).rig, bank, 0)
     seen = sample(scene.images[BETA][None], scene.position[None].float()).values[0]
@@ -113,9 +109,7 @@ def test_ones_own_field_on_ones_own_rig(network, bank):
 
 
 def test_what_was_resampled_comes_back(network, bank):
-    """A network that returns alpha: its picture survives both resamplings, and so do the positions of the
-    matches.
-    """
+    """A network that returns alpha: its picture survives both resamplings, and so do matches' positions."""
 
     class Identity:
         betas = 1

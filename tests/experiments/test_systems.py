@@ -1,6 +1,4 @@
-"""The four arrays: rigs are the paper's, recordings are files as cameras write them, fusion improves on
-alpha.
-"""
+"""The four arrays: the paper's rigs, recordings as cameras write files, fusion better than alpha."""
 
 import math
 import re

@@ -1,6 +1,4 @@
-"""What is damaged, and what is asked of it: rigs of all formats, images, weights, checkpoints, covariance
-files.
-"""
+"""What is damaged, and what is asked of it: rigs of all formats, images, weights, checkpoints, covariance."""
 
 from __future__ import annotations
 

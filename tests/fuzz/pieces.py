@@ -1,6 +1,4 @@
-"""Damage to files that are made of pieces: chunks of PNG and WebP, segments of JPEG, boxes of MP4, entries of
-TIFF.
-"""
+"""Damage to files made of pieces: chunks of PNG, WebP, segments of JPEG, boxes of MP4, entries of TIFF."""
 
 from __future__ import annotations
 

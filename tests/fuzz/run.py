@@ -1,5 +1,4 @@
-"""Damaged files of every kind, each in a process of its own with 4 GiB and 10 s; the table of
-docs/fuzzing.md.
+"""Damaged files of every kind, each in its own process with 4 GiB and 10 s; the table of docs/fuzzing.md.
 
     python -m tests.fuzz.run [--only rig] [--share 0.1] [--out docs/fuzzing.md]
 

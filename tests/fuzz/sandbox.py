@@ -24,8 +24,7 @@ WAITING = 12
 
 
 class Outcome(NamedTuple):
-    """How a case ended: "read", "refused" or what went wrong, its last line, seconds of a core, peak resident
-    bytes.
+    """How a case ended: "read", "refused" or what was wrong, last line, core seconds, peak resident bytes.
 
     What the child holds from its parent is not counted in the peak.
     """
@@ -37,8 +36,7 @@ class Outcome(NamedTuple):
 
 
 def ended(case: Callable[[], str], log: Path) -> Outcome:
-    """Run a case that returns "read" or "refused" (or anything else: a fault) in a child with 4 GiB and 10 s
-    of a core.
+    """Run a case that returns "read" or "refused" (else: a fault) in a child with 4 GiB and 10 s of a core.
 
     A traceback, a signal and a time-out are faults. What the case prints goes to `log`.
     """

@@ -159,9 +159,7 @@ def training_job(folder: Path) -> Job:
 
 
 def _run_of(out: Path) -> dict[str, bytes]:
-    """The numbers of each step, validations without their time, and the tensors of weights and last
-    checkpoint.
-    """
+    """The numbers of each step, validations less their time, tensors of weights and last checkpoint."""
     checkpoint = newest_checkpoint(out / "checkpoints")
     assert checkpoint is not None
     found = {name: tensor.numpy().tobytes() for name, tensor in checkpoint.tensors.items()}

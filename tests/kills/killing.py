@@ -49,9 +49,7 @@ class Job(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """A job that nobody killed: its contents, those of the former command, its seconds, writes, and largest
-    file.
-    """
+    """A job nobody killed: its contents, those of the former command, its seconds, writes, largest file."""
 
     contents: dict[str, bytes]
     former: Path | None
@@ -102,9 +100,7 @@ def started(arguments: list[str], log: Path, announced: Path | None = None) -> i
 
 
 def status_of(child: int, seconds: float | None = None) -> int | None:
-    """The exit status of a process (negative: the signal that ended it), None if it runs on after some
-    seconds.
-    """
+    """A process's exit status (negative: the signal that ended it), None if it runs on for some seconds."""
     end = time.monotonic() + (WAITING if seconds is None else seconds)
     while True:
         found, status = os.waitpid(child, os.WNOHANG)
@@ -271,8 +267,7 @@ def files_of(out: Path) -> dict[str, bytes]:
 
 
 def mixed(found: dict[str, bytes], versions: list[dict[str, bytes]], last: str) -> list[str]:
-    """What is wrong with files that belong together: some are torn, or not of the making of the one written
-    last.
+    """What is wrong with files that belong together: torn, or not of the making of the one written last.
 
     Where there is no last one yet, the others only have to be whole.
     """
@@ -320,9 +315,7 @@ def dask_cluster(folder: Path) -> Iterator[tuple[str, subprocess.Popen]]:
 
 
 def scheduler_killed(job: Job, right: Reference, folder: Path, *, kills: int, seed: int = 0) -> Killed:
-    """Kill the scheduler under a command, which has to end with one line, and continue with another
-    scheduler.
-    """
+    """Kill the scheduler under a command, which must end with one line, and continue with another."""
     rng = np.random.default_rng([seed, len(WAYS)])
     out, faults = folder / f"{job.name}-scheduler", []
     for _ in range(kills):

@@ -1,5 +1,4 @@
-"""Commands killed at random moments, inside writes, with their workers and schedulers; the table of
-docs/kills.md.
+"""Commands killed at random, inside writes, with their workers and schedulers; the table of docs/kills.md.
 
     python -m tests.kills.run [--only fuse] [--share 0.5] [--out docs/kills.md]
 

@@ -23,9 +23,7 @@ def texture(X: Tensor) -> Tensor:
 
 
 def seen(camera: Camera, samples: int = 3) -> tuple[Tensor, Tensor]:
-    """The image (3, H, W) that a camera records, `samples` squared rays a pixel, and how far along each ray
-    it is.
-    """
+    """The image (3, H, W) a camera records, `samples` squared rays a pixel, and how far along each it is."""
     grid = pixel_grid(camera.hw, dtype=torch.float64)
     steps = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5
     colours, distance = [], grid[..., 0]
@@ -38,9 +36,7 @@ def seen(camera: Camera, samples: int = 3) -> tuple[Tensor, Tensor]:
 
 
 def hit(camera: Camera, x: Tensor) -> tuple[Tensor, Tensor]:
-    """What the rays of pixels meet in the world, and how far from where they start; 0 for pixels without a
-    ray.
-    """
+    """What pixels' rays meet in the world, and how far from their start; 0 for pixels without a ray."""
     rays, valid = camera.rays(x)
     world = camera.cam_from_world.inverse()
     start = world.apply(camera.ray_origins(x))

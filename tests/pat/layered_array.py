@@ -1,6 +1,4 @@
-"""An array of two cameras before layered photographs: harder than the sample array, on which bounds were
-set.
-"""
+"""Two cameras before layered photographs: harder than the sample array, on which bounds were set."""
 
 from pathlib import Path
 

@@ -28,9 +28,7 @@ def test_attention(operator, transformation):
 
 
 def whole_graphs(operators: list[str]) -> dict[str, str]:
-    """The verdicts of compilation, by a process without the tests' own checks of shapes, which Dynamo cannot
-    trace.
-    """
+    """Compilation's verdicts, by a process without the tests' shape checks, which Dynamo cannot trace."""
     text = (
         f"from tests.transformations.run import verdict\nfor o in {operators}: print(verdict(o, 'compile'))"
     )

@@ -153,9 +153,7 @@ def geometry_alone(folder: Path, wheel: Path, python: str, torch: str | None, ke
 
 
 def lowest(torch: str | None) -> str:
-    """The last patches of the oldest versions that pyproject.toml allows; without torch where a version is
-    given.
-    """
+    """Last patches of the oldest versions pyproject.toml allows; without torch if a version is given."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     pinned = [re.sub(r">=(\d+)$", r">=\1.0", requirement) for requirement in project["dependencies"]]
     pinned = [re.sub(">=(.*)", r"==\1.*", requirement) for requirement in pinned]

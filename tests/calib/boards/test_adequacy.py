@@ -1,6 +1,4 @@
-"""Uncertainty of projection, halves of the frames, proposed views, lens models, the page for watching a
-folder.
-"""
+"""Uncertainty of projection, halves of the frames, proposed views, lens models, the watched folder's page."""
 
 from dataclasses import replace
 
@@ -222,9 +220,7 @@ def test_rational_lenses_are_fitted():
 
 
 def test_no_board_is_mistaken_for_its_mirror_image_by_a_poor_start():
-    """From a camera with one radial term a board near the corner was seen from the other side for good: 5.7
-    px.
-    """
+    """With one radial term a board near the corner was seen from the other side for good: 5.7 px."""
     true = camera(420.0, (480, 640), lens=(-2.0, 1.5, 0.001, -0.001, 0.05, -1.6, 1.2, 0.1))
     views = see(Rig({"c": true}), board_poses(12, seed=5, spread=0.7, depth=(0.6, 1.6)), noise=0.05)
     assert calibrate(views, BOARD).rms < 0.15

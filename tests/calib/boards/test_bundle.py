@@ -46,9 +46,7 @@ from tests.calib.tracks import (
 
 
 def shaken(problem, size, seed=0):
-    """The problem with all that is free moved: by `size` times 0.01 rad, 0.01 m, 5 px, 0.02 of a
-    coefficient.
-    """
+    """The problem, all that is free moved: by `size` times 0.01 rad, 0.01 m, 5 px, 0.02 of coefficients."""
     random = np.random.default_rng(seed)
     cameras = {}
     for (name, c), mask in zip(problem.cameras.items(), all_free(problem.cameras, lens=2).values()):
@@ -116,9 +114,7 @@ def test_perfect_corners_recover_the_ground_truth():
 
 
 def test_the_least_squares_are_scipys(small):
-    """The same minimum and the same covariance as a general solver finds without Schur complement or
-    autodiff.
-    """
+    """The minimum and covariance that a general solver finds without Schur complement or autodiff."""
     _, _, problem = small
     fit = adjust(problem)
     count = len(fit.names)
@@ -192,9 +188,7 @@ def test_fixed_numbers_stay_bit_identical(small):
 
 @pytest.mark.slow
 def test_the_covariance_is_true():
-    """Thirty draws of noise: squared errors in units of the covariance are chi-square, and so is each
-    number's.
-    """
+    """Thirty draws of noise: squared errors in the covariance's units are chi-square, each number's too."""
     rig, boards = four_cameras(), board_poses(24)
     squares, relative, worst = [], [], []
     for draw in range(30):
@@ -248,9 +242,7 @@ def test_caliscopes_tracks_fit_better_than_published(shared_data):
 
 @pytest.mark.slow
 def test_caliscopes_corners_through_all_of_calibrate(shared_data):
-    """Boards that are rigid, cameras that are not quite synchronised, nothing known before: at most its own
-    RMS.
-    """
+    """Rigid boards, cameras not quite synchronised, nothing known before: at most its own RMS."""
     found = calibrate(caliscope_views(shared_data), parse_board(CALISCOPE_BOARD))
     print("rms", found.rms)
     assert found.rms < CALISCOPE_RMS

@@ -1,6 +1,4 @@
-"""Finding boards: exact under perspective and lens, in dim, inverted and 16-bit images; why they are not
-found.
-"""
+"""Finding boards: exact under perspective and lens, in dim, inverted, 16-bit images; why not found."""
 
 from functools import cache
 

@@ -1,6 +1,4 @@
-"""Markers at known positions as a target: their file, their detection, and rigs from one image of each
-camera.
-"""
+"""Markers at known positions as a target: their file, detection, and rigs from one image a camera."""
 
 import cv2
 import numpy as np

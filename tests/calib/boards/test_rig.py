@@ -238,9 +238,7 @@ def test_unobservable_parameters_are_fixed():
 
 
 def test_a_poorly_constrained_camera_stays_plausible():
-    """Four boards in the middle, hardly tilted, corners to half a pixel: square pixels, a middle in the
-    middle.
-    """
+    """Four boards in the middle, hardly tilted, corners to half a pixel: square pixels, a central middle."""
     true = camera(900.0, (480, 640), lens=(-0.1, 0.0, 0.0, 0.0, 0.0))
     views = see(Rig({"cam": true}), board_poses(4, tilt=18.0, depth=(1.3, 1.6), spread=0.02), noise=0.5)
     found = calibrate_single("cam", views["cam"], BOARD, final=False).problem.cameras["cam"]
@@ -316,9 +314,7 @@ def test_a_board_that_bends_raises_the_deviations():
 
 @pytest.mark.parametrize(("frames", "raised"), [(4, 3.0), (7, 1.0)])
 def test_deviations_that_few_frames_cannot_check_are_raised(frames, raised):
-    """Of a real pair, baselines from three frames were up to 6.8 stated deviations off, and nothing said
-    so.
-    """
+    """Of a real pair, baselines of three frames were up to 6.8 stated deviations off; nothing said so."""
     found = calibrate(see(pair_rig(), board_poses(frames, spread=0.2), noise=0.05), BOARD)
     assert found.raised == raised
     assert any("too few to check standard deviations" in note for note in found.notes) == (raised > 1)
@@ -339,8 +335,7 @@ def test_frames_that_disagree_about_the_focal_lengths_raise_those_alone(found, m
 
 @pytest.mark.parametrize("part", [0, 2])
 def test_small_boards_around_the_centre_do_not_lead_the_start_astray(shared_data, part):
-    """Four fifths of a real recording: without part 0, aspect ratio and k2 ran off (4,227 by 937 px): "all
-    parallel".
+    """Four fifths of a recording: without part 0 aspect and k2 ran off (4,227 by 937 px): "all parallel".
 
     So did one of 96 random subsets of its cameras' boards.
     """

@@ -1,6 +1,4 @@
-"""`pat rig diff`: simulated recalibrations of a rig that moved and of one that did not, and what is
-refused.
-"""
+"""`pat rig diff`: simulated recalibrations of a rig that moved and one that did not; what is refused."""
 
 import math
 from itertools import pairwise
@@ -46,9 +44,7 @@ def compared(one, other):
 
 
 def shares(rig, count):
-    """Of so many recalibrations of a rig that did not move and of one that did, what share is said to be
-    so.
-    """
+    """Of so many recalibrations of a rig that did not move and one that did, what share is said to be so."""
     fits = [recalibrated(rig, seed) for seed in range(count + 1)]
     same = [not compared(*pair).significance.moved for pair in pairwise(fits)]
     moved = [compared(fits[i], recalibrated(turned(rig, i), 10_000 + i)).significance for i in range(count)]
@@ -157,9 +153,7 @@ def test_without_deviations_there_is_no_verdict(files, capsys):
 
 
 def test_images_say_which_rig_fits(tmp_path, capsys):
-    """The sample's images fit its rig, not one with a camera turned by .3 degrees, whichever is given
-    first.
-    """
+    """The sample's images fit its rig, not one with a camera turned .3 degrees, whichever comes first."""
     rig = Rig.load(SAMPLE / "rig.yaml")
     pose = rig["colour"].cam_from_world.perturbed(
         6 * TURN * torch.tensor([1.0, 0, 0]).double(), torch.zeros(3).double()

@@ -1,6 +1,4 @@
-"""`pat calibrate` on photographs: real sets with the published accuracy, mistakes in one line with nothing
-written.
-"""
+"""`pat calibrate` on photographs: real sets, published accuracy; mistakes in a line with nothing written."""
 
 import shutil
 
@@ -147,8 +145,7 @@ def test_videos(mine, without_report):
 
 @pytest.mark.slow
 def test_photographs_of_four_cameras(tmp_path):
-    """Through prints, lenses, noise and detector: ground truth within 3.5 deviations for each of some 50
-    parameters.
+    """Through prints, lenses, noise, detector: ground truth within 3.5 deviations for some 50 parameters.
 
     Sixteen boards and corners good to 0.1 px know the poses to about 0.1 degree and half a millimetre.
     """
@@ -203,9 +200,7 @@ def test_opencvs_pairs(shared_data, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_bumblebees_pairs(shared_data, tmp_path, capsys):
-    """Epipolar error 0.08 px at most, where the published stereo.yaml has 0.05 on the same corners; and its
-    numbers.
-    """
+    """Epipolar error 0.08 px at most; stereo.yaml as published has 0.05 on the same corners; its numbers."""
     folder = shared_data / "calibration/bumblebee2_chess"
     main(["calibrate", str(folder), "--board", "chessboard:4x6:30mm", "-o", str(tmp_path / "rig.yaml")])
     assert float(capsys.readouterr().out.split("Epipolar error ")[1].split()[0]) <= 0.08
@@ -260,9 +255,7 @@ NARROW = {
 @pytest.mark.slow
 @pytest.mark.parametrize("folder", NARROW)
 def test_narrow_lenses_by_models_of_fisheyes(shared_data, folder):
-    """They ask for an xi of omni below its bound, 0; and from a fisheye's focal length OpenCV finds no
-    poses.
-    """
+    """They ask for omni's xi below its bound, 0; and from a fisheye's focal length OpenCV finds no poses."""
     patterns, board, lens, wanted = NARROW[folder]
     board = parse_board(board)
     views = collect_folder(shared_data / "calibration" / folder, board, patterns=patterns).views

@@ -1,6 +1,4 @@
-"""Boards that are bent or stretched: found, modelled, said; flat ones stay flat; frames that do not fit are
-named.
-"""
+"""Bent or stretched boards: found, modelled, said; flat ones stay flat; frames that do not fit are named."""
 
 import re
 from dataclasses import replace

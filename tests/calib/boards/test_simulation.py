@@ -1,6 +1,4 @@
-"""Photographs of boards that were never printed: corners at their projections, and the rig recovered from
-them.
-"""
+"""Photographs of boards never printed: corners at their projections, the rig recovered from them."""
 
 import numpy as np
 import pytest

@@ -1,6 +1,4 @@
-"""Calibration from a rig known roughly: what images leave open keeps near it, with the deviations that were
-stated.
-"""
+"""Calibration from a rig known roughly: what images leave open keeps near it, with stated deviations."""
 
 import re
 import shutil
@@ -53,9 +51,7 @@ def one_board(seed: int) -> Pose:
 
 
 def test_the_stated_deviations_hold():
-    """One image of each camera: errors of all parameters in stated deviations, over rigs drawn around the
-    start.
-    """
+    """One image a camera: errors of all parameters in stated deviations, over rigs drawn around the start."""
     errors = []
     for seed in range(6):
         rig = drawn(four(), seed)

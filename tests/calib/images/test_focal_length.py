@@ -15,9 +15,7 @@ ASSUMED = 1.2 * max(HW)
 
 
 def views_and_points(rig: Rig, *, seed: int = 0, count: int = 500):
-    """A rig's views, F of its points, and the points: in front of it, good to .15 pixels, some of them
-    wrong.
-    """
+    """A rig's views, F of its points, and the points: before it, good to .15 pixels, some of them wrong."""
     g = np.random.default_rng(seed)
     alpha, beta = rig.cameras.values()
     x = torch.from_numpy(g.uniform(0, 1, (8 * count, 2)) * np.array(HW[::-1]))
@@ -33,9 +31,7 @@ def views_and_points(rig: Rig, *, seed: int = 0, count: int = 500):
 
 
 def hand_held(focal: float) -> Rig:
-    """Two views of one camera whose axes do not meet: beta is to the right, nearer, and turned about all
-    axes.
-    """
+    """Two views of one camera whose axes do not meet: beta is right, nearer, and turned about all axes."""
     first = Camera(K=intrinsics(focal, HW, (162.0, 117.5)), cam_from_world=Pose.identity(), hw=HW)
     R = rotation_from_vector(vector(0.12, -0.22, 0.08))
     return Rig(

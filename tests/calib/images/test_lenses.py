@@ -134,9 +134,7 @@ def test_the_doctor_takes_lenses_of_uncalibrated_cameras_as_they_are():
 
 
 def test_the_fusions_error_sees_through_lenses():
-    """The rectified pair behind a lens, known by F alone: its error is least for the true lens, and says
-    which way.
-    """
+    """A rectified pair behind a lens, by F alone: its error is least for the true lens, and tells the way."""
     images = rectified_images()
     rig = rectified_pair()
     F = rig.pair("left", "right").fundamental

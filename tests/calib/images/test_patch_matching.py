@@ -1,6 +1,4 @@
-"""Matched points by patches: to a few hundredths of a pixel, whatever brightness does; and left alone where
-wrong.
-"""
+"""Matched points by patches: to hundredths of a pixel, whatever brightness does; left alone where wrong."""
 
 import cv2
 import numpy as np
@@ -60,9 +58,7 @@ def test_matches_are_better_for_it():
 
 
 def test_deviations_distinguish_good_points_from_bad_ones():
-    """Points without texture have large ones, those that nothing fits infinite ones; others are as off as
-    they say.
-    """
+    """Points without texture have large ones, unfitted ones infinite; others are as off as they say."""
     alpha, beta = warped()
     flat = [np.where(np.arange(320) < 160, p, (p * 0.04 + 120).astype(np.uint8)) for p in (alpha, beta)]
     noisy = [(p + RANDOM.normal(0, 0.7, p.shape)).round().clip(0, 255).astype(np.uint8) for p in flat]

@@ -58,17 +58,13 @@ def test_a_perturbed_rig_returns(lens):
 
 
 def small_drift() -> tuple[Rig, Rig]:
-    """A pair of narrow field, its second camera rotated by 0.1 degrees about its vertical axis and its
-    horizontal.
-    """
+    """A narrow pair, its second camera rotated by 0.1 degrees about its vertical axis and its horizontal."""
     rig = simulated_rig("narrow", 2, np.random.default_rng(5))
     return rig, rig.perturbed({"c1.rotation": vector(0.0012, 0.0012, 0)})
 
 
 def test_depth_that_points_do_not_determine_stays():
-    """The rotation about the vertical hardly moves a line: what is determined returns, depth stays as it
-    was.
-    """
+    """Rotation about the vertical hardly moves a line: what is determined returns, depth stays as it was."""
     rig, bad = small_drift()
     points = simulated_matches(rig, "narrow", np.random.default_rng(6))
     found = refine_matches(bad, [points])
@@ -178,9 +174,7 @@ def test_what_images_do_not_determine_is_unobservable_and_named():
 
 
 def test_translations_are_freed_where_points_demand_it():
-    """What no turn and no shift of the principal points explains; where they do, the baseline stays as it
-    is.
-    """
+    """What no turn or shift of principal points explains; where they do, the baseline stays as it is."""
     rig = unlike_pair()
     exact = seen_points(rig, noise=0.0, seed=1)
     moved = rig.perturbed({"second.translation": vector(0, 0.006, 0.012)})
@@ -377,9 +371,7 @@ def test_depth_that_is_lost_counts_as_changed():
 
 
 def test_poses_do_not_stand_in_for_lenses():
-    """Wrong lenses were explained by other poses, with which depth changed; a rotation is not explained by
-    lenses.
-    """
+    """Wrong lenses were explained by other poses, which changed depth; no lens explains a rotation."""
     g = np.random.default_rng([0, 2, 4])
     rig = simulated_rig("wide", 2, g)
     matches = simulated_matches(rig, "wide", g)
@@ -403,9 +395,7 @@ def test_poses_do_not_stand_in_for_lenses():
     ],
 )
 def test_depth_does_not_change_for_nothing(shared_data, name, kind, seed):
-    """Real pairs' depth changed by 2.3 % or more, 4 to 76 times what its deviation fell by, and was worse for
-    it.
-    """
+    """Real pairs' depth changed by 2.3 % or more, 4 to 76 times its deviation's fall, and was worse."""
     (pair,) = syntim(shared_data, (name,))
     matches = match_cameras(pair.images)
     rig = Rig({name: pair.rig[name] for name in pair.images})
@@ -421,9 +411,7 @@ def test_depth_does_not_change_for_nothing(shared_data, name, kind, seed):
 
 
 def test_depth_changes_far_where_it_is_known(shared_data):
-    """A real pair's second camera turned by a degree: depth changes by six times what its deviation falls
-    by.
-    """
+    """A real pair's second camera turned by a degree: depth changes by six times its deviation's fall."""
     (pair,) = (pair for pair in bumblebee(shared_data, ("chair01",)) if pair.name.endswith("chair01"))
     matches = match_cameras(pair.images)
     rig = Rig({name: pair.rig[name] for name in pair.images})

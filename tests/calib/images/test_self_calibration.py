@@ -55,9 +55,7 @@ def test_pose_and_bounds_are_found_with_the_focal_lengths():
 
 
 def test_a_start_whose_baseline_vanishes_is_left_out(monkeypatch):
-    """Matches do not determine the baseline's length: from a wrong start it shrank to nothing (Cloth3 of
-    2006).
-    """
+    """Matches do not determine the baseline's length: from a wrong start it shrank to 0 (Cloth3 of 2006)."""
     rig = rectified_pair()
     (matches,) = seen_points(rig, noise=0.1, near=2.0, far=6.0).values()
     refine, calls = self_calibration.refine_matches, []

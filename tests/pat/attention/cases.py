@@ -7,8 +7,7 @@ from arraygeom.segments import Positions, Segments
 
 
 def random_case(seed: int, *, dtype=torch.float64) -> tuple[dict, dict]:
-    """Differentiable tensors and the other arguments of one random call: sizes, masks, and kinds of
-    sampling locations."""
+    """Differentiable tensors and other arguments of a random call: sizes, masks, kinds of locations."""
     g = torch.Generator().manual_seed(seed)
 
     def pick(low: int, high: int) -> int:

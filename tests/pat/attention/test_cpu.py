@@ -1,5 +1,4 @@
-"""The compiled CPU backend: equal to the reference in values and gradients, to the bit the same for any
-thread count."""
+"""The compiled CPU backend: the reference's values and gradients, to the bit for any thread count."""
 
 import hashlib
 import subprocess

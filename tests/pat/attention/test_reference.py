@@ -1,5 +1,4 @@
-"""The formula against a loop written by hand, against textbook row attention, and against finite
-differences."""
+"""The formula against a loop written by hand, textbook row attention, and finite differences."""
 
 import importlib
 import math

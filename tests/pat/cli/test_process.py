@@ -211,9 +211,7 @@ runpy.run_module("pat", run_name="__main__")
 
 
 def test_threads_that_wait_sleep():
-    """Spinning, two threads took twice the core seconds beside another process; what the user sets is
-    kept.
-    """
+    """Spinning, two threads took twice the core seconds beside another process; a user's setting is kept."""
     code = (
         "import os\nfrom pat.__main__ import main\ntry: main()\nfinally: print(os.environ['OMP_WAIT_POLICY'])"
     )

@@ -1,6 +1,4 @@
-"""Images warped to rows and back: the canvas holds alpha, depth comes back exactly, what cannot be is
-said.
-"""
+"""Images warped to rows and back: the canvas holds alpha, depth comes back exactly, failures are said."""
 
 import pytest
 import torch

@@ -112,9 +112,7 @@ def test_tables_hold_every_row(tmp_path):
 
 
 class Matcher:
-    """A network that finds every pixel `disparity` to the left, and gives the mean of beta's bands as
-    confidence.
-    """
+    """A network that finds each pixel `disparity` to the left; the mean of beta's bands is its confidence."""
 
     halo, beta_halo, multiple, equal_resolution, joins_bands = 0, 2, 1, True, "no"
     bands, uses_matches, keeps_luminance = None, False, False
@@ -140,9 +138,7 @@ class Matcher:
 
 
 def test_depth_is_compared_where_it_is_known():
-    """A constant disparity of 5 against a truth of 5 on the left half, 8 on the right, unknown in the first
-    row.
-    """
+    """Constant disparity of 5, truth 5 on the left half, 8 on the right, unknown in the first row."""
     (pair,) = pairs(1)
     value = torch.full((16, 24), 5.0)
     value[:, 12:] = 8

@@ -92,9 +92,7 @@ def test_fields_of_ones_own_and_networks_are_chosen():
 
 
 def test_a_networks_weights_are_its_attention():
-    """Against what the network itself computes for all pixels of the sample, small, beta at alpha's
-    resolution.
-    """
+    """Against what the network computes for all pixels of the sample, small, beta at alpha's resolution."""
     sample, network = load_sample(), load_weights("pat-supervised")
     rig, images = sample.rig, {}
     for name, image in sample.images.items():
@@ -222,9 +220,7 @@ def test_what_is_wrong_is_drawn_in_the_saved_page(driver, tmp_path):
 
 
 def test_the_served_page_in_a_browser(driver, tmp_path):
-    """`pat explore`: points, slides, chooses, clicks a beta, drags a camera, keys; and how long an answer
-    takes.
-    """
+    """`pat explore`: points, slides, chooses, clicks a beta, drags a camera, keys; how long answers take."""
     small_rig(baseline=0.2).save(tmp_path / "rig.yaml")
     command = [sys.executable, "-m", "pat", "explore", str(tmp_path / "rig.yaml"), "--no-browser"]
     server = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)

@@ -74,9 +74,7 @@ def wait_until(condition) -> None:
 
 
 def test_a_job_is_rendered_killed_and_resumed(config, tmp_path, capfd):
-    """The first run loses a worker and then is killed itself, and its worker with it; the second makes the
-    rest.
-    """
+    """The first run loses a worker, then is killed with its other worker; the second makes the rest."""
     out = tmp_path / "data"
     command = [sys.executable, "-m", "pat", "render", str(config), "--out", str(out), "--scenes", "40"]
     parent = subprocess.Popen(command, stderr=subprocess.DEVNULL)

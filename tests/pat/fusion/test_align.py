@@ -1,6 +1,4 @@
-"""align: recorded values at alpha's pixels, of any type, through lenses and rotations; files; what is
-refused.
-"""
+"""align: recorded values at alpha's pixels, any type, through lenses, rotations; files; what is refused."""
 
 import numpy as np
 import pytest

@@ -1,6 +1,4 @@
-"""Many frames and sequences on disk: resumed to the same bits, whole files only, one bad image costs one
-frame.
-"""
+"""Frames and sequences on disk: resumed to the same bits, whole files only, one bad image costs one frame."""
 
 import errno
 import json

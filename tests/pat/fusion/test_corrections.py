@@ -52,9 +52,7 @@ def psnr(network, sample, images, **options):
 
 
 def with_beta_rotated(rig, degrees):
-    """The rig with beta's stated rotation off about its x axis: every point is off by about as many
-    pixels.
-    """
+    """The rig, beta's stated rotation off about its x axis: every point is off by about as many pixels."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     wrong = torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]], dtype=rig[BETA].R.dtype)
     pose = rig[BETA].cam_from_world

@@ -1,6 +1,4 @@
-"""Each file is read and developed once, each field evaluated once for every pixel: whole frames, tiles,
-sequences.
-"""
+"""Each file is read and developed once, each field evaluated once a pixel: whole frames, tiles, sequences."""
 
 from collections import Counter
 

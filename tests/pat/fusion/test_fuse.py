@@ -71,9 +71,7 @@ def network_of(kind: str):
 
 
 def texture(channels: int, hw: tuple[int, int]) -> torch.Tensor:
-    """Blobs of some pixels: in float32 positions at 1000 pixels are rounded to 6e-5, and noise would show
-    that.
-    """
+    """Blobs of some pixels: in float32 positions at 1000 pixels are rounded to 6e-5, which noise shows."""
     g = torch.Generator().manual_seed(0)
     rough = torch.rand(1, channels, hw[0] // 5, hw[1] // 5, generator=g)
     return torch.nn.functional.interpolate(rough, hw, mode="bicubic", align_corners=False)[0].clamp(0, 1)
@@ -131,9 +129,7 @@ def test_matching_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
 @pytest.mark.slow
 @pytest.mark.parametrize("folder", ["kitti", "flickr1024/train"])
 def test_halos_are_wide_enough_for_the_weights(folder, shared_data):
-    """Tiles of real images equal the whole with the weights that are shipped, but for the rounding of
-    positions.
-    """
+    """Tiles of real images equal the whole with the shipped weights, but for rounding of positions."""
     pair, network = next(folder_pairs(shared_data / folder)), load_weights("mono-colour")
     images = {"left": luminance(pair.left), "right": pair.right}
     rig = Rig({name: View(hw=image.shape[1:]) for name, image in images.items()})
@@ -253,9 +249,7 @@ def test_resolution_ratio_is_that_of_pixels_an_angle():
 
 
 def test_colour_comes_from_where_the_field_says():
-    """A red half and a blue half: each alpha pixel gets the colour of its own side, from a turned beta
-    too.
-    """
+    """A red half and a blue half: each alpha pixel gets its own side's colour, from a turned beta too."""
     hw = (64, 96)
     rig = rig_of(hw, hw, focal=100.0, beta_focal=100.0)
     g = torch.Generator().manual_seed(0)
@@ -376,9 +370,7 @@ LENSES = {"mono": [0.9, 0.0, 0.0, 0.0], "colour": [-0.6, 0.2, 0.005, 0.0]}
 
 @pytest.mark.parametrize("with_lens", [("colour",), ("mono", "colour")])
 def test_lenses_are_seen_through(with_lens):
-    """The sample array behind lenses: the same colours at alpha's own, bent pixels, and alpha's detail
-    untouched.
-    """
+    """The sample array behind lenses: the same colours at alpha's own, bent pixels, alpha's detail kept."""
     sample = load_sample()
     rig, images, network = (
         sample.rig.crop("mono", 80, 160, (240, 320)),

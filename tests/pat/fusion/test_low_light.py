@@ -99,9 +99,7 @@ def test_alphas_values_are_kept(network, given):
 
 
 def test_tiles_are_denoised_as_the_whole(network, fused, monkeypatch):
-    """But for coefficients at the threshold and blocks equally alike: rounding chooses, and then a match may
-    differ.
-    """
+    """But for coefficients at the threshold and equal blocks: rounding chooses, then a match may differ."""
     _, images, noise = in_low_light(200, load_sample)
     view, level = images[ALPHA][None, :, 120:280], noise[ALPHA]
     views = view, level.deviation(view)
@@ -134,9 +132,7 @@ def test_a_distorted_alpha_is_denoised_too(network):
 
 
 def test_noisy_bands_at_one_position_are_joined():
-    """As one beta of three bands; in the rig's order, and nearer to the ground truth than if fused as
-    recorded.
-    """
+    """As one beta of three bands; in the rig's order, and nearer the ground truth than fused as recorded."""
     sample, images, noise = in_low_light(200, load_sample)
     cameras = {ALPHA: sample.rig[ALPHA], **dict.fromkeys(("r", "g", "b"), sample.rig[BETA])}
     rig = Rig(cameras, depth=sample.rig.depth).crop(ALPHA, 100, 200, (160, 200))

@@ -129,9 +129,7 @@ def test_colour_flickers_less_than_frame_by_frame(fused):
 
 
 def test_confidence_knows_where_colour_is_wrong(fused):
-    """Also about what moves: among the pixels around the square, the sure ones are right and the wrong ones
-    unsure.
-    """
+    """Also about what moves: of pixels around the square the sure ones are right, the wrong ones unsure."""
     _, ground_truth, ours, _ = fused
     x = pixel_grid(moving.HW)
     around = [(x[..., 0] > 15 + 2.5 * i) & (x[..., 0] < 85 + 2.5 * i) for i in range(7)]

@@ -18,9 +18,7 @@ def blurred(image: torch.Tensor, blur: float) -> torch.Tensor:
 def beside(
     scene: torch.Tensor, disparity: int, width: int = 192
 ) -> tuple[torch.Tensor, torch.Tensor, list[Segments]]:
-    """Two images of a flat scene (1, 1, H, W), `disparity` pixels apart, and the segments of alpha, on the
-    left.
-    """
+    """Two images of a flat scene (1, 1, H, W), `disparity` pixels apart, and segments of alpha, left."""
     alpha, beta = scene[..., :width], scene[..., disparity : disparity + width]
     view = View(hw=(alpha.shape[-2], width))
     look = lazily(Rectified(64.0), Pair(view, view))

@@ -1,6 +1,4 @@
-"""Certainty of matches: what it is read off, the same in pieces as at once, any network's, and depth's
-interval.
-"""
+"""Certainty of matches: what it is read off, the same in pieces, any network's, and depth's interval."""
 
 from dataclasses import replace
 
@@ -108,9 +106,7 @@ def test_true_depths_are_in_the_interval(motorcycle):
 
 
 def test_confidence_is_the_share_of_depths_that_are_right(motorcycle):
-    """Right is within a pixel of disparity; hidden points may be so by what was put there, so some more are
-    right.
-    """
+    """Right is within a pixel of disparity; points hidden may be so by what was filled in: a few more."""
     frame, depth = motorcycle
     known = depth.isfinite() & frame.depth.isfinite()
     pixel = 1 / (994.978 * 0.193001)

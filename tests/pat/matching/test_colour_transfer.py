@@ -100,9 +100,7 @@ def test_colour_that_does_not_follow_brightness_is_left_alone():
 
 
 def test_colour_at_matches_does_not_hang_on_what_the_other_image_shows_elsewhere():
-    """Alpha alone sees something dark on the left: whole images have other levels, what both see has the
-    same.
-    """
+    """Alpha alone sees something dark on the left: whole images differ in level, what both see does not."""
     scene = faint(1, contrast=0.1, blur=3.0)
     scene[..., :48] -= 0.35
     tint = torch.tensor([1.0, 0.6, 0.3]).view(1, 3, 1, 1)
@@ -120,9 +118,7 @@ def test_a_match_of_other_brightness_has_less_weight():
 
 
 def test_a_match_of_one_band_has_alphas_detail_even_if_the_band_is_inverted():
-    """One view for both cameras: what alpha sees bright the band sees dark, and without alpha it is
-    blurred.
-    """
+    """One view for both: what alpha sees bright the band sees dark, and without alpha it is blurred."""
     g = torch.Generator().manual_seed(2)
     coarse, fine = (torch.rand(1, 1, 96 // s, 128 // s, generator=g) for s in (32, 4))
     alpha = 0.7 * enlarged(coarse, 32) + 0.3 * enlarged(fine, 4)

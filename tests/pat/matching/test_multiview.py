@@ -193,9 +193,7 @@ def test_uncalibrated_colour_cameras_are_fused_too(network, scene):
 
 
 def test_the_depth_buffer_finds_what_is_hidden():
-    """A near point and a far one at one pixel of beta: the far one is hidden by as much as their disparities
-    differ.
-    """
+    """A near and a far point at one pixel of beta: the far one is hidden by their disparities' difference."""
     hw = (4, 8)
     pair = Rig({"a": camera(0.0), "b": camera(1.0)}).pair("a", "b")
     y, x = torch.meshgrid(torch.arange(4.0), torch.arange(8.0), indexing="ij")
@@ -220,9 +218,7 @@ def test_the_depth_buffer_finds_what_is_hidden():
 
 
 def test_a_band_unlike_alpha_is_matched_through_one_that_is_like_it():
-    """Bright where alpha is dark and where it is bright, so that neither its sign nor its edges tell the
-    depth.
-    """
+    """Bright where alpha is dark and where it is bright: neither its sign nor its edges tell the depth."""
 
     def unlike(image):
         return (2 * luminance(image) - 1).abs().clamp(0, 1)
@@ -242,9 +238,7 @@ def test_a_band_unlike_alpha_is_matched_through_one_that_is_like_it():
 
 
 def test_betas_whose_lengths_do_not_fit_agree_all_the_same(network, scene):
-    """As cameras that are found by pairs: the right one is thought to be farther away, so its depths are too
-    large.
-    """
+    """As cameras found by pairs: the right one is thought to be farther, so its depths are too large."""
     _, images, ground_truth = scene
     cameras = {"mono": camera(0.0), "left": camera(-0.25), "right": camera(0.25)}
     wrong = cameras | {"right": camera(0.4)}

@@ -38,9 +38,7 @@ def views(shift: torch.Tensor) -> ComparedViews:
 
 
 def found(moved: torch.Tensor, shift: torch.Tensor, slope: torch.Tensor | float = 0.0) -> torch.Tensor:
-    """Disparity of a flat scene, whose true one is DISPARITY, with beta `shift` to the left and segments
-    `moved`.
-    """
+    """Disparity of a flat scene, truly DISPARITY, with beta `shift` to the left and segments `moved`."""
     truth = torch.full((1, 1, H, W), DISPARITY, dtype=torch.float64)
     return with_gradients(views(shift), rows(moved, slope), truth)
 
@@ -65,9 +63,7 @@ def test_matches_follow_betas_content():
 
 @pytest.mark.parametrize("at", [(15, 30), (20, 40), (24, 25), (20, 33)])
 def test_gradients_are_those_of_the_best_agreement(at):
-    """Against differences of where repeated steps end, for segments that turn: content moves across them,
-    too.
-    """
+    """Against differences of where repeated steps end, for segments that turn: content crosses them, too."""
     seen, here = views(zero()), (0, 0, *at)
 
     def settled(slope: float) -> float:

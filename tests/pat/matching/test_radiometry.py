@@ -84,9 +84,7 @@ def points_of_one_hue():
 
 
 def test_in_one_hue_weights_of_a_sensor_are_preferred_to_a_small_gain_and_a_large_gain_to_weights_of_none():
-    """Both explain alpha there; weights of sum 1 then leave beta's exposure, which is the truth if gains are
-    equal.
-    """
+    """Both explain alpha there; weights of sum 1 leave beta's exposure, which is true if gains are equal."""
     x, g = points_of_one_hue()
     noise = 0.01 * torch.randn(4000, generator=g)
     for weights in ((0.33, 0.39, 0.28), (0.65, 0.3, 0.05)):
@@ -101,9 +99,7 @@ def test_in_one_hue_weights_of_a_sensor_are_preferred_to_a_small_gain_and_a_larg
 
 
 def test_in_one_hue_what_no_sensor_does_is_light():
-    """Warm surfaces are darker to an unfiltered sensor than Rec. 601's luma: a little brighter they are by
-    light.
-    """
+    """Warm surfaces are darker to unfiltered sensors than to Rec. 601's luma: brighter is by light."""
     x, g = points_of_one_hue()
     noise = 0.01 * torch.randn(4000, generator=g)
     assert fit(x, 1.08 * luminance(x[:, None])[0, 0] + noise).is_rec601
@@ -113,9 +109,7 @@ def test_in_one_hue_what_no_sensor_does_is_light():
 
 
 def test_light_that_differs_by_object_is_not_taken_for_other_weights():
-    """Four materials, each up to 2 % brighter or darker in the other view, of an alpha that sees another
-    exposure.
-    """
+    """Four materials, each up to 2 % brighter or darker in the other view, of an alpha exposed otherwise."""
     g = torch.Generator().manual_seed(0)
     colours = torch.tensor([[0.7, 0.6, 0.5], [0.3, 0.45, 0.6], [0.6, 0.3, 0.3], [0.35, 0.5, 0.3]]).T
     material = torch.randint(4, (4000,), generator=g)
@@ -127,9 +121,7 @@ def test_light_that_differs_by_object_is_not_taken_for_other_weights():
 
 
 def test_leaves_lit_more_brightly_are_not_taken_for_a_sensor_of_green_alone(monkeypatch):
-    """Green is darker to an unfiltered sensor than Rec. 601's luma; weights of .7 green would explain it
-    brighter.
-    """
+    """Green is darker to an unfiltered sensor than to Rec. 601's luma; weights of .7 green make it bright."""
     g = torch.Generator().manual_seed(0)
     colours, light = torch.tensor([[0.3, 0.6, 0.2], [0.6, 0.4, 0.25]]).T, torch.tensor([1.08, 1.0])
     material = torch.randint(2, (4000,), generator=g)
@@ -158,9 +150,7 @@ def test_a_gamma_needs_a_range_of_brightness():
 
 
 def test_fusion_of_another_response():
-    """Taken for Rec. 601, the colours of this alpha are several dB off; with its response stated they are
-    not.
-    """
+    """Taken for Rec. 601, this alpha's colours are several dB off; with its response stated they are not."""
     sample, network = load_sample(), load_weights("mono-colour-small")
     images = {ALPHA: combined(sample.ground_truth), BETA: sample.images[BETA]}
 

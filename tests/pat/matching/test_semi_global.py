@@ -64,9 +64,7 @@ def sampled_at(pair: Pair, step: int) -> Segments:
 
 
 def plane_seen(pair: Pair, depth: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Alpha and beta images (1, 1, H, W) of a textured plane that faces alpha, and its pixels' places in
-    beta.
-    """
+    """Alpha and beta images (1, 1, H, W) of a textured plane facing alpha, its pixels' places in beta."""
     rough = torch.rand(1, 1, 40, 60, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
 
     def texture(X):
@@ -215,9 +213,7 @@ def test_the_sharper_of_two_images_is_blurred_whichever_it_is():
 
 
 def test_parts_are_balanced_as_the_whole_is():
-    """The right half is darker and softer than the left: by themselves the halves would be treated
-    otherwise.
-    """
+    """The right half is darker and softer than the left: alone the halves would be treated otherwise."""
     alpha = torch.rand(1, 1, 60, 80, generator=torch.Generator().manual_seed(0))
     alpha[..., 40:] = 0.3 * blurred(alpha, 2.0)[..., 40:]
     beta = 0.5 * blurred(alpha, 1.0) + 0.2
@@ -235,9 +231,7 @@ def test_parts_are_balanced_as_the_whole_is():
 
 
 def test_what_lies_beyond_the_edge_of_beta_is_not_sought_within_it():
-    """Where beta ends, 40 columns of alpha are unseen: most are known as such, and matches beside them are
-    right.
-    """
+    """Beta ends, 40 columns of alpha are unseen: most are known as such, and matches beside are right."""
     alpha, beta, segments = beside(faint(0, contrast=0.03, blur=4.0), 40)
     noise = 0.01 * torch.randn(2, *alpha.shape, generator=torch.Generator().manual_seed(9))
     found = semi_global_matching(alpha + noise[0], beta + noise[1], beta + noise[1], *segments)

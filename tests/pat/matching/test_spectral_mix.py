@@ -46,9 +46,7 @@ def test_the_combination_is_that_of_least_squares_around_each_pixel():
 
 
 def test_slopes_are_those_of_detail_whatever_materials_do():
-    """Where the second band is bright the first is dark, and both have the same pattern; the third has
-    none.
-    """
+    """Where the second band is bright the first is dark, both have the same pattern; the third has none."""
     g = torch.Generator().manual_seed(0)
     pattern, left = 0.2 * torch.rand(48, 64, generator=g), torch.zeros(48, 64)
     left[:, :32] = 0.5

@@ -29,9 +29,7 @@ def test_runs_hold_what_is_nearby_and_do_not_overlap(half):
 
 
 def scene() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, Segments, Segments]:
-    """A square before a wall, edges between the blocks of half the size; alpha, beta, disparity, segments,
-    blocks.
-    """
+    """A square before a wall, edges between half-size blocks; alpha, beta, disparity, segments, blocks."""
     g = torch.Generator().manual_seed(0)
     wall, square = torch.rand(H, W + 64, generator=g), torch.rand(BOX[0].stop - BOX[0].start, 51, generator=g)
     images = []

@@ -1,6 +1,4 @@
-"""Colour profiles: other ones are converted to sRGB when an image is read, with a warning; raw files need an
-extra.
-"""
+"""Colour profiles: others are converted to sRGB on reading, with a warning; raw files need an extra."""
 
 import sys
 import time

@@ -130,9 +130,7 @@ def test_exr_is_written_and_holds_the_floats(tmp_path):
 
 
 def test_a_image_is_as_bright_as_the_light_that_alpha_measured():
-    """The right chroma on alpha's values is too bright where colours are strong; then it is the truth
-    again.
-    """
+    """The right chroma on alpha's values is too bright where colours are strong; then it is true again."""
     linear = light() ** torch.tensor([1.0, 3.0, 0.5]).view(3, 1, 1)
     ground_truth, alpha = srgb_from_linear(linear), srgb_from_linear(luminance(linear))
     fused = ground_truth - luminance(ground_truth) + alpha

@@ -1,6 +1,4 @@
-"""The authors' checkpoints: their own outputs to 1e-9, their files read, and everything else refused in a
-line.
-"""
+"""The authors' checkpoints: their outputs to 1e-9, their files read, everything else refused in a line."""
 
 from __future__ import annotations
 
@@ -132,9 +130,7 @@ def test_our_fields_give_what_their_formula_gives_at_the_same_pixels(case, field
 
 
 def _pixels_of(field, pair: Pair, pixel: torch.Tensor, samples: int) -> torch.Tensor:
-    """The pixels (n, 2) of beta that a field names for one of alpha's; short segments repeat some, and each
-    counts.
-    """
+    """The pixels (n, 2) of beta a field names for one of alpha's; short segments repeat some; each counts."""
     found = field(pair, pixel[None])
     if isinstance(found, Positions):
         return found.xy[0][found.mask[0]]

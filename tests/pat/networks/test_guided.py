@@ -39,9 +39,7 @@ def test_luminance_is_alphas():
 
 
 def test_three_filtered_cameras_serve_as_one():
-    """The same colours from three cameras in one place, up to what their guides (bands, not luminance)
-    say.
-    """
+    """The same colours from three cameras in one place, up to what their guides (bands, not luma) say."""
     torch.manual_seed(0)
     network = lively(GuidedPAT(SMALL))
     alpha, grey = torch.rand(1, 1, *HW), torch.rand(1, 1, *HW)
@@ -128,9 +126,7 @@ def test_colour_counts_more_where_brightness_is_alike():
 
 
 def test_features_are_as_exact_as_the_image_and_positions_more(monkeypatch):
-    """Features in float64 took a sixth of the time of a tile, and a sixth of its memory, for 2e-6 of the
-    image.
-    """
+    """Features in float64 took a sixth of a tile's time, and of its memory, for 2e-6 of the image."""
     asked, attend = [], guided.attend_with_statistics
 
     def noted(query, key, value, window, **options):

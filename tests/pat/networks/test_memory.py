@@ -1,5 +1,4 @@
-"""Peak memory with several betas, measured in processes of their own: it is what is counted, and hardly grows
-with their number."""
+"""Peak memory with several betas, in processes of their own: it is as counted, and hardly grows with them."""
 
 import json
 import subprocess
@@ -57,9 +56,7 @@ def found_in(inputs):
 
 
 def growth(work):
-    """Bytes by which the peak exceeds what the process had; the least of several runs, the first not
-    counted.
-    """
+    """Bytes by which the peak exceeds what the process had; the least of several runs after the first."""
     least = float("inf")
     for i in range(REPEATS + 1):
         give_back()

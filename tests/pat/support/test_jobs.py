@@ -1,6 +1,4 @@
-"""Tasks: once each, resumed, in other processes with the same results; killed workers and commands lose
-nothing.
-"""
+"""Tasks: once each, resumed, the same in other processes; killed workers and commands lose nothing."""
 
 import os
 import re
@@ -109,9 +107,7 @@ def test_a_killed_worker_loses_nothing(tmp_path):
 
 @pytest.mark.slow
 def test_a_killed_command_is_resumed_to_the_same_bits(material, tmp_path):  # noqa: F811
-    """Forty frames with two workers, everything killed with SIGKILL in the middle, begun again with
-    --resume.
-    """
+    """Forty frames, two workers, everything killed with SIGKILL in the middle, begun again with --resume."""
     (tmp_path / "fast").mkdir()
     (tmp_path / "slow").mkdir()
     for i in range(40):

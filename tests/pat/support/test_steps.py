@@ -68,9 +68,7 @@ def test_the_time_left_follows_from_the_share_of_the_stage_that_is_done(clock):
 
 
 def steps_of_a_rig_from_images(images):
-    """For each step: processor seconds since the beginning, and the share of which stage is done; the end is
-    last.
-    """
+    """For each step: processor seconds since the beginning, the share of its stage done; the end is last."""
     begin, found = time.process_time(), []
     with steps_shown(lambda line: found.append((time.process_time() - begin, progress()))):
         rig_from_images(images)
@@ -80,9 +78,7 @@ def steps_of_a_rig_from_images(images):
 @pytest.mark.slow
 @pytest.mark.skipif(not ARRAY.is_dir(), reason="no images of the fast + slow array")
 def test_estimates_of_a_rig_from_images_are_within_half(clock):
-    """By the least processor time that each step takes in three runs: other processes make it longer, never
-    shorter.
-    """
+    """By each step's least processor time in three runs: other processes make it longer, never shorter."""
     images = {name: read_image(ARRAY / f"{name}.png")[:1] for name in ("141", "cam1_4", "cam2_4")}
     runs = [steps_of_a_rig_from_images(images) for _ in range(3)]
     ends = np.min([np.diff([at for at, _ in run], prepend=0.0) for run in runs], 0).cumsum()

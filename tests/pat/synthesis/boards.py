@@ -40,9 +40,7 @@ class Sheet:
 
     @property
     def inner_corners(self) -> np.ndarray:
-        """The corners between squares (n, 3) in the board's frame, metres, row by row (as OpenCV numbers
-        them).
-        """
+        """Corners between squares (n, 3), board's frame, metres, row by row (as OpenCV numbers them)."""
         columns, rows = self.squares
         y, x = np.mgrid[1:rows, 1:columns] * self.square
         return np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
@@ -64,8 +62,7 @@ class Sheet:
 
 
 def board_scene(poses: Sequence[Pose], sheet: Sheet, image: Path) -> Scene:
-    """A board that is at the k-th pose (world_from_board) at the time of k seconds; its drawing is written to
-    `image`.
+    """A board at the k-th pose (world_from_board) at k seconds; its drawing is written to `image`.
 
     Render it with cameras of one frame a second for as many seconds as there are poses.
     """

@@ -66,9 +66,7 @@ def draw(bank: PhotoBank, rigs: RigDistribution, batch: int = 4, seed: int = 0) 
 
 
 def mean_shift(batch: ArrayBatch) -> torch.Tensor:
-    """Least-squares displacement (x, y), in alpha's pixels, of beta's colours against alpha's, off the
-    outlines.
-    """
+    """Least-squares displacement (x, y), alpha's pixels, of beta's colours against alpha's, off outlines."""
     across = transferred(batch)
     dy, dx = torch.gradient(batch.images[0], dim=(-2, -1))
     difference = across.image - batch.images[0]

@@ -1,6 +1,4 @@
-"""Banks of photographs that are loaded again and again are loaded once: their patterns take longer than a
-short run.
-"""
+"""Banks of photographs loaded again and again are loaded once: patterns take longer than a short run."""
 
 from hashlib import sha256
 from pathlib import Path

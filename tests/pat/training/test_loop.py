@@ -228,9 +228,7 @@ def test_a_sample_that_is_not_finite_is_named_and_saved(folder, whole, monkeypat
 
 
 def test_no_room_for_a_checkpoint(folder, whole, monkeypatch):
-    """The system refuses to write, as on a full disk; the older checkpoint stays, and the run can go on from
-    it.
-    """
+    """The system refuses to write, as on a full disk; the older checkpoint stays, a run can go on from it."""
     config = replace(whole, out=folder / "full")
     stopped(config, 5, monkeypatch)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -1,6 +1,4 @@
-"""Rendered scenes, stereo pairs and lenses as sources of samples: what they give, and what is wrong with
-them.
-"""
+"""Rendered scenes, stereo pairs and lenses as sources of samples: what they give, what is wrong with them."""
 
 import json
 import math
@@ -152,9 +150,7 @@ def test_all_items_are_drawn_equally_often():
 
 
 def through(root):
-    """Put lenses in front of two cameras of every scene: their images distorted, nothing known beyond the old
-    ones.
-    """
+    """Put lenses before two cameras of every scene: images distorted, nothing known beyond the old ones."""
     for folder in (root / "scenes").iterdir():
         source = Rendered(folder)
         rig = source.rig
