@@ -229,11 +229,8 @@ def depth_from_track(
     """
     a, b = track
     x = floating(x)
-    (X, Y, Z), (DX, DY, DZ), (column, row) = (
-        a.unbind(-1),
-        b.unbind(-1),
-        x.unbind(-1),
-    )  # faster than axes of length 2
+    # faster than axes of length 2
+    (X, Y, Z), (DX, DY, DZ), (column, row) = a.unbind(-1), b.unbind(-1), x.unbind(-1)
     along_x, along_y = DX * Z - X * DZ, DY * Z - Y * DZ
     slope = (DX - column * DZ) * along_x + (DY - row * DZ) * along_y
     moves = slope.abs() > FLAT * FLAT

@@ -102,9 +102,8 @@ class Pair(Batched):
         if checking():
             check_origin(alpha.t)
             check_origin(beta.t)
-        return beta.cam_from_world.__matmul__(
-            alpha.cam_from_world.inverse()
-        )  # torch.compile cannot trace @ of these
+        # torch.compile cannot trace @ of these
+        return beta.cam_from_world.__matmul__(alpha.cam_from_world.inverse())
 
     @property
     def depth_range(self) -> Depths:

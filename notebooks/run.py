@@ -15,18 +15,14 @@ HERE = Path(__file__).parent
 
 def execute(notebook: nbformat.NotebookNode, folder: Path) -> nbformat.NotebookNode:
     """The notebook with its outputs, run in `folder` with this checkout's packages. Raises as nbclient."""
-    patience = {
-        "timeout": 1800,
-        "startup_timeout": 600,
-        "iopub_timeout": 120,
-    }  # seconds, for machines with other work
+    # seconds, for machines with other work
+    patience = {"timeout": 1800, "startup_timeout": 600, "iopub_timeout": 120}
     client = NotebookClient(
         notebook, kernel_name="python3", resources={"metadata": {"path": str(folder)}}, **patience
     )
     client.execute(env={**os.environ, "PYTHONPATH": str(HERE.parent)})
-    notebook.metadata.pop(
-        "widgets", None
-    )  # the state of the explorer: images again, of no use without a kernel
+    # the state of the explorer: images again, of no use without a kernel
+    notebook.metadata.pop("widgets", None)
     for cell in notebook.cells:
         cell.metadata.pop("execution", None)
         for output in cell.get("outputs", []):

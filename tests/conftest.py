@@ -18,9 +18,8 @@ if find_spec("hypothesis"):
     settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
     settings.load_profile("any machine")
 
-os.environ.setdefault(
-    "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "300s"
-)  # of workers that start beside other work
+# of workers that start beside other work
+os.environ.setdefault("DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "300s")
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 

@@ -125,11 +125,8 @@ def _brown(c, limit, x, y, seen):
         dg = (k1 + u * (2 * k2 + 3 * u * k3) - g * (k4 + u * (2 * k5 + 3 * u * k6))) * inverse
         x[i] = a * g + 2 * p1 * a * b + p2 * (u + 2 * a * a) + u * (s1 + s2 * u)
         y[i] = b * g + p1 * (u + 2 * b * b) + 2 * p2 * a * b + u * (s3 + s4 * u)
-        cross, prism_x, prism_y = (
-            2 * (a * b * dg + p1 * a + p2 * b),
-            2 * (s1 + 2 * s2 * u),
-            2 * (s3 + 2 * s4 * u),
-        )
+        cross = 2 * (a * b * dg + p1 * a + p2 * b)
+        prism_x, prism_y = 2 * (s1 + 2 * s2 * u), 2 * (s3 + 2 * s4 * u)
         xx = g + 2 * a * a * dg + 2 * p1 * b + 6 * p2 * a + prism_x * a
         yy = g + 2 * b * b * dg + 6 * p1 * b + 2 * p2 * a + prism_y * b
         determinant = xx * yy - (cross + prism_x * b) * (cross + prism_y * a)
@@ -175,12 +172,8 @@ def _pieces(x, y, seen, hw, out):
         if shown:
             length = math.sqrt((x[i + 1] - x[i]) ** 2 + (y[i + 1] - y[i]) ** 2 + 1e-6) * (high - low)
         total += length
-        out[0, i], out[1, i], out[2, i], out[3, i] = (
-            low if shown else 0.0,
-            high if shown else 1.0,
-            length,
-            total,
-        )
+        out[0, i], out[1, i] = low if shown else 0.0, high if shown else 1.0
+        out[2, i], out[3, i] = length, total
     return total
 
 

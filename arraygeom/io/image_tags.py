@@ -54,11 +54,8 @@ def _jpeg(content: bytes, xmp: dict[tuple[str, str], str]) -> ImageTags | None:
         marker, length = struct.unpack_from(">HH", content, at)
         if marker == 0xFFE1 and content[at + 4 : at + 10] == b"Exif\0\0":
             fields = _fields(content[at + 10 : at + 2 + length])
-        if 0xFFC0 <= marker <= 0xFFCF and marker not in (
-            0xFFC4,
-            0xFFC8,
-            0xFFCC,
-        ):  # the start of a frame, not a table
+        tables = (0xFFC4, 0xFFC8, 0xFFCC)
+        if 0xFFC0 <= marker <= 0xFFCF and marker not in tables:  # the start of a frame
             height, width = struct.unpack_from(">HH", content, at + 5)
             return ImageTags((height, width), fields, xmp)
         at += 2 + length

@@ -45,11 +45,8 @@ def _camera(source: RigSource) -> Camera:
         source.numbers_in(translation, (3,), "Translation"),
     )
     world_from_cam = source.pose(R, t, "Rotation, Translation:", metres=1e-3)
-    return Camera(
-        K=K,
-        cam_from_world=Pose.inverse(world_from_cam),
-        hw=source.size(values["dimx"], values["dimy"], "dimx, dimy"),
-    )
+    hw = source.size(values["dimx"], values["dimy"], "dimx, dimy")
+    return Camera(K=K, cam_from_world=Pose.inverse(world_from_cam), hw=hw)
 
 
 def _value(source: RigSource, text: str, name: str) -> float:

@@ -208,9 +208,8 @@ def _scaramuzza(c: Tensor, X: Tensor) -> Tensor:
         depth, slope = _along(c, s * R)
         turn = z - R * slope
         step = (s * z - depth) / torch.where(turn != 0, turn, 1.0)
-        s = s - torch.where(
-            step.abs() < 0.1 * s.abs(), step, 0.0
-        )  # at the end of the range the slope is rounding
+        # at the end of the range the slope is rounding
+        s = s - torch.where(step.abs() < 0.1 * s.abs(), step, 0.0)
     return X[..., :2] * s[..., None]
 
 

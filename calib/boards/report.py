@@ -289,14 +289,8 @@ def draw_by_image(calibration: Calibration) -> Figure:
     figure = Figure(figsize=(10.4, 2.8), layout="constrained")
     axes = figure.subplots()
     for colour, (name, rms) in zip(cycle(COLOURS), frame_rms(calibration.fit.problem).items()):
-        axes.plot(
-            [frames.index(key) for key in rms],
-            list(rms.values()),
-            "o",
-            ms=4,
-            color=colour,
-            label=escaped(name),
-        )
+        numbers = [frames.index(key) for key in rms]
+        axes.plot(numbers, list(rms.values()), "o", ms=4, color=colour, label=escaped(name))
     step = max(1, len(frames) // 30)
     axes.set_xticks(
         range(0, len(frames), step), [escaped(str(f)) for f in frames[::step]], fontsize=7, rotation=60

@@ -354,13 +354,8 @@ def draw_difference(found: RigDifference) -> Figure:
     for name, by_pair in found.depths.items():
         for depth in (by_pair.depth.min(), by_pair.depth.max()):
             at = by_pair.depth == depth
-            panels.append(
-                (
-                    f"depth by {found.alpha} and {name}, {depth:.3g} m: %",
-                    by_pair.x[at],
-                    100 * by_pair.change[at],
-                )
-            )
+            title = f"depth by {found.alpha} and {name}, {depth:.3g} m: %"
+            panels.append((title, by_pair.x[at], 100 * by_pair.change[at]))
     figure = Figure(figsize=(9, 2.7 * len(panels) / 2), layout="constrained")
     for i, (title, x, values) in enumerate(panels, 1):
         axes: Any = figure.add_subplot(len(panels) // 2, 2, i)

@@ -311,11 +311,8 @@ def _covariance(problem: BundleProblem) -> Array | None:
 
 def near_fit(solved: Solved, name: str, views: BoardViews, board: Board) -> BoardViews:
     """A camera's views without the points that a solution shows to be outliers."""
-    camera, boards, deformation = (
-        solved.problem.cameras[name],
-        solved.problem.board_poses,
-        solved.problem.deformation,
-    )
+    problem = solved.problem
+    camera, boards, deformation = problem.cameras[name], problem.board_poses, problem.deformation
     poses = {key: camera.cam_from_world @ boards[key] for key in views.seen}
     points = board.points if deformation is None else deformation.deformed(board.points, board.part)
     return without_outliers(views, camera, poses, points, sigma=solved.sigma[name])

@@ -130,12 +130,8 @@ def most_probable(
     numbers = itertools.count(1)
 
     def model(z: Tensor) -> LocalModel[Tensor]:
-        log_step(
-            LOG,
-            1 - FURTHER_STEPS / ((number := next(numbers)) - 1 + FURTHER_STEPS),
-            "step %d of the fit",
-            number,
-        )
+        number = next(numbers)
+        log_step(LOG, 1 - FURTHER_STEPS / (number - 1 + FURTHER_STEPS), "step %d of the fit", number)
         r, J = jacobian(residuals, z)
         information, slope = _normal_equations(r, J, z)
         information, slope = basis.T @ information @ basis, basis.T @ slope

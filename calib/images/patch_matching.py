@@ -96,9 +96,5 @@ def _step(
     left = ((wanted - gain * seen) ** 2) @ weight
     covariance = np.linalg.inv(H)[:, :2, :2] * (left / weights.sum())[:, None, None]
     deviation = np.sqrt(np.linalg.eigvalsh(covariance)[:, 1])
-    return (
-        found._replace(y=found.y + shift, A=found.A + affine),
-        correlation,
-        np.linalg.norm(shift, axis=1),
-        deviation,
-    )
+    moved = found._replace(y=found.y + shift, A=found.A + affine)
+    return moved, correlation, np.linalg.norm(shift, axis=1), deviation

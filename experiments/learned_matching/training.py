@@ -169,8 +169,7 @@ def validated(encoder: MatchingEncoder, kept: list[MatchingSample]) -> list[floa
 
 
 def _log(config: FeatureTraining, step: int, losses: list[float], facts: list[float]) -> None:
-    """A line of the log: loss of the step, then loss and share within a pixel in validation, at full and half
-    size."""
+    """A log line: the step's loss, then loss and share within a pixel in validation, full and half size."""
     path = config.out / LOG
     names = ("step", "loss", "loss, half", "kept", "within one", "kept, half", "within one, half", "time")
     new = not path.exists()

@@ -209,11 +209,8 @@ def _attend_dense(query: Tensor, key: Tensor, value: Tensor, stride: int, bias: 
 def sample_positions(locations: Locations, query: Tensor, samples: int | None) -> SamplePositions:
     """Segments or Positions in the one form that the backends take, in the precision that they count in."""
     if isinstance(locations, Segments):
-        points, mask, straight = (
-            torch.stack([locations.start, locations.end], -2),
-            locations.valid[..., None],
-            True,
-        )
+        points = torch.stack([locations.start, locations.end], -2)
+        mask, straight = locations.valid[..., None], True
     elif isinstance(locations, Positions):
         points, mask, straight = locations.xy, locations.mask, False
         if samples not in (None, points.shape[-2]):

@@ -83,11 +83,8 @@ def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
     except (ValueError, OSError, FloatingPointError) as error:
         _fail(error, f"{error}", debug)
     except ImportError as error:
-        _fail(
-            error,
-            f"{error}" if "pip install" in f"{error}" else f"{error}: pip install 'arraygeom-pat[all]'",
-            debug,
-        )
+        remedy = "" if "pip install" in f"{error}" else ": pip install 'arraygeom-pat[all]'"
+        _fail(error, f"{error}{remedy}", debug)
     except MemoryError as error:
         _fail(error, "out of memory: give smaller images, or --max-memory where there is one", debug)
     except (RuntimeError, LookupError, ArithmeticError) as error:
@@ -212,9 +209,8 @@ def reworded(box: str) -> str:
     >>> reworded("╭─ Unrecognized options ──╮\\n│ Unrecognized options: --x │\\n╰─────╯")
     'unknown here: --x'
     """
-    lines = (
-        box.strip().splitlines()
-    )  # without a frame, where the terminal has no Unicode, the title is underlined
+    # without a frame, where the terminal has no Unicode, the title is underlined
+    lines = box.strip().splitlines()
     rows = [row.strip("│ ") for row in (lines[1:-1] if box.startswith("╭") else lines[2:])]
     said = [" ".join(text.split()) for text in re.split(r"[─-]{9,}", " ".join(rows))]
     text = " ".join(

@@ -239,13 +239,8 @@ def _recorded(
     steps = [Noise(8000, 3), Clip(), Quantise(8)]
     ideal = {ALPHA: luminance(ground_truth), BETA: seen}
     images = {name: record(scene[None], steps, g)[0] for name, scene in ideal.items()}
-    return AblationCase(
-        name,
-        rig.replace(depth=(float(known.min()) / 1.1, float(known.max()) * 1.1)),
-        images,
-        ground_truth,
-        depth,
-    )
+    rig = rig.replace(depth=(float(known.min()) / 1.1, float(known.max()) * 1.1))
+    return AblationCase(name, rig, images, ground_truth, depth)
 
 
 def sample_photographs(*, count: int = 12, seed: int = 0) -> PhotoBank:

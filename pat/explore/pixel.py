@@ -313,9 +313,8 @@ def match_offset(
         return None
     if other < own + BETTER:
         return MatchOffset(on_line, 0.0, own)
-    return (
-        MatchOffset(beside, distance, other) if distance < ACROSS else None
-    )  # at the edge it would be better beyond
+    # at the edge it would be better beyond
+    return MatchOffset(beside, distance, other) if distance < ACROSS else None
 
 
 def ends_of(found: Segments | Positions) -> Float[Tensor, "2 2"] | None:

@@ -108,11 +108,8 @@ def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -
         if len(objects) < count and (item := _object(setting, room, objects, surface, moving)):
             objects.append(item)
     walls = Material(texture=surface(setting, 0.8 * setting.far, _WALLS), roughness=0.9, specular=0.1)
-    key = Key(
-        position=vec(room.centre),
-        rotation=vec(Rotation.from_matrix(room.R).as_rotvec()),
-        extent=vec(room.extent),
-    )
+    rotation = Rotation.from_matrix(room.R).as_rotvec()
+    key = Key(position=vec(room.centre), rotation=vec(rotation), extent=vec(room.extent))
     objects.append(Object(name="room", shape="room", motion=Motion((key,)), material=walls))
     return Scene(
         objects=tuple(objects),

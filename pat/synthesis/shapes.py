@@ -186,11 +186,8 @@ def _lathe(profile: tuple[tuple[float, float], ...]) -> _Surface:
     def patch(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         at, azimuth = t * (len(radii) - 1), 2 * np.pi * s
         radius = np.interp(at, np.arange(len(radii)), radii)
-        return (
-            radius * np.cos(azimuth),
-            np.interp(at, np.arange(len(radii)), heights),
-            radius * np.sin(azimuth),
-        )
+        height = np.interp(at, np.arange(len(radii)), heights)
+        return radius * np.cos(azimuth), height, radius * np.sin(azimuth)
 
     return _Surface(patch, (_ROUND, len(radii) - 1))
 

@@ -65,12 +65,8 @@ class Watch:
         self.steps.write(f"{step},{loss!r},{norm!r},{rate!r}\n")
         self.bar.update(self.task, completed=min(done, 1.0), step=step, loss=loss, speed=speed)
         if self.board and step % 10 == 0:
-            for name, value in {
-                "loss": loss,
-                "gradient": norm,
-                "rate": rate,
-                "scenes a second": speed,
-            }.items():
+            values = {"loss": loss, "gradient": norm, "rate": rate, "scenes a second": speed}
+            for name, value in values.items():
                 self.board.add_scalar(name, value, step)
 
     def validated(self, facts: Mapping[str, float]) -> None:

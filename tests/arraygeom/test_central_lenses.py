@@ -135,9 +135,8 @@ def test_the_tools_own_formula(model, c):
     assert not (valid.numpy() & ~seen).any()
     radius = np.linalg.norm(expected, axis=-1)
     missed = seen & ~valid.numpy()
-    if model == "thin-prism-fisheye" or (
-        model == "unified" and any(c[1:])
-    ):  # the polynomials turn back somewhere
+    # the polynomials turn back somewhere
+    if model == "thin-prism-fisheye" or (model == "unified" and any(c[1:])):
         assert missed.mean() < 0.35
     else:
         assert (radius[missed] > 300).all() or missed.mean() < 0.002

@@ -133,9 +133,8 @@ def test_alpha_is_left_right_or_either():
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_there_is_no_line_on_the_epipole_nor_of_zero(dtype):
-    F = torch.tensor(
-        [[0.0, -1e-3, 0.02], [1e-3, 0, -0.031], [-0.02, 0.031, 0]], dtype=dtype
-    )  # [e]x: e at (31, 20)
+    # [e]x: e at (31, 20)
+    F = torch.tensor([[0.0, -1e-3, 0.02], [1e-3, 0, -0.031], [-0.02, 0.031, 0]], dtype=dtype)
     views = {"a": View(hw=(48, 64)), "b": View(hw=(40, 60))}
     pair = Rig(views, links={("a", "b"): Link(F)}).pair("a", "b")
     nothing = Rig(views, links={("a", "b"): Link(torch.zeros_like(F))}).pair("a", "b")

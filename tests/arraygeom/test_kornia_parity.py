@@ -298,9 +298,8 @@ def test_lenses_are_kornias_camera_models(name):
     rays, _ = back.rays(found.x.detach())
     if name != "parallel":
         near = theirs.unproject(Vector2(found.x.detach()), torch.ones(40, dtype=F64)).data
-        torch.testing.assert_close(
-            rays / rays[:, 2:], near, rtol=0, atol=1e-3
-        )  # theirs stops after 5 or 10 steps
+        # theirs stops after 5 or 10 steps
+        torch.testing.assert_close(rays / rays[:, 2:], near, rtol=0, atol=1e-3)
         torch.testing.assert_close(rays / rays[:, 2:], X / X[:, 2:], rtol=0, atol=1e-9)
     if name != "four":
         assert back == camera

@@ -239,7 +239,6 @@ def test_processes_that_compile_at_once_do_not_take_each_others_code(tmp_path):
     for reader in (first, Entry()):
         assert reader._cache_file.load("float32") in (None, "code of float32")
         assert reader._cache_file.load("float64") in (None, "code of float64")
-    first._cache_file._save_index(
-        {"float32": first._cache_file._data_name(1)}
-    )  # its index was the last to be written
+    # its index was the last to be written
+    first._cache_file._save_index({"float32": first._cache_file._data_name(1)})
     assert Entry()._cache_file.load("float32") == "code of float32"

@@ -55,9 +55,8 @@ def folder(halved, tmp_path_factory):
     for name, image in halved[1].items():
         write_image(folder / f"{name}.png", image)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(
-            "pat.fusion.from_images.MATCHED", 300
-        )  # the images are larger, as photographs are than 1600
+        # the images are larger, as photographs are than 1600
+        patched.setattr("pat.fusion.from_images.MATCHED", 300)
         main(["fuse", str(folder / "colour.png"), str(folder / "mono.png"), "-o", str(folder / "out")])
     return folder
 

@@ -193,6 +193,5 @@ def test_a_moved_rig_puts_the_match_off_the_line_by_as_much_as_it_says():
         true = float(epipolar_distance(F, x, here.position[None]).abs())
         assert true > 1
         assert abs(off.distance - true) < 0.3
-    assert (
-        inspect_pixel(scene, state.replace(x=(560.0, 60.0))).betas["colour"].offset is None
-    )  # without texture
+    # without texture
+    assert inspect_pixel(scene, state.replace(x=(560.0, 60.0))).betas["colour"].offset is None

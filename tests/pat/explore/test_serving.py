@@ -23,9 +23,8 @@ EXPLORE = ["explore", str(SAMPLE / "rig.yaml"), *IMAGES, "--no-browser"]
 def server():
     command = [sys.executable, "-m", "pat", *EXPLORE]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    heard = partial(
-        signal.signal, signal.SIGINT, signal.default_int_handler
-    )  # also if the tests run in the background
+    # also if the tests run in the background
+    heard = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(command, cwd=ROOT, preexec_fn=heard, **pipes)
     yield process, re.search(r"http://localhost:(\d+)", process.stdout.readline())[1]
     process.kill()

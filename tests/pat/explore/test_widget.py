@@ -250,9 +250,8 @@ def test_the_served_page_in_a_browser(driver, tmp_path):
         until(driver, lambda told: told[1] != before[1])
         driver.set_script_timeout(60)
         milliseconds = driver.execute_async_script(TIMES)
-        assert (
-            sorted(milliseconds)[len(milliseconds) // 2] < 1000
-        )  # far more than it takes: machines are shared
+        # far more than it takes: machines are shared
+        assert sorted(milliseconds)[len(milliseconds) // 2] < 1000
         assert all("localhost" in name for name in resources(driver))
     finally:
         server.kill()
