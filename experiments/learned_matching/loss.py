@@ -149,7 +149,7 @@ def scores(
 
 
 def _target(queries: Queries) -> Float[Tensor, "b n l"]:
-    """What the distribution should be: true positions shared by labels beside them; the last is unseen."""
+    """What the distribution should be: true positions shared by labels beside them; the last for unseen."""
     share = (1 - (queries.labels - queries.label[..., None]).abs()).clamp(min=0)
     share = share * queries.there * queries.seen[..., None]
     total = share.sum(-1, keepdim=True)

@@ -99,7 +99,7 @@ def test_in_one_hue_weights_of_a_sensor_are_preferred_to_a_small_gain_and_a_larg
 
 
 def test_in_one_hue_what_no_sensor_does_is_light():
-    """Warm surfaces are darker to unfiltered sensors than to Rec. 601's luma: brighter is by light."""
+    """Warm surfaces are darker to unfiltered sensors than to Rec. 601's luma: where brighter, by light."""
     x, g = points_of_one_hue()
     noise = 0.01 * torch.randn(4000, generator=g)
     assert fit(x, 1.08 * luminance(x[:, None])[0, 0] + noise).is_rec601
