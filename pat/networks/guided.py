@@ -54,7 +54,8 @@ class GuidedSettings:
         "added: it was trained to mend more than is left to be mended",
     )
     likeness: float = tuned(
-        0.06, "Source not recorded: difference of brightness at which likeness falls to 1 / e"
+        0.06,
+        "Middlebury, tune half (.08: .01 dB less): difference of brightness at which likeness falls to 1 / e",
     )
     likest: float = tuned(
         3.0,
