@@ -124,8 +124,8 @@ class LensView(View):
         if own and cls.__module__ != __name__:
             raise TypeError(
                 f"{cls.__name__} overrides {' and '.join(own)}, which fields do not ask: make it a "
-                "arraygeom.lenses.CameraModel with project and unproject, and give that to a Camera as "
-                "`distortion`"
+                "arraygeom.lenses.CameraModel with project and unproject, "
+                "and give that to a Camera as `distortion`"
             )
 
     def __post_init__(self) -> None:

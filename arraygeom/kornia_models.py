@@ -40,8 +40,8 @@ def to_kornia_model(camera: LensView) -> CameraModel:
         kind, numbers = CameraModelType.BROWN_CONRADY, _eight(lens)
     else:
         raise ValueError(
-            f"kornia has no {lens.model} model: it has pinholes, brown-conrady, kannala-brandt and "
-            "orthographic"
+            f"kornia has no {lens.model} model: "
+            "it has pinholes, brown-conrady, kannala-brandt and orthographic"
         )
     focal_and_centre = torch.stack([K[..., 0, 0], K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]], -1)
     batch = torch.broadcast_shapes(K.shape[:-2], numbers.shape[:-1])

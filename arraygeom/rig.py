@@ -246,8 +246,8 @@ class Rig(Batched):
         lengths = {name: camera.batch_size for name, camera in cameras.items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(
-                f"a rig's cameras are batches of one length, got {lengths}: expand those that are the same "
-                "in all"
+                f"a rig's cameras are batches of one length, got {lengths}: "
+                "expand those that are the same in all"
             )
         made = {name: Camera.from_kornia(camera, batched=batched) for name, camera in cameras.items()}
         return cls(made, **fields)
@@ -459,8 +459,8 @@ def depth_range(near: Any, far: Any) -> Depths:
     near, far = bounds
     if not traced() and not bool(((near > 0) & (far >= near)).all()):
         raise ValueError(
-            f"depth bounds must satisfy 0 < near <= far, in metres; got near = {_shown(near)}, far = "
-            f"{_shown(far)}"
+            "depth bounds must satisfy 0 < near <= far, in metres; "
+            f"got near = {_shown(near)}, far = {_shown(far)}"
         )
     return near, far
 

@@ -235,8 +235,8 @@ def draw_matches(
             below.set_title(f"{float(near.distance[i]):.2f} px off", fontsize=9)
         median = float(near.distance.nanmedian())
         part.suptitle(
-            f"{alpha} (above) and {name} (below): {len(x)} matched points, {median:.2f} px from their lines "
-            "(median)",
+            f"{alpha} (above) and {name} (below): "
+            f"{len(x)} matched points, {median:.2f} px from their lines (median)",
             fontsize=10,
         )
     return figure

@@ -373,8 +373,8 @@ def _sequence_table(
     rows.append(("ground truth", "", "", "", f"{1000 * flicker(ground_truth, greys):.2f}"))
     table = markdown_table(["", "PSNR, dB", "lowest", "SSIM", "flicker x 1000"], rows)
     return [
-        "Means over the frames; flicker is the mean change of chroma from frame to frame where nothing "
-        "moves.",
+        "Means over the frames; "
+        "flicker is the mean change of chroma from frame to frame where nothing moves.",
         "",
         *table.splitlines(),
     ]
@@ -422,6 +422,6 @@ def _permuted(
     before = score(other.clamp(0, 1), frame.image.clamp(0, 1)).psnr
     return [
         "",
-        f"Betas in another order: the bands follow to {same:.1f} dB (against the former order: {before:.1f} "
-        "dB).",
+        "Betas in another order: "
+        f"the bands follow to {same:.1f} dB (against the former order: {before:.1f} dB).",
     ]

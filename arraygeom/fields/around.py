@@ -133,8 +133,8 @@ def _check_size(plane: Tensor, view: LensView | None) -> None:
     if view is not None and tuple(plane.shape[:2]) != tuple(view.hw):
         (h, w), (height, width) = plane.shape[:2], view.hw
         raise ValueError(
-            f"the known depth or matches have {w}x{h} pixels, alpha has {width}x{height}: give them at "
-            "alpha's pixels"
+            f"the known depth or matches have {w}x{h} pixels, alpha has {width}x{height}: "
+            "give them at alpha's pixels"
         )
 
 

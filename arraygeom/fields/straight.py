@@ -221,8 +221,8 @@ def require_straight(pair: Pair) -> None:
     """Raises ValueError if a view has a lens."""
     if pair.has_lens:
         raise ValueError(
-            "a straight field needs pinhole cameras: use Curved or ThroughLenses, or undistort the images "
-            "first"
+            "a straight field needs pinhole cameras: "
+            "use Curved or ThroughLenses, or undistort the images first"
         )
 
 

@@ -18,8 +18,8 @@ from ..rig import Rig
 from .source import RigSource
 
 CONVENTION = (
-    "first pixel's centre at 0 (shift 0); extrinsics to another camera of the box, in centimetres; "
-    "world = first"
+    "first pixel's centre at 0 (shift 0); "
+    "extrinsics to another camera of the box, in centimetres; world = first"
 )
 PERSPECTIVE, FISHEYE = 0, 1
 CENTIMETRES = 1

@@ -94,8 +94,8 @@ def _outermost(source: RigSource, fields: dict[str, Any]) -> dict[str, Any]:
             )
     raise source.fail(
         "CameraParameters1",
-        "is missing: MATLAB objects cannot be read, save the struct, s = toStruct(stereoParams); save(f, "
-        "'s', '-v7')",
+        "is missing: MATLAB objects cannot be read, save the struct, "
+        "s = toStruct(stereoParams); save(f, 's', '-v7')",
     )
 
 
@@ -186,6 +186,6 @@ def _check_fundamental(source: RigSource, F: Tensor, one: Camera, two: Camera) -
     if not distance < 1:
         raise source.fail(
             "FundamentalMatrix",
-            f"contradicts the pose of camera 2 by {distance:.3g} px; is the rotation transposed, or the "
-            "pose inverted?",
+            f"contradicts the pose of camera 2 by {distance:.3g} px; "
+            "is the rotation transposed, or the pose inverted?",
         )

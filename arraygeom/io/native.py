@@ -92,8 +92,8 @@ def write(rig: Rig) -> str:
     """The text of a native file. Raises ValueError for a batch of rigs."""
     if rig.batch_shape:
         raise ValueError(
-            f"a rig file holds one rig and this is a batch of {tuple(rig.batch_shape)}: write one each, "
-            "rig[i]"
+            "a rig file holds one rig and this is a batch of "
+            f"{tuple(rig.batch_shape)}: write one each, rig[i]"
         )
     document: dict[str, Any] = {"format": FORMAT}
     if rig.name:
@@ -174,8 +174,8 @@ class _Document(RigSource):
         if not ("scale" in fields or "K" in fields):
             raise self.fail(
                 entry,
-                "is of a camera without 'focal': add that, or `scale` (the pixels that count as 1 in the "
-                "lens model)",
+                "is of a camera without 'focal': "
+                "add that, or `scale` (the pixels that count as 1 in the lens model)",
             )
         K = self.K(entry, fields, view.hw, scale="scale")
         lens = self.distortion(entry, {key: fields.get(key) for key in ("model", "coefficients")})
@@ -230,8 +230,8 @@ class _Document(RigSource):
             known = ", ".join([*COEFFICIENT_COUNTS, *CAMERA_MODELS])
             raise self.fail(
                 f"{entry}.model",
-                f"is '{value['model']}', not one of {known}: import the module that defines a model of your "
-                "own first",
+                f"is '{value['model']}', not one of {known}: "
+                "import the module that defines a model of your own first",
             )
         self.keys(value, ("model", "coefficients"), entry)
         coefficients = self.numbers(value.get("coefficients"), None, f"{entry}.coefficients")

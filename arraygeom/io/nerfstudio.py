@@ -24,8 +24,8 @@ from .export import brown_conrady, calibrated, focal_and_centre, pose_rows
 from .source import RigSource
 
 CONVENTION = (
-    "first pixel's centre at 0.5 (shift -0.5); OpenGL camera->world, rotated and inverted; scale "
-    "as in the file"
+    "first pixel's centre at 0.5 (shift -0.5); "
+    "OpenGL camera->world, rotated and inverted; scale as in the file"
 )
 FISHEYES = ("OPENCV_FISHEYE", "FISHEYE")
 PERSPECTIVES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")

@@ -293,16 +293,16 @@ def _check_one_capture(images: Mapping[str, _Image]) -> None:
             if one and two and one != two:
                 raise image.source.fail(
                     None,
-                    f"is of another {kind} than the image of '{name}' ({two}, {one}): give images of one "
-                    "capture",
+                    f"is of another {kind} than the image of '{name}' ({two}, {one}): "
+                    "give images of one capture",
                 )
         place, other = _place(first.tags), _place(image.tags)
         if place and other and math.dist(place, other) > SAME_PLACE:
             here, there = (f"{north:.4f}, {east:.4f}" for north, east in (other, place))
             raise image.source.fail(
                 None,
-                f"is of another place by GPS than the image of '{name}' ({here}; {there}): give images of "
-                "one capture",
+                f"is of another place by GPS than the image of '{name}' ({here}; "
+                f"{there}): give images of one capture",
             )
 
 

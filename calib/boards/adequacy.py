@@ -100,8 +100,8 @@ def _missing(found: Coverage) -> list[str]:
     if found.depths[1] < DEEP_ENOUGH * found.depths[0]:
         near, far = found.depths
         missing.append(
-            f"boards at one depth only ({near:.3g} to {far:.3g} m): bring it closer in some, further in "
-            "others"
+            f"boards at one depth only ({near:.3g} to {far:.3g} m): "
+            "bring it closer in some, further in others"
         )
     if found.tilts[1] < TILTED_ENOUGH:
         missing.append(f"boards tilted by {found.tilts[1]:.0f} degrees at most: tilt it by 20 to 40")

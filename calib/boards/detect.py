@@ -283,8 +283,8 @@ def _reason(grey: Grey, board: Board) -> str:
         return "the images are blurred: focus, and hold the board still"
     margin = "" if isinstance(board, MarkedBoard) else " completely and with its white margin"
     return (
-        f"no such board is visible{margin}: check the board's name, and that it is in the image, large "
-        "and lit"
+        f"no such board is visible{margin}: "
+        "check the board's name, and that it is in the image, large and lit"
     )
 
 
@@ -296,13 +296,13 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
         return f"its tags have {3 - border} black bits around their codes: add ':{other}' to the board's name"
     if isinstance(board, KnownPoints):
         return (
-            f"{len(ids)} of its markers are visible, too few, or not of {board.dictionary}: name their "
-            "dictionary"
+            f"{len(ids)} of its markers are visible, too few, "
+            f"or not of {board.dictionary}: name their dictionary"
         )
     if len(ids) >= 4 and max(ids) > last:
         return (
-            f"markers up to number {max(ids)} are visible and the board has {board.first} to {last}: is "
-            "its size right?"
+            f"markers up to number {max(ids)} are visible and the board has "
+            f"{board.first} to {last}: is its size right?"
         )
     if len(ids) >= 4:
         legacy = ""
@@ -316,8 +316,8 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
     for name in OTHER_DICTIONARIES:
         if len(seen := _tags(grey, name, 1)) >= 6:
             return (
-                f"{len(seen)} markers of the dictionary {name} are visible, not of {board.dictionary}: "
-                "name that one"
+                f"{len(seen)} markers of the dictionary {name} are visible, "
+                f"not of {board.dictionary}: name that one"
             )
     if len(_tags(np.ascontiguousarray(grey[:, ::-1]), board.dictionary, border)) >= 4:
         return "its markers are found once the image is mirrored: save the images as captured, not mirrored"

@@ -167,8 +167,8 @@ def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Cam
         )
     except cv2.error as error:
         raise ValueError(
-            f"{name}: OpenCV finds no camera that fits these boards ({error.err}): do all show the same "
-            "board?"
+            f"{name}: OpenCV finds no camera that fits these boards ({error.err}): "
+            "do all show the same board?"
         ) from None
     distortion = (
         Distortion(model if pinhole else "kannala-brandt", torch.tensor(coefficients)) if count else None

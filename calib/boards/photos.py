@@ -140,8 +140,8 @@ def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
     videos = [f for f in files if f.suffix.lower() in VIDEOS]
     if len(videos) > 1 or (videos and len(videos) < len(files)):
         raise ValueError(
-            f"{name}: has {len(videos)} videos and {len(files) - len(videos)} images: keep one video, or "
-            "images"
+            f"{name}: has {len(videos)} videos and {len(files) - len(videos)} "
+            "images: keep one video, or images"
         )
     if videos:
         return dict(_video_frames(videos[0]))

@@ -87,8 +87,8 @@ def report_html(
     worst = draw_worst_images(calibration, detected, photos) if detected and photos else None
     if worst is not None:
         parts += [
-            "<h2>Images that fit worst</h2><p>Points used (dots), left out (red circles), residuals "
-            "(enlarged).</p>",
+            "<h2>Images that fit worst</h2><p>Points used (dots), "
+            "left out (red circles), residuals (enlarged).</p>",
             image(worst),
         ]
     for name in calibration.views:
@@ -167,8 +167,8 @@ def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> st
     """One row per camera: points, residuals, and parameters with standard deviations."""
     residuals = calibration.fit.problem.residuals()
     head = (
-        "camera|images, points|error px, together (alone)|noise px|focal length px|principal point "
-        "px|lens|covered"
+        "camera|images, points|error px, "
+        "together (alone)|noise px|focal length px|principal point px|lens|covered"
     )
     rows = []
     for name, camera in calibration.fit.problem.cameras.items():

@@ -116,14 +116,14 @@ class RigDifference:
         found = self.significance
         if found is None:
             return (
-                "verdict: none: no deviations are known; differences may be those of two calibrations of "
-                "one rig"
+                "verdict: none: no deviations are known; "
+                "differences may be those of two calibrations of one rig"
             )
         test = f"chi-square {found.chi_square:.1f} of {found.freedom} parameters, p = {found.probability:.2g}"
         if not found.moved:
             return (
-                "verdict: the same: the rigs differ no more than their calibrations' errors let them "
-                f"({test})"
+                "verdict: the same: the rigs differ no more than their "
+                f"calibrations' errors let them ({test})"
             )
         return (
             f"verdict: moved: the rigs differ by more than their calibrations' errors ({test}); a rotation "

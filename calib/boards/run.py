@@ -224,8 +224,8 @@ def _advice(calibration: Calibration, name: str) -> str:
     if len(known.covariance):
         (best,) = next_views(known, calibration.board, float(np.mean(covered.depths)), count=1)
         parts.append(
-            f"<p><b>Next: {escape(best.text)}</b> (uncertainty of projection {best.before:.2g} px, with it "
-            f"{best.after:.2g}).</p>"
+            f"<p><b>Next: {escape(best.text)}</b> (uncertainty of projection {best.before:.2g} px, "
+            f"with it {best.after:.2g}).</p>"
         )
     return "".join(parts) + "".join(f'<p class="note">{escape(text)}</p>' for text in covered.missing)
 

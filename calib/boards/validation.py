@@ -160,8 +160,8 @@ class LensComparison:
         """The advised model and all errors, in a sentence."""
         if not self.errors:
             return (
-                f"too few frames to compare lens models ({FEWEST_TO_COMPARE} are needed): brown-conrady "
-                "is used"
+                f"too few frames to compare lens models ({FEWEST_TO_COMPARE} "
+                "are needed): brown-conrady is used"
             )
         listed = ", ".join(f"{lens} {self.rms(lens):.3f}" for lens in COMPARED if lens in self.errors)
         return f"the images support the lens model {self.advised} (error on held-out frames, px: {listed})"

@@ -146,8 +146,8 @@ class Diagnosis:
             return "nothing wrong: the points lie on their lines to the accuracy of their positions"
         return (
             f"none of the usual mistakes, but the rig is {self.before.misfit:.2f} px off these images: "
-            "it has drifted or was inaccurate from the beginning; `pat rig refine` may repair what can be "
-            "observed"
+            "it has drifted or was inaccurate from the beginning; "
+            "`pat rig refine` may repair what can be observed"
         ) + (f". As plausible as a drift, but not more: {others}" if others else "")
 
     def as_text(self) -> str:
@@ -497,7 +497,7 @@ def _depth_range(rig: Rig, pairs: Pairs) -> list[Remedy]:
         return []
     near, far = min(bounds[0] for bounds in found), max(bounds[1] for bounds in found)
     words = (
-        f"the depth range excludes the scene, which is {near:.3g} to {far:.3g} m away: correct `depth` "
-        "in the file"
+        f"the depth range excludes the scene, which is {near:.3g} to {far:.3g} m away: "
+        "correct `depth` in the file"
     )
     return [Remedy("depth range", words, lambda rig: rig.replace(depth=(near, far)))]

@@ -207,8 +207,8 @@ def agreeing_pairs(given: Pairs) -> dict[tuple[str, str], PointMatches]:
     if not kept:
         most = max((len(matches.alpha) for matches in found.values()), default=0)
         raise ValueError(
-            f"only {most} of the given matches agree with any rig, {ENOUGH} are needed: are they of these "
-            "images?"
+            f"only {most} of the given matches agree with any rig, "
+            f"{ENOUGH} are needed: are they of these images?"
         )
     return kept
 

@@ -73,8 +73,8 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
     points = sum(len(matches.alpha) for matches in pairs.values())
     at = "" if _scale(some, LARGEST_SIDE) == 1 else f", in images reduced to {LARGEST_SIDE} px"
     text = (
-        f"the rig fits these images badly: {points} matched points lie {off:.1f} px from their lines "
-        f"(median{at})"
+        "the rig fits these images badly: "
+        f"{points} matched points lie {off:.1f} px from their lines (median{at})"
     )
     if outside > OUTSIDE:
         text += f", {outside:.0%} of them behind the cameras or outside the depth range"

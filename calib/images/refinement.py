@@ -391,8 +391,8 @@ def _remaining(refined: Rig, held_out: Pairs, after: LineStatistics) -> list[str
     """An objection if the refined rig still fits far worse than any F would."""
     if after.median > max(LARGEST_DISTANCE, OF_OWN * own_distance(refined, held_out)):
         return [
-            f"points still lie {after.median:.1f} px from their lines: the rig has not drifted, see `pat "
-            "rig doctor`"
+            f"points still lie {after.median:.1f} px from their lines: "
+            "the rig has not drifted, see `pat rig doctor`"
         ]
     return []
 
@@ -412,8 +412,8 @@ def _uncertain_depth(depth: DepthChange | None) -> list[str]:
     found = ["depth would be less certain than before"] if depth.after > depth.before else []
     if depth.doubtful:
         found.append(
-            f"depth would change by {depth.change:.1%} but these points determine it to {depth.known:.1%} "
-            "only"
+            f"depth would change by {depth.change:.1%} but these points "
+            f"determine it to {depth.known:.1%} only"
         )
     elif depth.change > LARGE_CHANGE:
         found.append(f"depth would change by {depth.change:.0%}: a rig so far off is better calibrated anew")

@@ -237,8 +237,8 @@ class OnScenes:
         network: Network = load_weights(self.weights)
         if not isinstance(network, Comparing):
             raise ValueError(
-                f"--weights {self.weights}: this network matches without attention, too: `pat ablate` takes "
-                "it"
+                f"--weights {self.weights}: "
+                "this network matches without attention, too: `pat ablate` takes it"
             )
         if network.betas not in (1, 3):
             wanted = "give some for one beta in colour, or for three with a band each"

@@ -35,8 +35,8 @@ class PatchGrid:
     def __post_init__(self) -> None:
         if min(*self.hw, *self.grid, self.reduce) < 1 or any(side % self.reduce for side in self.hw):
             raise ValueError(
-                f"patches: {self.hw[1]}x{self.hw[0]} pixels cannot be reduced {self.reduce} times: use a "
-                "divisor"
+                f"patches: {self.hw[1]}x{self.hw[0]} pixels cannot be reduced "
+                f"{self.reduce} times: use a divisor"
             )
 
     @classmethod
@@ -58,8 +58,8 @@ class PatchGrid:
         """(top, left) of each. Raises ValueError for an image that is smaller than a patch."""
         if hw[0] < self.hw[0] or hw[1] < self.hw[1]:
             raise ValueError(
-                f"patches of {self.hw[1]}x{self.hw[0]} do not fit into an image of {hw[1]}x{hw[0]}: give "
-                "smaller ones"
+                f"patches of {self.hw[1]}x{self.hw[0]} do not fit into an image "
+                f"of {hw[1]}x{hw[0]}: give smaller ones"
             )
         tops, lefts = (_evenly(whole - part, n) for whole, part, n in zip(hw, self.hw, self.grid))
         return [(top, left) for top in tops for left in lefts]

@@ -36,8 +36,8 @@ def read_indices(folder: str | Path, name: str, hw: HW, *, beta: int | None = No
     rows, columns = (_read(file, hw) for file in index_files(folder, name, beta))
     if rows.shape != columns.shape:
         raise ValueError(
-            f"{folder}: rows of '{name}' have shape {rows.shape} and columns {columns.shape}: not of one "
-            "field"
+            f"{folder}: rows of '{name}' have shape {rows.shape} and "
+            f"columns {columns.shape}: not of one field"
         )
     xy = torch.from_numpy(np.stack([columns, rows], -1).astype(np.float32)).unflatten(0, hw)
     mask = (xy >= 0).all(-1)

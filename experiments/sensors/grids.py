@@ -34,8 +34,8 @@ class Crop(Step):
         (h, w), (height, width) = self.hw, image.shape[-2:]
         if min(self.top, self.left) < 0 or self.top + h > height or self.left + w > width:
             raise ValueError(
-                f"crop: {w}x{h} from ({self.left}, {self.top}) leaves the image of {width}x{height}: "
-                "give a window in it"
+                f"crop: {w}x{h} from ({self.left}, "
+                f"{self.top}) leaves the image of {width}x{height}: give a window in it"
             )
         return image[..., self.top : self.top + h, self.left : self.left + w]
 

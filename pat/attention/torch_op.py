@@ -19,8 +19,8 @@ from pat.attention.reference import Attended, AttentionInputs, SamplePositions
 
 INPUTS = "Tensor query, Tensor key, Tensor value, Tensor points, Tensor mask, Tensor? bias"
 SAVED = (
-    "Tensor statistics, Tensor logsum, Tensor best, Tensor? out, Tensor value_cotangent, Tensor "
-    "statistics_cotangent"
+    "Tensor statistics, Tensor logsum, Tensor best, Tensor? out, "
+    "Tensor value_cotangent, Tensor statistics_cotangent"
 )
 OPTIONS = "int samples, bool straight, bool nearest, bool measured, str backend, bool strict"
 

@@ -227,8 +227,8 @@ class Settings:
         found = [s for s in all_settings(*self.rooms) if self.kind in ("all", s.kind)]
         for entry in found:
             print(
-                f"{entry.kind:8}{entry.algorithm.removesuffix('Settings')}.{entry.name} = {entry.value}  "
-                f"{entry.why}"
+                f"{entry.kind:8}{entry.algorithm.removesuffix('Settings')}.{entry.name} "
+                f"= {entry.value}  {entry.why}"
             )
         print(f"{sum(s.numbers for s in found)} numbers under {len(found)} names")
 

@@ -440,8 +440,8 @@ def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> t
         raise ValueError(f"--image needs a rig: give --rig RIG, or the images alone: `pat {command} {files}`")
     if len(given) < 2:
         raise ValueError(
-            f"give two images or more, as `pat {command} mono.png colour.png`; or a rig, --alpha and each "
-            "--image"
+            f"give two images or more, as `pat {command} mono.png colour.png`; "
+            "or a rig, --alpha and each --image"
         )
     for path in given:
         options.refuse_missing_image(path)

@@ -189,8 +189,8 @@ class Info:
         if alpha is None and len(rig.names) > MOST_CAMERAS:
             alpha = rig.names[0]
             say(
-                f"pairs with alpha '{alpha}' and its nearest cameras, of {len(rig.names)}: --alpha NAME for "
-                "others"
+                f"pairs with alpha '{alpha}' and its nearest cameras, "
+                f"of {len(rig.names)}: --alpha NAME for others"
             )
         cameras, pairs = summarise_cameras(rig), summarise_pairs(rig, alpha)
         if self.json:
@@ -485,8 +485,8 @@ class RigDiff:
         of_a, of_b = line_distances(a, pairs), line_distances(b, pairs)
         medians = float(of_a.abs().median()), float(of_b.abs().median())
         text = (
-            f"on the images: {len(of_a)} points, {medians[0]:.2f} px from A's lines and {medians[1]:.2f} "
-            "px from B's"
+            f"on the images: {len(of_a)} points, "
+            f"{medians[0]:.2f} px from A's lines and {medians[1]:.2f} px from B's"
         )
         closer = float((of_a.abs() < of_b.abs()).float().mean())
         if nearer(of_b, of_a):

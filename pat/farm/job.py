@@ -239,8 +239,8 @@ def check_space(root: Path, scenes: int, scene_bytes: float) -> None:
         raise ValueError(
             f"{scenes} more scenes of about {scene_bytes / 1e6:.1f} MB need {need / 1e9:.1f} GB and {root} "
             "has "
-            f"{free / 1e9:.1f} GB free: {fits} would fit; free space, ask for fewer --scenes, or another "
-            "--out"
+            f"{free / 1e9:.1f} GB free: {fits} would fit; "
+            "free space, ask for fewer --scenes, or another --out"
         )
 
 
@@ -320,8 +320,8 @@ def summarise(root: Path) -> str:
     size = sum(file.stat().st_size for folder in folders for file in folder.iterdir())
     sizes = ", ".join(f"{name} {c.hw[1]}x{c.hw[0]}" for name, c in rig.cameras.items())
     text = (
-        f"{len(folders)} scenes of {sizes}; {size / 1e6 / len(folders):.2f} MB each, {size / 1e9:.2f} GB "
-        "in all"
+        f"{len(folders)} scenes of {sizes}; "
+        f"{size / 1e6 / len(folders):.2f} MB each, {size / 1e9:.2f} GB in all"
     )
     facts = [json.loads((f / FACTS).read_text(encoding="utf-8")) for f in folders if (f / FACTS).is_file()]
     if not facts:

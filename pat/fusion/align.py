@@ -177,8 +177,8 @@ def align(
     """
     if interpolation not in INTERPOLATIONS or fill not in ("none", "propagate"):
         raise ValueError(
-            "interpolation is nearest, bilinear or cubic, and fill none or propagate; got "
-            f"{interpolation}, {fill}"
+            "interpolation is nearest, bilinear or cubic, and fill none or propagate; "
+            f"got {interpolation}, {fill}"
         )
     if not 0 <= min_confidence <= 1:
         raise ValueError(f"the least confidence is {min_confidence:g}: give a number from 0 to 1")

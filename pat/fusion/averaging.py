@@ -30,8 +30,8 @@ class AveragingSettings:
         (0.22, 6, 2.0),
         "Middlebury, tune half: colour is averaged by itself first: the scale of unlikeness over "
         "the root of the "
-        "noise's standard deviation, how far away pixels are, and how much more luma counts than a "
-        "colour difference",
+        "noise's standard deviation, how far away pixels are, "
+        "and how much more luma counts than a colour difference",
     )
     recorded: tuple[float, int, float, float] = tuned(
         (0.11, 16, 1.25, 0.75),

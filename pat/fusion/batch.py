@@ -178,8 +178,8 @@ class Batch:
         text, file = self.dependencies, self.out / SETTINGS
         if resume and file.is_file() and file.read_text(encoding="utf-8") != text:
             raise ValueError(
-                f"{file}: the frames there were made with other settings: give the same ones, or "
-                "another --out"
+                f"{file}: the frames there were made with other settings: "
+                "give the same ones, or another --out"
             )
         now, before = self.inputs, _read_inputs(self.out / INPUTS) if resume else {}
         other = [i for i, name in enumerate(self.names) if before.get(name) != now[name]]

@@ -35,8 +35,8 @@ class DepthSettings:
     )
     one_side: float = physics(
         0.9,
-        "Length of the sum of all betas' segments, over the sum of their lengths, from which all "
-        "count as on one side",
+        "Length of the sum of all betas' segments, "
+        "over the sum of their lengths, from which all count as on one side",
     )
 
 

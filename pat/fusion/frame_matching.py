@@ -59,8 +59,8 @@ def warn_of_gaps(files: Files) -> None:
         if gaps:
             before, after = files[name][gaps[0]].name, files[name][gaps[0] + 1].name
             text = (
-                f"'{name}' has no frame between {before} and {after}: those after it count as recorded "
-                "earlier"
+                f"'{name}' has no frame between {before} and {after}: "
+                "those after it count as recorded earlier"
             )
             warn(f"{text} than they were; give all frames", MissingFramesWarning)
 

@@ -282,8 +282,8 @@ def _calibrated(
             note(next(line for line in found.as_text().splitlines() if line.startswith(f"{alpha} > {name}")))
         if pair is None:
             note(
-                f"no depth by {name}: its points show no parallax, beside {alpha} it is too near, or "
-                "its scene too far or flat"
+                f"no depth by {name}: "
+                f"its points show no parallax, beside {alpha} it is too near, or its scene too far or flat"
             )
             continue
         if pair.exact:
@@ -298,8 +298,8 @@ def _calibrated(
             pairs[name], depths[name] = _refined(pair, images, network, links)
         if pairs[name] is not pair:
             note(
-                f"{alpha} > {name}: {pairs[name].points} points, {pairs[name].distance:.2f} px from "
-                "their lines"
+                f"{alpha} > {name}: {pairs[name].points} points, "
+                f"{pairs[name].distance:.2f} px from their lines"
             )
     if _distorted(found.rig):
         note(describe_lenses(found.rig))

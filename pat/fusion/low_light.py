@@ -60,8 +60,8 @@ class LowLightSettings:
     found_bytes: float = size(12.0, "Of a position in a beta and its confidence")
     jointly: float = size(
         0.5,
-        "The time of the joint correction over that of denoising the views before, about (.45 to "
-        ".47 were measured)",
+        "The time of the joint correction over that of denoising the views before, "
+        "about (.45 to .47 were measured)",
     )
 
 

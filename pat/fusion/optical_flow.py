@@ -23,8 +23,8 @@ class FlowSettings:
 
     astray: float = tuned(
         1.0,
-        "Source not recorded: flow that does not lead back to within this many pixels has a weight "
-        "below 1 / e",
+        "Source not recorded: "
+        "flow that does not lead back to within this many pixels has a weight below 1 / e",
     )
     unlike: float = tuned(0.08, "Source not recorded: so is flow between pixels whose values differ by this")
 

@@ -44,8 +44,8 @@ class ColourTransferSettings:
     )
     fill: tuple[float, float] = tuned(
         (300.0, 3.0),
-        "Source not recorded: strength, and 8-bit difference that counts as an edge, of the smoothing that "
-        "diffuses colour",
+        "Source not recorded: "
+        "strength, and 8-bit difference that counts as an edge, of the smoothing that diffuses colour",
     )
     surroundings: int = tuned(
         24, "Middlebury: within how many pixels the brightness of both views is compared"
@@ -67,8 +67,8 @@ class ColourTransferSettings:
     )
     noise_share: float = tuned(
         20.0,
-        "SYNTIM and Middlebury: variance of colour's noise, of all bands, over that of what the views' "
-        "brightness differs by",
+        "SYNTIM and Middlebury: "
+        "variance of colour's noise, of all bands, over that of what the views' brightness differs by",
     )
     texture_share: float = tuned(0.6, "SYNTIM and Middlebury: texture's share that is taken off that")
     lowest: float = tuned(
@@ -76,8 +76,8 @@ class ColourTransferSettings:
     )
     least_noise: float = size(
         2e-5,
-        "Less variance than this, two thirds of a level of 8 bits in each band, is left; taking it "
-        "out takes time",
+        "Less variance than this, two thirds of a level of 8 bits in each band, "
+        "is left; taking it out takes time",
     )
     most_detail: float = size(0.2, "Differences of brightness beyond this are no detail that beta lost")
 

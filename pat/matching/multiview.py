@@ -44,15 +44,15 @@ class MultiviewSettings:
     )
     farthest: float = size(
         8.0,
-        "A difference of disparities of this many half-size pixels is 1 in the facts, as in "
-        "semi-global matching",
+        "A difference of disparities of this many half-size pixels is 1 in the facts, "
+        "as in semi-global matching",
     )
     sampled_rows: int = size(64, "In how many pairs of alpha's rows the depths of betas are compared")
     sampled_columns: int = size(4, "Every how many columns the depths of betas are compared")
     trials: int = size(
         400,
-        "Fits to four pixels each, of which that is taken with which most others agree (Fischler, "
-        "Bolles 1981)",
+        "Fits to four pixels each, "
+        "of which that is taken with which most others agree (Fischler, Bolles 1981)",
     )
     more: float = tuned(
         0.1,
@@ -63,8 +63,8 @@ class MultiviewSettings:
     parallax: float = tuned(
         2.0,
         "Twelve rendered arrays: the power of a beta's parallax by which the odds that its colour "
-        "is right fall: what it sees past depth's edges, and how far a wrong depth displaces it, "
-        "grow with parallax",
+        "is right fall: what it sees past depth's edges, "
+        "and how far a wrong depth displaces it, grow with parallax",
     )
 
 

@@ -32,11 +32,13 @@ class NormalisationSettings:
     )
     blurs: tuple[float, ...] = size(
         (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0),
-        "Standard deviations, in pixels, with which the sharper image is tried until it is as sharp "
-        "as the other",
+        "Standard deviations, in pixels, "
+        "with which the sharper image is tried until it is as sharp as the other",
     )
     sharper: float = tuned(
-        1.05, "Source not recorded: contrast over the other's up to which an image is no sharper"
+        1.05,
+        "Middlebury, tune half (1: .2 points of depth less): "
+        "contrast over the other's up to which an image is no sharper",
     )
 
 

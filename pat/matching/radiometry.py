@@ -94,8 +94,8 @@ class ResponseSettings:
     )
     shading: tuple[float, float] = tuned(
         (0.08, 0.7),
-        "Middlebury: logarithm of vignetting below which, at the points, there is none; above which, in a "
-        "corner, no lens is",
+        "Middlebury: logarithm of vignetting below which, at the points, there is none; "
+        "above which, in a corner, no lens is",
     )
     explained: float = tuned(0.5, "Middlebury: share of alpha's variance that must be explained")
 

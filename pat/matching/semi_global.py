@@ -54,13 +54,13 @@ class SemiGlobalSettings:
     label_bytes: int = size(3, "What it takes for each label of each pixel: cost, and sum of costs")
     consistent: float = tuned(
         0.2,
-        "Source not recorded: a match is consistent if matching back from beta ends less than this (times 8 "
-        "pixels) from it",
+        "Source not recorded: "
+        "a match is consistent if matching back from beta ends less than this (times 8 pixels) from it",
     )
     fill: tuple[float, float] = tuned(
         (50.0, 4.0),
-        "Source not recorded: strength, and 8-bit difference that is an edge, of the smoothing that fills "
-        "(Min et al. 2014)",
+        "Source not recorded: "
+        "strength, and 8-bit difference that is an edge, of the smoothing that fills (Min et al. 2014)",
     )
 
 

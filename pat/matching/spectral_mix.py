@@ -45,8 +45,8 @@ class MixSettings:
     diluted: float = tuned(
         0.8,
         "Source not recorded: wrong matches make least squares' weights too small; they are enlarged until "
-        "the combination varies as much as alpha, as if no less than this share of alpha's variance were "
-        "explained",
+        "the combination varies as much as alpha, "
+        "as if no less than this share of alpha's variance were explained",
     )
     wide: int = size(
         4, "Bands are compared with alpha within squares whose radius is the image's longer side over this"

@@ -45,14 +45,14 @@ class SubpixelSettings:
     same: float = tuned(0.7, "Middlebury: nearer matches at both sizes are of one surface, pixels")
     step_radius: int = size(3, "Window of the step to a fraction of a pixel")
     gradient_radius: int = size(6, "Window around a pixel whose brightness moves its match, in gradients")
-    step_floor: float = tuned(2e-5, "Source not recorded: regulariser (variance of brightness) of that step")
-    most_step: float = tuned(0.25, "Source not recorded: the most pixels of that step")
+    most_step: float = tuned(
+        0.25, "Middlebury, tune half (without a limit: 1 point of depth less): the most pixels of that step"
+    )
     flat: float = tuned(
         3e-6,
-        "Middlebury: slope of brightness (its square) along the segment at which a match weighs half in the "
-        "smoothing of surfaces",
+        "Middlebury: slope of brightness (its square) along the segment at which that step is half as long, "
+        "and a match weighs half in the smoothing of surfaces",
     )
-    least_weight: float = tuned(0.01, "Source not recorded: what any consistent match weighs in it")
     surface: tuple[float, float] = tuned(
         (30.0, 4.0), "Middlebury: strength of that smoothing, and the 8-bit difference that counts as an edge"
     )
@@ -87,8 +87,8 @@ def _precise(
     start = torch.where(near, (disparity + rough) / 2, disparity)
     rise, rest = _compared(own, other, segments, start)
     common, slope = box_mean(torch.cat([rise * rest, rise.square()], 1), SETTINGS.step_radius).split(1, 1)
-    step = (common / (slope + SETTINGS.step_floor)).clamp(-SETTINGS.most_step, SETTINGS.most_step)
-    weight = torch.where(consistent, slope / (slope + SETTINGS.flat) + SETTINGS.least_weight, 0.0) + 1e-5
+    step = (common / (slope + SETTINGS.flat)).clamp(-SETTINGS.most_step, SETTINGS.most_step)
+    weight = torch.where(consistent, slope / (slope + SETTINGS.flat), 0.0) + 1e-5
     planes = zip(numpy_of(torch.where(near, start + step, start)), numpy_of(weight[:, 0]), guides)
     smooth = np.stack(
         [filled(d, w, _surfaces(d[0], brightness), SETTINGS.surface) for d, w, brightness in planes]

@@ -160,8 +160,8 @@ def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
         import pillow_heif
     except ImportError:
         raise ValueError(
-            f"{label}: reading HEIC needs the package pillow-heif: pip install 'arraygeom-pat[heic]', or "
-            "save it as PNG"
+            f"{label}: reading HEIC needs the package pillow-heif: "
+            "pip install 'arraygeom-pat[heic]', or save it as PNG"
         ) from None
     problem = f"{label}: not a HEIC image that can be read (%s): save it as PNG"
     try:
@@ -182,8 +182,8 @@ def _png_of_raw(path: Path, label: str) -> bytes:
         import rawpy
     except ImportError:
         raise ValueError(
-            f"{label}: reading raw files needs the package rawpy: pip install 'arraygeom-pat[raw]', or save "
-            "it as TIFF"
+            f"{label}: reading raw files needs the package rawpy: "
+            "pip install 'arraygeom-pat[raw]', or save it as TIFF"
         ) from None
     try:
         with rawpy.imread(str(path)) as raw:
@@ -218,8 +218,8 @@ def _check_header(got: HW, wanted: HW | None, label: str) -> None:
     if wanted is not None and got != wanted:
         (h, w), (wanted_h, wanted_w) = got, wanted
         raise ValueError(
-            f"{label}: is {w}x{h}, the rig says {wanted_w}x{wanted_h}: resize the rig, or give the right "
-            "image"
+            f"{label}: is {w}x{h}, the rig says {wanted_w}x{wanted_h}: "
+            "resize the rig, or give the right image"
         )
 
 

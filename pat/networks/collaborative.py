@@ -36,8 +36,8 @@ class CollaborativeSettings:
     rows: int = size(16, "Rows of blocks that a thread works on at once")
     threshold: float = tuned(
         2.9,
-        "Middlebury, tune half: coefficients of so many standard deviations of the noise are kept "
-        "in the first pass",
+        "Middlebury, tune half: "
+        "coefficients of so many standard deviations of the noise are kept in the first pass",
     )
     as_recorded: float = tuned(
         0.5,

@@ -22,8 +22,8 @@ class DenoiserSettings:
     multiple: int = size(8, "Images are padded to multiples of this")
     scale: float = size(
         4.0,
-        "Deviations and differences are given to networks this many times larger: then they are "
-        "about as large as values",
+        "Deviations and differences are given to networks this many times larger: "
+        "then they are about as large as values",
     )
     blur: int = tuned(2, "Source not recorded: radius of the blur of colour differences, pixels")
     colour_noise: float = tuned(

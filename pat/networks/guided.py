@@ -40,8 +40,8 @@ class GuidedSettings:
     confidence_offsets: tuple[float, float] = tuned(
         (0.2, 2.0),
         "Middlebury, tune half: goes with the next training: added to the logit of the confidence "
-        "where colour is blended: where beta's brightness is unlike alpha's, and where it is the "
-        "same",
+        "where colour is blended: "
+        "where beta's brightness is unlike alpha's, and where it is the same",
     )
     exact_offset: float = tuned(
         1.0,
@@ -54,7 +54,8 @@ class GuidedSettings:
         "added: it was trained to mend more than is left to be mended",
     )
     likeness: float = tuned(
-        0.06, "Source not recorded: difference of brightness at which likeness falls to 1 / e"
+        0.06,
+        "Middlebury, tune half (.08: .01 dB less): difference of brightness at which likeness falls to 1 / e",
     )
     likest: float = tuned(
         3.0,

@@ -108,8 +108,8 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
     except (SafetensorError, OSError) as error:
         if zipfile.is_zipfile(path):
             raise ValueError(
-                f"{path}: a checkpoint of PyTorch's: `pat weights import` makes weights of one of "
-                "the paper's authors"
+                f"{path}: a checkpoint of PyTorch's: "
+                "`pat weights import` makes weights of one of the paper's authors"
             ) from None
         raise ValueError(f"{path}: not a safetensors file ({error}); was it copied whole?") from None
     if not undamaged(state, metadata):

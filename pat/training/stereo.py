@@ -94,8 +94,8 @@ def check_pair(pair: PairFiles, hw: HW) -> None:
     left, right = _header(pair.left), _header(pair.right)
     if left != right:
         raise ValueError(
-            f"{pair.left} is {_described(left)} and {pair.right.name} {_described(right)}: pairs must be "
-            "alike"
+            f"{pair.left} is {_described(left)} and {pair.right.name} "
+            f"{_described(right)}: pairs must be alike"
         )
     if left[2] == 1:
         raise ValueError(f"{pair.left} is grey: pairs to train on must be in colour")

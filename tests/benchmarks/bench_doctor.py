@@ -253,8 +253,8 @@ def main() -> None:
     print(text)
     if options.out:
         note = (
-            f"{options.cases} random cases of each mistake (seed {options.seed}) with real rigs and "
-            "their images."
+            f"{options.cases} random cases of each mistake (seed {options.seed}) "
+            "with real rigs and their images."
         )
         write_text(options.out, f"# Which remedies the doctor names\n\n{note}\n\n{text}")
 

@@ -94,8 +94,8 @@ def main() -> None:
     whole = pixel_grid(HW)
     pixels = HW[0] * HW[1]
     print(
-        f"{'field':36} {'pixels':>8} {'median s':>9} {'range s':>15} {'s, all pixels':>14} "
-        f"{'us/pixel/beta':>14}"
+        f"{'field':36} {'pixels':>8} {'median s':>9} {'range s':>15} "
+        f"{'s, all pixels':>14} {'us/pixel/beta':>14}"
     )
 
     def report(name: str, seconds: tuple[float, float, float], n: int) -> None:

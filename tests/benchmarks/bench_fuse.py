@@ -119,8 +119,8 @@ def full_run(cap: str, out: Path) -> str:
         if file.is_file():
             off = (own - read_image(file)).abs()
             lines.append(
-                f"Differs from that under {other} by at most {float(off.max()):.1e}, mean "
-                f"{float(off.mean()):.1e}."
+                f"Differs from that under {other} by at most {float(off.max()):.1e}, "
+                f"mean {float(off.mean()):.1e}."
             )
     return "\n".join(lines)
 

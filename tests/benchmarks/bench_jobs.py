@@ -174,8 +174,8 @@ def bad_images(job: Job) -> str:
     job.expect(done, f"mended: {job.said(out)[-200:]}")
     job.compare(out, "mended")
     return (
-        f"stopped at the corrupt image, or skipped it and the vanished one: {job.frames - 2} right; "
-        "mended: all"
+        "stopped at the corrupt image, or skipped it and the vanished one: "
+        f"{job.frames - 2} right; mended: all"
     )
 
 

@@ -144,8 +144,8 @@ def counts() -> str:
     calls = {name: kornia_calls(partial(o.f, o.x)) for name, o in OPERATORS.items()}
     every = set().union(*calls.values(), kornia_calls(convert))
     lines = [
-        f"{sum(map(bool, calls.values()))} of {len(calls)} operators call {len(every)} of kornia's "
-        "functions:",
+        f"{sum(map(bool, calls.values()))} of {len(calls)} operators "
+        f"call {len(every)} of kornia's functions:",
         "",
     ]
     lines += [f"- `{name}`" for name in sorted(every)]

@@ -56,12 +56,12 @@ def main() -> None:
         recording = time.process_time() - begin
     count = PatchGrid().count
     print(
-        f"a scene takes {size:.1f} MB of disk; reading it and cutting its {count} patches {cutting:.2f} s "
-        "of a core"
+        f"a scene takes {size:.1f} MB of disk; "
+        f"reading it and cutting its {count} patches {cutting:.2f} s of a core"
     )
     print(
-        f"a patch: {1000 * cutting / count:.1f} ms to read and cut, {1000 * recording / count:.1f} ms to "
-        "record"
+        f"a patch: {1000 * cutting / count:.1f} ms to read and cut, "
+        f"{1000 * recording / count:.1f} ms to record"
     )
 
 

@@ -143,8 +143,8 @@ def lines(args: Args) -> Iterator[str]:
     bench = Bench(args)
     h, w = args.hw
     yield (
-        f"mono-colour-small, {args.steps} steps of {args.batch} scenes of {h} x {w}, from nothing; one "
-        "thread."
+        f"mono-colour-small, {args.steps} steps of {args.batch} scenes "
+        f"of {h} x {w}, from nothing; one thread."
     )
     yield f"Validated on {args.examined * args.batch} scenes of photographs held out.\n"
     yield markdown_header(["variant", "PSNR, dB", "to the base", "matched within 1.5 px", "seconds a step"])

@@ -129,8 +129,8 @@ def table_rows(kind: str, cases: list[Case]) -> list[str]:
         counts = [sum(o.verdict == v for o in found) for v in ("read", "refused")]
         worst = f"{max(o.seconds for o in found):.1f} s | {max(o.peak for o in found) / 2**20:.0f} MiB"
         rows.append(
-            f"| {kind} | {format} | {len(found)} | {counts[0]} | {counts[1]} | {len(found) - sum(counts)} | "
-            f"{worst} |"
+            f"| {kind} | {format} | {len(found)} | {counts[0]} | {counts[1]} "
+            f"| {len(found) - sum(counts)} | {worst} |"
         )
     return rows
 

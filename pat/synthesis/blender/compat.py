@@ -35,8 +35,8 @@ def _not_installed(version: tuple[int, int]) -> str:
     if version in ((3, 11), (3, 13)):
         return f"rendering needs Blender as a Python module: {INSTALL}"
     return (
-        f"rendering needs Blender as a Python module, which exists for {PYTHONS}; this is "
-        f"{version[0]}.{version[1]}"
+        f"rendering needs Blender as a Python module, which exists for {PYTHONS}; "
+        f"this is {version[0]}.{version[1]}"
     )
 
 

@@ -113,8 +113,8 @@ def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
         for item in scene.objects:
             if inside(item, centre, shot.time):
                 raise ValueError(
-                    f"camera '{shot.camera}' is inside the object '{item.name}' at {shot.time:g} s: move "
-                    "one of them"
+                    f"camera '{shot.camera}' is inside the object '{item.name}' "
+                    f"at {shot.time:g} s: move one of them"
                 )
 
 

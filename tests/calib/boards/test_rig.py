@@ -270,8 +270,8 @@ def test_coverage_names_what_is_missing():
     assert found.depths == pytest.approx((2.0, 2.0))
     assert found.tilts[1] == pytest.approx(0, abs=1e-6)
     assert [m.split(" (")[0].split(":")[0] for m in found.missing] == [
-        "no points at the top left, top, top right, left, right, bottom left, bottom, bottom right of the "
-        "image",
+        "no points at the top left, top, top right, left, "
+        "right, bottom left, bottom, bottom right of the image",
         "boards at one depth only",
         "boards tilted by 0 degrees at most",
     ]
