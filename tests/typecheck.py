@@ -43,6 +43,7 @@ def install() -> None:
     """Check the packages' functions as they are imported."""
     jaxtyping.jaxtyped = jaxtyped
     ARRAY.__instancecheck_str__ = problem
+    ARRAY.__instancecheck__ = lambda array, value: not problem(array, value)
     jaxtyping.install_import_hook(["arraygeom", "pat", "calib"], f"{__name__}.of_types")
 
 
@@ -124,14 +125,25 @@ def problem(array: Any, value: Any) -> str:
     """What is wrong with a value for a type of arrays; empty if nothing is. As jaxtyping, but quickly."""
     calls = CALLS.sizes
     sizes = calls[-1] if calls else None
-    known = None if sizes is None else axes_of(array)
-    if known is None:
+    if sizes is None or axes_of(array) is None:
         return AS_JAXTYPING(array, value)
-    axes, several, any_axes = known
-    kind = (any_axes, type(value), getattr(value, "dtype", None))
-    wrong = KINDS.get(kind)
-    if wrong is None:
-        wrong = KINDS[kind] = AS_JAXTYPING(any_axes, value)
+    kind = (array, type(value), getattr(value, "dtype", None), getattr(value, "shape", None))
+    named = NAMED.get(kind)
+    if named is None:
+        named = NAMED[kind] = sizes_in(array, value)
+    if type(named) is str:
+        return named
+    for axis, size in named.items():
+        if sizes.get(axis, size) != size:
+            return f"axis {axis} is {size}, not {sizes[axis]}"
+    sizes.update(named)
+    return ""
+
+
+def sizes_in(array: Any, value: Any) -> dict[str, int] | str:
+    """The sizes of a value's axes by name, or what is wrong with it whatever the sizes of others."""
+    axes, several, any_axes = axes_of(array)
+    wrong = AS_JAXTYPING(any_axes, value)
     if wrong:
         return wrong
     shape = tuple(value.shape)
@@ -142,16 +154,15 @@ def problem(array: Any, value: Any) -> str:
         shape = (*shape[:several], shape[several:end], *shape[end:])
     elif len(shape) != len(axes):
         return f"it has {len(shape)} axes, not {len(axes)}"
-    found = sizes.copy()
+    found: dict[str, Any] = {}
     for axis, size in zip(axes, shape):
         if axis is not None and size != (axis if type(axis) is int else found.setdefault(axis, size)):
             return f"axis {axis} is {size}, not {found.get(axis, axis)}"
-    sizes.update(found)
-    return ""
+    return found
 
 
-KINDS: dict[tuple[Any, type, Any], str] = {}
-"""What is wrong with values of a class and a dtype for a type with any axes; empty if nothing is."""
+NAMED: dict[tuple[Any, type, Any, Any], dict[str, int] | str] = {}
+"""What `sizes_in` says of values of a class, a dtype and a shape for a type of arrays."""
 
 
 def known(hint: Any, names: dict[str, Any]) -> Any:
