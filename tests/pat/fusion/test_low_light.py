@@ -255,10 +255,10 @@ def test_a_darker_beta_keeps_its_colours(network, fused):
 
 
 def test_noise_that_shows_plainly_is_removed_unasked(network, fused):
-    sample, images, _ = in_low_light(50)
+    sample, images, _ = in_low_light(200)
     said: list[str] = []
     frame = fuse(network, sample.rig, images, alpha=ALPHA, noise="auto", explain=said.append)
-    assert torch.equal(frame.image, fused(50, told=False).image)
+    assert torch.equal(frame.image, fused(200, told=False).image)
     assert sum(line.startswith("noise shows plainly and is removed: mono ") for line in said) == 1
     clean = {name: image * 255 // 1 / 255 for name, image in sample.images.items()}
     assert max(map(shown_noise, clean.values())) < 4 / 255
