@@ -135,9 +135,8 @@ class LensView(View):
             if not isinstance(self.distortion, LensModel | None):
                 kind = type(self.distortion).__name__
                 raise TypeError(
-                    f"distortion is a {kind}: give a Distortion(model, coefficients), or a camera model of "
-                    "your own, "
-                    "a subclass of arraygeom.lenses.CameraModel"
+                    f"distortion is a {kind}: give a Distortion(model, coefficients), "
+                    "or a camera model of your own, a subclass of arraygeom.lenses.CameraModel"
                 )
             if self.distortion is not None and not is_dataclass(self.distortion):
                 kind = type(self.distortion).__name__

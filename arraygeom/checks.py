@@ -122,8 +122,7 @@ def check_hw(hw: Any) -> None:
     if max(h, w) > LARGEST_SIDE or h * w > MOST_PIXELS:
         raise ValueError(
             f"hw is {(h, w)}; images of up to {LARGEST_SIDE} pixels a side and {MOST_PIXELS / 1e6:.0f} "
-            "million in all "
-            "are supported: is it in pixels?"
+            "million in all are supported: is it in pixels?"
         )
 
 

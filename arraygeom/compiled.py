@@ -70,9 +70,8 @@ def can_compile() -> bool:
 @cache
 def _warn_of_no_folder() -> None:
     warn(
-        "compiled kernels cannot be kept, and each process compiles them again: let NUMBA_CACHE_DIR name a "
-        "folder "
-        "that can be written"
+        "compiled kernels cannot be kept, and each process compiles them again: "
+        "let NUMBA_CACHE_DIR name a folder that can be written"
     )
 
 

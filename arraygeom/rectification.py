@@ -54,9 +54,8 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
         ray = _middle_ray(camera, R)
         if not ray[2] > NEAREST_COSINE * ray.norm():
             raise ValueError(
-                "the baseline is nearly along an optical axis (motion forwards): no homography turns lines "
-                "into rows; "
-                "use the pair as it is, with Epipolar or Curved"
+                "the baseline is nearly along an optical axis (motion forwards): "
+                "no homography turns lines into rows; use the pair as it is, with Epipolar or Curved"
             )
     hw = hw or alpha.hw
     K = middle_intrinsics((alpha, beta), (R_alpha, R_beta), hw) if K is None else K

@@ -266,9 +266,8 @@ class Rig(Batched):
         lenses = [(name, camera.distortion) for name, camera in self.cameras.items()]
         if bent := [name for name, lens in lenses if lens is not None and not lens.harmless]:
             raise ValueError(
-                f"kornia's cameras with a lens have no pose ({', '.join(bent)}): give each as "
-                "camera.to_kornia() and "
-                "keep its cam_from_world"
+                f"kornia's cameras with a lens have no pose ({', '.join(bent)}): "
+                "give each as camera.to_kornia() and keep its cam_from_world"
             )
         return {name: _expanded(camera, shape).to_kornia() for name, camera in self.cameras.items()}
 

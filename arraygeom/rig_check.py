@@ -56,9 +56,8 @@ def unit_oddity(rig: Rig) -> str | None:
         )
     if 0 < longest < SMALLEST_BASELINE:
         return (
-            f"has cameras at most {1e3 * longest:.3g} mm apart: is this file in metres, and read as "
-            "millimetres? "
-            "Then read it with scale=1000"
+            f"has cameras at most {1e3 * longest:.3g} mm apart: is this file in metres, "
+            "and read as millimetres? Then read it with scale=1000"
         )
     return None
 
@@ -106,8 +105,7 @@ def _of_K(name: str, camera: Camera) -> Iterator[str]:
         x, y = K[:2, 2].tolist()
         yield (
             f"'{name}' has its principal point at ({x:.4g}, {y:.4g}), {off:.3g} px from the middle of "
-            f"{w}x{h}: "
-            "is hw (height, width), and K of whole images of this size?"
+            f"{w}x{h}: is hw (height, width), and K of whole images of this size?"
         )
 
 
@@ -129,9 +127,9 @@ def _of_overlap(rig: Rig, alpha: str, beta: str) -> Iterator[str]:
             "" if rig.depth is None else f" between {float(rig.depth[0]):g} and {float(rig.depth[1]):g} m"
         )
         yield (
-            f"'{beta}' sees nothing of what '{alpha}' sees{bounds}: check the poses, which are X_cam = R "
-            "X_world + t "
-            "with z forward and y down (OpenGL's look along -z), and the depth range"
+            f"'{beta}' sees nothing of what '{alpha}' sees{bounds}: check the poses, "
+            "which are X_cam = R X_world + t with z forward and y down (OpenGL's look along -z), "
+            "and the depth range"
         )
 
 
@@ -146,14 +144,12 @@ def _of_baseline(rig: Rig, a: str, b: str) -> Iterator[str]:
         if near < far and moved < LEAST_DISPARITY:
             yield (
                 f"'{a}' and '{b}' are {baseline:.3g} m apart: from {near:g} to {far:g} m a match moves by "
-                f"{moved:.2g} "
-                "px; are depth and poses both in metres?"
+                f"{moved:.2g} px; are depth and poses both in metres?"
             )
         if focal * baseline / far > 2 * max(rig[b].hw) * focal / float(rig[a].K[:2, :2].det().abs().sqrt()):
             yield (
                 f"'{a}' and '{b}' are {baseline:.3g} m apart, which is more than the depth of {far:g} m "
-                "allows: "
-                "are depth and poses both in metres?"
+                "allows: are depth and poses both in metres?"
             )
 
 

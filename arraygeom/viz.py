@@ -33,8 +33,7 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8
 """Okabe and Ito's, which colour-blind readers can tell apart."""
 
 
-# The rig in space
-# ---------------------------------------------------------------------------------------------
+# The rig in space -------------------------------------------------------------------------------------------
 
 
 def draw_rig(rig: Rig, *, alpha: str | None = None) -> Figure:
@@ -129,8 +128,7 @@ def seen_at(camera: Camera, x: Float[Tensor, "n 2"], depth: float) -> np.ndarray
     return numpy(torch.where(valid.any(0)[:, None], points, torch.nan))
 
 
-# Receptive fields
-# ------------------------------------------------------------------------------------------------
+# Receptive fields -------------------------------------------------------------------------------------------
 
 
 def draw_fields(
@@ -177,8 +175,7 @@ def draw_sampling_locations(axes: Axes, field: ReceptiveField, pair: Pair, x: Fl
             axes.scatter(*numpy(found.xy[i][found.mask[i]]).T, color=colour, s=1.5, linewidths=0)
 
 
-# How well it fits
-# ---------------------------------------------------------------------------------------------
+# How well it fits -------------------------------------------------------------------------------------------
 
 
 class NearLine(NamedTuple):
@@ -302,8 +299,7 @@ def draw_residuals(
     return figure
 
 
-# Shared
-# -------------------------------------------------------------------------------------------------------
+# Shared -----------------------------------------------------------------------------------------------------
 
 
 def new_figure(**options: Any) -> Figure:

@@ -365,8 +365,7 @@ def _line(row: AlignmentRow) -> list[str]:
     return [row.scene, row.beta, *shares, medians, f"{row.off:.1g}", row.dtype]
 
 
-# Scenes
-# -------------------------------------------------------------------------------------------------------
+# Scenes -----------------------------------------------------------------------------------------------------
 
 
 def middlebury_scenes(data: Path) -> Iterator[AlignmentScene]:

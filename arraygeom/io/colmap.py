@@ -171,8 +171,7 @@ def _pose(source: RigSource, entry: str, numbers: list[Any]) -> Pose:
     return source.pose(source.quaternion(numbers[:4], f"{entry} QW QX QY QZ"), numbers[4:7], entry)
 
 
-# The text files
-# -------------------------------------------------------------------------------------------------
+# The text files ---------------------------------------------------------------------------------------------
 
 
 def _cameras_text(source: RigSource) -> dict[int, LensView]:
@@ -235,8 +234,7 @@ def _sensors(source: RigSource, entry: str, fields: list[str]) -> Iterator[tuple
         raise source.fail(entry, "is not a rig (RIG_ID NUM_SENSORS ...); is the file whole?") from None
 
 
-# The binary files, little-endian
-# ---------------------------------------------------------------------------------
+# The binary files, little-endian ----------------------------------------------------------------------------
 
 
 def _cameras_binary(source: RigSource) -> dict[int, LensView]:

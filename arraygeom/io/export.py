@@ -47,9 +47,8 @@ def brown_conrady(name: str, lens: LensModel | None, *, at_most: int) -> list[fl
     c = lens.coefficients.tolist()
     if lens.model != BROWN_CONRADY or any(c[at_most:]):
         raise ValueError(
-            f"camera '{name}' has a {lens.model} lens of {len(c)} coefficients, which this format cannot "
-            "hold "
-            f"(brown-conrady with {at_most}): use the native format"
+            f"camera '{name}' has a {lens.model} lens of {len(c)} coefficients, "
+            f"which this format cannot hold (brown-conrady with {at_most}): use the native format"
         )
     return c[:at_most]
 

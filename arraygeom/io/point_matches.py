@@ -48,8 +48,7 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
             if outside.any():
                 raise ValueError(
                     f"{path}: {int(outside.sum())} of {len(x)} points are outside the image of '{name}', "
-                    f"{w}x{h}: "
-                    "are they of this image, at this size?"
+                    f"{w}x{h}: are they of this image, at this size?"
                 )
     return found
 

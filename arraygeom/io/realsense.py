@@ -114,7 +114,6 @@ def _lens(source: RigSource, name: str, fields: dict[str, str]) -> Distortion | 
         return source.kannala_brandt(c[:4], f"{name} Coeffs")
     raise source.fail(
         f"{name} Distortion",
-        f"is '{kind}' with these coefficients; Brown Conrady, Kannala Brandt4, and Modified Brown Conrady "
-        "without "
-        "tangential terms are read",
+        f"is '{kind}' with these coefficients; Brown Conrady, Kannala Brandt4, "
+        "and Modified Brown Conrady without tangential terms are read",
     )

@@ -228,8 +228,7 @@ class Solved:
         return dict(zip(self.names, np.sqrt(self.covariance.diagonal()).tolist()))
 
 
-# Linear equations
-# ------------------------------------------------------------------------------------------------
+# Linear equations -------------------------------------------------------------------------------------------
 
 
 class Linearised(NamedTuple):
@@ -360,8 +359,7 @@ def robust_weights(lengths: Array) -> Array:
     return np.minimum(1.0, (ROBUST / np.maximum(lengths, ROBUST)) ** 2)
 
 
-# Cameras' parameters
-# ---------------------------------------------------------------------------------------------
+# Cameras' parameters ----------------------------------------------------------------------------------------
 
 
 def parameter_sizes(camera: Camera) -> dict[str, int]:
@@ -447,8 +445,7 @@ def with_default(camera: Camera, entry: str) -> tuple[Camera, str]:
     return camera.replace(distortion=lens.with_coefficients(coefficients)), words
 
 
-# Priors
-# ----------------------------------------------------------------------------------------------------------
+# Priors -----------------------------------------------------------------------------------------------------
 
 
 class CameraPrior(NamedTuple):

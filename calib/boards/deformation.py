@@ -136,17 +136,14 @@ def described(
         if abs(stretch) > 3 * deviation[0]:
             found.append(
                 f"{name} is stretched: squares are {100 * abs(stretch):.2f} ± {100 * deviation[0]:.2g} % "
-                f"{'longer' if stretch > 0 else 'shorter'} down than across; this is modelled, with the "
-                "size across as "
-                "specified: measure both"
+                f"{'longer' if stretch > 0 else 'shorter'} down than across; this is modelled, "
+                "with the size across as specified: measure both"
             )
         relative = float(np.max(np.abs(shape.values[k, 1:]) / deviation[1:]))
         if relative > 3:
             found.append(
                 f"{name} is bent: its middle lies {1e3 * curved.depth:.2f} ± "
-                f"{1e3 * curved.depth / relative:.2g} mm "
-                f"{'in front of' if curved.towards else 'behind'} its edges (radius {curved.radius:.2f} m); "
-                "this "
-                "is modelled: glue it to something stiff and flat"
+                f"{1e3 * curved.depth / relative:.2g} mm {'in front of' if curved.towards else 'behind'} its "
+                f"edges (radius {curved.radius:.2f} m); this is modelled: glue it to something stiff and flat"
             )
     return found

@@ -309,9 +309,8 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
         if isinstance(board, Charuco):
             legacy = "? A board drawn by OpenCV before 4.6 needs ':legacy' at the end of its name"
         return (
-            f"{len(ids)} of its markers are visible, but not at their positions: is the size right (across "
-            "x down)"
-            f"{legacy}"
+            f"{len(ids)} of its markers are visible, but not at their positions: "
+            f"is the size right (across x down){legacy}"
         )
     for name in OTHER_DICTIONARIES:
         if len(seen := _tags(grey, name, 1)) >= 6:
@@ -333,8 +332,7 @@ def _grid_size(grey: Grey) -> tuple[int, int] | None:
     return (meta.shape[1], meta.shape[0]) if done else None
 
 
-# All images
-# ---------------------------------------------------------------------------------------------------
+# All images -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -421,8 +419,7 @@ def _check_board(
     if other := other_size(_greys([moments[key] for key in seen]), board, larger=True):
         raise ValueError(
             f"{name}: the images show a chessboard with {other} inner corners and the board given is "
-            f"{board}: "
-            "count the corners between squares, not the squares"
+            f"{board}: count the corners between squares, not the squares"
         )
 
 

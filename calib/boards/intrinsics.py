@@ -211,9 +211,8 @@ def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:
     usable = valid.numpy() & (rays[:, 2] > 0.05 * np.linalg.norm(rays, axis=1))
     if usable.sum() < 4:
         raise ValueError(
-            f"only {usable.sum()} of {len(usable)} points of a board are in front of {camera}: a pose needs "
-            "four; "
-            "check its lens and focal length"
+            f"only {usable.sum()} of {len(usable)} points of a board are in front of {camera}: "
+            "a pose needs four; check its lens and focal length"
         )
     flat = rays[usable, :2] / rays[usable, 2:]
     points = board.points[found.ids[usable]]

@@ -327,16 +327,15 @@ def _connection_error(
     if not crossing:
         see = "see" if len(rest) > 1 else "sees"
         return (
-            f"{_listed(rest)} never {see} the board in the same frame as {_listed(joined)}: take images "
-            "with the "
-            "board where both see it, and check that images of one moment have the same number"
+            f"{_listed(rest)} never {see} the board in the same frame as {_listed(joined)}: "
+            "take images with the board where both see it, and check that images of one moment have the "
+            "same number"
         )
     (a, b), pair = max(crossing.items(), key=lambda edge: len(edge[1].shared))
     by_name = {c.name: c for c in cameras}
     return (
-        f"{a} and {b} contradict each other: only {len(pair.agreeing)} of the {len(pair.shared)} frames "
-        "both see fit "
-        f"one relative pose; {_explain_contradiction(by_name[a], by_name[b], board)}"
+        f"{a} and {b} contradict each other: only {len(pair.agreeing)} of the {len(pair.shared)} frames both "
+        f"see fit one relative pose; {_explain_contradiction(by_name[a], by_name[b], board)}"
     )
 
 

@@ -100,12 +100,10 @@ def report_html(
         parts += [
             "<h2>Adequacy of each camera</h2>",
             "<p>Left, middle: standard deviation (pixels, worst direction) of the projection of points at "
-            "the nearest "
-            "and the furthest depth of the boards, after the motion of the camera that keeps the boards "
-            "where they "
-            "were seen best. Right: how far cameras fitted to every other frame differ, where boards were "
-            "seen (grey: "
-            "nowhere): where that is much more, the lens model or the boards are inadequate.</p>",
+            "the nearest and the furthest depth of the boards, after the motion of the camera that keeps "
+            "the boards where they were seen best. Right: how far cameras fitted to every other frame "
+            "differ, where boards were seen (grey: nowhere): where that is much more, "
+            "the lens model or the boards are inadequate.</p>",
             image(draw_adequacy(calibration, depths(covers.values()))),
         ]
     if len(calibration.views) > 1 and calibration.fit.covariance is not None:
@@ -113,8 +111,8 @@ def report_html(
         parts += [
             "<h2>Uncertainty of predicted positions</h2>",
             "<p>Standard deviation (pixels, worst direction) of the positions predicted in the other "
-            "cameras for "
-            f"pixels of the first, at {near:.3g} m (nearest board) and {far:.3g} m (furthest).</p>",
+            f"cameras for pixels of the first, at {near:.3g} m (nearest board) and {far:.3g} m "
+            "(furthest).</p>",
             image(draw_uncertainty(calibration, (near, far))),
         ]
     return html_page(parts, title)
@@ -143,8 +141,7 @@ def summary(calibration: Calibration) -> str:
     points = sum(len(seen.x) for seen in calibration.fit.problem.seen.values())
     text = (
         f"{len(calibration.views)} cameras, {len(calibration.frames)} frames of {calibration.board}, "
-        f"{points} points: "
-        f"reprojection error {calibration.rms:.3f} px (RMS)."
+        f"{points} points: reprojection error {calibration.rms:.3f} px (RMS)."
     )
     for where, errors in (("", calibration.epipolar), (" on held-out frames", calibration.held_out)):
         if errors:
@@ -159,8 +156,7 @@ def depths(covers: Iterable[Coverage]) -> tuple[float, float]:
     return max(min(near), 1e-3), max(far)
 
 
-# Tables
-# -------------------------------------------------------------------------------------------------------
+# Tables -----------------------------------------------------------------------------------------------------
 
 
 def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> str:
@@ -246,8 +242,7 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return f"<table><tr>{top}</tr>{''.join(lines)}</table>"
 
 
-# Figures
-# ------------------------------------------------------------------------------------------------------
+# Figures ----------------------------------------------------------------------------------------------------
 
 
 def draw_scene(calibration: Calibration) -> Figure:

@@ -126,11 +126,9 @@ class RigDifference:
                 f"calibrations' errors let them ({test})"
             )
         return (
-            f"verdict: moved: the rigs differ by more than their calibrations' errors ({test}); a rotation "
-            "of "
-            f"{found.camera} by {found.degrees:.3f} degrees and a shift of {1e3 * found.metres:.2f} mm "
-            "explain "
-            f"{found.share:.0%} of it"
+            f"verdict: moved: the rigs differ by more than their calibrations' errors ({test}); "
+            f"a rotation of {found.camera} by {found.degrees:.3f} degrees and a shift of "
+            f"{1e3 * found.metres:.2f} mm explain {found.share:.0%} of it"
         )
 
 
@@ -188,9 +186,8 @@ def _same_cameras(a: Rig, b: Rig) -> tuple[str, ...]:
         if a[name].hw != b[name].hw:
             (h, w), (h2, w2) = a[name].hw, b[name].hw
             raise ValueError(
-                f"'{name}' has {w}x{h} pixels in one rig and {w2}x{h2} in the other: calibrate again with "
-                "images as "
-                "they were, or give a rig that is resized alike"
+                f"'{name}' has {w}x{h} pixels in one rig and {w2}x{h2} in the other: "
+                "calibrate again with images as they were, or give a rig that is resized alike"
             )
     return a.names
 

@@ -104,8 +104,7 @@ def _named_like(folder: Path, rig: Rig) -> dict[str, str] | None:
     return patterns if all(any(folder.glob(pattern)) for pattern in patterns.values()) else None
 
 
-# While images are taken
-# ---------------------------------------------------------------------------------------
+# While images are taken -------------------------------------------------------------------------------------
 
 
 @dataclass

@@ -98,9 +98,9 @@ def _check_tilts(name: str, poses: Mapping[FrameKey, Pose], board: Board) -> Non
     widest = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)).max()))
     if widest < FEWEST_TILT:
         raise ValueError(
-            f"{name}: all boards are parallel (to {widest:.1f} degrees), so that focal length and distance "
-            "are "
-            "ambiguous: tilt the board by 20 to 40 degrees, to different sides, in most of the images"
+            f"{name}: all boards are parallel (to {widest:.1f} degrees), "
+            "so that focal length and distance are ambiguous: tilt the board by 20 to 40 degrees, "
+            "to different sides, in most of the images"
         )
 
 
@@ -168,8 +168,7 @@ def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, l
                 break
             raise ValueError(
                 f"{name}: the images do not determine the focal length: tilt the board by 20 to 40 degrees, "
-                "to "
-                "different sides, and bring it close in some of them"
+                "to different sides, and bring it close in some of them"
             )
         free[name][index] = False
         information = np.delete(np.delete(information, worst, 0), worst, 1)
@@ -222,8 +221,7 @@ def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
     return deformed if gain > (max(left, LEAST_GAIN) if few else LEAST_GAIN) else solved
 
 
-# The adjustment
-# -----------------------------------------------------------------------------------------------
+# The adjustment ---------------------------------------------------------------------------------------------
 
 
 def adjust(problem: BundleProblem, *, rounds: int = 4, equal_noise: bool = False) -> Solved:
@@ -305,8 +303,7 @@ def _covariance(problem: BundleProblem) -> Array | None:
     return np.linalg.inv(scaled) * scale[:, None] * scale
 
 
-# Outliers
-# -----------------------------------------------------------------------------------------------------
+# Outliers ---------------------------------------------------------------------------------------------------
 
 
 def near_fit(solved: Solved, name: str, views: BoardViews, board: Board) -> BoardViews:
@@ -367,8 +364,7 @@ def misfit_notes(fit: Solved) -> list[str]:
     return notes
 
 
-# All cameras
-# --------------------------------------------------------------------------------------------------
+# All cameras ------------------------------------------------------------------------------------------------
 
 
 def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solved]) -> Solved:

@@ -50,9 +50,8 @@ from .board import (
 
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 FORMS = (
-    "chessboard:9x6:25mm (inner corners), charuco:8x6:30mm (squares), circles:7x5:20mm, acircles:4x11:20mm "
-    "or "
-    "aprilgrid:6x6:88mm:0.3 (tags)"
+    "chessboard:9x6:25mm (inner corners), charuco:8x6:30mm (squares), circles:7x5:20mm, "
+    "acircles:4x11:20mm or aprilgrid:6x6:88mm:0.3 (tags)"
 )
 LARGEST = 100
 APRIL_TAGS = "apriltag_36h11"
@@ -266,8 +265,7 @@ def _check_points(path: Path, ids: Sequence[tuple[int, int]]) -> None:
         raise ValueError(f"{path}: marker {twice[0][0]} is there twice")
 
 
-# Printing
-# -----------------------------------------------------------------------------------------------------
+# Printing ---------------------------------------------------------------------------------------------------
 
 
 def page_of(board: Board, *, margin: float = 0.012) -> tuple[float, float]:
@@ -321,9 +319,8 @@ def _sheet(paper: str, page: tuple[float, float]) -> tuple[float, float]:
             return sheet
     larger = smallest_paper(page)
     raise ValueError(
-        f"the board needs {page[0]:.0f} x {page[1]:.0f} mm with its margin and {paper} has {short} x "
-        f"{long}: use "
-        f"{f'{larger}, ' if larger else ''}smaller squares or fewer of them"
+        f"the board needs {page[0]:.0f} x {page[1]:.0f} mm with its margin and {paper} has {short} x {long}: "
+        f"use {f'{larger}, ' if larger else ''}smaller squares or fewer of them"
     )
 
 

@@ -132,8 +132,7 @@ def baseline_deviation(rig: Mapping[str, Camera], a: str, b: str, covariance: Ri
     return float(np.sqrt((of_b - of_a) @ covariance.matrix @ (of_b - of_a)))
 
 
-# One camera
-# ---------------------------------------------------------------------------------------------------
+# One camera -------------------------------------------------------------------------------------------------
 
 
 class Intrinsics(NamedTuple):
@@ -213,8 +212,7 @@ def covered(x: Float[np.ndarray, "n 2"], seen: Float[np.ndarray, "m 2"], hw: HW)
     return np.asarray(nearest < reach)
 
 
-# How frames disagree
-# -------------------------------------------------------------------------------------------
+# How frames disagree ----------------------------------------------------------------------------------------
 
 
 class Jackknife(NamedTuple):
@@ -303,10 +301,9 @@ def with_disagreement(
         before, covariance = covariance, (level**2 * covariance + found.left_out) / 2
         raised = float(_ratio(covariance, before).max())
         notes.append(
-            "frames disagree more than the points' noise explains: standard deviations are raised, by up to "
-            f"{raised:.1f}, to those of a jackknife over frames (is the board flat and printed true to "
-            "size, and were "
-            "the images sharp?)"
+            "frames disagree more than the points' noise explains: standard deviations are raised, "
+            f"by up to {raised:.1f}, to those of a jackknife over frames (is the board flat and printed true "
+            "to size, and were the images sharp?)"
         )
     return replace(solved, covariance=covariance, raised=raised, notes=(*solved.notes, *notes))
 

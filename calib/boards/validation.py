@@ -76,8 +76,7 @@ def _common(a: BoardViews, b: BoardViews) -> tuple[np.ndarray, np.ndarray]:
     return xa, xb
 
 
-# Frames held out
-# ----------------------------------------------------------------------------------------------
+# Frames held out --------------------------------------------------------------------------------------------
 
 
 def held_out_errors(
@@ -210,8 +209,7 @@ def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"
     return np.asarray(np.bincount(seen.block, squares) / np.maximum(2 * count - POSE, 1))
 
 
-# Notes
-# --------------------------------------------------------------------------------------------------------
+# Notes ------------------------------------------------------------------------------------------------------
 
 
 def left_out_notes(

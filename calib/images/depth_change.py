@@ -66,9 +66,8 @@ class DepthChange(NamedTuple):
 
     def __str__(self) -> str:
         return (
-            f"depth changes by {self.change:.2%} (median of the points); its standard deviation, by the "
-            "stated ones "
-            f"of the parameters, is {self.before:.2%} before and {self.after:.2%} after"
+            f"depth changes by {self.change:.2%} (median of the points); its standard deviation, "
+            f"by the stated ones of the parameters, is {self.before:.2%} before and {self.after:.2%} after"
         )
 
 

@@ -56,8 +56,7 @@ class UncalibratedRig(NamedTuple):
         """One line per link, and one on lenses if there are any."""
         lines = [
             f"{a} > {b}: {self.points[a, b]} points, held-out ones {self.distance[a, b]:.2f} px from their "
-            "lines, all "
-            f"within {self.displacement[a, b]:.0f} px of the rough map"
+            f"lines, all within {self.displacement[a, b]:.0f} px of the rough map"
             + (", with the given focal lengths" if self.by_focal[a, b] else "")
             for a, b in self.rig.links
         ]

@@ -170,9 +170,8 @@ def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str
     if not kept:
         (a, b), most = max(found.items(), key=lambda item: len(item[1].alpha))
         raise ValueError(
-            f"only {len(most.alpha)} points seen in both '{a}' and '{b}' agree, {ENOUGH} are needed: do the "
-            "cameras "
-            "see the same things, at the same time and in focus?"
+            f"only {len(most.alpha)} points seen in both '{a}' and '{b}' agree, {ENOUGH} are needed: "
+            "do the cameras see the same things, at the same time and in focus?"
         )
     return kept
 

@@ -264,9 +264,8 @@ def two(rig: Rig) -> Rig:
         if camera.distortion is not None:
             model = camera.distortion.model
             raise ValueError(
-                f"these scenes are made for pinholes and '{name}' has a lens ({model}): give scenes of your "
-                "own to "
-                "pat.evaluation.ablation.ablate"
+                f"these scenes are made for pinholes and '{name}' has a lens ({model}): "
+                "give scenes of your own to pat.evaluation.ablation.ablate"
             )
     return Rig(
         dict(zip((ALPHA, BETA), cameras)), depth=tuple(float(d) for d in rig.pair(first, second).depth_range)

@@ -46,8 +46,7 @@ CHUNK_PIXELS = 2**18
 """How many segments a callable is asked for at a time."""
 LOCAL_SERVES = (
     "nearest values, without statistics, bias and derivatives, of `Local` windows of odd size and whole "
-    "spacing "
-    "in float32 images of one size on the CPU"
+    "spacing in float32 images of one size on the CPU"
 )
 
 

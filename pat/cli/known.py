@@ -161,8 +161,7 @@ class Known:
             low, high = known.quantile(torch.tensor([0.05, 0.95])).tolist()
             raise ValueError(
                 f"{self.depth_map}: holds {low:.3g} to {high:.3g} m, the rig's depth range is {near:g} to "
-                f"{far:g} m: "
-                "state its unit with --depth-scale, or another range with --depth"
+                f"{far:g} m: state its unit with --depth-scale, or another range with --depth"
             )
         return AroundDepth(depth, self.depth_tolerance, view)
 

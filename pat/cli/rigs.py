@@ -373,9 +373,8 @@ class Refine:
                 {text.partition("=")[0]: text.partition("=")[2] for text in self.image[::-1]}.values()
             )
             say(
-                "no rig written, though points come far nearer to their lines: --force writes it all the "
-                "same; or fuse "
-                f"without a rig: `pat fuse {files}`",
+                "no rig written, though points come far nearer to their lines: "
+                f"--force writes it all the same; or fuse without a rig: `pat fuse {files}`",
                 style="yellow",
             )
             sys.exit(REFUSED)

@@ -238,9 +238,8 @@ def check_space(root: Path, scenes: int, scene_bytes: float) -> None:
         fits = max(int((free - RESERVE) / scene_bytes), 0)
         raise ValueError(
             f"{scenes} more scenes of about {scene_bytes / 1e6:.1f} MB need {need / 1e9:.1f} GB and {root} "
-            "has "
-            f"{free / 1e9:.1f} GB free: {fits} would fit; "
-            "free space, ask for fewer --scenes, or another --out"
+            f"has {free / 1e9:.1f} GB free: {fits} would fit; free space, ask for fewer --scenes, "
+            "or another --out"
         )
 
 

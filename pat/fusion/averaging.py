@@ -28,16 +28,14 @@ class AveragingSettings:
 
     own: tuple[float, int, float] = tuned(
         (0.22, 6, 2.0),
-        "Middlebury, tune half: colour is averaged by itself first: the scale of unlikeness over "
-        "the root of the "
-        "noise's standard deviation, how far away pixels are, "
+        "Middlebury, tune half: colour is averaged by itself first: the scale of unlikeness over the root "
+        "of the noise's standard deviation, how far away pixels are, "
         "and how much more luma counts than a colour difference",
     )
     recorded: tuple[float, int, float, float] = tuned(
         (0.11, 16, 1.25, 0.75),
-        "Middlebury, tune half: colour is averaged as beta recorded it then: the same, and how much "
-        "of it is taken "
-        "where enough is alike",
+        "Middlebury, tune half: colour is averaged as beta recorded it then: the same, "
+        "and how much of it is taken where enough is alike",
     )
     rows: int = size(16, "Rows that a thread works on at once: what it sums stays in its cache")
 

@@ -94,9 +94,8 @@ def _refuse_bands(network: FusionNetwork, views: Views) -> None:
         said = ", and the rig says that it is in colour" if sensor.response == "rgb" else ""
         advice = f"its image is grey{said}: give one in colour, or "
     raise ValueError(
-        f"the betas have {total} band{'s' if total > 1 else ''} in all ({listed}), these weights "
-        f"make {wanted}: "
-        f"{advice}take the weights mono-spectral, which fuse any number of bands"
+        f"the betas have {total} band{'s' if total > 1 else ''} in all ({listed}), "
+        f"these weights make {wanted}: {advice}take the weights mono-spectral, which fuse any number of bands"
     )
 
 

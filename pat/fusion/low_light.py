@@ -192,9 +192,9 @@ def warn_of_noise(name: str, image: Float[Tensor, "c h w"], view: NoisyView) -> 
     )
     if stated > SETTINGS.far_more * max(found, 255 * SETTINGS.least_deviation):
         warn(
-            f"noise of '{name}': a standard deviation of {stated:.0f}/255 is stated, its image shows "
-            f"{found:.1f}/255: "
-            "detail will be lost; state electrons at white, or have the noise estimated"
+            f"noise of '{name}': a standard deviation of {stated:.0f}/255 is stated, "
+            f"its image shows {found:.1f}/255: detail will be lost; state electrons at white, "
+            "or have the noise estimated"
         )
 
 

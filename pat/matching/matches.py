@@ -112,7 +112,6 @@ class Matches:
         if self.hw != hw or len(self.betas) != betas:
             (h, w), (height, width) = self.hw, hw
             raise ValueError(
-                f"these matches are of {w}x{h} pixels in {len(self.betas)} betas, the images are "
-                f"{width}x{height} "
-                f"with {betas}: match these images"
+                f"these matches are of {w}x{h} pixels in {len(self.betas)} betas, "
+                f"the images are {width}x{height} with {betas}: match these images"
             )

@@ -78,9 +78,9 @@ class ResponseSettings:
     )
     equal_weights: tuple[float, float] = tuned(
         (8.0, 0.006),
-        "Middlebury: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other "
-        "weights, to be taken "
-        "in their place: a sensor without filters; light may differ by a gain of this standard deviation",
+        "Middlebury: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other weights, "
+        "to be taken in their place: a sensor without filters; light may differ by a gain of this standard "
+        "deviation",
     )
     least_change: float = physics(
         0.01, "Root mean square change of luma up to which the weights are left at Rec. 601's"

@@ -323,9 +323,8 @@ def _counts(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArr
     if own == 16 and not bits and 0 < largest < 2 ** max(FEW_BITS):
         needed = next(n for n in FEW_BITS if largest < 2**n)
         warn(
-            f"{label}: has 16 bits a value, and none above {largest}, so it is nearly black: if its camera "
-            "counts to "
-            f"{2**needed - 1}, state `bits: {needed}` in the rig file"
+            f"{label}: has 16 bits a value, and none above {largest}, so it is nearly black: "
+            f"if its camera counts to {2**needed - 1}, state `bits: {needed}` in the rig file"
         )
     if largest > white:
         raise ValueError(

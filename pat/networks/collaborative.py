@@ -41,9 +41,8 @@ class CollaborativeSettings:
     )
     as_recorded: float = tuned(
         0.5,
-        "Middlebury, tune half: later passes look for alike blocks in an estimate with so much of "
-        "the noise left: "
-        "where an image is flat the noise makes blocks alike that lie apart, as is needed",
+        "Middlebury, tune half: later passes look for alike blocks in an estimate with so much of the noise "
+        "left: where an image is flat the noise makes blocks alike that lie apart, as is needed",
     )
     kept: float = tuned(
         0.5, "Middlebury, tune half: share of the network's brightness that is kept: its errors are others"

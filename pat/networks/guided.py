@@ -39,9 +39,8 @@ class GuidedSettings:
     least_weight: float = size(1e-3, "The least weight of a pixel in propagation")
     confidence_offsets: tuple[float, float] = tuned(
         (0.2, 2.0),
-        "Middlebury, tune half: goes with the next training: added to the logit of the confidence "
-        "where colour is blended: "
-        "where beta's brightness is unlike alpha's, and where it is the same",
+        "Middlebury, tune half: goes with the next training: added to the logit of the confidence where "
+        "colour is blended: where beta's brightness is unlike alpha's, and where it is the same",
     )
     exact_offset: float = tuned(
         1.0,

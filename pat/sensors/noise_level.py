@@ -54,9 +54,9 @@ class NoiseLevel:
         """The noise of a camera that counts so many electrons at white, with a read noise in electrons."""
         if not electrons >= 1:
             raise ValueError(
-                f"noise: electrons at white must be 1 or more, such as 200, got {electrons:g}: state how "
-                "many a pixel "
-                "counts at white, not a standard deviation, or have the noise estimated"
+                f"noise: electrons at white must be 1 or more, such as 200, got {electrons:g}: "
+                "state how many a pixel counts at white, not a standard deviation, "
+                "or have the noise estimated"
             )
         return cls(1 / electrons, read / electrons, added_to)
 

@@ -121,8 +121,7 @@ def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -
     )
 
 
-# The room and its lights
-# ----------------------------------------------------------------------------------------
+# The room and its lights ------------------------------------------------------------------------------------
 
 
 def _room(setting: Setting) -> _Room:
@@ -217,8 +216,7 @@ def _tinted(rng: Generator, light: Light) -> Light:
     return replace(light, rgb=(1 + warmth, 1.0, 1 - warmth), nir=1 + 2 * max(warmth, 0.0))
 
 
-# Objects
-# --------------------------------------------------------------------------------------------------------
+# Objects ----------------------------------------------------------------------------------------------------
 
 
 def _object(

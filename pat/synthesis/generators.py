@@ -67,8 +67,7 @@ def generator_named(name: str) -> Callable[..., Scene]:
     return imported(name, "generator")  # type: ignore[no-any-return]
 
 
-# Surfaces
-# -------------------------------------------------------------------------------------------------------
+# Surfaces ---------------------------------------------------------------------------------------------------
 
 
 def _pattern(setting: Setting, depth: float, kinds: tuple[TextureKind, ...]) -> Texture:

@@ -107,9 +107,9 @@ def newest_checkpoint(folder: Path) -> Checkpoint | None:
     if files and found is None:
         names = ", ".join(path.name for path in files)
         raise ValueError(
-            f"{folder}: no checkpoint there can be read ({names}), so this run cannot continue: restore one "
-            "of them "
-            "from a copy, or remove these files to begin again at step 0, or give another --out"
+            f"{folder}: no checkpoint there can be read ({names}), so this run cannot continue: "
+            "restore one of them from a copy, or remove these files to begin again at step 0, "
+            "or give another --out"
         )
     return found
 
@@ -151,6 +151,5 @@ def _no_room(folder: Path, step: int, tensors: Mapping[str, Tensor], error: Exce
     reason = " ".join(str(error).split())
     return (
         f"the checkpoint of step {step} ({wanted:.0f} MiB) could not be written to {folder} ({free:.0f} MiB "
-        "free): "
-        f"{reason}; {last}: make room and give the same command again"
+        f"free): {reason}; {last}: make room and give the same command again"
     )

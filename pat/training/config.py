@@ -220,8 +220,7 @@ def command_line(arguments: list[str]) -> TrainConfig:
         description=(
             "Train weights on scenes made from photographs while training. RECIPE is a YAML file or one of "
             f"{', '.join(recipes())}; the options below change it. The same command again continues a run "
-            "that "
-            "stopped. On N processors: torchrun --nproc_per_node N -m pat train RECIPE --groups N"
+            "that stopped. On N processors: torchrun --nproc_per_node N -m pat train RECIPE --groups N"
         ),
         default=base,
         args=arguments,

@@ -217,9 +217,9 @@ def new_network(config: TrainConfig) -> Network:
         weights = load_weights(config.start)
         if type(weights) is not type(network) or weights.config != config.network:
             raise ValueError(
-                f"start: {config.start} holds a {type(weights).__name__} of {weights.config}, the recipe is "
-                "for a "
-                f"{type(network).__name__} of {config.network}: give its own recipe, or leave `start` out"
+                f"start: {config.start} holds a {type(weights).__name__} of {weights.config}, "
+                f"the recipe is for a {type(network).__name__} of {config.network}: give its own recipe, "
+                "or leave `start` out"
             )
         network.load_state_dict(weights.state_dict())
     return network

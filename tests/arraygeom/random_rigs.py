@@ -153,8 +153,7 @@ def _pixels(
     return explicit.pixels_of(alpha, rays)[0], rays
 
 
-# What is asserted
-# ---------------------------------------------------------------------------------------------
+# What is asserted -------------------------------------------------------------------------------------------
 
 
 def check(one: Drawn, dtype: torch.dtype) -> None:

@@ -471,12 +471,11 @@ def write(path: Path, lines: list[str], end: str) -> None:
     text = [
         "# Attention, measured",
         "",
-        f"{date.today()}, torch {torch.__version__}, {platform.machine()}. {end} D = 64, channels last. "
-        "(a) is `index`, (b) is `grid_sample`; 'faster' and 'leaner' are ratios of time and of extra peak "
-        "memory; "
-        "4 floating-point operations a sample and channel in forward, 12 with backward; least traffic is Q, "
-        "K, V and "
-        "out once, twice with backward. Written by `make bench`.",
+        f"{date.today()}, torch {torch.__version__}, {platform.machine()}. {end} D = 64, "
+        "channels last. (a) is `index`, (b) is `grid_sample`; 'faster' and 'leaner' are ratios of time and "
+        "of extra peak memory; 4 floating-point operations a sample and channel in forward, "
+        "12 with backward; least traffic is Q, K, V and out once, twice with backward. Written by `make "
+        "bench`.",
         *lines,
     ]
     write_text(path, "\n".join(text) + "\n")

@@ -90,10 +90,9 @@ def report(scenes: int, slow_scenes: int, workers: int) -> str:
     names = list(SETTINGS)
     return "\n".join(
         [
-            f"`python -m tests.benchmarks.bench_render`: {workers} workers on {os.cpu_count()} cores, load "
-            "before "
-            f"{load:.1f}; two views of 512x384; "
-            f"{refused} seeds were refused by the check and cost time, too.",
+            f"`python -m tests.benchmarks.bench_render`: {workers} workers on {os.cpu_count()} cores, "
+            f"load before {load:.1f}; two views of 512x384; {refused} seeds were refused by the check and "
+            "cost time, too.",
             "",
             markdown_header(
                 ["", "scenes", "an hour, all counted", "an hour, by s a scene", "s a scene", "core s a scene"]

@@ -110,9 +110,8 @@ def _upright(camera: Camera, name: str) -> Camera:
     K = K @ Q.T
     if abs(float(K[0, 1])) > 1e-9 * float(K[0, 0].abs()):
         raise ValueError(
-            f"camera '{name}' has skew (K[0, 1] = {float(K[0, 1]):.4g}), which Blender's cameras cannot "
-            "have: "
-            "set it to 0, or calibrate without skew"
+            f"camera '{name}' has skew (K[0, 1] = {float(K[0, 1]):.4g}), "
+            "which Blender's cameras cannot have: set it to 0, or calibrate without skew"
         )
     if not (K[0, 0] > 0 and K[1, 1] > 0):
         raise ValueError(
@@ -134,9 +133,8 @@ def _wide(camera: Camera, upright: Camera, name: str) -> Lens:
     angle = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])[valid].max()
     if angle > WIDEST:
         raise ValueError(
-            f"camera '{name}' sees {math.degrees(angle):.0f} degrees off its axis; a plane image covers at "
-            "most "
-            f"{math.degrees(WIDEST):.0f}: crop the camera"
+            f"camera '{name}' sees {math.degrees(angle):.0f} degrees off its axis; "
+            f"a plane image covers at most {math.degrees(WIDEST):.0f}: crop the camera"
         )
     plane = rays[..., :2] / rays[..., 2:].clamp(min=1e-6)
     f = float(_finest(plane, valid))
