@@ -45,9 +45,7 @@ class SubpixelSettings:
     same: float = tuned(0.7, "Middlebury: nearer matches at both sizes are of one surface, pixels")
     step_radius: int = size(3, "Window of the step to a fraction of a pixel")
     gradient_radius: int = size(6, "Window around a pixel whose brightness moves its match, in gradients")
-    most_step: float = tuned(
-        0.25, "Middlebury, tune half (without a limit: 1 point of depth less): the most pixels of that step"
-    )
+    most_step: float = tuned(0.25, "Middlebury, tune half: the most pixels of that step")
     flat: float = tuned(
         3e-6,
         "Middlebury: slope of brightness (its square) along the segment at which that step is half as long, "

@@ -54,7 +54,7 @@ class GuidedSettings:
     )
     likeness: float = tuned(
         0.06,
-        "Middlebury, tune half (.08: .01 dB less): difference of brightness at which likeness falls to 1 / e",
+        "Middlebury, tune half: difference of brightness at which likeness falls to 1 / e",
     )
     likest: float = tuned(
         3.0,

@@ -230,7 +230,7 @@ def test_a_sample_that_is_not_finite_is_named_and_saved(folder, whole, monkeypat
 def test_no_room_for_a_checkpoint(folder, whole, monkeypatch):
     """The system refuses to write, as on a full disk; the older checkpoint stays, a run can go on from it."""
     config = replace(whole, out=folder / "full")
-    stopped(config, 4, monkeypatch)
+    stopped(config, 5, monkeypatch)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     room = 2 * (whole.out / "best.safetensors").stat().st_size
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
@@ -241,8 +241,8 @@ def test_no_room_for_a_checkpoint(folder, whole, monkeypatch):
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert "\n" not in str(caught.value)
     assert [p.name for p in (config.out / "checkpoints").iterdir()] == ["step-00000003.safetensors"]
-    stopped(config, 7, monkeypatch)
-    assert losses(config.out) == losses(whole.out)[:7]
+    train(config)
+    assert losses(config.out) == losses(whole.out)
 
 
 def test_another_recipe_is_not_mixed_in(whole):
@@ -296,7 +296,7 @@ def test_schedules(whole):
 
 def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_again(folder, whole, monkeypatch):
     config = replace(whole, out=folder / "damaged")
-    stopped(config, 7, monkeypatch)
+    stopped(config, 8, monkeypatch)
     newer, older = sorted((config.out / "checkpoints").iterdir(), reverse=True)
     newer.write_bytes(newer.read_bytes()[:1000])
     assert newest_checkpoint(config.out / "checkpoints").facts["step"] == 3
@@ -311,8 +311,8 @@ def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_again(folder, wh
     assert (config.out / "log.jsonl").read_bytes() == log
     for file in (newer, older):
         file.unlink()
-    stopped(config, 3, monkeypatch)
-    assert losses(config.out) == losses(whole.out)[:3]
+    train(config)
+    assert losses(config.out) == losses(whole.out)
 
 
 def test_one_run_at_a_time_writes_to_a_folder(folder, whole):
