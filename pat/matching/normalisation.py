@@ -37,8 +37,7 @@ class NormalisationSettings:
     )
     sharper: float = tuned(
         1.05,
-        "Middlebury, tune half (1: .2 points of depth less): "
-        "contrast over the other's up to which an image is no sharper",
+        "Middlebury, tune half: contrast over the other's up to which an image is no sharper",
     )
 
 

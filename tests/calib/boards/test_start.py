@@ -127,15 +127,14 @@ def photos(tmp_path):
     return tmp_path
 
 
+def calibrating(photos):
+    """The command that calibrates the rig of these photographs."""
+    board = ("--board", "charuco:9x7:60mm")
+    return ["calibrate", str(photos / "photos"), *board, "-o", str(photos / "rig.yaml")]
+
+
 def test_one_photograph_of_each_camera(photos, capsys):
-    command = [
-        "calibrate",
-        str(photos / "photos"),
-        "--board",
-        "charuco:9x7:60mm",
-        "-o",
-        str(photos / "rig.yaml"),
-    ]
+    command = calibrating(photos)
     main([*command, "--start", str(photos / "start.yaml"), "--deviation", "position=0.001"])
     said = capsys.readouterr().out
     assert "2 cameras, 1 frames" in said
@@ -166,17 +165,7 @@ def test_mistakes_with_a_start(options, message, photos, capsys):
     if "--start" not in options:
         options = [*options, "--start", str(photos / "start.yaml")]
     with pytest.raises(SystemExit):
-        main(
-            [
-                "calibrate",
-                str(photos / "photos"),
-                "--board",
-                "charuco:9x7:60mm",
-                "-o",
-                str(photos / "rig.yaml"),
-                *options,
-            ]
-        )
+        main([*calibrating(photos), *options])
     assert message in capsys.readouterr().err
     assert not (photos / "rig.yaml").exists()
 
