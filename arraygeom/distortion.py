@@ -208,8 +208,8 @@ def lens_derivatives(
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 3"], Float[Tensor, "n 2 k"]]:
     """`project` of finite points by one lens, and its derivatives by points and coefficients, as constants.
 
-    None is a pinhole. In closed form for Brown-Conrady without a tilted sensor; otherwise by two reverse passes, with a copy of
-    the coefficients for each point.
+    None is a pinhole. In closed form for Brown-Conrady without a tilted sensor; otherwise by two reverse
+    passes, with a copy of the coefficients for each point.
     """
     X, c = X.detach(), X.new_zeros(0) if lens is None else lens.coefficients.detach()
     if lens is None or (lens.model == BROWN_CONRADY and len(c) < COEFFICIENT_COUNTS[BROWN_CONRADY][-1]):
