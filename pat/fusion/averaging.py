@@ -1,7 +1,7 @@
-"""Means over pixels with alike surroundings: non-local means (Buades et al. 2005) guided by another image.
+"""Means over pixels with alike surroundings: non-local means (Buades et al. 2005) of two images' colours.
 
 What a network makes of noisy views still has some of their noise. Pixels that are alike in its image are
-averaged in it, and then what betas recorded there.
+averaged: the colours that it has there, and those that betas recorded.
 """
 
 from __future__ import annotations
@@ -26,22 +26,15 @@ from ..support.settings import size, tuned
 class AveragingSettings:
     """Of means over pixels that are alike."""
 
-    own: tuple[float, int, float] = tuned(
-        (0.22, 6, 2.0),
-        "Middlebury, tune half: colour is averaged by itself first: the scale of unlikeness over the root "
-        "of the noise's standard deviation, how far away pixels are, "
-        "and how much more luma counts than a colour difference",
+    scale: float = tuned(
+        0.18,
+        "Middlebury, tune half: the scale of unlikeness, over the root of the noise's standard deviation",
     )
-    recorded: tuple[float, int, float, float] = tuned(
-        (0.11, 16, 1.25, 0.75),
-        "Middlebury, tune half: colour is averaged as beta recorded it then: the same, "
-        "and how much of it is taken where enough is alike",
-    )
+    radius: int = size(8, "How far away pixels are, rows and columns")
     rows: int = size(16, "Rows that a thread works on at once: what it sums stays in its cache")
 
 
 SETTINGS = AveragingSettings()
-OWN, RECORDED, ROWS = SETTINGS.own, SETTINGS.recorded, SETTINGS.rows
 
 
 def averaged_with_alike(
@@ -52,31 +45,24 @@ def averaged_with_alike(
 ) -> Float[Tensor, "3 h w"]:
     """An image with the mean colour of what is alike near each pixel: of its own, and of beta's recorded.
 
-    Luma stays. `beta` are its values at alpha's pixels, to be used as far as `confidence` says, with noise of
-    this standard deviation in the mean.
+    Luma stays. `beta` are its values at alpha's pixels, which count as much as the image's own where
+    `confidence` is 1, with noise of this standard deviation in the mean.
     """
-    luma, counts, root = luminance(image), confidence.square(), deviation**0.5
-    colour = (image - luma)[[0, 2]]
-    scale, radius, detail = OWN
-    sums, weight = sums_of_alike(torch.cat([colour, detail * luma]), colour, scale * root, radius)
-    colour = sums / weight
-    scale, radius, detail, share = RECORDED
-    recorded = (beta - luminance(beta))[[0, 2]]
-    values = torch.cat([recorded * counts, counts])
-    sums, _ = sums_of_alike(torch.cat([colour, detail * luma]), values, scale * root, radius, step=2)
-    enough = share * sums[2:] / (sums[2:] + 1)
-    return from_luma_chroma(luma, torch.lerp(colour, sums[:2] / (sums[2:] + 1e-6), enough))
+    luma, counts = luminance(image), confidence.square()
+    own, recorded = ((colours - luminance(colours))[[0, 2]] for colours in (image, beta))
+    values = torch.cat([own + counts * recorded, 1 + counts])
+    sums = sums_of_alike(image, values, SETTINGS.scale * deviation**0.5, SETTINGS.radius)
+    return from_luma_chroma(luma, sums[:2] / sums[2:])
 
 
 def sums_of_alike(
-    guide: Float[Tensor, "c h w"], values: Float[Tensor, "k h w"], scale: float, radius: int, step: int = 1
-) -> tuple[Float[Tensor, "k h w"], Float[Tensor, "1 h w"]]:
-    """For each pixel the weighted sums of the values at pixels around it, and of the weights.
+    guide: Float[Tensor, "c h w"], values: Float[Tensor, "k h w"], scale: float, radius: int
+) -> Float[Tensor, "k h w"]:
+    """For each pixel the weighted sums of the values at the pixels at most `radius` rows and columns away.
 
     The weight is about exp(-d / scale^2), where d is the mean square difference of the guide's 3 x 3 patches
-    around both. The pixels are those at most `radius` rows and columns away, every `step`-th of them; beyond
-    the edges images are mirrored. All in float32 on the CPU, on as many threads as torch may use; back on the
-    values' device.
+    around both. Beyond the edges images are mirrored. All in float32 on the CPU, on as many threads as torch
+    may use; back on the values' device.
     """
     h, w = guide.shape[-2:]
     around = radius + 1
@@ -84,36 +70,34 @@ def sums_of_alike(
     planes = [
         np.pad(image.detach().float().cpu().numpy(), mirrored, mode="reflect") for image in (guide, values)
     ]
-    out = np.zeros((len(values) + 1, h, w), np.float32)
+    out = np.zeros((len(values), h, w), np.float32)
     sharpness = np.float32(1 / (8 * 9 * len(guide) * scale**2))
 
     def rows(top: int, bottom: int) -> None:
-        add_alike(*planes, around, radius, step, sharpness, top, out[:, top:bottom])
+        add_alike(*planes, radius, sharpness, top, out[:, top:bottom])
 
-    in_parallel([partial(rows, *span) for span in spans(h, ROWS)])
-    sums = torch.from_numpy(out).to(values)
-    return sums[:-1], sums[-1:]
+    in_parallel([partial(rows, *span) for span in spans(h, SETTINGS.rows)])
+    return torch.from_numpy(out).to(values)
 
 
 @compiled(nogil=True, cache=True, fastmath=True)
-def add_alike(guide, values, around, radius, step, sharpness, top, out):
-    """Add to `out` (k + 1, rows, w), from row `top`: the weighted values, and the weights.
+def add_alike(guide, values, radius, sharpness, top, out):
+    """Add to `out` (k, rows, w), from row `top`, the weighted values.
 
     The weight is (1 - d / 8)^8, or 0 where d is over 8, in place of the exponential.
     """
-    channels, bands = len(guide), len(values)
-    rows, width = out.shape[1:]
+    around = radius + 1
+    bands, rows, width = out.shape
     difference = np.zeros((3, width + 2), np.float32)
     weight = np.zeros(width, np.float32)
-    first = around - 1
-    for dy in range(-radius, radius + 1, step):
-        for dx in range(-radius, radius + 1, step):
+    for dy in range(-radius, radius + 1):
+        for dx in range(-radius, radius + 1):
             for y in range(-1, rows + 1):
                 row = difference[y % 3]
                 row[:] = 0
-                for c in range(channels):
-                    own = guide[c, around + top + y, first : first + width + 2]
-                    other = guide[c, around + top + y + dy, first + dx : first + dx + width + 2]
+                for c in range(len(guide)):
+                    own = guide[c, around + top + y, radius : radius + width + 2]
+                    other = guide[c, around + top + y + dy, radius + dx : radius + dx + width + 2]
                     for x in range(width + 2):
                         row[x] += (other[x] - own[x]) ** 2
                 if y < 1:
@@ -139,8 +123,6 @@ def add_alike(guide, values, around, radius, step, sharpness, top, out):
                     seen = values[k, around + top + y - 1 + dy, around + dx : around + dx + width]
                     for x in range(width):
                         out[k, y - 1, x] += weight[x] * seen[x]
-                for x in range(width):
-                    out[bands, y - 1, x] += weight[x]
 
 
 separate_cache(add_alike)

@@ -20,7 +20,6 @@ from arraygeom.chunks import spans
 from arraygeom.threads import in_parallel
 
 from ..attention.kernels import compiled, separate_cache
-from ..media.colour import luminance
 from ..support.settings import size, tuned
 from .denoiser import opponent, opponent_deviation, over_flips, rgb_of_opponent
 
@@ -93,15 +92,6 @@ def _filtered(estimate: Tensor, recorded: Tensor, deviation: Tensor, guide: Tens
     first = collaboratively_filtered(recorded, estimate, guide, deviation, threshold=THRESHOLD)
     first = (first + estimate) / 2
     return wiener_filtered(recorded, first, deviation, _guide(first[:1], guide))
-
-
-def luma_refined(
-    image: Float[Tensor, "3 h w"], alpha: Float[Tensor, "1 h w"], deviation: Float[Tensor, "1 h w"]
-) -> Float[Tensor, "3 h w"]:
-    """An RGB image, its luma corrected by alpha as recorded, with noise of this standard deviation."""
-    luma = luminance(image)
-    found = wiener_filtered(alpha, luma, deviation, _guide(luma, alpha))
-    return image + (1 - KEPT) * (found - luma)
 
 
 def _guide(estimate: Tensor, recorded: Tensor) -> Tensor:

@@ -6,7 +6,6 @@ import torch
 from scipy.fft import dctn, idctn
 from scipy.linalg import hadamard
 
-from pat.media.colour import luminance
 from pat.networks.collaborative import (
     ALIKE,
     RADIUS,
@@ -14,7 +13,6 @@ from pat.networks.collaborative import (
     STEP,
     WINDOW,
     collaboratively_filtered,
-    luma_refined,
     refined,
     wiener_filtered,
 )
@@ -114,16 +112,6 @@ def test_images_of_a_batch_are_refined_one_by_one():
         assert torch.equal(
             together[i : i + 1], refined(images[i : i + 1], images[i : i + 1], deviation[i : i + 1])
         )
-
-
-def test_luma_is_drawn_to_what_alpha_recorded():
-    clean = stripes(3)
-    off = clean + 0.02 * torch.sin(torch.arange(64.0) / 5)
-    alpha = luminance(clean) + noise_of((1, 48, 64), 8, 0.03)
-    found = luma_refined(off, alpha, torch.full_like(alpha, 0.03))
-    error, before = (float(luminance(x - clean).square().mean()) for x in (found, off))
-    assert error < 0.5 * before
-    torch.testing.assert_close(found - luminance(found), off - luminance(off), atol=1e-6, rtol=0)
 
 
 def test_the_result_does_not_depend_on_the_number_of_threads():
