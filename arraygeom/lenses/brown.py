@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -167,11 +168,56 @@ def _(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 def _brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """The solution and whether there is one; where not, the solution of the radial terms alone.
 
-    Close to the turn the slope is nearly 0 and leads nowhere, hence two more attempts from further in.
+    Most points need a few steps. The rest are begun again by themselves, unless they are out of reach.
     """
     lens = Brown.named(c)
     limit = once(brown_limit, c).to(target)
-    start = solved = _brown_start(lens, target, limit)
+    start = _brown_start(lens, target, limit)
+    if traced():
+        return _attempts(lens, limit, start, target)
+    solved, valid = _attempt(lens, limit, start, start, target, steps=FEW)
+    rest = ~valid & (norm(target) <= _reach(lens, limit))
+    if not bool(rest.any()):
+        return solved, valid
+
+    def of_rest(v: Tensor) -> Tensor:
+        return v.expand(rest.shape)[rest]
+
+    found, valid_there = _attempts(_each(lens, of_rest), of_rest(limit), start[rest], target[rest])
+    return solved.masked_scatter(rest[..., None], found), valid.masked_scatter(rest, valid_there)
+
+
+def _reach(lens: Brown, limit: Tensor) -> Tensor:
+    """No point within the range is distorted to one farther out: radial, tangential and prism terms there."""
+    (p1, p2), (s1, s2, s3, s4) = lens.p, lens.s
+    radial = limit.sqrt() * _radial_factor(lens, limit)[0].abs()
+    tangential, prism = 3 * torch.hypot(p1, p2), torch.hypot(s1, s3) + limit * torch.hypot(s2, s4)
+    return (radial + limit * (tangential + prism)) * (1 + MARGIN)
+
+
+FEW = 8
+"""Newton steps that take all points to their solutions where none is near the turn."""
+
+
+def _attempts(lens: Brown, limit: Tensor, start: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Close to the turn the slope is nearly 0 and leads nowhere, hence two more attempts from further in."""
+    solved, valid = start, torch.zeros_like(target[..., 0], dtype=torch.bool)
+    for begin in (start, _pulled_in(start, 0.9 * limit), _pulled_in(target, 0.5 * limit)):
+        begun = torch.where(valid[..., None], solved, begin)
+        solved, valid = _attempt(lens, limit, start, begun, target, steps=MANY)
+        if not traced() and bool(valid.all()):
+            break
+    return solved, valid
+
+
+MANY = 30
+"""Newton steps of an attempt near the turn."""
+
+
+def _attempt(
+    lens: Brown, limit: Tensor, start: Tensor, begun: Tensor, target: Tensor, *, steps: int
+) -> tuple[Tensor, Tensor]:
+    """Solutions by Newton from `begun`, and whether they are; `start` where not."""
 
     def distorted(xy: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
         return _brown_planar(lens, xy)
@@ -179,21 +225,24 @@ def _brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     def within(xy: Tensor) -> Tensor:
         return xy.square().sum(-1) < BEYOND * limit
 
-    valid = torch.zeros_like(target[..., 0], dtype=torch.bool)
-    for begin in (start, _pulled_in(start, 0.9 * limit), _pulled_in(target, 0.5 * limit)):
-        begun = torch.where(valid[..., None], solved, begin)
-        attempt = solve_in_plane(distorted, begun, target, within)
-        planar, jacobian = _brown_planar(lens, attempt)
-        tolerance = SOLVED * torch.finfo(target.dtype).eps * (1 + norm(target))
-        valid = (
-            (norm(planar - target) < tolerance)
-            & (attempt.square().sum(-1) < limit)
-            & keeps_orientation(jacobian)
-        )
-        solved = torch.where(valid[..., None], attempt, start)
-        if not traced() and bool(valid.all()):
-            break
-    return solved, valid
+    attempt = solve_in_plane(distorted, begun, target, within, steps=steps)
+    planar, jacobian = _brown_planar(lens, attempt)
+    tolerance = SOLVED * torch.finfo(target.dtype).eps * (1 + norm(target))
+    inside = attempt.square().sum(-1) < limit
+    valid = (norm(planar - target) < tolerance) & inside & keeps_orientation(jacobian)
+    return torch.where(valid[..., None], attempt, start), valid
+
+
+def _each(lens: Brown, function: Callable[[Tensor], Tensor]) -> Brown:
+    """The lens after a function of each of its coefficients; without its tilt."""
+    (p1, p2), eighth = lens.p, lens.eighth
+    return Brown(
+        tuple(map(function, lens.k)),
+        (function(p1), function(p2)),
+        tuple(map(function, lens.s)),
+        None,
+        None if eighth is None else function(eighth),
+    )
 
 
 def _pulled_in(xy: Tensor, squared_radius: Tensor) -> Tensor:

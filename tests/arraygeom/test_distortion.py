@@ -11,6 +11,7 @@ from torch.autograd import gradcheck, gradgradcheck
 from arraygeom import distortion
 from arraygeom.checks import derived
 from arraygeom.distortion import Distortion
+from arraygeom.lenses import brown as brown_lens
 from arraygeom.lenses.fisheye import fisheye_limit
 from tests.oracles import Oracle
 
@@ -137,6 +138,32 @@ def test_a_second_rise_is_not_valid():
     d = Distortion("brown-conrady", torch.tensor([-1, 0.3, 0, 0], dtype=torch.float64))
     _, valid = d.distort(torch.tensor([[0.6, 0.0], [1.0, 0.0], [2.0, 0.0]], dtype=torch.float64))
     assert valid.tolist() == [True, False, False]
+
+
+def test_points_without_a_solution_take_no_time_from_others(monkeypatch):
+    """Those out of reach are not sought, those just beyond the turn apart from all that are found."""
+    lens = Distortion("brown-conrady", torch.tensor([-0.1, 0, 1e-3, 0], dtype=torch.float64))
+    found, beyond = 0.8 * torch.rand(500, 2, dtype=torch.float64), torch.tensor([[1.224, 0], [3, 4]]).double()
+    planar, counts = brown_lens._brown_planar, []
+
+    def counted(of, xy):
+        counts.append(len(xy))
+        return planar(of, xy)
+
+    monkeypatch.setattr(brown_lens, "_brown_planar", counted)
+    xy, valid = lens.undistort(found)
+    assert valid.all()
+    steps = len(counts)
+    both, valid = lens.undistort(torch.cat([found, beyond[1:]]))
+    assert valid.tolist() == [True] * 500 + [False]
+    assert torch.allclose(both[:-1], xy, rtol=0, atol=1e-13)
+    assert len(counts) <= 2 * steps + brown_lens.FEW
+    counts.clear()
+    both, valid = lens.undistort(torch.cat([found, beyond[:1]]))
+    assert valid.tolist() == [True] * 500 + [False]
+    assert torch.allclose(both[:-1], xy, rtol=0, atol=1e-13)
+    assert counts.count(501) <= steps + brown_lens.FEW
+    assert counts.count(1) > 60
 
 
 def test_poles_are_not_crossed():
