@@ -78,8 +78,9 @@ def background_filled(frame: Frame, inputs: Inputs) -> Float[Tensor, "h w"]:
     known = depth.isfinite() & (confidence > 0)
     if not bool(known.any()):
         return depth
+    confidence, half_width = confidence.detach(), frame.half_width.detach()
     least = SETTINGS.share * float(confidence[known].mean())
-    unit = float(frame.half_width[known & (confidence >= least)].nanmedian())
+    unit = float(half_width[known & (confidence >= least)].nanmedian())
     if not unit > 0:
         return depth
     fill = partial(_filled_rows, least=least, unit=unit)
@@ -102,7 +103,7 @@ def _filled_rows(
     """
     known = depth.isfinite()
     inverse = torch.where(known, 1 / depth.detach(), 0.0) / unit
-    certain = torch.where(known, confidence.detach(), 0.0)
+    certain = torch.where(known, confidence, 0.0)
     kept = certain >= least
     filled = torch.where(kept, inverse, _background(inverse, kept))
     y, x = torch.meshgrid(*(torch.arange(n, device=depth.device) % FINE for n in depth.shape), indexing="ij")
