@@ -160,8 +160,7 @@ def _spread(planes: Sequence[Plane], guide: NDArray[np.float32]) -> NDArray[np.f
     """Weighted sums around each pixel, those beyond an edge of the guide weighing less; four at a time."""
     over = cv2.ximgproc.createDTFilter(guide, SETTINGS.reach / FINE, 1.0, cv2.ximgproc.DTF_RF)
     found = [over.filter(cv2.merge(planes[first : first + 4])) for first in range(0, len(planes), 4)]
-    spread: NDArray[np.float32] = np.concatenate(found, -1).transpose(2, 0, 1)
-    return spread
+    return np.asarray(np.concatenate(found, -1).transpose(2, 0, 1), np.float32)
 
 
 def _background(inverse: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
