@@ -180,11 +180,14 @@ class Info:
 
         from arraygeom.summary import summarise_cameras, summarise_pairs
 
+        before = len(options.WARNED)
         rig = load_rig(self.rig, self.depth)
         if rig.name:
             say(rig.name)
+        warned = [str(message) for message in options.WARNED[before:]]
         for oddity in rig.check():
-            say(f"pat: {oddity}", style="yellow")
+            if not any(message.endswith(oddity.removeprefix("the rig ")) for message in warned):
+                say(f"pat: {oddity}", style="yellow")
         alpha = None if self.alpha is None else rig.require(self.alpha)
         if alpha is None and len(rig.names) > MOST_CAMERAS:
             alpha = rig.names[0]

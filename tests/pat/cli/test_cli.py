@@ -225,6 +225,12 @@ def test_rig_info_of_one_camera_has_no_pairs(small, tmp_path, capsys):
     assert "alpha" not in capsys.readouterr().out
 
 
+def test_rig_info_says_a_mistaken_unit_once(small, tmp_path, capsys):
+    Rig.load(small / "rig.yaml").scaled(1e3).save(tmp_path / "large.yaml")
+    main(["rig", "info", str(tmp_path / "large.yaml")])
+    assert capsys.readouterr().err.count("is this file in millimetres?") == 1
+
+
 def test_rig_info_as_json(small, capsys):
     main(["rig", "info", str(small / "rig.yaml"), "--json"])
     told = json.loads(capsys.readouterr().out)
