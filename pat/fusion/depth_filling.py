@@ -37,8 +37,8 @@ class FillSettings:
     )
     step: float = physics(
         2.0,
-        "Change of inverse depth that is as far as `reach` when planes are first fitted: its interval's width, "
-        "in half-widths",
+        "Change of inverse depth that is as far as `reach` when planes are first fitted: "
+        "its interval's width, in half-widths",
     )
     level: float = tuned(
         0.005,
