@@ -111,9 +111,10 @@ def _filled_rows(
     filled = torch.where(kept, inverse, _background(inverse, kept))
     y, x = torch.meshgrid(*(torch.arange(n, device=depth.device) % FINE for n in depth.shape), indexing="ij")
     for apart in (_far_by_depth, _far_by_slope):
-        coarse = (numpy_of(t[::FINE, ::FINE]) for t in (inverse, torch.where(kept, certain, 0.0)))
-        guide = np.stack([numpy_of(alpha[::FINE, ::FINE]), *apart(numpy_of(filled[::FINE, ::FINE]))], -1)
-        planes = (torch.from_numpy(t).to(inverse) for t in _planes(*coarse, guide))
+        whole = inverse, torch.where(kept, certain, 0.0), alpha, filled
+        matched, weight, grey, guess = (numpy_of(t[::FINE, ::FINE]) for t in whole)
+        guide = np.stack([grey, *apart(guess)], -1)
+        planes = (torch.from_numpy(t).to(inverse) for t in _planes(matched, weight, guide))
         value, right, down, around = (_repeated(plane, inverse) for plane in planes)
         kept = certain >= SETTINGS.share * around
         filled = torch.where(kept, inverse, value + x * right + y * down)
