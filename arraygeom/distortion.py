@@ -35,7 +35,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .checks import check_numbers, checking
-from .lenses.brown import brown_distort, brown_limit, brown_undistort
+from .lenses.brown import brown_derivatives, brown_distort, brown_limit, brown_undistort
 from .lenses.central import EXTENDED_UNIFIED, FOV, MODELS, central_project, central_unproject
 from .lenses.common import WIDEST, finite_points, once, unit
 from .lenses.fisheye import fisheye_limit, fisheye_project, fisheye_unproject
@@ -201,6 +201,31 @@ class Distortion(LensModel):
         """Coefficients (*b, 1.., n): the batch axes in front, one axis of length 1 for each further axis."""
         c = self.coefficients
         return c.reshape(*c.shape[:-1], *[1] * (points.ndim - c.ndim), c.shape[-1])
+
+
+def lens_derivatives(
+    lens: LensModel | None, X: Float[Tensor, "n 3"]
+) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 3"], Float[Tensor, "n 2 k"]]:
+    """`project` of finite points by one lens, and its derivatives by points and coefficients, as constants.
+
+    None is a pinhole. In closed form for Brown-Conrady without a tilted sensor; otherwise by two reverse
+    passes, with a copy of the coefficients for each point.
+    """
+    X, c = X.detach(), X.new_zeros(0) if lens is None else lens.coefficients.detach()
+    if lens is None or (lens.model == BROWN_CONRADY and len(c) < COEFFICIENT_COUNTS[BROWN_CONRADY][-1]):
+        ahead = X[:, 2:] > 0
+        z = torch.where(ahead, X[:, 2:], 1.0)
+        xy = X[:, :2] / z
+        pinhole = xy, torch.eye(2).to(X).expand(len(X), 2, 2), X.new_zeros(len(X), 2, 0)
+        x_d, by_plane, by_lens = pinhole if lens is None else brown_derivatives(c, xy)
+        by_depth = -by_plane @ torch.where(ahead, xy, 0.0)[..., None]
+        return x_d, torch.cat([by_plane, by_depth], -1) / z[..., None], by_lens
+    with torch.enable_grad():
+        through = X.requires_grad_(), c.requires_grad_().expand(len(X), -1)
+        x_d = lens.with_coefficients(through[1]).project(through[0][:, None])[0][:, 0]
+        slopes = [torch.autograd.grad(v.sum(), through, retain_graph=True) for v in x_d.unbind(-1)]
+    by_point, by_lens = (torch.stack(parts, 1) for parts in zip(*slopes))
+    return x_d.detach(), by_point, by_lens
 
 
 def typical_coefficients(lens: LensModel) -> tuple[float, ...]:

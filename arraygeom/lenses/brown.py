@@ -47,6 +47,36 @@ def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
     return tilted, inside & keeps_orientation(jacobian) & ahead
 
 
+def brown_derivatives(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`brown_distort` of points (n, 2) through a lens (k,) whose sensor is not tilted, in closed form.
+
+    The distorted points, their derivatives by the points (n, 2, 2) and by the coefficients (n, 2, k).
+    """
+    lens, limit = Brown.named(c[None]), once(brown_limit, c[None]).to(xy)
+    squared = xy.square().sum(-1)
+    inside = squared < limit
+    outside = torch.where(inside, 1.0, squared.clamp(min=TINY))
+    pull = torch.where(inside, 1.0, (limit / outside).sqrt())
+    at = xy * pull[:, None]
+    planar, jacobian = _brown_planar(lens, at)
+    along = torch.where(inside[:, None], 0.0, xy)
+    moved = pull[:, None, None] * (
+        torch.eye(2).to(xy) - along[:, :, None] * (along / outside[:, None])[:, None]
+    )
+    by_point = torch.stack(jacobian, -1).reshape(-1, 2, 2) @ moved
+    x, y = at.unbind(-1)
+    u = x * x + y * y
+    g = _radial_factor(lens, u)[0]
+    bottom = 1 + u * (lens.k[3] + u * (lens.k[4] + u * lens.k[5]))
+    powers = torch.stack([u, u * u, u**3], -1) / bottom[:, None]
+    radial, rational = (at[:, :, None] * f[:, None] for f in (powers, -g[:, None] * powers))
+    cross, none = 2 * x * y, torch.zeros_like(u)
+    tangential = torch.stack([cross, u + 2 * x * x, u + 2 * y * y, cross], -1).reshape(-1, 2, 2)
+    prism = torch.stack([u, u * u, none, none, none, none, u, u * u], -1).reshape(-1, 2, 4)
+    by_lens = torch.cat([radial[..., :2], tangential, radial[..., 2:], rational, prism], -1)
+    return planar, by_point, by_lens[..., : len(c)]
+
+
 def brown_undistort(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
     """Undo the tilt exactly, solve for the radius in a bracket, then for (x, y) by Newton.
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 
 from arraygeom import Camera, Pose, Rig, stack
-from arraygeom.distortion import pinhole_coefficients, term, typical_coefficients
+from arraygeom.distortion import lens_derivatives, pinhole_coefficients, term, typical_coefficients
 from arraygeom.lenses.central import MODELS, within_bounds
 from arraygeom.pixels import map_homogeneous
 from arraygeom.pose import rotation_vector
@@ -98,6 +99,7 @@ class BundleProblem:
         """The points that a camera observed, in the world, metres."""
         return self.rotated(name) + self.boards.t.numpy()[self.seen[name].block]
 
+    @cached_property
     def residuals(self) -> dict[str, Float[np.ndarray, "_ 2"]]:
         """By camera: measured minus projected, pixels."""
         found = {}
@@ -108,15 +110,16 @@ class BundleProblem:
 
     def rms(self) -> float:
         """Root mean square length of all residuals, pixels: OpenCV's reprojection error."""
-        lengths = np.concatenate([(r**2).sum(-1) for r in self.residuals().values()])
+        lengths = np.concatenate([(r**2).sum(-1) for r in self.residuals.values()])
         return float(np.sqrt(lengths.mean()))
 
+    @cached_property
     def loss(self) -> float:
         """Sum over residuals of s in standard deviations: s^2 / 2 up to k, k^2 (1/2 + log(s / k)) beyond."""
         total = sum(prior.loss(self.cameras[name]) for name, prior in self.priors.items())
         if self.deformation is not None:
             total += self.deformation.loss()
-        for name, r in self.residuals().items():
+        for name, r in self.residuals.items():
             s = np.linalg.norm(r, axis=-1) / self.sigma[name]
             far = np.maximum(s, ROBUST)
             total += float(np.where(s < ROBUST, s**2 / 2, ROBUST**2 * (0.5 + np.log(far / ROBUST))).sum())
@@ -408,26 +411,18 @@ def linear_projection(
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 p"]]:
     """Pixels of world points, and their derivatives with respect to the camera (`camera_jacobian`).
 
-    Two reverse passes through the lens, with a copy of its coefficients per point; the others by the chain
-    rule.
+    Through the lens by `lens_derivatives`; the others by the chain rule.
     """
-    local = camera.cam_from_world.apply(torch.from_numpy(X)).detach().requires_grad_()
-    through: tuple[torch.Tensor, ...] = (local,)
-    lens = camera.distortion
-    if lens is not None:
-        copies = lens.coefficients.detach().requires_grad_().expand(len(X), -1)
-        through, lens = (local, copies), lens.with_coefficients(copies)
-    plane = camera.replace(K=torch.eye(3).to(camera.K), distortion=lens).project_local(local[:, None]).x[:, 0]
-    slopes = [torch.autograd.grad(v.sum(), through, retain_graph=True) for v in plane.unbind(-1)]
-    by_point, *by_lens = (camera.K[:2, :2] @ torch.stack(parts, 1) for parts in zip(*slopes))
-    rotational = torch.linalg.cross((local.detach() - camera.t)[:, None].expand_as(by_point), by_point)
-    plane = plane.detach()
+    local = camera.cam_from_world.apply(torch.from_numpy(X)).detach()
+    plane, *slopes = lens_derivatives(camera.distortion, local)
+    by_point, by_lens = (camera.K[:2, :2] @ part for part in slopes)
+    rotational = torch.linalg.cross((local - camera.t)[:, None].expand_as(by_point), by_point)
     by_focal, by_centre = (
         focal_positions(camera.K) * plane[:, None],
         torch.eye(2).to(plane).expand(len(X), 2, 2),
     )
     x = map_homogeneous(camera.K[:2], plane)
-    return x.numpy(), torch.cat([rotational, by_point, by_focal, by_centre, *by_lens], -1).numpy()
+    return x.numpy(), torch.cat([rotational, by_point, by_focal, by_centre, by_lens], -1).numpy()
 
 
 def with_default(camera: Camera, entry: str) -> tuple[Camera, str]:

@@ -87,9 +87,18 @@ def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> Ca
     plausible = BoardViews(views.hw, {key: near_homography(d, board) for key, d in views.seen.items()})
     camera, poses = _solved(name, plausible, board, lens)
     for _ in range(2):
-        plausible = without_outliers(views, camera, poses, board.points)
+        before, plausible = plausible, without_outliers(views, camera, poses, board.points)
+        if _alike(before, plausible):
+            break
         camera, poses = _solved(name, plausible, board, lens)
     return CalibratedViews(name, camera, plausible, poses)
+
+
+def _alike(a: BoardViews, b: BoardViews) -> bool:
+    """Whether two selections of the same views are of the same points."""
+    return a.seen.keys() == b.seen.keys() and all(
+        np.array_equal(a.seen[key].ids, b.seen[key].ids) for key in a.seen
+    )
 
 
 def without_bad_images(views: BoardViews, initial: CalibratedViews, board: Board) -> BoardViews:

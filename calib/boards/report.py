@@ -161,7 +161,7 @@ def depths(covers: Iterable[Coverage]) -> tuple[float, float]:
 
 def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> str:
     """One row per camera: points, residuals, and parameters with standard deviations."""
-    residuals = calibration.fit.problem.residuals()
+    residuals = calibration.fit.problem.residuals
     head = (
         "camera|images, points|error px, "
         "together (alone)|noise px|focal length px|principal point px|lens|covered"
@@ -298,7 +298,7 @@ def draw_by_image(calibration: Calibration) -> Figure:
 
 def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figure:
     """One camera: observed points; median residuals of parts of the image, magnified; their scatter."""
-    seen, r = calibration.fit.problem.seen[name], calibration.fit.problem.residuals()[name]
+    seen, r = calibration.fit.problem.seen[name], calibration.fit.problem.residuals[name]
     hw = calibration.views[name].hw
     figure = Figure(
         figsize=(10.4, 10.4 / 3.4 * min(1.6, max(0.8, 1.33 * hw[0] / hw[1])) + 0.5), layout="compressed"
@@ -468,7 +468,7 @@ def _draw_image(
     if key in calibration.frames and used is not None:
         block = calibration.frames.index(key)
         mine = calibration.fit.problem.seen[name].block == block
-        r = calibration.fit.problem.residuals()[name][mine]
+        r = calibration.fit.problem.residuals[name][mine]
         enlarge = 0.06 * views.hw[1] / max(float(np.linalg.norm(r, axis=1).max()), 1e-9)
         at = calibration.fit.problem.seen[name].x[mine]
         axes.quiver(

@@ -216,8 +216,8 @@ def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
         deformed = adjust(trial)
     except np.linalg.LinAlgError:  # some parameters are not observable yet
         return solved
-    left = deformed.problem.loss()
-    gain = replace(solved.problem, sigma=deformed.sigma).loss() - left
+    left = deformed.problem.loss
+    gain = replace(solved.problem, sigma=deformed.sigma).loss - left
     return deformed if gain > (max(left, LEAST_GAIN) if few else LEAST_GAIN) else solved
 
 
@@ -253,7 +253,7 @@ def readjusted(problem: BundleProblem) -> BundleProblem:
 
 def noise(problem: BundleProblem, parameters: int) -> dict[str, float]:
     """A robust estimate of each camera's noise in x or y, pixels, given the number of fitted parameters."""
-    residuals = problem.residuals()
+    residuals = problem.residuals
     numbers = 2 * sum(len(r) for r in residuals.values())
     left = numbers / max(numbers - parameters, 0.1 * numbers)
     squares = np.array([_square(r) for r in residuals.values()])
@@ -281,7 +281,7 @@ def _minimised(problem: BundleProblem, *, iterations: int = 50) -> tuple[BundleP
     def model(problem: BundleProblem) -> LocalModel[BundleProblem]:
         equations = normal_equations(problem, linearised(problem))
         return LocalModel(
-            problem.loss(), BundleProblem.loss, lambda damping: problem.stepped(*equations.solve(damping))
+            problem.loss, lambda p: p.loss, lambda damping: problem.stepped(*equations.solve(damping))
         )
 
     return levenberg_marquardt(
@@ -327,7 +327,7 @@ class FrameMisfit(NamedTuple):
 def frame_rms(problem: BundleProblem) -> dict[str, dict[FrameKey, float]]:
     """By camera and frame: root mean square residual, pixels."""
     found = {}
-    for name, r in problem.residuals().items():
+    for name, r in problem.residuals.items():
         block = problem.seen[name].block
         squared, count = np.bincount(block, (r**2).sum(-1)), np.bincount(block)
         found[name] = {
@@ -430,7 +430,7 @@ def _refused_from(alone: float) -> float:
 def _inconsistent_cameras(solved: Solved, alone: Mapping[str, float]) -> str:
     """Text on cameras that fit much worse together than alone, or "". Raises ValueError if far worse."""
     doubts = []
-    for name, r in solved.problem.residuals().items():
+    for name, r in solved.problem.residuals.items():
         together = float(np.sqrt((r**2).sum(-1).mean()))
         fits = f"{name} fits to {alone[name]:.2f} px alone but to {together:.2f} px with the others"
         if together > _refused_from(alone[name]):

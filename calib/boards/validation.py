@@ -204,7 +204,7 @@ def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"
     posed = replace(
         judged, cameras=fitted.cameras, seen={name: seen}, free=fixed, priors={}, deformation=None
     )
-    squares = (readjusted(posed).residuals()[name] ** 2).sum(-1)
+    squares = (readjusted(posed).residuals[name] ** 2).sum(-1)
     count = np.bincount(seen.block)
     return np.asarray(np.bincount(seen.block, squares) / np.maximum(2 * count - POSE, 1))
 

@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom import Segments, depth_from_track, pixel_grid
-from arraygeom.chunks import chunked
 from arraygeom.epipolar import Depth, Track
 from arraygeom.pixels import HW
 
@@ -19,7 +18,7 @@ from ..matching.inputs import Inputs
 from ..matching.matches import Matches
 from ..matching.positions import FINE
 from ..networks.protocol import FusionOutput
-from ..support.settings import physics, size, tuned
+from ..support.settings import size
 from .inputs import Placement
 
 
@@ -29,14 +28,6 @@ class DepthSettings:
 
     unseen: float = size(
         1e-4, "At confidences up to this beta does not see the point: then its position gives no depth"
-    )
-    lost: float = tuned(
-        0.3, "Middlebury, tune half: confidence below which a pixel's depth is taken from beside it"
-    )
-    one_side: float = physics(
-        0.9,
-        "Length of the sum of all betas' segments, "
-        "over the sum of their lengths, from which all count as on one side",
     )
 
 
@@ -129,45 +120,3 @@ def measured_depth(
     overall = torch.stack(output.confidence).amin(0) if output.overall is None else output.overall
     half_width = torch.where(known, widths / torch.where(known, weights, 1.0), torch.nan)
     return FoundDepth(depth.to(output.image), half_width.to(output.image), overall[0, :h, :w])
-
-
-def background_filled(
-    depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"], inputs: Inputs
-) -> Float[Tensor, "h w"]:
-    """Depth whose values of low confidence are the farther of the nearest confident ones to either side.
-
-    What a beta does not see is occluded: farther away than what is beside it. Along rows, or along columns if
-    the betas are above or below alpha. What is unknown stays NaN. Betas on several sides see what is occluded
-    in one of them: depth is then as it is; so it is where it is known from elsewhere.
-    """
-    if any(beta.around for beta in inputs.betas):
-        return depth
-    steps = [beta.field.pixels for beta in inputs.betas if beta.field.pixels is not None]
-    if not steps:
-        return depth
-    every = (..., slice(None, None, 4), slice(None, None, 4), slice(None))
-    apart = torch.stack([(part.end[every] - part.start[every]).mean((0, 1, 2)) for part in steps])
-    if apart.sum(0).norm() < SETTINGS.one_side * apart.norm(dim=1).sum():
-        return depth
-    across, down = apart.sum(0).abs().tolist()
-    if across < down:
-        return chunked(_filled_rows, depth.mT, confidence.mT).mT
-    return chunked(_filled_rows, depth, confidence)
-
-
-def _filled_rows(depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """What is computed on the way is seven times as large."""
-    inverse = torch.where(depth.isfinite(), 1 / depth, torch.nan)
-    known = (confidence >= SETTINGS.lost) & depth.isfinite()
-    before = _nearest_known(inverse, known)
-    after = _nearest_known(inverse.flip(-1), known.flip(-1)).flip(-1)
-    beside = torch.fmin(before, after)
-    found = torch.where(known | beside.isnan(), inverse, beside)
-    return torch.where(depth.isfinite() & (found > 0), 1 / found, depth)
-
-
-def _nearest_known(values: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Each pixel's nearest known value to the left, itself included; NaN if there is none."""
-    columns = torch.arange(values.shape[1], device=values.device).expand_as(values)
-    last = torch.where(known, columns, -1).cummax(1).values
-    return torch.where(last >= 0, values.gather(1, last.clamp(min=0)), torch.nan)

@@ -24,7 +24,7 @@ from ..networks.protocol import FusionNetwork
 from ..support.memory import limited, parse_bytes, planned
 from .checks import warn_of_confidence
 from .corrections import Corrections, corrections_for, expected_work
-from .depth import background_filled
+from .depth_filling import background_filled
 from .inputs import FrameInputs, check_bands, prepared
 from .low_light import LowLight, Noise, denoised_views
 from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail, with_own_colours
@@ -199,7 +199,7 @@ def _matched_and_fused(
 
 def _completed(frame: Frame, inputs: FrameInputs, luminance: Luminance) -> Frame:
     """The fused frame with depth where betas are occluded, and alpha's detail in beta's luminance."""
-    frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
+    frame = frame._replace(depth=background_filled(frame, inputs.inputs))
     if luminance == "alpha":
         return frame
     return with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])

@@ -257,6 +257,27 @@ def test_derivatives(d, method):
     assert gradgradcheck(f, inputs)
 
 
+@pytest.mark.parametrize("count", [0, 4, 5, 8, 12, 14])
+def test_derivatives_at_once_are_automatic_ones(count):
+    """Behind the camera, on the axis and beyond the lens's range as well."""
+    lens = brown(count) if count else None
+    X = torch.randn(300, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    X[:2] = torch.tensor([[0, 0, 1.0], [0, 0, -1.0]])
+    copies = X.clone().requires_grad_()
+    c = torch.zeros(300, 0) if lens is None else lens.coefficients.clone().requires_grad_().expand(300, -1)
+    if lens is None:
+        x = copies[:, :2] / torch.where(copies[:, 2:] > 0, copies[:, 2:], 1.0)
+    else:
+        x = lens.with_coefficients(c).project(copies[:, None])[0][:, 0]
+    found = distortion.lens_derivatives(lens, X)
+    assert torch.equal(found[0], x.detach())
+    assert not any(part.requires_grad for part in found)
+    through = (copies, c) if count else (copies,)
+    for i, v in enumerate(x.unbind(-1)):
+        for slope, part in zip(torch.autograd.grad(v.sum(), through, retain_graph=True), found[1:]):
+            assert torch.allclose(part[:, i], slope, rtol=1e-9, atol=1e-9 * float(slope.abs().max()))
+
+
 def test_fisheye_derivatives_beyond_90_degrees():
     X = torch.tensor([[1.0, 0.2, -0.3], [-0.5, 0.7, 0.0]], dtype=torch.float64, requires_grad=True)
     c = torch.tensor(FISHEYES[0], dtype=torch.float64, requires_grad=True)

@@ -8,7 +8,8 @@ import torch
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from arraygeom import Pose, Rig
+from arraygeom import Camera, Pose, Rig
+from calib.boards import intrinsics
 from calib.boards.bundle import (
     CameraPrior,
     Observations,
@@ -20,9 +21,10 @@ from calib.boards.bundle import (
     parameter_names,
 )
 from calib.boards.rig import calibrate
-from calib.boards.solve import adjust
+from calib.boards.solve import adjust, noise
 from calib.boards.target import parse_board
 from tests.calib.board_scenes import (
+    BOARD,
     all_free,
     board_poses,
     camera,
@@ -98,8 +100,40 @@ def test_derivatives_of_boards(small):
     for i in range(6):
         step = np.zeros((8, 6))
         step[:, i] = 1e-6
-        ahead, behind = (problem.stepped(still, sign * step).residuals()["colour"] for sign in (1, -1))
+        ahead, behind = (problem.stepped(still, sign * step).residuals["colour"] for sign in (1, -1))
         assert np.abs((behind - ahead) / 2e-6 - found[..., i]).max() < 1e-5 * (1 + np.abs(found).max())
+
+
+def test_a_problems_points_are_projected_once(small, monkeypatch):
+    project, counts = Camera.project, []
+
+    def counted(camera, X):
+        counts.append(len(X))
+        return project(camera, X)
+
+    monkeypatch.setattr(Camera, "project", counted)
+    problem = replace(small[2], sigma=dict.fromkeys(small[2].cameras, 0.1))
+    assert problem.loss == problem.loss
+    assert noise(problem, 0).keys() == problem.sigma.keys()
+    assert len(counts) == len(problem.cameras)
+    assert replace(problem, sigma=dict.fromkeys(problem.cameras, 1.0)).loss < problem.loss
+
+
+def test_views_of_the_same_points_are_solved_once(small, monkeypatch):
+    """Before the adjustment; once more where there were fewer at first."""
+    solved, counts = intrinsics._solved, []
+
+    def counted(*given):
+        counts.append(given)
+        return solved(*given)
+
+    monkeypatch.setattr(intrinsics, "_solved", counted)
+    rig, boards, _ = small
+    views = see(rig, boards, noise=0.1)["mono"]
+    found = intrinsics.initial_camera("mono", views, BOARD, "brown-conrady")
+    assert len(counts) == 2
+    assert found.views.count > sum(len(d.ids) for d in counts[0][1].seen.values())
+    assert solved("mono", found.views, BOARD, "brown-conrady")[0] == found.camera
 
 
 def test_perfect_corners_recover_the_ground_truth():
@@ -121,7 +155,7 @@ def test_the_least_squares_are_scipys(small):
 
     def residuals(change):
         moved = fit.problem.stepped(change[:count], change[count:].reshape(-1, 6))
-        return np.concatenate([(r / fit.sigma[n]).ravel() for n, r in moved.residuals().items()])
+        return np.concatenate([(r / fit.sigma[n]).ravel() for n, r in moved.residuals.items()])
 
     theirs = least_squares(residuals, np.zeros(count + 48), x_scale="jac", max_nfev=4)
     assert 2 * theirs.cost == pytest.approx(float((residuals(np.zeros(count + 48)) ** 2).sum()), rel=2e-3)

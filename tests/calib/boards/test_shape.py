@@ -142,7 +142,7 @@ def test_leaving_a_frame_out_keeps_the_others():
     kept = np.arange(len(problem.frames)) != 3
     part = problem.of_boards(kept)
     assert len(part.frames) == len(problem.frames) - 1 == len(part.deformation.part)
-    before, after = problem.residuals()["mono"], part.residuals()["mono"]
+    before, after = problem.residuals["mono"], part.residuals["mono"]
     assert np.allclose(before[problem.seen["mono"].block != 3], after)
 
 

@@ -5,8 +5,10 @@ import torch
 
 from arraygeom import Camera, Epipolar, Pose, Rig, Segments, intrinsics
 from arraygeom.fields.grid import FieldOnGrid
-from pat.fusion.depth import background_filled, measured_depth
+from pat.fusion.depth import measured_depth
+from pat.fusion.depth_filling import background_filled
 from pat.fusion.inputs import Placement
+from pat.fusion.results import Frame
 from pat.matching.inputs import Beta, Inputs
 from pat.networks.protocol import FusionOutput
 
@@ -41,14 +43,19 @@ def test_positions_beyond_a_segment_are_its_ends(share):
         assert (depth[seen] < FAR * 1.001).all()
 
 
-def fields_along(*steps):
-    return Inputs(torch.zeros(1, 1, 6, 6), tuple(beta_along(step) for step in steps))
+def fields_along(*steps, alpha=None):
+    alpha = torch.zeros(6, 6) if alpha is None else alpha
+    return Inputs(alpha[None, None], tuple(beta_along(step) for step in steps))
 
 
 def beta_along(step):
     end = torch.zeros(1, 6, 6, 2)
     segments = Segments(end + torch.tensor(step), end, torch.ones(1, 6, 6, dtype=torch.bool))
     return Beta(torch.zeros(1, 1, 6, 6), FieldOnGrid(lambda x: segments, 2, segments))
+
+
+def frame_of(depth, confidence):
+    return Frame(torch.zeros(1, *depth.shape), depth, confidence, torch.full_like(depth, 0.01))
 
 
 @pytest.mark.parametrize("step", [[4.0, 0.0], [0.0, 4.0]])
@@ -64,16 +71,53 @@ def test_depth_of_low_confidence_is_that_of_the_background_beside_it(step):
     wanted[0, 2] = torch.nan
     if step[1]:
         depth, confidence, wanted = depth.mT, confidence.mT, wanted.mT
-    torch.testing.assert_close(
-        background_filled(depth, confidence, fields_along(step)), wanted, equal_nan=True
-    )
+    found = background_filled(frame_of(depth, confidence), fields_along(step))
+    torch.testing.assert_close(found, wanted, equal_nan=True, rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("step", [[4.0, 0.0], [0.0, 4.0]])
+def test_depth_beyond_the_border_is_that_of_the_slanted_plane_beside_it(step):
+    """And of the right one of two; a plane's inverse depth is linear. Nearest ones are twice as far off."""
+    y, x = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
+    upper = y < 60
+    truth = 1 / torch.where(upper, 0.4 + 5e-4 * x - 1e-3 * y, 0.9 - 1e-3 * x + 1e-3 * (y - 60))
+    depth, confidence = truth.clone(), torch.full_like(truth, 0.9)
+    lost = x < 20
+    depth[lost], confidence[lost] = 1.3, 0.2
+    alpha = torch.where(upper, 0.1, 0.9)
+    if step[1]:
+        depth, confidence, alpha, truth = (t.mT for t in (depth, confidence, alpha, truth))
+    found = background_filled(frame_of(depth, confidence), fields_along(step, alpha=alpha))
+    seen = depth == truth
+    beside = truth.mT[:, 20:21] if step[1] else truth[:, 20:21]
+    constant = beside.expand(120, 160).mT if step[1] else beside.expand(120, 160)
+    error, of_constant = ((1 / t - 1 / truth)[~seen].abs().mean() for t in (found, constant))
+    assert error < of_constant / 2
+    assert torch.equal(found[seen], depth[seen])
+
+
+def test_gradients_pass_where_depth_is_that_of_a_match():
+    depth = torch.full((6, 6), 5.0, requires_grad=True)
+    confidence = torch.ones(6, 6)
+    confidence[:, 2:4] = 0.1
+    background_filled(frame_of(depth, confidence), fields_along([4.0, 0.0])).sum().backward()
+    assert torch.equal(depth.grad, (confidence == 1).to(depth))
 
 
 @pytest.mark.parametrize("other", [[-4.0, 0.0], [0.0, 4.0]])
 def test_depth_stays_where_betas_are_on_several_sides(other):
     depth = torch.full((6, 6), 5.0)
     depth[:, 2:4] = 1.0
-    confidence = torch.where(depth < 2, 0.1, 1.0)
-    assert torch.equal(background_filled(depth, confidence, fields_along([4.0, 0.0], other)), depth)
-    beside = background_filled(depth, confidence, fields_along([4.0, 0.0], [3.0, 0.5]))
-    assert torch.equal(beside, torch.full((6, 6), 5.0))
+    frame = frame_of(depth, torch.where(depth < 2, 0.1, 1.0))
+    assert torch.equal(background_filled(frame, fields_along([4.0, 0.0], other)), depth)
+    beside = background_filled(frame, fields_along([4.0, 0.0], [3.0, 0.5]))
+    torch.testing.assert_close(beside, torch.full((6, 6), 5.0))
+
+
+@pytest.mark.parametrize("half_width", [0.0, torch.nan])
+def test_depth_stays_where_its_interval_is_not_known(half_width):
+    depth = torch.full((6, 6), 5.0)
+    depth[:, 2:4] = 1.0
+    frame = frame_of(depth, torch.where(depth < 2, 0.1, 1.0))
+    frame = frame._replace(half_width=torch.full_like(depth, half_width))
+    assert torch.equal(background_filled(frame, fields_along([4.0, 0.0])), depth)

@@ -1,0 +1,177 @@
+"""Depth where a match is far less certain than those around it: that of the plane through those."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from arraygeom.chunks import chunked
+
+from ..matching.filters import numpy_of
+from ..matching.inputs import Inputs
+from ..matching.positions import FINE
+from ..support.settings import physics, size, tuned
+from .results import Frame
+
+
+@dataclass(frozen=True)
+class FillSettings:
+    """Of the depth of pixels whose own match is not certain."""
+
+    share: float = tuned(
+        0.7,
+        "Middlebury, tune half: share of the confidence around it below which a match is left for a plane",
+    )
+    reach: float = tuned(
+        80.0,
+        "Middlebury, tune half: pixels to which matches count where alpha is even and depth has no step. "
+        "A change of alpha from black to white is as far, and one of depth or slope by its interval's width",
+    )
+    level: float = tuned(
+        0.005,
+        "Middlebury, tune half: variance of position, in squares of `reach`, below which planes are level",
+    )
+    rounds: int = size(2, "Times that planes are fitted, and what they explain badly counts less")
+    one_side: float = physics(
+        0.9,
+        "Length of the sum of all betas' segments, "
+        "over the sum of their lengths, from which all count as on one side",
+    )
+
+
+SETTINGS = FillSettings()
+WIDTH = 2
+"""Physics: half-widths of an interval in its width."""
+LEAST = 1e-20
+"""Size: sums of weights below this are those of a pixel that nothing reaches."""
+ROWS, HALO = 512, 128
+"""Size: rows of a part, and beside it that its planes see: matches there count a fifth of those at hand."""
+
+
+def background_filled(frame: Frame, inputs: Inputs) -> Float[Tensor, "h w"]:
+    """Depth that is far less certain than around it replaced by that of the plane through the background.
+
+    What a beta does not see is occluded: farther away than what is beside it, along the segments' rows or
+    columns. Planes of inverse depth are fitted to matches weighted by confidence; what lies beyond an edge of
+    alpha or a step of depth is far away (Gastal and Oliveira, Domain transform, 2011). What is unknown stays
+    NaN. Betas on several sides see what is occluded in one of them: depth is then as it is; so it is where it
+    is known from elsewhere. No gradient passes through planes.
+    """
+    depth, confidence = frame.depth, frame.confidence
+    if any(beta.around for beta in inputs.betas):
+        return depth
+    steps = [beta.field.pixels for beta in inputs.betas if beta.field.pixels is not None]
+    if not steps:
+        return depth
+    every = (..., slice(None, None, 4), slice(None, None, 4), slice(None))
+    apart = torch.stack([(part.end[every] - part.start[every]).mean((0, 1, 2)) for part in steps])
+    if apart.sum(0).norm() < SETTINGS.one_side * apart.norm(dim=1).sum():
+        return depth
+    known = depth.isfinite() & (confidence > 0)
+    if not bool(known.any()):
+        return depth
+    confidence, half_width = confidence.detach(), frame.half_width.detach()
+    least = SETTINGS.share * float(confidence[known].mean())
+    unit = float(half_width[known & (confidence >= least)].nanmedian())
+    if not unit > 0:
+        return depth
+    fill = partial(_filled_rows, least=least, unit=unit)
+    planes = depth, confidence, inputs.alpha[0, 0, : depth.shape[0], : depth.shape[1]]
+    if apart.sum(0).abs().argmax() == 1:
+        return chunked(fill, *(plane.mT for plane in planes), rows=ROWS, halo=HALO).mT
+    return chunked(fill, *planes, rows=ROWS, halo=HALO)
+
+
+def _filled_rows(
+    depth: Float[Tensor, "h w"],
+    confidence: Float[Tensor, "h w"],
+    alpha: Float[Tensor, "h w"],
+    least: float,
+    unit: float,
+) -> Float[Tensor, "h w"]:
+    """Depth of matches and planes; planes are computed for every second pixel, in units of inverse depth.
+
+    `least` is the confidence from which matches count before any plane is known.
+    """
+    known = depth.isfinite()
+    inverse = torch.where(known, 1 / depth.detach(), 0.0) / unit
+    certain = torch.where(known, confidence, 0.0)
+    kept = certain >= least
+    filled = torch.where(kept, inverse, _background(inverse, kept))
+    y, x = torch.meshgrid(*(torch.arange(n, device=depth.device) % FINE for n in depth.shape), indexing="ij")
+    for _ in range(SETTINGS.rounds):
+        weight = torch.where(kept, certain, 0.0)
+        planes = _planes(*(numpy_of(t[::FINE, ::FINE]) for t in (filled, inverse, weight, alpha)))
+        value, right, down, around = (_repeated(torch.from_numpy(t).to(inverse), inverse) for t in planes)
+        kept = certain >= SETTINGS.share * around
+        filled = torch.where(kept, inverse, value + x * right + y * down)
+    changed = known & ~kept & (filled > 0)
+    return torch.where(changed, 1 / torch.where(changed, filled * unit, 1.0), depth)
+
+
+def _repeated(plane: Float[Tensor, "h2 w2"], like: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """What is known of every second pixel for those to its right and below it, too."""
+    return plane.repeat_interleave(FINE, 0).repeat_interleave(FINE, 1)[: like.shape[0], : like.shape[1]]
+
+
+Plane = NDArray[np.float32]
+"""One number a pixel (h, w)."""
+
+
+def _planes(filled: Plane, inverse: Plane, weight: Plane, alpha: Plane) -> tuple[Plane, Plane, Plane, Plane]:
+    """Planes through weighted inverse depth: value, slopes a pixel of alpha, and the confidence around.
+
+    The arguments are of every second pixel; `filled` is inverse depth with its gaps filled.
+    """
+    reach = SETTINGS.reach / FINE
+    y, x = np.mgrid[: filled.shape[0], : filled.shape[1]].astype(np.float32)
+    x, y = ((t - t.mean()) / reach for t in (x, y))
+    centre = np.median(filled)
+    z = inverse - centre
+    slopes = (np.diff(filled, axis=axis, append=filled.take([-1], axis)) for axis in (0, 1))
+    guide = np.stack([alpha, *(t / WIDTH for t in (filled, *slopes))], -1)
+    counts = weight
+    for _ in range(SETTINGS.rounds):
+        terms = (1, x, y, x * x, x * y, y * y, z, x * z, y * z, weight)
+        sums = _spread([term * counts for term in terms], guide)
+        total = np.maximum(sums[0], np.finfo(np.float32).tiny)
+        mx, my, mxx, mxy, myy, mz, mxz, myz, around = sums[1:] / total
+        xx, yy, xy = mxx - mx * mx + SETTINGS.level, myy - my * my + SETTINGS.level, mxy - mx * my
+        xz, yz = mxz - mx * mz, myz - my * mz
+        determinant = xx * yy - xy * xy
+        right, down = (xz * yy - yz * xy) / determinant, (yz * xx - xz * xy) / determinant
+        value = mz + right * (x - mx) + down * (y - my)
+        counts = weight / (1 + (value - z) ** 2)
+    unknown = sums[0] < LEAST
+    value = np.where(unknown, filled, value + centre)
+    right, down = (np.where(unknown, 0, t / (FINE * reach)) for t in (right, down))
+    return value, right, down, np.where(unknown, 0, around)
+
+
+def _spread(planes: Sequence[Plane], guide: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Weighted sums around each pixel, those beyond an edge of the guide weighing less; four at a time."""
+    over = cv2.ximgproc.createDTFilter(guide, SETTINGS.reach / FINE, 1.0, cv2.ximgproc.DTF_RF)
+    found = [over.filter(cv2.merge(planes[first : first + 4])) for first in range(0, len(planes), 4)]
+    return np.asarray(np.concatenate(found, -1).transpose(2, 0, 1), np.float32)
+
+
+def _background(inverse: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """The farther of the nearest known ones to either side; as it is where a row has none."""
+    before = _nearest_known(inverse, known)
+    beside = torch.fmin(before, _nearest_known(inverse.flip(-1), known.flip(-1)).flip(-1))
+    return torch.where(beside.isnan(), inverse, beside)
+
+
+def _nearest_known(values: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Each pixel's nearest known value to the left, itself included; NaN if there is none."""
+    columns = torch.arange(values.shape[1], device=values.device).expand_as(values)
+    last = torch.where(known, columns, -1).cummax(1).values
+    return torch.where(last >= 0, values.gather(1, last.clamp(min=0)), torch.nan)
