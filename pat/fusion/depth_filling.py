@@ -33,13 +33,18 @@ class FillSettings:
     reach: float = tuned(
         80.0,
         "Middlebury, tune half: pixels to which matches count where alpha is even and depth has no step. "
-        "A change of alpha from black to white is as far, and one of depth or slope by its interval's width",
+        "A change of alpha from black to white is as far",
+    )
+    step: float = physics(
+        2.0,
+        "Change of inverse depth that is as far as `reach` when planes are first fitted: "
+        "its interval's width, in half-widths",
     )
     level: float = tuned(
         0.005,
         "Middlebury, tune half: variance of position, in squares of `reach`, below which planes are level",
     )
-    rounds: int = size(2, "Times that planes are fitted, and what they explain badly counts less")
+    trials: int = size(2, "Fits of a plane; in each, what the last one explains badly counts less")
     one_side: float = physics(
         0.9,
         "Length of the sum of all betas' segments, "
@@ -48,8 +53,6 @@ class FillSettings:
 
 
 SETTINGS = FillSettings()
-WIDTH = 2
-"""Physics: half-widths of an interval in its width."""
 LEAST = 1e-20
 """Size: sums of weights below this are those of a pixel that nothing reaches."""
 ROWS, HALO = 512, 128
@@ -107,10 +110,12 @@ def _filled_rows(
     kept = certain >= least
     filled = torch.where(kept, inverse, _background(inverse, kept))
     y, x = torch.meshgrid(*(torch.arange(n, device=depth.device) % FINE for n in depth.shape), indexing="ij")
-    for _ in range(SETTINGS.rounds):
-        weight = torch.where(kept, certain, 0.0)
-        planes = _planes(*(numpy_of(t[::FINE, ::FINE]) for t in (filled, inverse, weight, alpha)))
-        value, right, down, around = (_repeated(torch.from_numpy(t).to(inverse), inverse) for t in planes)
+    for apart in (_far_by_depth, _far_by_slope):
+        whole = inverse, torch.where(kept, certain, 0.0), alpha, filled
+        matched, weight, grey, guess = (numpy_of(t[::FINE, ::FINE]) for t in whole)
+        guide = np.stack([grey, *apart(guess)], -1)
+        planes = (torch.from_numpy(t).to(inverse) for t in _planes(matched, weight, guide))
+        value, right, down, around = (_repeated(plane, inverse) for plane in planes)
         kept = certain >= SETTINGS.share * around
         filled = torch.where(kept, inverse, value + x * right + y * down)
     changed = known & ~kept & (filled > 0)
@@ -126,20 +131,28 @@ Plane = NDArray[np.float32]
 """One number a pixel (h, w)."""
 
 
-def _planes(filled: Plane, inverse: Plane, weight: Plane, alpha: Plane) -> tuple[Plane, Plane, Plane, Plane]:
+def _far_by_depth(inverse: Plane) -> list[Plane]:
+    """A guide whose changes of 1 are steps of depth: what lies beyond them does not count."""
+    return [inverse / SETTINGS.step]
+
+
+def _far_by_slope(inverse: Plane) -> list[Plane]:
+    """A guide whose changes of 1 are those of slopes by a half-width a pixel: slanted planes are whole."""
+    return [np.diff(inverse, axis=axis, append=inverse.take([-1], axis)) for axis in (0, 1)]
+
+
+def _planes(inverse: Plane, weight: Plane, guide: NDArray[np.float32]) -> tuple[Plane, Plane, Plane, Plane]:
     """Planes through weighted inverse depth: value, slopes a pixel of alpha, and the confidence around.
 
-    The arguments are of every second pixel; `filled` is inverse depth with its gaps filled.
+    Of every second pixel; a change of 1 in the guide (h, w, c) is as far as `reach`.
     """
     reach = SETTINGS.reach / FINE
-    y, x = np.mgrid[: filled.shape[0], : filled.shape[1]].astype(np.float32)
+    y, x = np.mgrid[: weight.shape[0], : weight.shape[1]].astype(np.float32)
     x, y = ((t - t.mean()) / reach for t in (x, y))
-    centre = np.median(filled)
+    centre = np.median(inverse[weight > 0]) if weight.any() else 0.0
     z = inverse - centre
-    slopes = (np.diff(filled, axis=axis, append=filled.take([-1], axis)) for axis in (0, 1))
-    guide = np.stack([alpha, *(t / WIDTH for t in (filled, *slopes))], -1)
     counts = weight
-    for _ in range(SETTINGS.rounds):
+    for _ in range(SETTINGS.trials):
         terms = (1, x, y, x * x, x * y, y * y, z, x * z, y * z, weight)
         sums = _spread([term * counts for term in terms], guide)
         total = np.maximum(sums[0], np.finfo(np.float32).tiny)
@@ -151,9 +164,8 @@ def _planes(filled: Plane, inverse: Plane, weight: Plane, alpha: Plane) -> tuple
         value = mz + right * (x - mx) + down * (y - my)
         counts = weight / (1 + (value - z) ** 2)
     unknown = sums[0] < LEAST
-    value = np.where(unknown, filled, value + centre)
-    right, down = (np.where(unknown, 0, t / (FINE * reach)) for t in (right, down))
-    return value, right, down, np.where(unknown, 0, around)
+    right, down = right / (FINE * reach), down / (FINE * reach)
+    return value + centre, right, down, np.where(unknown, 0, around)
 
 
 def _spread(planes: Sequence[Plane], guide: NDArray[np.float32]) -> NDArray[np.float32]:
