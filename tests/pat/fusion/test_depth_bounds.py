@@ -75,25 +75,61 @@ def test_depth_of_low_confidence_is_that_of_the_background_beside_it(step):
     torch.testing.assert_close(found, wanted, equal_nan=True, rtol=1e-3, atol=0)
 
 
-@pytest.mark.parametrize("step", [[4.0, 0.0], [0.0, 4.0]])
-def test_depth_beyond_the_border_is_that_of_the_slanted_plane_beside_it(step):
-    """And of the right one of two; a plane's inverse depth is linear. Nearest ones are twice as far off."""
+def two_planes():
+    """Inverse depth of two slanted planes, one above the other, and alpha, in which an edge parts them."""
     y, x = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
     upper = y < 60
-    truth = 1 / torch.where(upper, 0.4 + 5e-4 * x - 1e-3 * y, 0.9 - 1e-3 * x + 1e-3 * (y - 60))
-    depth, confidence = truth.clone(), torch.full_like(truth, 0.9)
-    lost = x < 20
-    depth[lost], confidence[lost] = 1.3, 0.2
-    alpha = torch.where(upper, 0.1, 0.9)
+    inverse = torch.where(upper, 0.4 + 5e-4 * x - 1e-3 * y, 0.9 - 4e-3 * x + 1e-3 * (y - 60))
+    return inverse, torch.where(upper, 0.1, 0.9)
+
+
+@pytest.mark.parametrize("step", [[4.0, 0.0], [0.0, 4.0]])
+def test_depth_beyond_the_border_is_that_of_the_slanted_plane_beside_it(step):
+    """And of the right one of two; a plane's inverse depth is linear. Nearest ones are far off."""
+    inverse, alpha = two_planes()
+    confidence = torch.full_like(inverse, 0.9)
+    confidence[:, :20] = 0.2
+    depth = torch.where(confidence < 0.5, 1.3, 1 / inverse)
     if step[1]:
-        depth, confidence, alpha, truth = (t.mT for t in (depth, confidence, alpha, truth))
+        depth, confidence, alpha = (t.mT for t in (depth, confidence, alpha))
     found = background_filled(frame_of(depth, confidence), fields_along(step, alpha=alpha))
-    seen = depth == truth
-    beside = truth.mT[:, 20:21] if step[1] else truth[:, 20:21]
-    constant = beside.expand(120, 160).mT if step[1] else beside.expand(120, 160)
-    error, of_constant = ((1 / t - 1 / truth)[~seen].abs().mean() for t in (found, constant))
-    assert error < of_constant / 2
-    assert torch.equal(found[seen], depth[seen])
+    assert torch.equal(found[confidence > 0.5], depth[confidence > 0.5])
+    error = (1 / (found.mT if step[1] else found) - inverse)[:, :20].abs()
+    assert error.mean() < (inverse[:, 20:21] - inverse[:, :20]).abs().mean() / 7
+    inside = error[torch.arange(120) != 60]  # a row of the lower plane, of a pair whose first is of the upper
+    assert (inside[:, 1::2].mean() / inside[:, ::2].mean() - 1).abs() < 0.1
+
+
+def test_matches_that_the_plane_explains_badly_count_little():
+    inverse, alpha = two_planes()
+    confidence = torch.full_like(inverse, 0.9)
+    confidence[:, :20] = 0.2
+    wrong = torch.rand(inverse.shape, generator=torch.Generator().manual_seed(1)) < 0.2
+    depth = torch.where(confidence < 0.5, 1.3, 1 / (inverse + 0.05 * wrong))
+    found = background_filled(frame_of(depth, confidence), fields_along([4.0, 0.0], alpha=alpha))
+    assert (1 / found - inverse)[:, :20].mean() < 0.2 * 0.05 / 2
+
+
+def test_a_match_is_left_if_those_around_it_are_far_more_certain():
+    """As certain as the mean of the frame is not enough."""
+    inverse, alpha = two_planes()
+    confidence = torch.where(alpha > 0.5, 0.9, 0.1)
+    confidence[90, 80] = confidence.mean()
+    depth = 1 / inverse
+    depth[90, 80] = 1 / (inverse[90, 80] + 0.015)
+    found = background_filled(frame_of(depth, confidence), fields_along([4.0, 0.0], alpha=alpha))
+    assert abs(1 / float(found[90, 80]) - float(inverse[90, 80])) < 0.003
+
+
+def test_depth_in_parts_is_that_of_the_whole(monkeypatch):
+    inverse, alpha = (torch.cat([t, t.flip(0), t]) for t in two_planes())
+    confidence = torch.full_like(inverse, 0.9)
+    confidence[:, :20] = 0.2
+    confidence[::7] = 0.2
+    frame, inputs = frame_of(1 / inverse, confidence), fields_along([4.0, 0.0], alpha=alpha)
+    whole = background_filled(frame, inputs)
+    monkeypatch.setattr("pat.fusion.depth_filling.ROWS", 64)
+    assert (1 / background_filled(frame, inputs) - 1 / whole).abs().max() < 0.1 * 0.01
 
 
 def test_gradients_pass_where_depth_is_that_of_a_match():
