@@ -18,7 +18,7 @@ from arraygeom.chunks import chunked
 from ..matching.filters import numpy_of
 from ..matching.inputs import Inputs
 from ..matching.positions import FINE
-from ..support.settings import physics, size, tuned
+from ..support.settings import physics, tuned
 from .results import Frame
 
 
@@ -44,7 +44,6 @@ class FillSettings:
         0.005,
         "Middlebury, tune half: variance of position, in squares of `reach`, below which planes are level",
     )
-    trials: int = size(2, "Fits of a plane; in each, what the last one explains badly counts less")
     one_side: float = physics(
         0.9,
         "Length of the sum of all betas' segments, "
@@ -151,18 +150,15 @@ def _planes(inverse: Plane, weight: Plane, guide: NDArray[np.float32]) -> tuple[
     x, y = ((t - t.mean()) / reach for t in (x, y))
     centre = np.median(inverse[weight > 0]) if weight.any() else 0.0
     z = inverse - centre
-    counts = weight
-    for _ in range(SETTINGS.trials):
-        terms = (1, x, y, x * x, x * y, y * y, z, x * z, y * z, weight)
-        sums = _spread([term * counts for term in terms], guide)
-        total = np.maximum(sums[0], np.finfo(np.float32).tiny)
-        mx, my, mxx, mxy, myy, mz, mxz, myz, around = sums[1:] / total
-        xx, yy, xy = mxx - mx * mx + SETTINGS.level, myy - my * my + SETTINGS.level, mxy - mx * my
-        xz, yz = mxz - mx * mz, myz - my * mz
-        determinant = xx * yy - xy * xy
-        right, down = (xz * yy - yz * xy) / determinant, (yz * xx - xz * xy) / determinant
-        value = mz + right * (x - mx) + down * (y - my)
-        counts = weight / (1 + (value - z) ** 2)
+    terms = (1, x, y, x * x, x * y, y * y, z, x * z, y * z, weight)
+    sums = _spread([term * weight for term in terms], guide)
+    total = np.maximum(sums[0], np.finfo(np.float32).tiny)
+    mx, my, mxx, mxy, myy, mz, mxz, myz, around = sums[1:] / total
+    xx, yy, xy = mxx - mx * mx + SETTINGS.level, myy - my * my + SETTINGS.level, mxy - mx * my
+    xz, yz = mxz - mx * mz, myz - my * mz
+    determinant = xx * yy - xy * xy
+    right, down = (xz * yy - yz * xy) / determinant, (yz * xx - xz * xy) / determinant
+    value = mz + right * (x - mx) + down * (y - my)
     unknown = sums[0] < LEAST
     right, down = right / (FINE * reach), down / (FINE * reach)
     return value + centre, right, down, np.where(unknown, 0, around)

@@ -100,16 +100,6 @@ def test_depth_beyond_the_border_is_that_of_the_slanted_plane_beside_it(step):
     assert (inside[:, 1::2].mean() / inside[:, ::2].mean() - 1).abs() < 0.1
 
 
-def test_matches_that_the_plane_explains_badly_count_little():
-    inverse, alpha = two_planes()
-    confidence = torch.full_like(inverse, 0.9)
-    confidence[:, :20] = 0.2
-    wrong = torch.rand(inverse.shape, generator=torch.Generator().manual_seed(1)) < 0.2
-    depth = torch.where(confidence < 0.5, 1.3, 1 / (inverse + 0.05 * wrong))
-    found = background_filled(frame_of(depth, confidence), fields_along([4.0, 0.0], alpha=alpha))
-    assert (1 / found - inverse)[:, :20].mean() < 0.2 * 0.05 / 2
-
-
 def test_a_match_is_left_if_those_around_it_are_far_more_certain():
     """As certain as the mean of the frame is not enough."""
     inverse, alpha = two_planes()
