@@ -136,7 +136,7 @@ def _far_by_depth(inverse: Plane) -> list[Plane]:
 
 
 def _far_by_slope(inverse: Plane) -> list[Plane]:
-    """A guide whose changes of 1 are those of slopes, by a half-width in two pixels: slanted planes are whole."""
+    """A guide whose changes of 1 are those of slopes, by a half-width in two pixels: planes are whole."""
     return [np.diff(inverse, axis=axis, append=inverse.take([-1], axis)) for axis in (0, 1)]
 
 
