@@ -75,7 +75,7 @@ class _InStrips(TorchFunctionMode):
 def _convolved(
     x: Tensor, weight: Tensor, bias: Any, stride: Any, padding: Any, dilation: Any, groups: int
 ) -> Tensor:
-    """`torch.conv2d`, to the bit; of one large image in strips of rows, each with the rows around it."""
+    """`torch.conv2d` but for rounding; of one large image in strips of rows, each with the rows around it."""
     further = bias, stride, padding, dilation, groups
     plain = x.device.type == "cpu" and tuple(stride) == (1, 1) and not isinstance(padding, str)
     if not plain or len(x) != 1 or weight[0].numel() * len(weight) * x[0, 0].numel() < WORTH_STRIPS:

@@ -100,7 +100,7 @@ def test_every_task_has_torch_in_its_own_thread_alone(two_threads, alone):
     "of", [{}, {"dilation": 8, "padding": 8}, {"padding": 0}, {"stride": 2}, {"groups": 4}]
 )
 @pytest.mark.parametrize("channels_last", [False, True])
-def test_convolutions_in_strips_are_the_same_to_the_bit(two_threads, monkeypatch, of, channels_last):
+def test_convolutions_in_strips_are_the_same(two_threads, monkeypatch, of, channels_last):
     conv = torch.nn.Conv2d(16, 16, 3, **{"padding": 1, **of})
     x = torch.rand(1, 16, 301, 207)
     x = x.contiguous(memory_format=torch.channels_last) if channels_last else x
@@ -111,7 +111,8 @@ def test_convolutions_in_strips_are_the_same_to_the_bit(two_threads, monkeypatch
         whole = conv(x)
         with convolutions_in_parallel():
             made = conv(x)
-    assert torch.equal(made, whole)
+    # To the bit where oneDNN computes any height in one way; on some processors of AMD it does not.
+    torch.testing.assert_close(made, whole, rtol=0, atol=2e-6)
     assert made.stride() == whole.stride()
     assert len(strips) == (0 if "stride" in of else 4)
 
