@@ -98,7 +98,7 @@ def test_alphas_values_are_kept(network, given):
 
 
 def test_tiles_are_denoised_as_the_whole(network, fused, monkeypatch):
-    """But where blocks are equally alike: rounding chooses, then a match may differ."""
+    """But for coefficients at the threshold and equal blocks: rounding chooses, then a match may differ."""
     _, images, noise = in_low_light(200, load_sample)
     view, level = images[ALPHA][None, :, 120:280], noise[ALPHA]
     views = view, level.deviation(view)
@@ -115,7 +115,7 @@ def test_tiles_are_denoised_as_the_whole(network, fused, monkeypatch):
     monkeypatch.setattr("pat.fusion.low_light.in_tiles", partial(ordinary_tiles, rows=160))
     in_tiles = fuse(network, sample.rig, images, alpha=ALPHA, noise=noise)
     assert len(pieces) > 6
-    assert float(((in_tiles.image - fused(200).image).abs() > 2e-3).float().mean()) < 0.02
+    assert float(((in_tiles.image - fused(200).image).abs() > 2e-3).float().mean()) < 0.01
 
 
 def test_a_distorted_alpha_is_denoised_too(network):
