@@ -104,16 +104,6 @@ def test_an_estimate_is_refined(bands):
     assert (found - clean).square().mean() < 0.5 * (estimate - clean).square().mean()
 
 
-def test_brightness_is_the_mean_of_the_estimate_and_of_what_is_filtered_twice():
-    recorded = stripes(1) + noise_of((1, 48, 64), 2, 0.06)
-    estimate, deviation = stripes(1) + noise_of((1, 48, 64), 3, 0.03), torch.full_like(recorded, 0.06)
-    filtered = estimate
-    for _ in range(2):
-        filtered = wiener_filtered(recorded, filtered, deviation, (filtered + recorded) / 2)
-    found = refined(estimate[None], recorded[None], deviation[None])[0]
-    torch.testing.assert_close(found, (filtered + estimate) / 2, atol=1e-5, rtol=0)
-
-
 def test_images_of_a_batch_are_refined_one_by_one():
     images = torch.stack([stripes(3), stripes(3).flip(-1)]) + noise_of((2, 3, 48, 64), 4, 0.05)
     deviation = torch.stack([torch.full((3, 48, 64), d) for d in (0.05, 0.1)])
