@@ -35,10 +35,10 @@ class FillSettings:
         "Middlebury, tune half: pixels to which matches count where alpha is even and depth has no step. "
         "A change of alpha from black to white is as far",
     )
-    step: float = physics(
+    step: float = tuned(
         2.0,
-        "Change of inverse depth that is as far as `reach` when planes are first fitted: "
-        "its interval's width, in half-widths",
+        "Middlebury, tune half, of 1.5 to 10: change of inverse depth that is as far as `reach` when planes "
+        "are first fitted, in half-widths of its interval: its width",
     )
     level: float = tuned(
         0.005,
@@ -52,10 +52,8 @@ class FillSettings:
 
 
 SETTINGS = FillSettings()
-LEAST = 1e-20
-"""Size: sums of weights below this are those of a pixel that nothing reaches."""
 ROWS, HALO = 512, 128
-"""Size: rows of a part, and beside it that its planes see: matches there count a fifth of those at hand."""
+"""Size: rows of a part, and beside it that its planes see: matches there count a sixth of those at hand."""
 
 
 def background_filled(frame: Frame, inputs: Inputs) -> Float[Tensor, "h w"]:
@@ -143,7 +141,8 @@ def _far_by_slope(inverse: Plane) -> list[Plane]:
 def _planes(inverse: Plane, weight: Plane, guide: NDArray[np.float32]) -> tuple[Plane, Plane, Plane, Plane]:
     """Planes through weighted inverse depth: value, slopes a pixel of alpha, and the confidence around.
 
-    Of every second pixel; a change of 1 in the guide (h, w, c) is as far as `reach`.
+    Of every second pixel; a change of 1 in the guide (h, w, c) is as far as `reach`. No confidence is
+    around what no weight reaches.
     """
     reach = SETTINGS.reach / FINE
     y, x = np.mgrid[: weight.shape[0], : weight.shape[1]].astype(np.float32)
@@ -159,9 +158,7 @@ def _planes(inverse: Plane, weight: Plane, guide: NDArray[np.float32]) -> tuple[
     determinant = xx * yy - xy * xy
     right, down = (xz * yy - yz * xy) / determinant, (yz * xx - xz * xy) / determinant
     value = mz + right * (x - mx) + down * (y - my)
-    unknown = sums[0] < LEAST
-    right, down = right / (FINE * reach), down / (FINE * reach)
-    return value + centre, right, down, np.where(unknown, 0, around)
+    return value + centre, right / (FINE * reach), down / (FINE * reach), around
 
 
 def _spread(planes: Sequence[Plane], guide: NDArray[np.float32]) -> NDArray[np.float32]:
