@@ -178,15 +178,15 @@ class Info:
         from rich.console import Console
         from rich.table import Table
 
+        from arraygeom.rig_check import unit_oddity
         from arraygeom.summary import summarise_cameras, summarise_pairs
 
-        before = len(options.WARNED)
         rig = load_rig(self.rig, self.depth)
         if rig.name:
             say(rig.name)
-        warned = [str(message) for message in options.WARNED[before:]]
+        unit = unit_oddity(rig)  # which reading the file has warned of
         for oddity in rig.check():
-            if not any(message.endswith(oddity.removeprefix("the rig ")) for message in warned):
+            if unit is None or not oddity.endswith(unit):
                 say(f"pat: {oddity}", style="yellow")
         alpha = None if self.alpha is None else rig.require(self.alpha)
         if alpha is None and len(rig.names) > MOST_CAMERAS:
