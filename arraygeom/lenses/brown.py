@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..pixels import product, to_homogeneous
+from ..pixels import broadcast_shapes, product, to_homogeneous
 from ..roots import first_root, invert_increasing, keeps_orientation, newton_step, solve_in_plane
 from ..tracing import traced
 from .common import BEYOND, MARGIN, POLE, SOLVED, TINY, WIDEST, norm, once, polynomial_product
@@ -191,7 +191,7 @@ def _traced_brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 @_traced_brown_inverse.register_fake
 def _(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    shape = torch.broadcast_shapes(target.shape[:-1], c.shape[:-1])
+    shape = broadcast_shapes(target.shape[:-1], c.shape[:-1])
     return target.new_empty((*shape, 2)), target.new_empty(shape, dtype=torch.bool)
 
 
