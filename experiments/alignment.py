@@ -2,7 +2,9 @@
 
 A patch counts around a corner of alpha's image that the alignment says the beta sees (with true disparity:
 and whose patch it does see), if it can be located: its best match within some pixels of where the alignment,
-or the homography, puts it is like it. It is well aligned if that match is within half a pixel.
+or the homography, puts it is like it, and the best matches of its four halves are within half a pixel of
+that (noise, or an edge of depth within the patch, draws them apart: the patch then has no one place). It is
+well aligned if that match is within half a pixel.
 The homography is OpenCV's ECC on gradients, coarse to fine, of images without their lenses, as the makers of
 multispectral cameras align their bands.
 """
@@ -48,6 +50,10 @@ from pat.media.figures import save_panels
 HALF_PIXEL = 0.5
 PATCH, SEARCH = 10, 5
 """Pixels from a patch's middle to its edge, and as far as its best match is searched."""
+WHOLE = slice(-PATCH, PATCH + 1)
+HALVES = slice(-PATCH, 1), slice(0, PATCH + 1)
+PARTS = [(WHOLE, WHOLE), *((half, WHOLE) for half in HALVES), *((WHOLE, half) for half in HALVES)]
+"""Rows and columns of a patch and of its halves, about its middle."""
 POINTS, SPACING = 3000, 8
 """Corners of alpha at most, and their least distance, pixels."""
 LEVELS = 4
@@ -176,8 +182,8 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
             true = float((error <= HALF_PIXEL).mean())
             filled = float((view.visibility[occluded] == SEEN).mean()) if occluded.any() else 0.0
         others = [shown_band(resampled_values(values, plane, "bilinear")) for plane in planes]
-        offsets, like = zip(*(local_offsets(own, other, x) for other in others))
-        located = np.maximum(*like[:2]) >= ALIKE
+        offsets, each = zip(*(local_offsets(own, other, x) for other in others))
+        located = each[0] | each[1]
         near = [float((off[located] <= HALF_PIXEL).mean()) for off in offsets]
         rows.append(
             AlignmentRow(
@@ -226,21 +232,31 @@ def composites(scene: AlignmentScene, aligned: Aligned) -> dict[str, Float[Tenso
 
 def local_offsets(
     own: NDArray[np.uint8], other: NDArray[np.uint8], x: NDArray[Any]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """How far the patch of `other` that is most like that of `own` at pixels x (n, 2) lies from there, and
-    how much it is: correlation squared, which does not depend on the sign of a band's contrast. The peak is
-    found by a parabola.
+    whether it can be located: it is like it, and its halves agree. Alike is by correlation squared, which
+    does not depend on the sign of a band's contrast. The peak is found by a parabola.
     """
-    offsets, like = np.full(len(x), np.inf), np.zeros(len(x))
-    reach = PATCH + SEARCH
-    for i, (column, row) in enumerate(x):
-        patch = own[row - PATCH : row + PATCH + 1, column - PATCH : column + PATCH + 1]
-        window = other[row - reach : row + reach + 1, column - reach : column + reach + 1]
-        found = np.square(np.nan_to_num(cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED)))
-        best = np.unravel_index(int(found.argmax()), found.shape)
-        like[i] = found[best]
-        offsets[i] = np.hypot(_peak(found, best, 0) - SEARCH, _peak(found, best, 1) - SEARCH)
-    return offsets, like
+    found, like = zip(*(_best_match(own, other, pixel) for pixel in x)) if len(x) else ([], [])
+    best = np.reshape(found, (len(x), len(PARTS), 2))
+    agree = np.linalg.norm(best[:, 1:] - best[:, :1], axis=-1).max(1) <= HALF_PIXEL
+    return np.linalg.norm(best[:, 0], axis=-1), agree & (np.array(like) >= ALIKE)
+
+
+def _best_match(
+    own: NDArray[np.uint8], other: NDArray[np.uint8], pixel: NDArray[Any]
+) -> tuple[list[tuple[float, float]], float]:
+    """Of the patch and its halves: the offset (y, x) of what is most like them; how like the patch is."""
+    offsets, like = [], []
+    for part in PARTS:
+        rows, columns = (slice(at + s.start, at + s.stop) for at, s in zip(pixel[::-1], part))
+        around = (slice(s.start - SEARCH, s.stop + SEARCH) for s in (rows, columns))
+        matched = cv2.matchTemplate(other[tuple(around)], own[rows, columns], cv2.TM_CCOEFF_NORMED)
+        scores = np.square(np.nan_to_num(matched))
+        best = np.unravel_index(int(scores.argmax()), scores.shape)
+        like.append(float(scores[best]))
+        offsets.append((_peak(scores, best, 0) - SEARCH, _peak(scores, best, 1) - SEARCH))
+    return offsets, like[0]
 
 
 def _peak(found: NDArray[Any], best: Sequence[Any], axis: int) -> float:

@@ -45,9 +45,18 @@ def test_offsets_are_those_of_the_image(sign):
     x = np.stack(
         np.meshgrid(np.arange(reach, HW[1] - reach, 9), np.arange(reach, HW[0] - reach, 9)), -1
     ).reshape(-1, 2)
-    offsets, like = local_offsets(own, other, x)
+    offsets, located = local_offsets(own, other, x)
     assert np.median(np.abs(offsets - np.hypot(1.3, 0.6))) < 0.1
-    assert np.median(like) > 0.9
+    assert located.mean() > 0.9
+
+
+def test_what_has_no_one_place_is_not_located():
+    """Neither noise that the bands do not share, nor a patch of which an edge of depth parts."""
+    own, x = texture(), np.array([[60, 60], [100, 60], [140, 60]])
+    assert not local_offsets(own, texture(seed=1), x)[1].any()
+    parted = own.copy()
+    parted[:, 100:] = moved(own, 3, 0)[:, 100:]
+    assert local_offsets(own, parted, x)[1].tolist() == [True, False, True]
 
 
 def test_the_homography_is_found():
