@@ -69,8 +69,8 @@ def brown_derivatives(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     u = x * x + y * y
     g = _radial_factor(lens, u)[0]
     powers = torch.stack([u, u * u, u**3], -1)
-    if rational := lens.k[3:]:
-        k4, k5, k6 = rational
+    if len(lens.k) > 3:
+        k4, k5, k6 = lens.k[3:]
         powers = powers / (1 + u * (k4 + u * (k5 + u * k6)))[:, None]
     radial, rational = (at[:, :, None] * f[:, None] for f in (powers, -g[:, None] * powers))
     cross, none = 2 * x * y, torch.zeros_like(u)
