@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .camera import Camera, LensView, View
 from .checks import derived
-from .pixels import coarse_grid
+from .pixels import HW, coarse_grid
 
 if TYPE_CHECKING:
     from .rig import Rig
@@ -72,9 +72,12 @@ def _all(rig: Rig) -> Iterator[str]:
             yield from _of_K(name, camera)
     names = [name for name, camera in rig.cameras.items() if isinstance(camera, Camera)]
     pairs = list(combinations(names, 2)) if len(names) <= MOST_CAMERAS else list(pairwise(names))
-    for one, other in pairs:
-        yield from _of_overlap(rig, one, other)
-        yield from _of_overlap(rig, other, one)
+    small = rig
+    for name in names:
+        small = small.resize(name, _reduced(rig[name].hw))
+    for one, other in [order for pair in pairs for order in (pair, pair[::-1])]:
+        if not _overlap(small, one, other):  # a few pixels decide most pairs: through lenses all take seconds
+            yield from _of_overlap(rig, one, other)
     for pair in pairs:
         yield from _of_baseline(rig, *pair)
     yield from _of_sides(rig)
@@ -117,12 +120,23 @@ def _of_lens(name: str, camera: LensView) -> Iterator[str]:
         yield f"the lens model of '{name}' covers {100 * share:.0f} % of its image: check the coefficients"
 
 
-def _of_overlap(rig: Rig, alpha: str, beta: str) -> Iterator[str]:
+def _reduced(hw: HW) -> HW:
+    """The size of an image reduced to at most 128 pixels a side, of the same shape."""
+    scale = min(1.0, 128 / max(hw))
+    return max(1, round(scale * hw[0])), max(1, round(scale * hw[1]))
+
+
+def _overlap(rig: Rig, alpha: str, beta: str) -> bool:
+    """Whether the segment of any pixel of a grid reaches beta's image."""
     from .fields.default import recorded_field
 
     pair = rig.pair(alpha, beta)
     found = recorded_field(pair)(pair, _grid(rig[alpha]).to(rig[alpha].K))
-    if not bool((found.valid if hasattr(found, "valid") else found.mask).any()):
+    return bool((found.valid if hasattr(found, "valid") else found.mask).any())
+
+
+def _of_overlap(rig: Rig, alpha: str, beta: str) -> Iterator[str]:
+    if not _overlap(rig, alpha, beta):
         bounds = (
             "" if rig.depth is None else f" between {float(rig.depth[0]):g} and {float(rig.depth[1]):g} m"
         )
