@@ -12,6 +12,7 @@ from torch.utils._pytree import GetAttrKey, register_pytree_node, tree_leaves
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from .checks import derived
+from .pixels import broadcast_shapes
 
 T = TypeVar("T", bound="Batched")
 LABELS = ("name", "sensor")
@@ -38,7 +39,7 @@ class Batched:
     def batch_shape(self) -> torch.Size:
         """The batch axes, empty for one item."""
         shapes = [t.shape[: t.ndim - axes] for t, axes in tensors_of(self) if t.ndim > axes]
-        return torch.broadcast_shapes(*shapes) if shapes else torch.Size()  # its first call imports sympy
+        return broadcast_shapes(*shapes) if shapes else torch.Size()
 
     def __len__(self) -> int:
         return self._batched()[0]

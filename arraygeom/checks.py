@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from .pixels import broadcast_shapes
 from .tracing import followed
 
 T = TypeVar("T")
@@ -129,7 +130,7 @@ def check_hw(hw: Any) -> None:
 def check_batches(what: str, *shapes: tuple[int, ...]) -> None:
     """Raises ValueError unless batch axes broadcast."""
     try:
-        torch.broadcast_shapes(*shapes)
+        broadcast_shapes(*shapes)
     except RuntimeError:
         listed = " and ".join(map(str, map(tuple, shapes)))
         raise ValueError(f"the batch axes of {what} are {listed}: give all the same, or none") from None

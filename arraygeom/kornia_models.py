@@ -12,6 +12,7 @@ from .camera import Camera, LensView
 from .distortion import BROWN_CONRADY, KANNALA_BRANDT, Distortion
 from .lenses import Orthographic
 from .lenses.model import LensModel
+from .pixels import broadcast_shapes
 from .pose import Pose
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ def to_kornia_model(camera: LensView) -> CameraModel:
             "it has pinholes, brown-conrady, kannala-brandt and orthographic"
         )
     focal_and_centre = torch.stack([K[..., 0, 0], K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]], -1)
-    batch = torch.broadcast_shapes(K.shape[:-2], numbers.shape[:-1])
+    batch = broadcast_shapes(K.shape[:-2], numbers.shape[:-1])
     params = torch.cat([part.expand(*batch, -1) for part in (focal_and_centre, numbers.to(K))], -1)
     return CameraModel(ImageSize(*camera.hw), kind, params.flatten(0, -2) if params.ndim > 2 else params)
 

@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
+from .tracing import followed
+
 HW = tuple[int, int]
 
 
@@ -93,6 +95,23 @@ def product(A: Float[Tensor, "*b i j"], B: Float[Tensor, "*c j k"]) -> Float[Ten
 def broadcasts(batch: Sequence[int], points: Sequence[int]) -> bool:
     """Whether axes of points begin with a batch's, or axes of length 1 (on either side) in their place."""
     return len(points) >= len(batch) and all(a == b or 1 in (a, b) for a, b in zip(batch, points))
+
+
+def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
+    """As `torch.broadcast_shapes`, whose first call in a process takes half a second to import sympy.
+
+    Raises RuntimeError for shapes that do not broadcast.
+    """
+    if followed():
+        return torch.broadcast_shapes(*shapes)
+    sizes = [1] * max(map(len, shapes), default=0)
+    for shape in shapes:
+        for i, size in enumerate(reversed(shape), 1):
+            if sizes[-i] == 1:
+                sizes[-i] = size
+            elif size not in (1, sizes[-i]):
+                raise RuntimeError(f"shapes {', '.join(str(tuple(s)) for s in shapes)} do not broadcast")
+    return torch.Size(sizes)
 
 
 def map_homogeneous(M: Float[Tensor, "*b k 3"], x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*m k"]:

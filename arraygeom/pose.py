@@ -13,7 +13,7 @@ from torch import Tensor
 
 from .batching import Batched
 from .checks import check_batches, check_numbers, check_rotation, checking, derived
-from .pixels import broadcasts, floating, product
+from .pixels import broadcast_shapes, broadcasts, floating, product
 from .text import angle, range_text
 from .tracing import traced
 
@@ -206,7 +206,7 @@ def in_float64(function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
 
     Matrices are given the same batch axes.
     """
-    batch = torch.broadcast_shapes(*(t.shape[:-2] for t in tensors))
+    batch = broadcast_shapes(*(t.shape[:-2] for t in tensors))
     dtype = torch.promote_types(torch.float32, reduce(torch.promote_types, (t.dtype for t in tensors)))
     return function(*(t.double().expand(*batch, *t.shape[-2:]) for t in tensors)).to(dtype)
 

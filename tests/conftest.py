@@ -5,7 +5,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-import torch
 
 if find_spec("beartype"):  # arraygeom's tests run with nothing but its own dependencies, too
     from tests import typecheck
@@ -27,6 +26,8 @@ SHARED = Path(__file__).parents[2] / "shared" / "data"
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup() -> None:
     """Numbers drawn without a seed are the same whichever tests ran before, in whichever process."""
+    import torch  # here, as xdist's own process needs none
+
     torch.manual_seed(0)
 
 

@@ -37,13 +37,15 @@ class Calls(threading.local):
 
 
 CALLS = Calls()
+MAKING = threading.Lock()
+"""Checks are made by one thread at a time: a function's annotations are others for a moment."""
 
 
 def install() -> None:
     """Check the packages' functions as they are imported."""
     jaxtyping.jaxtyped = jaxtyped
     ARRAY.__instancecheck_str__ = problem
-    ARRAY.__instancecheck__ = lambda array, value: not problem(array, value)
+    ARRAY.__instancecheck__ = is_of
     jaxtyping.install_import_hook(["arraygeom", "pat", "calib"], f"{__name__}.of_types")
 
 
@@ -59,26 +61,27 @@ def jaxtyped(fn: Any = None, *, typechecker: Any = None) -> Any:
 
 
 def checked(fn: Callable) -> Callable:
-    """The function, arguments and result checked: types, and the sizes of axes against each other."""
+    """The function, arguments and result checked: types, and the sizes of axes against each other.
+
+    What checks it is made at its first call: most tests call few of all functions.
+    """
     if any("{" in str(hint) for hint in fn.__annotations__.values()):
-        return with_axes(WITH_ARGUMENTS(fn, typechecker=of_types), ours=False)
-    written = fn.__annotations__
-    hints = {name: known(hint, fn.__globals__) for name, hint in written.items()}
-    fn.__annotations__ = hints
-    typed = of_types(fn)
-    fn.__annotations__ = written  # the compiled kernels read theirs
-    types = {one for hint in hints.values() for one in arrays_in(hint)}
-    if not types:
-        return typed
-    ours = all(map(axes_of, types))
-    return with_axes(typed if ours else in_context(typed), ours=ours)
+        ready = WITH_ARGUMENTS(fn, typechecker=of_types), False
+    else:
+        ready = None
 
-
-def with_axes(typed: Callable, *, ours: bool) -> Callable:
-    """A checked function each of whose calls has axes of its own, which are compared here or by jaxtyping."""
-
-    @functools.wraps(typed)
+    @functools.wraps(fn)
     def checking(*args, **kwargs):
+        nonlocal ready
+        if ready is None:
+            import torch  # here, as xdist's own process needs none
+
+            if torch.compiler.is_compiling():  # which cannot follow how checks are made
+                return fn(*args, **kwargs)
+            ready = typed_and_ours(fn)
+        typed, ours = ready
+        if ours is None:
+            return typed(*args, **kwargs)
         calls = CALLS.sizes
         calls.append({} if ours else None)
         try:
@@ -87,6 +90,19 @@ def with_axes(typed: Callable, *, ours: bool) -> Callable:
             calls.pop()
 
     return checking
+
+
+def typed_and_ours(fn: Callable) -> tuple[Callable, bool | None]:
+    """The function, its types checked, and whether axes are compared here or by jaxtyping (None: no axes)."""
+    with MAKING:
+        written = fn.__annotations__
+        hints = {name: known(hint, fn.__globals__) for name, hint in written.items()}
+        fn.__annotations__ = hints
+        typed = of_types(fn)
+        fn.__annotations__ = written  # the compiled kernels read theirs
+    types = {one for hint in hints.values() for one in arrays_in(hint)}
+    ours = all(map(axes_of, types)) if types else None
+    return (in_context(typed) if ours is False else typed), ours
 
 
 def in_context(typed: Callable) -> Callable:
@@ -119,6 +135,24 @@ def axes_of(array: Any) -> tuple[list[str | int | None], int, Any] | None:
         int(w) if w.isdigit() else None if w == "..." or w.lstrip("*").startswith("_") else w for w in words
     ]
     return axes, several[0] if several else -1, array.dtype[array.array_type, "..."]
+
+
+def is_of(array: Any, value: Any) -> bool:
+    """Whether a value is of a type of arrays: `problem`, quicker for one like one seen before."""
+    calls = CALLS.sizes
+    if not calls or (sizes := calls[-1]) is None:
+        return not problem(array, value)
+    try:
+        named = NAMED[array, type(value), value.dtype, value.shape]
+    except (AttributeError, KeyError):
+        return not problem(array, value)
+    if type(named) is str:
+        return False
+    for axis, size in named.items():
+        if sizes.get(axis, size) != size:
+            return False
+    sizes.update(named)
+    return True
 
 
 def problem(array: Any, value: Any) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..pixels import product, to_homogeneous
+from ..pixels import broadcast_shapes, product, to_homogeneous
 from ..roots import first_root, invert_increasing, keeps_orientation, newton_step, solve_in_plane
 from ..tracing import traced
 from .common import BEYOND, MARGIN, POLE, SOLVED, TINY, WIDEST, norm, once, polynomial_product
@@ -16,7 +16,9 @@ from .common import BEYOND, MARGIN, POLE, SOLVED, TINY, WIDEST, norm, once, poly
 
 @dataclass(frozen=True)
 class Brown:
-    """The 14 coefficients by name (absent ones 0), and a 15th, the factor of r^8; each of shape (*b, 1..)."""
+    """The coefficients by name, each of shape (*b, 1..): k1 to k3, or to k6 if the lens is rational; none of
+    s where it has none of the prism; and a 15th, the factor of r^8.
+    """
 
     k: tuple[Tensor, ...]
     p: tuple[Tensor, Tensor]
@@ -29,11 +31,10 @@ class Brown:
         """From 4 to 14 coefficients in OpenCV's order, or those and the 15th."""
         n, eighth = c.shape[-1], c[..., 14] if c.shape[-1] == 15 else None
         c = c[..., :14]
-        padded = list(torch.cat([c, c.new_zeros((*c.shape[:-1], 14 - c.shape[-1]))], -1).unbind(-1))
+        padded = torch.cat([c, c.new_zeros((*c.shape[:-1], 14 - c.shape[-1]))], -1).unbind(-1)
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tx, ty = padded
-        return Brown(
-            (k1, k2, k3, k4, k5, k6), (p1, p2), (s1, s2, s3, s4), (tx, ty) if n == 14 else None, eighth
-        )
+        rational, prism = (k4, k5, k6) if n > 5 else (), (s1, s2, s3, s4) if n > 8 else ()
+        return Brown((k1, k2, k3, *rational), (p1, p2), prism, (tx, ty) if n == 14 else None, eighth)
 
 
 def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
@@ -67,8 +68,10 @@ def brown_derivatives(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     x, y = at.unbind(-1)
     u = x * x + y * y
     g = _radial_factor(lens, u)[0]
-    bottom = 1 + u * (lens.k[3] + u * (lens.k[4] + u * lens.k[5]))
-    powers = torch.stack([u, u * u, u**3], -1) / bottom[:, None]
+    powers = torch.stack([u, u * u, u**3], -1)
+    if len(lens.k) > 3:
+        k4, k5, k6 = lens.k[3:]
+        powers = powers / (1 + u * (k4 + u * (k5 + u * k6)))[:, None]
     radial, rational = (at[:, :, None] * f[:, None] for f in (powers, -g[:, None] * powers))
     cross, none = 2 * x * y, torch.zeros_like(u)
     tangential = torch.stack([cross, u + 2 * x * x, u + 2 * y * y, cross], -1).reshape(-1, 2, 2)
@@ -100,24 +103,32 @@ def brown_undistort(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
 def _brown_planar(lens: Brown, xy: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
     """Everything but the tilt, and its Jacobian (dx'/dx, dx'/dy, dy'/dx, dy'/dy)."""
     x, y = xy.unbind(-1)
-    (p1, p2), (s1, s2, s3, s4) = lens.p, lens.s
+    p1, p2 = lens.p
     u = x * x + y * y
     g, dg = _radial_factor(lens, u)
-    x_d = x * g + 2 * p1 * x * y + p2 * (u + 2 * x * x) + u * (s1 + s2 * u)
-    y_d = y * g + p1 * (u + 2 * y * y) + 2 * p2 * x * y + u * (s3 + s4 * u)
-    cross, prism_x, prism_y = 2 * (x * y * dg + p1 * x + p2 * y), 2 * (s1 + 2 * s2 * u), 2 * (s3 + 2 * s4 * u)
-    xx = g + 2 * x * x * dg + 2 * p1 * y + 6 * p2 * x + prism_x * x
-    yy = g + 2 * y * y * dg + 6 * p1 * y + 2 * p2 * x + prism_y * y
-    return torch.stack([x_d, y_d], -1), (xx, cross + prism_x * y, cross + prism_y * x, yy)
+    x_d = x * g + 2 * p1 * x * y + p2 * (u + 2 * x * x)
+    y_d = y * g + p1 * (u + 2 * y * y) + 2 * p2 * x * y
+    xx = g + 2 * x * x * dg + 2 * p1 * y + 6 * p2 * x
+    yy = g + 2 * y * y * dg + 6 * p1 * y + 2 * p2 * x
+    xy = yx = 2 * (x * y * dg + p1 * x + p2 * y)
+    if lens.s:
+        s1, s2, s3, s4 = lens.s
+        prism_x, prism_y = 2 * (s1 + 2 * s2 * u), 2 * (s3 + 2 * s4 * u)
+        x_d, y_d = x_d + u * (s1 + s2 * u), y_d + u * (s3 + s4 * u)
+        xx, xy, yx, yy = xx + prism_x * x, xy + prism_x * y, yx + prism_y * x, yy + prism_y * y
+    return torch.stack([x_d, y_d], -1), (xx, xy, yx, yy)
 
 
 def _radial_factor(lens: Brown, u: Tensor) -> tuple[Tensor, Tensor]:
     """g = (1 + k1 u + k2 u^2 + k3 u^3) / (1 + k4 u + k5 u^2 + k6 u^3) of the squared radius u, and dg/du."""
-    k1, k2, k3, k4, k5, k6 = lens.k
-    top, bottom = 1 + u * (k1 + u * (k2 + u * k3)), 1 + u * (k4 + u * (k5 + u * k6))
-    d_top, d_bottom = k1 + u * (2 * k2 + 3 * u * k3), k4 + u * (2 * k5 + 3 * u * k6)
+    k1, k2, k3, *rational = lens.k
+    top, d_top = 1 + u * (k1 + u * (k2 + u * k3)), k1 + u * (2 * k2 + 3 * u * k3)
     if lens.eighth is not None:
         top, d_top = top + u**4 * lens.eighth, d_top + 4 * u**3 * lens.eighth
+    if not rational:
+        return top, d_top
+    k4, k5, k6 = rational
+    bottom, d_bottom = 1 + u * (k4 + u * (k5 + u * k6)), k4 + u * (2 * k5 + 3 * u * k6)
     g = top / bottom
     return g, (d_top - g * d_bottom) / bottom
 
@@ -129,14 +140,16 @@ def brown_limit(c: Tensor) -> Tensor:
     With g = N / D the slope is P / D^2, P(u) = (N + 2 u N') D - 2 u N D', of degree 6 (or 7) with P(0) = 1.
     """
     lens = Brown.named(c)
-    k1, k2, k3, k4, k5, k6 = (k.detach().to("cpu", torch.float64) for k in lens.k)
+    k1, k2, k3, *rational = (k.detach().to("cpu", torch.float64) for k in lens.k)
     one = torch.ones_like(k1)
     k7 = () if lens.eighth is None else (lens.eighth.detach().to("cpu", torch.float64),)
-    rising = polynomial_product((one, 3 * k1, 5 * k2, 7 * k3, *(9 * k for k in k7)), (one, k4, k5, k6))
-    falling = polynomial_product((one, k1, k2, k3, *k7), (0 * one, 2 * k4, 4 * k5, 6 * k6))
+    rising = polynomial_product((one, 3 * k1, 5 * k2, 7 * k3, *(9 * k for k in k7)), (one, *rational))
+    below = (0 * one, *(n * k for n, k in zip((2, 4, 6), rational)))
+    falling = polynomial_product((one, k1, k2, k3, *k7), below)
     turn = first_root(torch.stack([a - b for a, b in zip(rising, falling)], -1))
-    pole = first_root(torch.stack([one, k4, k5, k6], -1))
-    limit = torch.minimum(torch.minimum(turn * (1 - MARGIN), pole * POLE), one * WIDEST**2)
+    limit = torch.minimum(turn * (1 - MARGIN), one * WIDEST**2)
+    if rational:
+        limit = torch.minimum(limit, first_root(torch.stack([one, *rational], -1)) * POLE)
     if not traced() and not any(bool(v.any()) for v in (*lens.p, *lens.s)):
         return limit
     return _before_dip(lens, limit)
@@ -150,13 +163,13 @@ def _before_dip(lens: Brown, limit: Tensor) -> Tensor:
     The terms' Jacobian is at most 7 |p| r and 2 |s| r (4 |s| r^3): where the slope is larger there is no
     fold.
     """
-    parts = (*lens.k, *lens.p, *lens.s, lens.k[0] * 0 if lens.eighth is None else lens.eighth)
-    *k, p1, p2, s1, s2, s3, s4, k7 = (v.detach().to("cpu", torch.float64)[..., None] for v in parts)
+    lens = _each(lens, lambda v: v.detach().to("cpu", torch.float64)[..., None])
     angles = torch.linspace(1 / RADII, 1, RADII, dtype=torch.float64)
     r = (limit.sqrt().atan()[..., None] * angles).tan()
-    g, dg = _radial_factor(Brown(tuple(k), (p1, p2), (s1, s2, s3, s4), None, k7), r.square())
+    g, dg = _radial_factor(lens, r.square())
     slope = g + 2 * r.square() * dg
-    bound = r * (7 * torch.hypot(p1, p2) + 2 * torch.hypot(s1, s3)) + 4 * r**3 * torch.hypot(s2, s4)
+    constant, squared = _prism_sizes(lens)
+    bound = r * (7 * torch.hypot(*lens.p) + 2 * constant) + 4 * r**3 * squared
     folds = slope <= bound
     ends = folds & ((~folds).flip(-1).cumsum(-1).flip(-1) > 0)  # the slope is larger again further out
     first = ends & ((ends.cumsum(-1) > 0) & ~folds).cumsum(-1).eq(0)
@@ -191,7 +204,7 @@ def _traced_brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 @_traced_brown_inverse.register_fake
 def _(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    shape = torch.broadcast_shapes(target.shape[:-1], c.shape[:-1])
+    shape = broadcast_shapes(target.shape[:-1], c.shape[:-1])
     return target.new_empty((*shape, 2)), target.new_empty(shape, dtype=torch.bool)
 
 
@@ -219,10 +232,18 @@ def _brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 def _reach(lens: Brown, limit: Tensor) -> Tensor:
     """No point within the range is distorted to one farther out: radial, tangential and prism terms there."""
-    (p1, p2), (s1, s2, s3, s4) = lens.p, lens.s
     radial = limit.sqrt() * _radial_factor(lens, limit)[0].abs()
-    tangential, prism = 3 * torch.hypot(p1, p2), torch.hypot(s1, s3) + limit * torch.hypot(s2, s4)
+    constant, squared = _prism_sizes(lens)
+    tangential, prism = 3 * torch.hypot(*lens.p), constant + limit * squared
     return (radial + limit * (tangential + prism)) * (1 + MARGIN)
+
+
+def _prism_sizes(lens: Brown) -> tuple[Tensor | float, Tensor | float]:
+    """The sizes of the prism's terms in r^2 and in r^4."""
+    if not lens.s:
+        return 0.0, 0.0
+    s1, s2, s3, s4 = lens.s
+    return torch.hypot(s1, s3), torch.hypot(s2, s4)
 
 
 FEW = 8

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from ..batching import Batched
-from ..pixels import floating, to_homogeneous
+from ..pixels import broadcast_shapes, floating, to_homogeneous
 
 AnyLens = TypeVar("AnyLens", bound="LensModel")
 
@@ -102,7 +102,7 @@ class CameraModel(LensModel):
     def coefficients(self) -> Float[Tensor, "*b n"]:  # type: ignore[override]
         """The model's own numbers, one after the other."""
         numbers = [t.flatten(t.ndim - axes) if axes else t[..., None] for t, axes in self._own().values()]
-        batch = torch.broadcast_shapes(*(t.shape[:-1] for t in numbers))
+        batch = broadcast_shapes(*(t.shape[:-1] for t in numbers))
         return torch.cat([t.expand(*batch, -1) for t in numbers], -1) if numbers else torch.zeros(0).double()
 
     def with_coefficients(self: AnyLens, coefficients: Float[Tensor, "*b n"]) -> AnyLens:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..checks import checking
+from ..pixels import broadcast_shapes
 from ..roots import keeps_orientation, newton_step, solve_in_plane
 from ..tracing import traced
 from .common import SOLVED, finite_points, norm
@@ -160,7 +161,7 @@ class Splined(CameraModel, name="splined"):
             last = first.new_tensor([nx - side, ny - side])
             first = torch.minimum(first.clamp(min=0), last)
         weights, slopes = _basis(at - first, self.order)
-        shape = torch.broadcast_shapes(u.shape[:-1], knots.shape[:-3])
+        shape = broadcast_shapes(u.shape[:-1], knots.shape[:-3])
         batches = knots.shape[: self.knots.ndim - 3].numel()
         flat = knots.reshape(-1, 2)
         batch = torch.arange(batches, device=u.device).reshape(knots.shape[:-3]) * (nx * ny)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.special import fdtrc
 
 PARAMETERS = 4
 """Per board: stretch of y against x, curvatures xx, xy, yy (1/m)."""
@@ -117,12 +118,10 @@ def is_significant(
     values: Float[np.ndarray, " s"], covariance: Float[np.ndarray, "s s"], frames: int
 ) -> bool:
     """Whether shapes differ from flat by more than the jackknife over frames explains (Hotelling's test)."""
-    from scipy.stats import f as f_distribution  # here, as it takes half a second to import
-
     count = len(values)
     squared = float(values @ np.linalg.solve(covariance, values))
     ratio = squared * (frames - count) / (count * (frames - 1))
-    return bool(f_distribution.sf(ratio, count, frames - count) < SIGNIFICANCE)
+    return bool(fdtrc(count, frames - count, ratio) < SIGNIFICANCE)
 
 
 def described(

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from matplotlib.figure import Figure
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from arraygeom import Camera, Pose, Rig, triangulate
 from arraygeom.pose import cross_matrix
@@ -294,7 +294,7 @@ def _tested(
     return Significance(
         total,
         freedom,
-        float(chi2.sf(total, freedom)),
+        float(chdtrc(freedom, total)),
         best,
         float(np.degrees(np.linalg.norm(motion[:3]))),
         float(shift.norm()),

@@ -276,10 +276,10 @@ def _weighted_fit(x: Tensor, y: Tensor) -> _Fit:
         share = cauchy(rest, SETTINGS.outlier * deviation)
         return share * (SETTINGS.independent / share.sum() / max(deviation, SETTINGS.error) ** 2)
 
+    drawn = torch.block_diag(x.new_zeros(1, 1), CHANGES.T @ CHANGES)
+
     def precision(found: Tensor) -> Tensor:
-        return torch.block_diag(
-            x.new_zeros(1, 1), CHANGES.T @ CHANGES / (SETTINGS.prior * float(found[0])) ** 2
-        )
+        return drawn / (SETTINGS.prior * float(found[0])) ** 2
 
     (scale, *change), rest, counts = robust_least_squares(terms, y, start, weigh, precision=precision)
     centred = y - counts @ y / counts.sum()

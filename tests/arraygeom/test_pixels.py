@@ -1,7 +1,10 @@
+import itertools
+
 import pytest
 import torch
 
 from arraygeom.pixels import (
+    broadcast_shapes,
     coarse_grid,
     map_homogeneous,
     pixel_grid,
@@ -25,6 +28,18 @@ def centroid(image: torch.Tensor) -> torch.Tensor:
 
 def moved(A: torch.Tensor, x: float, y: float) -> torch.Tensor:
     return (A @ torch.tensor([x, y, 1.0], dtype=torch.float64))[:2]
+
+
+def test_shapes_are_broadcast_as_by_torch():
+    known = [(), (1,), (2,), (0,), (3, 1), (1, 0), (2, 3, 1), torch.Size((3, 2))]
+    for shapes in itertools.chain(*(itertools.product(known, repeat=count) for count in range(4))):
+        try:
+            wanted = torch.broadcast_shapes(*shapes)
+        except RuntimeError:
+            with pytest.raises(RuntimeError, match="do not broadcast"):
+                broadcast_shapes(*shapes)
+        else:
+            assert broadcast_shapes(*shapes) == wanted
 
 
 @pytest.mark.parametrize("k", range(-1, 5))
