@@ -58,10 +58,11 @@ def invert_increasing(
         low, top = torch.where(value < y, r, low), torch.where(value > y, r, top)
         newton = r - (value - y) / slope
         enough = 4 * torch.finfo(y.dtype).eps * r
-        # Newton's steps can cycle within the bracket: from some iteration on either they halve or the bracket
-        # does.
-        cycles = ((newton - r).abs() > torch.maximum(step / 2, enough)) & (i >= PATIENCE)
-        following = torch.where((newton >= low) & (newton <= top) & ~cycles, newton, (low + top) / 2)
+        taken = (newton >= low) & (newton <= top)
+        if i >= PATIENCE:
+            # Newton's steps can cycle within the bracket: now either they halve or the bracket does.
+            taken = taken & ~((newton - r).abs() > torch.maximum(step / 2, enough))
+        following = torch.where(taken, newton, (low + top) / 2)
         step = (following - r).abs()
         moved = step > enough
         r = following
