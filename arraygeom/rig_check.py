@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import combinations, pairwise
 from typing import TYPE_CHECKING
 
@@ -78,6 +78,7 @@ def _all(rig: Rig) -> Iterator[str]:
     for one, other in [order for pair in pairs for order in (pair, pair[::-1])]:
         if not _overlap(small, one, other):  # a few pixels decide most pairs: through lenses all take seconds
             yield from _of_overlap(rig, one, other)
+    yield from _of_positions(rig, pairs)
     for pair in pairs:
         yield from _of_baseline(rig, *pair)
     yield from _of_sides(rig)
@@ -147,11 +148,20 @@ def _of_overlap(rig: Rig, alpha: str, beta: str) -> Iterator[str]:
         )
 
 
+def _of_positions(rig: Rig, pairs: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """One sentence for all cameras at one position."""
+    together: dict[tuple[float, ...], dict[str, None]] = {}
+    for pair in pairs:
+        if bool((rig[pair[0]].centre == rig[pair[1]].centre).all()):
+            together.setdefault(tuple(rig[pair[0]].centre.tolist()), {}).update(dict.fromkeys(pair))
+    for names in together.values():
+        *others, last = (f"'{name}'" for name in names)
+        yield f"{', '.join(others)} and {last} are at the same position: between them depth has no effect"
+
+
 def _of_baseline(rig: Rig, a: str, b: str) -> Iterator[str]:
     baseline = float((rig[a].centre - rig[b].centre).norm())
-    if baseline == 0:
-        yield f"'{a}' and '{b}' are at the same position: between them depth has no effect"
-    elif rig.depth is not None:
+    if baseline > 0 and rig.depth is not None:
         near, far = map(float, rig.depth)
         focal = float(rig[b].K[:2, :2].det().abs().sqrt())
         moved = focal * baseline * (1 / near - 1 / far)

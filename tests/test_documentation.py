@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from pkgutil import resolve_name
 
 import pytest
 import torch
@@ -124,3 +125,9 @@ def test_the_site_builds_without_a_warning(tmp_path):
     story = (tmp_path / "notebooks" / "1_ten_minutes.html").read_text()
     assert 'src="data:image/jpeg;base64,' in story
     assert 'href="2_receptive_fields.html"' in story
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda p: p.stem)
+def test_names_of_the_packages_in_the_pages_are_there(page):
+    for name in re.findall(r"`((?:arraygeom|calib|pat)(?:\.\w+)+)", page.read_text()):
+        assert resolve_name(name) is not None

@@ -51,6 +51,27 @@ class JoinedResiduals:
         return torch.cat(list(self.parts(z)))
 
 
+class _Evaluated:
+    """Residuals whose values at the last point are remembered, to be differentiated there if that is wanted.
+
+    A step that is accepted was evaluated as a trial.
+    """
+
+    def __init__(self, residuals: Residuals):
+        self.residuals, self.z = residuals, torch.empty(0)
+
+    def parts(self, z: Float[Tensor, " k"]) -> tuple[Tensor, Sequence[Tensor]]:
+        """The variable of the derivatives, and the values in parts, which depend on it."""
+        if z is not self.z:
+            at, f = z.detach().requires_grad_(), self.residuals
+            self.z, self.last = z, (at, f.parts(at) if isinstance(f, JoinedResiduals) else [f(at)])
+        return self.last
+
+    def __call__(self, z: Float[Tensor, " k"]) -> Float[Tensor, " m"]:
+        """All values, as constants."""
+        return torch.cat([part.detach() for part in self.parts(z)[1]])
+
+
 class Solution(NamedTuple):
     """The free parameters z, which of them were observable, and their covariance, in prior deviations.
 
@@ -75,7 +96,7 @@ def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
     Free parameters whose standard deviation stays above `LARGEST_POSTERIOR` are reset to 0 and the others
     solved for again. `residuals` takes `count` free parameters and then the `considered` ones.
     """
-    total = count + considered
+    residuals, total = _Evaluated(residuals), count + considered
     active = torch.ones(total, dtype=torch.bool)
     z, eye = torch.zeros(total, dtype=torch.float64), torch.eye(total, dtype=torch.float64)
     while True:
@@ -127,6 +148,7 @@ def most_probable(
     Undamped steps shortened until the cost falls would stop short where some parameters are hardly
     observable, as poses by a flat scene are.
     """
+    residuals = residuals if isinstance(residuals, _Evaluated) else _Evaluated(residuals)
     numbers = itertools.count(1)
 
     def model(z: Tensor) -> LocalModel[Tensor]:
@@ -140,7 +162,7 @@ def most_probable(
         def step(damping: float) -> Tensor:
             return z + basis @ torch.linalg.solve(information + damping * diagonal, slope)
 
-        return LocalModel(cost(r, z, scale), lambda z: cost(residuals(z).detach(), z, scale), step)
+        return LocalModel(cost(r, z, scale), lambda z: cost(residuals(z), z, scale), step)
 
     def is_converged(z: Tensor, moved: Tensor, *_: float) -> bool:
         return float((moved - z).abs().max()) < CONVERGED
@@ -176,8 +198,8 @@ def jacobian(f: Residuals, z: Float[Tensor, " n"]) -> tuple[Float[Tensor, " m"],
     The gradient of u . f in z is linear in u; its derivatives in u are the columns of the Jacobian. An entry
     of the gradient that is exactly 0 is of a parameter on which no value depends.
     """
-    z = z.detach().requires_grad_()
-    values, rows = f.parts(z) if isinstance(f, JoinedResiduals) else [f(z)], []
+    z, values = (f if isinstance(f, _Evaluated) else _Evaluated(f)).parts(z)
+    rows = []
     for part in values:
         u = torch.linspace(1, 2, len(part), dtype=part.dtype, requires_grad=True)
         (slope,) = torch.autograd.grad(part, z, u, create_graph=True)

@@ -173,3 +173,11 @@ def test_overlap_of_large_images_through_lenses_is_checked_by_few_pixels(monkeyp
     odd = Rig({"a": cameras[0], "b": cameras[1]}).check()
     assert sum("sees nothing" in sentence for sentence in odd) == 2 * turned
     assert turned or sum(asked) < 10_000
+
+
+def test_cameras_at_one_position_are_one_sentence():
+    """A camera of five bands whose tags state no translations had ten."""
+    rig = random_rig(0)
+    bands = dict.fromkeys(("blue", "green", "red"), rig["alpha"])
+    odd = [s for s in Rig({**bands, "beta": rig["beta"]}).check() if "same position" in s]
+    assert odd == ["'blue', 'green' and 'red' are at the same position: between them depth has no effect"]

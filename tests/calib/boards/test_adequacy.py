@@ -127,7 +127,16 @@ def test_fisheyes_of_each_model_are_found(lens):
         )
 
 
-@pytest.mark.parametrize("lens", ["omni", "double-sphere", "extended-unified", "thin-prism-fisheye"])
+@pytest.mark.parametrize(
+    "lens",
+    [
+        "double-sphere",
+        *(
+            pytest.param(lens, marks=pytest.mark.slow)
+            for lens in ("omni", "extended-unified", "thin-prism-fisheye")
+        ),
+    ],
+)
 def test_one_fisheye_by_another_model(lens):
     model, coefficients, focal = FISHEYES["kannala-brandt"]
     true = camera(focal, (480, 640), lens=coefficients, model=model)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from arraygeom import Camera, Distortion, Link, Rig, View
-from calib.images.depth_change import relative_change
+from calib.images.depth_change import DepthChange, relative_change
 from calib.images.held_out import median_off
 from calib.images.matches import PointMatches, match_cameras
 from calib.images.parameters import apply_change, free_parameters
@@ -410,6 +410,13 @@ def test_depth_does_not_change_for_nothing(shared_data, name, kind, seed):
     assert depth_error(found.rig, rig, matches) < depth_error(bad, rig, matches) + 0.01
 
 
+@pytest.mark.parametrize(("known", "doubtful"), [(0.02, False), (0.1, True)])
+def test_depth_may_change_far_where_it_is_known(known, doubtful):
+    """Here by six times its deviation's fall, as in the next test."""
+    assert DepthChange(change=0.178, before=0.44, after=0.4389, known=known).doubtful == doubtful
+
+
+@pytest.mark.slow
 def test_depth_changes_far_where_it_is_known(shared_data):
     """A real pair's second camera turned by a degree: depth changes by six times its deviation's fall."""
     (pair,) = (pair for pair in bumblebee(shared_data, ("chair01",)) if pair.name.endswith("chair01"))
