@@ -12,6 +12,7 @@ import re
 import threading
 from collections.abc import Callable
 from dataclasses import is_dataclass
+from types import FunctionType
 from typing import Any, get_args, get_type_hints
 
 import jaxtyping
@@ -70,7 +71,6 @@ def checked(fn: Callable) -> Callable:
     else:
         ready = None
 
-    @functools.wraps(fn)
     def checking(*args, **kwargs):
         nonlocal ready
         if ready is None:
@@ -89,7 +89,14 @@ def checked(fn: Callable) -> Callable:
         finally:
             calls.pop()
 
-    return checking
+    of_module = FunctionType(checking.__code__, named(fn.__module__), fn.__name__, None, checking.__closure__)
+    return functools.wraps(fn)(of_module)
+
+
+@functools.cache
+def named(module: str) -> dict[str, Any]:
+    """What checks need, by the name of a module they are in: `warn` takes their lines for that module's."""
+    return globals() | {"__name__": module}
 
 
 def typed_and_ours(fn: Callable) -> tuple[Callable, bool | None]:
