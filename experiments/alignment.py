@@ -182,8 +182,8 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
             true = float((error <= HALF_PIXEL).mean())
             filled = float((view.visibility[occluded] == SEEN).mean()) if occluded.any() else 0.0
         others = [shown_band(resampled_values(values, plane, "bilinear")) for plane in planes]
-        offsets, each = zip(*(local_offsets(own, other, x) for other in others))
-        located = each[0] | each[1]
+        offsets, locatable = zip(*(local_offsets(own, other, x) for other in others))
+        located = locatable[0] | locatable[1]
         near = [float((off[located] <= HALF_PIXEL).mean()) for off in offsets]
         rows.append(
             AlignmentRow(

@@ -54,7 +54,7 @@ class JoinedResiduals:
 class _Evaluated:
     """Residuals whose values at the last point are remembered, to be differentiated there if that is wanted.
 
-    A step that is accepted was evaluated as a trial.
+    A step that is accepted was evaluated as a trial. The point is known by its tensor, which must not change.
     """
 
     def __init__(self, residuals: Residuals):
