@@ -45,8 +45,8 @@ CHUNK_SAMPLES = 2**22
 CHUNK_PIXELS = 2**18
 """How many segments a callable is asked for at a time."""
 LOCAL_SERVES = (
-    "nearest values, without statistics, bias and derivatives, of `Local` windows of odd size and whole "
-    "spacing in float32 images of one size on the CPU"
+    "nearest values, without statistics and derivatives, with a bias for each sample or none, of `Local` "
+    "windows of odd size and whole spacing in float32 images of one size on the CPU"
 )
 
 
@@ -134,10 +134,10 @@ def _attend(
     if isinstance(locations, Dense) and backend == "auto" and samples is None and not measured:
         return (_attend_dense(query, key, value, locations.stride, bias),)
     if isinstance(locations, Local | Dense):
-        values_alone = nearest and samples is None and bias is None and not measured
+        values_alone = nearest and samples is None and not measured
         asked = values_alone and backend in ("auto", "local")
-        if isinstance(locations, Local) and asked and _local_serves(query, key, value, locations):
-            return _attend_local(query, key, value, locations)
+        if isinstance(locations, Local) and asked and _local_serves(query, key, value, locations, bias):
+            return _attend_local(query, key, value, locations, bias)
         alpha, beta = (View(hw=(t.shape[2], t.shape[3])) for t in (query, key))
         locations = lazily(locations, Pair(alpha, beta))
     if backend == "local":
@@ -185,16 +185,21 @@ def _check(query: Tensor, key: Tensor, value: Tensor, interpolation: str, backen
         raise ValueError(f"backend must be one of {', '.join(get_args(Backend))}, got {backend!r}")
 
 
-def _local_serves(query: Tensor, key: Tensor, value: Tensor, field: Local) -> bool:
+def _local_serves(query: Tensor, key: Tensor, value: Tensor, field: Local, bias: Tensor | None) -> bool:
     whole = field.size > 0 and field.size % 2 == 1 and float(field.spacing).is_integer()
     taken = query.dtype == torch.float32 and query.device.type == "cpu" and query.shape[2:] == key.shape[2:]
-    return whole and taken and torch_op.is_plain(query, key, value) and not _missing(query, key, value)
+    given = query, key, value, bias
+    plain = torch_op.is_plain(*given) and not _missing(*given)
+    of_samples = bias is None or (bias.shape == (field.size**2,) and bias.dtype == torch.float32)
+    return whole and taken and plain and of_samples
 
 
-def _attend_local(query: Tensor, key: Tensor, value: Tensor, field: Local) -> tuple[Tensor]:
+def _attend_local(
+    query: Tensor, key: Tensor, value: Tensor, field: Local, bias: Tensor | None
+) -> tuple[Tensor]:
     from pat.attention import cpu
 
-    return (cpu.forward_local(query, key, value, field),)
+    return (cpu.forward_local(query, key, value, field, bias),)
 
 
 def _attend_dense(query: Tensor, key: Tensor, value: Tensor, stride: int, bias: Tensor | None) -> Tensor:

@@ -44,15 +44,20 @@ def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Te
     return out.permute(0, 3, 1, 2), statistics, logsum, torch.empty(0, dtype=torch.int32)
 
 
-def forward_local(query: Tensor, key: Tensor, value: Tensor, field: Local) -> Tensor:
+def forward_local(query: Tensor, key: Tensor, value: Tensor, field: Local, bias: Tensor | None) -> Tensor:
     """Values (b, dv, h, w), channels first, of windows of a whole number of pixels around the same pixel of a
-    view of the same size, the nearest look-up, float32."""
+    view of the same size, the nearest look-up, float32. `bias`: (samples), the same for all pixels."""
     planes = [x.detach().contiguous().numpy() for x in (query, key, value)]
     out, step = np.empty_like(planes[2]), round(field.spacing)
+    of_samples = np.zeros(field.size**2, np.float32) if bias is None else bias.detach().contiguous().numpy()
     tops = range(0, out.shape[2], kernels.ROWS)
     images = [*zip(*planes, out)]
     in_parallel(
-        [partial(kernels.attend_rows, *image, field.size, step, top) for image in images for top in tops]
+        [
+            partial(kernels.attend_rows, *image, of_samples, field.size, step, top)
+            for image in images
+            for top in tops
+        ]
     )
     return torch.from_numpy(out)
 

@@ -36,8 +36,6 @@ class BandwisePAT(nn.Module):
         super().__init__()
         self.config = config
         self.single = GuidedPAT(GuidedPATConfig(**asdict(config)))
-        if config.head_dim and self.single.head.last.bias is not None:
-            nn.init.zeros_(self.single.head.last.bias)
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
         """As of the network inside."""

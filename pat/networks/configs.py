@@ -40,9 +40,8 @@ class GuidedPATConfig:
     """Widths of the features at 1/2, 1/4, 1/8 and 1/16 of the size, of the keys, and of the judgement.
 
     Attention reaches `window` pixels to either side of the match, with `taps` samples. Colour is propagated
-    within alpha in one round for each of `propagation_steps`, the spacing of 7 x 7 pixels at 1/4. Without
-    `head_dim` (0) nothing is added to what was matched and propagated. `keep_luminance` lets the network add
-    colour to alpha, and never luminance.
+    within alpha in one round for each of `propagation_steps`, the spacing of 7 x 7 pixels at 1/4.
+    `keep_luminance` lets the network add colour to alpha, and never luminance.
     """
 
     widths: tuple[int, int, int, int] = (16, 32, 40, 48)
@@ -53,7 +52,6 @@ class GuidedPATConfig:
     confidence_dim: int = 24
     propagation_dim: int = 8
     propagation_steps: tuple[int, ...] = (1, 3, 8)
-    head_dim: int = 32
     bands: int = 3
     keep_luminance: bool = True
 

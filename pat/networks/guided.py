@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, conv2d, pad, pixel_shuffle, pixel_unshuffle
+from torch.nn.functional import avg_pool2d, conv2d, pad, pixel_unshuffle
 
 from arraygeom import Local, Segments
 
@@ -29,6 +29,7 @@ from ..support.settings import size, tuned
 from .blocks import ResidualBlock, channels_last, conv, enlarge, stacked
 from .configs import GuidedPATConfig
 from .protocol import FusionOutput, JoinsBands, required
+from .recall import recalled
 
 
 @dataclass(frozen=True)
@@ -46,11 +47,6 @@ class GuidedSettings:
         1.0,
         "Middlebury, tune half: goes with the next training: added to the logit of taking the "
         "semi-global match's colour instead of the attended one",
-    )
-    head_share: float = tuned(
-        0.5,
-        "Middlebury, tune half: goes with the next training: how much of what the head adds is "
-        "added: it was trained to mend more than is left to be mended",
     )
     likeness: float = tuned(
         0.06,
@@ -134,8 +130,8 @@ class GuidedPAT(nn.Module):
     equal_resolution = True
     joins_bands: JoinsBands = "neighbours"
     uses_matches = True
-    halo = 640
-    """Encoder 85, judge 176, confidence 8, propagation 148, context 180 and head 16: the sum, rounded up."""
+    halo = 512
+    """Encoder 85, judge 176, confidence 8 and what is recalled 228 (propagated 148): the sum, rounded up."""
     beta_halo = 96
 
     def __init__(self, config: GuidedPATConfig = GuidedPATConfig()) -> None:
@@ -151,9 +147,6 @@ class GuidedPAT(nn.Module):
         self.propagation = nn.ModuleList(
             Propagation(w4, c.propagation_dim, spacing) for spacing in c.propagation_steps
         )
-        if c.head_dim:
-            self.propagate = UNet(w4 + 2 * c.bands, c.widths[1:], w2)
-            self.head = Head(4 * (1 + 3 * c.bands) + 2 * w2, c.head_dim, c.bands)
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
         """In the head; or around attention, one beta after the other, and the estimates of others."""
@@ -195,17 +188,12 @@ class GuidedPAT(nn.Module):
     def blended(
         self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], estimates: Sequence[BetaEstimate]
     ) -> Float[Tensor, "b c h w"]:
-        """What all bands have more than alpha: where the betas see it, where not, and what the head adds."""
+        """What all bands have more than alpha: where the betas see it, and where not."""
         confidence = _joined([s.blending.expand_as(s.colour) for s in estimates])
         colour = _joined([s.colour for s in estimates])
-        blend = torch.lerp(_joined([self._unseen(own, s) for s in estimates]), colour, confidence)
-        if not self.config.head_dim:
-            return blend
-        rough = avg_pool2d(torch.cat([colour * confidence, confidence], 1), SETTINGS.coarse)
-        context = self.propagate(stacked(own.quarter, rough))
-        return blend + SETTINGS.head_share * self.head(
-            alpha, blend, colour, confidence, own.half, enlarge(context)
-        )
+        alike = recalled(alpha, colour, confidence)
+        unseen = torch.lerp(_joined([self._unseen(own, s) for s in estimates]), alike, (1 - confidence) / 2)
+        return torch.lerp(unseen, colour, confidence)
 
     def _unseen(self, own: Encoded, estimate: BetaEstimate) -> Tensor:
         """Colour for where beta does not see the point: propagated at 1/4 of the size to pixels that are
@@ -397,17 +385,3 @@ class UNet(nn.Module):
         second = self.second(first)
         second = self.back_b(second + enlarge(self.up_b(self.third(second))))
         return self.last(self.back_a(first + enlarge(self.up_a(second))))
-
-
-class Head(nn.Module):
-    """What to add to the blend, at full size, computed on blocks of 2x2 pixels."""
-
-    def __init__(self, inputs: int, width: int, bands: int) -> None:
-        super().__init__()
-        self.start = nn.Sequential(conv(inputs, width), *(ResidualBlock(width) for _ in range(3)))
-        self.last = nn.Conv2d(width, 4 * bands, 3, padding=1)
-        nn.init.zeros_(self.last.weight)
-
-    def forward(self, *parts: Tensor) -> Tensor:
-        """(B, bands, H, W), from images at full size, features and context at 1/2."""
-        return pixel_shuffle(self.last(self.start(stacked(*parts))), 2)

@@ -34,7 +34,6 @@ DENOISERS = {"LowLightNetwork": (LowLightNetwork, DenoiserConfig)}
 
 LARGEST, MOST_ENTRIES = 1024, 16
 """Of the numbers in a configuration, and of a list of them. The largest shipped are 48 and 4."""
-MAY_BE_ZERO = ("head_dim",)
 
 if TYPE_CHECKING:
     Network = PAT | GuidedPAT | BandwisePAT
@@ -181,14 +180,9 @@ def _check_numbers(name: str, value: object) -> None:
     values = value if isinstance(value, tuple) else (value,)
     if len(values) > MOST_ENTRIES:
         raise ValueError(f"{name} has {len(values)} entries; at most {MOST_ENTRIES} are read")
-    least = 0 if name in MAY_BE_ZERO else 1
     for number in values:
-        if (
-            isinstance(number, int | float)
-            and not isinstance(number, bool)
-            and not least <= number <= LARGEST
-        ):
-            raise ValueError(f"{name} is {number}; wanted {least} to {LARGEST}")
+        if isinstance(number, int | float) and not isinstance(number, bool) and not 1 <= number <= LARGEST:
+            raise ValueError(f"{name} is {number}; wanted 1 to {LARGEST}")
 
 
 def _check_shapes(

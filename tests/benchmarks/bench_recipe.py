@@ -59,8 +59,6 @@ VARIANTS = (
     Variant("carried once, spacing 3", network={"propagation_steps": (3,)}),
     Variant("luminance free", network={"keep_luminance": False}),
     Variant("window 3 px, 13 taps", network={"window": 3.0, "taps": 13}),
-    Variant("head of 8 channels", network={"head_dim": 8}),
-    Variant("head of 16 channels", network={"head_dim": 16}),
     Variant("half the rate", {"rate": 1e-3}),
     Variant("twice the rate", {"rate": 4e-3}),
     Variant("every scene recorded once", {"reuse": 1.0}),

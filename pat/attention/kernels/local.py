@@ -20,10 +20,10 @@ LOWEST = np.finfo(np.float32).min
 
 
 @compiled(nogil=True, cache=True, fastmath={"contract"})
-def attend_rows(query, key, value, out, size, spacing, top):
+def attend_rows(query, key, value, out, bias, size, spacing, top):
     """`ROWS` rows of `out`, from `top` on, of one image (channels, h, w): the mean of the values at `size` x
-    `size` pixels, `spacing` apart, by the softmax of inner products. What is outside the image does not
-    count."""
+    `size` pixels, `spacing` apart, by the softmax of inner products and the samples' bias. What is outside
+    the image does not count."""
     channels, height, width = query.shape
     scores = np.empty((size * size, -(-width // LANES) * LANES), np.float32)
     total = np.empty(scores.shape[1], np.float32)
@@ -32,7 +32,7 @@ def attend_rows(query, key, value, out, size, spacing, top):
         for t in range(size * size):
             row, first, last, step = _sampled(t, y, size, spacing, height, width)
             score = scores[t, first:last]
-            score[:] = 0
+            score[:] = bias[t]
             for c in range(channels):
                 own, other = query[c, y, first:last], key[c, row, first + step : last + step]
                 for x in range(last - first):

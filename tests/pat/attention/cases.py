@@ -62,7 +62,7 @@ def gradients(out, tensors: dict, *, seed: int) -> dict:
     """Gradients of all tensors for one random cotangent of all outputs."""
     g = torch.Generator().manual_seed(seed)
     outputs = [t for t in out if t.requires_grad]
-    cotangents = [torch.randn(t.shape, generator=g, dtype=torch.float64).to(t.dtype) for t in outputs]
+    cotangents = [torch.randn(t.shape, generator=g, dtype=torch.float64).to(t) for t in outputs]
     found = torch.autograd.grad(outputs, list(tensors.values()), cotangents, materialize_grads=True)
     return dict(zip(tensors, found))
 

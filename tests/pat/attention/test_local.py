@@ -26,6 +26,18 @@ def test_it_gives_what_the_others_give(hw, field, backend):
     torch.testing.assert_close(found.double(), wanted, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("field", [Local(7, 3), Local(3), Local(1)], ids=str)
+def test_a_bias_counts_for_each_sample(field):
+    given, bias = features(), 3 * torch.randn(field.size**2, generator=torch.Generator().manual_seed(1))
+    local, reference = (
+        attend(*given, field, bias=bias, interpolation="nearest", backend=backend)
+        for backend in ("local", "reference")
+    )
+    torch.testing.assert_close(local, reference, rtol=1e-5, atol=1e-5)
+    without = attend(*given, field, interpolation="nearest")
+    assert torch.allclose(local, without, atol=1e-5) == (field.size == 1)
+
+
 @pytest.mark.parametrize("score", [torch.nan, torch.inf, -torch.inf])
 def test_scores_without_a_number_do_what_they_do_in_the_reference(score):
     query, key, value = (t.abs() for t in features())
@@ -56,7 +68,8 @@ def with_gradient():
 
 UNSERVED = {
     "bilinear": (features(), Local(3), {"interpolation": "bilinear"}),
-    "bias": (features(), Local(3), {"bias": torch.zeros(9)}),
+    "a bias for each pixel": (features(), Local(3), {"bias": torch.rand(20, 30, 9)}),
+    "a bias in float64": (features(), Local(3), {"bias": torch.rand(9, dtype=torch.float64)}),
     "even size": (features(), Local(4), {}),
     "half a pixel": (features(), Local(3, 1.5), {}),
     "float64": (features(dtype=torch.float64), Local(3), {}),

@@ -62,12 +62,8 @@ def network_of(kind: str):
     if kind == "PAT":
         return PAT(PATConfig(dim=8, interpolation="bilinear")).eval()
     if kind == "BandwisePAT":
-        network = BandwisePAT(BandwisePATConfig(widths=(8, 8, 8, 8))).eval()
-        torch.nn.init.normal_(network.single.head.last.weight, std=0.2)
-        return network
-    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8))).eval()
-    torch.nn.init.normal_(network.head.last.weight, std=0.2)
-    return network
+        return BandwisePAT(BandwisePATConfig(widths=(8, 8, 8, 8))).eval()
+    return GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8))).eval()
 
 
 def texture(channels: int, hw: tuple[int, int]) -> torch.Tensor:
@@ -256,8 +252,6 @@ def test_colour_comes_from_where_the_field_says():
     side = (torch.arange(96) < 48).float().expand(1, *hw)
     ground_truth = torch.cat([side, 0 * side, 1 - side]) * (0.5 + 0.5 * torch.rand(1, *hw, generator=g))
     network = network_of("GuidedPAT")
-    torch.nn.init.zeros_(network.head.last.weight)
-    torch.nn.init.zeros_(network.head.last.bias)
     upright = fuse(
         network, rig, {"mono": ground_truth, "colour": ground_truth}, alpha="mono", depth=(5, 20)
     ).image

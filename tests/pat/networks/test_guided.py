@@ -23,15 +23,9 @@ def rectified(beta_hw: tuple[int, int] = HW) -> FieldOnGrid:
     return FieldOnGrid.of(Rectified(10.0), Pair(View(hw=HW), View(hw=beta_hw)))
 
 
-def lively(network: GuidedPAT) -> GuidedPAT:
-    """A network whose answer depends on everything: the head starts at zero otherwise."""
-    torch.nn.init.normal_(network.head.last.weight, std=0.1)
-    return network
-
-
 def test_luminance_is_alphas():
     torch.manual_seed(0)
-    network = lively(GuidedPAT(SMALL))
+    network = GuidedPAT(SMALL)
     alpha, beta = torch.rand(2, 1, *HW), torch.rand(2, 3, 32, 64)
     fused = fused_at_once(network, Inputs.of(alpha, [beta], [rectified((32, 64))]))
     assert (luminance(fused.image) - alpha).abs().max() < 1e-5
@@ -41,7 +35,7 @@ def test_luminance_is_alphas():
 def test_three_filtered_cameras_serve_as_one():
     """The same colours from three cameras in one place, up to what their guides (bands, not luma) say."""
     torch.manual_seed(0)
-    network = lively(GuidedPAT(SMALL))
+    network = GuidedPAT(SMALL)
     alpha, grey = torch.rand(1, 1, *HW), torch.rand(1, 1, *HW)
     one = fused_at_once(network, Inputs.of(alpha, [grey.expand(-1, 3, -1, -1)], [rectified()]))
     three = fused_at_once(network, Inputs.of(alpha, [grey] * 3, [rectified()] * 3))
@@ -66,7 +60,7 @@ def test_the_window_stays_around_the_match():
 
 def test_gradients_reach_the_rig():
     torch.manual_seed(0)
-    network = lively(GuidedPAT(SMALL))
+    network = GuidedPAT(SMALL)
     translation = torch.tensor([-0.2, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
     camera = Camera(K=intrinsics(60.0, HW), cam_from_world=Pose.identity(), hw=HW)
     beta = camera.replace(cam_from_world=Pose(torch.eye(3, dtype=torch.float64), translation))
@@ -87,7 +81,7 @@ def test_gradients_reach_the_rig():
 
 def test_no_valid_segment_is_no_confidence():
     torch.manual_seed(0)
-    network = lively(GuidedPAT(SMALL))
+    network = GuidedPAT(SMALL)
     pair = Pair(View(hw=HW), View(hw=HW))
     nowhere = FieldOnGrid.of(lambda _, x: Segments(x, x, torch.zeros_like(x[..., 0], dtype=torch.bool)), pair)
     fused = fused_at_once(network, Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [nowhere]))
@@ -95,10 +89,9 @@ def test_no_valid_segment_is_no_confidence():
     assert fused.image.isfinite().all()
 
 
-def test_without_a_head_the_image_is_what_was_matched_and_propagated():
+def test_where_it_is_sure_the_image_is_what_was_matched():
     torch.manual_seed(0)
-    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8), head_dim=0, keep_luminance=False))
-    assert not [name for name in network.state_dict() if name.startswith(("head", "propagate"))]
+    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8), keep_luminance=False))
     alpha, beta = torch.rand(1, 1, *HW), torch.rand(1, 3, *HW)
     torch.nn.init.constant_(network.confidence[2].bias, 20.0)
     inputs = Inputs.of(alpha, [beta], [rectified()])
@@ -135,7 +128,7 @@ def test_features_are_as_exact_as_the_image_and_positions_more(monkeypatch):
 
     monkeypatch.setattr(guided, "attend_with_statistics", noted)
     images = torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)]
-    found = fused_at_once(lively(GuidedPAT(SMALL)).eval(), Inputs.of(*images, [rectified()]))
+    found = fused_at_once(GuidedPAT(SMALL).eval(), Inputs.of(*images, [rectified()]))
     assert asked == [{torch.float32, torch.float64}]
     assert found.position[0].dtype == torch.float64
 

@@ -95,7 +95,7 @@ def weights_file(path, config, network="GuidedPAT", state=None) -> None:
     ("network", "config", "problem"),
     [
         ("GuidedPAT", {"widths": [16, 32, 40, 10**9]}, r"widths is 1000000000; wanted 1 to 1024"),
-        ("GuidedPAT", {"widths": [1024] * 4, "fine_dim": 1024, "head_dim": 1024}, "do not fit the GuidedPAT"),
+        ("GuidedPAT", {"widths": [1024] * 4, "fine_dim": 1024}, "do not fit the GuidedPAT"),
         ("GuidedPAT", {"propagation_steps": [1] * 10**5}, "propagation_steps has 100000 entries"),
         ("GuidedPAT", {"widths": 5}, "widths: is 5; wanted a list"),
         ("GuidedPAT", {"widths": [16, 32, 40, "x"]}, r"widths\[3\]: is 'x'; wanted a whole number"),

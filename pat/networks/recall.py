@@ -1,0 +1,86 @@
+"""Colour by example: C3 attention of alpha to itself, far around.
+
+What no beta sees has often the texture of something that one sees. A pixel's query, and another's key, is
+alpha around it at three sizes; the score is the squared distance of the two, less the farther they are apart,
+and counts what betas are certain of. Nothing is trained. It is the non-local mean (Buades et al. 2005) of
+colour, by the compiled attention: no patches are gathered.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, pad, pixel_unshuffle
+
+from arraygeom import Local
+from arraygeom.pixels import pixel_grid
+
+from ..attention import attend
+from ..matching.filters import box_mean
+from ..support.settings import size, tuned
+from .blocks import enlarge
+
+
+@dataclass(frozen=True)
+class RecallSettings:
+    """Pixels are those of half the size."""
+
+    around: tuple[tuple[int, int, float], ...] = tuned(
+        ((0, 2, 1.0), (1, 5, 0.8), (4, 10, 0.6)),
+        "Middlebury, tune half: the radius of two means, and spacing and weight of 3 x 3 pixels of these, "
+        "at each size",
+    )
+    difference: float = tuned(
+        0.04, "Middlebury, tune half: squared distance of keys at which the weight falls to 1 / e"
+    )
+    distance: float = tuned(10.0, "Middlebury, tune half: pixels at which the weight falls to 1 / e")
+    certainty: int = tuned(
+        3, "Middlebury, tune half: the power of confidence, squared, that a pixel counts by"
+    )
+    least_weight: float = size(1e-3, "The least weight of a pixel")
+    side: int = size(33, "A pixel looks at so many in each row and column")
+    spacing: int = size(6, "The distance of these: 96 pixels to each side in all")
+
+
+SETTINGS = RecallSettings()
+FIELD = Local(SETTINGS.side, spacing=SETTINGS.spacing)
+
+
+def recalled(
+    alpha: Float[Tensor, "b 1 h w"],
+    colour: Float[Tensor, "b c h w"],
+    confidence: Float[Tensor, "b c h w"],
+) -> Float[Tensor, "b c h w"]:
+    """The colour of what is seen and looks alike in alpha; of four pixels together."""
+    certain = confidence.mean(1, keepdim=True)
+    weight, keys = avg_pool2d(certain, 2), surroundings(alpha)
+    seen = avg_pool2d(colour * certain, 2) / (weight + SETTINGS.least_weight)
+    counts = (weight.square() + SETTINGS.least_weight).log() * SETTINGS.certainty
+    scores = counts - torch.linalg.vector_norm(keys, dim=1, keepdim=True).square() / 2
+    query, key = torch.cat([keys, torch.ones_like(weight)], 1), torch.cat([keys, scores], 1)
+    del keys
+    found = attend(query, key, seen, FIELD, interpolation="nearest", bias=nearness().to(alpha))
+    return enlarge(found)
+
+
+def nearness() -> Float[Tensor, " n"]:
+    """What is added to the score of each pixel of the field for its distance."""
+    side = SETTINGS.side
+    offsets = pixel_grid((side, side)).flatten(0, 1) - (side - 1) / 2
+    return offsets.norm(dim=-1) * (-SETTINGS.spacing / SETTINGS.distance)
+
+
+def surroundings(alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b d h/2 w/2"]:
+    """Alpha's own four pixels, and smoothed ones around them: keys that are near where alpha looks alike."""
+    alpha = alpha * (2 / SETTINGS.difference) ** 0.5
+    half, parts = avg_pool2d(alpha, 2), [pixel_unshuffle(alpha, 2)]
+    h, w = half.shape[-2:]
+    for radius, spacing, weight in SETTINGS.around:
+        smooth = weight * (box_mean(box_mean(half, radius), radius) if radius else half)
+        around = pad(smooth, (spacing,) * 4, mode="replicate")
+        shifts = range(0, 2 * spacing + 1, spacing)
+        parts += [around[..., y : y + h, x : x + w] for y in shifts for x in shifts]
+    return torch.cat(parts, 1)
