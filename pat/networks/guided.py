@@ -3,7 +3,8 @@
 Our own network, for one alpha whose detail is to be preserved and betas that have colour. Matching
 (`pat.matching`) has found each pixel's position along its segment; attention samples a short window around it
 at full size. The network estimates the confidence that the match is the point that alpha sees, propagates
-colour from pixels of high confidence to the others, and adds it to alpha.
+colour from pixels of high confidence to the others, by likeness and by example (`recall`), and adds it to
+alpha.
 """
 
 from __future__ import annotations
