@@ -30,7 +30,7 @@ from ..support.settings import size, tuned
 from .blocks import ResidualBlock, channels_last, conv, enlarge, stacked
 from .configs import GuidedPATConfig
 from .protocol import FusionOutput, JoinsBands, required
-from .recall import recalled
+from .recall import with_examples
 
 
 @dataclass(frozen=True)
@@ -192,8 +192,8 @@ class GuidedPAT(nn.Module):
         """What all bands have more than alpha: where the betas see it, and where not."""
         confidence = _joined([s.blending.expand_as(s.colour) for s in estimates])
         colour = _joined([s.colour for s in estimates])
-        alike = recalled(alpha, colour, confidence)
-        unseen = torch.lerp(_joined([self._unseen(own, s) for s in estimates]), alike, (1 - confidence) / 2)
+        unseen = _joined([self._unseen(own, s) for s in estimates])
+        unseen = with_examples(unseen, alpha, colour, confidence)
         return torch.lerp(unseen, colour, confidence)
 
     def _unseen(self, own: Encoded, estimate: BetaEstimate) -> Tensor:

@@ -40,6 +40,11 @@ class RecallSettings:
     certainty: int = tuned(
         3, "Middlebury, tune half: the power of confidence, squared, that a pixel counts by"
     )
+    share: float = tuned(
+        1 / 3,
+        "Middlebury, tune half: of what no beta sees, so much is by example: at 1/2 the mean is the same, "
+        "and pairs with little texture lose more",
+    )
     least_weight: float = size(1e-3, "The least weight of a pixel")
     side: int = size(33, "A pixel looks at so many in each row and column")
     spacing: int = size(6, "The distance of these: 96 pixels to each side in all")
@@ -47,6 +52,16 @@ class RecallSettings:
 
 SETTINGS = RecallSettings()
 FIELD = Local(SETTINGS.side, spacing=SETTINGS.spacing)
+
+
+def with_examples(
+    unseen: Float[Tensor, "b c h w"],
+    alpha: Float[Tensor, "b 1 h w"],
+    colour: Float[Tensor, "b c h w"],
+    confidence: Float[Tensor, "b c h w"],
+) -> Float[Tensor, "b c h w"]:
+    """Colour for where no beta sees the point, in part by example, the less certain a pixel is the more."""
+    return torch.lerp(unseen, recalled(alpha, colour, confidence), SETTINGS.share * (1 - confidence))
 
 
 def recalled(

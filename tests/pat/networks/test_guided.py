@@ -9,7 +9,7 @@ from pat.data.sample_array import load_sample
 from pat.fusion.fuse import fuse
 from pat.matching.inputs import Inputs
 from pat.media.colour import luminance
-from pat.networks import guided
+from pat.networks import guided, recall
 from pat.networks.configs import GuidedPATConfig
 from pat.networks.guided import GuidedPAT, window_around
 from pat.networks.protocol import fused_at_once, matched_for
@@ -100,16 +100,16 @@ def test_where_it_is_sure_the_image_is_what_was_matched():
     assert torch.allclose(fused.image - alpha, seen.colour, atol=1e-3)
 
 
-def test_what_no_beta_sees_is_half_by_example(monkeypatch):
+def test_what_no_beta_sees_is_by_example_in_part(monkeypatch):
     torch.manual_seed(0)
     network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8), keep_luminance=False))
     torch.nn.init.constant_(network.confidence[2].bias, -30.0)
     inputs = Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [rectified()])
     images = []
-    for recalled in (0.0, 0.2):
-        monkeypatch.setattr(guided, "recalled", lambda _, colour, __, by=recalled: torch.full_like(colour, by))
+    for found in (0.0, 0.2):
+        monkeypatch.setattr(recall, "recalled", lambda _, colour, __, by=found: torch.full_like(colour, by))
         images.append(fused_at_once(network, inputs).image)
-    assert torch.allclose(images[1] - images[0], torch.tensor(0.1), atol=1e-4)
+    assert torch.allclose(images[1] - images[0], torch.tensor(0.2 * recall.SETTINGS.share), atol=1e-4)
 
 
 def test_colour_counts_more_where_brightness_is_alike():
