@@ -1,9 +1,9 @@
 """Colour by example: C3 attention of alpha to itself, far around.
 
 What no beta sees has often the texture of something that one sees. A pixel's query, and another's key, is
-alpha around it at three sizes; the score is the squared distance of the two, less the farther they are apart,
-and counts what betas are certain of. Nothing is trained. It is the non-local mean (Buades et al. 2005) of
-colour, by the compiled attention: no patches are gathered.
+alpha around it at three sizes. The score falls with the squared distance of the two and with how far apart
+the pixels are, and rises with the confidence of what is found. Nothing is trained. It is the non-local mean
+(Buades et al. 2005) of colour, by the compiled attention: no patches are gathered.
 """
 
 from __future__ import annotations
@@ -69,8 +69,9 @@ def recalled(
     colour: Float[Tensor, "b c h w"],
     confidence: Float[Tensor, "b c h w"],
 ) -> Float[Tensor, "b c h w"]:
-    """The colour of what is seen and looks alike in alpha; of four pixels together."""
-    certain = confidence.mean(1, keepdim=True)
+    """The colour of what is seen and looks alike in alpha, at half the size and enlarged. A pixel
+    counts as far as all bands are certain, which several betas may have."""
+    certain = confidence.amin(1, keepdim=True)
     weight, keys = avg_pool2d(certain, 2), surroundings(alpha)
     seen = avg_pool2d(colour * certain, 2) / (weight + SETTINGS.least_weight)
     counts = (weight.square() + SETTINGS.least_weight).log() * SETTINGS.certainty
@@ -82,7 +83,7 @@ def recalled(
 
 
 def nearness() -> Float[Tensor, " n"]:
-    """What is added to the score of each pixel of the field for its distance."""
+    """What is added to the score of each pixel of the field: the less the farther off it is."""
     side = SETTINGS.side
     offsets = pixel_grid((side, side)).flatten(0, 1) - (side - 1) / 2
     return offsets.norm(dim=-1) * (-SETTINGS.spacing / SETTINGS.distance)

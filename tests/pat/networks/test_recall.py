@@ -31,6 +31,15 @@ def test_colour_is_that_of_what_looks_alike(stripes):
     assert (found - expected).abs().mean() < 0.2 * (nearest - expected).abs().mean()
 
 
+def test_a_pixel_counts_where_all_bands_are_certain(stripes):
+    """Bands of several betas: one of them is wrong, and known to be, in the nearer part."""
+    alpha, colour, confidence = stripes
+    wrong, doubted = colour.clone(), confidence.clone()
+    wrong[:, :1, :, 40:80], doubted[:, :1, :, 40:80] = 1.0, 0.0
+    found = recalled(alpha, wrong, doubted)[..., :20]
+    assert (found - colour[..., :20]).abs().mean() < 0.03
+
+
 def test_nearer_pixels_count_more():
     near = nearness().view(SETTINGS.side, -1)
     middle = SETTINGS.side // 2
