@@ -150,7 +150,7 @@ class GuidedPAT(nn.Module):
         )
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
-        """In the head; or around attention, one beta after the other, and the estimates of others."""
+        """In what is recalled; or around attention, one beta after the other, and the estimates of others."""
         most = max(betas, default=0)
         return max(350.0 * alpha, 145.0 * alpha + 100.0 * most) + 130.0 * alpha * max(len(betas) - 1, 0)
 
