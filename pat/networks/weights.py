@@ -72,8 +72,22 @@ def load_weights(name: str | Path, *, precision: Precision = "float32") -> Netwo
     if precision == "bfloat16":
         if not (torch.cpu._is_avx512_bf16_supported() or torch.cuda.is_available()):
             raise ValueError("this processor does not multiply bfloat16: leave the precision at float32")
-        for part in convolutions(network):
-            in_bfloat16(part)
+        set_precision(network, precision)
+    return network
+
+
+def new_network(config: Any, start: Path | None = None) -> Network:
+    """A network, with the weights of a file to start from. Raises ValueError if those are another's."""
+    network: Network = next(made for made, of in NETWORKS.values() if type(config) is of)(config)
+    if start is not None:
+        weights = load_weights(start)
+        if type(weights) is not type(network) or weights.config != config:
+            raise ValueError(
+                f"start: {start} holds a {type(weights).__name__} of {weights.config}, "
+                f"the recipe is for a {type(network).__name__} of {config}: give its own recipe, "
+                "or leave `start` out"
+            )
+        network.load_state_dict(weights.state_dict())
     return network
 
 
@@ -82,10 +96,19 @@ def weights_for(bands: Sequence[int]) -> str:
     return "mono-colour" if all(count == 3 for count in bands) else "mono-spectral"
 
 
-def convolutions(network: nn.Module) -> list[nn.Module]:
-    """The parts without attention, whose search segments are functions that torch.compile would break at."""
+def set_precision(network: nn.Module, precision: Precision, *, compiled: bool = False) -> None:
+    """Let convolutions compute in this precision, and compile them by torch.compile.
+
+    Not attention, whose search segments are functions that torch.compile would break at.
+    """
     inner = network.single if isinstance(network, BandwisePAT) else network
-    return [part for part in inner.children() if not isinstance(part, (AttentionEngine, nn.ModuleList))]
+    for part in inner.children():
+        if isinstance(part, (AttentionEngine, nn.ModuleList)):
+            continue
+        if precision == "bfloat16":
+            in_bfloat16(part)
+        if compiled:
+            part.compile()
 
 
 def load_denoiser(path: str | Path = DENOISER) -> LowLightNetwork:

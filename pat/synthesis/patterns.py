@@ -22,7 +22,8 @@ def recoloured(images: list[np.ndarray], rng: np.random.Generator, count: int) -
 
     The correlation of colour and luminance of photographs does not hold here.
     """
-    return [to_bytes(_mixed(images, rng)) for _ in range(count)]
+    mixed = (_mixed(images, rng) for _ in range(count))
+    return [to_bytes(image) for image in mixed]
 
 
 def _mixed(images: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:

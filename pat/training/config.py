@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Union
+from typing import TYPE_CHECKING, Literal, Union
 
 import tyro
 import yaml
@@ -181,17 +181,21 @@ def parse_config(text: str, name: str = "config") -> TrainConfig:
     """A recipe from YAML text. Raises ValueError naming the entry."""
     values = parse_yaml(text, name) or {}
     try:
-        return _config(values)
+        if not isinstance(values, Mapping):
+            raise ValueError(f"wanted entries (name: value), got {values!r}")
+        config = from_document(TrainConfig, {k: v for k, v in values.items() if k != "network"})
+        if "network" not in values:
+            return config
+        network = values["network"]
+        if not isinstance(network, Mapping):
+            raise ValueError(f"network: wanted entries such as kind: GuidedPAT, got {network!r}")
+        kind = network.get("kind", "GuidedPAT")
+        if kind not in CONFIGS:
+            raise ValueError(f"network.kind: no network '{kind}'{near(kind, CONFIGS)}")
+        entries = {k: v for k, v in network.items() if k != "kind"}
+        return replace(config, network=from_document(CONFIGS[kind], entries, "network"))
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
-
-
-def _config(values: Any) -> TrainConfig:
-    """All but the network first: its entries depend on its kind."""
-    if not isinstance(values, Mapping):
-        raise ValueError(f"wanted entries (name: value), got {values!r}")
-    config = from_document(TrainConfig, {k: v for k, v in values.items() if k != "network"})
-    return replace(config, network=_network_config(values["network"])) if "network" in values else config
 
 
 def config_text(config: TrainConfig) -> str:
@@ -206,7 +210,8 @@ def save_config(config: TrainConfig, path: Path) -> None:
     """Write `config_text` atomically."""
     from arraygeom.atomic import write_text
 
-    write_text(path, config_text(config))
+    text = config_text(config)
+    write_text(path, text)
 
 
 def command_line(arguments: list[str]) -> TrainConfig:
@@ -235,13 +240,3 @@ def difference(config: TrainConfig, other: TrainConfig) -> str | None:
         if entry.name not in UNSEEN and ours != theirs:
             return f"{entry.name}: {ours}, {theirs}"
     return None
-
-
-def _network_config(values: Any) -> NetworkConfig:
-    """The configuration of a network from its entries and its `kind`."""
-    if not isinstance(values, Mapping):
-        raise ValueError(f"network: wanted entries such as kind: GuidedPAT, got {values!r}")
-    kind = values.get("kind", "GuidedPAT")
-    if kind not in CONFIGS:
-        raise ValueError(f"network.kind: no network '{kind}'{near(kind, CONFIGS)}")
-    return from_document(CONFIGS[kind], {k: v for k, v in values.items() if k != "kind"}, "network")

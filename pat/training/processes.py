@@ -58,6 +58,15 @@ class Process:
         if self.count > 1:
             distributed.barrier()
 
+    @contextmanager
+    def before_others(self) -> Iterator[None]:
+        """A block that the first process goes through before the others, for which it may leave a file."""
+        if not self.first:
+            self.wait()
+        yield
+        if self.first:
+            self.wait()
+
 
 @contextmanager
 def process(device: str = "auto") -> Iterator[Process]:

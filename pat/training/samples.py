@@ -8,12 +8,14 @@ where it stopped, and processes share a step without communication.
 
 from __future__ import annotations
 
+import dataclasses
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -38,7 +40,7 @@ from pat.synthesis.rigs import below
 from .config import RecordingConfig, TrainConfig
 from .lenses import LOST, MOST, Spectra, through_lenses
 from .measured import MeasuredPairs
-from .scenes import RenderedCrops
+from .scenes import Crops, RenderedCrops
 from .stereo import PairCrops
 
 CACHED = 48
@@ -67,6 +69,21 @@ class Sample(NamedTuple):
         return Inputs.of(self.alpha, self.betas, self.fields)
 
 
+class Mixture(NamedTuple):
+    """What steps record: entries as of `TrainConfig`, and the shares of `sources` other than photographs."""
+
+    reuse: float
+    filtered: float
+    rectified: float
+    sources: Mapping[str, float]
+
+    @classmethod
+    def of(cls, config: TrainConfig) -> Mixture:
+        """That of a recipe."""
+        sources = {"rendered": config.rendered, "pairs": config.pairs, "measured": config.measured}
+        return cls(config.reuse, config.filtered, config.rectified, sources)
+
+
 class Planned(NamedTuple):
     """The scenes that a step records: their number, and the kind of their rigs."""
 
@@ -77,15 +94,17 @@ class Planned(NamedTuple):
     """The number of the scenes to drop from the cache."""
 
 
-def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
+def plan(mixture: Mixture, seed: int) -> Iterator[Planned]:
     """What each step records, from step 0: new scenes, or some of the last `CACHED` again."""
     draw = random.Random(seed)
     cached: list[Planned] = []
     for number in range(2**62):
-        new = len(cached) < FEW or draw.random() < 1 / config.reuse
+        new = len(cached) < FEW or draw.random() < 1 / mixture.reuse
         if new:
-            kind = _source(config, draw) or ("rectified" if draw.random() < config.rectified else "general")
-            betas = 3 if draw.random() < config.filtered else 1
+            kind = _source(mixture.sources, draw) or (
+                "rectified" if draw.random() < mixture.rectified else "general"
+            )
+            betas = 3 if draw.random() < mixture.filtered else 1
             dropped = cached.pop() if len(cached) > CACHED else None
             cached.insert(0, Planned(number, kind, betas, None))
             yield cached[0]._replace(dropped=dropped.scenes if dropped else None)
@@ -93,45 +112,34 @@ def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
             yield cached[int(draw.random() * len(cached))]
 
 
-def _source(config: TrainConfig, draw: random.Random) -> str | None:
+def _source(shares: Mapping[str, float], draw: random.Random) -> str | None:
     """The source of scenes, if not photographs. Draws only where there is a choice."""
-    if not (config.rendered or config.pairs or config.measured):
+    if not any(shares.values()):
         return None
     drawn = draw.random()
-    for kind in ("rendered", "pairs", "measured"):
-        drawn -= getattr(config, kind)
+    for kind, share in shares.items():
+        drawn -= share
         if drawn < 0:
             return kind
     return None
 
 
+@dataclass
 class SampleSource:
     """Samples by the number of the step: called with a count it gives the first group of that many steps.
 
-    `photos` may be None where all batches come from `folders`, by kind of scenes.
+    Scenes are of `layered`, by the kind of their rigs and the number of betas, or of `folders`, by their
+    kind; `batch` of them are a group's.
     """
 
-    def __init__(
-        self,
-        photos: PhotoBank | None,
-        config: TrainConfig,
-        seed: int,
-        field: ReceptiveField,
-        device: str = "cpu",
-        *,
-        folders: Mapping[str, RenderedCrops | PairCrops] | None = None,
-    ):
-        self.config, self.seed, self.field, self.folders = config, seed, field, folders or {}
-        kinds = {"rectified": config.rectified_rigs, "general": config.general_rigs}
-        self.makers = {
-            (kind, betas): LayeredScenes(
-                photos, replace(rigs, betas=betas), hw=config.hw, seed=seed, device=device
-            )
-            for kind, rigs in kinds.items()
-            for betas in (1, 3)
-            if photos is not None
-        }
-        self.cache: dict[tuple[int, int], ArrayBatch] = {}
+    layered: Mapping[tuple[str, int], LayeredScenes]
+    folders: Mapping[str, Crops]
+    mixture: Mixture
+    batch: int
+    seed: int
+    field: ReceptiveField
+    recording: RecordingConfig
+    cache: dict[tuple[int, int], ArrayBatch] = dataclasses.field(default_factory=dict)
 
     def __call__(self, count: int) -> Iterator[Sample]:
         """The first group of the first `count` steps."""
@@ -139,7 +147,7 @@ class SampleSource:
 
     def steps(self, groups: list[int], *, start: int = 0) -> Iterator[list[Sample]]:
         """The samples of these groups, step by step, from step `start` on."""
-        for step, planned in enumerate(plan(self.config, self.seed)):
+        for step, planned in enumerate(plan(self.mixture, self.seed)):
             for key in [key for key in self.cache if key[0] == planned.dropped]:
                 del self.cache[key]
             if step >= start:
@@ -151,14 +159,13 @@ class SampleSource:
             g = _generator(self.seed, SCENE, planned.scenes, group)
             self.cache[planned.scenes, group] = self._made(planned, g)
         g = _generator(self.seed, RECORDING, step, group)
-        scene = self.cache[planned.scenes, group]
-        return degraded(scene, g, field=self.field, recording=self.config.recording)
+        return degraded(self.cache[planned.scenes, group], g, field=self.field, recording=self.recording)
 
     def _made(self, planned: Planned, g: Generator) -> ArrayBatch:
         if planned.kind in self.folders:
             crops = self.folders[planned.kind]
-            return crops.sample(self.config.batch, g, number=planned.scenes, betas=planned.betas)
-        return self.makers[planned.kind, planned.betas].sample(self.config.batch, g)
+            return crops.sample(self.batch, g, number=planned.scenes, betas=planned.betas)
+        return self.layered[planned.kind, planned.betas].sample(self.batch, g)
 
 
 def made_ahead(samples: Iterator[list[Sample]], network: FusionNetwork) -> Iterator[list[Sample]]:
@@ -185,33 +192,48 @@ def scenes(
     layered = config.rendered + config.pairs + config.measured < 1
     bank, unseen = photographs(config) if layered else (None, None)
     look, n = field or FIELDS[config.field](), config.held_out
-    learn, validate = config.seed + 1, config.seed + 2
-    known, new = (
-        crops(config, learn, device, lambda i: i % n != 0),
-        crops(config, validate, device, lambda i: i % n == 0),
-    )
-    return (
-        SampleSource(bank, config, learn, look, device, folders=known),
-        SampleSource(unseen, config, validate, look, device, folders=new),
-    )
+
+    def source(photos: PhotoBank | None, seed: int, choose: Callable[[int], bool]) -> SampleSource:
+        return source_of(config, photos, seed, look, device, crops(config, seed, device, choose))
+
+    learn = source(bank, config.seed + 1, lambda i: i % n != 0)
+    return learn, source(unseen, config.seed + 2, lambda i: i % n == 0)
 
 
-def crops(
-    config: TrainConfig, seed: int, device: str, choose: Callable[[int], bool]
-) -> dict[str, RenderedCrops | PairCrops]:
+def source_of(
+    config: TrainConfig,
+    photos: PhotoBank | None,
+    seed: int,
+    field: ReceptiveField,
+    device: str = "cpu",
+    folders: Mapping[str, Crops] = {},
+) -> SampleSource:
+    """A recipe's samples. `photos` may be None where all batches come from `folders`, by kind of scenes."""
+    kinds = {"rectified": config.rectified_rigs, "general": config.general_rigs}
+    layered = {
+        (kind, betas): LayeredScenes(
+            photos, replace(rigs, betas=betas), hw=config.hw, seed=seed, device=device
+        )
+        for kind, rigs in kinds.items()
+        for betas in (1, 3)
+        if photos is not None
+    }
+    return SampleSource(layered, folders, Mixture.of(config), config.batch, seed, field, config.recording)
+
+
+def crops(config: TrainConfig, seed: int, device: str, choose: Callable[[int], bool]) -> dict[str, Crops]:
     """Windows of rendered scenes and of pairs, by kind; of each the items chosen by their number."""
-    found: dict[str, RenderedCrops | PairCrops] = {}
-    common: dict[str, Any] = {"hw": config.hw, "seed": seed, "device": device, "choose": choose}
-    if config.rendered_from:
-        rigs = config.general_rigs
-        found["rendered"] = RenderedCrops(config.rendered_from, resolutions=rigs.resolutions, **common)
-    if config.pairs_from:
-        rigs = config.rectified_rigs
-        found["pairs"] = PairCrops(config.pairs_from, resolutions=rigs.resolutions, **common)
-    if config.measured_from:
-        rigs = config.rectified_rigs
-        found["measured"] = MeasuredPairs(config.measured_from, resolutions=rigs.resolutions, **common)
-    return found
+    general, rectified = config.general_rigs.resolutions, config.rectified_rigs.resolutions
+    sources: dict[str, tuple[type[Crops], tuple[Path, ...], tuple[float, ...]]] = {
+        "rendered": (RenderedCrops, config.rendered_from, general),
+        "pairs": (PairCrops, config.pairs_from, rectified),
+        "measured": (MeasuredPairs, config.measured_from, rectified),
+    }
+    return {
+        name: kind(folders, hw=config.hw, resolutions=resolutions, seed=seed, device=device, choose=choose)
+        for name, (kind, folders, resolutions) in sources.items()
+        if folders
+    }
 
 
 def photographs(config: TrainConfig) -> tuple[PhotoBank, PhotoBank]:
@@ -337,10 +359,8 @@ def alone(given: Sample, i: int) -> Sample:
     def one(parts: Sequence[Tensor]) -> list[Tensor]:
         return [part if len(part) == 1 else part[i : i + 1] for part in parts]
 
-    (alpha, ground_truth), on_grid = (
-        one([given.alpha, given.ground_truth]),
-        [f.of_one(i) for f in given.fields],
-    )
+    alpha, ground_truth = one([given.alpha, given.ground_truth])
+    on_grid = [f.of_one(i) for f in given.fields]
     return Sample(alpha, one(given.betas), on_grid, ground_truth, one(given.position), one(given.visible))
 
 

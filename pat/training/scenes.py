@@ -69,6 +69,10 @@ class Crops:
         """List the items, and refuse what cannot be used."""
         raise NotImplementedError
 
+    def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
+        """Windows of group `number`, of the items active then."""
+        raise NotImplementedError
+
     def beta_sizes(self, betas: int, generator: Generator) -> list[HW]:
         """Sizes of betas, drawn."""
         return [scaled(self.hw, one_of(self.resolutions, generator)) for _ in range(betas)]

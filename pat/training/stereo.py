@@ -1,14 +1,16 @@
 """Stereo pairs as training samples: a random window of an image as alpha and truth, of the other as beta.
 
-Their depth is not known, so the loss is on the image alone. Their cameras are assumed: rectified, a metre
+Where their depth is not known, the loss is on the image alone. Their cameras are assumed: rectified, a metre
 apart, with the pair's range of disparities.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -30,6 +32,15 @@ REDUCED = 2
 """The largest reduction of a window: images found online are often less sharp than their pixels."""
 
 
+class Pictures(NamedTuple):
+    """Two images (3, H, W), the largest disparity, pixels; and their disparities (H, W), 0 if not known."""
+
+    left: Tensor
+    right: Tensor
+    largest: float
+    disparities: tuple[Tensor, ...] = ()
+
+
 class PairCrops(Crops):
     """Random windows of the rectified stereo pairs in folders.
 
@@ -41,34 +52,61 @@ class PairCrops(Crops):
         found = [pair for root in roots for pair in pair_files(root)]
         self.pairs = chosen(found, choose, f"stereo pairs of {', '.join(map(str, roots))}")
         for pair in self.pairs:
-            check_pair(pair, self.hw)
-        self._images = lru_cache(ACTIVE)(
-            lambda i: (read_image(self.pairs[i].left), read_image(self.pairs[i].right))
-        )
+            self.check(pair)
+        self._pictures = lru_cache(ACTIVE)(lambda i: self.read(self.pairs[i]))
+
+    def check(self, pair: PairFiles) -> None:
+        """Raise ValueError for a pair that cannot be used."""
+        check_pair(pair, self.hw)
+
+    def read(self, pair: PairFiles) -> Pictures:
+        """The images of a pair."""
+        return Pictures(read_image(pair.left), read_image(pair.right), pair.max_disparity)
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
         """Windows of group `number`, of the pairs active then. Several betas are of the same camera.
 
-        There is no `depth`.
+        `depth` is NaN where it is not known, and there is none without disparities.
         """
         active = active_items(number, len(self.pairs), self.seed)
         sizes = self.beta_sizes(betas, generator)
         drawn = [self._window(one_of(active, generator), generator) for _ in range(batch)]
-        alpha, beta = (torch.stack(images) for images in list(zip(*drawn))[:2])
-        side, disparity = (torch.tensor(numbers, dtype=torch.float64) for numbers in list(zip(*drawn))[2:])
-        chosen_images = [alpha, *(reduced(beta, size).clamp(max=1) for size in sizes)]
-        return assumed_cameras(chosen_images, side, disparity, self.device)
+        images, disparities, sides, largest = zip(*drawn)
+        alpha, beta = (torch.stack(same) for same in zip(*images))
+        side, nearest = (torch.tensor(numbers, dtype=torch.float64) for numbers in (sides, largest))
+        shown = [alpha, *(reduced(beta, size).clamp(max=1) for size in sizes)]
+        cameras = assumed_cameras(shown, side, nearest, self.device)
+        if not disparities[0]:
+            return cameras
+        near, far = (depth_of(torch.stack(same), self.hw[1]) for same in zip(*disparities))
+        depth = [near, *(coarser(far, size) for size in sizes)]
+        return replace(cameras, depth=[d.to(self.device) for d in depth])
 
-    def _window(self, i: int, g: Generator) -> tuple[Tensor, Tensor, float, float]:
-        """Alpha, beta, 1 where alpha is left and -1 where it is right, and the largest disparity."""
-        images, (h, w) = self._images(i), self.hw
-        hw = images[0].shape[1:]
-        times = 1 + below(min(REDUCED, hw[0] // h, hw[1] // w), g)
-        top, left = (below(whole - times * n + 1, g) for whole, n in zip(hw, self.hw))
-        cut = [p[:, top : top + times * h, left : left + times * w] for p in images]
-        small = [reduced(p[None], self.hw)[0].clamp(max=1) for p in cut]
-        far = self.pairs[i].max_disparity / times
-        return (small[0], small[1], 1.0, far) if below(2, g) else (small[1], small[0], -1.0, far)
+    def _window(self, i: int, g: Generator) -> tuple[list[Tensor], list[Tensor], float, float]:
+        """Alpha and beta, their disparities, 1 where alpha is left, -1 where right, the largest disparity."""
+        pictures, (h, w) = self._pictures(i), self.hw
+        whole = pictures.left.shape[1:]
+        times = 1 + below(min(REDUCED, whole[0] // h, whole[1] // w), g)
+        top, left = (below(n - times * m + 1, g) for n, m in zip(whole, self.hw))
+        window = slice(top, top + times * h), slice(left, left + times * w)
+        cut = [p[None, :, *window] for p in (pictures.left, pictures.right)]
+        images = [reduced(p, self.hw)[0].clamp(max=1) for p in cut]
+        disparities = [d[window][::times, ::times] / times for d in pictures.disparities]
+        if below(2, g):
+            return images, disparities, 1.0, pictures.largest / times
+        return images[::-1], disparities[::-1], -1.0, pictures.largest / times
+
+
+def depth_of(disparity: Float[Tensor, "b h w"], width: int) -> Float[Tensor, "b h w"]:
+    """Of the cameras of `assumed_cameras`, in metres; NaN where the disparity is 0."""
+    return torch.where(disparity > 0, width / disparity, torch.nan)
+
+
+def coarser(depth: Float[Tensor, "b h w"], hw: HW) -> Float[Tensor, "b hs ws"]:
+    """The depth at about the centres of larger pixels, never a mean across an edge."""
+    h, w = depth.shape[-2:]
+    rows, columns = (((torch.arange(n) + 0.5) * whole / n).long() for n, whole in zip(hw, (h, w)))
+    return depth[:, rows][:, :, columns]
 
 
 def assumed_cameras(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,6 @@ from arraygeom.atomic import write_text
 from pat.media.images import write_image
 from pat.networks.protocol import FusionNetwork
 
-from .config import TrainConfig
 from .losses import explained
 from .samples import Sample
 
@@ -38,12 +38,12 @@ class Watch:
     """Progress reports, of the first process alone.
 
     `steps.csv` has a line for each step and `log.jsonl` one for each validation. Lines of steps after
-    `step`, where the run continues, are removed.
+    `step`, where the run continues, are removed. A step sees so many `scenes`.
     """
 
-    def __init__(self, config: TrainConfig, *, step: int = 0) -> None:
-        self.out = config.out
-        self.board = _board(config.out / "tensorboard") if config.tensorboard else None
+    def __init__(self, out: Path, step: int, scenes: int, *, tensorboard: bool) -> None:
+        self.out, self.scenes, self.ticked = out, scenes, time.monotonic()
+        self.board = _board(out / "tensorboard") if tensorboard else None
         _keep_lines(self.out / "steps.csv", step, lambda line: int(line.partition(",")[0]), header=HEADER)
         _keep_lines(self.out / "log.jsonl", step, lambda line: json.loads(line)["step"])
         self.steps = (self.out / "steps.csv").open("a", encoding="utf-8")
@@ -60,8 +60,10 @@ class Watch:
         self.task = self.bar.add_task("training", total=1.0, step=step, loss=0.0, speed=0.0)
         self.bar.start()
 
-    def step(self, step: int, loss: float, norm: float, rate: float, *, done: float, speed: float) -> None:
-        """Report one step; `done` is the completed fraction of the run, `speed` in scenes a second."""
+    def step(self, step: int, loss: float, norm: float, rate: float, *, done: float) -> None:
+        """Report one step; `done` is the completed fraction of the run."""
+        now = time.monotonic()
+        speed, self.ticked = self.scenes / (now - self.ticked), now
         self.steps.write(f"{step},{loss!r},{norm!r},{rate!r}\n")
         self.bar.update(self.task, completed=min(done, 1.0), step=step, loss=loss, speed=speed)
         if self.board and step % 10 == 0:

@@ -30,7 +30,7 @@ from pat.synthesis.photos import PhotoBank
 from pat.training import loop, losses
 from pat.training.config import TrainConfig, load_config
 from pat.training.losses import validation
-from pat.training.samples import Sample, SampleSource, photographs
+from pat.training.samples import Sample, SampleSource, photographs, source_of
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -129,7 +129,7 @@ class Bench:
         return Found(facts["psnr"], facts["matched"], seconds)
 
     def _source(self, config: TrainConfig, bank: PhotoBank, seed: int) -> SampleSource:
-        return SampleSource(bank, config, seed, FIELDS[config.field]())
+        return source_of(config, bank, seed, FIELDS[config.field]())
 
 
 def unmatched(seen: object, given: Sample) -> torch.Tensor:

@@ -29,12 +29,10 @@ from arraygeom.fields import FIELDS
 from pat.attention import attend
 from pat.attention.reference import Attended
 from pat.evaluation.ablation import sample_photographs
-from pat.networks.blocks import in_bfloat16
-from pat.networks.weights import Network, convolutions
+from pat.networks.weights import Network, new_network, set_precision
 from pat.training.config import TrainConfig, load_config
-from pat.training.loop import new_network
 from pat.training.losses import Objective
-from pat.training.samples import Sample, SampleSource
+from pat.training.samples import Sample, SampleSource, source_of
 
 
 @dataclass
@@ -103,7 +101,7 @@ def stored(given: Sample, folder: Path) -> list[Path]:
 
 
 def source(config: TrainConfig) -> SampleSource:
-    return SampleSource(sample_photographs(), config, 0, FIELDS[config.field]())
+    return source_of(config, sample_photographs(), 0, FIELDS[config.field]())
 
 
 def step(objective: Objective, given: Sample, adam: torch.optim.Optimizer) -> None:
@@ -117,10 +115,10 @@ def papers_network(batch: int, repeats: int) -> None:
     made = source(config)
     given = next(made(1))
     torch.manual_seed(0)
-    ours = Objective(new_network(config), "mse")
-    official = Objective(new_network(config), "mse")
+    ours = Objective(new_network(config.network), "mse")
+    official = Objective(new_network(config.network), "mse")
     official.network.load_state_dict(ours.network.state_dict())
-    along = Objective(new_network(replace(config, field="epipolar")), "mse")
+    along = Objective(new_network(config.network), "mse")
     straight = next(source(replace(config, field="epipolar"))(1))
     with tempfile.TemporaryDirectory() as folder:
         official.network.engine = Materialised(official.network.engine, stored(given, Path(folder)))
@@ -185,12 +183,8 @@ def our_networks(repeats: int, names: tuple[str, ...]) -> None:
 def prepared(config: TrainConfig, *, half: bool, compiled: bool) -> Network:
     """A new network whose convolutions compute as `precision` and `compile` have them."""
     torch.manual_seed(0)
-    network = new_network(config)
-    for part in convolutions(network):
-        if half:
-            in_bfloat16(part)
-        if compiled:
-            part.compile()
+    network = new_network(config.network)
+    set_precision(network, "bfloat16" if half else "float32", compiled=compiled)
     return network
 
 

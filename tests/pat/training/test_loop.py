@@ -1,6 +1,7 @@
 """Runs: what they leave, going on after any stop, several processes, numbers that are not finite."""
 
 import json
+import math
 import os
 import resource
 import shutil
@@ -18,12 +19,12 @@ import torch
 from safetensors import safe_open
 
 from pat.networks.configs import PATConfig
-from pat.networks.weights import load_weights, save_weights
+from pat.networks.weights import load_weights, new_network, save_weights
 from pat.support.locks import folder_lock
 from pat.training import loop
 from pat.training.checkpoints import newest_checkpoint
 from pat.training.config import save_config
-from pat.training.loop import new_network, shape, train
+from pat.training.loop import Schedule, train
 from pat.training.losses import Objective, validation
 from pat.training.processes import Process
 from pat.training.samples import made_ahead, scenes
@@ -58,7 +59,7 @@ def whole(folder):
 def test_samples_are_made_and_matched_ahead(folder):
     """The second while the first is in use; a network that is given their matches computes the same."""
     config, asked = short_run(folder), threading.Event()
-    network = new_network(config)
+    network = new_network(config.network)
 
     def source():
         for number, group in enumerate(scenes(config)[0].steps([0])):
@@ -192,7 +193,7 @@ def test_forty_steps_learn(folder):
         folder, out=folder / "learns", steps=40, batch=1, groups=1, rate=3e-3, validate=20, save=50
     )
     train(config)
-    before = validation(new_network(config).eval(), list(scenes(config)[1](8)))
+    before = validation(new_network(config.network).eval(), list(scenes(config)[1](8)))
     log = [json.loads(line) for line in (config.out / "log.jsonl").read_text().splitlines()]
     assert log[-1]["step"] == 40
     after = max(log, key=lambda line: line["psnr"])
@@ -252,14 +253,14 @@ def test_another_recipe_is_not_mixed_in(whole):
 
 
 def test_starting_from_weights(folder, whole):
-    network = new_network(replace(whole, start=whole.out / "best.safetensors"))
+    network = new_network(SMALL, whole.out / "best.safetensors")
     theirs = load_weights(whole.out / "best.safetensors").state_dict()
     assert all(torch.equal(v, theirs[k]) for k, v in network.state_dict().items())
     with pytest.raises(ValueError, match=r"GuidedPAT .* PAT "):
-        new_network(replace(whole, network=PATConfig(), start=whole.out / "best.safetensors"))
-    save_weights(new_network(replace(whole, network=replace(SMALL, taps=7))), folder / "other.safetensors")
+        new_network(PATConfig(), whole.out / "best.safetensors")
+    save_weights(new_network(replace(SMALL, taps=7)), folder / "other.safetensors")
     with pytest.raises(ValueError, match="give its own recipe"):
-        new_network(replace(whole, start=folder / "other.safetensors"))
+        new_network(SMALL, folder / "other.safetensors")
 
 
 def test_no_photographs(folder, whole):
@@ -288,11 +289,12 @@ def test_half_precision_and_compiled_parts_train(folder, whole):
     assert full == pytest.approx(half, abs=0.05)
 
 
-def test_schedules(whole):
-    assert [shape(replace(whole, warmup=4), s, s / 100) for s in (1, 2)] == [0.25, 0.5]
-    assert shape(whole, 50, 0.5) == pytest.approx(0.5)
-    halving = replace(whole, schedule="halving", warmup=0)
-    assert [shape(halving, 1, done) for done in (0.3, 0.4, 0.8)] == [1, 0.5, 0.25]
+def test_schedules():
+    warm = Schedule(8, math.inf, 1.0, "cosine", warmup=4, validate=4, save=4)
+    assert [warm.rate_at(s, s / 100) for s in (1, 2)] == [0.25, 0.5]
+    assert warm.rate_at(50, 0.5) == pytest.approx(0.5)
+    halving = Schedule(8, math.inf, 1.0, "halving", warmup=0, validate=4, save=4)
+    assert [halving.rate_at(1, done) for done in (0.3, 0.4, 0.8)] == [1, 0.5, 0.25]
 
 
 def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_again(folder, whole):

@@ -8,8 +8,8 @@ from torch import Generator
 from arraygeom import sample
 from pat.media.colour import luminance
 from pat.networks.configs import BandwisePATConfig
+from pat.networks.weights import new_network
 from pat.training.lenses import Spectra
-from pat.training.loop import new_network
 from pat.training.losses import Objective
 from pat.training.samples import scenes
 
@@ -65,7 +65,7 @@ def test_a_network_of_any_bands_learns_from_them(tmp_path):
         network=BandwisePATConfig(widths=(8, 8, 8, 8), taps=5),
         recording=replace(config.recording, spectral=1.0, paper=0.0, ideal=True),
     )
-    network = new_network(config)
+    network = new_network(config.network)
     objective = Objective(network, config.loss)
     for given in scenes(config)[0](3):
         loss = objective(given)
