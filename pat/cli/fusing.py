@@ -275,7 +275,7 @@ class Fuse(Known):
             view = view_of(rig, alpha, bits=bits, bands=len(frame.image))
             found_rig = rig if found is not None else None
             points = rig[alpha] if self.points else None
-            bands = band_names(frame, (name for name in rig.betas(alpha) if name in images))
+            bands = band_names(frame, (name for name in rig.betas(alpha) if name in files))
             written = save_frame(
                 frame,
                 self.out,
@@ -363,7 +363,8 @@ class Fuse(Known):
 
         try:
             with options.working("classical baseline"):
-                return exposed(classical_view(rig, images, alpha, longest=LONGEST), gain)
+                view = classical_view(rig, images, alpha, longest=LONGEST)
+                return exposed(view, gain)
         except ValueError as error:
             say(f"no classical baseline: {error}")
             return None

@@ -34,11 +34,11 @@ from ..support.memory import limited, parse_bytes
 from .checks import warn_of_confidence
 from .corrections import corrections_for, expected_work
 from .fuse import Progress
-from .inputs import FrameInputs, Placement, check_bands, prepared
+from .inputs import FrameInputs, Placement, prepared
 from .low_light import Noise, denoised_views
 from .steps import EqualResolution, FusionStep, Radiometry, Undistort, Upright, has_lens, undone
 from .tiles import fused_in_tiles, plan_frame
-from .views import Views
+from .views import Views, check_bands
 
 LOG = logging.getLogger(__name__)
 
@@ -187,7 +187,7 @@ def align(
     views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, field=field), noise)
     betas = views.betas
     network = network or load_weights(weights_for([len(views.images[name]) for name in betas]))
-    check_bands(network, views)
+    check_bands(views, network.bands)
     inputs, undo = prepared(network, views, _steps(network, normalise=match_levels))
     del views
     plan = plan_frame(

@@ -16,7 +16,6 @@ from arraygeom import ReceptiveField, Rig
 from arraygeom.chunks import Tile
 from arraygeom.threads import torch_in_one_thread
 
-from ..matching.inputs import Inputs
 from ..matching.match import Matcher, match
 from ..matching.radiometry import Given
 from ..media.images import Images
@@ -25,13 +24,13 @@ from ..support.memory import limited, parse_bytes, planned
 from .checks import warn_of_confidence
 from .corrections import Corrections, corrections_for, expected_work
 from .depth_filling import background_filled
-from .inputs import FrameInputs, check_bands, prepared
+from .inputs import FrameInputs, bytes_beside, prepared
 from .low_light import LowLight, Noise, denoised_views
 from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail, with_own_colours
 from .results import Frame
 from .steps import steps_for, undone
 from .tiles import LARGE, FusedTile, Plan, fused_in_tiles, plan_frame
-from .views import Views
+from .views import Views, check_bands
 
 LOG = logging.getLogger(__name__)
 
@@ -150,7 +149,7 @@ def fuse(
     betas, in_colour, noisy = views.betas, views.alpha_in_colour, bool(low_light.noisy)
     steps = steps_for(network, normalise=settings.match_levels or grey_world)
     inputs, undo = prepared(network, views, steps)
-    held = _bytes_beside(inputs.inputs, [views.own, *(images.values() if isinstance(images, dict) else ())])
+    held = bytes_beside(inputs.inputs, [views.own, *(images.values() if isinstance(images, dict) else ())])
     del views  # whose images are there again, padded
     LOG.info("planning")
     plan = plan_frame(
@@ -205,15 +204,6 @@ def _completed(frame: Frame, inputs: FrameInputs, luminance: Luminance) -> Frame
     return with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
 
 
-def _bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:
-    """Memory of images whose pixels are not those of the inputs: the caller's."""
-    own = {
-        part.untyped_storage().data_ptr() for part in (inputs.alpha, *(beta.image for beta in inputs.betas))
-    }
-    parts = {part.untyped_storage().data_ptr(): part.nbytes for part in images}
-    return float(sum(nbytes for place, nbytes in parts.items() if place not in own))
-
-
 def _with_rig(
     network: Any,
     rig: Rig | None,
@@ -261,5 +251,5 @@ def _seen(
     """The views to fuse, denoised, and what is known of their noise."""
     views = Views.of(rig, images, alpha=alpha, depth=settings.depth, field=settings.field)
     views, low_light = denoised_views(views, noise)
-    check_bands(network, views)
+    check_bands(views, network.bands)
     return views, low_light

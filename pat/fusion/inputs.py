@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Literal, NamedTuple
 
 from jaxtyping import Float
@@ -16,14 +16,13 @@ from arraygeom.fields import AroundDepth, AroundMatches, default_field, pinhole_
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
 from arraygeom.fields.ray_depth import ray_depth
 from arraygeom.pixels import HW
-from arraygeom.warned import warn
 
 from ..matching.inputs import Beta, Inputs
 from ..matching.normalisation import combined_bands
 from ..matching.tangents import along_tangents
 from ..networks.protocol import FusionNetwork
 from .steps import FusionStep, Undo, innermost
-from .views import Views, is_in_colour
+from .views import Views
 
 LOG = logging.getLogger(__name__)
 
@@ -69,36 +68,6 @@ class FrameInputs(NamedTuple):
     hw: HW
 
 
-def check_bands(network: FusionNetwork, views: Views) -> None:
-    """Refuse betas whose bands are not what the network makes; warn of those whose three are equal.
-
-    Raises ValueError that says which weights to take.
-    """
-    _refuse_bands(network, views)
-    for name in views.betas:
-        image = views.images[name]
-        if len(image) == 3 and not is_in_colour(image):
-            warn(f"the image of '{name}' has three equal bands: it is grey, and gives no colour")
-
-
-def _refuse_bands(network: FusionNetwork, views: Views) -> None:
-    wanted = network.bands
-    bands = {name: len(views.images[name]) for name in views.betas}
-    total = sum(bands.values())
-    if wanted is None or total == wanted or wanted in bands.values():
-        return
-    listed = ", ".join(f"'{name}' {count}" for name, count in bands.items())
-    advice = ""
-    if wanted == 3 and total == 1:
-        sensor = views.rig[next(iter(bands))].sensor
-        said = ", and the rig says that it is in colour" if sensor.response == "rgb" else ""
-        advice = f"its image is grey{said}: give one in colour, or "
-    raise ValueError(
-        f"the betas have {total} band{'s' if total > 1 else ''} in all ({listed}), "
-        f"these weights make {wanted}: {advice}take the weights mono-spectral, which fuse any number of bands"
-    )
-
-
 def prepared(
     network: FusionNetwork, views: Views, steps: Sequence[FusionStep]
 ) -> tuple[FrameInputs, list[Undo]]:
@@ -138,6 +107,15 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
             )
         placements.append(place)
     return FrameInputs(Inputs(alpha, tuple(betas), m, network.beta_halo, bands=network.bands), placements, hw)
+
+
+def bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:
+    """Memory of images whose pixels are not those of the inputs: the caller's."""
+    own = {
+        image.untyped_storage().data_ptr() for image in (inputs.alpha, *(beta.image for beta in inputs.betas))
+    }
+    parts = {image.untyped_storage().data_ptr(): image.nbytes for image in images}
+    return float(sum(nbytes for place, nbytes in parts.items() if place not in own))
 
 
 def bounds_of(field: ReceptiveField) -> Literal["depth", "distance"]:

@@ -57,7 +57,8 @@ def write_report(
 
     `images` are alpha's and the betas'; the page needs no other file and no network.
     """
-    write_text(path, report_page(frame, images, rig, alpha, facts))
+    page = report_page(frame, images, rig, alpha, facts)
+    write_text(path, page)
     return path
 
 

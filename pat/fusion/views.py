@@ -101,6 +101,30 @@ def grey_alpha(name: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "1 h w
     return grey(image)
 
 
+def check_bands(views: Views, wanted: int | None) -> None:
+    """Refuse betas whose bands are not what a network makes; warn of those whose three are equal.
+
+    Raises ValueError that says which weights to take.
+    """
+    bands = {name: len(views.images[name]) for name in views.betas}
+    total = sum(bands.values())
+    if wanted is not None and total != wanted and wanted not in bands.values():
+        listed = ", ".join(f"'{name}' {count}" for name, count in bands.items())
+        advice = ""
+        if wanted == 3 and total == 1:
+            sensor = views.rig[next(iter(bands))].sensor
+            said = ", and the rig says that it is in colour" if sensor.response == "rgb" else ""
+            advice = f"its image is grey{said}: give one in colour, or "
+        raise ValueError(
+            f"the betas have {total} band{'s' if total > 1 else ''} in all ({listed}), these weights make "
+            f"{wanted}: {advice}take the weights mono-spectral, which fuse any number of bands"
+        )
+    for name in views.betas:
+        image = views.images[name]
+        if len(image) == 3 and not is_in_colour(image):
+            warn(f"the image of '{name}' has three equal bands: it is grey, and gives no colour")
+
+
 def _checked(rig: Rig, images: Images, name: str) -> Tensor:
     image, (h, w) = images[name], rig[name].hw
     if image.ndim != 3 or image.dtype not in (torch.float32, torch.float64):
