@@ -7,7 +7,24 @@
 renders the images that a planned rig would take, `rig_diff` compares two calibrations.
 """
 
+from typing import Literal
+
 from .. import _lazy
+
+Lens = Literal[
+    "brown-conrady",
+    "rational",
+    "thin-prism",
+    "tilted",
+    "kannala-brandt",
+    "omni",
+    "double-sphere",
+    "extended-unified",
+    "scaramuzza",
+    "thin-prism-fisheye",
+    "none",
+]
+"""Lens models that a camera can be calibrated with."""
 
 __all__ = ["calibrate", "calibrate_photos", "collect_folder", "parse_board", "simulate_photos", "write_board"]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -16,23 +15,11 @@ from arraygeom import Camera, Distortion, Pose, intrinsics
 from arraygeom.lenses.central import MODELS
 from arraygeom.pixels import HW
 
+from . import Lens
 from .board import Board
 from .detect import BoardViews, Detection
 from .photos import FrameKey
 
-Lens = Literal[
-    "brown-conrady",
-    "rational",
-    "thin-prism",
-    "tilted",
-    "kannala-brandt",
-    "omni",
-    "double-sphere",
-    "extended-unified",
-    "scaramuzza",
-    "thin-prism-fisheye",
-    "none",
-]
 LENSES: dict[Lens, tuple[str, int]] = {
     "brown-conrady": ("brown-conrady", 5),
     "rational": ("brown-conrady", 8),

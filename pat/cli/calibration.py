@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from calib.boards import Lens
+
 from . import options
 from .options import Depth, Out, say
 
@@ -38,20 +40,7 @@ class Calibrate:
     """The rig file; its report (.html) and covariance (.covariance.json) are written beside it."""
     camera: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=PATTERN")]] = ()
     """Once a camera, such as left='left*.jpg', where names of folders and files do not show the camera."""
-    lens: Literal[
-        "auto",
-        "brown-conrady",
-        "rational",
-        "thin-prism",
-        "tilted",
-        "kannala-brandt",
-        "omni",
-        "double-sphere",
-        "extended-unified",
-        "scaramuzza",
-        "thin-prism-fisheye",
-        "none",
-    ] = "brown-conrady"
+    lens: Literal["auto", Lens] = "brown-conrady"
     """Lens model; from kannala-brandt on, they are for fisheyes. auto compares the first five, on held-out
     frames, and takes the best supported."""
     depth: Depth = None

@@ -158,15 +158,12 @@ class Fuse(Known):
             pass
         cameras = camera_names(self.given)
         focal = options.numbers_by_name(self.focal, "--focal")
-        if unknown := focal.keys() - cameras.keys():
-            raise ValueError(
-                f"--focal: no camera '{min(unknown)}'; the images' names are {', '.join(cameras)}"
-            )
         noise = options.noise_of(self.noise)
-        if isinstance(noise, dict) and (unknown := noise.keys() - cameras.keys()):
-            raise ValueError(
-                f"--noise: no camera '{min(unknown)}'; the images' names are {', '.join(cameras)}"
-            )
+        for option, named in {"--focal": focal, "--noise": noise if isinstance(noise, dict) else {}}.items():
+            if unknown := named.keys() - cameras.keys():
+                raise ValueError(
+                    f"{option}: no camera '{min(unknown)}'; the images' names are {', '.join(cameras)}"
+                )
         videos = [path for path in cameras.values() if path.suffix.lower() in options.VIDEO_SUFFIXES]
         if videos and len(videos) < len(cameras):
             others = [path for path in cameras.values() if path not in videos]
@@ -201,9 +198,7 @@ class Fuse(Known):
         rig = array.recorded
         for name, rate in rates.items():
             if name in rig.names:
-                rig = rig.with_camera(
-                    name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate))
-                )
+                rig = with_sensor(rig, name, frame_rate=rate)
         self.video = rates.get(array.alpha, self.video)
         self._many(rig, {name: files[name] for name in rig.names}, array.alpha)
         rig.save(self.out / FOUND_RIG)
@@ -229,11 +224,9 @@ class Fuse(Known):
     def _rig(self) -> Rig:
         rig = options.load_rig_or_say_no_image(self.given[0], self.depth)
         for name, rate in options.numbers_by_name(self.frame_rate, "--frame-rate").items():
-            rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate)))
+            rig = with_sensor(rig, name, frame_rate=rate)
         for name, offset in options.numbers_by_name(self.time_offset, "--time-offset").items():
-            rig = rig.with_camera(
-                name, rig[name].replace(sensor=replace(rig[name].sensor, time_offset=offset))
-            )
+            rig = with_sensor(rig, name, time_offset=offset)
         return rig
 
     def _one(
@@ -271,19 +264,15 @@ class Fuse(Known):
             frame, gain = self._exposed(frame)
             if found is None and not frame.depth.isfinite().any():
                 self._note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
-            bits = self.bits or 8
-            view = view_of(rig, alpha, bits=bits, bands=len(frame.image))
-            found_rig = rig if found is not None else None
-            points = rig[alpha] if self.points else None
             bands = band_names(frame, (name for name in rig.betas(alpha) if name in files))
             written = save_frame(
                 frame,
                 self.out,
-                bits=bits,
+                bits=self.bits or 8,
                 kind=self.kind,
-                view=view,
-                rig=found_rig,
-                points=points,
+                view=view_of(rig, alpha, bits=self.bits or 8, bands=len(frame.image)),
+                rig=None if found is None else rig,
+                points=rig[alpha] if self.points else None,
                 bands=bands,
             )
             shutil.rmtree(store, ignore_errors=True)
@@ -419,6 +408,11 @@ class Fuse(Known):
         say(f"{self.out}: {report}" + f", and {video.name}" * (self.sequence and video.is_file()))
         if report.failed:
             sys.exit(1)
+
+
+def with_sensor(rig: Rig, name: str, **changes: float) -> Rig:
+    """The rig with some entries of a camera's sensor changed."""
+    return rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, **changes)))
 
 
 def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> tuple[tuple[str, ...], bool]:

@@ -2,47 +2,30 @@
 
 from __future__ import annotations
 
+import logging
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from .options import (
-    WARNED,
-    WEIGHTS_HELP,
-    Depth,
-    FieldName,
-    Images,
-    Memory,
-    field_named,
-    noise_of,
-    optional,
-    response_of,
-    say,
-)
-
-if TYPE_CHECKING:
-    from arraygeom import ReceptiveField, Rig
-
-    from ..fusion.fuse import FuseSettings
-import logging
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Literal
-
 from . import options
+from .options import WEIGHTS_HELP, Depth, FieldName, Images, Memory, optional, say
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from arraygeom import Rig
+    from arraygeom import ReceptiveField, Rig
     from arraygeom.chunks import Tile
 
+    from ..fusion.fuse import FuseSettings
     from ..fusion.results import Frame
     from ..fusion.tiles import Plan
+
+LOG = logging.getLogger(__name__)
 
 MATCHES_HELP = "Matched points to use: CSV (x0,y0,x1,y1 a line, of two images in order) or a COLMAP database."
 MatchesFile = Annotated[Path | None, arg(metavar="FILE", help=MATCHES_HELP, help_behavior_hint="")]
@@ -93,11 +76,11 @@ class Known:
         from ..fusion.fuse import FuseSettings
 
         return FuseSettings(
-            field=field_named(self.field),
+            field=options.field_named(self.field),
             max_memory=self.max_memory,
             match_levels=self.normalise_radiometry,
-            response=response_of(self.response),
-            noise=noise_of(self.noise, by_default=noise_by_default),
+            response=options.response_of(self.response),
+            noise=options.noise_of(self.noise, by_default=noise_by_default),
             **further,
         )
 
@@ -116,7 +99,7 @@ class Known:
                 raise
             say(f"pat: {error}; not written (--strict)", style="red")
             sys.exit(LowConfidenceWarning.exit_status)
-        if any(isinstance(message, LowConfidenceWarning) for message in WARNED):
+        if any(isinstance(message, LowConfidenceWarning) for message in options.WARNED):
             sys.exit(LowConfidenceWarning.exit_status)
 
     def with_known(
@@ -185,9 +168,6 @@ class Known:
             assert isinstance(beta, LensView)
             fields[a[1]] = AroundMatches.from_points(*b, own.hw, views=(own, beta), field=field)
         return fields
-
-
-LOG = logging.getLogger(__name__)
 
 
 def fuse_with_progress(

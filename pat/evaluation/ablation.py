@@ -290,7 +290,7 @@ def _case(
         notes["classical"] = str(error)
     for name, family in chosen.items():
         rig = family.assumed(case.rig, Generator().manual_seed(crc32(case.name.encode())))
-        notes[name] = unsupported(network, family.field(far), rig)
+        notes[name] = unsupported(family.field(far), rig)
         if notes[name]:
             continue
         try:
@@ -327,8 +327,8 @@ def _at_distance(camera: Camera, x: Tensor, distance: Tensor) -> Tensor:
     return torch.where(rays.valid[..., None], rays.origin + distance[..., None] * rays.direction, torch.nan)
 
 
-def unsupported(network: FusionNetwork, field: ReceptiveField | None, rig: Rig) -> str:
-    """Why a network cannot use a field; empty if it can."""
+def unsupported(field: ReceptiveField | None, rig: Rig) -> str:
+    """Why a field cannot be used; empty if it can."""
     pair = rig.pair(ALPHA, BETA)
     if isinstance(field, Dense):
         needed = math.prod(pair.alpha.hw) / 4 * math.prod(pair.beta.hw) * 8
@@ -346,14 +346,10 @@ def markdown(rows: Sequence[AblationRow]) -> str:
     scenes = len({row.scene for row in rows})
     note = (
         f"{scenes} scenes; the focal ratio is alpha's focal length over beta's. PSNR in dB, behind it a 95% "
-        "interval.\n"
-        "Rectified, warped: both images are rectified by the calibration, and the result is warped back. "
-        "The\n"
-        "rectified assumption takes lines of the images as they are for rows, and both images for the same "
-        "field of\n"
-        "view; 'rows around H x' is given position and scale, and takes only the lines for rows. Off: mean "
-        "error in\n"
-        "beta of points at the depth found.\n\n"
+        "interval.\nRectified, warped: both images are rectified by the calibration, and the result is "
+        "warped back. The\nrectified assumption takes lines of the images as they are for rows, and both "
+        "images for the same field of\nview; 'rows around H x' is given position and scale, and takes only "
+        "the lines for rows. Off: mean error in\nbeta of points at the depth found.\n\n"
     )
     return note + markdown_table(columns, lines, align="l" + "r" * (len(columns) - 2) + "l")
 

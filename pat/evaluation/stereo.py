@@ -90,7 +90,12 @@ def evaluate_pairs(
             }
             rows += [_row(pair, rate, name, result, task.ground_truth) for name, result in results.items()]
             if images:
-                write_image(images / f"{pair.name.replace('/', '-')}_x{rate}.png", _strip(task, results))
+                shown = [
+                    beta_alone(task.alpha, task.beta, 0.0),
+                    *(result.image for result in results.values()),
+                ]
+                strip = torch.cat([*shown, task.ground_truth], -1)
+                write_image(images / f"{pair.name.replace('/', '-')}_x{rate}.png", strip)
     return rows
 
 
@@ -99,7 +104,12 @@ def summarise(rows: Sequence[StereoRow]) -> list[StereoSummary]:
     groups: dict[tuple[int, str], list[StereoRow]] = {}
     for row in rows:
         groups.setdefault((row.rate, row.method), []).append(row)
-    return [_summary(*key, group) for key, group in sorted(groups.items(), key=lambda item: item[0][0])]
+    summaries = []
+    for (rate, method), group in sorted(groups.items(), key=lambda item: item[0][0]):
+        psnr, ssim = [row.psnr for row in group], float(np.mean([row.ssim for row in group]))
+        mean, interval = float(np.mean(psnr)), bootstrap_interval(psnr)
+        summaries.append(StereoSummary(rate, method, len(group), mean, interval, ssim))
+    return summaries
 
 
 PrintedScores = Mapping[int, tuple[float, float]]
@@ -226,14 +236,3 @@ def disparity_errors(
         return None, None
     errors = disparity_score(found.to(value), value, compared)
     return errors.end_point_error, errors.within_one * float(compared.sum() / valid.sum())
-
-
-def _strip(task: MonoColourTask, results: Mapping[str, StereoResult]) -> Float[Tensor, "3 h w"]:
-    images = [result.image for result in results.values()]
-    return torch.cat([beta_alone(task.alpha, task.beta, 0.0), *images, task.ground_truth], -1)
-
-
-def _summary(rate: int, method: str, rows: Sequence[StereoRow]) -> StereoSummary:
-    psnrs = [row.psnr for row in rows]
-    ssim = float(np.mean([row.ssim for row in rows]))
-    return StereoSummary(rate, method, len(rows), float(np.mean(psnrs)), bootstrap_interval(psnrs), ssim)

@@ -246,7 +246,11 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
     x = pixel_of(state)
     field = scene.fields.get(state.family) or chosen_field(pair, state.family, x)
     found = field(pair, x)
-    samples = found.positions(samples_along(found)) if isinstance(found, Segments) else found
+    if isinstance(found, Segments):  # about one sample a pixel of beta
+        longest = float(torch.where(found.valid, found.length, 0.0).max())
+        samples = found.positions(math.ceil(longest) + 1)
+    else:
+        samples = found
     xy, valid = samples.xy[0], samples.mask[0]
     if state.weights == WINDOWS:
         scores = SHARPNESS * correlations(scene.guides[state.alpha], scene.guides[name], pair, x, xy)
@@ -322,11 +326,6 @@ def ends_of(found: Segments | Positions) -> Float[Tensor, "2 2"] | None:
     if not isinstance(found, Segments) or not bool(found.valid[0]):
         return None
     return torch.stack([found.start[0], found.end[0]])
-
-
-def samples_along(found: Segments) -> int:
-    """About one sample a pixel of beta."""
-    return math.ceil(float(torch.where(found.valid, found.length, 0.0).max())) + 1
 
 
 SHARPNESS = 30.0

@@ -141,34 +141,23 @@ class Batch:
         Raises JobError if a frame fails and the job is to stop, ValueError to resume with other settings, and
         for a folder that another command is writing to, or that cannot be written to.
         """
-        with folder_lock(self.out):
-            return self._run(workers, resume, on_error, video, console)
-
-    def _run(
-        self, workers: Workers, resume: bool, on_error: OnError, video: float | None, console: Console | None
-    ) -> JobReport:
-        self._begin(resume)
         plan, many = self.out / KEYS / PLAN, range(len(self.names))
-        options: dict[str, Any] = {
-            "workers": workers,
-            "resume": resume,
-            "on_error": on_error,
-            "console": console,
-        }
-        if self.sequence and not self.alone:
-            missing = [i for i in many if not (resume and self.fused_file(i).exists())]
-            keys = self.fusion.keys_of(missing)
-            alphas = self.files[self.alpha]
-            first = [Task(self._key_file(k), fuse_key, (plan, k), str(alphas[k.alpha])) for k in keys]
-            run_tasks(first, title="key frames", **options)
-        tasks = [Task(self.fused_file(i), fuse_one, (plan, i)) for i in many]
-        report = run_tasks(tasks, title="frames", **options)
-        if video is not None and (report.made or report.kept):
-            made = [p for i in many if (p := self.fused_file(i)).exists()]
-            write_video(self.out / "fused.mp4", (read_image(p) for p in made), rate=video)
-        if not report.failed:
-            shutil.rmtree(self.out / KEYS)
-        return report
+        how: dict[str, Any] = {"workers": workers, "resume": resume, "on_error": on_error, "console": console}
+        with folder_lock(self.out):
+            self._begin(resume)
+            if self.sequence and not self.alone:
+                missing = [i for i in many if not (resume and self.fused_file(i).exists())]
+                alphas, keys = self.files[self.alpha], self.fusion.keys_of(missing)
+                first = [Task(self._key_file(k), fuse_key, (plan, k), str(alphas[k.alpha])) for k in keys]
+                run_tasks(first, title="key frames", **how)
+            tasks = [Task(self.fused_file(i), fuse_one, (plan, i)) for i in many]
+            report = run_tasks(tasks, title="frames", **how)
+            if video is not None and (report.made or report.kept):
+                made = [p for i in many if (p := self.fused_file(i)).exists()]
+                write_video(self.out / "fused.mp4", (read_image(p) for p in made), rate=video)
+            if not report.failed:
+                shutil.rmtree(self.out / KEYS)
+            return report
 
     def _begin(self, resume: bool) -> None:
         """Write the settings and what frames are made from; or, to resume, compare them with those before.

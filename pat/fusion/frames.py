@@ -51,10 +51,13 @@ class ImageFiles:
 
 
 class CachedFrames:
-    """Frames, those asked for last cached, up to `CACHED` bytes: neighbours in time need them again."""
+    """Frames, those asked for last cached, up to `CACHED` bytes: neighbours in time need them again.
 
-    def __init__(self, frames: Frames) -> None:
-        self.frames = frames
+    Those of alpha are without noise, if its level is given.
+    """
+
+    def __init__(self, frames: Frames, level: NoiseLevel | None = None) -> None:
+        self.frames, self.level = frames, level
         self.cached: OrderedDict[int, Tensor] = OrderedDict()
 
     def __len__(self) -> int:
@@ -62,23 +65,10 @@ class CachedFrames:
 
     def __getitem__(self, i: int, /) -> Tensor:
         if i not in self.cached:
-            self.cached[i] = self.frames[i]
+            image = self.frames[i]
+            view = None if self.level is None else noisy_view(image, self.level)
+            self.cached[i] = image if view is None else view.denoised[0]
         self.cached.move_to_end(i)
         while len(self.cached) > 1 and sum(image.nbytes for image in self.cached.values()) > CACHED:
             self.cached.popitem(last=False)
         return self.cached[i]
-
-
-class DenoisedFrames:
-    """Frames of alpha without noise of a known level."""
-
-    def __init__(self, frames: Frames, level: NoiseLevel) -> None:
-        self.frames, self.level = frames, level
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, i: int, /) -> Tensor:
-        image = self.frames[i]
-        view = noisy_view(image, self.level)
-        return image if view is None else view.denoised[0]

@@ -24,12 +24,12 @@ from ..support.memory import limited, parse_bytes, planned
 from .checks import warn_of_confidence
 from .corrections import Corrections, corrections_for, expected_work
 from .depth_filling import background_filled
-from .inputs import FrameInputs, bytes_beside, prepared
+from .inputs import bytes_beside, prepared
 from .low_light import LowLight, Noise, denoised_views
 from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail, with_own_colours
 from .results import Frame
 from .steps import steps_for, undone
-from .tiles import LARGE, FusedTile, Plan, fused_in_tiles, plan_frame
+from .tiles import LARGE, Plan, fused_in_tiles, plan_frame
 from .views import Views, check_bands
 
 LOG = logging.getLogger(__name__)
@@ -171,11 +171,16 @@ def fuse(
     inputs = inputs._replace(inputs=right)
     with limited(planned(limit, plan.memory, large=math.prod(inputs.hw) > LARGE)):
         with torch.set_grad_enabled(differentiable):
-            done = _matched_and_fused(
-                network, inputs, matcher, plan, found=noisy, progress=progress, store=store
+            matches = matcher(inputs.inputs) if network.uses_matches else None
+            LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
+            done = fused_in_tiles(
+                network, inputs, matches, plan.tiles, found=noisy, progress=progress, store=store
             )
+            del matches
         warn_of_confidence(network, done.frame, inputs)
-        frame = _completed(done.frame, inputs, luminance)
+        frame = done.frame._replace(depth=background_filled(done.frame, inputs.inputs))
+        if luminance != "alpha":
+            frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
         del inputs, right  # the segments of a large frame: what follows needs memory, too
         frame = low_light.corrected(
             found.undone(frame), done.found, steps, found.response, keep_alpha=settings.keep_alpha
@@ -185,23 +190,6 @@ def fuse(
         if in_colour and len(frame.image) == 3 and frame.by_band is None and not noisy:
             frame = with_own_colours(frame, images[alpha])
         return frame if differentiable else frame.mapped(Tensor.detach)
-
-
-def _matched_and_fused(
-    network: FusionNetwork, inputs: FrameInputs, matcher: Matcher, plan: Plan, **options: Any
-) -> FusedTile:
-    """The whole frame from its tiles; options are those of `fused_in_tiles`."""
-    matches = matcher(inputs.inputs) if network.uses_matches else None
-    LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
-    return fused_in_tiles(network, inputs, matches, plan.tiles, **options)
-
-
-def _completed(frame: Frame, inputs: FrameInputs, luminance: Luminance) -> Frame:
-    """The fused frame with depth where betas are occluded, and alpha's detail in beta's luminance."""
-    frame = frame._replace(depth=background_filled(frame, inputs.inputs))
-    if luminance == "alpha":
-        return frame
-    return with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
 
 
 def _with_rig(

@@ -47,7 +47,8 @@ def flow_between(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Flow:
     b = b * (a.mean() / b.mean().clamp(min=1e-6))
     there, back = _steps(a, b), _steps(b, a)
     returned = there + warped(back, there)
-    likeness = _smooth((warped(b, there) - a).abs()[0])
+    unlike = (warped(b, there) - a).abs()[0]
+    likeness = torch.from_numpy(cv2.boxFilter(unlike.numpy(), -1, (5, 5)))
     weight = torch.exp(-returned.square().sum(0) / SETTINGS.astray**2 - (likeness / SETTINGS.unlike).square())
     return Flow(there, weight * _inside(there))
 
@@ -70,7 +71,3 @@ def _inside(step: Tensor) -> Tensor:
     h, w = step.shape[-2:]
     x = pixel_grid((h, w)) + step.movedim(0, -1)
     return ((x >= 0) & (x <= x.new_tensor([w - 1, h - 1]))).all(-1).float()
-
-
-def _smooth(plane: Tensor) -> Tensor:
-    return torch.from_numpy(cv2.boxFilter(plane.numpy(), -1, (5, 5)))

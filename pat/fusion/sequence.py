@@ -29,7 +29,7 @@ from ..networks.protocol import FusionNetwork
 from ..sensors import NoiseLevel
 from ..support.settings import physics, size, tuned
 from .corrections import Corrections
-from .frames import CachedFrames, DenoisedFrames, Frames
+from .frames import CachedFrames, Frames
 from .fuse import FuseSettings, corrections_of, fuse
 from .low_light import noise_levels
 from .optical_flow import flow_between, warped
@@ -230,7 +230,7 @@ class SequenceFusion:
     def _quiet(self) -> Frames:
         """Alpha's frames, without noise if it has some."""
         frames, level = self.frames[self.alpha], (self._noise or {}).get(self.alpha)
-        return frames if level is None else CachedFrames(DenoisedFrames(frames, level))
+        return frames if level is None else CachedFrames(frames, level)
 
     def _at_middle(self, find: Callable[[KeyFrame], T], otherwise: T) -> T:
         """What is found at the key frame nearest to the middle whose images can be read: what cannot is
