@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -16,16 +15,9 @@ from . import options
 from .options import WEIGHTS_HELP, Depth, FieldName, Images, Memory, optional, say
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from arraygeom import ReceptiveField, Rig
-    from arraygeom.chunks import Tile
 
     from ..fusion.fuse import FuseSettings
-    from ..fusion.results import Frame
-    from ..fusion.tiles import Plan
-
-LOG = logging.getLogger(__name__)
 
 MATCHES_HELP = "Matched points to use: CSV (x0,y0,x1,y1 a line, of two images in order) or a COLMAP database."
 MatchesFile = Annotated[Path | None, arg(metavar="FILE", help=MATCHES_HELP, help_behavior_hint="")]
@@ -168,39 +160,3 @@ class Known:
             assert isinstance(beta, LensView)
             fields[a[1]] = AroundMatches.from_points(*b, own.hw, views=(own, beta), field=field)
         return fields
-
-
-def fuse_with_progress(
-    weights: str,
-    rig: Rig,
-    images: Mapping[str, Tensor],
-    *,
-    device: str = "cpu",
-    precision: Literal["float32", "bfloat16"] = "float32",
-    **further: Any,
-) -> Frame:
-    """`fuse` with weights by name, the plan and a bar on the terminal. The frame is on the CPU."""
-    from ..fusion.fuse import fuse
-    from ..networks.weights import load_weights
-
-    where = options.device_of(device)
-    network = load_weights(weights, precision=precision).to(where)
-    if where != "cpu":
-        rig, images = rig.to(where), {name: image.to(where) for name, image in images.items()}
-    options.say_when_compiling()
-    with options.working("fusing") as retitle:
-
-        def announce(plan: Plan) -> None:
-            say(f"plan: {plan}")
-            retitle("fusing" if plan.seconds is None else f"fusing, about {plan.duration} in all")
-
-        frame = fuse(network, rig, images, progress=_numbered, announce=announce, **further)
-    return frame.mapped(lambda part: part.cpu())
-
-
-def _numbered(tiles: Iterable[Tile], count: int) -> Iterator[Tile]:
-    """The tiles, each said as it begins where there are several."""
-    for i, tile in enumerate(tiles, 1):
-        if count > 1:
-            LOG.info("tile %d of %d", i, count)
-        yield tile

@@ -182,7 +182,9 @@ def _rectified_plane(pair: Pair, depth: tuple[float, float]) -> _Plane:
     rotation = _rectifying_rotation(R, t)
     focal = (K_alpha[0, 0] + K_alpha[1, 1]) / 2
     K = np.diag([focal, focal, 1.0])
-    corners, z = _project(K @ rotation @ np.linalg.inv(K_alpha), _corners(hw))
+    right, bottom = hw[1] - 1, hw[0] - 1
+    ends = np.array([[0, 0, 1], [right, 0, 1], [0, bottom, 1], [right, bottom, 1.0]])
+    corners, z = _project(K @ rotation @ np.linalg.inv(K_alpha), ends)
     shift = -(rotation @ R.T @ t)[0] * focal / (np.array(depth) * [z.min(), z.max()])
     max_disparity = float(np.ptp(shift))
     K[:2, 2] = -corners.min(0) + [max_disparity, 0]
@@ -207,11 +209,6 @@ def _rectifying_rotation(R: NDArray, t: NDArray) -> NDArray[np.float64]:
     y = np.cross(np.array([0, 0, 1.0]) + R[2], x)
     y /= max(np.linalg.norm(y), 1e-12)
     return np.stack([x, y, np.cross(x, y)])
-
-
-def _corners(hw: tuple[int, int]) -> NDArray[np.float64]:
-    height, width = hw
-    return np.array([[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1.0]])
 
 
 def _project(H: NDArray, points: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -142,7 +142,11 @@ class LowLight:
 
         Except for `Radiometry`: values keep their scale.
         """
-        views = {name: self._noisy(name) for name in self.views.images}
+        recorded = {name: image[None] for name, image in self.views.images.items()}
+        views = {
+            name: self.noisy.get(name) or NoisyView(image, image, torch.zeros_like(image))
+            for name, image in recorded.items()
+        }
         parts = [self._stepped({name: view[i][0] for name, view in views.items()}, steps) for i in range(3)]
         return {name: NoisyView(*(part[name][None] for part in parts)) for name in parts[0]}
 
@@ -151,10 +155,6 @@ class LowLight:
         for step in steps:
             views = views if isinstance(step, Radiometry) else step.do(views).views
         return views.images
-
-    def _noisy(self, name: str) -> NoisyView:
-        image = self.views.images[name][None]
-        return self.noisy.get(name) or NoisyView(image, image, torch.zeros_like(image))
 
 
 def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:

@@ -108,8 +108,11 @@ def filled_page(
     parts["FACTS"] = "\n".join(rows)
     parts["NOTES"] = _listed("What was found", facts.notes)
     parts["WARNINGS"] = _listed("Warnings", facts.warnings, kind="warnings")
-    parts["LAYERS"] = "\n".join(_layer(name, url) for name, url in layers.items())
-    named = {name: html.escape(name) for name in overlays}
+    named = {name: html.escape(name) for name in (*layers, *overlays)}
+    parts["LAYERS"] = "\n".join(
+        f'<img class="layer" data-name="{named[name]}" alt="{named[name]}" src="{url}">'
+        for name, url in layers.items()
+    )
     parts["OVERLAYS"] = "\n".join(
         f'<img class="overlay" id="{named[name]}" alt="{named[name]}" src="{url}" hidden>'
         for name, url in overlays.items()
@@ -209,10 +212,6 @@ def shares_layer(confidence: Float[Tensor, "h w"]) -> str:
     layers = torch.cat([colour.expand(3, *cover.shape[1:]), 0.85 * cover])
     _, content = cv2.imencode(".png", to_bytes(layers).transpose(1, 2, 0))
     return f"data:image/png;base64,{base64.b64encode(content.tobytes()).decode()}"
-
-
-def _layer(name: str, url: str) -> str:
-    return f'<img class="layer" data-name="{html.escape(name)}" alt="{html.escape(name)}" src="{url}">'
 
 
 def _switch(name: str) -> str:

@@ -160,13 +160,6 @@ def view_of(rig: Rig, alpha: str, *, bits: int, bands: int = 3) -> Rig:
     return Rig({alpha: rig[alpha].replace(sensor=sensor)}, depth=rig.depth, name=rig.name)
 
 
-def shrunk(image: Float[Tensor, "c h w"]) -> Float[Tensor, "c h2 w2"]:
-    """The image, detached and on the CPU, at most `SHOWN` pixels wide and high."""
-    factor = min(SHOWN / max(image.shape[-2:]), 1.0)
-    hw = [max(round(n * factor), 1) for n in image.shape[-2:]]
-    return interpolate(image.detach().cpu().float()[None], size=hw, mode="area")[0]
-
-
 class Frame(NamedTuple):
     """A fused frame at alpha's view.
 
@@ -212,7 +205,9 @@ class Frame(NamedTuple):
         """For notebooks: the image and, beside it, depth (red is near) and confidence, as a PNG file."""
         confidence = self.confidence[None].expand(3, -1, -1)
         parts = picture_of(self.image).expand(3, -1, -1), colour_depth(self.depth), confidence
-        shown = [shrunk(part) for part in parts]
+        factor = min(SHOWN / max(self.image.shape[-2:]), 1.0)
+        hw = [max(round(n * factor), 1) for n in self.image.shape[-2:]]
+        shown = [interpolate(part.detach().cpu().float()[None], size=hw, mode="area")[0] for part in parts]
         values = (torch.cat(shown, -1).clamp(0, 1) * 255).round().to(torch.uint8)
         file = BytesIO()
         Image.fromarray(values.permute(1, 2, 0).numpy()).save(file, format="PNG")

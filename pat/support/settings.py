@@ -7,7 +7,7 @@ result worth speaking of; *tuned*: chosen on images, which are named.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import Field, field, fields, is_dataclass
+from dataclasses import field, fields, is_dataclass
 from importlib import import_module
 from pkgutil import iter_modules
 from typing import Any, Literal, NamedTuple
@@ -51,18 +51,11 @@ class SettingEntry(NamedTuple):
 
 def listed(settings: Any) -> Iterator[SettingEntry]:
     """The entries of an algorithm's settings, in their order. Raises ValueError for one without a kind."""
-    name = type(settings).__name__
+    algorithm = type(settings).__name__
     for entry in fields(settings):
-        yield SettingEntry(
-            name, entry.name, getattr(settings, entry.name), _kind(name, entry), entry.metadata["why"]
-        )
-
-
-def _kind(algorithm: str, entry: Field[Any]) -> Kind:
-    kind: Kind | None = entry.metadata.get("kind")
-    if kind is None:
-        raise ValueError(f"{algorithm}.{entry.name} is not said to be physics, size or tuned")
-    return kind
+        if "kind" not in entry.metadata:
+            raise ValueError(f"{algorithm}.{entry.name} is not said to be physics, size or tuned")
+        yield SettingEntry(algorithm, entry.name, getattr(settings, entry.name), **entry.metadata)
 
 
 def all_settings(*rooms: str) -> list[SettingEntry]:

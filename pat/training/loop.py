@@ -191,7 +191,7 @@ class Run:
 
     def _save(self, *, done: bool) -> None:
         if self.watch:
-            self.watch.flush()
+            self.watch.steps.flush()
             facts = {"step": self.step, "best": self.best, "minutes": self.minutes, "done": done}
             learner = self.learner
             state = collect(

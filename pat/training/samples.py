@@ -39,9 +39,8 @@ from pat.synthesis.rigs import below
 
 from .config import RecordingConfig, TrainConfig
 from .lenses import LOST, MOST, Spectra, through_lenses
-from .measured import MeasuredPairs
 from .scenes import Crops, RenderedCrops
-from .stereo import PairCrops
+from .stereo import MeasuredPairs, PairCrops
 
 CACHED = 48
 """Groups of scenes cached to be recorded again."""

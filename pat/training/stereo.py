@@ -20,7 +20,7 @@ from torch import Generator, Tensor
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.pixels import HW
 from arraygeom.pose import Pose
-from pat.data.pairs import PairFiles, pair_files
+from pat.data.pairs import MIDDLEBURY, PairFiles, pair_files
 from pat.data.windows import reduced
 from pat.media.images import read_image
 from pat.synthesis.layered import ArrayBatch
@@ -28,6 +28,8 @@ from pat.synthesis.rigs import below, one_of
 
 from .scenes import ACTIVE, Crops, active_items, chosen
 
+COUNTERPART = {"disp2.png": "disp6.png", "disp1.png": "disp5.png"}
+"""Files of the disparity of the right image, by those of the left."""
 REDUCED = 2
 """The largest reduction of a window: images found online are often less sharp than their pixels."""
 
@@ -95,6 +97,38 @@ class PairCrops(Crops):
         if below(2, g):
             return images, disparities, 1.0, pictures.largest / times
         return images[::-1], disparities[::-1], -1.0, pictures.largest / times
+
+
+class MeasuredPairs(PairCrops):
+    """Random windows of Middlebury's pairs in folders, of the collections of 2003, 2005 and 2006.
+
+    Raises ValueError as `PairCrops`, and for a pair without the disparity of both images.
+    """
+
+    def check(self, pair: PairFiles) -> None:
+        """Raise ValueError for a pair that cannot be used."""
+        super().check(pair)
+        disparity_files(pair)
+
+    def read(self, pair: PairFiles) -> Pictures:
+        """The images and disparities of a pair."""
+        left, right = (read_image(path)[0] * 255 for path in disparity_files(pair))
+        scale = 255 / pair.max_disparity
+        return super().read(pair)._replace(disparities=(left / scale, right / scale))
+
+
+def disparity_files(pair: PairFiles) -> tuple[Path, Path]:
+    """Of the left and of the right image. Raises ValueError where one is missing."""
+    for layout in MIDDLEBURY.values():
+        files = [
+            pair.left.with_name(name)
+            for name in (layout.ground_truth, COUNTERPART.get(layout.ground_truth, "-"))
+        ]
+        if pair.left.name == layout.left and all(file.is_file() for file in files):
+            return files[0], files[1]
+    raise ValueError(
+        f"{pair.left.parent}: wanted the true disparity of both images beside them, disp1.png and disp5.png"
+    )
 
 
 def depth_of(disparity: Float[Tensor, "b h w"], width: int) -> Float[Tensor, "b h w"]:

@@ -75,7 +75,7 @@ class Watch:
         """Report a validation."""
         line = json.dumps({k: round(v, 4) for k, v in facts.items()})
         self.bar.console.print(line, highlight=False) if not self.bar.disable else print(line, flush=True)
-        self.flush()
+        self.steps.flush()
         with (self.out / "log.jsonl").open("a", encoding="utf-8") as file:
             file.write(line + "\n")
         if self.board:
@@ -88,10 +88,6 @@ class Watch:
         write_image(self.out / "images" / f"step-{step:06d}.png", sheet)
         if self.board:
             self.board.add_image("validation", sheet, step)
-
-    def flush(self) -> None:
-        """Flush the files."""
-        self.steps.flush()
 
     def close(self) -> None:
         """Close bar and files."""

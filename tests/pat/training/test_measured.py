@@ -12,8 +12,8 @@ from pat.networks.configs import GuidedPATConfig
 from pat.networks.guided import GuidedPAT
 from pat.training.config import RecordingConfig, TrainConfig, parse_config
 from pat.training.losses import Objective
-from pat.training.measured import MeasuredPairs
 from pat.training.samples import degraded, scenes
+from pat.training.stereo import MeasuredPairs
 
 HW, NEAR, FAR = (32, 48), 9, 3
 """Disparities of a square and of what is behind it."""
