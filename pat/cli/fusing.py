@@ -164,8 +164,9 @@ class Fuse(Known):
         cameras = camera_names(self.given)
         focal = options.numbers_by_name(self.focal, "--focal")
         noise = options.noise_of(self.noise)
-        for option, named in {"--focal": focal, "--noise": noise if isinstance(noise, dict) else {}}.items():
-            if unknown := named.keys() - cameras.keys():
+        levels = noise if isinstance(noise, dict) else {}
+        for option, by_camera in {"--focal": focal, "--noise": levels}.items():
+            if unknown := by_camera.keys() - cameras.keys():
                 raise ValueError(
                     f"{option}: no camera '{min(unknown)}'; the images' names are {', '.join(cameras)}"
                 )

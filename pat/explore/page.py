@@ -146,8 +146,8 @@ def opened(
     networks = {} if network is None or isinstance(network, str) else {"network": network}
     weights = WINDOWS if network is None else network if isinstance(network, str) else "network"
     try:
-        scene, alpha = checked(rig, images, alpha)
-        scene = ExplorerScene(rig, scene.images, fields or {}, networks, scene.guides)
+        images, alpha = checked(rig, images, alpha)
+        scene = ExplorerScene(rig, images, fields or {}, networks)
     except ValueError as error:
         return Explorer(None, "", {**DEFAULTS, "x": [0, 0]}, str(error))
     h, w = rig[alpha].hw
@@ -156,8 +156,10 @@ def opened(
     )
 
 
-def checked(rig: Rig, images: Mapping[str, Tensor] | None, alpha: str | None) -> tuple[ExplorerScene, str]:
-    """The scene and alpha's name. Raises ValueError for what cannot be shown."""
+def checked(
+    rig: Rig, images: Mapping[str, Tensor] | None, alpha: str | None
+) -> tuple[Mapping[str, Tensor], str]:
+    """The images and alpha's name. Raises ValueError for what cannot be shown."""
     if len(rig.names) < 2:
         raise ValueError("the rig has one camera: a receptive field needs two cameras or more")
     alpha = rig.require(alpha or next((n for n in rig.names if not images or n in images), rig.names[0]))
@@ -166,7 +168,7 @@ def checked(rig: Rig, images: Mapping[str, Tensor] | None, alpha: str | None) ->
         rig.require(name)
     if alpha not in images or len(images) < 2:
         raise ValueError(f"give images of alpha, '{alpha}', and of at least one beta")
-    return ExplorerScene(rig, images), alpha
+    return images, alpha
 
 
 SQUARES = 2
@@ -186,7 +188,8 @@ def checkered_room(rig: Rig, alpha: str) -> dict[str, Float[Tensor, "1 h w"]]:
         raise ValueError("a synthetic room needs a calibrated rig with a depth range: give images")
     near, far = (float(d) for d in rig.depth)
     view = cameras[alpha]
-    rays = torch.where(valid_rays(view)[1][..., None], valid_rays(view)[0], 0.0)
+    rays, valid = valid_rays(view)
+    rays = torch.where(valid[..., None], rays, 0.0)
     side = near * rays[..., :2].abs().amax((0, 1))
     half = torch.cat([side, side.new_tensor([min(far, DEEPEST * near)])])
     return {name: room_image(camera, view, half) for name, camera in cameras.items()}
