@@ -47,7 +47,7 @@ from pat.training.scenes import (
 from pat.training.stereo import PairCrops
 
 from .runs import losses, short_run
-from .test_loop import command, one_thread, stopped  # noqa: F401
+from .test_loop import by_torchrun, one_thread, stopped  # noqa: F401
 
 EXACT = RecordingConfig(gain=0, blur=0, noise=0, paper=0)
 
@@ -472,7 +472,7 @@ def test_a_run_on_all_sources_goes_on_bit_for_bit(mixed, monkeypatch):
 def test_two_processes_on_all_sources_are_as_one(mixed):
     config = replace(mixed, out=mixed.out.with_name("two"))
     save_config(config, config.out.with_suffix(".yaml"))
-    running = command(config.out.with_suffix(".yaml"), processes=2)
+    running = by_torchrun(config, config.out.with_suffix(".yaml"), None)
     said, _ = running.communicate()
     assert running.returncode == 0, said
     ours, theirs = ([[float(x) for x in row] for row in losses(c.out)[1:]] for c in (config, mixed))
