@@ -30,7 +30,7 @@ from ..support.settings import size, tuned
 from .blocks import ResidualBlock, channels_last, conv, enlarge, stacked
 from .configs import GuidedPATConfig
 from .protocol import FusionOutput, JoinsBands, required
-from .recall import with_examples
+from .recall import smoothed_within, with_examples
 
 
 @dataclass(frozen=True)
@@ -192,11 +192,11 @@ class GuidedPAT(nn.Module):
         """What all bands have more than alpha: where the betas see it, and where not."""
         confidence = _joined([s.blending.expand_as(s.colour) for s in estimates])
         colour = _joined([s.colour for s in estimates])
-        unseen = _joined([self._unseen(own, s) for s in estimates])
+        unseen = _joined([self._unseen(own, alpha, s) for s in estimates])
         unseen = with_examples(unseen, alpha, colour, confidence)
         return torch.lerp(unseen, colour, confidence)
 
-    def _unseen(self, own: Encoded, estimate: BetaEstimate) -> Tensor:
+    def _unseen(self, own: Encoded, alpha: Tensor, estimate: BetaEstimate) -> Tensor:
         """Colour for where beta does not see the point: propagated at 1/4 of the size to pixels that are
         similar in alpha, or diffused."""
         confidence = estimate.logit.sigmoid()
@@ -204,7 +204,9 @@ class GuidedPAT(nn.Module):
         colour = avg_pool2d(estimate.colour * confidence, SETTINGS.coarse) / (weight + SETTINGS.least_weight)
         for step in self.propagation:
             colour, weight = step(own.quarter, colour, weight)
-        choices = enlarge(colour, SETTINGS.coarse), *estimate.diffused.to(colour).unbind(1)
+        half = [avg_pool2d(part, 2) for part in (estimate.colour * confidence, confidence)]
+        colour = enlarge(colour) * (1 - half[1]) + half[0]
+        choices = enlarge(smoothed_within(alpha, colour)), *estimate.diffused.to(colour).unbind(1)
         return torch.stack([w * c for w, c in zip(estimate.choice.softmax(1).split(1, 1), choices)]).sum(0)
 
     def estimate(self, own: Encoded, alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaEstimate:

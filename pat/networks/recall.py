@@ -3,7 +3,8 @@
 What no beta sees has often the texture of something that one sees. A pixel's query, and another's key, is
 alpha around it at three sizes. The score falls with the squared distance of the two and with how far apart
 the pixels are, and rises with the confidence of what is found. Nothing is trained. It is the non-local mean
-(Buades et al. 2005) of colour, by the compiled attention: no patches are gathered.
+(Buades et al. 2005) of colour, by the compiled attention: no patches are gathered. What is found is smoothed
+within what is alike in alpha, by attention to ever wider neighbourhoods.
 """
 
 from __future__ import annotations
@@ -34,20 +35,22 @@ class RecallSettings:
         "at each size",
     )
     difference: float = tuned(
-        0.04, "Middlebury, tune half: squared distance of keys at which the weight falls to 1 / e"
+        0.03, "Middlebury, tune half: squared distance of keys at which the weight falls to 1 / e"
     )
     distance: float = tuned(10.0, "Middlebury, tune half: pixels at which the weight falls to 1 / e")
     certainty: int = tuned(
         3, "Middlebury, tune half: the power of confidence, squared, that a pixel counts by"
     )
     share: float = tuned(
-        1 / 3,
-        "Middlebury, tune half: of what no beta sees, so much is by example: at 1/2 the mean is the same, "
-        "and pairs with little texture lose more",
+        0.5, "Middlebury, tune half: of what no beta sees, so much is by example"
+    )
+    alike: float = tuned(
+        0.04, "Middlebury, tune half: difference of alpha at which smoothing's weight falls to 1 / e"
     )
     least_weight: float = size(1e-3, "The least weight of a pixel")
     side: int = size(33, "A pixel looks at so many in each row and column")
     spacing: int = size(6, "The distance of these: 96 pixels to each side in all")
+    rounds: tuple[int, ...] = size((1, 2, 4), "Spacings of 7 x 7 pixels, by which it is smoothed in turn")
 
 
 SETTINGS = RecallSettings()
@@ -79,7 +82,19 @@ def recalled(
     query, key = torch.cat([keys, torch.ones_like(weight)], 1), torch.cat([keys, scores], 1)
     del keys
     found = attend(query, key, seen, FIELD, interpolation="nearest", bias=nearness().to(alpha))
-    return enlarge(found)
+    return enlarge(smoothed_within(alpha, torch.lerp(found, seen, weight)))
+
+
+def smoothed_within(
+    alpha: Float[Tensor, "b 1 h w"], colour: Float[Tensor, "b c h/2 w/2"]
+) -> Float[Tensor, "b c h/2 w/2"]:
+    """Means over what is alike in alpha, the nearest first (Tomasi and Manduchi 1998)."""
+    pixels = pixel_unshuffle(alpha * (2**0.5 / SETTINGS.alike), 2)
+    query = torch.cat([pixels, torch.ones_like(pixels[:, :1])], 1)
+    key = torch.cat([pixels, pixels.square().sum(1, keepdim=True) / -2], 1)
+    for spacing in SETTINGS.rounds:
+        colour = attend(query, key, colour, Local(7, spacing=spacing), interpolation="nearest")
+    return colour
 
 
 def nearness() -> Float[Tensor, " n"]:
