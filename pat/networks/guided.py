@@ -30,7 +30,8 @@ from ..support.settings import size, tuned
 from .blocks import ResidualBlock, channels_last, conv, enlarge, stacked
 from .configs import GuidedPATConfig
 from .protocol import FusionOutput, JoinsBands, required
-from .recall import smoothed_within, with_examples
+from .recall import SETTINGS as RECALL
+from .recall import smoothed_within, with_examples, with_less_noise
 
 
 @dataclass(frozen=True)
@@ -194,7 +195,7 @@ class GuidedPAT(nn.Module):
         colour = _joined([s.colour for s in estimates])
         unseen = _joined([self._unseen(own, alpha, s) for s in estimates])
         unseen = with_examples(unseen, alpha, colour, confidence)
-        return torch.lerp(unseen, colour, confidence)
+        return with_less_noise(alpha, torch.lerp(unseen, colour, confidence), confidence)
 
     def _unseen(self, own: Encoded, alpha: Tensor, estimate: BetaEstimate) -> Tensor:
         """Colour for where beta does not see the point: propagated at 1/4 of the size to pixels that are
@@ -206,7 +207,7 @@ class GuidedPAT(nn.Module):
             colour, weight = step(own.quarter, colour, weight)
         half = [avg_pool2d(part, 2) for part in (estimate.colour * confidence, confidence)]
         colour = enlarge(colour) * (1 - half[1]) + half[0]
-        choices = enlarge(smoothed_within(alpha, colour)), *estimate.diffused.to(colour).unbind(1)
+        choices = enlarge(smoothed_within(alpha, colour, RECALL.rounds)), *estimate.diffused.to(colour).unbind(1)
         return torch.stack([w * c for w, c in zip(estimate.choice.softmax(1).split(1, 1), choices)]).sum(0)
 
     def estimate(self, own: Encoded, alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaEstimate:

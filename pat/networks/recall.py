@@ -9,6 +9,7 @@ within what is alike in alpha, by attention to ever wider neighbourhoods.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -50,7 +51,8 @@ class RecallSettings:
     least_weight: float = size(1e-3, "The least weight of a pixel")
     side: int = size(33, "A pixel looks at so many in each row and column")
     spacing: int = size(6, "The distance of these: 96 pixels to each side in all")
-    rounds: tuple[int, ...] = size((1, 2, 4), "Spacings of 7 x 7 pixels, by which it is smoothed in turn")
+    rounds: tuple[int, ...] = size((1, 2, 4), "Spacings of smoothing what is filled in, at half the size")
+    last: tuple[int, ...] = size((2, 1), "And of smoothing all colour, at full size")
 
 
 SETTINGS = RecallSettings()
@@ -65,6 +67,14 @@ def with_examples(
 ) -> Float[Tensor, "b c h w"]:
     """Colour for where no beta sees the point, in part by example, the less certain a pixel is the more."""
     return torch.lerp(unseen, recalled(alpha, colour, confidence), SETTINGS.share * (1 - confidence))
+
+
+def with_less_noise(
+    alpha: Float[Tensor, "b 1 h w"], colour: Float[Tensor, "b c h w"], confidence: Float[Tensor, "b c h w"]
+) -> Float[Tensor, "b c h w"]:
+    """Colour, in part the mean of what is alike in alpha, the less certain a pixel is the more."""
+    smooth = smoothed_within(alpha, colour, SETTINGS.last, confidence)
+    return torch.lerp(colour, smooth, SETTINGS.share * (1 - confidence))
 
 
 def recalled(
@@ -82,18 +92,22 @@ def recalled(
     query, key = torch.cat([keys, torch.ones_like(weight)], 1), torch.cat([keys, scores], 1)
     del keys
     found = attend(query, key, seen, FIELD, interpolation="nearest", bias=nearness().to(alpha))
-    return enlarge(smoothed_within(alpha, torch.lerp(found, seen, weight)))
+    return enlarge(smoothed_within(alpha, torch.lerp(found, seen, weight), SETTINGS.rounds))
 
 
 def smoothed_within(
-    alpha: Float[Tensor, "b 1 h w"], colour: Float[Tensor, "b c h/2 w/2"]
-) -> Float[Tensor, "b c h/2 w/2"]:
-    """Means over what is alike in alpha, the nearest first (Tomasi and Manduchi 1998)."""
-    pixels = pixel_unshuffle(alpha * (2**0.5 / SETTINGS.alike), 2)
-    query = torch.cat([pixels, torch.ones_like(pixels[:, :1])], 1)
-    key = torch.cat([pixels, pixels.square().sum(1, keepdim=True) / -2], 1)
-    for spacing in SETTINGS.rounds:
-        colour = attend(query, key, colour, Local(7, spacing=spacing), interpolation="nearest")
+    alpha: Float[Tensor, "b 1 h w"], colour: Tensor, spacings: Sequence[int], confidence: Tensor | None = None
+) -> Tensor:
+    """Colour (B, C, H, W), or at half the size, by means over 5 x 5 pixels, so far apart in turn: the more
+    alike in alpha (Tomasi and Manduchi 1998) and the more certain (B, C, H, W), the more a pixel counts."""
+    scaled = alpha * (2**0.5 / SETTINGS.alike)
+    pixels = pixel_unshuffle(scaled, alpha.shape[-1] // colour.shape[-1])
+    scores = pixels.square().sum(1, keepdim=True) / -2
+    if confidence is not None:
+        scores = scores + (confidence.amin(1, keepdim=True) + SETTINGS.least_weight).log()
+    query, key = torch.cat([pixels, torch.ones_like(scores)], 1), torch.cat([pixels, scores], 1)
+    for spacing in spacings:
+        colour = attend(query, key, colour, Local(5, spacing=spacing), interpolation="nearest")
     return colour
 
 
