@@ -30,8 +30,7 @@ from ..support.settings import size, tuned
 from .blocks import ResidualBlock, channels_last, conv, enlarge, stacked
 from .configs import GuidedPATConfig
 from .protocol import FusionOutput, JoinsBands, required
-from .recall import SETTINGS as RECALL
-from .recall import smoothed_within, with_examples, with_less_noise
+from .recall import fitted, with_examples, with_less_noise
 
 
 @dataclass(frozen=True)
@@ -132,8 +131,9 @@ class GuidedPAT(nn.Module):
     equal_resolution = True
     joins_bands: JoinsBands = "neighbours"
     uses_matches = True
-    halo = 512
-    """Encoder 85, judge 176, confidence 8 and what is recalled 228 (propagated 148): the sum, rounded up."""
+    halo = 544
+    """Encoder 85, judge 176, confidence 8, what is recalled 228 (propagated 148), smoothing 34: the sum,
+    rounded up."""
     beta_halo = 96
 
     def __init__(self, config: GuidedPATConfig = GuidedPATConfig()) -> None:
@@ -205,9 +205,8 @@ class GuidedPAT(nn.Module):
         colour = avg_pool2d(estimate.colour * confidence, SETTINGS.coarse) / (weight + SETTINGS.least_weight)
         for step in self.propagation:
             colour, weight = step(own.quarter, colour, weight)
-        half = [avg_pool2d(part, 2) for part in (estimate.colour * confidence, confidence)]
-        colour = enlarge(colour) * (1 - half[1]) + half[0]
-        choices = enlarge(smoothed_within(alpha, colour, RECALL.rounds)), *estimate.diffused.to(colour).unbind(1)
+        propagated = fitted(enlarge(colour), alpha, estimate.colour, confidence)
+        choices = propagated, *estimate.diffused.to(colour).unbind(1)
         return torch.stack([w * c for w, c in zip(estimate.choice.softmax(1).split(1, 1), choices)]).sum(0)
 
     def estimate(self, own: Encoded, alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaEstimate:

@@ -42,9 +42,7 @@ class RecallSettings:
     certainty: int = tuned(
         3, "Middlebury, tune half: the power of confidence, squared, that a pixel counts by"
     )
-    share: float = tuned(
-        0.5, "Middlebury, tune half: of what no beta sees, so much is by example"
-    )
+    share: float = tuned(0.5, "Middlebury, tune half: of what no beta sees, so much is by example")
     alike: float = tuned(
         0.04, "Middlebury, tune half: difference of alpha at which smoothing's weight falls to 1 / e"
     )
@@ -66,7 +64,8 @@ def with_examples(
     confidence: Float[Tensor, "b c h w"],
 ) -> Float[Tensor, "b c h w"]:
     """Colour for where no beta sees the point, in part by example, the less certain a pixel is the more."""
-    return torch.lerp(unseen, recalled(alpha, colour, confidence), SETTINGS.share * (1 - confidence))
+    found = fitted(recalled(alpha, colour, confidence), alpha, colour, confidence)
+    return torch.lerp(unseen, found, SETTINGS.share * (1 - confidence))
 
 
 def with_less_noise(
@@ -81,9 +80,9 @@ def recalled(
     alpha: Float[Tensor, "b 1 h w"],
     colour: Float[Tensor, "b c h w"],
     confidence: Float[Tensor, "b c h w"],
-) -> Float[Tensor, "b c h w"]:
-    """The colour of what is seen and looks alike in alpha, at half the size and enlarged. A pixel
-    counts as far as all bands are certain, which several betas may have."""
+) -> Float[Tensor, "b c h/2 w/2"]:
+    """The colour of what is seen and looks alike in alpha. A pixel counts as far as all bands are certain,
+    which several betas may have."""
     certain = confidence.amin(1, keepdim=True)
     weight, keys = avg_pool2d(certain, 2), surroundings(alpha)
     seen = avg_pool2d(colour * certain, 2) / (weight + SETTINGS.least_weight)
@@ -91,8 +90,20 @@ def recalled(
     scores = counts - torch.linalg.vector_norm(keys, dim=1, keepdim=True).square() / 2
     query, key = torch.cat([keys, torch.ones_like(weight)], 1), torch.cat([keys, scores], 1)
     del keys
-    found = attend(query, key, seen, FIELD, interpolation="nearest", bias=nearness().to(alpha))
-    return enlarge(smoothed_within(alpha, torch.lerp(found, seen, weight), SETTINGS.rounds))
+    return attend(query, key, seen, FIELD, interpolation="nearest", bias=nearness().to(alpha))
+
+
+def fitted(
+    filled: Tensor,
+    alpha: Float[Tensor, "b 1 h w"],
+    colour: Float[Tensor, "b c h w"],
+    confidence: Tensor,
+) -> Float[Tensor, "b c h w"]:
+    """What is filled in (B, C, H/2, W/2), smoothed together with colour that is certain, and enlarged;
+    `confidence` is (B, C or 1, H, W)."""
+    certain = avg_pool2d(confidence, 2)
+    together = filled * (1 - certain) + avg_pool2d(colour * confidence, 2)
+    return enlarge(smoothed_within(alpha, together, SETTINGS.rounds))
 
 
 def smoothed_within(
