@@ -2,6 +2,7 @@
 
 import gc
 import os
+from collections.abc import Generator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -32,6 +33,17 @@ def pytest_runtest_setup() -> None:
     import torch  # here, as xdist's own process needs none
 
     torch.manual_seed(0)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call() -> Generator:
+    """A test leaves torch no more threads than it had: they would spin, and slow all that runs after it."""
+    import torch
+
+    threads = torch.get_num_threads()
+    found = yield
+    assert torch._C.get_num_threads() <= threads, "the test left torch more threads than it had"
+    return found
 
 
 @pytest.fixture(scope="session")

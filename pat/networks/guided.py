@@ -30,7 +30,7 @@ from ..support.settings import size, tuned
 from .blocks import ResidualBlock, channels_last, conv, enlarge, stacked
 from .configs import GuidedPATConfig
 from .protocol import FusionOutput, JoinsBands, required
-from .recall import with_examples
+from .recall import fitted, with_examples, with_less_noise
 
 
 @dataclass(frozen=True)
@@ -131,8 +131,9 @@ class GuidedPAT(nn.Module):
     equal_resolution = True
     joins_bands: JoinsBands = "neighbours"
     uses_matches = True
-    halo = 512
-    """Encoder 85, judge 176, confidence 8 and what is recalled 228 (propagated 148): the sum, rounded up."""
+    halo = 544
+    """Encoder 85, judge 176, confidence 8, what is recalled 228 (propagated 148), smoothing 34: the sum,
+    rounded up."""
     beta_halo = 96
 
     def __init__(self, config: GuidedPATConfig = GuidedPATConfig()) -> None:
@@ -192,11 +193,11 @@ class GuidedPAT(nn.Module):
         """What all bands have more than alpha: where the betas see it, and where not."""
         confidence = _joined([s.blending.expand_as(s.colour) for s in estimates])
         colour = _joined([s.colour for s in estimates])
-        unseen = _joined([self._unseen(own, s) for s in estimates])
+        unseen = _joined([self._unseen(own, alpha, s) for s in estimates])
         unseen = with_examples(unseen, alpha, colour, confidence)
-        return torch.lerp(unseen, colour, confidence)
+        return with_less_noise(alpha, torch.lerp(unseen, colour, confidence), confidence)
 
-    def _unseen(self, own: Encoded, estimate: BetaEstimate) -> Tensor:
+    def _unseen(self, own: Encoded, alpha: Tensor, estimate: BetaEstimate) -> Tensor:
         """Colour for where beta does not see the point: propagated at 1/4 of the size to pixels that are
         similar in alpha, or diffused."""
         confidence = estimate.logit.sigmoid()
@@ -204,7 +205,8 @@ class GuidedPAT(nn.Module):
         colour = avg_pool2d(estimate.colour * confidence, SETTINGS.coarse) / (weight + SETTINGS.least_weight)
         for step in self.propagation:
             colour, weight = step(own.quarter, colour, weight)
-        choices = enlarge(colour, SETTINGS.coarse), *estimate.diffused.to(colour).unbind(1)
+        propagated = fitted(enlarge(colour), alpha, estimate.colour, confidence)
+        choices = propagated, *estimate.diffused.to(colour).unbind(1)
         return torch.stack([w * c for w, c in zip(estimate.choice.softmax(1).split(1, 1), choices)]).sum(0)
 
     def estimate(self, own: Encoded, alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaEstimate:

@@ -3,11 +3,13 @@
 What no beta sees has often the texture of something that one sees. A pixel's query, and another's key, is
 alpha around it at three sizes. The score falls with the squared distance of the two and with how far apart
 the pixels are, and rises with the confidence of what is found. Nothing is trained. It is the non-local mean
-(Buades et al. 2005) of colour, by the compiled attention: no patches are gathered.
+(Buades et al. 2005) of colour, by the compiled attention: no patches are gathered. What is found is smoothed
+within what is alike in alpha, by attention to ever wider neighbourhoods.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -34,20 +36,21 @@ class RecallSettings:
         "at each size",
     )
     difference: float = tuned(
-        0.04, "Middlebury, tune half: squared distance of keys at which the weight falls to 1 / e"
+        0.03, "Middlebury, tune half: squared distance of keys at which the weight falls to 1 / e"
     )
     distance: float = tuned(10.0, "Middlebury, tune half: pixels at which the weight falls to 1 / e")
     certainty: int = tuned(
         3, "Middlebury, tune half: the power of confidence, squared, that a pixel counts by"
     )
-    share: float = tuned(
-        1 / 3,
-        "Middlebury, tune half: of what no beta sees, so much is by example: at 1/2 the mean is the same, "
-        "and pairs with little texture lose more",
+    share: float = tuned(0.5, "Middlebury, tune half: of what no beta sees, so much is by example")
+    alike: float = tuned(
+        0.04, "Middlebury, tune half: difference of alpha at which smoothing's weight falls to 1 / e"
     )
     least_weight: float = size(1e-3, "The least weight of a pixel")
     side: int = size(33, "A pixel looks at so many in each row and column")
     spacing: int = size(6, "The distance of these: 96 pixels to each side in all")
+    rounds: tuple[int, ...] = size((1, 2, 4), "Spacings of smoothing what is filled in, at half the size")
+    last: tuple[int, ...] = size((2, 1), "And of smoothing all colour, at full size")
 
 
 SETTINGS = RecallSettings()
@@ -61,16 +64,25 @@ def with_examples(
     confidence: Float[Tensor, "b c h w"],
 ) -> Float[Tensor, "b c h w"]:
     """Colour for where no beta sees the point, in part by example, the less certain a pixel is the more."""
-    return torch.lerp(unseen, recalled(alpha, colour, confidence), SETTINGS.share * (1 - confidence))
+    found = fitted(recalled(alpha, colour, confidence), alpha, colour, confidence)
+    return torch.lerp(unseen, found, SETTINGS.share * (1 - confidence))
+
+
+def with_less_noise(
+    alpha: Float[Tensor, "b 1 h w"], colour: Float[Tensor, "b c h w"], confidence: Float[Tensor, "b c h w"]
+) -> Float[Tensor, "b c h w"]:
+    """Colour, in part the mean of what is alike in alpha, the less certain a pixel is the more."""
+    smooth = smoothed_within(alpha, colour, SETTINGS.last, confidence)
+    return torch.lerp(colour, smooth, SETTINGS.share * (1 - confidence))
 
 
 def recalled(
     alpha: Float[Tensor, "b 1 h w"],
     colour: Float[Tensor, "b c h w"],
     confidence: Float[Tensor, "b c h w"],
-) -> Float[Tensor, "b c h w"]:
-    """The colour of what is seen and looks alike in alpha, at half the size and enlarged. A pixel
-    counts as far as all bands are certain, which several betas may have."""
+) -> Float[Tensor, "b c h/2 w/2"]:
+    """The colour of what is seen and looks alike in alpha. A pixel counts as far as all bands are certain,
+    which several betas may have."""
     certain = confidence.amin(1, keepdim=True)
     weight, keys = avg_pool2d(certain, 2), surroundings(alpha)
     seen = avg_pool2d(colour * certain, 2) / (weight + SETTINGS.least_weight)
@@ -78,8 +90,36 @@ def recalled(
     scores = counts - torch.linalg.vector_norm(keys, dim=1, keepdim=True).square() / 2
     query, key = torch.cat([keys, torch.ones_like(weight)], 1), torch.cat([keys, scores], 1)
     del keys
-    found = attend(query, key, seen, FIELD, interpolation="nearest", bias=nearness().to(alpha))
-    return enlarge(found)
+    return attend(query, key, seen, FIELD, interpolation="nearest", bias=nearness().to(alpha))
+
+
+def fitted(
+    filled: Tensor,
+    alpha: Float[Tensor, "b 1 h w"],
+    colour: Float[Tensor, "b c h w"],
+    confidence: Tensor,
+) -> Float[Tensor, "b c h w"]:
+    """What is filled in (B, C, H/2, W/2), smoothed together with colour that is certain, and enlarged;
+    `confidence` is (B, C or 1, H, W)."""
+    certain = avg_pool2d(confidence, 2)
+    together = filled * (1 - certain) + avg_pool2d(colour * confidence, 2)
+    return enlarge(smoothed_within(alpha, together, SETTINGS.rounds))
+
+
+def smoothed_within(
+    alpha: Float[Tensor, "b 1 h w"], colour: Tensor, spacings: Sequence[int], confidence: Tensor | None = None
+) -> Tensor:
+    """Colour (B, C, H, W), or at half the size, by means over 5 x 5 pixels, so far apart in turn: the more
+    alike in alpha (Tomasi and Manduchi 1998) and the more certain (B, C, H, W), the more a pixel counts."""
+    scaled = alpha * (2**0.5 / SETTINGS.alike)
+    pixels = pixel_unshuffle(scaled, alpha.shape[-1] // colour.shape[-1])
+    scores = pixels.square().sum(1, keepdim=True) / -2
+    if confidence is not None:
+        scores = scores + (confidence.amin(1, keepdim=True) + SETTINGS.least_weight).log()
+    query, key = torch.cat([pixels, torch.ones_like(scores)], 1), torch.cat([pixels, scores], 1)
+    for spacing in spacings:
+        colour = attend(query, key, colour, Local(5, spacing=spacing), interpolation="nearest")
+    return colour
 
 
 def nearness() -> Float[Tensor, " n"]:

@@ -4,6 +4,7 @@ import bz2
 import csv
 import warnings
 from collections import defaultdict
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -56,7 +57,7 @@ def triangulated(cameras: list[Camera], pixels: list[torch.Tensor]) -> torch.Ten
 
 def epipolar_errors(a: Camera, b: Camera, xa: torch.Tensor, xb: torch.Tensor) -> torch.Tensor:
     """Pixels in b between what was seen and the nearest point of alpha's (possibly curved) epipolar line."""
-    depths = torch.logspace(-1.5, 3, 4000, dtype=torch.float64) * (a.centre - b.centre).norm()
+    depths = torch.logspace(-1.5, 3, 1000, dtype=torch.float64) * (a.centre - b.centre).norm()
     X = a.centre + directions(a, xa)[:, None] * depths[:, None]
     projected = b.project(X)
     start, end = projected.x[:, :-1], projected.x[:, 1:]
@@ -66,12 +67,14 @@ def epipolar_errors(a: Camera, b: Camera, xa: torch.Tensor, xb: torch.Tensor) ->
     return torch.where(projected.valid[:, 1:] & projected.valid[:, :-1], distance, torch.inf).amin(-1)
 
 
+@cache
+def features(path: Path):
+    return cv2.SIFT_create(3000).detectAndCompute(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), None)
+
+
 def matches(a: Path, b: Path) -> tuple[torch.Tensor, torch.Tensor]:
     """Pixels of SIFT features that are each other's nearest, and much nearer than the second."""
-    sift, found = cv2.SIFT_create(3000), []
-    for path in (a, b):
-        found.append(sift.detectAndCompute(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), None))
-    (points_a, da), (points_b, db) = found
+    (points_a, da), (points_b, db) = features(a), features(b)
     forward, back = (cv2.BFMatcher().knnMatch(*pair, k=2) for pair in ((da, db), (db, da)))
     best_back = {m.queryIdx: m.trainIdx for m, _ in back}
     good = [m for m, n in forward if m.distance < 0.7 * n.distance and best_back[m.trainIdx] == m.queryIdx]
@@ -122,7 +125,7 @@ def test_fifteen_cameras_reproject_to_a_pixel(shared_data):
         camera, point, x, y = map(float, line.split())
         seen[int(point)][f"cam{int(camera)}"] = [x, y]
     found = []
-    for views in list(seen.values())[::8]:
+    for views in list(seen.values())[::16]:
         if len(views) >= 2:
             cameras, pixels = [rig[name] for name in views], [tensor([x]) for x in views.values()]
             X = triangulated(cameras, pixels)

@@ -32,7 +32,7 @@ class Noted(list):
 
 def test_an_error_is_raised_once_no_task_runs_any_more(monkeypatch):
     """Else what a task writes would still appear after it was cleaned up."""
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(threads_module, "threads", lambda: 2)
     begun, both, done = [], threading.Barrier(2, timeout=300), []
 
     def slow():

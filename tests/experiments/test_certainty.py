@@ -27,15 +27,15 @@ def judged(pair, power=2.0, condition="ideal", count=4000):
 
 def test_pairs_that_are_alike_teach_each_other():
     found = [judged(name) for name in "abc"]
-    shown = held(found, by_thirds(found, steps=300))
+    shown = held(found, by_thirds(found, steps=200))
     assert shown["all"].stated.error < 0.03
     assert abs(shown["all"].covered - 0.9) < 0.03
 
 
 def test_a_pair_does_not_teach_itself():
     found = [judged("a"), judged("b"), judged("c", 0.2)]
-    assert held([found[2]], by_thirds(found, steps=300))["all"].stated.error > 0.2
-    network = fitted([found[2]], steps=300)
+    assert held([found[2]], by_thirds(found, steps=200))["all"].stated.error > 0.2
+    network = fitted([found[2]], steps=200)
     assert held([found[2]], lambda one: Stated.by(network, one.numbers))["all"].stated.error < 0.05
 
 
@@ -54,7 +54,7 @@ def test_intervals_are_wider_where_pairs_are_not_alike():
     numbers = torch.full((1, MEASURED), 0.9)
     alone, wide = (
         Stated.by(network, numbers).half_width.item()
-        for network in (fitted(found, steps=300), widened(found, steps=300))
+        for network in (fitted(found, steps=200), widened(found, steps=200))
     )
     assert wide > 1.3 * alone
 
@@ -63,7 +63,7 @@ def test_conditions_are_summed_up_for_themselves():
     found = [
         judged(name, power, condition) for name in "ab" for condition, power in (("ideal", 1.0), ("x8", 3.0))
     ]
-    network = fitted([one for one in found if one.condition == "ideal"], steps=300)
+    network = fitted([one for one in found if one.condition == "ideal"], steps=200)
     shown = held(found, lambda one: Stated.by(network, one.numbers))
     assert list(shown) == ["ideal", "x8", "all"]
     assert shown["x8"].stated.error > 0.1 > shown["ideal"].stated.error

@@ -9,7 +9,7 @@ import torch
 
 from arraygeom import Pose, rotation_from_vector
 from calib.boards.corners import refine_corners, smooth_map
-from calib.boards.simulation import photograph
+from calib.boards.simulation import fine_rays, photograph
 from calib.boards.target import parse_board
 from tests.calib.board_scenes import camera, tensor
 
@@ -26,12 +26,17 @@ def the_same_draws_in_any_order():
 
 
 @cache
+def rays():
+    return fine_rays(CAMERA)
+
+
+@cache
 def rendered(text):
     """A board, its pose, and an image of it without noise."""
     board = parse_board(text)
     R = rotation_from_vector(torch.deg2rad(tensor(24.0, -28.0, 9.0)))
     pose = Pose(R, tensor(0.01, -0.005, 0.34) - R @ tensor(*board.points.mean(0)))
-    return board, pose, photograph(CAMERA, pose, board, dpi=240).astype(float)
+    return board, pose, photograph(CAMERA, pose, board, dpi=240, rays=rays()).astype(float)
 
 
 def seen(text, *, noise=1.5):

@@ -41,7 +41,7 @@ CHOSEN = (
 
 @pytest.fixture(scope="module")
 def case():
-    return next(layered_cases(1, hw=(96, 128), seed=3))
+    return next(layered_cases(1, hw=(64, 96), seed=3))
 
 
 def test_cases_are_unrectified_rigs_that_see_the_same_scene(case):

@@ -36,6 +36,12 @@ def images(sample):
 
 
 @pytest.fixture(scope="module")
+def ideal(network, sample, images):
+    """PSNR of the whole sample as its rig says."""
+    return psnr(network, sample, images)
+
+
+@pytest.fixture(scope="module")
 def middle(network):
     """The middle of the sample, its images, and PSNR with them."""
     sample = middle_of_sample()
@@ -103,9 +109,8 @@ def test_nothing_is_changed_where_the_cameras_are_as_the_rig_says(sample, networ
 
 
 @pytest.mark.parametrize("degrees", [0.3, -0.3])
-def test_a_rotated_camera_is_put_right(sample, network, images, degrees):
+def test_a_rotated_camera_is_put_right(sample, network, images, ideal, degrees):
     rig, lines = with_beta_rotated(sample.rig, degrees), []
-    ideal = psnr(network, sample, images)
     assert psnr(network, sample, images, rig=rig, explain=lines.append) > ideal - 0.5
     assert psnr(network, sample, images, rig=rig, align=False) < ideal - 1.0
     assert "off its search segments" in lines[0]
@@ -118,9 +123,10 @@ def test_found_corrections_serve_other_frames(sample, network, images):
     assert torch.equal(fuse(network, rig, images, alpha=ALPHA, corrections=found).image, one.image)
 
 
-def test_a_sequence_finds_corrections_once(sample, network, images, monkeypatch):
+def test_a_sequence_finds_corrections_once(middle, network, monkeypatch):
     from pat.fusion import sequence
 
+    sample, images, _ = middle
     calls = []
     found = sequence.corrections_of
     monkeypatch.setattr(sequence, "corrections_of", lambda *a, **k: calls.append(1) or found(*a, **k))

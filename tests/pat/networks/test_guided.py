@@ -107,7 +107,8 @@ def test_what_no_beta_sees_is_by_example_in_part(monkeypatch):
     inputs = Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [rectified()])
     images = []
     for found in (0.0, 0.2):
-        monkeypatch.setattr(recall, "recalled", lambda _, colour, __, by=found: torch.full_like(colour, by))
+        by_example = torch.full((1, 3, HW[0] // 2, HW[1] // 2), found)
+        monkeypatch.setattr(recall, "recalled", lambda *_, same=by_example: same)
         images.append(fused_at_once(network, inputs).image)
     assert torch.allclose(images[1] - images[0], torch.tensor(0.2 * recall.SETTINGS.share), atol=1e-4)
 

@@ -2,8 +2,9 @@
 
 import pytest
 import torch
+from torch.nn.functional import avg_pool2d
 
-from pat.networks.recall import SETTINGS, nearness, recalled
+from pat.networks.recall import SETTINGS, fitted, nearness, recalled, smoothed_within, with_less_noise
 
 HW = (64, 160)
 RED, BLUE = torch.tensor([0.3, -0.1, -0.1]), torch.tensor([-0.1, -0.1, 0.3])
@@ -23,7 +24,7 @@ def stripes():
 def test_colour_is_that_of_what_looks_alike(stripes):
     alpha, colour, confidence = stripes
     hidden = torch.where(confidence > 0, colour, torch.rand_like(colour))
-    found, expected = recalled(alpha, hidden, confidence)[..., :20], colour[..., :20]
+    found, expected = recalled(alpha, hidden, confidence)[..., :10], avg_pool2d(colour, 2)[..., :10]
     assert found.shape == expected.shape
     assert (found - expected).abs().mean() < 0.03
     assert (found - expected.flip(1)).abs().mean() > 0.2
@@ -36,8 +37,8 @@ def test_a_pixel_counts_where_all_bands_are_certain(stripes):
     alpha, colour, confidence = stripes
     wrong, doubted = colour.clone(), confidence.clone()
     wrong[:, :1, :, 40:80], doubted[:, :1, :, 40:80] = 1.0, 0.0
-    found = recalled(alpha, wrong, doubted)[..., :20]
-    assert (found - colour[..., :20]).abs().mean() < 0.03
+    found = recalled(alpha, wrong, doubted)[..., :10]
+    assert (found - avg_pool2d(colour, 2)[..., :10]).abs().mean() < 0.03
 
 
 def test_nearer_pixels_count_more():
@@ -51,7 +52,54 @@ def test_nearer_pixels_count_more():
 
 def test_gradients_reach_alpha_and_colour(stripes):
     alpha, colour, confidence = (part[..., :32, :64].double().clone().requires_grad_() for part in stripes)
-    recalled(alpha, colour, confidence)[..., :16].square().sum().backward()
+    fitted(recalled(alpha, colour, confidence), alpha, colour, confidence)[..., :16].square().sum().backward()
     assert all(
         part.grad.isfinite().all() and part.grad.abs().max() > 0 for part in (alpha, colour, confidence)
     )
+
+
+@pytest.fixture
+def halves():
+    """Alpha of two levels beside each other, each of a colour, which is noisy."""
+    right = torch.arange(HW[1]).expand(*HW) >= 80
+    alpha = torch.where(right, 0.6, 0.4)[None, None]
+    colour = torch.where(right, RED[:, None, None], BLUE[:, None, None])[None]
+    return alpha, colour, colour + 0.05 * torch.randn(1, 3, *HW, generator=torch.Generator().manual_seed(0))
+
+
+def test_smoothing_stays_within_what_is_alike(halves):
+    alpha, colour, noisy = halves
+    for part, same, spacings in (
+        (noisy, colour, SETTINGS.last),
+        (avg_pool2d(noisy, 2), avg_pool2d(colour, 2), SETTINGS.rounds),
+    ):
+        smooth = smoothed_within(alpha, part, spacings)
+        assert (smooth - same).square().mean() < 0.05 * (part - same).square().mean()
+        flat = smoothed_within(torch.full_like(alpha, 0.5), part, spacings)
+        assert (flat - same).abs().max() > 0.1
+
+
+def test_what_is_certain_counts_more_and_is_left_alone(halves):
+    alpha, colour, noisy = halves
+    certain = torch.zeros_like(noisy)
+    certain[..., ::2] = 1.0
+    mixed = torch.where(certain > 0, colour, noisy)
+    weighted, equally = (smoothed_within(alpha, mixed, SETTINGS.last, by) for by in (certain, None))
+    assert (weighted - colour).square().mean() < 0.1 * (equally - colour).square().mean()
+    less = with_less_noise(alpha, mixed, certain)
+    assert torch.equal(less[certain > 0], mixed[certain > 0])
+    doubtful = certain == 0
+    share = (less - mixed)[doubtful] / (weighted - mixed)[doubtful]
+    assert torch.allclose(share, torch.tensor(SETTINGS.share), atol=1e-3)
+
+
+def test_what_is_filled_in_is_smoothed_with_what_is_certain(halves):
+    alpha, colour, _ = halves
+    certain = torch.ones_like(alpha)
+    certain[..., 60:80] = 0.0
+    filled = torch.zeros_like(avg_pool2d(colour, 2))
+    found = fitted(filled, alpha, colour, certain)
+    assert torch.allclose(found[..., 84:], colour[..., 84:], atol=1e-3)
+    hole, truth = found[..., 62:78], colour[..., 62:78]
+    assert (hole - truth).norm() < 0.7 * truth.norm()
+    assert (hole - truth).norm() < (hole - colour[..., -1:]).norm()
