@@ -40,14 +40,9 @@ class GuidedSettings:
     coarse: int = size(4, "Context is computed at this part of the size")
     least_weight: float = size(1e-3, "The least weight of a pixel in propagation")
     confidence_offsets: tuple[float, float] = tuned(
-        (1.2, 3.0),
+        (0.2, 2.0),
         "Middlebury, tune half: goes with the next training: added to the logit of the confidence where "
         "colour is blended: where beta's brightness is unlike alpha's, and where it is the same",
-    )
-    unexpected: float = tuned(
-        10.0,
-        "Middlebury, tune half: how much less colour counts, as a logit, for each unit by which it differs "
-        "from what one would fill in there",
     )
     exact_offset: float = tuned(
         1.0,
@@ -102,13 +97,11 @@ class BetaEstimate(NamedTuple):
         found = pad(self.logit.sigmoid(), (1, 1, 1, 1), mode="replicate")
         return avg_pool2d(avg_pool2d(found, 2, 1), 2, 1)[:, 0] * (self.peak > 0)
 
-    def blending(self, expected: Float[Tensor, "b c h w"] | None = None) -> Float[Tensor, "b c h w"]:
-        """The weight of `colour` in the image, 0 to 1; less where it is not what is expected there."""
+    @property
+    def blending(self) -> Float[Tensor, "b 1 h w"]:
+        """The weight of `colour` in the image, 0 to 1."""
         unlike, alike = SETTINGS.confidence_offsets
-        logit = self.logit + unlike + (alike - unlike) * self.likeness
-        if expected is not None:
-            logit = logit - SETTINGS.unexpected * (self.colour - expected).norm(dim=1, keepdim=True)
-        return logit.sigmoid().expand_as(self.colour)
+        return (self.logit + unlike + (alike - unlike) * self.likeness).sigmoid()
 
     def beyond(self, base: Float[Tensor, "b c h w"], band: int) -> BetaEstimate:
         """One band, counted from a base instead of from alpha; `base` (B, C, H, W) is bands minus alpha."""
@@ -198,12 +191,10 @@ class GuidedPAT(nn.Module):
         self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], estimates: Sequence[BetaEstimate]
     ) -> Float[Tensor, "b c h w"]:
         """What all bands have more than alpha: where the betas see it, and where not."""
-        confidence = _joined([s.blending() for s in estimates])
+        confidence = _joined([s.blending.expand_as(s.colour) for s in estimates])
         colour = _joined([s.colour for s in estimates])
         unseen = _joined([self._unseen(own, alpha, s) for s in estimates])
         unseen = with_examples(unseen, alpha, colour, confidence)
-        expected = unseen.split([s.colour.shape[1] for s in estimates], 1)
-        confidence = _joined([s.blending(e) for s, e in zip(estimates, expected)])
         return with_less_noise(alpha, torch.lerp(unseen, colour, confidence), confidence)
 
     def _unseen(self, own: Encoded, alpha: Tensor, estimate: BetaEstimate) -> Tensor:
