@@ -55,10 +55,10 @@ def filled_by(network: GuidedPAT, fill: int | None) -> None:
         vars(network).pop("_unseen", None)
         return
 
-    def alone(self: GuidedPAT, own: Encoded, estimate: BetaEstimate) -> Tensor:
+    def alone(self: GuidedPAT, own: Encoded, alpha: Tensor, estimate: BetaEstimate) -> Tensor:
         chosen = one_hot(torch.tensor(fill), 1 + FILLS).to(estimate.choice)[:, None, None]
         return GuidedPAT._unseen(
-            self, own, estimate._replace(choice=(1e4 * chosen).expand_as(estimate.choice))
+            self, own, alpha, estimate._replace(choice=(1e4 * chosen).expand_as(estimate.choice))
         )
 
     vars(network)["_unseen"] = MethodType(alone, network)
