@@ -28,7 +28,7 @@ from .blocks import enlarge
 
 @dataclass(frozen=True)
 class RecallSettings:
-    """Pixels are those of half the size."""
+    """Pixels are those of half the size, but for `last`."""
 
     around: tuple[tuple[int, int, float], ...] = tuned(
         ((0, 2, 1.0), (1, 5, 0.8), (4, 10, 0.6)),
@@ -42,7 +42,11 @@ class RecallSettings:
     certainty: int = tuned(
         3, "Middlebury, tune half: the power of confidence, squared, that a pixel counts by"
     )
-    share: float = tuned(0.5, "Middlebury, tune half: of what no beta sees, so much is by example")
+    share: float = tuned(
+        0.5,
+        "Middlebury, tune half: of what no beta sees, so much is by example; of what is doubtful, so much "
+        "is smoothed in the end",
+    )
     alike: float = tuned(
         0.04, "Middlebury, tune half: difference of alpha at which smoothing's weight falls to 1 / e"
     )
@@ -50,7 +54,7 @@ class RecallSettings:
     side: int = size(33, "A pixel looks at so many in each row and column")
     spacing: int = size(6, "The distance of these: 96 pixels to each side in all")
     rounds: tuple[int, ...] = size((1, 2, 4), "Spacings of smoothing what is filled in, at half the size")
-    last: tuple[int, ...] = size((2, 1), "And of smoothing all colour, at full size")
+    last: tuple[int, ...] = size((2, 1), "Spacings of smoothing what is doubtful in the end, at full size")
 
 
 SETTINGS = RecallSettings()
