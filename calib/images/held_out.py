@@ -12,7 +12,6 @@ from arraygeom import Rig
 from arraygeom.pixels import HW
 
 from .matches import Pairs, PointMatches
-from .refined import LineStatistics
 from .residuals import epipolar_residuals
 
 HELD_OUT = 4
@@ -25,11 +24,6 @@ TRIMMED = 0.85
 """The share of the points, those nearest to their lines, that statistics use."""
 PARTS = 3
 """The jackknife leaves out one of so many by so many parts of the image."""
-
-
-def line_statistics(distance: Float[Tensor, " n"]) -> LineStatistics:
-    """Statistics of the distances of points from their lines."""
-    return LineStatistics(len(distance), float(distance.abs().median()))
 
 
 def trimmed_square(distance: Float[Tensor, " n"]) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from itertools import combinations
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arraygeom import Link, Pair, apply_homography, epipolar_distance, epipolar_lines, triangulate
+from arraygeom import Link, Pair, Rig, apply_homography, epipolar_distance, epipolar_lines, triangulate
 from arraygeom.chunks import chunked
 from arraygeom.pixels import shift_matrix
 from arraygeom.progress import log_step
@@ -62,6 +62,12 @@ Pairs = Mapping[tuple[str, str], PointMatches]
 """Matches of pairs of cameras, by their names (alpha, beta)."""
 Images = Mapping[str, Float[Tensor, "_ _ _"]]
 """An image (C, H, W) of each camera, by name."""
+
+
+def cameras_of(rig: Rig, pairs: Iterable[tuple[str, str]]) -> list[str]:
+    """The cameras of some pairs, in the rig's order."""
+    among = {name for pair in pairs for name in pair}
+    return [name for name in rig.names if name in among]
 
 
 def match_points(alpha: Float[Tensor, "_ h w"], beta: Float[Tensor, "_ hb wb"]) -> PointMatches:
@@ -298,6 +304,16 @@ def seen_depths(pair: Pair, matches: PointMatches) -> tuple[float, float]:
         )
     low, high = _percentiles(depth, 0.02)
     return 0.9 * low, 1.25 * high
+
+
+def depth_seen(rig: Rig, pairs: Pairs) -> tuple[float, float] | None:
+    """`seen_depths` of all calibrated pairs together; None if no pair has enough points."""
+    found = []
+    for names, matches in pairs.items():
+        if (pair := rig.pair(*names)).calibrated:
+            with suppress(ValueError):
+                found.append(seen_depths(pair, matches))
+    return (min(near for near, _ in found), max(far for _, far in found)) if found else None
 
 
 def fit_fundamental(matches: PointMatches) -> Float[Tensor, "3 3"]:

@@ -8,7 +8,6 @@ depends on the rig alone. Bilinear sampling propagates the gradient to the segme
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -20,7 +19,7 @@ from torch.nn.functional import avg_pool2d, interpolate, pad, unfold
 from arraygeom import Positions, Rig, Segments, pixel_grid
 from arraygeom.fields import recorded_field
 
-from .matches import Images, Pairs, seen_depths
+from .matches import Images
 
 
 @runtime_checkable
@@ -90,20 +89,6 @@ def photometric_errors(
     valid = locations.mask.any(-1) if isinstance(locations, Positions) else locations.valid
     confidence = found.peak[0].detach().sqrt()
     return torch.where(valid, confidence * (found.value - own)[0, 0], 0.0), valid
-
-
-def with_depths(rig: Rig, pairs: Pairs) -> Rig:
-    """The rig with the depth range of the matched points, if it has none."""
-    if rig.depth is not None:
-        return rig
-    bounds = []
-    for names, matches in pairs.items():
-        if (pair := rig.pair(*names)).calibrated:
-            with suppress(ValueError):
-                bounds.append(seen_depths(pair, matches))
-    return (
-        rig.replace(depth=(min(near for near, _ in bounds), max(far for _, far in bounds))) if bounds else rig
-    )
 
 
 def patches(grey: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 25 h w"]:

@@ -33,7 +33,10 @@ class EpipolarResiduals(NamedTuple):
 
 
 class MatchDepths(NamedTuple):
-    """Depth in alpha (metres) of matched points, whether in front of both cameras, and observable."""
+    """Depth in alpha (metres) of matched points, whether in front of both cameras, and observable.
+
+    Of uncalibrated pairs no depth is observable, nor a number.
+    """
 
     depth: Float[Tensor, "*b n"]
     front: Bool[Tensor, "*b n"]
@@ -42,6 +45,8 @@ class MatchDepths(NamedTuple):
 
 LEAST_PARALLAX = 2.0
 """Least angle between rays, in pixels, at which their depth is observable."""
+FEW = 10
+"""Least number of points for a share."""
 
 
 def epipolar_residuals(pair: Pair, matches: PointMatches) -> EpipolarResiduals:
@@ -59,19 +64,25 @@ def sampson_of_pairs(rig: Rig, pairs: Pairs) -> list[Float[Tensor, " n"]]:
     return [torch.where(part.valid, part.sampson, 0.0) for part in parts]
 
 
-def residuals_and_depths(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, MatchDepths | None]:
-    """The residuals, and the depths where the rays are closest to each other: None for uncalibrated pairs."""
+def residuals_and_depths(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, MatchDepths]:
+    """The residuals, and the depths where the rays are closest to each other."""
     residuals, (a, b) = _residuals(pair, matches)
-    calibrated = pair.calibrated and pair.link is None
-    return residuals, _depths(pair, a.detach(), b.detach(), residuals.valid) if calibrated else None
+    return residuals, _depths(pair, a.detach(), b.detach(), residuals.valid)
 
 
-def match_depths(pair: Pair, matches: PointMatches) -> MatchDepths | None:
-    """Depths where rays are closest to each other, differentiable in the rig; None for uncalibrated pairs."""
-    if not pair.calibrated or pair.link is not None:
-        return None
-    (a, b), _, valid = _rays(pair, *_for_each(pair, matches))
-    return _depths(pair, a, b, valid)
+def match_depths(rig: Rig, pairs: Pairs) -> MatchDepths:
+    """Of all points of all pairs: depths where rays are closest to each other, differentiable in the rig."""
+    found = []
+    for names, matches in pairs.items():
+        pair = rig.pair(*names)
+        (a, b), _, valid = _rays(pair, *_for_each(pair, matches))
+        found.append(_depths(pair, a, b, valid))
+    return MatchDepths(*(torch.cat(part) for part in zip(*found)))
+
+
+def share(chosen: Bool[Tensor, " n"]) -> float:
+    """The share of points that are chosen; NaN for few points."""
+    return float(chosen.double().mean()) if len(chosen) >= FEW else math.nan
 
 
 def systematic_modes(pair: Pair, matches: PointMatches) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
@@ -112,10 +123,8 @@ def _residuals(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, tu
         at_alpha, at_beta = torch.autograd.grad(algebraic.sum(), (alpha, beta), retain_graph=True)
     across = at_beta.square().sum(-1)
     both = (across + at_alpha.square().sum(-1)).clamp(min=1e-300)
-    return EpipolarResiduals(algebraic / both.sqrt(), algebraic / across.clamp(min=1e-300).sqrt(), valid), (
-        a,
-        b,
-    )
+    line = algebraic / across.clamp(min=1e-300).sqrt()
+    return EpipolarResiduals(algebraic / both.sqrt(), line, valid), (a, b)
 
 
 def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
@@ -133,6 +142,9 @@ def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
 
 def _depths(pair: Pair, a: Tensor, b: Tensor, valid: Tensor) -> MatchDepths:
     """Along the rays a of alpha and b of beta, each in its camera's frame."""
+    if not pair.calibrated or pair.link is not None:
+        never = torch.zeros_like(valid)
+        return MatchDepths(torch.full_like(a[..., 2], torch.nan), never, never)
     R, t = pair.beta_from_alpha.R, pair.beta_from_alpha.t[..., None, :]
     rotated = a @ R.transpose(-1, -2)
     aa, bb, ab = (rotated * rotated).sum(-1), (b * b).sum(-1), (rotated * b).sum(-1)

@@ -303,7 +303,7 @@ class Doctor:
             former = self.out.with_name(f"{self.out.name}.old")
             write_text(former, self.out.read_text(encoding="utf-8"))
             kept = f"; the former file: {former}"
-        found.repaired.save(self.out)
+        found.named.rig.save(self.out)
         say(f"written: {self.out} ({found.named.words}: undone{kept})")
 
 

@@ -26,8 +26,8 @@ from torch.nn.functional import interpolate
 from arraygeom import Distortion, Pose, Rig, pixel_grid, sample
 from arraygeom.atomic import write_text
 from calib.images.doctor import Diagnosis, diagnose_matches
+from calib.images.hypotheses import ROTATIONS, TRANSPOSE, on_cameras
 from calib.images.matches import match_cameras, seen_depths
-from calib.images.remedies import ROTATIONS, TRANSPOSE, on_cameras
 from pat.evaluation.tables import markdown_header, markdown_row
 from tests.calib.real import RealPair, every_pair
 

@@ -23,7 +23,7 @@ from torch import Tensor
 from arraygeom import Link, Rig, View
 from arraygeom.pixels import coarse_grid
 from calib.images.from_images import rig_from_images
-from calib.images.held_out import line_distances, line_statistics, split
+from calib.images.held_out import line_distances, split
 from calib.images.matches import PointMatches, fit_fundamental, line_distance, match_cameras
 from calib.images.refinement import FREE, LineStatistics, RefinementProblem, polish, refine, refine_matches
 from experiments.showcase import FAST, FAST_FRAME, SCENE, SLOW, SLOW_FRAME, published_matrices
@@ -80,7 +80,7 @@ def own_agreement(pairs: dict) -> LineStatistics:
     """How held-out points agree with an F fitted to all points."""
     _, held_out = split([pairs])
     (names, points), *_ = pairs.items()
-    return line_statistics(line_distance(held_out[names], fit_fundamental(points)))
+    return LineStatistics.of(line_distance(held_out[names], fit_fundamental(points)))
 
 
 def beyond(found: LineStatistics, own: LineStatistics) -> float:
