@@ -9,7 +9,7 @@ combination of parameters stays where it was.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -63,6 +63,15 @@ class DepthChange(NamedTuple):
             return False
         gained = max(self.before**2 - self.after**2, 0.0) ** 0.5
         return self.change > SMALL_CHANGE or self.change > UNGAINED_CHANGE * gained
+
+    def objections(self) -> Iterator[str]:
+        """Why the rig's change should not be accepted."""
+        if self.after > self.before:
+            yield "depth would be less certain than before"
+        if self.doubtful:
+            yield f"depth would change by {self.change:.1%} but these points determine it to {self.known:.1%} only"
+        elif self.change > LARGE_CHANGE:
+            yield f"depth would change by {self.change:.0%}: a rig so far off is better calibrated anew"
 
     def __str__(self) -> str:
         return (

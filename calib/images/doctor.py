@@ -31,7 +31,7 @@ from .hypotheses import (
     ignored_lens,
     in_degrees,
 )
-from .matches import Images, Pairs, PointMatches, agreeing_pairs, depth_seen, match_cameras
+from .matches import Images, Pairs, PointMatches, agreeing_pairs, cameras_of, depth_seen, match_cameras
 from .parameters import SIGMA
 from .residuals import related
 
@@ -235,7 +235,7 @@ def _thinned(matches: PointMatches) -> PointMatches:
 
 def _ignored_lens(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
     """The distortion that best explains the points, for cameras that have none."""
-    bare = bare_cameras(rig, {name for names in pairs for name in names})
+    bare = bare_cameras(rig, cameras_of(rig, pairs))
     if not bare:
         return []
     squared = max(_corner_radius(camera) for camera in bare.values()) ** 2

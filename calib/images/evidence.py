@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import Delaunay, QhullError
 from torch import Tensor
 
-from arraygeom import Camera, LensView, Pair, Rig
+from arraygeom import LensView, Pair, Rig
 from arraygeom.robust import cauchy, least_squares, robust_least_squares
 
 from .held_out import trimmed_square
@@ -29,9 +29,10 @@ from .parameters import SIGMA, UNCERTAIN, apply_change, free_parameters
 from .refinement import systematic_columns
 from .residuals import (
     FEW,
+    depths_of_pair,
+    epipolar_residuals,
     lines_basis,
     match_depths,
-    residuals_and_depths,
     sampson_of_pairs,
     share,
     stack_key,
@@ -149,7 +150,8 @@ def _observations(pairs: Sequence[Pair], matches: PointMatches) -> PointObservat
     for i, pair in enumerate(pairs):
         groups.setdefault(stack_key(pair), []).append(i)
     for group in groups.values():
-        (_, line, valid), depths = residuals_and_depths(stacked([pairs[i] for i in group]), matches)
+        pair = stacked([pairs[i] for i in group])
+        (_, line, valid), depths = epipolar_residuals(pair, matches), depths_of_pair(pair, matches)
         line = torch.where(valid, line.detach(), LARGEST_DISTANCE)
         off[group] = line.nan_to_num(LARGEST_DISTANCE).clamp(-LARGEST_DISTANCE, LARGEST_DISTANCE)
         depth[group] = torch.where(depths.observable, depths.depth, torch.nan)
@@ -224,9 +226,7 @@ class DriftEvidence:
     @classmethod
     def of(cls, rig: Rig, pairs: Pairs, used: Bool[Tensor, " n"], noise: float) -> DriftEvidence:
         """By those of the points that are used; `noise`: standard deviation of their distances, pixels."""
-        names = cameras_of(rig, pairs)
-        free = UNCERTAIN if any(isinstance(rig[name], Camera) for name in names) else ()
-        parameters = free_parameters(rig, names, free=free)
+        parameters = free_parameters(rig, cameras_of(rig, pairs), free=UNCERTAIN)
 
         def distances(z: Tensor) -> list[Tensor]:
             return [r.nan_to_num() / noise for r in sampson_of_pairs(apply_change(rig, parameters, z), pairs)]
@@ -236,7 +236,12 @@ class DriftEvidence:
         B = systematic_columns(rig, pairs) / noise
         wrong_side = _rotation_to_plausible_depth(rig, pairs)
         fixed = {scale: RARE * math.log1p(scale**2) + (wrong_side / scale) ** 2 for scale in SCALES}
-        best = min(SCALES, key=lambda scale: _Drift.of(r[used], J[used], B[used], scale).cost + fixed[scale])
+
+        def cost_of(scale: float) -> float:
+            explained, volume, _ = _drift(r[used], J[used], B[used], scale)
+            return explained + volume + fixed[scale]
+
+        best = min(SCALES, key=cost_of)
         found = cls(math.inf, distances, z, r, J, B, best, fixed[best], CLIPPED / noise)
         for _ in range(STEPS):
             cost = found._at(found.z, used)
@@ -252,35 +257,27 @@ class DriftEvidence:
         return min(self._at(z, used) for z in (self.z, self._refitted(used)))
 
     def _refitted(self, used: Bool[Tensor, " n"]) -> Tensor:
-        return _Drift.of(self.r[used], self.J[used], self.B[used], self.scale).z
+        return _drift(self.r[used], self.J[used], self.B[used], self.scale)[2]
 
     def _at(self, z: Tensor, used: Bool[Tensor, " n"]) -> float:
         """The cost of a drift by the points' distances as they are then; infinite where there are none."""
         r, J, B = Evaluated.at(z, self.distances).values[used], self.J[used], self.B[used]
-        clipped = _Drift.of(r.clamp(-self.clipped, self.clipped), J[:, :0], B, self.scale)
-        volume = _Drift.of(r, J, B, self.scale).volume
-        cost = clipped.cost - clipped.volume + volume + float((z / self.scale).square().sum()) + self.fixed
+        left = _drift(r.clamp(-self.clipped, self.clipped), J[:, :0], B, self.scale)[0]
+        volume = _drift(r, J, B, self.scale)[1]
+        cost = left + volume + float((z / self.scale).square().sum()) + self.fixed
         return cost if math.isfinite(cost) else math.inf
 
 
-class _Drift(NamedTuple):
-    """Residuals r + J z + B b; z normal, of deviation `scale`, and b: -2 log evidence, its log determinant.
+def _drift(r: Tensor, J: Tensor, B: Tensor, scale: float) -> tuple[float, float, Tensor]:
+    """-2 log evidence by residuals r + J z + B b with z normal, of deviation `scale`, and b; most probable z.
 
-    z: the most probable one.
+    The evidence comes in two parts: by what is left of the residuals, and the log determinant.
     """
-
-    cost: float
-    volume: float
-    z: Tensor
-
-    @classmethod
-    def of(cls, r: Tensor, J: Tensor, B: Tensor, scale: float) -> _Drift:
-        columns = torch.cat([scale * J, B], 1)
-        information = columns.T @ columns + torch.eye(columns.shape[1], dtype=r.dtype)
-        slope = columns.T @ r
-        step = torch.linalg.solve(information, slope)
-        volume = float(torch.logdet(information))
-        return cls(float(r @ r - slope @ step) + volume, volume, -scale * step[: J.shape[1]])
+    columns = torch.cat([scale * J, B], 1)
+    information = columns.T @ columns + torch.eye(columns.shape[1], dtype=r.dtype)
+    slope = columns.T @ r
+    step = torch.linalg.solve(information, slope)
+    return float(r @ r - slope @ step), float(torch.logdet(information)), -scale * step[: J.shape[1]]
 
 
 def _rotation_to_plausible_depth(rig: Rig, pairs: Pairs) -> float:

@@ -104,11 +104,6 @@ class TwoViews:
     points: PointMatches
 
     @cached_property
-    def unit(self) -> float:
-        """Half the longer side, pixels."""
-        return max(self.hw) / 2
-
-    @cached_property
     def sigma(self) -> Float[Tensor, " k"]:
         """Of each component."""
         centre, pose = SIGMA["centre"] * max(self.hw), SIGMA["pose"]
@@ -156,7 +151,7 @@ class TwoViews:
         for i, (x, smooth, length) in enumerate(zip(self.centred, self.smooth, lengths)):
             x = x - change[7 + 2 * i : 9 + 2 * i] + smooth @ change[13 + 4 * i : 17 + 4 * i]
             radial = change[11] + (change[12] if i else -change[12])
-            x = x * (1 + radial * (x / self.unit).square().sum(-1, keepdim=True))
+            x = x * (1 + radial * (2 * x / max(self.hw)).square().sum(-1, keepdim=True))
             rays.append(torch.cat([x / length, torch.ones_like(x[:, :1])], -1))
         a, b = rays
         rotated = a @ pose.R.T

@@ -34,6 +34,8 @@ OFF_CENTRE = 0.05
 """Principal points within this of the middle of the image, as a share of its longer side, are plausible."""
 TRANSPOSE = torch.eye(3, dtype=torch.float64)[[1, 0, 2]]
 """Exchanges x and y."""
+OPENGL = Pose(torch.diag(torch.tensor([1, -1, -1], dtype=torch.float64)), torch.zeros(3, dtype=torch.float64))
+"""From the axes of OpenGL and Blender, y upwards and z backwards."""
 TURNS = tuple(range(-29, 29))
 """Whole turns, in radians, that may be missing from a rotation vector in degrees: it is at most 180 long."""
 
@@ -140,34 +142,24 @@ def in_degrees(rig: Rig, turns: Mapping[str, int]) -> Hypothesis:
     return Hypothesis("degrees and radians", words, rig.replace(cameras=cameras))
 
 
-def mirror_matrix(hw: HW, *, across: bool) -> Float[Tensor, "3 3"]:
-    """The pixel map of mirroring an image left to right (`across`), or top to bottom.
-
-    >>> (mirror_matrix((4, 6), across=True) @ torch.tensor([5.0, 1.0, 1.0], dtype=torch.float64)).tolist()
-    [0.0, 1.0, 1.0]
-    """
-    A = torch.eye(3, dtype=torch.float64)
-    axis = 0 if across else 1
-    A[axis, axis], A[axis, 2] = -1, hw[1 - axis] - 1
-    return A
-
-
-ROTATIONS: dict[str, Callable[[HW], Tensor]] = {
-    "rotated by 180 degrees": lambda hw: rot90_matrix(hw, 2),
-    "rotated by 90 degrees counter-clockwise": lambda hw: rot90_matrix(hw, 1),
-    "rotated by 90 degrees clockwise": lambda hw: rot90_matrix(hw, 3),
-    "mirrored left to right": lambda hw: mirror_matrix(hw, across=True),
-    "mirrored top to bottom": lambda hw: mirror_matrix(hw, across=False),
-    "mirrored about the diagonal (rows and columns exchanged)": lambda hw: TRANSPOSE,
-    "mirrored about the other diagonal": lambda hw: rot90_matrix(hw[::-1], 2) @ TRANSPOSE,
+ROTATIONS = {
+    "rotated by 180 degrees": (2, False),
+    "rotated by 90 degrees counter-clockwise": (1, False),
+    "rotated by 90 degrees clockwise": (3, False),
+    "mirrored left to right": (3, True),
+    "mirrored top to bottom": (1, True),
+    "mirrored about the diagonal (rows and columns exchanged)": (0, True),
+    "mirrored about the other diagonal": (2, True),
 }
-"""Rotations and mirrorings of an image of a size: x' ~ A x."""
+"""Rotations and mirrorings of an image: quarter turns, after an exchange of x and y or not."""
 
 
 def rotated_view(view: View, words: str) -> tuple[Float[Tensor, "3 3"], HW]:
-    """A and the new size of one of `ROTATIONS`."""
-    A = ROTATIONS[words](view.hw)
-    return A, view.hw[::-1] if bool(A[0, 0] == 0) else view.hw
+    """A of the pixels, x' ~ A x, and the new size after one of `ROTATIONS`."""
+    turns, exchanged = ROTATIONS[words]
+    hw = view.hw[::-1] if exchanged else view.hw
+    A = rot90_matrix(hw, turns)
+    return A @ TRANSPOSE if exchanged else A, hw[::-1] if turns % 2 else hw
 
 
 def swap(rig: Rig, a: str, b: str) -> Rig:
@@ -200,21 +192,6 @@ def _same_size(A: Tensor) -> Change:
     return partial(on_pixels, change=lambda _, view: (A, view.hw))
 
 
-def _of_other_axes(pose: Pose) -> Pose:
-    """The same camera where y was upwards and z backwards, as in OpenGL and Blender."""
-    D = torch.diag(pose.t.new_tensor([1, -1, -1]))
-    return Pose(D @ pose.R, D @ pose.t)
-
-
-def _reordered(pose: Pose, order: list[int]) -> Pose:
-    return Pose.from_quaternion(pose.quaternion[..., order], pose.t)
-
-
-def _transposed(camera: Camera) -> Camera:
-    P = TRANSPOSE.to(camera.K)
-    return camera.replace(K=P @ camera.K @ P)
-
-
 def _opposite_lens(camera: Camera) -> Camera:
     lens = camera.distortion
     return camera if lens is None else camera.replace(distortion=Distortion(lens.model, -lens.coefficients))
@@ -225,12 +202,12 @@ POSES: dict[tuple[str, str], Callable[[Pose], Pose]] = {
     ("sign of t", "translation of {} with the wrong sign"): lambda pose: Pose(pose.R, -pose.t),
     ("R transposed", "R of {} transposed"): lambda pose: Pose(pose.R.mT, pose.t),
     ("centre as t", "t of {} is the camera's centre"): lambda pose: Pose.from_centre(pose.R, pose.t),
-    ("OpenGL axes", "axes of {} are OpenGL's (y upwards, z backwards)"): _of_other_axes,
-    ("order of quaternions", "quaternion of {} is w, x, y, z and was read as x, y, z, w"): partial(
-        _reordered, order=[1, 2, 3, 0]
+    ("OpenGL axes", "axes of {} are OpenGL's (y upwards, z backwards)"): lambda pose: OPENGL @ pose,
+    ("order of quaternions", "quaternion of {} is w, x, y, z and was read as x, y, z, w"): lambda pose: (
+        Pose.from_quaternion(pose.quaternion[..., [1, 2, 3, 0]], pose.t)
     ),
-    ("order of quaternions", "quaternion of {} is x, y, z, w and was read as w, x, y, z"): partial(
-        _reordered, order=[3, 0, 1, 2]
+    ("order of quaternions", "quaternion of {} is x, y, z, w and was read as w, x, y, z"): lambda pose: (
+        Pose.from_quaternion(pose.quaternion[..., [3, 0, 1, 2]], pose.t)
     ),
     ("degrees and radians", "rotation of {} in radians, taken for degrees"): lambda pose: Pose(
         rotation_from_vector(torch.rad2deg(rotation_vector(pose.R))), pose.t
@@ -238,7 +215,10 @@ POSES: dict[tuple[str, str], Callable[[Pose], Pose]] = {
 }
 """Mistakes in a pose, and what undoes them."""
 EXCHANGED = {
-    "x and y exchanged in focal lengths and principal point of {}": partial(on_cameras, change=_transposed)
+    "x and y exchanged in focal lengths and principal point of {}": partial(
+        on_cameras,
+        change=lambda camera: camera.replace(K=TRANSPOSE.to(camera.K) @ camera.K @ TRANSPOSE.to(camera.K)),
+    )
 }
 CURVED = {
     "images of {} are undistorted already: distortion applied twice": partial(

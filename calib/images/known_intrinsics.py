@@ -69,7 +69,10 @@ def centres_found(
         rig = refine_matches(rig, [near], free=free, sigma=SIGMA, keep_depth=False).rig
     first = float(rig.pair(alpha, rig.betas(alpha)[0]).beta_from_alpha.t.norm())
     rig = rig.scaled((stated[0] if any(stated) else 1.0) / first)
-    facts = {b: _fit(rig, near, b) for b in rig.betas(alpha)}
+    facts = {}
+    for name in rig.betas(alpha):
+        own = {pair: matches for pair, matches in near.items() if name in pair}
+        facts[name] = sum(len(matches.alpha) for matches in own.values()), median_off(rig, own)
     return rig.replace(depth=_depths(rig, alpha, near)), facts
 
 
@@ -159,19 +162,10 @@ def _points_ahead(
     return float((torch.linalg.cross(one, two) * torch.linalg.cross(baseline, two)).sum(-1).sign().sum())
 
 
-def _fit(rig: Rig, near: Mapping[tuple[str, str], PointMatches], name: str) -> tuple[int, float]:
-    """The points of a camera with all others, and their median distance from their lines."""
-    own = {pair: matches for pair, matches in near.items() if name in pair}
-    return sum(len(matches.alpha) for matches in own.values()), median_off(rig, own)
-
-
 def _depths(rig: Rig, alpha: str, near: Mapping[tuple[str, str], PointMatches]) -> tuple[float, float]:
     """The range of depths that all pairs' points have, extended. Raises ValueError without parallax."""
-    found = []
-    for (a, b), matches in near.items():
-        bounds = depth_bounds(Rig({name: rig[name] for name in (a, b)}), matches)
-        if bounds is not None:
-            found.append(bounds)
+    every = [depth_bounds(Rig({name: rig[name] for name in pair}), m) for pair, m in near.items()]
+    found = [bounds for bounds in every if bounds is not None]
     if not found:
         raise ValueError("the images have no parallax, so depths stay unknown: give a rig file")
     return min(n for n, _ in found), max(f for _, f in found)

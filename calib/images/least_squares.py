@@ -149,7 +149,7 @@ def most_probable(
         return LocalModel(cost(r, z, scale), lambda at: cost(at.values, at.z.detach(), scale), step)
 
     def is_converged(before: Evaluated, after: Evaluated, *_: float) -> bool:
-        return float((after.z - before.z).abs().max()) < CONVERGED
+        return float((after.z - before.z).detach().abs().max()) < CONVERGED
 
     start = Evaluated.at(z, residuals)
     return levenberg_marquardt(start, model, is_converged, steps=steps, damping=DAMPING)[0].z.detach()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,23 +21,10 @@ from arraygeom.fields import recorded_field
 
 from .matches import Images
 
+Attend = Callable[[Tensor, Tensor, Tensor, Segments | Positions], Any]
+"""Attention from queries to keys and values along a field: `pat.attention.attend_with_statistics`.
 
-@runtime_checkable
-class PhotometricMatch(Protocol):
-    """The result of attention: values (1, D, h, w) and the largest weight (1, h, w) as a confidence."""
-
-    @property
-    def value(self) -> Tensor:
-        """The weighted value."""
-
-    @property
-    def peak(self) -> Tensor:
-        """The largest weight."""
-
-
-Attend = Callable[[Tensor, Tensor, Tensor, Segments | Positions], PhotometricMatch]
-"""Attention from queries to keys and values along a field: `pat.attention.attend_with_statistics`."""
-
+Of its result `value`, (1, D, h, w), and `peak`, the largest weight (1, h, w), count."""
 LARGEST = 480
 """Images are reduced to this many pixels along their longer side."""
 PIXELS = 6000

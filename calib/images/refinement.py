@@ -31,7 +31,6 @@ from arraygeom.progress import log_step, part, stage
 from arraygeom.threads import torch_in_one_thread
 
 from .depth_change import (
-    LARGE_CHANGE,
     NEGLIGIBLE,
     DepthChange,
     depth_modes,
@@ -173,7 +172,7 @@ def fitted(
     candidates = [(rig, free)]
     if free == FREE and any(isinstance(view, Camera) for view in rig.cameras.values()):
         candidates.append((rig, (*FREE, *EXTRA_FREE)))
-    if (with_lens := with_lenses(rig, rig.names)) is not rig:
+    if (with_lens := with_lenses(rig)) is not rig:
         candidates.append((with_lens, free))
     problems = [RefinementProblem.of(*candidate, frames=frames, sigma=sigma) for candidate in candidates]
     ends = [sum(problem.count**2 for problem in problems[:i]) for i in range(len(problems) + 1)]
@@ -331,7 +330,7 @@ class RefinementProblem:
                 f"points still lie {off:.1f} px from their lines: "
                 "the rig has not drifted, see `pat rig doctor`"
             )
-        objections += _uncertain_depth(depth)
+        objections += [] if depth is None else depth.objections()
         if (behind := share_outside(refined.replace(depth=None), self.used)) > MOST_BEHIND:
             mistake = "is it swapped, or does it face the other way? See `pat rig doctor`"
             objections.append(f"{behind:.0%} of the points lie behind a camera: {mistake}")
@@ -394,21 +393,6 @@ def _contradictions(parameters: Sequence[FreeParameter], z: Tensor) -> list[str]
                 f"{ratio:.0f} standard deviations of {sigma:.3g}: is something else wrong (`pat rig "
                 "doctor`)? If so large a change is plausible, say so with --sigma"
             )
-    return found
-
-
-def _uncertain_depth(depth: DepthChange | None) -> list[str]:
-    """Objections to what happens to depth."""
-    if depth is None:
-        return []
-    found = ["depth would be less certain than before"] if depth.after > depth.before else []
-    if depth.doubtful:
-        found.append(
-            f"depth would change by {depth.change:.1%} but these points "
-            f"determine it to {depth.known:.1%} only"
-        )
-    elif depth.change > LARGE_CHANGE:
-        found.append(f"depth would change by {depth.change:.0%}: a rig so far off is better calibrated anew")
     return found
 
 

@@ -55,7 +55,15 @@ def epipolar_residuals(pair: Pair, matches: PointMatches) -> EpipolarResiduals:
     With cameras, rays replace pixels and E replaces F, so that lenses are respected to first order in the
     distance. Raises ValueError if neither cameras nor F are known.
     """
-    return _residuals(pair, matches)[0]
+    alpha, beta = (x.detach().requires_grad_() for x in _for_each(pair, matches))
+    with torch.enable_grad():
+        (a, b), F, valid = _rays(pair, alpha, beta)
+        algebraic = ((b @ F) * a).sum(-1)
+        at_alpha, at_beta = torch.autograd.grad(algebraic.sum(), (alpha, beta), retain_graph=True)
+    across = at_beta.square().sum(-1)
+    both = (across + at_alpha.square().sum(-1)).clamp(min=1e-300)
+    line = algebraic / across.clamp(min=1e-300).sqrt()
+    return EpipolarResiduals(algebraic / both.sqrt(), line, valid)
 
 
 def sampson_of_pairs(rig: Rig, pairs: Pairs) -> list[Float[Tensor, " n"]]:
@@ -64,20 +72,27 @@ def sampson_of_pairs(rig: Rig, pairs: Pairs) -> list[Float[Tensor, " n"]]:
     return [torch.where(part.valid, part.sampson, 0.0) for part in parts]
 
 
-def residuals_and_depths(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, MatchDepths]:
-    """The residuals, and the depths where the rays are closest to each other."""
-    residuals, (a, b) = _residuals(pair, matches)
-    return residuals, _depths(pair, a.detach(), b.detach(), residuals.valid)
-
-
 def match_depths(rig: Rig, pairs: Pairs) -> MatchDepths:
     """Of all points of all pairs: depths where rays are closest to each other, differentiable in the rig."""
-    found = []
-    for names, matches in pairs.items():
-        pair = rig.pair(*names)
-        (a, b), _, valid = _rays(pair, *_for_each(pair, matches))
-        found.append(_depths(pair, a, b, valid))
+    found = [depths_of_pair(rig.pair(*names), matches) for names, matches in pairs.items()]
     return MatchDepths(*(torch.cat(part) for part in zip(*found)))
+
+
+def depths_of_pair(pair: Pair, matches: PointMatches) -> MatchDepths:
+    """Those of one pair."""
+    (a, b), _, valid = _rays(pair, *_for_each(pair, matches))
+    if not pair.calibrated or pair.link is not None:
+        never = torch.zeros_like(valid)
+        return MatchDepths(torch.full_like(a[..., 2], torch.nan), never, never)
+    R, t = pair.beta_from_alpha.R, pair.beta_from_alpha.t[..., None, :]
+    rotated = a @ R.transpose(-1, -2)
+    aa, bb, ab = (rotated * rotated).sum(-1), (b * b).sum(-1), (rotated * b).sum(-1)
+    ta, tb = (rotated * t).sum(-1), (b * t).sum(-1)
+    sine2 = aa * bb - ab.square()
+    along_a, along_b = (ab * tb - bb * ta) / sine2, (aa * tb - ab * ta) / sine2
+    pixel = 1 / pair.cameras[1].K[..., :2, :2].det().abs().sqrt()[..., None]
+    observable = valid & (sine2 / (aa * bb) > (LEAST_PARALLAX * pixel).square())
+    return MatchDepths(along_a * a[..., 2], (along_a > 0) & (along_b > 0), observable)
 
 
 def share(chosen: Bool[Tensor, " n"]) -> float:
@@ -115,18 +130,6 @@ def displacements(hw: HW, points: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2 4"
     return torch.stack([r2 * p, r2 * r2 * p, *decentred], -1)
 
 
-def _residuals(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, tuple[Tensor, Tensor]]:
-    alpha, beta = (x.detach().requires_grad_() for x in _for_each(pair, matches))
-    with torch.enable_grad():
-        (a, b), F, valid = _rays(pair, alpha, beta)
-        algebraic = ((b @ F) * a).sum(-1)
-        at_alpha, at_beta = torch.autograd.grad(algebraic.sum(), (alpha, beta), retain_graph=True)
-    across = at_beta.square().sum(-1)
-    both = (across + at_alpha.square().sum(-1)).clamp(min=1e-300)
-    line = algebraic / across.clamp(min=1e-300).sqrt()
-    return EpipolarResiduals(algebraic / both.sqrt(), line, valid), (a, b)
-
-
 def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
     """Derivatives of the line distances by the eight degrees of freedom of F (of E, for rays) up to scale."""
     alpha, beta = (x.detach().requires_grad_() for x in matches)
@@ -138,22 +141,6 @@ def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
     size = columns.norm(dim=0).clamp(min=1e-150)
     complement = torch.linalg.svd((F.detach().flatten() * size)[None]).Vh[1:]
     return columns / size @ complement.T
-
-
-def _depths(pair: Pair, a: Tensor, b: Tensor, valid: Tensor) -> MatchDepths:
-    """Along the rays a of alpha and b of beta, each in its camera's frame."""
-    if not pair.calibrated or pair.link is not None:
-        never = torch.zeros_like(valid)
-        return MatchDepths(torch.full_like(a[..., 2], torch.nan), never, never)
-    R, t = pair.beta_from_alpha.R, pair.beta_from_alpha.t[..., None, :]
-    rotated = a @ R.transpose(-1, -2)
-    aa, bb, ab = (rotated * rotated).sum(-1), (b * b).sum(-1), (rotated * b).sum(-1)
-    ta, tb = (rotated * t).sum(-1), (b * t).sum(-1)
-    sine2 = aa * bb - ab.square()
-    along_a, along_b = (ab * tb - bb * ta) / sine2, (aa * tb - ab * ta) / sine2
-    pixel = 1 / pair.cameras[1].K[..., :2, :2].det().abs().sqrt()[..., None]
-    observable = valid & (sine2 / (aa * bb) > (LEAST_PARALLAX * pixel).square())
-    return MatchDepths(along_a * a[..., 2], (along_a > 0) & (along_b > 0), observable)
 
 
 def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:

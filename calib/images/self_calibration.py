@@ -28,7 +28,6 @@ from arraygeom import (
     View,
     intrinsics,
     rotation_from_vector,
-    triangulate,
 )
 from arraygeom.pixels import HW, map_homogeneous
 from arraygeom.robust import cauchy, least_squares, normal_deviation, robust_least_squares
@@ -110,18 +109,16 @@ def self_calibrated(
         for name, view in views.items()
         if isinstance(view, LensView) and view.distortion is not None
     }
-    matches = _without_lenses(list(views.values()), matches)
-    K = {
-        name: intrinsics(length, views[name].hw)
-        for name, length in _focal_lengths(views, link, focal).items()
-    }
+    matches = undistort_matches(Pair(views[alpha], views[beta]), matches)
+    lengths = _focal_lengths(views, link, focal)
+    K = {name: intrinsics(length, views[name].hw) for name, length in lengths.items()}
     near = near_lines(matches, link.F, within=NEAR_LINE)
     best = AS_GOOD * float(line_distance(near, link.F).median()) + SLACK
     trials: list[RefinedPair] = []
-    for pose in initial_poses(near, link, K[alpha], K[beta]):
+    for beta_from_alpha in initial_poses(near, link, K[alpha], K[beta]):
         cameras = {
-            alpha: _camera(views[alpha], K[alpha], Pose.identity()),
-            beta: _camera(views[beta], K[beta], pose),
+            name: Camera(hw=view.hw, sensor=view.sensor, K=K[name], cam_from_world=pose)
+            for (name, view), pose in zip(views.items(), (Pose.identity(), beta_from_alpha))
         }
         LOG.info("calibrating %s and %s, pose %d", alpha, beta, len(trials) + 1)
         trial = _refined_pair(Rig(cameras), matches, near, fixed=("centre",) if lenses else ())
@@ -136,7 +133,7 @@ def self_calibrated(
     )
     rig = found.rig
     for name, view in lenses.items():
-        rig = rig.with_camera(name, with_lens_of(_pair(rig).cameras[rig.names.index(name)], view))
+        rig = rig.with_camera(name, with_lens_of(rig[name], view))
     return found._replace(rig=rig, exact=found.distance <= best and not lenses)
 
 
@@ -155,17 +152,6 @@ def has_parallax(matches: PointMatches, hw: HW) -> bool:
     start = least_squares(terms, matches.beta, torch.ones_like(x))
     rest = robust_least_squares(terms, matches.beta, start, weigh).rest
     return float(rest.norm(dim=-1).quantile(STILL_SHARE)) > LOCALISED
-
-
-def _without_lenses(views: Sequence[View], matches: PointMatches) -> PointMatches:
-    """The points where pinhole views would have them; those that a lens does not show are left out."""
-    there, shown = [], torch.ones(len(matches.alpha), dtype=torch.bool)
-    for view, x in zip(views, matches):
-        if isinstance(view, LensView) and view.distortion is not None:
-            x, valid = view.to(torch.float64).undistort(x.double())
-            shown = shown & valid
-        there.append(x)
-    return PointMatches(*there).only(shown)
 
 
 @torch_in_one_thread()
@@ -236,17 +222,14 @@ def depth_bounds(rig: Rig, matches: PointMatches) -> tuple[float, float] | None:
     None for points without parallax.
     """
     pair = _pair(rig)
-    near = near_lines(matches, pair.fundamental, within=NEAR_LINE)
-    cameras = [camera.to(torch.float64) for camera in pair.cameras]
-    found = triangulate(cameras, torch.stack(near), deviation=LOCALISED, residual=NEAR_LINE)
-    if int(found.valid.sum()) < ENOUGH:
+    inverse = 1 / depths_near_lines(pair, matches, within=NEAR_LINE)
+    if len(inverse) < ENOUGH:
         return None
-    inverse = 1 / cameras[0].cam_from_world.apply(found.X[found.valid])[:, 2]
     off = (inverse - inverse.median()).abs()
     inverse = inverse[off <= OUTLYING * off.median() + 1e-9]
     low, high = inverse.quantile(inverse.new_tensor([0.01, 0.99])).tolist()
     baseline = float(pair.beta_from_alpha.t.norm())
-    least = LEAST_MARGIN * max(pair.beta.hw) / (float(cameras[1].K[0, 0]) * baseline)
+    least = LEAST_MARGIN * max(pair.beta.hw) / (float(pair.cameras[1].K[0, 0]) * baseline)
     more = max(MARGIN * (high - low), least)
     return 1 / (high + more), math.inf if low <= more else 1 / (low - more)
 
@@ -298,10 +281,6 @@ def _lateral_poses(matches: PointMatches, R: Tensor, K: Tensor, K_beta: Tensor) 
     return [Pose(R, t), Pose(R, -t)]
 
 
-def _camera(view: View, K: Tensor, pose: Pose) -> Camera:
-    return Camera(hw=view.hw, sensor=view.sensor, K=K, cam_from_world=pose)
-
-
 def _refined_pair(
     rig: Rig, matches: PointMatches, near: PointMatches, *, fixed: Sequence[str] = ()
 ) -> RefinedPair | None:
@@ -313,22 +292,15 @@ def _refined_pair(
     free = [f"{beta}.{kind}" for kind in (*SIGMA, "centre") if kind not in fixed]
     sigma = {**SIGMA, "centre": CENTRE_SHARE * max(rig[beta].hw)}
     refined = refine_matches(rig, [{(alpha, beta): matches}], free=free, sigma=sigma, keep_depth=False).rig
-    if not float(_pair(refined).cameras[1].t.norm()) > SHORTEST:
+    length = float(refined[beta].t.norm())
+    if not length > SHORTEST:
         return None
-    refined = _unit_baseline(refined)
+    refined = refined.scaled(1 / length)
     bounds = depth_bounds(refined, near)
     if bounds is None:
         return None
-    return RefinedPair(
-        refined.replace(depth=bounds), len(near.alpha), median_off(refined, {(alpha, beta): near})
-    )
-
-
-def _unit_baseline(rig: Rig) -> Rig:
-    name = rig.names[1]
-    camera = _pair(rig).cameras[1]
-    pose = camera.cam_from_world
-    return rig.with_camera(name, camera.replace(cam_from_world=Pose(pose.R, pose.t / pose.t.norm())))
+    off = median_off(refined, {(alpha, beta): near})
+    return RefinedPair(refined.replace(depth=bounds), len(near.alpha), off)
 
 
 def _pair(rig: Rig) -> Pair:
