@@ -69,7 +69,10 @@ class DepthChange(NamedTuple):
         if self.after > self.before:
             yield "depth would be less certain than before"
         if self.doubtful:
-            yield f"depth would change by {self.change:.1%} but these points determine it to {self.known:.1%} only"
+            yield (
+                f"depth would change by {self.change:.1%} but these points "
+                f"determine it to {self.known:.1%} only"
+            )
         elif self.change > LARGE_CHANGE:
             yield f"depth would change by {self.change:.0%}: a rig so far off is better calibrated anew"
 
