@@ -20,7 +20,6 @@ from arraygeom.threads import torch_in_one_thread
 
 from .depth_change import relative_change
 from .evidence import SCALES, DriftEvidence, FitStatistics, fit_statistics, observations
-from .held_out import image_parts, line_distances
 from .hypotheses import (
     SHIFTS,
     TURNS,
@@ -33,7 +32,7 @@ from .hypotheses import (
 )
 from .matches import Images, Pairs, PointMatches, agreeing_pairs, cameras_of, depth_seen, match_cameras
 from .parameters import SIGMA
-from .residuals import related
+from .residuals import image_parts, line_distances, related
 
 LOG = logging.getLogger(__name__)
 

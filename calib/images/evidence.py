@@ -21,7 +21,6 @@ from torch import Tensor
 from arraygeom import LensView, Pair, Rig
 from arraygeom.robust import cauchy, least_squares, robust_least_squares
 
-from .held_out import trimmed_square
 from .hypotheses import Hypothesis
 from .least_squares import Evaluated, Residuals, jacobian
 from .matches import Pairs, PointMatches, cameras_of
@@ -37,6 +36,7 @@ from .residuals import (
     share,
     stack_key,
     stacked,
+    trimmed_square,
 )
 
 LARGEST_DISTANCE = 1000.0

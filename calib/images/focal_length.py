@@ -23,10 +23,9 @@ from arraygeom.pixels import HW
 from arraygeom.threads import torch_in_one_thread
 
 from .depth_change import share_outside
-from .held_out import HELD_OUT, PARTS, held_out_parts, nearer, parts_of
 from .least_squares import cost, most_probable, noise_scale, posterior_covariance, shifts_left_out
 from .matches import PointMatches
-from .residuals import displacements
+from .residuals import HELD_OUT, PARTS, displacements, held_out_parts, nearer, parts_of
 from .self_calibration import FOCAL_SHARE, initial_poses
 
 SIGMA = {"focal": 0.5, "ratio": 0.01, "pose": 3.0, "centre": 0.03, "radial": 0.1, "systematic": 0.3}

@@ -19,9 +19,9 @@ from arraygeom import Pose, Rig
 from arraygeom.pixels import map_homogeneous
 
 from .guided_matches import guided_matches
-from .held_out import median_off
 from .matches import ENOUGH, Images, PointMatches, near_lines
 from .refinement import refine_matches
+from .residuals import median_off
 from .self_calibration import depth_bounds
 
 WINDOW = 0.09

@@ -158,8 +158,7 @@ def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str
         log_step(LOG, done / total, "features of %s", name)
         features[name] = detect_features(image)
         done += matching_time({name: image}, 0)
-    for name, own in features.items():
-        if len(own.points) < ENOUGH:
+        if len(features[name].points) < ENOUGH:
             raise ValueError(
                 f"the image of '{name}' has hardly any texture to match: take one in focus, with detail"
             )

@@ -11,9 +11,8 @@ from torch.nn.functional import interpolate
 from arraygeom import Rig
 
 from .depth_change import share_outside
-from .held_out import median_off
 from .matches import Images, Pairs, match_cameras
-from .residuals import own_distance, related
+from .residuals import median_off, own_distance, related
 
 LARGEST_SIDE = 1000
 """Images are reduced to this many pixels..."""

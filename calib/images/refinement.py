@@ -38,15 +38,6 @@ from .depth_change import (
     relative_change,
     share_outside,
 )
-from .held_out import (
-    PARTS,
-    held_out_pixels,
-    image_parts,
-    line_distances,
-    median_off,
-    nearer,
-    split,
-)
 from .least_squares import (
     Evaluated,
     Residuals,
@@ -72,7 +63,19 @@ from .matches import (
 from .parameters import LARGEST_CHANGE, FreeParameter, apply_change, considered_parameters, free_parameters
 from .photometric import Attend, PhotometricFrame, photometric_errors
 from .refined import LineStatistics, ParameterChange, PhotometricResult, Refinement
-from .residuals import own_distance, related, sampson_of_pairs, systematic_modes
+from .residuals import (
+    PARTS,
+    held_out_pixels,
+    image_parts,
+    line_distances,
+    median_off,
+    nearer,
+    own_distance,
+    related,
+    sampson_of_pairs,
+    split,
+    systematic_modes,
+)
 
 LOG = logging.getLogger(__name__)
 

@@ -34,11 +34,11 @@ from arraygeom.robust import cauchy, least_squares, normal_deviation, robust_lea
 from arraygeom.text import angle
 from arraygeom.threads import torch_in_one_thread
 
-from .held_out import median_off
 from .lenses import with_lens_of
 from .matches import ENOUGH, LOCALISED, Images, PointMatches, contrast_equalised, line_distance, near_lines
 from .patch_matching import refine_points
 from .refinement import refine_matches
+from .residuals import median_off
 
 LOG = logging.getLogger(__name__)
 

@@ -478,8 +478,8 @@ class RigDiff:
             say(f"written: {self.out}")
 
     def _on_images(self, a: Rig, b: Rig) -> str:
-        from calib.images.held_out import line_distances, nearer
         from calib.images.matches import match_cameras
+        from calib.images.residuals import line_distances, nearer
 
         images = options.read_images(a, self.image)
         with options.working("matching points of the images"):

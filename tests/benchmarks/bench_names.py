@@ -29,9 +29,9 @@ from arraygeom.io.native import write
 from arraygeom.pose import rotation_vector
 from calib.images.depth_change import share_outside
 from calib.images.doctor import Diagnosis, diagnose_matches
-from calib.images.held_out import median_off
 from calib.images.hypotheses import TRANSPOSE, on_cameras, on_pixels, rotated_view, swap
 from calib.images.matches import match_cameras, seen_depths
+from calib.images.residuals import median_off
 from pat.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.bench_drift import drifted, error
 from tests.benchmarks.printed import print_tables

@@ -14,8 +14,8 @@ from calib.boards.poses import StartDeviations, start_prior
 from calib.boards.rig import calibrate
 from calib.boards.simulation import photograph
 from calib.boards.target import parse_board
-from calib.images.held_out import line_distances
 from calib.images.matches import match_cameras
+from calib.images.residuals import line_distances
 from experiments.alignment import nine_band_calibration
 from pat.cli.main import main
 from pat.media.images import read_image

@@ -19,11 +19,11 @@ from arraygeom import (
     rotation_from_vector,
 )
 from calib.images.doctor import diagnose_matches
-from calib.images.held_out import line_distances
 from calib.images.lenses import largest_distortion, with_lenses
 from calib.images.matches import PointMatches, fit_fundamental, match_cameras, undistort_matches
 from calib.images.photometric import PhotometricFrame, photometric_errors
 from calib.images.refinement import Refinement, refine_matches
+from calib.images.residuals import line_distances
 from experiments.showcase import FAST, FAST_FRAME, SCENE, SLOW_FRAME, published_matrices
 from pat.attention import attend_with_statistics
 from pat.cli.main import main

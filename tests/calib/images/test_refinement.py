@@ -8,13 +8,12 @@ import torch
 
 from arraygeom import Camera, Distortion, Link, Rig, View
 from calib.images.depth_change import DepthChange, relative_change
-from calib.images.held_out import median_off
 from calib.images.hypotheses import swap
 from calib.images.matches import PointMatches, match_cameras
 from calib.images.parameters import apply_change, free_parameters
 from calib.images.photometric import PhotometricFrame, photometric_errors
 from calib.images.refinement import RefinementProblem, jacobian, polish, refine, refine_matches, solve
-from calib.images.residuals import epipolar_residuals, sampson_of_pairs
+from calib.images.residuals import epipolar_residuals, median_off, sampson_of_pairs
 from pat.attention import attend_with_statistics
 from pat.cli.main import main
 from pat.media.images import write_image
