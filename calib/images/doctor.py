@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from arraygeom import Camera, Rig
-from arraygeom.pixels import HW
+from arraygeom.pixels import HW, coarse_grid
 from arraygeom.pose import rotation_vector
 from arraygeom.threads import torch_in_one_thread
 
@@ -24,7 +24,6 @@ from .hypotheses import (
     SHIFTS,
     TURNS,
     Hypothesis,
-    bare_cameras,
     from_degrees,
     hypotheses,
     ignored_lens,
@@ -234,10 +233,12 @@ def _thinned(matches: PointMatches) -> PointMatches:
 
 def _ignored_lens(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
     """The distortion that best explains the points, for cameras that have none."""
-    bare = bare_cameras(rig, cameras_of(rig, pairs))
+    bare = [name for name in cameras_of(rig, pairs) if isinstance(rig[name], Camera)]
+    bare = [name for name in bare if rig[name].distortion is None]
     if not bare:
         return []
-    squared = max(_corner_radius(camera) for camera in bare.values()) ** 2
+    corners = [rig[name].rays(coarse_grid(rig[name].hw).reshape(-1, 2))[0][:, :2] for name in bare]
+    squared = max(float(rays.norm(dim=-1).max()) for rays in corners) ** 2
     lowest, highest = BARREL / squared, PINCUSHION / squared
     k1 = 0.0
     for _ in range(3):
@@ -247,13 +248,6 @@ def _ignored_lens(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
         k1, step = candidates[best], candidates[1] - candidates[0]
         lowest, highest = k1 - step, k1 + step
     return [ignored_lens(rig, bare, k1)]
-
-
-def _corner_radius(camera: Camera) -> float:
-    """Distance from the axis, at z = 1, of the farthest corner."""
-    h, w = camera.hw
-    corners = camera.K.new_tensor([[0, 0], [w - 1, 0], [0, h - 1], [w - 1, h - 1]])
-    return float(camera.rays(corners)[0][:, :2].norm(dim=-1).max())
 
 
 def _degrees(rig: Rig, pairs: Pairs) -> list[Hypothesis]:

@@ -106,18 +106,12 @@ def _centre_offset(view: LensView) -> float:
     return float((view.K[:2, 2] - middle).norm()) / max(view.hw)
 
 
-def bare_cameras(rig: Rig, names: Iterable[str]) -> dict[str, Camera]:
-    """Those of the cameras that are calibrated and have no lens distortion."""
-    return {n: c for n in names if isinstance(c := rig[n], Camera) and c.distortion is None}
-
-
-def ignored_lens(rig: Rig, names: Iterable[str], k1: float) -> Hypothesis:
-    """Distortion was ignored, and is about `k1` in all cameras that have none.
+def ignored_lens(rig: Rig, bare: Sequence[str], k1: float) -> Hypothesis:
+    """Distortion was ignored, and is about `k1` in all these cameras, which have none.
 
     With k2 = 1.5 k1^2, as lenses tend to have it (a fisheye's r = theta has 1.8, ordinary wide ones about
     1.3): one parameter, and one to one at any radius.
     """
-    bare = bare_cameras(rig, names)
     words = f"distortion ignored: about k1 = {k1:.3f} in {', '.join(map(repr, bare))}"
     lens = Distortion("brown-conrady", torch.tensor([k1, 1.5 * k1**2, 0, 0], dtype=torch.float64))
     bent = on_cameras(rig, bare, lambda camera: camera.replace(distortion=lens))
@@ -192,11 +186,6 @@ def _same_size(A: Tensor) -> Change:
     return partial(on_pixels, change=lambda _, view: (A, view.hw))
 
 
-def _opposite_lens(camera: Camera) -> Camera:
-    lens = camera.distortion
-    return camera if lens is None else camera.replace(distortion=Distortion(lens.model, -lens.coefficients))
-
-
 POSES: dict[tuple[str, str], Callable[[Pose], Pose]] = {
     ("pose inverted", "pose of {} inverted (world from camera)"): Pose.inverse,
     ("sign of t", "translation of {} with the wrong sign"): lambda pose: Pose(pose.R, -pose.t),
@@ -224,7 +213,12 @@ CURVED = {
     "images of {} are undistorted already: distortion applied twice": partial(
         on_cameras, change=lambda camera: camera.replace(distortion=None)
     ),
-    "distortion of {} with the wrong sign (the inverse map)": partial(on_cameras, change=_opposite_lens),
+    "distortion of {} with the wrong sign (the inverse map)": partial(
+        on_cameras,
+        change=lambda camera: camera.replace(
+            distortion=camera.distortion.replace(coefficients=-camera.distortion.coefficients)
+        ),
+    ),
 }
 FITS: dict[str, Callable[[HW, HW], Tensor]] = {
     "resized": resize_matrix,

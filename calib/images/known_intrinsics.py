@@ -51,8 +51,10 @@ def centres_found(
     stated = [float(rig.pair(alpha, name).beta_from_alpha.t.norm()) for name in rig.betas(alpha)]
     pairs: dict[tuple[str, str], PointMatches] = {}
     for a, b in combinations(rig.names, 2):
-        found = _consistent(rig, a, b, _matched(rig, a, b, images, shown))
-        if found is not None:
+        infinite = rig[b].K @ rig[b].R @ rig[a].R.mT @ torch.linalg.inv(rig[a].K)
+        window = round(WINDOW * max(images[b].shape[-2:]))
+        matches = guided_matches(images[a], images[b], infinite, window=window, shown=(shown[a], shown[b]))
+        if (found := _consistent(rig, a, b, matches)) is not None:
             pairs[a, b] = found
     names = _connected(alpha, list(pairs))
     if len(names) < 2:
@@ -74,12 +76,6 @@ def centres_found(
         own = {pair: matches for pair, matches in near.items() if name in pair}
         facts[name] = sum(len(matches.alpha) for matches in own.values()), median_off(rig, own)
     return rig.replace(depth=_depths(rig, alpha, near)), facts
-
-
-def _matched(rig: Rig, a: str, b: str, images: Images, shown: Mapping[str, Tensor]) -> PointMatches:
-    infinite = rig[b].K @ rig[b].R @ rig[a].R.mT @ torch.linalg.inv(rig[a].K)
-    window = round(WINDOW * max(images[b].shape[-2:]))
-    return guided_matches(images[a], images[b], infinite, window=window, shown=(shown[a], shown[b]))
 
 
 def _normals(rig: Rig, a: str, b: str, matches: PointMatches) -> Float[Tensor, "n 3"]:

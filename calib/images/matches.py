@@ -262,7 +262,8 @@ def _with_rough_map(matches: PointMatches, F: Tensor) -> FittedLink:
         raise ValueError(
             f"only {len(matches.alpha)} points seen in both images agree with F: does it belong to them?"
         )
-    found, _ = cv2.estimateAffinePartial2D(*(points.numpy() for points in matches), ransacReprojThreshold=30)
+    x, y = (points.numpy() for points in matches)
+    found, _ = cv2.estimateAffinePartial2D(x, y, ransacReprojThreshold=30)
     if found is None:
         raise ValueError("no similarity fits the points seen in both images")
     H = torch.from_numpy(np.vstack([found, [0, 0, 1]]))

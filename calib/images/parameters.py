@@ -12,9 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import Camera, LensView, Link, Rig, rotation_from_vector
+from arraygeom import Camera, LensView, Link, Rig, intrinsics, rotation_from_vector
 from arraygeom.distortion import typical_coefficients
-from arraygeom.pixels import HW
 
 SIGMA = {"rotation": math.radians(0.5), "translation": 0.01, "focal": 0.01, "centre": 5.0, "distortion": 0.02}
 """Default standard deviations: radians, a share of the longest baseline, a share of the focal length, pixels
@@ -154,16 +153,9 @@ def _perturbed_link(link: Link, value: Tensor | None, rig: Rig, names: tuple[str
     """F after seven small changes: rotations of both sets of singular vectors, the second singular value."""
     if value is None:
         return link
-    A, B = (_to_unit(rig[name].hw).to(link.F) for name in names)
-    U, S, Vh = torch.linalg.svd(torch.linalg.inv(B).T @ link.F @ torch.linalg.inv(A))
+    K, K_beta = (intrinsics(max(rig[name].hw) / 2, rig[name].hw).to(link.F) for name in names)
+    U, S, Vh = torch.linalg.svd(K_beta.T @ link.F @ K)
     second = (S[1] / S[0]) * (1 + value[6])
     U, Vh = U @ rotation_from_vector(value[:3]), rotation_from_vector(value[3:6]) @ Vh
     F = U @ torch.diag(torch.stack([torch.ones_like(second), second, torch.zeros_like(second)])) @ Vh
-    return Link(B.T @ F @ A, link.H)
-
-
-def _to_unit(hw: HW) -> Tensor:
-    """Pixels to coordinates between about -1 and 1."""
-    s = 2 / max(hw)
-    rows = [[s, 0, -s * (hw[1] - 1) / 2], [0, s, -s * (hw[0] - 1) / 2], [0, 0, 1]]
-    return torch.tensor(rows, dtype=torch.float64)
+    return Link(torch.linalg.inv(K_beta).T @ F @ torch.linalg.inv(K), link.H)

@@ -61,7 +61,7 @@ from .matches import (
     with_map,
 )
 from .parameters import LARGEST_CHANGE, FreeParameter, apply_change, considered_parameters, free_parameters
-from .photometric import Attend, PhotometricFrame, photometric_errors
+from .photometric import Attend, PhotometricImage, photometric_errors
 from .refined import LineStatistics, ParameterChange, PhotometricResult, Refinement
 from .residuals import (
     PARTS,
@@ -123,8 +123,13 @@ def refine(
     prior. `force` accepts a result in spite of objections. Raises ValueError, one line: a camera that the rig
     lacks, an image of another size than the rig states, equal images, too few points.
     """
-    for frame in frames:
-        _check(rig, frame)
+    for name, image in (item for frame in frames for item in frame.items()):
+        (h, w), (height, width) = rig[name].hw, image.shape[1:]
+        if (height, width) != (h, w):
+            raise ValueError(
+                f"the image of '{name}' is {width}x{height}, the rig states {w}x{h}: "
+                "`pat rig doctor` finds the reason"
+            )
     with stage("points" + ", stage 1 of 2" * (attend is not None), new=True):
         seconds = sum(matching_time(frame, math.comb(len(frame), 2)) for frame in frames)
         matched_at = seconds / (seconds + FITTED * math.comb(len(frames[0]), 2))
@@ -425,7 +430,7 @@ def polish(
     rig = fit.after(solution.z)
     depth = depth_seen(rig, fit.used) if rig.depth is None else rig.depth
     base = replace(fit, rig=fit.rig.replace(depth=depth))
-    views = [PhotometricFrame.of(frame) for frame in frames]
+    views = [{name: PhotometricImage.of(image) for name, image in frame.items()} for frame in frames]
     root = solution.directions
 
     done = 0
@@ -465,16 +470,6 @@ def _with_maps(rig: Rig, pairs: Pairs) -> Rig:
         if names in links and links[names].H is None and len(matches.alpha) >= ENOUGH:
             links[names] = with_map(rig.pair(*names), matches).link
     return rig.replace(links=links)
-
-
-def _check(rig: Rig, frame: Images) -> None:
-    for name, image in frame.items():
-        h, w = rig[name].hw
-        if tuple(image.shape[1:]) != (h, w):
-            got = f"{image.shape[2]}x{image.shape[1]}"
-            raise ValueError(
-                f"the image of '{name}' is {got}, the rig states {w}x{h}: `pat rig doctor` finds the reason"
-            )
 
 
 def _changes(parameters: Sequence[FreeParameter], solution: Solution) -> Iterable[ParameterChange]:

@@ -105,9 +105,7 @@ def self_calibrated(
     if not has_parallax(matches, views[alpha].hw):
         return None
     lenses = {
-        name: view
-        for name, view in views.items()
-        if isinstance(view, LensView) and view.distortion is not None
+        n: view for n, view in views.items() if isinstance(view, LensView) and view.distortion is not None
     }
     matches = undistort_matches(Pair(views[alpha], views[beta]), matches)
     lengths = _focal_lengths(views, link, focal)
@@ -128,9 +126,8 @@ def self_calibrated(
         return None
     least = min(trial.distance for trial in trials)
     fitting = [t for t in trials if t.distance <= (1 + ALIKE / math.sqrt(t.points)) * least + ALIKE_SLACK]
-    found = min(
-        fitting, key=lambda trial: float(angle(_pair(trial.rig).beta_from_alpha.R.T @ _upright(link)))
-    )
+    upright = _upright(link)
+    found = min(fitting, key=lambda t: float(angle(_pair(t.rig).beta_from_alpha.R.T @ upright)))
     rig = found.rig
     for name, view in lenses.items():
         rig = rig.with_camera(name, with_lens_of(rig[name], view))

@@ -21,7 +21,7 @@ from arraygeom import (
 from calib.images.doctor import diagnose_matches
 from calib.images.lenses import largest_distortion, with_lenses
 from calib.images.matches import PointMatches, fit_fundamental, match_cameras, undistort_matches
-from calib.images.photometric import PhotometricFrame, photometric_errors
+from calib.images.photometric import PhotometricImage, photometric_errors
 from calib.images.refinement import Refinement, refine_matches
 from calib.images.residuals import line_distances
 from experiments.showcase import FAST, FAST_FRAME, SCENE, SLOW_FRAME, published_matrices
@@ -142,7 +142,7 @@ def test_the_fusions_error_sees_through_lenses():
     views = with_lenses(
         Rig({n: View(hw=rig[n].hw) for n in rig.names}, links={("left", "right"): Link(F, H)})
     )
-    ready = PhotometricFrame.of(images)
+    ready = {name: PhotometricImage.of(image) for name, image in images.items()}
 
     def error(change):
         changed = views.perturbed({"right.distortion": change})

@@ -11,7 +11,7 @@ from calib.images.depth_change import DepthChange, relative_change
 from calib.images.hypotheses import swap
 from calib.images.matches import PointMatches, match_cameras
 from calib.images.parameters import apply_change, free_parameters
-from calib.images.photometric import PhotometricFrame, photometric_errors
+from calib.images.photometric import PhotometricImage, photometric_errors
 from calib.images.refinement import RefinementProblem, jacobian, polish, refine, refine_matches, solve
 from calib.images.residuals import epipolar_residuals, median_off, sampson_of_pairs
 from pat.attention import attend_with_statistics
@@ -276,7 +276,7 @@ def test_a_fundamental_matrix_is_refined():
 def test_photometric_error_is_least_for_the_true_rig():
     rig, images = rectified_pair(), rectified_images()
     rig = rig.replace(depth=(2.5, 6.5))
-    views = PhotometricFrame.of(images)
+    views = {name: PhotometricImage.of(image) for name, image in images.items()}
 
     def error(pixels):
         moved = rig.perturbed({"right.centre": vector(0, pixels)})
