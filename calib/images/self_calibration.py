@@ -245,20 +245,22 @@ def _focal_lengths(views: Mapping[str, View], link: Link, focal: Mapping[str, fl
 def initial_poses(
     matches: PointMatches, link: Link, K: Float[Tensor, "3 3"], K_beta: Float[Tensor, "3 3"]
 ) -> list[Pose]:
-    """Poses of beta, baselines of 1, from which to fit: parallel axes, by F, by an essential matrix."""
-    return [*_lateral_poses(matches, _upright(link), K, K_beta), *_poses(matches, link.F, K, K_beta)]
+    """Poses of beta, baselines of 1, from which to fit: parallel axes, by F, by an essential matrix.
 
-
-def _poses(matches: PointMatches, F: Tensor, K: Tensor, K_beta: Tensor) -> list[Pose]:
-    """Poses of beta by F and by an essential matrix fitted to the points."""
-    x, y = (map_homogeneous(torch.linalg.inv(k), p)[..., :2].numpy() for k, p in zip((K, K_beta), matches))
-    threshold = 1 / float(K_beta[0, 0])
-    fitted, _ = cv2.findEssentialMat(x, y, np.eye(3), method=cv2.RANSAC, threshold=threshold)
-    found = []
-    for E in ((K_beta.T @ F @ K).numpy(), fitted):
+    Of parallel axes beta is to either side along the direction in which most points differ.
+    """
+    R, rays = _upright(link), [torch.linalg.inv(k) for k in (K, K_beta)]
+    x, y = (map_homogeneous(inverse, points)[..., :2] for inverse, points in zip(rays, matches))
+    flow = y - map_homogeneous(R @ rays[0], matches.alpha)[..., :2]
+    _, _, axes = torch.linalg.svd(flow - flow.median(0).values)
+    t = torch.cat([axes[0], axes.new_zeros(1)])
+    found = [Pose(R, t), Pose(R, -t)]
+    seen, threshold = (x.numpy(), y.numpy(), np.eye(3)), 1 / float(K_beta[0, 0])
+    fitted, _ = cv2.findEssentialMat(*seen, method=cv2.RANSAC, threshold=threshold)
+    for E in ((K_beta.T @ link.F @ K).numpy(), fitted):
         if E is not None and E.shape == (3, 3):
-            _, R, t, _ = cv2.recoverPose(E, x, y, np.eye(3))
-            found.append(Pose(torch.from_numpy(R), torch.from_numpy(t[:, 0])))
+            _, R_of_E, t_of_E, _ = cv2.recoverPose(E, *seen)
+            found.append(Pose(torch.from_numpy(R_of_E), torch.from_numpy(t_of_E[:, 0])))
     return found
 
 
@@ -267,15 +269,6 @@ def _upright(link: Link) -> Float[Tensor, "3 3"]:
     H = torch.eye(3) if link.H is None else link.H
     steps = round(math.atan2(float(H[1, 0] / H[2, 2]), float(H[0, 0] / H[2, 2])) / (math.pi / 2))
     return rotation_from_vector(torch.tensor([0.0, 0.0, steps * math.pi / 2], dtype=torch.float64))
-
-
-def _lateral_poses(matches: PointMatches, R: Tensor, K: Tensor, K_beta: Tensor) -> list[Pose]:
-    """Poses of parallel axes, beta to either side along the direction in which most points differ."""
-    x = map_homogeneous(R @ torch.linalg.inv(K), matches.alpha)[..., :2]
-    flow = map_homogeneous(torch.linalg.inv(K_beta), matches.beta)[..., :2] - x
-    _, _, axes = torch.linalg.svd(flow - flow.median(0).values)
-    t = torch.cat([axes[0], axes.new_zeros(1)])
-    return [Pose(R, t), Pose(R, -t)]
 
 
 def _refined_pair(
