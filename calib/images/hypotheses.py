@@ -186,6 +186,13 @@ def _same_size(A: Tensor) -> Change:
     return partial(on_pixels, change=lambda _, view: (A, view.hw))
 
 
+def _opposite_lens(camera: Camera) -> Camera:
+    lens = camera.distortion
+    return (
+        camera if lens is None else camera.replace(distortion=lens.replace(coefficients=-lens.coefficients))
+    )
+
+
 POSES: dict[tuple[str, str], Callable[[Pose], Pose]] = {
     ("pose inverted", "pose of {} inverted (world from camera)"): Pose.inverse,
     ("sign of t", "translation of {} with the wrong sign"): lambda pose: Pose(pose.R, -pose.t),
@@ -213,12 +220,7 @@ CURVED = {
     "images of {} are undistorted already: distortion applied twice": partial(
         on_cameras, change=lambda camera: camera.replace(distortion=None)
     ),
-    "distortion of {} with the wrong sign (the inverse map)": partial(
-        on_cameras,
-        change=lambda camera: camera.replace(
-            distortion=camera.distortion.replace(coefficients=-camera.distortion.coefficients)
-        ),
-    ),
+    "distortion of {} with the wrong sign (the inverse map)": partial(on_cameras, change=_opposite_lens),
 }
 FITS: dict[str, Callable[[HW, HW], Tensor]] = {
     "resized": resize_matrix,
