@@ -35,7 +35,17 @@ from arraygeom.text import angle
 from arraygeom.threads import torch_in_one_thread
 
 from .lenses import with_lens_of
-from .matches import ENOUGH, LOCALISED, Images, PointMatches, contrast_equalised, line_distance, near_lines
+from .matches import (
+    ENOUGH,
+    LOCALISED,
+    Images,
+    PointMatches,
+    contrast_equalised,
+    depths_near_lines,
+    line_distance,
+    near_lines,
+    undistort_matches,
+)
 from .patch_matching import refine_points
 from .refinement import refine_matches
 from .residuals import median_off

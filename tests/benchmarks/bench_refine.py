@@ -85,7 +85,7 @@ def own_agreement(pairs: dict) -> LineStatistics:
 
 def beyond(found: LineStatistics, own: LineStatistics) -> float:
     """A distance without that of the points themselves."""
-    return math.sqrt(max(found.rms**2 - own.rms**2, 0.0))
+    return math.sqrt(max(found.median**2 - own.median**2, 0.0))
 
 
 def _span(values: list[float]) -> str:
