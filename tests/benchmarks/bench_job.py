@@ -27,7 +27,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from pat.fusion.checks import LowConfidenceWarning
+from .job_parts import STAGES
 
 ROOT = Path(__file__).parents[2]
 RESULTS = Path(__file__).with_name("RESULTS_job.md")
@@ -48,12 +48,13 @@ class Case:
 
 @dataclass
 class Run:
-    """One process: seconds of the wall and of cores, peak resident bytes, and what it printed as JSON."""
+    """One process: seconds of the wall and of cores, peak resident bytes, JSON it printed, what it said."""
 
     wall: float
     cores: float
     peak: float
     printed: dict[str, Any] = field(default_factory=dict)
+    said: str = ""
 
 
 CASES = (
@@ -68,10 +69,10 @@ MANY = QUICK[0].name
 """The case of which many frames are fused."""
 
 
-def run(command: Sequence[str], cache: Path, root: Path = ROOT) -> Run:
-    """Run a command in a checkout, numba's cache in a folder. Raises RuntimeError if it fails; low
-    confidence, as the blur of enlarged images gives, is no failure."""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+def run(command: Sequence[str], cache: Path | None = None, root: Path = ROOT) -> Run:
+    """Run a command in a checkout, numba's cache in a folder if one is given. Raises RuntimeError if it
+    fails; low confidence (3), as the blur of enlarged images gives, is no failure."""
+    environment = os.environ if cache is None else {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
     begin = time.perf_counter()
     with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(command, cwd=root, env=environment, stdout=out, stderr=errors, text=True)
@@ -80,13 +81,12 @@ def run(command: Sequence[str], cache: Path, root: Path = ROOT) -> Run:
         process.returncode = os.waitstatus_to_exitcode(status)
         for stream in (out, errors):
             stream.seek(0)
-        lines = out.read().splitlines()
-        if process.returncode not in (0, LowConfidenceWarning.exit_status):
-            raise RuntimeError(
-                f"{' '.join(command)} ended with {process.returncode}:\n{errors.read()[-2000:]}"
-            )
+        lines, said = out.read().splitlines(), errors.read()
+        if process.returncode not in (0, 3):
+            raise RuntimeError(f"{' '.join(command)} ended with {process.returncode}:\n{said[-2000:]}")
     printed = [json.loads(line) for line in lines if line.startswith("{")]
-    return Run(wall, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024.0, printed[-1] if printed else {})
+    cores, peak = used.ru_utime + used.ru_stime, used.ru_maxrss * 1024.0
+    return Run(wall, cores, peak, printed[-1] if printed else {}, said)
 
 
 def fuse_arguments(case: Case, folder: Path, out: Path) -> list[str]:
@@ -102,7 +102,7 @@ def scenes(cases: Sequence[Case], work: Path) -> Iterator[tuple[Case, Path]]:
     for case in cases:
         folder = work / f"scene{case.wh[0]}"
         if not folder.exists():
-            run([*PARTS, "scene", str(folder), *map(str, case.wh), "3"], work / "warm")
+            run([*PARTS, "scene", str(folder), *map(str, case.wh), "4"], work / "warm")
         yield case, folder
 
 
@@ -166,16 +166,8 @@ def many_frames(case: Case, folder: Path, work: Path, one: float, root: Path) ->
                 (frames / f"{i:03d}.png").symlink_to(folder / f"{name}.png")
     images = [word for name in names for word in ("--image", f"{name}={work / f'frames{case.wh[0]}' / name}")]
     workers = len(os.sched_getaffinity(0))
-    command = [
-        *PAT,
-        "fuse",
-        str(folder / "rig.yaml"),
-        "--alpha",
-        "mono",
-        *images,
-        "--out",
-        tempfile.mkdtemp(dir=work),
-    ]
+    out = tempfile.mkdtemp(dir=work)
+    command = [*PAT, "fuse", str(folder / "rig.yaml"), "--alpha", "mono", *images, "--out", out]
     cache = work / ("warm" if root == ROOT else "old")
     found = run([*command, "--workers", str(workers)], cache, root)
     same = f"{60 / one:.1f}"
@@ -238,22 +230,7 @@ def stages_row(case: Case, found: dict[str, list[Run]]) -> list[str]:
     return [case.name, *(f"{shares['stages'][n] / total:.0%}, {shares['cores'][n]:.2f}" for n in STAGE_NAMES)]
 
 
-STAGE_NAMES = (
-    *(
-        "import",
-        "read",
-        "views",
-        "field",
-        "plan",
-        "pre-pass",
-        "matching",
-        "attention",
-        "network",
-        "depth",
-        "write",
-    ),
-    "rest",
-)
+STAGE_NAMES = "import", *STAGES, "rest"
 COLUMNS = (
     *("", "seconds", "core seconds", "peak memory", "cold, seconds", "other checkout, seconds (of a core)"),
     *("classical baseline, seconds (of a core): ratio", "OpenCV, seconds (of a core): ratio"),

@@ -13,7 +13,6 @@ distance from the lines of the other camera's, in undistorted pixels. Lenses hav
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import reduce
@@ -23,6 +22,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
+import tyro
 from jaxtyping import Float
 
 from arraygeom import Camera, Distortion, Pose, Rig
@@ -32,8 +32,8 @@ from calib.boards.photos import FrameKey
 from calib.boards.rig import calibrate
 from calib.boards.target import parse_board
 from calib.boards.validation import FOLDS, epipolar_errors
-from pat.evaluation.tables import markdown_header, markdown_row
-from tests.benchmarks.printed import print_tables
+from pat.evaluation.tables import markdown_row
+from tests.benchmarks.printed import DATA, head, print_tables
 from tests.calib.rendered import BOARD
 from tests.calib.tracks import CALISCOPE_BOARD, caliscope_views
 
@@ -160,9 +160,7 @@ def held_out(calibrated: Calibrator, views: Views, board: Board) -> HeldOut:
 
 
 def rows(data: Path, boards: Path) -> Iterator[str]:
-    yield markdown_header(
-        ["boards", "frames", "calibrated by", "median px", "mean px", "parts refused", "seconds"]
-    )
+    yield head("boards | frames | calibrated by | median px | mean px | parts refused | seconds")
     for name, views, board in sets(data, boards):
         frames = len(set().union(*(v.seen for v in views.values())))
         by: dict[str, Calibrator] = {"calib": here, "calibrateMultiview": multiview}
@@ -172,19 +170,13 @@ def rows(data: Path, boards: Path) -> Iterator[str]:
             yield markdown_row([name, frames, label, *found, refused, f"{seconds:.0f}"])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--boards", type=Path, default=Path("out/boards"))
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
+def main(data: Path = DATA, boards: Path = Path("out/boards"), out: Path | None = None) -> None:
+    """Print the table."""
     if not hasattr(cv2, "calibrateMultiview"):
-        parser.error(f"OpenCV {cv2.__version__} has no calibrateMultiview: use an environment with OpenCV 5")
-    cv2.setRNGSeed(0)
-    torch.set_num_threads(1)
+        raise SystemExit("this OpenCV has no calibrateMultiview: use an environment with OpenCV 5")
     title = f"Boards calibrated here and by OpenCV {cv2.__version__}"
-    print_tables(title, [rows(options.data, options.boards)], options.out)
+    print_tables(title, [rows(data, boards)], out)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)
