@@ -12,7 +12,6 @@ with another checkout. `--quick`: 1280x800 with one beta only, cold once and war
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -26,6 +25,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any
+
+import tyro
 
 from .job_parts import STAGES
 
@@ -247,15 +248,10 @@ FIRST_COLUMNS = ("", "seconds", "core seconds")
 MANY_COLUMNS = ("", "frames a minute", "as processes of one frame", "core seconds a frame", "cores busy")
 
 
-def main() -> None:
-    """Print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--runs", type=int, default=3)
-    parser.add_argument("--against", type=Path, help="another checkout, measured in turn")
-    given = parser.parse_args()
-    cases, runs = (QUICK, 1) if given.quick else (CASES, given.runs)
-    old = given.against and given.against.resolve()
+def main(quick: bool = False, runs: int = 3, against: Path | None = None) -> None:
+    """Print the figures, of another checkout measured in turn, too, if it is given."""
+    cases, runs = (QUICK, 1) if quick else (CASES, runs)
+    old = against and against.resolve()
     load = os.getloadavg()[0]
     rows, stages, first, many = [], [], [], []
     with tempfile.TemporaryDirectory() as name:
@@ -267,10 +263,10 @@ def main() -> None:
             rows.append(shown(COLUMNS, row(case, found)))
             if "stages" in found:
                 stages.append(shown(("", *STAGE_NAMES), stages_row(case, found)))
-            if case.name == MANY and not given.quick:
+            if case.name == MANY and not quick:
                 one = median(r.wall for r in found["pat fuse"])
                 many += [shown(MANY_COLUMNS, line) for line in many_frames(case, images, work, one, ROOT)]
-        for root in () if given.quick else (ROOT, old) if old else (ROOT,):
+        for root in () if quick else (ROOT, old) if old else (ROOT,):
             note = "" if root == ROOT else ", other checkout"
             lines = first_second(work, min(runs, 3), root)
             first += [shown(FIRST_COLUMNS, [f"`{cells[0]}`{note}", *cells[1:]]) for cells in lines]
@@ -289,7 +285,7 @@ def main() -> None:
     if many:
         text += f"\n{FRAMES} frames from folders, a worker a core:\n\n{table(MANY_COLUMNS, many)}"
     print(text)
-    if not given.quick:
+    if not quick:
         RESULTS.write_text(text, encoding="utf-8")
 
 
@@ -300,4 +296,4 @@ def shown(columns: Sequence[str], cells: list[str]) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)
