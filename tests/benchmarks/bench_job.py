@@ -20,7 +20,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
@@ -28,9 +27,10 @@ from typing import Any
 
 import tyro
 
+from tests.processes import ROOT, dask_cluster
+
 from .job_parts import STAGES
 
-ROOT = Path(__file__).parents[2]
 RESULTS = Path(__file__).with_name("RESULTS_job.md")
 PARTS = (sys.executable, "-m", "tests.benchmarks.job_parts")
 PAT = (sys.executable, "-m", "pat")
@@ -174,32 +174,10 @@ def many_frames(case: Case, folder: Path, work: Path, one: float, root: Path) ->
     same = f"{60 / one:.1f}"
     busy = f"{found.cores / found.wall / workers:.0%}"
     yield [case.name, f"{60 * FRAMES / found.wall:.1f}", same, f"{found.cores / FRAMES:.2f}", busy]
-    with cluster(work, workers, cache, root) as address:
+    environment = {"NUMBA_CACHE_DIR": str(cache)}
+    with dask_cluster(work, workers, root=root, environment=environment) as (address, _):
         there = run([*command, "--scheduler", address], cache, root)
     yield [f"{case.name}, Dask", f"{60 * FRAMES / there.wall:.1f}", same, "", ""]
-
-
-@contextmanager
-def cluster(work: Path, workers: int, cache: Path, root: Path) -> Iterator[str]:
-    """The address of a Dask scheduler on this machine with workers of one thread, which are processes."""
-    file, dask = work / "scheduler.json", [sys.executable, "-m", "dask"]
-    quiet: dict[str, Any] = {"cwd": root, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    quiet["env"] = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(root)}
-    given = ["--scheduler-file", str(file)]
-    scheduler = subprocess.Popen(
-        [*dask, "scheduler", "--port", "0", "--dashboard-address", ":0", *given], **quiet
-    )
-    many = ["--nworkers", str(workers), "--nthreads", "1", "--memory-limit", "0", "--no-dashboard"]
-    both = [scheduler, subprocess.Popen([*dask, "worker", *many, *given], **quiet)]
-    try:
-        while not file.exists() and scheduler.poll() is None:
-            time.sleep(0.1)
-        yield json.loads(file.read_text())["address"]
-    finally:
-        for process in reversed(both):
-            process.terminate()
-            process.wait()
-        file.unlink(missing_ok=True)
 
 
 def row(case: Case, found: dict[str, list[Run]]) -> list[str]:

@@ -24,11 +24,12 @@ import torch
 from torch import Tensor
 
 from arraygeom import Camera, Distortion, Pose, Rig, relative_pose
+from docs.update_readme import write_block
 from pat.fusion.fuse import fuse
 from pat.networks.guided import GuidedPAT
 from tests.arraygeom.rigs import random_rig
 from tests.arraygeom.test_kornia_parity import CASES, Parity, cases
-from tests.benchmarks.printed import DOCS, timed, write_block
+from tests.benchmarks.printed import DOCS, timed
 from tests.transformations.operators import OPERATORS
 
 OUR_PACKAGES = "arraygeom", "pat", "calib"

@@ -30,7 +30,8 @@ from arraygeom import Camera, Distortion, Pose
 from arraygeom.kornia_models import to_kornia_model
 from arraygeom.lenses import PolynomialFisheye
 from arraygeom.lenses.model import LensModel
-from tests.benchmarks.printed import DOCS, timed, write_block
+from docs.update_readme import write_block
+from tests.benchmarks.printed import DOCS, timed
 
 try:
     import pycolmap

@@ -40,8 +40,9 @@ from arraygeom import (
     world_rays,
 )
 from arraygeom.lenses import FlatPort, RollingShutter
+from docs.update_readme import write_block
 from tests.benchmarks.bench_kornia import gradient_error
-from tests.benchmarks.printed import DOCS, timed, write_block
+from tests.benchmarks.printed import DOCS, timed
 
 try:
     import pycolmap

@@ -11,7 +11,6 @@ import cv2
 import torch
 
 from arraygeom.atomic import write_text
-from docs.update_readme import with_block
 from pat.evaluation.tables import markdown_header
 
 DATA = Path("../shared/data")
@@ -57,8 +56,3 @@ def print_tables(title: str, tables: Iterable[Iterable[str]], out: Path | None) 
         lines.append("")
     if out:
         write_text(out, f"# {title}\n\n" + "\n".join(lines).rstrip() + "\n")
-
-
-def write_block(page: Path, name: str, text: str) -> None:
-    """Put a text in place of a block of a document."""
-    write_text(page, with_block(page.read_text(), name, text))
