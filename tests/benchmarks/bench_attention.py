@@ -11,7 +11,6 @@ RESULTS.md.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -23,9 +22,10 @@ import time
 from collections.abc import Callable
 from datetime import date
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
+import tyro
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -400,28 +400,23 @@ def bars(done: dict, rates: dict) -> list[str]:
     return lines
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--job", help=argparse.SUPPRESS)
-    parser.add_argument("--device", choices=("cpu", "cuda"), help="this one only")
-    parser.add_argument("--quick", action="store_true", help="small sizes only")
-    options = parser.parse_args()
-    if options.job:
-        print(json.dumps(measure(Job(*json.loads(options.job)))))
+def main(device: Literal["cpu", "cuda"] | None = None, quick: bool = False, job: str | None = None) -> None:
+    """Print the table, of one device or of both, without the large sizes if it is to be quick.
+
+    Args:
+        job: One measurement, in this process.
+    """
+    if job:
+        print(json.dumps(measure(Job(*json.loads(job)))))
         return
-    if options.device == "cuda" and not torch.cuda.is_available():
+    if device == "cuda" and not torch.cuda.is_available():
         sys.exit("no GPU on this machine: nothing to measure with --device cuda")
     begin, load = time.perf_counter(), os.getloadavg()[0]
-    lines = [
-        line
-        for device in ("cpu", "cuda")
-        if options.device in (None, device)
-        for line in table(device, quick=options.quick)
-    ]
+    lines = [line for kind in ("cpu", "cuda") if device in (None, kind) for line in table(kind, quick=quick)]
     minutes, after = (time.perf_counter() - begin) / 60, os.getloadavg()[0]
     end = f"{minutes:.1f} minutes in all; load of the machine {load:.1f} before, {after:.1f} after."
     print(end)
-    if options.device is None and not options.quick:
+    if device is None and not quick:
         write(RESULTS, lines, end)
 
 
@@ -441,4 +436,4 @@ def write(path: Path, lines: list[str], end: str) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

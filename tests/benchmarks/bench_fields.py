@@ -13,6 +13,7 @@ from statistics import median
 
 import numpy as np
 import torch
+import tyro
 
 from arraygeom import (
     Camera,
@@ -113,4 +114,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -18,10 +18,13 @@ from collections.abc import Callable
 from functools import partial
 from statistics import median
 from types import FrameType
+from typing import Literal
 
 import kornia.geometry
 import torch
+import tyro
 from torch import Tensor
+from tyro.conf import Positional
 
 from arraygeom import Camera, Distortion, Pose, Rig, relative_pose
 from docs.update_readme import write_block
@@ -156,7 +159,8 @@ def convert() -> None:
     Pose.from_kornia(pose.to_kornia())
     Pose.from_quaternion(pose.quaternion, pose.t)
     pair = rig.pair("alpha", "beta")
-    relative_pose(pair.fundamental, pair.alpha.K, pair.beta.K, torch.rand(8, 2), torch.rand(8, 2))
+    x = torch.rand(2, 8, 2)
+    relative_pose(pair.fundamental, *(camera.K for camera in pair.cameras), *x)
 
 
 def fused() -> None:
@@ -166,10 +170,15 @@ def fused() -> None:
     fuse(GuidedPAT(), rig, images, alpha="alpha")
 
 
-if __name__ == "__main__":
+def main(what: Positional[tuple[Literal["table", "calls"], ...]] = ("table", "calls")) -> None:
+    """Print the lists, and put them into docs/kornia.md."""
     torch.set_num_threads(1)
     tables = {"table": table, "calls": counts}
-    for what in sys.argv[1:] or tables:
-        made = tables[what]()
+    for name in what:
+        made = tables[name]()
         print(made)
-        write_block(DOCS / "kornia.md", what, made)
+        write_block(DOCS / "kornia.md", name, made)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import reduce
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -37,6 +37,8 @@ from tests.benchmarks.printed import DATA, head, print_tables
 from tests.calib.rendered import BOARD
 from tests.calib.tracks import CALISCOPE_BOARD, caliscope_views
 
+opencv: Any = cv2
+"""Of version 5, which has more than stubs know of."""
 Views = Mapping[str, BoardViews]
 Calibrator = Callable[[Views, Board], Rig]
 FEWEST = 6
@@ -77,10 +79,10 @@ def multiview(views: Views, board: Board) -> Rig:
             mine.append(x[repeated].astype(np.float32))
     detected = np.array([[name in seen for _, seen in frames] for name in views], np.uint8)
     sizes = [v.hw[::-1] for v in views.values()]
-    models = np.full(len(views), cv2.CALIB_MODEL_PINHOLE, np.uint8)
+    models = np.full(len(views), opencv.CALIB_MODEL_PINHOLE, np.uint8)
     Ks, lenses = zip(*(_single(v, board) for v in views.values()))
     flags = np.full(len(views), cv2.CALIB_USE_INTRINSIC_GUESS, np.int32)
-    _, Ks, lenses, Rs, ts, *_ = cv2.calibrateMultiview(
+    _, Ks, lenses, Rs, ts, *_ = opencv.calibrateMultiview(
         points, pixels, sizes, detected, models, Ks, lenses, None, None, flags, cv2.CALIB_USE_INTRINSIC_GUESS
     )
     return _rig(views, Ks, lenses, Rs, ts)

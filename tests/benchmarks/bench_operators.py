@@ -190,7 +190,7 @@ def images() -> Iterator[Row]:
     pair = PINHOLES.pair("camera 0", "camera 1")
     image = torch.rand(1, 3, *HW, dtype=F64, generator=G)
     depth = 3 + torch.rand(1, *HW, dtype=F64, generator=G)
-    T, one = pair.beta_from_alpha.matrix[None], pair.alpha.K[None]
+    T, one = pair.beta_from_alpha.matrix[None], pair.cameras[0].K[None]
 
     def theirs(d: Tensor) -> Tensor:
         return warp_frame_depth(image, d[:, None], T, one)

@@ -23,9 +23,9 @@ from torch import Tensor
 from arraygeom import Link, Rig, View
 from arraygeom.pixels import coarse_grid
 from calib.images.from_images import rig_from_images
-from calib.images.held_out import line_distances, line_statistics, split
+from calib.images.held_out import line_distances, split, trimmed_square
 from calib.images.matches import PointMatches, fit_fundamental, line_distance, match_cameras
-from calib.images.refinement import FREE, LineStatistics, RefinementProblem, polish, refine, refine_matches
+from calib.images.refinement import FREE, RefinementProblem, polish, refine, refine_matches
 from experiments.showcase import FAST, FAST_FRAME, SCENE, SLOW, SLOW_FRAME, published_matrices
 from pat.attention import attend_with_statistics
 from pat.data.sample_array import load_sample
@@ -65,25 +65,25 @@ def real_pairs(data: Path, draws: int, g: torch.Generator) -> Iterator[str]:
         rig = Rig({name: pair.rig[name] for name in names})
         matches = match_cameras(pair.images)
         _, held_out = split([matches])
-        results = [refine_matches(worse(rig, g), [matches]).held_out for _ in range(draws)]
-        before, after = ([r[i].median for r in results] for i in (0, 1))
-        own = own_agreement(matches)
-        rest = [beyond(r[1], own) for r in results]
-        cells = (pair.name, len(matches[names].alpha), f"{own.median:.2f}")
+        results = [refine_matches(worse(rig, g), [matches]) for _ in range(draws)]
+        before, after = ([r.held_out[i].median for r in results] for i in (0, 1))
+        own = own_distances(matches)
+        rest = [beyond(line_distances(r.rig, held_out), own) for r in results]
+        cells = (pair.name, len(matches[names].alpha), f"{median(own):.2f}")
         published = f"{median(line_distances(rig, held_out)):.2f}"
         yield markdown_row([*cells, published, *map(_span, (before, after, rest))])
 
 
-def own_agreement(pairs: dict) -> LineStatistics:
-    """How held-out points agree with an F fitted to all points."""
+def own_distances(pairs: dict) -> Tensor:
+    """Of held-out points from the lines of an F fitted to all points."""
     _, held_out = split([pairs])
     (names, points), *_ = pairs.items()
-    return line_statistics(line_distance(held_out[names], fit_fundamental(points)))
+    return line_distance(held_out[names], fit_fundamental(points))
 
 
-def beyond(found: LineStatistics, own: LineStatistics) -> float:
-    """A distance without that of the points themselves."""
-    return math.sqrt(max(found.rms**2 - own.rms**2, 0.0))
+def beyond(found: Tensor, own: Tensor) -> float:
+    """The root mean square distance of the nearest points without that of the points themselves."""
+    return math.sqrt(max(trimmed_square(found) - trimmed_square(own), 0.0))
 
 
 def _span(values: list[float]) -> str:
@@ -105,7 +105,7 @@ def fast_and_slow(data: Path) -> Iterator[str]:
     rigs = refine_matches(rig, [matches]).rig, rig_from_images(images).rig
     for names in rig.links:
         points = {names: held_out[names]}
-        own = own_agreement({names: matches[names]}).median
+        own = median(own_distances({names: matches[names]}))
         before, *after = (median(line_distances(r, points)) for r in (rig, *rigs))
         medians = (f"{off:.2f}" for off in (before, own, *after))
         yield markdown_row([names[1], len(held_out[names].alpha), *medians])

@@ -6,6 +6,7 @@ python -m tests.benchmarks.bench_weights
 from __future__ import annotations
 
 import torch
+import tyro
 from torch.utils.flop_counter import FlopCounterMode
 
 from pat.evaluation.protocols import rectified_fusion
@@ -38,4 +39,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)
