@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -13,14 +12,13 @@ from pathlib import Path
 
 import torch
 import tyro
-from torch import Generator, Tensor
+from torch import Tensor
 
 from experiments.fit import fit, recipe_text
 from pat.sensors import generator_for
 from pat.support.locks import folder_lock
 from pat.support.schema import from_document, read_yaml
 from pat.synthesis.photos import PhotoBank
-from pat.training.loop import Schedule
 
 from .features import FeatureConfig, MatchingEncoder, load_features, save_features
 from .loss import Precision, matching_loss
@@ -84,21 +82,25 @@ def train_features(config: FeatureTraining) -> Path:
         encoder, scenes, kept = _new_encoder(config), _scenes(config, 1), validation_samples(config)
         recipe = recipe_text(config, "photos", "stereo")
 
-        def samples(start: int) -> Iterator[tuple[MatchingSample, Generator]]:
+        def losses(start: int) -> Iterator[Tensor]:
             for step in itertools.count(start):
                 recording, queries = (generator_for(config.seed, n, step) for n in ("recording", "queries"))
-                yield recorded_sample(scenes.of_step(step), recording, config.recording), queries
-
-        def loss(given: tuple[MatchingSample, Generator]) -> Tensor:
-            full, half = matching_loss(encoder, *given, precision=config.precision)
-            return full.loss + half.loss
+                given = recorded_sample(scenes.of_step(step), recording, config.recording)
+                full, half = matching_loss(encoder, given, queries, precision=config.precision)
+                yield full.loss + half.loss
 
         def keep(averaged: MatchingEncoder, step: int) -> None:
             save_features(averaged, config.out / WEIGHTS, {"recipe": recipe, "step": str(step)})
 
-        schedule = Schedule(config.steps, math.inf, config.rate, "cosine", 100, config.validate, config.save)
-        shown = {"average": config.average, "examine": partial(validated, kept=kept), "keep": keep}
-        fit(encoder, loss, samples, schedule, config.out, recipe, batch=config.batch, **shown)
+        fit(
+            encoder,
+            losses,
+            config.out,
+            recipe,
+            **{name: getattr(config, name) for name in ("steps", "rate", "save", "validate", "average")},
+            examine=partial(validated, kept=kept),
+            keep=keep,
+        )
     return config.out / WEIGHTS
 
 

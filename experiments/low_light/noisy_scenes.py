@@ -88,7 +88,7 @@ class NoisyScenes:
         )
         self.makers = [LayeredScenes(photos, rig, hw=HW, seed=seed) for rig in rigs]
 
-    def steps(self, batch: int, side: int, start: int = 0) -> Iterator[NoisyScene]:
+    def steps(self, batch: int, side: int, *, start: int = 0) -> Iterator[NoisyScene]:
         """Windows of each step from step `start` on."""
         first = start // STEPS
         kept = deque(map(self.group, range(max(first - KEPT + 1, -EARLIER), first + 1)), maxlen=KEPT)

@@ -7,18 +7,17 @@ on layered scenes that are recorded with such noise, denoised view by view, and 
 from __future__ import annotations
 
 import itertools
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import tyro
 from torch import Generator, Tensor, nn
 
-from experiments.fit import fit, recipe_text
+from experiments.fit import Losses, fit, recipe_text
 from pat.media.colour import luminance
 from pat.networks.denoiser import LowLightNetwork
 from pat.networks.weights import load_denoiser, load_weights, save_weights
@@ -26,10 +25,9 @@ from pat.sensors import generator_for
 from pat.support.locks import folder_lock
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rigs import below
-from pat.training.loop import Schedule
 from pat.training.losses import image_loss
 
-from .noisy_scenes import NoisyScene, NoisyScenes, flipped, noise_levels, noisy
+from .noisy_scenes import NoisyScenes, flipped, noise_levels, noisy
 
 VIEWS, FUSED = "views.safetensors", "best.safetensors"
 
@@ -75,54 +73,45 @@ def train_denoiser(config: DenoiserTraining) -> Path:
         bank = PhotoBank.load(*config.photos, cache=config.cache, seed=config.seed)
         if config.steps[0]:
             single = nn.ModuleDict({"band": network.band, "colour": network.colour})
-            views = partial(recorded_views, config, bank, network)
-            single.load_state_dict(_fitted(config, 0, single, partial(view_loss, config), views))
+            _fit(config, 0, single, partial(view_losses, config, bank, network))
             _save(network, config, config.out / VIEWS)
         network.eval().requires_grad_(False)
         network.fused.train().requires_grad_(True)
         scenes = NoisyScenes(bank, load_weights(config.fusion), network, config.seed)
-        windows = partial(scenes.steps, config.batch, config.side)
-        loss = partial(fused_loss, config, network)
-        network.fused.load_state_dict(_fitted(config, 1, network.fused, loss, windows))
+        _fit(config, 1, network.fused, partial(fused_losses, config, scenes, network))
         _save(network, config, config.out / FUSED)
     return config.out / FUSED
 
 
-def _fitted(
-    config: DenoiserTraining, part: int, network: nn.Module, loss: Callable, samples: Callable
-) -> dict[str, Tensor]:
-    """The averaged weights after the first or the second part."""
-    schedule = Schedule(config.steps[part], math.inf, config.rate, "cosine", 100, config.save, config.save)
-    out = config.out / ("views", "fused")[part]
-    return fit(network, loss, samples, schedule, out, recipe_text(config), batch=config.batch).state_dict()
+def _fit(config: DenoiserTraining, part: int, network: nn.Module, losses: Losses) -> None:
+    """Train the first or the second part, and leave the averaged weights in the network."""
+    out, save = config.out / ("views", "fused")[part], config.save
+    rates: dict[str, Any] = {"steps": config.steps[part], "rate": config.rate, "save": save, "validate": save}
+    network.load_state_dict(fit(network, losses, out, recipe_text(config), **rates).state_dict())
 
 
-Views = list[tuple[nn.Module, Tensor, Tensor, Tensor]]
-
-
-def recorded_views(
+def view_losses(
     config: DenoiserTraining, bank: PhotoBank, network: LowLightNetwork, start: int
-) -> Iterator[Views]:
-    """Denoisers of single views, with parts of photographs, as recorded, and the deviation of the noise."""
+) -> Iterator[Tensor]:
+    """Of the denoisers of single views, on photographs."""
     for step in itertools.count(start):
         g = generator_for(config.seed, "views", step)
         halves = windows(bank, config.batch, config.side, g).split(-(-config.batch // 2))
         parts = [(d, x) for c in halves for d, x in ((network.band, luminance(c)), (network.colour, c))]
-        yield [(d, x, *noisy(x, noise_levels(len(x), g), g)) for d, x in parts]
+        given = [(d, x, *noisy(x, noise_levels(len(x), g), g)) for d, x in parts]
+        with _autocast(config):
+            found = [image_loss(d(recorded, deviation), x) for d, x, recorded, deviation in given]
+        yield torch.stack(found).mean()
 
 
-def view_loss(config: DenoiserTraining, given: Views) -> Tensor:
-    """Of the denoisers of single views."""
-    with _autocast(config):
-        found = [image_loss(denoiser(recorded, deviation), x) for denoiser, x, recorded, deviation in given]
-    return torch.stack(found).mean()
-
-
-def fused_loss(config: DenoiserTraining, network: LowLightNetwork, scene: NoisyScene) -> Tensor:
-    """Of the denoiser of the fused image."""
-    with _autocast(config):
-        image = network(scene.image, scene.alpha, scene.beta, scene.confidence)
-    return image_loss(image, scene.ground_truth)
+def fused_losses(
+    config: DenoiserTraining, scenes: NoisyScenes, network: LowLightNetwork, start: int
+) -> Iterator[Tensor]:
+    """Of the denoiser of the fused image, on layered scenes."""
+    for scene in scenes.steps(config.batch, config.side, start=start):
+        with _autocast(config):
+            image = network(scene.image, scene.alpha, scene.beta, scene.confidence)
+        yield image_loss(image, scene.ground_truth)
 
 
 def _autocast(config: DenoiserTraining) -> torch.autocast:
