@@ -348,10 +348,8 @@ def _sequence_table(
         rows.append((name, *figures, f"{1000 * flicker(images, greys):.2f}"))
     rows.append(("ground truth", "", "", "", f"{1000 * flicker(ground_truth, greys):.2f}"))
     table = markdown_table(["", "PSNR, dB", "lowest", "SSIM", "flicker x 1000"], rows)
-    note = (
-        "Means over the frames; flicker is the mean change of chroma from frame to frame where nothing moves."
-    )
-    return [note, "", *table.splitlines()]
+    note = "flicker is the mean change of chroma from frame to frame where nothing moves."
+    return [f"Means over the frames; {note}", "", *table.splitlines()]
 
 
 WRONG = 0.1
