@@ -201,9 +201,8 @@ def test_names_that_the_rig_lacks_are_reported(rendered):
 
 def test_show_and_info_on_the_command_line(rendered, tmp_path, capsys):
     sensors = tmp_path / "sensors.yaml"
-    sensors.write_text(
-        "mono: [{spectral: luminance}, clip, encode-srgb]\ncolour: [{box-blur: 3}, clip, encode-srgb]\n"
-    )
+    chains = "mono: [{spectral: luminance}, clip, encode-srgb]", "colour: [{box-blur: 3}, clip, encode-srgb]"
+    sensors.write_text("\n".join(chains))
     arguments = ["patches", str(rendered), "--sensors", str(sensors), "--out", str(tmp_path / "x.png")]
     main([*arguments, "--samples", "2"], group=Experiments)
     assert read_image(tmp_path / "x.png").std() > 0.1
