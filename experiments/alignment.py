@@ -183,11 +183,11 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
         offsets, locatable = zip(*(local_offsets(own, other, x) for other in others))
         located = locatable[0] | locatable[1]
         near = [float((off[located] <= HALF_PIXEL).mean()) for off in offsets]
-        medians = (float(np.median(off[located])) for off in offsets[:2])
-        shares = float(seen.mean()), float(located.mean()), *near[:2]
-        by_truth = near[2] if len(near) > 2 else None
-        off, dtype = sampling_error(view, values), str(view.values.dtype)
-        rows.append(AlignmentRow(scene.name, name, *shares, *medians, by_truth, true, filled, off, dtype))
+        medians = [float(np.median(off[located])) for off in offsets]
+        shares = float(seen.mean()), float(located.mean()), near[0], near[1], medians[0], medians[1]
+        truths = near[2] if len(near) > 2 else None, true, filled
+        off = sampling_error(view, values)
+        rows.append(AlignmentRow(scene.name, name, *shares, *truths, off, str(view.values.dtype)))
     return rows
 
 

@@ -168,8 +168,8 @@ def methods_of(network: FusionNetwork, recording: Recording) -> dict[str, Stereo
     if level is None:
         found["classical, corrected"] = lambda a, b, d: corrected_classical(network, a, b, d)
     else:
-        found["denoised, classical"] = lambda *given: classical(
-            *(_non_local(image, level) for image in given[:2]), given[2]
+        found["denoised, classical"] = lambda a, b, d: classical(
+            _non_local(a, level), _non_local(b, level), d
         )
     found["uncorrected"] = rectified_fusion(network, response="rec601", align=False)
     noisy: dict[str, Any] = {} if level is None else {"noise": {"alpha": level, "beta": level}}

@@ -40,7 +40,7 @@ def read_rows(path: str | Path) -> list[Row]:
         found = json.loads(Path(path).read_text(encoding="utf-8"))
         if not isinstance(found, list):
             raise TypeError("wanted a list")
-        return [Row(**{k: math.nan if v is None else v for k, v in row.items()}) for row in found]
+        return [Row(**{k: math.nan if v is None else v for k, v in row.items()}) for row in found]  # type: ignore[arg-type]
     except (TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{path}: not the rows of an ablation ({error})") from None
 

@@ -239,7 +239,7 @@ def _bands(given: ColourPair, g: Generator, recording: MatchingRecording) -> tup
 
 def _recorded(image: Tensor, g: Generator, recording: MatchingRecording, rate: int) -> Tensor:
     """One view's brightness (B, 1, H, W) as its camera records it, enlarged again if it is reduced."""
-    hw = image.shape[-2:]
+    hw = image.shape[-2], image.shape[-1]
     if _chance(recording.gamma, g):
         image = image.clamp(0, 1) ** float((0.25 * torch.randn((), generator=g)).exp())
     if _chance(recording.gain, g):
