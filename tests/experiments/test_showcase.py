@@ -143,15 +143,8 @@ def shown(data, tmp_path_factory):
 def test_every_case_has_its_table_and_its_figure(shown):
     text, out = shown
     assert (out / "showcase.md").read_text() == text
-    for expected in (
-        "#### kitti",
-        "#### middlebury",
-        "#### flickr1024",
-        "| Serfaty |",
-        "| cam3 |",
-        "SSIM of fusion",
-    ):
-        assert expected in text
+    tables = "#### kitti", "#### middlebury", "#### flickr1024", "| Serfaty |", "| cam3 |", "SSIM of fusion"
+    assert all(expected in text for expected in tables)
     figures = [line[line.index("(") + 1 : -1] for line in text.splitlines() if line.startswith("![")]
     assert figures == ["syntim_Serfaty.png", "fast_slow.png"]
     assert all(read_image(out / figure).shape[0] == 3 for figure in figures)
@@ -194,21 +187,10 @@ def test_the_links_are_in_our_pixels(shown):
 def test_what_is_missing_is_named(data, tmp_path, capsys, missing):
     folder = tmp_path / "data"
     shutil.copytree(data, folder)
-    gone = folder / missing
+    gone, given = folder / missing, ["--data", str(folder), "--out", str(tmp_path / "out")]
     shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
     with pytest.raises(SystemExit) as stop:
-        main(
-            [
-                "showcase",
-                "--data",
-                str(folder),
-                "--out",
-                str(tmp_path / "out"),
-                "--weights",
-                str(data / "small.safetensors"),
-            ],
-            group=Experiments,
-        )
+        main(["showcase", *given, "--weights", str(data / "small.safetensors")], group=Experiments)
     error = capsys.readouterr().err.strip().splitlines()
     assert stop.value.code == 2
     assert error[-1].startswith("pat: ")
@@ -217,19 +199,8 @@ def test_what_is_missing_is_named(data, tmp_path, capsys, missing):
 
 
 def test_evaluate_writes_and_prints_the_tables(data, tmp_path, capsys):
-    main(
-        [
-            "evaluate",
-            "--kitti",
-            str(data / "kitti"),
-            "--rates",
-            "2",
-            "--out",
-            str(tmp_path),
-            "--weights",
-            str(data / "small.safetensors"),
-        ]
-    )
+    given = ["--kitti", str(data / "kitti"), "--rates", "2", "--out", str(tmp_path)]
+    main(["evaluate", *given, "--weights", str(data / "small.safetensors")])
     printed = capsys.readouterr().out
     assert printed == (tmp_path / "scores.md").read_text()
     assert printed.startswith("#### kitti\n\n| beta reduced 2x | alpha | beta | classical | fusion |\n")
@@ -281,17 +252,8 @@ def test_the_tables_commands_say_what_is_wrong(arguments, complaint, data, tmp_p
 
 
 def test_the_papers_figures_are_beside_ours(data, tmp_path, capsys):
-    arguments = [
-        "evaluate",
-        "--kitti",
-        str(data / "kitti"),
-        "--rates",
-        "2",
-        "--controls",
-        "--out",
-        str(tmp_path),
-    ]
-    main([*arguments, "--weights", "mono-colour-small"], group=Experiments)
+    given = ["--kitti", str(data / "kitti"), "--rates", "2", "--controls", "--out", str(tmp_path)]
+    main(["evaluate", *given, "--weights", "mono-colour-small"], group=Experiments)
     printed = capsys.readouterr().out
     assert printed == (tmp_path / "scores.md").read_text()
     assert "| shuffled fields | the paper, printed, on its own data |" in printed
