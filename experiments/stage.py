@@ -54,11 +54,9 @@ class SystemScene(LayeredScenes):
         super().__init__(bank, RigDistribution(), hw=rig[alpha].hw, layers=(layers, layers), seed=seed)
         near, far = (torch.tensor([d], dtype=torch.float64) for d in depths)
         rigs = RigBatch([self.camera(name) for name in (alpha, *rig.betas(alpha))], near, far)
-        self.scene = draw_layers(rigs, self.layers, self.photos, len(self.outlines), self.generator("scene"))
-
-    def generator(self, purpose: str) -> Generator:
-        """Randomness for one purpose, the same each time."""
-        return purpose_generator(self.seed, purpose)
+        self.scene = draw_layers(
+            rigs, self.layers, self.photos, len(self.outlines), purpose_generator(seed, "scene")
+        )
 
     def camera(self, name: str) -> Camera:
         """A camera of the rig as a batch of one, in alpha's frame."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from experiments.exposures import banded
 from experiments.rendered import RenderedScene
-from experiments.stage import SystemScene
+from experiments.stage import SystemScene, purpose_generator
 from experiments.system import SystemRecording
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.sensors import Clip, Noise, record
@@ -31,7 +31,7 @@ MOVING = 0.12
 
 def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     """Eleven frames of alpha, and of each beta those of that time."""
-    rig, generator = stage.rig, stage.generator("record")
+    rig, generator = stage.rig, purpose_generator(stage.seed, "record")
     raw: dict[str, list[Tensor]] = {name: [] for name in rig.names}
     ground_truth = []
     for name, frames in lights(stage).items():
