@@ -61,10 +61,6 @@ def broken(rendered, tmp_path):
     return tmp_path / "data"
 
 
-def generator(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
 def test_the_papers_windows_reach_from_edge_to_edge():
     corners = PatchGrid().corners((1536, 2048))
     assert len(corners) == PatchGrid().count == 49
