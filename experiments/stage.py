@@ -93,21 +93,17 @@ class SystemScene(LayeredScenes):
 
     def mixed(self, weights: Float[Tensor, "l 4"]) -> Layers:
         """The scene in grey: for each layer weights of its texture's red, green and blue, and a constant."""
-        grey = (
-            (weights[None, :, None, :3].to(self.scene.colour) @ self.scene.colour)
-            .expand(-1, -1, 3, -1)
-            .clone()
-        )
-        grey[..., 3] += weights[None, :, None, 3].to(grey)
+        weights = weights[None, :, None].to(self.scene.colour)
+        grey = (weights[..., :3] @ self.scene.colour).expand(-1, -1, 3, -1).clone()
+        grey[..., 3] += weights[..., 3]
         return dataclasses.replace(self.scene, colour=grey)
 
     def moved(self, layer: int, step: Float[Tensor, "3"]) -> Layers:
         """The scene with one layer moved, metres in alpha's frame."""
         planes, moving = self.scene.plane_from_world, torch.zeros_like(self.scene.plane_from_world.t)
         moving[:, layer] = step.to(moving)
-        return dataclasses.replace(
-            self.scene, plane_from_world=Pose(planes.R, planes.t - matvec(planes.R, moving))
-        )
+        moved = Pose(planes.R, planes.t - matvec(planes.R, moving))
+        return dataclasses.replace(self.scene, plane_from_world=moved)
 
     def shares(self) -> Float[Tensor, " l"]:
         """The part of alpha's image that each layer covers."""

@@ -45,9 +45,8 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
         raw[name] = [record(seen, (Noise(ELECTRONS, READ), Clip()), purpose_generator(stage.seed, name))[0]]
         if name != alpha:
             bands[name] = banded(light(stage, alpha), sensor.response)[0]
-    return SystemRecording(
-        raw, [srgb_from_linear(torch.cat([bands[name] for name in rig.betas(alpha)]))], lights
-    )
+    ground_truth = srgb_from_linear(torch.cat([bands[name] for name in rig.betas(alpha)]))
+    return SystemRecording(raw, [ground_truth], lights)
 
 
 def light(stage: SystemScene | RenderedScene, name: str) -> Tensor:

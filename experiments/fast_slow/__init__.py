@@ -47,9 +47,9 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
 def lights(stage: SystemScene | RenderedScene) -> Mapping[str, Iterable[Tensor]]:
     """The linear colours that each camera receives, frame by frame."""
     if isinstance(stage, RenderedScene):
-        counts = {name: len(frames) for name, frames in stage.frames.items()}
         return {
-            name: [stage.light(name, i).clamp(0, 1) for i in range(count)] for name, count in counts.items()
+            name: [stage.light(name, i).clamp(0, 1) for i in range(len(frames))]
+            for name, frames in stage.frames.items()
         }
     velocity, layer = object_velocity(stage)
 

@@ -34,9 +34,8 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     own, other = (hazed(*stage.seen(name)) for name in ("nir", "colour"))
     nir = record(infrared, (Noise(8_000, 4), Clip()), generator)
     colour = record(other, (Noise(6_000, 3), Clip()), generator)
-    ground_truth = from_luma_chroma(
-        srgb_from_linear(infrared[0]), to_luma_chroma(srgb_from_linear(own[0]))[1]
-    )
+    chroma = to_luma_chroma(srgb_from_linear(own[0]))[1]
+    ground_truth = from_luma_chroma(srgb_from_linear(infrared[0]), chroma)
     return SystemRecording({"nir": [nir[0]], "colour": [colour[0]]}, [ground_truth.clamp(0, 1)])
 
 
