@@ -278,6 +278,10 @@ class Rig(Batched):
     def __contains__(self, name: object) -> bool:
         return name in self.cameras
 
+    def __len__(self) -> int:
+        """How many cameras; of a batch of rigs, how many rigs."""
+        return super().__len__() if self.batch_shape else len(self.cameras)
+
     def __iter__(self) -> Iterator[Any]:
         """The cameras' names in order; of a batch of rigs, the rigs."""
         return (self[i] for i in range(len(self))) if self.batch_shape else iter(self.names)
