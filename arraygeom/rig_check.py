@@ -139,7 +139,7 @@ def _overlap(pair: Pair) -> bool:
     """Whether the segment of any pixel of a grid reaches beta's image."""
     from .fields.default import recorded_field
 
-    found = recorded_field(pair)(pair, _grid(pair.alpha).to(pair.alpha.K))
+    found = recorded_field(pair)(pair, _grid(pair.alpha).to(pair.cameras[0].K))
     return bool((found.valid if hasattr(found, "valid") else found.mask).any())
 
 
