@@ -78,9 +78,8 @@ def _predicted(
             weights, error = _fit(bands[some][:, train], own[train])
             error = math.hypot(error, MISPLACED)
             value = (weights[:, None, None] * bands[some]).sum(0).clamp(min=0)
-            shot = sum(
-                (w / scale[i]) ** 2 * (bands[i] * scale[i] + READ_NOISE) for w, i in zip(weights, some)
-            )
+            parts = zip(weights, [scale[i] for i in some], bands[some])
+            shot = sum((w / s) ** 2 * (b * s + READ_NOISE) for w, s, b in parts)
             variance = shot + FULL_WELL * (error * value) ** 2
             here = good[some].all(0) & noise.isinf()
             predicted, noise = torch.where(here, value, predicted), torch.where(here, variance, noise)

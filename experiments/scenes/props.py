@@ -22,7 +22,7 @@ Profile = Sequence[tuple[float, float]]
 """Radius and height of an object of revolution, metres, from its top."""
 
 
-def profile(*numbers: float) -> Profile:
+def profile(*numbers: float) -> list[tuple[float, float]]:
     """Radius and height in turn, millimetres."""
     return [(r / 1000, h / 1000) for r, h in zip(numbers[::2], numbers[1::2])]
 
