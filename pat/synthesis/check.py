@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
 
@@ -41,37 +41,14 @@ class CheckLimits:
     overlap: float = 0.1
 
 
-@dataclass(frozen=True, kw_only=True)
-class SceneCheck:
-    """Figures by view and by "alpha > beta", and the reasons for refusal (none if accepted)."""
-
-    views: dict[str, dict[str, float]] = field(default_factory=dict)
-    pairs: dict[str, dict[str, float]] = field(default_factory=dict)
-    reasons: tuple[str, ...] = ()
-
-    @property
-    def accepted(self) -> bool:
-        """Whether there is no reason for refusal."""
-        return not self.reasons
-
-    def to_document(self) -> dict[str, Any]:
-        """For a file: `accepted`, `reasons`, `views`, `pairs`."""
-        return {
-            "accepted": self.accepted,
-            "reasons": list(self.reasons),
-            "views": self.views,
-            "pairs": self.pairs,
-        }
-
-
 def check_views(
-    rig: Rig, frames: Mapping[str, RenderedFrame], limits: CheckLimits | None = None
-) -> SceneCheck:
-    """Check one frame of every camera against each other and against the limits.
+    rig: Rig, frames: Mapping[str, RenderedFrame], limits: CheckLimits = CheckLimits()
+) -> dict[str, Any]:
+    """Check one frame of every camera against each other and against the limits, for a file.
 
-    Pairs of frames of different times are left out.
+    `views` and `pairs` are figures by view and by "alpha > beta", pairs of frames of different times left
+    out; `reasons` are those for refusal, and without any the scene is `accepted`.
     """
-    limits = limits or CheckLimits()
     views = {name: view_figures(frame) for name, frame in frames.items()}
     together = [(a, b) for a, b in permutations(frames, 2) if frames[a].time == frames[b].time]
     pairs = {
@@ -81,23 +58,24 @@ def check_views(
     reasons = [r for name, figures in views.items() for r in _view_reasons(name, figures, limits)]
     reasons += [r for name, figures in pairs.items() for r in _pair_reasons(name, figures, limits)]
     reasons += _overlap_reasons(pairs, {a for a, _ in together}, limits)
-    return SceneCheck(views=views, pairs=pairs, reasons=tuple(reasons))
+    return {"accepted": not reasons, "reasons": reasons, "views": views, "pairs": pairs}
 
 
 def view_figures(frame: RenderedFrame) -> dict[str, float]:
     """Brightness, texture and depths of one image."""
     finite = frame.depth.isfinite()
     depths = frame.depth[finite] if finite.any() else frame.depth.new_tensor([torch.inf])
-    figures = {
-        "mean": frame.rgb.mean(),
-        "dark": (frame.rgb.amax(0) < 0.004).float().mean(),
-        "bright": (frame.rgb.amin(0) > 1).float().mean(),
-        "texture": texture(frame.rgb),
-        "covered": finite.float().mean(),
-        "near": depths.min(),
-        "far": depths.max(),
-    }
-    return _rounded(figures)
+    return _rounded(
+        {
+            "mean": frame.rgb.mean(),
+            "dark": (frame.rgb.amax(0) < 0.004).float().mean(),
+            "bright": (frame.rgb.amin(0) > 1).float().mean(),
+            "texture": texture(frame.rgb),
+            "covered": finite.float().mean(),
+            "near": depths.min(),
+            "far": depths.max(),
+        }
+    )
 
 
 def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:

@@ -3,37 +3,34 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from dataclasses import dataclass
 from typing import cast
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import Adam
-from torch.optim.swa_utils import AveragedModel
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from pat.networks.weights import Network
+from pat.networks.weights import Network, new_network, set_precision
 
+from .config import TrainConfig
 from .losses import Objective
 from .processes import Process
 from .samples import Sample, alone
 
 
-@dataclass
 class Learner:
-    """A network and its objective; `together` is the objective whose gradients all processes share.
+    """A recipe's network and objective; `together` is the objective whose gradients all processes share."""
 
-    `clip` is the largest norm of the gradients.
-    """
-
-    network: Network
-    average: AveragedModel
-    objective: Objective
-    together: nn.Module
-    adam: Adam
-    clip: float
-    here: Process
+    def __init__(self, config: TrainConfig, here: Process):
+        self.here, self.clip = here, config.clip
+        self.network = new_network(config.network, config.start).to(here.device)
+        self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / config.average))
+        set_precision(self.network, config.precision, compiled=config.compile)  # not the average's
+        self.objective = Objective(self.network, config.loss, attention=config.attention)
+        self.together = here.together(self.objective)
+        self.adam = Adam(self.network.parameters(), betas=config.momenta)
 
     @property
     def averaged(self) -> Network:

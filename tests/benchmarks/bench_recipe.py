@@ -23,14 +23,13 @@ import torch
 import tyro
 
 from arraygeom.atomic import write_text
-from arraygeom.fields import FIELDS
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.networks.weights import load_weights
 from pat.synthesis.photos import PhotoBank
 from pat.training import loop, losses
 from pat.training.config import TrainConfig, load_config
 from pat.training.losses import validation
-from pat.training.samples import Sample, SampleSource, photographs, source_of
+from pat.training.samples import Sample, SampleSource, photographs
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -129,7 +128,7 @@ class Bench:
         return Found(facts["psnr"], facts["matched"], seconds)
 
     def _source(self, config: TrainConfig, bank: PhotoBank, seed: int) -> SampleSource:
-        return source_of(config, bank, seed, FIELDS[config.field]())
+        return SampleSource(config, bank, seed)
 
 
 def unmatched(seen: object, given: Sample) -> torch.Tensor:

@@ -25,14 +25,13 @@ import tyro
 from torch import Tensor, nn
 
 from arraygeom import pixel_grid
-from arraygeom.fields import FIELDS
 from pat.attention import attend
 from pat.attention.reference import Attended
 from pat.evaluation.ablation import sample_photographs
 from pat.networks.weights import Network, new_network, set_precision
 from pat.training.config import TrainConfig, load_config
 from pat.training.losses import Objective
-from pat.training.samples import Sample, SampleSource, source_of
+from pat.training.samples import Sample, SampleSource
 
 
 @dataclass
@@ -101,7 +100,7 @@ def stored(given: Sample, folder: Path) -> list[Path]:
 
 
 def source(config: TrainConfig) -> SampleSource:
-    return source_of(config, sample_photographs(), 0, FIELDS[config.field]())
+    return SampleSource(config, sample_photographs(), 0)
 
 
 def step(objective: Objective, given: Sample, adam: torch.optim.Optimizer) -> None:

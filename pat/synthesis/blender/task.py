@@ -79,7 +79,7 @@ def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) 
             "versions": {"blender": studio.bpy.app.version_string, "pat": version("arraygeom-pat")},
             "seconds": round(time.monotonic() - started, 3),
             "frames": files,
-            "check": check_views(rig, first, settings.limits).to_document(),
+            "check": check_views(rig, first, settings.limits),
         }
         (folder / RENDER_FILE).write_text(json.dumps(about, indent=1), encoding="utf-8")
     return Rendered(out)
@@ -161,17 +161,7 @@ def _scratch() -> Iterator[Path]:
     where = _SHARED_MEMORY if os.access(_SHARED_MEMORY, os.W_OK) else None
     for left in _SHARED_MEMORY.glob(f"{_SCRATCH}*") if where else ():
         owner = left.name.removeprefix(_SCRATCH).partition("-")[0]
-        if owner.isdecimal() and not _alive(int(owner)):
+        if owner.isdecimal() and not Path(f"/proc/{owner}").exists():
             shutil.rmtree(left, ignore_errors=True)
     with tempfile.TemporaryDirectory(dir=where, prefix=f"{_SCRATCH}{os.getpid()}-") as folder:
         yield Path(folder)
-
-
-def _alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return True
