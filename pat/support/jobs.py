@@ -87,7 +87,7 @@ class JobReport:
         warned = {file for files in self.warned.values() for file in files}
         further = {"there already": self.kept, "failed": self.failed, "with warnings": warned}
         return ", ".join(
-            [f"{len(self.made)} made", *(f"{len(n)} {what}" for what, n in further.items() if n)]
+            [f"{len(self.made)} made"] + [f"{len(n)} {what}" for what, n in further.items() if n]
         )
 
 
@@ -140,9 +140,8 @@ def run_tasks(
     console = console or Console(stderr=True)
     here = workers.count == 1 and not workers.apart
     run = _on_dask if workers.scheduler else _in_this_process if here else _in_processes
-    for outcome in followed(
-        run(left, workers), title=title, total=len(tasks), done=len(there), console=console
-    ):
+    made = run(left, workers)
+    for outcome in followed(made, title=title, total=len(tasks), done=len(there), console=console):
         if outcome.error is None:
             report.made.append(outcome.makes)
             report.warn(outcome, named[outcome.makes])
@@ -243,10 +242,8 @@ class _Process:
                 if died is not None:
                     died.join()
                     code = died.exitcode
-                    error = (
-                        "its process died "
-                        f"({signal.Signals(-code).name if code < 0 else f'exit status {code}'})"
-                    )
+                    how = signal.Signals(-code).name if code < 0 else f"exit status {code}"
+                    error = f"its process died ({how})"
                 continue
             if outcome is None:
                 self.end()
