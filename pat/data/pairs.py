@@ -95,7 +95,7 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
     """
     root = _folder(root)
     scenes = _some(_middlebury_scenes(root), root)
-    return (_middlebury_pair(root, left, layout) for left, layout in scenes)
+    return (_middlebury_pair(root, *scene) for scene in scenes)
 
 
 def folder_pairs(root: str | Path, *, max_disparity: float = PAPER_DISPARITY) -> Iterator[StereoPair]:
@@ -164,9 +164,8 @@ def _right_of(left: Path, root: Path) -> list[Path]:
     if left.suffix.lower() not in IMAGE_SUFFIXES:
         return []
     before, inside = root.as_posix(), left.as_posix()[len(root.as_posix()) :]
-    rights = (
-        Path(before + mark[1].join(inside.rsplit(mark[0], 1))) for mark in LEFT_AND_RIGHT if mark[0] in inside
-    )
+    marks = [(ours, theirs) for ours, theirs in LEFT_AND_RIGHT if ours in inside]
+    rights = (Path(before + theirs.join(inside.rsplit(ours, 1))) for ours, theirs in marks)
     return [right for right in rights if right.is_file()][:1]
 
 

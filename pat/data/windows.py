@@ -79,11 +79,8 @@ def read_view(folder: Path, name: str) -> RenderedView:
         raise ValueError(f"{folder}: camera '{name}' is not calibrated")
     hw = (frame.depth.shape[-2], frame.depth.shape[-1])
     if hw != camera.hw or frame.rgb.shape[1:] != frame.depth.shape:
-        raise ValueError(
-            f"{folder}: the image of '{name}' is {hw[1]}x{hw[0]}, its rig says "
-            f"{camera.hw[1]}x{camera.hw[0]}: "
-            "remove it and run 'pat render' again"
-        )
+        text = f"the image of '{name}' is {hw[1]}x{hw[0]}, its rig says {camera.hw[1]}x{camera.hw[0]}"
+        raise ValueError(f"{folder}: {text}: remove it and run 'pat render' again")
     return RenderedView(frame.rgb, frame.depth, camera.to(torch.float64))
 
 

@@ -78,8 +78,7 @@ def classical_view(
         )
     small = {name: reduced(image, longest).clamp(0, 1) for name, image in images.items()}
     for name, image in small.items():
-        h, w = image.shape[-2:]
-        rig = rig.resize(name, (h, w))
+        rig = rig.resize(name, (image.shape[-2], image.shape[-1]))
     views, back = Undistort().do(Views.of(rig, small, alpha=alpha))
     image = classical_baseline(views.rig, views.images, alpha)
     return back(Frame(image, *torch.zeros(3, *image.shape[-2:]))).image
@@ -146,15 +145,8 @@ def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Te
     from skimage.restoration import denoise_nl_means
 
     given = image.movedim(0, -1).numpy()
-    found = denoise_nl_means(
-        given,
-        patch_size=5,
-        patch_distance=6,
-        h=0.8 * deviation,
-        sigma=deviation,
-        fast_mode=True,
-        channel_axis=-1,
-    )
+    noise = {"h": 0.8 * deviation, "sigma": deviation}
+    found = denoise_nl_means(given, 5, 6, **noise, fast_mode=True, channel_axis=-1)
     return torch.from_numpy(np.ascontiguousarray(found.reshape(given.shape))).movedim(-1, 0).to(image)
 
 
@@ -188,9 +180,8 @@ def _rectified_plane(pair: Pair, depth: tuple[float, float]) -> _Plane:
     shift = -(rotation @ R.T @ t)[0] * focal / (np.array(depth) * [z.min(), z.max()])
     max_disparity = float(np.ptp(shift))
     K[:2, 2] = -corners.min(0) + [max_disparity, 0]
-    width, height = (
-        int(side) for side in np.ceil(np.ptp(corners, axis=0) + np.array([max_disparity + 1, 1]))
-    )
+    sides = np.ceil(np.ptp(corners, axis=0) + np.array([max_disparity + 1, 1]))
+    width, height = (int(side) for side in sides)
     if width * height > 8 * hw[0] * (hw[1] + max_disparity):
         raise ValueError(UNRECTIFIABLE)
     K_shifted = K.copy()
@@ -290,15 +281,8 @@ def _softened(mono: Image, sharpness: float) -> Image:
 def raw_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float) -> Image:
     """Semi-global matching, padded because OpenCV leaves `count` columns at the left without disparity."""
     count = 16 * int(np.ceil((min(max_disparity, left.shape[1]) + 1) / 16))
-    matcher = cv2.StereoSGBM.create(
-        0,
-        count,
-        BLOCK,
-        P1=8 * BLOCK**2,
-        P2=32 * BLOCK**2,
-        preFilterCap=31,
-        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-    )
+    costs = {"P1": 8 * BLOCK**2, "P2": 32 * BLOCK**2, "preFilterCap": 31}
+    matcher = cv2.StereoSGBM.create(0, count, BLOCK, **costs, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY)
     padded = (cv2.copyMakeBorder(x, 0, 0, count, count, cv2.BORDER_REPLICATE) for x in (left, right))
     return matcher.compute(*padded)[:, count:-count].astype(np.float32) / 16
 

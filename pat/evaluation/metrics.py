@@ -46,15 +46,8 @@ def score(image: Float[Tensor, "_ _ _"], ground_truth: Float[Tensor, "_ _ _"]) -
     ours, theirs = (x.detach().cpu().double().numpy() for x in (image, ground_truth))
     with np.errstate(divide="ignore"):
         psnr = -10 * np.log10(np.square(ours - theirs).mean())
-    ssim = structural_similarity(
-        theirs,
-        ours,
-        data_range=1,
-        channel_axis=0,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-    )
+    how = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    ssim = structural_similarity(theirs, ours, data_range=1, channel_axis=0, **how)
     return Score(float(psnr), float(ssim))
 
 

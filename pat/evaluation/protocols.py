@@ -49,9 +49,8 @@ def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
             "the mono + colour protocol needs equal sizes"
         )
     ground_truth = cut_to_multiple(pair.left, rate)
-    return MonoColourTask(
-        luminance(ground_truth), reduce_by(cut_to_multiple(pair.right, rate), rate), ground_truth
-    )
+    beta = reduce_by(cut_to_multiple(pair.right, rate), rate)
+    return MonoColourTask(luminance(ground_truth), beta, ground_truth)
 
 
 def reduce_by(image: Float[Tensor, "c h w"], rate: int) -> Float[Tensor, "c hr wr"]:

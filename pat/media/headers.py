@@ -73,14 +73,11 @@ def _png(content: bytes) -> ImageHeader:
 def _pnm(content: bytes) -> ImageHeader | None:
     """By hand: Pillow does not state the bits."""
     gap = rb"(?:\s|#[^\n]*\n)+"
-    found = re.match(
-        rb"P[1-6]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})\s(?:\s*(\d{1,5})\s)?", content[:4096]
-    )
-    return (
-        ImageHeader((int(found[2]), int(found[1])), bits=16 if int(found[3] or 0) > 255 else 8)
-        if found
-        else None
-    )
+    form = rb"P[1-6]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})\s(?:\s*(\d{1,5})\s)?"
+    found = re.match(form, content[:4096])
+    if found is None:
+        return None
+    return ImageHeader((int(found[2]), int(found[1])), bits=16 if int(found[3] or 0) > 255 else 8)
 
 
 def _tiff(content: bytes) -> ImageHeader | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,8 +35,6 @@ MOST_PIXELS = 2**28
 """Images with more are read only where their size is expected: some 3 GiB in colour."""
 
 _LZW = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW]
-
-
 _HEIF = tuple(b"ftyp" + brand for brand in (b"heic", b"heix", b"mif1", b"msf1", b"heim", b"heis"))
 
 
@@ -156,13 +155,7 @@ def has_many_bits(path: Path) -> bool:
 
 def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
     """The image of a HEIC or HEIF file, upright, as a PNG file; its size is compared before it is decoded."""
-    try:
-        import pillow_heif
-    except ImportError:
-        raise ValueError(
-            f"{label}: reading HEIC needs the package pillow-heif: "
-            "pip install 'arraygeom-pat[heic]', or save it as PNG"
-        ) from None
+    pillow_heif = _of_extra("pillow_heif", "heic", f"{label}: reading HEIC")
     problem = f"{label}: not a HEIC image that can be read (%s): save it as PNG"
     try:
         stored = pillow_heif.open_heif(path, convert_hdr_to_8bit=True)
@@ -178,18 +171,11 @@ def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
 
 def _png_of_raw(path: Path, label: str) -> bytes:
     """A camera's raw file as PNG: developed to sRGB in 16 bits with the camera's white balance, upright."""
-    try:
-        import rawpy
-    except ImportError:
-        raise ValueError(
-            f"{label}: reading raw files needs the package rawpy: "
-            "pip install 'arraygeom-pat[raw]', or save it as TIFF"
-        ) from None
+    rawpy = _of_extra("rawpy", "raw", f"{label}: reading raw files")
+    how = {"use_camera_wb": True, "no_auto_bright": True, "output_bps": 16, "gamma": (2.4, 12.92)}
     try:
         with rawpy.imread(str(path)) as raw:
-            colours = raw.postprocess(
-                use_camera_wb=True, no_auto_bright=True, output_bps=16, gamma=(2.4, 12.92)
-            )
+            colours = raw.postprocess(**how)
     except (rawpy.LibRawError, OSError) as error:
         raise ValueError(f"{label}: not a raw file that can be read ({error}): save it as TIFF") from None
     return cv2.imencode(".png", colours[..., ::-1])[1].tobytes()
@@ -217,10 +203,8 @@ def _check_header(got: HW, wanted: HW | None, label: str) -> None:
         )
     if wanted is not None and got != wanted:
         (h, w), (wanted_h, wanted_w) = got, wanted
-        raise ValueError(
-            f"{label}: is {w}x{h}, the rig says {wanted_w}x{wanted_h}: "
-            "resize the rig, or give the right image"
-        )
+        text = f"{label}: is {w}x{h}, the rig says {wanted_w}x{wanted_h}"
+        raise ValueError(f"{text}: resize the rig, or give the right image")
 
 
 def _upright(values: NDArray, orientation: int) -> NDArray:
@@ -336,13 +320,15 @@ def _counts(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArr
 
 def exr_writer(path: Path) -> Any:
     """The package OpenEXR, to write to `path`. Raises ValueError where it is not installed."""
+    return _of_extra("OpenEXR", "synthesis", f"{path}: writing EXR")
+
+
+def _of_extra(package: str, extra: str, purpose: str) -> Any:
     try:
-        import OpenEXR
+        return import_module(package)
     except ImportError:
-        raise ValueError(
-            f"{path}: writing EXR needs the package OpenEXR: pip install 'arraygeom-pat[synthesis]'"
-        ) from None
-    return OpenEXR
+        install = f"pip install 'arraygeom-pat[{extra}]'"
+        raise ValueError(f"{purpose} needs the package {package}: {install}, or another format") from None
 
 
 def _write_exr(path: Path, planes: NDArray, bits: int) -> None:

@@ -58,13 +58,10 @@ def generator_named(name: str) -> Callable[..., Scene]:
 
     Raises ValueError for a name that is neither.
     """
-    if name == "abstract":
-        return abstract
-    if name == "photographs":
-        return photographs
-    if ":" not in name:
+    ours: dict[str, Callable[..., Scene]] = {"abstract": abstract, "photographs": photographs}
+    if name not in ours and ":" not in name:
         raise ValueError(f"no generator is called '{name}': use abstract, photographs or MODULE:FUNCTION")
-    return imported(name, "generator")  # type: ignore[no-any-return]
+    return ours.get(name) or imported(name, "generator")
 
 
 # Surfaces ---------------------------------------------------------------------------------------------------
@@ -103,11 +100,9 @@ def _near_infrared(rng: Generator, rgb: Vec3) -> float:
     kind = rng.choice(["dye", "pigment", "soot"], p=[0.5, 0.4, 0.1])
     if kind == "dye":
         return float(rng.uniform(0.45, 0.8))
-    return (
-        float(rng.uniform(0.03, 0.1))
-        if kind == "soot"
-        else float(np.clip(r * rng.uniform(0.8, 1.2), 0.02, 0.9))
-    )
+    if kind == "soot":
+        return float(rng.uniform(0.03, 0.1))
+    return float(np.clip(r * rng.uniform(0.8, 1.2), 0.02, 0.9))
 
 
 @lru_cache(maxsize=8)

@@ -206,9 +206,8 @@ class Scene:
 
     def to_yaml(self) -> str:
         """The text of a scene file."""
-        return yaml.safe_dump(
-            {"format": FORMAT, **to_document(self)}, sort_keys=False, width=120, default_flow_style=None
-        )
+        document = {"format": FORMAT, **to_document(self)}
+        return yaml.safe_dump(document, sort_keys=False, width=120, default_flow_style=None)
 
     @classmethod
     def from_yaml(cls, text: str, source: str = "scene") -> Scene:

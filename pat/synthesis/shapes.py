@@ -107,9 +107,8 @@ def _lengths(points: NDArray) -> tuple[float, float]:
 
 def _welded(loose: Mesh, extent: NDArray) -> Mesh:
     """Corners that coincide made one, and faces without area gone."""
-    _, first, new = np.unique(
-        np.round(loose.vertices / extent, 6), axis=0, return_index=True, return_inverse=True
-    )
+    corners = np.round(loose.vertices / extent, 6)
+    _, first, new = np.unique(corners, axis=0, return_index=True, return_inverse=True)
     faces, uv = _triangles_last(new.reshape(-1)[loose.faces], loose.uv)
     keep = np.array([len(set(f)) >= 3 for f in faces.tolist()])
     return Mesh(loose.vertices[first], faces[keep], uv[keep])
@@ -138,9 +137,8 @@ def _noise(points: NDArray, seed: int) -> NDArray:
     """Smooth noise in -1..1 with features about 1 across: plane waves of random directions."""
     waves, rng = 24, np.random.default_rng(seed)
     direction = rng.normal(size=(waves, 3))
-    direction *= (2 * np.pi * rng.uniform(0.35, 0.8, (waves, 1))) / np.linalg.norm(
-        direction, axis=1, keepdims=True
-    )
+    length = np.linalg.norm(direction, axis=1, keepdims=True)
+    direction *= (2 * np.pi * rng.uniform(0.35, 0.8, (waves, 1))) / length
     total = np.cos(points @ direction.T + rng.uniform(0, 2 * np.pi, waves)).sum(1)
     return np.tanh(total / math.sqrt(waves / 2) / 1.5)
 

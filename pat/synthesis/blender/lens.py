@@ -48,9 +48,8 @@ class Lens(NamedTuple):
         """Values as they are at the nearest pixels; 0 where the lens sees nothing."""
         if self.x is None or self.valid is None:
             return image
-        return torch.where(
-            self.valid, sample(image[None], self.x[None].to(image), interpolation="nearest").values[0], 0
-        )
+        values = sample(image[None], self.x[None].to(image), interpolation="nearest").values[0]
+        return torch.where(self.valid, values, 0)
 
     def depth(self, depth: Float[Tensor, "h1 w1"], index: Int[Tensor, "h1 w1"]) -> Float[Tensor, "h2 w2"]:
         """Depth along exact rays, exact on planes: beside edges the nearest pixel's surface is extrapolated.
