@@ -73,9 +73,7 @@ def classical_view(
     Raises ValueError for cameras that are not calibrated, and for those that cannot be rectified.
     """
     if names := [name for name in images if not isinstance(rig[name], Camera)]:
-        raise ValueError(
-            f"{', '.join(names)}: not calibrated, and the classical baseline needs poses and depths"
-        )
+        raise ValueError(f"{', '.join(names)}: not calibrated, and the classical baseline needs poses")
     small = {name: reduced(image, longest).clamp(0, 1) for name, image in images.items()}
     for name, image in small.items():
         rig = rig.resize(name, (image.shape[-2], image.shape[-1]))

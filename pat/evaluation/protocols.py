@@ -56,9 +56,7 @@ def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
 def reduce_by(image: Float[Tensor, "c h w"], rate: int) -> Float[Tensor, "c hr wr"]:
     """The mean of each `rate` x `rate` block, as a sensor with larger pixels sees it."""
     if rate < 1 or any(side % rate for side in image.shape[1:]):
-        raise ValueError(
-            f"cannot reduce {tuple(image.shape[1:])} by {rate}: give a rate that divides both sides"
-        )
+        raise ValueError(f"cannot reduce {tuple(image.shape[1:])} by {rate}: give a divisor of both sides")
     return avg_pool2d(image, rate)
 
 

@@ -131,9 +131,7 @@ class ExplorerScene:
             hw = self.rig[name].hw
             if tuple(image.shape[1:]) != hw:
                 got, wanted = f"{image.shape[2]}x{image.shape[1]}", f"{hw[1]}x{hw[0]}"
-                raise ValueError(
-                    f"the image of '{name}' is {got}, the rig says {wanted}: give the right image"
-                )
+                raise ValueError(f"the image of '{name}' is {got}, the rig says {wanted}: give the right one")
             grey = luminance(image) if image.shape[0] == 3 else image.mean(0, keepdim=True)
             self.guides[name] = grey[None]
 

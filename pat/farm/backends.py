@@ -105,9 +105,7 @@ class BlenderSettings:
 
     def __post_init__(self) -> None:
         if (self.generator == "photographs") != (self.photos is not None):
-            raise ValueError(
-                "the generator 'photographs' needs a folder `photos`, and only that one takes it"
-            )
+            raise ValueError("the generator 'photographs' needs a folder `photos`, no other one takes it")
         if ":" not in self.generator:
             generator_named(self.generator)
         self.render_settings()
@@ -152,9 +150,7 @@ def rig_from_alpha(rig: Rig) -> RigBatch:
         if not isinstance(camera, Camera):
             raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")
         if camera.distortion is not None:
-            raise ValueError(
-                f"camera '{name}' has a lens model, layered scenes have none: use Blender, or omit it"
-            )
+            raise ValueError(f"camera '{name}' has a lens, layered scenes have none: use Blender, or omit it")
     if rig.depth is None:
         raise ValueError("the rig has no depth range: add `depth: [near, far]` in metres to its file")
     near, far = (float(d) for d in rig.depth)

@@ -132,9 +132,7 @@ def write_image(
     path = Path(path)
     planes = image.detach().cpu().numpy()
     if planes.shape[0] not in (1, 3):
-        raise ValueError(
-            f"{path}: an image has 1 or 3 channels, got {planes.shape[0]}: write channels one by one"
-        )
+        raise ValueError(f"{path}: an image has 1 or 3 channels, got {len(planes)}: write them one by one")
     if not (unknown and bits == 32) and not np.isfinite(planes).all():
         raise ValueError(f"{path}: the image to write has NaN or infinite values")
     if path.suffix.lower() == ".exr":
@@ -274,9 +272,7 @@ def _opaque(values: NDArray, label: str) -> NDArray:
         raise ValueError(f"{label}: has {values.shape[2]} channels: give a grey (1) or RGB (3) image")
     full = np.iinfo(values.dtype).max if np.issubdtype(values.dtype, np.integer) else 1.0
     if (values[..., 3] != full).any():
-        raise ValueError(
-            f"{label}: has an alpha channel with transparent pixels: flatten it and save it without alpha"
-        )
+        raise ValueError(f"{label}: has transparent pixels: flatten it and save it without alpha channel")
     return values[..., :3]
 
 

@@ -163,9 +163,7 @@ class Object:
 
     def __post_init__(self) -> None:
         if (self.shape == "lathe") != (len(self.profile) > 1):
-            raise ValueError(
-                f"'{self.name}': a lathe, and nothing else, needs a profile of two points or more"
-            )
+            raise ValueError(f"'{self.name}': a lathe, and nothing else, needs a profile of 2 points or more")
 
 
 @dataclass(frozen=True, kw_only=True)

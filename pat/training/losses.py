@@ -58,9 +58,7 @@ class Objective(nn.Module):
     def __init__(self, network: Network, loss: str, *, attention: float = 0.0) -> None:
         super().__init__()
         if attention and not isinstance(network, Comparing):
-            raise ValueError(
-                f"attention: {type(network).__name__} has no attention to supervise: leave it at 0"
-            )
+            raise ValueError(f"attention: {type(network).__name__} has none to supervise: leave it at 0")
         self.network = network
         self.image_loss = IMAGE_LOSSES[loss]
         self.attention = attention

@@ -65,10 +65,8 @@ class Crops:
         found = [item for root in roots for item in self._listed(root)]
         self.items = [item for i, item in enumerate(found) if choose(i)]
         if not self.items:
-            raise ValueError(
-                f"{self.what} of {', '.join(map(str, roots))}: {len(found)} are too few to learn from some "
-                "and to hold others out: give more"
-            )
+            given = f"{self.what} of {', '.join(map(str, roots))}: {len(found)}"
+            raise ValueError(f"{given} are too few to learn from some and to hold others out: give more")
         self._check()
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
@@ -160,14 +158,12 @@ def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
     count = len(rig.names)
     if len(sizes) < max(count, 2):
         raise ValueError(
-            f"{folder}: has {len(sizes)} calibrated cameras of {count}: all must be, two at least"
+            f"{folder}: {len(sizes)} of {count} cameras are calibrated: all must be, two at least"
         )
     names = [name for name, size in sizes.items() if size[0] >= hw[0] and size[1] >= hw[1]]
     if not names:
         listed = ", ".join(f"{name} {w}x{h}" for name, (h, w) in sizes.items())
-        raise ValueError(
-            f"{folder}: no image is as large as the samples, {hw[1]}x{hw[0]} ({listed}): lower `hw`"
-        )
+        raise ValueError(f"{folder}: none as large as the samples, {hw[1]}x{hw[0]} ({listed}): lower `hw`")
     return names
 
 

@@ -91,13 +91,13 @@ class PairCrops(Crops):
         cameras = [c.to(self.device, torch.float32) for c in (left, *(right.resize(hw) for hw in sizes))]
         near = w / nearest
         bounds = torch.stack([near, torch.full_like(near, torch.inf)], -1).to(self.device, torch.float32)
-        depth = []
+        depth: list[Tensor] = []
         if self.measured:
             stacked = (torch.stack(same) for same in zip(*disparities))
             ours, theirs = (torch.where(d > 0, w / d, torch.nan) for d in stacked)
             depth = [ours, *(coarser(theirs, size) for size in sizes)]
-        on_device = ([x.to(self.device) for x in made] for made in (shown, depth))
-        return ArrayBatch(*on_device, cameras, bounds)
+        placed, depth = ([x.to(self.device) for x in made] for made in (shown, depth))
+        return ArrayBatch(placed, depth, cameras, bounds)
 
 
 class MeasuredPairs(PairCrops):
@@ -124,9 +124,7 @@ def disparity_files(pair: PairFiles) -> tuple[Path, Path]:
         left, right = (pair.left.with_name(name) for name in names)
         if pair.left.name == layout.left and left.is_file() and right.is_file():
             return left, right
-    raise ValueError(
-        f"{pair.left.parent}: wanted the true disparity of both images beside them, disp1.png and disp5.png"
-    )
+    raise ValueError(f"{pair.left.parent}: wanted both images' true disparities, disp1.png and disp5.png")
 
 
 def coarser(depth: Float[Tensor, "b h w"], hw: HW) -> Float[Tensor, "b hs ws"]:
@@ -140,16 +138,13 @@ def check_pair(pair: PairFiles, hw: HW) -> None:
     """Raises ValueError unless both images are in colour, of one size, and at least `hw`."""
     left, right = _header(pair.left), _header(pair.right)
     if left != right:
-        raise ValueError(
-            f"{pair.left} is {_described(left)} and {pair.right.name} "
-            f"{_described(right)}: pairs must be alike"
-        )
+        other = f"{pair.right.name} {_described(right)}"
+        raise ValueError(f"{pair.left} is {_described(left)} and {other}: pairs must be alike")
     if left[2] == 1:
         raise ValueError(f"{pair.left} is grey: pairs to train on must be in colour")
     if left[0] < hw[0] or left[1] < hw[1]:
-        raise ValueError(
-            f"{pair.left} is {_described(left)}, smaller than the samples, {hw[1]}x{hw[0]}: lower `hw`"
-        )
+        wanted = f"smaller than the samples, {hw[1]}x{hw[0]}: lower `hw`"
+        raise ValueError(f"{pair.left} is {_described(left)}, {wanted}")
 
 
 def _header(file: Path) -> tuple[int, int, int]:
@@ -158,9 +153,7 @@ def _header(file: Path) -> tuple[int, int, int]:
         with Image.open(file) as image:
             return image.height, image.width, 1 if image.mode[0] in "1LIF" else 3
     except (OSError, UnidentifiedImageError):
-        raise ValueError(
-            f"{file}: not an image that can be read: give a whole PNG, TIFF or JPEG file"
-        ) from None
+        raise ValueError(f"{file}: not an image that can be read: give a whole PNG or JPEG file") from None
 
 
 def _described(header: tuple[int, int, int]) -> str:

@@ -112,10 +112,8 @@ def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
         centre = rig[shot.camera].centre.detach().cpu().double().numpy()
         for item in scene.objects:
             if inside(item, centre, shot.time):
-                raise ValueError(
-                    f"camera '{shot.camera}' is inside the object '{item.name}' "
-                    f"at {shot.time:g} s: move one of them"
-                )
+                where = f"inside the object '{item.name}' at {shot.time:g} s"
+                raise ValueError(f"camera '{shot.camera}' is {where}: move one of them")
 
 
 def take(studio: Studio, lens: Lens, shot: Shot) -> RenderedFrame:
@@ -124,9 +122,7 @@ def take(studio: Studio, lens: Lens, shot: Shot) -> RenderedFrame:
     index = found[compat.index_name(found)].round().int()
     depth = torch.where(found["Depth.Z"] < NOTHING, found["Depth.Z"], torch.inf)
     if not (index > 0).any():
-        raise ValueError(
-            f"camera '{shot.camera}' sees nothing of the scene at {shot.time:g} s: rotate it or move it"
-        )
+        raise ValueError(f"camera '{shot.camera}' sees nothing at {shot.time:g} s: rotate it or move it")
     nir = None
     if studio.settings.infrared:
         nir = lens.resampled(studio.channels(lens.pinhole, shot.time, "nir")["Combined.R"][None])

@@ -271,7 +271,7 @@ def test_what_is_wrong_with_scenes(broken, tmp_path):
 
     (tmp_path / "empty").mkdir()
     assert "holds no rendered scene" in said(tmp_path / "empty")
-    assert "000000: no image is as large as the samples, 256x128 (mono 128x96, wide 112x80" in said(
+    assert "000000: none as large as the samples, 256x128 (mono 128x96, wide 112x80" in said(
         broken, (128, 256)
     )
     assert "4 are too few to learn from some and to hold others out" in said(broken, choose=lambda i: i > 10)
@@ -290,7 +290,7 @@ def test_what_is_wrong_with_scenes(broken, tmp_path):
     (scene / "render.json").unlink()
     assert "000002: is not a whole scene (no render.json)" in said(broken)
     rig.replace(cameras={"mono": rig["mono"]}).save(broken / "scenes" / "000000" / "rig.yaml")
-    assert "has 1 calibrated cameras of 1: all must be, two at least" in said(broken / "scenes" / "000000")
+    assert "1 of 1 cameras are calibrated: all must be, two at least" in said(broken / "scenes" / "000000")
 
 
 # Stereo pairs ----------------------------------------------------------------------------------------------
