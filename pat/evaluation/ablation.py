@@ -359,9 +359,8 @@ def _cells(rows: Sequence[AblationRow], every: Sequence[AblationRow]) -> list[st
     groups = [[r.psnr for r in served if a <= r.ratio < b] for a, b in zip(RATIOS, (*RATIOS[1:-1], math.inf))]
     means = [f"{np.mean(g):.2f}" if g else "" for g in groups]
     note = "" if len(served) == len(rows) else f"{len(rows) - len(served)} scenes omitted"
-    error, within = (
-        np.mean([getattr(row, name) for row in served]) for name in ("end_point_error", "within_one")
-    )
+    error = np.mean([row.end_point_error for row in served])
+    within = np.mean([row.within_one for row in served])
     off = ["", ""] if math.isnan(error) else [f"{error:.2f}", f"{within:.1%}"]
     image = [f"{np.mean(psnr):.2f}{interval}", f"{np.mean(ssim):.4f}", f"{difference:+.2f}"]
     return [*image, *means, *off, note]

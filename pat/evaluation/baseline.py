@@ -165,9 +165,8 @@ def _rectified_plane(pair: Pair, depth: tuple[float, float]) -> _Plane:
     beta's principal point is shifted so that disparities start at 0 whichever camera is on the left.
     """
     pose = pair.beta_from_alpha
-    K_alpha, K_beta, R, t = (
-        x.detach().cpu().double().numpy() for x in (*(c.K for c in pair.cameras), pose.R, pose.t)
-    )
+    given = (*(c.K for c in pair.cameras), pose.R, pose.t)
+    K_alpha, K_beta, R, t = (x.detach().cpu().double().numpy() for x in given)
     hw = pair.alpha.hw
     rotation = _rectifying_rotation(R, t)
     focal = (K_alpha[0, 0] + K_alpha[1, 1]) / 2

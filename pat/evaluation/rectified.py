@@ -50,9 +50,8 @@ def rectified(rig: Rig, images: Mapping[str, Tensor]) -> Warped:
     views = (first, found.H_alpha), (second, found.H_beta)
     canvas = found.pair.alpha.hw
     made = {name: warped(images[name], torch.linalg.inv(H), canvas).clamp(0, 1) for name, H in views}
-    level = Rig(
-        dict(zip((first, second), found.pair.cameras)), depth=tuple(float(d) for d in pair.depth_range)
-    )
+    near, far = (float(d) for d in pair.depth_range)
+    level = Rig(dict(zip((first, second), found.pair.cameras)), depth=(near, far))
     return Warped(level, made, found, pair)
 
 

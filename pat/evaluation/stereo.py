@@ -74,9 +74,7 @@ def evaluate_pairs(
     for pair in track(pairs, "evaluating", disable=not sys.stderr.isatty()):
         for rate in rates:
             task = mono_colour_task(pair, rate)
-            results = {
-                name: _result(name, method, pair, task, max_disparity) for name, method in methods.items()
-            }
+            results = {n: _result(n, method, pair, task, max_disparity) for n, method in methods.items()}
             rows += [_row(pair, rate, name, result, task.ground_truth) for name, result in results.items()]
             if images:
                 beta, shown = beta_alone(task.alpha, task.beta, 0.0), [r.image for r in results.values()]
@@ -115,9 +113,8 @@ def _table(rows: Sequence[StereoRow], printed: tuple[float, float] | None = None
     methods = distinct(row.method for row in rows)
     scores = {(row.pair, row.method): f"{row.psnr:.2f} / {row.ssim:.4f}" for row in rows}
     columns = [f"beta reduced {rows[0].rate}x" if rows[0].rate > 1 else "beta as it is", *methods]
-    lines = [
-        [pair, *(scores.get((pair, m), "") for m in methods)] for pair in distinct(row.pair for row in rows)
-    ]
+    pairs = distinct(row.pair for row in rows)
+    lines = [[pair, *(scores.get((pair, m), "") for m in methods)] for pair in pairs]
     lines.append(["**mean**", *(_mean_cell([row for row in rows if row.method == m]) for m in methods)])
     if printed:
         columns.append("the paper, printed, on its own data")
@@ -152,9 +149,7 @@ def depth_markdown(rows: Sequence[StereoRow]) -> str:
 def _depth_cell(rows: Sequence[StereoRow]) -> str:
     if not rows:
         return ""
-    error, within = (
-        float(np.mean([getattr(row, name) for row in rows])) for name in ("end_point_error", "within_one")
-    )
+    error, within = np.mean([(row.end_point_error, row.within_one) for row in rows], 0).tolist()
     return f"{error:.2f} px / {within:.1%}"
 
 

@@ -397,10 +397,8 @@ def fused_colour(
     if not coloured:
         return own
     weights = sum(s.peak for s in coloured)
-    difference = sum(
-        (s.peak / weights) * (s.value - luminance(s.value[:, None, None]).reshape(1)) for s in coloured
-    )
-    return own + difference
+    differences = [s.value - luminance(s.value[:, None, None]).reshape(1) for s in coloured]
+    return own + sum((s.peak / weights) * difference for s, difference in zip(coloured, differences))
 
 
 def image_pixel(x: float, y: float, hw: HW) -> tuple[float, float]:

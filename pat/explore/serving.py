@@ -45,9 +45,8 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
 
         def do_POST(self) -> None:
             length = self.headers.get("Content-Length", "")
-            if not (
-                self._is_own() and self.path == "/answer" and length.isdigit() and int(length) <= LARGEST
-            ):
+            short = length.isdigit() and int(length) <= LARGEST
+            if not (self._is_own() and self.path == "/answer" and short):
                 self._refuse()
                 return
             try:
@@ -62,15 +61,12 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
         def _is_own(self) -> bool:
             hosts = [f"{name}:{self.server.server_port}" for name in OWN_NAMES]  # type: ignore[attr-defined]
             origin = self.headers.get("Origin")
-            return self.headers.get("Host") in hosts and (
-                origin is None or origin.partition("://")[2] in hosts
-            )
+            of_page = origin is None or origin.partition("://")[2] in hosts
+            return self.headers.get("Host") in hosts and of_page
 
         def _refuse(self) -> None:
-            own = self._is_own()
-            self._send(
-                404 if own else 403, "text/plain", b"nothing here\n" if own else b"for localhost alone\n"
-            )
+            status, why = (404, b"nothing here\n") if self._is_own() else (403, b"for localhost alone\n")
+            self._send(status, "text/plain", why)
 
         def _send(self, status: int, kind: str, body: bytes) -> None:
             self.send_response(status)

@@ -50,9 +50,7 @@ def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = 
     else:
         planes = read_recorded(path)
         if len(planes) != 1:
-            raise ValueError(
-                f"{path}: has {len(planes)} channels: give depth, which has one, not its picture"
-            )
+            raise ValueError(f"{path}: has {len(planes)} channels: give depth, with one, not its picture")
         values = planes[0]
     if hw is not None and values.shape != tuple(hw):
         (h, w), (height, width) = values.shape, hw

@@ -196,9 +196,8 @@ def _applied(header: ImageHeader, orientation: str, label: str) -> int:
 
 def _check_header(got: HW, wanted: HW | None, label: str) -> None:
     if wanted is None and got[0] * got[1] > MOST_PIXELS:
-        raise ValueError(
-            f"{label}: is {got[1]}x{got[0]}, more than {MOST_PIXELS / 1e6:.0f} million pixels: reduce it"
-        )
+        most = f"{MOST_PIXELS / 1e6:.0f} million pixels"
+        raise ValueError(f"{label}: is {got[1]}x{got[0]}, more than {most}: reduce it")
     if wanted is not None and got != wanted:
         (h, w), (wanted_h, wanted_w) = got, wanted
         text = f"{label}: is {w}x{h}, the rig says {wanted_w}x{wanted_h}"

@@ -86,9 +86,7 @@ class JobReport:
     def __str__(self) -> str:
         warned = {file for files in self.warned.values() for file in files}
         further = {"there already": self.kept, "failed": self.failed, "with warnings": warned}
-        return ", ".join(
-            [f"{len(self.made)} made"] + [f"{len(n)} {what}" for what, n in further.items() if n]
-        )
+        return ", ".join([f"{len(self.made)} made", *(f"{len(n)} {w}" for w, n in further.items() if n)])
 
 
 class JobError(ValueError):
@@ -259,9 +257,8 @@ class _Process:
         if self.process is None:
             spawn = get_context("spawn")
             self.pipe, theirs = spawn.Pipe()
-            self.process = spawn.Process(
-                target=_serve, args=(theirs, self.workers.threads, os.getpid()), daemon=True
-            )
+            given = theirs, self.workers.threads, os.getpid()
+            self.process = spawn.Process(target=_serve, args=given, daemon=True)
             self.process.start()
             theirs.close()
         self.pipe.send(task)

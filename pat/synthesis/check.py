@@ -121,9 +121,8 @@ def pair_figures(alpha: Camera, here: RenderedFrame, beta: Camera, there: Render
         "contradicted": (clean & ~visible & ~nearer).sum() / total,
     }
     if visible.any():
-        figures |= dict(
-            zip(("median", "p95", "p99"), error[visible].quantile(error.new_tensor([0.5, 0.95, 0.99])))
-        )
+        for name, share in ("median", 0.5), ("p95", 0.95), ("p99", 0.99):
+            figures[name] = error[visible].quantile(share)
         figures["colour"], figures["shift"] = _compared(here, x[visible], there, target[visible])
     return _rounded(figures)
 

@@ -44,11 +44,10 @@ def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0)
     def image(setting: Setting, depth: float, kinds: tuple[TextureKind, ...]) -> Texture:
         rng, tint = setting.rng, float(setting.rng.uniform(0.75, 1.0))
         width = setting.metres(depth, rng.uniform(150, 400))
-        paint = Paint((tint, tint, tint), float(rng.uniform(0.8, 1.0)))
+        paints = (Paint((tint, tint, tint), float(rng.uniform(0.8, 1.0))),)
         shift = (float(rng.uniform()), float(rng.uniform()), 0.0)
-        return Texture(
-            kind="image", image=_bright_one(rng, files), scale=1 / width, paints=(paint,), offset=shift
-        )
+        file = _bright_one(rng, files)
+        return Texture(kind="image", image=file, scale=1 / width, paints=paints, offset=shift)
 
     return furnished("photographs", seed, rig, image, moving)
 

@@ -45,9 +45,7 @@ def structure_loss(image: Tensor, ground_truth: Tensor) -> Tensor:
 
 IMAGE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "psnr": image_loss,
-    "psnr-ssim": lambda image, ground_truth: (
-        image_loss(image, ground_truth) + structure_loss(image, ground_truth)
-    ),
+    "psnr-ssim": lambda image, truth: image_loss(image, truth) + structure_loss(image, truth),
     "mse": mse_loss,
 }
 

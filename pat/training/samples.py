@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -128,17 +128,15 @@ class SampleSource:
     ):
         self.config, self.seed, self.field = config, seed, field or FIELDS[config.field]()
         rigs = {"rectified": config.rectified_rigs, "general": config.general_rigs}
-        hw = config.hw
+        how: dict[str, Any] = {"hw": config.hw, "seed": seed, "device": device}
         self.layered = {
-            (kind, n): LayeredScenes(photos, replace(rigs[kind], betas=n), hw=hw, seed=seed, device=device)
+            (kind, n): LayeredScenes(photos, replace(rigs[kind], betas=n), **how)
             for kind in rigs
             for n in (1, 3)
             if photos is not None
         }
         self.folders = {
-            name: kind(
-                roots, hw=hw, resolutions=rigs[like].resolutions, seed=seed, device=device, choose=choose
-            )
+            name: kind(roots, resolutions=rigs[like].resolutions, choose=choose, **how)
             for name, (kind, like) in FOLDERS.items()
             if (roots := getattr(config, f"{name}_from"))
         }
@@ -293,10 +291,8 @@ def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
     alpha, beta = pair.cameras
     drawn = torch.randn(len(beta.K), 3, generator=g, dtype=torch.float64).to(beta.K)
     rotation = rotation_from_vector(drawn * pixels / beta.K[:, :1, 0])
-    moved: Camera = beta.replace(
-        cam_from_world=Pose(rotation, torch.zeros_like(beta.t)) @ beta.cam_from_world
-    )
-    return Pair(alpha, moved, pair.depth)
+    pose = Pose(rotation, torch.zeros_like(beta.t)) @ beta.cam_from_world
+    return Pair(alpha, beta.replace(cam_from_world=pose), pair.depth)
 
 
 def transfer(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Tensor]:

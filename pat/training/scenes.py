@@ -114,9 +114,8 @@ class RenderedCrops(Crops):
         rigs = [scene_rig(folder) for folder in self.items]
         self.names = [rig.names for rig in rigs]
         self.alphas = [large_enough(folder, rig, self.hw) for folder, rig in zip(self.items, rigs)]
-        self._view = lru_cache(3 * ACTIVE)(
-            lambda scene, name: undistorted(read_view(self.items[scene], name))
-        )
+        cached = lru_cache(3 * ACTIVE)
+        self._view = cached(lambda scene, name: undistorted(read_view(self.items[scene], name)))
 
     def _drawn(self, scene: int, sizes: list[HW], g: Generator) -> list[RenderedView]:
         """Alpha's window and one of each beta."""
@@ -157,9 +156,8 @@ def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
     sizes = {name: pinhole_of(c).hw for name, c in rig.cameras.items() if isinstance(c, Camera)}
     count = len(rig.names)
     if len(sizes) < max(count, 2):
-        raise ValueError(
-            f"{folder}: {len(sizes)} of {count} cameras are calibrated: all must be, two at least"
-        )
+        found = f"{len(sizes)} of {count} cameras are calibrated"
+        raise ValueError(f"{folder}: {found}: all must be, two at least")
     names = [name for name, size in sizes.items() if size[0] >= hw[0] and size[1] >= hw[1]]
     if not names:
         listed = ", ".join(f"{name} {w}x{h}" for name, (h, w) in sizes.items())
@@ -198,9 +196,8 @@ def finite_window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> 
     """A `window` whose infinite depths are replaced by those of a distance `SKY`."""
     cut = window(view, top, left, size, hw)
     rays, _ = cut.camera.rays(pixel_grid(hw, dtype=torch.float64))
-    return cut._replace(
-        depth=torch.where(cut.depth.isposinf(), (SKY / rays.norm(dim=-1)).to(cut.depth), cut.depth)
-    )
+    sky = (SKY / rays.norm(dim=-1)).to(cut.depth)
+    return cut._replace(depth=torch.where(cut.depth.isposinf(), sky, cut.depth))
 
 
 def bounds(depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b 2"]:
@@ -215,10 +212,5 @@ def batched(drawn: Sequence[Sequence[RenderedView]], device: str) -> ArrayBatch:
     views = list(zip(*drawn))
     images = [srgb_image(torch.stack([v.rgb for v in same])).to(device) for same in views]
     depth = [torch.stack([v.depth for v in same]).to(device) for same in views]
-    cameras = [
-        stack([in_frame_of(alpha.camera, v.camera) for alpha, v in zip(views[0], same)]).to(
-            device, torch.float32
-        )
-        for same in views
-    ]
-    return ArrayBatch(images, depth, cameras, bounds(depth[0]))
+    placed = [stack([in_frame_of(a.camera, v.camera) for a, v in zip(views[0], same)]) for same in views]
+    return ArrayBatch(images, depth, [c.to(device, torch.float32) for c in placed], bounds(depth[0]))

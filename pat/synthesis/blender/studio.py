@@ -66,9 +66,8 @@ class Studio:
         cycles.use_denoising = s.denoise != "none"
         cycles.denoiser = "OPENIMAGEDENOISE"
         cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
-        cycles.denoising_quality, cycles.denoising_prefilter = (
-            ("HIGH", "ACCURATE") if s.denoise == "accurate" else ("FAST", "FAST")
-        )
+        cycles.denoising_quality = "HIGH" if s.denoise == "accurate" else "FAST"
+        cycles.denoising_prefilter = "ACCURATE" if s.denoise == "accurate" else "FAST"
         self._light_paths()
         render.use_persistent_data = True
         render.dither_intensity = 0
