@@ -37,8 +37,8 @@ def score(image: Float[Tensor, "_ _ _"], ground_truth: Float[Tensor, "_ _ _"]) -
     11 pixels.
     """
     if image.shape != ground_truth.shape:
-        ours, theirs = tuple(image.shape), tuple(ground_truth.shape)
-        raise ValueError(f"the image is {ours} and the ground truth {theirs}: give equal shapes")
+        got, wanted = tuple(image.shape), tuple(ground_truth.shape)
+        raise ValueError(f"the image is {got} and the ground truth {wanted}: give equal shapes")
     if min(image.shape[-2:]) < SSIM_WINDOW:
         raise ValueError(f"SSIM needs sides of {SSIM_WINDOW} pixels or more, got {tuple(image.shape[-2:])}")
     ours, theirs = (x.detach().cpu().double().numpy() for x in (image, ground_truth))

@@ -72,14 +72,9 @@ class Setting:
         self.near, self.far = near, far if math.isfinite(far) else 10 * near
         self.centres = np.stack([c.centre.double().numpy() for c in self.cameras])
 
-    @property
-    def focal(self) -> float:
-        """The longest focal length, pixels."""
-        return max(float(c.K[:2, :2].abs().max()) for c in self.cameras)
-
     def metres(self, depth: float, pixels: float) -> float:
         """Width of so many pixels at a depth, in the camera with the finest resolution."""
-        return float(pixels * depth / self.focal)
+        return float(pixels * depth / max(float(c.K[:2, :2].abs().max()) for c in self.cameras))
 
     def camera(self) -> Camera:
         """One of the cameras, drawn."""
