@@ -149,8 +149,8 @@ def depth_markdown(rows: Sequence[StereoRow]) -> str:
 def _depth_cell(rows: Sequence[StereoRow]) -> str:
     if not rows:
         return ""
-    error, within = np.mean([(row.end_point_error, row.within_one) for row in rows], 0).tolist()
-    return f"{error:.2f} px / {within:.1%}"
+    errors = np.array([row[-2:] for row in rows], float)  # end-point error, share within a pixel
+    return "{:.2f} px / {:.1%}".format(*errors.mean(0))
 
 
 def structure_kept(rows: Sequence[StereoRow]) -> str:

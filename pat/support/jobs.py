@@ -33,6 +33,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from arraygeom.extras import needs
 from arraygeom.warned import warn
 
 from .steps import about, steps_shown
@@ -301,14 +302,12 @@ AHEAD = 4
 def _on_dask(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
     """Outcomes as they come; Dask repeats what dead workers were running; what kills several is one too.
 
-    Raises ValueError without Dask or scheduler.
+    Raises ImportError without Dask, ValueError without scheduler.
     """
     if not tasks:
         return
-    try:
+    with needs("cluster", "a scheduler"):
         from distributed import Client, as_completed
-    except ImportError:
-        raise ValueError("a scheduler needs Dask: pip install 'arraygeom-pat[cluster]'") from None
     try:
         client = Client(workers.scheduler, timeout=20)
     except (OSError, ValueError) as error:

@@ -102,7 +102,7 @@ def validation(network: FusionNetwork, samples: list[Sample]) -> dict[str, float
         fused, compared = _compared(network, given)
         error = (fused.image.clamp(0, 1) - given.ground_truth).square().flatten(1).mean(1)
         psnr.append(-10 * error.clamp(min=1e-8).log10().mean())
-        for where, visible in list(zip(given.position, given.visible))[:1]:
+        for where, visible in zip(given.position[:1], given.visible):
             off = (fused.position[0] - where.movedim(-1, 1)).norm(dim=1)
             near.append((off[visible] < 1.5).float().mean())
             for one in compared[:1]:

@@ -12,6 +12,7 @@ import random
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -192,9 +193,9 @@ def scenes(
     """Sources of samples to learn from and to validate on, from different photographs, scenes and pairs."""
     layered = config.rendered + config.pairs + config.measured < 1
     learned, unseen = photographs(config) if layered else (None, None)
-    n, how = config.held_out, {"field": field, "device": device}
-    learn = SampleSource(config, learned, config.seed + 1, choose=lambda i: i % n != 0, **how)
-    return learn, SampleSource(config, unseen, config.seed + 2, choose=lambda i: i % n == 0, **how)
+    n, source = config.held_out, partial(SampleSource, config, field=field, device=device)
+    learn = source(learned, config.seed + 1, choose=lambda i: i % n != 0)
+    return learn, source(unseen, config.seed + 2, choose=lambda i: i % n == 0)
 
 
 def photographs(config: TrainConfig) -> tuple[PhotoBank, PhotoBank]:

@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom.atomic import write_text
+from arraygeom.extras import needs
 from pat.media.images import write_image
 from pat.networks.protocol import FusionNetwork
 
@@ -44,7 +45,11 @@ class Watch:
 
     def __init__(self, config: TrainConfig, step: int) -> None:
         self.out, self.scenes, self.ticked = config.out, config.batch * config.groups, time.monotonic()
-        self.board = _board(self.out / "tensorboard") if config.tensorboard else None
+        self.board: Any = None
+        if config.tensorboard:
+            with needs("tensorboard", "--tensorboard"):
+                from torch.utils.tensorboard import SummaryWriter
+            self.board = SummaryWriter(self.out / "tensorboard")
         _keep_lines(self.out / "steps.csv", step, lambda line: int(line.partition(",")[0]), header=HEADER)
         _keep_lines(self.out / "log.jsonl", step, lambda line: json.loads(line)["step"])
         self.steps = (self.out / "steps.csv").open("a", encoding="utf-8")
@@ -116,11 +121,3 @@ def _keep_lines(path: Path, step: int, step_of: Any, *, header: str = "") -> Non
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.is_file() else []
     earlier = [line for line in lines[bool(header) :] if line.endswith("\n") and step_of(line) <= step]
     write_text(path, header + "".join(earlier))
-
-
-def _board(folder: Path) -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        raise ValueError("tensorboard is not installed: pip install 'arraygeom-pat[tensorboard]'") from None
-    return SummaryWriter(folder)
