@@ -82,13 +82,6 @@ class ObjectPose(NamedTuple):
     position: Float[NDArray, "3"]
     extent: Float[NDArray, "3"]
 
-    @property
-    def matrix(self) -> Float[NDArray, "4 4"]:
-        """The same as one affine map."""
-        M = np.eye(4)
-        M[:3, :3], M[:3, 3] = self.R * self.extent, self.position
-        return M
-
 
 @dataclass(frozen=True, kw_only=True)
 class Key:

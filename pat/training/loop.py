@@ -179,8 +179,8 @@ class Run:
         if self.watch:
             self.watch.steps.flush()
             facts = {"step": self.step, "best": self.best, "minutes": self.minutes, "done": done}
-            facts |= {"recipe": config_text(self.config)}
-            state = collect(self.network, self.adam, self.average, facts)
+            recipe = {"recipe": config_text(self.config)}
+            state = collect(self.network, self.adam, self.average, {**facts, **recipe})
             write_checkpoint(self.config.out / CHECKPOINTS, state)
 
     def _offence(self, given: list[Sample]) -> str:
