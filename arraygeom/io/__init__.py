@@ -90,7 +90,6 @@ __all__ = [
     "WRITERS",
     "RigFileError",
     "RigFileWarning",
-    "convention",
     "read_rig",
     "recognise",
     "write_rig",
@@ -169,11 +168,6 @@ def recognise(path: str | Path) -> str:
             return name
     known = ", ".join(READERS)
     raise UnknownRigFormat(path, None, f"is not a rig file of a known format ({known}); or name its format")
-
-
-def convention(format: str) -> str:
-    """What a format's file means and the shift of pixels applied when reading it, in one line."""
-    return getattr(READERS[format], "CONVENTION", "stated in the file: units and first_pixel_centre")
 
 
 def _left_out(rig: Rig, format: str) -> str:
