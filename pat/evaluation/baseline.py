@@ -44,16 +44,8 @@ REGRESSION_RADIUS, REGRESSION_FLOOR = 3, 3e-3
 """Window and regulariser (variance of luminance) of the regression of colour on luminance."""
 
 
-class _Smoothing(NamedTuple):
-    """Strength of the edge-aware smoothing, and the difference of 8-bit luminance that counts as an edge."""
-
-    strength: float
-    edge: float
-
-
-DISPARITY_FILL = _Smoothing(50, 4)
-COLOUR_FILL = _Smoothing(300, 3)
-
+DISPARITY_FILL, COLOUR_FILL = (50, 4), (300, 3)
+"""Strength of the edge-aware smoothing, and the difference of 8-bit luminance that counts as an edge."""
 UNRECTIFIABLE = "the cameras look along the line between them: such a pair cannot be rectified"
 
 
@@ -310,11 +302,11 @@ def _regressed(chroma: Image, luma: Image, residual: Image) -> Image:
     return chroma + slope * np.clip(residual, -0.2, 0.2)[..., None]
 
 
-def _diffused(values: Image, weight: Image, guide: NDArray[np.uint8], how: _Smoothing) -> Image:
+def _diffused(values: Image, weight: Image, guide: NDArray[np.uint8], how: tuple[float, float]) -> Image:
     """The weighted mean of `values` over what is connected in `guide`. Weights must be positive."""
 
     def smooth(plane: Image) -> Image:
-        return cv2.ximgproc.fastGlobalSmootherFilter(guide, plane.astype(np.float32), how.strength, how.edge)
+        return cv2.ximgproc.fastGlobalSmootherFilter(guide, plane.astype(np.float32), *how)
 
     total = smooth(weight)
     planes = np.atleast_3d(values).transpose(2, 0, 1)

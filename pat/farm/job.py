@@ -206,10 +206,9 @@ def write_manifest(config: RenderConfig, root: Path) -> None:
         former = read_yaml(path).get("made from", {})
         other = [key for key in identity if former.get(key) != identity[key]]
         if other:
-            raise ValueError(
-                f"{root} holds scenes made from another {' and '.join(other)}: give another --out, "
-                f"or put {config.rig.name if other == ['rig'] else 'the configuration'} back"
-            )
+            changed = config.rig.name if other == ["rig"] else "the configuration"
+            text = f"{root} holds scenes made from another {' and '.join(other)}"
+            raise ValueError(f"{text}: give another --out, or put {changed} back")
         return
     manifest = {"format": FORMAT, "made from": identity, "versions": versions()}
     write_text(path, yaml.safe_dump(manifest, sort_keys=False, width=120, default_flow_style=None))

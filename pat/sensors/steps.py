@@ -116,10 +116,8 @@ class Noise(Step):
 
     def __post_init__(self) -> None:
         if self.full_well <= 0 or self.read < 0:
-            raise ValueError(
-                "noise: wanted full_well > 0 and read >= 0 electrons, "
-                f"got {self.full_well:g} and {self.read:g}"
-            )
+            got = f"{self.full_well:g} and {self.read:g}"
+            raise ValueError(f"noise: wanted full_well > 0 and read >= 0 electrons, got {got}")
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         if self.counts == "poisson":
