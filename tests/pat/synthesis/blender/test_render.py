@@ -104,6 +104,47 @@ def points(camera: Camera, frame, index: int) -> torch.Tensor:
 
 def on_walls(scene: Scene, camera: Camera, frame) -> None:
     place = scene.objects[3].motion.at(0)
+    X = (points(camera, frame, 4).numpy() - place.position) @ place.R / place.extent
+    assert len(X) > 100
+    most = 0.98 if camera.distortion is None else 0.85  # beside edges, depth behind a lens is an estimate
+    assert np.quantile(np.abs(np.abs(X).max(1) - 0.5), most) < 1e-4
+
+
+def on_sphere(scene: Scene, camera: Camera, frame) -> None:
+    """The sphere has 64 x 32 flat faces: up to 0.24 % of its radius inside."""
+    X = points(camera, frame, 1).numpy() - scene.objects[0].motion.at(0).position
+    radius = np.linalg.norm(X, axis=1)
+    assert len(X) > 15
+    assert (np.abs(np.quantile(radius, [0.02, 0.98]) - 0.4985) < 0.0025).all()
+
+
+def fiducials(camera: Camera, count: int = 12) -> list[Object]:
+    """Squares about 9 pixels wide, parallel to the image's plane, all over the image at several depths."""
+    rng = np.random.default_rng(0)
+    h, w = camera.hw
+    found = []
+    for k in range(count):
+        depth = float(rng.uniform(2, 9))
+        column, row = (k % 4 + rng.uniform(0.3, 0.7)) / 4 * w, (k // 4 + rng.uniform(0.3, 0.7)) / 3 * h
+        X = camera.unproject(torch.tensor([column, row], dtype=torch.float64), torch.tensor(depth).double())
+        turn = cv2.Rodrigues(camera.R.T.numpy())[0].ravel().tolist()
+        size = 9 * depth / float(camera.K[:2, :2].abs().max())
+        found.append(
+            glowing(
+                f"square{k}",
+                Motion((Key(position=tuple(X.tolist()), rotation=tuple(turn), extent=(size, size, 1.0)),)),
+            )
+        )
+    return found
+
+
+def predicted_centre(camera: Camera, square: Object) -> torch.Tensor:
+    """Where arraygeom sees the square's light: the centroid of its outline, projected point by point."""
+    side = torch.linspace(-0.5, 0.5, 101, dtype=torch.float64)[:-1]
+    low = torch.full_like(side, -0.5)
+    outline = torch.cat(
+        [torch.stack(p, -1) for p in ((side, low), (-low, side), (-side, -low), (low, -side))]
+    )
     pose = square.motion.at(0)
     X = torch.nn.functional.pad(outline, (0, 1)) @ torch.from_numpy(pose.R * pose.extent).T
     a = camera.project(X + torch.from_numpy(pose.position)).x
