@@ -20,7 +20,7 @@ from safetensors import safe_open
 from pat.networks.configs import PATConfig
 from pat.networks.weights import load_weights, new_network, save_weights
 from pat.support.locks import folder_lock
-from pat.training import loop
+from pat.training import loop, samples
 from pat.training.checkpoints import newest_checkpoint
 from pat.training.config import TrainConfig, save_config
 from pat.training.loop import rate_at, train
@@ -208,7 +208,7 @@ def test_groups_must_be_shared_evenly():
 
 def test_a_sample_that_is_not_finite_is_named_and_saved(folder, whole, monkeypatch):
     config = replace(whole, out=folder / "nan")
-    ordinary = loop.SampleSource.sample
+    ordinary = samples.SampleSource.sample
 
     def poisoned(self, planned, step, group):
         given = ordinary(self, planned, step, group)
@@ -216,7 +216,7 @@ def test_a_sample_that_is_not_finite_is_named_and_saved(folder, whole, monkeypat
             given.ground_truth[1, :, 5, 5] = torch.nan
         return given
 
-    monkeypatch.setattr(loop.SampleSource, "sample", poisoned)
+    monkeypatch.setattr(samples.SampleSource, "sample", poisoned)
     with pytest.raises(FloatingPointError, match=r"step 5: .*, by sample 1 of group 1; "):
         train(config)
     (file,) = config.out.glob("offending-*")
