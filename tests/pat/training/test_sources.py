@@ -344,7 +344,7 @@ def test_nobody_knows_where_a_pairs_points_are(tmp_path):
 
 def test_middleburys_collections_say_their_largest_disparity(shared_data):
     crops = PairCrops([shared_data / "middlebury"], hw=(96, 192))
-    assert {round(pair.max_disparity) for pair in crops.pairs} >= {64, 85, 128}
+    assert {round(pair.max_disparity) for pair in crops.items} >= {64, 85, 128}
     assert crops.sample(2, generator(), number=0).images[0].std() > 0.05
 
 
