@@ -17,7 +17,7 @@ from arraygeom.pixels import HW
 
 from . import Lens
 from .board import Board
-from .detect import BoardViews, Detection
+from .detect import BoardViews, Detection, homography_errors
 from .photos import FrameKey
 
 LENSES: dict[Lens, tuple[str, int]] = {
@@ -146,12 +146,8 @@ def near_homography(found: Detection, board: Board) -> Detection:
     """Points that a homography of the board fits (least median of squares), but for the lens's distortion."""
     if len(found.ids) < FEWEST_POINTS or not board.flat:
         return found
-    plane = board.points[found.ids, :2]
-    H, _ = cv2.findHomography(plane, found.x, cv2.LMEDS)
-    if H is None:
-        return found
-    off = np.linalg.norm(cv2.perspectiveTransform(plane[:, None], H)[:, 0] - found.x, axis=-1)
-    return found.where(off < max(1.0, 4 * float(np.median(off)) / RAYLEIGH_MEDIAN))
+    off = homography_errors(board.points[found.ids, :2], found.x)
+    return found.where(off <= max(1.0, 4 * float(np.median(off)) / RAYLEIGH_MEDIAN))
 
 
 def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Camera, dict[FrameKey, Pose]]:

@@ -103,7 +103,9 @@ def calibrate(
         singles = {}
         initial = rig_near_start(start, views, board, models, deviations or StartDeviations())
         fitted = solve_inliers(initial, initial.views, board, rounds=2)
-    solved = with_disagreement(fitted, board.extents, unchecked=bool(singles) and board.flat)
+    solved = with_disagreement(
+        fitted, [b.extent for b in board.members], unchecked=bool(singles) and board.flat
+    )
     notes = [*solved.notes, *misfit_notes(solved)]
     if start is None:
         notes[:0] = left_out_notes(views, singles, fitted)

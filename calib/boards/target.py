@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,20 @@ FORMS = (
 )
 LARGEST = 100
 APRIL_TAGS = "apriltag_36h11"
+FIRST = r"from\d{1,4}"
+OPTIONS = {
+    "chessboard": {},
+    "circles": {},
+    "acircles": {},
+    "charuco": {
+        "length": r"[\d.]+ *[a-z]+",
+        "dictionary": r"\d+x\d+(_\d+)?|(aruco|april).*",
+        "legacy": "legacy",
+        "first": FIRST,
+    },
+    "aprilgrid": {"ratio": r"\d*\.?\d+", "border": "border[12]", "first": FIRST},
+}
+"""Patterns of what may follow the counts and the length of each kind of board."""
 COLUMNS = ("id", "x", "y", "z"), ("id", "corner", "x", "y", "z")
 """Of a file of points."""
 FEWEST_POINTS = 6
@@ -81,21 +95,30 @@ def parse_board(text: str) -> Board:
         text = _kalibr_target(Path(text))
     if ".csv" in text:
         return _known_points(text)
-    kind, _, rest = text.strip().lower().partition(":")
-    parts = rest.split(":")
-    if kind not in ("chessboard", "charuco", "circles", "acircles", "aprilgrid") or len(parts) < 2:
+    kind, *parts = text.strip().lower().split(":")
+    if kind not in OPTIONS or len(parts) < 2:
         raise ValueError(f"board '{text}' is not recognised: write it like {FORMS}")
+    columns, rows = _counts(text, parts[0], fewest=2 if kind == "aprilgrid" else 3)
+    length = _length(text, parts[1])
+    options = _options(text, parts[2:], OPTIONS[kind])
     if kind == "aprilgrid":
-        return _april_grid(text, parts)
-    columns, rows = _counts(text, parts[0])
-    spacing = _length(text, parts[1])
+        return _april_grid(text, columns, rows, length, options)
     if kind == "charuco":
-        return _charuco(text, columns, rows, spacing, parts[2:])
-    if len(parts) > 2:
-        raise ValueError(f"board '{text}': '{parts[2]}' is unexpected; write it like {FORMS}")
+        return _charuco(text, columns, rows, length, options)
     if kind == "chessboard":
-        return Chessboard(columns, rows, spacing)
-    return Circles(columns, rows, spacing, asymmetric=kind == "acircles")
+        return Chessboard(columns, rows, length)
+    return Circles(columns, rows, length, asymmetric=kind == "acircles")
+
+
+def _options(text: str, given: Sequence[str], patterns: Mapping[str, str]) -> dict[str, str]:
+    """Each option by the name of the pattern that it matches, once each. Raises ValueError for others."""
+    found: dict[str, str] = {}
+    for option in given:
+        name = next((n for n, p in patterns.items() if n not in found and re.fullmatch(p, option)), None)
+        if name is None:
+            raise ValueError(f"board '{text}': '{option}' is not recognised; write it like {FORMS}")
+        found[name] = option
+    return found
 
 
 def parse_boards(texts: Sequence[str]) -> Board:
@@ -121,48 +144,27 @@ def parse_boards(texts: Sequence[str]) -> Board:
     return Boards(first.columns, first.rows, first.spacing, tuple(boards))
 
 
-def _charuco(text: str, columns: int, rows: int, spacing: float, options: list[str]) -> Charuco:
-    lengths = [o for o in options if re.fullmatch(r"[\d.]+ *[a-z]+", o)]
-    names = [
-        o
-        for o in options
-        if re.fullmatch(r"\d+x\d+(_\d+)?", o) or o.startswith("aruco") or o.startswith("april")
-    ]
-    first, options = _first_marker(options)
-    recognised = {*lengths[:1], *names[:1], "legacy"}
-    if rest := [o for o in options if o not in recognised]:
-        raise ValueError(
-            f"board '{text}': '{rest[0]}' is not recognised; write it like charuco:8x6:30mm:22mm:4x4_50"
-        )
-    marker = _length(text, lengths[0]) if lengths else 0.75 * spacing
+def _charuco(text: str, columns: int, rows: int, spacing: float, options: Mapping[str, str]) -> Charuco:
+    marker = _length(text, options["length"]) if "length" in options else 0.75 * spacing
     if not marker < spacing:
         raise ValueError(
             f"board '{text}': markers of {millimetres(marker)} do not fit into squares that are no larger"
         )
-    name = _smallest_dictionary(text, names[0] if names else "4x4", first + (columns * rows + 1) // 2)
-    return Charuco(columns - 1, rows - 1, spacing, name, first, marker=marker, legacy="legacy" in options)
+    first = int(options.get("first", "from0")[4:])
+    markers = range(first, first + columns * rows // 2)
+    name = _smallest_dictionary(text, options.get("dictionary", "4x4"), first + (columns * rows + 1) // 2)
+    return Charuco(columns - 1, rows - 1, spacing, name, markers, marker=marker, legacy="legacy" in options)
 
 
-def _first_marker(options: list[str]) -> tuple[int, list[str]]:
-    """The number in an option such as "from24", and the other options."""
-    numbers = [int(o.removeprefix("from")) for o in options if re.fullmatch(r"from\d{1,4}", o)]
-    return sum(numbers[:1]), [o for o in options if not re.fullmatch(r"from\d{1,4}", o)]
-
-
-def _april_grid(text: str, parts: list[str]) -> AprilGrid:
-    columns, rows = _counts(text, parts[0], fewest=2)
-    first, options = _first_marker(parts[2:])
-    ratios = [o for o in options if re.fullmatch(r"\d*\.?\d+", o) and 0.05 <= float(o) <= 1]
-    if rest := [o for o in options if o not in {*ratios[:1], "border1", "border2"}]:
-        raise ValueError(
-            f"board '{text}': '{rest[0]}' is not recognised; write it like aprilgrid:6x6:88mm:0.3"
-        )
-    if first + columns * rows > len(marker_dictionary(APRIL_TAGS).bytesList):
-        raise ValueError(f"board '{text}': the tag family 36h11 has no {first + columns * rows} tags")
-    tag = _length(text, parts[1])
-    gap = tag * float(ratios[0] if ratios else 0.3)
-    border = 1 if "border1" in options else 2
-    return AprilGrid(2 * columns, 2 * rows, 2 * gap, APRIL_TAGS, first, tag=tag, border=border)
+def _april_grid(text: str, columns: int, rows: int, tag: float, options: Mapping[str, str]) -> AprilGrid:
+    ratio, first = float(options.get("ratio", 0.3)), int(options.get("first", "from0")[4:])
+    if not 0.05 <= ratio <= 1:
+        raise ValueError(f"board '{text}': '{ratio:g}' is no share of a tag: write it like 0.3")
+    markers = range(first, first + columns * rows)
+    if markers.stop > len(marker_dictionary(APRIL_TAGS).bytesList):
+        raise ValueError(f"board '{text}': the tag family 36h11 has no {markers.stop} tags")
+    border = int(options.get("border", "border2")[-1])
+    return AprilGrid(2 * columns, 2 * rows, 2 * tag * ratio, APRIL_TAGS, markers, tag=tag, border=border)
 
 
 def _kalibr_target(path: Path) -> str:
@@ -234,19 +236,21 @@ def _known_points(text: str) -> KnownPoints:
                 f"{path}: its first line is '{','.join(head)[:60]}': write id,x,y,z or id,corner,x,y,z"
             )
         rows = [_point(path, number, row, head) for number, row in enumerate(table, 2)]
-    ids = tuple(marker for marker, _ in rows)
-    _check_points(path, ids)
-    positions = tuple(position for _, position in rows)
+    if len(rows) < FEWEST_POINTS:
+        raise ValueError(f"{path}: has {len(rows)} points and {FEWEST_POINTS} is the least")
+    ids, positions = zip(*rows)
+    if twice := [marker for marker in ids if ids.count(marker) > 1]:
+        raise ValueError(f"{path}: marker {twice[0][0]} is there twice")
     name = _smallest_dictionary(text, dictionary.removeprefix(":").lower() or "4x4", max(ids)[0] + 1)
     apart = np.linalg.norm(np.array(positions)[:, None] - np.array(positions), axis=-1)
     spacing = float(np.median(np.sort(apart, axis=1)[:, 1]))
-    return KnownPoints(len(ids), 1, spacing, name, 0, file=str(path), ids=ids, positions=positions)
+    markers = sorted({marker for marker, _ in ids})
+    return KnownPoints(len(ids), 1, spacing, name, markers, file=str(path), ids=ids, positions=positions)
 
 
-Row = tuple[tuple[int, int], tuple[float, float, float]]
-
-
-def _point(path: Path, number: int, row: dict[str, str], head: tuple[str, ...]) -> Row:
+def _point(
+    path: Path, number: int, row: dict[str, str], head: tuple[str, ...]
+) -> tuple[tuple[int, int], tuple[float, float, float]]:
     try:
         values = dict(zip(head, row.values()))
         x, y, z = (float(values[axis]) for axis in "xyz")
@@ -256,13 +260,6 @@ def _point(path: Path, number: int, row: dict[str, str], head: tuple[str, ...]) 
     if marker < 0 or not -1 <= corner <= 3 or not np.isfinite([x, y, z]).all():
         raise ValueError(f"{path}, line {number}: wanted {','.join(head)}, numbers in metres, corners 0 to 3")
     return (marker, corner), (x, y, z)
-
-
-def _check_points(path: Path, ids: Sequence[tuple[int, int]]) -> None:
-    if len(ids) < FEWEST_POINTS:
-        raise ValueError(f"{path}: has {len(ids)} points and {FEWEST_POINTS} is the least")
-    if twice := [marker for marker in ids if ids.count(marker) > 1]:
-        raise ValueError(f"{path}: marker {twice[0][0]} is there twice")
 
 
 # Printing ---------------------------------------------------------------------------------------------------
@@ -325,7 +322,7 @@ def _sheet(paper: str, page: tuple[float, float]) -> tuple[float, float]:
 
 
 def _draw_ruler(axes: Any, text: str, width: float, y: float) -> None:
-    """A line of a whole number of centimetres with a tick at each, and the board's name."""
+    """Draw a line of a whole number of centimetres with a tick at each, and the board's name."""
     length = max(10.0, 10 * (min(width, 100.0) // 10))
     axes.plot([0, length], [y, y], color="0.4", lw=0.6)
     for x in np.arange(0, length + 1, 10):
