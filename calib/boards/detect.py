@@ -7,7 +7,7 @@ stretched, equalised and inverted in turn until the board is found.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -398,7 +398,7 @@ def board_views(
     for key, (hw, _) in images.items():
         by_size.setdefault(hw, []).append(moments[key].label)
     if len(by_size) > 1:
-        shown = [f"{w}x{h} ({_named(labels, 2)})" for (h, w), labels in by_size.items()]
+        shown = [f"{w}x{h} ({named(labels, 2)})" for (h, w), labels in by_size.items()]
         raise ValueError(
             f"{name}: its images differ in size: {'; '.join(shown)}; keep those of one camera at one setting"
         )
@@ -411,7 +411,7 @@ def _check_board(
     """Raises ValueError if no image shows the board, or if most of some show a larger one."""
     if not seen:
         why = explain(_greys(list(moments.values())), board.members[0])
-        labels = _named([p.label for p in moments.values()], NAMED)
+        labels = named([p.label for p in moments.values()], NAMED)
         raise ValueError(
             f"{name}: the board {board} is found in none of {len(moments)} images ({labels}): {why}"
         )
@@ -428,7 +428,7 @@ def _missing(
     missing = [photo for key, photo in moments.items() if key not in seen]
     if not missing:
         return []
-    labels, why = _named([p.label for p in missing], NAMED), explain(_greys(missing), board.members[0])
+    labels, why = named([p.label for p in missing], NAMED), explain(_greys(missing), board.members[0])
     return [f"{name}: no board in {len(missing)} of {len(moments)} images ({labels}): {why}"]
 
 
@@ -437,5 +437,6 @@ def _greys(photos: list[Photo]) -> Iterable[Grey]:
     return (photo.read() for photo in photos[::step][:EXPLAINED_IMAGES])
 
 
-def _named(labels: list[str], most: int) -> str:
+def named(labels: Sequence[str], most: int) -> str:
+    """The first labels, and how many more there are."""
     return ", ".join(labels[:most]) + (f" and {len(labels) - most} more" if len(labels) > most else "")

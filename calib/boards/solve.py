@@ -5,7 +5,7 @@ Gauss-Newton with Marquardt's damping (Triggs et al. 2000).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,7 +21,6 @@ from .bundle import (
     BundleProblem,
     CameraPrior,
     InitialRig,
-    Masks,
     Solved,
     intrinsic_values,
     linearised,
@@ -32,7 +31,7 @@ from .bundle import (
     with_default,
 )
 from .deformation import LEAST_GAIN, BoardDeformation, fewest_frames, is_significant
-from .detect import BoardViews
+from .detect import BoardViews, named
 from .intrinsics import (
     LEAST_SIGMA,
     RAYLEIGH_MEDIAN,
@@ -117,7 +116,7 @@ def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
     solved = _with_deformation(adjust(problem), flat)
     for _ in range(ROUNDS):
         returned, changed = observable(replace(solved.problem, free=full), final=False)
-        if _equal(returned.free, solved.problem.free):
+        if all(np.array_equal(mask, solved.problem.free[name]) for name, mask in returned.free.items()):
             break
         notes = changed
         solved = _with_deformation(adjust(returned), flat)
@@ -175,10 +174,6 @@ def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, l
         cameras[name], fixed = with_default(cameras[name], entry)
         notes.append(f"{name}: {fixed}: the images do not determine it")
     return replace(problem, cameras=cameras, free=free), notes
-
-
-def _equal(a: Masks, b: Masks) -> bool:
-    return all((a[name] == b[name]).all() for name in a)
 
 
 def _relative_information(problem: BundleProblem) -> np.ndarray:
@@ -346,22 +341,17 @@ def misfits(fit: Solved) -> list[FrameMisfit]:
     return sorted(found, key=lambda m: -m.rms / m.typical)
 
 
-def misfit_notes(fit: Solved) -> list[str]:
+def misfit_notes(fit: Solved) -> Iterator[str]:
     """A note if the adjustment went on changing, and one per camera on its frames that do not fit."""
-    notes = (
-        []
-        if fit.converged
-        else ["the adjustment has not come to rest: too few boards, or some that contradict it"]
-    )
+    if not fit.converged:
+        yield "the adjustment has not come to rest: too few boards, or some that contradict it"
     for name in fit.problem.cameras:
         if mine := [m for m in misfits(fit) if m.camera == name]:
-            listed = ", ".join(f"{m.frame} ({m.rms:.2f} px)" for m in mine[:LISTED])
-            more = f" and {len(mine) - LISTED} more" if len(mine) > LISTED else ""
-            notes.append(
-                f"{name}: frames that do not fit: {listed}{more}, others {mine[0].typical:.2f} px: "
+            listed = named([f"{m.frame} ({m.rms:.2f} px)" for m in mine], LISTED)
+            yield (
+                f"{name}: frames that do not fit: {listed}, others {mine[0].typical:.2f} px: "
                 "moved, blurred or wrongly detected? See the report"
             )
-    return notes
 
 
 # All cameras ------------------------------------------------------------------------------------------------

@@ -125,11 +125,13 @@ def baseline_deviation(rig: Mapping[str, Camera], a: str, b: str, covariance: Ri
     """The standard deviation of the distance between two cameras, metres."""
     baseline = (rig[b].centre - rig[a].centre).numpy()
     direction = baseline / max(float(np.linalg.norm(baseline)), 1e-12)
-    of_a, of_b = (
-        direction @ rig[n].cam_from_world.centre_jacobian.numpy() @ covariance.of(n, rig[n])[:6]
-        for n in (a, b)
-    )
-    return float(np.sqrt((of_b - of_a) @ covariance.matrix @ (of_b - of_a)))
+    change = direction @ (by_centre(rig[b], b, covariance) - by_centre(rig[a], a, covariance))
+    return float(np.sqrt(change @ covariance.matrix @ change))
+
+
+def by_centre(camera: Camera, name: str, covariance: RigCovariance) -> Float[np.ndarray, "3 c"]:
+    """Derivatives of a camera's optical centre by the parameters of a covariance."""
+    return np.asarray(camera.cam_from_world.centre_jacobian.numpy() @ covariance.of(name, camera)[:6])
 
 
 # One camera -------------------------------------------------------------------------------------------------
@@ -282,35 +284,30 @@ def with_disagreement(
     parameters, as frames that disagree about a focal length say nothing of the lens.
     """
     problem, covariance, notes = solved.problem, solved.covariance, list[str]()
-    enough = len(problem.names) > 0 and len(problem.frames) >= FEWEST_TO_JACKKNIFE
-    raised = 1.0
-    if covariance is not None and unchecked and len(problem.frames) < FEWEST_TO_JACKKNIFE:
+    raised, frames = 1.0, len(problem.frames)
+    if covariance is not None and unchecked and frames < FEWEST_TO_JACKKNIFE:
         covariance, raised = UNCHECKED**2 * covariance, UNCHECKED
         notes.append(
-            f"{len(problem.frames)} frames are too few to check standard deviations: they are raised by "
+            f"{frames} frames are too few to check standard deviations: they are raised by "
             f"{UNCHECKED:.0f}, as more frames do of real boards; take {FEWEST_TO_JACKKNIFE} or more"
         )
-    if problem.deformation is None and (covariance is None or not enough):
-        return replace(solved, covariance=covariance, raised=raised, notes=(*solved.notes, *notes))
-    found = jackknife(problem)
-    if problem.deformation is not None:
+    checked = covariance is not None and len(covariance) > 0 and frames >= FEWEST_TO_JACKKNIFE
+    found = jackknife(problem) if checked or problem.deformation is not None else None
+    if found is not None and problem.deformation is not None:
         deviations = np.sqrt(found.deformations.diagonal()).reshape(problem.deformation.values.shape)
         notes += described(problem.deformation, deviations, extents)
-    if enough and covariance is not None and _excess(found.covariance, covariance) > CONSIDERABLE:
-        level = max(1.0, float(np.median(_ratio(found.left_out, covariance))))
-        before, covariance = covariance, (level**2 * covariance + found.left_out) / 2
-        raised = float(_ratio(covariance, before).max())
-        notes.append(
-            "frames disagree more than the points' noise explains: standard deviations are raised, "
-            f"by up to {raised:.1f}, to those of a jackknife over frames (is the board flat and printed true "
-            "to size, and were the images sharp?)"
-        )
+    if found is not None and checked and covariance is not None:
+        excess = np.trace(np.linalg.solve(covariance, found.covariance)) / len(covariance)
+        if excess**0.5 > CONSIDERABLE:
+            level = max(1.0, float(np.median(_ratio(found.left_out, covariance))))
+            before, covariance = covariance, (level**2 * covariance + found.left_out) / 2
+            raised = float(_ratio(covariance, before).max())
+            notes.append(
+                "frames disagree more than the points' noise explains: standard deviations are raised, "
+                f"by up to {raised:.1f}, to those of a jackknife over frames (is the board flat and printed "
+                "true to size, and were the images sharp?)"
+            )
     return replace(solved, covariance=covariance, raised=raised, notes=(*solved.notes, *notes))
-
-
-def _excess(a: np.ndarray, b: np.ndarray) -> float:
-    """The typical ratio of the standard deviations of two covariances, in all directions."""
-    return float(np.sqrt(np.trace(np.linalg.solve(b, a)) / len(b)))
 
 
 def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:

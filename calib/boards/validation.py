@@ -15,11 +15,11 @@ from arraygeom import Camera, Rig, epipolar_distance
 
 from .board import Board
 from .bundle import POSE, BundleProblem, Observations, Solved, camera_jacobian
-from .detect import BoardViews
+from .detect import BoardViews, named
 from .intrinsics import Lens
 from .poses import StartDeviations
 from .solve import calibrate_single, readjusted
-from .uncertainty import compensation, covered, grid_points, in_own_frame
+from .uncertainty import by_centre, compensation, covered, grid_points, in_own_frame, rig_covariance
 
 FEWEST_TO_HOLD_OUT = 8
 """Frames are held out from this many on that two cameras share."""
@@ -51,29 +51,21 @@ def epipolar_errors(
     """By pair: distances in undistorted pixels from beta's points to alpha's lines, and the reverse."""
     found = {}
     for a, b in combinations(views, 2):
-        xa, xb = _common(views[a], views[b])
-        if len(xa):
-            found[a, b] = _symmetric_distance(rig, a, b, xa, xb)
+        parts = []
+        for key in views[a].seen:
+            if key in views[b].seen:
+                one, other = views[a].seen[key], views[b].seen[key]
+                _, i, j = np.intersect1d(one.ids, other.ids, return_indices=True)
+                parts.append((one.x[i], other.x[j]))
+        if not any(len(x) for x, _ in parts):
+            continue
+        xa, xb = (torch.from_numpy(np.concatenate(part)) for part in zip(*parts))
+        pair, reverse = rig.pair(a, b), rig.pair(b, a)
+        (pa, va), (pb, vb) = pair.alpha.undistort(xa), pair.beta.undistort(xb)
+        forward = epipolar_distance(pair.fundamental, pa, pb).abs()
+        backward = epipolar_distance(reverse.fundamental, pb, pa).abs()
+        found[a, b] = ((forward + backward) / 2)[va & vb].numpy()
     return found
-
-
-def _symmetric_distance(rig: Rig, a: str, b: str, xa: np.ndarray, xb: np.ndarray) -> np.ndarray:
-    pair, reverse = rig.pair(a, b), rig.pair(b, a)
-    (pa, va), (pb, vb) = pair.alpha.undistort(torch.from_numpy(xa)), pair.beta.undistort(torch.from_numpy(xb))
-    forward = epipolar_distance(pair.fundamental, pa, pb).abs()
-    backward = epipolar_distance(reverse.fundamental, pb, pa).abs()
-    return ((forward + backward) / 2)[va & vb].numpy()
-
-
-def _common(a: BoardViews, b: BoardViews) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (n, 2) of the points both cameras observed in the same frames."""
-    parts: list[tuple[np.ndarray, np.ndarray]] = [(np.zeros((0, 2)), np.zeros((0, 2)))]
-    for key in a.seen:
-        if key in b.seen:
-            _, i, j = np.intersect1d(a.seen[key].ids, b.seen[key].ids, return_indices=True)
-            parts.append((a.seen[key].x[i], b.seen[key].x[j]))
-    xa, xb = (np.concatenate(part) for part in zip(*parts))
-    return xa, xb
 
 
 # Frames held out --------------------------------------------------------------------------------------------
@@ -244,9 +236,7 @@ def _points_left_out(name: str, detected: BoardViews, used: BoardViews) -> Itera
     }
     worst = sorted((key for key in counts if counts[key]), key=lambda key: -counts[key])
     if worst:
-        listed = ", ".join(f"{counts[key]} of {key}" for key in worst[:5]) + (
-            ", ..." if len(worst) > 5 else ""
-        )
+        listed = named([f"{counts[key]} of {key}" for key in worst], 5)
         yield f"{name}: {sum(counts.values())} of {detected.count} points left out as outliers ({listed})"
 
 
@@ -254,12 +244,9 @@ def _gains(fit: Solved, deviations: StartDeviations) -> str:
     """What the images add to the start, by kind of parameter."""
     focal = np.mean([float(c.K[0, 0]) for c in fit.problem.cameras.values()])
     width = np.mean([c.hw[1] for c in fit.problem.cameras.values()])
-    kinds = {
-        "focal": ("focal lengths", deviations.focal * focal),
-        "centre": ("principal points", deviations.centre * width),
-    }
+    focal, width = deviations.focal * focal, deviations.centre * width
     texts = []
-    for kind, (label, before) in kinds.items():
+    for kind, label, before in (("focal", "focal lengths", focal), ("centre", "principal points", width)):
         found = [d for name, d in fit.deviations.items() if f".{kind}." in name]
         texts += [f"{label} ±{before:.3g} > ±{np.median(found):.3g} px"] if found else []
     positions = np.median(_position_deviations(fit))
@@ -269,31 +256,21 @@ def _gains(fit: Solved, deviations: StartDeviations) -> str:
 
 def _position_deviations(fit: Solved) -> list[float]:
     """Of each camera's optical centre, root mean square of the axes, metres."""
-    assert fit.covariance is not None
-    found = []
+    covariance, found = rig_covariance(fit), []
+    assert covariance is not None
     for name, camera in fit.problem.cameras.items():
-        mine = [
-            fit.names.index(f"{name}.{kind}.{i}") for kind in ("rotation", "translation") for i in range(3)
-        ]
-        derivatives = camera.cam_from_world.centre_jacobian.numpy()
-        covariance = derivatives @ fit.covariance[np.ix_(mine, mine)] @ derivatives.T
-        found.append(float(np.sqrt(np.trace(covariance) / 3)))
+        derivatives = by_centre(camera, name, covariance)
+        found.append(float(np.sqrt(np.trace(derivatives @ covariance.matrix @ derivatives.T) / 3)))
     return found
 
 
-def _far(fit: Solved) -> list[str]:
+def _far(fit: Solved) -> Iterator[str]:
     """Which cameras lie far from the start."""
-    notes = []
     for name, camera in fit.problem.cameras.items():
         prior = fit.problem.priors[name]
         ratio = np.abs(prior.residual(camera)) / np.sqrt(np.linalg.inv(prior.information).diagonal())
-        parts = np.split(ratio[:10], [3, 6, 8])
-        kinds = zip(
-            ("orientation", "position", "focal length", "principal point"), (part.max() for part in parts)
-        )
+        parts = [part.max() for part in np.split(ratio[:10], [3, 6, 8])]
+        kinds = zip(("orientation", "position", "focal length", "principal point"), parts)
         if far := [f"{kind} ({worst:.0f} deviations)" for kind, worst in kinds if worst > FAR_FROM_START]:
             listed = ", ".join(far)
-            notes.append(
-                f"{name}: far from the start: {listed}: is the start right, or its deviations too small?"
-            )
-    return notes
+            yield f"{name}: far from the start: {listed}: is the start right, or its deviations too small?"

@@ -315,7 +315,7 @@ def test_a_board_that_bends_raises_the_deviations():
                 noise = g.normal(0, 0.05, (int(inside.sum()), 2))
                 views[name].seen[frame] = Detection(np.flatnonzero(inside), x[inside] + noise)
     bent = calibrate(views, BOARD)
-    assert bent.raised > 1.3
+    assert bent.fit.raised > 1.3
     assert any("is the board flat" in note for note in bent.notes)
 
 
@@ -323,7 +323,7 @@ def test_a_board_that_bends_raises_the_deviations():
 def test_deviations_that_few_frames_cannot_check_are_raised(frames, raised):
     """Of a real pair, baselines of three frames were up to 6.8 stated deviations off; nothing said so."""
     found = calibrate(see(pair_rig(), board_poses(frames, spread=0.2), noise=0.05), BOARD)
-    assert found.raised == raised
+    assert found.fit.raised == raised
     assert any("too few to check standard deviations" in note for note in found.notes) == (raised > 1)
 
 
@@ -332,7 +332,7 @@ def test_frames_that_disagree_about_the_focal_lengths_raise_those_alone(found, m
     factor = np.array([5.0 if "focal" in name else 1.0 for name in found.fit.names])
     disagreeing = found.fit.covariance * factor[:, None] * factor
     given = jackknife(found.fit.problem)._replace(covariance=disagreeing, left_out=disagreeing)
-    assert found.raised == 1.0
+    assert found.fit.raised == 1.0
     monkeypatch.setattr("calib.boards.uncertainty.jackknife", lambda _: given)
     raised = with_disagreement(found.fit, [BOARD.extent])
     ratio = np.sqrt(raised.covariance.diagonal() / found.fit.covariance.diagonal())
