@@ -9,7 +9,7 @@ import torch
 
 from arraygeom import Pose, Rig, View, rotation_from_vector
 from calib.boards.bundle import changed, parameter_names
-from calib.boards.rig_diff import _projections, rig_difference
+from calib.boards.rig_diff import _projections, draw_difference, rig_difference
 from calib.boards.solve import adjust
 from calib.boards.uncertainty import rig_covariance
 from pat.cli.main import main
@@ -213,3 +213,14 @@ def test_derivatives_are_those_of_the_difference(rig):
             _projections(rig, other, world.perturbed(*step.split(3)), "nir", X.numpy()).change - part.change
         ) / 1e-6
         assert np.allclose(part.by_motion[:, i], by_step.ravel(), rtol=1e-3, atol=1e-3 * abs(by_step).max())
+
+
+def test_cameras_that_look_away_from_each_other_have_no_depths(rig):
+    """The picture and the text failed on an empty list."""
+    back = torch.tensor([0.0, math.pi, 0.0], dtype=torch.float64)
+    pose = rig["nir"].cam_from_world.perturbed(back, torch.zeros(3, dtype=torch.float64))
+    apart = rig.with_camera("nir", rig["nir"].replace(cam_from_world=pose))
+    found = rig_difference(apart, apart, depth=DEPTH)
+    assert found.depths == {}
+    assert "depth by" not in found.as_text()
+    assert len(draw_difference(found).axes) == 8
