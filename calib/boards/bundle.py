@@ -22,7 +22,7 @@ from arraygeom import Camera, Pose, Rig, stack
 from arraygeom.distortion import lens_derivatives, pinhole_coefficients, term, typical_coefficients
 from arraygeom.lenses.central import MODELS, within_bounds
 from arraygeom.pixels import map_homogeneous
-from arraygeom.pose import rotation_vector
+from arraygeom.pose import cross_matrix, rotation_vector
 from arraygeom.rig import focal_positions
 
 from .board import Board, KnownPoints
@@ -136,7 +136,7 @@ class BundleProblem:
             boards=self.boards[torch.from_numpy(kept)],
             seen=seen,
             frames=tuple(key for key, keep in zip(self.frames, kept) if keep),
-            deformation=self.deformation and self.deformation.of_blocks(self.deformation.part[kept]),
+            deformation=self.deformation and replace(self.deformation, part=self.deformation.part[kept]),
         )
 
     def stepped(self, change: Float[np.ndarray, " c"], boards: Float[np.ndarray, "b 6"]) -> BundleProblem:
@@ -271,10 +271,8 @@ def linearised(problem: BundleProblem) -> dict[str, Linearised]:
 
 def _by_pose(problem: BundleProblem, name: str) -> Float[np.ndarray, "n 3 6"]:
     """Derivatives of a camera's points in the world by their boards' poses, exp(w) R and the translation."""
-    x, y, z = problem.rotated(name).T
-    o, one = np.zeros_like(x), np.ones_like(x)
-    rows = [[o, z, -y, one, o, o], [-z, o, x, o, one, o], [y, -x, o, o, o, one]]
-    return np.moveaxis(np.array(rows), -1, 0)
+    turned = -cross_matrix(torch.from_numpy(problem.rotated(name))).numpy()
+    return np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], -1)
 
 
 def _by_deformation(problem: BundleProblem, name: str) -> Float[np.ndarray, "n 3 s"]:

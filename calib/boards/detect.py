@@ -320,8 +320,6 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
                 f"{len(seen)} markers of the dictionary {name} are visible, "
                 f"not of {board.dictionary}: name that one"
             )
-    if len(_tags(np.ascontiguousarray(grey[:, ::-1]), board.dictionary, border)) >= 4:
-        return "its markers are found once the image is mirrored: save the images as captured, not mirrored"
     return None
 
 

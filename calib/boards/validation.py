@@ -190,7 +190,7 @@ def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"
     fitted, judged = readjusted(problem.of_boards(~out)), problem.of_boards(out)
     (name,) = fitted.cameras
     if fitted.deformation is not None and judged.deformation is not None:
-        judged = replace(judged, deformation=fitted.deformation.of_blocks(judged.deformation.part))
+        judged = replace(judged, deformation=replace(fitted.deformation, part=judged.deformation.part))
     seen = Observations(judged.seen[name].block, judged.on_board(name), judged.seen[name].x)
     fixed = {name: np.zeros(len(judged.free[name]), dtype=bool)}
     posed = replace(
