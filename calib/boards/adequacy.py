@@ -163,11 +163,10 @@ def coverages(calibration: Calibration) -> dict[str, Coverage]:
     return found
 
 
-def coverage_advice(calibration: Calibration, covers: Mapping[str, Coverage]) -> list[str]:
+def coverage_advice(calibration: Calibration, covers: Mapping[str, Coverage]) -> Iterator[str]:
     """What each camera's images lack, and, where that is something, which views would help most."""
-    found = []
     for name, covered in covers.items():
-        found += [f"{name}: {text}" for text in covered.missing]
+        yield from (f"{name}: {text}" for text in covered.missing)
         if not covered.missing or calibration.fit.covariance is None:
             continue
         known = intrinsics_of(calibration.fit, name)
@@ -175,5 +174,4 @@ def coverage_advice(calibration: Calibration, covers: Mapping[str, Coverage]) ->
             views = next_views(known, calibration.board, float(np.mean(covered.depths)))
             listed = "; then ".join(view.text for view in views)
             gain = f"uncertainty from {views[0].before:.2g} to {views[-1].after:.2g} px"
-            found.append(f"{name}: two more views would help most: {listed} ({gain})")
-    return found
+            yield f"{name}: two more views would help most: {listed} ({gain})"

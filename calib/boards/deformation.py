@@ -8,6 +8,7 @@ axis.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -104,14 +105,13 @@ def is_significant(
 
 def described(
     shape: BoardDeformation, deviations: Float[np.ndarray, "k 4"], extents: list[tuple[float, float]]
-) -> list[str]:
+) -> Iterator[str]:
     """Sentences on boards whose shapes were estimated, with standard deviations."""
-    found = []
     for k, (extent, deviation) in enumerate(zip(extents, deviations)):
         name = f"board {k + 1}" if len(extents) > 1 else "the board"
         stretch, a, b, c = shape.values[k]
         if abs(stretch) > 3 * deviation[0]:
-            found.append(
+            yield (
                 f"{name} is stretched: squares are {100 * abs(stretch):.2f} ± {100 * deviation[0]:.2g} % "
                 f"{'longer' if stretch > 0 else 'shorter'} down than across; this is modelled, "
                 "with the size across as specified: measure both"
@@ -122,9 +122,8 @@ def described(
             main = int(np.abs(curvatures).argmax())
             curvature, length = float(curvatures[main]), float(np.abs(axes[:, main]) @ np.array(extent))
             depth, side = 1e3 * abs(curvature) * length**2 / 8, "in front of" if curvature > 0 else "behind"
-            found.append(
+            yield (
                 f"{name} is bent: its middle lies {depth:.2f} ± {depth / relative:.2g} mm "
                 f"{side} its edges (radius {1 / abs(curvature):.2f} m); "
                 "this is modelled: glue it to something stiff and flat"
             )
-    return found

@@ -139,13 +139,16 @@ def solve_inliers(
     """`solve` in some rounds, each without the `detected` points that the one before shows to be outliers."""
     solved = solve(initial, board, final=final)
     for _ in range(rounds - 1):
-        views = {name: near_fit(solved, name, v, board) for name, v in detected.items()}
+        problem, boards, deformation = solved.problem, solved.problem.board_poses, solved.problem.deformation
+        points = board.points if deformation is None else deformation.deformed(board.points, board.part)
+        views = {}
+        for name, v in detected.items():
+            camera = problem.cameras[name]
+            poses = {key: camera.cam_from_world @ boards[key] for key in v.seen}
+            views[name] = without_outliers(v, camera, poses, points, sigma=problem.sigma[name])
         if all(v.count == solved.views[name].count for name, v in views.items()):
             break
-        problem = solved.problem
-        again = initial._replace(
-            cameras=problem.cameras, boards=problem.board_poses, views=views, deformation=problem.deformation
-        )
+        again = initial._replace(cameras=problem.cameras, boards=boards, views=views, deformation=deformation)
         solved = solve(again, board, final=final)
     return solved
 
@@ -153,12 +156,16 @@ def solve_inliers(
 def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, list[str]]:
     """The problem, unobservable parameters of lenses and principal points fixed at defaults, and notes.
 
-    The worst is fixed first. Once the fit is `final`, raises ValueError where a focal length is unobservable.
+    Judged by pixels and stated priors, in units of typical sizes; the worst is fixed first. Once the fit is
+    `final`, raises ValueError where a focal length is unobservable.
     """
     free = {name: mask.copy() for name, mask in problem.free.items()}
     cameras, notes = dict(problem.cameras), list[str]()
     candidates = [(name, int(i)) for name in cameras for i in np.flatnonzero(free[name])]
-    information = _relative_information(problem)
+    sizes = np.concatenate([typical_sizes(c)[free[name]] for name, c in cameras.items()])
+    stated = {name: prior for name, prior in problem.priors.items() if prior.pose is not None}
+    equations = normal_equations(replace(problem, priors=stated), linearised(problem))
+    information = equations.information() * sizes[:, None] * sizes
     while (worst := _worst(candidates, information)) is not None:
         name, index = candidates.pop(worst)
         entry = parameter_names(cameras[name])[index]
@@ -174,16 +181,6 @@ def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, l
         cameras[name], fixed = with_default(cameras[name], entry)
         notes.append(f"{name}: {fixed}: the images do not determine it")
     return replace(problem, cameras=cameras, free=free), notes
-
-
-def _relative_information(problem: BundleProblem) -> np.ndarray:
-    """Inverse covariance of the free parameters in units of typical sizes, by pixels and stated priors."""
-    sizes = np.concatenate(
-        [typical_sizes(camera)[problem.free[name]] for name, camera in problem.cameras.items()]
-    )
-    stated = {name: prior for name, prior in problem.priors.items() if prior.pose is not None}
-    information = normal_equations(replace(problem, priors=stated), linearised(problem)).information()
-    return information * sizes[:, None] * sizes
 
 
 def _worst(candidates: list[tuple[str, int]], information: np.ndarray) -> int | None:
@@ -301,15 +298,6 @@ def _covariance(problem: BundleProblem) -> Array | None:
 # Outliers ---------------------------------------------------------------------------------------------------
 
 
-def near_fit(solved: Solved, name: str, views: BoardViews, board: Board) -> BoardViews:
-    """A camera's views without the points that a solution shows to be outliers."""
-    problem = solved.problem
-    camera, boards, deformation = problem.cameras[name], problem.board_poses, problem.deformation
-    poses = {key: camera.cam_from_world @ boards[key] for key in views.seen}
-    points = board.points if deformation is None else deformation.deformed(board.points, board.part)
-    return without_outliers(views, camera, poses, points, sigma=solved.sigma[name])
-
-
 class FrameMisfit(NamedTuple):
     """A frame a camera does not fit: its residuals, and those of the camera's median frame (RMS, pixels)."""
 
@@ -375,8 +363,8 @@ def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solv
         return solved
     priors = {name: _as_prior(name, alone) for name, alone in singles.items()}
     free = {name: prior.information.diagonal() > 0 for name, prior in priors.items()}
-    for index, mask in enumerate(free.values()):
-        mask[:6] = index > 0
+    for name, mask in free.items():
+        mask[:6] = name != next(iter(free))
     held = replace(initial.problem(board), priors=priors, deformation=solved.problem.deformation, free=free)
     notes = [note for alone in singles.values() for note in alone.notes]
     notes.append(f"{doubts}; so each camera's intrinsics keep close to its own calibration")
