@@ -261,18 +261,14 @@ def linearised(problem: BundleProblem) -> dict[str, Linearised]:
         x, by_camera = linear_projection(camera, problem.world(name))
         r = seen.x - x
         by_point = by_camera[..., 3:6] @ camera.R.numpy()
-        by_board = by_point @ _by_pose(problem, name)
+        # a rotation exp(w) of the board and a translation, about the world's axes
+        turned = -cross_matrix(torch.from_numpy(problem.rotated(name))).numpy()
+        by_board = np.concatenate([by_point @ turned, by_point], -1)
         by_shared = np.concatenate([by_camera[..., free], by_point @ _by_deformation(problem, name)], -1)
         weight = np.sqrt(robust_weights(np.linalg.norm(r, axis=-1) / sigma)) / sigma
         wide = weight[:, None, None]
         found[name] = Linearised(weight[:, None] * r, wide * by_shared, wide * by_board, seen.block, columns)
     return found
-
-
-def _by_pose(problem: BundleProblem, name: str) -> Float[np.ndarray, "n 3 6"]:
-    """Derivatives of a camera's points in the world by their boards' poses, exp(w) R and the translation."""
-    turned = -cross_matrix(torch.from_numpy(problem.rotated(name))).numpy()
-    return np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], -1)
 
 
 def _by_deformation(problem: BundleProblem, name: str) -> Float[np.ndarray, "n 3 s"]:
@@ -394,9 +390,8 @@ def changed(camera: Camera, change: torch.Tensor) -> Camera:
     lens = moved.distortion
     if lens is None or lens.model not in MODELS:
         return moved
-    return moved.replace(
-        distortion=lens.with_coefficients(within_bounds(MODELS[lens.model], lens.coefficients))
-    )
+    bounded = within_bounds(MODELS[lens.model], lens.coefficients)
+    return moved.replace(distortion=lens.with_coefficients(bounded))
 
 
 def camera_jacobian(camera: Camera, X: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 p"]:
@@ -415,10 +410,8 @@ def linear_projection(
     plane, *slopes = lens_derivatives(camera.distortion, local)
     by_point, by_lens = (camera.K[:2, :2] @ part for part in slopes)
     rotational = torch.linalg.cross((local - camera.t)[:, None].expand_as(by_point), by_point)
-    by_focal, by_centre = (
-        focal_positions(camera.K) * plane[:, None],
-        torch.eye(2).to(plane).expand(len(X), 2, 2),
-    )
+    by_focal = focal_positions(camera.K) * plane[:, None]
+    by_centre = torch.eye(2).to(plane).expand(len(X), 2, 2)
     x = map_homogeneous(camera.K[:2], plane)
     return x.numpy(), torch.cat([rotational, by_point, by_focal, by_centre, by_lens], -1).numpy()
 

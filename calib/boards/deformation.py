@@ -88,11 +88,6 @@ def _deformed(p: np.ndarray, middle: np.ndarray, values: np.ndarray) -> np.ndarr
     return np.stack([middle[:, 0] + x, middle[:, 1] + y, p[:, 2] + first / 2 - first * second / 24], -1)
 
 
-def fewest_frames(count: int) -> int:
-    """The least number of frames whose agreement on so many values means something."""
-    return 2 * count + 2
-
-
 def is_significant(
     values: Float[np.ndarray, " s"], covariance: Float[np.ndarray, "s s"], frames: int
 ) -> bool:

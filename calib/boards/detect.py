@@ -104,9 +104,7 @@ def other_size(images: Iterable[Grey], board: Board, *, larger: bool = False) ->
 def _versions(grey: Grey) -> Iterator[Grey]:
     yield grey
     equalised = cv2.createCLAHE(3.0, (8, 8)).apply(grey)
-    yield equalised
-    yield 255 - grey
-    yield 255 - equalised
+    yield from (equalised, 255 - grey, 255 - equalised)
 
 
 def _chessboard(grey: Grey, board: Chessboard) -> Detection | None:
@@ -117,14 +115,11 @@ def _chessboard(grey: Grey, board: Chessboard) -> Detection | None:
         done, corners = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
     if not done or len(corners) != len(board.points):
         return None
-    x = _right_handed(corners.reshape(board.rows, board.columns, 2))
-    return Detection(np.arange(len(x)), x.astype(np.float64))
-
-
-def _right_handed(grid: np.ndarray) -> np.ndarray:
-    """The corners ordered so that x, y and the direction into the board are a right-handed frame."""
+    grid = corners.reshape(board.rows, board.columns, 2).astype(np.float64)
     (ax, ay), (bx, by) = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-    return (grid if ax * by - ay * bx > 0 else grid[:, ::-1]).reshape(-1, 2)
+    if ax * by < ay * bx:  # x, y and the direction into the board have to be a right-handed frame
+        grid = grid[:, ::-1]
+    return Detection(np.arange(len(board.points)), grid.reshape(-1, 2))
 
 
 def _charuco(grey: Grey, board: Charuco) -> Detection | None:
@@ -285,10 +280,7 @@ def _reason(grey: Grey, board: Board) -> str:
     if cv2.Laplacian(grey, cv2.CV_64F).std() < 4:
         return "the images are blurred: focus, and hold the board still"
     margin = "" if isinstance(board, MarkedBoard) else " completely and with its white margin"
-    return (
-        f"no such board is visible{margin}: "
-        "check the board's name, and that it is in the image, large and lit"
-    )
+    return f"no such board is visible{margin}: is its name right, and is it in the image, large and lit?"
 
 
 def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
@@ -300,10 +292,7 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
             f"add ':border{3 - border}' to the board's name"
         )
     if isinstance(board, KnownPoints):
-        return (
-            f"{len(ids)} of its markers are visible, too few, "
-            f"or not of {board.dictionary}: name their dictionary"
-        )
+        return f"only {len(ids)} of its markers are visible: is their dictionary {board.dictionary}?"
     if len(ids) >= 4 and max(ids) > last:
         return (
             f"markers up to number {max(ids)} are visible and the board has "
@@ -316,10 +305,7 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
         )
     for name in OTHER_DICTIONARIES:
         if len(seen := _tags(grey, name, 1)) >= 6:
-            return (
-                f"{len(seen)} markers of the dictionary {name} are visible, "
-                f"not of {board.dictionary}: name that one"
-            )
+            return f"{len(seen)} markers of the dictionary {name} are visible: name that one"
     return None
 
 
@@ -410,9 +396,7 @@ def _check_board(
     if not seen:
         why = explain(_greys(list(moments.values())), board.members[0])
         labels = named([p.label for p in moments.values()], NAMED)
-        raise ValueError(
-            f"{name}: the board {board} is found in none of {len(moments)} images ({labels}): {why}"
-        )
+        raise ValueError(f"{name}: the board {board} is in none of {len(moments)} images ({labels}): {why}")
     if other := other_size(_greys([moments[key] for key in seen]), board, larger=True):
         raise ValueError(
             f"{name}: the images show a chessboard with {other} inner corners and the board given is "

@@ -247,9 +247,7 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
 def _fisheye(views: BoardViews, board: Board) -> OpenCVSolution:
     """From the focal length of half a sphere, or, if OpenCV then finds no poses, of a narrow view."""
     if not board.flat:
-        raise ValueError(
-            "fisheyes need a flat board to start from: points of known position give pinhole cameras"
-        )
+        raise ValueError("fisheyes need a flat board to start from: points in space give pinhole cameras")
     points = [board.points[d.ids][:, None] for d in views.seen.values()]
     pixels = [d.x[:, None] for d in views.seen.values()]
     h, w = views.hw

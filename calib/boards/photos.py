@@ -70,14 +70,10 @@ def find_photos(folder: Path, *, patterns: Mapping[str, str] | None = None) -> P
     FileNotFoundError and ValueError.
     """
     if not folder.is_dir():
-        raise FileNotFoundError(
-            f"{folder}: no such folder of images: give one with a subfolder for each camera"
-        )
+        raise FileNotFoundError(f"{folder}: no such folder: give one with a subfolder for each camera")
     cameras = _by_pattern(folder, patterns) if patterns else _by_folder(folder) or _by_name(folder)
     if not cameras:
-        raise ValueError(
-            f"{folder}: no images or videos here: give a folder with a subfolder for each camera"
-        )
+        raise ValueError(f"{folder}: no images or videos: give a folder with a subfolder for each camera")
     photos = {name: _moments(name, files) for name, files in cameras.items()}
     keys = {key for moments in photos.values() for key in moments}
     if len(keys) == 1 or any(len(moments) > 1 for moments in photos.values()):
@@ -135,18 +131,13 @@ def _usable(paths: Iterable[Path]) -> list[Path]:
 def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
     videos = [f for f in files if f.suffix.lower() in VIDEOS]
     if len(videos) > 1 or (videos and len(videos) < len(files)):
-        raise ValueError(
-            f"{name}: has {len(videos)} videos and {len(files) - len(videos)} "
-            "images: keep one video, or images"
-        )
+        raise ValueError(f"{name}: {len(videos)} videos among {len(files)} files: keep one video, or images")
     if videos:
         return dict(_video_frames(videos[0]))
     _check_orientations(name, files)
     keys = frame_keys([f.stem for f in files])
     if len(set(keys)) < len(keys):
-        raise ValueError(
-            f"{name}: two images have the same number, such as {files[0].name}: give each its own"
-        )
+        raise ValueError(f"{name}: two images have one number, such as {files[0].name}: give each its own")
     return {key: Photo(file.name, partial(_decode_file, file)) for key, file in zip(keys, files)}
 
 
@@ -157,9 +148,7 @@ def _check_orientations(name: str, files: list[Path]) -> None:
         first.setdefault(_orientation(file), file)
     if len(first) > 1:
         listed = ", ".join(f"{tag} in {file.name}" for tag, file in first.items())
-        raise ValueError(
-            f"{name}: its images have different orientation tags ({listed}): remove the tags from all"
-        )
+        raise ValueError(f"{name}: its images differ in orientation tags ({listed}): remove the tags")
 
 
 def _orientation(file: Path) -> int:

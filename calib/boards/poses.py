@@ -119,9 +119,7 @@ def rig_near_start(
         if len(views) > 1 and not any(
             v.seen.keys() & other.seen.keys() for n, other in views.items() if n != name
         ):
-            raise ValueError(
-                f"{name}: never sees the board in the same frame as another camera: check the numbers"
-            )
+            raise ValueError(f"{name}: shares no frame with another camera: check the images' numbers")
     seen = [
         CalibratedViews(
             name, c, views[name], {key: board_pose(c, d, board) for key, d in views[name].seen.items()}
@@ -138,9 +136,7 @@ def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) ->
     """A camera of a start, with a lens. Raises ValueError if it is missing or its size is not the images'."""
     camera = start.cameras.get(name)
     if not isinstance(camera, Camera):
-        raise ValueError(
-            f"{name}: the start has no camera of this name with K and pose; it has {list(start.names)}"
-        )
+        raise ValueError(f"{name}: the start has no calibrated camera called so; it has {list(start.names)}")
     if camera.hw != views.hw:
         (h, w), (rows, columns) = camera.hw, views.hw
         raise ValueError(f"{name}: its images are {columns}x{rows} and the start states {w}x{h}")

@@ -362,7 +362,7 @@ def _map(
     """Draw values at pixels of `grid_points`; what lies between pixels that are no neighbours is grey."""
     axes.set(xlim=(0, hw[1]), ylim=(hw[0], 0), aspect="equal", xticks=[], yticks=[], facecolor="0.85")
     if len(x) < 4:
-        axes.set_title(escaped(f"{title}: too little to draw"), fontsize=9, loc="left")
+        axes.set_title(escaped(f"{title}: too few points"), fontsize=9, loc="left")
         return
     triangles = Triangulation(*x.T)
     spread = np.ptp(x[triangles.triangles], axis=1) * (np.array(GRID)[::-1] - 1) / (hw[1], hw[0])

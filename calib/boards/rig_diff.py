@@ -103,16 +103,10 @@ class RigDifference:
         """One line: whether the rig has moved."""
         found = self.significance
         if found is None:
-            return (
-                "verdict: none: no deviations are known; "
-                "differences may be those of two calibrations of one rig"
-            )
+            return "verdict: none: no deviations are known; one rig calibrated twice may differ so"
         test = f"chi-square {found.chi_square:.1f} of {found.freedom} parameters, p = {found.probability:.2g}"
         if not found.moved:
-            return (
-                "verdict: the same: the rigs differ no more than their "
-                f"calibrations' errors let them ({test})"
-            )
+            return f"verdict: the same: the rigs differ no more than their calibrations' errors ({test})"
         return (
             f"verdict: moved: the rigs differ by more than their calibrations' errors ({test}); "
             f"a rotation of {found.camera} by {found.degrees:.3f} degrees and a shift of "
@@ -169,9 +163,7 @@ def _same_cameras(a: Rig, b: Rig) -> tuple[str, ...]:
         raise ValueError(f"the rigs are of other cameras ({listed}): give two calibrations of the same")
     for name in a.names:
         if not all(isinstance(rig[name], Camera) for rig in (a, b)):
-            raise ValueError(
-                f"'{name}' is not calibrated in both rigs: what it sees where cannot be compared"
-            )
+            raise ValueError(f"'{name}' is not calibrated in both rigs: what it sees cannot be compared")
         if a[name].hw != b[name].hw:
             (h, w), (h2, w2) = a[name].hw, b[name].hw
             raise ValueError(

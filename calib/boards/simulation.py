@@ -78,9 +78,7 @@ def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
             found.append(Pose(R, centre - R @ middle))
         if len(found) == count:
             return stack(found)
-    raise ValueError(
-        f"the cameras see the board {board} together almost nowhere: take a larger or a smaller one"
-    )
+    raise ValueError(f"the cameras hardly see the board {board} together: take a larger or a smaller one")
 
 
 Rays = tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]

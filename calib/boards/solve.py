@@ -30,7 +30,7 @@ from .bundle import (
     typical_sizes,
     with_default,
 )
-from .deformation import LEAST_GAIN, BoardDeformation, fewest_frames, is_significant
+from .deformation import LEAST_GAIN, BoardDeformation, is_significant
 from .detect import BoardViews, named
 from .intrinsics import (
     LEAST_SIGMA,
@@ -200,7 +200,7 @@ def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
     if flat is None or solved.problem.deformation is not None:
         return solved
     trial, count = replace(solved.problem, deformation=flat), len(solved.problem.frames)
-    few = count < fewest_frames(len(flat))
+    few = count < 2 * len(flat) + 2
     try:
         agreed = jackknife(trial)
         if not few and not is_significant(agreed.step, agreed.deformations, count):

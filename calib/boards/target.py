@@ -129,9 +129,7 @@ def parse_boards(texts: Sequence[str]) -> Board:
     used: dict[str, set[int]] = {}
     for board in boards:
         if not isinstance(board, MarkedBoard):
-            raise ValueError(
-                f"board '{board}': several boards at once need markers: use charuco or aprilgrid"
-            )
+            raise ValueError(f"board '{board}': several boards need markers: use charuco or aprilgrid")
         taken = used.setdefault(board.dictionary, set())
         if taken & set(board.markers):
             raise ValueError(
@@ -147,9 +145,7 @@ def parse_boards(texts: Sequence[str]) -> Board:
 def _charuco(text: str, columns: int, rows: int, spacing: float, options: Mapping[str, str]) -> Charuco:
     marker = _length(text, options["length"]) if "length" in options else 0.75 * spacing
     if not marker < spacing:
-        raise ValueError(
-            f"board '{text}': markers of {millimetres(marker)} do not fit into squares that are no larger"
-        )
+        raise ValueError(f"board '{text}': markers of {millimetres(marker)} do not fit into its squares")
     first = int(options.get("first", "from0")[4:])
     markers = range(first, first + columns * rows // 2)
     name = _smallest_dictionary(text, options.get("dictionary", "4x4"), first + (columns * rows + 1) // 2)
@@ -184,9 +180,7 @@ def _kalibr_target(path: Path) -> str:
             return f"chessboard:{target['targetCols']}x{target['targetRows']}:{size:.6f}mm"
     except (KeyError, TypeError, ValueError, RecursionError, yaml.YAMLError):
         pass
-    raise ValueError(
-        f"{path}: not a target of Kalibr's that is known here: an aprilgrid, or a checkerboard of squares"
-    )
+    raise ValueError(f"{path}: not an aprilgrid of Kalibr's, nor a checkerboard of squares")
 
 
 def _counts(text: str, part: str, *, fewest: int = 3) -> tuple[int, int]:
@@ -214,9 +208,7 @@ def _smallest_dictionary(text: str, name: str, markers: int) -> str:
     for full in names:
         if hasattr(cv2.aruco, f"DICT_{full}") and len(marker_dictionary(full).bytesList) >= markers:
             return full.lower()
-    raise ValueError(
-        f"board '{text}': no dictionary '{name}' of OpenCV has the {markers} markers it needs; try 4x4"
-    )
+    raise ValueError(f"board '{text}': no dictionary '{name}' of OpenCV has {markers} markers; try 4x4")
 
 
 def _known_points(text: str) -> KnownPoints:
@@ -232,9 +224,7 @@ def _known_points(text: str) -> KnownPoints:
         table = csv.DictReader(lines, skipinitialspace=True)
         head = tuple(name.strip().lower() for name in table.fieldnames or ())
         if head not in COLUMNS:
-            raise ValueError(
-                f"{path}: its first line is '{','.join(head)[:60]}': write id,x,y,z or id,corner,x,y,z"
-            )
+            raise ValueError(f"{path}: begins '{','.join(head)[:60]}': write id,x,y,z or id,corner,x,y,z")
         rows = [_point(path, number, row, head) for number, row in enumerate(table, 2)]
     if len(rows) < FEWEST_POINTS:
         raise ValueError(f"{path}: has {len(rows)} points and {FEWEST_POINTS} is the least")

@@ -87,9 +87,7 @@ class RigCovariance:
         if not all(isinstance(name, str) for name in names) or not np.isfinite(matrix).all():
             raise ValueError(f"{path}: holds names that are no text, or NaN or infinity: calibrate again")
         if matrix.shape != (len(names), len(names)):
-            raise ValueError(
-                f"{path}: has {len(names)} names and a matrix of {matrix.shape}; is the file complete?"
-            )
+            raise ValueError(f"{path}: {len(names)} names, a matrix of {matrix.shape}: is the file complete?")
         return cls(names, matrix)
 
 

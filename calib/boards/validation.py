@@ -150,10 +150,7 @@ class LensComparison:
     def advice(self) -> str:
         """The advised model and all errors, in a sentence."""
         if not self.errors:
-            return (
-                f"too few frames to compare lens models ({FEWEST_TO_COMPARE} "
-                "are needed): brown-conrady is used"
-            )
+            return f"too few frames to compare lenses (fewer than {FEWEST_TO_COMPARE}): brown-conrady is used"
         listed = ", ".join(f"{lens} {self.rms(lens):.3f}" for lens in COMPARED if lens in self.errors)
         return f"the images support the lens model {self.advised} (error on held-out frames, px: {listed})"
 
