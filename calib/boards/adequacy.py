@@ -167,10 +167,8 @@ def coverage_advice(calibration: Calibration, covers: Mapping[str, Coverage]) ->
     """What each camera's images lack, and, where that is something, which views would help most."""
     for name, covered in covers.items():
         yield from (f"{name}: {text}" for text in covered.missing)
-        if not covered.missing or calibration.fit.covariance is None:
-            continue
         known = intrinsics_of(calibration.fit, name)
-        if len(known.covariance):
+        if covered.missing and len(known.covariance):
             views = next_views(known, calibration.board, float(np.mean(covered.depths)))
             listed = "; then ".join(view.text for view in views)
             gain = f"uncertainty from {views[0].before:.2g} to {views[-1].after:.2g} px"

@@ -104,6 +104,19 @@ class MarkedBoard(Board):
     def _from(self) -> str:
         return f":from{self.markers[0]}" if self.markers[0] else ""
 
+    def _draw_marker(
+        self, axes: Any, number: int, left: float, top: float, side: float, *, border: int = 1, turns: int = 0
+    ) -> None:
+        """Draw a marker, runs of black bits as one rectangle each: no hairlines between bits."""
+        known = marker_dictionary(self.dictionary)
+        bits = known.markerSize + 2 * border
+        black = np.rot90(cv2.aruco.generateImageMarker(known, number, bits, borderBits=border) == 0, turns)
+        step = side / bits
+        for row, line in enumerate(black):
+            edges: np.ndarray = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
+            for begin, end in edges.reshape(-1, 2).tolist():
+                axes.add_patch(_black(left + begin * step, top + row * step, (end - begin) * step, step))
+
 
 @dataclass(frozen=True)
 class Chessboard(Board):
@@ -143,13 +156,11 @@ class Charuco(MarkedBoard):
 
     def _draw(self, axes: Any) -> None:
         side, marker = 1e3 * self.spacing, 1e3 * self.marker
-        white = set()
-        for corners, number in zip(
-            np.array(self.opencv.getObjPoints()), np.array(self.opencv.getIds()).reshape(-1)
-        ):
+        white, places = set(), np.array(self.opencv.getObjPoints())
+        for corners, number in zip(places, np.array(self.opencv.getIds()).reshape(-1)):
             left, top = (1e3 * float(v) for v in corners[:, :2].min(0))
             white.add((int(left // side), int(top // side)))
-            _draw_marker(axes, self.dictionary, int(number), left, top, marker)
+            self._draw_marker(axes, int(number), left, top, marker)
         for column, row in np.ndindex(self.columns + 1, self.rows + 1):
             if (column, row) not in white:
                 axes.add_patch(_black(column * side, row * side, side, side))
@@ -197,7 +208,7 @@ class AprilGrid(MarkedBoard):
         tag, gap = 1e3 * self.tag, 1e3 * self.gap
         for number, corners in zip(self.markers, self.corners):
             left, top = 1e3 * self.points[corners[0], :2] + gap
-            _draw_marker(axes, self.dictionary, number, left, top, tag, border=self.border, quarter_turns=2)
+            self._draw_marker(axes, number, left, top, tag, border=self.border, turns=2)
         for column, row in np.ndindex(self.columns // 2 + 1, self.rows // 2 + 1):
             axes.add_patch(_black(column * (tag + gap), row * (tag + gap), gap, gap))
 
@@ -305,30 +316,6 @@ def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
 def millimetres(length: float) -> str:
     """A length in metres as text, such as "30mm"."""
     return f"{1e3 * length:.6g}mm"
-
-
-def _draw_marker(
-    axes: Any,
-    dictionary: str,
-    number: int,
-    left: float,
-    top: float,
-    side: float,
-    *,
-    border: int = 1,
-    quarter_turns: int = 0,
-) -> None:
-    """Runs of black bits as one rectangle each: no hairlines between bits."""
-    known = marker_dictionary(dictionary)
-    bits = known.markerSize + 2 * border
-    black = np.rot90(
-        cv2.aruco.generateImageMarker(known, number, bits, borderBits=border) == 0, quarter_turns
-    )
-    step = side / bits
-    for row, line in enumerate(black):
-        edges: np.ndarray = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
-        for begin, end in edges.reshape(-1, 2).tolist():
-            axes.add_patch(_black(left + begin * step, top + row * step, (end - begin) * step, step))
 
 
 def _black(x: float, y: float, width: float, height: float) -> Rectangle:

@@ -134,21 +134,14 @@ def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
         raise ValueError(f"{name}: {len(videos)} videos among {len(files)} files: keep one video, or images")
     if videos:
         return dict(_video_frames(videos[0]))
-    _check_orientations(name, files)
+    tags = {_orientation(file): file.name for file in reversed(files)}
+    if len(tags) > 1:  # they are applied: images stored alike would otherwise be rotated differently
+        listed = ", ".join(f"{tag} in {file}" for tag, file in reversed(tags.items()))
+        raise ValueError(f"{name}: its images differ in orientation tags ({listed}): remove the tags")
     keys = frame_keys([f.stem for f in files])
     if len(set(keys)) < len(keys):
         raise ValueError(f"{name}: two images have one number, such as {files[0].name}: give each its own")
     return {key: Photo(file.name, partial(_decode_file, file)) for key, file in zip(keys, files)}
-
-
-def _check_orientations(name: str, files: list[Path]) -> None:
-    """Tags are applied: images of one camera stored alike would otherwise be rotated differently."""
-    first: dict[int, Path] = {}
-    for file in files:
-        first.setdefault(_orientation(file), file)
-    if len(first) > 1:
-        listed = ", ".join(f"{tag} in {file.name}" for tag, file in first.items())
-        raise ValueError(f"{name}: its images differ in orientation tags ({listed}): remove the tags")
 
 
 def _orientation(file: Path) -> int:

@@ -71,7 +71,9 @@ def calibrate_photos(
     if nominal is not None:
         if lens == "auto":
             raise ValueError("--lens auto compares lenses on held-out frames: with --start name one")
-        patterns = patterns or _named_like(photos, nominal)
+        named = {name: f"{glob.escape(name)}.*" for name in nominal.names}
+        if not patterns and all(any(photos.glob(pattern)) for pattern in named.values()):
+            patterns = named  # a file called like each camera
     found = collect_folder(photos, target, patterns=patterns, progress=progress)
     comparisons = compare_lenses(found.views, target) if lens == "auto" else {}
     chosen = {name: comparisons[name].advised if lens == "auto" else lens for name in found.views}
@@ -96,12 +98,6 @@ def calibrate_photos(
     advice = coverage_advice(calibration, coverages(calibration))
     messages = [summary(calibration), *by_cameras([*lenses, *found.notes, *calibration.notes, *advice])]
     return CalibrationOutput(messages, [path for path in written if path.exists()])
-
-
-def _named_like(folder: Path, rig: Rig) -> dict[str, str] | None:
-    """A pattern for each camera if the folder holds a file called like each."""
-    patterns = {name: f"{glob.escape(name)}.*" for name in rig.names}
-    return patterns if all(any(folder.glob(pattern)) for pattern in patterns.values()) else None
 
 
 # While images are taken -------------------------------------------------------------------------------------
@@ -210,10 +206,9 @@ def _camera(session: Session, name: str) -> str:
 
 
 def _advice(calibration: Calibration, name: str) -> str:
-    focal, deviation = calibration.rig[name].K[0, 0], calibration.deviations().get(f"{name}.focal.0")
-    parts = [
-        f"<p>Focal length {float(focal):.1f} px" + (f" ± {deviation:.2g}" if deviation else "") + ".</p>"
-    ]
+    deviation = calibration.deviations().get(f"{name}.focal.0")
+    stated = f" ± {deviation:.2g}" if deviation else ""
+    parts = [f"<p>Focal length {float(calibration.rig[name].K[0, 0]):.1f} px{stated}.</p>"]
     covered = coverages(calibration)[name]
     known = intrinsics_of(calibration.fit, name)
     if len(known.covariance):

@@ -149,13 +149,17 @@ class Intrinsics(NamedTuple):
 
 
 def intrinsics_of(fit: Solved, name: str) -> Intrinsics:
-    """One camera of a fit that has a covariance."""
-    assert fit.covariance is not None
+    """One camera of a fit; none of its intrinsics is free where the fit has no covariance."""
     camera, seen = in_own_frame(fit.problem, name)
-    entries = [f"{name}.{entry}" for entry in parameter_names(camera)]
-    free = np.array([i >= 6 and entry in fit.names for i, entry in enumerate(entries)])
-    index = [fit.names.index(entry) for entry, is_free in zip(entries, free) if is_free]
-    return Intrinsics(camera, fit.covariance[np.ix_(index, index)], free, fit.sigma[name], seen)
+    entries, known = [f"{name}.{entry}" for entry in parameter_names(camera)], rig_covariance(fit)
+    free = np.array(
+        [i >= 6 and known is not None and entry in known.names for i, entry in enumerate(entries)]
+    )
+    covariance = np.zeros((0, 0))
+    if known is not None:
+        index = [known.names.index(entry) for entry, is_free in zip(entries, free) if is_free]
+        covariance = known.matrix[np.ix_(index, index)]
+    return Intrinsics(camera, covariance, free, fit.sigma[name], seen)
 
 
 def in_own_frame(problem: BundleProblem, name: str) -> tuple[Camera, Float[np.ndarray, "m 3"]]:

@@ -12,7 +12,7 @@ from calib.boards.bundle import camera_jacobian, parameter_names
 from calib.boards.intrinsics import board_pose
 from calib.boards.report import by_cameras
 from calib.boards.rig import calibrate
-from calib.boards.run import watch
+from calib.boards.run import _advice, watch
 from calib.boards.simulation import simulate_photos
 from calib.boards.solve import misfit_notes
 from calib.boards.target import parse_board
@@ -279,3 +279,10 @@ def test_what_was_detected_is_shown_before_it_is_calibrated(tmp_path, monkeypatc
 def test_notes_of_several_cameras_are_one():
     notes = ["a: no points: here", "b: no points: here", "held to the start", "b: bent", "a: no points: here"]
     assert by_cameras(notes) == ["a, b: no points: here", "held to the start", "b: bent"]
+
+
+def test_what_a_fit_does_not_determine_gives_no_advice(found):
+    """The watched folder's page failed on it."""
+    said = _advice(replace(found, fit=replace(found.fit, covariance=None)), "cam")
+    assert "Focal length" in said
+    assert "Next: " not in said
