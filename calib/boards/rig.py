@@ -89,15 +89,17 @@ def calibrate(
             for name, v in views.items()
         }
         fitted = solve_together(initial_rig(singles, board), board, singles)
-        found = left_out_notes(views, singles, fitted)
     else:
         singles, stated = {}, deviations or StartDeviations()
         initial = rig_near_start(start, views, board, models, stated)
         fitted = solve_inliers(initial, initial.views, board, rounds=2)
-        found = start_notes(initial.views, fitted, stated)
     extents = [each.extent for each in board.members]
     solved = with_disagreement(fitted, extents, unchecked=bool(singles) and board.flat)
-    notes = *found, *solved.notes, *misfit_notes(solved)
+    notes = [*solved.notes, *misfit_notes(solved)]
+    if start is None:
+        notes[:0] = left_out_notes(views, singles, fitted)
+    else:
+        notes[:0] = start_notes(initial.views, fitted, stated)
     rig = Rig(solved.problem.cameras)
     single = {name: alone.problem.rms() for name, alone in singles.items()}
-    return Calibration(rig, board, solved, single, epipolar_errors(rig, solved.views), notes)
+    return Calibration(rig, board, solved, single, epipolar_errors(rig, solved.views), tuple(notes))

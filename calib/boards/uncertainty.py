@@ -123,13 +123,11 @@ def baseline_deviation(rig: Mapping[str, Camera], a: str, b: str, covariance: Ri
     """The standard deviation of the distance between two cameras, metres."""
     baseline = (rig[b].centre - rig[a].centre).numpy()
     direction = baseline / max(float(np.linalg.norm(baseline)), 1e-12)
-    change = direction @ (by_centre(rig[b], b, covariance) - by_centre(rig[a], a, covariance))
-    return float(np.sqrt(change @ covariance.matrix @ change))
-
-
-def by_centre(camera: Camera, name: str, covariance: RigCovariance) -> Float[np.ndarray, "3 c"]:
-    """Derivatives of a camera's optical centre by the parameters of a covariance."""
-    return np.asarray(camera.cam_from_world.centre_jacobian.numpy() @ covariance.of(name, camera)[:6])
+    of_a, of_b = (
+        direction @ rig[n].cam_from_world.centre_jacobian.numpy() @ covariance.of(n, rig[n])[:6]
+        for n in (a, b)
+    )
+    return float(np.sqrt((of_b - of_a) @ covariance.matrix @ (of_b - of_a)))
 
 
 # One camera -------------------------------------------------------------------------------------------------

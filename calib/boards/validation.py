@@ -19,7 +19,7 @@ from .detect import BoardViews, named
 from .intrinsics import Lens
 from .poses import StartDeviations
 from .solve import calibrate_single, readjusted
-from .uncertainty import by_centre, compensation, covered, grid_points, in_own_frame, rig_covariance
+from .uncertainty import compensation, covered, grid_points, in_own_frame
 
 FEWEST_TO_HOLD_OUT = 8
 """Frames are held out from this many on that two cameras share."""
@@ -253,11 +253,14 @@ def _gains(fit: Solved, deviations: StartDeviations) -> str:
 
 def _position_deviations(fit: Solved) -> list[float]:
     """Of each camera's optical centre, root mean square of the axes, metres."""
-    covariance, found = rig_covariance(fit), []
-    assert covariance is not None
+    assert fit.covariance is not None
+    found = []
     for name, camera in fit.problem.cameras.items():
-        derivatives = by_centre(camera, name, covariance)
-        found.append(float(np.sqrt(np.trace(derivatives @ covariance.matrix @ derivatives.T) / 3)))
+        derivatives = camera.cam_from_world.centre_jacobian.numpy()
+        first = fit.names.index(f"{name}.rotation.0")
+        pose = slice(first, first + 6)
+        covariance = derivatives @ fit.covariance[pose, pose] @ derivatives.T
+        found.append(float(np.sqrt(np.trace(covariance) / 3)))
     return found
 
 
