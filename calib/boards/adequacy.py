@@ -91,7 +91,7 @@ def _missing(found: Coverage) -> Iterator[str]:
         yield f"points in only {found.share:.0%} of the image: fill it, corners too"
     near, far = found.depths
     if far < DEEP_ENOUGH * near:
-        yield f"boards at one depth only ({near:.3g} to {far:.3g} m): bring it closer and further"
+        yield f"boards at one depth only ({near:.3g} to {far:.3g} m): take some closer, some further"
     if found.tilts[1] < TILTED_ENOUGH:
         yield f"boards tilted by {found.tilts[1]:.0f} degrees at most: tilt it by 20 to 40"
 

@@ -263,7 +263,7 @@ def linearised(problem: BundleProblem) -> dict[str, Linearised]:
         by_point = by_camera[..., 3:6] @ camera.R.numpy()
         # a rotation exp(w) of the board and a translation, about the world's axes
         turned = -cross_matrix(torch.from_numpy(problem.rotated(name))).numpy()
-        by_board = np.concatenate([by_point @ turned, by_point], -1)
+        by_board = by_point @ np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], -1)
         by_shared = np.concatenate([by_camera[..., free], by_point @ _by_deformation(problem, name)], -1)
         weight = np.sqrt(robust_weights(np.linalg.norm(r, axis=-1) / sigma)) / sigma
         wide = weight[:, None, None]

@@ -169,16 +169,8 @@ def test_photographs_of_four_cameras(tmp_path):
 @pytest.mark.slow
 def test_opencvs_pairs(shared_data, tmp_path, capsys):
     """RMS 0.195 px left and 0.217 px together, f 535.9 and baseline 83.2 mm are published."""
-    main(
-        [
-            "calibrate",
-            str(shared_data / "calibration/opencv_stereo"),
-            "--board",
-            "chessboard:9x6:25mm",
-            "-o",
-            str(tmp_path / "rig.yaml"),
-        ]
-    )
+    folder = shared_data / "calibration/opencv_stereo"
+    main(["calibrate", str(folder), "--board", "chessboard:9x6:25mm", "-o", str(tmp_path / "rig.yaml")])
     rig = Rig.load(tmp_path / "rig.yaml")
     assert float(rig["left"].K[0, 0]) == pytest.approx(535.9, rel=0.01)
     assert 1e3 * float(rig["right"].centre.norm()) == pytest.approx(83.2, rel=0.005)
