@@ -219,11 +219,6 @@ class Solved:
         return self.problem.names
 
     @property
-    def sigma(self) -> Mapping[str, float]:
-        """Each camera's noise along x or y, pixels."""
-        return self.problem.sigma
-
-    @property
     def deviations(self) -> dict[str, float]:
         """Of each free parameter by name ("left.focal.0"), in its own unit; empty without a covariance."""
         if self.covariance is None:

@@ -118,7 +118,7 @@ def without_outliers(
 
 def _spans(points: Float[np.ndarray, "n 3"]) -> bool:
     """Whether there are enough points, and not all on a line."""
-    return len(points) >= FEWEST_POINTS and np.linalg.matrix_rank(points - points.mean(0), 1e-6) > 1
+    return len(points) >= FEWEST_POINTS and bool(np.linalg.matrix_rank(points - points.mean(0), 1e-6) > 1)
 
 
 def _projection_errors(

@@ -171,7 +171,7 @@ def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> st
             "images, points": f"{len(calibration.views[name].seen)}, {len(r)}",
             "error px, together (alone)": f"{rms:.3f}"
             + (f" ({calibration.single[name]:.3f})" if name in calibration.single else ""),
-            "noise px": f"{calibration.fit.sigma[name]:.3f}",
+            "noise px": f"{calibration.fit.problem.sigma[name]:.3f}",
             "focal length px": _with_deviations(calibration, name, camera, "focal"),
             "principal point px": _with_deviations(calibration, name, camera, "centre"),
             "lens": _with_deviations(calibration, name, camera, "distortion"),
@@ -294,10 +294,10 @@ def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figur
     left.set_title(f"points observed (red: none), {covered.share:.0%} covered", fontsize=9)
     show_image(middle, hw)
     _draw_field(middle, seen.x, r, hw)
-    limit = max(4 * calibration.fit.sigma[name], 1e-3)
+    limit = max(4 * calibration.fit.problem.sigma[name], 1e-3)
     right.plot(*np.clip(r, -limit, limit).T, ".", ms=1.5, color=COLOURS[0])
     right.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", xlabel="x (px)", ylabel="y (px)")
-    right.set_title(f"residuals, noise {calibration.fit.sigma[name]:.3f} px", fontsize=9)
+    right.set_title(f"residuals, noise {calibration.fit.problem.sigma[name]:.3f} px", fontsize=9)
     right.spines[["top", "right"]].set_visible(False)
     return figure
 

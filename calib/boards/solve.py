@@ -209,7 +209,7 @@ def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
     except np.linalg.LinAlgError:  # some parameters are not observable yet
         return solved
     left = deformed.problem.loss
-    gain = replace(solved.problem, sigma=deformed.sigma).loss - left
+    gain = replace(solved.problem, sigma=deformed.problem.sigma).loss - left
     return deformed if gain > (max(left, LEAST_GAIN) if few else LEAST_GAIN) else solved
 
 
@@ -324,7 +324,7 @@ def misfits(fit: Solved) -> list[FrameMisfit]:
     found = []
     for name, by_frame in frame_rms(fit.problem).items():
         typical = float(np.median(list(by_frame.values())))
-        limit = max(MISFIT * typical, CONSPICUOUS * 2**0.5 * max(fit.sigma[name], LEAST_SIGMA))
+        limit = max(MISFIT * typical, CONSPICUOUS * 2**0.5 * max(fit.problem.sigma[name], LEAST_SIGMA))
         found += [FrameMisfit(name, frame, rms, typical) for frame, rms in by_frame.items() if rms > limit]
     return sorted(found, key=lambda m: -m.rms / m.typical)
 

@@ -82,6 +82,8 @@ PAPERS = {
     "A0": (841, 1189),
 }
 """Sheets of printers, millimetres."""
+MARGIN = 0.012
+"""White around a board, metres."""
 BELOW = 14.0
 """Millimetres below a board, for its ruler and name."""
 
@@ -255,9 +257,9 @@ def _point(
 # Printing ---------------------------------------------------------------------------------------------------
 
 
-def page_of(board: Board, *, margin: float = 0.012) -> tuple[float, float]:
+def page_of(board: Board) -> tuple[float, float]:
     """Width and height of the page that a board is drawn on, with margins and ruler, millimetres."""
-    width, height = (1e3 * (v + 2 * margin) for v in board.extent)
+    width, height = (1e3 * (v + 2 * MARGIN) for v in board.extent)
     return width, height + BELOW
 
 
@@ -276,22 +278,22 @@ def page_note(board: Board) -> str:
     return f"{size}: print it on {paper} or larger at 100 %, not fitted to the page, then measure its ruler"
 
 
-def draw_board(board: Board, *, margin: float = 0.012, paper: str | None = None) -> Figure:
-    """The board as a figure whose size in inches is the true one, with a white margin (metres), ruler below.
+def draw_board(board: Board, *, paper: str | None = None) -> Figure:
+    """The board as a figure whose size in inches is the true one, with a white margin, ruler below.
 
     Saved as PDF or SVG it prints at true size; the ruler serves to check it. On a sheet of `paper` ("A4") it
     is in the middle. Raises ValueError if it does not fit there.
     """
     width, height = (1e3 * v for v in board.extent)
-    page = page_of(board, margin=margin)
+    page = page_of(board)
     total = page if paper is None else _sheet(paper, page)
-    left, top = ((whole - part) / 2 + 1e3 * margin for whole, part in zip(total, page))
+    left, top = ((whole - part) / 2 + 1e3 * MARGIN for whole, part in zip(total, page))
     figure = Figure(figsize=(total[0] / 25.4, total[1] / 25.4), facecolor="white")
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(-left, total[0] - left), ylim=(total[1] - top, -top))
     axes.set_axis_off()
     board._draw(axes)
-    _draw_ruler(axes, str(board), width, height + 1e3 * margin + 2)
+    _draw_ruler(axes, str(board), width, height + 1e3 * MARGIN + 2)
     return figure
 
 

@@ -157,7 +157,7 @@ def intrinsics_of(fit: Solved, name: str) -> Intrinsics:
     if known is not None:
         index = [known.names.index(entry) for entry, is_free in zip(entries, free) if is_free]
         covariance = known.matrix[np.ix_(index, index)]
-    return Intrinsics(camera, covariance, free, fit.sigma[name], seen)
+    return Intrinsics(camera, covariance, free, fit.problem.sigma[name], seen)
 
 
 def in_own_frame(problem: BundleProblem, name: str) -> tuple[Camera, Float[np.ndarray, "m 3"]]:

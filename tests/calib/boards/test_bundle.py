@@ -154,7 +154,7 @@ def test_the_least_squares_are_scipys(small):
 
     def residuals(change):
         moved = fit.problem.stepped(change[:count], change[count:].reshape(-1, 6))
-        return np.concatenate([(r / fit.sigma[n]).ravel() for n, r in moved.residuals.items()])
+        return np.concatenate([(r / fit.problem.sigma[n]).ravel() for n, r in moved.residuals.items()])
 
     theirs = least_squares(residuals, np.zeros(count + 48), x_scale="jac", max_nfev=4)
     assert 2 * theirs.cost == pytest.approx(float((residuals(np.zeros(count + 48)) ** 2).sum()), rel=2e-3)
@@ -190,7 +190,7 @@ def test_outliers_have_no_influence(small):
         if kind == "focal":
             a, b = (f.problem.cameras[camera_name].K[int(index), int(index)] for f in (fit, clean))
             assert abs(float(a - b)) < 1.5 * deviations[i]
-    assert fit.sigma["mono"] == pytest.approx(0.1, rel=0.25)
+    assert fit.problem.sigma["mono"] == pytest.approx(0.1, rel=0.25)
 
 
 def test_an_unobservable_scale_has_no_covariance(small):

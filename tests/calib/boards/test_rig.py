@@ -191,7 +191,7 @@ def test_boards_that_move_between_the_exposures_do_not_distort_the_lenses(pair):
     for i in range(2):
         change = abs(float(result.rig["colour"].K[i, i] - alone.problem.cameras["colour"].K[i, i]))
         assert change < alone.deviations[f"colour.focal.{i}"]
-    assert len(set(result.fit.sigma.values())) == 1
+    assert len(set(result.fit.problem.sigma.values())) == 1
 
 
 def test_one_image_is_too_few(pair):
