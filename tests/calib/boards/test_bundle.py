@@ -70,25 +70,20 @@ def small():
 @pytest.mark.parametrize(
     ("lens", "model"),
     [
-        ((), ""),
+        ((), "none"),
         ((-0.3, 0.1, 0.001, -0.002, 0.02), "brown-conrady"),
         ((5.7, 1.6, 6e-5, -7e-5, -0.1, 6.0, 3.1, 0.0), "brown-conrady"),
         ((0.02, -0.01, 0.003, 0.0), "kannala-brandt"),
     ],
 )
 def test_derivatives_are_those_of_finite_differences(lens, model):
-    c = camera(
-        (520.0, 530.0), (480, 640), (0.1, -0.2, 0.3), (4.0, -9.0, 70.0), lens, model or "brown-conrady"
-    )
+    c = camera((520.0, 530.0), (480, 640), (0.1, -0.2, 0.3), (4.0, -9.0, 70.0), lens, model)
     X = np.random.default_rng(0).normal((0.0, 0.1, 2.0), (0.4, 0.3, 0.3), (40, 3))
     found = camera_jacobian(c, X)
-    for i, name in enumerate(parameter_names(c)):
-        step = torch.zeros(found.shape[-1], dtype=torch.float64)
-        step[i] = 1e-6
+    for i, step in enumerate(1e-6 * torch.eye(found.shape[-1], dtype=torch.float64)):
         ends = [changed(c, s * step).project(torch.from_numpy(X)).x.numpy() for s in (1, -1)]
-        assert np.abs((ends[0] - ends[1]) / 2e-6 - found[..., i]).max() < 1e-5 * (
-            1 + np.abs(found[..., i]).max()
-        ), name
+        expected = (ends[0] - ends[1]) / 2e-6
+        assert np.abs(expected - found[..., i]).max() < 1e-5 * (1 + np.abs(found[..., i]).max()), i
 
 
 def test_derivatives_of_boards(small):
@@ -184,12 +179,10 @@ def test_outliers_have_no_influence(small):
     x = problem.seen["mono"].x.copy()
     x[::40] += np.random.default_rng(1).uniform(20, 60, x[::40].shape)
     fit = adjust(replace(problem, seen={**problem.seen, "mono": problem.seen["mono"]._replace(x=x)}))
-    deviations = np.sqrt(clean.covariance.diagonal())
-    for i, name in enumerate(clean.names):
-        camera_name, kind, index = name.split(".")
-        if kind == "focal":
-            a, b = (f.problem.cameras[camera_name].K[int(index), int(index)] for f in (fit, clean))
-            assert abs(float(a - b)) < 1.5 * deviations[i]
+    for name, c in clean.problem.cameras.items():
+        change = (fit.problem.cameras[name].K - c.K).diagonal()[:2].abs().tolist()
+        assert change[0] < 1.5 * clean.deviations[f"{name}.focal.0"]
+        assert change[1] < 1.5 * clean.deviations[f"{name}.focal.1"]
     assert fit.problem.sigma["mono"] == pytest.approx(0.1, rel=0.25)
 
 
@@ -214,9 +207,7 @@ def test_fixed_numbers_stay_bit_identical(small):
     fit, started = adjust(started, rounds=1), started.cameras
     assert torch.equal(fit.problem.cameras["mono"].R, started["mono"].R)
     assert torch.equal(fit.problem.cameras["colour"].K.diagonal(), started["colour"].K.diagonal())
-    assert torch.equal(
-        fit.problem.cameras["colour"].distortion.coefficients, started["colour"].distortion.coefficients
-    )
+    assert fit.problem.cameras["colour"].distortion == started["colour"].distortion
 
 
 @pytest.mark.slow
