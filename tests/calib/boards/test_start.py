@@ -13,7 +13,6 @@ from calib.boards.bundle import CameraPrior, changed, intrinsic_values
 from calib.boards.poses import StartDeviations, start_prior
 from calib.boards.rig import calibrate
 from calib.boards.simulation import photograph
-from calib.boards.target import parse_board
 from calib.images.held_out import line_distances
 from calib.images.matches import match_cameras
 from experiments.alignment import nine_band_calibration
@@ -28,9 +27,8 @@ STATED = StartDeviations(position=1e-3, rotation=1.0, focal=0.02, centre=0.01)
 def four() -> Rig:
     """Cameras of one kind on a square of 80 mm, all parallel, at nominal values."""
     corners = [(x, y, 0.0) for y in (0.0, 0.08) for x in (0.0, 0.08)]
-    return Rig(
-        {f"c{i}": camera(1400.0, (480, 640), corner, offset=(0.0, 0.0)) for i, corner in enumerate(corners)}
-    )
+    cameras = [camera(1400.0, (480, 640), corner, offset=(0.0, 0.0)) for corner in corners]
+    return Rig({f"c{i}": c for i, c in enumerate(cameras)})
 
 
 def drawn(start: Rig, seed: int) -> Rig:
@@ -110,9 +108,7 @@ def photos(tmp_path):
     (tmp_path / "photos").mkdir()
     boards, rig = one_board(0), drawn(start, 3)
     for name, c in rig.cameras.items():
-        image = photograph(
-            c, c.cam_from_world @ Pose(boards.R[0], boards.t[0]), parse_board("charuco:9x7:60mm"), dpi=60
-        )
+        image = photograph(c, c.cam_from_world @ boards[0], BOARD, dpi=60)
         cv2.imwrite(str(tmp_path / "photos" / f"{name}.png"), image)
     return tmp_path
 
@@ -167,8 +163,6 @@ def test_the_nine_band_array(shared_data):
     off = [float((found.rig[b].centre - found.rig[a].centre).norm()) - GRID for a, b in neighbours()]
     assert np.abs(off).max() < 5e-4
     assert found.rms < 0.11
-    images = {
-        name: read_image(shared_data / "nine_band_array" / "scene" / f"{name}.png")
-        for name in ("Cam-3", "Cam-6")
-    }
+    folder = shared_data / "nine_band_array" / "scene"
+    images = {name: read_image(folder / f"{name}.png") for name in ("Cam-3", "Cam-6")}
     assert float(line_distances(found.rig, match_cameras(images)).abs().median()) < 0.25
