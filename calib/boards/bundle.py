@@ -22,7 +22,7 @@ from arraygeom import Camera, Pose, Rig, stack
 from arraygeom.distortion import lens_derivatives, pinhole_coefficients, term, typical_coefficients
 from arraygeom.lenses.central import MODELS, within_bounds
 from arraygeom.pixels import map_homogeneous
-from arraygeom.pose import cross_matrix, rotation_vector
+from arraygeom.pose import rotation_vector
 from arraygeom.rig import focal_positions
 
 from .board import Board, KnownPoints
@@ -256,14 +256,20 @@ def linearised(problem: BundleProblem) -> dict[str, Linearised]:
         x, by_camera = linear_projection(camera, problem.world(name))
         r = seen.x - x
         by_point = by_camera[..., 3:6] @ camera.R.numpy()
-        # a rotation exp(w) of the board and a translation, about the world's axes
-        turned = -cross_matrix(torch.from_numpy(problem.rotated(name))).numpy()
-        by_board = by_point @ np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], -1)
+        by_board = by_point @ _by_pose(problem, name)
         by_shared = np.concatenate([by_camera[..., free], by_point @ _by_deformation(problem, name)], -1)
         weight = np.sqrt(robust_weights(np.linalg.norm(r, axis=-1) / sigma)) / sigma
         wide = weight[:, None, None]
         found[name] = Linearised(weight[:, None] * r, wide * by_shared, wide * by_board, seen.block, columns)
     return found
+
+
+def _by_pose(problem: BundleProblem, name: str) -> Float[np.ndarray, "n 3 6"]:
+    """Derivatives of a camera's points in the world by their boards' poses, exp(w) R and the translation."""
+    x, y, z = problem.rotated(name).T
+    o, one = np.zeros_like(x), np.ones_like(x)
+    rows = [[o, z, -y, one, o, o], [-z, o, x, o, one, o], [y, -x, o, o, o, one]]
+    return np.moveaxis(np.array(rows), -1, 0)
 
 
 def _by_deformation(problem: BundleProblem, name: str) -> Float[np.ndarray, "n 3 s"]:
