@@ -134,9 +134,11 @@ def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
         raise ValueError(f"{name}: {len(videos)} videos among {len(files)} files: keep one video, or images")
     if videos:
         return dict(_video_frames(videos[0]))
-    tags = {_orientation(file): file.name for file in reversed(files)}
+    tags: dict[int, str] = {}
+    for file in files:
+        tags.setdefault(_orientation(file), file.name)
     if len(tags) > 1:  # they are applied: images stored alike would otherwise be rotated differently
-        listed = ", ".join(f"{tag} in {file}" for tag, file in reversed(tags.items()))
+        listed = ", ".join(f"{tag} in {file}" for tag, file in tags.items())
         raise ValueError(f"{name}: its images differ in orientation tags ({listed}): remove the tags")
     keys = frame_keys([f.stem for f in files])
     if len(set(keys)) < len(keys):
