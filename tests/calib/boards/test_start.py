@@ -13,8 +13,8 @@ from calib.boards.bundle import CameraPrior, changed, intrinsic_values
 from calib.boards.poses import StartDeviations, start_prior
 from calib.boards.rig import calibrate
 from calib.boards.simulation import photograph
-from calib.images.held_out import line_distances
 from calib.images.matches import match_cameras
+from calib.images.residuals import line_distances
 from experiments.alignment import nine_band_calibration
 from pat.cli.main import main
 from pat.media.images import read_image
