@@ -19,6 +19,7 @@ from arraygeom.distortion import Distortion
 from pat.cli.main import main
 from pat.farm.backends import LayeredSettings, rig_from_alpha
 from pat.farm.job import RenderConfig, Shard, check_space, publish, render, write_manifest
+from pat.sensors import seed_for
 from pat.support.jobs import JobError
 from pat.synthesis.rendered import Rendered
 
@@ -260,6 +261,10 @@ def test_shards_share_the_scenes_out():
     for text in ("0/3", "4/3", "1", "a/b", "1/0"):
         with pytest.raises(ValueError, match="is not i/n"):
             Shard.parse(text)
+
+
+def test_seeds_are_of_the_scene_and_the_attempt_alone():
+    assert len({seed_for(1, "scene", i, k) for i in range(20) for k in range(3)}) == 60
 
 
 def test_rigs_that_layers_cannot_show_are_refused():
