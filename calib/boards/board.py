@@ -176,16 +176,11 @@ class AprilGrid(MarkedBoard):
     tag: float
     border: int = 2
 
-    @property
-    def gap(self) -> float:
-        """The space between two tags, metres."""
-        return self.spacing / 2
-
     @cached_property
     def points(self) -> Float[np.ndarray, "n 3"]:
         """Positions of the tags' corners on the board, metres, row by row."""
         grid = unit_grid(self.columns, self.rows)
-        return (grid // 2) * (self.tag + self.gap) + (grid % 2) * self.tag
+        return (grid // 2) * (self.tag + self.offset) + (grid % 2) * self.tag
 
     @cached_property
     def corners(self) -> Int[np.ndarray, "m 4"]:
@@ -196,16 +191,16 @@ class AprilGrid(MarkedBoard):
 
     @property
     def offset(self) -> float:
-        """The gap, metres: there are small squares at the tags' corners."""
-        return self.gap
+        """The gap between two tags, metres, which small squares fill at their corners."""
+        return self.spacing / 2
 
     def __str__(self) -> str:
         tail = (":border1" if self.border == 1 else "") + self._from
         tags = f"{self.columns // 2}x{self.rows // 2}"
-        return f"aprilgrid:{tags}:{millimetres(self.tag)}:{self.gap / self.tag:.6g}{tail}"
+        return f"aprilgrid:{tags}:{millimetres(self.tag)}:{self.offset / self.tag:.6g}{tail}"
 
     def _draw(self, axes: Any) -> None:
-        tag, gap = 1e3 * self.tag, 1e3 * self.gap
+        tag, gap = 1e3 * self.tag, 1e3 * self.offset
         for number, corners in zip(self.markers, self.corners):
             left, top = 1e3 * self.points[corners[0], :2] + gap
             self._draw_marker(axes, number, left, top, tag, border=self.border, turns=2)

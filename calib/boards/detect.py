@@ -230,7 +230,7 @@ def _clear(board: Board) -> float:
         return (1 - board.marker / board.spacing) / 2
     if isinstance(board, AprilGrid):
         black = board.border * board.tag / (marker_dictionary(board.dictionary).markerSize + 2 * board.border)
-        return min(black, board.gap) / board.spacing
+        return min(black, board.offset) / board.spacing
     return 0.5
 
 
@@ -355,7 +355,6 @@ def collect_folder(
         images = dict(zip(moments, found))
         views[name] = board_views(name, moments, images)
         seen = [key for key, (_, boards) in images.items() if boards]
-        _check_board(name, moments, seen, board)
         notes += _missing(name, moments, seen, board)
     return CollectedViews(views, photos, tuple(notes))
 
@@ -389,29 +388,23 @@ def board_views(
     return BoardViews(next(iter(by_size)), {k: d for _, boards in images.values() for k, d in boards.items()})
 
 
-def _check_board(
+def _missing(
     name: str, moments: Mapping[FrameKey, Photo], seen: Collection[FrameKey], board: Board
-) -> None:
-    """Raises ValueError if no image shows the board, or if most of some show a larger one."""
+) -> Iterator[str]:
+    """A note on a camera's images without the board. Raises ValueError if all are, or show a larger one."""
+    why, missing = "", [photo for key, photo in moments.items() if key not in seen]
+    if missing:
+        labels = named([photo.label for photo in missing], NAMED)
+        why = f"images ({labels}): {explain(_greys(missing), board.members[0])}"
     if not seen:
-        why = explain(_greys(list(moments.values())), board.members[0])
-        labels = named([p.label for p in moments.values()], NAMED)
-        raise ValueError(f"{name}: the board {board} is in none of {len(moments)} images ({labels}): {why}")
+        raise ValueError(f"{name}: the board {board} is in none of {len(moments)} {why}")
     if other := other_size(_greys([moments[key] for key in seen]), board, larger=True):
         raise ValueError(
             f"{name}: the images show a chessboard with {other} inner corners and the board given is "
             f"{board}: count the corners between squares, not the squares"
         )
-
-
-def _missing(
-    name: str, moments: Mapping[FrameKey, Photo], seen: Collection[FrameKey], board: Board
-) -> list[str]:
-    missing = [photo for key, photo in moments.items() if key not in seen]
-    if not missing:
-        return []
-    labels, why = named([p.label for p in missing], NAMED), explain(_greys(missing), board.members[0])
-    return [f"{name}: no board in {len(missing)} of {len(moments)} images ({labels}): {why}"]
+    if missing:
+        yield f"{name}: no board in {len(missing)} of {len(moments)} {why}"
 
 
 def _greys(photos: list[Photo]) -> Iterable[Grey]:

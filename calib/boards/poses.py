@@ -114,21 +114,17 @@ def rig_near_start(
     The camera with most images keeps its orientation. Raises ValueError if the start has no such camera, or
     one of another size, or if a camera shares no moment with another.
     """
-    cameras = {name: _start_camera(name, start, v, lens[name]) for name, v in views.items()}
+    seen = []
     for name, v in views.items():
-        if len(views) > 1 and not any(
-            v.seen.keys() & other.seen.keys() for n, other in views.items() if n != name
-        ):
+        camera = _start_camera(name, start, v, lens[name])
+        others = [other.seen.keys() for n, other in views.items() if n != name]
+        if others and not any(v.seen.keys() & keys for keys in others):
             raise ValueError(f"{name}: shares no frame with another camera: check the images' numbers")
-    seen = [
-        CalibratedViews(
-            name, c, views[name], {key: board_pose(c, d, board) for key, d in views[name].seen.items()}
-        )
-        for name, c in cameras.items()
-    ]
+        board_poses = {key: board_pose(camera, d, board) for key, d in v.seen.items()}
+        seen.append(CalibratedViews(name, camera, v, board_poses))
     anchor = max(seen, key=lambda v: len(v.poses))
     poses = {v.name: _aligned(anchor, v, board) for v in seen}
-    priors = {name: start_prior(camera, deviations) for name, camera in cameras.items()}
+    priors = {v.name: start_prior(v.camera, deviations) for v in seen}
     return consistent_boards(seen, poses, board)._replace(priors=priors)
 
 

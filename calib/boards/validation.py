@@ -30,14 +30,7 @@ FEWEST_LEFT = 3
 """Frames that every camera must keep."""
 FAR_FROM_START = 4.0
 """Standard deviations from the start beyond which a camera is named."""
-COMPARED: tuple[Lens, ...] = (
-    "none",
-    "kannala-brandt",
-    "brown-conrady",
-    "rational",
-    "thin-prism",
-    "tilted",
-)
+COMPARED: tuple[Lens, ...] = ("none", "kannala-brandt", "brown-conrady", "rational", "thin-prism", "tilted")
 """Models that are compared, by number of coefficients."""
 LENS_FOLDS = 4
 FEWEST_TO_COMPARE = 8

@@ -74,9 +74,8 @@ def test_points_far_beyond_the_boards_are_less_certain(found):
 
 def test_halves_are_compared_only_where_boards_were_seen():
     """Boards in the middle of the image: nothing is said of its corners, where the lens is extrapolated."""
-    fit = calibrate(
-        see(Rig({"cam": TRUE}), board_poses(10, spread=0.05, depth=(1.6, 2.4)), noise=0.2), BOARD
-    ).fit
+    boards = board_poses(10, spread=0.05, depth=(1.6, 2.4))
+    fit = calibrate(see(Rig({"cam": TRUE}), boards, noise=0.2), BOARD).fit
     x, _ = half_difference(fit, 1.5)["cam"]
     seen = fit.problem.seen["cam"].x
     assert 20 < len(x) < 200
@@ -110,9 +109,8 @@ FISHEYES = {
 def test_fisheyes_of_each_model_are_found(lens):
     model, coefficients, focal = FISHEYES[lens]
     true = camera(focal, (480, 640), lens=coefficients, model=model)
-    found = calibrate(
-        see(Rig({"a": true}), board_poses(12, depth=(0.4, 0.9), spread=0.7), noise=0.05), BOARD, lens=lens
-    )
+    boards = board_poses(12, depth=(0.4, 0.9), spread=0.7)
+    found = calibrate(see(Rig({"a": true}), boards, noise=0.05), BOARD, lens=lens)
     assert found.rms == pytest.approx(0.05 * 2**0.5, rel=0.1)
     if lens == "double-sphere":  # whose xi and focal length stand for one another: it is fixed at 0
         assert [note for note in found.notes if "xi" in note]
@@ -200,11 +198,8 @@ def test_a_lens_that_sees_the_board_behind_it_gives_no_pose():
     ],
 )
 def test_the_lens_that_the_images_support_is_advised(lens, advised):
-    views = see(
-        Rig({"c": camera(420.0, (480, 640), lens=lens)}),
-        board_poses(12, seed=3, spread=0.7, depth=(0.6, 1.6)),
-        noise=0.05,
-    )
+    boards = board_poses(12, seed=3, spread=0.7, depth=(0.6, 1.6))
+    views = see(Rig({"c": camera(420.0, (480, 640), lens=lens)}), boards, noise=0.05)
     assert compare_lenses(views, BOARD)["c"].advised == advised
 
 

@@ -61,8 +61,7 @@ def shaken(problem, size, seed=0):
 @pytest.fixture(scope="module")
 def small():
     """Two cameras, eight boards, noise of 0.1 px; the ground truth."""
-    rig = four_cameras()
-    rig = Rig({name: rig[name] for name in ("mono", "colour")})
+    rig = Rig({name: four_cameras()[name] for name in ("mono", "colour")})
     boards = board_poses(8, spread=0.2)
     return rig, boards, scene_of(rig, boards, see(rig, boards, noise=0.1))
 

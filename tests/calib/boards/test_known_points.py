@@ -32,8 +32,7 @@ def written(folder, points, head="id,x,y,z"):
 
 
 def seen(board, count=1, noise=0.1):
-    cameras = four_cameras().cameras
-    rig = Rig({name: cameras[name] for name in ("mono", "colour")})
+    rig = Rig({name: four_cameras()[name] for name in ("mono", "colour")})
     turn, shift = (np.linspace(*ends, count)[:, None] * np.ones(3) for ends in ((-0.5, 0.5), (0.0, 0.2)))
     R = rotation_from_vector(torch.from_numpy(turn))
     return rig, see(rig, Pose(R, torch.from_numpy(shift + np.array([0, 0, 2.2]))), board, noise=noise)
