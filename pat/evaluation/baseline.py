@@ -25,7 +25,7 @@ from torch import Tensor
 from arraygeom import Camera, Pair, Rig
 
 from ..fusion.results import Frame
-from ..fusion.steps import Undistort
+from ..fusion.steps import undistort
 from ..fusion.views import Views
 from ..media.colour import from_luma_chroma, luminance, luminance_of, to_bytes
 from ..media.figures import reduced
@@ -80,7 +80,7 @@ def classical_view(
     for name, image in small.items():
         h, w = image.shape[-2:]
         rig = rig.resize(name, (h, w))
-    views, back = Undistort().do(Views.of(rig, small, alpha=alpha))
+    views, back = undistort(Views.of(rig, small, alpha=alpha))
     image = classical_baseline(views.rig, views.images, alpha)
     return back(Frame(image, *torch.zeros(3, *image.shape[-2:]))).image
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import cv2
@@ -36,7 +37,7 @@ from .corrections import corrections_for, expected_work
 from .fuse import Progress
 from .inputs import FrameInputs, Placement, prepared
 from .low_light import Noise, denoised_views
-from .steps import EqualResolution, FusionStep, Radiometry, Undistort, Upright, has_lens, undone
+from .steps import FusionStep, equal_resolution, has_lens, normalise_betas, undistort, undone, upright
 from .tiles import fused_in_tiles, plan_frame
 from .views import Views, check_bands
 
@@ -222,8 +223,8 @@ def align(
 
 def _steps(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:
     """Those of a fusion that change where pixels are, and the radiometry that matching sees."""
-    resize = [EqualResolution(network)] if network.equal_resolution else []
-    return [Undistort(), Upright(), *resize, *([Radiometry()] if normalise else [])]
+    resize = [partial(equal_resolution, network)] if network.equal_resolution else []
+    return [undistort, upright, *resize, *([normalise_betas] if normalise else [])]
 
 
 class _Located(NamedTuple):

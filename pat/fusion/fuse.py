@@ -99,7 +99,7 @@ def fuse(
     fuse` (`pat.fusion.from_images.array_from_images`, which also gives them), and depths are multiples of the
     baseline. Frames too large for the memory allowed are fused in tiles of alpha, each with the part of every
     beta that its segments touch, and a halo: equal to the whole to 1e-4. Distorted images are first resampled
-    to pinhole views (`pat.fusion.steps.Undistort`), rotated betas made upright, and betas resized to alpha's
+    to pinhole views (`pat.fusion.steps.undistort`), rotated betas made upright, and betas resized to alpha's
     angular resolution; the result is at alpha's own pixels all the same. Where alpha is known to measure the
     luminance of linear light and one beta the colours, the result is as bright in that sense
     (`pat.media.raw.as_bright`).
@@ -183,7 +183,11 @@ def fuse(
             frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
         del inputs, right  # the segments of a large frame: what follows needs memory, too
         frame = low_light.corrected(
-            found.undone(frame), done.found, steps, found.response, keep_alpha=settings.keep_alpha
+            found.undone(frame),
+            done.found,
+            steps_for(network, normalise=False),
+            found.response,
+            keep_alpha=settings.keep_alpha,
         )
         LOG.info("back to the pixels of %s", alpha)
         frame = undone(frame, undo)

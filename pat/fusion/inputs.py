@@ -78,7 +78,7 @@ def prepared(
     LOG.info("preparing %d images", len(views.images))
     undo: list[Undo] = []
     for step in steps:
-        views, back = step.do(views)
+        views, back = step(views)
         undo.insert(0, back)
     return frame_inputs(network, views), undo
 

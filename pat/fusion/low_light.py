@@ -29,7 +29,7 @@ from ..sensors import NoiseLevel
 from ..support.settings import physics, size, tuned
 from .averaging import averaged_with_alike
 from .results import Frame
-from .steps import FusionStep, Radiometry
+from .steps import FusionStep
 from .views import Views
 
 LOG = logging.getLogger(__name__)
@@ -120,7 +120,8 @@ class LowLight:
         """A frame fused from the denoised views, corrected by what all of them recorded.
 
         `found` is where its pixels are in each beta, x and y, and the confidence of that. `steps` were taken
-        before it was fused and are not undone yet; `response` says what brings betas to alpha's exposure.
+        before it was fused, but for radiometry: values keep their scale; they are not undone yet. `response`
+        says what brings betas to alpha's exposure.
         With `keep_alpha`, or if alpha has no noise, the luma is alpha's as recorded. Betas that are not all
         RGB are denoised one by one alone.
         """
@@ -138,10 +139,7 @@ class LowLight:
         return frame._replace(image=image if given is None else image + given - own.denoised[0])
 
     def prepared(self, steps: Sequence[FusionStep]) -> dict[str, NoisyView]:
-        """Every view as recorded, denoised, and its deviation, after the steps before it is fused.
-
-        Except for `Radiometry`: values keep their scale.
-        """
+        """Every view as recorded, denoised, and its deviation, after the steps before it is fused."""
         recorded = {name: image[None] for name, image in self.views.images.items()}
         views = {
             name: self.noisy.get(name) or NoisyView(image, image, torch.zeros_like(image))
@@ -153,7 +151,7 @@ class LowLight:
     def _stepped(self, images: Mapping[str, Tensor], steps: Sequence[FusionStep]) -> Mapping[str, Tensor]:
         views = self.views.replace(images)
         for step in steps:
-            views = views if isinstance(step, Radiometry) else step.do(views).views
+            views = step(views).views
         return views.images
 
 

@@ -75,7 +75,7 @@ def measure(scale: float) -> dict[str, str]:
     images = {"narrow": image(1, hw, 0), "wide": image(3, array["wide"].hw, 1)}
     views = Views.of(array, images, alpha="narrow")
     for step in steps_for(network, normalise=False):
-        views = step.do(views).views
+        views = step(views).views
     frame = frame_inputs(network, views)
     small = rig(0.1)
     fuse(network, small, {n: image(i.shape[0], small[n].hw, 2) for n, i in images.items()}, alpha="narrow")
