@@ -135,7 +135,6 @@ class Fuse(Known):
         rig = self._rig()
         alpha, found = files_by_camera(rig, self.alpha, self.given, self.image)
         found = self._frames(found)
-        self._choose_bits(found)
         views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=alpha)
         if self.sequence:
             return self._many(rig, found, alpha)
@@ -189,7 +188,6 @@ class Fuse(Known):
 
         self.sequence |= bool(rates)
         files = self._frames(files)
-        self._choose_bits(files)
         first = {name: paths[0] for name, paths in files.items()}
         focal = options.numbers_by_name(self.focal, "--focal")
         options.say_when_compiling()
@@ -210,29 +208,26 @@ class Fuse(Known):
         rig.save(self.out / FOUND_RIG)
         say(f"the rig that was found: {self.out / FOUND_RIG}")
 
-    def _choose_bits(self, files: Mapping[str, Sequence[Path]]) -> None:
-        """As many bits as the images have, unless asked otherwise."""
-        from ..media.images import has_many_bits
-
-        if self.bits is None:
-            deep = any(has_many_bits(paths[0]) for paths in files.values())
-            self.bits = 32 if self.kind == "exr" else 16 if deep else 8
-
     def _frames(self, files: dict[str, list[Path]]) -> dict[str, list[Path]]:
-        """The files of the frames that every camera has; all of them, of a sequence."""
+        """The files of the frames that every camera has; all of them, of a sequence. The result has as many
+        bits as these images, unless asked otherwise."""
         from ..fusion.frame_matching import matched_frames, warn_of_gaps
+        from ..media.images import has_many_bits
 
         if self.sequence:
             warn_of_gaps(files)
-            return files
-        return matched_frames(files)
+        else:
+            files = matched_frames(files)
+        if self.bits is None:
+            deep = any(has_many_bits(paths[0]) for paths in files.values())
+            self.bits = 32 if self.kind == "exr" else 16 if deep else 8
+        return files
 
     def _rig(self) -> Rig:
         rig = options.load_rig_or_say_no_image(self.given[0], self.depth)
-        for name, rate in options.numbers_by_name(self.frame_rate, "--frame-rate").items():
-            rig = with_sensor(rig, name, frame_rate=rate)
-        for name, offset in options.numbers_by_name(self.time_offset, "--time-offset").items():
-            rig = with_sensor(rig, name, time_offset=offset)
+        for entry, given in {"frame_rate": self.frame_rate, "time_offset": self.time_offset}.items():
+            for name, value in options.numbers_by_name(given, f"--{entry.replace('_', '-')}").items():
+                rig = with_sensor(rig, name, **{entry: value})
         return rig
 
     def _one(
@@ -248,9 +243,9 @@ class Fuse(Known):
         """Fuse one frame. `found` is what was found out about the rig, if it was found from the images;
         `healing` gives the rig healed by them, with which a frame is fused again."""
         from arraygeom import Camera
-        from arraygeom.atomic import sweep
+        from arraygeom.atomic import sweep, write_text
 
-        from ..fusion.report import write_report
+        from ..fusion.report import report_page
         from ..fusion.results import band_names, describe_bands, save_frame, view_of
         from ..support.locks import folder_lock
 
@@ -290,7 +285,8 @@ class Fuse(Known):
                 facts = self._facts(rig, found, time.monotonic() - begin)
                 if self.classical:
                     facts = facts._replace(classical=self._classical(rig, images, alpha, gain))
-                written.append(write_report(self.out / "index.html", frame, images, rig, alpha, facts))
+                write_text(self.out / "index.html", report_page(frame, images, rig, alpha, facts))
+                written.append(self.out / "index.html")
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
         if self.report:
             say(f"to see the result, open {self.out / 'index.html'} in a browser")
@@ -470,7 +466,7 @@ def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> t
                 f"{given[0]}: {options.NO_IMAGE}; if it is a rig, give --image NAME=FILE for each camera"
             )
         options.files_by_name(named)
-        options.refuse_missing_rig(given[0])
+        options.refuse_missing(given[0], rig=True)
         return named, True
     if image:
         files = " ".join(text.partition("=")[2] or text for text in image)
@@ -481,7 +477,7 @@ def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> t
             "or a rig, --alpha and each --image"
         )
     for path in given:
-        options.refuse_missing_image(path)
+        options.refuse_missing(path, rig=False)
     return (), False
 
 
@@ -498,7 +494,11 @@ def files_by_camera(
     if unknown := [path for path in given[1:] if path.stem not in rig.names]:
         raise ValueError(f"{unknown[0]}: no camera of the rig has its name: give --image NAME={unknown[0]}")
     found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
-    refuse_equal_files({name: paths[0] for name, paths in found.items()})
+    for (a, (first, *_)), (b, (second, *_)) in combinations(found.items(), 2):
+        if first.is_file() and second.is_file() and filecmp.cmp(first, second, shallow=False):
+            raise ValueError(
+                f"the images of '{a}' and '{b}' are the same image, {second}: give each camera its own"
+            )
     return rig.require(alpha), found
 
 
@@ -506,12 +506,3 @@ def is_rig_file(path: Path) -> bool:
     """Whether a file is meant as a rig: neither folder nor pattern, nor named as images and videos are."""
     suffixes = options.IMAGE_SUFFIXES | options.VIDEO_SUFFIXES
     return not (any(c in path.name for c in "*?[") or path.suffix.lower() in suffixes or path.is_dir())
-
-
-def refuse_equal_files(files: Mapping[str, Path]) -> None:
-    """Raise ValueError if two cameras are given one file, or a copy of it."""
-    for (a, first), (b, second) in combinations(files.items(), 2):
-        if first.is_file() and second.is_file() and filecmp.cmp(first, second, shallow=False):
-            raise ValueError(
-                f"the images of '{a}' and '{b}' are the same image, {second}: give each camera its own"
-            )

@@ -67,11 +67,11 @@ def noise_of(texts: Iterable[str], *, by_default: bool = False) -> Any:
         return "auto" if by_default else None
     if entries in (["estimate"], ["none"]):
         return None if entries == ["none"] else "estimate"
-    levels = []
     if {"estimate", "none"} & {*entries}:
         raise ValueError(
             f"--noise: got {', '.join(entries)}: give estimate or none alone, or NAME=ELECTRONS of each"
         )
+    levels = []
     for entry in entries:
         name, _, numbers = entry.partition("=")
         try:
@@ -196,7 +196,7 @@ def field_named(name: str) -> ReceptiveField | None:
 
 def load_rig(path: Path, depth: tuple[float, float] | None = None) -> Rig:
     """The rig of a file, with other depth bounds if given."""
-    refuse_missing_rig(path)
+    refuse_missing(path, rig=True)
     from arraygeom import Rig
 
     rig = Rig.load(path)
@@ -218,23 +218,17 @@ def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> R
         ) from None
 
 
-def refuse_missing_rig(path: Path) -> None:
-    """Raise FileNotFoundError for a rig file that does not exist, before torch is imported to read it."""
-    if not path.exists():
-        _, _, file = str(path).partition("=")
-        named = file and Path(file).exists()
-        advice = "if it is an image, write --image before each NAME=FILE" if named else "check the path"
-        raise FileNotFoundError(f"{path}: no such rig file: {advice}")
-
-
-def refuse_missing_image(path: Path) -> None:
-    """Raise FileNotFoundError for an image, folder or video that does not exist, before torch is imported."""
-    if path.exists() or any(c in path.name for c in "*?["):
+def refuse_missing(path: Path, *, rig: bool) -> None:
+    """Raise FileNotFoundError for a rig file, or an image, folder or video, that does not exist, before torch
+    is imported to read it."""
+    if path.exists() or (not rig and any(c in path.name for c in "*?[")):
         return
     _, _, file = str(path).partition("=")
-    named = file and Path(file).exists()
-    advice = f"give {file} alone, cameras are called as their files are" if named else "check the path"
-    raise FileNotFoundError(f"{path}: no such image: {advice}")
+    advice = "check the path"
+    if file and Path(file).exists():
+        alone = f"give {file} alone, cameras are called as their files are"
+        advice = "if it is an image, write --image before each NAME=FILE" if rig else alone
+    raise FileNotFoundError(f"{path}: no such {'rig file' if rig else 'image'}: {advice}")
 
 
 def files_by_name(texts: Iterable[str], option: str = "--image") -> dict[str, Path]:
@@ -264,19 +258,23 @@ def read_images(rig: Rig, texts: Iterable[str], *, sized: bool = True) -> dict[s
 def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
     """Images of `--image NAME=FILE`: the first of every camera make a frame, the second ones the next.
 
-    Raises ValueError for cameras with unequal numbers of images.
+    Raises ValueError as `by_frame`.
     """
     from ..media.images import read_image
 
     files: dict[str, list[Path]] = {}
     for name, path in (_named_file("--image", text) for text in texts):
         files.setdefault(rig.require(name), []).append(path)
+    return [{n: read_image(path, name=n) for n, path in frame.items()} for frame in by_frame(files)]
+
+
+def by_frame(files: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]]:
+    """The first file of each camera, the second of each, and so on. Raises ValueError for unequal numbers."""
     counts = {name: len(paths) for name, paths in files.items()}
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"'{name}' {count}" for name, count in counts.items())
-        raise ValueError(f"--image: every camera needs an image of every frame; given are {listed}")
-    frames = zip(*files.values())
-    return [{n: read_image(path, name=n) for n, path in zip(files, frame)} for frame in frames]
+        raise ValueError(f"every camera needs an image of every frame; there are {listed}")
+    return [dict(zip(files, paths)) for paths in zip(*files.values())]
 
 
 def _named_file(option: str, text: str) -> tuple[str, Path]:
