@@ -86,8 +86,8 @@ def backward(
     )
     points_out = query.new_zeros((b, *positions.points.shape[1:]) if wanted[3] else 0, dtype=counted)
     bias_out = query.new_zeros((b, ha, wa, positions.samples) if wanted[4] else 0, dtype=counted)
-    outputs = (_flat(t) for t in (query_out, points_out, bias_out))
-    gradients = kernels.Gradients(*outputs, wanted[0], wanted[3], wanted[4])
+    by_query, by_points, by_bias = (_flat(t) for t in (query_out, points_out, bias_out))
+    gradients = kernels.Gradients(by_query, by_points, by_bias, wanted[0], wanted[3], wanted[4])
     taps = _tap_list(b * ha * wa, call)
     step = len(taps.tap_count)
     for first in range(0, b * ha * wa, step):

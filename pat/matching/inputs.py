@@ -179,4 +179,4 @@ def _ends_in(field: FieldOnGrid, box: Box, step: int) -> Float[Tensor, "n 2"]:
         y, x = torch.meshgrid(rows, columns, indexing="ij")
         return ends_of(field.at(torch.stack([x, y], -1).reshape(-1, 2).float()))
     some = (slice(None), rows[:, None], columns)
-    return ends_of(Segments(field.pixels.start[some], field.pixels.end[some], field.pixels.valid[some]))
+    return ends_of(field.pixels[some])

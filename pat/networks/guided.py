@@ -155,12 +155,6 @@ class GuidedPAT(nn.Module):
         most = max(betas, default=0)
         return max(350.0 * alpha, 145.0 * alpha + 100.0 * most) + 130.0 * alpha * max(len(betas) - 1, 0)
 
-    def _in_parts(self, inputs: Inputs) -> bool:
-        """Whether each beta has some bands, in order; else those with all of them show the same colours."""
-        return (
-            all(beta.image.shape[1] != self.config.bands for beta in inputs.betas) or len(inputs.betas) == 1
-        )
-
     def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
         """Fuse alpha (B, 1, H, W) with the betas. The image has the betas' bands.
 
@@ -170,17 +164,14 @@ class GuidedPAT(nn.Module):
 
     def explain(self, inputs: Inputs, matches: Matches) -> tuple[FusionOutput, list[BetaEstimate]]:
         """The same, with the estimate of each beta, which training supervises."""
-        parts = self._in_parts(inputs)
-        bands = sum(beta.image.shape[1] for beta in inputs.betas)
-        if parts and bands != self.config.bands:
-            raise ValueError(f"the betas have {bands} bands in all, this network makes {self.config.bands}")
+        wanted, bands = self.config.bands, [beta.image.shape[1] for beta in inputs.betas]
+        # Each beta has some bands, in order; else those with all of them show the same colours.
+        parts = len(bands) == 1 or wanted not in bands
+        if parts and sum(bands) != wanted:
+            raise ValueError(f"the betas have {sum(bands)} bands in all, this network makes {wanted}")
         alpha, own = inputs.alpha, self.encoder(inputs.alpha)
         estimates = [self.estimate(own, alpha, *one) for one in zip(inputs.betas, matches.betas)]
-        used = (
-            estimates
-            if parts
-            else [combined([e for e in estimates if e.colour.shape[1] == self.config.bands])]
-        )
+        used = estimates if parts else [combined([e for e, n in zip(estimates, bands) if n == wanted])]
         residual = self.blended(own, alpha, used)
         if self.config.keep_luminance:
             residual = residual - inputs.luminance * luminance(residual)
@@ -213,7 +204,7 @@ class GuidedPAT(nn.Module):
         """The estimate of one beta of any bands."""
         of, exactly = found.comparison.combined, alpha.dtype if self.training else torch.float64
         bands, diffused = found.colours
-        segments = _in_type(beta.field.straight, exactly)
+        segments = beta.field.straight.to(exactly)
         extent = Extent.of(segments)
         position = matches(segments, found.disparity, beyond_edge=True, extent=extent).movedim(-1, 1)
         window = window_around(found.disparity, segments, self.config.window, extent)
@@ -341,11 +332,6 @@ def window_around(
     extent = extent or Extent.of(segments)
     middle, step = matches(segments, disparity, extent=extent), window * extent.towards
     return Segments(middle + step, middle - step, segments.valid.expand(middle.shape[:-1]))
-
-
-def _in_type(segments: Segments, kind: torch.dtype) -> Segments:
-    """Segments as numbers of another type."""
-    return Segments(segments.start.to(kind), segments.end.to(kind), segments.valid)
 
 
 class Encoder(nn.Module):
