@@ -57,13 +57,13 @@ class Views:
         names = [name for name in rig.betas(alpha) if name in images]
         if not names:
             raise ValueError(
-                f"no image of any other camera than alpha, '{alpha}': fusion needs at least one beta"
+                f"no image of another camera than alpha, '{alpha}': fusion needs at least one beta"
             )
         checked = {name: _checked(rig, images, name) for name in (alpha, *names)}
         fields = field if isinstance(field, Mapping) else dict.fromkeys(names, field)
         rig = rig if depth is None else rig.replace(depth=depth)
-        own = grey_alpha(alpha, checked[alpha])
-        return cls(rig, {**checked, alpha: own}, alpha, fields, is_in_colour(checked[alpha]))
+        images = {**checked, alpha: grey_alpha(alpha, checked[alpha])}
+        return cls(rig, images, alpha, fields, is_in_colour(checked[alpha]))
 
     @property
     def own(self) -> Float[Tensor, "1 h w"]:
