@@ -10,7 +10,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -24,7 +24,6 @@ from arraygeom.chunks import chunked
 from arraygeom.sampling import Interpolation, on_image
 from arraygeom.undistortion import pixels_between, recorded_pixels, resampled, with_pixels
 
-from ..matching.inputs import Beta
 from ..matching.match import Matcher, match
 from ..matching.matches import BetaMatches
 from ..matching.radiometry import Given
@@ -227,48 +226,31 @@ def _steps(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:
     return [undistort, upright, *resize, *([normalise_betas] if normalise else [])]
 
 
-class _Located(NamedTuple):
-    """Positions of alpha's recorded pixels (H, W, 2) in a beta as prepared, and which are on it."""
-
-    where: Float[Tensor, "h w 2"]
-    inside: Bool[Tensor, "h w"]
-
-
-def _located(inputs: FrameInputs, i: int, found: BetaMatches, recorded: View) -> _Located:
-    """Where alpha's pixels are in the i-th beta, by its matches."""
+def _located(
+    inputs: FrameInputs, i: int, found: BetaMatches, recorded: View
+) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
+    """Where alpha's recorded pixels are in the i-th beta as prepared, by its matches; which are on it."""
     h, w = inputs.hw
     beta = inputs.inputs.betas[i]
     hw = (beta.image.shape[-2], beta.image.shape[-1])
     if not has_lens(recorded):
         where, inside = found.positions(beta.field.straight, hw)
-        return _Located(where[0, :h, :w], inside[0, :h, :w])
+        return where[0, :h, :w], inside[0, :h, :w]
     pinhole = inputs.placements[i].pair.alpha
     assert isinstance(pinhole, LensView)
     assert isinstance(recorded, LensView)
     x, seen = pixels_between(pinhole, recorded)
     disparity = _between_pixels(found.disparity[0, :, :h, :w], x)
-    where, inside = chunked(
-        lambda x, disparity: _at_points(beta, found, x, disparity, hw), x, disparity, axis=0
-    )
-    return _Located(where, inside & seen)
 
+    def at_points(x: Float[Tensor, "h w 2"], disparity: Float[Tensor, "h w"]) -> tuple[Tensor, Tensor]:
+        segments, rows = beta.field.at(x.reshape(-1, 2)), (1, *x.shape[:2])
+        assert isinstance(segments, Segments)
+        parts = (part.unflatten(0, rows) for part in (segments.start, segments.end, segments.valid))
+        where, inside = replace(found, disparity=disparity[None, None]).positions(Segments(*parts), hw)
+        return where[0], inside[0]
 
-def _at_points(
-    beta: Beta,
-    found: BetaMatches,
-    x: Float[Tensor, "h w 2"],
-    disparity: Float[Tensor, "h w"],
-    hw: tuple[int, int],
-) -> tuple[Tensor, Tensor]:
-    """Positions in beta of some points between alpha's pixels, by their disparities."""
-    segments = beta.field.at(x.reshape(-1, 2))
-    assert isinstance(segments, Segments)
-    h, w = x.shape[:2]
-    parts = (
-        part.reshape(1, h, w, *part.shape[1:]) for part in (segments.start, segments.end, segments.valid)
-    )
-    where, inside = replace(found, disparity=disparity[None, None]).positions(Segments(*parts), hw)
-    return where[0], inside[0]
+    where, inside = chunked(at_points, x, disparity, axis=0)
+    return where, inside & seen
 
 
 def _between_pixels(disparity: Float[Tensor, "1 h w"], x: Float[Tensor, "h2 w2 2"]) -> Float[Tensor, "h2 w2"]:
@@ -295,7 +277,7 @@ def _aligned_view(
     camera: LensView,
     name: str,
     place: Placement,
-    located: _Located,
+    located: tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]],
     confidence: Float[Tensor, "h w"],
     seen: Bool[Tensor, "h w"],
     values: Any,
@@ -304,9 +286,9 @@ def _aligned_view(
 ) -> AlignedView:
     values, now = _as_array(values, name, camera.hw), place.pair.beta
     assert isinstance(now, LensView)
-    where, valid = chunked(lambda x: recorded_pixels(x, now, camera), located.where.double(), axis=0)
+    where, valid = chunked(lambda x: recorded_pixels(x, now, camera), located[0].double(), axis=0)
     where = where.float()
-    inside = located.inside & valid & on_image(where, camera.hw)
+    inside = located[1] & valid & on_image(where, camera.hw)
     visibility = torch.where(inside, torch.where(seen, SEEN, OCCLUDED), OUTSIDE).to(torch.uint8).numpy()
     taken = filled(resampled_values(values, where.numpy(), interpolation), visibility == SEEN, fill)
     return AlignedView(
@@ -363,16 +345,13 @@ def resampled_values(
         taken = chunked(
             lambda x: sample(image, x[None].double(), interpolation=kind).values[0, 0], where, axis=0
         )
-        return _in_type(taken.numpy(), values.dtype)
+        found = taken.numpy()
+        if np.issubdtype(values.dtype, np.integer):
+            limits = np.iinfo(values.dtype)
+            found = np.clip(np.rint(found), limits.min, limits.max)
+        return found.astype(values.dtype)
 
     return np.stack([band(plane) for plane in values])
-
-
-def _in_type(values: NDArray[np.float64], dtype: Any) -> NDArray[Any]:
-    if np.issubdtype(dtype, np.integer):
-        limits = np.iinfo(dtype)
-        values = np.clip(np.rint(values), limits.min, limits.max)
-    return values.astype(dtype)
 
 
 def filled(values: NDArray[Any], valid: NDArray[np.bool_], fill: Fill) -> NDArray[Any]:
