@@ -57,7 +57,7 @@ class Views:
         names = [name for name in rig.betas(alpha) if name in images]
         if not names:
             raise ValueError(
-                f"no image of another camera than alpha, '{alpha}': fusion needs at least one beta"
+                f"no image of any other camera than alpha, '{alpha}': fusion needs at least one beta"
             )
         checked = {name: _checked(rig, images, name) for name in (alpha, *names)}
         fields = field if isinstance(field, Mapping) else dict.fromkeys(names, field)
