@@ -233,13 +233,8 @@ def _sweep(way, shape, planes, guide, reach, pad, small, large, paths, fewest, j
             dx, dy = ((1 - k) * step, -step) if k < 3 else (-step, 0)
             if row > 0 or k == 3:
                 left, right = max(-dx, 0), width - max(dx, 0)
-                _jumps(
-                    guide[y, left:right],
-                    guide[y + dy, left + dx : right + dx],
-                    small,
-                    large,
-                    jumps[k, left:right],
-                )
+                there = guide[y + dy, left + dx : right + dx]
+                _jumps(guide[y, left:right], there, small, large, jumps[k, left:right])
         from_above, from_behind = width + 2 * height + 1 - row, 2 * (width + 2 * height + 1 - row)
         for i in range(width):
             x = i if way == 0 else width - 1 - i
@@ -263,18 +258,10 @@ def _advance(known, p, q, before, now, jump, is_first):
     base, leap, lowest = _repeat(fewest[before]), _repeat(np.int16(fewest[before] + jump)), _repeat(WALL)
     stride = lanes + pad
     start, end = pad + before * runs * stride, pad + now * runs * stride
+    ours, theirs = from_index(first, runs * p), from_index(first, runs * q)
     for lane in range(0, runs * lanes, LANES):
         at = p * runs * lanes + lane
-        stay = _reached(
-            paths,
-            start + lane,
-            from_index(first, runs * p),
-            from_index(first, runs * q),
-            reach,
-            stride,
-            runs,
-            penalty,
-        )
+        stay = _reached(paths, start + lane, ours, theirs, reach, stride, runs, penalty)
         path = _add(_costs_at(cost, at), _subtract(_less(stay, leap), base))
         _keep(paths, end + lane, stride, runs, penalty, path)
         lowest = _less(lowest, path)
@@ -352,10 +339,8 @@ def winners(
                 sums, start, at = total[here][run], starts[run], places[run * lanes :]
                 within = _count_within(far, start, count)
                 for k in range(within):
-                    claim, place = (
-                        np.int32(sums[k]) << 16 | np.int32(start + k),
-                        at[k] if at[k] >= 0 else nowhere,
-                    )
+                    claim = np.int32(sums[k]) << 16 | np.int32(start + k)
+                    place = at[k] if at[k] >= 0 else nowhere
                     claims[place] = min(claims[place], claim)
                     best = min(best, claim)
                 # The very first label is taken if there is no other.
