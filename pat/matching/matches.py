@@ -69,8 +69,9 @@ class BetaMatches:
         half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
         whole = (..., slice(top, bottom), slice(left, right))
         names = {"disparity": whole, "bands": whole, "diffused": whole, "facts": half, "certainty": half}
-        parts: dict[str, Any] = {name: getattr(self, name) for name in names}
-        return replace(self, **{n: part if part is None else part[names[n]] for n, part in parts.items()})
+        parts = {name: getattr(self, name) for name in names}
+        cut: dict[str, Any] = {n: part if part is None else part[names[n]] for n, part in parts.items()}
+        return replace(self, **cut)
 
     def stored(self) -> BetaMatches:
         """The same with colours as float16; differences from alpha are rounded by 1e-4 at most."""
