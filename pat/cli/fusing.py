@@ -166,15 +166,11 @@ class Fuse(Known):
         levels = noise if isinstance(noise, dict) else {}
         for option, by_camera in {"--focal": focal, "--noise": levels}.items():
             if unknown := by_camera.keys() - cameras.keys():
-                raise ValueError(
-                    f"{option}: no camera '{min(unknown)}'; the images' names are {', '.join(cameras)}"
-                )
+                known = ", ".join(cameras)
+                raise ValueError(f"{option}: no camera '{min(unknown)}'; the images' names are {known}")
         videos = [path for path in cameras.values() if path.suffix.lower() in options.VIDEO_SUFFIXES]
-        if videos and len(videos) < len(cameras):
-            others = [path for path in cameras.values() if path not in videos]
-            raise ValueError(
-                f"{videos[0]} is a video and {others[0]} is not: give images alone, or videos alone"
-            )
+        if videos and (others := [path for path in cameras.values() if path not in videos]):
+            raise ValueError(f"{videos[0]} is a video and {others[0]} is not: give images alone, or videos")
         if not videos:
             return self._without_rig_from({name: find_images(path) for name, path in cameras.items()}, {})
         with TemporaryDirectory() as folder:
@@ -250,9 +246,7 @@ class Fuse(Known):
         from ..support.locks import folder_lock
 
         if self.points and not isinstance(rig[alpha], Camera):
-            raise ValueError(
-                "--points needs a calibrated alpha, and the rig has only F for it: leave out --points"
-            )
+            raise ValueError("--points needs a calibrated alpha, and the rig has only F for it: leave it out")
         begin, store = time.monotonic(), self.out / ".tiles"
         with folder_lock(self.out):
             sweep(self.out)
@@ -365,10 +359,10 @@ class Fuse(Known):
 
         gain = exposure_gain(frame.image) if self.exposure == "auto" else 1.0
         if gain != 1:
-            what = "dark" if gain > 1 else "overexposed"
-            self._note(
-                f"exposure: light times {gain:.2f}, as the image is {what} (--exposure keep leaves it)"
+            what = (
+                "dark (--exposure keep leaves it)" if gain > 1 else "overexposed (--exposure keep leaves it)"
             )
+            self._note(f"exposure: light times {gain:.2f}, as the image is {what}")
         return frame._replace(image=exposed(frame.image, gain)), gain
 
     def _many(self, rig: Rig, files: dict[str, list[Path]], alpha: str) -> None:
@@ -376,11 +370,8 @@ class Fuse(Known):
         from ..support.jobs import Workers, cores
 
         self.refuse_several()
-        single = {
-            "--points": self.points,
-            "--classical": self.classical,
-            "--device cuda": self.device == "cuda",
-        }
+        single = {"--points": self.points, "--classical": self.classical}
+        single["--device cuda"] = self.device == "cuda"
         if named := [option for option, given in single.items() if given]:
             raise ValueError(f"{', '.join(named)}: for a single frame only: leave out for several")
         batch = Batch(
@@ -406,8 +397,8 @@ class Fuse(Known):
             video=self.video if self.sequence and self.video and self.bits != 32 else None,
             console=options.console(),
         )
-        video = self.out / "fused.mp4"
-        say(f"{self.out}: {report}" + f", and {video.name}" * (self.sequence and video.is_file()))
+        video = ", and fused.mp4" * (self.sequence and (self.out / "fused.mp4").is_file())
+        say(f"{self.out}: {report}{video}")
         if report.failed:
             sys.exit(1)
 

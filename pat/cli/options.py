@@ -80,10 +80,8 @@ def noise_of(texts: Iterable[str], *, by_default: bool = False) -> Any:
             raise ValueError(
                 f"--noise: '{entry}' is neither estimate nor none nor NAME=ELECTRONS[,READ], as mono=200,2"
             ) from None
-        if len(read) > 1:
-            raise ValueError(
-                f"--noise: '{entry}' has {len(read) + 1} numbers; wanted electrons at white and read noise"
-            )
+        if (more := len(read) + 1) > 2:
+            raise ValueError(f"--noise: '{entry}' has {more} numbers; wanted electrons at white, read noise")
         levels.append((name, NoiseLevel.of_electrons(electrons, sum(read))))
     return dict(_once("--noise", levels))
 
@@ -178,9 +176,7 @@ def device_of(name: str) -> str:
     if torch.cuda.is_available():
         return "cuda"
     if name == "cuda":
-        raise ValueError(
-            "--device cuda: no CUDA device is available: leave it out, or install torch for CUDA"
-        )
+        raise ValueError("--device cuda: no CUDA device is available: leave it out, or get torch for CUDA")
     return "cpu"
 
 
@@ -250,9 +246,7 @@ def read_images(rig: Rig, texts: Iterable[str], *, sized: bool = True) -> dict[s
     from ..media.images import read_image
 
     files = {rig.require(name): path for name, path in files_by_name(texts).items()}
-    return {
-        name: read_image(path, name=name, hw=rig[name].hw if sized else None) for name, path in files.items()
-    }
+    return {n: read_image(path, name=n, hw=rig[n].hw if sized else None) for n, path in files.items()}
 
 
 def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
@@ -279,14 +273,14 @@ def by_frame(files: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]]:
 
 def _named_file(option: str, text: str) -> tuple[str, Path]:
     name, _, path = text.partition("=")
-    if not (name and path):
-        file = path or text
-        if not Path(file).suffix:
-            raise ValueError(f"{option}: '{text}' is not NAME=FILE")
-        raise ValueError(
-            f"{option} {text}: which camera is it of? Give NAME=FILE, such as {Path(file).stem}={file}"
-        )
-    return name, Path(path)
+    if name and path:
+        return name, Path(path)
+    file = path or text
+    if not Path(file).suffix:
+        raise ValueError(f"{option}: '{text}' is not NAME=FILE")
+    raise ValueError(
+        f"{option} {text}: which camera is it of? Give NAME=FILE, such as {Path(file).stem}={file}"
+    )
 
 
 def _named_number(option: str, text: str) -> tuple[str, float]:
@@ -353,12 +347,8 @@ def working(title: str) -> Iterator[Callable[[str], None]]:
 
     from ..support.steps import steps_shown
 
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[step]}"),
-    )
+    title_column, step_column = TextColumn("{task.description}"), TextColumn("{task.fields[step]}")
+    columns = SpinnerColumn(), title_column, TimeElapsedColumn(), step_column
     terminal, printed = console().is_terminal, time.monotonic()
     with Progress(*columns, console=console(), transient=True, disable=not terminal) as bar:
         task = bar.add_task(title, total=None, step="")
