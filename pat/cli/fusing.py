@@ -359,10 +359,8 @@ class Fuse(Known):
 
         gain = exposure_gain(frame.image) if self.exposure == "auto" else 1.0
         if gain != 1:
-            what = (
-                "dark (--exposure keep leaves it)" if gain > 1 else "overexposed (--exposure keep leaves it)"
-            )
-            self._note(f"exposure: light times {gain:.2f}, as the image is {what}")
+            what = "dark" if gain > 1 else "overexposed"
+            self._note(f"exposure: light times {gain:.2f}: the image is {what} (--exposure keep leaves it)")
         return frame._replace(image=exposed(frame.image, gain)), gain
 
     def _many(self, rig: Rig, files: dict[str, list[Path]], alpha: str) -> None:

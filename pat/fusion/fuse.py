@@ -147,8 +147,8 @@ def fuse(
     if noise == "auto" and low_light.noisy and explain:
         explain(low_light.described())
     betas, in_colour, noisy = views.betas, views.alpha_in_colour, bool(low_light.noisy)
-    steps = steps_for(network, normalise=settings.match_levels or grey_world)
-    inputs, undo = prepared(network, views, steps)
+    normalise = settings.match_levels or grey_world
+    inputs, undo = prepared(network, views, steps_for(network, normalise=normalise))
     held = bytes_beside(inputs.inputs, [views.own, *(images.values() if isinstance(images, dict) else ())])
     del views  # whose images are there again, padded
     LOG.info("planning")
@@ -173,22 +173,17 @@ def fuse(
         with torch.set_grad_enabled(differentiable):
             matches = matcher(inputs.inputs) if network.uses_matches else None
             LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
-            done = fused_in_tiles(
-                network, inputs, matches, plan.tiles, found=noisy, progress=progress, store=store
-            )
+            how: dict[str, Any] = {"found": noisy, "progress": progress, "store": store}
+            done = fused_in_tiles(network, inputs, matches, plan.tiles, **how)
             del matches
         warn_of_confidence(network, done.frame, inputs)
         frame = done.frame._replace(depth=background_filled(done.frame, inputs.inputs))
         if luminance != "alpha":
             frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
         del inputs, right  # the segments of a large frame: what follows needs memory, too
-        frame = low_light.corrected(
-            found.undone(frame),
-            done.found,
-            steps_for(network, normalise=False),
-            found.response,
-            keep_alpha=settings.keep_alpha,
-        )
+        taken = steps_for(network, normalise=False), found.response
+        frame = found.undone(frame)
+        frame = low_light.corrected(frame, done.found, *taken, keep_alpha=settings.keep_alpha)
         LOG.info("back to the pixels of %s", alpha)
         frame = undone(frame, undo)
         if in_colour and len(frame.image) == 3 and frame.by_band is None and not noisy:

@@ -89,12 +89,9 @@ class _BlockCentres:
         grid = (pixel_grid((h, w), dtype=torch.float64)[rows, columns] + 0.5) * FINE - 0.5
         found = self.field.at(grid.reshape(-1, 2))
         if not isinstance(found, Positions):
-            raise TypeError(
-                "this field gives segments for some pixels and positions for others: give one kind"
-            )
-        return Positions(
-            *(t.reshape(*grid.shape[:2], *t.shape[t.ndim - n :]) for t, n in ((found.xy, 2), (found.mask, 1)))
-        )
+            raise TypeError("this field gives segments for some pixels, positions for others: give one kind")
+        parts = (found.xy, 2), (found.mask, 1)
+        return Positions(*(t.reshape(*grid.shape[:2], *t.shape[t.ndim - n :]) for t, n in parts))
 
     def by_rows(self) -> list[slice]:
         """Rows that are asked for at once."""
@@ -167,10 +164,8 @@ def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool)
 def _places(grid: _BlockCentres, box: tuple[slice, ...], hw: tuple[int, ...]) -> NDArray[np.int32]:
     """Where positions are in the reduced beta, pixels counted row by row; -1 for those that do not count."""
     (h, w), (rows, columns) = hw, box
-    parts = []
-    for top, bottom in spans(
-        min(rows.stop, grid.hw[0]) - rows.start, max(1, AT_ONCE // (w * grid.field.samples))
-    ):
+    parts, at_once = [], max(1, AT_ONCE // (w * grid.field.samples))
+    for top, bottom in spans(min(rows.stop, grid.hw[0]) - rows.start, at_once):
         found = grid.at(slice(rows.start + top, rows.start + bottom), columns)
         x, y = ((found.xy + 0.5) / FINE - 0.5).round().int().unbind(-1)
         inside = found.mask & (x >= 0) & (y >= 0) & (x < w) & (y < h)

@@ -249,12 +249,9 @@ def _joined(bands: list[Tensor]) -> Tensor:
 
 def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]) -> FusionOutput:
     """The image with the position in each beta, its deviation, and its confidence."""
-    return FusionOutput(
-        image,
-        [s.position for s in estimates],
-        [s.deviation for s in estimates],
-        [s.confidence for s in estimates],
-    )
+    found = zip(*((s.position, s.deviation, s.confidence) for s in estimates))
+    position, deviation, confidence = map(list, found)
+    return FusionOutput(image, position, deviation, confidence)
 
 
 def combined(estimates: Sequence[BetaEstimate]) -> BetaEstimate:
@@ -342,9 +339,8 @@ class Encoder(nn.Module):
         w2, w4, w8, _ = widths
         self.at_half = nn.Sequential(conv(4, w2), ResidualBlock(w2))
         self.at_quarter = nn.Sequential(conv(w2, w4, stride=2), ResidualBlock(w4))
-        self.at_eighth = nn.Sequential(
-            conv(w4, w8, stride=2), ResidualBlock(w8), ResidualBlock(w8, dilation=3)
-        )
+        eighth = conv(w4, w8, stride=2), ResidualBlock(w8), ResidualBlock(w8, dilation=3)
+        self.at_eighth = nn.Sequential(*eighth)
         self.up = nn.Conv2d(w8, w4, 1)
         self.merge = ResidualBlock(w4)
 
