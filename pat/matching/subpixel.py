@@ -108,11 +108,16 @@ def with_gradients(
     By the implicit function theorem: there the least squares' step is zero, and stays so if the match moves
     by as much as images and segments move the step.
     """
+    step = _step(views, segments, disparity)
+    return disparity + (step - step.detach())
+
+
+def _step(views: ComparedViews, segments: Segments, disparity: Tensor) -> Float[Tensor, "b 1 h w"]:
+    """One step towards the best agreement, pixels; its gradients hold where it is zero."""
     rise, rest = _compared(views.alpha, views.beta, segments, disparity)
     rise = rise.detach()
     common, slope = box_mean(torch.cat([rise * rest, rise.square()], 1), SETTINGS.gradient_radius).split(1, 1)
-    step = common / (slope.detach() + SETTINGS.flat)
-    return disparity + (step - step.detach())
+    return common / (slope.detach() + SETTINGS.flat)
 
 
 def _compared(
