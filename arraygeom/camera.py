@@ -13,6 +13,7 @@ from torch import Tensor
 from .batching import Batched
 from .checks import check_batches, check_hw, check_K, check_origin, checking
 from .distortion import Distortion
+from .lenses.common import on_plane
 from .lenses.model import LensModel
 from .pixels import (
     HW,
@@ -147,7 +148,7 @@ class LensView(View):
     def project_local(self, X: Real[Tensor, "*n 3"]) -> Projected:
         """Points in the camera's own frame to pixels."""
         X = floating(X)
-        normalised, valid = self._through_lens(X)
+        normalised, valid = on_plane(X) if self.distortion is None else self.distortion.project(X)
         return Projected(map_homogeneous(self.K[..., :2, :], normalised), X[..., 2], valid)
 
     def rays(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*m 3"], Bool[Tensor, "*m"]]:
@@ -190,13 +191,6 @@ class LensView(View):
     def transformed(self: AnyLensView, A: Float[Tensor, "3 3"], hw: HW) -> AnyLensView:
         """The camera of the image whose pixels are x' ~ A x, of size `hw`: K' = A K."""
         return self.replace(K=product(A.to(self.K), self.K), hw=hw)
-
-    def _through_lens(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        if self.distortion is not None:
-            return self.distortion.project(X)
-        z = X[..., 2:]
-        front = z > 0
-        return X[..., :2] / torch.where(front, z, 1.0), front[..., 0]
 
     def _each_through(self, f: ThroughLens, x: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels to normalised points, through f, and back to pixels."""

@@ -36,8 +36,8 @@ from torch import Tensor
 
 from .checks import check_numbers, checking
 from .lenses.brown import brown_derivatives, brown_distort, brown_limit, brown_undistort
-from .lenses.central import EXTENDED_UNIFIED, FOV, MODELS, central_project, central_unproject
-from .lenses.common import WIDEST, finite_points, once, unit
+from .lenses.central import EXTENDED_UNIFIED, FOV, central_project, central_unproject
+from .lenses.common import WIDEST, finite_points, on_plane, once, unit
 from .lenses.fisheye import fisheye_limit, fisheye_project, fisheye_unproject
 from .lenses.model import LensModel
 from .pixels import to_homogeneous
@@ -45,34 +45,25 @@ from .tracing import traced
 
 BROWN_CONRADY = "brown-conrady"
 KANNALA_BRANDT = "kannala-brandt"
-COEFFICIENT_COUNTS = {
-    BROWN_CONRADY: (4, 5, 8, 12, 14),
-    KANNALA_BRANDT: (4,),
-    **{name: (len(model.harmless),) for name, model in MODELS.items()},
-}
-
-TYPICAL_COEFFICIENTS = {
-    "brown-conrady": (1.0, 1.0, 0.02, 0.02, 1.0, 1.0, 1.0, 1.0, 0.02, 0.02, 0.02, 0.02, 0.1, 0.1),
-    "kannala-brandt": (0.3, 0.3, 0.3, 0.3),
-    "thin-prism-fisheye": (0.3, 0.3, 0.02, 0.02, 0.3, 0.3, 0.02, 0.02),
-    "double-sphere": (0.3, 0.3),
-    "extended-unified": (0.3, 0.5),
-    "unified": (1.0, 1.0, 1.0, 0.02, 0.02),
-    "fov": (0.5,),
-    "scaramuzza": (0.5, 0.5, 0.5),
-}
-"""Upper bounds of the usual sizes of coefficients."""
 LENS_TERMS = {
-    "brown-conrady": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty"),
-    "kannala-brandt": ("k1", "k2", "k3", "k4"),
-    "thin-prism-fisheye": ("k1", "k2", "p1", "p2", "k3", "k4", "sx", "sy"),
-    "double-sphere": ("xi", "alpha"),
-    "extended-unified": ("alpha", "beta"),
-    "unified": ("xi", "k1", "k2", "p1", "p2"),
-    "fov": ("omega",),
-    "scaramuzza": ("b2", "b3", "b4"),
+    BROWN_CONRADY: {
+        **{"k1": 1.0, "k2": 1.0, "p1": 0.02, "p2": 0.02, "k3": 1.0, "k4": 1.0, "k5": 1.0, "k6": 1.0},
+        **{"s1": 0.02, "s2": 0.02, "s3": 0.02, "s4": 0.02, "tx": 0.1, "ty": 0.1},
+    },
+    KANNALA_BRANDT: {"k1": 0.3, "k2": 0.3, "k3": 0.3, "k4": 0.3},
+    "double-sphere": {"xi": 0.3, "alpha": 0.3},
+    "extended-unified": {"alpha": 0.3, "beta": 0.5},
+    "unified": {"xi": 1.0, "k1": 1.0, "k2": 1.0, "p1": 0.02, "p2": 0.02},
+    "fov": {"omega": 0.5},
+    "scaramuzza": {"b2": 0.5, "b3": 0.5, "b4": 0.5},
+    "thin-prism-fisheye": {
+        **{"k1": 0.3, "k2": 0.3, "p1": 0.02, "p2": 0.02, "k3": 0.3, "k4": 0.3, "sx": 0.02, "sy": 0.02},
+    },
 }
-"""Names of the coefficients, in order."""
+"""Names of the coefficients, in order, and upper bounds of their usual sizes."""
+COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {
+    name: (4, 5, 8, 12, 14) if name == BROWN_CONRADY else (len(terms),) for name, terms in LENS_TERMS.items()
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -161,8 +152,8 @@ class Distortion(LensModel):
         if self.model != BROWN_CONRADY:
             xy_d, valid = self._project(X)
             return xy_d, valid & finite
-        ahead = X[..., 2] > 0
-        xy_d, valid = self.distort(X[..., :2] / torch.where(ahead, X[..., 2], 1)[..., None])
+        xy, ahead = on_plane(X)
+        xy_d, valid = self.distort(xy)
         return xy_d, valid & ahead & finite
 
     def unproject(self, xy_d: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
@@ -231,7 +222,7 @@ def lens_derivatives(
 def typical_coefficients(lens: LensModel) -> tuple[float, ...]:
     """Usual sizes of a lens's numbers; 1 for those of a camera model."""
     count = lens.coefficients.shape[-1]
-    return TYPICAL_COEFFICIENTS.get(lens.model, (1.0,) * count)[:count]
+    return tuple(LENS_TERMS[lens.model].values())[:count] if lens.model in LENS_TERMS else (1.0,) * count
 
 
 def pinhole_coefficients(lens: LensModel) -> Float[Tensor, "*b n"]:
@@ -242,4 +233,4 @@ def pinhole_coefficients(lens: LensModel) -> Float[Tensor, "*b n"]:
 
 def term(lens: LensModel, index: int) -> str:
     """The name of a lens's number."""
-    return LENS_TERMS[lens.model][index] if lens.model in LENS_TERMS else f"number {index + 1}"
+    return list(LENS_TERMS[lens.model])[index] if lens.model in LENS_TERMS else f"number {index + 1}"

@@ -153,13 +153,6 @@ class Pair(Batched):
         """The pair whose beta records images of another size."""
         return self.transform_beta(resize_matrix(self.beta.hw, hw), hw)
 
-    def rot90_beta(self, quarter_turns: int) -> Pair:
-        """The pair whose beta has its image rotated; see `Camera.rot90`."""
-        h, w = self.beta.hw
-        return self.transform_beta(
-            rot90_matrix((h, w), quarter_turns), (w, h) if quarter_turns % 2 else (h, w)
-        )
-
     def transform_beta(self, A: Float[Tensor, "3 3"], hw: HW) -> Pair:
         """The pair in which beta's pixels are x' ~ A x and its image's size is `hw`."""
         eye = torch.eye(3, dtype=A.dtype)
@@ -278,6 +271,10 @@ class Rig(Batched):
     def __contains__(self, name: object) -> bool:
         return name in self.cameras
 
+    def __len__(self) -> int:
+        """How many cameras; of a batch of rigs, how many rigs."""
+        return super().__len__() if self.batch_shape else len(self.cameras)
+
     def __iter__(self) -> Iterator[Any]:
         """The cameras' names in order; of a batch of rigs, the rigs."""
         return (self[i] for i in range(len(self))) if self.batch_shape else iter(self.names)
@@ -320,10 +317,8 @@ class Rig(Batched):
 
     def rot90(self, name: str, quarter_turns: int) -> Rig:
         """The rig whose camera `name` has its image rotated; see `Camera.rot90`."""
-        hw = self[name].hw
-        return self.transformed(
-            name, rot90_matrix(hw, quarter_turns), hw if quarter_turns % 2 == 0 else (hw[1], hw[0])
-        )
+        A = rot90_matrix(self[name].hw, quarter_turns)
+        return self.transformed(name, A, self[name].rot90(quarter_turns).hw)
 
     def transformed(self, name: str, A: Float[Tensor, "3 3"], hw: HW) -> Rig:
         """The rig in which the pixels of camera `name` are x' ~ A x and its image's size is `hw`."""

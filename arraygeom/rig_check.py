@@ -14,7 +14,7 @@ from .checks import derived
 from .pixels import HW, coarse_grid
 
 if TYPE_CHECKING:
-    from .rig import Rig
+    from .rig import Pair, Rig
 
 SMALLEST_BASELINE, LARGEST_BASELINE = 1e-4, 50.0
 """A baseline outside these bounds, in metres, is more likely a mistaken unit than a camera array."""
@@ -73,11 +73,19 @@ def _all(rig: Rig) -> Iterator[str]:
     names = [name for name, camera in rig.cameras.items() if isinstance(camera, Camera)]
     pairs = list(combinations(names, 2)) if len(names) <= MOST_CAMERAS else list(pairwise(names))
     small = rig
-    for name in names:
-        small = small.resize(name, _reduced(rig[name].hw))
+    if not rig.links:
+        small = rig.replace(
+            cameras={n: camera.resize(_reduced(camera.hw)) for n, camera in rig.cameras.items()}
+        )
     for one, other in [order for pair in pairs for order in (pair, pair[::-1])]:
-        if not _overlap(small, one, other):  # a few pixels decide most pairs: through lenses all take seconds
-            yield from _of_overlap(rig, one, other)
+        # a few pixels decide most pairs: through lenses all take seconds
+        if not _overlap(small.pair(one, other)) and not _overlap(rig.pair(one, other)):
+            bounds = "" if rig.depth is None else " between {:g} and {:g} m".format(*map(float, rig.depth))
+            yield (
+                f"'{other}' sees nothing of what '{one}' sees{bounds}: check the poses, "
+                "which are X_cam = R X_world + t with z forward and y down (OpenGL's look along -z), "
+                "and the depth range"
+            )
     yield from _of_positions(rig, pairs)
     for pair in pairs:
         yield from _of_baseline(rig, *pair)
@@ -127,25 +135,12 @@ def _reduced(hw: HW) -> HW:
     return max(1, round(scale * hw[0])), max(1, round(scale * hw[1]))
 
 
-def _overlap(rig: Rig, alpha: str, beta: str) -> bool:
+def _overlap(pair: Pair) -> bool:
     """Whether the segment of any pixel of a grid reaches beta's image."""
     from .fields.default import recorded_field
 
-    pair = rig.pair(alpha, beta)
-    found = recorded_field(pair)(pair, _grid(rig[alpha]).to(rig[alpha].K))
+    found = recorded_field(pair)(pair, _grid(pair.alpha).to(pair.cameras[0].K))
     return bool((found.valid if hasattr(found, "valid") else found.mask).any())
-
-
-def _of_overlap(rig: Rig, alpha: str, beta: str) -> Iterator[str]:
-    if not _overlap(rig, alpha, beta):
-        bounds = (
-            "" if rig.depth is None else f" between {float(rig.depth[0]):g} and {float(rig.depth[1]):g} m"
-        )
-        yield (
-            f"'{beta}' sees nothing of what '{alpha}' sees{bounds}: check the poses, "
-            "which are X_cam = R X_world + t with z forward and y down (OpenGL's look along -z), "
-            "and the depth range"
-        )
 
 
 def _of_positions(rig: Rig, pairs: Iterable[tuple[str, str]]) -> Iterator[str]:

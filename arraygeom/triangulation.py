@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .camera import Camera
 from .epipolar import Depth, beside, depth_from_track, track
+from .lenses.common import on_plane
 from .multiview import world_rays
 from .pixels import floating, product
 from .pose import matvec
@@ -103,10 +104,11 @@ def depth_of(
             "rays of one of these cameras do not meet in a point: use arraygeom.fields.ray_depth"
         )
     pose = pair.beta_from_alpha
-    normalised, seen = zip(*(_normalised(c.to(x.dtype), p) for c, p in ((alpha, x), (beta, x_beta))))
+    rays, seen = zip(*(c.to(x.dtype).rays(p) for c, p in ((alpha, x), (beta, x_beta))))
+    (normalised, ahead), (normalised_beta, ahead_beta) = map(on_plane, rays)
     eye = torch.eye(3).to(pose.R).expand_as(pose.R)
-    found = depth_from_track(track(eye, eye, pose, normalised[0]), normalised[1])
-    valid = found.valid & seen[0] & seen[1]
+    found = depth_from_track(track(eye, eye, pose, normalised), normalised_beta)
+    valid = found.valid & seen[0] & seen[1] & ahead & ahead_beta
     depth = torch.where(valid, found.depth, 0.0)
     sigma = torch.zeros_like(depth) if deviation is None else deviation
     return Depth(depth, torch.where(valid, sigma * _metres_per_pixel(pair, x, depth, valid), 0.0), valid)
@@ -119,13 +121,6 @@ def _metres_per_pixel(pair: Pair, x: Tensor, depth: Tensor, valid: Tensor) -> Te
     ends = [beta.project(alpha.unproject(x.to(safe), safe * (1 + s))).x for s in (5e-4, -5e-4)]
     pixels = (ends[0] - ends[1]).square().sum(-1).clamp(min=1e-24).sqrt()
     return torch.where(valid, 1e-3 * safe / pixels, 0.0).to(depth)
-
-
-def _normalised(camera: Camera, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Where the ray of a pixel meets z = 1, and whether it does."""
-    rays, seen = camera.rays(x)
-    seen = seen & (rays[..., 2] > 0)
-    return rays[..., :2] / torch.where(seen, rays[..., 2], 1.0)[..., None], seen
 
 
 class _Sight(NamedTuple):

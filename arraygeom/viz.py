@@ -349,12 +349,6 @@ def _upright(X: np.ndarray) -> np.ndarray:
     return np.stack([x, z, -y])
 
 
-def _joined(lines: list[np.ndarray]) -> np.ndarray:
-    """Many lines as one with gaps of NaN."""
-    gap = np.full((1, 3), np.nan)
-    return np.concatenate([part for line in lines for part in (line, gap)])
-
-
 def _equal_axes(axes: Any) -> None:
     """The same metres along each axis."""
     limits = np.array([getattr(axes, f"get_{a}lim")() for a in "xyz"])

@@ -45,6 +45,11 @@ def with_block(text: str, name: str, content: str) -> str:
     return f"{text[: text.index(begin)]}{begin}\n\n{content.strip()}\n\n{text[text.index(end) :]}"
 
 
+def write_block(document: Path, name: str, content: str) -> None:
+    """Replace that block of a document, atomically."""
+    write_text(document, with_block(document.read_text(), name, content))
+
+
 def without_images(text: str) -> str:
     """Markdown without the lines that are only an image."""
     return "".join(line for line in text.splitlines(keepends=True) if not line.startswith("!["))

@@ -12,7 +12,11 @@ from tyro.conf import Positional
 from pat.cli.main import main
 from pat.cli.options import MaybeOut, MaybePath, Memory, Out, Weights, say, working, writable
 
+from .alignment import evaluate_alignment
 from .evaluation import commands
+from .fast_slow.recorded import run_recorded
+from .showcase import showcase
+from .system import NAMES, load_system, run_system
 
 
 @dataclass
@@ -27,8 +31,6 @@ class Showcase:
 
     def run(self) -> None:
         """Write and print the tables. Raises ValueError or FileNotFoundError naming what is missing."""
-        from .showcase import showcase
-
         writable(self.out, folder=True)
         print(showcase(self.data, self.out, self.weights), end="")
         say(f"written: {self.out / 'showcase.md'}, and its figures and rig files")
@@ -49,8 +51,6 @@ class Alignment:
 
     def run(self) -> None:
         """Write and print the table. Raises ValueError or FileNotFoundError naming what is missing."""
-        from .alignment import evaluate_alignment
-
         writable(self.out, folder=True)
         with working("aligning") as retitle:
             text = evaluate_alignment(
@@ -66,8 +66,6 @@ class SystemsList:
 
     def run(self) -> None:
         """Print a line for each."""
-        from .system import NAMES, load_system
-
         for name in NAMES:
             print(f"{name:12s} {load_system(name).title}")
 
@@ -97,9 +95,6 @@ class SystemsRun:
 
     def run(self) -> None:
         """Print the scores, and the expected ones where they are of the same settings."""
-        from .fast_slow.recorded import run_recorded
-        from .system import load_system, run_system
-
         out = writable(self.out or Path("out/systems") / self.name, folder=True)
         if self.recording is None:
             same = ("full", "scene", "photos", "weights", "max_memory")

@@ -160,23 +160,21 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
     reach = PATCH + SEARCH
     corners = corners[((corners >= reach) & (corners < np.array([w, h]) - reach)).all(1)]
     straight, pinhole = without_lenses(scene.rig, scene.images)
+    truth, visible = scene.truth, np.ones((h, w), bool)
+    if truth is not None:
+        expected = pixel_grid((h, w)).numpy().copy()
+        expected[..., 0] -= truth.value.numpy()
+        occluded = occluded_pixels(truth)
+        visible = truth.valid.numpy() & (expected[..., 0] >= 0) & ~occluded
+    candidates = corners[patch_mean(visible.astype(float), corners) > 1 - 1e-6]
     rows = []
     for name in scene.rig.betas(scene.alpha):
         view, values = aligned[name], np.asarray(scene.recorded[name])
-        visible = np.ones((h, w), bool)
-        occluded = None
-        if scene.truth is not None:
-            occluded = occluded_pixels(scene.truth)
-            inside = pixel_grid((h, w)).numpy()[..., 0] - scene.truth.value.numpy() >= 0
-            visible = scene.truth.valid.numpy() & inside & ~occluded
-        candidates = corners[patch_mean(visible.astype(float), corners) > 1 - 1e-6]
         seen = view.valid[candidates[:, 1], candidates[:, 0]]
         x = candidates[seen]
         planes = [np.nan_to_num(view.positions), by_homography(scene, name, straight, pinhole)]
         true, filled = None, None
-        if scene.truth is not None and occluded is not None:
-            expected = pixel_grid((h, w)).numpy().copy()
-            expected[..., 0] -= scene.truth.value.numpy()
+        if truth is not None:
             planes.append(expected)
             error = np.linalg.norm(view.positions - expected, axis=-1)[x[:, 1], x[:, 0]]
             true = float((error <= HALF_PIXEL).mean())
@@ -185,23 +183,11 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
         offsets, locatable = zip(*(local_offsets(own, other, x) for other in others))
         located = locatable[0] | locatable[1]
         near = [float((off[located] <= HALF_PIXEL).mean()) for off in offsets]
-        rows.append(
-            AlignmentRow(
-                scene.name,
-                name,
-                seen=float(seen.mean()),
-                located=float(located.mean()),
-                aligned=near[0],
-                homography=near[1],
-                median=float(np.median(offsets[0][located])),
-                median_homography=float(np.median(offsets[1][located])),
-                by_truth=near[2] if len(near) > 2 else None,
-                true=true,
-                filled=filled,
-                off=sampling_error(view, values),
-                dtype=str(view.values.dtype),
-            )
-        )
+        medians = [float(np.median(off[located])) for off in offsets]
+        shares = float(seen.mean()), float(located.mean()), near[0], near[1], medians[0], medians[1]
+        truths = near[2] if len(near) > 2 else None, true, filled
+        off = sampling_error(view, values)
+        rows.append(AlignmentRow(scene.name, name, *shares, *truths, off, str(view.values.dtype)))
     return rows
 
 
@@ -209,24 +195,24 @@ def composites(scene: AlignmentScene, aligned: Aligned) -> dict[str, Float[Tenso
     """The first two betas as red and blue and alpha as green: by the homography, and aligned."""
     straight, pinhole = without_lenses(scene.rig, scene.images)
     names = scene.rig.betas(scene.alpha)[:2]
-    found: dict[str, list[NDArray[Any]]] = {"by a homography": [], "by pat align, white where not seen": []}
+    found: list[list[NDArray[Any]]] = [[], []]
     for name in names:
         values, view = np.asarray(scene.recorded[name]), aligned[name]
         rigid = by_homography(scene, name, straight, pinhole)
-        planes = [
-            resampled_values(values, plane, "bilinear")[0] for plane in (rigid, np.nan_to_num(view.positions))
-        ]
-        scale = 0.95 / np.percentile(values[0], 99)
-        found["by a homography"].append(planes[0] * scale)
-        found["by pat align, white where not seen"].append(np.where(view.valid, planes[1] * scale, 1.0))
+        by_plane, by_scene = (
+            resampled_values(values, plane, "bilinear")[0] * (0.95 / np.percentile(values[0], 99))
+            for plane in (rigid, np.nan_to_num(view.positions))
+        )
+        found[0].append(by_plane)
+        found[1].append(np.where(view.valid, by_scene, 1.0))
     own = aligned[scene.alpha].values[0]
     green = own * (0.95 / np.percentile(own, 99))
     unseen = np.any([~aligned[name].valid for name in names], 0)
+    titles = "by a homography", "by pat align, white where not seen"
     panels = {}
-    for title, (red, *further) in found.items():
-        middle = green if "homography" in title else np.where(unseen, 1.0, green)
-        bands = [red, middle, (further or [red])[0]]
-        panels[title] = torch.from_numpy(np.stack(bands).clip(0, 1).astype(np.float32))
+    for title, (red, *further), middle in zip(titles, found, (green, np.where(unseen, 1.0, green))):
+        bands = np.stack([red, middle, (further or [red])[0]])
+        panels[title] = torch.from_numpy(bands.clip(0, 1).astype(np.float32))
     return panels
 
 
@@ -357,21 +343,15 @@ def alignment_markdown(rows: Sequence[AlignmentRow]) -> str:
     for name in dict.fromkeys(row.beta for row in known):
         mine = [row for row in known if row.beta == name]
         means: dict[str, Any] = {
-            share: float(np.mean([getattr(row, share) for row in mine])) for share in SHARES + MEDIANS
+            n: float(np.mean([getattr(row, n) for row in mine])) for n in (*SHARES, *MEDIANS)
         }
         scene, off = f"{len(mine)} stereo pairs", max(row.off for row in mine)
         lines.append(_line(mine[0]._replace(scene=scene, off=off, **means)))
     columns = [
-        "scene",
-        "beta",
-        "corners seen",
-        "located",
-        "within .5 px",
-        "homography",
-        "by the truth",
-        "of the truth",
+        *("scene", "beta", "corners seen", "located", "within .5 px", "homography", "by the truth"),
+        *("of the truth", "occluded, filled", "median px, both", "values off", "type"),
     ]
-    return markdown_table([*columns, "occluded, filled", "median px, both", "values off", "type"], lines)
+    return markdown_table(columns, lines)
 
 
 def _line(row: AlignmentRow) -> list[str]:
@@ -439,9 +419,8 @@ def nine_band_start(folder: Path) -> Rig:
 def nine_band_calibration(folder: Path, deviations: StartDeviations) -> Calibration:
     """The array of nine bands from its image of a board by each camera."""
     start, board = nine_band_start(folder), parse_board(BOARD)
-    views = collect_folder(
-        folder / "calibration", board, patterns={name: f"{name}.png" for name in start.names}
-    ).views
+    patterns = {name: f"{name}.png" for name in start.names}
+    views = collect_folder(folder / "calibration", board, patterns=patterns).views
     return calibrate(views, board, start=start, deviations=deviations)
 
 

@@ -61,19 +61,18 @@ class SystemRecording:
     @property
     def reference(self) -> dict[str, Tensor]:
         """All but the raw images, by name."""
-        ground_truth = {
-            f"ground truth/{i:03d}": image.contiguous() for i, image in enumerate(self.ground_truth)
-        }
-        return ground_truth | {f"light/{name}": image.contiguous() for name, image in self.light.items()}
+        tensors = {f"ground truth/{i:03d}": image for i, image in enumerate(self.ground_truth)}
+        tensors |= {f"light/{name}": image for name, image in self.light.items()}
+        return {name: image.contiguous() for name, image in tensors.items()}
 
     @classmethod
     def of(cls, reference: Mapping[str, Tensor]) -> SystemRecording:
         """The recording of a `reference`, without the raw images."""
-        kinds = {name.partition("/")[::2]: tensor for name, tensor in reference.items()}
-        ground_truth = [kinds[key] for key in sorted(kinds) if key[0] == "ground truth"]
-        return cls(
-            {}, ground_truth, {name: tensor for (kind, name), tensor in kinds.items() if kind == "light"}
-        )
+        kinds: dict[str, dict[str, Tensor]] = {"ground truth": {}, "light": {}}
+        for name, tensor in sorted(reference.items()):
+            kind, _, which = name.partition("/")
+            kinds[kind][which] = tensor
+        return cls({}, list(kinds["ground truth"].values()), kinds["light"])
 
 
 @dataclass(frozen=True)
@@ -183,11 +182,8 @@ def recorded(
         with safe_open(cache, "pt") as file:
             if file.metadata()["key"] == key:
                 say(f"using the recording in {out}")
-                counts = json.loads(file.metadata()["counts"])
-                names = file.keys()  # not a mapping: it cannot be iterated
-                return SystemRecording.of({name: file.get_tensor(name) for name in names}), _files(
-                    out, counts
-                )
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+                return SystemRecording.of(tensors), _files(out, json.loads(file.metadata()["counts"]))
     say(f"rendering and recording {', '.join(f'{n} {rig[n].hw[1]}x{rig[n].hw[0]}' for n in rig.names)}")
     cache.unlink(missing_ok=True)
     recording = module.record_scene(_stage(system, rig, scene, photos))
@@ -254,28 +250,19 @@ def _still(job: SystemRun) -> tuple[list[str], Panels]:
     if recording.light:
         merged_frame = merged(frame, rig, images, alpha)
         rows["fusion, exposures merged"] = merged_frame.image
-        extra = [
-            *_ranges(rig, recording, images, frame, merged_frame),
-            *_permuted(load_weights(job.weights), read, images, alpha, frame),
-        ]
+        extra = _ranges(rig, recording, images, frame, merged_frame)
+        extra += _permuted(load_weights(job.weights), read, images, alpha, frame)
         write_image(out / "merged.tif", linear_from_srgb(merged_frame.image.clamp(min=0)), bits=32)
     white = 1.0 if not recording.light else float(ground_truth.max())
     panels = {f"{n}{' (alpha)' if n == alpha else ''}": images[n] for n in rig.names}
-    panels |= {
-        f"{n}: clipped red, noisy blue": missed(images[n], recording.light[n])
-        for n in rig.names
-        if recording.light
-    }
+    for name, light in recording.light.items():
+        panels[f"{name}: clipped red, noisy blue"] = missed(images[name], light)
     compared = {"ground truth": ground_truth, **{n: p for n, p in rows.items() if n != "alpha alone"}}
     shown = tone_curve(ground_truth) if recording.light else torch.Tensor.clone
     panels |= {name: shown(image) for name, image in compared.items()}
     panels |= {"depth (red is near)": colour_depth(frame.depth), "confidence": frame.confidence[None]}
-    return [
-        *_table(rows, ground_truth, white),
-        *_confidence_line(frame, ground_truth),
-        *extra,
-        *memory,
-    ], panels
+    scores = [*_table(rows, ground_truth, white), *_confidence_line(frame, ground_truth)]
+    return [*scores, *extra, *memory], panels
 
 
 def fused_apart(job: SystemRun, files: Mapping[str, Path]) -> tuple[Frame, list[str]]:
@@ -283,16 +270,8 @@ def fused_apart(job: SystemRun, files: Mapping[str, Path]) -> tuple[Frame, list[
     images = [text for name, path in files.items() for text in ("--image", f"{name}={path}")]
     out, rig = job.out, job.out / "inputs" / "rig.yaml"
     command = [sys.executable, "-m", "pat", "fuse", "--rig", str(rig), "--alpha", job.system.alpha, *images]
-    command += [
-        "--out",
-        str(out),
-        "--bits",
-        "16",
-        "--weights",
-        job.weights,
-        "--max-memory",
-        str(job.max_memory),
-    ]
+    command += ["--out", str(out), "--bits", "16", "--weights", job.weights]
+    command += ["--max-memory", str(job.max_memory)]
     begin, planned = time.monotonic(), ""
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     most = watch_peak(process.pid)
@@ -308,22 +287,16 @@ def fused_apart(job: SystemRun, files: Mapping[str, Path]) -> tuple[Frame, list[
     depth = torch.from_numpy(imread(out / "depth.tif")) if (out / "depth.tif").is_file() else None
     image, confidence = read_image(out / "fused.png"), read_image(out / "confidence.png")[0]
     depth = torch.full_like(confidence, torch.nan) if depth is None else depth
-    return Frame(image, depth, confidence, torch.full_like(depth, torch.nan)), [
-        "",
-        f"{planned}. Memory: {peak}. Time: {took}.",
-    ]
+    frame = Frame(image, depth, confidence, torch.full_like(depth, torch.nan))
+    return frame, ["", f"{planned}. Memory: {peak}. Time: {took}."]
 
 
 def _sequence(job: SystemRun) -> tuple[list[str], Panels]:
     alpha, rig, out, ground_truth = job.system.alpha, job.rig, job.out, job.recording.ground_truth
     frames = {name: ImageFiles(paths, rig, name, alpha=alpha) for name, paths in job.files.items()}
-    fusion = SequenceFusion(
-        load_weights(job.weights), rig, frames, alpha, settings=FuseSettings(max_memory=job.max_memory)
-    )
-    keys = fusion.timeline.key_frames()
-    colours = {key.alpha: fusion.colour(key) for key in keys}
-    fused = [fusion.frame(i, keys, lambda key: colours[key.alpha]) for i in range(len(ground_truth))]
-    alone = [fusion.alone(i) for i in range(len(fused))]
+    settings = FuseSettings(max_memory=job.max_memory)
+    fusion = SequenceFusion(load_weights(job.weights), rig, frames, alpha, settings=settings)
+    colours, fused, alone = fused_frames(fusion, len(ground_truth))
     for i, frame in enumerate(fused):
         save_frame(frame, out / "frames", name=f"{i:03d}", view=view_of(rig, alpha, bits=8))
     write_video(out / "fused.mp4", [f.image for f in fused], rate=10)
@@ -338,21 +311,24 @@ def _sequence(job: SystemRun) -> tuple[list[str], Panels]:
     lines = [*_sequence_table(methods, ground_truth, greys), *_confidence_line(fused[2], ground_truth[2])]
     i = next(i for i in range(len(fused)) if i not in colours)
     first = next(name for name in rig.betas(alpha))
-    panels = {
-        f"alpha, frame {i}": greys[i],
-        f"beta {first}": frames[first][0],
-        "ground truth": ground_truth[i],
-    }
+    panels = {f"alpha, frame {i}": greys[i], f"beta {first}": frames[first][0]}
+    panels["ground truth"] = ground_truth[i]
     panels |= {n: p[i] for n, p in methods.items() if n != "alpha alone"}
     panels |= {"confidence": fused[i].confidence[None], "confidence, frame alone": alone[i].confidence[None]}
     return lines, panels
 
 
+def fused_frames(fusion: SequenceFusion, count: int) -> tuple[set[int], list[Frame], list[Frame]]:
+    """The numbers of the key frames, all frames with colour propagated from these, each fused alone."""
+    keys = fusion.timeline.key_frames()
+    colours = {key.alpha: fusion.colour(key) for key in keys}
+    frames = [fusion.frame(i, keys, lambda key: colours[key.alpha]) for i in range(count)]
+    return set(colours), frames, [fusion.alone(i) for i in range(count)]
+
+
 def _images(fusion: SequenceFusion, i: int) -> dict[str, Tensor]:
-    return {
-        fusion.alpha: fusion.grey(i),
-        **{n: fusion.frames[n][j] for n, j in fusion.timeline.at(i).items()},
-    }
+    betas = {n: fusion.frames[n][j] for n, j in fusion.timeline.at(i).items()}
+    return {fusion.alpha: fusion.grey(i), **betas}
 
 
 def _table(rows: Mapping[str, Tensor], ground_truth: Tensor, white: float) -> list[str]:
@@ -372,12 +348,8 @@ def _sequence_table(
         rows.append((name, *figures, f"{1000 * flicker(images, greys):.2f}"))
     rows.append(("ground truth", "", "", "", f"{1000 * flicker(ground_truth, greys):.2f}"))
     table = markdown_table(["", "PSNR, dB", "lowest", "SSIM", "flicker x 1000"], rows)
-    return [
-        "Means over the frames; "
-        "flicker is the mean change of chroma from frame to frame where nothing moves.",
-        "",
-        *table.splitlines(),
-    ]
+    note = "flicker is the mean change of chroma from frame to frame where nothing moves."
+    return [f"Means over the frames; {note}", "", *table.splitlines()]
 
 
 WRONG = 0.1
@@ -390,10 +362,8 @@ def _confidence_line(frame: Frame, ground_truth: Tensor) -> list[str]:
     order = frame.confidence.flatten().argsort()
     quarter = len(order) // 4
     high, low = (float((off[part] > WRONG).float().mean()) for part in (order[-quarter:], order[:quarter]))
-    return [
-        "",
-        f"Wrong colours: {high:.1%} of the quarter where confidence is highest, {low:.1%} where lowest.",
-    ]
+    share = f"{high:.1%} of the quarter where confidence is highest, {low:.1%} where lowest."
+    return ["", f"Wrong colours: {share}"]
 
 
 def _ranges(
@@ -418,10 +388,8 @@ def _permuted(
     order = [2, 0, 1]
     permuted = rig.replace(cameras={n: rig[n] for n in (alpha, *(betas[i] for i in order))})
     other = fuse(network, permuted, images, alpha=alpha).image
-    same = score(other.clamp(0, 1), frame.image[order].clamp(0, 1)).psnr
-    before = score(other.clamp(0, 1), frame.image.clamp(0, 1)).psnr
-    return [
-        "",
-        "Betas in another order: "
-        f"the bands follow to {same:.1f} dB (against the former order: {before:.1f} dB).",
-    ]
+    same, before = (
+        score(other.clamp(0, 1), image.clamp(0, 1)).psnr for image in (frame.image[order], frame.image)
+    )
+    follow = f"the bands follow to {same:.1f} dB (against the former order: {before:.1f} dB)."
+    return ["", f"Betas in another order: {follow}"]

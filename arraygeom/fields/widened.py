@@ -46,13 +46,16 @@ class Widened:
         """Segments if `across` is 0 and the field gives segments, else positions (*n, rows * samples, 2)."""
         found = self._evaluated(pair, x)
         if isinstance(found, Segments):
-            longer = self._longer(found)
+            more = self.along * direction(found.end - found.start)
+            longer = Segments(found.start - more, found.end + more, found.valid)
             if self.across == 0:
                 clipped = clip_to_image(longer.start, longer.end, pair.beta.hw)
                 return Segments(clipped.start, clipped.end, clipped.valid & found.valid)
             found = longer.positions(self.samples)
         else:
-            found = self._stretched(found)
+            xy, along = found.xy, self.along
+            steps = torch.linspace(-along, along, xy.shape[-2], dtype=xy.dtype, device=xy.device)
+            found = Positions(xy + steps[:, None] * tangents(found), found.mask)
         return self._band(found, pair.beta.hw)
 
     def _evaluated(self, pair: Pair, x: Tensor) -> SamplingLocations:
@@ -77,14 +80,6 @@ class Widened:
     def rows(self) -> int:
         """How many rows of samples a band has."""
         return 2 * math.ceil(self.across) + 1
-
-    def _longer(self, s: Segments) -> Segments:
-        more = self.along * direction(s.end - s.start)
-        return Segments(s.start - more, s.end + more, s.valid)
-
-    def _stretched(self, p: Positions) -> Positions:
-        steps = torch.linspace(-self.along, self.along, p.xy.shape[-2], dtype=p.xy.dtype, device=p.xy.device)
-        return Positions(p.xy + steps[:, None] * tangents(p), p.mask)
 
     def _band(self, p: Positions, hw: HW) -> Positions:
         tangent = tangents(p)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,77 +21,26 @@ from ..rig import Rig
 from ..rig_check import unit_oddity
 from ..sensor import Sensor
 from ..warned import warn
-from . import (
-    aniposelib,
-    boofcv,
-    bouguet,
-    colmap,
-    kalibr,
-    kitti,
-    lensboy,
-    luxonis,
-    matlab,
-    metashape,
-    middlebury,
-    mrcal,
-    multical,
-    native,
-    nerfstudio,
-    open3d,
-    opencv,
-    pycalib,
-    realsense,
-    ros,
-    strecha,
-    syntim,
-    xmp,
-    zed,
-)
+from . import kitti
 from .source import RigFileError, RigFileWarning, RigSource, UnknownRigFormat
 
-# In the order in which they are asked whether they recognise a file.
+FORMATS = (
+    *("colmap", "opencv", "kalibr", "boofcv", "ros", "native", "bouguet", "matlab", "kitti-raw", "kitti"),
+    *("middlebury", "syntim", "nerfstudio", "multical", "aniposelib", "pycalib", "strecha", "open3d"),
+    *("metashape", "xmp", "luxonis", "mrcal", "lensboy", "realsense", "zed"),
+)
+"""Each a module, in the order in which they are asked whether they recognise a file."""
 READERS: dict[str, Any] = {
-    "colmap": colmap,
-    "opencv": opencv,
-    "kalibr": kalibr,
-    "boofcv": boofcv,
-    "ros": ros,
-    "native": native,
-    "bouguet": bouguet,
-    "matlab": matlab,
-    "kitti-raw": kitti.Raw,
-    "kitti": kitti,
-    "middlebury": middlebury,
-    "syntim": syntim,
-    "nerfstudio": nerfstudio,
-    "multical": multical,
-    "aniposelib": aniposelib,
-    "pycalib": pycalib,
-    "strecha": strecha,
-    "open3d": open3d,
-    "metashape": metashape,
-    "xmp": xmp,
-    "luxonis": luxonis,
-    "mrcal": mrcal,
-    "lensboy": lensboy,
-    "realsense": realsense,
-    "zed": zed,
+    name: kitti.Raw if name == "kitti-raw" else import_module(f"{__name__}.{name}") for name in FORMATS
 }
-READERS["caliscope"] = aniposelib
-WRITERS: dict[str, Any] = {
-    "native": native,
-    "opencv": opencv,
-    "colmap": colmap,
-    "kalibr": kalibr,
-    "nerfstudio": nerfstudio,
-}
+READERS["caliscope"] = READERS["aniposelib"]
+WRITERS = {name: READERS[name] for name in ("native", "opencv", "colmap", "kalibr", "nerfstudio")}
 
 __all__ = [
     "READERS",
     "WRITERS",
     "RigFileError",
     "RigFileWarning",
-    "convention",
     "read_rig",
     "recognise",
     "write_rig",
@@ -169,11 +119,6 @@ def recognise(path: str | Path) -> str:
             return name
     known = ", ".join(READERS)
     raise UnknownRigFormat(path, None, f"is not a rig file of a known format ({known}); or name its format")
-
-
-def convention(format: str) -> str:
-    """What a format's file means and the shift of pixels applied when reading it, in one line."""
-    return getattr(READERS[format], "CONVENTION", "stated in the file: units and first_pixel_centre")
 
 
 def _left_out(rig: Rig, format: str) -> str:

@@ -9,11 +9,10 @@ so it is not applied.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from ..camera import Camera
 from ..rig import Rig
-from .source import RigSource
+from .source import Entry, RigSource, pose_of
 
 CONVENTION = "first pixel's centre at 0 (shift 0); world->camera, Rodrigues vectors; metres"
 
@@ -25,29 +24,23 @@ def recognises(path: Path, head: str) -> bool:
 def read(source: RigSource) -> Rig:
     """Every camera that is not marked `ignore`, under its name, or else that of its table."""
     document = source.toml()
-    tables = document.get("cameras") if isinstance(document.get("cameras"), dict) else document
-    cameras = {
-        key: fields
-        for key, fields in (tables or {}).items()
-        if isinstance(fields, dict) and key != "metadata"
-    }
-    if not any("matrix" in fields for fields in cameras.values()):
+    tables = document["cameras"] if isinstance(document.get("cameras").value, dict) else document
+    cameras = [(k, fields) for k, fields in tables.items() if fields.value and isinstance(fields.value, dict)]
+    if not any("matrix" in fields for _, fields in cameras):
         raise source.fail("matrix", "is in no table; is this a camera array of aniposelib or caliscope?")
-    used = {key: fields for key, fields in cameras.items() if not fields.get("ignore", False)}
-    return source.rig((_name(key, fields), _camera(source, key, fields)) for key, fields in used.items())
+    used = [(k, f) for k, f in cameras if k != "metadata" and not f.get("ignore", False).value]
+    return source.rig((_name(key, fields), _camera(fields)) for key, fields in used)
 
 
-def _name(key: str, fields: dict[str, Any]) -> str:
-    return str(fields.get("name", f"cam{key}" if key.isdigit() else key))
+def _name(key: str, fields: Entry) -> str:
+    return str(fields.get("name", f"cam{key}" if key.isdigit() else key).value)
 
 
-def _camera(source: RigSource, key: str, fields: dict[str, Any]) -> Camera:
-    c, entry = fields.get("distortions"), f"{key}.distortions"
-    fisheye = bool(fields.get("fisheye", False))
-    rotation, translation = (source.get(fields, k, key) for k in ("rotation", "translation"))
+def _camera(fields: Entry) -> Camera:
+    c = fields.get("distortions")
     return Camera(
-        K=source.intrinsics(source.get(fields, "matrix", key), f"{key}.matrix"),
-        cam_from_world=source.pose(rotation, translation, key),
-        hw=source.size_of(source.get(fields, "size", key), f"{key}.size"),
-        distortion=source.kannala_brandt(c, entry) if fisheye else source.brown_conrady(c, entry),
+        K=fields["matrix"].intrinsics(),
+        cam_from_world=pose_of(fields["rotation"], fields["translation"]),
+        hw=fields["size"].size(),
+        distortion=c.kannala_brandt() if fields.get("fisheye").value else c.brown_conrady(),
     )

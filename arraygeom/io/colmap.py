@@ -23,7 +23,7 @@ from ..lenses.central import FOV, THIN_PRISM_FISHEYE
 from ..pose import Pose
 from ..rig import Rig
 from .export import brown_conrady, calibrated, focal_and_centre
-from .source import RigFileError, RigSource
+from .source import Entry, RigFileError, RigSource
 
 CONVENTION = (
     "first pixel's centre at 0.5 (shift -0.5); world->camera, quaternions w x y z; scale as in the model"
@@ -57,15 +57,8 @@ MODELS = {
 AT_ORIGIN = [1.0] + 6 * [0.0]
 """QW QX QY QZ TX TY TZ."""
 
-
-class _Image(NamedTuple):
-    name: str
-    camera: int
-    pose: Pose
-
-
-Sensors = list[tuple[int, Pose]]
-"""The cameras of a rig, by id, and their poses in it."""
+Posed = tuple[Pose, int, str]
+"""Of an image, or of a camera in its rig: pose, the camera's id, name."""
 
 
 def recognises(path: Path, head: str) -> bool:
@@ -81,17 +74,18 @@ def read(source: RigSource) -> Rig:
         )
     suffix = ".bin" if (folder / "cameras.bin").exists() else ".txt"
     read_cameras, read_images, read_rigs = PARTS[suffix]
-    cameras = read_cameras(_file(folder, "cameras", suffix))
-    images = read_images(_file(folder, "images", suffix))
+    cameras: dict[int, LensView] = {}
+    for entry, i, model in read_cameras(_file(folder, "cameras", suffix)):
+        if i in cameras:
+            raise entry.fail(f"camera {i} occurs twice; keep one")
+        cameras[i] = _intrinsics(entry, model)
+    images = list(read_images(_file(folder, "images", suffix)))
     rigs = folder / f"rigs{suffix}"
     sensors = [s for s in (read_rigs(RigSource(rigs)) if rigs.exists() else []) if len(s) > 1]
     if len(sensors) > 1:
         raise RigSource(rigs).fail(None, f"has {len(sensors)} rigs of several cameras; keep one")
-    if sensors:
-        named = ((_sensor_name(i, images), i, pose) for i, pose in sensors[0])
-    else:
-        named = ((image.name, image.camera, image.pose) for image in images)
-    return source.rig((name, _camera(source, cameras, i, pose)) for name, i, pose in named)
+    named = [(pose, i, _sensor_name(i, images)) for pose, i, _ in sensors[0]] if sensors else images
+    return source.rig((name, _camera(source, cameras, i, pose)) for pose, i, name in named)
 
 
 def write(rig: Rig) -> dict[str, str]:
@@ -142,129 +136,131 @@ def _camera(source: RigSource, cameras: dict[int, LensView], i: int, pose: Pose)
     return Camera(K=view.K, cam_from_world=pose, hw=view.hw, distortion=view.distortion)
 
 
-def _sensor_name(camera: int, images: list[_Image]) -> str:
+def _pose(entry: Entry) -> Pose:
+    """From QW QX QY QZ TX TY TZ."""
+    numbers = entry.numbers((7,))
+    return Pose(entry.at(numbers[:4], "QW QX QY QZ").quaternion(), numbers[4:])
+
+
+def _sensor(entry: Entry, camera: int, numbers: list[float] | None) -> Posed:
+    if numbers is None:
+        raise entry.fail(f"camera {camera} has no pose in its rig; calibrate the rig first")
+    return _pose(Entry(entry.source, numbers, entry.name)), camera, ""
+
+
+def _sensor_name(camera: int, images: list[Posed]) -> str:
     """The folder that all images of the camera are in, if they are in one; else after its id."""
-    folders = {str(Path(image.name).parent) for image in images if image.camera == camera}
+    folders = {str(Path(name).parent) for _, i, name in images if i == camera}
     return folders.pop() if len(folders) == 1 and "." not in folders else f"camera{camera}"
 
 
-def _intrinsics(
-    source: RigSource, entry: str, model: str, wh: tuple[Any, Any], parameters: list[Any]
-) -> LensView:
+def _intrinsics(entry: Entry, model: str) -> LensView:
+    """From WIDTH HEIGHT PARAMS."""
     if model not in MODELS:
-        raise source.fail(
-            entry, f"has model {model}, which is not read: calibrate with one of {', '.join(MODELS)}"
-        )
+        raise entry.fail(f"has model {model}, which is not read: calibrate with one of {', '.join(MODELS)}")
     kind = MODELS[model]
-    p = source.numbers(parameters, (kind.focals + 2 + kind.coefficients,), f"{entry} ({model})").tolist()
-    K = source.focal_and_centre(
-        [p[0], p[kind.focals - 1], *p[kind.focals : kind.focals + 2]], entry, first_pixel=0.5
+    hw = entry.at(entry.value[:2], "WIDTH HEIGHT").size()
+    p = entry.at(entry.value[2:], model).numbers((kind.focals + 2 + kind.coefficients,)).tolist()
+    pinhole, c = [p[0], p[kind.focals - 1], *p[kind.focals : kind.focals + 2]], p[kind.focals + 2 :]
+    return LensView(
+        hw=hw,
+        K=entry.at(pinhole, model).focal_and_centre(first_pixel=0.5),
+        distortion=None
+        if not kind.lens or (kind.lens == FOV and not any(c))
+        else entry.at(c, model).lens(kind.lens),
     )
-    hw, c = source.size(*wh, entry), p[kind.focals + 2 :]
-    lens = (
-        None if kind.lens is None or (kind.lens == FOV and not any(c)) else source.lens(kind.lens, c, entry)
-    )
-    return LensView(hw=hw, K=K, distortion=lens)
-
-
-def _pose(source: RigSource, entry: str, numbers: list[Any]) -> Pose:
-    return source.pose(source.quaternion(numbers[:4], f"{entry} QW QX QY QZ"), numbers[4:7], entry)
 
 
 # The text files ---------------------------------------------------------------------------------------------
 
 
-def _cameras_text(source: RigSource) -> dict[int, LensView]:
-    """The intrinsics of every line, CAMERA_ID MODEL WIDTH HEIGHT PARAMS, by id."""
-    found: dict[int, LensView] = {}
-    for number, line in _lines(source):
-        fields, entry = line.split(), f"line {number}"
+def _cameras_text(source: RigSource) -> Iterator[tuple[Entry, int, str]]:
+    """WIDTH HEIGHT PARAMS, the id and the model of every line CAMERA_ID MODEL WIDTH HEIGHT PARAMS."""
+    for entry in _lines(source, "cameras"):
+        fields = entry.value.split()
         if len(fields) < 5:
-            raise source.fail(entry, "wanted CAMERA_ID MODEL WIDTH HEIGHT PARAMS; is the file whole?")
-        i = _id(source, fields[0], entry)
-        if i in found:
-            raise source.fail(entry, f"camera {i} occurs twice; keep one")
-        width, height, *parameters = source.numbers_in(" ".join(fields[2:]), None, entry).tolist()
-        found[i] = _intrinsics(source, entry, fields[1], (width, height), parameters)
-    _check_count(source, "cameras", len(found))
-    return found
+            raise entry.fail("wanted CAMERA_ID MODEL WIDTH HEIGHT PARAMS; is the file whole?")
+        yield Entry(source, fields[2:], entry.name).words(), _id(entry, fields[0]), fields[1]
 
 
-def _images_text(source: RigSource) -> list[_Image]:
+def _images_text(source: RigSource) -> Iterator[Posed]:
     """Every other line; those between hold the points, and may be blank."""
-    lines = [(n, line) for n, line in enumerate(source.text().split("\n"), 1) if not line.startswith("#")]
-    while lines and not lines[0][1].strip():
-        lines.pop(0)
-    found = [_image(source, n, line) for n, line in lines[::2] if line.strip()]
-    _check_count(source, "images", len(found))
-    return found
+    for entry in _lines(source, "images", every=2):
+        fields = entry.value.split(maxsplit=9)
+        if len(fields) != 10:
+            raise entry.fail("wanted IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; is the file whole?")
+        pose = _pose(Entry(source, fields[1:8], entry.name).words())
+        yield pose, _id(entry, fields[8]), fields[9].strip()
 
 
-def _image(source: RigSource, number: int, line: str) -> _Image:
-    fields, entry = line.split(maxsplit=9), f"line {number}"
-    if len(fields) != 10:
-        raise source.fail(entry, "wanted IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; is the file whole?")
-    pose = _pose(source, entry, source.numbers_in(" ".join(fields[1:8]), (7,), entry).tolist())
-    return _Image(fields[9].strip(), _id(source, fields[8], entry), pose)
-
-
-def _rigs_text(source: RigSource) -> list[Sensors]:
-    found = [list(_sensors(source, f"line {n}", line.split())) for n, line in _lines(source)]
+def _rigs_text(source: RigSource) -> list[list[Posed]]:
+    found = [list(_sensors(entry)) for entry in _lines(source, "rigs")]
     if not found:
         raise source.fail(None, "holds no rig; was it cut off?")
-    _check_count(source, "rigs", len(found))
     return found
 
 
-def _sensors(source: RigSource, entry: str, fields: list[str]) -> Iterator[tuple[int, Pose]]:
+def _sensors(entry: Entry) -> Iterator[Posed]:
     """RIG_ID NUM_SENSORS REF_TYPE REF_ID, then TYPE ID HAS_POSE [QW QX QY QZ TX TY TZ] for the others."""
-    tokens = iter(fields[1:])
+    tokens = iter(entry.value.split()[1:])
     try:
-        count = int(next(tokens))
-        for k in range(count):
-            kind, i = next(tokens), _id(source, next(tokens), entry)
+        for k in range(int(next(tokens))):
+            kind, i = next(tokens), _id(entry, next(tokens))
             posed = k == 0 or next(tokens) == "1"
-            words = " ".join(next(tokens) for _ in range(7)) if k and posed else ""
-            numbers = source.numbers_in(words, (7,), entry).tolist() if words else AT_ORIGIN
+            words = [next(tokens) for _ in range(7)] if k and posed else AT_ORIGIN
+            numbers = [float(word) for word in words] if posed else None
             if kind == "CAMERA":
-                yield _sensor(source, entry, i, numbers if posed else None)
+                yield _sensor(entry, i, numbers)
     except RigFileError:
         raise
     except (StopIteration, ValueError, RuntimeError):
-        raise source.fail(entry, "is not a rig (RIG_ID NUM_SENSORS ...); is the file whole?") from None
+        raise entry.fail("is not a rig (RIG_ID NUM_SENSORS ...); is the file whole?") from None
+
+
+def _lines(source: RigSource, what: str, every: int = 1) -> list[Entry]:
+    """The lines that are no comments, nor blank (of an image's two the second may be); as many as stated."""
+    lines = [(n, line) for n, line in enumerate(source.text().splitlines(), 1) if not line.startswith("#")]
+    first = next((i for i, (_, line) in enumerate(lines) if line.strip()), 0)
+    found = [source.at(line, f"line {n}") for n, line in lines[first::every] if line.strip()]
+    for line in source.text().splitlines()[:8]:
+        head, _, rest = line.partition(f"Number of {what}:")
+        stated = rest.split(",")[0].strip()
+        if head.startswith("#") and stated.isdigit() and int(stated) != len(found):
+            raise source.fail(None, f"announces {stated} {what} and holds {len(found)}; was it cut off?")
+    return found
+
+
+def _id(entry: Entry, text: str) -> int:
+    if not text.isdigit():
+        raise entry.fail(f"wanted a number as id, got '{text[:40]}'")
+    return int(text)
 
 
 # The binary files, little-endian ----------------------------------------------------------------------------
 
 
-def _cameras_binary(source: RigSource) -> dict[int, LensView]:
-    """The intrinsics of every camera by id."""
+def _cameras_binary(source: RigSource) -> Iterator[tuple[Entry, int, str]]:
     names = {model.id: name for name, model in MODELS.items()}
-    data, found = _Bytes(source), dict[int, LensView]()
+    data = _Bytes(source)
     for _ in range(data.count()):
         i, model, w, h = data.take("<IiQQ")
-        entry = f"camera {i}"
-        if i in found:
-            raise source.fail(entry, "occurs twice; keep one")
         if model not in names:
-            raise source.fail(entry, f"has model number {model}, which is not supported")
+            raise source.fail(f"camera {i}", f"has model number {model}, which is not supported")
         kind = MODELS[names[model]]
-        parameters = list(data.take(f"<{kind.focals + 2 + kind.coefficients}d"))
-        found[i] = _intrinsics(source, entry, names[model], (w, h), parameters)
-    return found
+        parameters = data.take(f"<{kind.focals + 2 + kind.coefficients}d")
+        yield source.at([w, h, *parameters], f"camera {i}"), i, names[model]
 
 
-def _images_binary(source: RigSource) -> list[_Image]:
-    data, found = _Bytes(source), []
+def _images_binary(source: RigSource) -> Iterator[Posed]:
+    data = _Bytes(source)
     for _ in range(data.count()):
         i, *numbers, camera = data.take("<I7dI")
         name = data.string()
         data.take(f"{24 * data.count()}x")  # the points
-        found.append(_Image(name, camera, _pose(source, f"image {i}", numbers)))
-    return found
+        yield _pose(source.at(numbers, f"image {i}")), camera, name
 
 
-def _rigs_binary(source: RigSource) -> list[Sensors]:
+def _rigs_binary(source: RigSource) -> list[list[Posed]]:
     """The cameras of each rig; other sensors are passed over."""
     data, rigs = _Bytes(source), []
     for _ in range(data.count()):
@@ -275,12 +271,12 @@ def _rigs_binary(source: RigSource) -> list[Sensors]:
             posed = k == 0 or bool(data.take("<B")[0])
             numbers = list(data.take("<7d")) if k and posed else AT_ORIGIN
             if kind == 0:
-                sensors.append(_sensor(source, f"rig {rig}", i, numbers if posed else None))
+                sensors.append(_sensor(source.at(None, f"rig {rig}"), i, numbers if posed else None))
         rigs.append(sensors)
     return rigs
 
 
-PARTS = {
+PARTS: dict[str, tuple[Any, Any, Any]] = {
     ".txt": (_cameras_text, _images_text, _rigs_text),
     ".bin": (_cameras_binary, _images_binary, _rigs_binary),
 }
@@ -318,34 +314,6 @@ class _Bytes:
             raise self.source.fail(f"byte {self.at}", "the file ends within a name; was it cut off?")
         text, self.at = self.data[self.at : end].decode("utf-8", errors="replace"), end + 1
         return text
-
-
-def _sensor(source: RigSource, entry: str, camera: int, numbers: list[Any] | None) -> tuple[int, Pose]:
-    if numbers is None:
-        raise source.fail(entry, f"camera {camera} has no pose in its rig; calibrate the rig first")
-    return camera, _pose(source, entry, numbers)
-
-
-def _lines(source: RigSource) -> Iterator[tuple[int, str]]:
-    """The numbered lines that are neither blank nor comments."""
-    for number, line in enumerate(source.text().splitlines(), 1):
-        if line.strip() and not line.startswith("#"):
-            yield number, line
-
-
-def _check_count(source: RigSource, what: str, found: int) -> None:
-    """COLMAP's comment says how many entries follow."""
-    for line in source.text().splitlines()[:8]:
-        head, _, rest = line.partition(f"Number of {what}:")
-        stated = rest.split(",")[0].strip()
-        if head.startswith("#") and stated.isdigit() and int(stated) != found:
-            raise source.fail(None, f"announces {stated} {what} and holds {found}; was it cut off?")
-
-
-def _id(source: RigSource, text: str, entry: str) -> int:
-    if not text.isdigit():
-        raise source.fail(entry, f"wanted a number as id, got '{text[:40]}'")
-    return int(text)
 
 
 def _parameters(name: str, camera: Camera) -> tuple[str, list[float]]:

@@ -24,18 +24,19 @@ from ..pose import Pose
 from ..rig import Rig
 from ..sensor import Sensor
 from .export import brown_conrady, calibrated, focal_and_centre, pose_rows
-from .source import RigSource
+from .source import Entry, RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); T_cn_cnm1 chained, world = cam0 (or the IMU); metres"
 
-CAMERA_MODELS = {"pinhole": (), "omni": ("xi",), "ds": ("xi", "alpha"), "eucm": ("alpha", "beta")}
-"""And what stands before the focal lengths in `intrinsics`."""
-LENSES = {
-    "pinhole": ("radtan", "equidistant", "fov", "none"),
-    "omni": ("radtan", "none"),
-    "ds": ("none",),
-    "eucm": ("none",),
+MODELS: dict[str, tuple[str | None, int, tuple[str, ...]]] = {
+    "pinhole": (None, 0, ("radtan", "equidistant", "fov", "none")),
+    "omni": (UNIFIED, 1, ("radtan", "none")),
+    "ds": (DOUBLE_SPHERE, 2, ("none",)),
+    "eucm": (EXTENDED_UNIFIED, 2, ("none",)),
 }
+"""Of each camera model: the lens, the numbers before the focal lengths, distortion models."""
+DISTORTIONS = {"radtan": (BROWN_CONRADY, 4), "equidistant": (KANNALA_BRANDT, 4), "fov": (FOV, 1)}
+"""The lens of a pinhole's distortion model, and how many numbers it has."""
 AGAIN = "calibrate again with --models pinhole-radtan, or ds-none for wide angles"
 
 
@@ -45,14 +46,14 @@ def recognises(path: Path, head: str) -> bool:
 
 def read(source: RigSource) -> Rig:
     """Cameras cam0, cam1, ..."""
-    chain = {name: fields for name, fields in source.yaml().items() if re.fullmatch(r"cam\d+", str(name))}
+    chain = {name: fields for name, fields in source.yaml().items() if re.fullmatch(r"cam\d+", name)}
     if not chain:
         raise source.fail("cam0", "is missing; is this a Kalibr camchain?")
     names = sorted(chain, key=lambda name: int(name[3:]))
     if names != [f"cam{i}" for i in range(len(names))]:
         raise source.fail(names[-1], f"the chain has a gap: it holds {', '.join(names)}")
-    poses = _poses(source, {name: source.mapping(chain[name], name) for name in names})
-    return source.rig((name, _camera(source, name, chain[name], poses[name])) for name in names)
+    entries = [chain[name].mapping() for name in names]
+    return source.rig(zip(names, map(_camera, entries, _poses(entries))))
 
 
 def write(rig: Rig) -> str:
@@ -79,60 +80,43 @@ def write(rig: Rig) -> str:
     return yaml.safe_dump(document, default_flow_style=None, sort_keys=False)
 
 
-def _poses(source: RigSource, chain: dict[str, dict[str, Any]]) -> dict[str, Pose]:
-    if all("T_cam_imu" in fields for fields in chain.values()):
-        return {n: source.pose_matrix(fields["T_cam_imu"], f"{n}.T_cam_imu") for n, fields in chain.items()}
-    poses, pose = {}, Pose.identity()
-    for i, (name, fields) in enumerate(chain.items()):
-        if i > 0:
-            pose = source.pose_matrix(source.get(fields, "T_cn_cnm1", name), f"{name}.T_cn_cnm1") @ pose
-        poses[name] = pose
+def _poses(chain: list[Entry]) -> list[Pose]:
+    """Poses of the cameras in camera 0, or in the IMU if all of them state that."""
+    if all("T_cam_imu" in fields for fields in chain):
+        return [fields["T_cam_imu"].pose_matrix() for fields in chain]
+    poses = [Pose.identity()]
+    for fields in chain[1:]:
+        poses.append(fields["T_cn_cnm1"].pose_matrix() @ poses[-1])
     return poses
 
 
-def _camera(source: RigSource, name: str, fields: dict[str, Any], pose: Pose) -> Camera:
-    model = source.get(fields, "camera_model", name)
-    if model not in CAMERA_MODELS:
-        raise source.fail(
-            f"{name}.camera_model", f"is '{model}'; supported: {', '.join(CAMERA_MODELS)}: {AGAIN}"
-        )
-    first = len(CAMERA_MODELS[model])
-    numbers = source.numbers(source.get(fields, "intrinsics", name), (first + 4,), f"{name}.intrinsics")
-    K = source.focal_and_centre(numbers[first:], f"{name}.intrinsics")
-    offset = source.number(fields.get("timeshift_cam_imu", 0.0), f"{name}.timeshift_cam_imu")
+def _camera(fields: Entry, pose: Pose) -> Camera:
+    model, listed = fields["camera_model"], fields["intrinsics"]
+    if model.value not in MODELS:
+        raise model.fail(f"is '{model.value}'; supported: {', '.join(MODELS)}: {AGAIN}")
+    first = MODELS[model.value][1]
+    numbers = listed.numbers((first + 4,))
     return Camera(
-        K=K,
+        K=fields.at(numbers[first:], "intrinsics").focal_and_centre(),
         cam_from_world=pose,
-        hw=source.size_of(source.get(fields, "resolution", name), f"{name}.resolution"),
-        distortion=_lens(source, name, model, numbers[:first].tolist(), fields),
-        sensor=Sensor(time_offset=offset),
+        hw=fields["resolution"].size(),
+        distortion=_lens(model.value, numbers[:first].tolist(), fields),
+        sensor=Sensor(time_offset=fields.get("timeshift_cam_imu", 0.0).number()),
     )
 
 
-def _lens(
-    source: RigSource, name: str, camera: str, before: list[float], fields: dict[str, Any]
-) -> Distortion | None:
+def _lens(camera: str, before: list[float], fields: Entry) -> Distortion | None:
     """The lens of a camera model and a distortion model; `before` are the numbers before focal lengths."""
-    model, entry = fields.get("distortion_model", "none"), f"{name}.distortion_coeffs"
-    if model not in LENSES[camera]:
-        known = ", ".join(LENSES[camera])
-        raise source.fail(
-            f"{name}.distortion_model", f"is '{model}'; supported for {camera}: {known}: {AGAIN}"
-        )
-    count = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}[model]
-    c = (
-        source.numbers(source.get(fields, "distortion_coeffs", name), (count,), entry).tolist()
-        if count
-        else []
-    )
-    if camera == "omni":
-        return source.lens(UNIFIED, [*before, *(c or [0.0] * 4)], f"{name}.intrinsics")
-    if camera != "pinhole":
-        return source.lens(
-            DOUBLE_SPHERE if camera == "ds" else EXTENDED_UNIFIED, before, f"{name}.intrinsics"
-        )
-    lens = {"radtan": BROWN_CONRADY, "equidistant": KANNALA_BRANDT, "fov": FOV, "none": None}[model]
-    return None if lens is None else source.lens(lens, c, entry)
+    lens, _, known = MODELS[camera]
+    model = fields.get("distortion_model", "none")
+    if model.value not in known:
+        raise model.fail(f"is '{model.value}'; supported for {camera}: {', '.join(known)}: {AGAIN}")
+    bent, count = DISTORTIONS.get(model.value, (None, 0))
+    c = fields["distortion_coeffs"].numbers((count,)).tolist() if count else []
+    if lens is not None:
+        c = [0.0] * 4 if lens == UNIFIED and not c else c
+        return fields.at([*before, *c], "intrinsics").lens(lens)
+    return None if bent is None else fields.at(c, "distortion_coeffs").lens(bent)
 
 
 def _entry(name: str, camera: Camera) -> dict[str, Any]:

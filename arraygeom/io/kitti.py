@@ -11,16 +11,17 @@ import re
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from ..camera import Camera
 from ..pose import Pose
 from ..rig import Rig
-from .source import RigSource
+from .source import Entry, RigSource, pose_of
 
 CONVENTION = (
     "first pixel's centre at 0 (shift 0); P = K [I | t] on rectified camera 0, raw X_i = R X_0 + T; metres"
 )
+ENTRIES = r"(P|S|K|D|R|T)\d?(_rect)?(_\d\d)?"
+"""Names of the lines that are read; others (dates, say) are passed over."""
 
 
 def recognises(path: Path, head: str) -> bool:
@@ -29,33 +30,20 @@ def recognises(path: Path, head: str) -> bool:
 
 def read(source: RigSource) -> Rig:
     """The rectified cameras: P0..P3 of `calib.txt`, P_rect and S_rect of `calib_cam_to_cam.txt`."""
-    entries = _entries(source)
-    names = [name for name in entries if re.fullmatch(r"P\d|P_rect_\d\d", name)]
+    entries = source.lines(":", ENTRIES)
+    names = [name for name, _ in entries.items() if re.fullmatch(r"P\d|P_rect_\d\d", name)]
     if not names:
         raise source.fail("P0", "is missing; is this a KITTI calibration file?")
-    return source.rig((f"cam{int(name[-1])}", _rectified(source, entries, name)) for name in names)
+    return source.rig((f"cam{int(name[-1])}", _rectified(entries, name)) for name in names)
 
 
-def _rectified(source: RigSource, entries: dict[str, Tensor], name: str) -> Camera:
-    P = source.numbers(entries[name], (3, 4), name)
-    K = source.intrinsics(P[:, :3], name)
+def _rectified(entries: Entry, name: str) -> Camera:
+    P, size = entries[name].numbers((3, 4)), name.replace("P_", "S_")
+    K = entries.at(P[:, :3], name).intrinsics()
     pose = Pose(torch.eye(3, dtype=torch.float64), torch.linalg.solve(K, P[:, 3]))
-    size = entries.get(name.replace("P_", "S_")) if "_" in name else None
-    hw = source.size_unstated(K) if size is None else source.size_of(size, f"size of {name}")
+    stated = size != name and size in entries
+    hw = entries[size].size() if stated else entries.source.size_unstated(K)
     return Camera(K=K, cam_from_world=pose, hw=hw)
-
-
-def _entries(source: RigSource) -> dict[str, Tensor]:
-    """The lines `name: numbers`; lines of other things (dates) are passed over."""
-    entries: dict[str, Tensor] = {}
-    for line in source.text().splitlines():
-        name, colon, values = line.partition(":")
-        if not colon or not re.fullmatch(r"(P|S|K|D|R|T)\d?(_rect)?(_\d\d)?", name):
-            continue
-        if name in entries:
-            raise source.fail(name, "occurs twice; keep one")
-        entries[name] = source.numbers_in(values, None, name)
-    return entries
 
 
 class Raw:
@@ -70,18 +58,17 @@ class Raw:
     @staticmethod
     def read(source: RigSource) -> Rig:
         """The unrectified cameras: S, K, D, R and T."""
-        entries = _entries(source)
-        numbers = sorted(name[-2:] for name in entries if re.fullmatch(r"K_\d\d", name))
+        entries = source.lines(":", ENTRIES)
+        numbers = sorted(name[-2:] for name, _ in entries.items() if re.fullmatch(r"K_\d\d", name))
         if not numbers:
             raise source.fail("K_00", "is missing; is this KITTI's calib_cam_to_cam.txt?")
-        return source.rig((f"cam{int(n)}", Raw._camera(source, entries, n)) for n in numbers)
+        return source.rig((f"cam{int(n)}", Raw._camera(entries, n)) for n in numbers)
 
     @staticmethod
-    def _camera(source: RigSource, entries: dict[str, Tensor], n: str) -> Camera:
-        S, K, D, R, T = (source.get(entries, f"{letter}_{n}", "") for letter in "SKDRT")
+    def _camera(entries: Entry, n: str) -> Camera:
         return Camera(
-            K=source.intrinsics(K, f"K_{n}"),
-            cam_from_world=source.pose(R, T, f"R_{n}, T_{n}:"),
-            hw=source.size_of(S, f"S_{n}"),
-            distortion=source.brown_conrady(D, f"D_{n}"),
+            K=entries[f"K_{n}"].intrinsics(),
+            cam_from_world=pose_of(entries[f"R_{n}"], entries[f"T_{n}"]),
+            hw=entries[f"S_{n}"].size(),
+            distortion=entries[f"D_{n}"].brown_conrady(),
         )

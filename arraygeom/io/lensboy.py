@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -19,7 +18,7 @@ from ..lenses.model import LensModel
 from ..lenses.splined import PINHOLE
 from ..pose import Pose
 from ..rig import Rig
-from .source import RigSource
+from .source import Entry, RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); no pose: the camera is the world"
 OLDEST = 3
@@ -33,42 +32,33 @@ def recognises(path: Path, head: str) -> bool:
 def read(source: RigSource) -> Rig:
     """The one camera, by its file's name."""
     fields = source.json()
-    numbers = [source.get(fields, key, "") for key in ("fx", "fy", "cx", "cy")]
     camera = Camera(
-        K=source.focal_and_centre(numbers, "fx, fy, cx, cy"),
+        K=fields.listed("fx", "fy", "cx", "cy").focal_and_centre(),
         cam_from_world=Pose.identity(),
-        hw=source.size_of(
-            [source.get(fields, f"image_{side}", "") for side in ("width", "height")], "image_width"
-        ),
-        distortion=_lens(source, fields),
+        hw=fields.listed("image_width", "image_height").size(),
+        distortion=_lens(fields),
     )
     return source.rig([(source.path.stem, camera)])
 
 
-def _lens(source: RigSource, fields: dict[str, Any]) -> LensModel | None:
-    kind = source.get(fields, "type", "")
-    if kind == "opencv":
-        return source.brown_conrady(fields.get("distortion_coeffs"), "distortion_coeffs")
-    if kind != "pinhole_splined":
-        raise source.fail("type", f"is '{kind}'; opencv and pinhole_splined are read")
-    version = str(fields["lensboy-version"]).partition(".")[0]
+def _lens(fields: Entry) -> LensModel | None:
+    kind = fields["type"]
+    if kind.value == "opencv":
+        return fields.get("distortion_coeffs").brown_conrady()
+    if kind.value != "pinhole_splined":
+        raise kind.fail(f"is '{kind.value}'; opencv and pinhole_splined are read")
+    version = str(fields["lensboy-version"].value).partition(".")[0]
     if not version.isdecimal() or int(version) < OLDEST:
-        raise source.fail(
-            "lensboy-version", f"is {version}; splines from version {OLDEST} on are read: calibrate again"
+        raise fields["lensboy-version"].fail(
+            f"is {version}; splines from version {OLDEST} on are read: calibrate again"
         )
-    counts = [
-        int(source.number(source.get(fields, f"num_knots_{axis}", ""), f"num_knots_{axis}")) for axis in "xy"
-    ]
-    nx, ny = counts
-    grids = [
-        source.numbers(source.get(fields, f"d{axis}_grid", ""), (ny, nx), f"d{axis}_grid") for axis in "xy"
-    ]
+    nx, ny = counts = [int(fields[f"num_knots_{axis}"].number()) for axis in "xy"]
+    knots = torch.stack([fields[f"d{axis}_grid"].numbers((ny, nx)) for axis in "xy"], -1)
     spacing = []
     for axis, count in zip("xy", counts):
-        degrees = source.number(source.get(fields, f"fov_deg_{axis}", ""), f"fov_deg_{axis}")
+        field = fields[f"fov_deg_{axis}"]
+        degrees = field.number()
         if not 0 < degrees < 360 or count < 4:
-            raise source.fail(
-                f"fov_deg_{axis}", f"is {degrees:g} of {count} knots; wanted 0 to 360 and 4 knots or more"
-            )
+            raise field.fail(f"is {degrees:g} of {count} knots; wanted 0 to 360 and 4 knots or more")
         spacing.append(4 * math.tan(math.radians(degrees) / 4) / (count - 3))
-    return Splined(torch.stack(grids, -1), torch.tensor(spacing, dtype=torch.float64), base=PINHOLE)
+    return Splined(knots, torch.tensor(spacing, dtype=torch.float64), base=PINHOLE)

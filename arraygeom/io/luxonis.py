@@ -8,14 +8,11 @@ of the stated size. The world is the first camera.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
-
-import torch
 
 from ..camera import Camera
 from ..pose import Pose
 from ..rig import Rig
-from .source import RigSource
+from .source import Entry, RigSource, pose_of
 
 CONVENTION = (
     "first pixel's centre at 0 (shift 0); "
@@ -33,35 +30,26 @@ def recognises(path: Path, head: str) -> bool:
 
 def read(source: RigSource) -> Rig:
     """The calibrated cameras by their sockets: "CAM_A" (colour on most), "CAM_B", "CAM_C", ..."""
-    listed = source.get(source.json(), "cameraData", "")
-    entries: dict[int, dict[str, Any]] = {}
-    for item in listed if isinstance(listed, list) else []:
-        if not isinstance(item, list) or len(item) != 2:
-            raise source.fail("cameraData", "is not a list of [socket, camera]; is the file whole?")
-        socket = int(source.number(item[0], "cameraData socket"))
+    listed = source.json()["cameraData"]
+    entries: dict[int, Entry] = {}
+    for item in listed.each():
+        if not isinstance(item.value, list) or len(item.value) != 2:
+            raise listed.fail("is not a list of [socket, camera]; is the file whole?")
+        socket = int(item.at(item.value[0], "socket").number())
         if not 0 <= socket < len(SOCKETS) or socket in entries:
-            raise source.fail(
-                "cameraData", f"has socket {socket} twice, or a socket that no board has; keep one"
-            )
-        entry = source.mapping(item[1], _name(socket))
-        if entry.get("width") and entry.get("height"):  # others are not calibrated
+            raise listed.fail(f"has socket {socket} twice, or a socket that no board has; keep one")
+        entry = source.at(item.value[1], _name(socket))
+        if entry.get("width").value and entry.get("height").value:  # others are not calibrated
             entries[socket] = entry
     if not entries:
-        raise source.fail("cameraData", "holds no calibrated camera; is the file whole?")
-    root, first_to_root = _to_root(source, entries, min(entries))
+        raise listed.fail("holds no calibrated camera; is the file whole?")
+    root, first_to_root = _to_root(entries, min(entries))
     cameras = []
-    for socket in sorted(entries):
-        own_root, to_root = _to_root(source, entries, socket)
+    for socket, entry in sorted(entries.items()):
+        own_root, to_root = _to_root(entries, socket)
         if own_root != root:
-            raise source.fail(
-                _name(socket), f"is related to no camera that {_name(min(entries))} is related to"
-            )
-        cameras.append(
-            (
-                _name(socket),
-                _camera(source, entries[socket], _name(socket), to_root.inverse() @ first_to_root),
-            )
-        )
+            raise entry.fail(f"is related to no camera that {_name(min(entries))} is related to")
+        cameras.append((entry.name, _camera(entry, to_root.inverse() @ first_to_root)))
     return source.rig(cameras)
 
 
@@ -69,38 +57,32 @@ def _name(socket: int) -> str:
     return f"CAM_{SOCKETS[socket]}"
 
 
-def _to_root(source: RigSource, entries: dict[int, dict[str, Any]], socket: int) -> tuple[int, Pose]:
+def _to_root(entries: dict[int, Entry], socket: int) -> tuple[int, Pose]:
     """The camera that a chain of extrinsics ends at, and its points from the first camera's."""
     pose, passed = Pose.identity(), [socket]
     while True:
-        name = _name(passed[-1])
-        extrinsics = entries[passed[-1]].get("extrinsics") or {}
-        to = int(source.number(extrinsics.get("toCameraSocket", -1), f"{name}.toCameraSocket"))
+        extrinsics = entries[passed[-1]].get("extrinsics")
+        to = int(extrinsics.get("toCameraSocket", -1).number()) if extrinsics.value else -1
         if to not in entries:  # -1 of the last one
             return passed[-1], pose
         if to in passed:
-            raise source.fail(f"{name}.toCameraSocket", f"is {to}: the chain of extrinsics is a circle")
-        if extrinsics.get("lengthUnit", CENTIMETRES) != CENTIMETRES:
-            raise source.fail(
-                f"{name}.lengthUnit", f"is {extrinsics['lengthUnit']}; centimetres (1) are read"
-            )
-        shift = source.mapping(source.get(extrinsics, "translation", name), f"{name}.translation")
-        t = [source.get(shift, axis, f"{name}.translation") for axis in "xyz"]
-        step = source.pose(source.get(extrinsics, "rotationMatrix", name), t, name, metres=0.01)
+            raise extrinsics["toCameraSocket"].fail(f"is {to}: the chain of extrinsics is a circle")
+        unit = extrinsics.get("lengthUnit", CENTIMETRES)
+        if unit.value != CENTIMETRES:
+            raise unit.fail(f"is {unit.value}; centimetres (1) are read")
+        step = pose_of(extrinsics["rotationMatrix"], extrinsics["translation"].listed(*"xyz"), metres=0.01)
         pose, passed = step @ pose, [*passed, to]
 
 
-def _camera(source: RigSource, entry: dict[str, Any], name: str, pose: Pose) -> Camera:
-    kind, lens = entry.get("cameraType", PERSPECTIVE), entry.get("distortionCoeff") or []
-    if kind not in (PERSPECTIVE, FISHEYE):
-        raise source.fail(f"{name}.cameraType", f"is {kind}; perspective (0) and fisheye (1) are read")
-    entered = f"{name}.distortionCoeff"
-    if kind == FISHEYE:  # padded with zeros to fourteen numbers by some versions
-        numbers = source.numbers(lens, None, entered)
-        lens = numbers[:4] if not bool(torch.count_nonzero(numbers[4:])) else numbers
+def _camera(entry: Entry, pose: Pose) -> Camera:
+    kind, lens = entry.get("cameraType", PERSPECTIVE), entry.get("distortionCoeff", [])
+    if kind.value not in (PERSPECTIVE, FISHEYE):
+        raise kind.fail(f"is {kind.value}; perspective (0) and fisheye (1) are read")
+    if kind.value == FISHEYE and not bool(lens.numbers()[4:].any()):
+        lens.value = lens.numbers()[:4]  # padded with zeros to fourteen numbers by some versions
     return Camera(
-        K=source.intrinsics(source.get(entry, "intrinsicMatrix", name), f"{name}.intrinsicMatrix"),
+        K=entry["intrinsicMatrix"].intrinsics(),
         cam_from_world=pose,
-        hw=source.size(entry["width"], entry["height"], f"{name}.width, height"),
-        distortion=(source.kannala_brandt if kind == FISHEYE else source.brown_conrady)(lens, entered),
+        hw=entry.listed("width", "height").size(),
+        distortion=lens.kannala_brandt() if kind.value == FISHEYE else lens.brown_conrady(),
     )

@@ -28,22 +28,19 @@ from ..pixels import HW, pixel_grid, to_homogeneous
 from ..pose import Pose
 from ..rig import Rig
 from .matfile import load_variables
-from .source import RigSource
+from .source import Entry, RigSource, pose_of
 
 CONVENTION = (
     "first pixel's centre at 1 (shift -1); row vectors transposed, world = camera 1; WorldUnits, else mm"
 )
 FISHEYE = "MappingCoefficients"
-UNITS = {
-    "mm": 1e-3,
-    "millimeters": 1e-3,
-    "cm": 1e-2,
-    "centimeters": 1e-2,
-    "m": 1.0,
-    "meters": 1.0,
-    "in": 0.0254,
+METRES = {
+    1e-3: ("mm", "millimeters", "millimetres"),
+    1e-2: ("cm", "centimeters", "centimetres"),
+    1.0: ("m", "meters", "metres"),
+    0.0254: ("in", "inches"),
 }
-UNITS |= {"millimetres": 1e-3, "centimetres": 1e-2, "metres": 1.0, "inches": 0.0254}
+UNITS = {name: metres for metres, names in METRES.items() for name in names}
 
 
 def recognises(path: Path, head: str) -> bool:
@@ -60,41 +57,30 @@ def recognises(path: Path, head: str) -> bool:
 
 def read(source: RigSource) -> Rig:
     """The pair, named "camera1" and "camera2", or a single camera "camera1"."""
-    fields = _outermost(source, _document(source))
+    fields = _outermost(source)
     if "CameraParameters1" not in fields:
-        return source.rig([("camera1", _camera(source, fields, "", Pose.identity()))])
-    poses = Pose.identity(), _pose(source, fields)
-    cameras = [
-        _camera(source, source.mapping(source.get(fields, name, ""), name), name, pose)
-        for name, pose in zip(("CameraParameters1", "CameraParameters2"), poses)
-    ]
-    if fields.get("FundamentalMatrix") is not None:
-        _check_fundamental(
-            source, source.numbers(fields["FundamentalMatrix"], (3, 3), "FundamentalMatrix"), *cameras
-        )
+        return source.rig([("camera1", _camera(fields, Pose.identity()))])
+    poses = Pose.identity(), _pose(fields)
+    cameras = [_camera(fields[f"CameraParameters{i}"], pose) for i, pose in enumerate(poses, 1)]
+    if (F := fields.get("FundamentalMatrix")).value is not None:
+        _check_fundamental(F, *cameras)
     return source.rig(zip(("camera1", "camera2"), cameras))
 
 
-def _document(source: RigSource) -> dict[str, Any]:
+def _outermost(source: RigSource) -> Entry:
+    """The struct itself, or the first variable of the file that holds one."""
     with source.path.open("rb") as file:
         is_text = source.path.suffix != ".mat" and not file.read(7).startswith(b"MATLAB ")
-    return source.json() if is_text else load_variables(source)
-
-
-def _outermost(source: RigSource, fields: dict[str, Any]) -> dict[str, Any]:
-    """The struct itself, or the first variable of the file that holds one."""
-    for value in (fields, *fields.values()):
+    fields = source.json().value if is_text else load_variables(source)
+    second = any(name.endswith("Camera2") or name == "CameraParameters2" for name in fields)
+    for value in (fields,) if second else (fields, *fields.values()):
         if isinstance(value, dict) and ("CameraParameters1" in value or _is_camera(value)):
-            return value
-        if value is fields and any(
-            name.endswith("Camera2") or name == "CameraParameters2" for name in fields
-        ):
-            raise source.fail(
-                "CameraParameters1", "is missing, and the second camera's is here; is the file whole?"
-            )
+            return source.at(value)
     raise source.fail(
         "CameraParameters1",
-        "is missing: MATLAB objects cannot be read, save the struct, "
+        "is missing, and the second camera's is here; is the file whole?"
+        if second
+        else "is missing: MATLAB objects cannot be read, save the struct, "
         "s = toStruct(stereoParams); save(f, 's', '-v7')",
     )
 
@@ -107,73 +93,61 @@ def _is_fisheye(fields: Any) -> bool:
     return isinstance(fields, dict) and FISHEYE in fields
 
 
-def _camera(source: RigSource, fields: dict[str, Any], entry: str, pose: Pose) -> Camera:
-    if _is_fisheye(fields.get("Intrinsics", fields)):
-        return _fisheye(source, fields.get("Intrinsics", fields), entry, pose)
-    if "K" in fields:
-        K = source.intrinsics(fields["K"], f"{entry}.K", first_pixel=1.0)
-    else:
-        rows = source.numbers(
-            source.get(fields, ("IntrinsicMatrix", "K"), entry), (3, 3), f"{entry}.IntrinsicMatrix"
-        )
-        K = source.intrinsics(rows.T, f"{entry}.IntrinsicMatrix", first_pixel=1.0)
-    lens = _lens(source, fields, entry)
-    return Camera(K=K, cam_from_world=pose, hw=_size(source, fields, entry, K), distortion=lens)
+def _camera(fields: Entry, pose: Pose) -> Camera:
+    fisheye = fields["Intrinsics"] if _is_fisheye(fields.get("Intrinsics").value) else fields
+    if FISHEYE in fisheye:
+        K, lens = _fisheye(fisheye)
+        return Camera(K=K, cam_from_world=pose, hw=_size(fisheye, K), distortion=lens)
+    columns = fields["K"] if "K" in fields else fields["IntrinsicMatrix"].transposed(3)
+    K = columns.intrinsics(first_pixel=1.0)
+    return Camera(K=K, cam_from_world=pose, hw=_size(fields, K), distortion=_lens(fields))
 
 
-def _fisheye(source: RigSource, fields: dict[str, Any], entry: str, pose: Pose) -> Camera:
-    a0, a2, a3, a4 = source.numbers(fields[FISHEYE], (4,), f"{entry}.{FISHEYE}").tolist()
+def _fisheye(fields: Entry) -> tuple[Tensor, Distortion | None]:
+    a0, a2, a3, a4 = fields[FISHEYE].numbers((4,)).tolist()
     if not a0 > 0:
-        raise source.fail(
-            f"{entry}.{FISHEYE}", f"begins with {a0:g}; it is positive, about the focal length in pixels"
-        )
-    centre = source.numbers(source.get(fields, "DistortionCenter", entry), (2,), f"{entry}.DistortionCenter")
-    stretch = source.numbers(fields.get("StretchMatrix", [[1, 0], [0, 1]]), (2, 2), f"{entry}.StretchMatrix")
+        raise fields[FISHEYE].fail(f"begins with {a0:g}; it is positive, about the focal length in pixels")
     K = torch.eye(3, dtype=torch.float64)
-    K[:2, :2], K[:2, 2] = stretch * a0, centre
-    K = source.intrinsics(K, f"{entry}.StretchMatrix", first_pixel=1.0)
-    lens = source.lens(SCARAMUZZA, [a2 * a0, a3 * a0**2, a4 * a0**3], f"{entry}.{FISHEYE}")
-    return Camera(K=K, cam_from_world=pose, hw=_size(source, fields, entry, K), distortion=lens)
+    K[:2, :2] = fields.get("StretchMatrix", [[1, 0], [0, 1]]).numbers((2, 2)) * a0
+    K[:2, 2] = fields["DistortionCenter"].numbers((2,))
+    lens = fields.at([a2 * a0, a3 * a0**2, a4 * a0**3], FISHEYE).lens(SCARAMUZZA)
+    return fields.at(K, "StretchMatrix").intrinsics(first_pixel=1.0), lens
 
 
-def _size(source: RigSource, fields: dict[str, Any], entry: str, K: Tensor) -> HW:
+def _size(fields: Entry, K: Tensor) -> HW:
     size = fields.get("ImageSize")
-    if size is None or np.size(size) == 0:
-        return source.size_unstated(K)
-    height, width = source.numbers(size, (2,), f"{entry}.ImageSize").tolist()
-    return source.size(width, height, f"{entry}.ImageSize")
+    if size.value is None or np.size(size.value) == 0:
+        return fields.source.size_unstated(K)
+    return fields.at(size.numbers((2,)).flip(0), "ImageSize").size()
 
 
-def _lens(source: RigSource, fields: dict[str, Any], entry: str) -> Distortion | None:
-    radial = source.numbers(fields.get("RadialDistortion", []), None, f"{entry}.RadialDistortion").tolist()
-    tangential = source.numbers(
-        fields.get("TangentialDistortion", []), None, f"{entry}.TangentialDistortion"
-    ).tolist()
+def _lens(fields: Entry) -> Distortion | None:
+    radial, tangential = (
+        fields.get(f"{kind}Distortion", []).numbers().tolist() for kind in ("Radial", "Tangential")
+    )
     if not radial and not tangential:
         return None
     if len(radial) not in (2, 3) or len(tangential) not in (0, 2):
-        raise source.fail(f"{entry}.RadialDistortion", "wanted 2 or 3 radial and 2 tangential coefficients")
-    return source.brown_conrady([*radial[:2], *(tangential or [0.0, 0.0]), *radial[2:]], entry)
+        raise fields.fail("has no 2 or 3 numbers of RadialDistortion and 2 of TangentialDistortion")
+    c = [*radial[:2], *(tangential or [0.0, 0.0]), *radial[2:]]
+    return fields.at(c, "RadialDistortion").brown_conrady()
 
 
-def _pose(source: RigSource, fields: dict[str, Any]) -> Pose:
+def _pose(fields: Entry) -> Pose:
     """X_2 = R X_1 + t, in metres."""
-    unit = str(fields.get("WorldUnits") or "mm").strip().lower()
+    unit = str(fields.get("WorldUnits").value or "mm").strip().lower()
     if unit not in UNITS:
-        raise source.fail("WorldUnits", f"is '{unit}'; known: {', '.join(UNITS)}")
+        raise fields["WorldUnits"].fail(f"is '{unit}'; known: {', '.join(UNITS)}")
     if "PoseCamera2" not in fields:
-        R = source.numbers(source.get(fields, "RotationOfCamera2", ""), (3, 3), "RotationOfCamera2")
-        return source.pose(
-            R.T, source.get(fields, "TranslationOfCamera2", ""), "camera 2", metres=UNITS[unit]
-        )
-    pose = source.mapping(fields["PoseCamera2"], "PoseCamera2")
+        R = fields["RotationOfCamera2"].transposed(3)
+        return pose_of(R, fields["TranslationOfCamera2"], metres=UNITS[unit])
+    pose = fields["PoseCamera2"]
     if "A" in pose:
-        return source.pose_matrix(pose["A"], "PoseCamera2.A", metres=UNITS[unit])
-    R, t = source.get(pose, ("R", "Rotation"), "PoseCamera2"), source.get(pose, "Translation", "PoseCamera2")
-    return source.pose(R, t, "PoseCamera2", metres=UNITS[unit])
+        return pose["A"].pose_matrix(metres=UNITS[unit])
+    return pose_of(pose["R", "Rotation"], pose["Translation"], metres=UNITS[unit])
 
 
-def _check_fundamental(source: RigSource, F: Tensor, one: Camera, two: Camera) -> None:
+def _check_fundamental(F: Entry, one: Camera, two: Camera) -> None:
     """Points both pinholes see have to be on the lines of F as stated, which is of pixels counted from 1."""
     h, w = one.hw
     x = pixel_grid((4, 4), dtype=torch.float64).reshape(-1, 2) * torch.tensor([w / 4, h / 4])
@@ -181,11 +155,10 @@ def _check_fundamental(source: RigSource, F: Tensor, one: Camera, two: Camera) -
     rays = to_homogeneous(x) @ torch.linalg.inv(one.K).T
     X = two.cam_from_world.apply(torch.cat([rays * baseline * 5, rays * baseline * 50]))
     x_two = to_homogeneous(X[:, :2] / X[:, 2:]) @ two.K.T
-    lines = epipolar_lines(shift_origin(F, 1.0), torch.cat([x, x]))
+    lines = epipolar_lines(shift_origin(F.numbers((3, 3)), 1.0), torch.cat([x, x]))
     distance = (lines * x_two).sum(-1).abs().median()
     if not distance < 1:
-        raise source.fail(
-            "FundamentalMatrix",
+        raise F.fail(
             f"contradicts the pose of camera 2 by {distance:.3g} px; "
-            "is the rotation transposed, or the pose inverted?",
+            "is the rotation transposed, or the pose inverted?"
         )

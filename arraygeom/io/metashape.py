@@ -53,7 +53,7 @@ def read(source: RigSource) -> Rig:
         if sensor not in views:
             views[sensor] = _sensor(source, sensors[sensor], f"sensor {sensor}")
         view, entry = views[sensor], f"{name}.transform"
-        pose = source.pose_matrix(source.numbers_in(transform, (16,), entry), entry).inverse()
+        pose = source.at(transform, entry).words().pose_matrix().inverse()
         own = scales.get(camera.get("component_id"))
         metres = own if own is not None else scale if scale is not None else 1.0
         pose = Pose(pose.R, pose.t * metres)
@@ -101,14 +101,11 @@ def _sensor(source: RigSource, sensor: ET.Element, entry: str) -> LensView:
     resolution = sensor.find("resolution") if resolution is None else resolution
     if resolution is None:
         raise source.fail(entry, "has no resolution")
-    width, height = (
-        source.numbers_in(resolution.get(n) or "", (1,), f"{entry} {n}") for n in ("width", "height")
-    )
-    h, w = source.size(width, height, f"{entry} resolution")
+    sides = [resolution.get(side) or "" for side in ("width", "height")]
+    h, w = source.at(sides, f"{entry} resolution").words().size()
     f, cx, cy, b1, b2 = (_number(source, calibration, name, entry) for name in ("f", "cx", "cy", "b1", "b2"))
-    K = source.intrinsics(
-        [[f + b1, b2, w / 2 + cx], [0, f, h / 2 + cy], [0, 0, 1]], f"{entry} f", first_pixel=0.5
-    )
+    numbers = source.at([f + b1, f, w / 2 + cx, h / 2 + cy], f"{entry} f")
+    K = numbers.focal_and_centre(first_pixel=0.5, skew=b2)
     return LensView(hw=(h, w), K=K, distortion=_lens(source, calibration, entry))
 
 
@@ -124,14 +121,14 @@ def _lens(source: RigSource, calibration: ET.Element, entry: str) -> Distortion 
             entry, "has p3, p4, or for a frame k4, which are not read: optimise the cameras without them"
         )
     if kind == "frame":
-        return source.brown_conrady([k1, k2, p2, p1, k3], entry)
-    return source.lens(THIN_PRISM_FISHEYE, [k1, k2, p2, p1, k3, k4, 0.0, 0.0], entry)
+        return source.at([k1, k2, p2, p1, k3], entry).brown_conrady()
+    return source.at([k1, k2, p2, p1, k3, k4, 0.0, 0.0], entry).lens(THIN_PRISM_FISHEYE)
 
 
 def _scale(source: RigSource, part: ET.Element) -> float | None:
     """Metres a unit of a chunk or a component, if that is known."""
     text = part.findtext("transform/scale")
-    return None if text is None else float(source.numbers_in(text, (1,), "scale"))
+    return None if text is None else source.at(text, "scale").words().number()
 
 
 def _number(source: RigSource, calibration: ET.Element, name: str, entry: str) -> float:
@@ -139,4 +136,4 @@ def _number(source: RigSource, calibration: ET.Element, name: str, entry: str) -
     text = calibration.findtext(name)
     if text is None and name == "f":
         raise source.fail(entry, "has no f, the focal length")
-    return 0.0 if text is None else float(source.numbers_in(text, (1,), f"{entry} {name}"))
+    return 0.0 if text is None else source.at(text, f"{entry} {name}").words().number()

@@ -12,15 +12,12 @@ import ast
 import math
 import re
 from pathlib import Path
-from typing import Any
-
-import torch
 
 from ..camera import Camera
 from ..lenses import Equirectangular, Splined
 from ..lenses.model import LensModel
 from ..rig import Rig
-from .source import RigSource
+from .source import Entry, RigSource, pose_of
 
 CONVENTION = (
     "first pixel's centre at 0 (shift 0); rt_cam_ref (extrinsics) = X_camera from X_reference, in metres"
@@ -48,45 +45,42 @@ def read(source: RigSource) -> Rig:
 
 def _camera(source: RigSource) -> Camera:
     fields = _fields(source)
-    model = str(source.get(fields, "lensmodel", ""))
-    numbers = source.numbers(source.get(fields, "intrinsics", ""), None, "intrinsics")
-    lens = _lens(source, model, numbers)
-    where = "rt_cam_ref" if "rt_cam_ref" in fields else "extrinsics"
-    rt = source.numbers(source.get(fields, where, ""), (6,), where)
+    rt = fields["rt_cam_ref" if "rt_cam_ref" in fields else "extrinsics"]
+    R, t = rt.numbers((6,)).split(3)
+    numbers = fields["intrinsics"].numbers()
     return Camera(
-        K=source.focal_and_centre(numbers[:4], "intrinsics"),
-        cam_from_world=source.pose(rt[:3], rt[3:], where),
-        hw=source.size_of(source.get(fields, "imagersize", ""), "imagersize"),
-        distortion=lens,
+        K=fields.at(numbers[:4], "intrinsics").focal_and_centre(),
+        cam_from_world=pose_of(source.at(R, rt.name), source.at(t, rt.name)),
+        hw=fields["imagersize"].size(),
+        distortion=_lens(fields["lensmodel"], fields["intrinsics"]),
     )
 
 
-def _lens(source: RigSource, model: str, numbers: torch.Tensor) -> LensModel | None:
+def _lens(model: Entry, numbers: Entry) -> LensModel | None:
     """The lens of a model's name and of what follows focal lengths and centre in the numbers."""
-    splined = SPLINED.fullmatch(model)
-    if not splined and model not in LENSES and model != SPHERE:
+    name = str(model.value)
+    splined = SPLINED.fullmatch(name)
+    if not splined and name not in LENSES and name != SPHERE:
         known = ", ".join([*LENSES, SPHERE, "LENSMODEL_SPLINED_STEREOGRAPHIC"])
-        raise source.fail(
-            "lensmodel", f"is '{model}'; of mrcal's {known} are read: use mrcal-convert-lensmodel"
-        )
+        raise model.fail(f"is '{name}'; of mrcal's {known} are read: use mrcal-convert-lensmodel")
     if not splined:
-        rest = source.numbers(numbers, (4 + LENSES.get(model, 0),), "intrinsics")[4:]
-        return Equirectangular() if model == SPHERE else source.brown_conrady(rest, "intrinsics")
+        rest = numbers.numbers((4 + LENSES.get(name, 0),))[4:]
+        return Equirectangular() if name == SPHERE else model.source.at(rest, "intrinsics").brown_conrady()
     order, nx, ny = (int(number) for number in splined.groups()[:3])
-    knots = source.numbers(numbers, (4 + 2 * nx * ny,), "intrinsics")[4:].reshape(ny, nx, 2)
+    knots = numbers.numbers((4 + 2 * nx * ny,))[4:].reshape(ny, nx, 2)
     edge = 2 * math.tan(math.radians(float(splined[4])) / 4)
     try:
         return Splined(knots, knots.new_full((2,), 2 * edge / max(nx - order, 1)), order)
     except ValueError as error:
-        raise source.fail("lensmodel", str(error)) from None
+        raise model.fail(str(error)) from None
 
 
-def _fields(source: RigSource) -> dict[str, Any]:
+def _fields(source: RigSource) -> Entry:
     """What the file, a dictionary of Python's literals with comments, says."""
     text = source.text(LONGEST)
     try:
         document = ast.literal_eval(text.strip())
     except (ValueError, SyntaxError, MemoryError, RecursionError):
         raise source.fail(None, "is not a dictionary of numbers and texts; is the file whole?") from None
-    fields = source.mapping(document, None)
-    return {key.decode() if isinstance(key, bytes) else str(key): value for key, value in fields.items()}
+    fields = source.at(document).mapping().value
+    return source.at({k.decode() if isinstance(k, bytes) else str(k): value for k, value in fields.items()})

@@ -8,13 +8,11 @@ name suggests; the world is then A. Lengths are in the board's unit, taken as me
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from ..camera import Camera
-from ..distortion import Distortion
 from ..pose import Pose
 from ..rig import Rig
-from .source import RigSource
+from .source import Entry, RigSource, pose_of
 
 CONVENTION = "first pixel's centre at 0 (shift 0); camera<-rig, 'B_to_A' takes A into B; metres"
 
@@ -26,30 +24,28 @@ def recognises(path: Path, head: str) -> bool:
 def read(source: RigSource) -> Rig:
     """The cameras that have a pose, under their names."""
     document = source.json()
-    cameras = source.mapping(source.get(document, "cameras", ""), "cameras")
-    poses = _poses(source, source.mapping(source.get(document, "camera_poses", ""), "camera_poses"), cameras)
+    cameras = dict(document["cameras"].items())
+    poses = _poses(document["camera_poses"], cameras)
     missing = [name for name in cameras if name not in poses]
     if missing:
         raise source.fail(
             f"camera_poses.{missing[0]}", "is missing; was this camera not calibrated with the others?"
         )
-    return source.rig((name, _camera(source, name, cameras[name], poses[name])) for name in cameras)
+    return source.rig((name, _camera(fields, poses[name])) for name, fields in cameras.items())
 
 
-def _poses(source: RigSource, entries: dict[str, Any], cameras: dict[str, Any]) -> dict[str, Pose]:
+def _poses(entries: Entry, cameras: dict[str, Entry]) -> dict[str, Pose]:
     """Poses by camera: those that are stated, then those that follow from others."""
     links = []
     poses: dict[str, Pose] = {}
     for key, fields in entries.items():
-        entry = f"camera_poses.{key}"
-        R, T = (source.get(source.mapping(fields, entry), letter, entry) for letter in "RT")
-        pose = source.pose(R, T, entry)
+        pose = pose_of(fields["R"], fields["T"])
         if key in cameras:
             poses[key] = pose
             continue
         b, _, a = key.partition("_to_")
         if a not in cameras or b not in cameras:
-            raise source.fail(entry, f"names no camera of this file ({', '.join(cameras)})")
+            raise fields.fail(f"names no camera of this file ({', '.join(cameras)})")
         links.append((a, b, pose))
     if not poses and links:
         poses[links[0][0]] = Pose.identity()
@@ -58,18 +54,11 @@ def _poses(source: RigSource, entries: dict[str, Any], cameras: dict[str, Any]) 
     return poses
 
 
-def _camera(source: RigSource, name: str, fields: Any, pose: Pose) -> Camera:
-    entry = f"cameras.{name}"
-    fields = source.mapping(fields, entry)
+def _camera(fields: Entry, pose: Pose) -> Camera:
+    fisheye = "fisheye" in str(fields.get("model", "").value).lower()
     return Camera(
-        K=source.intrinsics(source.get(fields, "K", entry), f"{entry}.K"),
+        K=fields["K"].intrinsics(),
         cam_from_world=pose,
-        hw=source.size_of(source.get(fields, "image_size", entry), f"{entry}.image_size"),
-        distortion=_lens(source, fields, f"{entry}.dist"),
+        hw=fields["image_size"].size(),
+        distortion=fields["dist"].kannala_brandt() if fisheye else fields.get("dist").brown_conrady(),
     )
-
-
-def _lens(source: RigSource, fields: dict[str, Any], entry: str) -> Distortion | None:
-    if "fisheye" in str(fields.get("model", "")).lower():
-        return source.kannala_brandt(source.get(fields, "dist", entry), entry)
-    return source.brown_conrady(fields.get("dist"), entry)

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections import ChainMap
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,7 @@ from ..distortion import KANNALA_BRANDT, Distortion
 from ..pose import Pose
 from ..rig import Rig
 from .export import brown_conrady, calibrated, focal_and_centre, pose_rows
-from .source import RigSource
+from .source import Entry, RigSource
 
 CONVENTION = (
     "first pixel's centre at 0.5 (shift -0.5); "
@@ -42,15 +40,11 @@ def recognises(path: Path, head: str) -> bool:
 def read(source: RigSource) -> Rig:
     """One camera for each frame, named by its `file_path`."""
     document = source.json()
-    frames = source.get(document, "frames", "")
-    if not isinstance(frames, list) or not frames:
-        raise source.fail("frames", "is no list, or an empty one; is the file whole?")
-    del document["frames"]
+    shared = {key: value for key, value in document.value.items() if key != "frames"}
     cameras = []
-    for i, frame in enumerate(frames):
-        entry = f"frames[{i}]"
-        fields = ChainMap(source.mapping(frame, entry), document)
-        cameras.append((str(source.get(fields, "file_path", entry)), _camera(source, fields, entry)))
+    for frame in document["frames"].each():
+        fields = Entry(source, shared | frame.mapping().value, frame.name)
+        cameras.append((str(fields["file_path"].value), _camera(fields)))
     return source.rig(cameras)
 
 
@@ -60,49 +54,38 @@ def write(rig: Rig) -> str:
     return json.dumps({"frames": frames}, indent=1) + "\n"
 
 
-def _camera(source: RigSource, fields: Mapping[str, Any], entry: str) -> Camera:
-    h, w = source.size(source.get(fields, "w", entry), source.get(fields, "h", entry), f"{entry} w, h")
-    fx = _focal(source, fields, "x", w, entry)
-    fy = _focal(source, fields, "y", h, entry) if fields.keys() & {"fl_y", "camera_angle_y"} else fx
-    centre = [source.number(fields.get(k, n / 2), f"{entry} {k}") for k, n in (("cx", w), ("cy", h))]
-    K = source.focal_and_centre([fx, fy, *centre], f"{entry} fl_x, fl_y", first_pixel=0.5)
-    matrix = source.get(fields, "transform_matrix", entry)
-    world_from_gl = source.pose_matrix(matrix, f"{entry}.transform_matrix")
-    pose = FLIP @ world_from_gl.inverse()
-    return Camera(K=K, cam_from_world=pose, hw=(h, w), distortion=_lens(source, fields, entry))
+def _camera(fields: Entry) -> Camera:
+    h, w = fields.listed("w", "h").size()
+    fx = _focal(fields, "x", w)
+    fy = _focal(fields, "y", h) if "fl_y" in fields or "camera_angle_y" in fields else fx
+    centre = [fields.get(k, n / 2).number() for k, n in (("cx", w), ("cy", h))]
+    K = fields.at([fx, fy, *centre], "fl_x, fl_y").focal_and_centre(first_pixel=0.5)
+    pose = FLIP @ fields["transform_matrix"].pose_matrix().inverse()
+    return Camera(K=K, cam_from_world=pose, hw=(h, w), distortion=_lens(fields))
 
 
-def _focal(source: RigSource, fields: Mapping[str, Any], axis: str, size: int, entry: str) -> float:
+def _focal(fields: Entry, axis: str, size: int) -> float:
     """Stated, or from the field of view in radians."""
-    if fields.get(f"fl_{axis}") is not None:
-        return source.number(fields[f"fl_{axis}"], f"{entry} fl_{axis}")
-    angle = source.number(
-        source.get(fields, (f"camera_angle_{axis}",), f"{entry} fl_{axis}"), f"{entry} camera_angle"
-    )
+    stated = fields[f"fl_{axis}", f"camera_angle_{axis}"]
+    if stated.name.endswith(f"fl_{axis}"):
+        return stated.number()
+    angle = stated.number()
     if not 0 < angle < math.pi:
-        raise source.fail(f"{entry} camera_angle_{axis}", f"is {angle:g}; wanted radians between 0 and pi")
+        raise stated.fail(f"is {angle:g}; wanted radians between 0 and pi")
     return size / 2 / math.tan(angle / 2)
 
 
-def _lens(source: RigSource, fields: Mapping[str, Any], entry: str) -> Distortion | None:
-    model = str(fields.get("camera_model", "OPENCV")).upper()
-    if model not in FISHEYES + PERSPECTIVES:
-        raise source.fail(
-            f"{entry} camera_model", f"is {model}; supported: {', '.join(PERSPECTIVES + FISHEYES)}"
-        )
-    value = {
-        k: source.number(fields.get(k, 0.0), f"{entry} {k}") for k in ("k1", "k2", "k3", "k4", "p1", "p2")
-    }
-    if fields.get("is_fisheye") or model in FISHEYES:
-        return source.kannala_brandt([value[k] for k in ("k1", "k2", "k3", "k4")], entry)
-    if not any(k in fields for k in value):
-        return None
+def _lens(fields: Entry) -> Distortion | None:
+    model = fields.get("camera_model", "OPENCV")
+    name = str(model.value).upper()
+    if name not in FISHEYES + PERSPECTIVES:
+        raise model.fail(f"is {name}; supported: {', '.join(PERSPECTIVES + FISHEYES)}")
+    value = {k: fields.get(k, 0.0).number() for k in ("k1", "k2", "p1", "p2", "k3", "k4")}
+    if fields.get("is_fisheye").value or name in FISHEYES:
+        return fields.at([value[k] for k in ("k1", "k2", "k3", "k4")], "k1").kannala_brandt()
     if value["k4"] != 0:
-        raise source.fail(
-            f"{entry} k4", "is the r^8 term of a perspective lens, which OpenCV's model does not have"
-        )
-    c = [value[k] for k in ("k1", "k2", "p1", "p2", "k3")]
-    return source.brown_conrady(c if "k3" in fields else c[:4], entry)
+        raise fields["k4"].fail("is the r^8 term of a perspective lens, which OpenCV's model does not have")
+    return fields.at(list(value.values())[: 5 if "k3" in fields else 4], "k1").brown_conrady()
 
 
 def _frame(name: str, camera: Camera) -> dict[str, Any]:

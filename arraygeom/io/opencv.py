@@ -22,7 +22,7 @@ from ..pose import Pose
 from ..rig import Rig
 from ..safe_yaml import DEEPEST, LARGEST_TEXT
 from .export import brown_conrady, calibrated, focal_and_centre
-from .source import RigSource
+from .source import Entry, RigSource, pose_of
 
 CONVENTION = "first pixel's centre at 0 (shift 0); X_2 = R X_1 + T, world = camera 1; metres"
 K_NAMES = ("M{}", "cameraMatrix{}", "camera_matrix{}", "Camera_Matrix{}", "K{}", "CM{}", "intrinsicMatrix{}")
@@ -43,22 +43,22 @@ def recognises(path: Path, head: str) -> bool:
 
 def read(source: RigSource) -> Rig:
     """One camera at the origin, named "camera"; or a pair, named "left" and "right" unless the file says."""
-    nodes: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     for path in _files(source.path):
-        nodes |= _nodes(RigSource(path))
+        found |= _nodes(RigSource(path))
+    nodes = source.at(found).mapping()
     if not any(name.format(1) in nodes for name in K_NAMES):
         if "R" in nodes and "T" in nodes:
             raise source.fail(
                 "M1", "is missing: a pair's R and T are here without its intrinsics.yml beside them"
             )
-        return source.rig(
-            [(str(nodes.get("camera_name", "camera")), _camera(source, nodes, "", Pose.identity()))]
-        )
+        name = str(nodes.get("camera_name", "camera").value)
+        return source.rig([(name, _camera(nodes, "", Pose.identity()))])
     if "R" not in nodes or "T" not in nodes:
         raise source.fail("R, T", "are missing: put the pair's extrinsics.yml beside its intrinsics.yml")
-    poses = Pose.identity(), source.pose(nodes["R"], nodes["T"], "R, T:")
-    names = [str(nodes.get(f"name{i}", default)) for i, default in ((1, "left"), (2, "right"))]
-    return source.rig((name, _camera(source, nodes, i, pose)) for i, name, pose in zip("12", names, poses))
+    poses = Pose.identity(), pose_of(nodes["R"], nodes["T"])
+    names = [str(nodes.get(f"name{i}", default).value) for i, default in ((1, "left"), (2, "right"))]
+    return source.rig((name, _camera(nodes, i, pose)) for i, name, pose in zip("12", names, poses))
 
 
 def write(rig: Rig) -> str | dict[str, str]:
@@ -87,23 +87,22 @@ _NESTED_IN_LINE = rf"(?<![^\s,])(?:-[ \t]+|[^\s,:]{{1,80}}:[ \t]+){{{DEEPEST}}}"
 _HEADER = "%YAML:1.0\n---\n"
 
 
-def _camera(source: RigSource, nodes: dict[str, Any], i: str, pose: Pose) -> Camera:
-    K = source.intrinsics(source.get(nodes, [n.format(i) for n in K_NAMES], ""), f"camera matrix {i}".strip())
-    c = next((nodes[n.format(i)] for n in D_NAMES if n.format(i) in nodes), None)
-    entry = f"distortion coefficients {i}".strip()
-    fisheye = bool(nodes.get(f"fisheye_model{i}", nodes.get("fisheye_model", 0)))
-    lens = source.kannala_brandt(c, entry) if fisheye else source.brown_conrady(c, entry)
-    return Camera(K=K, cam_from_world=pose, hw=_size(source, nodes, i, K), distortion=lens)
+def _camera(nodes: Entry, i: str, pose: Pose) -> Camera:
+    K = nodes[tuple(name.format(i) for name in K_NAMES)].intrinsics()
+    c = nodes.get(next((name.format(i) for name in D_NAMES if name.format(i) in nodes), D_NAMES[0]))
+    fisheye = bool(nodes.get(f"fisheye_model{i}", nodes.get("fisheye_model", 0).value).value)
+    lens = c.kannala_brandt() if fisheye else c.brown_conrady()
+    return Camera(K=K, cam_from_world=pose, hw=_size(nodes, i, K), distortion=lens)
 
 
-def _size(source: RigSource, nodes: dict[str, Any], i: str, K: Tensor) -> HW:
+def _size(nodes: Entry, i: str, K: Tensor) -> HW:
     for suffix in (i, ""):
         if f"image_width{suffix}" in nodes and f"image_height{suffix}" in nodes:
-            return source.size(nodes[f"image_width{suffix}"], nodes[f"image_height{suffix}"], "image_width")
+            return nodes.listed(f"image_width{suffix}", f"image_height{suffix}").size()
         for name in ("image_size", "imageSize", "size"):
             if f"{name}{suffix}" in nodes:
-                return source.size_of(nodes[f"{name}{suffix}"], name)
-    return source.size_unstated(K)
+                return nodes[f"{name}{suffix}"].size()
+    return nodes.source.size_unstated(K)
 
 
 def _files(path: Path) -> list[Path]:

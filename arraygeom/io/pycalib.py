@@ -7,11 +7,10 @@ arbitrary and taken as metres. No image size is stated. Cameras are named cam0, 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from ..camera import Camera
 from ..rig import Rig
-from .source import RigSource
+from .source import Entry, RigSource, pose_of
 
 CONVENTION = "first pixel's centre at 0 (shift 0); world->camera; scale as in the file"
 
@@ -23,19 +22,17 @@ def recognises(path: Path, head: str) -> bool:
 def read(source: RigSource) -> Rig:
     """All cameras of the lists K, d, R, t; or the one camera."""
     document = source.json()
-    K, R, t = (source.get(document, key, "") for key in ("K", "R", "t"))
-    d = document.get("d")
-    single = source.numbers(K, None, "K").numel() == 9 and len(K) == 3
-    Ks, Rs, ts, ds = ([K], [R], [t], [d]) if single else (K, R, t, d or [None] * len(K))
-    if not len(Ks) == len(Rs) == len(ts) == len(ds):
-        counts = f"{len(Ks)}, {len(Rs)}, {len(ts)} and {len(ds)}"
+    K, d = document["K"], document.get("d")
+    single = K.numbers().numel() == 9 and len(K.value) == 3
+    lists = [[entry] if single else entry.each() for entry in (K, document["R"], document["t"])]
+    lists.append([d] * len(lists[0]) if single or not d.value else d.each())
+    if len({len(entries) for entries in lists}) > 1:
+        counts = "{}, {}, {} and {}".format(*map(len, lists))
         raise source.fail("K, R, t, d", f"have {counts} cameras; they are lists of equal length")
-    return source.rig(
-        (f"cam{i}", _camera(source, i, *numbers)) for i, numbers in enumerate(zip(Ks, Rs, ts, ds))
-    )
+    return source.rig((f"cam{i}", _camera(source, *numbers)) for i, numbers in enumerate(zip(*lists)))
 
 
-def _camera(source: RigSource, i: int, K: Any, R: Any, t: Any, d: Any) -> Camera:
-    matrix = source.intrinsics(K, f"K[{i}]")
-    pose, lens = source.pose(R, t, f"[{i}]"), source.brown_conrady(d, f"d[{i}]")
-    return Camera(K=matrix, cam_from_world=pose, hw=source.size_unstated(matrix), distortion=lens)
+def _camera(source: RigSource, K: Entry, R: Entry, t: Entry, d: Entry) -> Camera:
+    matrix = K.intrinsics()
+    hw = source.size_unstated(matrix)
+    return Camera(K=matrix, cam_from_world=pose_of(R, t), hw=hw, distortion=d.brown_conrady())

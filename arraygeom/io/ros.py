@@ -9,7 +9,6 @@ zeros states nothing: the camera is then at the world's origin, rotated by R_rec
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -17,7 +16,7 @@ from ..camera import Camera
 from ..distortion import Distortion
 from ..pose import Pose
 from ..rig import Rig
-from .source import RigSource
+from .source import Entry, RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); P on rectified points, world = the rectified frame; metres"
 
@@ -45,41 +44,34 @@ def _is_camera_info(text: str) -> bool:
 
 def _camera(source: RigSource) -> tuple[str, Camera]:
     info = source.yaml()
-    K = source.intrinsics(_data(source, info, "camera_matrix"), "camera_matrix")
-    width, height = (source.get(info, f"image_{k}", "") for k in ("width", "height"))
     camera = Camera(
-        K=K,
-        cam_from_world=_pose(source, info),
-        hw=source.size(width, height, "image_width, image_height"),
-        distortion=_lens(source, info),
+        K=info["camera_matrix"]["data"].intrinsics(),
+        cam_from_world=_pose(info),
+        hw=info.listed("image_width", "image_height").size(),
+        distortion=_lens(info),
     )
-    return str(info.get("camera_name") or source.path.stem), camera
+    return str(info.get("camera_name").value or source.path.stem), camera
 
 
-def _pose(source: RigSource, info: dict[str, Any]) -> Pose:
-    R = torch.eye(3, dtype=torch.float64)
+def _pose(info: Entry) -> Pose:
+    rect_from_cam = stereo = Pose.identity()
     if "rectification_matrix" in info:
-        R = source.rotation(_data(source, info, "rectification_matrix"), "rectification_matrix")
-    rect_from_cam, t = Pose(R, torch.zeros(3, dtype=torch.float64)), torch.zeros(3, dtype=torch.float64)
+        rect_from_cam = Pose(info["rectification_matrix"]["data"].rotation(), stereo.t)
     if "projection_matrix" in info:
-        P = source.numbers(_data(source, info, "projection_matrix"), (3, 4), "projection_matrix")
+        entry = info["projection_matrix"]["data"]
+        P = entry.numbers((3, 4))
         if P.any():
-            t = torch.linalg.solve(source.intrinsics(P[:, :3], "projection_matrix"), P[:, 3])
-    return rect_from_cam.inverse() @ Pose(torch.eye(3, dtype=torch.float64), t)
+            K = entry.source.at(P[:, :3], entry.name).intrinsics()
+            stereo = Pose(stereo.R, torch.linalg.solve(K, P[:, 3]))
+    return rect_from_cam.inverse() @ stereo
 
 
-def _lens(source: RigSource, info: dict[str, Any]) -> Distortion | None:
-    model, entry = source.get(info, "distortion_model", ""), "distortion_coefficients"
-    if model in ("plumb_bob", "rational_polynomial"):
-        return source.brown_conrady(_data(source, info, entry), entry)
-    if model in ("equidistant", "fisheye"):
-        return source.kannala_brandt(_data(source, info, entry), entry)
-    if model in ("", "none"):
+def _lens(info: Entry) -> Distortion | None:
+    model, c = info["distortion_model"], info.get("distortion_coefficients")
+    if model.value in ("plumb_bob", "rational_polynomial"):
+        return c["data"].brown_conrady()
+    if model.value in ("equidistant", "fisheye"):
+        return c["data"].kannala_brandt()
+    if model.value in ("", "none"):
         return None
-    raise source.fail(
-        "distortion_model", f"is '{model}'; supported: plumb_bob, rational_polynomial, equidistant"
-    )
-
-
-def _data(source: RigSource, info: dict[str, Any], name: str) -> Any:
-    return source.get(source.mapping(source.get(info, name, ""), name), "data", name)
+    raise model.fail(f"is '{model.value}'; supported: plumb_bob, rational_polynomial, equidistant")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -43,10 +44,7 @@ class RigFileWarning(UserWarning):
 
 
 class RigSource:
-    """One rig file being read. Its methods raise RigFileError with the entry's name.
-
-    `hw` is the images' size for files that do not state it.
-    """
+    """One rig file being read. `hw` is the images' size for files that do not state it."""
 
     def __init__(self, path: Path, *, hw: HW | None = None) -> None:
         self.path, self.hw = path, hw
@@ -58,6 +56,10 @@ class RigSource:
     def warn(self, message: str) -> None:
         """Warn about the file as a whole."""
         warn(f"{self.path}: {message}", RigFileWarning)
+
+    def at(self, value: Any, name: str = "") -> Entry:
+        """A value of the file, by its name there."""
+        return Entry(self, value, name)
 
     def content(self) -> bytes:
         """The file's bytes; reading a pipe would wait for ever."""
@@ -80,97 +82,51 @@ class RigSource:
             raise self.fail(None, f"has {len(text):,} characters; at most {most:,} are read")
         return text
 
-    def json(self) -> dict[str, Any]:
+    def json(self) -> Entry:
         """The file as a JSON object without repeated keys."""
         text = self.text()
         try:
-            document = load_json(text)
+            return self.at(load_json(text)).mapping()
         except json.JSONDecodeError as error:
-            raise self.fail(
-                f"line {error.lineno}", f"is not JSON ({error.msg}); is the file whole?"
-            ) from None
+            where, problem = f"line {error.lineno}", f"is not JSON ({error.msg}); is the file whole?"
+        except RigFileError:
+            raise
         except ValueError as error:
-            raise self.fail(None, str(error)) from None
-        return self.mapping(document, None)
+            where, problem = None, str(error)
+        raise self.fail(where, problem)
 
-    def toml(self) -> dict[str, Any]:
+    def toml(self) -> Entry:
         """The file as TOML."""
         text = self.text()
         try:
-            return tomllib.loads(text)
+            return self.at(tomllib.loads(text)).mapping()
         except tomllib.TOMLDecodeError as error:
             raise self.fail(None, f"is not TOML ({error}); is the file whole?") from None
 
-    def yaml(self, text: str | None = None) -> dict[str, Any]:
+    def yaml(self, text: str | None = None) -> Entry:
         """The file, or a text instead of it, as a YAML mapping without repeated keys."""
         try:
-            return self.mapping(load_yaml(self.text() if text is None else text), None)
+            return self.at(load_yaml(self.text() if text is None else text)).mapping()
         except yaml.YAMLError as error:
             line, problem = yaml_problem(error)
             raise self.fail(
                 f"line {line}" if line else None, f"is not YAML ({problem}); is the file whole?"
             ) from None
 
-    def mapping(self, value: Any, entry: str | None) -> dict[str, Any]:
-        """A value that has to be a mapping with something in it."""
-        if not isinstance(value, dict) or not value:
-            raise self.fail(entry, "is not a mapping of names to values, or an empty one; is the file whole?")
-        return value
-
-    def get(self, fields: Mapping[str, Any], keys: str | Iterable[str], entry: str) -> Any:
-        """The value of the first of the keys that is there."""
-        keys = (keys,) if isinstance(keys, str) else tuple(keys)
-        for key in keys:
-            if fields.get(key) is not None:
-                return fields[key]
-        raise self.fail(entry or None, f"has no {' or '.join(keys)}")
-
-    def numbers(self, value: Any, shape: tuple[int, ...] | None, entry: str) -> Tensor:
-        """Finite numbers as a float64 tensor of a shape (any nesting that has as many), or a vector."""
-        tensor = float64_of(value)
-        if tensor is None:
-            raise self.fail(entry, f"holds something other than numbers: {short(value)}")
-        if shape is not None and tensor.numel() != torch.Size(shape).numel():
-            wanted = " x ".join(map(str, shape))
-            raise self.fail(entry, f"has {tensor.numel()} numbers, wanted {wanted}; is the file whole?")
-        if not tensor.isfinite().all():
-            raise self.fail(entry, "holds NaN or infinity; did the calibration fail?")
-        return tensor.reshape(shape or (-1,))
-
-    def numbers_in(self, text: str, shape: tuple[int, ...] | None, entry: str) -> Tensor:
-        """The `numbers` that a text consists of."""
-        try:
-            values = [float(word) for word in text.split()]
-        except ValueError:
-            raise self.fail(entry, f"holds something other than numbers: {short(text)}") from None
-        return self.numbers(values, shape, entry)
-
-    def number(self, value: Any, entry: str) -> float:
-        """One finite number."""
-        return float(self.numbers(value, (1,), entry))
-
-    def size(self, width: Any, height: Any, entry: str) -> HW:
-        """(height, width), positive and whole."""
-        w, h = self.number(width, entry), self.number(height, entry)
-        if min(w, h) < 1 or w != int(w) or h != int(h):
-            raise self.fail(entry, f"is {w:g} x {h:g}, wanted an image's width x height in whole pixels")
-        return self.bounded((int(h), int(w)), entry)
-
-    def size_of(self, wh: Any, entry: str) -> HW:
-        """(height, width) from a list of width and height."""
-        width, height = self.numbers(wh, (2,), entry).tolist()
-        return self.size(width, height, entry)
-
-    def bounded(self, hw: HW, entry: str) -> HW:
-        """A size, once it is one that images have."""
-        h, w = hw
-        if max(h, w) > LARGEST_SIDE or h * w > MOST_PIXELS:
-            raise self.fail(
-                entry,
-                f"is {w} x {h}; images of up to {LARGEST_SIDE} pixels a side and {MOST_PIXELS / 1e6:.0f} "
-                "million in all are supported: is it in pixels?",
-            )
-        return hw
+    def lines(self, separator: str, pattern: str) -> Entry:
+        """Numbers by name, one a line, of the names that a pattern matches."""
+        entries: dict[str, Tensor] = {}
+        for line in self.text().splitlines():
+            name, found, value = (part.strip() for part in line.partition(separator))
+            if not found or not re.fullmatch(pattern, name):
+                continue
+            if name in entries:
+                raise self.fail(name, "occurs twice; keep one")
+            if value.startswith("[") and not value.endswith("]"):
+                raise self.fail(name, "has no closing bracket; is the file whole?")
+            value = value[1:-1] if value.startswith("[") else value
+            entries[name] = self.at(re.sub("[;,]", " ", value), name).words().numbers()
+        return self.at(entries).mapping()
 
     def size_unstated(self, K: Tensor) -> HW:
         """The size for a format that states none: as given by the user, else guessed, with a warning."""
@@ -183,99 +139,6 @@ class RigSource:
         )
         return h, w
 
-    def intrinsics(self, value: Any, entry: str, *, first_pixel: float = 0.0) -> Tensor:
-        """K (3, 3) with the first pixel's centre moved from `first_pixel` to 0."""
-        K = self.numbers(value, (3, 3), entry)
-        if K[2].tolist() != [0.0, 0.0, 1.0]:
-            raise self.fail(
-                entry, f"has last row {short(K[2].tolist())}, wanted [0, 0, 1]; is it transposed?"
-            )
-        if not (K[0, 0] > 0 and K[1, 1] > 0):
-            raise self.fail(
-                entry, f"has focal lengths {K[0, 0]:g} and {K[1, 1]:g}; they are positive, in pixels"
-            )
-        return shift_matrix(first_pixel, first_pixel) @ K
-
-    def focal_and_centre(self, numbers: Any, entry: str, *, first_pixel: float = 0.0) -> Tensor:
-        """K from [fx, fy, cx, cy]."""
-        fx, fy, cx, cy = self.numbers(numbers, (4,), entry).tolist()
-        return self.intrinsics([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], entry, first_pixel=first_pixel)
-
-    def rotation(self, value: Any, entry: str) -> Tensor:
-        """A rotation matrix from nine numbers, or three (a rotation vector in radians).
-
-        A deviation below 1e-3, as rounding in text files makes, is removed (nearest rotation).
-        """
-        numbers = self.numbers(value, None, entry)
-        if numbers.numel() == 3:
-            if numbers.abs().max() > LARGEST_ANGLE:
-                raise self.fail(entry, f"is a rotation vector of {numbers.abs().max():.3g}; it is in radians")
-            return rotation_from_vector(numbers)
-        R = self.numbers(numbers, (3, 3), entry)
-        error = float(rotation_error(R))
-        if torch.linalg.det(R) < 0:
-            raise self.fail(entry, "is a reflection (determinant -1), not a rotation; was an axis flipped?")
-        if error > ROUNDED:
-            raise self.fail(entry, f"is not a rotation (R R^T is off by {error:.2g}); were all rows copied?")
-        U, _, Vh = torch.linalg.svd(R)
-        return R if error < 1e-12 else U @ Vh
-
-    def pose(self, R: Any, t: Any, entry: str, *, metres: float = 1.0) -> Pose:
-        """X_to = R X_from + t with t given in units of `metres`."""
-        return Pose(
-            self.rotation(R, f"{entry} rotation"), self.numbers(t, (3,), f"{entry} translation") * metres
-        )
-
-    def pose_matrix(self, T: Any, entry: str, *, metres: float = 1.0) -> Pose:
-        """A pose from a 4 x 4 or 3 x 4 matrix."""
-        numbers = self.numbers(T, None, entry)
-        M = self.numbers(numbers, (3, 4) if numbers.numel() == 12 else (4, 4), entry)
-        if len(M) == 4 and (M[3] - M.new_tensor([0, 0, 0, 1])).abs().max() > 1e-9:
-            raise self.fail(
-                entry, f"has last row {short(M[3].tolist())}, wanted [0, 0, 0, 1]; is it transposed?"
-            )
-        return self.pose(M[:3, :3], M[:3, 3], entry, metres=metres)
-
-    def quaternion(self, wxyz: Any, entry: str) -> Tensor:
-        """A rotation from a quaternion, scalar first, of length 1 to 1e-3."""
-        q = self.numbers(wxyz, (4,), entry)
-        if not (q.norm() - 1).abs() < ROUNDED:
-            raise self.fail(entry, f"is a quaternion of length {q.norm():.4g}, not 1; is the order w x y z?")
-        from kornia.geometry.conversions import quaternion_to_rotation_matrix
-
-        return quaternion_to_rotation_matrix(q / q.norm())
-
-    def brown_conrady(self, value: Any, entry: str) -> Distortion | None:
-        """A lens from OpenCV's coefficients, zero-padded to a number the model has; none if all are 0."""
-        c = self.numbers([] if value is None else value, None, entry)
-        if not c.any():
-            return None
-        if c.numel() > 14:
-            raise self.fail(entry, f"has {c.numel()} coefficients; OpenCV's model has at most 14")
-        count = next(n for n in (4, 5, 8, 12, 14) if n >= c.numel())
-        return Distortion(BROWN_CONRADY, torch.nn.functional.pad(c, (0, count - c.numel())))
-
-    def kannala_brandt(self, value: Any, entry: str) -> Distortion:
-        """A fisheye lens from one to four coefficients."""
-        c = self.numbers(value, None, entry)
-        if not 1 <= c.numel() <= 4:
-            raise self.fail(entry, f"has {c.numel()} coefficients; the fisheye model has 4 (k1 k2 k3 k4)")
-        return Distortion(KANNALA_BRANDT, torch.nn.functional.pad(c, (0, 4 - c.numel())))
-
-    def lens(self, model: str, coefficients: Any, entry: str) -> Distortion | None:
-        """A lens of any model; others than the two above from all coefficients, within the model's bounds."""
-        if model in (BROWN_CONRADY, KANNALA_BRANDT):
-            return (self.brown_conrady if model == BROWN_CONRADY else self.kannala_brandt)(
-                coefficients, entry
-            )
-        c = self.numbers(coefficients, (COEFFICIENT_COUNTS[model][0],), entry)
-        lens = Distortion(model, c)
-        if not lens.project(c.new_tensor([0.0, 0.0, 1.0]))[1]:
-            raise self.fail(
-                entry, f"is {short(c.tolist())}, which no {model} lens has; was the calibration good?"
-            )
-        return lens
-
     def rig(self, cameras: Iterable[tuple[str, Camera]], **fields: Any) -> Rig:
         """The rig, once no name occurs twice."""
         named: dict[str, Camera] = {}
@@ -286,6 +149,183 @@ class RigSource:
         if not named:
             raise self.fail(None, "holds no camera; is the file whole?")
         return Rig(named, **fields)
+
+
+class Entry:
+    """A value in a rig file and its name there, with which errors begin (RigFileError)."""
+
+    def __init__(self, source: RigSource, value: Any, name: str) -> None:
+        self.source, self.value, self.name = source, value, name
+
+    def fail(self, message: str) -> RigFileError:
+        """The error to raise about the value."""
+        return self.source.fail(self.name or None, message)
+
+    def at(self, value: Any, name: str) -> Entry:
+        """A value within this one."""
+        return Entry(self.source, value, f"{self.name}.{name}" if self.name else name)
+
+    def mapping(self) -> Entry:
+        """This, a mapping with something in it."""
+        if not isinstance(self.value, Mapping) or not self.value:
+            raise self.fail("is not a mapping of names to values, or an empty one; is the file whole?")
+        return self
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.mapping().value
+
+    def __getitem__(self, keys: str | tuple[str, ...]) -> Entry:
+        """What a mapping has under the first of the keys that is there."""
+        keys = (keys,) if isinstance(keys, str) else keys
+        for key in keys:
+            if (value := self.mapping().value.get(key)) is not None:
+                return self.at(value, key)
+        raise self.fail(f"has no {' or '.join(keys)}")
+
+    def get(self, key: str, default: Any = None) -> Entry:
+        """What a mapping has under a key, or the default."""
+        return self.at(self.mapping().value.get(key, default), key)
+
+    def items(self) -> list[tuple[str, Entry]]:
+        """All that a mapping has."""
+        return [(str(key), self.at(value, str(key))) for key, value in self.mapping().value.items()]
+
+    def each(self) -> list[Entry]:
+        """The parts of a list."""
+        if not isinstance(self.value, list) or not self.value:
+            raise self.fail("is no list, or an empty one; is the file whole?")
+        return [Entry(self.source, value, f"{self.name}[{i}]") for i, value in enumerate(self.value)]
+
+    def listed(self, *keys: str) -> Entry:
+        """What a mapping has under these keys, as one list."""
+        return self.at([self[key].value for key in keys], ", ".join(keys))
+
+    def tensor(self, *, infinite: bool = False) -> Tensor:
+        """Finite numbers (or infinite ones too), nested in lists or not, as a float64 tensor."""
+        tensor = float64_of(self.value)
+        if tensor is None:
+            raise self.fail(f"holds something other than numbers: {short(self.value)}")
+        if tensor.isnan().any() or (tensor.isinf().any() and not infinite):
+            raise self.fail("holds NaN or infinity; did the calibration fail?")
+        return tensor
+
+    def numbers(self, shape: tuple[int, ...] | None = None, *, infinite: bool = False) -> Tensor:
+        """Its numbers as a tensor of a shape (any nesting that has as many), or a vector."""
+        tensor = self.tensor(infinite=infinite)
+        if shape is not None and tensor.numel() != torch.Size(shape).numel():
+            wanted = " x ".join(map(str, shape))
+            raise self.fail(f"has {tensor.numel()} numbers, wanted {wanted}; is the file whole?")
+        return tensor.reshape(shape or (-1,))
+
+    def words(self) -> Entry:
+        """The numbers that a text, or several, consist of."""
+        text = self.value if isinstance(self.value, str) else " ".join(self.value)
+        try:
+            return Entry(self.source, [float(word) for word in text.split()], self.name)
+        except ValueError:
+            raise self.fail(f"holds something other than numbers: {short(text)}") from None
+
+    def number(self) -> float:
+        """One finite number."""
+        return float(self.numbers((1,)))
+
+    def transposed(self, side: int) -> Entry:
+        """A square matrix column by column."""
+        return Entry(self.source, self.numbers((side, side)).T, self.name)
+
+    def size(self) -> HW:
+        """(height, width), positive and whole, from a width and a height."""
+        w, h = self.numbers((2,)).tolist()
+        if min(w, h) < 1 or w != int(w) or h != int(h):
+            raise self.fail(f"is {w:g} x {h:g}, wanted an image's width x height in whole pixels")
+        if max(h, w) > LARGEST_SIDE or h * w > MOST_PIXELS:
+            raise self.fail(
+                f"is {w:.0f} x {h:.0f}; images of up to {LARGEST_SIDE} pixels a side and "
+                f"{MOST_PIXELS / 1e6:.0f} million in all are supported: is it in pixels?"
+            )
+        return int(h), int(w)
+
+    def intrinsics(self, first_pixel: float = 0.0) -> Tensor:
+        """K (3, 3) with the first pixel's centre moved from `first_pixel` to 0."""
+        K = self.numbers((3, 3))
+        if K[2].tolist() != [0.0, 0.0, 1.0]:
+            raise self.fail(f"has last row {short(K[2].tolist())}, wanted [0, 0, 1]; is it transposed?")
+        if not (K[0, 0] > 0 and K[1, 1] > 0):
+            raise self.fail(f"has focal lengths {K[0, 0]:g} and {K[1, 1]:g}; they are positive, in pixels")
+        return shift_matrix(first_pixel, first_pixel) @ K
+
+    def focal_and_centre(self, first_pixel: float = 0.0, skew: float = 0.0) -> Tensor:
+        """K from [fx, fy, cx, cy]."""
+        fx, fy, cx, cy = self.numbers((4,)).tolist()
+        K = [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]
+        return Entry(self.source, K, self.name).intrinsics(first_pixel)
+
+    def rotation(self) -> Tensor:
+        """A rotation matrix from nine numbers, or three (a rotation vector in radians).
+
+        A deviation below 1e-3, as rounding in text files makes, is removed (nearest rotation).
+        """
+        numbers = self.numbers()
+        if numbers.numel() == 3:
+            if numbers.abs().max() > LARGEST_ANGLE:
+                raise self.fail(f"is a rotation vector of {numbers.abs().max():.3g}; it is in radians")
+            return rotation_from_vector(numbers)
+        R = self.numbers((3, 3))
+        error = float(rotation_error(R))
+        if torch.linalg.det(R) < 0:
+            raise self.fail("is a reflection (determinant -1), not a rotation; was an axis flipped?")
+        if error > ROUNDED:
+            raise self.fail(f"is not a rotation (R R^T is off by {error:.2g}); were all rows copied?")
+        U, _, Vh = torch.linalg.svd(R)
+        return R if error < 1e-12 else U @ Vh
+
+    def pose_matrix(self, metres: float = 1.0) -> Pose:
+        """A pose from a 4 x 4 or 3 x 4 matrix with translations in units of `metres`."""
+        M = self.numbers((3, 4) if self.numbers().numel() == 12 else (4, 4))
+        if len(M) == 4 and (M[3] - M.new_tensor([0, 0, 0, 1])).abs().max() > 1e-9:
+            raise self.fail(f"has last row {short(M[3].tolist())}, wanted [0, 0, 0, 1]; is it transposed?")
+        return Pose(Entry(self.source, M[:3, :3], self.name).rotation(), M[:3, 3] * metres)
+
+    def quaternion(self) -> Tensor:
+        """A rotation from a quaternion, scalar first, of length 1 to 1e-3."""
+        q = self.numbers((4,))
+        if not (q.norm() - 1).abs() < ROUNDED:
+            raise self.fail(f"is a quaternion of length {q.norm():.4g}, not 1; is the order w x y z?")
+        from kornia.geometry.conversions import quaternion_to_rotation_matrix
+
+        return quaternion_to_rotation_matrix(q / q.norm())
+
+    def brown_conrady(self) -> Distortion | None:
+        """A lens from OpenCV's coefficients, zero-padded to a number the model has; none if all are 0."""
+        c = torch.zeros(0) if self.value is None else self.numbers()
+        if not c.any():
+            return None
+        if c.numel() > 14:
+            raise self.fail(f"has {c.numel()} coefficients; OpenCV's model has at most 14")
+        count = next(n for n in (4, 5, 8, 12, 14) if n >= c.numel())
+        return Distortion(BROWN_CONRADY, torch.nn.functional.pad(c, (0, count - c.numel())))
+
+    def kannala_brandt(self) -> Distortion:
+        """A fisheye lens from one to four coefficients."""
+        c = self.numbers()
+        if not 1 <= c.numel() <= 4:
+            raise self.fail(f"has {c.numel()} coefficients; the fisheye model has 4 (k1 k2 k3 k4)")
+        return Distortion(KANNALA_BRANDT, torch.nn.functional.pad(c, (0, 4 - c.numel())))
+
+    def lens(self, model: str) -> Distortion | None:
+        """A lens of any model; others than the two above from all coefficients, within the model's bounds."""
+        if model in (BROWN_CONRADY, KANNALA_BRANDT):
+            return self.brown_conrady() if model == BROWN_CONRADY else self.kannala_brandt()
+        c = self.numbers((COEFFICIENT_COUNTS[model][0],))
+        lens = Distortion(model, c)
+        if not lens.project(c.new_tensor([0.0, 0.0, 1.0]))[1]:
+            raise self.fail(f"is {short(c.tolist())}, which no {model} lens has; was the calibration good?")
+        return lens
+
+
+def pose_of(R: Entry, t: Entry, metres: float = 1.0) -> Pose:
+    """X_to = R X_from + t with t given in units of `metres`."""
+    return Pose(R.rotation(), t.numbers((3,)) * metres)
 
 
 def float64_of(value: Any) -> Tensor | None:

@@ -35,14 +35,15 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _camera(source: RigSource) -> Camera:
-    K, skipped, R, centre, wh = source.numbers_in(source.text(), (26,), "the file").split([9, 3, 9, 3, 2])
+    numbers = source.at(source.text(), "the file").words().numbers((26,))
+    K, skipped, R, centre, wh = numbers.split([9, 3, 9, 3, 2])
     if skipped.any():
         raise source.fail(
             "line 4", f"is {short(skipped.tolist())}: a lens, which is not read: undistort the images first"
         )
-    world_from_cam = source.rotation(R, "lines 5 to 7")
+    world_from_cam = source.at(R, "lines 5 to 7").rotation()
     return Camera(
-        K=source.intrinsics(K, "lines 1 to 3"),
+        K=source.at(K, "lines 1 to 3").intrinsics(),
         cam_from_world=Pose.from_centre(world_from_cam.mT, centre),
-        hw=source.size_of(wh, "line 9"),
+        hw=source.at(wh, "line 9").size(),
     )

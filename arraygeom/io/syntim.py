@@ -10,9 +10,8 @@ import re
 from pathlib import Path
 
 from ..camera import Camera
-from ..pose import Pose
 from ..rig import Rig
-from .source import RigSource
+from .source import RigSource, pose_of
 
 CONVENTION = "first pixel's centre at 0 (shift 0); X_cam = R^T (X - t); millimetres"
 SIDES = {"_g": "left", "_d": "right"}
@@ -34,23 +33,16 @@ def read(source: RigSource) -> Rig:
 
 def _camera(source: RigSource) -> Camera:
     text = source.text()
-    values = {k: _value(source, text, k) for k in ("u0", "v0", "au", "av", "dimx", "dimy")}
-    K = source.focal_and_centre([values[k] for k in ("au", "av", "u0", "v0")], "au, av, u0, v0")
+    stated = reversed(re.findall(rf"\b(\w+)\s*=\s*{NUMBER}", text, re.IGNORECASE))
+    fields = source.at({name.lower(): value for name, value in stated})
     rotation, _, translation = text.partition("Rotation:")[2].partition("Translation:")
-    rotation, translation = (
-        " ".join(re.findall(NUMBER, part, re.IGNORECASE)) for part in (rotation, translation)
-    )
     R, t = (
-        source.numbers_in(rotation, (3, 3), "Rotation"),
-        source.numbers_in(translation, (3,), "Translation"),
+        source.at(re.findall(NUMBER, part, re.IGNORECASE), name).words()
+        for part, name in ((rotation, "Rotation"), (translation, "Translation"))
     )
-    world_from_cam = source.pose(R, t, "Rotation, Translation:", metres=1e-3)
-    hw = source.size(values["dimx"], values["dimy"], "dimx, dimy")
-    return Camera(K=K, cam_from_world=Pose.inverse(world_from_cam), hw=hw)
-
-
-def _value(source: RigSource, text: str, name: str) -> float:
-    found = re.search(rf"\b{name}\s*=\s*{NUMBER}", text, re.IGNORECASE)
-    if not found:
-        raise source.fail(name, "is missing; is the file whole?")
-    return float(source.numbers_in(found[1], (1,), name))
+    R.numbers((3, 3))
+    return Camera(
+        K=fields.listed("au", "av", "u0", "v0").words().focal_and_centre(),
+        cam_from_world=pose_of(R, t, metres=1e-3).inverse(),
+        hw=fields.listed("dimx", "dimy").words().size(),
+    )

@@ -139,14 +139,14 @@ class _Image(NamedTuple):
     def numbers(self, name: str, namespace: str = PIX4D) -> Tensor | None:
         """The numbers of a tag, None if it is not stated."""
         text = self.tags.text(namespace, name)
-        return None if text is None else self.source.numbers_in(re.sub(r"[,;]", " ", text), None, name)
+        return None if text is None else self.source.at(re.sub(r"[,;]", " ", text), name).words().numbers()
 
     def needed(self, name: str, count: int) -> Tensor:
         """So many numbers of a tag of Pix4D's."""
         found = self.numbers(name)
         if found is None:
             raise self.source.fail(name, "is not stated: give a rig file instead")
-        return self.source.numbers(found, (count,), name)
+        return self.source.at(found, name).numbers((count,))
 
     @property
     def per_mm(self) -> Tensor:
@@ -210,9 +210,8 @@ class _Image(NamedTuple):
             if self.numbers("PerspectiveDistortion") is None:
                 return self._intrinsics(K), None
             r1, r2, r3, t1, t2 = self.needed("PerspectiveDistortion", 5)
-            return self._intrinsics(K), self.source.brown_conrady(
-                [r1, r2, t1, t2, r3], "PerspectiveDistortion"
-            )
+            lens = self.source.at([r1, r2, t1, t2, r3], "PerspectiveDistortion").brown_conrady()
+            return self._intrinsics(K), lens
         if kind != "fisheye":
             raise self.source.fail("ModelType", f"is '{kind}'; perspective and fisheye are read")
         p = self.numbers("FisheyePolynomial")
@@ -230,16 +229,17 @@ class _Image(NamedTuple):
         dated, _, numbers = text.rpartition(";")
         if not dated:
             raise self.source.fail("DewarpData", "is not a date and nine numbers: give a rig file instead")
-        fx, fy, cx, cy, *c = self.source.numbers_in(numbers.replace(",", " "), (9,), "DewarpData").tolist()
+        listed = self.source.at(numbers.replace(",", " "), "DewarpData").words()
+        fx, fy, cx, cy, *c = listed.numbers((9,)).tolist()
         middle = [
             (self.numbers(f"CalibratedOpticalCenter{axis}", DJI), n / 2) for axis, n in (("X", w), ("Y", h))
         ]
         x, y = (half if stated is None else float(stated[0]) for stated, half in middle)
         K = torch.tensor([[fx, 0, x + cx], [0, fy, y + cy], [0, 0, 1]], dtype=torch.float64)
-        return self._intrinsics(K), self.source.brown_conrady(c, "DewarpData")
+        return self._intrinsics(K), self.source.at(c, "DewarpData").brown_conrady()
 
     def _intrinsics(self, K: Tensor) -> Tensor:
-        return self.source.intrinsics(K, "PrincipalPoint")
+        return self.source.at(K, "PrincipalPoint").intrinsics()
 
     def _check_centre(self, K: Tensor) -> None:
         (h, w), (x, y) = self.tags.hw, K[:2, 2].tolist()

@@ -10,16 +10,13 @@ camera is on the right of the left one, so that t = -(Baseline, TY, TZ). World =
 from __future__ import annotations
 
 import configparser
-from collections.abc import Mapping
 from pathlib import Path
-
-from torch import Tensor
 
 from ..camera import Camera
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
-from .source import RigSource
+from .source import Entry, RigSource, pose_of
 
 CONVENTION = (
     "first pixel's centre at 0 (shift 0); rotation vector left to right, baseline in mm; world = left"
@@ -44,12 +41,12 @@ def read(source: RigSource) -> Rig:
     """Both cameras, `left` and `right`, at the size that is asked for, else at the largest."""
     parser = configparser.ConfigParser(interpolation=None)
     try:
-        parser.read_string(source.text(LONGEST))
+        parser.read_string(source.text(LONGEST).replace(",", "."))  # some systems write a decimal comma
     except configparser.Error as error:
         raise source.fail(
             None, f"is not an INI file ({str(error).splitlines()[0]}); is the file whole?"
         ) from None
-    sections = {name.lower(): dict(parser[name]) for name in parser.sections()}
+    sections = {name.lower(): source.at(dict(parser[name]), name.upper()) for name in parser.sections()}
     there = {
         name: hw for name, hw in SIZES.items() if {f"left_cam_{name}", f"right_cam_{name}"} <= sections.keys()
     }
@@ -59,34 +56,27 @@ def read(source: RigSource) -> Rig:
     if source.hw is not None and source.hw not in there.values():
         raise source.fail(None, f"has no cameras of {source.hw[1]}x{source.hw[0]}; it has {listed}")
     name = next(name for name, hw in there.items() if source.hw in (None, hw))
-    pose = _pose(source, sections.get("stereo", {}), name)
+    poses = {"left": Pose.identity(), "right": _pose(sections.get("stereo", source.at({}, "STEREO")), name)}
     return source.rig(
-        (side, _camera(source, f"{side}_cam_{name}", sections, there[name], pose))
-        for side, pose in (("left", Pose.identity()), ("right", pose))
+        (side, _camera(sections[f"{side}_cam_{name}"], there[name], pose)) for side, pose in poses.items()
     )
 
 
-def _pose(source: RigSource, stereo: Mapping[str, str], name: str) -> Pose:
+def _pose(stereo: Entry, name: str) -> Pose:
     """Of the right camera: points are R X + t. Offsets have been written for all resolutions at once too."""
-    rotation = [source.get(stereo, f"{key}_{name}", "STEREO") for key in ("rx", "cv", "rz")]
-    baseline = source.get(stereo, "baseline", "STEREO")
-    offsets = [stereo.get(f"{key}_{name}", stereo.get(key, "0")) for key in ("ty", "tz")]
-    t = _numbers(source, [baseline, *offsets], "STEREO Baseline, TY, TZ")
-    return source.pose(_numbers(source, rotation, "STEREO RX, CV, RZ"), -t, "STEREO", metres=1e-3)
+    offsets = [stereo.get(f"{key}_{name}", stereo.get(key, "0").value).value for key in ("ty", "tz")]
+    t = stereo.at([stereo["baseline"].value, *offsets], "baseline, ty, tz").words()
+    rotation = stereo.listed(*(f"{key}_{name}" for key in ("rx", "cv", "rz"))).words()
+    return pose_of(rotation, t, metres=-1e-3)
 
 
-def _camera(
-    source: RigSource, section: str, sections: Mapping[str, Mapping[str, str]], hw: HW, pose: Pose
-) -> Camera:
-    fields, entry = sections[section], section.upper()
-    K = _numbers(source, [source.get(fields, key, entry) for key in ("fx", "fy", "cx", "cy")], entry)
+def _camera(fields: Entry, hw: HW, pose: Pose) -> Camera:
     fisheye = "k4" in fields and "p1" not in fields
     keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
-    c = _numbers(source, [fields.get(key, "0") for key in keys], entry)
-    lens = source.kannala_brandt(c, entry) if fisheye else source.brown_conrady(c, entry)
-    return Camera(K=source.focal_and_centre(K, entry), cam_from_world=pose, hw=hw, distortion=lens)
-
-
-def _numbers(source: RigSource, words: list[str], entry: str) -> Tensor:
-    """Numbers, which some systems have written with a decimal comma."""
-    return source.numbers_in(" ".join(words).replace(",", "."), (len(words),), entry)
+    c = fields.at([fields.get(key, "0").value for key in keys], ", ".join(keys)).words()
+    return Camera(
+        K=fields.listed("fx", "fy", "cx", "cy").words().focal_and_centre(),
+        cam_from_world=pose,
+        hw=hw,
+        distortion=c.kannala_brandt() if fisheye else c.brown_conrady(),
+    )

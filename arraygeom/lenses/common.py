@@ -81,6 +81,12 @@ def unit(ray: Tensor) -> Tensor:
     return ray / norm(ray)[..., None]
 
 
+def on_plane(X: Tensor) -> tuple[Tensor, Tensor]:
+    """Where rays (*n, 3) meet the plane z = 1, and which do: those ahead."""
+    ahead = X[..., 2] > 0
+    return X[..., :2] / torch.where(ahead, X[..., 2], 1.0)[..., None], ahead
+
+
 def norm(xy: Tensor) -> Tensor:
     """Lengths of vectors."""
     return xy.square().sum(-1).sqrt()

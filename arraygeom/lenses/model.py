@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..batching import Batched
 from ..pixels import broadcast_shapes, floating, to_homogeneous
+from .common import on_plane
 
 AnyLens = TypeVar("AnyLens", bound="LensModel")
 
@@ -61,8 +62,8 @@ class LensModel(Batched):
     def undistort(self, xy: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Points of the image plane to those of a pinhole, and which it has."""
         ray, valid = self.unproject(xy)
-        ahead = ray[..., 2] > 0
-        return ray[..., :2] / torch.where(ahead, ray[..., 2], 1.0)[..., None], valid & ahead
+        xy, ahead = on_plane(ray)
+        return xy, valid & ahead
 
     def distort(self, xy: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Points of a pinhole to those of the image plane."""

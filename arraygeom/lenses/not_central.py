@@ -13,7 +13,7 @@ from torch import Tensor
 from ..checks import checking
 from ..pixels import to_homogeneous
 from ..tracing import followed
-from .common import cosine_and_sinc, finite_points, unit
+from .common import cosine_and_sinc, finite_points, on_plane, unit
 from .model import CameraModel, LensModel, beside_points
 
 ROWS, ANGLES = 12, 24
@@ -67,10 +67,7 @@ class BehindModel(CameraModel):
         return self.lens is not None and self.lens.sees_behind
 
     def _through(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        if self.lens is not None:
-            return self.lens.project(X)
-        ahead = X[..., 2] > 0
-        return X[..., :2] / torch.where(ahead, X[..., 2], 1.0)[..., None], ahead
+        return on_plane(X) if self.lens is None else self.lens.project(X)
 
     def _ray(self, xy: Tensor) -> tuple[Tensor, Tensor]:
         if self.lens is not None:

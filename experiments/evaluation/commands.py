@@ -1,28 +1,62 @@
-"""The commands of this room: `python -m experiments evaluate`, `conditions`, `outside`, `certainty`, ...
-
-As in `pat.cli`, nothing here imports torch before a command runs.
-"""
+"""The commands of this room: `python -m experiments evaluate`, `conditions`, `outside`, `certainty`, ..."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
+import torch
 from tyro.conf import Positional, arg
 
-from pat.cli import authors, options
-from pat.cli.options import MaybePath, Out, Weights, optional, say, writable
+from arraygeom import ReceptiveField
+from arraygeom.atomic import write_text
+from experiments.patches.dataset import ScenePatches
+from experiments.patches.show import draw_patches
+from experiments.sensors import read_chains
+from pat.cli import authors
+from pat.cli.options import MaybePath, Out, Weights, optional, progress, say, writable
+from pat.data.pairs import StereoPair, middlebury_pairs
+from pat.evaluation import protocols, stereo
+from pat.evaluation.ablation import sample_photographs
+from pat.evaluation.tables import write_csv
+from pat.matching.certainty import fitted_network
+from pat.media.figures import save_figure, save_panels
+from pat.networks.protocol import Comparing
+from pat.networks.weights import Network, load_weights
+from pat.sensors import generator_for
+from pat.support.schema import read_yaml
+from pat.support.tensor_files import write_tensors
+from pat.synthesis.photos import PhotoBank
 
-if TYPE_CHECKING:
-    from arraygeom import ReceptiveField
-    from pat.data.pairs import StereoPair
-    from pat.networks.protocol import Comparing
-    from pat.networks.weights import Network
+from . import certainty, conditions, fields, paper, sweeps
+from .halves import of_half
+from .outside import evaluate_outside, outside_markdown
+from .sweep_report import write_report
 
 Half = Literal["tune", "report", "all"]
-RIG_FOUND = "fusion, rig found"
+
+
+def known(option: str, names: Iterable[str], among: Iterable[str]) -> None:
+    """Raises ValueError for the first of some names that there is not; the option, "--only: no condition"."""
+    for name in names:
+        if name not in among:
+            raise ValueError(f"{option} '{name}': there are {', '.join(among)}")
+
+
+def finished(path: Path, text: str, more: str = "") -> None:
+    """Write and print a text, and say where it is."""
+    write_text(path, text)
+    print(text, end="")
+    say(f"written: {path}{more}")
+
+
+def with_truth(found: Sequence, half: str) -> Sequence:
+    """Raises ValueError where no pair of a half has a true disparity."""
+    if not found:
+        raise ValueError(f"--half {half}: none of its pairs has a true disparity: give the other half")
+    return found
 
 
 @dataclass
@@ -34,8 +68,6 @@ class Pairs(authors.Evaluate):
 
     def sets(self) -> dict[str, Iterable[StereoPair]]:
         """The pairs of the half by data set."""
-        from .halves import of_half
-
         return {name: of_half(pairs, self.half) for name, pairs in super().sets().items()}
 
     def pairs(self) -> list[StereoPair]:
@@ -67,27 +99,19 @@ class Evaluate(Pairs):
 
     def run(self) -> None:
         """Write and print the scores. Raises ValueError for no images, and for rates below 1."""
-        from pat.evaluation import protocols, stereo
-        from pat.networks.weights import load_weights
-
-        from . import paper
-
         if self.without_rig and self.protocol != "table1":
             raise ValueError("--without-rig needs --protocol table1")
         sets, network, bands = self.sets(), load_weights(self.weights), paper.PROTOCOLS[self.protocol]
         compared = paper.controls(network, bands=bands) if self.controls else {}
         if self.without_rig:
-            compared[RIG_FOUND] = paper.with_found_rig(network)
+            compared["fusion, rig found"] = paper.with_found_rig(network)
         field = paper.AuthorsRows() if self.as_authors else None
         if self.as_authors:
             sets = {name: map(paper.halved, pairs) for name, pairs in sets.items()}
         fusion = protocols.rectified_fusion(network, bands=bands, field=field)
         methods = {**protocols.BASELINES, "fusion": fusion, **compared}
         rows = stereo.evaluate_sets(sets, methods, self.rates, out=self.out)
-        printed = {
-            name: scores for (protocol, name), scores in paper.PRINTED.items() if protocol == self.protocol
-        }
-        text = stereo.sets_markdown(rows, printed=printed)
+        text = stereo.sets_markdown(rows, printed=paper.PRINTED[self.protocol])
         if compared:
             text += "\n" + paper.falls([row for found in rows.values() for row in found], names=compared)
         self.write(rows, text)
@@ -107,24 +131,12 @@ class Conditions(Pairs):
 
     def run(self) -> None:
         """Write and print the tables. Raises ValueError for no images, and a condition that is none."""
-        from arraygeom.atomic import write_text
-        from pat.networks.weights import load_weights
-
-        from . import conditions
-
         names = self.only or tuple(conditions.CONDITIONS)
-        unknown = [name for name in names if name not in conditions.CONDITIONS]
-        if unknown:
-            raise ValueError(
-                f"--only: no condition '{unknown[0]}': there are {', '.join(conditions.CONDITIONS)}"
-            )
+        known("--only: no condition", names, conditions.CONDITIONS)
         pairs, network = self.pairs(), load_weights(self.weights)
-        rows = conditions.evaluate_conditions(pairs, network, names, progress=options.progress("evaluating"))
-        text = conditions.conditions_markdown(rows)
-        write_text(self.out / "conditions.md", text)
+        rows = conditions.evaluate_conditions(pairs, network, names, progress=progress("evaluating"))
         conditions.save_condition_curves(rows, self.out / "conditions.png")
-        print(text, end="")
-        say(f"written: {self.out / 'conditions.md'}")
+        finished(self.out / "conditions.md", conditions.conditions_markdown(rows))
 
 
 @dataclass
@@ -136,21 +148,10 @@ class Outside(Pairs):
 
     def run(self) -> None:
         """Write and print the table. Raises ValueError for no images, and for none with a true disparity."""
-        from arraygeom.atomic import write_text
-        from pat.networks.weights import load_weights
-
-        from .outside import evaluate_outside, outside_markdown
-
-        pairs = [pair for pair in self.pairs() if pair.disparity is not None]
-        if not pairs:
-            raise ValueError(
-                f"--half {self.half}: none of its pairs has a true disparity: give the other half"
-            )
-        shown = options.progress("evaluating")(pairs, len(pairs))
-        text = outside_markdown(evaluate_outside(shown, load_weights(self.weights)))
-        write_text(self.out / "outside.md", text)
-        print(text, end="")
-        say(f"written: {self.out / 'outside.md'}")
+        pairs = with_truth([pair for pair in self.pairs() if pair.disparity is not None], self.half)
+        shown = progress("evaluating")(pairs, len(pairs))
+        rows = evaluate_outside(shown, load_weights(self.weights))
+        finished(self.out / "outside.md", outside_markdown(rows))
 
 
 @dataclass
@@ -172,31 +173,12 @@ class Certainty:
 
     def run(self) -> None:
         """Write and print the tables. Raises ValueError for a condition that is none."""
-        from arraygeom.atomic import write_text
-        from pat.data.pairs import middlebury_pairs
-        from pat.matching.certainty import fitted_network
-        from pat.networks.weights import load_weights
-        from pat.support.tensor_files import write_tensors
-
-        from . import certainty
-        from .conditions import CONDITIONS
-        from .halves import of_half
-
         names = self.conditions or certainty.FITTED_ON
-        unknown = [name for name in names if name not in CONDITIONS]
-        if unknown:
-            raise ValueError(f"--conditions: no condition '{unknown[0]}': there are {', '.join(CONDITIONS)}")
+        known("--conditions: no condition", names, conditions.CONDITIONS)
         writable(self.out, folder=True)
-        pairs, network = (
-            list(of_half(middlebury_pairs(self.middlebury), self.half)),
-            load_weights(self.weights),
-        )
-        shown = options.progress("fusing")(pairs, len(pairs))
-        found = list(certainty.judged(network, shown, names))
-        if not found:
-            raise ValueError(
-                f"--half {self.half}: none of its pairs has a true disparity: give the other half"
-            )
+        pairs = list(of_half(middlebury_pairs(self.middlebury), self.half))
+        shown = progress("fusing")(pairs, len(pairs))
+        found = with_truth(list(certainty.judged(load_weights(self.weights), shown, names)), self.half)
         if self.fit:
             write_tensors(self.fit, certainty.widened(found).state_dict())
             held = certainty.held(found, certainty.by_thirds(found))
@@ -204,9 +186,7 @@ class Certainty:
             held = certainty.held(found, lambda one: certainty.Stated.by(fitted_network(), one.numbers))
         certainty.save_reliability(held, self.out / "reliability.png")
         text = certainty.held_markdown(held)
-        write_text(self.out / "certainty.md", text)
-        print(text, end="")
-        say(f"written: {self.out / 'certainty.md'}, and reliability.png beside it")
+        finished(self.out / "certainty.md", text, ", and reliability.png beside it")
 
 
 @dataclass
@@ -225,14 +205,9 @@ class OnScenes:
 
     def comparing(self, fields: Iterable[str]) -> Comparing:
         """The network, once its attention alone is known to find the points and such fields to exist."""
-        from pat.networks.protocol import Comparing
-        from pat.networks.weights import load_weights
-
         if self.scenes < 1:
             raise ValueError(f"--scenes: {self.scenes}: give at least 1")
-        unknown = [name for name in self.without if name not in fields]
-        if unknown:
-            raise ValueError(f"--without: no field '{unknown[0]}': there are {', '.join(fields)}")
+        known("--without: no field", self.without, fields)
         writable(self.out, folder=True)
         network: Network = load_weights(self.weights)
         if not isinstance(network, Comparing):
@@ -244,6 +219,10 @@ class OnScenes:
             wanted = "give some for one beta in colour, or for three with a band each"
             raise ValueError(f"--weights {self.weights}: they are for {network.betas} betas: {wanted}")
         return network
+
+    def bank(self) -> PhotoBank:
+        """The photographs."""
+        return PhotoBank.load(*self.photos) if self.photos else sample_photographs()
 
     def say_written(self) -> None:
         """Print the table."""
@@ -269,19 +248,11 @@ class Sweeps(OnScenes):
 
     def run(self) -> None:
         """Write ablation.md, .json, .svg, .png; print the table. Raises ValueError for an unknown sweep."""
-        from pat.synthesis.photos import PhotoBank
-
-        from .sweep_report import write_report
-        from .sweeps import FIELDS, SWEEPS, ablate, points
-
-        network = self.comparing(FIELDS)
-        fields = {name: field for name, field in FIELDS.items() if name not in self.without}
-        rigs = list(points(self.sweeps or tuple(SWEEPS), hw=self.hw))
-        bank = PhotoBank.load(*self.photos) if self.photos else None
-        shown = options.progress("ablating")(rigs, len(rigs))
-        write_report(
-            ablate(network, shown, fields, scenes=self.scenes, photos=bank, seed=self.seed), self.out
-        )
+        network = self.comparing(sweeps.FIELDS)
+        chosen = {name: field for name, field in sweeps.FIELDS.items() if name not in self.without}
+        rigs = list(sweeps.points(self.sweeps or tuple(sweeps.SWEEPS), hw=self.hw))
+        shown, of = progress("ablating")(rigs, len(rigs)), {"scenes": self.scenes, "seed": self.seed}
+        write_report(sweeps.ablate(network, shown, chosen, photos=self.bank(), **of), self.out)
         self.say_written()
 
 
@@ -294,19 +265,8 @@ class Fields(OnScenes):
 
     def run(self) -> None:
         """Write ablation.md, .csv, peaks.png (attention's maxima in three pictures); print the table."""
-        from arraygeom.atomic import write_text
-        from pat.data.pairs import middlebury_pairs
-        from pat.evaluation.ablation import sample_photographs
-        from pat.evaluation.tables import write_csv
-        from pat.media.figures import save_panels
-        from pat.synthesis.photos import PhotoBank
-
-        from . import fields
-        from .halves import of_half
-
         network = self.comparing(fields.fields_of(1.0))
-        bank = PhotoBank.load(*self.photos) if self.photos else sample_photographs()
-        cases = list(fields.layered_cases(bank, self.scenes))
+        cases = list(fields.layered_cases(self.bank(), self.scenes))
         if self.middlebury is not None:
             for linked in (True, False):
                 pairs = of_half(middlebury_pairs(self.middlebury), "report")
@@ -316,7 +276,7 @@ class Fields(OnScenes):
             every = fields.fields_of(max_displacement)
             return {name: field for name, field in every.items() if name not in self.without}
 
-        rows = fields.evaluate_fields(network, options.progress("fusing")(cases, len(cases)), fields=chosen)
+        rows = fields.evaluate_fields(network, progress("fusing")(cases, len(cases)), fields=chosen)
         looked_at = [case for case in cases if case.kind != "F alone"]
         panels = fields.drawn_peaks(network, looked_at[:: -(-len(looked_at) // 3)])
         save_panels(panels, self.out / "peaks.png", columns=4)
@@ -343,15 +303,6 @@ class Patches:
 
     def run(self) -> None:
         """Draw patches chosen by the seed. Raises ValueError for less than one."""
-        import torch
-
-        from experiments.patches.dataset import ScenePatches
-        from experiments.patches.show import draw_patches
-        from experiments.sensors import read_chains
-        from pat.media.figures import save_figure
-        from pat.sensors import generator_for
-        from pat.support.schema import read_yaml
-
         if self.samples < 1:
             raise ValueError(f"--samples: {self.samples}: give a whole number from 1 up")
         chains = None if self.sensors is None else read_chains(read_yaml(self.sensors), str(self.sensors))

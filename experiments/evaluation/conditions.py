@@ -289,17 +289,9 @@ def depth_errors(
 
 def conditions_markdown(rows: Sequence[ConditionRow]) -> str:
     """PSNR / SSIM by condition and method with intervals of the gain over classical; regions; depth."""
-    return "\n".join(
-        [
-            _by_condition(rows),
-            "By region, ideal:",
-            "",
-            _by_region(rows),
-            "Depth, without noise or misalignment:",
-            "",
-            _depth(rows),
-        ]
-    )
+    depth = "Depth, without noise or misalignment:"
+    parts = _by_condition(rows), "By region, ideal:", "", _by_region(rows), depth, "", _depth(rows)
+    return "\n".join(parts)
 
 
 def _by_condition(rows: Sequence[ConditionRow]) -> str:
@@ -331,14 +323,8 @@ def _by_region(rows: Sequence[ConditionRow]) -> str:
         found = [r for r in ideal if r.method == method]
         values = [[v for r in found if (v := r.psnr.get(region)) is not None] for region in REGIONS]
         lines.append([method, *(f"{np.mean(v):.2f}" if v else "" for v in values)])
-    names = [
-        "whole",
-        "seen by beta",
-        "occluded",
-        "beyond beta's edge",
-        f"without the left {LEFT_CROP} columns",
-    ]
-    return markdown_table(["PSNR", *names], lines)
+    names = ["whole", "seen by beta", "occluded", "beyond beta's edge"]
+    return markdown_table(["PSNR", *names, f"without the left {LEFT_CROP} columns"], lines)
 
 
 def _depth(rows: Sequence[ConditionRow]) -> str:

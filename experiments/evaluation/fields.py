@@ -128,13 +128,8 @@ def layered_cases(bank: PhotoBank, count: int, *, hw: tuple[int, int] = (96, 128
     for number in range(count):
         rig = rig_of(hw, ratio=(1.0, 1.25)[number % 2], ahead=(0.0, 30.0)[number // 2 % 2])
         pair = rig.pair(ALPHA, BETA)
-        yield Case(
-            "unrectified",
-            f"scene {number}",
-            pair,
-            made(rig, bank, number),
-            float(covering_displacement(pair)),
-        )
+        largest = float(covering_displacement(pair))
+        yield Case("unrectified", f"scene {number}", pair, made(rig, bank, number), largest)
 
 
 def evaluate_fields(
@@ -203,18 +198,10 @@ def fields_markdown(rows: Sequence[FieldRow]) -> str:
     parts = []
     for kind in distinct(row.kind for row in rows):
         some = [row for row in rows if row.kind == kind]
-        lines = [
-            _line(name, [r for r in some if r.field == name]) for name in distinct(r.field for r in some)
-        ]
-        columns = [
-            f"{kind} ({len(distinct(r.case for r in some))})",
-            "PSNR",
-            "SSIM",
-            "peaks within 1 px",
-            "CPU s",
-            "MiB",
-            "",
-        ]
+        names = distinct(row.field for row in some)
+        lines = [_line(name, [row for row in some if row.field == name]) for name in names]
+        title = f"{kind} ({len(distinct(row.case for row in some))})"
+        columns = [title, "PSNR", "SSIM", "peaks within 1 px", "CPU s", "MiB", ""]
         parts.append(markdown_table(columns, lines, align="lrrrrrl"))
     return "\n".join(parts)
 

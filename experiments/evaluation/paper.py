@@ -36,10 +36,14 @@ from pat.networks.weights import Network
 PROTOCOLS = {"table1": False, "table2": True}
 """Whether each channel of beta is a camera of its own."""
 PRINTED = {
-    ("table1", "flickr1024"): {2: (27.26, 0.8992), 4: (25.85, 0.8840)},
-    ("table1", "kitti"): {2: (29.55, 0.9097), 4: (28.40, 0.8957)},
-    ("table2", "flickr1024"): {2: (25.55, 0.8714), 4: (24.00, 0.8493)},
-    ("table2", "kitti"): {2: (28.77, 0.8955), 4: (28.13, 0.8903)},
+    "table1": {
+        "flickr1024": {2: (27.26, 0.8992), 4: (25.85, 0.8840)},
+        "kitti": {2: (29.55, 0.9097), 4: (28.40, 0.8957)},
+    },
+    "table2": {
+        "flickr1024": {2: (25.55, 0.8714), 4: (24.00, 0.8493)},
+        "kitti": {2: (28.77, 0.8955), 4: (28.13, 0.8903)},
+    },
 }
 """PSNR and SSIM of fusion as the paper prints them, by protocol, data set, rate; on its choice of images."""
 
@@ -105,10 +109,8 @@ def controls(network: FusionNetwork, *, bands: bool = False) -> dict[str, Stereo
         return fusion(alpha, torch.zeros_like(beta), max_disparity)
 
     def with_foreign_beta(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor | StereoResult:
-        foreign = interpolate(other, hw_of(beta), mode="bicubic", align_corners=False, antialias=True)[
-            0
-        ].clamp(0, 1)
-        return fusion(alpha, foreign, max_disparity)
+        foreign = interpolate(other, hw_of(beta), mode="bicubic", align_corners=False, antialias=True)
+        return fusion(alpha, foreign[0].clamp(0, 1), max_disparity)
 
     def shuffled(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor | StereoResult:
         field = ShuffledField(rectified_field(max_disparity))
@@ -134,7 +136,6 @@ def falls(rows: Sequence[StereoRow], *, method: str = "fusion", names: Iterable[
     lines = []
     for name in names:
         gains = [psnr[pair, rate, name] - value for (pair, rate, m), value in psnr.items() if m == method]
-        lines.append(
-            f"- {name}: {np.mean(gains):+.2f} dB against {method}, {min(gains):+.2f} to {max(gains):+.2f}\n"
-        )
+        line = f"{np.mean(gains):+.2f} dB against {method}, {min(gains):+.2f} to {max(gains):+.2f}"
+        lines.append(f"- {name}: {line}\n")
     return "".join(lines)

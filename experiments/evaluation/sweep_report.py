@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,7 +31,7 @@ def write_report(rows: Sequence[Row], out: Path) -> None:
     write_text(out / "ablation.md", markdown(rows))
     write_text(out / "ablation.json", json.dumps([_plain(row) for row in rows], indent=0))
     for kind in ("svg", "png"):
-        save_curves(rows, out / f"ablation.{kind}")
+        save_figure(curves(rows), out / f"ablation.{kind}")
 
 
 def read_rows(path: str | Path) -> list[Row]:
@@ -40,10 +40,7 @@ def read_rows(path: str | Path) -> list[Row]:
         found = json.loads(Path(path).read_text(encoding="utf-8"))
         if not isinstance(found, list):
             raise TypeError("wanted a list")
-        rows: list[dict[str, Any]] = [
-            {k: math.nan if v is None else v for k, v in row.items()} for row in found
-        ]
-        return [Row(**row) for row in rows]
+        return [Row(**{k: math.nan if v is None else v for k, v in row.items()}) for row in found]  # type: ignore[arg-type]
     except (TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{path}: not the rows of an ablation ({error})") from None
 
@@ -69,19 +66,15 @@ def _tables(rows: Sequence[Row], sweep: str) -> str:
     values, fields = distinct(row.value for row in some), distinct(row.field for row in some)
     parts = []
     for measure, (label, form) in MEASURES.items():
-        lines = [[field, *(_cell(_drawn(some, field, v, measure), form) for v in values)] for field in fields]
+
+        def cell(field: str, value: float, measure: str = measure, form: str = form) -> str:
+            drawn = _drawn(some, field, value, measure)
+            return form.format(np.mean(drawn)) if drawn else ""
+
+        lines = [[field, *(cell(field, value) for value in values)] for field in fields]
         parts.append(markdown_table([label, *(f"{v:g}" for v in values)], lines))
     notes = distinct(f"{row.field} at {row.value:g}: {row.note}" for row in some if row.note)
     return "\n".join(parts) + "".join(f"\n{note}." for note in notes) + "\n" * bool(notes)
-
-
-def _cell(values: Sequence[float], form: str) -> str:
-    return form.format(np.mean(values)) if values else ""
-
-
-def save_curves(rows: Sequence[Row], path: Path) -> Path:
-    """Write the figure of `curves`."""
-    return save_figure(curves(rows), path)
 
 
 def curves(rows: Sequence[Row]) -> Figure:

@@ -11,7 +11,7 @@ from arraygeom import HomographyDisplacement, Rig, Sensor
 from arraygeom.atomic import write_text
 from experiments.flicker import flicker
 from experiments.showcase import FAST, SCENE, SLOW, FastSlowArray, bright_gain, fast_and_slow_array
-from experiments.system import SystemResult
+from experiments.system import SystemResult, fused_frames
 from pat.evaluation.tables import markdown_table
 from pat.fusion.fuse import FuseSettings
 from pat.fusion.results import Frame, save_frame
@@ -40,12 +40,8 @@ def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], 
     field = HomographyDisplacement(array.displacement)
     settings = FuseSettings(field=field, match_levels=True)
     job = SequenceFusion(load_weights(weights), rig, frames, FAST, settings=settings)
-    keys = job.timeline.key_frames()
-    say(f"fusing key frames {', '.join(str(FAST_FRAMES[k.alpha]) for k in keys)}, then all")
-    colours = {key.alpha: job.colour(key) for key in keys}
-    fused = [job.frame(i, keys, lambda key: colours[key.alpha]) for i in range(len(FAST_FRAMES))]
-    say("fusing each frame alone, to compare")
-    alone = [job.alone(i) for i in range(len(FAST_FRAMES))]
+    say("fusing all frames, with colour propagated and each alone")
+    _, fused, alone = fused_frames(job, len(FAST_FRAMES))
     table = _table(fused, alone, frames[FAST])
     written = _write(out, array, frames, fused, alone)
     write_text(out / "scores.md", table)
@@ -69,9 +65,7 @@ def recorded_frames(folder: Path) -> dict[str, list[Tensor]]:
 
 def _table(fused: list[Frame], alone: list[Frame], greys: list[Tensor]) -> str:
     frames = {"each frame alone": alone, "colour propagated": fused}
-    rows = [
-        (name, f"{1000 * flicker([f.image for f in found], greys):.2f}") for name, found in frames.items()
-    ]
+    rows = [(n, f"{1000 * flicker([f.image for f in found], greys):.2f}") for n, found in frames.items()]
     return (
         f"{markdown_table(['', 'flicker x 1000'], rows)}\n"
         "Flicker is the mean change of chroma from frame to frame where nothing moves.\n"

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
-from torch.nn.functional import avg_pool2d, interpolate
+from torch.nn.functional import avg_pool2d
 
 from arraygeom import Epipolar, Segments
 from arraygeom.fields.grid import FieldOnGrid
@@ -33,7 +33,7 @@ from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rigs import below, one_of, uniform
 from pat.training.config import GENERAL, RECTIFIED
-from pat.training.samples import pair_of, transfer
+from pat.training.samples import enlarged, pair_of, transfer
 
 REUSED = 3
 """How many times a scene is recorded on average."""
@@ -199,10 +199,8 @@ def _mirrored(given: ColourPair, across: int, down: int) -> ColourPair:
     """The same with columns, and with rows, in the opposite order."""
     h, w = given.alpha.shape[-2:]
     sides = [side for side, flip in ((-1, across), (-2, down)) if flip]
-    sign, origin = (
-        torch.tensor([1 - 2.0 * across, 1 - 2.0 * down]),
-        torch.tensor([across * (w - 1.0), down * (h - 1.0)]),
-    )
+    sign = torch.tensor([1 - 2.0 * across, 1 - 2.0 * down])
+    origin = torch.tensor([across * (w - 1.0), down * (h - 1.0)])
     end, along, *rest = given.matches
     vectors = (x.flip([side - 1 for side in sides]) for x in (end * sign + origin, along * sign))
     found = TrueMatches(*vectors, *(x.flip(sides) for x in rest))
@@ -241,7 +239,7 @@ def _bands(given: ColourPair, g: Generator, recording: MatchingRecording) -> tup
 
 def _recorded(image: Tensor, g: Generator, recording: MatchingRecording, rate: int) -> Tensor:
     """One view's brightness (B, 1, H, W) as its camera records it, enlarged again if it is reduced."""
-    hw = image.shape[-2:]
+    hw = image.shape[-2], image.shape[-1]
     if _chance(recording.gamma, g):
         image = image.clamp(0, 1) ** float((0.25 * torch.randn((), generator=g)).exp())
     if _chance(recording.gain, g):
@@ -257,7 +255,7 @@ def _recorded(image: Tensor, g: Generator, recording: MatchingRecording, rate: i
     image = (image * 255).round() / 255
     if _chance(recording.jpeg, g):
         image = _compressed(image, 60 + below(36, g))
-    return interpolate(image, hw, mode="bicubic", align_corners=False).clamp(0, 1) if rate > 1 else image
+    return enlarged(image, hw)
 
 
 def _vignetting(image: Tensor, most: float) -> Tensor:

@@ -3,36 +3,31 @@
 
 from __future__ import annotations
 
-import csv
-import json
-import math
+import itertools
 import sys
-import time
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import cast
 
 import torch
 import tyro
-from torch import nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch import Tensor
 
+from experiments.fit import fit, recipe_text
 from pat.sensors import generator_for
 from pat.support.locks import folder_lock
 from pat.support.schema import from_document, read_yaml
 from pat.synthesis.photos import PhotoBank
-from pat.training.checkpoints import collect, newest_checkpoint, restore, write_checkpoint
 
 from .features import FeatureConfig, MatchingEncoder, load_features, save_features
 from .loss import Precision, matching_loss
 from .samples import MatchingRecording, MatchingSample, MatchingScenes, recorded_sample, tune_stereo
 
 RECIPES = Path(__file__).parent
-WEIGHTS, LOG = "features.safetensors", "log.csv"
+WEIGHTS = "features.safetensors"
 KEPT = 24
 """Samples for validation."""
-UNSEEN = ("out", "cache", "save", "validate", "photos", "stereo")
-"""Entries that may differ between a run and its continuation."""
 
 
 @dataclass(frozen=True)
@@ -84,24 +79,28 @@ def train_features(config: FeatureTraining) -> Path:
     """
     with folder_lock(config.out):
         torch.manual_seed(config.seed)
-        encoder = _new_encoder(config)
-        average = AveragedModel(encoder, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / config.average))
-        adam = torch.optim.Adam(encoder.parameters(), lr=config.rate, betas=(0.9, 0.99))
-        step = _restored(config, encoder, adam, average)
-        scenes, kept = _scenes(config, 1), validation_samples(config)
-        if step == 0:
-            _log(config, 0, [math.nan] * 2, validated(encoder, kept))
-        while step < config.steps:
-            losses = _advance(config, step, encoder, adam, average, sample_of(config, scenes, step))
-            step += 1
-            if step % config.validate == 0 or step == config.steps:
-                _log(config, step, losses, validated(cast(MatchingEncoder, average.module), kept))
-            if step % config.save == 0 or step == config.steps:
-                said = {"recipe": _recipe(config), "step": str(step)}
-                save_features(cast(MatchingEncoder, average.module), config.out / WEIGHTS, said)
-                facts = {"step": step, "best": 0.0, "minutes": 0.0, "done": step == config.steps}
-                state = collect(encoder, adam, average, facts | {"recipe": _recipe(config)})
-                write_checkpoint(config.out / "checkpoints", state)
+        encoder, scenes, kept = _new_encoder(config), _scenes(config, 1), validation_samples(config)
+        recipe = recipe_text(config, "photos", "stereo")
+
+        def losses(start: int) -> Iterator[Tensor]:
+            for step in itertools.count(start):
+                recording, queries = (generator_for(config.seed, n, step) for n in ("recording", "queries"))
+                given = recorded_sample(scenes.of_step(step), recording, config.recording)
+                full, half = matching_loss(encoder, given, queries, precision=config.precision)
+                yield full.loss + half.loss
+
+        def keep(averaged: MatchingEncoder, step: int) -> None:
+            save_features(averaged, config.out / WEIGHTS, {"recipe": recipe, "step": str(step)})
+
+        fit(
+            encoder,
+            losses,
+            config.out,
+            recipe,
+            **{name: getattr(config, name) for name in ("steps", "rate", "save", "validate", "average")},
+            examine=partial(validated, kept=kept),
+            keep=keep,
+        )
     return config.out / WEIGHTS
 
 
@@ -113,12 +112,6 @@ def _new_encoder(config: FeatureTraining) -> MatchingEncoder:
     if encoder.config != config.network:
         raise ValueError(f"start: {config.start} is of {encoder.config}, the recipe of {config.network}")
     return encoder.train().requires_grad_(True)
-
-
-def sample_of(config: FeatureTraining, scenes: MatchingScenes, step: int) -> MatchingSample:
-    """What step `step` sees."""
-    g = generator_for(config.seed, "recording", step)
-    return recorded_sample(scenes.of_step(step), g, config.recording)
 
 
 def _scenes(config: FeatureTraining, number: int) -> MatchingScenes:
@@ -139,66 +132,12 @@ def validation_samples(config: FeatureTraining) -> list[MatchingSample]:
     return [recorded_sample(scenes.made(i), g, config.recording) for i, g in enumerate(draws)]
 
 
-def _advance(
-    config: FeatureTraining,
-    step: int,
-    encoder: MatchingEncoder,
-    adam: torch.optim.Adam,
-    average: AveragedModel,
-    given: MatchingSample,
-) -> list[float]:
-    """One step of the optimiser; the losses at full and at half size."""
-    for group in adam.param_groups:
-        group["lr"] = config.rate * min(0.5 + 0.5 * math.cos(math.pi * step / config.steps), (step + 1) / 100)
-    adam.zero_grad()
-    g = generator_for(config.seed, "queries", step)
-    found = matching_loss(encoder, given, g, precision=config.precision)
-    sum((s.loss for s in found), torch.zeros(())).backward()
-    nn.utils.clip_grad_norm_(encoder.parameters(), 1.0, error_if_nonfinite=True)
-    adam.step()
-    average.update_parameters(encoder)
-    return [float(s.loss.detach()) for s in found]
-
-
 @torch.no_grad()
-def validated(encoder: MatchingEncoder, kept: list[MatchingSample]) -> list[float]:
+def validated(encoder: MatchingEncoder, kept: list[MatchingSample]) -> dict[str, float]:
     """Mean loss, and mean share within a pixel, at full and at half size."""
     found = [matching_loss(encoder, given, generator_for(0, "queries", i)) for i, given in enumerate(kept)]
-    values = torch.stack([torch.stack([x for s in pair for x in s]) for pair in found])
-    return values.nanmean(0).tolist()
-
-
-def _log(config: FeatureTraining, step: int, losses: list[float], facts: list[float]) -> None:
-    """A log line: the step's loss, then loss and share within a pixel in validation, full and half size."""
-    path = config.out / LOG
-    names = ("step", "loss", "loss, half", "kept", "within one", "kept, half", "within one, half", "time")
-    new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.writer(file)
-        if new:
-            writer.writerow(names)
-        writer.writerow([step, *(f"{x:.4f}" for x in (*losses, *facts)), f"{time.time():.0f}"])
-
-
-def _restored(
-    config: FeatureTraining,
-    encoder: MatchingEncoder,
-    adam: torch.optim.Adam,
-    average: AveragedModel,
-) -> int:
-    """Put back the last checkpoint of the same run, if there is one; returns its step."""
-    former = newest_checkpoint(config.out / "checkpoints")
-    if former is None:
-        return 0
-    if former.facts["recipe"] != _recipe(config):
-        other = former.facts["recipe"]
-        raise ValueError(f"{config.out} holds a run of another recipe ({other}): give another --out")
-    restore(former, encoder, adam, average)
-    return int(former.facts["step"])
-
-
-def _recipe(config: FeatureTraining) -> str:
-    return json.dumps({k: v for k, v in asdict(config).items() if k not in UNSEEN}, default=str)
+    values = torch.stack([torch.stack([x for s in pair for x in s]) for pair in found]).nanmean(0)
+    return dict(zip(("kept", "within one", "kept, half", "within one, half"), values.tolist()))
 
 
 def command_line(arguments: list[str]) -> FeatureTraining:

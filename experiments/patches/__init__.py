@@ -1,1 +1,1 @@
-"""The paper's patches of rendered scenes as a data set of torch, and its own index files."""
+"""The paper's patches of rendered scenes as a data set of torch."""

@@ -34,8 +34,7 @@ _CLASSES: tuple[type[Step], ...] = (
     *(Resample, Crop, Mosaic, Demosaic, Noise, Clip, Quantise, Jitter),
 )
 STEPS: dict[str, type[Step]] = {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", c.__name__).lower(): c for c in _CLASSES}
-STEPS |= {"linear": DecodeSRGB, "coded": EncodeSRGB}
-"""Every step by its name in files; "linear" and "coded" are former names of the sRGB conversions."""
+"""Every step by its name in files."""
 
 
 def read_chain(value: Any, where: str = "chain") -> tuple[Step, ...]:

@@ -146,10 +146,16 @@ def test_names_are_cameras_and_numbers_items():
 
 def test_single_items_are_no_batch():
     rig = random_rig(1)
-    for wrong in (lambda: rig[0], lambda: len(rig), lambda: list(rig["alpha"]), lambda: View(hw=(2, 2))[0]):
+    for wrong in (
+        lambda: rig[0],
+        lambda: len(rig["alpha"]),
+        lambda: list(rig["alpha"]),
+        lambda: View(hw=(2, 2))[0],
+    ):
         with pytest.raises(TypeError, match=r"arraygeom.stack"):
             wrong()
     assert all([rig, rig["alpha"], View(hw=(2, 2))])
+    assert len(rig) == len(list(rig)) == len(rig.names)
     with pytest.raises(IndexError):
         stack([rig])[1]
 

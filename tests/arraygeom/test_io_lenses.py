@@ -341,7 +341,7 @@ def test_nerfstudios_fisheye(tmp_path):
         ("kalibr_wide.yaml", "[0.92]", "[4.0]", r"cam3.distortion_coeffs: is \[4.0\], which no fov lens has"),
         ("kalibr_wide.yaml", "[0.92]", "[0.92, 1]", "cam3.distortion_coeffs: has 2 numbers, wanted 1"),
         ("kalibr_wide.yaml", "[1.2, 400.0,", "[400.0,", "cam0.intrinsics: has 4 numbers, wanted 5"),
-        ("colmap_wide/cameras.txt", "240 0.92", "240 3.5", "line 4: is"),
+        ("colmap_wide/cameras.txt", "240 0.92", "240 3.5", r"line 4\.FOV: is"),
         (
             "colmap_wide/cameras.txt",
             "FOV",

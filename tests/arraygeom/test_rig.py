@@ -27,10 +27,9 @@ def uncalibrated() -> Rig:
     return Rig(views, links={("alpha", "beta"): Link(pair.fundamental, pair.homography)})
 
 
-@pytest.mark.parametrize("quarter_turns", [-1, 1, 2])
-def test_a_pair_follows_what_happens_to_betas_image_as_its_rig_does(quarter_turns):
+def test_a_pair_follows_what_happens_to_betas_image_as_its_rig_does():
     for rig in (random_rig(0), uncalibrated()):
-        one, other = rig.pair("alpha", "beta").rot90_beta(quarter_turns), rig.rot90("beta", quarter_turns)
+        one, other = rig.pair("alpha", "beta").resize_beta((30, 31)), rig.resize("beta", (30, 31))
         assert one.beta.hw == other["beta"].hw
         torch.testing.assert_close(one.fundamental, other.pair("alpha", "beta").fundamental)
 

@@ -9,11 +9,12 @@ colours.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import tyro
+from tyro.conf import Positional
 
 from arraygeom import Camera, Pose, Rig, intrinsics
 from pat import fuse, load_weights
@@ -75,17 +76,14 @@ def table(folders: Sequence[Path]) -> Iterator[str]:
     yield markdown_row(["**mean**", *(f"{v:.2f}" for v in np.mean(rows, 0))])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folders", nargs="*", type=Path)
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--rig", type=Path, help="write the rig to render to this file, and end")
-    args = parser.parse_args()
-    if args.rig:
-        array().save(args.rig)
-        return
-    print_tables("Betas on all sides", [table(args.folders)], args.out)
+def main(
+    folders: Positional[tuple[Path, ...]] = (), out: Path | None = None, rig: Path | None = None
+) -> None:
+    """Print the table of folders of scenes; or write the rig to render to the file `rig`, and end."""
+    if rig:
+        return array().save(rig)
+    print_tables("Betas on all sides", [table(folders)], out)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

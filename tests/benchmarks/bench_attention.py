@@ -11,7 +11,6 @@ RESULTS.md.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -20,10 +19,13 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from datetime import date
 from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import torch
+import tyro
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -104,41 +106,35 @@ METHODS = {
 } | {name: fused(name.split(",")[0]) for name in ("reference", "cpu", ONE_THREAD, "triton")}
 
 
-def measure(job: dict) -> dict:
+def measure(job: Job) -> dict[str, float]:
     """Times one job in this process, and its peak memory: beyond inputs, and of all the process."""
-    device, dtype = job["device"], DTYPES[job["dtype"]]
-    ha, wa, d, samples = job["ha"], job["wa"], job["d"], job["samples"]
+    device, dtype = job.device, DTYPES[job.dtype]
     torch.manual_seed(0)
-    if job["method"] == ONE_THREAD:
+    if job.method == ONE_THREAD:
         torch.set_num_threads(1)
-    q, k, v = (features(ha, wa, d, dtype, device).requires_grad_(job["backward"]) for _ in range(3))
-    segments, run = field(ha, wa, samples, device), METHODS[job["method"]]
-    cotangent = torch.ones_like(q) if job["backward"] else None
+    shape = job.ha, job.wa, job.d
+    q, k, v = (features(*shape, dtype, device).requires_grad_(job.backward) for _ in range(3))
+    segments, run = field(job.ha, job.wa, job.samples, device), METHODS[job.method]
+    cotangent = torch.ones_like(q) if job.backward else None
 
     def once() -> float:
         _wait(device)
         begin = time.perf_counter()
-        out = run(q, k, v, segments, samples, job["interpolation"])
-        if job["backward"]:
+        out = run(q, k, v, segments, job.samples, job.interpolation)
+        if job.backward:
             torch.autograd.grad(out, (q, k, v), cotangent)
         _wait(device)
         return time.perf_counter() - begin
 
-    if job["warm"]:
+    if job.compiled:
         _warm(run, device, dtype, job)
     before = _peak(device, reset=True)
     times = [once()]
     peak = _peak(device)
-    while len(times) < job["repeats"] and sum(times) < ENOUGH:
+    while len(times) < job.repeats and sum(times) < ENOUGH:
         times.append(once())
-    return {
-        "time": statistics.median(times),
-        "low": min(times),
-        "high": max(times),
-        "extra": peak - before,
-        "peak": peak,
-        "unit": 4 * q.numel() * q.element_size(),
-    }
+    found = {"time": statistics.median(times), "low": min(times), "high": max(times)}
+    return found | {"extra": peak - before, "peak": peak, "unit": 4 * q.numel() * q.element_size()}
 
 
 def features(ha: int, wa: int, d: int, dtype: torch.dtype, device: str) -> Tensor:
@@ -150,13 +146,12 @@ def features(ha: int, wa: int, d: int, dtype: torch.dtype, device: str) -> Tenso
     return out.permute(0, 3, 1, 2)
 
 
-def _warm(run, device: str, dtype: torch.dtype, job: dict) -> None:
+def _warm(run: Callable, device: str, dtype: torch.dtype, job: Job) -> None:
     """Compiles what has to be, on a small image."""
-    q, k, v = (
-        torch.randn(1, job["d"], 8, 8, dtype=dtype, device=device, requires_grad=True) for _ in range(3)
-    )
-    out = run(q, k, v, field(8, 8, 4, device), 4, job["interpolation"])
-    if job["backward"]:
+    shape = 1, job.d, 8, 8
+    q, k, v = (torch.randn(shape, dtype=dtype, device=device, requires_grad=True) for _ in range(3))
+    out = run(q, k, v, field(8, 8, 4, device), 4, job.interpolation)
+    if job.backward:
         out.sum().backward()
 
 
@@ -177,7 +172,7 @@ def _peak(device: str, *, reset: bool = False) -> int:
     return int(status["VmHWM"].split()[0]) * 1024
 
 
-def in_own_process(job: dict) -> dict:
+def in_own_process(job: Job) -> dict:
     """`measure` in a fresh process, or the reason why it gave nothing."""
     command = [sys.executable, "-m", "tests.benchmarks.bench_attention", "--job", json.dumps(job)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -232,13 +227,36 @@ BASELINES = (
 SMALL, LARGE, WHOLE = (128, 256), (256, 512), (3036, 4024)
 
 
-def jobs(device: str, quick: bool) -> list[dict]:
+class Job(NamedTuple):
+    """What is measured: a method on images of height and width `ha`, `wa` with `d` channels."""
+
+    device: str
+    method: str
+    interpolation: str
+    ha: int
+    wa: int
+    samples: int
+    backward: bool
+    dtype: str = "float32"
+    d: int = 64
+    repeats: int = REPEATS
+
+    @property
+    def compiled(self) -> bool:
+        """Whether something has to be compiled before."""
+        return self.method in ("cpu", ONE_THREAD, "triton")
+
+    @property
+    def name(self) -> tuple[str, str, str, str]:
+        """By which it is known in the table."""
+        shape = f"{self.wa}x{self.ha}, {self.samples}, {self.dtype}"
+        return shape, "forward + backward" if self.backward else "forward", self.method, self.interpolation
+
+
+def jobs(device: str, quick: bool) -> list[Job]:
     """What is measured; (a) and (b) where they fit."""
     fast = "cpu" if device == "cpu" else "triton"
-    own, plain = (
-        [(fast, "nearest"), (fast, "bilinear")],
-        [("reference", "nearest"), ("reference", "bilinear")],
-    )
+    own, plain = ([(method, how) for how in ("nearest", "bilinear")] for method in (fast, "reference"))
     both = (False, True)
     if device == "cuda":
         methods = [*BASELINES, *own] if torch.cuda.is_available() else own[:1]
@@ -255,42 +273,23 @@ def jobs(device: str, quick: bool) -> list[dict]:
         plan += [] if quick else [(hw, samples, "float32", own, both) for hw, samples in more]
         plan += [] if quick else [(WHOLE, 80, "bfloat16", own, both[:1])]
     return [
-        job(device, method, interpolation, *hw, samples, backward, dtype=dtype)
+        Job(device, method, interpolation, *hw, samples, backward, dtype)
         for hw, samples, dtype, methods, directions in plan
         for backward in directions
         for method, interpolation in methods
     ]
 
 
-def job(device, method, interpolation, ha, wa, samples, backward, *, dtype="float32") -> dict:
-    return {
-        "device": device,
-        "method": method,
-        "interpolation": interpolation,
-        "ha": ha,
-        "wa": wa,
-        "samples": samples,
-        "backward": backward,
-        "dtype": dtype,
-        "d": 64,
-        "warm": method in ("cpu", ONE_THREAD, "triton"),
-        "repeats": REPEATS,
-    }
-
-
-def obstacle(entry: dict) -> str | None:
+def obstacle(job: Job) -> str | None:
     """Why an entry cannot be measured here, if so."""
-    if entry["device"] == "cuda" and not torch.cuda.is_available():
+    if job.device == "cuda" and not torch.cuda.is_available():
         return "no GPU on this machine: not measured"
-    if entry["method"] in ("cpu", ONE_THREAD, "triton", "reference"):
+    if job.compiled or job.method == "reference":
         return None
-    gathered = entry["ha"] * entry["wa"] * entry["samples"] * entry["d"] * DTYPES[entry["dtype"]].itemsize
-    needed, free = gathered * (2 + 3 * entry["backward"]), _free(entry["device"])
-    return (
-        f"needs {needed / GIB:.0f} GiB, {free / GIB:.0f} are free: not measured"
-        if needed > 0.9 * free
-        else None
-    )
+    gathered = job.ha * job.wa * job.samples * job.d * DTYPES[job.dtype].itemsize
+    needed, free = gathered * (2 + 3 * job.backward), _free(job.device)
+    enough = needed <= 0.9 * free
+    return None if enough else f"needs {needed / GIB:.0f} GiB, {free / GIB:.0f} are free: not measured"
 
 
 def _free(device: str) -> int:
@@ -301,55 +300,35 @@ def _free(device: str) -> int:
     return int(lines["MemAvailable"].split()[0]) * 1024
 
 
-def name(entry: dict) -> tuple[str, str, str, str]:
-    """By which an entry is known in the table."""
-    shape = f"{entry['wa']}x{entry['ha']}, {entry['samples']}, {entry['dtype']}"
-    return (
-        shape,
-        "forward + backward" if entry["backward"] else "forward",
-        entry["method"],
-        entry["interpolation"],
-    )
-
-
-def row(entry: dict, done: dict, rates: dict, bandwidth: float) -> str:
+def row(job: Job, done: dict, rates: dict, bandwidth: float) -> str:
     """One line of the table."""
-    rate = rates[entry["method"] == ONE_THREAD]
-    result, (shape, work, *_) = done[name(entry)], name(entry)
+    result, (shape, work, *_) = done[job.name], job.name
     if "failed" in result:
-        return markdown_row([*name(entry), result["failed"][:80], *[""] * (len(COLUMNS) - 5)])
-    flops = (3 if entry["backward"] else 1) * 4 * entry["ha"] * entry["wa"] * entry["samples"] * entry["d"]
-    least = (2 if entry["backward"] else 1) * result["unit"]
+        return markdown_row([*job.name, result["failed"][:80], *[""] * (len(COLUMNS) - 5)])
+    flops = (3 if job.backward else 1) * 4 * job.ha * job.wa * job.samples * job.d
+    least = (2 if job.backward else 1) * result["unit"]
+    bases = ("index", "nearest"), ("grid_sample", job.interpolation)
     against = [
         f"{base['time'] / result['time']:.1f}x, {base['extra'] / max(result['extra'], 1):.1f}x"
         if "time" in base
         else "-"
-        for base in (
-            done.get((shape, work, "index", "nearest"), {}),
-            done.get((shape, work, "grid_sample", entry["interpolation"]), {}),
-        )
+        for base in (done.get((shape, work, *names), {}) for names in bases)
     ]
+    seconds = result["time"]
     cells = [
-        f"{result['time']:.3f} ({result['low']:.3f} to {result['high']:.3f})",
+        f"{seconds:.3f} ({result['low']:.3f} to {result['high']:.3f})",
         *against,
         f"{result['extra'] / result['unit']:.2f}",
-        f"{flops / result['time'] / 1e12:.2g} ({flops / result['time'] / rate:.0%})",
-        f"{least / result['time'] / 1e9:.2g} ({least / result['time'] / bandwidth:.0%})",
+        f"{flops / seconds / 1e12:.2g} ({flops / seconds / rates[job.method == ONE_THREAD]:.0%})",
+        f"{least / seconds / 1e9:.2g} ({least / seconds / bandwidth:.0%})",
     ]
-    return markdown_row([*name(entry), *cells])
+    return markdown_row([*job.name, *cells])
 
 
 COLUMNS = (
-    "alpha (= beta), samples, dtype",
-    "what",
-    "method",
-    "look-up",
-    "seconds (fastest to slowest)",
-    "faster, leaner than (a)",
-    "faster, leaner than (b)",
-    "extra memory / (Q + K + V + out)",
-    "TFLOP/s (of the matmul rate)",
-    "GB/s (of the copy bandwidth)",
+    *("alpha (= beta), samples, dtype", "what", "method", "look-up", "seconds (fastest to slowest)"),
+    *("faster, leaner than (a)", "faster, leaner than (b)", "extra memory / (Q + K + V + out)"),
+    *("TFLOP/s (of the matmul rate)", "GB/s (of the copy bandwidth)"),
 )
 
 
@@ -357,13 +336,9 @@ def table(device: str, *, quick: bool) -> list[str]:
     """Measures everything on a device, printing as it goes."""
     here = device == "cpu" or torch.cuda.is_available()
     rates, bandwidth = (_rates(device), copy_bandwidth(device)) if here else ({False: 1.0, True: 1.0}, 1.0)
-    machine = (
-        f"{torch.get_num_threads()} threads"
-        if device == "cpu"
-        else torch.cuda.get_device_name()
-        if here
-        else ""
-    )
+    machine = f"{torch.get_num_threads()} threads"
+    if device == "cuda":
+        machine = torch.cuda.get_device_name() if here else ""
     limits = (
         f"{machine}: float32 matmul {rates[False] / 1e12:.3f} TFLOP/s (one thread {rates[True] / 1e12:.3f}), "
         f"copy {bandwidth / 1e9:.1f} GB/s (read and written)."
@@ -374,10 +349,10 @@ def table(device: str, *, quick: bool) -> list[str]:
     ]
     print("\n".join(lines), flush=True)
     done: dict = {}
-    for entry in jobs(device, quick):
-        reason = obstacle(entry)
-        done[name(entry)] = {"failed": reason} if reason else in_own_process(entry)
-        lines.append(row(entry, done, rates, bandwidth))
+    for job in jobs(device, quick):
+        reason = obstacle(job)
+        done[job.name] = {"failed": reason} if reason else in_own_process(job)
+        lines.append(row(job, done, rates, bandwidth))
         print(lines[-1], flush=True)
     found = bars(done, rates) if device == "cpu" else []
     print("\n".join(found), flush=True)
@@ -387,37 +362,21 @@ def table(device: str, *, quick: bool) -> list[str]:
 def bars(done: dict, rates: dict) -> list[str]:
     """What was asked for, of the CPU, against what was measured."""
 
-    def get(
-        what: str,
-        backward: bool,
-        method: str,
-        interpolation: str = "nearest",
-        hw=LARGE,
-        samples=80,
-        dtype="float32",
-    ):
-        entry = job("cpu", method, interpolation, *hw, samples, backward, dtype=dtype)
-        return done.get(name(entry), {}).get(what, math.nan)
+    def get(what: str, *how: Any, hw: tuple[int, int] = LARGE, samples: int = 80, **more: str) -> float:
+        backward, method, interpolation = (*how, "nearest")[:3]
+        job = Job("cpu", method, interpolation, *hw, samples, backward, **more)
+        return done.get(job.name, {}).get(what, math.nan)
 
     own = {(b, i): get("time", b, "cpu", i) for b in (False, True) for i in ("nearest", "bilinear")}
     one = {i: get("time", False, ONE_THREAD, i) for i in ("nearest", "bilinear")}
     memory = {(b, n): get("extra", b, "cpu", samples=n) for b in (False, True) for n in (40, 80, 640)}
     unit = get("unit", False, "cpu")
     flops = 4 * LARGE[0] * LARGE[1] * 80 * 64
-    whole = [get(what, False, "cpu", hw=WHOLE, dtype="bfloat16") for what in ("peak", "unit", "time")]
+    peak, needed = (get(what, False, "cpu", hw=WHOLE, dtype="bfloat16") for what in ("peak", "unit"))
+    slow, slow_backward = (get("time", b, "index") for b in (False, True))
     asked = [
-        (
-            "nearest forward, times faster than (a)",
-            get("time", False, "index") / own[False, "nearest"],
-            ">=",
-            80,
-        ),
-        (
-            "nearest forward + backward, times faster",
-            get("time", True, "index") / own[True, "nearest"],
-            ">=",
-            45,
-        ),
+        ("nearest forward, times faster than (a)", slow / own[False, "nearest"], ">=", 80),
+        ("nearest forward + backward, times faster", slow_backward / own[True, "nearest"], ">=", 45),
         ("nearest forward, of the matmul rate", flops / own[False, "nearest"] / rates[False], ">=", 0.3),
         ("the same with one thread, of one thread's rate", flops / one["nearest"] / rates[True], ">=", 0.3),
         ("bilinear forward, times nearest", own[False, "bilinear"] / own[False, "nearest"], "<=", 2),
@@ -426,7 +385,7 @@ def bars(done: dict, rates: dict) -> list[str]:
         ("extra memory, forward + backward", memory[True, 80] / unit, "<=", 3),
         ("extra memory, forward, 640 over 40 samples", memory[False, 640] / memory[False, 40], "<=", 1.1),
         ("extra memory, forward + backward, 640 over 40", memory[True, 640] / memory[True, 40], "<=", 1.1),
-        ("4024x3036 bfloat16, peak beyond Q + K + V + out, GiB", (whole[0] - whole[1]) / GIB, "<=", 1),
+        ("4024x3036 bfloat16, peak beyond Q + K + V + out, GiB", (peak - needed) / GIB, "<=", 1),
     ]
     lines = [
         "",
@@ -441,28 +400,23 @@ def bars(done: dict, rates: dict) -> list[str]:
     return lines
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--job", help=argparse.SUPPRESS)
-    parser.add_argument("--device", choices=("cpu", "cuda"), help="this one only")
-    parser.add_argument("--quick", action="store_true", help="small sizes only")
-    options = parser.parse_args()
-    if options.job:
-        print(json.dumps(measure(json.loads(options.job))))
+def main(device: Literal["cpu", "cuda"] | None = None, quick: bool = False, job: str | None = None) -> None:
+    """Print the table, of one device or of both, without the large sizes if it is to be quick.
+
+    Args:
+        job: One measurement, in this process.
+    """
+    if job:
+        print(json.dumps(measure(Job(*json.loads(job)))))
         return
-    if options.device == "cuda" and not torch.cuda.is_available():
+    if device == "cuda" and not torch.cuda.is_available():
         sys.exit("no GPU on this machine: nothing to measure with --device cuda")
     begin, load = time.perf_counter(), os.getloadavg()[0]
-    lines = [
-        line
-        for device in ("cpu", "cuda")
-        if options.device in (None, device)
-        for line in table(device, quick=options.quick)
-    ]
+    lines = [line for kind in ("cpu", "cuda") if device in (None, kind) for line in table(kind, quick=quick)]
     minutes, after = (time.perf_counter() - begin) / 60, os.getloadavg()[0]
     end = f"{minutes:.1f} minutes in all; load of the machine {load:.1f} before, {after:.1f} after."
     print(end)
-    if options.device is None and not options.quick:
+    if device is None and not quick:
         write(RESULTS, lines, end)
 
 
@@ -482,4 +436,4 @@ def write(path: Path, lines: list[str], end: str) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -8,17 +8,16 @@ is left out, and says so. Seconds are of the whole, finding the board included, 
 
 from __future__ import annotations
 
-import argparse
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
+import tyro
 
 from arraygeom import Camera, Rig
-from arraygeom.atomic import write_text
 from arraygeom.io import read_rig
 from calib.boards.detect import collect_folder
 from calib.boards.rig import Calibration, calibrate
@@ -26,6 +25,7 @@ from calib.boards.solve import adjust, calibrate_single
 from calib.boards.target import parse_board
 from calib.boards.validation import epipolar_errors
 from pat.evaluation.tables import markdown_header, markdown_row
+from tests.benchmarks.printed import DATA, print_tables
 from tests.calib.board_scenes import errors_of, pose_errors
 from tests.calib.rendered import BOARD
 from tests.calib.tracks import (
@@ -164,30 +164,32 @@ def focal(rig: Rig, name: str) -> float:
     return float(camera(rig, name).K[0, 0])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--boards", type=Path, default=Path("out/boards"))
-    parser.add_argument("--only", nargs="*", choices=["opencv", "bumblebee", "action", "tracks", "rendered"])
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
-    tables: dict[str, tuple[Callable[[Path], Iterator[Figure]], Path]] = {
-        "opencv": (opencv_pairs, options.data),
-        "bumblebee": (bumblebee_pairs, options.data),
-        "action": (action_cameras, options.data),
-        "tracks": (tracks, options.data),
-        "rendered": (rendered, options.boards),
-    }
-    lines = [markdown_header(["what", "found", "wanted"], align="l")]
-    print(*lines, sep="\n")
-    for name in options.only or tables:
-        table, source = tables[name]
-        for row in table(source) if source.is_dir() else [Figure(name, f"left out: no folder {source}", "")]:
-            lines.append(markdown_row(row))
-            print(lines[-1], flush=True)
-    if options.out:
-        write_text(options.out, "# How good calibration is\n\n" + "\n".join(lines) + "\n")
+TABLES = {
+    "opencv": opencv_pairs,
+    "bumblebee": bumblebee_pairs,
+    "action": action_cameras,
+    "tracks": tracks,
+    "rendered": rendered,
+}
+
+
+def rows(names: Sequence[str], data: Path, boards: Path) -> Iterator[str]:
+    yield markdown_header(["what", "found", "wanted"], align="l")
+    for name in names:
+        source = boards if name == "rendered" else data
+        missing = Figure(name, f"left out: no folder {source}", "")
+        yield from map(markdown_row, TABLES[name](source) if source.is_dir() else [missing])
+
+
+def main(
+    data: Path = DATA,
+    boards: Path = Path("out/boards"),
+    only: tuple[Literal["opencv", "bumblebee", "action", "tracks", "rendered"], ...] = (),
+    out: Path | None = None,
+) -> None:
+    """Print the tables."""
+    print_tables("How good calibration is", [rows(only or tuple(TABLES), data, boards)], out)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -11,24 +11,24 @@ only for rigs that fit their own images to 0.17 px.
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
+import tyro
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from arraygeom import Distortion, Pose, Rig, pixel_grid, sample
-from arraygeom.atomic import write_text
+from arraygeom import Camera, Pose, Rig, pixel_grid, sample
 from calib.images.doctor import Diagnosis, diagnose_matches
 from calib.images.matches import match_cameras, seen_depths
 from calib.images.remedies import ROTATIONS, TRANSPOSE, on_cameras
 from pat.evaluation.tables import markdown_header, markdown_row
+from tests.benchmarks.bench_names import negated, shifted
+from tests.benchmarks.printed import DATA, print_tables
 from tests.calib.real import RealPair, every_pair
 
 Images = dict[str, Tensor]
@@ -56,28 +56,15 @@ def nothing(rig: Rig, images: Images, g: Random) -> Made:
     return rig, images
 
 
+def on_some(change: Callable[[Camera], Camera]) -> Callable[[Rig, Images, Random], Made]:
+    return lambda rig, images, g: (on_cameras(rig, some(rig.names, g), change), images)
+
+
 def shift(pixels: float) -> Callable[[Rig, Images, Random], Made]:
     def make(rig: Rig, images: Images, g: Random) -> Made:
-        d = pixels * g.choice([-1, 1])
-        return on_cameras(rig, some(rig.names, g), lambda c: c.replace(K=moved(c.K, d))), images
+        return on_some(shifted(pixels * g.choice([-1, 1])))(rig, images, g)
 
     return make
-
-
-def moved(K: Tensor, d: float) -> Tensor:
-    K = K.clone()
-    K[:2, 2] += d
-    return K
-
-
-def transposed(rig: Rig, images: Images, g: Random) -> Made:
-    names = some(rig.names, g)
-    return on_cameras(rig, names, lambda c: c.replace(cam_from_world=Pose(c.R.T, c.t))), images
-
-
-def inverted(rig: Rig, images: Images, g: Random) -> Made:
-    names = some(rig.names, g)
-    return on_cameras(rig, names, lambda c: c.replace(cam_from_world=c.cam_from_world.inverse())), images
 
 
 def units(rig: Rig, images: Images, g: Random) -> Made:
@@ -143,11 +130,7 @@ def lens(rig: Rig, images: Images, g: Random) -> Made:
     if way == 0:
         return on_cameras(rig, rig.names, lambda c: c.replace(distortion=None)), images
     if way == 1:
-        return on_cameras(
-            rig,
-            rig.names,
-            lambda c: c.replace(distortion=Distortion(c.distortion.model, -c.distortion.coefficients)),
-        ), images
+        return on_cameras(rig, rig.names, negated), images
     return rig, {name: undistorted(rig, name, image) for name, image in images.items()}
 
 
@@ -164,8 +147,8 @@ MISTAKES: dict[str, Callable[[Rig, Images, Random], Made]] = {
     "resized": resized,
     "rotated or mirrored": rotated,
     "cameras swapped": swapped,
-    "pose inverted": inverted,
-    "R transposed": transposed,
+    "pose inverted": on_some(lambda c: c.replace(cam_from_world=c.cam_from_world.inverse())),
+    "R transposed": on_some(lambda c: c.replace(cam_from_world=Pose(c.R.T, c.t))),
     "x and y exchanged": exchanged,
     "units": units,
     "distortion": lens,
@@ -212,10 +195,11 @@ def case(kind: str, pool: Sequence[Subject], g: Random) -> tuple[str, Diagnosis,
     raise RuntimeError(f"no visible case of '{kind}'")
 
 
-def confusions(data: Path, *, cases: int, seed: int, kinds: Sequence[str] = tuple(MISTAKES)) -> str:
+def confusions(data: Path, cases: int, seed: int, kinds: Sequence[str]) -> Iterator[str]:
     """The table, and every case that was not named alone."""
-    pool = list(subjects(data))
-    lines, totals, misses = [], Counter(), []
+    yield f"{cases} random cases of each mistake (seed {seed}) with real rigs and their images.\n"
+    pool, totals, misses = list(subjects(data)), Counter(), []
+    yield markdown_header(["mistake made", "cases", "drawn again", "named"], align="lrrl")
     for kind in kinds:
         g = np.random.default_rng([seed, list(MISTAKES).index(kind)])
         named: Counter[str] = Counter()
@@ -224,40 +208,28 @@ def confusions(data: Path, *, cases: int, seed: int, kinds: Sequence[str] = tupl
             name, found, again = case(kind, pool, g)
             redrawn += again
             label = found.named.kind
+            equal = label == kind or kind in [r.kind for r in found.equal]
             if label != kind:
-                equal = kind in [r.kind for r in found.equal]
                 label += " (or the true one)" if equal else ""
                 misses.append(f"{kind}: {name}: {found.verdict}; before {found.before}; after {found.after}")
-                totals["right or equal"] += equal
-            totals["right"] += label == kind
-            totals["right or equal"] += label == kind
-            totals["all"] += 1
+            totals += Counter({"right": label == kind, "right or equal": equal, "all": 1})
             named[label] += 1
         spoken = ", ".join(f"{label} {count}" for label, count in named.most_common())
-        lines.append(markdown_row([kind, cases, redrawn, spoken]))
-        print(lines[-1], flush=True)
-    head = markdown_header(["mistake made", "cases", "drawn again", "named"], align="lrrl")
-    return "\n".join([head, *lines]) + f"\n\n{dict(totals)}\n\n" + "\n".join(misses) + "\n"
+        yield markdown_row([kind, cases, redrawn, spoken])
+    yield f"\n{dict(totals)}\n"
+    yield from misses
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--cases", type=int, default=10)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", nargs="*", choices=list(MISTAKES), default=list(MISTAKES))
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
-    cv2.setRNGSeed(options.seed)
-    text = confusions(options.data, cases=options.cases, seed=options.seed, kinds=options.only)
-    print(text)
-    if options.out:
-        note = (
-            f"{options.cases} random cases of each mistake (seed {options.seed}) "
-            "with real rigs and their images."
-        )
-        write_text(options.out, f"# Which remedies the doctor names\n\n{note}\n\n{text}")
+def main(
+    data: Path = DATA,
+    cases: int = 10,
+    seed: int = 0,
+    only: tuple[str, ...] = tuple(MISTAKES),
+    out: Path | None = None,
+) -> None:
+    """Print the table, of some mistakes or of all."""
+    print_tables("Which remedies the doctor names", [confusions(data, cases, seed, only)], out)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

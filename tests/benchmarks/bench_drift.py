@@ -12,36 +12,29 @@ or k1 off.
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
-import cv2
 import numpy as np
 import torch
+import tyro
 
 from arraygeom import Distortion, Rig
 from calib.images.depth_change import observed_depths
 from calib.images.matches import match_cameras
 from calib.images.refinement import refine_matches
 from calib.images.remedies import swap
-from pat.evaluation.tables import markdown_header, markdown_row
-from tests.benchmarks.printed import print_tables
+from pat.evaluation.tables import markdown_row
+from tests.benchmarks.printed import DATA, head, print_tables
 from tests.calib.real import RealPair, bumblebee, syntim
 from tests.calib.simulated import simulated_matches, simulated_rig
 
 REAL = ("Serfaty", "BatInria", "Color", "Poly", "Money", "SmRub", "BalMouss", "TableSTV")
 DRIFTS = (
-    "nothing",
-    "focal +2 %",
-    "rotation .1",
-    "rotation .3",
-    "rotation 1",
-    "centre 5 px",
-    "centre 15 px",
+    *("nothing", "focal +2 %", "rotation .1", "rotation .3", "rotation 1", "centre 5 px", "centre 15 px"),
     "swapped",
 )
 LENSES = ("lens left out", "k1 +.05", "k1 +.2", "k1 -.1")
@@ -117,21 +110,11 @@ def summary(what: str, rows: Sequence[Row]) -> str:
     )
 
 
-HEAD = [
-    "rig",
-    "drift",
-    "px before",
-    "px after",
-    "depth before",
-    "depth after",
-    "said",
-    "stated",
-    "objections",
-]
+HEAD = head("rig | drift | px before | px after | depth before | depth after | said | stated | objections")
 
 
 def simulated(draws: int) -> Iterator[str]:
-    yield markdown_header(HEAD)
+    yield HEAD
     rows = []
     for field in ("wide", "narrow"):
         for count in (2, 4):
@@ -146,7 +129,7 @@ def simulated(draws: int) -> Iterator[str]:
 
 
 def real(data: Path, draws: int) -> Iterator[str]:
-    yield markdown_header(HEAD)
+    yield HEAD
     rows = [found for pair in pairs(data) for found in _real_pair(pair, draws)]
     yield from (found.line for found in rows)
     yield summary("Real pairs", rows)
@@ -173,23 +156,16 @@ def _real_pair(pair: RealPair, draws: int) -> Iterator[Row]:
             yield row(label, rig, bad, matches, kind)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--draws", type=int, default=2)
-    parser.add_argument("--only", nargs="*", choices=["simulated", "real"], default=["simulated", "real"])
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
-    cv2.setRNGSeed(0)
-    torch.set_num_threads(1)
-    tables = {
-        "simulated": lambda: simulated(options.draws),
-        "real": lambda: real(options.data, options.draws),
-    }
-    print_tables(
-        "Depth of drifted rigs after refinement", (tables[name]() for name in options.only), options.out
-    )
+def main(
+    data: Path = DATA,
+    draws: int = 2,
+    only: tuple[Literal["simulated", "real"], ...] = ("simulated", "real"),
+    out: Path | None = None,
+) -> None:
+    """Print the tables."""
+    tables = {"simulated": lambda: simulated(draws), "real": lambda: real(data, draws)}
+    print_tables("Depth of drifted rigs after refinement", (tables[name]() for name in only), out)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -9,7 +9,6 @@ milliseconds.
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import shutil
@@ -23,14 +22,15 @@ from pathlib import Path
 from statistics import median, quantiles
 from typing import Any
 
+import tyro
 from selenium import webdriver
 from selenium.common.exceptions import WebDriverException
 
 from pat.data.sample_array import load_sample
 from pat.evaluation.tables import markdown_header, markdown_row
+from tests.benchmarks.bench_job import PAT, ROOT
 from tests.benchmarks.printed import print_tables
 
-ROOT = Path(__file__).parents[2]
 SAMPLE = ROOT / "pat" / "data" / "sample"
 NETWORKS = "windows", "pat-supervised"
 MOVED = """
@@ -115,16 +115,8 @@ def measured(driver: Any, points: int) -> Iterator[tuple[str, str, list[float]]]
         ]
         for network in NETWORKS:
             chosen = [] if network == "windows" else ["--weights", network]
-            command = [
-                sys.executable,
-                "-m",
-                "pat",
-                "explore",
-                str(SAMPLE / "rig.yaml"),
-                *images,
-                *chosen,
-                "--no-browser",
-            ]
+            rig = str(SAMPLE / "rig.yaml")
+            command = [*PAT, "explore", rig, *images, *chosen, "--no-browser"]
             with server(command, ROOT) as address:
                 driver.get(address)
                 yield "`pat explore`", network, times(driver, points)
@@ -136,22 +128,11 @@ def measured(driver: Any, points: int) -> Iterator[tuple[str, str, list[float]]]
 def in_jupyter(driver: Any, folder: Path, network: str, points: int) -> list[float]:
     """The same in a notebook of one cell, with its kernel."""
     cell = {"cell_type": "code", "metadata": {}, "execution_count": None, "outputs": [], "id": "explorer"}
-    notebook = {
-        "cells": [{**cell, "source": NOTEBOOK.format(network)}],
-        "metadata": KERNEL,
-        "nbformat": 4,
-        "nbformat_minor": 5,
-    }
+    cells = [{**cell, "source": NOTEBOOK.format(network)}]
+    notebook = {"cells": cells, "metadata": KERNEL, "nbformat": 4, "nbformat_minor": 5}
     (folder / "explorer.ipynb").write_text(json.dumps(notebook))
-    command = [
-        sys.executable,
-        "-m",
-        "jupyterlab",
-        "--no-browser",
-        "--allow-root",
-        "--ServerApp.token=",
-        "--port=8899",
-    ]
+    quiet = ["--no-browser", "--allow-root", "--ServerApp.token=", "--port=8899"]
+    command = [sys.executable, "-m", "jupyterlab", *quiet]
     with server(command, folder) as address:
         base = address.split("/lab")[0].split("/tree")[0].rstrip("/")
         driver.get(f"{base}/lab/tree/explorer.ipynb")
@@ -173,23 +154,14 @@ def rows(points: int) -> Iterator[str]:
     yield from markdown_header(["in", "attention by", "points", "median, ms", "90 %, ms"]).splitlines()
     with browser() as driver:
         for where, network, found in measured(driver, points):
-            cells = (
-                where,
-                network,
-                str(len(found)),
-                f"{median(found):.0f}",
-                f"{quantiles(found, n=10)[-1]:.0f}",
-            )
-            yield markdown_row(list(cells))
+            figures = f"{median(found):.0f}", f"{quantiles(found, n=10)[-1]:.0f}"
+            yield markdown_row([where, network, len(found), *figures])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--points", type=int, default=40)
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
-    print_tables("The explorer in a browser", [rows(options.points)], options.out)
+def main(points: int = 40, out: Path | None = None) -> None:
+    """Print the table."""
+    print_tables("The explorer in a browser", [rows(points)], out)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -7,12 +7,13 @@ window about H x, and the 96 nearest, in numpy; timed on a sample of pixels and 
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable
+from statistics import median
 
 import numpy as np
 import torch
+import tyro
 
 from arraygeom import (
     Camera,
@@ -33,6 +34,7 @@ from arraygeom import (
     rotation_from_vector,
     sampling_locations,
 )
+from tests.benchmarks.printed import timed
 
 HW = (800, 1280)
 RUNS = 5
@@ -51,17 +53,6 @@ def pairs(lens: Distortion | None = None) -> list[Pair]:
     ]
     depth = (torch.tensor(1.0, dtype=torch.float64), torch.tensor(20.0, dtype=torch.float64))
     return [Pair(cameras[0], beta, depth) for beta in cameras[1:]]
-
-
-def timed(work: Callable[[], object]) -> tuple[float, float, float]:
-    """(median, least, most) seconds of several runs after one to warm up."""
-    work()
-    times = []
-    for _ in range(RUNS):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times), min(times), max(times)
 
 
 def pixel_by_pixel(pair: Pair, x: np.ndarray, *, count: int = 96, window: int = 80) -> np.ndarray:
@@ -92,39 +83,35 @@ def main() -> None:
     g = np.random.default_rng(0)
     sample = torch.from_numpy(g.uniform(0, [HW[1] - 1, HW[0] - 1], (SAMPLE, 2)).round()).float()
     whole = pixel_grid(HW)
-    pixels = HW[0] * HW[1]
     print(
         f"{'field':36} {'pixels':>8} {'median s':>9} {'range s':>15} "
         f"{'s, all pixels':>14} {'us/pixel/beta':>14}"
     )
 
-    def report(name: str, seconds: tuple[float, float, float], n: int) -> None:
-        median, low, high = seconds
-        all_of_them = median * pixels / n
-        each = median / (3 * n) * 1e6
-        print(f"{name:36} {n:>8} {median:9.3f} {low:7.3f}-{high:7.3f} {all_of_them:14.3f} {each:14.3f}")
+    def report(name: str, work: Callable[[], object], n: int) -> None:
+        (seconds,) = timed(work, repeats=RUNS, clock=time.perf_counter)
+        middle, low, high = (f(seconds) for f in (median, min, max))
+        every, each = middle * HW[0] * HW[1] / n, middle / (3 * n) * 1e6
+        print(f"{name:36} {n:>8} {middle:9.3f} {low:7.3f}-{high:7.3f} {every:14.3f} {each:14.3f}")
 
-    def field(name: str, f: ReceptiveField, chosen: list[Pair], x: torch.Tensor) -> None:
-        with torch.no_grad():
-            report(name, timed(lambda: [sampling_locations(f, pair, x) for pair in chosen]), x.numel() // 2)
-
-    field("Epipolar", Epipolar(), straight, whole)
-    field("EpipolarLine", EpipolarLine(), straight, whole)
-    field("HomographyDisplacement(40)", HomographyDisplacement(40.0), straight, whole)
-    field("HomographyDisplacement()", HomographyDisplacement(), straight, whole)
-    field("Rectified(40)", Rectified(40.0), straight, whole)
-    field("Widened(Epipolar, along=2)", Widened(Epipolar(), along=2.0), straight, whole)
-    field("Widened(Epipolar, across=1), sample", Widened(Epipolar(), across=1.0), straight, sample)
-    field("Local(5), sample", Local(5), straight, sample)
-    field("NearestVoxels(96, 80), sample", NearestVoxels(), straight, sample)
-    field("Curved(96), lenses, sample", Curved(), curved, sample)
-    points = sample.numpy()
-    report(
-        "pixel by pixel (numpy), sample",
-        timed(lambda: [pixel_by_pixel(p, points[:200]) for p in straight]),
-        200,
-    )
+    fields: dict[str, tuple[ReceptiveField, list[Pair], torch.Tensor]] = {
+        "Epipolar": (Epipolar(), straight, whole),
+        "EpipolarLine": (EpipolarLine(), straight, whole),
+        "HomographyDisplacement(40)": (HomographyDisplacement(40.0), straight, whole),
+        "HomographyDisplacement()": (HomographyDisplacement(), straight, whole),
+        "Rectified(40)": (Rectified(40.0), straight, whole),
+        "Widened(Epipolar, along=2)": (Widened(Epipolar(), along=2.0), straight, whole),
+        "Widened(Epipolar, across=1), sample": (Widened(Epipolar(), across=1.0), straight, sample),
+        "Local(5), sample": (Local(5), straight, sample),
+        "NearestVoxels(96, 80), sample": (NearestVoxels(), straight, sample),
+        "Curved(96), lenses, sample": (Curved(), curved, sample),
+    }
+    with torch.no_grad():
+        for name, (f, chosen, x) in fields.items():
+            report(name, lambda: [sampling_locations(f, pair, x) for pair in chosen], x.numel() // 2)  # noqa: B023
+    points = sample.numpy()[:200]
+    report("pixel by pixel (numpy), sample", lambda: [pixel_by_pixel(p, points) for p in straight], 200)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

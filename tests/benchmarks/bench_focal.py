@@ -14,8 +14,7 @@ from collections.abc import Iterator
 from itertools import chain, pairwise
 from pathlib import Path
 
-import cv2
-import torch
+import tyro
 from torch.nn.functional import interpolate
 
 from arraygeom import Camera
@@ -25,7 +24,7 @@ from calib.images.from_images import rig_from_images
 from calib.images.self_calibration import FOCAL_SHARE
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.fusion.from_images import MATCHED, resized_rig, scaled
-from tests.benchmarks.printed import data_and_out, print_tables
+from tests.benchmarks.printed import DATA, print_tables
 from tests.calib.real import RealPair, ball, bumblebee, hilti, kitti, lund, middlebury, named, syntim
 
 TUNE = ("SYNTIM Color", "SYNTIM Poly", "chess", "fox")
@@ -75,13 +74,8 @@ def row(pair: RealPair) -> list[str]:
     points = str(len(found.matches[names].alpha))
     if fit is None:
         return [*cells, points, "", "", "mirrored, or of unlike sizes"]
-    return [
-        *cells,
-        points,
-        f"{fit.length / true - 1:+.0%}",
-        f"{fit.deviation:.0%}",
-        "found" if fit.found else "",
-    ]
+    figures = f"{fit.length / true - 1:+.0%}", f"{fit.deviation:.0%}", "found" if fit.found else ""
+    return [*cells, points, *figures]
 
 
 def _camera(pair: RealPair, name: str) -> Camera:
@@ -96,12 +90,10 @@ def rows(data: Path) -> Iterator[str]:
         yield markdown_row(row(pair))
 
 
-def main() -> None:
-    options = data_and_out(__doc__)
-    torch.set_num_threads(1)
-    cv2.setRNGSeed(0)
-    print_tables("Focal lengths found from two images", [rows(options.data)], options.out)
+def main(data: Path = DATA, out: Path | None = None) -> None:
+    """Print the table."""
+    print_tables("Focal lengths found from two images", [rows(data)], out)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -11,15 +11,16 @@ tests/benchmarks/RESULTS_fuse.md, each in its section, beside those that were th
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
 import shutil
 import time
 from pathlib import Path
 from statistics import median
+from typing import Literal
 
 import torch
+import tyro
 from torch.nn.functional import interpolate
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
@@ -37,6 +38,7 @@ from pat.fusion.views import Views
 from pat.media.images import read_image
 from pat.networks.protocol import matched_for
 from pat.networks.weights import load_weights
+from tests.benchmarks.printed import timed
 
 SIDE = 2048
 CAPS = ("4GiB", "8GiB", "2GiB")
@@ -60,12 +62,8 @@ def image(channels: int, hw: tuple[int, int], seed: int) -> torch.Tensor:
 def matmul_rate() -> float:
     """GFLOP/s of the product of two square matrices, the median of seven."""
     a, b = torch.rand(2, SIDE, SIDE)
-    times = []
-    for _ in range(7):
-        begin = time.perf_counter()
-        a @ b
-        times.append(time.perf_counter() - begin)
-    return 2 * SIDE**3 / median(times) / 1e9
+    (seconds,) = timed(lambda: a @ b, repeats=7, clock=time.perf_counter)
+    return 2 * SIDE**3 / median(seconds) / 1e9
 
 
 def measure(scale: float) -> dict[str, str]:
@@ -139,26 +137,25 @@ def put(heading: str, text: str) -> None:
     write_text(RESULTS, f"{start}\n\n{body.strip()}\n")
 
 
-def main() -> None:
-    """Print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scale", type=float, default=0.5)
-    parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
-    parser.add_argument("--full-runs", action="store_true", help="4024x3036 under caps of memory instead")
-    parser.add_argument("--caps", nargs="+", default=CAPS, choices=CAPS)
-    parser.add_argument("--out", type=Path, default=Path("out/systems/wide-narrow-full"))
-    given = parser.parse_args()
-    torch.set_num_threads(given.threads)
-    for cap in given.caps if given.full_runs else ():
-        text = full_run(cap, given.out)
+def main(
+    scale: float = 0.5,
+    threads: int = len(os.sched_getaffinity(0)),
+    full_runs: bool = False,
+    caps: tuple[Literal["4GiB", "8GiB", "2GiB"], ...] = CAPS,
+    out: Path = Path("out/systems/wide-narrow-full"),
+) -> None:
+    """Print the figures; with `full_runs` of 4024x3036 under caps of memory instead."""
+    torch.set_num_threads(threads)
+    for cap in caps if full_runs else ():
+        text = full_run(cap, out)
         print(f"\n{cap}\n{text}", flush=True)
         put(f"wide-narrow, 4024x3036, under {cap}", text)
-    if not given.full_runs:
-        load = f"{given.threads} threads, load before: {os.getloadavg()[0]:.1f}\n"
-        text = f"{load}\n{markdown_table(['', ''], measure(given.scale).items(), align='l')}"
+    if not full_runs:
+        load = f"{threads} threads, load before: {os.getloadavg()[0]:.1f}\n"
+        text = f"{load}\n{markdown_table(['', ''], measure(scale).items(), align='l')}"
         print(text)
-        put(f"A part of the frame, {given.threads} threads", text)
+        put(f"A part of the frame, {threads} threads", text)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

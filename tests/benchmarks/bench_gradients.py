@@ -11,12 +11,14 @@ for depth.
 from __future__ import annotations
 
 import math
-import sys
 
 import torch
+import tyro
 from torch import Tensor
+from tyro.conf import Positional
 
 from pat import fuse, load_weights
+from tests.benchmarks.printed import head
 from tests.pat.layered_array import load_sample
 
 HW, TOP, LEFT, STEP = (192, 256), 104, 192, math.radians(0.1)
@@ -53,9 +55,13 @@ def rows(degrees: float) -> list[str]:
     return made
 
 
-if __name__ == "__main__":
-    print("| degrees | rotation | error, gradient | difference | inverse depth, gradient | difference |")
-    print("|---|---|---|---|---|---|")
-    for given in sys.argv[1:] or ("0", "0.1", "0.3"):
-        for row in rows(float(given)):
+def main(degrees: Positional[tuple[float, ...]] = (0, 0.1, 0.3)) -> None:
+    """Print the table."""
+    print(head("degrees | rotation | error, gradient | difference | inverse depth, gradient | difference"))
+    for given in degrees:
+        for row in rows(given):
             print(row, flush=True)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

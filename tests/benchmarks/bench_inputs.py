@@ -46,18 +46,10 @@ class Came(NamedTuple):
     def row(self, kind: Kind) -> list[str]:
         """Of the table."""
         confidence = "" if self.status == 2 else f"{self.confidence:.2f}"
-        wanted = (
-            ""
-            if self.as_wanted(kind)
-            else f" (expected: {kind.status}, {'depth' if kind.depth else 'no depth'})"
-        )
-        return [
-            kind.name + wanted,
-            str(self.status),
-            "yes" if self.depth else "no",
-            confidence,
-            f"{self.peak:.0f}",
-        ]
+        depth = "depth" if kind.depth else "no depth"
+        wanted = "" if self.as_wanted(kind) else f" (expected: {kind.status}, {depth})"
+        shown = "yes" if self.depth else "no"
+        return [kind.name + wanted, str(self.status), shown, confidence, f"{self.peak:.0f}"]
 
 
 def what_came(kind: Kind, folder: Path) -> Came:
@@ -74,14 +66,11 @@ def what_came(kind: Kind, folder: Path) -> Came:
 
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said), warnings.catch_warnings():
         status, peak = with_peak(fused)
-    maps = [
-        cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        for file in sorted((folder / "out").glob("*confidence.png"))
-    ]
-    confidence = float(maps[0].mean() / 255) if maps else 0.0
+    files = sorted((folder / "out").glob("*confidence.png"))
+    confidence = cv2.imread(str(files[0]), cv2.IMREAD_UNCHANGED).mean() / 255 if files else 0.0
     depth = any((folder / "out").glob("*depth.tif"))
     lines = said.getvalue().strip().splitlines() or [""]
-    return Came(status, depth, confidence, (peak or 0) / 2**20, lines[-1])
+    return Came(status, depth, float(confidence), (peak or 0) / 2**20, lines[-1])
 
 
 @dataclass

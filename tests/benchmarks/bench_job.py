@@ -12,7 +12,6 @@ with another checkout. `--quick`: 1280x800 with one beta only, cold once and war
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -21,15 +20,17 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from pat.fusion.checks import LowConfidenceWarning
+import tyro
 
-ROOT = Path(__file__).parents[2]
+from tests.processes import ROOT, dask_cluster
+
+from .job_parts import STAGES
+
 RESULTS = Path(__file__).with_name("RESULTS_job.md")
 PARTS = (sys.executable, "-m", "tests.benchmarks.job_parts")
 PAT = (sys.executable, "-m", "pat")
@@ -48,12 +49,13 @@ class Case:
 
 @dataclass
 class Run:
-    """One process: seconds of the wall and of cores, peak resident bytes, and what it printed as JSON."""
+    """One process: seconds of the wall and of cores, peak resident bytes, JSON it printed, what it said."""
 
     wall: float
     cores: float
     peak: float
     printed: dict[str, Any] = field(default_factory=dict)
+    said: str = ""
 
 
 CASES = (
@@ -68,10 +70,10 @@ MANY = QUICK[0].name
 """The case of which many frames are fused."""
 
 
-def run(command: Sequence[str], cache: Path, root: Path = ROOT) -> Run:
-    """Run a command in a checkout, numba's cache in a folder. Raises RuntimeError if it fails; low
-    confidence, as the blur of enlarged images gives, is no failure."""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+def run(command: Sequence[str], cache: Path | None = None, root: Path = ROOT) -> Run:
+    """Run a command in a checkout, numba's cache in a folder if one is given. Raises RuntimeError if it
+    fails; low confidence (3), as the blur of enlarged images gives, is no failure."""
+    environment = os.environ if cache is None else {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
     begin = time.perf_counter()
     with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(command, cwd=root, env=environment, stdout=out, stderr=errors, text=True)
@@ -80,13 +82,12 @@ def run(command: Sequence[str], cache: Path, root: Path = ROOT) -> Run:
         process.returncode = os.waitstatus_to_exitcode(status)
         for stream in (out, errors):
             stream.seek(0)
-        lines = out.read().splitlines()
-        if process.returncode not in (0, LowConfidenceWarning.exit_status):
-            raise RuntimeError(
-                f"{' '.join(command)} ended with {process.returncode}:\n{errors.read()[-2000:]}"
-            )
+        lines, said = out.read().splitlines(), errors.read()
+        if process.returncode not in (0, 3):
+            raise RuntimeError(f"{' '.join(command)} ended with {process.returncode}:\n{said[-2000:]}")
     printed = [json.loads(line) for line in lines if line.startswith("{")]
-    return Run(wall, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024.0, printed[-1] if printed else {})
+    cores, peak = used.ru_utime + used.ru_stime, used.ru_maxrss * 1024.0
+    return Run(wall, cores, peak, printed[-1] if printed else {}, said)
 
 
 def fuse_arguments(case: Case, folder: Path, out: Path) -> list[str]:
@@ -102,7 +103,7 @@ def scenes(cases: Sequence[Case], work: Path) -> Iterator[tuple[Case, Path]]:
     for case in cases:
         folder = work / f"scene{case.wh[0]}"
         if not folder.exists():
-            run([*PARTS, "scene", str(folder), *map(str, case.wh), "3"], work / "warm")
+            run([*PARTS, "scene", str(folder), *map(str, case.wh), "4"], work / "warm")
         yield case, folder
 
 
@@ -166,47 +167,17 @@ def many_frames(case: Case, folder: Path, work: Path, one: float, root: Path) ->
                 (frames / f"{i:03d}.png").symlink_to(folder / f"{name}.png")
     images = [word for name in names for word in ("--image", f"{name}={work / f'frames{case.wh[0]}' / name}")]
     workers = len(os.sched_getaffinity(0))
-    command = [
-        *PAT,
-        "fuse",
-        str(folder / "rig.yaml"),
-        "--alpha",
-        "mono",
-        *images,
-        "--out",
-        tempfile.mkdtemp(dir=work),
-    ]
+    out = tempfile.mkdtemp(dir=work)
+    command = [*PAT, "fuse", str(folder / "rig.yaml"), "--alpha", "mono", *images, "--out", out]
     cache = work / ("warm" if root == ROOT else "old")
     found = run([*command, "--workers", str(workers)], cache, root)
     same = f"{60 / one:.1f}"
     busy = f"{found.cores / found.wall / workers:.0%}"
     yield [case.name, f"{60 * FRAMES / found.wall:.1f}", same, f"{found.cores / FRAMES:.2f}", busy]
-    with cluster(work, workers, cache, root) as address:
+    environment = {"NUMBA_CACHE_DIR": str(cache)}
+    with dask_cluster(work, workers, root=root, environment=environment) as (address, _):
         there = run([*command, "--scheduler", address], cache, root)
     yield [f"{case.name}, Dask", f"{60 * FRAMES / there.wall:.1f}", same, "", ""]
-
-
-@contextmanager
-def cluster(work: Path, workers: int, cache: Path, root: Path) -> Iterator[str]:
-    """The address of a Dask scheduler on this machine with workers of one thread, which are processes."""
-    file, dask = work / "scheduler.json", [sys.executable, "-m", "dask"]
-    quiet: dict[str, Any] = {"cwd": root, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    quiet["env"] = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(root)}
-    given = ["--scheduler-file", str(file)]
-    scheduler = subprocess.Popen(
-        [*dask, "scheduler", "--port", "0", "--dashboard-address", ":0", *given], **quiet
-    )
-    many = ["--nworkers", str(workers), "--nthreads", "1", "--memory-limit", "0", "--no-dashboard"]
-    both = [scheduler, subprocess.Popen([*dask, "worker", *many, *given], **quiet)]
-    try:
-        while not file.exists() and scheduler.poll() is None:
-            time.sleep(0.1)
-        yield json.loads(file.read_text())["address"]
-    finally:
-        for process in reversed(both):
-            process.terminate()
-            process.wait()
-        file.unlink(missing_ok=True)
 
 
 def row(case: Case, found: dict[str, list[Run]]) -> list[str]:
@@ -238,22 +209,7 @@ def stages_row(case: Case, found: dict[str, list[Run]]) -> list[str]:
     return [case.name, *(f"{shares['stages'][n] / total:.0%}, {shares['cores'][n]:.2f}" for n in STAGE_NAMES)]
 
 
-STAGE_NAMES = (
-    *(
-        "import",
-        "read",
-        "views",
-        "field",
-        "plan",
-        "pre-pass",
-        "matching",
-        "attention",
-        "network",
-        "depth",
-        "write",
-    ),
-    "rest",
-)
+STAGE_NAMES = "import", *STAGES, "rest"
 COLUMNS = (
     *("", "seconds", "core seconds", "peak memory", "cold, seconds", "other checkout, seconds (of a core)"),
     *("classical baseline, seconds (of a core): ratio", "OpenCV, seconds (of a core): ratio"),
@@ -270,15 +226,10 @@ FIRST_COLUMNS = ("", "seconds", "core seconds")
 MANY_COLUMNS = ("", "frames a minute", "as processes of one frame", "core seconds a frame", "cores busy")
 
 
-def main() -> None:
-    """Print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--runs", type=int, default=3)
-    parser.add_argument("--against", type=Path, help="another checkout, measured in turn")
-    given = parser.parse_args()
-    cases, runs = (QUICK, 1) if given.quick else (CASES, given.runs)
-    old = given.against and given.against.resolve()
+def main(quick: bool = False, runs: int = 3, against: Path | None = None) -> None:
+    """Print the figures, of another checkout measured in turn, too, if it is given."""
+    cases, runs = (QUICK, 1) if quick else (CASES, runs)
+    old = against and against.resolve()
     load = os.getloadavg()[0]
     rows, stages, first, many = [], [], [], []
     with tempfile.TemporaryDirectory() as name:
@@ -290,10 +241,10 @@ def main() -> None:
             rows.append(shown(COLUMNS, row(case, found)))
             if "stages" in found:
                 stages.append(shown(("", *STAGE_NAMES), stages_row(case, found)))
-            if case.name == MANY and not given.quick:
+            if case.name == MANY and not quick:
                 one = median(r.wall for r in found["pat fuse"])
                 many += [shown(MANY_COLUMNS, line) for line in many_frames(case, images, work, one, ROOT)]
-        for root in () if given.quick else (ROOT, old) if old else (ROOT,):
+        for root in () if quick else (ROOT, old) if old else (ROOT,):
             note = "" if root == ROOT else ", other checkout"
             lines = first_second(work, min(runs, 3), root)
             first += [shown(FIRST_COLUMNS, [f"`{cells[0]}`{note}", *cells[1:]]) for cells in lines]
@@ -312,7 +263,7 @@ def main() -> None:
     if many:
         text += f"\n{FRAMES} frames from folders, a worker a core:\n\n{table(MANY_COLUMNS, many)}"
     print(text)
-    if not given.quick:
+    if not quick:
         RESULTS.write_text(text, encoding="utf-8")
 
 
@@ -323,4 +274,4 @@ def shown(columns: Sequence[str], cells: list[str]) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -13,27 +13,28 @@ they are called from our code, by a profiler.
 from __future__ import annotations
 
 import math
-import re
-import statistics
 import sys
-import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
+from statistics import median
 from types import FrameType
+from typing import Literal
 
 import kornia.geometry
 import torch
+import tyro
 from torch import Tensor
+from tyro.conf import Positional
 
 from arraygeom import Camera, Distortion, Pose, Rig, relative_pose
+from docs.update_readme import write_block
 from pat.fusion.fuse import fuse
 from pat.networks.guided import GuidedPAT
 from tests.arraygeom.rigs import random_rig
 from tests.arraygeom.test_kornia_parity import CASES, Parity, cases
+from tests.benchmarks.printed import DOCS, timed
 from tests.transformations.operators import OPERATORS
 
-PAGE = Path(__file__).parents[2] / "docs" / "kornia.md"
 OUR_PACKAGES = "arraygeom", "pat", "calib"
 RUNS = 15
 STEP = 1e-6
@@ -82,14 +83,9 @@ def low_precision(name: str, side: int, dtype: torch.dtype) -> str:
 def time_ratio(case: Parity) -> float:
     """Kornia's time of value and gradient divided by ours: medians of processor time, alternating."""
     leaf = case.at.clone().requires_grad_()
-    times: tuple[list[float], list[float]] = ([], [])
-    for _ in range(RUNS):
-        for f, spent in zip((case.ours, case.theirs), times):
-            begin = time.process_time()
-            torch.autograd.grad(f(leaf).sum(), leaf)
-            spent.append(time.process_time() - begin)
-    ours, theirs = (statistics.median(spent[2:]) for spent in times)
-    return theirs / ours
+    ways = (lambda f=f: torch.autograd.grad(f(leaf).sum(), leaf) for f in (case.ours, case.theirs))
+    ours, theirs = timed(*ways, repeats=RUNS)
+    return median(theirs) / median(ours)
 
 
 def table() -> str:
@@ -163,7 +159,8 @@ def convert() -> None:
     Pose.from_kornia(pose.to_kornia())
     Pose.from_quaternion(pose.quaternion, pose.t)
     pair = rig.pair("alpha", "beta")
-    relative_pose(pair.fundamental, pair.alpha.K, pair.beta.K, torch.rand(8, 2), torch.rand(8, 2))
+    x = torch.rand(2, 8, 2)
+    relative_pose(pair.fundamental, *(camera.K for camera in pair.cameras), *x)
 
 
 def fused() -> None:
@@ -173,17 +170,15 @@ def fused() -> None:
     fuse(GuidedPAT(), rig, images, alpha="alpha")
 
 
-def write_page(what: str, text: str) -> None:
-    """Put a text between the page's markers of that name."""
-    begin, end = f"<!-- {what}: begin -->", f"<!-- {what}: end -->"
-    pattern = re.compile(re.escape(begin) + r".*?" + re.escape(end), re.S)
-    PAGE.write_text(pattern.sub(lambda _: f"{begin}\n{text}\n{end}", PAGE.read_text()))
+def main(what: Positional[tuple[Literal["table", "calls"], ...]] = ("table", "calls")) -> None:
+    """Print the lists, and put them into docs/kornia.md."""
+    torch.set_num_threads(1)
+    tables = {"table": table, "calls": counts}
+    for name in what:
+        made = tables[name]()
+        print(made)
+        write_block(DOCS / "kornia.md", name, made)
 
 
 if __name__ == "__main__":
-    torch.set_num_threads(1)
-    tables = {"table": table, "calls": counts}
-    for what in sys.argv[1:] or tables:
-        made = tables[what]()
-        print(made)
-        write_page(what, made)
+    tyro.cli(main)

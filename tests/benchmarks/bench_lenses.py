@@ -14,17 +14,15 @@ NaN, infinity, or OpenCV's -1000000.
 
 from __future__ import annotations
 
-import argparse
 import math
-import statistics
-import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
+from statistics import median
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
+import tyro
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -32,7 +30,8 @@ from arraygeom import Camera, Distortion, Pose
 from arraygeom.kornia_models import to_kornia_model
 from arraygeom.lenses import PolynomialFisheye
 from arraygeom.lenses.model import LensModel
-from docs.update_readme import with_block
+from docs.update_readme import write_block
+from tests.benchmarks.printed import DOCS, timed
 
 try:
     import pycolmap
@@ -41,7 +40,7 @@ except ImportError:
 
 Array = NDArray[np.float64]
 Answer = tuple[Array, NDArray[np.bool_]]
-PAGE = Path(__file__).parents[2] / "docs" / "lenses.md"
+PAGE = DOCS / "lenses.md"
 FOCAL, POINTS, STEPS, OFF = 1000.0, 100, 48, 0.1
 K = np.diag([FOCAL, FOCAL, 1.0])
 
@@ -54,18 +53,19 @@ class Family(NamedTuple):
     widest: float
 
 
+def tangential(x: Array, y: Array, radial: Array, p1: Array, p2: Array) -> Array:
+    """Points times a radial factor, and Brown's tangential terms."""
+    u = x * x + y * y
+    across, down = 2 * p1 * x * y + p2 * (u + 2 * x * x), p1 * (u + 2 * y * y) + 2 * p2 * x * y
+    return np.stack([x * radial + across, y * radial + down], -1)
+
+
 def polynomials(c: Any, x: Array, y: Array) -> Array:
     """Brown's radial and tangential terms: k1 k2 p1 p2 k3 k4 k5 k6."""
     k1, k2, p1, p2, k3, k4, k5, k6 = c
     u = x * x + y * y
     radial = (1 + u * (k1 + u * (k2 + u * k3))) / (1 + u * (k4 + u * (k5 + u * k6)))
-    return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (u + 2 * x * x),
-            y * radial + p1 * (u + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        -1,
-    )
+    return tangential(x, y, radial, p1, p2)
 
 
 def flat(X: Array) -> tuple[Array, Array]:
@@ -87,13 +87,7 @@ def prism(c: Any, X: Array) -> Array:
     x, y = by_angle(X, lambda t: t).T
     u = x * x + y * y
     radial = 1 + u * (k1 + u * (k2 + u * (k3 + u * k4)))
-    return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (u + 2 * x * x) + sx * u,
-            y * radial + p1 * (u + 2 * y * y) + 2 * p2 * x * y + sy * u,
-        ],
-        -1,
-    )
+    return tangential(x, y, radial, p1, p2) + np.stack([sx * u, sy * u], -1)
 
 
 def double_sphere(c: Any, X: Array) -> Array:
@@ -241,34 +235,29 @@ def homogeneous(xy: Array) -> Array:
     return np.concatenate([xy, np.ones_like(xy[:, :1])], 1)
 
 
-ZERO = np.zeros(3)
-
-
 def opencv(name: str) -> Library | None:
-    if name == "brown-conrady":
-        return Library(
-            one_by_one(lambda c, X: cv2.projectPoints(X[:, None], ZERO, ZERO, K, c)[0][:, 0]),
-            one_by_one(lambda c, x: homogeneous(cv2.undistortPoints(x[:, None], K, c)[:, 0])),
-        )
-    if name == "kannala-brandt":
-        return Library(
-            one_by_one(lambda c, X: cv2.fisheye.projectPoints(X[:, None], ZERO, ZERO, K, c)[0][:, 0]),
-            one_by_one(lambda c, x: homogeneous(cv2.fisheye.undistortPoints(x[:, None], K, c)[:, 0])),
-        )
-    if name == "unified":
-        return Library(
-            one_by_one(
-                lambda c, X: cv2.omnidir.projectPoints(X[:, None], ZERO, ZERO, K, c[0], c[1:])[0].reshape(
-                    -1, 2
-                )
-            ),
-            one_by_one(
-                lambda c, x: homogeneous(
-                    cv2.omnidir.undistortPoints(x[:, None], K, c[1:], c[:1], np.eye(3)).reshape(-1, 2)
-                )
-            ),
-        )
-    return None
+    zero, eye = np.zeros(3), np.eye(3)
+    maps: dict[str, tuple[Callable[[Array, Array], Array], Callable[[Array, Array], Array]]] = {
+        "brown-conrady": (
+            lambda c, X: cv2.projectPoints(X[:, None], zero, zero, K, c)[0],
+            lambda c, x: cv2.undistortPoints(x[:, None], K, c),
+        ),
+        "kannala-brandt": (
+            lambda c, X: cv2.fisheye.projectPoints(X[:, None], zero, zero, K, c)[0],
+            lambda c, x: cv2.fisheye.undistortPoints(x[:, None], K, c),
+        ),
+        "unified": (
+            lambda c, X: cv2.omnidir.projectPoints(X[:, None], zero, zero, K, c[0], c[1:])[0],
+            lambda c, x: cv2.omnidir.undistortPoints(x[:, None], K, c[1:], c[:1], eye),
+        ),
+    }
+    if name not in maps:
+        return None
+    there, back = maps[name]
+    return Library(
+        one_by_one(lambda c, X: there(c, X).reshape(-1, 2)),
+        one_by_one(lambda c, x: homogeneous(back(c, x).reshape(-1, 2))),
+    )
 
 
 def kornia(name: str) -> Library | None:
@@ -342,35 +331,19 @@ def counted(name: str, library: Library, lenses: Drawn) -> list[str]:
         rays = np.where(found[:, None], rays, [0, 0, 1.0])
         off = np.linalg.norm(FOCAL * family.formula(each.T, rays) - lenses.asked, axis=1)
         back = found & (off <= OFF) & before_fold(family, each, angles(rays))
-    shown = [
-        f"{int((valid & ~right).sum()):,}",
-        f"{int((lenses.seen & ~valid).sum()):,}",
-        f"{int((found & ~back).sum()):,}",
-        f"{int((lenses.seen & ~found).sum()):,}",
-    ]
-    return [*shown, f"{max(near[valid & right].max(initial=0), off[back].max(initial=0)):.0e}"]
+    counts = (valid & ~right, lenses.seen & ~valid, found & ~back, lenses.seen & ~found)
+    largest = max(near[valid & right].max(initial=0), off[back].max(initial=0))
+    return [*(f"{int(wrong.sum()):,}" for wrong in counts), f"{largest:.0e}"]
 
 
-def milliseconds(f: Callable[[], object]) -> float:
-    """Median of five runs, of processor time."""
-    spent = []
-    for _ in range(5):
-        begin = time.process_time()
-        f()
-        spent.append(1e3 * (time.process_time() - begin))
-    return statistics.median(spent)
-
-
-def timed(library: Library, lenses: Drawn) -> list[str]:
+def milliseconds(library: Library, lenses: Drawn) -> list[str]:
     """Of 100,000 points through the first lens."""
     seen = lenses.X[lenses.seen]
     X = np.resize(seen, (1, 100_000, 3))
     x = np.resize(lenses.asked[:POINTS][lenses.seen[:POINTS]], (1, 100_000, 2))
     c = lenses.c[:1]
-    return [
-        f"{milliseconds(lambda: library.project(c, X)):.0f}",
-        f"{milliseconds(lambda: library.unproject(c, x)):.0f}",
-    ]
+    found = timed(lambda: library.project(c, X), lambda: library.unproject(c, x))
+    return [f"{1e3 * median(seconds):.0f}" for seconds in found]
 
 
 def derivatives(name: str, library: str) -> list[str]:
@@ -424,17 +397,8 @@ def _place(line: str) -> tuple[int, int]:
 
 
 HEAD = (
-    "lens",
-    "library",
-    "project, wrong",
-    "missed",
-    "unproject, wrong",
-    "missed",
-    "largest other error, px",
-    "second derivative",
-    "vmap",
-    "project, ms",
-    "unproject, ms",
+    *("lens", "library", "project, wrong", "missed", "unproject, wrong", "missed", "largest other error, px"),
+    *("second derivative", "vmap", "project, ms", "unproject, ms"),
 )
 
 
@@ -447,31 +411,23 @@ def rows(names: Sequence[str], lenses: int) -> list[list[str]]:
             chosen = of(name)
             if chosen is not None:
                 row = [name, library, *counted(name, chosen, points), *derivatives(name, library)]
-                made.append([*row, *timed(chosen, points)])
+                made.append([*row, *milliseconds(chosen, points)])
                 print(" | ".join(made[-1]), flush=True)
     return made
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--lenses", type=int, default=1000)
-    parser.add_argument("--write", action="store_true", help="put the table into docs/lenses.md")
-    parser.add_argument(
-        "--models", nargs="*", default=list(FAMILIES), help="some of them; the others' rows stay"
-    )
-    given = parser.parse_args()
+def main(lenses: int = 1000, models: tuple[str, ...] = tuple(FAMILIES), write: bool = False) -> None:
+    """Print the table, and put it into docs/lenses.md if asked; the rows of other models stay."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    made = [
-        "| " + " | ".join(row) + " |"
-        for row in (HEAD, ["---"] * len(HEAD), *rows(given.models, given.lenses))
-    ]
-    if given.write:
-        page = PAGE.read_text()
-        block = page[page.index("<!-- lenses:begin -->") : page.index("<!-- lenses:end -->")]
-        kept = [
-            line for line in block.splitlines() if line[2:].split(" ")[0] in set(FAMILIES) - set(given.models)
-        ]
-        PAGE.write_text(
-            with_block(page, "lenses", "\n".join([*made[:2], *sorted([*made[2:], *kept], key=_place)]))
-        )
+    made = [f"| {' | '.join(row)} |" for row in (HEAD, ["---"] * len(HEAD), *rows(models, lenses))]
+    if write:
+        others = set(FAMILIES) - set(models)
+        _, _, block = PAGE.read_text().partition("<!-- lenses:begin -->")
+        lines = block.partition("<!-- lenses:end -->")[0].splitlines()
+        kept = [line for line in lines if line[2:].split(" ")[0] in others]
+        write_block(PAGE, "lenses", "\n".join([*made[:2], *sorted([*made[2:], *kept], key=_place)]))
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

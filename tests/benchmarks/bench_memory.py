@@ -8,16 +8,15 @@ tests/benchmarks/RESULTS_memory.md. On two cores some five minutes for 4 megapix
 
 from __future__ import annotations
 
-import argparse
-import os
 import re
-import subprocess
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from .bench_job import PARTS, PAT, ROOT, shown, table
+import tyro
+
+from .bench_job import PARTS, PAT, run, shown, table
 
 RESULTS = Path(__file__).with_name("RESULTS_memory.md")
 SIDES = {4: (2304, 1728), 12: (4000, 3000), 24: (6000, 4000), 50: (8192, 6144)}
@@ -47,9 +46,7 @@ class Case:
         scene = folder / f"{self.megapixels}{'lens' if self.lens else ''}"
         if not scene.exists():
             sides = map(str, SIDES[self.megapixels])
-            subprocess.run(
-                [*PARTS, "scene", str(scene), *sides, "4", *["-0.05"] * self.lens], cwd=ROOT, check=True
-            )
+            run([*PARTS, "scene", str(scene), *sides, "4", *["-0.05"] * self.lens])
         return scene
 
     def arguments(self, scene: Path, out: Path) -> list[str]:
@@ -93,16 +90,10 @@ class Measured(NamedTuple):
 
     def row(self, case: Case) -> list[str]:
         """A line of the table."""
-        gib = [f"{value / 2**30:.2f}" for value in (self.plan, self.peak)]
+        sizes = (f"{value / 2**30:.2f}" for value in (self.plan, self.peak))
         limit = "" if case.limit is None else f"{size_of(case.limit) / 2**30:.2f}"
-        return [
-            str(case.megapixels),
-            case.name,
-            limit,
-            *gib,
-            f"{self.plan / self.peak:.2f}",
-            f"{self.seconds:.0f}",
-        ]
+        ratio = f"{self.plan / self.peak:.2f}"
+        return [str(case.megapixels), case.name, limit, *sizes, ratio, f"{self.seconds:.0f}"]
 
 
 def size_of(limit: str) -> float:
@@ -112,29 +103,24 @@ def size_of(limit: str) -> float:
 
 def measured(case: Case, folder: Path) -> Measured:
     """Run the command. Raises RuntimeError with what it printed if it fails, or says no plan."""
-    command = [*PAT, "fuse", *case.arguments(case.images(folder), folder / "out")]
-    with tempfile.TemporaryFile("w+") as said:
-        process = subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=subprocess.STDOUT, text=True)
-        _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        said.seek(0)
-        text = said.read()
-    plans = re.findall(r"plan: .* ([0-9.]+) GiB in all", text)
-    if process.returncode not in (0, 3) or not plans:
-        raise RuntimeError(f"{' '.join(command)} ended with {process.returncode}:\n{text[-2000:]}")
-    return Measured(float(plans[-1]) * 2**30, used.ru_maxrss * 1024.0, used.ru_utime + used.ru_stime)
+    found = run([*PAT, "fuse", *case.arguments(case.images(folder), folder / "out")])
+    plans = re.findall(r"plan: .* ([0-9.]+) GiB in all", found.said)
+    if not plans:
+        raise RuntimeError(f"{case.name}: no plan was said:\n{found.said[-2000:]}")
+    return Measured(float(plans[-1]) * 2**30, found.peak, found.cores)
 
 
-def main() -> None:
-    """Print the lines, and put them into the table, whose other lines stay."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--megapixels", type=int, nargs="*", default=list(SIDES))
-    parser.add_argument("--only", help="the cases of this name, such as '1 beta, no rig'")
-    given = parser.parse_args()
+def main(megapixels: tuple[int, ...] = tuple(SIDES), only: str | None = None) -> None:
+    """Print the lines, and put them into the table, whose other lines stay.
+
+    Args:
+        megapixels: The sizes.
+        only: The cases of this name, such as "1 beta, no rig".
+    """
     rows = {key_of(line): line for line in RESULTS.read_text().splitlines()[2:]} if RESULTS.exists() else {}
     with tempfile.TemporaryDirectory() as folder:
         for case in CASES:
-            if case.megapixels in given.megapixels and given.only in (None, case.name):
+            if case.megapixels in megapixels and only in (None, case.name):
                 cells = shown(COLUMNS, measured(case, Path(folder)).row(case))
                 line = table(COLUMNS, [cells]).splitlines()[-1]
                 rows[key_of(line)] = line
@@ -152,4 +138,4 @@ def order(line: str) -> int:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

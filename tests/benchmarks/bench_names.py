@@ -12,16 +12,15 @@ points. The mistakes of images (another size, cropped, rotated) are in `bench_do
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
+import tyro
 from torch import Tensor
 
 from arraygeom import Camera, Distortion, Pose, Rig, rotation_from_vector
@@ -34,30 +33,22 @@ from calib.images.misfit import share_outside
 from calib.images.remedies import TRANSPOSE, on_cameras, on_pixels, rotated_view, swap
 from pat.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.bench_drift import drifted, error
-from tests.benchmarks.printed import print_tables
+from tests.benchmarks.printed import DATA, print_tables
 from tests.calib.real import every_pair
 from tests.calib.simulated import simulated_matches, simulated_rig
 
 Random = np.random.Generator
 DRIFTED = "drifted"
 REAL = (
-    "SYNTIM Color",
-    "SYNTIM Serfaty",
-    "SYNTIM BatInria",
-    "SYNTIM TableSTV",
-    "SYNTIM SmRub",
-    "Bumblebee2 chair01",
+    *(f"SYNTIM {name}" for name in ("Color", "Serfaty", "BatInria", "TableSTV", "SmRub")),
+    *("Bumblebee2 chair01", "Bumblebee2 stones01", "KITTI 03/000000", "Middlebury 2006_third/Cloth1"),
+    *("Hilti 0", "Lund 1-3"),
 )
-REAL += ("Bumblebee2 stones01", "KITTI 03/000000", "Middlebury 2006_third/Cloth1", "Hilti 0", "Lund 1-3")
 TUNE = (
-    "SYNTIM Poly",
-    "SYNTIM Billet",
-    "SYNTIM Money",
-    "Bumblebee2 chair02",
-    "Bumblebee2 thing01",
-    "KITTI object",
+    *(f"SYNTIM {name}" for name in ("Poly", "Billet", "Money")),
+    *("Bumblebee2 chair02", "Bumblebee2 thing01", "KITTI object", "Middlebury 2006_third/Midd1"),
+    *("Hilti 2", "Lund 4-6", "fox 0001-0009", "fox 0073-0077"),
 )
-TUNE += ("Middlebury 2006_third/Midd1", "Hilti 2", "Lund 4-6", "fox 0001-0009", "fox 0073-0077")
 SHIFTS = ("1-based, one", "1-based, both")
 """Too small to be gross, and drifts to the eye."""
 
@@ -234,19 +225,14 @@ def table(cases: dict[str, Callable[[Random, bool], Case]], draws: int, *, obser
                 if mistake.lens and case.rig[case.rig.names[0]].distortion is None:
                     continue
                 bad = mistake.make(case.rig, g)
-                if (
-                    observed
-                    and mistake.kind != "nothing"
-                    and what not in SHIFTS
-                    and not observable(case, bad)
-                ):
+                gross_mistake = mistake.kind != "nothing" and what not in SHIFTS
+                if observed and gross_mistake and not observable(case, bad):
                     continue
                 outcome, found = judge(mistake, case, bad)
                 outcomes[outcome] += 1
                 names[found.named.kind] += 1
-                gross[
-                    "drift" if mistake.kind == "nothing" else "small" if what in SHIFTS else "gross", outcome
-                ] += 1
+                size = "gross" if gross_mistake else "drift" if mistake.kind == "nothing" else "small"
+                gross[size, outcome] += 1
                 if outcome in ("worse", "wrong", "false alarm"):
                     notes.append(f"{label}, {what}, draw {draw}: {outcome}: {found.verdict}")
             if outcomes:
@@ -258,32 +244,31 @@ def table(cases: dict[str, Callable[[Random, bool], Case]], draws: int, *, obser
     yield from notes
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--draws", type=int, default=20)
-    parser.add_argument("--cameras", type=int, default=2, help="of the simulated rigs")
-    parser.add_argument("--real", action="store_true", help="eleven real pairs instead of simulated rigs")
-    parser.add_argument("--tune", action="store_true", help="eleven others, by which numbers were chosen")
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
-    cv2.setRNGSeed(0)
-    torch.set_num_threads(1)
-    if options.real or options.tune:
-        pairs = real_cases(options.data, TUNE if options.tune else REAL)
+def main(
+    data: Path = DATA,
+    draws: int = 20,
+    cameras: int = 2,
+    real: bool = False,
+    tune: bool = False,
+    out: Path | None = None,
+) -> None:
+    """Print the table.
+
+    Args:
+        cameras: Of the simulated rigs.
+        real: Eleven real pairs instead of simulated rigs.
+        tune: Eleven others, by which numbers were chosen.
+    """
+    if real or tune:
+        pairs = real_cases(data, TUNE if tune else REAL)
         cases = {name: lambda g, lens, case=case: case for name, case in pairs}
     else:
-        count = options.cameras
         cases = {
-            f"{f}, {count} cameras": lambda g, lens, f=f: simulated_case(f, count, g, lens=lens)
+            f"{f}, {cameras} cameras": lambda g, lens, f=f: simulated_case(f, cameras, g, lens=lens)
             for f in ("wide", "narrow")
         }
-    print_tables(
-        "What the doctor names",
-        [table(cases, options.draws, observed=options.real or options.tune)],
-        options.out,
-    )
+    print_tables("What the doctor names", [table(cases, draws, observed=real or tune)], out)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

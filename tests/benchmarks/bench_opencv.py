@@ -13,16 +13,16 @@ distance from the lines of the other camera's, in undistorted pixels. Lenses hav
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import reduce
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
+import tyro
 from jaxtyping import Float
 
 from arraygeom import Camera, Distortion, Pose, Rig
@@ -32,11 +32,13 @@ from calib.boards.photos import FrameKey
 from calib.boards.rig import calibrate
 from calib.boards.target import parse_board
 from calib.boards.validation import FOLDS, epipolar_errors
-from pat.evaluation.tables import markdown_header, markdown_row
-from tests.benchmarks.printed import print_tables
+from pat.evaluation.tables import markdown_row
+from tests.benchmarks.printed import DATA, head, print_tables
 from tests.calib.rendered import BOARD
 from tests.calib.tracks import CALISCOPE_BOARD, caliscope_views
 
+opencv: Any = cv2
+"""Of version 5, which has more than stubs know of."""
 Views = Mapping[str, BoardViews]
 Calibrator = Callable[[Views, Board], Rig]
 FEWEST = 6
@@ -77,10 +79,10 @@ def multiview(views: Views, board: Board) -> Rig:
             mine.append(x[repeated].astype(np.float32))
     detected = np.array([[name in seen for _, seen in frames] for name in views], np.uint8)
     sizes = [v.hw[::-1] for v in views.values()]
-    models = np.full(len(views), cv2.CALIB_MODEL_PINHOLE, np.uint8)
+    models = np.full(len(views), opencv.CALIB_MODEL_PINHOLE, np.uint8)
     Ks, lenses = zip(*(_single(v, board) for v in views.values()))
     flags = np.full(len(views), cv2.CALIB_USE_INTRINSIC_GUESS, np.int32)
-    _, Ks, lenses, Rs, ts, *_ = cv2.calibrateMultiview(
+    _, Ks, lenses, Rs, ts, *_ = opencv.calibrateMultiview(
         points, pixels, sizes, detected, models, Ks, lenses, None, None, flags, cv2.CALIB_USE_INTRINSIC_GUESS
     )
     return _rig(views, Ks, lenses, Rs, ts)
@@ -160,9 +162,7 @@ def held_out(calibrated: Calibrator, views: Views, board: Board) -> HeldOut:
 
 
 def rows(data: Path, boards: Path) -> Iterator[str]:
-    yield markdown_header(
-        ["boards", "frames", "calibrated by", "median px", "mean px", "parts refused", "seconds"]
-    )
+    yield head("boards | frames | calibrated by | median px | mean px | parts refused | seconds")
     for name, views, board in sets(data, boards):
         frames = len(set().union(*(v.seen for v in views.values())))
         by: dict[str, Calibrator] = {"calib": here, "calibrateMultiview": multiview}
@@ -172,19 +172,13 @@ def rows(data: Path, boards: Path) -> Iterator[str]:
             yield markdown_row([name, frames, label, *found, refused, f"{seconds:.0f}"])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--boards", type=Path, default=Path("out/boards"))
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
+def main(data: Path = DATA, boards: Path = Path("out/boards"), out: Path | None = None) -> None:
+    """Print the table."""
     if not hasattr(cv2, "calibrateMultiview"):
-        parser.error(f"OpenCV {cv2.__version__} has no calibrateMultiview: use an environment with OpenCV 5")
-    cv2.setRNGSeed(0)
-    torch.set_num_threads(1)
+        raise SystemExit("this OpenCV has no calibrateMultiview: use an environment with OpenCV 5")
     title = f"Boards calibrated here and by OpenCV {cv2.__version__}"
-    print_tables(title, [rows(options.data, options.boards)], options.out)
+    print_tables(title, [rows(data, boards)], out)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

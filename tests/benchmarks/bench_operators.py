@@ -11,17 +11,15 @@ processor time for 2,000 points or one image of 240 x 320, float64, one thread, 
 
 from __future__ import annotations
 
-import argparse
-import statistics
-import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
+from statistics import median
 from typing import Any, NamedTuple
 
 import cv2
 import kornia.geometry as kg
 import numpy as np
 import torch
+import tyro
 from kornia.geometry.depth import warp_frame_depth
 from scipy.optimize import least_squares
 from torch import Tensor
@@ -42,8 +40,9 @@ from arraygeom import (
     world_rays,
 )
 from arraygeom.lenses import FlatPort, RollingShutter
-from docs.update_readme import with_block
+from docs.update_readme import write_block
 from tests.benchmarks.bench_kornia import gradient_error
+from tests.benchmarks.printed import DOCS, timed
 
 try:
     import pycolmap
@@ -51,7 +50,6 @@ except ImportError:
     pycolmap = None
 
 F64, HW, N = torch.float64, (240, 320), 2000
-PAGE = Path(__file__).parents[2] / "docs" / "lenses.md"
 G = torch.Generator().manual_seed(0)
 
 
@@ -97,14 +95,8 @@ class Row(NamedTuple):
 
 def ratio(ours: Callable[[], object], theirs: Callable[[], object], runs: int = 5) -> str:
     """Times of theirs divided by ours: medians, alternating."""
-    spent: tuple[list[float], list[float]] = ([], [])
-    for _ in range(runs):
-        for f, times in zip((ours, theirs), spent):
-            begin = time.process_time()
-            f()
-            times.append(time.process_time() - begin)
-    mine, other = (statistics.median(times) for times in spent)
-    return f"{other / mine:.2g}"
+    mine, other = timed(ours, theirs, repeats=runs)
+    return f"{median(other) / median(mine):.2g}"
 
 
 def apart(ours: Tensor, theirs: Any) -> str:
@@ -172,25 +164,15 @@ def triangulations() -> Iterator[Row]:
         return (found[:3] / found[3]).T
 
     slope = f"{gradient_error(lambda v: points_of(BROWN, v.reshape(2, 20, 2)), bent[:, :20].flatten()):.0e}"
-    value = (
-        f"true points {apart(points_of(BROWN, bent), X)}, theirs {apart(torch.as_tensor(undistorted()), X)}"
-    )
-    yield Row(
-        "triangulate, lenses",
-        "OpenCV",
-        value,
-        slope,
-        "none",
-        ratio(lambda: points_of(BROWN, bent), undistorted, 3),
-    )
+    own, theirs_ = (apart(torch.as_tensor(found), X) for found in (points_of(BROWN, bent), undistorted()))
+    times = ratio(lambda: points_of(BROWN, bent), undistorted, 3)
+    yield Row("triangulate, lenses", "OpenCV", f"true points {own}, theirs {theirs_}", slope, "none", times)
     for name, model in NOT_CENTRAL.items():
         rig = rig_of(model)
         x = seen(rig)
         error = gradient_error(lambda v, rig=rig: points_of(rig, v.reshape(2, 20, 2)), x[:, :20].flatten())
-        slope = f"{error:.0e}"
-        yield Row(
-            f"triangulate, {name}", "no other", f"true points {apart(points_of(rig, x), X)}", slope, "", ""
-        )
+        value = f"true points {apart(points_of(rig, x), X)}"
+        yield Row(f"triangulate, {name}", "no other", value, f"{error:.0e}", "", "")
 
 
 def poses() -> Iterator[Row]:
@@ -208,7 +190,7 @@ def images() -> Iterator[Row]:
     pair = PINHOLES.pair("camera 0", "camera 1")
     image = torch.rand(1, 3, *HW, dtype=F64, generator=G)
     depth = 3 + torch.rand(1, *HW, dtype=F64, generator=G)
-    T, one = pair.beta_from_alpha.matrix[None], pair.alpha.K[None]
+    T, one = pair.beta_from_alpha.matrix[None], pair.cameras[0].K[None]
 
     def theirs(d: Tensor) -> Tensor:
         return warp_frame_depth(image, d[:, None], T, one)
@@ -226,25 +208,15 @@ def images() -> Iterator[Row]:
 
     def swept(picture: np.ndarray = picture) -> np.ndarray:
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        return np.stack(
-            [
-                cv2.warpPerspective(picture, pair.homography_at(d).numpy(), HW[::-1], flags=flags)
-                for d in planes
-            ]
-        )
+        maps = (pair.homography_at(d).numpy() for d in planes)
+        return np.stack([cv2.warpPerspective(picture, H, HW[::-1], flags=flags) for H in maps])
 
     found = plane_sweep(pair, image, planes)
     inner = swept(np.ones_like(picture)) > 1 - 1e-9
     off = (found.values[0].permute(1, 2, 3, 0).numpy() - swept())[inner]
     value = f"{np.abs(off).max():.0e}, theirs rounded to 1/32 px"
-    yield Row(
-        "plane sweep, 8 planes",
-        "OpenCV",
-        value,
-        "as warp",
-        "none",
-        ratio(lambda: plane_sweep(pair, image, planes), swept),
-    )
+    times = ratio(lambda: plane_sweep(pair, image, planes), swept)
+    yield Row("plane sweep, 8 planes", "OpenCV", value, "as warp", "none", times)
 
 
 def adjustment() -> Iterator[Row]:
@@ -260,16 +232,12 @@ def adjustment() -> Iterator[Row]:
     def cost(v: np.ndarray) -> np.ndarray:
         p = torch.from_numpy(v)
         moved = rig.perturbed(dict(zip(zeros, p[: sum(sizes)].split(sizes))))
-        return (
-            reprojection_residuals(list(moved.cameras.values()), p[sum(sizes) :].reshape(-1, 3), x)
-            .flatten()
-            .numpy()
-        )
+        found = p[sum(sizes) :].reshape(-1, 3)
+        return reprojection_residuals(list(moved.cameras.values()), found, x).flatten().numpy()
 
     def theirs() -> Any:
-        return least_squares(
-            cost, np.concatenate([np.zeros(sum(sizes)), points.flatten().numpy()]), method="trf"
-        )
+        start = np.concatenate([np.zeros(sum(sizes)), points.flatten().numpy()])
+        return least_squares(cost, start, method="trf")
 
     ours = bundle_adjusted(rig, points, x, free=free)
     value = f"cost, relative {float(ours.cost[-1]) / (2 * theirs().cost) - 1:+.0e}"
@@ -287,31 +255,19 @@ def adjustment() -> Iterator[Row]:
 
     slope = gradient_error(lambda v: camera.project(v.reshape(-1, 3)).x, X[:20].flatten())
     times = ratio(lambda: camera.project(X), projected)
-    yield Row(
-        "projection through a lens",
-        "OpenCV",
-        apart(camera.project(X).x, projected()),
-        f"{slope:.0e}",
-        "none",
-        times,
-    )
+    value = apart(camera.project(X).x, projected())
+    yield Row("projection through a lens", "OpenCV", value, f"{slope:.0e}", "none", times)
     rays = world_rays(camera, camera.project(X).x)
     away = torch.linalg.cross(X, rays.direction).sub(rays.plucker[:, 3:]).norm(dim=-1).max()
-    yield Row(
-        "rays, Pluecker coordinates",
-        "no other",
-        f"true points off their rays by {float(away):.0e} m",
-        "",
-        "",
-        "",
-    )
+    value = f"true points off their rays by {float(away):.0e} m"
+    yield Row("rays, Pluecker coordinates", "no other", value, "", "", "")
 
 
 HEAD = ("operator", "beside", "value", "gradient error, ours", "theirs", "time, theirs / ours")
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--write", action="store_true", help="put the table into docs/lenses.md")
+
+def main(write: bool = False) -> None:
+    """Print the table, and put it into docs/lenses.md if asked."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     lines = [HEAD, ["---"] * len(HEAD)]
@@ -319,6 +275,9 @@ if __name__ == "__main__":
         for row in part():
             print(" | ".join(row), flush=True)
             lines.append(row)
-    if parser.parse_args().write:
-        text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-        PAGE.write_text(with_block(PAGE.read_text(), "operators", text))
+    if write:
+        write_block(DOCS / "lenses.md", "operators", "\n".join(f"| {' | '.join(line)} |" for line in lines))
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

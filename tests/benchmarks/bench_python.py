@@ -41,11 +41,8 @@ SIZES = {"640x400": 1, "1280x800": 2}
 RESULTS = Path(__file__).with_name("RESULTS_python.md")
 POLICIES = {"import torch; from pat import fuse": {}, "as the command": {"OMP_WAIT_POLICY": "PASSIVE"}}
 
-
 COLUMNS = [
-    "two threads",
-    "processes beside",
-    "load before",
+    *("two threads", "processes beside", "load before"),
     *(f"{name}, seconds a frame" for name in POLICIES),
     "ratio",
 ]
@@ -70,13 +67,8 @@ class Bench:
                     for label, folder in checkouts.items():
                         load = f"{os.getloadavg()[0]:.0f}"
                         took = [self.seconds(folder, policy, scale) for policy in POLICIES.values()]
-                        cells = [
-                            label + size,
-                            str(busy),
-                            load,
-                            *(f"{t:.2f}" for t in took),
-                            f"{took[0] / took[1]:.2f}",
-                        ]
+                        figures = [*(f"{t:.2f}" for t in took), f"{took[0] / took[1]:.2f}"]
+                        cells = [label + size, str(busy), load, *figures]
                         rows.append(cells)
                         print(markdown_table(COLUMNS, [cells]).splitlines()[-1], flush=True)
             finally:

@@ -22,7 +22,6 @@ from unittest.mock import patch
 import torch
 import tyro
 
-from arraygeom.atomic import write_text
 from arraygeom.fields import FIELDS
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.networks.weights import load_weights
@@ -31,6 +30,7 @@ from pat.training import loop, losses
 from pat.training.config import TrainConfig, load_config
 from pat.training.losses import validation
 from pat.training.samples import Sample, SampleSource, photographs, source_of
+from tests.benchmarks.printed import print_tables
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -94,19 +94,10 @@ class Bench:
     """The photographs and the held-out scenes, which all variants share."""
 
     def __init__(self, args: Args) -> None:
-        changes: dict[str, Any] = {
-            "photos": args.photos,
-            "cache": args.cache,
-            "steps": args.steps,
-            "hw": args.hw,
-            "batch": args.batch,
-        }
-        every: dict[str, Any] = {
-            "validate": args.steps,
-            "save": args.steps,
-            "average": args.steps // 5,
-            "warmup": args.steps // 8,
-        }
+        names = ("photos", "cache", "steps", "hw", "batch")
+        changes: dict[str, Any] = {name: getattr(args, name) for name in names}
+        every: dict[str, Any] = {"validate": args.steps, "save": args.steps}
+        every |= {"average": args.steps // 5, "warmup": args.steps // 8}
         self.base = replace(load_config("mono-colour-small"), **changes, **every, device="cpu")
         self.bank, unseen = photographs(self.base)
         self.held_out = list(self._source(self.base, unseen, 7)(args.examined))
@@ -151,25 +142,16 @@ def lines(args: Args) -> Iterator[str]:
         found = bench.trained(variant)
         if number < SEEDS:
             seeds.append(found.psnr)
-        figures = (
-            f"{found.psnr:.2f}",
-            f"{found.psnr - seeds[0]:+.2f}",
-            f"{found.matched:.1%}",
-            f"{found.seconds:.2f}",
+        gain = f"{found.psnr - seeds[0]:+.2f}"
+        yield markdown_row(
+            [variant.name, f"{found.psnr:.2f}", gain, f"{found.matched:.1%}", f"{found.seconds:.2f}"]
         )
-        yield markdown_row([variant.name, *figures])
     span = f"{min(seeds):.2f} to {max(seeds):.2f} dB"
     yield f"\nThe base with {SEEDS} seeds: {span}: differences of that size say nothing."
 
 
 def main(args: Args) -> None:
-    torch.set_num_threads(1)
-    table = []
-    for line in lines(args):
-        print(line, flush=True)
-        table.append(line)
-    if args.out:
-        write_text(args.out, "\n".join(["# Choices of the small network's recipe", "", *table]) + "\n")
+    print_tables("Choices of the small network's recipe", [lines(args)], args.out)
 
 
 if __name__ == "__main__":

@@ -10,22 +10,22 @@ the nearest 85% of the points: their distance without that from this F.
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
+from typing import Literal
 
-import cv2
 import torch
+import tyro
 from torch import Tensor
 
 from arraygeom import Link, Rig, View
 from arraygeom.pixels import coarse_grid
 from calib.images.from_images import rig_from_images
-from calib.images.held_out import line_distances, line_statistics, split
+from calib.images.held_out import line_distances, split, trimmed_square
 from calib.images.matches import PointMatches, fit_fundamental, line_distance, match_cameras
-from calib.images.refinement import FREE, LineStatistics, RefinementProblem, polish, refine, refine_matches
+from calib.images.refinement import FREE, RefinementProblem, polish, refine, refine_matches
 from experiments.showcase import FAST, FAST_FRAME, SCENE, SLOW, SLOW_FRAME, published_matrices
 from pat.attention import attend_with_statistics
 from pat.data.sample_array import load_sample
@@ -35,7 +35,7 @@ from pat.evaluation.tables import markdown_header, markdown_row
 from pat.fusion.fuse import fuse
 from pat.media.images import read_image
 from pat.networks.weights import load_weights
-from tests.benchmarks.printed import print_tables
+from tests.benchmarks.printed import DATA, head, print_tables
 from tests.calib.real import bumblebee, syntim
 from tests.calib.scenes import uninformed
 
@@ -56,9 +56,7 @@ def median(values: Tensor) -> float:
 
 
 def real_pairs(data: Path, draws: int, g: torch.Generator) -> Iterator[str]:
-    yield markdown_header(
-        ["real pair", "points", "of points", "as published", "made worse", "refined", "of the rig"]
-    )
+    yield head("real pair | points | of points | as published | made worse | refined | of the rig")
     for pair in (
         *syntim(data, ("Serfaty", "BatInria", "Billet", "SmRub", "Money", "Color", "Poly")),
         *bumblebee(data),
@@ -67,25 +65,25 @@ def real_pairs(data: Path, draws: int, g: torch.Generator) -> Iterator[str]:
         rig = Rig({name: pair.rig[name] for name in names})
         matches = match_cameras(pair.images)
         _, held_out = split([matches])
-        results = [refine_matches(worse(rig, g), [matches]).held_out for _ in range(draws)]
-        before, after = ([r[i].median for r in results] for i in (0, 1))
-        own = own_agreement(matches)
-        rest = [beyond(r[1], own) for r in results]
-        cells = (pair.name, len(matches[names].alpha), f"{own.median:.2f}")
+        results = [refine_matches(worse(rig, g), [matches]) for _ in range(draws)]
+        before, after = ([r.held_out[i].median for r in results] for i in (0, 1))
+        own = own_distances(matches)
+        rest = [beyond(line_distances(r.rig, held_out), own) for r in results]
+        cells = (pair.name, len(matches[names].alpha), f"{median(own):.2f}")
         published = f"{median(line_distances(rig, held_out)):.2f}"
         yield markdown_row([*cells, published, *map(_span, (before, after, rest))])
 
 
-def own_agreement(pairs: dict) -> LineStatistics:
-    """How held-out points agree with an F fitted to all points."""
+def own_distances(pairs: dict) -> Tensor:
+    """Of held-out points from the lines of an F fitted to all points."""
     _, held_out = split([pairs])
     (names, points), *_ = pairs.items()
-    return line_statistics(line_distance(held_out[names], fit_fundamental(points)))
+    return line_distance(held_out[names], fit_fundamental(points))
 
 
-def beyond(found: LineStatistics, own: LineStatistics) -> float:
-    """A distance without that of the points themselves."""
-    return math.sqrt(max(found.rms**2 - own.rms**2, 0.0))
+def beyond(found: Tensor, own: Tensor) -> float:
+    """The root mean square distance of the nearest points without that of the points themselves."""
+    return math.sqrt(max(trimmed_square(found) - trimmed_square(own), 0.0))
 
 
 def _span(values: list[float]) -> str:
@@ -94,9 +92,7 @@ def _span(values: list[float]) -> str:
 
 def fast_and_slow(data: Path) -> Iterator[str]:
     """F as published; as `pat rig refine` and `start` leave it, which find lenses; of the points' own."""
-    yield markdown_header(
-        ["fast + slow", "points held out", "published F", "F of all points", "refined", "started"]
-    )
+    yield head("fast + slow | points held out | published F | F of all points | refined | started")
     folder = data / "hfr_lfr"
     files = {FAST: folder / SCENE / f"{FAST_FRAME}.png"}
     files |= {name: folder / SCENE / f"{name}_{SLOW_FRAME}.png" for name in SLOW}
@@ -109,7 +105,7 @@ def fast_and_slow(data: Path) -> Iterator[str]:
     rigs = refine_matches(rig, [matches]).rig, rig_from_images(images).rig
     for names in rig.links:
         points = {names: held_out[names]}
-        own = own_agreement({names: matches[names]}).median
+        own = median(own_distances({names: matches[names]}))
         before, *after = (median(line_distances(r, points)) for r in (rig, *rigs))
         medians = (f"{off:.2f}" for off in (before, own, *after))
         yield markdown_row([names[1], len(held_out[names].alpha), *medians])
@@ -117,17 +113,10 @@ def fast_and_slow(data: Path) -> Iterator[str]:
 
 def rendered_rigs(draws: int, g: torch.Generator, scenes: Path | None) -> Iterator[str]:
     """The sample array and scenes rendered before: rigs, and colours at alpha's view, are the truth."""
-    yield markdown_header(
-        [
-            "rendered",
-            "draw",
-            "true rig",
-            "made worse",
-            "by points",
-            "and by the fusion's error",
-            "from images alone",
-        ]
+    head = (
+        "rendered | draw | true rig | made worse | by points | and by the fusion's error | from images alone"
     )
+    yield markdown_header(columns(head))
     network, sample = load_weights("mono-colour"), load_sample()
     found = rendered_cases(scenes) if scenes else ()
     ours = AblationCase("sample array", sample.rig, sample.images, sample.ground_truth, torch.empty(0))
@@ -174,26 +163,23 @@ def exact_points(rig: Rig, names: tuple[str, str]) -> PointMatches:
     return PointMatches(x[seen], y[seen])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--draws", type=int, default=3)
-    parser.add_argument("--only", nargs="*", choices=["array", "rendered", "photometry", "real"])
-    parser.add_argument(
-        "--scenes", type=Path, help="a folder of scenes rendered by pat render, two cameras each"
-    )
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
-    cv2.setRNGSeed(0)
+def main(
+    data: Path = DATA,
+    draws: int = 3,
+    only: tuple[Literal["array", "rendered", "photometry", "real"], ...] = (),
+    scenes: Path | None = None,
+    out: Path | None = None,
+) -> None:
+    """Print the tables; `scenes` is a folder of scenes rendered by pat render, two cameras each."""
     g = torch.Generator().manual_seed(0)
     tables = {
-        "array": lambda: fast_and_slow(options.data),
-        "rendered": lambda: rendered_rigs(options.draws, g, options.scenes),
-        "photometry": lambda: by_photometry(options.draws, g),
-        "real": lambda: real_pairs(options.data, options.draws, g),
+        "array": lambda: fast_and_slow(data),
+        "rendered": lambda: rendered_rigs(draws, g, scenes),
+        "photometry": lambda: by_photometry(draws, g),
+        "real": lambda: real_pairs(data, draws, g),
     }
-    print_tables("Refinement of rigs", (tables[name]() for name in options.only or tables), options.out)
+    print_tables("Refinement of rigs", (tables[name]() for name in only or tables), out)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -9,7 +9,6 @@ the machine does other work, too.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import tempfile
@@ -20,16 +19,19 @@ from typing import Any
 
 import numpy as np
 import torch
+import tyro
 import yaml
 
 from arraygeom import Camera, Pose, Rig, intrinsics
 from arraygeom.atomic import write_text
-from pat.evaluation.tables import markdown_header, markdown_row
+from pat.evaluation.tables import markdown_row
 from pat.farm.job import FACTS, RenderConfig, render
 from pat.synthesis.blender import RenderSettings
 from pat.synthesis.blender import render as render_scene
 from pat.synthesis.generators import abstract
+from tests.benchmarks.printed import head
 
+RESULTS = Path(__file__).with_name("RENDERING.md")
 SETTINGS: dict[str, dict[str, Any]] = {
     "fast preset": {},
     "without speed settings": {"denoise": "accurate", "fast_light": False, "bounces": 4},
@@ -88,31 +90,24 @@ def report(scenes: int, slow_scenes: int, workers: int) -> str:
             *(made(Path(folder), name, n, workers) for name, n in zip(SETTINGS, (scenes, slow_scenes)))
         )
     names = list(SETTINGS)
-    return "\n".join(
-        [
-            f"`python -m tests.benchmarks.bench_render`: {workers} workers on {os.cpu_count()} cores, "
-            f"load before {load:.1f}; two views of 512x384; {refused} seeds were refused by the check and "
-            "cost time, too.",
-            "",
-            markdown_header(
-                ["", "scenes", "an hour, all counted", "an hour, by s a scene", "s a scene", "core s a scene"]
-            ),
-            speed(names[0], fast, fast_seconds, workers),
-            speed(f"{names[0]}, the scenes of the next row", fast[: len(slow)], None, workers),
-            speed(names[1], slow, slow_seconds, workers),
-            "",
-            "MB of each worker after its scenes, none replaced:",
-            "",
-            markdown_header(
-                ["scenes", "1st", "5th", "10th", "25th", "last", "most", "a scene adds"], align="r"
-            ),
-            *memory(fast),
-            "",
-        ]
-    )
+    lines = [
+        f"`python -m tests.benchmarks.bench_render`: {workers} workers on {os.cpu_count()} cores, "
+        f"load before {load:.1f}; two views of 512x384; {refused} seeds were refused by the check and "
+        "cost time, too.",
+        "",
+        head(" | scenes | an hour, all counted | an hour, by s a scene | s a scene | core s a scene"),
+        speed(names[0], fast, fast_seconds, workers),
+        speed(f"{names[0]}, the scenes of the next row", fast[: len(slow)], None, workers),
+        speed(names[1], slow, slow_seconds, workers),
+        "",
+        "MB of each worker after its scenes, none replaced:",
+        "",
+        head("scenes | 1st | 5th | 10th | 25th | last | most | a scene adds", align="r"),
+    ]
+    return "\n".join([*lines, *memory(fast), ""])
 
 
-def paper() -> str:
+def papers_scene() -> str:
     """One scene with the paper's preset on all cores."""
     settings, begin = RenderSettings.preset("paper"), time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
@@ -122,25 +117,25 @@ def paper() -> str:
     return f"paper preset, {sizes}: {time.monotonic() - begin:.0f} s on {os.cpu_count()} cores, {verdict}"
 
 
-def main() -> None:
-    """Print the tables and keep them."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scenes", type=int, default=100)
-    parser.add_argument(
-        "--slow-scenes", type=int, default=4, help="how many of them without the speed settings"
-    )
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=Path(__file__).with_name("RENDERING.md"))
-    parser.add_argument(
-        "--paper", action="store_true", help="only one scene with the paper's preset, 15 minutes"
-    )
-    given = parser.parse_args()
-    if given.paper:
-        return print(paper())
-    found = report(given.scenes, given.slow_scenes, given.workers)
+def main(
+    scenes: int = 100,
+    slow_scenes: int = 4,
+    workers: int = 2,
+    out: Path = RESULTS,
+    paper: bool = False,
+) -> None:
+    """Print the tables and keep them.
+
+    Args:
+        slow_scenes: How many of them without the speed settings.
+        paper: Only one scene with the paper's preset, 15 minutes.
+    """
+    if paper:
+        return print(papers_scene())
+    found = report(scenes, slow_scenes, workers)
     print(found)
-    write_text(given.out, f"# Rendering\n\n{found}")
+    write_text(out, f"# Rendering\n\n{found}")
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from arraygeom.atomic import write_text
 from pat.evaluation.ablation import ALPHA, BETA, AblationCase, layered_cases
 from pat.evaluation.baseline import classical
 from pat.evaluation.metrics import bootstrap_interval, score
@@ -26,6 +25,7 @@ from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
 from pat.synthesis.rig_distribution import RigDistribution
 from pat.training.config import load_config
+from tests.benchmarks.printed import print_tables
 
 SINGLE = load_config("mono-colour-single-rig").rectified_rigs
 GENERAL = replace(
@@ -95,12 +95,8 @@ def lines(args: Args, networks: dict[str, FusionNetwork]) -> Iterator[str]:
 
 
 def main(args: Args) -> None:
-    table = []
-    for line in lines(args, {"random": load_weights(args.random), "single": load_weights(args.single)}):
-        print(line, flush=True)
-        table.append(line)
-    if args.out:
-        write_text(args.out, "\n".join(["# Weights of one rig, weights of random rigs", "", *table]) + "\n")
+    networks = {"random": load_weights(args.random), "single": load_weights(args.single)}
+    print_tables("Weights of one rig, weights of random rigs", [lines(args, networks)], args.out)
 
 
 if __name__ == "__main__":

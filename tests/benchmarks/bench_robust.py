@@ -9,21 +9,19 @@ covariance is right. *refused*: draws that raise an error.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
-import torch
+import tyro
 from rich.progress import track
 
 from arraygeom import Rig
 from calib.boards.detect import BoardViews, Detection
 from calib.boards.rig import Calibration, calibrate
-from pat.evaluation.tables import markdown_header, markdown_row
-from tests.benchmarks.printed import print_tables
+from pat.evaluation.tables import markdown_row
+from tests.benchmarks.printed import head, print_tables
 from tests.calib.board_scenes import BOARD, board_poses, errors_of, four_cameras, see
 
 NOISE = 0.1
@@ -68,16 +66,7 @@ def judged(share: float, draw: int) -> Draw:
 
 
 def rows(draws: range, shares: Sequence[float]) -> Iterator[str]:
-    columns = (
-        "wrong corners",
-        "draws",
-        "worst error, sigma",
-        "beyond 5 sigma",
-        "chi-square",
-        "RMS px",
-        "refused",
-    )
-    yield markdown_header(columns)
+    yield head("wrong corners | draws | worst error, sigma | beyond 5 sigma | chi-square | RMS px | refused")
     notes = []
     for share in shares:
         found: dict[int, Draw] = {}
@@ -88,30 +77,21 @@ def rows(draws: range, shares: Sequence[float]) -> Iterator[str]:
                 notes.append(f"{share:.0%} draw {draw}: {error}")
         beyond = [f"{share:.0%} draw {i}: {d.worst:.1f} sigma" for i, d in found.items() if d.worst > 5]
         worst, squares, rms = (np.array(column) for column in zip(*found.values()))
-        cells = (
-            f"{worst.max():.1f}",
-            len(beyond),
-            f"{squares.mean():.2f}, {squares.max():.2f}",
-            f"{rms.max():.3f}",
-        )
+        square = f"{squares.mean():.2f}, {squares.max():.2f}"
+        cells = f"{worst.max():.1f}", len(beyond), square, f"{rms.max():.3f}"
         yield markdown_row([f"{share:.0%}", len(draws), *cells, len(draws) - len(found)])
         notes += beyond
         notes += [f"{share:.0%} draw {i}: RMS {d.rms:.2f} px" for i, d in found.items() if d.rms > 3 * NOISE]
     yield "\n".join(["", *notes])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--draws", type=int, default=20)
-    parser.add_argument("--first", type=int, default=0, help="number of the first draw")
-    parser.add_argument("--shares", type=float, nargs="*", default=[0.0, 0.05, 0.2])
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    cv2.setRNGSeed(0)
-    draws = range(options.first, options.first + options.draws)
-    print_tables("Board calibration with wrong corners", [rows(draws, options.shares)], options.out)
+def main(
+    draws: int = 20, first: int = 0, shares: tuple[float, ...] = (0.0, 0.05, 0.2), out: Path | None = None
+) -> None:
+    """Print the table of so many draws, from the number `first` on."""
+    title = "Board calibration with wrong corners"
+    print_tables(title, [rows(range(first, first + draws), shares)], out)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

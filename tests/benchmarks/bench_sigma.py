@@ -13,15 +13,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import torch
+import tyro
 
 from calib.boards.bundle import BundleProblem, Solved, intrinsic_values
 from calib.boards.detect import collect_folder
 from calib.boards.rig import Calibration, calibrate
 from calib.boards.solve import readjusted
 from calib.boards.target import parse_board
-from pat.evaluation.tables import markdown_header, markdown_row
-from tests.benchmarks.printed import data_and_out, print_tables
+from pat.evaluation.tables import markdown_row
+from tests.benchmarks.printed import DATA, head, print_tables
 
 
 def sets(data: Path) -> Iterator[tuple[str, Calibration]]:
@@ -64,18 +64,8 @@ def difference(a: BundleProblem, b: BundleProblem) -> np.ndarray:
 
 
 def rows(data: Path) -> Iterator[str]:
-    yield markdown_header(
-        [
-            "boards",
-            "frames",
-            "RMS px",
-            "parameters",
-            "stated / jackknife",
-            "within 30 %",
-            "f",
-            "raised",
-            "shape",
-        ]
+    yield head(
+        "boards | frames | RMS px | parameters | stated / jackknife | within 30 % | f | raised | shape"
     )
     notes = []
     for name, found in sets(data):
@@ -93,11 +83,10 @@ def rows(data: Path) -> Iterator[str]:
     yield "\n".join(["", "Stated / jackknife of the parameters that are not within 30 %:", "", *notes])
 
 
-def main() -> None:
-    options = data_and_out(__doc__)
-    torch.set_num_threads(1)
-    print_tables("Stated sigma on real boards", [rows(options.data)], options.out)
+def main(data: Path = DATA, out: Path | None = None) -> None:
+    """Print the table."""
+    print_tables("Stated sigma on real boards", [rows(data)], out)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

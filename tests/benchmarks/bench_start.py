@@ -14,9 +14,8 @@ from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 
-import cv2
 import numpy as np
-import torch
+import tyro
 
 from calib.boards.poses import StartDeviations
 from calib.boards.uncertainty import baseline_deviation, rig_covariance
@@ -25,7 +24,7 @@ from calib.images.matches import PointMatches, match_cameras
 from experiments.alignment import nine_band_calibration
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.media.images import read_image
-from tests.benchmarks.printed import data_and_out, print_tables
+from tests.benchmarks.printed import DATA, print_tables
 
 ROWS = ((0, 1, 2), (3, 4, 5), (6, 7, 8))
 GRID = 0.04
@@ -45,16 +44,11 @@ def scene_matches(folder: Path) -> dict[tuple[str, str], PointMatches]:
 
 
 def rows(folder: Path) -> Iterator[str]:
-    head = (
-        "positions stated",
-        "RMS px",
-        "baselines off by, mm",
-        "their sigma, mm",
-        "f",
-        "scene px",
-        "worst pair",
+    yield markdown_header(
+        columns(
+            "positions stated | RMS px | baselines off by, mm | their sigma, mm | f | scene px | worst pair"
+        )
     )
-    yield markdown_header(list(head))
     matches = scene_matches(folder)
     for position in (5e-4, 5e-3):
         found = nine_band_calibration(folder, StartDeviations(position=position))
@@ -75,16 +69,11 @@ def _cells(found: Calibration, matches: Mapping[tuple[str, str], PointMatches]) 
     yield f"{max(scene):.2f}"
 
 
-def main() -> None:
-    options = data_and_out(__doc__)
-    torch.set_num_threads(1)
-    cv2.setRNGSeed(0)
-    print_tables(
-        "An array from one image of a board by each camera",
-        [rows(options.data / "nine_band_array")],
-        options.out,
-    )
+def main(data: Path = DATA, out: Path | None = None) -> None:
+    """Print the table."""
+    title = "An array from one image of a board by each camera"
+    print_tables(title, [rows(data / "nine_band_array")], out)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -8,12 +8,12 @@ in turn, medians and ranges.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from statistics import median
 
 import torch
+import tyro
 from torch import Tensor
 
 from arraygeom import Pair, Positions, Rectified, View
@@ -21,6 +21,7 @@ from arraygeom.fields.grid import FieldOnGrid
 from pat.matching.inputs import Inputs
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
+from tests.benchmarks.printed import spread
 
 HW, BATCH, PART, POSITIONS = (32, 96), 32, 4, 96
 PAPER = PATConfig(dim=64, block_bias=False, fusion_bias=True, values_after_block=True)
@@ -51,14 +52,8 @@ def step(
     return time.process_time() - began
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, default=3)
-    parser.add_argument(
-        "--profile", action="store_true", help="Also the operators that take most of a step of ours."
-    )
-    options = parser.parse_args()
+def main(steps: int = 3, profile: bool = False) -> None:
+    """Print the table; with `profile` also the operators that take most of a step of ours."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     network = PAT(PAPER)
@@ -85,18 +80,17 @@ def main() -> None:
     for way in ways.values():
         step(network, adam, part, way)  # compiled, and in the caches
     times: dict[str, list[float]] = {name: [] for name in ways}
-    for _ in range(options.steps):
+    for _ in range(steps):
         for name, way in ways.items():
             times[name].append(step(network, adam, images, way))
     base = median(times["gathered, as the authors"])
     print("| way | s a step | samples a second | times the authors' |\n| --- | ---: | ---: | ---: |")
     for name, found in times.items():
-        spread = f"{median(found):.1f} ({min(found):.1f} to {max(found):.1f})"
-        print(f"| {name} | {spread} | {BATCH / median(found):.2f} | {base / median(found):.2f} |")
-    if options.profile:
-        from torch.profiler import ProfilerActivity, profile
+        print(f"| {name} | {spread(found, 1)} | {BATCH / median(found):.2f} | {base / median(found):.2f} |")
+    if profile:
+        from torch import profiler
 
-        with profile(activities=[ProfilerActivity.CPU]) as seen:
+        with profiler.profile(activities=[profiler.ProfilerActivity.CPU]) as seen:
             step(network, adam, part, ways["C3, segments"])
         print(seen.key_averages().table(sort_by="self_cpu_time_total", row_limit=8, max_name_column_width=40))
 
@@ -108,4 +102,4 @@ def _listed(xy: Tensor, pixels: Tensor) -> Positions:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

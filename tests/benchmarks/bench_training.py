@@ -11,13 +11,12 @@ matters little: median (least to most) of the repeats.
 
 from __future__ import annotations
 
-import statistics
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 import torch
@@ -33,30 +32,7 @@ from pat.networks.weights import Network, new_network, set_precision
 from pat.training.config import TrainConfig, load_config
 from pat.training.losses import Objective
 from pat.training.samples import Sample, SampleSource, source_of
-
-
-@dataclass
-class Times:
-    """Seconds of the repeats."""
-
-    seconds: list[float]
-
-    @property
-    def median(self) -> float:
-        return statistics.median(self.seconds)
-
-    def __str__(self) -> str:
-        return f"{self.median:7.3f} s ({min(self.seconds):.3f} to {max(self.seconds):.3f})"
-
-
-def timed(work: Callable[[], object], repeats: int) -> Times:
-    work()
-    seconds = []
-    for _ in range(repeats):
-        began = time.process_time()
-        work()
-        seconds.append(time.process_time() - began)
-    return Times(seconds)
+from tests.benchmarks.printed import spread, timed
 
 
 class Materialised(nn.Module):
@@ -104,10 +80,21 @@ def source(config: TrainConfig) -> SampleSource:
     return source_of(config, sample_photographs(), 0, FIELDS[config.field]())
 
 
-def step(objective: Objective, given: Sample, adam: torch.optim.Optimizer) -> None:
-    adam.zero_grad()
-    objective(given).backward()
-    adam.step()
+def stepped(objective: Objective, given: Sample, repeats: int) -> list[float]:
+    """Seconds of steps."""
+    optimiser = torch.optim.Adam(objective.parameters(), lr=0.0)
+
+    def step() -> None:
+        optimiser.zero_grad()
+        objective(given).backward()
+        optimiser.step()
+
+    return timed(step, repeats=repeats)[0]
+
+
+def report(name: str, seconds: list[float], samples: int = 0) -> None:
+    rate = f"  {samples / median(seconds):6.2f} samples/s" if samples else ""
+    print(f"{name:42s} {spread(seconds, 3)}{rate}", flush=True)
 
 
 def papers_network(batch: int, repeats: int) -> None:
@@ -123,23 +110,22 @@ def papers_network(batch: int, repeats: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         official.network.engine = Materialised(official.network.engine, stored(given, Path(folder)))
         agree = (official(given) - ours(given)).abs().item()
-        rows = {
-            "official: stored lists, materialised": timed(
-                lambda: step(official, given, adam(official)), repeats
-            ),
-            "ours: the same positions made on the fly": timed(lambda: step(ours, given, adam(ours)), repeats),
-            "ours: epipolar segments made on the fly": timed(
-                lambda: step(along, straight, adam(along)), repeats
-            ),
+        ways = {
+            "official: stored lists, materialised": (official, given),
+            "ours: the same positions made on the fly": (ours, given),
+            "ours: epipolar segments made on the fly": (along, straight),
         }
-    scenes = timed(lambda: list(islice(made.steps([0], start=int(time.time_ns() % 1000)), 1)), repeats)
+        rows = {name: stepped(*way, repeats) for name, way in ways.items()}
+    (scenes,) = timed(
+        lambda: list(islice(made.steps([0], start=int(time.time_ns() % 1000)), 1)), repeats=repeats
+    )
     print(
         f"\nThe paper's network, {batch} samples of {config.hw[1]} x {config.hw[0]}; the losses differ by "
         f"{agree:.1e}\n"
     )
-    for name, times in rows.items():
-        print(f"{name:42s} {times}  {batch / times.median:6.2f} samples/s")
-    print(f"{'making new scenes, fields included':42s} {scenes}")
+    for name, seconds in rows.items():
+        report(name, seconds, batch)
+    report("making new scenes, fields included", scenes)
     attention(ours, given, straight, repeats)
 
 
@@ -154,15 +140,16 @@ def attention(objective: Objective, given: Sample, straight: Sample, repeats: in
     def ours(one: Sample) -> None:
         attend(q, k, v, one.fields[0].at, samples=None, interpolation="nearest").square().sum().backward()
 
+    ways = {
+        "  official": lambda: materialised(q, k, v, index).value.square().sum().backward(),
+        "  ours, nearest": lambda: ours(given),
+        "  ours, along": lambda: ours(straight),
+        "  field of nearest pixels alone": lambda: given.fields[0].at(x),
+        "  field of segments alone": lambda: straight.fields[0].at(x),
+    }
     print("\nof which attention and where to look, forward and backward:")
-    print(
-        "  official      "
-        f"{timed(lambda: materialised(q, k, v, index).value.square().sum().backward(), repeats)}"
-    )
-    print(f"  ours, nearest {timed(lambda: ours(given), repeats)}")
-    print(f"  ours, along   {timed(lambda: ours(straight), repeats)}")
-    print(f"  field of nearest pixels alone  {timed(lambda: given.fields[0].at(x), repeats)}")
-    print(f"  field of segments alone        {timed(lambda: straight.fields[0].at(x), repeats)}")
+    for name, seconds in zip(ways, timed(*ways.values(), repeats=repeats)):
+        report(name, seconds)
 
 
 HOW = {"float32": (False, False), "bfloat16": (True, False), "compiled": (False, True)}
@@ -176,8 +163,7 @@ def our_networks(repeats: int, names: tuple[str, ...]) -> None:
         print(f"\n{name}, {config.batch} samples of {config.hw[1]} x {config.hw[0]}, one step:\n")
         for how, (half, compiled) in HOW.items():
             objective = Objective(prepared(config, half=half, compiled=compiled), config.loss)
-            times = timed(lambda: step(objective, given, adam(objective)), repeats)  # noqa: B023
-            print(f"{how:42s} {times}  {config.batch / times.median:6.2f} samples/s", flush=True)
+            report(how, stepped(objective, given, repeats), config.batch)
 
 
 def prepared(config: TrainConfig, *, half: bool, compiled: bool) -> Network:
@@ -186,10 +172,6 @@ def prepared(config: TrainConfig, *, half: bool, compiled: bool) -> Network:
     network = new_network(config.network)
     set_precision(network, "bfloat16" if half else "float32", compiled=compiled)
     return network
-
-
-def adam(objective: Objective) -> torch.optim.Optimizer:
-    return torch.optim.Adam(objective.parameters(), lr=0.0)
 
 
 def main(

@@ -11,21 +11,22 @@ with 500 such pixels.
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from statistics import fmean
 from types import MethodType
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
+import tyro
 from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, one_hot
+from tyro.conf import Positional
 
 from experiments.evaluation.conditions import regions_of
 from experiments.evaluation.halves import of_half
@@ -153,15 +154,11 @@ def by_distances(found: dict[int, list[Unseen]]) -> Iterator[str]:
             yield markdown_row([label, str(len(rows)), *means, f"{min(gains):.1f} dB"])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--half", choices=["tune", "report"], default="report")
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
-    pairs = list(of_half(middlebury_pairs(args.data / "middlebury"), args.half))
-    print_tables("Colour where beta does not see", tables(pairs), args.out)
+def main(data: Positional[Path], half: Literal["tune", "report"] = "report", out: Path | None = None) -> None:
+    """Print the tables of the pairs of one half."""
+    pairs = list(of_half(middlebury_pairs(data / "middlebury"), half))
+    print_tables("Colour where beta does not see", tables(pairs), out)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -5,15 +5,14 @@ python -m tests.benchmarks.bench_weights
 
 from __future__ import annotations
 
-import statistics
-import time
-
 import torch
+import tyro
 from torch.utils.flop_counter import FlopCounterMode
 
 from pat.evaluation.protocols import rectified_fusion
-from pat.evaluation.tables import markdown_header, markdown_row
+from pat.evaluation.tables import markdown_row
 from pat.networks.weights import SHIPPED, load_weights
+from tests.benchmarks.printed import head, spread, timed
 
 HW = (384, 448)
 REPEATS = 5
@@ -27,22 +26,17 @@ def main() -> None:
         f"{HW[1]} x {HW[0]} pixels, one thread; seconds of the processor: median (least to most) of "
         f"{REPEATS}\n"
     )
-    print(markdown_header(["weights", "parameters", "GFLOP", "seconds"]))
+    print(head("weights | parameters | GFLOP | seconds"))
     for path in sorted(SHIPPED.glob("*.safetensors")):
         network = load_weights(path)
         fuse = rectified_fusion(network)
         with FlopCounterMode(display=False) as counter:
             fuse(alpha, beta, 100.0)
-        seconds = []
-        for _ in range(REPEATS):
-            began = time.process_time()
-            fuse(alpha, beta, 100.0)
-            seconds.append(time.process_time() - began)
+        (seconds,) = timed(lambda: fuse(alpha, beta, 100.0), repeats=REPEATS)  # noqa: B023
         parameters = sum(p.numel() for p in network.parameters())
-        spread = f"{statistics.median(seconds):.2f} ({min(seconds):.2f} to {max(seconds):.2f})"
         flops = f"{counter.get_total_flops() / 1e9:.1f}"
-        print(markdown_row([path.stem, f"{parameters:,}", flops, spread]), flush=True)
+        print(markdown_row([path.stem, f"{parameters:,}", flops, spread(seconds)]), flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

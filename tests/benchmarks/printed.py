@@ -1,22 +1,53 @@
-"""Tables of a benchmark: printed while they grow, then written to a file."""
+"""What benchmarks share: how work is timed, and tables that are printed while they grow."""
 
-import argparse
-from collections.abc import Iterable
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from statistics import median
+
+import cv2
+import torch
 
 from arraygeom.atomic import write_text
+from pat.evaluation.tables import markdown_header
+
+DATA = Path("../shared/data")
+DOCS = Path(__file__).parents[2] / "docs"
 
 
-def data_and_out(description: str) -> argparse.Namespace:
-    """The options of a benchmark on real images: the folder `data`, and the file `out` for its tables."""
-    parser = argparse.ArgumentParser(description=description.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--out", type=Path)
-    return parser.parse_args()
+def head(line: str, *, align: str = "lr") -> str:
+    """The head of a table whose columns are between the bars of a line."""
+    return markdown_header([cell.strip() for cell in line.split("|")], align=align)
+
+
+def timed(
+    *ways: Callable[[], object], repeats: int = 5, clock: Callable[[], float] = time.process_time
+) -> list[list[float]]:
+    """Seconds of the repeats of each way, in turn, after one of each that is not counted."""
+    found: list[list[float]] = [[] for _ in ways]
+    for i in range(repeats + 1):
+        for way, seconds in zip(ways, found):
+            began = clock()
+            way()
+            seconds += [clock() - began] if i else []
+    return found
+
+
+def spread(seconds: list[float], digits: int = 2) -> str:
+    """The median, and least to most."""
+    middle, least, most = (f"{f(seconds):.{digits}f}" for f in (median, min, max))
+    return f"{middle} ({least} to {most})"
 
 
 def print_tables(title: str, tables: Iterable[Iterable[str]], out: Path | None) -> None:
-    """Print each table's rows as they come, a blank line between tables; write them to `out` if given."""
+    """Print each table's rows as they come, a blank line between tables; write them to `out` if given.
+
+    They are made on one thread, and what OpenCV draws at random is the same each time.
+    """
+    torch.set_num_threads(1)
+    cv2.setRNGSeed(0)
     lines: list[str] = []
     for table in tables:
         for row in table:

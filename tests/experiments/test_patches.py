@@ -2,7 +2,6 @@
 
 import shutil
 
-import numpy as np
 import pytest
 import torch
 from torch.utils.data import DataLoader
@@ -10,18 +9,15 @@ from torch.utils.data import DataLoader
 from arraygeom import (
     Camera,
     Epipolar,
-    NearestVoxels,
     Pose,
     Rig,
     Sensor,
     intrinsics,
     rotation_from_vector,
-    sampling_locations,
 )
 from experiments.__main__ import Experiments
 from experiments.patches.dataset import ScenePatches, SceneShuffle, collate
 from experiments.patches.grid import PatchGrid, cut
-from experiments.patches.indices import agreement, index_files, read_indices, write_indices
 from pat.cli.main import main
 from pat.data import scene_folders
 from pat.data.windows import reduced_depth
@@ -205,7 +201,8 @@ def test_names_that_the_rig_lacks_are_reported(rendered):
 
 def test_show_and_info_on_the_command_line(rendered, tmp_path, capsys):
     sensors = tmp_path / "sensors.yaml"
-    sensors.write_text("mono: [{spectral: luminance}, clip, coded]\ncolour: [{box-blur: 3}, clip, coded]\n")
+    chains = "mono: [{spectral: luminance}, clip, encode-srgb]", "colour: [{box-blur: 3}, clip, encode-srgb]"
+    sensors.write_text("\n".join(chains))
     arguments = ["patches", str(rendered), "--sensors", str(sensors), "--out", str(tmp_path / "x.png")]
     main([*arguments, "--samples", "2"], group=Experiments)
     assert read_image(tmp_path / "x.png").std() > 0.1
@@ -216,33 +213,3 @@ def test_show_and_info_on_the_command_line(rendered, tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(arguments, group=Experiments)
     assert "no step is called 'spectrl'; did you mean 'spectral'" in " ".join(capsys.readouterr().err.split())
-
-
-def test_index_files_give_back_what_was_written(tmp_path):
-    pair = make_rig().crop("mono", 0, 0, (10, 12)).pair("mono", "colour")
-    field = sampling_locations(NearestVoxels(count=12, window=8), pair)
-    written = write_indices(tmp_path, "rig", field, beta=2)
-    assert [f.name for f in written] == ["xxs_rig_2.npy", "yys_rig_2.npy"]
-    back = read_indices(tmp_path, "rig", (10, 12), beta=2)
-    assert torch.equal(torch.where(field.mask[..., None], back.xy, 0.0), field.xy)
-    assert agreement(field, back).min() == 1
-    moved = write_indices(tmp_path, "moved", type(field)(field.xy + 1, field.mask))
-    assert agreement(field, read_indices(tmp_path, "moved", (10, 12))).mean() < 0.9
-    assert index_files(tmp_path, "moved") == tuple(moved)
-
-
-def test_index_files_that_are_not_as_documented_are_reported(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"xxs_a\.npy"):
-        read_indices(tmp_path, "a", (2, 3))
-    np.save(tmp_path / "xxs_a.npy", np.zeros((6, 4), np.int16))
-    np.save(tmp_path / "yys_a.npy", np.zeros((6, 5), np.int16))
-    with pytest.raises(ValueError, match="not of one field"):
-        read_indices(tmp_path, "a", (2, 3))
-    with pytest.raises(ValueError, match=r"6 .*3x3 .*9"):
-        read_indices(tmp_path, "a", (3, 3))
-    np.save(tmp_path / "xxs_a.npy", np.zeros((6, 4)))
-    with pytest.raises(ValueError, match="holds float64"):
-        read_indices(tmp_path, "a", (2, 3))
-    (tmp_path / "xxs_a.npy").write_bytes(b"no")
-    with pytest.raises(ValueError, match="not a NumPy file"):
-        read_indices(tmp_path, "a", (2, 3))

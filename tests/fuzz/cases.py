@@ -51,26 +51,36 @@ NO_FILE = 0.03
 Check = Callable[[Path, random.Random], str]
 
 
-def damaged(seed: Seed, number: int, folder: Path) -> Path:
-    """A copy of a seed's file (with its folder, where files belong together) with damage of this number."""
-    source = random.Random(f"{seed.kind} {seed.format} {seed.file.name} {number}")
-    home = folder / "case"
+def placed(seed: Seed, home: Path) -> tuple[Path, Path]:
+    """A folder with nothing but a copy of a seed's file, or of its folder: the file there, what is read."""
     shutil.rmtree(home, ignore_errors=True)
     if seed.whole_folder:
         shutil.copytree(seed.file.parent, home)
     else:
         home.mkdir(parents=True)
-    text = seed.file.suffix not in (".bin", ".mat", ".safetensors", ".npz") and seed.kind not in (
-        "image",
-        "video",
-    )
+        shutil.copy(seed.file, home)
     path = home / seed.file.name
+    return path, home if seed.whole_folder and seed.kind == "rig" else path
+
+
+def damaged(seed: Seed, number: int, folder: Path) -> Path:
+    """A copy of a seed's file (with its folder, where files belong together) with damage of this number."""
+    source = random.Random(f"{seed.kind} {seed.format} {seed.file.name} {number}")
+    path, read = placed(seed, folder / "case")
+    binary = seed.file.suffix in (".bin", ".mat", ".safetensors", ".npz") or seed.kind in ("image", "video")
     if source.random() < NO_FILE:
-        path.unlink(missing_ok=True)
+        path.unlink()
         source.choice((os.mkfifo, _linked_in_a_circle, os.mkdir))(path)
-        return home if seed.whole_folder and seed.kind == "rig" else path
-    path.write_bytes(mutated(seed.file.read_bytes(), source, text=text, suffix=seed.file.suffix))
-    return home if seed.whole_folder and seed.kind == "rig" else path
+    else:
+        content = seed.file.read_bytes()
+        path.write_bytes(mutated(content, source, text=not binary, suffix=seed.file.suffix))
+    return read
+
+
+def refused(error: Exception, path: Path | None = None) -> str:
+    """A refusal is one line, and names the file."""
+    one_line = "\n" not in str(error) and (path is None or str(path) in str(error))
+    return "refused" if one_line else f"message: {error}"
 
 
 def _linked_in_a_circle(path: Path) -> None:
@@ -239,7 +249,7 @@ def read_and_write(path: Path, source: random.Random) -> str:
     try:
         image = read_image(path, hw=source.choice([None, None, (60, 80)]))
     except (ValueError, FileNotFoundError) as error:
-        return "refused" if "\n" not in str(error) and str(path) in str(error) else f"message: {error}"
+        return refused(error, path)
     if not (image.isfinite().all() and image.min() >= 0 and image.max() <= 1):
         return "values outside 0..1"
     write_image(path.with_name("again.png"), image)
@@ -274,7 +284,7 @@ def watch_video(path: Path, _: random.Random) -> str:
     try:
         video = read_video(path)
     except (ValueError, FileNotFoundError) as error:
-        return "refused" if "\n" not in str(error) and str(path) in str(error) else f"message: {error}"
+        return refused(error, path)
     whole = all(frame.isfinite().all() for frame in itertools.islice(video.frames, 100))
     return "read" if whole and 0 < video.rate < float("inf") else f"{video.rate} frames a second"
 
@@ -296,7 +306,7 @@ def use_weights(path: Path, _: random.Random) -> str:
     try:
         load_weights(path)
     except (ValueError, FileNotFoundError) as error:
-        return "refused" if "\n" not in str(error) and str(path) in str(error) else f"message: {error}"
+        return refused(error, path)
     return "read"
 
 
@@ -323,7 +333,7 @@ def use_checkpoint(path: Path, _: random.Random) -> str:
             return "no checkpoint, and none was named"
         restore(found, *training())
     except ValueError as error:
-        return "refused" if "\n" not in str(error) else f"message: {error}"
+        return refused(error)
     facts = found.facts
     whole = (
         isinstance(facts["step"], int)
@@ -343,7 +353,7 @@ def use_covariance(path: Path, _: random.Random) -> str:
     try:
         found = RigCovariance.load(path)
     except (ValueError, FileNotFoundError) as error:
-        return "refused" if "\n" not in str(error) and str(path) in str(error) else f"message: {error}"
+        return refused(error, path)
     whole = np.isfinite(found.matrix).all() and all(isinstance(name, str) for name in found.names)
     return "read" if whole else f"{found.names} {found.matrix}"
 

@@ -16,86 +16,14 @@ from .pieces import PIECES, rearranged
 LOADER, DUMPER = (getattr(yaml, f"C{name}", getattr(yaml, name)) for name in ("SafeLoader", "SafeDumper"))
 NUMBER = re.compile(rb"(?<![\w.])-?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?![\w.])")
 EXTREMES = (
-    *(
-        b"0",
-        b"-1",
-        b"1",
-        b"nan",
-        b".nan",
-        b"NaN",
-        b"inf",
-        b"-.inf",
-        b"Infinity",
-        b"1e308",
-        b"-1e308",
-        b"1e-308",
-        b"1e400",
-    ),
-    *(
-        b"99999999999999999999",
-        b"2147483648",
-        b"4294967296",
-        b"65536",
-        b"1e76",
-        b"0x10",
-        b"1_000",
-        b"1e9",
-        b"3.5",
-        b"-0",
-    ),
-    *(
-        b"",
-        b"null",
-        b"true",
-        b"abc",
-        b'"1"',
-        b"[]",
-        b"{}",
-        b"[1]",
-        b"[[1, 2], 3]",
-        b"{a: 1}",
-        b"~",
-        b"2001-01-01",
-        b"*a",
-    ),
-)
+    b"0|-1|1|nan|.nan|NaN|inf|-.inf|Infinity|1e308|-1e308|1e-308|1e400|99999999999999999999|2147483648"
+    b'|4294967296|65536|1e76|0x10|1_000|1e9|3.5|-0||null|true|abc|"1"|[]|{}|[1]|[[1, 2], 3]|{a: 1}'
+    b"|~|2001-01-01|*a"
+).split(b"|")
 VALUES: tuple[Any, ...] = (
-    *(
-        None,
-        True,
-        False,
-        0,
-        -1,
-        1,
-        2,
-        1e308,
-        -1e308,
-        1e-308,
-        float("nan"),
-        float("inf"),
-        10**20,
-        2**31,
-        1e76,
-        1e9,
-        3.5,
-    ),
-    *(
-        "",
-        "a",
-        "1",
-        "\0",
-        "é" * 20,
-        "x" * 5000,
-        [],
-        {},
-        [1],
-        [[]],
-        [1, "a"],
-        {"a": 1},
-        [None],
-        [[1, 2], [3]],
-        [0] * 2000,
-    ),
+    *(None, True, False, 0, -1, 1, 2, 1e308, -1e308, 1e-308, float("nan"), float("inf"), 10**20, 2**31),
+    *(1e76, 1e9, 3.5, "", "a", "1", "\0", "é" * 20, "x" * 5000, [], {}, [1], [[]], [1, "a"], {"a": 1}),
+    *([None], [[1, 2], [3]], [0] * 2000),
 )
 BINARY = (0, 1, 0x7F, 0x80, 0xFF)
 WORDS = (0, 1, -1, 2**31 - 1, -(2**31), 10**6, 2**24)
@@ -263,11 +191,8 @@ def structure(source: random.Random, content: bytes, suffix: str) -> bytes:
     if b"&" in content:  # aliases may stand for more than can be walked through
         return number(source, content)
     try:
-        document = (
-            json.loads(content)
-            if suffix == ".json"
-            else yaml.load(content.replace(b"%YAML:1.0", b""), LOADER)
-        )
+        plain = content.replace(b"%YAML:1.0", b"")
+        document = json.loads(content) if suffix == ".json" else yaml.load(plain, LOADER)
         nodes = list(_nodes(document))
     except Exception:
         return number(source, content)
@@ -282,12 +207,9 @@ def structure(source: random.Random, content: bytes, suffix: str) -> bytes:
     else:
         value = parent[key]
         parent[key] = [value, value] if source.randrange(2) else {"a": value}
-    written = (
-        json.dumps(document, default=str)
-        if suffix == ".json"
-        else yaml.dump(document, Dumper=DUMPER, default_flow_style=None)
-    )
-    return written.encode()
+    if suffix == ".json":
+        return json.dumps(document, default=str).encode()
+    return yaml.dump(document, Dumper=DUMPER, default_flow_style=None).encode()
 
 
 def _nodes(document: Any) -> list[tuple[Any, Any]]:
@@ -299,17 +221,6 @@ def _nodes(document: Any) -> list[tuple[Any, Any]]:
 
 
 TEXT: tuple[Mutation, ...] = (
-    truncate,
-    flip,
-    insert,
-    remove,
-    number,
-    number,
-    number,
-    lines,
-    token,
-    token,
-    recode,
-    deepen,
+    *(truncate, flip, insert, remove, number, number, number, lines, token, token, recode, deepen),
 )
 BYTES: tuple[Mutation, ...] = (truncate, flip, flip, overwrite_word, overwrite_word, insert, remove)

@@ -6,6 +6,7 @@ import random
 import struct
 import zlib
 from collections.abc import Callable
+from functools import partial
 
 Span = tuple[int, int]
 
@@ -52,22 +53,6 @@ def _walked(content: bytes, start: int, form: str, extra: int) -> list[Span]:
     return spans
 
 
-def _png(content: bytes) -> list[Span]:
-    return _walked(content, 8, ">I", 12)
-
-
-def _webp(content: bytes) -> list[Span]:
-    return _walked(content, 12, "<4xI", 8)
-
-
-def _jpeg(content: bytes) -> list[Span]:
-    return _walked(content, 2, ">2xH", 2)
-
-
-def _mp4(content: bytes) -> list[Span]:
-    return _walked(content, 0, ">I", 0)
-
-
 def _tiff(content: bytes) -> list[Span]:
     try:
         start = struct.unpack_from("<I", content, 4)[0]
@@ -78,17 +63,17 @@ def _tiff(content: bytes) -> list[Span]:
 
 
 PIECES: dict[str, Callable[[bytes], list[Span]]] = {
-    ".png": _png,
-    ".webp": _webp,
-    ".jpg": _jpeg,
-    ".mp4": _mp4,
+    ".png": partial(_walked, start=8, form=">I", extra=12),
+    ".webp": partial(_walked, start=12, form="<4xI", extra=8),
+    ".jpg": partial(_walked, start=2, form=">2xH", extra=2),
+    ".mp4": partial(_walked, start=0, form=">I", extra=0),
     ".tif": _tiff,
 }
 
 
 def _with_checksums(content: bytes) -> bytes:
     made = [content[:8]]
-    for first, last in _png(content):
+    for first, last in PIECES[".png"](content):
         body = content[first + 4 : last - 4]
         made.append(content[first : first + 4] + body + struct.pack(">I", zlib.crc32(body)))
     return b"".join(made)

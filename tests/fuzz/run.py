@@ -23,10 +23,9 @@ from typing import NamedTuple
 import torch
 import tyro
 
-from arraygeom.atomic import write_text
-from docs.update_readme import with_block
+from docs.update_readme import write_block
 
-from .cases import KINDS, Check, Seed, damaged
+from .cases import KINDS, Check, Seed, damaged, placed
 from .sandbox import Outcome, ended
 
 FAULTS = Path("out/fuzz")
@@ -59,14 +58,11 @@ class Fuzz:
         rows, begin = [], time.monotonic()
         for kind in KINDS if self.only is None else [self.only]:
             rows += table_rows(kind, faults_of(kind, round(KINDS[kind][2] * self.share), self.first))
-        lines = [
-            "| kind | format | cases | read | refused | faults | slowest | largest |",
-            "|---|---|---:|---:|---:|---:|---:|---:|",
-        ]
-        text = "\n".join([*lines, *rows])
+        head = "| kind | format | cases | read | refused | faults | slowest | largest |"
+        text = "\n".join([head, "|---|---|---:|---:|---:|---:|---:|---:|", *rows])
         print(f"{text}\n{(time.monotonic() - begin) / 60:.0f} minutes")
         if self.out is not None:
-            write_text(self.out, with_block(self.out.read_text(), "fuzzing", text))
+            write_block(self.out, "fuzzing", text)
         return int(FAULTS.exists())
 
 
@@ -92,18 +88,9 @@ def faults_of(kind: str, cases: int, first: int = 0) -> list[Case]:
 
 def warm_up(seeds: list[Seed], check: Check, folder: Path) -> None:
     """Ask for undamaged files in this process, so that what is imported late is there before it forks."""
-    home = folder / "case"
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         for i, seed in enumerate(seeds):
-            shutil.rmtree(home, ignore_errors=True)
-            if seed.whole_folder:
-                shutil.copytree(seed.file.parent, home)
-            else:
-                home.mkdir(parents=True)
-                shutil.copy(seed.file, home)
-            check(
-                home if seed.whole_folder and seed.kind == "rig" else home / seed.file.name, random.Random(i)
-            )
+            check(placed(seed, folder / "case")[1], random.Random(i))
 
 
 def keep(case: Case, home: Path, log: Path) -> None:
@@ -128,10 +115,8 @@ def table_rows(kind: str, cases: list[Case]) -> list[str]:
     for format, found in by_format.items():
         counts = [sum(o.verdict == v for o in found) for v in ("read", "refused")]
         worst = f"{max(o.seconds for o in found):.1f} s | {max(o.peak for o in found) / 2**20:.0f} MiB"
-        rows.append(
-            f"| {kind} | {format} | {len(found)} | {counts[0]} | {counts[1]} "
-            f"| {len(found) - sum(counts)} | {worst} |"
-        )
+        figures = len(found), *counts, len(found) - sum(counts)
+        rows.append(f"| {kind} | {format} | {' | '.join(map(str, figures))} | {worst} |")
     return rows
 
 

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import faulthandler
 import os
 import resource
 import signal
-import sys
 import time
-import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
-
 from pat.support.memory import give_back
+from tests.processes import forked
 
 MEMORY = 4 << 30
 SECONDS = 10
@@ -42,10 +38,7 @@ def ended(case: Callable[[], str], log: Path) -> Outcome:
     """
     give_back()  # or the child takes what its parent freed and holds, which is not counted
     begin, (reader, writer) = time.monotonic(), os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.write(writer, str(_resident()).encode())
-        _child(case, log)
+    child = forked(lambda: _limited(case, writer), log)
     held = int(os.read(reader, 32))
     os.close(reader)
     os.close(writer)
@@ -81,28 +74,15 @@ def _wait(child: int, begin: float) -> tuple[int, resource.struct_rusage]:
         pause = min(pause * 1.5, 0.05)
 
 
-def _child(case: Callable[[], str], log: Path) -> None:
-    """Does not return."""
-    code = 2
-    try:
-        torch.set_num_threads(1)  # the threads of the forking process are not there
-        handle = os.open(log, os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
-        os.dup2(handle, 1)
-        os.dup2(handle, 2)
-        sys.stdout, sys.stderr = (open(n, "w", closefd=False) for n in (1, 2))  # noqa: SIM115
-        faulthandler.disable()
-        resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        spent = resource.getrusage(resource.RUSAGE_SELF)
-        limit = int(spent.ru_utime + spent.ru_stime) + SECONDS
-        resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 1))
-        verdict = case()
-        code = {"read": 0, "refused": 1}.get(verdict, 2)
-        if code == 2:
-            print(verdict)
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+def _limited(case: Callable[[], str], writer: int) -> int:
+    """The exit status of a case within the limits; what the child holds before is written to a pipe."""
+    os.write(writer, str(_resident()).encode())
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
+    spent = resource.getrusage(resource.RUSAGE_SELF)
+    limit = int(spent.ru_utime + spent.ru_stime) + SECONDS
+    resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 1))
+    verdict = case()
+    code = {"read": 0, "refused": 1}.get(verdict, 2)
+    if code == 2:
+        print(verdict)
+    return code

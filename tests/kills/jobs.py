@@ -39,51 +39,44 @@ cameras:
 """
 
 
+Arguments = Callable[[Path], list[str]]
+
+
+def whole(last: str) -> Callable[[Path, list[dict[str, bytes]]], list[str]]:
+    """What is wrong with the files of a folder, of which `last` is written last."""
+    return lambda out, versions: mixed(files_of(out), versions, last)
+
+
 def conversion_job(folder: Path) -> Job:
     """A rig written as a COLMAP model, over that of another rig."""
     rig = read_rig(FIXTURES / "kalibr.yaml")
     for name, made in (("new", rig), ("old", rig.with_camera("cam0", rig["cam1"]))):
         made.save(folder / f"{name}.yaml")
 
-    def arguments(name: str) -> Callable[[Path], list[str]]:
+    def arguments(name: str) -> Arguments:
         return lambda out: ["rig", "convert", str(folder / f"{name}.yaml"), str(out), "--write-as", "colmap"]
 
-    def faults(out: Path, versions: list[dict[str, bytes]]) -> list[str]:
-        return mixed(files_of(out), versions, "images.txt")
-
-    return Job("conversion", arguments("new"), files_of, faults, former=arguments("old"))
+    return Job("conversion", arguments("new"), files_of, whole("images.txt"), former=arguments("old"))
 
 
 def frame_job(folder: Path) -> Job:
     """One frame, over the results of another one."""
     options = ["--no-report", "--points", "--threads", "1"]
 
-    def arguments(i: int) -> Callable[[Path], list[str]]:
-        return lambda out: [
-            *_fuse(folder),
-            *_images(folder, f"fast_{i}.png", "slow_0.png"),
-            "--out",
-            str(out),
-            *options,
-        ]
+    def arguments(i: int) -> Arguments:
+        images = _images(folder, f"fast_{i}.png", "slow_0.png")
+        return lambda out: [*_fuse(folder), *images, "--out", str(out), *options]
 
-    def faults(out: Path, versions: list[dict[str, bytes]]) -> list[str]:
-        return mixed(files_of(out), versions, "fused.png")
-
-    return Job("fuse", arguments(0), files_of, faults, former=arguments(1))
+    return Job("fuse", arguments(0), files_of, whole("fused.png"), former=arguments(1))
 
 
 def batch_job(folder: Path, *more: str, name: str = "batch") -> Job:
     """Several frames, each as its own files. Those that were there are kept."""
 
+    further = more or ("--threads", "1")
+
     def arguments(out: Path) -> list[str]:
-        return [
-            *_fuse(folder),
-            *_images(folder, "", "many"),
-            "--out",
-            str(out),
-            *(more or ("--threads", "1")),
-        ]
+        return [*_fuse(folder), *_images(folder, "", "many"), "--out", str(out), *further]
 
     return Job(name, arguments, _frames_of, _frames_mixed, again=("--resume",), kept=_times)
 
@@ -111,15 +104,8 @@ def _fuse(folder: Path) -> list[str]:
             write_image(folder / "fusion" / "many" / f"{i}.png", frames["slow"][0])
         moving.rig(0.003).save(folder / "fusion" / "rig.yaml")
     made = folder / "fusion"
-    return [
-        "fuse",
-        str(made / "rig.yaml"),
-        "--alpha",
-        "fast",
-        "--weights",
-        str(made / "tiny.safetensors"),
-        "--no-align",
-    ]
+    weights = str(made / "tiny.safetensors")
+    return ["fuse", str(made / "rig.yaml"), "--alpha", "fast", "--weights", weights, "--no-align"]
 
 
 def _images(folder: Path, fast: str, slow: str) -> list[str]:
@@ -192,27 +178,17 @@ def calibration_job(folder: Path) -> Job:
         for name, c in cameras.items():
             (photos / name).mkdir(parents=True)
             for i in range(6):
-                image = photograph(
-                    c, c.cam_from_world @ Pose(boards.R[i], boards.t[i]), parse_board(BOARD), dpi=60
-                )
+                pose = c.cam_from_world @ Pose(boards.R[i], boards.t[i])
+                image = photograph(c, pose, parse_board(BOARD), dpi=60)
                 cv2.imwrite(str(photos / name / f"{i}.png"), image)
 
-    def arguments(lens: str) -> Callable[[Path], list[str]]:
-        return lambda out: [
-            "calibrate",
-            str(photos),
-            "--board",
-            BOARD,
-            "--lens",
-            lens,
-            "-o",
-            str(out / "rig.yaml"),
-        ]
+    def arguments(lens: str) -> Arguments:
+        given = ["calibrate", str(photos), "--board", BOARD, "--lens", lens]
+        return lambda out: [*given, "-o", str(out / "rig.yaml")]
 
-    def faults(out: Path, versions: list[dict[str, bytes]]) -> list[str]:
-        return mixed(files_of(out), versions, "rig.yaml")
-
-    return Job("calibration", arguments("brown-conrady"), files_of, faults, former=arguments("none"))
+    return Job(
+        "calibration", arguments("brown-conrady"), files_of, whole("rig.yaml"), former=arguments("none")
+    )
 
 
 def rendering_job(folder: Path, backend: str = "layered", scenes: int = 4) -> Job:
@@ -230,9 +206,7 @@ def rendering_job(folder: Path, backend: str = "layered", scenes: int = 4) -> Jo
 
     def compared(out: Path) -> dict[str, bytes]:
         made = files_of(out / "scenes")
-        return {
-            name: content for name, content in made.items() if not name.endswith(("farm.json", "render.json"))
-        }
+        return {n: content for n, content in made.items() if not n.endswith(("farm.json", "render.json"))}
 
     def faults(out: Path, versions: list[dict[str, bytes]]) -> list[str]:
         found, wrong = compared(out), []
@@ -246,13 +220,8 @@ def rendering_job(folder: Path, backend: str = "layered", scenes: int = 4) -> Jo
     def kept(out: Path) -> dict[str, int]:
         return {path.name: path.stat().st_mtime_ns for path in (out / "scenes").glob("*")}
 
-    return Job(
-        "rendering" if backend == "layered" else "rendering by Blender",
-        arguments,
-        compared,
-        faults,
-        kept=kept,
-    )
+    name = "rendering" if backend == "layered" else "rendering by Blender"
+    return Job(name, arguments, compared, faults, kept=kept)
 
 
 def all_jobs(folder: Path) -> Iterator[Job]:

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import faulthandler
-import json
 import os
 import resource
 import shutil
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import psutil
-import torch
 
 from pat.cli.main import main
 from tests.kills.long_writes import sitecustomize
+from tests.processes import ROOT, dask_cluster, forked
 
 CHAIN = 3
 """Kills of one folder before it is finished and compared."""
@@ -69,34 +65,21 @@ class Killed(NamedTuple):
 
 def started(arguments: list[str], log: Path, announced: Path | None = None) -> int:
     """`pat` with arguments in a forked process of its own group; writes are long where they are announced."""
-    child = os.fork()
-    if child:
-        return child
-    code = 2
-    try:
+
+    def act() -> int:
         os.setsid()
-        torch.set_num_threads(1)
-        faulthandler.disable()
         signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        handle = os.open(log, os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
-        os.dup2(handle, 1)
-        os.dup2(handle, 2)
-        sys.stdout, sys.stderr = (open(n, "w", closefd=False) for n in (1, 2))  # noqa: SIM115
         if announced is not None:
-            folders = [str(Path(sitecustomize.__file__).parent), str(Path(__file__).parents[2])]
+            folders = [str(Path(sitecustomize.__file__).parent), str(ROOT)]
             os.environ |= {"LONG_WRITES": str(announced), "PYTHONPATH": os.pathsep.join(folders)}
             sitecustomize.lengthen(announced)
-        main(arguments)
-        code = 0
-    except SystemExit as ended:
-        code = ended.code if isinstance(ended.code, int) else 0
-    except BaseException as error:
-        print(repr(error))
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+        try:
+            main(arguments)
+        except SystemExit as ended:
+            return ended.code if isinstance(ended.code, int) else 0
+        return 0
+
+    return forked(act, log)
 
 
 def status_of(child: int, seconds: float | None = None) -> int | None:
@@ -168,11 +151,11 @@ def killed(job: Job, right: Reference, folder: Path, *, way: str, kills: int, se
             done += hit
             if hit and out.exists():
                 faults += job.faults(out, right.versions)
-            faults += [f"{name} was made again" for name in kept if kept[name] != job.kept(out).get(name)]
+            faults += _made_again(job, out, kept)
             kept = job.kept(out) if out.exists() else {}
         _succeed([*job.arguments(out), *more], folder)
         finished += 1
-        faults += [f"{name} was made again" for name in kept if kept[name] != job.kept(out).get(name)]
+        faults += _made_again(job, out, kept)
         faults += _different(job, out, right.contents) + left_over(out)
     return Killed(done, finished, [f"{job.name}, {way}: {fault}" for fault in faults])
 
@@ -250,6 +233,11 @@ def _different(job: Job, out: Path, contents: dict[str, bytes]) -> list[str]:
     return [f"not the same in the end: {name}" for name in names]
 
 
+def _made_again(job: Job, out: Path, kept: dict[str, int]) -> list[str]:
+    now = job.kept(out) if kept else {}
+    return [f"{name} was made again" for name in kept if kept[name] != now.get(name)]
+
+
 def left_over(out: Path) -> list[str]:
     """Temporary files in a folder whose command came to its end."""
     hidden = [path.relative_to(out) for path in out.rglob(".*") if path.name != ".work"]
@@ -275,43 +263,11 @@ def mixed(found: dict[str, bytes], versions: list[dict[str, bytes]], last: str) 
     if torn or last not in found:
         return [f"torn: {name}" for name in torn]
     made = [right for right in versions if right.get(last) == found[last]]
-    return (
-        []
-        if any(found == right for right in made)
-        else [f"beside {last} are files of another making, or missing"]
-    )
+    whole = any(found == right for right in made)
+    return [] if whole else [f"beside {last} are files of another making, or missing"]
 
 
 # Dask's scheduler -------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def dask_cluster(folder: Path) -> Iterator[tuple[str, subprocess.Popen]]:
-    """A scheduler and a worker as processes of their own; the address, and the scheduler's process."""
-    facts = folder / "scheduler.json"
-    facts.unlink(missing_ok=True)
-    module = (
-        [sys.executable, "-m", "distributed.cli.dask_scheduler"],
-        [sys.executable, "-m", "distributed.cli.dask_worker"],
-    )
-    own = ["--no-dashboard", "--scheduler-file", str(facts)]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
-    running: list[subprocess.Popen] = []
-    try:
-        for command in (
-            [*module[0], "--host", "127.0.0.1", "--port", "0", *own],
-            [*module[1], "--nthreads", "1", *own],
-        ):
-            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
-            running.append(subprocess.Popen(command, env=environment, **quiet))  # type: ignore[call-overload]
-            while not facts.exists() or not facts.read_text().endswith("}"):
-                time.sleep(0.05)
-        yield json.loads(facts.read_text())["address"], running[0]
-    finally:
-        for process in running:
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
 
 
 def scheduler_killed(job: Job, right: Reference, folder: Path, *, kills: int, seed: int = 0) -> Killed:
@@ -334,7 +290,7 @@ def scheduler_killed(job: Job, right: Reference, folder: Path, *, kills: int, se
         kept = job.kept(out)
         with dask_cluster(folder) as (address, _):
             _succeed([*job.arguments(out), *job.again, "--scheduler", address], folder)
-        faults += [f"{name} was made again" for name in kept if kept[name] != job.kept(out).get(name)]
+        faults += _made_again(job, out, kept)
         faults += _different(job, out, right.contents) + left_over(out)
     return Killed(kills, kills, [f"{job.name}, scheduler: {fault}" for fault in faults])
 

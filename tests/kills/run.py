@@ -16,8 +16,7 @@ from pathlib import Path
 import torch
 import tyro
 
-from arraygeom.atomic import write_text
-from docs.update_readme import with_block
+from docs.update_readme import write_block
 
 from .jobs import all_jobs
 from .killing import Job, Killed, killed, reference, scheduler_killed
@@ -70,11 +69,8 @@ class Kills:
                     print(rows[job.name], *faults, sep="\n", file=sys.stderr, flush=True)
         print("\n".join([table(rows), *faults, f"{(time.monotonic() - begin) / 60:.0f} minutes"]))
         if self.out is not None:
-            document = self.out.read_text()
-            write_text(
-                self.out,
-                with_block(document, "kills", table(rows_of(document) | rows if self.only else rows)),
-            )
+            kept = rows_of(self.out.read_text()) if self.only else {}
+            write_block(self.out, "kills", table(kept | rows))
         return int(bool(faults))
 
     def _kill(self, job: Job, folder: Path) -> dict[str, Killed]:

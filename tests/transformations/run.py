@@ -13,6 +13,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -20,8 +21,7 @@ import tyro
 from torch import Tensor
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
-from arraygeom.atomic import write_text
-from docs.update_readme import with_block
+from docs.update_readme import write_block
 
 from .operators import OPERATORS, Operator
 
@@ -61,12 +61,8 @@ def check_vmap(o: Operator) -> None:
     _near(vmap(o.f)(xs), torch.stack([o.f(x) for x in xs]), 1e-9)
 
 
-def check_jacrev(o: Operator) -> None:
-    _near(jacrev(o.f)(o.x).reshape(-1, len(o.x)), differences(o.f, o.x))
-
-
-def check_jacfwd(o: Operator) -> None:
-    _near(jacfwd(o.f)(o.x).reshape(-1, len(o.x)), differences(o.f, o.x))
+def check_jacobian(jacobian: Callable, o: Operator) -> None:
+    _near(jacobian(o.f)(o.x).reshape(-1, len(o.x)), differences(o.f, o.x))
 
 
 def check_hessian(o: Operator) -> None:
@@ -97,8 +93,8 @@ CHECKS: dict[str, Callable[[Operator], None]] = {
     "vjp": check_vjp,
     "jvp": check_jvp,
     "vmap": check_vmap,
-    "jacrev": check_jacrev,
-    "jacfwd": check_jacfwd,
+    "jacrev": partial(check_jacobian, jacrev),
+    "jacfwd": partial(check_jacobian, jacfwd),
     "hessian": check_hessian,
     "compile": check_compile,
     "autocast": check_autocast,
@@ -160,7 +156,7 @@ class Table:
         text = "\n".join([*lines, "", *(f"{i}. {message}" for i, message in enumerate(notes, 1))])
         print(text)
         if self.out is not None:
-            write_text(self.out, with_block(self.out.read_text(), "transformations", text))
+            write_block(self.out, "transformations", text)
         return int(wrong > 0)
 
 

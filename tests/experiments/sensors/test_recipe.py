@@ -9,7 +9,6 @@ from experiments.sensors import (
     DecodeSRGB,
     Defocus,
     Demosaic,
-    EncodeSRGB,
     Spectral,
     read_chain,
     read_chains,
@@ -19,7 +18,7 @@ from pat.sensors import Clip, Noise, Quantise, Resample
 
 TEXT = """
 mono:
-  - linear
+  - decode-srgb
   - spectral: luminance
   - defocus: {focus: 3, f_number: 2.8, lens: 25, shape: gaussian}
   - resample: 0.5
@@ -33,14 +32,6 @@ blue:
   - demosaic: {pattern: BGGR, method: edge-aware}
   - spectral: {response: {wavelength: [400, 500], response: [1, 1]}}
 """
-
-
-def test_former_names_of_the_srgb_conversions_are_read():
-    assert (
-        read_chain(["linear", "coded"])
-        == read_chain(["decode-srgb", "encode-srgb"])
-        == (DecodeSRGB(), EncodeSRGB())
-    )
 
 
 def test_a_file_says_what_each_camera_does():
@@ -61,7 +52,7 @@ def test_every_step_has_a_name():
 
 def test_a_chain_from_a_file_runs():
     chain = read_chain(
-        yaml.safe_load("[linear, {vignetting: {falloff: [-0.2]}}, mosaic, demosaic, coded, {quantise: 8}]")
+        ["decode-srgb", {"vignetting": {"falloff": [-0.2]}}, "mosaic", "demosaic", "encode-srgb"]
     )
     assert record(torch.rand(1, 3, 8, 8), chain, torch.Generator()).image.shape == (1, 3, 8, 8)
 
@@ -71,7 +62,7 @@ def test_a_chain_from_a_file_runs():
     [
         ("[{nois: {full_well: 3}}]", r"chain\[0\]: no step is called 'nois'; did you mean 'noise'"),
         (
-            "[linear, {noise: {fullwell: 3}}]",
+            "[clip, {noise: {fullwell: 3}}]",
             r"chain\[1\].noise.fullwell: unknown key; did you mean 'full_well'",
         ),
         ("[{noise: {read: 3}}]", r"full_well: missing"),
@@ -85,8 +76,8 @@ def test_a_chain_from_a_file_runs():
         ("[{crop: {top: 0, left: 0, hw: [3]}}]", r"hw: has 1 entries; wanted 2"),
         ("[{mosaic: RGBG}]", r"pattern: is 'RGBG'; did you mean 'RGGB'"),
         ("[{clip: 3}]", r"clip: takes no options"),
-        ("[[linear]]", r"wanted a step's name"),
-        ("{linear: 1}", r"wanted a list of steps"),
+        ("[[clip]]", r"wanted a step's name"),
+        ("{clip: 1}", r"wanted a list of steps"),
     ],
 )
 def test_typos_are_named_with_their_entry(text, words):

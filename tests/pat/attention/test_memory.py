@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks.bench_attention import job, measure
+from tests.benchmarks.bench_attention import Job, measure
 
 RESETS_PEAK = Path("/proc/self/clear_refs").exists()
 
@@ -14,7 +14,7 @@ RESETS_PEAK = Path("/proc/self/clear_refs").exists()
 @pytest.mark.parametrize(("backward", "most"), [(False, 1.2), (True, 3.0)])
 def test_memory_is_that_of_the_images(interpolation, backward, most):
     few, many = (
-        measure(job("cpu", "cpu", interpolation, 128, 512, samples, backward) | {"repeats": 1})
+        measure(Job("cpu", "cpu", interpolation, 128, 512, samples, backward, repeats=1))
         for samples in (40, 640)
     )
     assert few["extra"] < most * few["unit"]

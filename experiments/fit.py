@@ -1,0 +1,86 @@
+"""Training of any network by any loss: one loop, whose runs continue where they stopped."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor, nn
+from torch.optim import Adam
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from pat.training.checkpoints import collect, newest_checkpoint, restore, write_checkpoint
+
+Losses = Callable[[int], Iterator[Tensor]]
+"""The loss of each step from a given one on, computed when it is asked for."""
+
+
+def fit(
+    network: nn.Module,
+    losses: Losses,
+    out: Path,
+    recipe: str,
+    *,
+    steps: int,
+    rate: float,
+    save: int,
+    validate: int,
+    average: int = 300,
+    examine: Callable[[Any], dict[str, float]] = lambda network: {},
+    keep: Callable[[Any, int], None] = lambda network, step: None,
+) -> nn.Module:
+    """Train a network for so many steps, or the rest of the run in `out`; returns it with averaged weights.
+
+    The rate falls along half a cosine; `average` is the time constant in steps. The averaged network is
+    validated by `examine`, and given to `keep` with each checkpoint. Raises RuntimeError if a gradient is not
+    finite, ValueError for a folder with another run.
+    """
+    averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / average))
+    adam = Adam(network.parameters(), lr=rate, betas=(0.9, 0.99))
+    former, step = newest_checkpoint(out / "checkpoints"), 0
+    if former:
+        if former.facts["recipe"] != recipe:
+            other = former.facts["recipe"]
+            raise ValueError(f"{out} holds a run of another recipe ({other}): give another --out")
+        restore(former, network, adam, averaged)
+        step = former.facts["step"]
+    if step == 0 and (facts := examine(averaged.module)):
+        _log(out, {"step": 0} | facts)
+    given = losses(step)
+    while step < steps:
+        for group in adam.param_groups:
+            group["lr"] = rate * min(0.5 + 0.5 * math.cos(math.pi * step / steps), (step + 1) / 100)
+        loss = next(given)
+        adam.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(network.parameters(), 1.0, error_if_nonfinite=True)
+        adam.step()
+        averaged.update_parameters(network)
+        step += 1
+        done = step == steps
+        if step % validate == 0 or done:
+            _log(out, {"step": step, "loss": float(loss.detach())} | examine(averaged.module))
+        if step % save == 0 or done:
+            keep(averaged.module, step)
+            state = {"step": step, "best": 0.0, "minutes": 0.0, "done": done, "recipe": recipe}
+            write_checkpoint(out / "checkpoints", collect(network, adam, averaged, state))
+    return averaged.module
+
+
+def _log(out: Path, facts: dict[str, float]) -> None:
+    """Print a line of a run's log.jsonl."""
+    line = json.dumps({name: round(value, 4) for name, value in facts.items()})
+    print(line, flush=True)
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / "log.jsonl").open("a", encoding="utf-8") as file:
+        file.write(line + "\n")
+
+
+def recipe_text(config: Any, *unseen: str) -> str:
+    """A recipe without the entries that may differ between a run and its continuation."""
+    left_out = {"out", "cache", "save", "validate", *unseen}
+    return json.dumps({k: v for k, v in asdict(config).items() if k not in left_out}, default=str)
