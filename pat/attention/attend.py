@@ -110,9 +110,8 @@ def attend_with_statistics(
 
     The statistics are float32 (float64 for float64 inputs) and differentiable, too.
     """
-    return Attended(
-        *_attend(query, key, value, locations, samples, interpolation, bias, backend, measured=True)
-    )
+    how = samples, interpolation, bias, backend
+    return Attended(*_attend(query, key, value, locations, *how, measured=True))
 
 
 def _attend(
@@ -238,9 +237,8 @@ def sample_positions(locations: Locations, query: Tensor, samples: int | None) -
 
 def samples_for(segments: Segments) -> int:
     """Enough samples for one on each beta pixel of the longest valid segment."""
-    needs_numbers(
-        "the number of samples of the longest segment (give `samples`)", segments.start, segments.end
-    )
+    what = "the number of samples of the longest segment (give `samples`)"
+    needs_numbers(what, segments.start, segments.end)
     lengths = torch.where(segments.valid, segments.length.detach(), 0)
     return int(lengths.max().ceil()) + 1
 

@@ -74,9 +74,8 @@ def backward(
     counted = accumulated(query)
     call = _call(inputs)
     upstream = _flat(channels_last(cotangents[0]))
-    statistics, statistics_upstream = (
-        t if t.numel() else t.new_zeros(4) for t in (saved[0], cotangents[1].to(counted).contiguous())
-    )
+    measured = saved[0], cotangents[1].to(counted).contiguous()
+    statistics, statistics_upstream = (t if t.numel() else t.new_zeros(4) for t in measured)
     step = 4 if saved[0].numel() else 0
     found = kernels.Saved(_flat(statistics), _flat(saved[1]), upstream, _flat(statistics_upstream), step)
     query_out = _new(*((b, ha, wa, d) if wanted[0] else (0,)), dtype=query.dtype)

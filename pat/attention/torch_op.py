@@ -128,9 +128,8 @@ def _channels_last_like(image: Tensor) -> Tensor:
 def _keep(ctx, inputs, output) -> None:
     query, key, value, points, mask, bias, *ctx.options = inputs
     backend = ctx.options[-2]
-    ctx.save_for_backward(
-        query, key, value, points, mask, bias, *output[1:], output[0] if backend == "triton" else None
-    )
+    out = output[0] if backend == "triton" else None
+    ctx.save_for_backward(query, key, value, points, mask, bias, *output[1:], out)
 
 
 def _differentiate(ctx, value_cotangent, statistics_cotangent, *_):

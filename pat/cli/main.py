@@ -210,9 +210,8 @@ def reworded(box: str) -> str:
     lines = box.strip().splitlines()
     rows = [row.strip("│ ") for row in (lines[1:-1] if box.startswith("╭") else lines[2:])]
     said = [" ".join(text.split()) for text in re.split(r"[─-]{9,}", " ".join(rows))]
-    text = " ".join(
-        part for i, part in enumerate(said) if part and (i == 0 or part.startswith("Perhaps you meant"))
-    )
+    hints = [part for part in said[1:] if part.startswith("Perhaps you meant")]
+    text = " ".join(part for part in (*said[:1], *hints) if part)
     for pattern, words in REWORDED:
         text = re.sub(pattern, words, text)
     return text

@@ -37,9 +37,8 @@ FIELD_NAMES = ("epipolar", "line", "homography", "rectified", "nearest", "local"
 FIELD_HELP = (
     f"Receptive field in the other cameras: {', '.join(FIELD_NAMES)}, or MODULE:OBJECT for your own; "
 )
-FieldName = Annotated[
-    str, arg(metavar="NAME|MODULE:OBJECT", help=f"{FIELD_HELP}auto takes what the rig allows.")
-]
+FIELD_HELP += "auto takes what the rig allows."
+FieldName = Annotated[str, arg(metavar="NAME|MODULE:OBJECT", help=FIELD_HELP)]
 
 
 def response_of(text: str) -> Any:

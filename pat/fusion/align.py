@@ -305,11 +305,8 @@ def _of_alpha(rig: Rig, name: str, recorded: Recorded) -> AlignedView:
     """Alpha's own values, each at its own pixel."""
     hw = rig[name].hw
     values = _as_array(recorded[name], name, hw)
-    grid, ones = pixel_grid(hw).numpy(), np.ones(hw, np.float32)
-    visibility = np.full(hw, SEEN, np.uint8)
-    return AlignedView(
-        values, grid, visibility, ones, _band_names(name, len(values)), rig[name].sensor.response
-    )
+    planes = pixel_grid(hw).numpy(), np.full(hw, SEEN, np.uint8), np.ones(hw, np.float32)
+    return AlignedView(values, *planes, _band_names(name, len(values)), rig[name].sensor.response)
 
 
 def _as_array(values: Any, name: str, hw: tuple[int, int]) -> NDArray[Any]:
@@ -359,9 +356,8 @@ def filled(values: NDArray[Any], valid: NDArray[np.bool_], fill: Fill) -> NDArra
     if fill == "none" or not valid.any():
         nothing = np.nan if np.issubdtype(values.dtype, np.floating) else 0
         return np.where(valid, values, np.asarray(nothing, values.dtype))
-    _, labels = cv2.distanceTransformWithLabels(
-        (~valid).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE, labelType=cv2.DIST_LABEL_PIXEL
-    )
+    how = cv2.DIST_L2, cv2.DIST_MASK_PRECISE
+    _, labels = cv2.distanceTransformWithLabels((~valid).view(np.uint8), *how, labelType=cv2.DIST_LABEL_PIXEL)
     nearest = np.zeros(labels.max() + 1, np.int64)
     nearest[labels[valid]] = np.flatnonzero(valid)
     return values.reshape(len(values), -1)[:, nearest[labels]]

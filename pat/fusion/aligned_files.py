@@ -48,9 +48,8 @@ class RecordedFiles(Mapping[str, NDArray[Any]]):
     def __getitem__(self, name: str) -> NDArray[Any]:
         view = self.rig[name]
         pattern = view.sensor.bayer
-        values = read_recorded(
-            self.files[name], name=name, hw=view.hw, orientation="apply" if pattern is None else "ignore"
-        )
+        turned: Literal["apply", "ignore"] = "apply" if pattern is None else "ignore"
+        values = read_recorded(self.files[name], name=name, hw=view.hw, orientation=turned)
         if pattern is None or not np.issubdtype(values.dtype, np.integer):
             return values
         white = 2 ** (view.sensor.bits or 8 * values.dtype.itemsize) - 1

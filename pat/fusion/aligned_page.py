@@ -120,8 +120,7 @@ def _index_colours(index: NDArray[np.float32]) -> Float[Tensor, "3 h w"]:
     """-1 brown, 0 pale, 1 green; black where unknown."""
     stops = torch.tensor([[0.55, 0.32, 0.04], [0.96, 0.96, 0.86], [0.0, 0.41, 0.22]])
     value = torch.from_numpy(np.nan_to_num(index)).clamp(-1, 1)[..., None]
-    colour = torch.where(
-        value < 0, torch.lerp(stops[1], stops[0], -value), torch.lerp(stops[1], stops[2], value)
-    )
+    brown, green = torch.lerp(stops[1], stops[0], -value), torch.lerp(stops[1], stops[2], value)
+    colour = torch.where(value < 0, brown, green)
     known = torch.from_numpy(np.isfinite(index))[..., None]
     return torch.where(known, colour, 0.0).movedim(-1, 0)

@@ -247,9 +247,8 @@ class Batch:
                 frame = self._frame(i)
             view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
             bands = band_names(frame, (name for name in self.rig.betas(self.alpha) if name in self.files))
-            save_frame(
-                frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i], bands=bands
-            )
+            how: dict[str, Any] = {"bits": self.bits, "kind": self.kind, "view": view}
+            save_frame(frame, self.out, name=self.names[i], bands=bands, **how)
 
     def _frame(self, i: int) -> Frame:
         if not self.sequence:
@@ -339,9 +338,8 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
     path = Path(text)
     label = f"{name}: " if name else ""
     if path.is_dir():
-        found = [
-            p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")
-        ]
+        shown = (p for p in path.iterdir() if not p.name.startswith("."))
+        found = [p for p in shown if p.suffix.lower() in IMAGE_SUFFIXES]
     elif any(c in path.name for c in "*?["):
         found = list(path.parent.glob(path.name))
     else:

@@ -77,9 +77,8 @@ def save_frame(
     depths = {f"{prefix}depth{part}" for part in (".tif", ".png", "_16.png", "_nearest.tif", "_farthest.tif")}
     stale = depths | (set() if name else {"points.ply", "index.html"})
     with write_together(out, last=last, stale=stale) as folder:
-        tasks: list[Callable[[], object]] = [
-            partial(write_image, folder / f"{prefix}confidence.png", frame.confidence[None])
-        ]
+        confidence = partial(write_image, folder / f"{prefix}confidence.png", frame.confidence[None])
+        tasks: list[Callable[[], object]] = [confidence]
         if frame.depth.isfinite().any():
             for part, depth in zip(("", "_nearest", "_farthest"), (frame.depth, *frame.depth_interval)):
                 path = folder / f"{prefix}depth{part}.tif"

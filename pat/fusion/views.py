@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -190,9 +191,8 @@ def read_view(rig: Rig, name: str, path: str | Path, *, like: Sensor) -> Float[T
     """
     view = rig[name]
     raw = view.sensor.bayer is not None
-    image = read_image(
-        path, name=name, bits=view.sensor.bits, hw=view.hw, orientation="ignore" if raw else "apply"
-    )
+    turned: Literal["apply", "ignore"] = "ignore" if raw else "apply"
+    image = read_image(path, name=name, bits=view.sensor.bits, hw=view.hw, orientation=turned)
     if view.sensor.bayer and image.shape[0] != 1:
         raise ValueError(
             f"{name}: {path}: is in colour, and the rig says raw {view.sensor.bayer}: drop 'bayer'"

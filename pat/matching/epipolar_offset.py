@@ -144,10 +144,8 @@ class _Windows(NamedTuple):
         columns, rows = (np.ascontiguousarray(displaced[..., i], np.float32) for i in range(2))
         height, width = self.beta.shape
         inside = (columns > 2) & (rows > 2) & (columns < width - 3) & (rows < height - 3)
-        planes = (self.beta, *self.gradients)
-        value, gx, gy = (
-            cv2.remap(p, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for p in planes
-        )
+        planes, beyond = (self.beta, *self.gradients), cv2.BORDER_REPLICATE
+        value, gx, gy = (cv2.remap(p, columns, rows, cv2.INTER_LINEAR, borderMode=beyond) for p in planes)
         return value, gx, gy, self.weight * inside.astype(np.float32)
 
     def _mean(self, plane: Image, weight: Image) -> Image:

@@ -149,9 +149,8 @@ def collaboratively_filtered(
 
 
 _PHASES = np.outer(np.arange(SIDE), 2 * np.arange(SIDE) + 1) * np.pi / (2 * SIDE)
-COSINES = (np.cos(_PHASES) * np.where(np.arange(SIDE) > 0, 2, 1)[:, None] ** 0.5 / SIDE**0.5).astype(
-    np.float32
-)
+_LENGTHS = np.where(np.arange(SIDE) > 0, 2, 1)[:, None] ** 0.5
+COSINES = (np.cos(_PHASES) * _LENGTHS / SIDE**0.5).astype(np.float32)
 """The cosine transform (DCT-II) as an orthogonal matrix. By scipy it would add to the time of every start."""
 WINDOW = np.outer(np.kaiser(SIDE, 2.0), np.kaiser(SIDE, 2.0)).astype(np.float32)
 """What a block's pixels count when blocks are put together."""

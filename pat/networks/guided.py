@@ -106,9 +106,8 @@ class BetaEstimate(NamedTuple):
     def beyond(self, base: Float[Tensor, "b c h w"], band: int) -> BetaEstimate:
         """One band, counted from a base instead of from alpha; `base` (B, C, H, W) is bands minus alpha."""
         of = slice(band, band + 1)
-        return self._replace(
-            colour=(self.colour - base)[:, of], diffused=(self.diffused - base[:, None])[:, :, of]
-        )
+        colour, diffused = (self.colour - base)[:, of], (self.diffused - base[:, None])[:, :, of]
+        return self._replace(colour=colour, diffused=diffused)
 
 
 class Encoded(NamedTuple):
@@ -146,9 +145,8 @@ class GuidedPAT(nn.Module):
         self.fine_key = nn.Conv2d(w2, 4 * c.fine_dim, 1)
         self.judge = UNet(w4 + 9, c.widths[1:], c.judge_dim)
         self.confidence = ConfidenceHead(c.judge_dim + w2 + 4 + 12, c.confidence_dim)
-        self.propagation = nn.ModuleList(
-            Propagation(w4, c.propagation_dim, spacing) for spacing in c.propagation_steps
-        )
+        rounds = (Propagation(w4, c.propagation_dim, spacing) for spacing in c.propagation_steps)
+        self.propagation = nn.ModuleList(rounds)
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
         """In what is recalled; or around attention, one beta after the other, and the estimates of others."""
