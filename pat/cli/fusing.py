@@ -248,14 +248,29 @@ class Fuse(Known):
         if self.points and not isinstance(rig[alpha], Camera):
             raise ValueError("--points needs a calibrated alpha, and the rig has only F for it: leave it out")
         begin, store = time.monotonic(), self.out / ".tiles"
+
+        def fused(rig: Rig) -> Frame:
+            known, field = self.with_known(rig, alpha, files, options.field_named(self.field))
+            return fuse_with_progress(
+                self.weights or "mono-colour",
+                known,
+                images,
+                alpha=alpha,
+                device=self.device,
+                precision=self.precision,
+                settings=replace(self._settings(), field=field),
+                explain=self._note,
+                store=store,
+            )
+
         with folder_lock(self.out):
             sweep(self.out)
             if not self.resume:
                 shutil.rmtree(store, ignore_errors=True)
-            frame = self._fused(rig, images, alpha, files, store)
+            frame = fused(rig)
             if (healed := healing()) is not None and healed.text not in self._notes:
                 rig = self._healed(rig, healed)
-                frame = self._fused(rig, images, alpha, files, store)
+                frame = fused(rig)
             frame, gain = self._exposed(frame)
             if found is None and not frame.depth.isfinite().any():
                 self._note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
@@ -284,23 +299,6 @@ class Fuse(Known):
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
         if self.report:
             say(f"to see the result, open {self.out / 'index.html'} in a browser")
-
-    def _fused(
-        self, rig: Rig, images: Mapping[str, Tensor], alpha: str, files: Mapping[str, str | Path], store: Path
-    ) -> Frame:
-        """One frame, with a rig and what else is known of the scene."""
-        known, field = self.with_known(rig, alpha, files, options.field_named(self.field))
-        return fuse_with_progress(
-            self.weights or "mono-colour",
-            known,
-            images,
-            alpha=alpha,
-            device=self.device,
-            precision=self.precision,
-            settings=replace(self._settings(), field=field),
-            explain=self._note,
-            store=store,
-        )
 
     def _healed(self, rig: Rig, healed: Healed | None) -> Rig:
         """The rig, or the one that its images healed, which is written beside the results."""
