@@ -73,11 +73,6 @@ class BetaMatches:
         cut: dict[str, Any] = {n: part if part is None else part[names[n]] for n, part in parts.items()}
         return replace(self, **cut)
 
-    def stored(self) -> BetaMatches:
-        """The same with colours as float16; differences from alpha are rounded by 1e-4 at most."""
-        bands, diffused = self.colours
-        return replace(self, bands=bands.half(), diffused=diffused.half())
-
 
 @dataclass(frozen=True)
 class Matches:

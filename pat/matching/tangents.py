@@ -63,7 +63,7 @@ def along_tangents(
         warn(f"the field in '{name}' is a set of positions without an order: each pixel is matched alone")
     with torch.no_grad():
         labels = torch.from_numpy(_labels(alpha, guide, grid, ordered=ordered))
-    lines = grid.tangents(labels) if ordered else _around(grid.chosen(labels), to_bytes(alpha[:, 0])[0])
+    lines = grid.tangents(labels) if ordered else _around(grid.chosen(labels))
     longest = float(torch.where(lines.valid, lines.length.detach(), 0.0).max())
     planes = torch.cat([lines.start, lines.end], -1).movedim(-1, 0)[None]
 
@@ -208,7 +208,7 @@ def _tangents(found: Positions, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]
     return start, end, mask.any(-1)
 
 
-def _around(found: Chosen, guide: NDArray[np.uint8]) -> Segments:
+def _around(found: Chosen) -> Segments:
     """Segments along x around positions chosen alone, which a median makes agree with their neighbours."""
     xy = found.xy.detach().float().numpy()
     smooth = np.stack([cv2.medianBlur(np.ascontiguousarray(xy[..., i]), 5) for i in range(2)], -1)
