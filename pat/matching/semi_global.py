@@ -249,9 +249,9 @@ def _block(image: _Image, box: tuple, windows: Windows, settings: SemiGlobalSett
         claims = image.claims.pop()
     except IndexError:
         claims = np.full(math.prod(image.hw) + 1, 2**31 - 1, np.int32)
-    parts = [np.ascontiguousarray(plane[inner]) for plane in image.found]
-    corner = (i.start - o.start for i, o in zip(inner, outer))
-    kernels.winners(total, *labels, *segments, *image.hw, *corner, jump, claims, *parts)
+    parts = tuple(np.ascontiguousarray(plane[inner]) for plane in image.found)
+    corner = inner[0].start - outer[0].start, inner[1].start - outer[1].start
+    kernels.winners(total, *labels, segments, image.hw, corner, jump, claims, parts)
     image.claims.append(claims)
     for plane, part in zip(image.found, parts):
         plane[inner] = part

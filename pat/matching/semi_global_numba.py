@@ -297,32 +297,18 @@ def _keep(paths, start, stride, runs, penalty, path):
 
 
 @compiled(nogil=True, cache=True)
-def winners(
-    total,
-    first,
-    count,
-    end,
-    along,
-    length,
-    cut,
-    rows,
-    columns,
-    top,
-    left,
-    large,
-    claims,
-    disparity,
-    facts,
-    positions,
-):
-    """Of each pixel of a part that begins at `top`, `left`: the best label, to a fraction (disparity); facts
+def winners(total, first, count, segments, hw, corner, large, claims, found):
+    """Of each pixel of a part that begins at a corner: the best label, to a fraction (disparity); facts
     (h, w, 1 or 3): the whole label, its margin to the second best, and its cost; where it is in beta, pixels
     counted row by row (positions; rows * columns: not on it). `total` is in parts, the larger penalty `large`
     the unit of the facts.
 
     `claims`, of each pixel of beta and one more, keeps the least cost with which a pixel of alpha matches it,
-    and that pixel's label: 16 bits of either.
+    and that pixel's label: 16 bits of either. `segments` are end, along, length and cut, as of `costs`;
+    `found` are disparity, facts and positions.
     """
+    (end, along, length, cut), (rows, columns), (top, left) = segments, hw, corner
+    disparity, facts, positions = found
     height, width, measured = facts.shape[0], facts.shape[1], facts.shape[2] > 1
     _, _, runs, lanes = total.shape
     nowhere, most = rows * columns, np.float32(8 * PARTS) * large
