@@ -79,10 +79,8 @@ def _predicted(
             error = math.hypot(error, MISPLACED)
             value = (weights[:, None, None] * bands[some]).sum(0).clamp(min=0)
             parts = zip(weights, [scale[i] for i in some], bands[some])
-            variance = (
-                sum((w / s) ** 2 * (b * s + READ_NOISE) for w, s, b in parts)
-                + FULL_WELL * (error * value) ** 2
-            )
+            shot = sum((w / s) ** 2 * (b * s + READ_NOISE) for w, s, b in parts)
+            variance = shot + FULL_WELL * (error * value) ** 2
             here = good[some].all(0) & noise.isinf()
             predicted, noise = torch.where(here, value, predicted), torch.where(here, variance, noise)
     return predicted, noise
@@ -156,8 +154,5 @@ def missed(image: Float[Tensor, "1 h w"], light: Float[Tensor, "1 h w"], *, with
     part; blue where noise exceeds it."""
     value = linear_from_srgb(image)
     wrong, clipped = (value - light).abs() > within * light, (value < light) & (value > CLIPPED)
-    red, blue = (
-        image.new_tensor([0.9, 0.1, 0.1])[:, None, None],
-        image.new_tensor([0.15, 0.35, 0.95])[:, None, None],
-    )
+    red, blue = (image.new_tensor(rgb)[:, None, None] for rgb in ([0.9, 0.1, 0.1], [0.15, 0.35, 0.95]))
     return torch.where(wrong & clipped, red, torch.where(wrong, blue, image.expand(3, -1, -1)))

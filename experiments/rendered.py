@@ -7,11 +7,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from jaxtyping import Float
-from torch import Generator, Tensor
+from torch import Tensor
 
 from arraygeom import Camera, Rig
 from experiments.scenes import SCENES
-from experiments.stage import RenderedView, purpose_generator
+from experiments.stage import RenderedView
 from pat.media.colour import srgb_from_linear
 from pat.synthesis.blender import RenderSettings, render
 
@@ -36,10 +36,6 @@ class RenderedScene:
         with TemporaryDirectory() as folder:
             rendered = render(scene, rig.replace(cameras=pinholes), Path(folder) / "scene", settings=settings)
             self.frames = {n: [rendered.frame(n, i) for i in range(rendered.frames(n))] for n in rig.names}
-
-    def generator(self, purpose: str) -> Generator:
-        """Randomness for one purpose, the same each time."""
-        return purpose_generator(self.seed, purpose)
 
     def light(self, name: str, frame: int = 0) -> Float[Tensor, "1 3 h w"]:
         """The linear light a camera receives in a frame; over 1 is brighter than paper in the window."""

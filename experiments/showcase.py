@@ -38,6 +38,31 @@ SYNTIM = ("Serfaty",)
 """Scenes in colour whose calibration fits their images to about a pixel, and on which nothing was chosen."""
 FAST, SLOW = "fast", {"cam1": "F1_ref_to_cam1", "cam2": "F2_ref_to_cam2", "cam3": "F3_ref_to_cam3"}
 """The fast camera is alpha; the slow ones see about 600, 550 and 450 nm: red, green, blue."""
+PAIRS_TEXT = """### Stereo pairs
+
+The left image made grey is alpha, the right one reduced is beta, the left one in colour is the ground
+truth. PSNR in dB / SSIM; behind a mean, its 95% bootstrap interval. Pairs on which settings were chosen are
+left out (`experiments/evaluation/halves.yaml`). Every image is in `pairs/`: beta
+enlarged, alpha, classical, fusion, ground truth.
+
+"""
+SYNTIM_TEXT = """### Calibrated pairs, not rectified (SYNTIM)
+
+Two cameras rotated against each other, K, R and t as published; the depth range is that of matched points,
+widened. Alpha is the left image made grey. The rigs are `syntim_SCENE.yaml`. Between the images of
+Serfaty two binders were moved: their misplaced colour comes from that.
+
+"""
+FAST_SLOW_TEXT = """### The paper's fast + slow array
+
+Alpha is a frame of the fast camera; the slow ones have filters: 600 nm is shown as red, 550 nm as green,
+450 nm as blue. Only fundamental matrices are published. They put points seen in both images some pixels
+beside their lines, so F is fitted to those points, and with it a rough homography H and the displacement
+along the line. All that is in `fast_slow.yaml`. Values are taken to be linear, alpha's brightest 0.5% are
+brought to white, all are sRGB-encoded, and each beta is normalised to alpha's mean and standard deviation:
+so colours are in proportion to a grey world, not measured. There is no ground truth.
+
+"""
 SCENE, FAST_FRAME, SLOW_FRAME = "pillow_1", "141", "4"
 """Frames of about one instant."""
 
@@ -51,35 +76,20 @@ def showcase(data: Path, out: Path, weights: str = "mono-colour", rates: Sequenc
         if not (data / folder).is_dir():
             raise FileNotFoundError(f"{data / folder}: no such folder: give the folder that holds {folder}")
     network = load_weights(weights)
-    scenes, array = (
-        [syntim_scene(data / "syntim", name) for name in SYNTIM],
-        fast_and_slow_array(data / "hfr_lfr"),
-    )
-    parts = (
-        _pairs(network, data, out, rates),
-        _syntim(network, scenes, out),
-        _fast_and_slow(network, array, out),
-    )
-    text = "\n".join(parts)
+    scenes = [syntim_scene(data / "syntim", name) for name in SYNTIM]
+    array = fast_and_slow_array(data / "hfr_lfr")
+    pairs = _pairs(network, data, out, rates)
+    text = "\n".join([pairs, _syntim(network, scenes, out), _fast_and_slow(network, array, out)])
     write_text(out / "showcase.md", text)
     return text
 
 
 def _pairs(network: FusionNetwork, data: Path, out: Path, rates: Sequence[int]) -> str:
-    methods = {name: BASELINES[name] for name in ("alpha", "classical")} | {
-        "fusion": rectified_fusion(network)
-    }
+    methods = {name: BASELINES[name] for name in ("alpha", "classical")}
+    methods["fusion"] = rectified_fusion(network)
     sets = {name: of_half(DATA_SETS[name](data / name), "report") for name in PAIRS}
     rows = evaluate_sets(sets, methods, rates, out=out / "pairs")
-    return (
-        "### Stereo pairs\n\n"
-        "The left image made grey is alpha, the right one reduced is beta, the left one in colour is the "
-        "ground\n"
-        "truth. PSNR in dB / SSIM; behind a mean, its 95% bootstrap interval. Pairs on which settings were "
-        "chosen are\n"
-        "left out (`experiments/evaluation/halves.yaml`). Every image is in `pairs/`: beta\n"
-        f"enlarged, alpha, classical, fusion, ground truth.\n\n{sets_markdown(rows, depth=False)}"
-    )
+    return PAIRS_TEXT + sets_markdown(rows, depth=False)
 
 
 class SyntimScene(NamedTuple):
@@ -102,15 +112,7 @@ def syntim_scene(folder: Path, name: str) -> SyntimScene:
 def _syntim(network: FusionNetwork, scenes: Sequence[SyntimScene], out: Path) -> str:
     rows = [row for scene in scenes for row in _fused_scene(network, scene, out)]
     figures = "".join(f"![{scene.name}](syntim_{scene.name}.png)\n" for scene in scenes)
-    return (
-        "### Calibrated pairs, not rectified (SYNTIM)\n\n"
-        "Two cameras rotated against each other, K, R and t as published; the depth range is that of "
-        "matched points,\n"
-        "widened. Alpha is the left image made grey. The rigs are `syntim_SCENE.yaml`. Between the images "
-        "of\n"
-        "Serfaty two binders were moved: their misplaced colour comes from that.\n\n"
-        f"{markdown(rows)}\n{structure_kept(rows)}\n\n{figures}"
-    )
+    return f"{SYNTIM_TEXT}{markdown(rows)}\n{structure_kept(rows)}\n\n{figures}"
 
 
 def _fused_scene(network: FusionNetwork, scene: SyntimScene, out: Path) -> list[StereoRow]:
@@ -124,11 +126,8 @@ def _fused_scene(network: FusionNetwork, scene: SyntimScene, out: Path) -> list[
         "fusion": frame.image.clamp(0, 1),
     }
     shown = {"alpha: left, grey": images["left"], "beta: right": right, "ground truth: left": left}
-    shown |= {
-        "classical": results["classical"],
-        "fusion": results["fusion"],
-        "depth": colour_depth(frame.depth),
-    }
+    shown |= {name: results[name] for name in ("classical", "fusion")}
+    shown["depth"] = colour_depth(frame.depth)
     save_panels(shown, out / f"syntim_{name}.png", columns=3)
     rig.save(out / f"syntim_{name}.yaml")
     return [StereoRow(name, 1, method, *score(image, left)) for method, image in results.items()]
@@ -164,22 +163,8 @@ def _fast_and_slow(network: FusionNetwork, array: FastSlowArray, out: Path) -> s
     shown |= {"betas by the rough homography alone": transformed(array), "fusion": frame.image}
     save_panels(shown, out / "fast_slow.png", columns=2)
     array.rig.save(out / "fast_slow.yaml")
-    return (
-        "### The paper's fast + slow array\n\n"
-        "Alpha is a frame of the fast camera; the slow ones have filters: 600 nm is shown as red, 550 nm as "
-        "green,\n"
-        "450 nm as blue. Only fundamental matrices are published. They put points seen in both images some "
-        "pixels\n"
-        "beside their lines, so F is fitted to those points, and with it a rough homography H and the "
-        "displacement\n"
-        "along the line. All that is in `fast_slow.yaml`. Values are taken to be linear, alpha's brightest "
-        "0.5% are\n"
-        "brought to white, all are sRGB-encoded, and each beta is normalised to alpha's mean and standard "
-        "deviation:\n"
-        "so colours are in proportion to a grey world, not measured. There is no ground truth.\n\n"
-        f"{array.table}\n"
-        f"Search segments: +-{array.displacement:.0f} pixels of alpha.\n\n![fast + slow](fast_slow.png)\n"
-    )
+    segments = f"Search segments: +-{array.displacement:.0f} pixels of alpha."
+    return f"{FAST_SLOW_TEXT}{array.table}\n{segments}\n\n![fast + slow](fast_slow.png)\n"
 
 
 def fast_and_slow_array(folder: Path) -> FastSlowArray:
@@ -196,14 +181,12 @@ def fast_and_slow_array(folder: Path) -> FastSlowArray:
         matches = match_points(images[FAST], images[name])
         fits[name] = fit = fit_link(matches, F)
         off = [float(line_distance(near_lines(matches, F, within=6), G).median()) for G in (F, fit.link.F)]
-        rows.append(
-            (name, len(fit.matches.alpha), f"{off[0]:.2f}", f"{off[1]:.2f}", f"+-{fit.displacement:.0f}")
-        )
+        figures = f"{off[0]:.2f}", f"{off[1]:.2f}", f"+-{fit.displacement:.0f}"
+        rows.append((name, len(fit.matches.alpha), *figures))
     links = {(FAST, name): fit.link for name, fit in fits.items()}
     views = {name: View(hw=(image.shape[1], image.shape[2])) for name, image in images.items()}
-    return FastSlowArray(
-        Rig(views, links=links, name="fast + slow"), images, fits, markdown_table(columns, rows)
-    )
+    rig = Rig(views, links=links, name="fast + slow")
+    return FastSlowArray(rig, images, fits, markdown_table(columns, rows))
 
 
 def published_matrices(file: Path) -> dict[str, Float[Tensor, "3 3"]]:

@@ -54,11 +54,9 @@ class SystemScene(LayeredScenes):
         super().__init__(bank, RigDistribution(), hw=rig[alpha].hw, layers=(layers, layers), seed=seed)
         near, far = (torch.tensor([d], dtype=torch.float64) for d in depths)
         rigs = RigBatch([self.camera(name) for name in (alpha, *rig.betas(alpha))], near, far)
-        self.scene = draw_layers(rigs, self.layers, self.photos, len(self.outlines), self.generator("scene"))
-
-    def generator(self, purpose: str) -> Generator:
-        """Randomness for one purpose, the same each time."""
-        return purpose_generator(self.seed, purpose)
+        self.scene = draw_layers(
+            rigs, self.layers, self.photos, len(self.outlines), purpose_generator(seed, "scene")
+        )
 
     def camera(self, name: str) -> Camera:
         """A camera of the rig as a batch of one, in alpha's frame."""
@@ -95,21 +93,17 @@ class SystemScene(LayeredScenes):
 
     def mixed(self, weights: Float[Tensor, "l 4"]) -> Layers:
         """The scene in grey: for each layer weights of its texture's red, green and blue, and a constant."""
-        grey = (
-            (weights[None, :, None, :3].to(self.scene.colour) @ self.scene.colour)
-            .expand(-1, -1, 3, -1)
-            .clone()
-        )
-        grey[..., 3] += weights[None, :, None, 3].to(grey)
+        weights = weights[None, :, None].to(self.scene.colour)
+        grey = (weights[..., :3] @ self.scene.colour).expand(-1, -1, 3, -1).clone()
+        grey[..., 3] += weights[..., 3]
         return dataclasses.replace(self.scene, colour=grey)
 
     def moved(self, layer: int, step: Float[Tensor, "3"]) -> Layers:
         """The scene with one layer moved, metres in alpha's frame."""
         planes, moving = self.scene.plane_from_world, torch.zeros_like(self.scene.plane_from_world.t)
         moving[:, layer] = step.to(moving)
-        return dataclasses.replace(
-            self.scene, plane_from_world=Pose(planes.R, planes.t - matvec(planes.R, moving))
-        )
+        moved = Pose(planes.R, planes.t - matvec(planes.R, moving))
+        return dataclasses.replace(self.scene, plane_from_world=moved)
 
     def shares(self) -> Float[Tensor, " l"]:
         """The part of alpha's image that each layer covers."""

@@ -1,8 +1,8 @@
 """Rigs and ordinary images: diagnosis, refinement, and uncalibrated rigs, by points matched between cameras.
 
-`matches`, `patch_matching` (matched points) -> `residuals` -> `remedies`, `doctor` (the usual mistakes) and
-`parameters`, `least_squares`, `depth_change`, `lenses`, `photometric`, `refinement` (a better rig) ->
-`from_images` (a rig from images alone) and `misfit` (whether a rig fits images at all).
+`matches`, `patch_matching` (matched points) -> `residuals` -> `hypotheses`, `evidence`, `doctor` (the usual
+mistakes) and `parameters`, `least_squares`, `depth_change`, `lenses`, `photometric`, `refinement` (a better
+rig) -> `from_images` (a rig from images alone) and `misfit` (whether a rig fits images at all).
 """
 
 from .. import _lazy

@@ -9,7 +9,7 @@ combination of parameters stays where it was.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -19,7 +19,7 @@ from torch import Tensor
 from arraygeom import Rig
 
 from .matches import Pairs
-from .residuals import match_depths
+from .residuals import FEW, match_depths, share
 
 SIGNIFICANT_CHANGE = 3.0
 """Standard deviations by which a mode of depth must change."""
@@ -33,10 +33,10 @@ LARGE_CHANGE = 0.25
 """Relative change of depth that is not accepted unasked."""
 SMALL_CHANGE = 0.03
 """Relative change of depth of no concern, where lines come nearer and depth becomes more certain."""
+BEYOND = 1.5
+"""Points are outside the depth range by more than this factor."""
 UNGAINED_CHANGE = 3.0
 """A change of depth is of concern beyond this many times the deviation of it that it takes away."""
-FEW = 10
-"""Least number of points whose depth is observable."""
 
 
 class DepthChange(NamedTuple):
@@ -64,6 +64,18 @@ class DepthChange(NamedTuple):
         gained = max(self.before**2 - self.after**2, 0.0) ** 0.5
         return self.change > SMALL_CHANGE or self.change > UNGAINED_CHANGE * gained
 
+    def objections(self) -> Iterator[str]:
+        """Why the rig's change should not be accepted."""
+        if self.after > self.before:
+            yield "depth would be less certain than before"
+        if self.doubtful:
+            yield (
+                f"depth would change by {self.change:.1%} but these points "
+                f"determine it to {self.known:.1%} only"
+            )
+        elif self.change > LARGE_CHANGE:
+            yield f"depth would change by {self.change:.0%}: a rig so far off is better calibrated anew"
+
     def __str__(self) -> str:
         return (
             f"depth changes by {self.change:.2%} (median of the points); its standard deviation, "
@@ -83,46 +95,38 @@ def relative_change(given: Rig, refined: Rig, pairs: Pairs) -> float:
 
 def observed_depths(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
     """Depths in alpha (metres) of all points of all pairs; NaN behind a camera and where unobservable."""
-    parts = []
-    for names, matches in pairs.items():
-        found = match_depths(rig.pair(*names), matches)
-        depth = torch.full((len(matches.alpha),), torch.nan, dtype=torch.float64)
-        if found is not None:
-            depth = torch.where(found.front & found.observable, found.depth, depth)
-        parts.append(depth.detach())
-    return torch.cat(parts)
+    depth, front, observable = match_depths(rig, pairs)
+    return torch.where(front & observable, depth, torch.nan).detach()
 
 
-def share_behind(rig: Rig, pairs: Pairs) -> float:
-    """The share of points behind a camera, of those whose rays meet anywhere; 0 for too few."""
-    found = [match_depths(rig.pair(*names), matches) for names, matches in pairs.items()]
-    front = torch.cat(
-        [torch.ones(0, dtype=torch.bool), *(f.front[f.observable] for f in found if f is not None)]
-    )
-    return float((~front).double().mean()) if len(front) >= FEW else 0.0
+def share_outside(rig: Rig, pairs: Pairs) -> float:
+    """The share of points of observable depth that are behind the cameras or outside the rig's depth range.
+
+    Points of calibrated pairs only: 0 where there is no such pair, NaN for few points. The depth range, if
+    the rig has one, counts with a margin.
+    """
+    depth, front, observable = match_depths(rig, pairs)
+    if bool(depth.isnan().all()):
+        return 0.0
+    if rig.depth is not None:
+        near, far = (float(bound) for bound in rig.depth)
+        front = front & (depth >= near / BEYOND) & (depth <= far * BEYOND)
+    return share(~front[observable])
 
 
 def log_depths(
     after: Callable[[Tensor], Rig], rigs: Sequence[Rig], pairs: Pairs
-) -> Callable[[Tensor], Tensor] | None:
+) -> Callable[[Tensor], list[Tensor]] | None:
     """The logarithm of depth as a function of the parameters, of points observable in all these rigs.
 
     None for too few.
     """
-    kept = {}
-    for names, matches in pairs.items():
-        depths = torch.stack([observed_depths(rig, {names: matches}) for rig in rigs])
-        kept[names] = matches.only(~depths.isnan().any(0))
-    kept = {names: matches for names, matches in kept.items() if len(matches.alpha)}
-    if sum(len(matches.alpha) for matches in kept.values()) < FEW:
+    seen = ~torch.stack([observed_depths(rig, pairs) for rig in rigs]).isnan().any(0)
+    if int(seen.sum()) < FEW:
         return None
-
-    def values(z: Tensor) -> Tensor:
-        rig = after(z)
-        found = [match_depths(rig.pair(*names), matches) for names, matches in kept.items()]
-        return torch.cat([part.depth.clamp(min=1e-6).log() for part in found if part is not None])
-
-    return values
+    parts = zip(pairs.items(), seen.split([len(matches.alpha) for matches in pairs.values()]))
+    kept = {names: matches.only(part) for (names, matches), part in parts if bool(part.any())}
+    return lambda z: [match_depths(after(z), kept).depth.clamp(min=1e-6).log()]
 
 
 class DepthModes(NamedTuple):

@@ -6,55 +6,41 @@ import json
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from statistics import fmean
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial import Delaunay, QhullError
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from arraygeom import Camera, LensView, Pair, Rig
-from arraygeom.pixels import HW
+from arraygeom import Camera, Rig
+from arraygeom.pixels import HW, coarse_grid
 from arraygeom.pose import rotation_vector
-from arraygeom.rig import Depths
-from arraygeom.robust import cauchy, least_squares, robust_least_squares
 from arraygeom.threads import torch_in_one_thread
 
 from .depth_change import relative_change
-from .evidence import SCALES, DriftEvidence
-from .held_out import image_parts, line_distances, trimmed_square
-from .matches import Images, Pairs, PointMatches, agreeing_pairs, match_cameras, seen_depths
-from .parameters import SIGMA
-from .remedies import (
-    NOTHING,
+from .evidence import SCALES, DriftEvidence, FitStatistics, fit_statistics, observations
+from .hypotheses import (
+    SHIFTS,
     TURNS,
-    Remedy,
-    bare_cameras,
-    degrees_remedy,
+    Hypothesis,
     from_degrees,
-    lens_remedy,
-    remedies,
+    hypotheses,
+    ignored_lens,
+    in_degrees,
 )
-from .residuals import lines_basis, related, residuals_and_depths, stack_key, stacked
+from .matches import Images, Pairs, PointMatches, agreeing_pairs, cameras_of, depth_seen, match_cameras
+from .parameters import SIGMA
+from .residuals import image_parts, line_distances, related
 
 LOG = logging.getLogger(__name__)
 
 MOST = 250
 """Largest number of matches used of a pair."""
-LARGEST_DISTANCE = 1000.0
-"""Upper bound of a match's distance from its line, pixels; also for pixels without a ray."""
 HEALTHY_MISFIT = 0.2
 """A rig with a smaller misfit than this, in pixels, is healthy."""
-OF_TRIMMED = 0.52
-"""`trimmed_square` of normal points of variance 1."""
 EQUAL = (1.4, 0.03)
 """Explanations are equal whose misfit is less than 1.4 times the best one's plus 0.03 px."""
-WRONG_SIDE_PENALTY = 100.0
-"""Penalty, pixels, of points behind the cameras, outside the depth range, or mirrored."""
 LARGEST_REMAINDER = (0.33, 0.2)
 """A mistake is named if its remedy leaves no more than the first share of the misfit: many wrong remedies
 improve a drifted rig somewhat. Nor is one as good as another that leaves less than the second share of what
@@ -69,77 +55,34 @@ EXPLAINED, ROUGHLY = (2 * HEALTHY_MISFIT, 0.06), 0.9
 of those whose remedy is approximate."""
 SAME_DEPTH, SAME_DISTANCE = 1e-3, 1e-3
 """Rigs are the same whose depths (relative) and distances from lines (pixels) differ by less, in median."""
-LEAST_NOISE = 0.05
-"""Lower bound of the points' noise, pixels."""
-FEW = 10
-"""Least number of points for a share."""
 BARREL, PINCUSHION = -0.6, 0.4
 """Bounds of k1 times the squared radius of the farthest corner, at z = 1."""
-
-
-class FitStatistics(NamedTuple):
-    """Statistics of matched points under a rig.
-
-    off: median distance in pixels of a point from its epipolar line.
-    misfit: the part of it (root mean square, pixels) that is due to the rig and not to the matches' noise.
-    front: share of the points in front of both cameras, of those whose depth is observable.
-    inside: share of those in front that lie in the rig's depth range; NaN without one.
-    handed: share of the triangles of neighbouring points whose orientation changes between the images, or
-    not, as the rig implies: mirrored images change it.
-    depth: median depth in metres of the points in front; NaN if too few.
-    """
-
-    off: float
-    misfit: float
-    front: float
-    inside: float
-    handed: float
-    depth: float = math.nan
-
-    @property
-    def penalised_misfit(self) -> float:
-        """The misfit plus penalties, pixels."""
-        wrong = (self.front < 0.5) + (self.inside < 0.5) + (self.handed < 0.5)
-        return self.misfit + WRONG_SIDE_PENALTY * wrong
-
-    def __str__(self) -> str:
-        parts = [f"{self.off:.2f} px from the lines, {self.misfit:.2f} px of it due to the rig"]
-        if not math.isnan(self.front):
-            parts.append(f"{self.front:.0%} in front")
-        if not math.isnan(self.inside):
-            parts.append(f"{self.inside:.0%} within the depth range")
-        if not math.isnan(self.depth):
-            parts.append(f"median depth {self.depth:.3g} m")
-        if self.handed < 0.5:
-            parts.append("one image mirrored relative to the other")
-        return ", ".join(parts)
 
 
 @dataclass(frozen=True)
 class Diagnosis:
     """The result of a diagnosis.
 
-    named: the mistake, or `NOTHING`: no mistake explains the images clearly better than a drift of the
-    cameras does. equal: other kinds of mistake that explain the images as well.
-    before, after: statistics of the given rig and of the repaired one. tried: all explanations, best first.
-    matches: number of points used. healthy: the given rig fits the images. certain: all explanations that are
+    named: the mistake, with the repaired rig; or that of kind "nothing": no mistake explains the images
+    clearly better than a drift of the cameras does. equal: other kinds of mistake that explain them as well.
+    before, after: statistics of the given rig and of the repaired one. tried: of all, best first. matches:
+    number of points used. healthy: the given rig fits the images. certain: all explanations that are
     as good as the one named are undone by the same rig.
     """
 
-    named: Remedy
-    equal: tuple[Remedy, ...]
+    named: Hypothesis
+    equal: tuple[Hypothesis, ...]
     before: FitStatistics
     after: FitStatistics
-    tried: tuple[tuple[Remedy, FitStatistics], ...]
+    tried: Mapping[Hypothesis, FitStatistics]
     matches: int
     healthy: bool
-    repaired: Rig
     certain: bool
 
     @property
     def verdict(self) -> str:
         """The diagnosis in a sentence or two."""
-        others = "; or: ".join(remedy.words for remedy in self.equal)
+        others = "; or: ".join(hypothesis.words for hypothesis in self.equal)
         if self.named.kind != "nothing":
             return f"likely mistake: {self.named.words}" + (f"; or: {others}" if others else "")
         if self.healthy:
@@ -159,12 +102,12 @@ class Diagnosis:
 
     def as_json(self) -> str:
         """The same as JSON, with the ten best explanations."""
-        tried = [{"kind": r.kind, "words": r.words, **_rounded(f)} for r, f in self.tried[:10]]
+        tried = [{"kind": h.kind, "words": h.words, **_rounded(f)} for h, f in self.tried.items()][:10]
         document = {
             "verdict": self.verdict,
             "mistake": self.named.kind,
             "words": self.named.words,
-            "as_good": [{"mistake": remedy.kind, "words": remedy.words} for remedy in self.equal],
+            "as_good": [{"mistake": h.kind, "words": h.words} for h in self.equal],
             "healthy": self.healthy,
             "matches": self.matches,
             "before": _rounded(self.before),
@@ -174,8 +117,8 @@ class Diagnosis:
         return json.dumps(document, indent=2)
 
 
-def _rounded(figures: FitStatistics) -> dict[str, float | None]:
-    return {name: None if math.isnan(value) else round(value, 4) for name, value in figures._asdict().items()}
+def _rounded(fit: FitStatistics) -> dict[str, float | None]:
+    return {name: None if math.isnan(value) else round(value, 4) for name, value in fit._asdict().items()}
 
 
 @torch_in_one_thread()
@@ -197,84 +140,80 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     """`diagnose` from matched points of images of these sizes."""
     pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
-    tried = [r for r in remedies(rig, sizes) if not fits or r.is_plausible(rig)]
-    tried = [NOTHING, *tried]
+    tried = hypotheses(rig, sizes)
     if fits:
         tried += [*_ignored_lens(rig, pairs), *_degrees(rig, pairs), *_depth_range(rig, pairs)]
     LOG.info("trying %d mistakes on %d pairs", len(tried), len(pairs))
-    figures, inliers, noise = _evaluate(rig, tried, pairs)
-    order = sorted(range(0 if fits else 1, len(tried)), key=lambda i: figures[i].penalised_misfit)
-    healthy = fits and figures[0].penalised_misfit < HEALTHY_MISFIT
+    fit, inliers, noise = fit_statistics(tried, pairs)
+    misfit = {h: f.penalised_misfit for h, f in fit.items()}
+    given = named = tried[0]
+    table = sorted(tried if fits else tried[1:], key=lambda h: misfit[h])
+    healthy = fits and misfit[given] < HEALTHY_MISFIT
+    as_good: list[Hypothesis] = []
     if not fits:
-        least = EQUAL[0] * figures[order[0]].penalised_misfit + EQUAL[1]
-        as_good = [i for i in order if figures[i].penalised_misfit <= least]
-        best = min(as_good)
-    elif healthy:
-        best, as_good = 0, []
-    else:
+        as_good = [h for h in table if misfit[h] <= EQUAL[0] * misfit[table[0]] + EQUAL[1]]
+        named = min(as_good, key=tried.index)
+    elif not healthy:
         LOG.info("comparing the mistakes that leave least with a drift")
-        best, as_good = _by_evidence(rig, tried, figures, order, pairs, inliers, noise)
-    equal = {tried[i].kind: tried[i] for i in reversed(as_good)}
-    equal.pop(tried[best].kind, None)
-    table = tuple((tried[i], figures[i]) for i in order)
-    count = sum(len(matches.alpha) for matches in pairs.values())
-    repaired = tried[best].repair(rig)
-    certain = best > 0 and all(_same_rig(repaired, tried[i].repair(rig), pairs) for i in as_good if i != best)
+        named, as_good = _by_evidence(misfit, table, pairs, inliers, noise, mirrored=fit[given].handed < 0.5)
+    equal = {h.kind: h for h in reversed(as_good) if h.kind != named.kind}
+    others = (h for h in as_good if h is not named)
     return Diagnosis(
-        tried[best],
+        named,
         tuple(equal.values()),
-        figures[0],
-        figures[best],
-        table,
-        count,
-        healthy,
-        repaired,
-        certain,
+        before=fit[given],
+        after=fit[named],
+        tried={h: fit[h] for h in table},
+        matches=sum(len(matches.alpha) for matches in pairs.values()),
+        healthy=healthy,
+        certain=named is not given and all(_same_rig(named.rig, h.rig, pairs) for h in others),
     )
 
 
 def _by_evidence(
-    rig: Rig,
-    tried: Sequence[Remedy],
-    figures: Sequence[FitStatistics],
-    order: Sequence[int],
+    misfit: Mapping[Hypothesis, float],
+    table: Sequence[Hypothesis],
     pairs: Pairs,
-    inliers: Tensor,
+    inliers: Bool[Tensor, " n"],
     noise: float,
-) -> tuple[int, list[int]]:
-    """The mistake that explains the points clearly better than a drift of the rig does, 0 if none; all that
-    are as good as it, or as the drift, best first.
+    *,
+    mirrored: bool,
+) -> tuple[Hypothesis, list[Hypothesis]]:
+    """The mistake that explains the points clearly better than a drift of the rig does, or the rig as given.
 
-    Points of one object, or wrong ones in one place, do not decide: it is better without each part of them in
-    turn. No drift mirrors an image; one of the principal point does what a small shift of pixels does.
+    And all that are as good as it, or as the drift, best first. Points of one object, or wrong ones in one
+    place, do not decide: it is better without each part of them in turn. No drift mirrors an image; one of
+    the principal point does what a small shift of pixels does. `misfit` has likely ones first, `table` those
+    that leave least.
     """
-    limit = LARGEST_REMAINDER[0] * figures[0].penalised_misfit
-    some = [i for i in order if i and figures[i].penalised_misfit <= limit][:MOST_COMPARED]
+    given = next(iter(misfit))
+    limit = LARGEST_REMAINDER[0] * misfit[given]
+    some = [h for h in table if h is not given and misfit[h] <= limit][:MOST_COMPARED]
     if not some:
-        return 0, []
-    limit = figures[some[0]].penalised_misfit / LARGEST_REMAINDER[1] + EQUAL[1]
-    some = [i for i in some if figures[i].penalised_misfit <= limit]
-    found = {i: DriftEvidence.of(tried[i].repair(rig), pairs, inliers, noise) for i in some}
-    given = DriftEvidence.of(rig, pairs, inliers, noise)
-    mirrored = figures[0].handed < 0.5
-    some.sort(key=lambda i: found[i].cost)
-    least = found[some[0]].cost
-    best = min(i for i in some if found[i].cost <= least + TIE)
-    allowed = max(
-        ROUGHLY if tried[best].approximate else EXPLAINED[0], EXPLAINED[1] * figures[0].penalised_misfit
-    )
-    parts = image_parts(rig, pairs)
+        return given, []
+    limit = misfit[some[0]] / LARGEST_REMAINDER[1] + EQUAL[1]
+    found = {
+        h: DriftEvidence.of(h.rig, pairs, inliers, noise)
+        for h in (given, *some)
+        if misfit[h] <= limit or h is given
+    }
+    drift = found.pop(given)
+    least = min(evidence.cost for evidence in found.values())
+    best = next(h for h in misfit if h in found and found[h].cost <= least + TIE)
+    allowed = max(ROUGHLY if best.approximate else EXPLAINED[0], EXPLAINED[1] * misfit[given])
+    parts = image_parts(given.rig, pairs)
     rest = (inliers & (parts != part) for part in parts.unique().tolist())
     clear = (
-        figures[best].penalised_misfit <= allowed
-        and found[best].cost + MARGIN < given.cost
-        and all(found[best].by(used) + MARGIN < given.by(used) for used in rest)
+        misfit[best] <= allowed
+        and found[best].cost + MARGIN < drift.cost
+        and all(found[best].by(used) + MARGIN < drift.by(used) for used in rest)
     )
-    named = mirrored or (clear and (bool(rig.links) or not tried[best].small))
-    bound = MARGIN + (least if named else min(least, given.cost))
-    near = EQUAL[0] * figures[best].penalised_misfit + EQUAL[1] if named else 0.0
-    as_good = [i for i in some if found[i].cost <= bound or figures[i].penalised_misfit <= near]
-    return best if named else 0, as_good
+    is_named = mirrored or (clear and (bool(given.rig.links) or best.kind not in SHIFTS))
+    bound = MARGIN + (least if is_named else min(least, drift.cost))
+    near = EQUAL[0] * misfit[best] + EQUAL[1] if is_named else 0.0
+    ranked = sorted(found, key=lambda h: found[h].cost)
+    as_good = [h for h in ranked if found[h].cost <= bound or misfit[h] <= near]
+    return best if is_named else given, as_good
 
 
 def _same_rig(rig: Rig, other: Rig, pairs: Pairs) -> bool:
@@ -292,167 +231,26 @@ def _thinned(matches: PointMatches) -> PointMatches:
     return PointMatches(matches.alpha[::step], matches.beta[::step])
 
 
-def _evaluate(rig: Rig, tried: Sequence[Remedy], pairs: Pairs) -> tuple[list[FitStatistics], Tensor, float]:
-    """The statistics of every explanation, from the same points: the inliers of the best of them.
-
-    Those inliers, and the standard deviation of their distances too.
-    """
-    rigs = [remedy.repair(rig) for remedy in tried]
-    observed = _observe(rigs, pairs)
-    inliers, floor = _inliers(rig, tried, observed.off, pairs)
-    preserved = [handedness(matches) for matches in pairs.values()]
-    figures = [
-        _figures(
-            *(part[i] for part in observed),
-            inliers=inliers,
-            floor=floor,
-            bounds=repaired.depth,
-            handed=fmean(abs(share - _mirrors(repaired, names)) for share, names in zip(preserved, pairs)),
-        )
-        for i, repaired in enumerate(rigs)
-    ]
-    return figures, inliers, max(math.sqrt(floor / OF_TRIMMED), LEAST_NOISE)
-
-
-def handedness(matches: PointMatches) -> float:
-    """The share of Delaunay triangles of the points in alpha that keep their orientation in beta."""
-    try:
-        corners = Delaunay(matches.alpha.numpy()).simplices
-    except QhullError:
-        return 1.0
-    areas = [_area(points[torch.from_numpy(corners).long()]) for points in matches]
-    return float((areas[0] * areas[1] > 0).double().mean())
-
-
-def _area(triangles: Tensor) -> Tensor:
-    first, second = (triangles[:, i] - triangles[:, 0] for i in (1, 2))
-    return first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-
-
-def _mirrors(rig: Rig, names: tuple[str, str]) -> bool:
-    """Whether exactly one of two cameras is that of a mirrored image."""
-    views = [rig[name] for name in names]
-    return sum(isinstance(v, LensView) and bool(v.K[:2, :2].det() < 0) for v in views) == 1
-
-
-class PointObservations(NamedTuple):
-    """All points of all pairs (n) under several rigs (k): signed pixels from the line, depth, in front.
-
-    Unobservable depths are NaN.
-    """
-
-    off: Float[Tensor, "k n"]
-    depth: Float[Tensor, "k n"]
-    front: Bool[Tensor, "k n"]
-
-
-def _observe(rigs: Sequence[Rig], pairs: Pairs) -> PointObservations:
-    parts = [_observe_pair([rig.pair(*names) for rig in rigs], matches) for names, matches in pairs.items()]
-    return PointObservations(*(torch.cat(part, 1) for part in zip(*parts)))
-
-
-def _observe_pair(pairs: Sequence[Pair], matches: PointMatches) -> PointObservations:
-    """One pair of cameras under several rigs, batched by lens model."""
-    count = len(matches.alpha)
-    off, depth = torch.full((2, len(pairs), count), torch.nan, dtype=torch.float64)
-    front = torch.zeros(len(pairs), count, dtype=torch.bool)
-    groups: dict[object, list[int]] = {}
-    for i, pair in enumerate(pairs):
-        groups.setdefault(stack_key(pair), []).append(i)
-    for group in groups.values():
-        pair = stacked([pairs[i] for i in group])
-        (_, line, valid), depths = residuals_and_depths(pair, matches)
-        line = torch.where(valid, line.detach(), LARGEST_DISTANCE)
-        off[group] = line.nan_to_num(LARGEST_DISTANCE).clamp(-LARGEST_DISTANCE, LARGEST_DISTANCE)
-        if depths is not None:
-            depth[group] = torch.where(depths.observable, depths.depth, torch.nan)
-            front[group] = depths.front
-    return PointObservations(off, depth, front)
-
-
-def _inliers(rig: Rig, tried: Sequence[Remedy], off: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
-    """The points consistent with some pose of the cameras, their mean square distance then, square pixels.
-
-    The pose is free, so only the lens matters: the best explanation that changes it is used.
-    """
-    fits = []
-    for remedy, o in zip(tried, off):
-        if remedy.kind in ("nothing", "distortion"):
-            repaired = remedy.repair(rig)
-            lengths = [len(matches.alpha) for matches in pairs.values()]
-            left = [
-                _beyond_pose(repaired.pair(*n), m, r) for (n, m), r in zip(pairs.items(), o.split(lengths))
-            ]
-            fits.append(torch.cat(left))
-    left_over = min(fits, key=lambda e: float(e.abs().median()))
-    inliers = left_over.abs() <= max(4 * float(left_over.abs().median()), 0.2)
-    return inliers, trimmed_square(left_over[inliers])
-
-
-def _beyond_pose(pair: Pair, matches: PointMatches, off: Tensor) -> Tensor:
-    """The residual of the distances after a robust first-order fit of F."""
-    terms = lines_basis(pair, matches).T
-
-    def weigh(rest: Tensor) -> Tensor:
-        return cauchy(rest, 2 * max(float(rest.abs().median()), 1e-3)).square()
-
-    return robust_least_squares(
-        terms, off, least_squares(terms, off, torch.ones_like(off)), weigh, steps=7
-    ).rest
-
-
-def _figures(
-    off: Tensor,
-    depth: Tensor,
-    front: Tensor,
-    *,
-    inliers: Tensor,
-    floor: float,
-    bounds: Depths | None,
-    handed: float,
-) -> FitStatistics:
-    off = off[inliers]
-    misfit = math.sqrt(max(trimmed_square(off) - floor, 0.0))
-    observable = ~depth.isnan()
-    share = float(front[observable].double().mean()) if int(observable.sum()) >= FEW else math.nan
-    seen = depth[observable & front]
-    median = float(seen.median()) if len(seen) >= FEW else math.nan
-    return FitStatistics(float(off.abs().median()), misfit, share, _inside(bounds, seen), handed, median)
-
-
-def _inside(bounds: Depths | None, depth: Tensor) -> float:
-    """The share of depths between half the near and twice the far bound."""
-    if bounds is None or len(depth) < FEW:
-        return math.nan
-    near, far = (float(bound) for bound in bounds)
-    return float(((depth > 0.5 * near) & (depth < 2 * far)).double().mean())
-
-
-def _ignored_lens(rig: Rig, pairs: Pairs) -> list[Remedy]:
+def _ignored_lens(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
     """The distortion that best explains the points, for cameras that have none."""
-    bare = bare_cameras(rig, {name for names in pairs for name in names})
+    bare = [name for name in cameras_of(rig, pairs) if isinstance(rig[name], Camera)]
+    bare = [name for name in bare if rig[name].distortion is None]
     if not bare:
         return []
-    squared = max(_corner_radius(camera) for camera in bare.values()) ** 2
+    corners = [rig[name].rays(coarse_grid(rig[name].hw).reshape(-1, 2))[0][:, :2] for name in bare]
+    squared = max(float(rays.norm(dim=-1).max()) for rays in corners) ** 2
     lowest, highest = BARREL / squared, PINCUSHION / squared
     k1 = 0.0
     for _ in range(3):
         candidates = torch.linspace(lowest, highest, 13, dtype=torch.float64).tolist()
-        off = _observe([lens_remedy(rig, bare, k).repair(rig) for k in candidates], pairs).off
+        off = observations([ignored_lens(rig, bare, k).rig for k in candidates], pairs).off
         best = int(off.abs().median(1).values.argmin())
         k1, step = candidates[best], candidates[1] - candidates[0]
         lowest, highest = k1 - step, k1 + step
-    return [lens_remedy(rig, bare, k1)]
+    return [ignored_lens(rig, bare, k1)]
 
 
-def _corner_radius(camera: Camera) -> float:
-    """Distance from the axis, at z = 1, of the farthest corner."""
-    h, w = camera.hw
-    corners = camera.K.new_tensor([[0, 0], [w - 1, 0], [0, h - 1], [w - 1, h - 1]])
-    return float(camera.rays(corners)[0][:, :2].norm(dim=-1).max())
-
-
-def _degrees(rig: Rig, pairs: Pairs) -> list[Remedy]:
+def _degrees(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
     """Rotation vectors in degrees, taken for radians, with the lost whole turns that suit points best.
 
     Not where a drift may be what turned the cameras.
@@ -466,11 +264,11 @@ def _degrees(rig: Rig, pairs: Pairs) -> list[Remedy]:
         cost = cost + off.amin(1)
         turns[other] = off.argmin(1)
     best = int(cost.argmin())
-    remedy = degrees_remedy({first: TURNS[best]} | {other: TURNS[int(i[best])] for other, i in turns.items()})
-    repaired = remedy.repair(rig)
-    before, after = ([r.pair(first, other).beta_from_alpha.R for other in others] for r in (rig, repaired))
+    missing = {first: TURNS[best]} | {other: TURNS[int(i[best])] for other, i in turns.items()}
+    found = in_degrees(rig, missing)
+    before, after = ([r.pair(first, other).beta_from_alpha.R for other in others] for r in (rig, found.rig))
     angles = [float(rotation_vector(R.mT @ Q).norm()) for R, Q in zip(before, after)]
-    return [remedy] if max(angles) > 3 * SCALES[-1] * SIGMA["rotation"] else []
+    return [found] if max(angles) > 3 * SCALES[-1] * SIGMA["rotation"] else []
 
 
 def _off_planes(rig: Rig, names: tuple[str, str], matches: PointMatches) -> Float[Tensor, "k k"]:
@@ -485,19 +283,12 @@ def _off_planes(rig: Rig, names: tuple[str, str], matches: PointMatches) -> Floa
     return sines.nan_to_num(1.0).median(-1).values
 
 
-def _depth_range(rig: Rig, pairs: Pairs) -> list[Remedy]:
+def _depth_range(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
     """The depth range of the points, for a rig that has another."""
-    found = []
-    for names, matches in pairs.items() if rig.depth is not None else ():
-        pair = rig.pair(*names)
-        if pair.calibrated and pair.link is None:
-            with suppress(ValueError):
-                found.append(seen_depths(pair, matches))
-    if not found:
+    if rig.depth is None or (bounds := depth_seen(rig, pairs)) is None:
         return []
-    near, far = min(bounds[0] for bounds in found), max(bounds[1] for bounds in found)
     words = (
-        f"the depth range excludes the scene, which is {near:.3g} to {far:.3g} m away: "
+        f"the depth range excludes the scene, which is {bounds[0]:.3g} to {bounds[1]:.3g} m away: "
         "correct `depth` in the file"
     )
-    return [Remedy("depth range", words, lambda rig: rig.replace(depth=(near, far)))]
+    return [Hypothesis("depth range", words, rig.replace(depth=bounds))]

@@ -1,28 +1,52 @@
-"""How well matched points support a rig that may have drifted: the evidence of a mistake against mere drift.
+"""How well matched points support a hypothesis, by their distances and depths, and better than mere drift.
 
-The residuals are normal with the noise of the points, plus a drift of the cameras whose prior deviations are
-those of `parameters.SIGMA` times a scale, plus what lens models leave (`systematic_modes`); to first order in
-the drift. A mistake that a drift explains as well is not a mistake that can be named.
+Against drift the residuals are normal with the noise of the points, plus a drift of the cameras whose prior
+deviations are those of `parameters.SIGMA` times a scale, plus what lens models leave (`systematic_modes`); to
+first order in the drift. A mistake that a drift explains as well is not a mistake that can be named.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from statistics import fmean
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
+from scipy.spatial import Delaunay, QhullError
 from torch import Tensor
 
-from arraygeom import Camera, Rig
+from arraygeom import LensView, Pair, Rig
+from arraygeom.robust import cauchy, least_squares, robust_least_squares
 
-from .least_squares import JoinedResiduals, Residuals, jacobian
-from .matches import Pairs
+from .hypotheses import Hypothesis
+from .least_squares import Evaluated, Residuals, jacobian
+from .matches import Pairs, PointMatches, cameras_of
 from .parameters import SIGMA, UNCERTAIN, apply_change, free_parameters
 from .refinement import systematic_columns
-from .residuals import match_depths, sampson_of_pairs
+from .residuals import (
+    FEW,
+    depths_of_pair,
+    epipolar_residuals,
+    lines_basis,
+    match_depths,
+    sampson_of_pairs,
+    share,
+    stack_key,
+    stacked,
+    trimmed_square,
+)
 
+LARGEST_DISTANCE = 1000.0
+"""Upper bound of a match's distance from its line, pixels; also for pixels without a ray."""
+OF_TRIMMED = 0.52
+"""`trimmed_square` of normal points of variance 1."""
+LEAST_NOISE = 0.05
+"""Lower bound of the points' noise, pixels."""
+WRONG_SIDE_PENALTY = 100.0
+"""Penalty, pixels, of points behind the cameras, outside the depth range, or mirrored."""
 SCALES = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)
 """Drifts tried, in units of the prior deviations."""
 RARE = 6.0
@@ -33,6 +57,149 @@ NO_BETTER = 0.1
 """... which end once the evidence improves by less."""
 CLIPPED = 30.0
 """Residuals count as at most so many pixels."""
+
+
+class FitStatistics(NamedTuple):
+    """Statistics of matched points under a rig.
+
+    off: median distance in pixels of a point from its epipolar line.
+    misfit: the part of it (root mean square, pixels) that is due to the rig and not to the matches' noise.
+    front: share of the points in front of both cameras, of those whose depth is observable.
+    inside: share of those in front that lie in the rig's depth range; NaN without one.
+    handed: share of the triangles of neighbouring points whose orientation changes between the images, or
+    not, as the rig implies: mirrored images change it.
+    depth: median depth in metres of the points in front; NaN if too few.
+    """
+
+    off: float
+    misfit: float
+    front: float
+    inside: float
+    handed: float
+    depth: float
+
+    @property
+    def penalised_misfit(self) -> float:
+        """The misfit plus penalties, pixels."""
+        wrong = (self.front < 0.5) + (self.inside < 0.5) + (self.handed < 0.5)
+        return self.misfit + WRONG_SIDE_PENALTY * wrong
+
+    def __str__(self) -> str:
+        parts = [f"{self.off:.2f} px from the lines, {self.misfit:.2f} px of it due to the rig"]
+        if not math.isnan(self.front):
+            parts.append(f"{self.front:.0%} in front")
+        if not math.isnan(self.inside):
+            parts.append(f"{self.inside:.0%} within the depth range")
+        if not math.isnan(self.depth):
+            parts.append(f"median depth {self.depth:.3g} m")
+        if self.handed < 0.5:
+            parts.append("one image mirrored relative to the other")
+        return ", ".join(parts)
+
+
+def fit_statistics(
+    tried: Sequence[Hypothesis], pairs: Pairs
+) -> tuple[dict[Hypothesis, FitStatistics], Bool[Tensor, " n"], float]:
+    """The statistics of every hypothesis, from the same points: the inliers of the best of them.
+
+    Those inliers, and the standard deviation of their distances too.
+    """
+    observed = observations([hypothesis.rig for hypothesis in tried], pairs)
+    inliers, floor = _inliers(tried, observed.off, pairs)
+    preserved = [_handedness(matches) for matches in pairs.values()]
+    found = {}
+    for hypothesis, off, depth, front in zip(tried, *observed):
+        rig, observable = hypothesis.rig, ~depth.isnan()
+        ahead = depth[observable & front]
+        inside = math.nan
+        if rig.depth is not None:
+            near, far = (float(bound) for bound in rig.depth)
+            inside = share((ahead > 0.5 * near) & (ahead < 2 * far))
+        found[hypothesis] = FitStatistics(
+            off=float(off[inliers].abs().median()),
+            misfit=math.sqrt(max(trimmed_square(off[inliers]) - floor, 0.0)),
+            front=share(front[observable]),
+            inside=inside,
+            handed=fmean(abs(kept - _mirrors(rig, names)) for kept, names in zip(preserved, pairs)),
+            depth=float(ahead.median()) if len(ahead) >= FEW else math.nan,
+        )
+    return found, inliers, max(math.sqrt(floor / OF_TRIMMED), LEAST_NOISE)
+
+
+class PointObservations(NamedTuple):
+    """All points of all pairs (n) under several rigs (k): signed pixels from the line, depth, in front.
+
+    Unobservable depths are NaN.
+    """
+
+    off: Float[Tensor, "k n"]
+    depth: Float[Tensor, "k n"]
+    front: Bool[Tensor, "k n"]
+
+
+def observations(rigs: Sequence[Rig], pairs: Pairs) -> PointObservations:
+    """One pair of cameras after the other, under all rigs, batched by lens model."""
+    parts = [_observations([rig.pair(*names) for rig in rigs], matches) for names, matches in pairs.items()]
+    return PointObservations(*(torch.cat(part, 1) for part in zip(*parts)))
+
+
+def _observations(pairs: Sequence[Pair], matches: PointMatches) -> PointObservations:
+    off, depth = torch.zeros(2, len(pairs), len(matches.alpha), dtype=torch.float64)
+    front = torch.zeros(off.shape, dtype=torch.bool)
+    groups: dict[object, list[int]] = {}
+    for i, pair in enumerate(pairs):
+        groups.setdefault(stack_key(pair), []).append(i)
+    for group in groups.values():
+        pair = stacked([pairs[i] for i in group])
+        (_, line, valid), depths = epipolar_residuals(pair, matches), depths_of_pair(pair, matches)
+        line = torch.where(valid, line.detach(), LARGEST_DISTANCE)
+        off[group] = line.nan_to_num(LARGEST_DISTANCE).clamp(-LARGEST_DISTANCE, LARGEST_DISTANCE)
+        depth[group] = torch.where(depths.observable, depths.depth, torch.nan)
+        front[group] = depths.front
+    return PointObservations(off, depth, front)
+
+
+def _inliers(tried: Sequence[Hypothesis], off: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
+    """The points consistent with some pose of the cameras, their mean square distance then, square pixels.
+
+    The pose is free, so only the lens matters: the best explanation that changes it is used.
+    """
+    lengths = [len(matches.alpha) for matches in pairs.values()]
+    fits = []
+    for hypothesis, distances in zip(tried, off):
+        if hypothesis.kind in ("nothing", "distortion"):
+            parts = zip(pairs.items(), distances.split(lengths))
+            fits.append(torch.cat([_beyond_pose(hypothesis.rig.pair(*n), m, r) for (n, m), r in parts]))
+    left_over = min(fits, key=lambda e: float(e.abs().median()))
+    inliers = left_over.abs() <= max(4 * float(left_over.abs().median()), 0.2)
+    return inliers, trimmed_square(left_over[inliers])
+
+
+def _beyond_pose(pair: Pair, matches: PointMatches, off: Tensor) -> Tensor:
+    """The residual of the distances after a robust first-order fit of F."""
+    terms = lines_basis(pair, matches).T
+
+    def weigh(rest: Tensor) -> Tensor:
+        return cauchy(rest, 2 * max(float(rest.abs().median()), 1e-3)).square()
+
+    start = least_squares(terms, off, torch.ones_like(off))
+    return robust_least_squares(terms, off, start, weigh, steps=7).rest
+
+
+def _handedness(matches: PointMatches) -> float:
+    """The share of Delaunay triangles of the points in alpha that keep their orientation in beta."""
+    try:
+        corners = torch.from_numpy(Delaunay(matches.alpha.numpy()).simplices).long()
+    except QhullError:
+        return 1.0
+    areas = [(points[corners[:, 1:]] - points[corners[:, :1]]).det() for points in matches]
+    return float((areas[0] * areas[1] > 0).double().mean())
+
+
+def _mirrors(rig: Rig, names: tuple[str, str]) -> bool:
+    """Whether exactly one of two cameras is that of a mirrored image."""
+    views = [rig[name] for name in names]
+    return sum(isinstance(v, LensView) and bool(v.K[:2, :2].det() < 0) for v in views) == 1
 
 
 @dataclass(frozen=True)
@@ -59,21 +226,23 @@ class DriftEvidence:
     @classmethod
     def of(cls, rig: Rig, pairs: Pairs, used: Bool[Tensor, " n"], noise: float) -> DriftEvidence:
         """By those of the points that are used; `noise`: standard deviation of their distances, pixels."""
-        names = [name for name in rig.names if any(name in pair for pair in pairs)]
-        free = list(UNCERTAIN) if any(isinstance(rig[name], Camera) for name in names) else []
-        parameters = tuple(free_parameters(rig, names, free=free))
-        distances = JoinedResiduals(
-            lambda z: [
-                r.nan_to_num() / noise for r in sampson_of_pairs(apply_change(rig, parameters, z), pairs)
-            ]
-        )
+        parameters = free_parameters(rig, cameras_of(rig, pairs), free=UNCERTAIN)
+
+        def distances(z: Tensor) -> list[Tensor]:
+            return [r.nan_to_num() / noise for r in sampson_of_pairs(apply_change(rig, parameters, z), pairs)]
+
         z = torch.zeros(sum(len(u.sigma) for u in parameters), dtype=torch.float64)
         r, J = jacobian(distances, z)
-        B, clipped = systematic_columns(rig, pairs) / noise, CLIPPED / noise
+        B = systematic_columns(rig, pairs) / noise
         wrong_side = _rotation_to_plausible_depth(rig, pairs)
         fixed = {scale: RARE * math.log1p(scale**2) + (wrong_side / scale) ** 2 for scale in SCALES}
-        best = min(SCALES, key=lambda scale: _Drift.of(r[used], J[used], B[used], scale).cost + fixed[scale])
-        found = cls(math.inf, distances, z, r, J, B, best, fixed[best], clipped)
+
+        def cost_of(scale: float) -> float:
+            explained, volume, _ = _drift(r[used], J[used], B[used], scale)
+            return explained + volume + fixed[scale]
+
+        best = min(SCALES, key=cost_of)
+        found = cls(math.inf, distances, z, r, J, B, best, fixed[best], CLIPPED / noise)
         for _ in range(STEPS):
             cost = found._at(found.z, used)
             if not cost < found.cost - NO_BETTER:
@@ -88,48 +257,37 @@ class DriftEvidence:
         return min(self._at(z, used) for z in (self.z, self._refitted(used)))
 
     def _refitted(self, used: Bool[Tensor, " n"]) -> Tensor:
-        return _Drift.of(self.r[used], self.J[used], self.B[used], self.scale).z
+        return _drift(self.r[used], self.J[used], self.B[used], self.scale)[2]
 
     def _at(self, z: Tensor, used: Bool[Tensor, " n"]) -> float:
         """The cost of a drift by the points' distances as they are then; infinite where there are none."""
-        r, J, B = self.distances(z).detach()[used], self.J[used], self.B[used]
-        clipped = _Drift.of(r.clamp(-self.clipped, self.clipped), J[:, :0], B, self.scale)
-        volume = _Drift.of(r, J, B, self.scale).volume
-        cost = clipped.cost - clipped.volume + volume + float((z / self.scale).square().sum()) + self.fixed
+        r, J, B = Evaluated.at(z, self.distances).values[used], self.J[used], self.B[used]
+        left = _drift(r.clamp(-self.clipped, self.clipped), J[:, :0], B, self.scale)[0]
+        volume = _drift(r, J, B, self.scale)[1]
+        cost = left + volume + float((z / self.scale).square().sum()) + self.fixed
         return cost if math.isfinite(cost) else math.inf
 
 
-class _Drift(NamedTuple):
-    """Residuals r + J z + B b; z normal, of deviation `scale`, and b: -2 log evidence, its log determinant.
+def _drift(r: Tensor, J: Tensor, B: Tensor, scale: float) -> tuple[float, float, Tensor]:
+    """-2 log evidence by residuals r + J z + B b with z normal, of deviation `scale`, and b; most probable z.
 
-    z: the most probable one.
+    The evidence comes in two parts: by what is left of the residuals, and the log determinant.
     """
-
-    cost: float
-    volume: float
-    z: Tensor
-
-    @classmethod
-    def of(cls, r: Tensor, J: Tensor, B: Tensor, scale: float) -> _Drift:
-        columns = torch.cat([scale * J, B], 1)
-        information = columns.T @ columns + torch.eye(columns.shape[1], dtype=r.dtype)
-        slope = columns.T @ r
-        step = torch.linalg.solve(information, slope)
-        volume = float(torch.logdet(information))
-        return cls(float(r @ r - slope @ step) + volume, volume, -scale * step[: J.shape[1]])
+    columns = torch.cat([scale * J, B], 1)
+    information = columns.T @ columns + torch.eye(columns.shape[1], dtype=r.dtype)
+    slope = columns.T @ r
+    step = torch.linalg.solve(information, slope)
+    return float(r @ r - slope @ step), float(torch.logdet(information)), -scale * step[: J.shape[1]]
 
 
 def _rotation_to_plausible_depth(rig: Rig, pairs: Pairs) -> float:
     """The rotation, in prior deviations, that brings half the points in front and into the depth range."""
+    near, far = (0.0, math.inf) if rig.depth is None else (float(bound) for bound in rig.depth)
     found = []
     for names, matches in pairs.items():
-        pair = rig.pair(*names)
-        depths = match_depths(pair, matches)
-        if depths is None:
-            continue
-        baseline = float(pair.beta_from_alpha.t.norm())
-        near, far = (0.0, math.inf) if rig.depth is None else (float(bound) for bound in rig.depth)
-        parallax = (baseline / depths.depth).nan_to_num()
-        low, high = baseline / (2 * far), baseline / max(near / 2, 1e-12)
-        found.append((low - parallax).clamp(min=0) + (parallax - high).clamp(min=0))
+        if (pair := rig.pair(*names)).calibrated and pair.link is None:
+            baseline = float(pair.beta_from_alpha.t.norm())
+            parallax = (baseline / match_depths(rig, {names: matches}).depth).nan_to_num()
+            low, high = baseline / (2 * far), baseline / max(near / 2, 1e-12)
+            found.append((low - parallax).clamp(min=0) + (parallax - high).clamp(min=0))
     return float(torch.cat(found).median()) / SIGMA["rotation"] if found else 0.0

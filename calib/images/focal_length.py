@@ -22,11 +22,10 @@ from arraygeom import Camera, Link, Pose, Rig, View, intrinsics, rotation_from_v
 from arraygeom.pixels import HW
 from arraygeom.threads import torch_in_one_thread
 
-from .depth_change import share_behind
-from .held_out import HELD_OUT, PARTS, held_out_parts, nearer, parts_of
+from .depth_change import share_outside
 from .least_squares import cost, most_probable, noise_scale, posterior_covariance, shifts_left_out
 from .matches import PointMatches
-from .residuals import displacements
+from .residuals import HELD_OUT, PARTS, displacements, held_out_parts, nearer, parts_of
 from .self_calibration import FOCAL_SHARE, initial_poses
 
 SIGMA = {"focal": 0.5, "ratio": 0.01, "pose": 3.0, "centre": 0.03, "radial": 0.1, "systematic": 0.3}
@@ -74,13 +73,13 @@ def fit_focal_length(views: Mapping[str, View], link: Link, matches: PointMatche
         starts = [TwoViews(hw, pose, points) for pose in initial_poses(points, link, K, K)]
         z = torch.zeros(len(starts[0].sigma), dtype=torch.float64)
         z[0] = math.log(factor) / SIGMA["focal"]
-        ahead = [start for start in starts if start.share_behind((alpha, beta), z) <= BEHIND]
-        best = sorted(ahead, key=lambda start: cost(start.residuals(z), z, 1.0))[:2]
+        ahead = [start for start in starts if start.is_ahead((alpha, beta), z)]
+        best = sorted(ahead, key=lambda start: cost(start.distances(z), z, 1.0))[:2]
         fits += [FocalFit(start, start.fitted(z)) for start in best]
-    fits = [fit for fit in fits if fit.views.share_behind((alpha, beta), fit.z) <= BEHIND]
+    fits = [fit for fit in fits if fit.views.is_ahead((alpha, beta), fit.z)]
     if not fits:
         return None
-    left = [fit.views.residuals(fit.z) for fit in fits]
+    left = [fit.views.distances(fit.z) for fit in fits]
     scale = min(noise_scale(r) for r in left)
     return min(zip(fits, left), key=lambda pair: cost(pair[1], pair[0].z, scale))[0]
 
@@ -102,11 +101,6 @@ class TwoViews:
     hw: HW
     pose: Pose
     points: PointMatches
-
-    @cached_property
-    def unit(self) -> float:
-        """Half the longer side, pixels."""
-        return max(self.hw) / 2
 
     @cached_property
     def sigma(self) -> Float[Tensor, " k"]:
@@ -143,7 +137,11 @@ class TwoViews:
         t = self.basis @ torch.cat([change[5:7], torch.ones_like(change[:1])])
         return Pose(rotation_from_vector(change[2:5]) @ self.pose.R, t / t.norm())
 
-    def residuals(self, z: Float[Tensor, " k"]) -> Float[Tensor, " n"]:
+    def residuals(self, z: Float[Tensor, " k"]) -> list[Tensor]:
+        """The distances, in one part."""
+        return [self.distances(z)]
+
+    def distances(self, z: Float[Tensor, " k"]) -> Float[Tensor, " n"]:
         """Sampson distances of the points after a change, pixels."""
         change, pose = self.sigma * z, self.moved(z)
         f = self.length(z)
@@ -152,7 +150,7 @@ class TwoViews:
         for i, (x, smooth, length) in enumerate(zip(self.centred, self.smooth, lengths)):
             x = x - change[7 + 2 * i : 9 + 2 * i] + smooth @ change[13 + 4 * i : 17 + 4 * i]
             radial = change[11] + (change[12] if i else -change[12])
-            x = x * (1 + radial * (x / self.unit).square().sum(-1, keepdim=True))
+            x = x * (1 + radial * (2 * x / max(self.hw)).square().sum(-1, keepdim=True))
             rays.append(torch.cat([x / length, torch.ones_like(x[:, :1])], -1))
         a, b = rays
         rotated = a @ pose.R.T
@@ -165,12 +163,12 @@ class TwoViews:
         """The most probable change, from z on; the first `fixed` components stay."""
         return most_probable(self.residuals, z, torch.eye(len(z), dtype=z.dtype)[:, fixed:], steps=STEPS)
 
-    def share_behind(self, names: tuple[str, str], z: Tensor) -> float:
-        """Of the points, behind a camera."""
+    def is_ahead(self, names: tuple[str, str], z: Tensor) -> bool:
+        """Whether no more of the points are behind a camera than `BEHIND`."""
         K = intrinsics(float(self.length(z)), self.hw).double()
         poses = Pose.identity(), self.moved(z)
         rig = Rig({n: Camera(hw=self.hw, K=K, cam_from_world=pose) for n, pose in zip(names, poses)})
-        return share_behind(rig, {names: self.points})
+        return not share_outside(rig, {names: self.points}) > BEHIND
 
 
 @dataclass(frozen=True)
@@ -209,7 +207,7 @@ class FocalFit:
             others = replace(self.views, points=points.only(~out))
             for row, first in enumerate((0.0, float(self.z[0]))):
                 z = torch.cat([self.z.new_tensor([first]), self.z[1:]])
-                distances[row, out] = self.views.residuals(others.fitted(z, fixed=1))[out]
+                distances[row, out] = self.views.distances(others.fitted(z, fixed=1))[out]
         return nearer(*distances)
 
     @property

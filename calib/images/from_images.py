@@ -17,7 +17,6 @@ from arraygeom import Rig, View, intrinsics
 from arraygeom.progress import part, stage
 from arraygeom.threads import torch_in_one_thread
 
-from .held_out import median_off, split
 from .lenses import describe_lenses
 from .matches import (
     AGREE,
@@ -32,6 +31,7 @@ from .matches import (
     with_map,
 )
 from .refinement import refine_matches
+from .residuals import median_off, split
 
 JOINED = 1.0
 """Seconds that one core takes for each pair to fit all lines jointly, roughly."""

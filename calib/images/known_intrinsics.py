@@ -19,9 +19,9 @@ from arraygeom import Pose, Rig
 from arraygeom.pixels import map_homogeneous
 
 from .guided_matches import guided_matches
-from .held_out import median_off
 from .matches import ENOUGH, Images, PointMatches, near_lines
 from .refinement import refine_matches
+from .residuals import median_off
 from .self_calibration import depth_bounds
 
 WINDOW = 0.09
@@ -51,8 +51,10 @@ def centres_found(
     stated = [float(rig.pair(alpha, name).beta_from_alpha.t.norm()) for name in rig.betas(alpha)]
     pairs: dict[tuple[str, str], PointMatches] = {}
     for a, b in combinations(rig.names, 2):
-        found = _consistent(rig, a, b, _matched(rig, a, b, images, shown))
-        if found is not None:
+        infinite = rig[b].K @ rig[b].R @ rig[a].R.mT @ torch.linalg.inv(rig[a].K)
+        window = round(WINDOW * max(images[b].shape[-2:]))
+        matches = guided_matches(images[a], images[b], infinite, window=window, shown=(shown[a], shown[b]))
+        if (found := _consistent(rig, a, b, matches)) is not None:
             pairs[a, b] = found
     names = _connected(alpha, list(pairs))
     if len(names) < 2:
@@ -69,14 +71,11 @@ def centres_found(
         rig = refine_matches(rig, [near], free=free, sigma=SIGMA, keep_depth=False).rig
     first = float(rig.pair(alpha, rig.betas(alpha)[0]).beta_from_alpha.t.norm())
     rig = rig.scaled((stated[0] if any(stated) else 1.0) / first)
-    facts = {b: _fit(rig, near, b) for b in rig.betas(alpha)}
+    facts = {}
+    for name in rig.betas(alpha):
+        own = {pair: matches for pair, matches in near.items() if name in pair}
+        facts[name] = sum(len(matches.alpha) for matches in own.values()), median_off(rig, own)
     return rig.replace(depth=_depths(rig, alpha, near)), facts
-
-
-def _matched(rig: Rig, a: str, b: str, images: Images, shown: Mapping[str, Tensor]) -> PointMatches:
-    infinite = rig[b].K @ rig[b].R @ rig[a].R.mT @ torch.linalg.inv(rig[a].K)
-    window = round(WINDOW * max(images[b].shape[-2:]))
-    return guided_matches(images[a], images[b], infinite, window=window, shown=(shown[a], shown[b]))
 
 
 def _normals(rig: Rig, a: str, b: str, matches: PointMatches) -> Float[Tensor, "n 3"]:
@@ -159,19 +158,10 @@ def _points_ahead(
     return float((torch.linalg.cross(one, two) * torch.linalg.cross(baseline, two)).sum(-1).sign().sum())
 
 
-def _fit(rig: Rig, near: Mapping[tuple[str, str], PointMatches], name: str) -> tuple[int, float]:
-    """The points of a camera with all others, and their median distance from their lines."""
-    own = {pair: matches for pair, matches in near.items() if name in pair}
-    return sum(len(matches.alpha) for matches in own.values()), median_off(rig, own)
-
-
 def _depths(rig: Rig, alpha: str, near: Mapping[tuple[str, str], PointMatches]) -> tuple[float, float]:
     """The range of depths that all pairs' points have, extended. Raises ValueError without parallax."""
-    found = []
-    for (a, b), matches in near.items():
-        bounds = depth_bounds(Rig({name: rig[name] for name in (a, b)}), matches)
-        if bounds is not None:
-            found.append(bounds)
+    every = [depth_bounds(Rig({name: rig[name] for name in pair}), m) for pair, m in near.items()]
+    found = [bounds for bounds in every if bounds is not None]
     if not found:
         raise ValueError("the images have no parallax, so depths stay unknown: give a rig file")
     return min(n for n, _ in found), max(f for _, f in found)

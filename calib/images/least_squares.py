@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -34,42 +33,26 @@ DAMPING = 1e-3
 LEAST_NOISE = 0.03
 """Lower bound of the noise of matched points, pixels."""
 
-Residuals = Callable[[Tensor], Tensor]
+Residuals = Callable[[Tensor], Sequence[Tensor]]
+"""In parts, such as pairs of cameras: derivatives by what a part does not depend on are not computed."""
 
 
-@dataclass(frozen=True)
-class JoinedResiduals:
-    """Residuals of several parts, such as pairs of cameras, each depending on some of the parameters only.
+class Evaluated(NamedTuple):
+    """Residuals at z, a variable of which they are functions, to be differentiated there if wanted."""
 
-    Derivatives by the others, which are 0, are not computed.
-    """
+    z: Float[Tensor, " k"]
+    parts: Sequence[Tensor]
 
-    parts: Callable[[Tensor], Sequence[Tensor]]
+    @classmethod
+    def at(cls, z: Float[Tensor, " k"], residuals: Residuals) -> Evaluated:
+        """The residuals at z."""
+        z = z.detach().requires_grad_()
+        return cls(z, residuals(z))
 
-    def __call__(self, z: Float[Tensor, " k"]) -> Float[Tensor, " m"]:
-        """All residuals."""
-        return torch.cat(list(self.parts(z)))
-
-
-class _Evaluated:
-    """Residuals whose values at the last point are remembered, to be differentiated there if that is wanted.
-
-    A step that is accepted was evaluated as a trial. The point is known by its tensor, which must not change.
-    """
-
-    def __init__(self, residuals: Residuals):
-        self.residuals, self.z = residuals, torch.empty(0)
-
-    def parts(self, z: Float[Tensor, " k"]) -> tuple[Tensor, Sequence[Tensor]]:
-        """The variable of the derivatives, and the values in parts, which depend on it."""
-        if z is not self.z:
-            at, f = z.detach().requires_grad_(), self.residuals
-            self.z, self.last = z, (at, f.parts(at) if isinstance(f, JoinedResiduals) else [f(at)])
-        return self.last
-
-    def __call__(self, z: Float[Tensor, " k"]) -> Float[Tensor, " m"]:
-        """All values, as constants."""
-        return torch.cat([part.detach() for part in self.parts(z)[1]])
+    @property
+    def values(self) -> Float[Tensor, " m"]:
+        """All of them, as constants."""
+        return torch.cat([part.detach() for part in self.parts])
 
 
 class Solution(NamedTuple):
@@ -96,7 +79,7 @@ def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
     Free parameters whose standard deviation stays above `LARGEST_POSTERIOR` are reset to 0 and the others
     solved for again. `residuals` takes `count` free parameters and then the `considered` ones.
     """
-    residuals, total = _Evaluated(residuals), count + considered
+    total = count + considered
     active = torch.ones(total, dtype=torch.bool)
     z, eye = torch.zeros(total, dtype=torch.float64), torch.eye(total, dtype=torch.float64)
     while True:
@@ -148,26 +131,28 @@ def most_probable(
     Undamped steps shortened until the cost falls would stop short where some parameters are hardly
     observable, as poses by a flat scene are.
     """
-    residuals = residuals if isinstance(residuals, _Evaluated) else _Evaluated(residuals)
     numbers = itertools.count(1)
 
-    def model(z: Tensor) -> LocalModel[Tensor]:
+    def model(at: Evaluated) -> LocalModel[Evaluated]:
         number = next(numbers)
         log_step(LOG, 1 - FURTHER_STEPS / (number - 1 + FURTHER_STEPS), "step %d of the fit", number)
-        r, J = jacobian(residuals, z)
+        (r, J), z = _differentiated(at), at.z.detach()
         information, slope = _normal_equations(r, J, z)
         information, slope = basis.T @ information @ basis, basis.T @ slope
         scale, diagonal = noise_scale(r), information.diagonal().diag()
 
-        def step(damping: float) -> Tensor:
-            return z + basis @ torch.linalg.solve(information + damping * diagonal, slope)
+        def step(damping: float) -> Evaluated:
+            return Evaluated.at(
+                z + basis @ torch.linalg.solve(information + damping * diagonal, slope), residuals
+            )
 
-        return LocalModel(cost(r, z, scale), lambda z: cost(residuals(z), z, scale), step)
+        return LocalModel(cost(r, z, scale), lambda at: cost(at.values, at.z.detach(), scale), step)
 
-    def is_converged(z: Tensor, moved: Tensor, *_: float) -> bool:
-        return float((moved - z).abs().max()) < CONVERGED
+    def is_converged(before: Evaluated, after: Evaluated, *_: float) -> bool:
+        return float((after.z - before.z).detach().abs().max()) < CONVERGED
 
-    return levenberg_marquardt(z, model, is_converged, steps=steps, damping=DAMPING)[0]
+    start = Evaluated.at(z, residuals)
+    return levenberg_marquardt(start, model, is_converged, steps=steps, damping=DAMPING)[0].z.detach()
 
 
 def cost(r: Float[Tensor, " m"], z: Float[Tensor, " k"], scale: float) -> float:
@@ -192,23 +177,28 @@ def _normal_equations(r: Tensor, J: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
     return information + torch.eye(len(z), dtype=z.dtype), -(slope + z)
 
 
-def jacobian(f: Residuals, z: Float[Tensor, " n"]) -> tuple[Float[Tensor, " m"], Float[Tensor, "m n"]]:
-    """f(z) and its derivatives, for many values of few parameters.
+def jacobian(
+    residuals: Residuals, z: Float[Tensor, " n"]
+) -> tuple[Float[Tensor, " m"], Float[Tensor, "m n"]]:
+    """The residuals at z and their derivatives, for many values of few parameters.
 
     The gradient of u . f in z is linear in u; its derivatives in u are the columns of the Jacobian. An entry
     of the gradient that is exactly 0 is of a parameter on which no value depends.
     """
-    z, values = (f if isinstance(f, _Evaluated) else _Evaluated(f)).parts(z)
+    return _differentiated(Evaluated.at(z, residuals))
+
+
+def _differentiated(at: Evaluated) -> tuple[Tensor, Tensor]:
     rows = []
-    for part in values:
+    for part in at.parts:
         u = torch.linspace(1, 2, len(part), dtype=part.dtype, requires_grad=True)
-        (slope,) = torch.autograd.grad(part, z, u, create_graph=True)
+        (slope,) = torch.autograd.grad(part, at.z, u, create_graph=True)
         depends = slope.detach() != 0
-        columns = torch.zeros(len(z), len(part), dtype=part.dtype)
+        columns = torch.zeros(len(at.z), len(part), dtype=part.dtype)
         if bool(depends.any()):
-            basis = torch.eye(len(z)).to(slope)[depends]
+            basis = torch.eye(len(at.z)).to(slope)[depends]
             (columns[depends],) = torch.autograd.grad(
                 slope, u, basis, is_grads_batched=True, retain_graph=True
             )
         rows.append(columns.T)
-    return torch.cat([part.detach() for part in values]), torch.cat(rows)
+    return at.values, torch.cat(rows)

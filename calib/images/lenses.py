@@ -7,8 +7,6 @@ has one radial term, as a quotient).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -19,16 +17,13 @@ from arraygeom.pixels import coarse_grid
 TERMS = 4
 
 
-def with_lenses(rig: Rig, names: Iterable[str]) -> Rig:
+def with_lenses(rig: Rig) -> Rig:
     """The rig with a lens without distortion for those of the views that are linked and have no lens."""
-    linked = {name for pair in rig.links for name in pair}
-    for name in names:
-        view = rig[name]
-        if name in linked and not isinstance(view, LensView):
+    for name in dict.fromkeys(name for pair in rig.links for name in pair):
+        if not isinstance(view := rig[name], LensView):
             K = intrinsics(max(view.hw) / 2, view.hw)
-            rig = rig.with_camera(
-                name, LensView(hw=view.hw, sensor=view.sensor, K=K, distortion=_no_distortion())
-            )
+            lens = LensView(hw=view.hw, sensor=view.sensor, K=K, distortion=_no_distortion())
+            rig = rig.with_camera(name, lens)
     return rig
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from itertools import combinations
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arraygeom import Link, Pair, apply_homography, epipolar_distance, epipolar_lines, triangulate
+from arraygeom import Link, Pair, Rig, apply_homography, epipolar_distance, epipolar_lines, triangulate
 from arraygeom.chunks import chunked
 from arraygeom.pixels import shift_matrix
 from arraygeom.progress import log_step
@@ -62,6 +62,12 @@ Pairs = Mapping[tuple[str, str], PointMatches]
 """Matches of pairs of cameras, by their names (alpha, beta)."""
 Images = Mapping[str, Float[Tensor, "_ _ _"]]
 """An image (C, H, W) of each camera, by name."""
+
+
+def cameras_of(rig: Rig, pairs: Iterable[tuple[str, str]]) -> list[str]:
+    """The cameras of some pairs, in the rig's order."""
+    among = {name for pair in pairs for name in pair}
+    return [name for name in rig.names if name in among]
 
 
 def match_points(alpha: Float[Tensor, "_ h w"], beta: Float[Tensor, "_ hb wb"]) -> PointMatches:
@@ -152,8 +158,7 @@ def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str
         log_step(LOG, done / total, "features of %s", name)
         features[name] = detect_features(image)
         done += matching_time({name: image}, 0)
-    for name, own in features.items():
-        if len(own.points) < ENOUGH:
+        if len(features[name].points) < ENOUGH:
             raise ValueError(
                 f"the image of '{name}' has hardly any texture to match: take one in focus, with detail"
             )
@@ -238,8 +243,7 @@ class FittedLink(NamedTuple):
 def fit_link(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float = 6.0) -> FittedLink:
     """Improve `F`, and fit a rough map, by the matches within some pixels of their lines.
 
-    F by MAGSAC++ (Barath et al. 2020) to 1 px; H by `rough_map`. Raises ValueError for fewer than 20
-    consistent matches.
+    F by MAGSAC++ (Barath et al. 2020) to 1 px. Raises ValueError for fewer than 20 consistent matches.
     """
     near = near_lines(matches, F, within=within)
     fitted = fit_fundamental(near) if len(near.alpha) >= ENOUGH else F
@@ -253,26 +257,26 @@ def with_map(pair: Pair, matches: PointMatches) -> FittedLink:
 
 
 def _with_rough_map(matches: PointMatches, F: Tensor) -> FittedLink:
+    """H by RANSAC, then shifted along the mean direction of the lines."""
     if len(matches.alpha) < ENOUGH:
         raise ValueError(
             f"only {len(matches.alpha)} points seen in both images agree with F: does it belong to them?"
         )
-    H, displacement = rough_map(matches, F)
-    return FittedLink(Link(F, H), matches, displacement)
-
-
-def rough_map(matches: PointMatches, F: Float[Tensor, "3 3"]) -> tuple[Float[Tensor, "3 3"], float]:
-    """A similarity centred on the points along their lines, and the distance containing 98% of them, pixels.
-
-    By RANSAC, then shifted along the mean direction of the lines.
-    """
-    H = similarity(matches)
-    low, high = _percentiles(_along_lines(matches, F, H), 0.01)
+    x, y = (points.numpy() for points in matches)
+    found, _ = cv2.estimateAffinePartial2D(x, y, ransacReprojThreshold=30)
+    if found is None:
+        raise ValueError("no similarity fits the points seen in both images")
+    H = torch.from_numpy(np.vstack([found, [0, 0, 1]]))
     line = epipolar_lines(F, matches.alpha)
-    shift = torch.stack([-line[:, 1], line[:, 0]], -1).mean(0) * (low + high) / 2
+    along = torch.stack([-line[:, 1], line[:, 0]], -1)
+
+    def extent(H: Tensor) -> tuple[float, float]:
+        return _percentiles(((matches.beta - apply_homography(H, matches.alpha).x) * along).sum(-1), 0.01)
+
+    shift = along.mean(0) * sum(extent(H)) / 2
     H = shift_matrix(*(-shift).tolist()).to(H) @ H
-    low, high = _percentiles(_along_lines(matches, F, H), 0.01)
-    return H, max(-low, high)
+    low, high = extent(H)
+    return FittedLink(Link(F, H), matches, max(-low, high))
 
 
 def undistort_matches(pair: Pair, matches: PointMatches) -> PointMatches:
@@ -281,23 +285,38 @@ def undistort_matches(pair: Pair, matches: PointMatches) -> PointMatches:
     return PointMatches(x, y).only(x_valid & y_valid)
 
 
+def depths_near_lines(pair: Pair, matches: PointMatches, *, within: float) -> Float[Tensor, " m"]:
+    """Depths in alpha, metres, of those points that are within some pixels of their lines and in front."""
+    undistorted = PointMatches(pair.alpha.undistort(matches.alpha)[0], pair.beta.undistort(matches.beta)[0])
+    near = matches.only(line_distance(undistorted, pair.fundamental) <= within)
+    cameras = [camera.to(torch.float64) for camera in pair.cameras]
+    found = triangulate(cameras, torch.stack(near), deviation=LOCALISED, residual=within)
+    return cameras[0].cam_from_world.apply(found.X)[found.valid, 2]
+
+
 def seen_depths(pair: Pair, matches: PointMatches) -> tuple[float, float]:
     """Depth bounds of matched points, metres in front of alpha: 0.9 of the nearest to 1.25 of the farthest.
 
     Nearest and farthest without the outermost 2% of the points. Raises ValueError for fewer than 20 points in
     front.
     """
-    undistorted = PointMatches(pair.alpha.undistort(matches.alpha)[0], pair.beta.undistort(matches.beta)[0])
-    near = matches.only(line_distance(undistorted, pair.fundamental) <= 3)
-    cameras = [camera.to(torch.float64) for camera in pair.cameras]
-    found = triangulate(cameras, torch.stack(near), deviation=LOCALISED, residual=3.0)
-    depth = cameras[0].cam_from_world.apply(found.X)[found.valid, 2]
+    depth = depths_near_lines(pair, matches, within=3.0)
     if len(depth) < ENOUGH:
         raise ValueError(
             f"only {len(depth)} points seen in both images fit the calibration: does it belong to them?"
         )
     low, high = _percentiles(depth, 0.02)
     return 0.9 * low, 1.25 * high
+
+
+def depth_seen(rig: Rig, pairs: Pairs) -> tuple[float, float] | None:
+    """`seen_depths` of all calibrated pairs together; None if no pair has enough points."""
+    found = []
+    for names, matches in pairs.items():
+        if (pair := rig.pair(*names)).calibrated:
+            with suppress(ValueError):
+                found.append(seen_depths(pair, matches))
+    return (min(near for near, _ in found), max(far for _, far in found)) if found else None
 
 
 def fit_fundamental(matches: PointMatches) -> Float[Tensor, "3 3"]:
@@ -310,24 +329,6 @@ def fit_fundamental(matches: PointMatches) -> Float[Tensor, "3 3"]:
         if found is not None and found.shape == (3, 3):
             return torch.from_numpy(found)
     raise ValueError("no fundamental matrix fits the points seen in both images")
-
-
-def similarity(matches: PointMatches) -> Float[Tensor, "3 3"]:
-    """The similarity that most matches fit to 30 pixels of beta, by RANSAC."""
-    x, y = (points.numpy() for points in matches)
-    found, _ = cv2.estimateAffinePartial2D(x, y, ransacReprojThreshold=30)
-    if found is None:
-        raise ValueError("no similarity fits the points seen in both images")
-    return torch.from_numpy(np.vstack([found, [0, 0, 1]]))
-
-
-def _along_lines(
-    matches: PointMatches, F: Float[Tensor, "3 3"], H: Float[Tensor, "3 3"]
-) -> Float[Tensor, " n"]:
-    """Signed position of each match along its line, from the point nearest to H x, pixels of beta."""
-    line = epipolar_lines(F, matches.alpha)
-    from_map = matches.beta - apply_homography(H, matches.alpha).x
-    return (from_map * torch.stack([-line[:, 1], line[:, 0]], -1)).sum(-1)
 
 
 def _percentiles(values: Tensor, share: float) -> tuple[float, float]:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from arraygeom import Rig
 
-from .held_out import median_off
+from .depth_change import share_outside
 from .matches import Images, Pairs, match_cameras
-from .residuals import match_depths, own_distance, related
+from .residuals import median_off, own_distance, related
 
 LARGEST_SIDE = 1000
 """Images are reduced to this many pixels..."""
@@ -24,11 +23,7 @@ BADLY, OF_OWN = 1.5, 3.0
 """A rig fits badly whose points lie farther from their lines than this, in pixels of the reduced images
 (median), and than this many times their distance from the lines of an F fitted to them."""
 OUTSIDE = 0.5
-"""And a rig is wrong with more than this share of points behind the cameras or outside its depth range..."""
-BEYOND = 1.5
-"""... by more than this factor."""
-FEW = 10
-"""Least number of points for a share."""
+"""And a rig is wrong with more than this share of points outside (`share_outside`)."""
 
 
 class Misfit(NamedTuple):
@@ -60,18 +55,21 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
     some = {name: images[name] for name in list(images.keys())[:MOST_CAMERAS]}
     if len(some) < 2 or any(rig[name].hw != tuple(image.shape[1:]) for name, image in some.items()):
         return None
-    rough = _compared(rig, some, ROUGH_SIDE)
-    limit = BADLY * _scale(some, ROUGH_SIDE) / _scale(some, LARGEST_SIDE)
-    if rough is not None and rough.off <= limit and rough.outside <= OUTSIDE:
+    scales = {
+        side: min(_scale(image, side) for image in some.values()) for side in (ROUGH_SIDE, LARGEST_SIDE)
+    }
+    limit = BADLY * scales[ROUGH_SIDE] / scales[LARGEST_SIDE]
+    rough = _matched(rig, some, ROUGH_SIDE)
+    if rough is not None and median_off(*rough) <= limit and share_outside(*rough) <= OUTSIDE:
         return None
-    found = _compared(rig, some, LARGEST_SIDE)
-    if found is None:
+    if (found := _matched(rig, some, LARGEST_SIDE)) is None:
         return None
-    rig, pairs, off, outside = found
+    rig, pairs = found
+    off, outside = median_off(rig, pairs), share_outside(rig, pairs)
     if off <= max(BADLY, OF_OWN * own_distance(rig, pairs)) and not outside > OUTSIDE:
         return None
     points = sum(len(matches.alpha) for matches in pairs.values())
-    at = "" if _scale(some, LARGEST_SIDE) == 1 else f", in images reduced to {LARGEST_SIDE} px"
+    at = "" if scales[LARGEST_SIDE] == 1 else f", in images reduced to {LARGEST_SIDE} px"
     text = (
         "the rig fits these images badly: "
         f"{points} matched points lie {off:.1f} px from their lines (median{at})"
@@ -85,53 +83,20 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
     return Misfit(off, outside, diagnosis.named.kind != "nothing", text + verdict)
 
 
-class _Compared(NamedTuple):
-    """Matched points of reduced images: median distance from their lines (pixels), and `share_outside`."""
-
-    rig: Rig
-    pairs: Pairs
-    off: float
-    outside: float
+def _scale(image: Tensor, largest: int) -> float:
+    """By what an image is reduced."""
+    return min(1.0, largest / max(image.shape[1:]))
 
 
-def _scale(images: Mapping[str, Tensor], largest: int) -> float:
-    """By what an image is reduced, of all the one that is reduced most."""
-    return min(1.0, *(largest / max(image.shape[1:]) for image in images.values()))
-
-
-def _compared(rig: Rig, images: Mapping[str, Tensor], largest: int) -> _Compared | None:
+def _matched(rig: Rig, images: Mapping[str, Tensor], largest: int) -> tuple[Rig, Pairs] | None:
     """Points matched between images with sides reduced to so many pixels at most; None if too few."""
     reduced = {}
     for name, image in images.items():
-        h, w = image.shape[1:]
-        scale = min(1.0, largest / max(h, w))
-        hw = round(h * scale), round(w * scale)
+        scale = _scale(image, largest)
+        hw = round(image.shape[1] * scale), round(image.shape[2] * scale)
         rig = rig.resize(name, hw)
-        reduced[name] = (
-            torch.nn.functional.interpolate(image[None], hw, mode="area")[0] if scale < 1 else image
-        )
+        reduced[name] = interpolate(image[None], hw, mode="area")[0] if scale < 1 else image
     try:
-        pairs = related(rig, match_cameras(reduced))
+        return rig, related(rig, match_cameras(reduced))
     except ValueError:
         return None
-    return _Compared(rig, pairs, median_off(rig, pairs), share_outside(rig, pairs))
-
-
-def share_outside(rig: Rig, pairs: Pairs) -> float:
-    """The share of points of observable depth that are behind the cameras or outside the rig's depth range.
-
-    Points of calibrated pairs only: 0 where there is no such pair, NaN for few points. The depth range counts
-    with a margin.
-    """
-    near, far = (
-        (0.0, math.inf) if rig.depth is None else (float(rig.depth[0]) / BEYOND, float(rig.depth[1]) * BEYOND)
-    )
-    outside = []
-    for names, matches in pairs.items():
-        if (found := match_depths(rig.pair(*names), matches)) is not None:
-            inside = found.front & (found.depth >= near) & (found.depth <= far)
-            outside.append(~inside[found.observable])
-    if not outside:
-        return 0.0
-    joined = torch.cat(outside)
-    return float(joined.double().mean()) if len(joined) >= FEW else math.nan

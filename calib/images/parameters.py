@@ -12,9 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import Camera, LensView, Link, Rig, rotation_from_vector
+from arraygeom import Camera, LensView, Link, Rig, intrinsics, rotation_from_vector
 from arraygeom.distortion import typical_coefficients
-from arraygeom.pixels import HW
 
 SIGMA = {"rotation": math.radians(0.5), "translation": 0.01, "focal": 0.01, "centre": 5.0, "distortion": 0.02}
 """Default standard deviations: radians, a share of the longest baseline, a share of the focal length, pixels
@@ -81,13 +80,9 @@ def free_parameters(
         raise ValueError(f"--sigma: wanted a positive number for one of {', '.join(SIGMA)}; got '{wrong[0]}'")
     sigma = {**SIGMA, **stated}
     parameters = rig.parameters(free=["*"]) if any(isinstance(rig[n], LensView) for n in names) else {}
-    calibrated = {
-        name: like
-        for name, like in parameters.items()
-        if isinstance(rig.cameras.get(_camera_of(name)), Camera)
-    }
-    wanted = _matching(calibrated, free)
-    wanted += [name for name in parameters if name not in calibrated and not name.startswith("depth.")]
+    parameters = {n: like for n, like in parameters.items() if n not in ("depth.near", "depth.far")}
+    calibrated = [name for name in parameters if isinstance(rig[_camera_of(name)], Camera)]
+    wanted = [*_matching(calibrated, free), *(name for name in parameters if name not in calibrated)]
     fixed = {f"{names[0]}.rotation", f"{names[0]}.translation"}
     found = [
         _free_parameter(rig, name, parameters[name], sigma)
@@ -105,8 +100,6 @@ def considered_parameters(
 
     Their uncertainty counts, but they are not changed.
     """
-    if not any(isinstance(rig[name], Camera) for name in names):
-        return []
     fixed = {f.name for f in free}
     found = free_parameters(rig, names, free=UNCERTAIN, sigma=sigma)
     return [f for f in found if f.name not in fixed and f.unit != "F" and not f.name.endswith(".distortion")]
@@ -128,21 +121,16 @@ def _camera_of(parameter: str) -> str:
     return parameter.rpartition(".")[0]
 
 
-def _matching(parameters: Mapping[str, Tensor], free: Iterable[str]) -> list[str]:
-    if not parameters:
-        return []
-    wanted: list[str] = []
-    for pattern in free:
+def _matching(parameters: Sequence[str], free: Iterable[str]) -> list[str]:
+    wanted: dict[str, None] = {}
+    for pattern in free if parameters else ():
         kind = ALIASES.get(pattern, pattern)
         names = fnmatch.filter(parameters, kind if "." in kind else f"*.{kind}")
-        names = [n for n in names if not n.startswith("depth.")]
         if not names:
-            kinds = ", ".join(
-                dict.fromkeys(n.rpartition(".")[2] for n in parameters if not n.startswith("depth."))
-            )
+            kinds = ", ".join(dict.fromkeys(name.rpartition(".")[2] for name in parameters))
             raise ValueError(f"--free: the rig has no '{pattern}' (it has: {kinds})")
-        wanted += [n for n in names if n not in wanted]
-    return wanted
+        wanted |= dict.fromkeys(names)
+    return list(wanted)
 
 
 def _free_parameter(rig: Rig, name: str, like: Tensor, sigma: Mapping[str, float]) -> FreeParameter:
@@ -155,30 +143,19 @@ def _free_parameter(rig: Rig, name: str, like: Tensor, sigma: Mapping[str, float
         natural = torch.tensor(typical_coefficients(view.distortion), dtype=torch.float64)
         size = natural * (sigma[kind] if isinstance(view, Camera) else LENS_SIGMA)
     if kind == "translation":
-        size = size * _longest_baseline(rig)
+        centres = torch.stack([c.centre for c in rig.cameras.values() if isinstance(c, Camera)])
+        size = size * (max(float(torch.pdist(centres).max()), 1e-6) if len(centres) > 1 else 1.0)
     unit, factor = UNITS.get(kind, ("", 1.0))
     return FreeParameter(name, size, unit, factor, FOCAL_CORRELATION if kind == "focal" else 0.0)
-
-
-def _longest_baseline(rig: Rig) -> float:
-    centres = torch.stack([c.centre for c in rig.cameras.values() if isinstance(c, Camera)])
-    return max(float(torch.pdist(centres).max()), 1e-6) if len(centres) > 1 else 1.0
 
 
 def _perturbed_link(link: Link, value: Tensor | None, rig: Rig, names: tuple[str, str]) -> Link:
     """F after seven small changes: rotations of both sets of singular vectors, the second singular value."""
     if value is None:
         return link
-    A, B = (_to_unit(rig[name].hw).to(link.F) for name in names)
-    U, S, Vh = torch.linalg.svd(torch.linalg.inv(B).T @ link.F @ torch.linalg.inv(A))
+    K, K_beta = (intrinsics(max(rig[name].hw) / 2, rig[name].hw).to(link.F) for name in names)
+    U, S, Vh = torch.linalg.svd(K_beta.T @ link.F @ K)
     second = (S[1] / S[0]) * (1 + value[6])
     U, Vh = U @ rotation_from_vector(value[:3]), rotation_from_vector(value[3:6]) @ Vh
     F = U @ torch.diag(torch.stack([torch.ones_like(second), second, torch.zeros_like(second)])) @ Vh
-    return Link(B.T @ F @ A, link.H)
-
-
-def _to_unit(hw: HW) -> Tensor:
-    """Pixels to coordinates between about -1 and 1."""
-    s = 2 / max(hw)
-    rows = [[s, 0, -s * (hw[1] - 1) / 2], [0, s, -s * (hw[0] - 1) / 2], [0, 0, 1]]
-    return torch.tensor(rows, dtype=torch.float64)
+    return Link(torch.linalg.inv(K_beta).T @ F @ torch.linalg.inv(K), link.H)

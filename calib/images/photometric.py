@@ -8,9 +8,7 @@ depends on the rig alone. Bilinear sampling propagates the gradient to the segme
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,25 +18,10 @@ from torch.nn.functional import avg_pool2d, interpolate, pad, unfold
 from arraygeom import Positions, Rig, Segments, pixel_grid
 from arraygeom.fields import recorded_field
 
-from .matches import Images, Pairs, seen_depths
+Attend = Callable[[Tensor, Tensor, Tensor, Segments | Positions], Any]
+"""Attention from queries to keys and values along a field: `pat.attention.attend_with_statistics`.
 
-
-@runtime_checkable
-class PhotometricMatch(Protocol):
-    """The result of attention: values (1, D, h, w) and the largest weight (1, h, w) as a confidence."""
-
-    @property
-    def value(self) -> Tensor:
-        """The weighted value."""
-
-    @property
-    def peak(self) -> Tensor:
-        """The largest weight."""
-
-
-Attend = Callable[[Tensor, Tensor, Tensor, Segments | Positions], PhotometricMatch]
-"""Attention from queries to keys and values along a field: `pat.attention.attend_with_statistics`."""
-
+Of its result `value`, (1, D, h, w), and `peak`, the largest weight (1, h, w), count."""
 LARGEST = 480
 """Images are reduced to this many pixels along their longer side."""
 PIXELS = 6000
@@ -51,28 +34,24 @@ EVEN = 0.02
 """Deviations below this, of images in 0..1, are noise."""
 
 
-@dataclass(frozen=True)
-class PhotometricFrame:
-    """One frame prepared, by camera: the reduced size, features (1, D, H, W) and values (1, 1, H, W) of each
-    pixel, and the grid (h, w, 2) of query pixels."""
+class PhotometricImage(NamedTuple):
+    """An image, reduced: features (1, D, h, w), values (1, 1, h, w), a grid (r, c, 2) of query pixels."""
 
-    hw: Mapping[str, tuple[int, int]]
-    keys: Mapping[str, Tensor]
-    values: Mapping[str, Tensor]
-    grid: Mapping[str, Tensor]
+    keys: Tensor
+    values: Tensor
+    grid: Tensor
 
     @classmethod
-    def of(cls, images: Images) -> PhotometricFrame:
-        """The frame's images, reduced, with patches as features."""
-        grey = {name: _reduced(image) for name, image in images.items()}
-        keys = {name: patches(image) for name, image in grey.items()}
-        sizes = {name: (int(p.shape[2]), int(p.shape[3])) for name, p in grey.items()}
-        grid = {name: _grid(hw) for name, hw in sizes.items()}
-        return cls(sizes, keys, {name: structure(image) for name, image in grey.items()}, grid)
+    def of(cls, image: Float[Tensor, "_ _ _"]) -> PhotometricImage:
+        """An image reduced, with patches as features."""
+        grey = _reduced(image)
+        h, w = grey.shape[-2:]
+        step = max(1, round((h * w / PIXELS) ** 0.5))
+        return cls(patches(grey), structure(grey), pixel_grid((h, w))[step // 2 :: step, step // 2 :: step])
 
 
 def photometric_errors(
-    rig: Rig, views: PhotometricFrame, names: tuple[str, str], attend: Attend
+    rig: Rig, views: Mapping[str, PhotometricImage], names: tuple[str, str], attend: Attend
 ) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
     """The error of attention's value against alpha's, at the pixels of the grid, and its validity.
 
@@ -81,29 +60,16 @@ def photometric_errors(
     """
     alpha, beta = names
     for name in names:
-        rig = rig.resize(name, views.hw[name])
-    pair, x = rig.pair(*names).to(torch.float32), views.grid[alpha]
+        h, w = views[name].keys.shape[-2:]
+        rig = rig.resize(name, (h, w))
+    pair, x = rig.pair(*names).to(torch.float32), views[alpha].grid
     locations = recorded_field(pair, samples=64, nodes=16)(pair, x)
     columns, rows = x[0, :, 0].long(), x[:, 0, 1].long()
-    query, own = (image[alpha][:, :, rows][..., columns] for image in (views.keys, views.values))
-    found = attend(query, views.keys[beta], views.values[beta], locations)
+    query, own = (image[:, :, rows][..., columns] for image in views[alpha][:2])
+    found = attend(query, views[beta].keys, views[beta].values, locations)
     valid = locations.mask.any(-1) if isinstance(locations, Positions) else locations.valid
     confidence = found.peak[0].detach().sqrt()
     return torch.where(valid, confidence * (found.value - own)[0, 0], 0.0), valid
-
-
-def with_depths(rig: Rig, pairs: Pairs) -> Rig:
-    """The rig with the depth range of the matched points, if it has none."""
-    if rig.depth is not None:
-        return rig
-    bounds = []
-    for names, matches in pairs.items():
-        if (pair := rig.pair(*names)).calibrated:
-            with suppress(ValueError):
-                bounds.append(seen_depths(pair, matches))
-    return (
-        rig.replace(depth=(min(near for near, _ in bounds), max(far for _, far in bounds))) if bounds else rig
-    )
 
 
 def patches(grey: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 25 h w"]:
@@ -135,8 +101,3 @@ def _reduced(image: Tensor) -> Tensor:
     if factor >= 1:
         return grey
     return interpolate(grey, size=(round(h * factor), round(w * factor)), mode="bilinear", antialias=True)
-
-
-def _grid(hw: tuple[int, int]) -> Tensor:
-    step = max(1, round((hw[0] * hw[1] / PIXELS) ** 0.5))
-    return pixel_grid(hw)[step // 2 :: step, step // 2 :: step]

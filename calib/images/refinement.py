@@ -19,7 +19,7 @@ import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import accumulate, product
 
 import torch
 from jaxtyping import Bool, Float
@@ -31,26 +31,15 @@ from arraygeom.progress import log_step, part, stage
 from arraygeom.threads import torch_in_one_thread
 
 from .depth_change import (
-    LARGE_CHANGE,
     NEGLIGIBLE,
     DepthChange,
     depth_modes,
     log_depths,
     relative_change,
-    share_behind,
-)
-from .held_out import (
-    PARTS,
-    held_out_pixels,
-    image_parts,
-    line_distances,
-    line_statistics,
-    median_off,
-    nearer,
-    split,
+    share_outside,
 )
 from .least_squares import (
-    JoinedResiduals,
+    Evaluated,
     Residuals,
     Solution,
     jacobian,
@@ -60,11 +49,33 @@ from .least_squares import (
     solve,
 )
 from .lenses import with_distortion, with_lenses
-from .matches import ENOUGH, Images, Pairs, agreeing_pairs, match_cameras, matching_time, with_map
+from .matches import (
+    ENOUGH,
+    Images,
+    Pairs,
+    agreeing_pairs,
+    cameras_of,
+    depth_seen,
+    match_cameras,
+    matching_time,
+    with_map,
+)
 from .parameters import LARGEST_CHANGE, FreeParameter, apply_change, considered_parameters, free_parameters
-from .photometric import Attend, PhotometricFrame, photometric_errors, with_depths
+from .photometric import Attend, PhotometricImage, photometric_errors
 from .refined import LineStatistics, ParameterChange, PhotometricResult, Refinement
-from .residuals import own_distance, related, sampson_of_pairs, systematic_modes
+from .residuals import (
+    PARTS,
+    held_out_pixels,
+    image_parts,
+    line_distances,
+    median_off,
+    nearer,
+    own_distance,
+    related,
+    sampson_of_pairs,
+    split,
+    systematic_modes,
+)
 
 LOG = logging.getLogger(__name__)
 
@@ -78,6 +89,8 @@ LARGEST_DISTANCE, OF_OWN = 1.0, 3.0
 and than this many times their distance from the lines of an F fitted to them."""
 AT_BEST = 1.1
 """No more is freed where held-out points are within this factor of their distance from such lines."""
+MOST_BEHIND = 0.5
+"""Share of the points that may lie behind a camera: some wrong matches always do."""
 UNCHANGED = 1e-3
 """Relative deviation of depth within which a pattern of depth stays."""
 CORRELATED_PIXELS = 10.0
@@ -110,8 +123,13 @@ def refine(
     prior. `force` accepts a result in spite of objections. Raises ValueError, one line: a camera that the rig
     lacks, an image of another size than the rig states, equal images, too few points.
     """
-    for frame in frames:
-        _check(rig, frame)
+    for name, image in (item for frame in frames for item in frame.items()):
+        (h, w), (height, width) = rig[name].hw, image.shape[1:]
+        if (height, width) != (h, w):
+            raise ValueError(
+                f"the image of '{name}' is {width}x{height}, the rig states {w}x{h}: "
+                "`pat rig doctor` finds the reason"
+            )
     with stage("points" + ", stage 1 of 2" * (attend is not None), new=True):
         seconds = sum(matching_time(frame, math.comb(len(frame), 2)) for frame in frames)
         matched_at = seconds / (seconds + FITTED * math.comb(len(frames[0]), 2))
@@ -162,7 +180,7 @@ def fitted(
     candidates = [(rig, free)]
     if free == FREE and any(isinstance(view, Camera) for view in rig.cameras.values()):
         candidates.append((rig, (*FREE, *EXTRA_FREE)))
-    if (with_lens := with_lenses(rig, rig.names)) is not rig:
+    if (with_lens := with_lenses(rig)) is not rig:
         candidates.append((with_lens, free))
     problems = [RefinementProblem.of(*candidate, frames=frames, sigma=sigma) for candidate in candidates]
     ends = [sum(problem.count**2 for problem in problems[:i]) for i in range(len(problems) + 1)]
@@ -207,9 +225,7 @@ class RefinementProblem:
     ) -> RefinementProblem:
         """Raises ValueError if nothing is free."""
         used, held_out = split([related(rig, pairs) for pairs in frames])
-        names = [
-            name for name in rig.names if any(name in pair for pairs in (used, held_out) for pair in pairs)
-        ]
+        names = cameras_of(rig, (*used, *held_out))
         parameters = free_parameters(rig, names, free=free, sigma=sigma)
         if not parameters:
             raise ValueError(
@@ -243,11 +259,10 @@ class RefinementProblem:
         log_step(LOG, 0, "refining %d parameters by %d points", self.count, len(systematic))
         columns = systematic.split([len(matches.alpha) for matches in self.used.values()])
 
-        def parts(z: Tensor) -> list[Tensor]:
+        def residuals(z: Tensor) -> list[Tensor]:
             found = sampson_of_pairs(self.after(z[: self.uncertain]), self.used)
             return [part + own @ z[self.uncertain :] for part, own in zip(found, columns)]
 
-        residuals = JoinedResiduals(parts)
         considered = self.uncertain - self.count + systematic.shape[1]
         unrestricted = solve(residuals, self.count, considered)
         found = self._determined(unrestricted, residuals)
@@ -257,7 +272,7 @@ class RefinementProblem:
 
     def solve_freely(self) -> Solution:
         """The posterior given the used points, whatever happens to depth."""
-        return solve(JoinedResiduals(lambda z: sampson_of_pairs(self.after(z), self.used)), self.count, 0)
+        return solve(lambda z: sampson_of_pairs(self.after(z), self.used), self.count)
 
     def _determined(self, solution: Solution, residuals: Residuals, *, keep_depth: bool = False) -> Solution:
         """The solution without the modes of depth that the points do not determine.
@@ -294,31 +309,39 @@ class RefinementProblem:
         log_depth: Residuals,
     ) -> Solution:
         """The most probable `active` parameters that leave these patterns of depth as they were."""
-        before = log_depth(torch.zeros_like(solution.z)).detach()
-        tight = noise_scale(residuals(solution.full).detach()) / (UNCHANGED * len(before) ** 0.5)
-
-        def constrained(full: Tensor) -> Tensor:
-            return torch.cat(
-                [residuals(full), tight * (patterns.T @ (log_depth(full[: self.count]) - before))]
-            )
-
         start = torch.zeros_like(solution.full)
-        full = most_probable(
-            constrained, start, torch.eye(len(start), dtype=start.dtype)[:, active], steps=12
-        )
+        before = Evaluated.at(start[: self.count], log_depth).values
+        noise = noise_scale(Evaluated.at(solution.full, residuals).values)
+        tight = noise / (UNCHANGED * len(before) ** 0.5)
+
+        def constrained(full: Tensor) -> list[Tensor]:
+            (depth,) = log_depth(full[: self.count])
+            return [*residuals(full), tight * (patterns.T @ (depth - before))]
+
+        basis = torch.eye(len(start), dtype=start.dtype)[:, active]
+        full = most_probable(constrained, start, basis, steps=12)
         return solution._replace(z=full[: self.count])
 
     def report(self, solution: Solution, *, force: bool = False) -> Refinement:
         """A solution's changes, and whether held-out points, the prior and depth's uncertainty support it."""
         refined = self.after(solution.z)
         before, after = (line_distances(rig, self.held_out) for rig in (self.rig, refined))
-        held_out = line_statistics(before), line_statistics(after)
         depth = self._depth_change(refined, solution)
         moved = bool(solution.z.any())
-        objections = [] if moved and nearer(before, after) else [NO_NEARER]
+        objections = (
+            [] if moved and nearer(before, after) else ["held-out points are no nearer to their lines"]
+        )
         objections += _contradictions(self.parameters, solution.z)
-        objections += _remaining(refined, self.held_out, held_out[1]) if moved else []
-        objections += [*_uncertain_depth(depth), *_behind(refined, self.used)]
+        off = float(after.abs().median())
+        if moved and off > max(LARGEST_DISTANCE, OF_OWN * own_distance(refined, self.held_out)):
+            objections.append(
+                f"points still lie {off:.1f} px from their lines: "
+                "the rig has not drifted, see `pat rig doctor`"
+            )
+        objections += [] if depth is None else depth.objections()
+        if (behind := share_outside(refined.replace(depth=None), self.used)) > MOST_BEHIND:
+            mistake = "is it swapped, or does it face the other way? See `pat rig doctor`"
+            objections.append(f"{behind:.0%} of the points lie behind a camera: {mistake}")
         if not objections and depth is not None and depth.change > NEGLIGIBLE:
             objections += self._explained_by_lenses(after)
         accepted = moved and (force or not objections)
@@ -327,7 +350,7 @@ class RefinementProblem:
             accepted=accepted,
             changes=tuple(_changes(self.parameters, solution)) if accepted else (),
             unobservable=tuple(_unobservable(self.parameters, solution.active)),
-            held_out=held_out,
+            held_out=(LineStatistics.of(before), LineStatistics.of(after)),
             depth=depth,
             objections=tuple(objections),
             kept=tuple(_kept(self.parameters, solution)),
@@ -341,7 +364,7 @@ class RefinementProblem:
         if any(u.name.endswith(".distortion") for u in self.parameters) or self.rig.links:
             return []
         rig = with_distortion(self.rig)
-        names = [name for name in rig.names if any(name in pair for pair in self.used)]
+        names = cameras_of(rig, self.used)
         lenses = free_parameters(rig, names, free=["distortion"], sigma={"distortion": LEFT_OUT_SIGMA})
         lens_alone = replace(self, rig=rig, parameters=tuple(lenses), considered=())
         explained = lens_alone.after(lens_alone.solve_freely().z)
@@ -364,11 +387,6 @@ class RefinementProblem:
         return DepthChange(relative_change(self.rig, refined, self.used), before, after, solution.known)
 
 
-NO_NEARER = "held-out points are no nearer to their lines"
-MOST_BEHIND = 0.5
-"""Share of the points that may lie behind a camera: some wrong matches always do."""
-
-
 def _contradictions(parameters: Sequence[FreeParameter], z: Tensor) -> list[str]:
     """An objection for each parameter vector that changes by more than its prior allows."""
     found = []
@@ -386,44 +404,9 @@ def _contradictions(parameters: Sequence[FreeParameter], z: Tensor) -> list[str]
     return found
 
 
-def _remaining(refined: Rig, held_out: Pairs, after: LineStatistics) -> list[str]:
-    """An objection if the refined rig still fits far worse than any F would."""
-    if after.median > max(LARGEST_DISTANCE, OF_OWN * own_distance(refined, held_out)):
-        return [
-            f"points still lie {after.median:.1f} px from their lines: "
-            "the rig has not drifted, see `pat rig doctor`"
-        ]
-    return []
-
-
-def _behind(refined: Rig, used: Pairs) -> list[str]:
-    """An objection if most points would be behind a camera, however near their lines."""
-    if (share := share_behind(refined, used)) <= MOST_BEHIND:
-        return []
-    mistake = "is it swapped, or does it face the other way? See `pat rig doctor`"
-    return [f"{share:.0%} of the points lie behind a camera: {mistake}"]
-
-
-def _uncertain_depth(depth: DepthChange | None) -> list[str]:
-    """Objections to what happens to depth."""
-    if depth is None:
-        return []
-    found = ["depth would be less certain than before"] if depth.after > depth.before else []
-    if depth.doubtful:
-        found.append(
-            f"depth would change by {depth.change:.1%} but these points "
-            f"determine it to {depth.known:.1%} only"
-        )
-    elif depth.change > LARGE_CHANGE:
-        found.append(f"depth would change by {depth.change:.0%}: a rig so far off is better calibrated anew")
-    return found
-
-
 def systematic_columns(rig: Rig, pairs: Pairs) -> Float[Tensor, "m s"]:
     """Derivatives of all distances by what the calibrated cameras' lens models leave, in prior deviations."""
-    names = [
-        name for name in rig.names if isinstance(rig[name], Camera) and any(name in pair for pair in pairs)
-    ]
+    names = [name for name in cameras_of(rig, pairs) if isinstance(rig[name], Camera)]
     columns = {name: slice(4 * i, 4 * i + 4) for i, name in enumerate(names)}
     parts = []
     for pair, matches in pairs.items():
@@ -444,9 +427,10 @@ def polish(
     neighbours are correlated. Accepted if the error on held-out pixels falls and held-out points are not
     significantly worse.
     """
-    rig = with_depths(fit.after(solution.z), fit.used)
-    base = replace(fit, rig=fit.rig.replace(depth=rig.depth))
-    views = [PhotometricFrame.of(frame) for frame in frames]
+    rig = fit.after(solution.z)
+    depth = depth_seen(rig, fit.used) if rig.depth is None else rig.depth
+    base = replace(fit, rig=fit.rig.replace(depth=depth))
+    views = [{name: PhotometricImage.of(image) for name, image in frame.items()} for frame in frames]
     root = solution.directions
 
     done = 0
@@ -488,27 +472,13 @@ def _with_maps(rig: Rig, pairs: Pairs) -> Rig:
     return rig.replace(links=links)
 
 
-def _check(rig: Rig, frame: Images) -> None:
-    for name, image in frame.items():
-        h, w = rig[name].hw
-        if tuple(image.shape[1:]) != (h, w):
-            got = f"{image.shape[2]}x{image.shape[1]}"
-            raise ValueError(
-                f"the image of '{name}' is {got}, the rig states {w}x{h}: `pat rig doctor` finds the reason"
-            )
-
-
 def _changes(parameters: Sequence[FreeParameter], solution: Solution) -> Iterable[ParameterChange]:
-    sizes = [len(u.sigma) for u in parameters]
-    at = 0
-    for u, z, active in zip(parameters, solution.z.split(sizes), solution.active.split(sizes)):
-        mine = slice(at, at := at + len(z))
-        if bool(active.any()):
-            deviation = (u.root @ solution.covariance[mine, mine] @ u.root.T).diagonal().sqrt()
-            amount = u.root @ z
-            yield ParameterChange(
-                u.name, tuple((amount * u.factor).tolist()), tuple((deviation * u.factor).tolist()), u.unit
-            )
+    for u, end in zip(parameters, accumulate(len(u.sigma) for u in parameters)):
+        mine = slice(end - len(u.sigma), end)
+        if bool(solution.active[mine].any()):
+            amount = u.factor * (u.root @ solution.z[mine])
+            deviation = u.factor * (u.root @ solution.covariance[mine, mine] @ u.root.T).diagonal().sqrt()
+            yield ParameterChange(u.name, tuple(amount.tolist()), tuple(deviation.tolist()), u.unit)
 
 
 def _kept(parameters: Sequence[FreeParameter], solution: Solution) -> Iterable[str]:

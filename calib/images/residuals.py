@@ -1,5 +1,6 @@
 """Residuals of matched points under a rig: epipolar distances, depths, and whether they are in front.
 
+And which points to fit, which to hold out, and which part of the image they are in.
 Distances are in pixels of the distorted images, through any lens, and differentiable in the rig.
 A batch of rigs (*b) takes the same points for each, or points (*b, n, 2).
 """
@@ -11,7 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from arraygeom import Camera, LensView, Link, Pair, Rig, View, essential_matrix, stack
@@ -33,7 +34,10 @@ class EpipolarResiduals(NamedTuple):
 
 
 class MatchDepths(NamedTuple):
-    """Depth in alpha (metres) of matched points, whether in front of both cameras, and observable."""
+    """Depth in alpha (metres) of matched points, whether in front of both cameras, and observable.
+
+    Of uncalibrated pairs no depth is observable, nor a number.
+    """
 
     depth: Float[Tensor, "*b n"]
     front: Bool[Tensor, "*b n"]
@@ -42,6 +46,18 @@ class MatchDepths(NamedTuple):
 
 LEAST_PARALLAX = 2.0
 """Least angle between rays, in pixels, at which their depth is observable."""
+FEW = 10
+"""Least number of points for a share."""
+HELD_OUT = 4
+"""One in this many points or frames is held out."""
+CELL = 24
+"""Points are held out by squares of this many pixels of alpha, so that neighbours are in the same part."""
+SIGNIFICANT = 2.0
+"""Standard errors by which the distances of held-out points must decrease."""
+TRIMMED = 0.85
+"""The share of the points, those nearest to their lines, that statistics use."""
+PARTS = 3
+"""The jackknife leaves out one of so many by so many parts of the image."""
 
 
 def epipolar_residuals(pair: Pair, matches: PointMatches) -> EpipolarResiduals:
@@ -50,7 +66,15 @@ def epipolar_residuals(pair: Pair, matches: PointMatches) -> EpipolarResiduals:
     With cameras, rays replace pixels and E replaces F, so that lenses are respected to first order in the
     distance. Raises ValueError if neither cameras nor F are known.
     """
-    return _residuals(pair, matches)[0]
+    alpha, beta = (x.detach().requires_grad_() for x in _for_each(pair, matches))
+    with torch.enable_grad():
+        (a, b), F, valid = _rays(pair, alpha, beta)
+        algebraic = ((b @ F) * a).sum(-1)
+        at_alpha, at_beta = torch.autograd.grad(algebraic.sum(), (alpha, beta), retain_graph=True)
+    across = at_beta.square().sum(-1)
+    both = (across + at_alpha.square().sum(-1)).clamp(min=1e-300)
+    line = algebraic / across.clamp(min=1e-300).sqrt()
+    return EpipolarResiduals(algebraic / both.sqrt(), line, valid)
 
 
 def sampson_of_pairs(rig: Rig, pairs: Pairs) -> list[Float[Tensor, " n"]]:
@@ -59,19 +83,32 @@ def sampson_of_pairs(rig: Rig, pairs: Pairs) -> list[Float[Tensor, " n"]]:
     return [torch.where(part.valid, part.sampson, 0.0) for part in parts]
 
 
-def residuals_and_depths(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, MatchDepths | None]:
-    """The residuals, and the depths where the rays are closest to each other: None for uncalibrated pairs."""
-    residuals, (a, b) = _residuals(pair, matches)
-    calibrated = pair.calibrated and pair.link is None
-    return residuals, _depths(pair, a.detach(), b.detach(), residuals.valid) if calibrated else None
+def match_depths(rig: Rig, pairs: Pairs) -> MatchDepths:
+    """Of all points of all pairs: depths where rays are closest to each other, differentiable in the rig."""
+    found = [depths_of_pair(rig.pair(*names), matches) for names, matches in pairs.items()]
+    return MatchDepths(*(torch.cat(part) for part in zip(*found)))
 
 
-def match_depths(pair: Pair, matches: PointMatches) -> MatchDepths | None:
-    """Depths where rays are closest to each other, differentiable in the rig; None for uncalibrated pairs."""
-    if not pair.calibrated or pair.link is not None:
-        return None
+def depths_of_pair(pair: Pair, matches: PointMatches) -> MatchDepths:
+    """Those of one pair."""
     (a, b), _, valid = _rays(pair, *_for_each(pair, matches))
-    return _depths(pair, a, b, valid)
+    if not pair.calibrated or pair.link is not None:
+        never = torch.zeros_like(valid)
+        return MatchDepths(torch.full_like(a[..., 2], torch.nan), never, never)
+    R, t = pair.beta_from_alpha.R, pair.beta_from_alpha.t[..., None, :]
+    rotated = a @ R.transpose(-1, -2)
+    aa, bb, ab = (rotated * rotated).sum(-1), (b * b).sum(-1), (rotated * b).sum(-1)
+    ta, tb = (rotated * t).sum(-1), (b * t).sum(-1)
+    sine2 = aa * bb - ab.square()
+    along_a, along_b = (ab * tb - bb * ta) / sine2, (aa * tb - ab * ta) / sine2
+    pixel = 1 / pair.cameras[1].K[..., :2, :2].det().abs().sqrt()[..., None]
+    observable = valid & (sine2 / (aa * bb) > (LEAST_PARALLAX * pixel).square())
+    return MatchDepths(along_a * a[..., 2], (along_a > 0) & (along_b > 0), observable)
+
+
+def share(chosen: Bool[Tensor, " n"]) -> float:
+    """The share of points that are chosen; NaN for few points."""
+    return float(chosen.double().mean()) if len(chosen) >= FEW else math.nan
 
 
 def systematic_modes(pair: Pair, matches: PointMatches) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
@@ -104,20 +141,6 @@ def displacements(hw: HW, points: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2 4"
     return torch.stack([r2 * p, r2 * r2 * p, *decentred], -1)
 
 
-def _residuals(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, tuple[Tensor, Tensor]]:
-    alpha, beta = (x.detach().requires_grad_() for x in _for_each(pair, matches))
-    with torch.enable_grad():
-        (a, b), F, valid = _rays(pair, alpha, beta)
-        algebraic = ((b @ F) * a).sum(-1)
-        at_alpha, at_beta = torch.autograd.grad(algebraic.sum(), (alpha, beta), retain_graph=True)
-    across = at_beta.square().sum(-1)
-    both = (across + at_alpha.square().sum(-1)).clamp(min=1e-300)
-    return EpipolarResiduals(algebraic / both.sqrt(), algebraic / across.clamp(min=1e-300).sqrt(), valid), (
-        a,
-        b,
-    )
-
-
 def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
     """Derivatives of the line distances by the eight degrees of freedom of F (of E, for rays) up to scale."""
     alpha, beta = (x.detach().requires_grad_() for x in matches)
@@ -129,19 +152,6 @@ def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
     size = columns.norm(dim=0).clamp(min=1e-150)
     complement = torch.linalg.svd((F.detach().flatten() * size)[None]).Vh[1:]
     return columns / size @ complement.T
-
-
-def _depths(pair: Pair, a: Tensor, b: Tensor, valid: Tensor) -> MatchDepths:
-    """Along the rays a of alpha and b of beta, each in its camera's frame."""
-    R, t = pair.beta_from_alpha.R, pair.beta_from_alpha.t[..., None, :]
-    rotated = a @ R.transpose(-1, -2)
-    aa, bb, ab = (rotated * rotated).sum(-1), (b * b).sum(-1), (rotated * b).sum(-1)
-    ta, tb = (rotated * t).sum(-1), (b * t).sum(-1)
-    sine2 = aa * bb - ab.square()
-    along_a, along_b = (ab * tb - bb * ta) / sine2, (aa * tb - ab * ta) / sine2
-    pixel = 1 / pair.cameras[1].K[..., :2, :2].det().abs().sqrt()[..., None]
-    observable = valid & (sine2 / (aa * bb) > (LEAST_PARALLAX * pixel).square())
-    return MatchDepths(along_a * a[..., 2], (along_a > 0) & (along_b > 0), observable)
 
 
 def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
@@ -211,3 +221,70 @@ def own_distance(rig: Rig, pairs: Pairs) -> float:
         except ValueError:
             continue
     return float(torch.cat(found).median()) if found else 0.0
+
+
+def trimmed_square(distance: Float[Tensor, " n"]) -> float:
+    """The mean square of the distances of those points that are nearest to their lines."""
+    squares = distance.square().sort().values
+    return float(squares[: max(1, int(TRIMMED * len(squares)))].mean())
+
+
+def nearer(before: Float[Tensor, " n"], after: Float[Tensor, " n"]) -> bool:
+    """Whether distances from the lines decreased significantly: a paired test, distances clipped at 5 px."""
+    gain = before.abs().clamp(max=5) - after.abs().clamp(max=5)
+    return float(gain.mean()) > SIGNIFICANT * float(gain.std()) / len(gain) ** 0.5
+
+
+def line_distances(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
+    """Signed distances in pixels of all points from their lines, in beta."""
+    return torch.cat([epipolar_residuals(rig.pair(*n), m).line.detach() for n, m in pairs.items()])
+
+
+def median_off(rig: Rig, pairs: Pairs) -> float:
+    """The median size of these distances, pixels."""
+    return float(line_distances(rig, pairs).abs().median())
+
+
+def split(
+    frames: Sequence[Pairs],
+) -> tuple[dict[tuple[str, str], PointMatches], dict[tuple[str, str], PointMatches]]:
+    """Points to use and points to hold out: whole frames if several, else squares of alpha's image."""
+    if len(frames) > 1:
+        held_out = max(1, len(frames) // HELD_OUT)
+        return _joined(frames[:-held_out]), _joined(frames[-held_out:])
+    (pairs,) = frames
+    marks = {names: held_out_parts(matches) == 0 for names, matches in pairs.items()}
+    return (
+        {names: matches.only(~marks[names]) for names, matches in pairs.items()},
+        {names: matches.only(marks[names]) for names, matches in pairs.items() if bool(marks[names].any())},
+    )
+
+
+def held_out_parts(matches: PointMatches) -> Int[Tensor, " n"]:
+    """Which of `HELD_OUT` parts, each of squares of alpha, a point is in; that of number 0 is held out."""
+    column, row = (matches.alpha / CELL).floor().long().unbind(-1)
+    return (column + 2 * row) % HELD_OUT
+
+
+def _joined(frames: Sequence[Pairs]) -> dict[tuple[str, str], PointMatches]:
+    names = dict.fromkeys(name for frame in frames for name in frame)
+    parts = {name: [frame[name] for frame in frames if name in frame] for name in names}
+    return {name: PointMatches(*(torch.cat(side) for side in zip(*found))) for name, found in parts.items()}
+
+
+def held_out_pixels(error: Tensor) -> Tensor:
+    """Held-out pixels of a grid: one square of 4 x 4 in `HELD_OUT`."""
+    rows, columns = (torch.arange(n) // 4 for n in error.shape)
+    return (columns + 2 * rows[:, None]) % HELD_OUT == 0
+
+
+def image_parts(rig: Rig, pairs: Pairs) -> Int[Tensor, " n"]:
+    """Which of `PARTS` x `PARTS` parts of alpha's image each point is in."""
+    return torch.cat([parts_of(rig[alpha].hw, matches.alpha) for (alpha, _), matches in pairs.items()])
+
+
+def parts_of(hw: HW, points: Float[Tensor, "n 2"]) -> Int[Tensor, " n"]:
+    """Which of `PARTS` x `PARTS` parts of an image of this size each point (x, y) is in."""
+    h, w = hw
+    cell = (points * PARTS / points.new_tensor([w, h])).floor().long().clamp(0, PARTS - 1)
+    return cell[:, 0] + PARTS * cell[:, 1]

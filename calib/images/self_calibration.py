@@ -28,18 +28,27 @@ from arraygeom import (
     View,
     intrinsics,
     rotation_from_vector,
-    triangulate,
 )
 from arraygeom.pixels import HW, map_homogeneous
 from arraygeom.robust import cauchy, least_squares, normal_deviation, robust_least_squares
 from arraygeom.text import angle
 from arraygeom.threads import torch_in_one_thread
 
-from .held_out import median_off
 from .lenses import with_lens_of
-from .matches import ENOUGH, LOCALISED, Images, PointMatches, contrast_equalised, line_distance, near_lines
+from .matches import (
+    ENOUGH,
+    LOCALISED,
+    Images,
+    PointMatches,
+    contrast_equalised,
+    depths_near_lines,
+    line_distance,
+    near_lines,
+    undistort_matches,
+)
 from .patch_matching import refine_points
 from .refinement import refine_matches
+from .residuals import median_off
 
 LOG = logging.getLogger(__name__)
 
@@ -106,22 +115,18 @@ def self_calibrated(
     if not has_parallax(matches, views[alpha].hw):
         return None
     lenses = {
-        name: view
-        for name, view in views.items()
-        if isinstance(view, LensView) and view.distortion is not None
+        n: view for n, view in views.items() if isinstance(view, LensView) and view.distortion is not None
     }
-    matches = _without_lenses(list(views.values()), matches)
-    K = {
-        name: intrinsics(length, views[name].hw)
-        for name, length in _focal_lengths(views, link, focal).items()
-    }
+    matches = undistort_matches(Pair(views[alpha], views[beta]), matches)
+    lengths = _focal_lengths(views, link, focal)
+    K = {name: intrinsics(length, views[name].hw) for name, length in lengths.items()}
     near = near_lines(matches, link.F, within=NEAR_LINE)
     best = AS_GOOD * float(line_distance(near, link.F).median()) + SLACK
     trials: list[RefinedPair] = []
-    for pose in initial_poses(near, link, K[alpha], K[beta]):
+    for beta_from_alpha in initial_poses(near, link, K[alpha], K[beta]):
         cameras = {
-            alpha: _camera(views[alpha], K[alpha], Pose.identity()),
-            beta: _camera(views[beta], K[beta], pose),
+            name: Camera(hw=view.hw, sensor=view.sensor, K=K[name], cam_from_world=pose)
+            for (name, view), pose in zip(views.items(), (Pose.identity(), beta_from_alpha))
         }
         LOG.info("calibrating %s and %s, pose %d", alpha, beta, len(trials) + 1)
         trial = _refined_pair(Rig(cameras), matches, near, fixed=("centre",) if lenses else ())
@@ -131,12 +136,11 @@ def self_calibrated(
         return None
     least = min(trial.distance for trial in trials)
     fitting = [t for t in trials if t.distance <= (1 + ALIKE / math.sqrt(t.points)) * least + ALIKE_SLACK]
-    found = min(
-        fitting, key=lambda trial: float(angle(_pair(trial.rig).beta_from_alpha.R.T @ _upright(link)))
-    )
+    upright = _upright(link)
+    found = min(fitting, key=lambda t: float(angle(_pair(t.rig).beta_from_alpha.R.T @ upright)))
     rig = found.rig
     for name, view in lenses.items():
-        rig = rig.with_camera(name, with_lens_of(_pair(rig).cameras[rig.names.index(name)], view))
+        rig = rig.with_camera(name, with_lens_of(rig[name], view))
     return found._replace(rig=rig, exact=found.distance <= best and not lenses)
 
 
@@ -155,17 +159,6 @@ def has_parallax(matches: PointMatches, hw: HW) -> bool:
     start = least_squares(terms, matches.beta, torch.ones_like(x))
     rest = robust_least_squares(terms, matches.beta, start, weigh).rest
     return float(rest.norm(dim=-1).quantile(STILL_SHARE)) > LOCALISED
-
-
-def _without_lenses(views: Sequence[View], matches: PointMatches) -> PointMatches:
-    """The points where pinhole views would have them; those that a lens does not show are left out."""
-    there, shown = [], torch.ones(len(matches.alpha), dtype=torch.bool)
-    for view, x in zip(views, matches):
-        if isinstance(view, LensView) and view.distortion is not None:
-            x, valid = view.to(torch.float64).undistort(x.double())
-            shown = shown & valid
-        there.append(x)
-    return PointMatches(*there).only(shown)
 
 
 @torch_in_one_thread()
@@ -236,17 +229,14 @@ def depth_bounds(rig: Rig, matches: PointMatches) -> tuple[float, float] | None:
     None for points without parallax.
     """
     pair = _pair(rig)
-    near = near_lines(matches, pair.fundamental, within=NEAR_LINE)
-    cameras = [camera.to(torch.float64) for camera in pair.cameras]
-    found = triangulate(cameras, torch.stack(near), deviation=LOCALISED, residual=NEAR_LINE)
-    if int(found.valid.sum()) < ENOUGH:
+    inverse = 1 / depths_near_lines(pair, matches, within=NEAR_LINE)
+    if len(inverse) < ENOUGH:
         return None
-    inverse = 1 / cameras[0].cam_from_world.apply(found.X[found.valid])[:, 2]
     off = (inverse - inverse.median()).abs()
     inverse = inverse[off <= OUTLYING * off.median() + 1e-9]
     low, high = inverse.quantile(inverse.new_tensor([0.01, 0.99])).tolist()
     baseline = float(pair.beta_from_alpha.t.norm())
-    least = LEAST_MARGIN * max(pair.beta.hw) / (float(cameras[1].K[0, 0]) * baseline)
+    least = LEAST_MARGIN * max(pair.beta.hw) / (float(pair.cameras[1].K[0, 0]) * baseline)
     more = max(MARGIN * (high - low), least)
     return 1 / (high + more), math.inf if low <= more else 1 / (low - more)
 
@@ -265,20 +255,22 @@ def _focal_lengths(views: Mapping[str, View], link: Link, focal: Mapping[str, fl
 def initial_poses(
     matches: PointMatches, link: Link, K: Float[Tensor, "3 3"], K_beta: Float[Tensor, "3 3"]
 ) -> list[Pose]:
-    """Poses of beta, baselines of 1, from which to fit: parallel axes, by F, by an essential matrix."""
-    return [*_lateral_poses(matches, _upright(link), K, K_beta), *_poses(matches, link.F, K, K_beta)]
+    """Poses of beta, baselines of 1, from which to fit: parallel axes, by F, by an essential matrix.
 
-
-def _poses(matches: PointMatches, F: Tensor, K: Tensor, K_beta: Tensor) -> list[Pose]:
-    """Poses of beta by F and by an essential matrix fitted to the points."""
-    x, y = (map_homogeneous(torch.linalg.inv(k), p)[..., :2].numpy() for k, p in zip((K, K_beta), matches))
-    threshold = 1 / float(K_beta[0, 0])
-    fitted, _ = cv2.findEssentialMat(x, y, np.eye(3), method=cv2.RANSAC, threshold=threshold)
-    found = []
-    for E in ((K_beta.T @ F @ K).numpy(), fitted):
+    Of parallel axes beta is to either side along the direction in which most points differ.
+    """
+    R, rays = _upright(link), [torch.linalg.inv(k) for k in (K, K_beta)]
+    x, y = (map_homogeneous(inverse, points)[..., :2] for inverse, points in zip(rays, matches))
+    flow = y - map_homogeneous(R @ rays[0], matches.alpha)[..., :2]
+    _, _, axes = torch.linalg.svd(flow - flow.median(0).values)
+    t = torch.cat([axes[0], axes.new_zeros(1)])
+    found = [Pose(R, t), Pose(R, -t)]
+    seen, threshold = (x.numpy(), y.numpy(), np.eye(3)), 1 / float(K_beta[0, 0])
+    fitted, _ = cv2.findEssentialMat(*seen, method=cv2.RANSAC, threshold=threshold)
+    for E in ((K_beta.T @ link.F @ K).numpy(), fitted):
         if E is not None and E.shape == (3, 3):
-            _, R, t, _ = cv2.recoverPose(E, x, y, np.eye(3))
-            found.append(Pose(torch.from_numpy(R), torch.from_numpy(t[:, 0])))
+            _, R_of_E, t_of_E, _ = cv2.recoverPose(E, *seen)
+            found.append(Pose(torch.from_numpy(R_of_E), torch.from_numpy(t_of_E[:, 0])))
     return found
 
 
@@ -287,19 +279,6 @@ def _upright(link: Link) -> Float[Tensor, "3 3"]:
     H = torch.eye(3) if link.H is None else link.H
     steps = round(math.atan2(float(H[1, 0] / H[2, 2]), float(H[0, 0] / H[2, 2])) / (math.pi / 2))
     return rotation_from_vector(torch.tensor([0.0, 0.0, steps * math.pi / 2], dtype=torch.float64))
-
-
-def _lateral_poses(matches: PointMatches, R: Tensor, K: Tensor, K_beta: Tensor) -> list[Pose]:
-    """Poses of parallel axes, beta to either side along the direction in which most points differ."""
-    x = map_homogeneous(R @ torch.linalg.inv(K), matches.alpha)[..., :2]
-    flow = map_homogeneous(torch.linalg.inv(K_beta), matches.beta)[..., :2] - x
-    _, _, axes = torch.linalg.svd(flow - flow.median(0).values)
-    t = torch.cat([axes[0], axes.new_zeros(1)])
-    return [Pose(R, t), Pose(R, -t)]
-
-
-def _camera(view: View, K: Tensor, pose: Pose) -> Camera:
-    return Camera(hw=view.hw, sensor=view.sensor, K=K, cam_from_world=pose)
 
 
 def _refined_pair(
@@ -313,22 +292,15 @@ def _refined_pair(
     free = [f"{beta}.{kind}" for kind in (*SIGMA, "centre") if kind not in fixed]
     sigma = {**SIGMA, "centre": CENTRE_SHARE * max(rig[beta].hw)}
     refined = refine_matches(rig, [{(alpha, beta): matches}], free=free, sigma=sigma, keep_depth=False).rig
-    if not float(_pair(refined).cameras[1].t.norm()) > SHORTEST:
+    length = float(refined[beta].t.norm())
+    if not length > SHORTEST:
         return None
-    refined = _unit_baseline(refined)
+    refined = refined.scaled(1 / length)
     bounds = depth_bounds(refined, near)
     if bounds is None:
         return None
-    return RefinedPair(
-        refined.replace(depth=bounds), len(near.alpha), median_off(refined, {(alpha, beta): near})
-    )
-
-
-def _unit_baseline(rig: Rig) -> Rig:
-    name = rig.names[1]
-    camera = _pair(rig).cameras[1]
-    pose = camera.cam_from_world
-    return rig.with_camera(name, camera.replace(cam_from_world=Pose(pose.R, pose.t / pose.t.norm())))
+    off = median_off(refined, {(alpha, beta): near})
+    return RefinedPair(refined.replace(depth=bounds), len(near.alpha), off)
 
 
 def _pair(rig: Rig) -> Pair:

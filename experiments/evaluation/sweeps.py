@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -114,15 +114,6 @@ class Row(NamedTuple):
     note: str = ""
 
 
-@runtime_checkable
-class Way(Protocol):
-    """Something other than a field: it is given the network, the calibration and the images."""
-
-    def fuse(self, network: Comparing, rig: Rig, images: Mapping[str, Tensor]) -> Result:
-        """The result at alpha's view. Raises ValueError for a rig that it is not for."""
-        ...
-
-
 @dataclass(frozen=True)
 class Directly:
     """Images as they are, beta resized to about alpha's angular resolution as `fuse` does, with a field.
@@ -181,7 +172,7 @@ class Rows:
         return Rectified(2 * max(float(covering_displacement(pair)), 1.0), alpha_is="either")(pair, x)
 
 
-FIELDS: dict[str, ReceptiveField | Way] = {
+FIELDS: dict[str, ReceptiveField | Resampled] = {
     "calibrated segments": Epipolar(),
     "rectified, warped": Resampled(),
     "rows": Rows(),
@@ -194,7 +185,7 @@ FIELDS: dict[str, ReceptiveField | Way] = {
 def ablate(
     network: Comparing,
     rigs: Mapping[str, Rig] | Iterable[Point],
-    fields: Mapping[str, ReceptiveField | Way] = FIELDS,
+    fields: Mapping[str, ReceptiveField | Resampled] = FIELDS,
     *,
     scenes: int = 6,
     photos: PhotoBank | None = None,
@@ -203,7 +194,7 @@ def ablate(
     """Each field on so many scenes of each rig; `rigs` by name, or points of sweeps (`points`).
 
     A rig has two calibrated pinhole cameras, alpha first, and a depth range: its scenes lie in it. `fields`
-    are fields, one's own included, or ways. Raises ValueError for another kind of rig.
+    are fields, one's own included, or images that are rectified. Raises ValueError for another kind of rig.
     """
     given = [Point(name, 0.0, rig, rig) for name, rig in rigs.items()] if isinstance(rigs, Mapping) else rigs
     bank = photos or sample_photographs()
@@ -231,11 +222,11 @@ def _row(
     network: Comparing,
     point: Point,
     name: str,
-    field: ReceptiveField | Way,
+    field: ReceptiveField | Resampled,
     number: int,
     scene: RecordedScene,
 ) -> Row:
-    way = field if hasattr(field, "fuse") else Directly(field)
+    way = field if isinstance(field, Resampled) else Directly(field)
     began = time.perf_counter()
     try:
         result = way.fuse(network, two(point.assumed), scene.images)

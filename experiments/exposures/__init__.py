@@ -12,7 +12,7 @@ from torch import Tensor
 from arraygeom import Band
 from experiments.rendered import RenderedScene
 from experiments.sensors import Spectral
-from experiments.stage import SystemScene
+from experiments.stage import SystemScene, purpose_generator
 from experiments.system import SystemRecording
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.media.raw import light_of
@@ -42,19 +42,18 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
         own = luminance(lit) if name == alpha else banded(lit, sensor.response)
         seen = own * light_of(sensor, rig[alpha].sensor)
         lights[name] = own[0]
-        raw[name] = [record(seen, (Noise(ELECTRONS, READ), Clip()), stage.generator(name))[0]]
+        raw[name] = [record(seen, (Noise(ELECTRONS, READ), Clip()), purpose_generator(stage.seed, name))[0]]
         if name != alpha:
             bands[name] = banded(light(stage, alpha), sensor.response)[0]
-    return SystemRecording(
-        raw, [srgb_from_linear(torch.cat([bands[name] for name in rig.betas(alpha)]))], lights
-    )
+    ground_truth = srgb_from_linear(torch.cat([bands[name] for name in rig.betas(alpha)]))
+    return SystemRecording(raw, [ground_truth], lights)
 
 
 def light(stage: SystemScene | RenderedScene, name: str) -> Tensor:
     """Linear colours of what a camera sees, 1 being alpha's white."""
     if isinstance(stage, RenderedScene):
         return GAIN * stage.light(name)
-    count, g = stage.scene.present.shape[1], stage.generator("light")
+    count, g = stage.scene.present.shape[1], purpose_generator(stage.seed, "light")
     lit = DARKEST ** torch.rand(count, generator=g)
     lit[1], lit[2] = 1.0, DARKEST
     strength = stage.seen(name, stage.painted(lit.sqrt().tolist()))[0].square()

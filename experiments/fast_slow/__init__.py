@@ -13,7 +13,7 @@ from torch import Tensor
 
 from experiments.exposures import banded
 from experiments.rendered import RenderedScene
-from experiments.stage import SystemScene
+from experiments.stage import SystemScene, purpose_generator
 from experiments.system import SystemRecording
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.sensors import Clip, Noise, record
@@ -31,7 +31,7 @@ MOVING = 0.12
 
 def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     """Eleven frames of alpha, and of each beta those of that time."""
-    rig, generator = stage.rig, stage.generator("record")
+    rig, generator = stage.rig, purpose_generator(stage.seed, "record")
     raw: dict[str, list[Tensor]] = {name: [] for name in rig.names}
     ground_truth = []
     for name, frames in lights(stage).items():
@@ -47,9 +47,9 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
 def lights(stage: SystemScene | RenderedScene) -> Mapping[str, Iterable[Tensor]]:
     """The linear colours that each camera receives, frame by frame."""
     if isinstance(stage, RenderedScene):
-        counts = {name: len(frames) for name, frames in stage.frames.items()}
         return {
-            name: [stage.light(name, i).clamp(0, 1) for i in range(count)] for name, count in counts.items()
+            name: [stage.light(name, i).clamp(0, 1) for i in range(len(frames))]
+            for name, frames in stage.frames.items()
         }
     velocity, layer = object_velocity(stage)
 

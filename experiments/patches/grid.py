@@ -126,10 +126,8 @@ def _windows(
         hw = _beta_size(cameras[alpha], beta, patches)
         seen, _, valid = beta.project(X)
         centre = middles.new_tensor([(beta.hw[1] - 1) / 2, (beta.hw[0] - 1) / 2])
-        found[name] = (
-            [_corner(x, hw, beta.hw) for x in torch.where(valid[:, None], seen, centre).tolist()],
-            hw,
-        )
+        x = torch.where(valid[:, None], seen, centre).tolist()
+        found[name] = [_corner(middle, hw, beta.hw) for middle in x], hw
     return found
 
 

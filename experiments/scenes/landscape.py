@@ -85,19 +85,14 @@ def _washing() -> Iterator[Object]:
         yield lathed(f"post {side}", (side, 0, 0), [(0, 2.1), (0.05, 2.1), (0.05, 0), (0, 0)], _BARK)
     yield box("line", (-0.07, -2.0, 0), (4.75, 0.012, 0.012), _WHITE)
     dyes = (
-        (0.55, 0.03, 0.03),
-        (0.72, 0.70, 0.66),
-        (0.03, 0.09, 0.38),
-        (0.75, 0.50, 0.04),
+        *((0.55, 0.03, 0.03), (0.72, 0.70, 0.66), (0.03, 0.09, 0.38), (0.75, 0.50, 0.04)),
         (0.02, 0.02, 0.025),
     )
+    widths, heights = (0.62, 0.95, 0.7, 0.55, 0.6), (0.85, 0.6, 0.95, 0.75, 1.05)
     x = -2.1
-    for i, (rgb, width, height) in enumerate(
-        zip(dyes, (0.62, 0.95, 0.7, 0.55, 0.6), (0.85, 0.6, 0.95, 0.75, 1.05))
-    ):
-        checks = Texture(
-            kind="checker", paints=(paint(*rgb), paint(*(min(1.6 * c + 0.02, 0.9) for c in rgb))), scale=9
-        )
+    for i, (rgb, width, height) in enumerate(zip(dyes, widths, heights)):
+        light = paint(*(min(1.6 * c + 0.02, 0.9) for c in rgb))
+        checks = Texture(kind="checker", paints=(paint(*rgb), light), scale=9)
         cloth = Material(texture=checks, roughness=0.95, specular=0.03)
         middle = (x + width / 2, -1.99 + height / 2, 0.02 * (-1) ** i)
         yield box(f"cloth{i}", middle, (width, height, 0.012), cloth, yaw=14 * (-1) ** i)
@@ -109,11 +104,9 @@ def _fence() -> Iterator[Object]:
         x = -6.6 + 0.3 * i
         if abs(x - 0.55) > 0.65:
             yield box(f"pale{i}", (x, -0.45, 6), (0.09, 0.9, 0.03), _WHITE)
-    for side, middle in (("left", -3.5), ("right", 4.45)):
+    for side, middle, width in (("left", -3.5, 6.6), ("right", 4.45, 6.5)):
         for y in (-0.3, -0.7):
-            yield box(
-                f"rail {side}{y}", (middle, y, 6.04), (6.6 if side == "left" else 6.5, 0.06, 0.03), _WHITE
-            )
+            yield box(f"rail {side}{y}", (middle, y, 6.04), (width, 0.06, 0.03), _WHITE)
 
 
 def _house() -> Iterator[Object]:

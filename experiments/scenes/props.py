@@ -22,6 +22,11 @@ Profile = Sequence[tuple[float, float]]
 """Radius and height of an object of revolution, metres, from its top."""
 
 
+def profile(*numbers: float) -> list[tuple[float, float]]:
+    """Radius and height in turn, millimetres."""
+    return [(r / 1000, h / 1000) for r, h in zip(numbers[::2], numbers[1::2])]
+
+
 def first_camera(rig: Rig) -> Camera:
     """The first calibrated camera, on the CPU. Raises ValueError if there is none."""
     for camera in rig.cameras.values():

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from pat.synthesis.scene import Material, Object, Paint, Texture, Vec3
 
-from .props import ball, box, lathed, moved, paint, plain, wood
+from .props import ball, box, lathed, moved, paint, plain, profile, wood
 
 FLOOR, SHELF, WALL = 0.76, 1.15, 1.45
 """Height of the floor, and depths of the bookshelf's front and of the wall behind it."""
@@ -49,9 +49,8 @@ def _under_the_table() -> Iterator[Object]:
     for i in range(4):
         x = -0.92 + 0.6 * i
         yield box(f"door{i}", (x, 0.46, SHELF - 0.004), (0.57, 0.54, 0.018), WALNUT)
-        yield ball(
-            f"knob{i}", (x + (0.22 if i % 2 == 0 else -0.22), 0.42, SHELF - 0.03), (0.03, 0.03, 0.03), BRASS
-        )
+        knob = (x + (0.22 if i % 2 == 0 else -0.22), 0.42, SHELF - 0.03)
+        yield ball(f"knob{i}", knob, (0.03, 0.03, 0.03), BRASS)
     top = -1.145
     yield box(
         "carton", (-0.75, top - 0.13, SHELF + 0.15), (0.42, 0.26, 0.26), plain(0.36, 0.24, 0.13, grain=0.1)
@@ -59,7 +58,7 @@ def _under_the_table() -> Iterator[Object]:
     yield box(
         "case", (0.1, top - 0.07, SHELF + 0.15), (0.5, 0.14, 0.24), plain(0.05, 0.12, 0.11, grain=0.1), yaw=4
     )
-    urn = [(0.05, 0.34), (0.06, 0.34), (0.05, 0.3), (0.12, 0.22), (0.13, 0.14), (0.07, 0.0), (0, 0)]
+    urn = profile(50, 340, 60, 340, 50, 300, 120, 220, 130, 140, 70, 0, 0, 0)
     yield lathed("urn", (0.82, top, SHELF + 0.15), urn, plain(0.50, 0.20, 0.08, roughness=0.3))
 
 
@@ -70,13 +69,9 @@ def _armchair() -> Iterator[Object]:
     yield ball("seat", (0, -0.37, -0.04), (0.6, 0.22, 0.72), cloth)
     for side in (-1, 1):
         yield box(f"arm{side}", (0.36 * side, -0.4, -0.01), (0.13, 0.38, 0.72), cloth)
-        yield lathed(f"foot{side}", (0.32 * side, 0, -0.3), [(0.03, 0.14), (0.015, 0), (0, 0)], WALNUT)
-    yield ball(
-        "cushion",
-        (0.03, -0.6, 0.2),
-        (0.44, 0.4, 0.16),
-        _pattern("checker", (0.7, 0.42, 0.04), (0.6, 0.5, 0.3), 9.0),
-    )
+        yield lathed(f"foot{side}", (0.32 * side, 0, -0.3), profile(30, 140, 15, 0, 0, 0), WALNUT)
+    checks = _pattern("checker", (0.7, 0.42, 0.04), (0.6, 0.5, 0.3), 9.0)
+    yield ball("cushion", (0.03, -0.6, 0.2), (0.44, 0.4, 0.16), checks)
 
 
 def _chair() -> Iterator[Object]:
@@ -89,11 +84,9 @@ def _chair() -> Iterator[Object]:
 
 
 def _floor_lamp() -> Iterator[Object]:
-    yield lathed(
-        "pole", (0, 0, 0), [(0, 1.55), (0.012, 1.55), (0.012, 0.03), (0.13, 0.02), (0.14, 0), (0, 0)], BRASS
-    )
+    yield lathed("pole", (0, 0, 0), profile(0, 1550, 12, 1550, 12, 30, 130, 20, 140, 0, 0, 0), BRASS)
     linen = Material(texture=Texture(paints=(paint(0.85, 0.66, 0.42),)), roughness=0.9, emission=0.4)
-    yield lathed("shade", (0, -1.45, 0), [(0.14, 0.3), (0.142, 0.3), (0.21, 0.0), (0.208, 0.0)], linen)
+    yield lathed("shade", (0, -1.45, 0), profile(140, 300, 142, 300, 210, 0, 208, 0), linen)
 
 
 def _pictures() -> Iterator[Object]:
@@ -106,12 +99,8 @@ def _pictures() -> Iterator[Object]:
         yield box(f"mount{i}", (x, y, WALL - 0.013), (w - 0.07, h - 0.07, 0.03), _WHITE)
         colours = tuple(paint(*rgb) for rgb in paints)
         painted = Texture(kind="wave", paints=colours, scale=2.6, distortion=5.0, offset=(3.0 * i, 1.0, 2.0))
-        yield box(
-            f"painting{i}",
-            (x, y, WALL - 0.016),
-            (w - 0.2, h - 0.2, 0.03),
-            Material(texture=painted, roughness=0.6),
-        )
+        canvas = Material(texture=painted, roughness=0.6)
+        yield box(f"painting{i}", (x, y, WALL - 0.016), (w - 0.2, h - 0.2, 0.03), canvas)
 
 
 def _window() -> Iterator[Object]:
@@ -125,7 +114,7 @@ def _window() -> Iterator[Object]:
     linen = plain(0.46, 0.18, 0.10, roughness=0.95, specular=0.05, grain=0.1)
     for side in (-1, 1):
         for i in range(5):
-            fold = [(0.055, 2.3), (0.055, 0.0), (0, 0)]
+            fold = profile(55, 2300, 55, 0, 0, 0)
             yield lathed(
                 f"curtain{side}{i}", (side * (0.56 + 0.085 * i), 1.6, -0.09 - 0.02 * (i % 2)), fold, linen
             )

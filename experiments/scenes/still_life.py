@@ -7,7 +7,7 @@ the middle of the table's front part, on its top.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from arraygeom.rig import Rig
 from pat.synthesis.furnish import seeded, vec
 from pat.synthesis.scene import Key, Light, Material, Motion, Object, Paint, Scene, Texture, Vec3, World
 
-from .props import arranged, ball, box, first_camera, lathed, moved, on_path, paint, plain
+from .props import arranged, ball, box, first_camera, lathed, moved, on_path, paint, plain, profile
 from .room import BRASS, FLOOR, OAK, SHELF, WALNUT, furniture
 
 VIEW = 1.4
@@ -45,9 +45,8 @@ def still_life(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
     camera, rng = first_camera(rig), seeded("still-life", seed)
     objects = [*_furniture(), *_books(rng), *_plant(rng), *_pottery(), *_fruit(), *_toys(moving), *_lamp()]
     distance = VIEW * float(camera.K[0, 0]) / camera.hw[1]
-    if any(
-        isinstance(c, Camera) and distance * c.hw[1] / float(c.K[0, 0]) > WIDE for c in rig.cameras.values()
-    ):
+    cameras = [c for c in rig.cameras.values() if isinstance(c, Camera)]
+    if any(distance * c.hw[1] / float(c.K[0, 0]) > WIDE for c in cameras):
         objects += _room(rng)
     world = World((0.06, 0.065, 0.07), 0.06)
     return arranged(
@@ -114,13 +113,8 @@ def _books(rng: Generator) -> Iterator[Object]:
         yield from _row_of_books(rng, f"book{row}", top, left, right)
     for i, colour in enumerate(_CLOTHBOUND[1:5]):
         y = -0.0125 + 0.14 - 0.02 - 0.036 * i
-        yield box(
-            f"lying{i}",
-            (0.72 + 0.01 * i, y, SHELF + 0.14),
-            (0.27, 0.034, 0.19),
-            plain(*colour),
-            yaw=6 * i - 8,
-        )
+        middle = (0.72 + 0.01 * i, y, SHELF + 0.14)
+        yield box(f"lying{i}", middle, (0.27, 0.034, 0.19), plain(*colour), yaw=6 * i - 8)
 
 
 def _room(rng: Generator) -> Iterator[Object]:
@@ -157,18 +151,9 @@ def _book(rng: Generator, name: str, x: float, floor: float, wh: tuple[float, fl
 def _plant(rng: Generator) -> Iterator[Object]:
     clay, soil = plain(0.42, 0.15, 0.07, roughness=0.85, grain=0.15), plain(0.03, 0.02, 0.012, roughness=1.0)
     x, z = -0.52, 0.38
-    pot = [
-        (0.0, 0.12),
-        (0.083, 0.12),
-        (0.083, 0.14),
-        (0.098, 0.14),
-        (0.098, 0.11),
-        (0.09, 0.108),
-        (0.07, 0),
-        (0, 0),
-    ]
+    pot = profile(0, 120, 83, 120, 83, 140, 98, 140, 98, 110, 90, 108, 70, 0, 0, 0)
     yield lathed("pot", (x, 0, z), pot, clay)
-    yield lathed("saucer", (x, 0, z), [(0, 0.008), (0.1, 0.012), (0.115, 0.02), (0.11, 0), (0, 0)], clay)
+    yield lathed("saucer", (x, 0, z), profile(0, 8, 100, 12, 115, 20, 110, 0, 0, 0), clay)
     yield ball("soil", (x, -0.118, z), (0.16, 0.012, 0.16), soil)
     for i in range(44):
         azimuth, lean = i * 137.5, 12 + 62 * (i / 44) ** 0.8
@@ -176,22 +161,13 @@ def _plant(rng: Generator) -> Iterator[Object]:
         rotation = Rotation.from_euler("xy", (lean, azimuth), degrees=True)
         tip = rotation.apply([0, -1, 0])
         green = (0.05 + 0.05 * float(rng.uniform()), 0.20 + 0.12 * float(rng.uniform()), 0.035)
-        leaf = Material(
-            texture=Texture(
-                kind="noise", paints=(_leafy(green), _leafy(tuple(1.35 * c for c in green))), scale=60.0
-            ),
-            roughness=0.4,
-            specular=0.4,
-        )
+        paints = tuple(paint(*(factor * c for c in green), nir=0.55) for factor in (1.0, 1.35))
+        veins = Texture(kind="noise", paints=paints, scale=60.0)
+        leaf = Material(texture=veins, roughness=0.4, specular=0.4)
         middle = np.array([x, -0.13, z]) + tip * length / 2
         blade = ball(f"leaf{i}", vec(middle), (0.035 + 0.02 * float(rng.uniform()), length, 0.004), leaf)
-        yield replace(
-            blade, motion=Motion((replace(blade.motion.keys[0], rotation=vec(rotation.as_rotvec())),))
-        )
-
-
-def _leafy(rgb: Sequence[float]) -> Paint:
-    return paint(*rgb, nir=0.55)
+        key = replace(blade.motion.keys[0], rotation=vec(rotation.as_rotvec()))
+        yield replace(blade, motion=Motion((key,)))
 
 
 def _pottery() -> Iterator[Object]:
@@ -199,46 +175,22 @@ def _pottery() -> Iterator[Object]:
     blue, white, red = (
         plain(*c, **glaze) for c in ((0.02, 0.09, 0.33), (0.72, 0.70, 0.64), (0.45, 0.03, 0.02))
     )
-    vase = [
-        (0.022, 0.33),
-        (0.03, 0.335),
-        (0.032, 0.33),
-        (0.024, 0.30),
-        (0.024, 0.26),
-        (0.075, 0.19),
-        (0.085, 0.13),
-    ]
-    yield lathed("vase", (-0.24, 0, 0.52), [*vase, (0.05, 0.02), (0.05, 0), (0, 0)], blue)
+    vase = profile(22, 330, 30, 335, 32, 330, 24, 300, 24, 260, 75, 190, 85, 130)
+    yield lathed("vase", (-0.24, 0, 0.52), [*vase, *profile(50, 20, 50, 0, 0, 0)], blue)
     bands = Texture(
         kind="wave", paints=(paint(0.72, 0.66, 0.5), paint(0.5, 0.2, 0.07)), scale=60.0, distortion=0.6
     )
-    jar = [
-        (0, 0.235),
-        (0.016, 0.235),
-        (0.02, 0.22),
-        (0.012, 0.205),
-        (0.06, 0.19),
-        (0.066, 0.18),
-        (0.066, 0.17),
-    ]
-    jar += [(0.09, 0.15), (0.1, 0.09), (0.07, 0.005), (0.07, 0), (0, 0)]
+    jar = profile(0, 235, 16, 235, 20, 220, 12, 205, 60, 190, 66, 180, 66, 170)
+    jar += profile(90, 150, 100, 90, 70, 5, 70, 0, 0, 0)
     yield lathed("jar", (0.26, 0, 0.6), jar, Material(texture=bands, roughness=0.25, specular=0.5))
-    mug = [(0.036, 0.012), (0.038, 0.095), (0.042, 0.097), (0.044, 0.092), (0.044, 0.008), (0.04, 0), (0, 0)]
-    yield lathed("mug", (0.36, 0, 0.1), [(0, 0.01), *mug], white)
+    mug = profile(36, 12, 38, 95, 42, 97, 44, 92, 44, 8, 40, 0, 0, 0)
+    yield lathed("mug", (0.36, 0, 0.1), [*profile(0, 10), *mug], white)
     key = Key(position=(0.412, -0.05, 0.1), rotation=(math.pi / 2, 0, 0), extent=(0.062, 0.012, 0.066))
     yield Object(name="handle", shape="torus", motion=Motion((key,)), material=white)
     coffee = plain(0.045, 0.02, 0.01, roughness=0.05, specular=0.6)
     yield ball("coffee", (0.36, -0.082, 0.1), (0.076, 0.003, 0.076), coffee)
-    bowl = [
-        (0, 0.02),
-        (0.06, 0.022),
-        (0.115, 0.06),
-        (0.128, 0.085),
-        (0.133, 0.086),
-        (0.133, 0.082),
-        (0.1, 0.03),
-    ]
-    yield lathed("bowl", (0.02, -0.004, 0.24), [*bowl, (0.055, 0.008), (0.055, 0), (0, 0)], red)
+    bowl = profile(0, 20, 60, 22, 115, 60, 128, 85, 133, 86, 133, 82, 100, 30)
+    yield lathed("bowl", (0.02, -0.004, 0.24), [*bowl, *profile(55, 8, 55, 0, 0, 0)], red)
 
 
 def _fruit() -> Iterator[Object]:
@@ -248,15 +200,7 @@ def _fruit() -> Iterator[Object]:
     apple = Material(texture=skin, roughness=0.2, specular=0.5)
     green = plain(0.28, 0.42, 0.04, roughness=0.2, specular=0.5, grain=0.1)
     lemon = plain(0.80, 0.60, 0.03, roughness=0.4, specular=0.4, grain=0.08)
-    round_ = [
-        (0.0, 0.062),
-        (0.008, 0.066),
-        (0.03, 0.073),
-        (0.042, 0.05),
-        (0.034, 0.012),
-        (0.014, 0.0),
-        (0, 0.005),
-    ]
+    round_ = profile(0, 62, 8, 66, 30, 73, 42, 50, 34, 12, 14, 0, 0, 5)
     for i, (x, z) in enumerate(((-0.045, 0.24), (0.035, 0.28), (0.03, 0.19))):
         yield ball(f"orange{i}", (x, -0.085, z), (0.082, 0.078, 0.082), orange, euler=(40 * i, 15, 70 * i))
     yield lathed("apple", (0.095, -0.05, 0.235), round_, apple, euler=(0, 0, 14))
@@ -267,16 +211,10 @@ def _fruit() -> Iterator[Object]:
 
 def _toys(moving: float) -> Iterator[Object]:
     colours = ((0.55, 0.03, 0.03), (0.03, 0.30, 0.08), (0.03, 0.10, 0.45), (0.75, 0.48, 0.03))
-    positions = (
-        (0.56, -0.025, 0.13, 20),
-        (0.63, -0.025, 0.2, -15),
-        (0.585, -0.075, 0.16, 40),
-        (0.49, -0.025, 0.22, 5),
-    )
-    for i, ((x, y, z, yaw), colour) in enumerate(zip(positions, colours)):
-        yield box(
-            f"block{i}", (x, y, z), (0.05, 0.05, 0.05), plain(*colour, roughness=0.55, grain=0.1), yaw=yaw
-        )
+    positions = ((0.56, -0.025, 0.13), (0.63, -0.025, 0.2), (0.585, -0.075, 0.16), (0.49, -0.025, 0.22))
+    for i, (position, yaw, colour) in enumerate(zip(positions, (20, -15, 40, 5), colours)):
+        painted = plain(*colour, roughness=0.55, grain=0.1)
+        yield box(f"block{i}", position, (0.05, 0.05, 0.05), painted, yaw=yaw)
     stripes = Texture(kind="checker", paints=(paint(0.80, 0.60, 0.03), paint(0.05, 0.12, 0.45)), scale=13.0)
     surface = Material(texture=stripes, roughness=0.3, specular=0.4)
     toy = ball("ball", (-0.36, -0.05, 0.12), (0.1, 0.1, 0.1), surface)
@@ -300,9 +238,9 @@ def _lamp() -> Iterator[Object]:
     yield lathed(
         "lamp",
         (x, 0, z),
-        [(0, 0.3), (0.008, 0.3), (0.008, 0.03), (0.03, 0.02), (0.08, 0.012), (0.08, 0)],
+        profile(0, 300, 8, 300, 8, 30, 30, 20, 80, 12, 80, 0),
         BRASS,
     )
-    rim = [(0.072, 0.2), (0.074, 0.2), (0.14, 0.002), (0.142, 0.0), (0.138, 0.002)]
+    rim = profile(72, 200, 74, 200, 140, 2, 142, 0, 138, 2)
     yield lathed("shade", (x, -0.33, z), rim, shade)
     yield ball("bulb", (x, -0.36, z), (0.05, 0.06, 0.05), bulb)

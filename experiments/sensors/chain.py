@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -67,21 +67,8 @@ def exposed(step: Step, light: OpticalImage, generator: Generator) -> OpticalIma
     """The images after any step; those that change the grid of pixels have a `pixel_matrix`."""
     if isinstance(step, LitStep):
         return step.expose(light, generator)
-    A = step.pixel_matrix(light.hw) if isinstance(step, GridStep) else torch.eye(3, dtype=torch.float64)
-    return light.resampled(A, step.apply(light.image, generator))
-
-
-@runtime_checkable
-class GridStep(Protocol):
-    """A step after which there are other pixels."""
-
-    def pixel_matrix(self, hw: HW) -> Float[Tensor, "3 3"]:
-        """A with x_after ~ A x_before for an image of height and width `hw`."""
-        ...
-
-    def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c2 h2 w2"]:
-        """The images after the step."""
-        ...
+    matrix = getattr(step, "pixel_matrix", lambda hw: torch.eye(3, dtype=torch.float64))
+    return light.resampled(matrix(light.hw), step.apply(light.image, generator))
 
 
 class Recorded(NamedTuple):

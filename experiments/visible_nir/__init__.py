@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 
 from experiments.rendered import RenderedScene
-from experiments.stage import SystemScene
+from experiments.stage import SystemScene, purpose_generator
 from experiments.system import SystemRecording
 from pat.media.colour import from_luma_chroma, linear_from_srgb, srgb_from_linear, to_luma_chroma
 from pat.sensors import Clip, Noise, record
@@ -26,7 +26,7 @@ GENERATOR = "landscape"
 
 def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     """One frame."""
-    generator = stage.generator("record")
+    generator = purpose_generator(stage.seed, "record")
     if isinstance(stage, RenderedScene):
         infrared = stage.infrared("nir")
     else:
@@ -34,15 +34,14 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     own, other = (hazed(*stage.seen(name)) for name in ("nir", "colour"))
     nir = record(infrared, (Noise(8_000, 4), Clip()), generator)
     colour = record(other, (Noise(6_000, 3), Clip()), generator)
-    ground_truth = from_luma_chroma(
-        srgb_from_linear(infrared[0]), to_luma_chroma(srgb_from_linear(own[0]))[1]
-    )
+    chroma = to_luma_chroma(srgb_from_linear(own[0]))[1]
+    ground_truth = from_luma_chroma(srgb_from_linear(infrared[0]), chroma)
     return SystemRecording({"nir": [nir[0]], "colour": [colour[0]]}, [ground_truth.clamp(0, 1)])
 
 
 def infrared_weights(stage: SystemScene) -> torch.Tensor:
     """For each layer: weights of its visible colours in its near infrared, and an offset."""
-    count, g = stage.scene.present.shape[1], stage.generator("infrared")
+    count, g = stage.scene.present.shape[1], purpose_generator(stage.seed, "infrared")
     mixture = torch.rand(count, 3, generator=g)
     contrast = torch.where(torch.rand(count, 1, generator=g) < 0.25, -0.6, 0.9)
     weights = contrast * mixture / mixture.sum(1, keepdim=True)

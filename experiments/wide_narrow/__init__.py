@@ -12,7 +12,7 @@ from torch import Tensor
 from arraygeom import Rig
 from experiments.rendered import RenderedScene
 from experiments.sensors import DecodeSRGB, Mosaic
-from experiments.stage import SystemScene
+from experiments.stage import SystemScene, purpose_generator
 from experiments.system import SystemRecording
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.sensors import Clip, GaussianBlur, Noise, record
@@ -27,7 +27,7 @@ GENERATOR = "still-life"
 def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     """One frame."""
     image, depth = stage.seen("narrow")
-    generator = stage.generator("record")
+    generator = purpose_generator(stage.seed, "record")
     sharp = linear_from_srgb(image)
     ground_truth = defocused(sharp, depth, stage.rig)
     tele = record(luminance(ground_truth), (Noise(10_000, 3), Clip()), generator)

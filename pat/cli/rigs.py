@@ -294,7 +294,7 @@ class Doctor:
             former = self.out.with_name(f"{self.out.name}.old")
             write_text(former, self.out.read_text(encoding="utf-8"))
             kept = f"; the former file: {former}"
-        found.repaired.save(self.out)
+        found.named.rig.save(self.out)
         say(f"written: {self.out} ({found.named.words}: undone{kept})")
 
 
@@ -454,8 +454,8 @@ class RigDiff:
             say(f"written: {self.out}")
 
     def _on_images(self, a: Rig, b: Rig) -> str:
-        from calib.images.held_out import line_distances, nearer
         from calib.images.matches import match_cameras
+        from calib.images.residuals import line_distances, nearer
 
         images = options.read_images(a, self.image)
         with options.working("matching points of the images"):

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from arraygeom import Rig
 from arraygeom.warned import warn
+from calib.images.depth_change import share_outside
 from calib.images.matches import Pairs, match_cameras
-from calib.images.misfit import OUTSIDE, find_misfit, share_outside
+from calib.images.misfit import OUTSIDE, find_misfit
 from calib.images.refinement import refine_matches
 from calib.images.residuals import own_distance, related
 from calib.images.self_calibration import depth_bounds

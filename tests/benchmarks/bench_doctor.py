@@ -24,8 +24,8 @@ from torch.nn.functional import interpolate
 
 from arraygeom import Camera, Pose, Rig, pixel_grid, sample
 from calib.images.doctor import Diagnosis, diagnose_matches
+from calib.images.hypotheses import ROTATIONS, TRANSPOSE, on_cameras
 from calib.images.matches import match_cameras, seen_depths
-from calib.images.remedies import ROTATIONS, TRANSPOSE, on_cameras
 from pat.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.bench_names import negated, shifted
 from tests.benchmarks.printed import DATA, print_tables

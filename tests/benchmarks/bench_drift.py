@@ -24,9 +24,9 @@ import tyro
 
 from arraygeom import Distortion, Rig
 from calib.images.depth_change import observed_depths
+from calib.images.hypotheses import swap
 from calib.images.matches import match_cameras
 from calib.images.refinement import refine_matches
-from calib.images.remedies import swap
 from pat.evaluation.tables import markdown_row
 from tests.benchmarks.printed import DATA, head, print_tables
 from tests.calib.real import RealPair, bumblebee, syntim

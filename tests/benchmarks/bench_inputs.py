@@ -12,7 +12,6 @@ import io
 import sys
 import tempfile
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,13 +19,14 @@ import cv2
 import tyro
 
 from experiments.peaks import with_peak
-from pat.cli.main import main
-from pat.evaluation.tables import markdown_table
+from pat.cli.main import main as pat
+from pat.evaluation.tables import markdown_row
 
 from .input_kinds import Kind, kinds
+from .printed import DATA, head
 
 RESULTS = Path(__file__).with_name("RESULTS_inputs.md")
-COLUMNS = ["input", "status", "depth", "confidence", "peak, MiB"]
+HEAD = head("input | status | depth | confidence | peak, MiB")
 
 
 class Came(NamedTuple):
@@ -59,7 +59,7 @@ def what_came(kind: Kind, folder: Path) -> Came:
 
     def fused() -> int:
         try:
-            main(["fuse", *words])
+            pat(["fuse", *words])
         except SystemExit as ended:
             return int(ended.code or 0)
         return 0
@@ -73,35 +73,23 @@ def what_came(kind: Kind, folder: Path) -> Came:
     return Came(status, depth, float(confidence), (peak or 0) / 2**20, lines[-1])
 
 
-@dataclass
-class Bench:
-    """Measure and print the table."""
-
-    data: Path = Path("../shared/data")
-    only: str = ""
-    """Kinds whose name has this in it."""
-
-    def run(self) -> int:
-        """All kinds, in turn; 1 if one is not as expected."""
-        known = {}
-        if RESULTS.exists():
-            known = {line.split(" | ")[0]: line for line in RESULTS.read_text().splitlines()[2:]}
-        wrong = 0
-        for kind in (kind for kind in kinds(self.data.resolve()) if self.only in kind.name):
-            with tempfile.TemporaryDirectory() as folder:
-                came = what_came(kind, Path(folder))
-            wrong += not came.as_wanted(kind)
-            line = markdown_table(COLUMNS, [came.row(kind)]).splitlines()[-1]
-            print(line if came.as_wanted(kind) else f"{line}\n{came.said}", flush=True)
-            known = {
-                key: text for key, text in known.items() if not key.startswith(f"| {kind.name} (expected")
-            }
-            known[f"| {kind.name}"] = line
-            RESULTS.write_text(
-                "\n".join([*markdown_table(COLUMNS, []).splitlines()[:2], *known.values()]) + "\n"
-            )
-        return int(wrong > 0)
+def main(data: Path = DATA, only: str = "") -> None:
+    """Print the table of all kinds, or of those with a word in their name; exit with 1 if one is wrong."""
+    known = {}
+    if RESULTS.exists():
+        known = {line.split(" | ")[0]: line for line in RESULTS.read_text().splitlines()[2:]}
+    wrong = 0
+    for kind in (kind for kind in kinds(data.resolve()) if only in kind.name):
+        with tempfile.TemporaryDirectory() as folder:
+            came = what_came(kind, Path(folder))
+        wrong += not came.as_wanted(kind)
+        line = markdown_row(came.row(kind))
+        print(line if came.as_wanted(kind) else f"{line}\n{came.said}", flush=True)
+        known = {k: text for k, text in known.items() if not k.startswith(f"| {kind.name} (expected")}
+        known[f"| {kind.name}"] = line
+        RESULTS.write_text("\n".join([HEAD, *known.values()]) + "\n")
+    sys.exit(wrong > 0)
 
 
 if __name__ == "__main__":
-    sys.exit(tyro.cli(Bench).run())
+    tyro.cli(main)

@@ -26,11 +26,11 @@ from torch import Tensor
 from arraygeom import Camera, Distortion, Pose, Rig, rotation_from_vector
 from arraygeom.io.native import write
 from arraygeom.pose import rotation_vector
+from calib.images.depth_change import share_outside
 from calib.images.doctor import Diagnosis, diagnose_matches
-from calib.images.held_out import median_off
+from calib.images.hypotheses import TRANSPOSE, on_cameras, on_pixels, rotated_view, swap
 from calib.images.matches import match_cameras, seen_depths
-from calib.images.misfit import share_outside
-from calib.images.remedies import TRANSPOSE, on_cameras, on_pixels, rotated_view, swap
+from calib.images.residuals import median_off
 from pat.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.bench_drift import drifted, error
 from tests.benchmarks.printed import DATA, print_tables
@@ -183,7 +183,7 @@ def judged(mistake: Mistake, case: Case, bad: Rig) -> Outcome:
         return ("drifted" if alarm else "right" if mistake.kind == "nothing" else DRIFTED), found
     if name == mistake.kind:
         return "right", found
-    before, after = (error(r, case.rig, case.matches) for r in (bad, found.repaired))
+    before, after = (error(r, case.rig, case.matches) for r in (bad, found.named.rig))
     if bad is case.rig:
         return "false alarm", found
     if mistake.kind in [r.kind for r in found.equal]:

@@ -12,13 +12,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from statistics import median
 
 import tyro
 
-from pat.evaluation.tables import markdown_table
+from pat.evaluation.tables import markdown_row, markdown_table
 
 FRAME = """
 import time, warnings
@@ -48,44 +48,34 @@ COLUMNS = [
 ]
 
 
-@dataclass
-class Bench:
-    """Measure and print the table."""
+def main(busy: int = 3, frames: int = 4, against: Path | None = None) -> None:
+    """Print the table: medians after the first frame, in turn, and their ratio."""
+    checkouts = {"": Path.cwd()} | ({"before: ": against} if against else {})
+    rows = []
+    for count in (0, busy):
+        others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+        try:
+            for (size, scale), (label, folder) in product(SIZES.items(), checkouts.items()):
+                load = f"{os.getloadavg()[0]:.0f}"
+                script = FRAME.format(frames=frames, scale=scale)
+                took = [seconds(folder, policy, script) for policy in POLICIES.values()]
+                figures = [*(f"{t:.2f}" for t in took), f"{took[0] / took[1]:.2f}"]
+                rows.append([label + size, str(count), load, *figures])
+                print(markdown_row(rows[-1]), flush=True)
+        finally:
+            for process in others:
+                process.kill()
+    RESULTS.write_text(markdown_table(COLUMNS, rows))
 
-    busy: int = 3
-    frames: int = 4
-    against: Path | None = None
 
-    def run(self) -> None:
-        """The medians after the first frame, in turn, and their ratio."""
-        checkouts = {"": Path.cwd()} | ({"before: ": self.against} if self.against else {})
-        rows = []
-        for busy in (0, self.busy):
-            others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(busy)]
-            try:
-                for size, scale in SIZES.items():
-                    for label, folder in checkouts.items():
-                        load = f"{os.getloadavg()[0]:.0f}"
-                        took = [self.seconds(folder, policy, scale) for policy in POLICIES.values()]
-                        figures = [*(f"{t:.2f}" for t in took), f"{took[0] / took[1]:.2f}"]
-                        cells = [label + size, str(busy), load, *figures]
-                        rows.append(cells)
-                        print(markdown_table(COLUMNS, [cells]).splitlines()[-1], flush=True)
-            finally:
-                for process in others:
-                    process.kill()
-        RESULTS.write_text(markdown_table(COLUMNS, rows))
-
-    def seconds(self, folder: Path, policy: dict[str, str], scale: int) -> float:
-        """The median of a process's frames, the first left out."""
-        plain = {k: v for k, v in os.environ.items() if not k.startswith("OMP_")}
-        environment = {**plain, **policy, "PYTHONPATH": str(folder)}
-        command = [sys.executable, "-c", FRAME.format(frames=self.frames, scale=scale)]
-        done = subprocess.run(
-            command, cwd=folder, env=environment, capture_output=True, text=True, check=True
-        )
-        return median(map(float, done.stdout.split()[1:]))
+def seconds(folder: Path, policy: dict[str, str], script: str) -> float:
+    """The median of a process's frames, the first left out."""
+    plain = {k: v for k, v in os.environ.items() if not k.startswith("OMP_")}
+    environment = {**plain, **policy, "PYTHONPATH": str(folder)}
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True)
+    return median(map(float, done.stdout.split()[1:]))
 
 
 if __name__ == "__main__":
-    tyro.cli(Bench).run()
+    tyro.cli(main)

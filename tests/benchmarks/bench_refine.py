@@ -23,9 +23,9 @@ from torch import Tensor
 from arraygeom import Link, Rig, View
 from arraygeom.pixels import coarse_grid
 from calib.images.from_images import rig_from_images
-from calib.images.held_out import line_distances, split, trimmed_square
 from calib.images.matches import PointMatches, fit_fundamental, line_distance, match_cameras
 from calib.images.refinement import FREE, RefinementProblem, polish, refine, refine_matches
+from calib.images.residuals import line_distances, split, trimmed_square
 from experiments.showcase import FAST, FAST_FRAME, SCENE, SLOW, SLOW_FRAME, published_matrices
 from pat.attention import attend_with_statistics
 from pat.data.sample_array import load_sample

@@ -10,7 +10,7 @@ Scenes whose cameras look along their baseline are left out, because nothing rec
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,19 +46,6 @@ RIGS: dict[str, RigDistribution] = {
 }
 
 
-@dataclass
-class Args:
-    single: str
-    """Weights trained on the single rig."""
-    random: str = "mono-colour-small"
-    """Weights trained as long on random rigs."""
-    scenes: int = 16
-    photos: tuple[Path, ...] = ()
-    """Folders of photographs; scikit-image's if none is given."""
-    out: Path | None = None
-    """Markdown file for the table."""
-
-
 def ahead(networks: dict[str, FusionNetwork], case: AblationCase) -> dict[str, float] | None:
     """By how many dB each leads the classical baseline; and its PSNR. None if nothing rectifies."""
     try:
@@ -74,16 +61,14 @@ def ahead(networks: dict[str, FusionNetwork], case: AblationCase) -> dict[str, f
     }
 
 
-def lines(args: Args, networks: dict[str, FusionNetwork]) -> Iterator[str]:
-    yield (
-        f"{args.scenes} layered scenes of 240 x 320 a row; PSNR in dB, ahead of classical; [95% interval].\n"
-    )
+def lines(networks: dict[str, FusionNetwork], scenes: int, photos: tuple[Path, ...]) -> Iterator[str]:
+    yield (f"{scenes} layered scenes of 240 x 320 a row; PSNR in dB, ahead of classical; [95% interval].\n")
     yield markdown_header(
         ["rig", "classical", *(cell for name in networks for cell in (f"{name} rigs", "lost"))]
     )
     reference: dict[str, float] = {}
     for kind, rigs in RIGS.items():
-        cases = layered_cases(args.scenes, photos=args.photos, rigs=rigs, seed=7)
+        cases = layered_cases(scenes, photos=photos, rigs=rigs, seed=7)
         found = [figures for case in cases if (figures := ahead(networks, case)) is not None]
         cells = [kind, f"{np.mean([f['classical'] for f in found]):.2f}"]
         for name in networks:
@@ -94,10 +79,23 @@ def lines(args: Args, networks: dict[str, FusionNetwork]) -> Iterator[str]:
         yield markdown_row(cells)
 
 
-def main(args: Args) -> None:
-    networks = {"random": load_weights(args.random), "single": load_weights(args.single)}
-    print_tables("Weights of one rig, weights of random rigs", [lines(args, networks)], args.out)
+def main(
+    single: str,
+    random: str = "mono-colour-small",
+    scenes: int = 16,
+    photos: tuple[Path, ...] = (),
+    out: Path | None = None,
+) -> None:
+    """Print the table.
+
+    Args:
+        single: Weights trained on the single rig.
+        random: Weights trained as long on random rigs.
+        photos: Folders of photographs; scikit-image's if none is given.
+    """
+    networks = {"random": load_weights(random), "single": load_weights(single)}
+    print_tables("Weights of one rig, weights of random rigs", [lines(networks, scenes, photos)], out)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    tyro.cli(main)

@@ -10,7 +10,7 @@ experiments evaluate --protocol table2`.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
 from pat.sensors import Clip, Noise, Quantise, record
 from pat.synthesis.layered import LayeredScenes
+from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rig_distribution import RigDistribution
 from pat.training.config import TrainConfig
 from pat.training.lenses import Spectra
@@ -46,23 +47,13 @@ KINDS = {
 """Number of places, and of random bands (0 for red, green and blue)."""
 
 
-@dataclass
-class Args:
-    photos: tuple[Path, ...]
-    """Folders of photographs: those of the training, of which it holds some out."""
-    weights: tuple[str, ...] = ("mono-spectral", "mono-colour")
-    scenes: int = 10
-    cache: Path | None = None
-    """File (.npz) of photographs read before, or to be written."""
-    seed: int = 9
-
-
-def cases(args: Args, places: int, random: int) -> Iterator[tuple[Rig, dict[str, Tensor], Tensor]]:
+def cases(
+    photos: PhotoBank, count: int, seed: int, places: int, random: int
+) -> Iterator[tuple[Rig, dict[str, Tensor], Tensor]]:
     """A rig, its images (alpha and one of each band) and the truth."""
-    _, unseen = photographs(TrainConfig(photos=args.photos, cache=args.cache))
-    scenes, g = LayeredScenes(unseen, replace(RIGS, betas=places), hw=HW, seed=args.seed), Generator()
-    g.manual_seed(args.seed)
-    for _ in range(args.scenes):
+    scenes = LayeredScenes(photos, replace(RIGS, betas=places), hw=HW, seed=seed)
+    g = Generator().manual_seed(seed)
+    for _ in range(count):
         made = scenes.sample(1, g)
         spectra = Spectra.drawn(1, random, g) if random else None
         seen = [spectra.of(image) if spectra else image for image in made.images]
@@ -90,9 +81,14 @@ def baseline(rig: Rig, images: dict[str, Tensor], places: int, random: int) -> T
     )
 
 
-def row(args: Args, networks: dict[str, FusionNetwork], places: int, random: int) -> list[str]:
+def row(
+    made: Iterator[tuple[Rig, dict[str, Tensor], Tensor]],
+    networks: dict[str, FusionNetwork],
+    places: int,
+    random: int,
+) -> list[str]:
     found: dict[str, list[tuple[float, float]]] = {}
-    for rig, images, ground_truth in cases(args, places, random):
+    for rig, images, ground_truth in made:
         answers = {"classical": baseline(rig, images, places, random)}
         for name, network in networks.items():
             if name == "mono-spectral" or len(ground_truth) == 3:
@@ -103,15 +99,27 @@ def row(args: Args, networks: dict[str, FusionNetwork], places: int, random: int
     return [cells.get(name, "") for name in ("classical", *networks)]
 
 
-def main(args: Args) -> None:
-    networks = {name: load_weights(name) for name in args.weights}
-    print(
-        f"{args.scenes} layered scenes of {HW[1]} x {HW[0]}, betas of half the resolution; mean PSNR / SSIM\n"
-    )
+def main(
+    photos: tuple[Path, ...],
+    weights: tuple[str, ...] = ("mono-spectral", "mono-colour"),
+    scenes: int = 10,
+    cache: Path | None = None,
+    seed: int = 9,
+) -> None:
+    """Print the table.
+
+    Args:
+        photos: Folders of photographs: those of the training, of which it holds some out.
+        cache: File (.npz) of photographs read before, or to be written.
+    """
+    networks = {name: load_weights(name) for name in weights}
+    _, unseen = photographs(TrainConfig(photos=photos, cache=cache))
+    print(f"{scenes} layered scenes of {HW[1]} x {HW[0]}, betas of half the resolution; mean PSNR / SSIM\n")
     print(markdown_header(["bands", "classical", *networks]))
     for kind, (places, random) in KINDS.items():
-        print(markdown_row([kind, *row(args, networks, places, random)]), flush=True)
+        made = cases(unseen, scenes, seed, places, random)
+        print(markdown_row([kind, *row(made, networks, places, random)]), flush=True)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    tyro.cli(main)

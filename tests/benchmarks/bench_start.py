@@ -19,8 +19,8 @@ import tyro
 
 from calib.boards.poses import StartDeviations
 from calib.boards.uncertainty import baseline_deviation, rig_covariance
-from calib.images.held_out import line_distances
 from calib.images.matches import PointMatches, match_cameras
+from calib.images.residuals import line_distances
 from experiments.alignment import nine_band_calibration
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.media.images import read_image

@@ -17,7 +17,7 @@ def test_a_benchmark_begins(name, capsys):
     if name == "bench_explorer":
         pytest.importorskip("selenium")
     module = importlib.import_module(f"tests.benchmarks.{name}")
-    begin = next(found for found in ("Args", "Bench", "main") if hasattr(module, found))
+    begin = next(found for found in ("Args", "main") if hasattr(module, found))
     with pytest.raises(SystemExit) as ended:
         tyro.cli(getattr(module, begin), args=["--help"])
     assert ended.value.code == 0

@@ -7,7 +7,6 @@ import torch
 
 from arraygeom import Dense, Epipolar, EpipolarLine, Rectified, sample
 from arraygeom.fields.grid import FieldOnGrid
-from experiments.__main__ import Experiments
 from experiments.evaluation.fields import (
     FieldRow,
     drawn_peaks,
@@ -20,7 +19,6 @@ from experiments.evaluation.fields import (
 )
 from experiments.evaluation.sweeps import ALPHA, BETA, fused
 from pat.attention.scores import peak_position
-from pat.cli.main import main
 from pat.data.pairs import Disparity, StereoPair
 from pat.evaluation.ablation import sample_photographs
 from pat.matching.inputs import Inputs
@@ -42,13 +40,6 @@ def pair() -> StereoPair:
     valid = torch.ones(HW, dtype=torch.bool)
     valid[:2] = False
     return StereoPair("made", wide[..., :48], wide[..., 5:], 12.0, Disparity(torch.full(HW, 5.0), valid))
-
-
-@pytest.fixture(scope="module")
-def network() -> PAT:
-    torch.manual_seed(0)
-    made = PAT(PATConfig(dim=8, residual=True, interpolation="bilinear", normalised=True)).eval()
-    return made.requires_grad_(False)
 
 
 def test_true_positions_of_a_pair(pair):
@@ -89,13 +80,10 @@ def test_what_cannot_serve_is_named(network, pair):
     epipolar, rectified = evaluate_fields(network, [case], fields=lambda max_displacement: fields)
     assert epipolar.note
     assert "| epipolar | " in fields_markdown([epipolar, rectified])
-    large = case._replace(
-        scene=case.scene._replace(images={ALPHA: torch.rand(1, 200, 200), BETA: torch.rand(3, 200, 200)})
-    )
-    assert (
-        "left out"
-        in evaluate_fields(network, [large], fields=lambda max_displacement: {"dense": Dense()})[0].note
-    )
+    images = {ALPHA: torch.rand(1, 200, 200), BETA: torch.rand(3, 200, 200)}
+    large = case._replace(scene=case.scene._replace(images=images))
+    (row,) = evaluate_fields(network, [large], fields=lambda max_displacement: {"dense": Dense()})
+    assert "left out" in row.note
 
 
 def test_a_network_of_several_betas_gets_a_band_each(pair):
@@ -131,12 +119,7 @@ def test_drawn_peaks_are_red_where_the_table_counts_them_wrong(network, pair):
     assert found.std() > 0.1
 
 
-def test_weights_for_two_bands_are_refused_at_once(tmp_path, capsys):
+def test_weights_for_two_bands_are_refused_at_once(tmp_path, refusal):
     save_weights(PAT(PATConfig(betas=2, in_channels=1, dim=8)), tmp_path / "two.safetensors")
-    with pytest.raises(SystemExit) as stop:
-        main(
-            ["fields", "--weights", str(tmp_path / "two.safetensors"), "--out", str(tmp_path)],
-            group=Experiments,
-        )
-    assert stop.value.code == 2
-    assert "they are for 2 betas: give some for one beta in colour, or for three" in capsys.readouterr().err
+    said = refusal("fields", "--weights", str(tmp_path / "two.safetensors"), "--out", str(tmp_path))
+    assert "they are for 2 betas: give some for one beta in colour, or for three" in said

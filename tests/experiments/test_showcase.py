@@ -143,15 +143,8 @@ def shown(data, tmp_path_factory):
 def test_every_case_has_its_table_and_its_figure(shown):
     text, out = shown
     assert (out / "showcase.md").read_text() == text
-    for expected in (
-        "#### kitti",
-        "#### middlebury",
-        "#### flickr1024",
-        "| Serfaty |",
-        "| cam3 |",
-        "SSIM of fusion",
-    ):
-        assert expected in text
+    tables = "#### kitti", "#### middlebury", "#### flickr1024", "| Serfaty |", "| cam3 |", "SSIM of fusion"
+    assert all(expected in text for expected in tables)
     figures = [line[line.index("(") + 1 : -1] for line in text.splitlines() if line.startswith("![")]
     assert figures == ["syntim_Serfaty.png", "fast_slow.png"]
     assert all(read_image(out / figure).shape[0] == 3 for figure in figures)
@@ -191,45 +184,20 @@ def test_the_links_are_in_our_pixels(shown):
 
 
 @pytest.mark.parametrize("missing", ["syntim", "hfr_lfr/fundamental_matrices.json", "kitti/right.png"])
-def test_what_is_missing_is_named(data, tmp_path, capsys, missing):
+def test_what_is_missing_is_named(data, tmp_path, refusal, missing):
     folder = tmp_path / "data"
     shutil.copytree(data, folder)
-    gone = folder / missing
+    gone, given = folder / missing, ["--data", str(folder), "--out", str(tmp_path / "out")]
     shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
-    with pytest.raises(SystemExit) as stop:
-        main(
-            [
-                "showcase",
-                "--data",
-                str(folder),
-                "--out",
-                str(tmp_path / "out"),
-                "--weights",
-                str(data / "small.safetensors"),
-            ],
-            group=Experiments,
-        )
-    error = capsys.readouterr().err.strip().splitlines()
-    assert stop.value.code == 2
+    error = refusal("showcase", *given, "--weights", str(data / "small.safetensors")).strip().splitlines()
     assert error[-1].startswith("pat: ")
     assert missing.split("/")[0] in error[-1]
     assert not (tmp_path / "out").exists()
 
 
 def test_evaluate_writes_and_prints_the_tables(data, tmp_path, capsys):
-    main(
-        [
-            "evaluate",
-            "--kitti",
-            str(data / "kitti"),
-            "--rates",
-            "2",
-            "--out",
-            str(tmp_path),
-            "--weights",
-            str(data / "small.safetensors"),
-        ]
-    )
+    given = ["--kitti", str(data / "kitti"), "--rates", "2", "--out", str(tmp_path)]
+    main(["evaluate", *given, "--weights", str(data / "small.safetensors")])
     printed = capsys.readouterr().out
     assert printed == (tmp_path / "scores.md").read_text()
     assert printed.startswith("#### kitti\n\n| beta reduced 2x | alpha | beta | classical | fusion |\n")
@@ -245,11 +213,8 @@ def test_evaluate_writes_and_prints_the_tables(data, tmp_path, capsys):
         (["--kitti", ".", "--rates", "0"], "--rates: 0"),
     ],
 )
-def test_evaluate_says_what_is_wrong(arguments, complaint, tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["evaluate", *arguments, "--out", str(tmp_path / "out")])
-    assert stop.value.code == 2
-    assert complaint in capsys.readouterr().err
+def test_evaluate_says_what_is_wrong(arguments, complaint, tmp_path, refusal):
+    assert complaint in refusal("evaluate", *arguments, "--out", str(tmp_path / "out"), group=None)
     assert not (tmp_path / "out").exists()
 
 
@@ -272,26 +237,14 @@ def test_evaluate_says_what_is_wrong(arguments, complaint, tmp_path, capsys):
         (["certainty", "--middlebury", ".", "--conditions", "dusk"], "--conditions: no condition 'dusk'"),
     ],
 )
-def test_the_tables_commands_say_what_is_wrong(arguments, complaint, data, tmp_path, capsys):
+def test_the_tables_commands_say_what_is_wrong(arguments, complaint, data, tmp_path, refusal):
     given = [argument.replace("DATA", str(data)) for argument in arguments]
-    with pytest.raises(SystemExit) as stop:
-        main([*given, "--out", str(tmp_path / "out")], group=Experiments)
-    assert stop.value.code == 2
-    assert complaint in capsys.readouterr().err
+    assert complaint in refusal(*given, "--out", str(tmp_path / "out"))
 
 
 def test_the_papers_figures_are_beside_ours(data, tmp_path, capsys):
-    arguments = [
-        "evaluate",
-        "--kitti",
-        str(data / "kitti"),
-        "--rates",
-        "2",
-        "--controls",
-        "--out",
-        str(tmp_path),
-    ]
-    main([*arguments, "--weights", "mono-colour-small"], group=Experiments)
+    given = ["--kitti", str(data / "kitti"), "--rates", "2", "--controls", "--out", str(tmp_path)]
+    main(["evaluate", *given, "--weights", "mono-colour-small"], group=Experiments)
     printed = capsys.readouterr().out
     assert printed == (tmp_path / "scores.md").read_text()
     assert "| shuffled fields | the paper, printed, on its own data |" in printed

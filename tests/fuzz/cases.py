@@ -10,7 +10,7 @@ import shutil
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,12 +24,12 @@ from arraygeom.io import read_rig, write_rig
 from calib.boards.uncertainty import RigCovariance
 from pat.cli.main import main
 from pat.media.images import read_image, write_image
-from pat.media.video import read_video
+from pat.media.video import Video, read_video
 from pat.networks.configs import GuidedPATConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import load_weights, save_weights
 from pat.synthesis.photos import read_photographs
-from pat.training.checkpoints import collect, newest_checkpoint, restore, write_checkpoint
+from pat.training.checkpoints import FACTS, collect, newest_checkpoint, restore, write_checkpoint
 
 from .mutations import mutated
 
@@ -75,6 +75,19 @@ def damaged(seed: Seed, number: int, folder: Path) -> Path:
         content = seed.file.read_bytes()
         path.write_bytes(mutated(content, source, text=not binary, suffix=seed.file.suffix))
     return read
+
+
+def answered(read: Callable[[Path], Any], fault: Callable[[Any], str] = lambda found: "") -> Check:
+    """A file is read, or refused in a line that names it; `fault` says what is wrong with what was read."""
+
+    def check(path: Path, _: random.Random) -> str:
+        try:
+            found = read(path)
+        except (ValueError, FileNotFoundError) as error:
+            return refused(error, path)
+        return fault(found) or "read"
+
+    return check
 
 
 def refused(error: Exception, path: Path | None = None) -> str:
@@ -279,14 +292,10 @@ def video_seeds(folder: Path) -> Iterator[Seed]:
     yield Seed("video", "mp4", folder / "video.mp4")
 
 
-def watch_video(path: Path, _: random.Random) -> str:
-    """All frames of `read_video`."""
-    try:
-        video = read_video(path)
-    except (ValueError, FileNotFoundError) as error:
-        return refused(error, path)
+def faults_of_video(video: Video) -> str:
+    """Of its first frames and its rate."""
     whole = all(frame.isfinite().all() for frame in itertools.islice(video.frames, 100))
-    return "read" if whole and 0 < video.rate < float("inf") else f"{video.rate} frames a second"
+    return "" if whole and 0 < video.rate < float("inf") else f"{video.rate} frames a second"
 
 
 # Weights, checkpoints, documents ----------------------------------------------------------------------------
@@ -300,14 +309,6 @@ def small_network() -> GuidedPAT:
 def weight_seeds(folder: Path) -> Iterator[Seed]:
     save_weights(small_network(), folder / "weights" / "small.safetensors")
     yield Seed("weights", "guided", folder / "weights" / "small.safetensors")
-
-
-def use_weights(path: Path, _: random.Random) -> str:
-    try:
-        load_weights(path)
-    except (ValueError, FileNotFoundError) as error:
-        return refused(error, path)
-    return "read"
 
 
 def training() -> tuple[nn.Module, torch.optim.Optimizer, torch.optim.swa_utils.AveragedModel]:
@@ -335,11 +336,7 @@ def use_checkpoint(path: Path, _: random.Random) -> str:
     except ValueError as error:
         return refused(error)
     facts = found.facts
-    whole = (
-        isinstance(facts["step"], int)
-        and isinstance(facts["minutes"], float | int)
-        and isinstance(facts["done"], bool)
-    )
+    whole = all(type(facts[name]) in kinds for name, kinds in FACTS.items())
     return "read" if whole else f"facts of other types: {facts}"
 
 
@@ -349,21 +346,17 @@ def covariance_seeds(folder: Path) -> Iterator[Seed]:
     yield Seed("covariance", "json", folder / "covariance.json")
 
 
-def use_covariance(path: Path, _: random.Random) -> str:
-    try:
-        found = RigCovariance.load(path)
-    except (ValueError, FileNotFoundError) as error:
-        return refused(error, path)
+def faults_of_covariance(found: RigCovariance) -> str:
     whole = np.isfinite(found.matrix).all() and all(isinstance(name, str) for name in found.names)
-    return "read" if whole else f"{found.names} {found.matrix}"
+    return "" if whole else f"{found.names} {found.matrix}"
 
 
 KINDS: dict[str, tuple[Callable[[Path], Iterator[Seed]], Check, int]] = {
     "rig": (rig_seeds, convert_and_inspect, 5000),
     "image": (image_seeds, read_and_write, 1000),
-    "video": (video_seeds, watch_video, 100),
-    "weights": (weight_seeds, use_weights, 200),
+    "video": (video_seeds, answered(read_video, faults_of_video), 100),
+    "weights": (weight_seeds, answered(load_weights), 200),
     "checkpoint": (checkpoint_seeds, use_checkpoint, 150),
-    "covariance": (covariance_seeds, use_covariance, 150),
+    "covariance": (covariance_seeds, answered(RigCovariance.load, faults_of_covariance), 150),
 }
 """Good files, the question asked of a damaged one, and how many are made."""

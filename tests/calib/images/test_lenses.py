@@ -19,11 +19,11 @@ from arraygeom import (
     rotation_from_vector,
 )
 from calib.images.doctor import diagnose_matches
-from calib.images.held_out import line_distances
 from calib.images.lenses import largest_distortion, with_lenses
 from calib.images.matches import PointMatches, fit_fundamental, match_cameras, undistort_matches
-from calib.images.photometric import PhotometricFrame, photometric_errors
+from calib.images.photometric import PhotometricImage, photometric_errors
 from calib.images.refinement import Refinement, refine_matches
+from calib.images.residuals import line_distances
 from experiments.showcase import FAST, FAST_FRAME, SCENE, SLOW_FRAME, published_matrices
 from pat.attention import attend_with_statistics
 from pat.cli.main import main
@@ -118,7 +118,7 @@ def test_a_lens_that_is_known_is_kept_and_improved():
 
 
 def test_bending_is_what_no_straight_camera_does():
-    rig = with_lenses(Rig({n: View(hw=HW) for n in NAMES}, links={NAMES: Link(torch.eye(3).double())}), NAMES)
+    rig = with_lenses(Rig({n: View(hw=HW) for n in NAMES}, links={NAMES: Link(torch.eye(3).double())}))
     assert float(largest_distortion(rig["a"])) < 1e-6
     view = rig["a"].replace(distortion=Distortion("brown-conrady", vector(0.05, 0, 0, 0)))
     corner = torch.tensor([[0.0, 0.0]], dtype=torch.float64)
@@ -140,9 +140,9 @@ def test_the_fusions_error_sees_through_lenses():
     F = rig.pair("left", "right").fundamental
     H = torch.tensor([[1, 0, -15.0], [0, 1, 0], [0, 0, 1]], dtype=torch.float64)
     views = with_lenses(
-        Rig({n: View(hw=rig[n].hw) for n in rig.names}, links={("left", "right"): Link(F, H)}), rig.names
+        Rig({n: View(hw=rig[n].hw) for n in rig.names}, links={("left", "right"): Link(F, H)})
     )
-    ready = PhotometricFrame.of(images)
+    ready = {name: PhotometricImage.of(image) for name, image in images.items()}
 
     def error(change):
         changed = views.perturbed({"right.distortion": change})

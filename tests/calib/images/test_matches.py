@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Camera, Pose, Rig, apply_homography, epipolar_lines, intrinsics, rotation_from_vector
+from arraygeom import apply_homography, epipolar_lines
 from calib.images import matches
 from calib.images.matches import (
     ENOUGH,
@@ -16,29 +16,12 @@ from calib.images.matches import (
     near_lines,
     seen_depths,
 )
-from tests.calib.scenes import texture
-
-HW = (240, 320)
+from tests.calib.scenes import seen_points, texture, unlike_pair
 
 
-def rig_of(depth=(1.0, 9.0)) -> Rig:
-    R = rotation_from_vector(torch.tensor([0.01, -0.03, 0.05], dtype=torch.float64))
-    t = torch.tensor([-0.2, 0.03, 0.02], dtype=torch.float64)
-    cameras = {
-        "left": Camera(K=intrinsics(300.0, HW), cam_from_world=Pose.from_centre(R, R.T @ t + 3), hw=HW),
-        "right": Camera(K=intrinsics(250.0, HW), cam_from_world=Pose(R.T, t), hw=HW),
-    }
-    return Rig(cameras, depth=depth)
-
-
-def seen_points(rig, *, count=300, near=2.0, far=6.0, noise=0.0):
-    """Matches of random points between two depths in front of left, good to `noise` pixels."""
-    g = torch.Generator().manual_seed(0)
-    left, right = rig["left"], rig["right"]
-    x = torch.rand(count, 2, generator=g, dtype=torch.float64) * torch.tensor([319.0, 239.0])
-    depth = near + (far - near) * torch.rand(count, generator=g, dtype=torch.float64)
-    y = right.project(left.unproject(x, depth)).x
-    return PointMatches(x, y + noise * torch.randn(count, 2, generator=g, dtype=torch.float64))
+def matched(rig, *, count=300, noise=0.0) -> PointMatches:
+    (points,) = seen_points(rig, count=count, noise=noise).values()
+    return points
 
 
 def test_matches_follow_a_known_map():
@@ -57,8 +40,8 @@ def test_flat_images_have_no_matches():
 
 
 def test_lines_choose_matches():
-    rig = rig_of()
-    F, matches = rig.pair("left", "right").fundamental, seen_points(rig)
+    rig = unlike_pair()
+    F, matches = rig.pair("first", "second").fundamental, matched(rig)
     assert line_distance(matches, F).max() < 1e-6
     wrong = PointMatches(matches.alpha, matches.beta.flip(0))
     both = PointMatches(torch.cat([matches.alpha, wrong.alpha]), torch.cat([matches.beta, wrong.beta]))
@@ -66,13 +49,13 @@ def test_lines_choose_matches():
 
 
 def test_a_link_is_refined_and_its_map_reaches_the_points():
-    rig = rig_of()
-    F, matches = rig.pair("left", "right").fundamental, seen_points(rig, noise=0.2)
+    rig = unlike_pair()
+    F, matches = rig.pair("first", "second").fundamental, matched(rig, noise=0.2)
     shift = torch.tensor([[1.0, 0, 2.0], [0, 1, -2.0], [0, 0, 1]], dtype=torch.float64)
     off = torch.linalg.inv(shift).T @ F
     assert line_distance(matches, off).median() > 1
     fit = fit_link(matches, off)
-    exact = seen_points(rig)
+    exact = matched(rig)
     assert line_distance(exact, fit.link.F).median() < 0.2
     away = exact.beta - apply_homography(fit.link.H, exact.alpha).x
     assert (away.norm(dim=-1) < fit.displacement + 3).double().mean() > 0.9
@@ -82,25 +65,25 @@ def test_a_link_is_refined_and_its_map_reaches_the_points():
 
 
 def test_a_link_needs_points_that_agree():
-    rig = rig_of()
-    matches = seen_points(rig)
+    rig = unlike_pair()
+    matches = matched(rig)
     other = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, -500]], dtype=torch.float64)
     with pytest.raises(ValueError):
         fit_link(matches, other)
 
 
 def test_depths_contain_the_matched_points():
-    rig = rig_of()
-    near, far = seen_depths(rig.pair("left", "right"), seen_points(rig, noise=0.1))
+    rig = unlike_pair()
+    near, far = seen_depths(rig.pair("first", "second"), matched(rig, noise=0.1))
     assert 1.7 < near < 2.0
     assert 6.0 < far < 7.6
 
 
 def test_depths_need_points_that_fit():
-    rig = rig_of()
-    few = seen_points(rig, count=ENOUGH - 1)
+    rig = unlike_pair()
+    few = matched(rig, count=ENOUGH - 1)
     with pytest.raises(ValueError, match=str(ENOUGH - 1)):
-        seen_depths(rig.pair("left", "right"), few)
+        seen_depths(rig.pair("first", "second"), few)
 
 
 def test_features_are_matched_as_by_opencv():

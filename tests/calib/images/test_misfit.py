@@ -10,8 +10,9 @@ import torch
 
 from arraygeom import Pose
 from calib.images import misfit
+from calib.images.depth_change import share_outside
 from calib.images.matches import PointMatches, match_cameras
-from calib.images.misfit import find_misfit, misfit_warning, share_outside
+from calib.images.misfit import find_misfit, misfit_warning
 from pat.cli.main import main
 from pat.media.images import write_image
 from tests.calib.scenes import rectified_images, rectified_pair, texture, vector

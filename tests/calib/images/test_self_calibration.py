@@ -9,8 +9,8 @@ import torch
 from arraygeom import Distortion, LensView, Pose, Rig, intrinsics, rotation_from_vector
 from arraygeom.pixels import coarse_grid
 from calib.images import self_calibration
-from calib.images.held_out import line_distances
 from calib.images.matches import PointMatches, with_map
+from calib.images.residuals import line_distances
 from calib.images.self_calibration import (
     RefinedPair,
     dense_matches,

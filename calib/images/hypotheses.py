@@ -1,0 +1,297 @@
+"""The usual mistakes in rigs: a table of hypotheses, each with the rig that is right if it holds.
+
+What was done to images and the rig does not state (rotation, resizing, cropping) is done to the rig's camera.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from arraygeom import Camera, Distortion, LensView, Pose, Rig, View, resize_matrix, rotation_from_vector
+from arraygeom.pixels import HW, rot90_matrix, shift_matrix
+from arraygeom.pose import rotation_vector
+
+from .parameters import LARGEST_CHANGE, SIGMA
+
+RESIZED = (0.5, 2.0, 0.25, 4.0, 1 / 3, 3.0, 2 / 3, 1.5, 0.75, 4 / 3)
+UNITS = {
+    1e-3: "millimetres taken for metres",
+    1e3: "metres taken for millimetres",
+    1e-2: "centimetres taken for metres",
+    1e2: "metres taken for centimetres",
+}
+SHIFTS = {"half-pixel shift": 0.5, "one-pixel shift": 1.0}
+"""A drift of a calibrated camera's principal point does the same."""
+OFF_CENTRE = 0.05
+"""Principal points within this of the middle of the image, as a share of its longer side, are plausible."""
+TRANSPOSE = torch.eye(3, dtype=torch.float64)[[1, 0, 2]]
+"""Exchanges x and y."""
+OPENGL = Pose(torch.diag(torch.tensor([1, -1, -1], dtype=torch.float64)), torch.zeros(3, dtype=torch.float64))
+"""From the axes of OpenGL and Blender, y upwards and z backwards."""
+TURNS = tuple(range(-29, 29))
+"""Whole turns, in radians, that may be missing from a rotation vector in degrees: it is at most 180 long."""
+
+Change = Callable[[Rig, Sequence[str]], Rig]
+"""The rig in which some cameras are changed."""
+Group = tuple[Sequence[str], str]
+"""Names of cameras, and what they are called together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A possible mistake: its kind ("resized", "units", ...), description, and the rig that is right then.
+
+    approximate: that rig holds numbers that were estimated.
+    """
+
+    kind: str
+    words: str
+    rig: Rig
+    approximate: bool = False
+
+
+def hypotheses(rig: Rig, sizes: Mapping[str, HW]) -> list[Hypothesis]:
+    """That nothing is wrong, and all single mistakes plausible in a rig whose images have these sizes.
+
+    Likely ones come first. Where images do not have the sizes that the rig states, only those that explain
+    it.
+    """
+    names = [name for name in rig.names if name in sizes]
+    wrong = [name for name in names if rig[name].hw != sizes[name]]
+    found = [
+        Hypothesis("cameras swapped", f"images of '{a}' and '{b}' swapped", swap(rig, a, b))
+        for a, b in combinations(names, 2)
+    ]
+    if wrong:
+        found = [*_of_sizes(rig, wrong, sizes), *found]
+    else:
+        found = [h for h in [*found, *_of_numbers(rig, names)] if _is_plausible(rig, h)]
+    fitting = [h for h in found if all(h.rig[name].hw == sizes[name] for name in names)]
+    return [Hypothesis("nothing", "as given", rig), *fitting]
+
+
+def _is_plausible(given: Rig, hypothesis: Hypothesis) -> bool:
+    """Whether a rig may hold this mistake, by its numbers alone.
+
+    Another size and exchanged axes change K by more than a drift does, and take principal points away from
+    the middles of images, not towards them. By points alone a drift is taken for such a mistake now and then:
+    lines of distant narrow views depend on little but the difference of two principal points.
+    """
+    if hypothesis.kind not in ("resized", "x and y exchanged"):
+        return True
+    views = zip(given.cameras.values(), hypothesis.rig.cameras.values())
+    changed = [(a, b) for a, b in views if a is not b and isinstance(a, LensView) and isinstance(b, LensView)]
+    nearer = all(_centre_offset(b) <= max(_centre_offset(a), OFF_CENTRE) for a, b in changed)
+    return nearer and (not changed or any(_beyond_drift(a.K, b.K) for a, b in changed))
+
+
+def _beyond_drift(given: Tensor, other: Tensor) -> bool:
+    """Whether a focal length or a principal point differs by more than `LARGEST_CHANGE` prior deviations."""
+    focal = (other / given - 1).diagonal()[:2].abs().max() / SIGMA["focal"]
+    centre = (other - given)[:2, 2].norm() / SIGMA["centre"]
+    return bool(torch.maximum(focal, centre) > LARGEST_CHANGE)
+
+
+def _centre_offset(view: LensView) -> float:
+    """Of the principal point from the middle of the image, as a share of its longer side."""
+    middle = view.K.new_tensor([view.hw[1] - 1, view.hw[0] - 1]) / 2
+    return float((view.K[:2, 2] - middle).norm()) / max(view.hw)
+
+
+def ignored_lens(rig: Rig, bare: Sequence[str], k1: float) -> Hypothesis:
+    """Distortion was ignored, and is about `k1` in all these cameras, which have none.
+
+    With k2 = 1.5 k1^2, as lenses tend to have it (a fisheye's r = theta has 1.8, ordinary wide ones about
+    1.3): one parameter, and one to one at any radius.
+    """
+    words = f"distortion ignored: about k1 = {k1:.3f} in {', '.join(map(repr, bare))}"
+    lens = Distortion("brown-conrady", torch.tensor([k1, 1.5 * k1**2, 0, 0], dtype=torch.float64))
+    bent = on_cameras(rig, bare, lambda camera: camera.replace(distortion=lens))
+    return Hypothesis("distortion", words, bent, approximate=True)
+
+
+def from_degrees(R: Float[Tensor, "3 3"], turns: Int[Tensor, "*b"]) -> Float[Tensor, "*b 3 3"]:
+    """The rotations whose vector was in degrees, so many turns longer, and was taken for radians."""
+    vector = rotation_vector(R)
+    angle = vector.norm()
+    whole = torch.deg2rad(angle + 2 * math.pi * turns)[..., None]
+    return rotation_from_vector(vector / angle.clamp(min=1e-12) * whole)
+
+
+def in_degrees(rig: Rig, turns: Mapping[str, int]) -> Hypothesis:
+    """Rotation vectors of cameras were in degrees, taken for radians; `turns` of each are missing."""
+    cameras = dict(rig.cameras)
+    for name, missing in turns.items():
+        pose = Pose(from_degrees(rig[name].R, torch.tensor(missing)), rig[name].t)
+        cameras[name] = rig[name].replace(cam_from_world=pose)
+    words = "rotation of all cameras in degrees, taken for radians"
+    return Hypothesis("degrees and radians", words, rig.replace(cameras=cameras))
+
+
+ROTATIONS = {
+    "rotated by 180 degrees": (2, False),
+    "rotated by 90 degrees counter-clockwise": (1, False),
+    "rotated by 90 degrees clockwise": (3, False),
+    "mirrored left to right": (3, True),
+    "mirrored top to bottom": (1, True),
+    "mirrored about the diagonal (rows and columns exchanged)": (0, True),
+    "mirrored about the other diagonal": (2, True),
+}
+"""Rotations and mirrorings of an image: quarter turns, after an exchange of x and y or not."""
+
+
+def rotated_view(view: View, words: str) -> tuple[Float[Tensor, "3 3"], HW]:
+    """A of the pixels, x' ~ A x, and the new size after one of `ROTATIONS`."""
+    turns, exchanged = ROTATIONS[words]
+    hw = view.hw[::-1] if exchanged else view.hw
+    A = rot90_matrix(hw, turns)
+    return A @ TRANSPOSE if exchanged else A, hw[::-1] if turns % 2 else hw
+
+
+def swap(rig: Rig, a: str, b: str) -> Rig:
+    """The rig in which two names have exchanged their cameras."""
+    other = {a: b, b: a}
+    cameras = {n: rig[other.get(n, n)] for n in rig.names}
+    links = {(other.get(i, i), other.get(j, j)): link for (i, j), link in rig.links.items()}
+    return rig.replace(cameras=cameras, links=links)
+
+
+def on_cameras(rig: Rig, names: Iterable[str], change: Callable[[Camera], Camera]) -> Rig:
+    """The rig with the calibrated ones among some cameras changed."""
+    changed = {n: change(c) for n in names if isinstance(c := rig[n], Camera)}
+    return rig.replace(cameras={**rig.cameras, **changed})
+
+
+def on_pixels(rig: Rig, names: Iterable[str], change: Callable[[str, View], tuple[Tensor, HW]]) -> Rig:
+    """The rig with the pixels of some cameras transformed: x' ~ A x, and the new size."""
+    for name in names:
+        rig = rig.transformed(name, *change(name, rig[name]))
+    return rig
+
+
+def _poses(change: Callable[[Pose], Pose]) -> Change:
+    return partial(on_cameras, change=lambda c: c.replace(cam_from_world=change(c.cam_from_world)))
+
+
+def _same_size(A: Tensor) -> Change:
+    """x' ~ A x of the pixels of cameras whose image sizes stay."""
+    return partial(on_pixels, change=lambda _, view: (A, view.hw))
+
+
+def _opposite_lens(camera: Camera) -> Camera:
+    lens = camera.distortion
+    return (
+        camera if lens is None else camera.replace(distortion=lens.replace(coefficients=-lens.coefficients))
+    )
+
+
+POSES: dict[tuple[str, str], Callable[[Pose], Pose]] = {
+    ("pose inverted", "pose of {} inverted (world from camera)"): Pose.inverse,
+    ("sign of t", "translation of {} with the wrong sign"): lambda pose: Pose(pose.R, -pose.t),
+    ("R transposed", "R of {} transposed"): lambda pose: Pose(pose.R.mT, pose.t),
+    ("centre as t", "t of {} is the camera's centre"): lambda pose: Pose.from_centre(pose.R, pose.t),
+    ("OpenGL axes", "axes of {} are OpenGL's (y upwards, z backwards)"): lambda pose: OPENGL @ pose,
+    ("order of quaternions", "quaternion of {} is w, x, y, z and was read as x, y, z, w"): lambda pose: (
+        Pose.from_quaternion(pose.quaternion[..., [1, 2, 3, 0]], pose.t)
+    ),
+    ("order of quaternions", "quaternion of {} is x, y, z, w and was read as w, x, y, z"): lambda pose: (
+        Pose.from_quaternion(pose.quaternion[..., [3, 0, 1, 2]], pose.t)
+    ),
+    ("degrees and radians", "rotation of {} in radians, taken for degrees"): lambda pose: Pose(
+        rotation_from_vector(torch.rad2deg(rotation_vector(pose.R))), pose.t
+    ),
+}
+"""Mistakes in a pose, and what undoes them."""
+EXCHANGED = {
+    "x and y exchanged in focal lengths and principal point of {}": partial(
+        on_cameras,
+        change=lambda camera: camera.replace(K=TRANSPOSE.to(camera.K) @ camera.K @ TRANSPOSE.to(camera.K)),
+    )
+}
+CURVED = {
+    "images of {} are undistorted already: distortion applied twice": partial(
+        on_cameras, change=lambda camera: camera.replace(distortion=None)
+    ),
+    "distortion of {} with the wrong sign (the inverse map)": partial(on_cameras, change=_opposite_lens),
+}
+FITS: dict[str, Callable[[HW, HW], Tensor]] = {
+    "resized": resize_matrix,
+    "cropped about its middle": lambda old, new: shift_matrix((old[1] - new[1]) / 2, (old[0] - new[0]) / 2),
+    "cropped at the right and the bottom": lambda old, new: shift_matrix(0, 0),
+}
+"""How an image may have come to another size."""
+
+
+def _of_numbers(rig: Rig, names: Sequence[str]) -> Iterator[Hypothesis]:
+    """Mistakes in a rig's numbers, or of images that keep their sizes."""
+    every = _groups(names)
+    calibrated = [name for name in names if isinstance(rig[name], Camera)]
+    for (kind, words), change in POSES.items():
+        yield from _of_groups(rig, _groups(calibrated), kind, {words: _poses(change)})
+    for factor, words in UNITS.items() if rig.depth is not None else ():
+        scaled = _poses(lambda pose, factor=factor: Pose(pose.R, pose.t * factor))
+        yield Hypothesis("units", f"translations against the depth range: {words}", scaled(rig, rig.names))
+    yield from _of_groups(rig, _groups(calibrated), "x and y exchanged", EXCHANGED)
+    if rig.links:
+        words = "x and y exchanged in F (it is for row, column)"
+        yield Hypothesis("x and y exchanged", words, _same_size(TRANSPOSE)(rig, names))
+    yield from _rotated(rig, every)
+    for factor in RESIZED:
+        A = torch.diag(torch.tensor([factor, factor, 1.0], dtype=torch.float64))
+        A[:2, 2] = 0.5 * factor - 0.5
+        words = f"K of {{}} is for images {1 / factor:.3g} times as large"
+        yield from _of_groups(rig, every, "resized", {words: _same_size(A)})
+    curved = [name for name in calibrated if rig[name].distortion is not None]
+    yield from _of_groups(rig, _groups(curved), "distortion", CURVED)
+    for kind, pixels in SHIFTS.items():
+        shifts = {
+            f"pixels of {{}} are {shift:+g} from where the rig counts them": _same_size(
+                shift_matrix(-shift, -shift)
+            )
+            for shift in (-pixels, pixels)
+        }
+        yield from _of_groups(rig, every, kind, shifts)
+
+
+def _of_sizes(rig: Rig, wrong: Sequence[str], sizes: Mapping[str, HW]) -> Iterator[Hypothesis]:
+    """Explanations of image sizes other than those that the rig states."""
+    label = ", ".join(map(repr, wrong))
+
+    def resized(matrix: Callable[[HW, HW], Tensor]) -> Rig:
+        return on_pixels(rig, wrong, lambda name, view: (matrix(view.hw, sizes[name]), sizes[name]))
+
+    yield from _rotated(rig, [(wrong, label)])
+    if all(rig[name].hw == sizes[name][::-1] for name in wrong):
+        as_cropped = resized(FITS["cropped at the right and the bottom"])
+        yield Hypothesis("x and y exchanged", f"size of {label} written as height, width", as_cropped)
+    for words, matrix in FITS.items():
+        yield Hypothesis("resized", f"image of {label} {words}", resized(matrix))
+
+
+def _rotated(rig: Rig, groups: Sequence[Group]) -> Iterator[Hypothesis]:
+    """Images rotated or mirrored after calibration, whether or not the sizes allow it."""
+    for words in ROTATIONS:
+        change = partial(on_pixels, change=lambda _, view, words=words: rotated_view(view, words))
+        yield from _of_groups(rig, groups, "rotated or mirrored", {f"image of {{}} {words}": change})
+
+
+def _of_groups(
+    rig: Rig, groups: Sequence[Group], kind: str, changes: Mapping[str, Change]
+) -> Iterator[Hypothesis]:
+    """A kind of mistake in each group of cameras: by words, {} for the cameras, what undoes it."""
+    for names, label in groups:
+        for words, change in changes.items():
+            yield Hypothesis(kind, words.format(label), change(rig, names))
+
+
+def _groups(names: Sequence[str]) -> list[Group]:
+    """All cameras together, then one by one; with a label."""
+    return [(names, "all cameras"), *(([name], f"'{name}'") for name in names)] if names else []

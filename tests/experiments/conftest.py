@@ -1,0 +1,30 @@
+"""What the tests of experiments share."""
+
+import pytest
+import torch
+
+from experiments.__main__ import Experiments
+from pat.cli.main import main
+from pat.networks.configs import PATConfig
+from pat.networks.paper import PAT
+
+
+@pytest.fixture(scope="module")
+def network() -> PAT:
+    """A small one that matches by attention alone."""
+    torch.manual_seed(0)
+    made = PAT(PATConfig(dim=8, residual=True, interpolation="bilinear", normalised=True)).eval()
+    return made.requires_grad_(False)
+
+
+@pytest.fixture
+def refusal(capsys):
+    """What a command says as it refuses its arguments."""
+
+    def said(*arguments, group=Experiments) -> str:
+        with pytest.raises(SystemExit) as stop:
+            main(list(arguments), **{} if group is None else {"group": group})
+        assert stop.value.code == 2
+        return capsys.readouterr().err
+
+    return said
