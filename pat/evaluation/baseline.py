@@ -25,7 +25,7 @@ from torch import Tensor
 from arraygeom import Camera, Pair, Rig
 
 from ..fusion.results import Frame
-from ..fusion.steps import Undistort
+from ..fusion.steps import undistort
 from ..fusion.views import Views
 from ..media.colour import from_luma_chroma, luminance, luminance_of, to_bytes
 from ..media.figures import reduced
@@ -69,7 +69,7 @@ def classical_view(
     small = {name: reduced(image, longest).clamp(0, 1) for name, image in images.items()}
     for name, image in small.items():
         rig = rig.resize(name, (image.shape[-2], image.shape[-1]))
-    views, back = Undistort().do(Views.of(rig, small, alpha=alpha))
+    views, back = undistort(Views.of(rig, small, alpha=alpha))
     image = classical_baseline(views.rig, views.images, alpha)
     return back(Frame(image, *torch.zeros(3, *image.shape[-2:]))).image
 
