@@ -23,7 +23,8 @@ def decodable(content: bytes) -> bytes | None:
     None for a TIFF that lacks some of its pixels.
     """
     if content.startswith(PNG):
-        return _still(content)
+        chunks = png_chunks(content)
+        return PNG + b"".join(content[start:end] for kind, start, end in chunks if kind not in ANIMATION)
     if content[:4] in TIFF and not _is_whole(content):
         return None
     return content
@@ -53,11 +54,6 @@ def first_tiff_page(content: bytes) -> Any:
             return file.pages.first
     finally:
         log.disabled = before
-
-
-def _still(content: bytes) -> bytes:
-    chunks = png_chunks(content)
-    return PNG + b"".join(content[start:end] for kind, start, end in chunks if kind not in ANIMATION)
 
 
 def _is_whole(content: bytes) -> bool:

@@ -27,10 +27,8 @@ _CURRENT: ContextVar[_Part | None] = ContextVar("_CURRENT", default=None)
 @contextmanager
 def stage(name: str = "", *, new: bool = False) -> Iterator[None]:
     """A block that is a stage of its own; within another one it is a part of that, unless it is `new`."""
-    if _CURRENT.get() is not None and not new:
-        yield
-        return
-    token = _CURRENT.set(_Part(name, 0.0, 1.0))
+    outer = _CURRENT.get()
+    token = _CURRENT.set(_Part(name, 0.0, 1.0) if outer is None or new else outer)
     try:
         yield
     finally:
@@ -40,12 +38,11 @@ def stage(name: str = "", *, new: bool = False) -> Iterator[None]:
 @contextmanager
 def part(begin: float, end: float) -> Iterator[None]:
     """A block that is a part of the current stage or part, from one share of it (0..1) to another."""
-    outer = _CURRENT.get()
-    if outer is None:
-        yield
-        return
-    length = outer.end - outer.begin
-    token = _CURRENT.set(_Part(outer.stage, outer.begin + begin * length, outer.begin + end * length))
+    if (inner := _CURRENT.get()) is not None:
+        stage, first, last = inner
+        length = last - first
+        inner = _Part(stage, first + begin * length, first + end * length)
+    token = _CURRENT.set(inner)
     try:
         yield
     finally:

@@ -53,13 +53,10 @@ def relative_pose(
     K_alpha, K_beta = (K[..., None, :, :].expand_as(poses.R) for K in (K_alpha, K_beta))
     tracks = track(K_alpha, K_beta, poses, x[..., None, :, :])
     in_front = depth_from_track(tracks, x_beta[..., None, :, :]).valid
-    best = in_front.sum(-1).argmax(-1)
-    chosen = [_chosen(part, best) for part in (poses.R, poses.t, in_front)]
-    return TwoViewPose(Pose(*chosen[:2]), chosen[2])
-
-
-def _chosen(part: Tensor, index: Tensor) -> Tensor:
-    """Along the axis after the batch's."""
-    axis = index.ndim
-    index = index.reshape(*index.shape, *[1] * (part.ndim - axis))
-    return part.gather(axis, index.expand(*part.shape[:axis], 1, *part.shape[axis + 1 :])).squeeze(axis)
+    best = in_front.sum(-1).argmax(-1, keepdim=True)
+    axis = best.ndim - 1
+    R, t, in_front = (
+        part.take_along_dim(best.reshape(*best.shape, *[1] * (part.ndim - best.ndim)), axis).squeeze(axis)
+        for part in (poses.R, poses.t, in_front)
+    )
+    return TwoViewPose(Pose(R, t), in_front)

@@ -262,7 +262,8 @@ class Rig(Batched):
                 f"kornia's cameras with a lens have no pose ({', '.join(bent)}): "
                 "give each as camera.to_kornia() and keep its cam_from_world"
             )
-        return {name: _expanded(camera, shape).to_kornia() for name, camera in self.cameras.items()}
+        batched = map_tensors(self.cameras, lambda t, axes: t.expand(*shape, *t.shape[t.ndim - axes :]))
+        return {name: camera.to_kornia() for name, camera in batched.items()}
 
     def __getitem__(self, name: Any) -> Any:
         """The camera of a name; or, of a batch of rigs, those at an index."""
@@ -424,11 +425,6 @@ class Rig(Batched):
         if self.depth is not None:
             known |= {"depth.near": self.depth[0], "depth.far": self.depth[1]}
         return known
-
-
-def _expanded(camera: Camera, shape: torch.Size) -> Camera:
-    """The camera with a batch's axes in all of its tensors."""
-    return map_tensors(camera, lambda t, axes: t.expand(*shape, *t.shape[t.ndim - axes :]))
 
 
 def _view(name: str, camera: Any) -> View:

@@ -59,20 +59,11 @@ def test_its_own_distribution_agrees_with_that_of_the_whole():
     assert set(own["tool"]["setuptools"]["packages"]) == packages
 
 
-@pytest.mark.slow
-def test_the_tests_of_arraygeom_need_torch_kornia_numpy_yaml_and_jaxtyping(tmp_path):
+@pytest.mark.parametrize("more", [["--collect-only"], pytest.param([], marks=pytest.mark.slow)])
+def test_the_tests_of_arraygeom_need_torch_kornia_numpy_yaml_and_jaxtyping(tmp_path, more):
     link_packages(tmp_path)
-    command = [
-        sys.executable,
-        "-S",
-        "-m",
-        "pytest",
-        "-m",
-        "not slow",
-        "-p",
-        "no:cacheprovider",
-        "tests/arraygeom",
-    ]
+    pytest_alone = [sys.executable, "-S", "-m", "pytest", "-q", "-m", "not slow", "-p", "no:cacheprovider"]
+    command = [*pytest_alone, *more, "tests/arraygeom"]
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-4000:]

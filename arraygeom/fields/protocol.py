@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Real
 from torch import Tensor
 
+from ..batching import tensors_of
 from ..camera import Camera
 from ..checks import check_field, check_pixels
 from ..chunks import chunked
@@ -55,16 +56,10 @@ def lazily(field: ReceptiveField, pair: Pair) -> Callable[[Tensor], SamplingLoca
 
 def all_pixels(pair: Pair) -> Float[Tensor, "*b h w 2"]:
     """Alpha's pixel centres, float32, with the axes of a batch of rigs (of length 1) in front."""
-    known = _numbers(pair)
-    grid = pixel_grid(pair.alpha.hw, device=None if known is None else known.device)
+    known = pair.alpha if isinstance(pair.alpha, Camera) else pair.link
+    device = next((t.device for t, _ in tensors_of(known)), None)
+    grid = pixel_grid(pair.alpha.hw, device=device)
     return grid.reshape(*[1] * len(pair.batch_shape), *grid.shape)
-
-
-def _numbers(pair: Pair) -> Tensor | None:
-    """A matrix of the pair, if it has any."""
-    if isinstance(pair.alpha, Camera):
-        return pair.alpha.K
-    return None if pair.link is None else pair.link.F
 
 
 def compilable(x: Tensor) -> bool:

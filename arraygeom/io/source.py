@@ -125,7 +125,7 @@ class RigSource:
             if value.startswith("[") and not value.endswith("]"):
                 raise self.fail(name, "has no closing bracket; is the file whole?")
             value = value[1:-1] if value.startswith("[") else value
-            entries[name] = self.at(re.sub("[;,]", " ", value), name).words().numbers()
+            entries[name] = self.at(value, name).words().numbers()
         return self.at(entries).mapping()
 
     def size_unstated(self, K: Tensor) -> HW:
@@ -218,8 +218,9 @@ class Entry:
         return tensor.reshape(shape or (-1,))
 
     def words(self) -> Entry:
-        """The numbers that a text, or several, consist of."""
+        """The numbers that a text, or several, consist of, between spaces, commas or semicolons."""
         text = self.value if isinstance(self.value, str) else " ".join(self.value)
+        text = re.sub("[,;]", " ", text)
         try:
             return Entry(self.source, [float(word) for word in text.split()], self.name)
         except ValueError:

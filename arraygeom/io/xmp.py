@@ -139,7 +139,7 @@ class _Image(NamedTuple):
     def numbers(self, name: str, namespace: str = PIX4D) -> Tensor | None:
         """The numbers of a tag, None if it is not stated."""
         text = self.tags.text(namespace, name)
-        return None if text is None else self.source.at(re.sub(r"[,;]", " ", text), name).words().numbers()
+        return None if text is None else self.source.at(text, name).words().numbers()
 
     def needed(self, name: str, count: int) -> Tensor:
         """So many numbers of a tag of Pix4D's."""
@@ -181,8 +181,7 @@ class _Image(NamedTuple):
     def camera(self) -> Camera:
         """The camera with its pose in the rig."""
         K, lens = self._dji() if self.text("ModelType") is None else self._pix4d()
-        self._check_centre(K)
-        rotation = self.rotation
+        K, rotation = self._checked(K), self.rotation
         R = torch.eye(3, dtype=torch.float64) if rotation is None else rotation.mT
         pose = Pose(R, -R @ self.centre)
         camera = Camera(K=K, cam_from_world=pose, hw=self.tags.hw, distortion=lens, sensor=self.sensor())
@@ -208,10 +207,10 @@ class _Image(NamedTuple):
             units = self.text("PerspectiveFocalLengthUnits") or ("pixel" if focal > IN_PIXELS else "mm")
             K[:2, :2] = torch.diag(focal.expand(2) if "pixel" in units else focal * self.per_mm)
             if self.numbers("PerspectiveDistortion") is None:
-                return self._intrinsics(K), None
+                return K, None
             r1, r2, r3, t1, t2 = self.needed("PerspectiveDistortion", 5)
             lens = self.source.at([r1, r2, t1, t2, r3], "PerspectiveDistortion").brown_conrady()
-            return self._intrinsics(K), lens
+            return K, lens
         if kind != "fisheye":
             raise self.source.fail("ModelType", f"is '{kind}'; perspective and fisheye are read")
         p = self.numbers("FisheyePolynomial")
@@ -222,31 +221,31 @@ class _Image(NamedTuple):
         scale = 2 / math.pi
         K[:2, :2] = self.needed("FisheyeAffineMatrix", 4).reshape(2, 2) * float(p[1]) * scale
         bends = p[2:] / p[1] * scale ** torch.arange(1, len(p) - 1, dtype=torch.float64)
-        return self._intrinsics(K), PolynomialFisheye(bends)
+        return K, PolynomialFisheye(bends)
 
     def _dji(self) -> tuple[Tensor, Distortion | None]:
         (h, w), text = self.tags.hw, self.tags.text(DJI, "DewarpData") or ""
         dated, _, numbers = text.rpartition(";")
         if not dated:
             raise self.source.fail("DewarpData", "is not a date and nine numbers: give a rig file instead")
-        listed = self.source.at(numbers.replace(",", " "), "DewarpData").words()
+        listed = self.source.at(numbers, "DewarpData").words()
         fx, fy, cx, cy, *c = listed.numbers((9,)).tolist()
         middle = [
             (self.numbers(f"CalibratedOpticalCenter{axis}", DJI), n / 2) for axis, n in (("X", w), ("Y", h))
         ]
         x, y = (half if stated is None else float(stated[0]) for stated, half in middle)
         K = torch.tensor([[fx, 0, x + cx], [0, fy, y + cy], [0, 0, 1]], dtype=torch.float64)
-        return self._intrinsics(K), self.source.at(c, "DewarpData").brown_conrady()
+        return K, self.source.at(c, "DewarpData").brown_conrady()
 
-    def _intrinsics(self, K: Tensor) -> Tensor:
-        return self.source.at(K, "PrincipalPoint").intrinsics()
-
-    def _check_centre(self, K: Tensor) -> None:
+    def _checked(self, K: Tensor) -> Tensor:
+        """An intrinsic matrix, its principal point near the image's middle."""
+        K = self.source.at(K, "PrincipalPoint").intrinsics()
         (h, w), (x, y) = self.tags.hw, K[:2, 2].tolist()
         if not (0.25 * w < x < 0.75 * w and 0.25 * h < y < 0.75 * h):
             raise self.source.fail(
                 "PrincipalPoint", f"is at {x:.0f}, {y:.0f} of an image of {w}x{h}: was it cropped or resized?"
             )
+        return K
 
     def sensor(self) -> Sensor:
         """What the tags say of the sensor: band, black level, exposure and gain."""

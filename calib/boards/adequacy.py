@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -33,10 +33,8 @@ TILT = 30.0
 """Degrees by which a proposed board is tilted."""
 FILLS = 0.35, 0.7
 """Widths of proposed boards, as shares of the image's."""
-NAMES = {(-1, -1): "upper left", (0, -1): "top", (1, -1): "upper right", (-1, 0): "left", (0, 0): "middle"}
-NAMES |= {(1, 0): "right", (-1, 1): "lower left", (0, 1): "bottom", (1, 1): "lower right"}
-TILTS = {(0, 1): "right edge nearer", (0, -1): "left edge nearer", (1, 0): "upper edge nearer"}
-TILTS |= {(-1, 0): "lower edge nearer"}
+TILTS = {(0, 1): "right", (0, -1): "left", (1, 0): "upper", (-1, 0): "lower"}
+"""The edge that comes nearer by a rotation about x and y."""
 
 
 class Coverage(NamedTuple):
@@ -65,7 +63,8 @@ def coverage(views: BoardViews, cam_from_board: Mapping[FrameKey, Pose], board: 
         board.points[d.ids] @ poses[k].R[2].numpy() + float(poses[k].t[2]) for k, d in views.seen.items()
     ]
     tilts = np.degrees([np.arccos(min(1.0, abs(float(pose.R[2, 2])))) for pose in poses.values()])
-    found = Coverage(cells, _range(np.concatenate(depths)), _range(tilts), ())
+    (near, far), (least, most) = ((float(v.min()), float(v.max())) for v in (np.concatenate(depths), tilts))
+    found = Coverage(cells, (near, far), (least, most), ())
     return found._replace(missing=tuple(_missing(found)))
 
 
@@ -78,12 +77,7 @@ def point_counts(parts: Iterable[Float[np.ndarray, "_ 2"]], hw: HW) -> Int[np.nd
     return counts.astype(np.int64)
 
 
-def _range(values: np.ndarray) -> tuple[float, float]:
-    return float(values.min()), float(values.max())
-
-
-def _missing(found: Coverage) -> list[str]:
-    missing = []
+def _missing(found: Coverage) -> Iterator[str]:
     thirds = found.cells.reshape(3, CELLS[0] // 3, CELLS[1])
     empty = [
         POSITIONS[i][j]
@@ -92,20 +86,14 @@ def _missing(found: Coverage) -> list[str]:
         if not part.any()
     ]
     if empty:
-        missing.append(
-            f"no points at the {', '.join(empty)} of the image: the lens model is extrapolated there"
-        )
+        yield f"no points at the {', '.join(empty)} of the image: the lens model is extrapolated there"
     elif found.share < WIDE_ENOUGH:
-        missing.append(f"points in only {found.share:.0%} of the image: fill it, corners too")
-    if found.depths[1] < DEEP_ENOUGH * found.depths[0]:
-        near, far = found.depths
-        missing.append(
-            f"boards at one depth only ({near:.3g} to {far:.3g} m): "
-            "bring it closer in some, further in others"
-        )
+        yield f"points in only {found.share:.0%} of the image: fill it, corners too"
+    near, far = found.depths
+    if far < DEEP_ENOUGH * near:
+        yield f"boards at one depth only ({near:.3g} to {far:.3g} m): take some closer, some further"
     if found.tilts[1] < TILTED_ENOUGH:
-        missing.append(f"boards tilted by {found.tilts[1]:.0f} degrees at most: tilt it by 20 to 40")
-    return missing
+        yield f"boards tilted by {found.tilts[1]:.0f} degrees at most: tilt it by 20 to 40"
 
 
 class NextView(NamedTuple):
@@ -119,22 +107,20 @@ class NextView(NamedTuple):
 def next_views(known: Intrinsics, board: Board, depth: float, *, count: int = 2) -> list[NextView]:
     """The views that lower a camera's uncertainty of projection most, one after the other."""
     _, change = moved_pixels(known, depth)
+
+    def median(information: np.ndarray) -> float:
+        covariance = np.linalg.inv(information)
+        return float(np.median(np.sqrt(np.einsum("nif,fg,nig->n", change, covariance, change))))
+
     gains = {text: _gain(known, X) for text, X in proposed_views(known.camera, board.members[0]).items()}
     candidates = {text: gain for text, gain in gains.items() if gain is not None}
-    information, found = np.linalg.inv(known.covariance), []
-    before = _median(change, known.covariance)
+    information, found = np.linalg.inv(known.covariance), list[NextView]()
     for _ in range(count):
-        after = {
-            text: _median(change, np.linalg.inv(information + gain)) for text, gain in candidates.items()
-        }
+        after = {text: median(information + gain) for text, gain in candidates.items()}
         best = min(after, key=lambda text: after[text])
-        found.append(NextView(best, before, after[best]))
-        before, information = after[best], information + candidates[best]
+        found.append(NextView(best, median(information), after[best]))
+        information = information + candidates[best]
     return found
-
-
-def _median(change: np.ndarray, covariance: np.ndarray) -> float:
-    return float(np.median(np.sqrt(np.einsum("nif,fg,nig->n", change, covariance, change))))
 
 
 def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarray, "n 3"]]:
@@ -143,14 +129,15 @@ def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarra
     middle = torch.from_numpy(board.middle)
     for fill in FILLS:
         depth = float(camera.K[0, 0]) * max(board.extent) / (fill * w)
-        for (i, j), position in NAMES.items():
-            share = 0.5 + np.array([i, j]) * (0.5 - 0.4 * fill)
+        for row, column in np.ndindex(3, 3):
+            share = 0.5 + np.array([column - 1, row - 1]) * (0.5 - 0.4 * fill)
             pixel = torch.from_numpy(share * (w - 1, h - 1))
             centre = camera.unproject(pixel, torch.tensor(depth, dtype=torch.float64))
-            for (a, b), tilt in TILTS.items():
+            where = f"the board at the {POSITIONS[row][column]}, {depth:.2g} m away"
+            for (a, b), edge in TILTS.items():
                 R = rotation_from_vector(torch.deg2rad(TILT * torch.tensor([a, b, 0.0], dtype=torch.float64)))
                 X = Pose(R, centre - R @ middle).apply(torch.from_numpy(board.points)).numpy()
-                found[f"the board at the {position}, {depth:.2g} m away, tilted, {tilt}"] = X
+                found[f"{where}, tilted, {edge} edge nearer"] = X
     return found
 
 
@@ -168,26 +155,21 @@ def _gain(known: Intrinsics, X: np.ndarray) -> np.ndarray | None:
 
 def coverages(calibration: Calibration) -> dict[str, Coverage]:
     """Coverage of every camera."""
-    problem = calibration.fit.problem
-    boards = problem.board_poses
-    found = {}
+    boards, found = calibration.fit.problem.board_poses, {}
     for name, views in calibration.views.items():
-        poses = {key: problem.cameras[name].cam_from_world @ boards[key] for key in views.seen}
+        camera = calibration.fit.problem.cameras[name]
+        poses = {key: camera.cam_from_world @ boards[key] for key in views.seen}
         found[name] = coverage(views, poses, calibration.board)
     return found
 
 
-def coverage_advice(calibration: Calibration, covers: Mapping[str, Coverage]) -> list[str]:
+def coverage_advice(calibration: Calibration, covers: Mapping[str, Coverage]) -> Iterator[str]:
     """What each camera's images lack, and, where that is something, which views would help most."""
-    found = []
     for name, covered in covers.items():
-        found += [f"{name}: {text}" for text in covered.missing]
-        if not covered.missing or calibration.fit.covariance is None:
-            continue
+        yield from (f"{name}: {text}" for text in covered.missing)
         known = intrinsics_of(calibration.fit, name)
-        if len(known.covariance):
+        if covered.missing and len(known.covariance):
             views = next_views(known, calibration.board, float(np.mean(covered.depths)))
             listed = "; then ".join(view.text for view in views)
             gain = f"uncertainty from {views[0].before:.2g} to {views[-1].after:.2g} px"
-            found.append(f"{name}: two more views would help most: {listed} ({gain})")
-    return found
+            yield f"{name}: two more views would help most: {listed} ({gain})"

@@ -6,7 +6,6 @@ origin.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,7 +21,7 @@ FLAT = 0.03
 
 
 @dataclass(frozen=True)
-class Board(ABC):
+class Board:
     """A flat grid of points, `columns` x `rows` of them, `spacing` metres apart."""
 
     columns: int
@@ -64,10 +63,10 @@ class Board(ABC):
                 found.append(distance.argmin(1))
         return tuple(found)
 
-    @property
+    @cached_property
     def part(self) -> Int[np.ndarray, " n"]:
         """The board that each point is on: 0, unless several boards are used at once."""
-        return np.zeros(len(self.points), dtype=int)
+        return np.repeat(np.arange(len(self.members)), [len(b.points) for b in self.members])
 
     @property
     def middle(self) -> Float[np.ndarray, "3"]:
@@ -75,40 +74,48 @@ class Board(ABC):
         return np.asarray((self.points.max(0) + self.points.min(0)) / 2)
 
     @property
-    def extents(self) -> list[tuple[float, float]]:
-        """`extent` of each board."""
-        return [self.extent]
-
-    @property
     def extent(self) -> tuple[float, float]:
-        """Width and height of the print without its margin, metres: the squares around the corners."""
-        return (self.columns + 1) * self.spacing, (self.rows + 1) * self.spacing
+        """Width and height of the print without its margin, metres."""
+        width, height, _ = (np.ptp(self.points, axis=0) + 2 * self.offset).tolist()
+        return width, height
 
     @property
     def offset(self) -> float:
         """The first point's distance from the print's upper and left edge without its margin, metres."""
         return self.spacing
 
-    @abstractmethod
     def _draw(self, axes: Any) -> None:
         """Draw the board with its corner at (0, 0), in millimetres, y down."""
+        raise ValueError(f"{self}: is no board to print: print boards one by one, and no points in space")
 
 
 @dataclass(frozen=True)
 class MarkedBoard(Board):
     """A board whose points are identified individually: a part is enough, its orientation unambiguous.
 
-    first: the number of its first marker.
+    markers: their numbers, in order.
     """
 
     dictionary: str
-    first: int
+    markers: Sequence[int]
     identified: ClassVar[bool] = True
 
     @property
-    @abstractmethod
-    def markers(self) -> Sequence[int]:
-        """The numbers of its markers."""
+    def _from(self) -> str:
+        return f":from{self.markers[0]}" if self.markers[0] else ""
+
+    def _draw_marker(
+        self, axes: Any, number: int, left: float, top: float, side: float, *, border: int = 1, turns: int = 0
+    ) -> None:
+        """Draw a marker, runs of black bits as one rectangle each: no hairlines between bits."""
+        known = marker_dictionary(self.dictionary)
+        bits = known.markerSize + 2 * border
+        black = np.rot90(cv2.aruco.generateImageMarker(known, number, bits, borderBits=border) == 0, turns)
+        step = side / bits
+        for row, line in enumerate(black):
+            edges: np.ndarray = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
+            for begin, end in edges.reshape(-1, 2).tolist():
+                axes.add_patch(_black(left + begin * step, top + row * step, (end - begin) * step, step))
 
 
 @dataclass(frozen=True)
@@ -132,37 +139,28 @@ class Charuco(MarkedBoard):
     marker: float
     legacy: bool = False
 
-    @property
-    def markers(self) -> range:
-        """The numbers of its markers."""
-        return range(self.first, self.first + (self.columns + 1) * (self.rows + 1) // 2)
-
     @cached_property
     def opencv(self) -> cv2.aruco.CharucoBoard:
         """OpenCV's board, lengths in metres."""
         size = self.columns + 1, self.rows + 1
-        ids = np.array(self.markers)
-        board = cv2.aruco.CharucoBoard(
-            size, self.spacing, self.marker, marker_dictionary(self.dictionary), ids
-        )
+        dictionary = marker_dictionary(self.dictionary)
+        board = cv2.aruco.CharucoBoard(size, self.spacing, self.marker, dictionary, np.array(self.markers))
         board.setLegacyPattern(self.legacy)
         return board
 
     def __str__(self) -> str:
         squares = f"{self.columns + 1}x{self.rows + 1}"
-        tail = (":legacy" if self.legacy else "") + (f":from{self.first}" if self.first else "")
+        tail = (":legacy" if self.legacy else "") + self._from
         lengths = f"{millimetres(self.spacing)}:{millimetres(self.marker)}"
         return f"charuco:{squares}:{lengths}:{self.dictionary.lower()}{tail}"
 
     def _draw(self, axes: Any) -> None:
         side, marker = 1e3 * self.spacing, 1e3 * self.marker
-        white = set()
-        for corners, number in zip(
-            np.array(self.opencv.getObjPoints()), np.array(self.opencv.getIds()).reshape(-1)
-        ):
+        white, places = set(), np.array(self.opencv.getObjPoints())
+        for corners, number in zip(places, np.array(self.opencv.getIds()).reshape(-1)):
             left, top = (1e3 * float(v) for v in corners[:, :2].min(0))
             white.add((int(left // side), int(top // side)))
-            _draw_marker(axes, self.dictionary, int(number), left, top, marker)
+            self._draw_marker(axes, int(number), left, top, marker)
         for column, row in np.ndindex(self.columns + 1, self.rows + 1):
             if (column, row) not in white:
                 axes.add_patch(_black(column * side, row * side, side, side))
@@ -178,21 +176,11 @@ class AprilGrid(MarkedBoard):
     tag: float
     border: int = 2
 
-    @property
-    def gap(self) -> float:
-        """The space between two tags, metres."""
-        return self.spacing / 2
-
-    @property
-    def markers(self) -> range:
-        """The numbers of its tags."""
-        return range(self.first, self.first + self.columns * self.rows // 4)
-
     @cached_property
     def points(self) -> Float[np.ndarray, "n 3"]:
         """Positions of the tags' corners on the board, metres, row by row."""
         grid = unit_grid(self.columns, self.rows)
-        return (grid // 2) * (self.tag + self.gap) + (grid % 2) * self.tag
+        return (grid // 2) * (self.tag + self.offset) + (grid % 2) * self.tag
 
     @cached_property
     def corners(self) -> Int[np.ndarray, "m 4"]:
@@ -202,26 +190,20 @@ class AprilGrid(MarkedBoard):
         return np.stack([a[:, ::2], a[:, 1::2], b[:, 1::2], b[:, ::2]], -1).reshape(-1, 4)
 
     @property
-    def extent(self) -> tuple[float, float]:
-        """Width and height of the print without its margin, metres: the small squares at tags' corners."""
-        width, height = (float(v) + 2 * self.gap for v in self.points[:, :2].max(0))
-        return width, height
-
-    @property
     def offset(self) -> float:
-        """The gap, metres."""
-        return self.gap
+        """The gap between two tags, metres, which small squares fill at their corners."""
+        return self.spacing / 2
 
     def __str__(self) -> str:
-        tail = (":border1" if self.border == 1 else "") + (f":from{self.first}" if self.first else "")
+        tail = (":border1" if self.border == 1 else "") + self._from
         tags = f"{self.columns // 2}x{self.rows // 2}"
-        return f"aprilgrid:{tags}:{millimetres(self.tag)}:{self.gap / self.tag:.6g}{tail}"
+        return f"aprilgrid:{tags}:{millimetres(self.tag)}:{self.offset / self.tag:.6g}{tail}"
 
     def _draw(self, axes: Any) -> None:
-        tag, gap = 1e3 * self.tag, 1e3 * self.gap
+        tag, gap = 1e3 * self.tag, 1e3 * self.offset
         for number, corners in zip(self.markers, self.corners):
             left, top = 1e3 * self.points[corners[0], :2] + gap
-            _draw_marker(axes, self.dictionary, number, left, top, tag, border=self.border, quarter_turns=2)
+            self._draw_marker(axes, number, left, top, tag, border=self.border, turns=2)
         for column, row in np.ndindex(self.columns // 2 + 1, self.rows // 2 + 1):
             axes.add_patch(_black(column * (tag + gap), row * (tag + gap), gap, gap))
 
@@ -243,21 +225,8 @@ class Boards(Board):
         """The points of all boards, each in its own frame, metres."""
         return np.concatenate([b.points for b in self.boards])
 
-    @cached_property
-    def part(self) -> Int[np.ndarray, " n"]:
-        """The board that each point is on."""
-        return np.repeat(np.arange(len(self.boards)), [len(b.points) for b in self.boards])
-
-    @property
-    def extents(self) -> list[tuple[float, float]]:
-        """`extent` of each board."""
-        return [b.extent for b in self.boards]
-
     def __str__(self) -> str:
         return " and ".join(map(str, self.boards))
-
-    def _draw(self, axes: Any) -> None:
-        raise ValueError("several boards are printed one by one")
 
 
 @dataclass(frozen=True)
@@ -279,23 +248,12 @@ class Circles(Board):
         return grid * self.spacing
 
     @property
-    def radius(self) -> float:
+    def offset(self) -> float:
         """Radius of the printed circles, metres."""
         return 0.3 * self.spacing * (2**0.5 if self.asymmetric else 1)
 
-    @property
-    def offset(self) -> float:
-        """A circle's radius, metres."""
-        return self.radius
-
-    @property
-    def extent(self) -> tuple[float, float]:
-        """Width and height of the print without its margin, metres."""
-        width, height = (float(v) + 2 * self.radius for v in self.points[:, :2].max(0))
-        return width, height
-
     def _draw(self, axes: Any) -> None:
-        radius = 1e3 * self.radius
+        radius = 1e3 * self.offset
         for x, y in (1e3 * self.points[:, :2] + radius).tolist():
             axes.add_patch(Circle((x, y), radius, facecolor="black", edgecolor="none"))
 
@@ -317,39 +275,25 @@ class KnownPoints(MarkedBoard):
         """Their positions about their mean, metres; in their own plane, x and y, if they lie in one."""
         points = np.array(self.positions, dtype=np.float64)
         points -= points.mean(0)
-        if self.relief >= FLAT:
+        if not self.flat:
             return points
         axes = np.linalg.svd(points)[2]
         return np.asarray(points @ (axes * np.array([1, 1, np.linalg.det(axes)])[:, None]).T)
 
     @cached_property
-    def relief(self) -> float:
-        """How far the points are from lying in a plane, as a share of their extent."""
-        points = np.array(self.positions, dtype=np.float64)
-        first, *_, third = np.linalg.svd(points - points.mean(0), compute_uv=False)
-        return float(third / first)
-
-    @property
     def flat(self) -> bool:
         """Whether they are so nearly in a plane that cameras need several views of them."""
-        return self.relief < FLAT
+        points = np.array(self.positions, dtype=np.float64)
+        first, *_, third = np.linalg.svd(points - points.mean(0), compute_uv=False)
+        return bool(third / first < FLAT)
 
     @property
-    def markers(self) -> Sequence[int]:
-        """The numbers of the markers."""
-        return sorted({marker for marker, _ in self.ids})
-
-    @property
-    def extent(self) -> tuple[float, float]:
-        """Width and height, metres."""
-        width, height, _ = np.ptp(self.points, axis=0).tolist()
-        return width, height
+    def offset(self) -> float:
+        """Nothing is printed around the points."""
+        return 0.0
 
     def __str__(self) -> str:
         return f"{self.file}:{self.dictionary}"
-
-    def _draw(self, axes: Any) -> None:
-        raise ValueError(f"{self.file}: points of known position are no board to print")
 
 
 def unit_grid(columns: int, rows: int) -> Float[np.ndarray, "n 3"]:
@@ -367,30 +311,6 @@ def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
 def millimetres(length: float) -> str:
     """A length in metres as text, such as "30mm"."""
     return f"{1e3 * length:.6g}mm"
-
-
-def _draw_marker(
-    axes: Any,
-    dictionary: str,
-    number: int,
-    left: float,
-    top: float,
-    side: float,
-    *,
-    border: int = 1,
-    quarter_turns: int = 0,
-) -> None:
-    """Runs of black bits as one rectangle each: no hairlines between bits."""
-    known = marker_dictionary(dictionary)
-    bits = known.markerSize + 2 * border
-    black = np.rot90(
-        cv2.aruco.generateImageMarker(known, number, bits, borderBits=border) == 0, quarter_turns
-    )
-    step = side / bits
-    for row, line in enumerate(black):
-        edges: np.ndarray = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
-        for begin, end in edges.reshape(-1, 2).tolist():
-            axes.add_patch(_black(left + begin * step, top + row * step, (end - begin) * step, step))
 
 
 def _black(x: float, y: float, width: float, height: float) -> Rectangle:

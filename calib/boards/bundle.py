@@ -136,7 +136,7 @@ class BundleProblem:
             boards=self.boards[torch.from_numpy(kept)],
             seen=seen,
             frames=tuple(key for key, keep in zip(self.frames, kept) if keep),
-            deformation=self.deformation and self.deformation.of_blocks(self.deformation.part[kept]),
+            deformation=self.deformation and replace(self.deformation, part=self.deformation.part[kept]),
         )
 
     def stepped(self, change: Float[np.ndarray, " c"], boards: Float[np.ndarray, "b 6"]) -> BundleProblem:
@@ -217,11 +217,6 @@ class Solved:
     def names(self) -> tuple[str, ...]:
         """The free parameters, in the order of the covariance."""
         return self.problem.names
-
-    @property
-    def sigma(self) -> Mapping[str, float]:
-        """Each camera's noise along x or y, pixels."""
-        return self.problem.sigma
 
     @property
     def deviations(self) -> dict[str, float]:
@@ -396,9 +391,8 @@ def changed(camera: Camera, change: torch.Tensor) -> Camera:
     lens = moved.distortion
     if lens is None or lens.model not in MODELS:
         return moved
-    return moved.replace(
-        distortion=lens.with_coefficients(within_bounds(MODELS[lens.model], lens.coefficients))
-    )
+    bounded = within_bounds(MODELS[lens.model], lens.coefficients)
+    return moved.replace(distortion=lens.with_coefficients(bounded))
 
 
 def camera_jacobian(camera: Camera, X: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 p"]:
@@ -417,10 +411,8 @@ def linear_projection(
     plane, *slopes = lens_derivatives(camera.distortion, local)
     by_point, by_lens = (camera.K[:2, :2] @ part for part in slopes)
     rotational = torch.linalg.cross((local - camera.t)[:, None].expand_as(by_point), by_point)
-    by_focal, by_centre = (
-        focal_positions(camera.K) * plane[:, None],
-        torch.eye(2).to(plane).expand(len(X), 2, 2),
-    )
+    by_focal = focal_positions(camera.K) * plane[:, None]
+    by_centre = torch.eye(2).to(plane).expand(len(X), 2, 2)
     x = map_homogeneous(camera.K[:2], plane)
     return x.numpy(), torch.cat([rotational, by_point, by_focal, by_centre, by_lens], -1).numpy()
 

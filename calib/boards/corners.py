@@ -128,11 +128,8 @@ def _shape(board: Map, p: Array) -> EdgeGeometry:
 
 def _fitted(grey: Array, start: Array, shape: EdgeGeometry, clear: float) -> tuple[Array, Array]:
     """Corners fitted from their predicted positions."""
-    h, w = grey.shape
     length = np.linalg.norm(shape.along, axis=-1).min(1)
-    inside = np.minimum(
-        np.minimum(start[:, 0], w - 1 - start[:, 0]), np.minimum(start[:, 1], h - 1 - start[:, 1])
-    )
+    inside = np.minimum(start, np.array(grey.shape)[::-1] - 1 - start).min(1)
     extent = np.minimum(np.minimum(0.45 * length, LONGEST_EDGE), inside - 1)
     sine = np.abs(np.linalg.det(shape.normal))
     width = np.minimum(clear * length * sine - BLEED, WIDEST_BAND)
@@ -166,7 +163,9 @@ def _least_squares(
     grey: Array, start: Array, shape: EdgeGeometry, extent: Array, width: Array
 ) -> tuple[Array, Array]:
     """Gauss-Newton on all corners at once: positions, and residuals (root mean square) in contrasts."""
-    pixels = _around(start, extent)
+    half = int(np.ceil(extent.max()))
+    square = np.stack(np.meshgrid(*2 * [np.arange(-half, half + 1)]), -1).reshape(-1, 2)
+    pixels = np.rint(start).astype(int)[:, None] + square
     values = grey[pixels[..., 1].clip(0, grey.shape[0] - 1), pixels[..., 0].clip(0, grey.shape[1] - 1)]
     model = _initial_model(values, start, *_distances(pixels - start[:, None], shape, extent, width))
     for _ in range(STEPS):
@@ -181,13 +180,6 @@ def _least_squares(
             break
     misfit = np.sqrt(((root * left) ** 2).sum(1) / (root**2).sum(1).clip(1e-9))
     return model.x, misfit / np.abs(model.contrast[:, 0]).clip(1e-9)
-
-
-def _around(x: Array, extent: Array) -> Array:
-    """The pixels (n, m, 2) of a square about each corner."""
-    half = int(np.ceil(extent.max()))
-    row = np.arange(-half, half + 1)
-    return np.rint(x).astype(int)[:, None] + np.stack(np.meshgrid(row, row), -1).reshape(-1, 2)
 
 
 def _initial_model(values: Array, x: Array, root: Array, d: Array, e: Array) -> CornerModel:

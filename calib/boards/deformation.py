@@ -8,8 +8,8 @@ axis.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -69,10 +69,6 @@ class BoardDeformation:
         """The shapes after a change of all values."""
         return replace(self, values=self.values + change.reshape(self.values.shape))
 
-    def of_blocks(self, part: Int[np.ndarray, " b"]) -> BoardDeformation:
-        """The same shapes for other blocks."""
-        return replace(self, part=part)
-
     @property
     def information(self) -> Float[np.ndarray, " s"]:
         """Inverse variances of the values before any measurement."""
@@ -82,23 +78,6 @@ class BoardDeformation:
         """Half the squared Mahalanobis distance from flat boards."""
         return float(self.information @ self.values.ravel() ** 2) / 2
 
-    def main_curvature(self, board: int, extent: tuple[float, float]) -> Curvature:
-        """The board's main curvature over a board of some width and height (metres)."""
-        _, a, b, c = self.values[board]
-        curvatures, axes = np.linalg.eigh(np.array([[a, b], [b, c]]))
-        main = int(np.abs(curvatures).argmax())
-        length = float(np.abs(axes[:, main]) @ np.array(extent))
-        curvature = float(curvatures[main])
-        return Curvature(abs(curvature) * length**2 / 8, 1 / max(abs(curvature), 1e-9), curvature > 0)
-
-
-class Curvature(NamedTuple):
-    """How far the middle is off two opposite edges' plane, metres; radius, metres; towards the cameras."""
-
-    depth: float
-    radius: float
-    towards: bool
-
 
 def _deformed(p: np.ndarray, middle: np.ndarray, values: np.ndarray) -> np.ndarray:
     stretch, a, b, c = values.T
@@ -107,11 +86,6 @@ def _deformed(p: np.ndarray, middle: np.ndarray, values: np.ndarray) -> np.ndarr
     first, second = cu * u + cv * v, cu**2 + cv**2
     x, y = u - cu * first / 6, v - cv * first / 6
     return np.stack([middle[:, 0] + x, middle[:, 1] + y, p[:, 2] + first / 2 - first * second / 24], -1)
-
-
-def fewest_frames(count: int) -> int:
-    """The least number of frames whose agreement on so many values means something."""
-    return 2 * count + 2
 
 
 def is_significant(
@@ -126,23 +100,25 @@ def is_significant(
 
 def described(
     shape: BoardDeformation, deviations: Float[np.ndarray, "k 4"], extents: list[tuple[float, float]]
-) -> list[str]:
+) -> Iterator[str]:
     """Sentences on boards whose shapes were estimated, with standard deviations."""
-    found = []
     for k, (extent, deviation) in enumerate(zip(extents, deviations)):
         name = f"board {k + 1}" if len(extents) > 1 else "the board"
-        stretch, curved = shape.values[k, 0], shape.main_curvature(k, extent)
+        stretch, a, b, c = shape.values[k]
         if abs(stretch) > 3 * deviation[0]:
-            found.append(
+            yield (
                 f"{name} is stretched: squares are {100 * abs(stretch):.2f} ± {100 * deviation[0]:.2g} % "
                 f"{'longer' if stretch > 0 else 'shorter'} down than across; this is modelled, "
                 "with the size across as specified: measure both"
             )
         relative = float(np.max(np.abs(shape.values[k, 1:]) / deviation[1:]))
         if relative > 3:
-            found.append(
-                f"{name} is bent: its middle lies {1e3 * curved.depth:.2f} ± "
-                f"{1e3 * curved.depth / relative:.2g} mm {'in front of' if curved.towards else 'behind'} its "
-                f"edges (radius {curved.radius:.2f} m); this is modelled: glue it to something stiff and flat"
+            curvatures, axes = np.linalg.eigh(np.array([[a, b], [b, c]]))
+            main = int(np.abs(curvatures).argmax())
+            curvature, length = float(curvatures[main]), float(np.abs(axes[:, main]) @ np.array(extent))
+            depth, side = 1e3 * abs(curvature) * length**2 / 8, "in front of" if curvature > 0 else "behind"
+            yield (
+                f"{name} is bent: its middle lies {depth:.2f} ± {depth / relative:.2g} mm "
+                f"{side} its edges (radius {1 / abs(curvature):.2f} m); "
+                "this is modelled: glue it to something stiff and flat"
             )
-    return found

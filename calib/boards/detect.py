@@ -7,7 +7,7 @@ stretched, equalised and inverted in turn until the board is found.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -104,9 +104,7 @@ def other_size(images: Iterable[Grey], board: Board, *, larger: bool = False) ->
 def _versions(grey: Grey) -> Iterator[Grey]:
     yield grey
     equalised = cv2.createCLAHE(3.0, (8, 8)).apply(grey)
-    yield equalised
-    yield 255 - grey
-    yield 255 - equalised
+    yield from (equalised, 255 - grey, 255 - equalised)
 
 
 def _chessboard(grey: Grey, board: Chessboard) -> Detection | None:
@@ -117,14 +115,11 @@ def _chessboard(grey: Grey, board: Chessboard) -> Detection | None:
         done, corners = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
     if not done or len(corners) != len(board.points):
         return None
-    x = _right_handed(corners.reshape(board.rows, board.columns, 2))
-    return Detection(np.arange(len(x)), x.astype(np.float64))
-
-
-def _right_handed(grid: np.ndarray) -> np.ndarray:
-    """The corners ordered so that x, y and the direction into the board are a right-handed frame."""
+    grid = corners.reshape(board.rows, board.columns, 2).astype(np.float64)
     (ax, ay), (bx, by) = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-    return (grid if ax * by - ay * bx > 0 else grid[:, ::-1]).reshape(-1, 2)
+    if ax * by < ay * bx:  # x, y and the direction into the board have to be a right-handed frame
+        grid = grid[:, ::-1]
+    return Detection(np.arange(len(board.points)), grid.reshape(-1, 2))
 
 
 def _charuco(grey: Grey, board: Charuco) -> Detection | None:
@@ -143,11 +138,12 @@ def _april_grid(grey: Grey, board: AprilGrid) -> Detection | None:
     if 4 * len(tags) < FEWEST:
         return None
     x = np.array([seen[i] for i in tags.tolist()])
-    tags -= board.first
+    tags -= board.markers[0]
     points = board.corners[tags].reshape(-1)
     # tags stand on their heads in Kalibr's files, and otherwise in others'
     rotated = [np.roll(x, k, 1).reshape(-1, 2).astype(np.float64) for k in range(4)]
-    return Detection(points, min(rotated, key=lambda x: _distance_from_plane(board.points[points, :2], x)))
+    p = board.points[points, :2]
+    return Detection(points, min(rotated, key=lambda x: float(np.median(homography_errors(p, x)))))
 
 
 def _known_points(grey: Grey, board: KnownPoints) -> Detection | None:
@@ -178,20 +174,19 @@ def _tags(grey: Grey, dictionary: str, border: int) -> dict[int, np.ndarray]:
     for method in (cv2.aruco.CORNER_REFINE_SUBPIX, *april):
         parameters = cv2.aruco.DetectorParameters()
         parameters.markerBorderBits, parameters.cornerRefinementMethod = border, method
-        corners, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters).detectMarkers(
-            grey
-        )
+        detector = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters)
+        corners, ids, _ = detector.detectMarkers(grey)
         numbers = [] if ids is None else ids.reshape(-1).tolist()
         found |= {number: x.reshape(4, 2) for number, x in zip(numbers, corners)}
     return found
 
 
-def _distance_from_plane(p: np.ndarray, x: np.ndarray) -> float:
-    """The median distance of pixels from a homography of the points on the board."""
+def homography_errors(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+    """Distances of pixels from a homography of points on a board (least median of squares), inf if none."""
     H, _ = cv2.findHomography(p, x, cv2.LMEDS)
     if H is None:
-        return float("inf")
-    return float(np.median(np.linalg.norm(cv2.perspectiveTransform(p[:, None], H)[:, 0] - x, axis=-1)))
+        return np.full(len(p), np.inf)
+    return np.linalg.norm(cv2.perspectiveTransform(p[:, None], H)[:, 0] - x, axis=-1)
 
 
 def _circles(grey: Grey, board: Circles) -> Detection | None:
@@ -235,17 +230,21 @@ def _clear(board: Board) -> float:
         return (1 - board.marker / board.spacing) / 2
     if isinstance(board, AprilGrid):
         black = board.border * board.tag / (marker_dictionary(board.dictionary).markerSize + 2 * board.border)
-        return min(black, board.gap) / board.spacing
+        return min(black, board.offset) / board.spacing
     return 0.5
 
 
 def _by_gradients(grey: Grey, x: np.ndarray, share: float) -> np.ndarray:
     """Corners by OpenCV's gradient criterion, in windows of `share` times the distance to the next corner."""
-    apart = np.sort(np.linalg.norm(x[:, None] - x[None], axis=-1), axis=1)[:, 1]
-    half = int(np.clip(share * np.quantile(apart, 0.1), 2, 11))
+    half = int(np.clip(share * np.quantile(_apart(x), 0.1), 2, 11))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
     refined = cv2.cornerSubPix(grey, x.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
     return refined.reshape(-1, 2).astype(np.float64)
+
+
+def _apart(x: np.ndarray) -> np.ndarray:
+    """The distance of each point from the next one."""
+    return np.asarray(np.sort(np.linalg.norm(x[:, None] - x[None], axis=-1), axis=1)[:, 1])
 
 
 def _plausible(found: Detection, board: Board) -> bool:
@@ -262,11 +261,10 @@ def _plausible(found: Detection, board: Board) -> bool:
     if H is None:
         return False
     flat = cv2.perspectiveTransform(p[:, None], H)[:, 0]
-    apart = np.sort(np.linalg.norm(flat[:, None] - flat[None], axis=-1), axis=1)[:, 1]
     basis = monomials((p - p.mean(0)) / np.abs(p - p.mean(0)).max(0), 3 if len(p) >= 30 else 1)
     distort = np.linalg.lstsq(basis, found.x - flat, rcond=None)[0]
     left = np.linalg.norm(found.x - flat - basis @ distort, axis=-1)
-    return bool(np.median(left) < LARGEST_MISFIT * np.median(apart) and np.isfinite(left).all())
+    return bool(np.median(left) < LARGEST_MISFIT * np.median(_apart(flat)) and np.isfinite(left).all())
 
 
 def _reason(grey: Grey, board: Board) -> str:
@@ -282,44 +280,32 @@ def _reason(grey: Grey, board: Board) -> str:
     if cv2.Laplacian(grey, cv2.CV_64F).std() < 4:
         return "the images are blurred: focus, and hold the board still"
     margin = "" if isinstance(board, MarkedBoard) else " completely and with its white margin"
-    return (
-        f"no such board is visible{margin}: "
-        "check the board's name, and that it is in the image, large and lit"
-    )
+    return f"no such board is visible{margin}: is its name right, and is it in the image, large and lit?"
 
 
 def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
     border = board.border if isinstance(board, AprilGrid) else 1
     ids, last = _tags(grey, board.dictionary, border), board.markers[-1]
     if isinstance(board, AprilGrid) and len(_tags(grey, board.dictionary, 3 - border)) >= max(4, len(ids)):
-        other = f"border{3 - border}"
-        return f"its tags have {3 - border} black bits around their codes: add ':{other}' to the board's name"
-    if isinstance(board, KnownPoints):
         return (
-            f"{len(ids)} of its markers are visible, too few, "
-            f"or not of {board.dictionary}: name their dictionary"
+            f"its tags have {3 - border} black bits around their codes: "
+            f"add ':border{3 - border}' to the board's name"
         )
+    if isinstance(board, KnownPoints):
+        return f"only {len(ids)} of its markers are visible: is their dictionary {board.dictionary}?"
     if len(ids) >= 4 and max(ids) > last:
         return (
             f"markers up to number {max(ids)} are visible and the board has "
-            f"{board.first} to {last}: is its size right?"
+            f"{board.markers[0]} to {last}: is its size right?"
         )
     if len(ids) >= 4:
-        legacy = ""
-        if isinstance(board, Charuco):
-            legacy = "? A board drawn by OpenCV before 4.6 needs ':legacy' at the end of its name"
         return (
-            f"{len(ids)} of its markers are visible, but not at their positions: "
-            f"is the size right (across x down){legacy}"
+            f"{len(ids)} of its markers are visible, but not at their positions: is the size right (across x "
+            "down)? A charuco board drawn by OpenCV before 4.6 needs ':legacy' at the end of its name"
         )
     for name in OTHER_DICTIONARIES:
         if len(seen := _tags(grey, name, 1)) >= 6:
-            return (
-                f"{len(seen)} markers of the dictionary {name} are visible, "
-                f"not of {board.dictionary}: name that one"
-            )
-    if len(_tags(np.ascontiguousarray(grey[:, ::-1]), board.dictionary, border)) >= 4:
-        return "its markers are found once the image is mirrored: save the images as captured, not mirrored"
+            return f"{len(seen)} markers of the dictionary {name} are visible: name that one"
     return None
 
 
@@ -335,36 +321,16 @@ def _grid_size(grey: Grey) -> tuple[int, int] | None:
 # All images -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class CollectedViews:
+DetectedImage = tuple[HW, dict[FrameKey, Detection]]
+"""An image's size, and the points of each board in it."""
+
+
+class CollectedViews(NamedTuple):
     """Detections of each camera, its images, and notes on failed ones."""
 
     views: dict[str, BoardViews]
     photos: Photos
     notes: tuple[str, ...]
-
-
-def collect(photos: Photos, board: Board, *, progress: Progress | None = None) -> CollectedViews:
-    """Detect the board in all images of all cameras.
-
-    Raises ValueError, naming images and cause, if a camera's images differ in size, if the board is found in
-    none of them, or if they show a board of another size.
-    """
-    jobs = [(name, key, photo) for name, moments in photos.items() for key, photo in moments.items()]
-    with ThreadPoolExecutor(2) as pool:
-        results = pool.map(lambda job: detected(job[2], job[1], board), jobs)
-        found = list(progress(results, len(jobs)) if progress else results)
-    by_camera = {name: [(k, r) for (n, k, _), r in zip(jobs, found) if n == name] for name in photos}
-    views, notes = {}, []
-    for name, moments in photos.items():
-        sizes = {key: hw for key, (hw, _) in by_camera[name]}
-        _check_sizes(name, moments, sizes)
-        seen = {key: boards for key, (_, boards) in by_camera[name] if boards}
-        _check_board(name, moments, seen, board)
-        by_board = {key: d for boards in seen.values() for key, d in boards.items()}
-        views[name] = BoardViews(next(iter(sizes.values())), by_board)
-        notes += _missing(name, moments, seen, board)
-    return CollectedViews(views, photos, tuple(notes))
 
 
 def collect_folder(
@@ -374,11 +340,26 @@ def collect_folder(
     patterns: Mapping[str, str] | None = None,
     progress: Progress | None = None,
 ) -> CollectedViews:
-    """`collect` for the images of a folder (see `find_photos`)."""
-    return collect(find_photos(Path(folder), patterns=patterns), board, progress=progress)
+    """Detect the board in all images of all cameras of a folder (see `find_photos`).
+
+    Raises ValueError, naming images and cause, if a camera's images differ in size, if the board is found in
+    none of them, or if they show a board of another size.
+    """
+    photos = find_photos(Path(folder), patterns=patterns)
+    jobs = [job for moments in photos.values() for job in moments.items()]
+    with ThreadPoolExecutor(2) as pool:
+        results = pool.map(lambda job: detected(job[1], job[0], board), jobs)
+        found = iter(list(progress(results, len(jobs)) if progress else results))
+    views, notes = {}, list[str]()
+    for name, moments in photos.items():
+        images = dict(zip(moments, found))
+        views[name] = board_views(name, moments, images)
+        seen = [key for key, (_, boards) in images.items() if boards]
+        notes += _missing(name, moments, seen, board)
+    return CollectedViews(views, photos, tuple(notes))
 
 
-def detected(photo: Photo, key: FrameKey, board: Board) -> tuple[HW, dict[FrameKey, Detection]]:
+def detected(photo: Photo, key: FrameKey, board: Board) -> DetectedImage:
     """An image's size and the points of each board in it, numbered as those of all boards.
 
     Each board has poses of its own, hence a key of its own; that of the first one is the image's. Raises
@@ -392,45 +373,38 @@ def detected(photo: Photo, key: FrameKey, board: Board) -> tuple[HW, dict[FrameK
     return (grey.shape[0], grey.shape[1]), found
 
 
-def _check_sizes(
-    name: str, moments: Mapping[FrameKey, Photo], sizes: Mapping[FrameKey, tuple[int, int]]
-) -> None:
-    counts = Counter(sizes.values())
-    if len(counts) == 1:
-        return
-    shown = [
-        f"{w}x{h} ({_named([moments[k].label for k in sizes if sizes[k] == (h, w)], 2)})" for h, w in counts
-    ]
-    raise ValueError(
-        f"{name}: its images differ in size: {'; '.join(shown)}; keep those of one camera at one setting"
-    )
-
-
-def _check_board(
-    name: str, moments: Mapping[FrameKey, Photo], seen: Collection[FrameKey], board: Board
-) -> None:
-    """Raises ValueError if no image shows the board, or if most of some show a larger one."""
-    if not seen:
-        why = explain(_greys(list(moments.values())), board.members[0])
-        labels = _named([p.label for p in moments.values()], NAMED)
+def board_views(
+    name: str, moments: Mapping[FrameKey, Photo], images: Mapping[FrameKey, DetectedImage]
+) -> BoardViews:
+    """What was detected in a camera's images. Raises ValueError if they differ in size."""
+    by_size: dict[HW, list[str]] = {}
+    for key, (hw, _) in images.items():
+        by_size.setdefault(hw, []).append(moments[key].label)
+    if len(by_size) > 1:
+        shown = [f"{w}x{h} ({named(labels, 2)})" for (h, w), labels in by_size.items()]
         raise ValueError(
-            f"{name}: the board {board} is found in none of {len(moments)} images ({labels}): {why}"
+            f"{name}: its images differ in size: {'; '.join(shown)}; keep those of one camera at one setting"
         )
+    return BoardViews(next(iter(by_size)), {k: d for _, boards in images.values() for k, d in boards.items()})
+
+
+def _missing(
+    name: str, moments: Mapping[FrameKey, Photo], seen: Collection[FrameKey], board: Board
+) -> Iterator[str]:
+    """A note on a camera's images without the board. Raises ValueError if all are, or show a larger one."""
+    why, missing = "", [photo for key, photo in moments.items() if key not in seen]
+    if missing:
+        labels = named([photo.label for photo in missing], NAMED)
+        why = f"images ({labels}): {explain(_greys(missing), board.members[0])}"
+    if not seen:
+        raise ValueError(f"{name}: the board {board} is in none of {len(moments)} {why}")
     if other := other_size(_greys([moments[key] for key in seen]), board, larger=True):
         raise ValueError(
             f"{name}: the images show a chessboard with {other} inner corners and the board given is "
             f"{board}: count the corners between squares, not the squares"
         )
-
-
-def _missing(
-    name: str, moments: Mapping[FrameKey, Photo], seen: Collection[FrameKey], board: Board
-) -> list[str]:
-    missing = [photo for key, photo in moments.items() if key not in seen]
-    if not missing:
-        return []
-    labels, why = _named([p.label for p in missing], NAMED), explain(_greys(missing), board.members[0])
-    return [f"{name}: no board in {len(missing)} of {len(moments)} images ({labels}): {why}"]
+    if missing:
+        yield f"{name}: no board in {len(missing)} of {len(moments)} {why}"
 
 
 def _greys(photos: list[Photo]) -> Iterable[Grey]:
@@ -438,5 +412,6 @@ def _greys(photos: list[Photo]) -> Iterable[Grey]:
     return (photo.read() for photo in photos[::step][:EXPLAINED_IMAGES])
 
 
-def _named(labels: list[str], most: int) -> str:
+def named(labels: Sequence[str], most: int) -> str:
+    """The first labels, and how many more there are."""
     return ", ".join(labels[:most]) + (f" and {len(labels) - most} more" if len(labels) > most else "")

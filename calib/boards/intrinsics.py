@@ -17,7 +17,7 @@ from arraygeom.pixels import HW
 
 from . import Lens
 from .board import Board
-from .detect import BoardViews, Detection
+from .detect import BoardViews, Detection, homography_errors
 from .photos import FrameKey
 
 LENSES: dict[Lens, tuple[str, int]] = {
@@ -75,24 +75,17 @@ def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> Ca
     camera, poses = _solved(name, plausible, board, lens)
     for _ in range(2):
         before, plausible = plausible, without_outliers(views, camera, poses, board.points)
-        if _alike(before, plausible):
+        if all(np.array_equal(before.seen[key].ids, d.ids) for key, d in plausible.seen.items()):
             break
         camera, poses = _solved(name, plausible, board, lens)
     return CalibratedViews(name, camera, plausible, poses)
-
-
-def _alike(a: BoardViews, b: BoardViews) -> bool:
-    """Whether two selections of the same views are of the same points."""
-    return a.seen.keys() == b.seen.keys() and all(
-        np.array_equal(a.seen[key].ids, b.seen[key].ids) for key in a.seen
-    )
 
 
 def without_bad_images(views: BoardViews, initial: CalibratedViews, board: Board) -> BoardViews:
     """The views without images whose reprojection error is far above the others'."""
     rms = {}
     for key, pose in initial.poses.items():
-        errors = projection_errors(initial.camera, pose, initial.views.seen[key], board.points)
+        errors = _projection_errors(initial.camera, pose, initial.views.seen[key], board.points)
         rms[key] = float(np.sqrt((errors**2).mean()))
     limit = max(2.0, 10 * float(np.median(list(rms.values()))))
     return views.only([key for key in views.seen if rms[key] < limit])
@@ -113,28 +106,22 @@ def without_outliers(
     keep all.
     """
     off = {
-        key: projection_errors(camera, poses[key], d, points) for key, d in views.seen.items() if key in poses
+        key: _projection_errors(camera, poses[key], d, points)
+        for key, d in views.seen.items()
+        if key in poses
     }
     sigma = max(sigma or float(np.median(np.concatenate(list(off.values())))) / RAYLEIGH_MEDIAN, LEAST_SIGMA)
     kept = {key: views.seen[key].where(r < OUTLIER * sigma) for key, r in off.items()}
-    return BoardViews(
-        views.hw,
-        {
-            key: kept[key] if key in kept and _spans(points[kept[key].ids]) else d
-            for key, d in views.seen.items()
-        },
-    )
+    enough = {key: d for key, d in kept.items() if _spans(points[d.ids])}
+    return BoardViews(views.hw, {**views.seen, **enough})
 
 
 def _spans(points: Float[np.ndarray, "n 3"]) -> bool:
     """Whether there are enough points, and not all on a line."""
-    if len(points) < FEWEST_POINTS:
-        return False
-    _, second, _ = np.linalg.svd(points - points.mean(0), compute_uv=False)
-    return bool(second > 1e-6)
+    return len(points) >= FEWEST_POINTS and bool(np.linalg.matrix_rank(points - points.mean(0), 1e-6) > 1)
 
 
-def projection_errors(
+def _projection_errors(
     camera: Camera, pose: Pose, found: Detection, points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " m"]:
     """How far the points of an image are from a camera's projections of the board's, pixels."""
@@ -146,12 +133,8 @@ def near_homography(found: Detection, board: Board) -> Detection:
     """Points that a homography of the board fits (least median of squares), but for the lens's distortion."""
     if len(found.ids) < FEWEST_POINTS or not board.flat:
         return found
-    plane = board.points[found.ids, :2]
-    H, _ = cv2.findHomography(plane, found.x, cv2.LMEDS)
-    if H is None:
-        return found
-    off = np.linalg.norm(cv2.perspectiveTransform(plane[:, None], H)[:, 0] - found.x, axis=-1)
-    return found.where(off < max(1.0, 4 * float(np.median(off)) / RAYLEIGH_MEDIAN))
+    off = homography_errors(board.points[found.ids, :2], found.x)
+    return found.where(off <= max(1.0, 4 * float(np.median(off)) / RAYLEIGH_MEDIAN))
 
 
 def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Camera, dict[FrameKey, Pose]]:
@@ -162,13 +145,10 @@ def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Cam
             _pinhole(views, board, count) if pinhole else _fisheye(views, board)
         )
     except cv2.error as error:
-        raise ValueError(
-            f"{name}: OpenCV finds no camera that fits these boards ({error.err}): "
-            "do all show the same board?"
-        ) from None
-    distortion = (
-        Distortion(model if pinhole else "kannala-brandt", torch.tensor(coefficients)) if count else None
-    )
+        wrong = f"{name}: OpenCV finds no camera that fits these boards ({error.err})"
+        raise ValueError(f"{wrong}: do all show the same board?") from None
+    initial = model if pinhole else "kannala-brandt"
+    distortion = Distortion(initial, torch.tensor(coefficients)) if count else None
     camera = Camera(K=torch.tensor(K), cam_from_world=Pose.identity(), hw=views.hw, distortion=distortion)
     if not pinhole and model != "kannala-brandt":
         camera = _with_model(camera, model)
@@ -267,17 +247,12 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
 def _fisheye(views: BoardViews, board: Board) -> OpenCVSolution:
     """From the focal length of half a sphere, or, if OpenCV then finds no poses, of a narrow view."""
     if not board.flat:
-        raise ValueError(
-            "fisheyes need a flat board to start from: points of known position give pinhole cameras"
-        )
+        raise ValueError("fisheyes need a flat board to start from: points in space give pinhole cameras")
     points = [board.points[d.ids][:, None] for d in views.seen.values()]
     pixels = [d.x[:, None] for d in views.seen.values()]
     h, w = views.hw
-    flags = (
-        cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC
-        | cv2.fisheye.CALIB_FIX_SKEW
-        | cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
-    )
+    flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
+    flags |= cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
 
     def calibrated(focal: float) -> OpenCVSolution:
         K, none = np.array(intrinsics(focal, views.hw)), np.zeros((4, 1))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -70,22 +70,15 @@ def find_photos(folder: Path, *, patterns: Mapping[str, str] | None = None) -> P
     FileNotFoundError and ValueError.
     """
     if not folder.is_dir():
-        raise FileNotFoundError(
-            f"{folder}: no such folder of images: give one with a subfolder for each camera"
-        )
+        raise FileNotFoundError(f"{folder}: no such folder: give one with a subfolder for each camera")
     cameras = _by_pattern(folder, patterns) if patterns else _by_folder(folder) or _by_name(folder)
     if not cameras:
-        raise ValueError(
-            f"{folder}: no images or videos here: give a folder with a subfolder for each camera"
-        )
-    return _of_one_moment({name: _moments(name, files) for name, files in cameras.items()})
-
-
-def _of_one_moment(photos: dict[str, dict[FrameKey, Photo]]) -> Photos:
-    """Cameras with one image each took it at the same moment: numbers in the files' names are cameras'."""
+        raise ValueError(f"{folder}: no images or videos: give a folder with a subfolder for each camera")
+    photos = {name: _moments(name, files) for name, files in cameras.items()}
     keys = {key for moments in photos.values() for key in moments}
     if len(keys) == 1 or any(len(moments) > 1 for moments in photos.values()):
         return photos
+    # of one moment: numbers in the files' names are the cameras'
     return {name: dict(zip(["image 1"], moments.values())) for name, moments in photos.items()}
 
 
@@ -111,59 +104,46 @@ def _common_prefix(lists: list[list[str]]) -> int:
 
 
 def _by_pattern(folder: Path, patterns: Mapping[str, str]) -> dict[str, list[Path]]:
-    cameras = {}
-    for name, pattern in patterns.items():
-        cameras[name] = sorted(p for p in folder.glob(pattern) if _usable(p))
-        if not cameras[name]:
-            raise ValueError(f"{name}: no image or video in {folder} is called '{pattern}'")
+    cameras = {name: _usable(folder.glob(pattern)) for name, pattern in patterns.items()}
+    if empty := [name for name, files in cameras.items() if not files]:
+        raise ValueError(f"{empty[0]}: no image or video in {folder} is called '{patterns[empty[0]]}'")
     return cameras
 
 
 def _by_folder(folder: Path) -> dict[str, list[Path]]:
     folders = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
-    return {p.name: files for p in folders if (files := sorted(f for f in p.iterdir() if _usable(f)))}
+    return {p.name: files for p in folders if (files := _usable(p.iterdir()))}
 
 
 def _by_name(folder: Path) -> dict[str, list[Path]]:
     cameras: dict[str, list[Path]] = {}
-    for path in sorted(p for p in folder.iterdir() if _usable(p)):
+    for path in _usable(folder.iterdir()):
         name = path.stem if path.suffix.lower() in VIDEOS else re.sub(r"[ _.-]*\d+$", "", path.stem)
         cameras.setdefault(name or "camera", []).append(path)
     return cameras
 
 
-def _usable(path: Path) -> bool:
-    return path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES | VIDEOS and not path.name.startswith(".")
+def _usable(paths: Iterable[Path]) -> list[Path]:
+    files = sorted(p for p in paths if p.is_file() and not p.name.startswith("."))
+    return [p for p in files if p.suffix.lower() in IMAGE_SUFFIXES | VIDEOS]
 
 
 def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
     videos = [f for f in files if f.suffix.lower() in VIDEOS]
     if len(videos) > 1 or (videos and len(videos) < len(files)):
-        raise ValueError(
-            f"{name}: has {len(videos)} videos and {len(files) - len(videos)} "
-            "images: keep one video, or images"
-        )
+        raise ValueError(f"{name}: {len(videos)} videos among {len(files)} files: keep one video, or images")
     if videos:
         return dict(_video_frames(videos[0]))
-    _check_orientations(name, files)
+    tags: dict[int, str] = {}
+    for file in files:
+        tags.setdefault(_orientation(file), file.name)
+    if len(tags) > 1:  # they are applied: images stored alike would otherwise be rotated differently
+        listed = ", ".join(f"{tag} in {file}" for tag, file in tags.items())
+        raise ValueError(f"{name}: its images differ in orientation tags ({listed}): remove the tags")
     keys = frame_keys([f.stem for f in files])
     if len(set(keys)) < len(keys):
-        raise ValueError(
-            f"{name}: two images have the same number, such as {files[0].name}: give each its own"
-        )
+        raise ValueError(f"{name}: two images have one number, such as {files[0].name}: give each its own")
     return {key: Photo(file.name, partial(_decode_file, file)) for key, file in zip(keys, files)}
-
-
-def _check_orientations(name: str, files: list[Path]) -> None:
-    """Tags are applied: images of one camera stored alike would otherwise be rotated differently."""
-    first: dict[int, Path] = {}
-    for file in files:
-        first.setdefault(_orientation(file), file)
-    if len(first) > 1:
-        listed = ", ".join(f"{tag} in {file.name}" for tag, file in first.items())
-        raise ValueError(
-            f"{name}: its images have different orientation tags ({listed}): remove the tags from all"
-        )
 
 
 def _orientation(file: Path) -> int:
@@ -190,9 +170,7 @@ def _decode_file(path: Path) -> np.ndarray:
         raise ValueError(f"{path}: not an image that can be read: give a complete PNG, TIFF or JPEG file")
     if tag > 1 and content[8:12] == b"WEBP":  # of which OpenCV applies none
         with Image.open(path) as stored:
-            image = np.ascontiguousarray(
-                np.asarray(ImageOps.exif_transpose(stored).convert("RGB"))[..., ::-1]
-            )
+            return cv2.cvtColor(np.asarray(ImageOps.exif_transpose(stored).convert("RGB")), cv2.COLOR_RGB2BGR)
     return image
 
 

@@ -6,13 +6,14 @@ roughly.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from arraygeom import Camera, Distortion, Pose, Rig
 from arraygeom.distortion import pinhole_coefficients
@@ -32,12 +33,15 @@ MOST_CANDIDATES = 15
 
 
 class RelativePose(NamedTuple):
-    """The relative pose of two cameras, and which of their shared frames agree with it."""
+    """A relative pose of two cameras, and which of their shared frames agree with it.
+
+    score: how many those are, then minus their total error, pixels.
+    """
 
     a_from_b: Pose
     agreeing: tuple[FrameKey, ...]
     shared: tuple[FrameKey, ...]
-    corners: int
+    score: tuple[int, float]
 
     @property
     def consistent(self) -> bool:
@@ -110,23 +114,17 @@ def rig_near_start(
     The camera with most images keeps its orientation. Raises ValueError if the start has no such camera, or
     one of another size, or if a camera shares no moment with another.
     """
-    cameras = {name: _start_camera(name, start, v, lens[name]) for name, v in views.items()}
+    seen = []
     for name, v in views.items():
-        if len(views) > 1 and not any(
-            v.seen.keys() & other.seen.keys() for n, other in views.items() if n != name
-        ):
-            raise ValueError(
-                f"{name}: never sees the board in the same frame as another camera: check the numbers"
-            )
-    seen = [
-        CalibratedViews(
-            name, c, views[name], {key: board_pose(c, d, board) for key, d in views[name].seen.items()}
-        )
-        for name, c in cameras.items()
-    ]
+        camera = _start_camera(name, start, v, lens[name])
+        others = [other.seen.keys() for n, other in views.items() if n != name]
+        if others and not any(v.seen.keys() & keys for keys in others):
+            raise ValueError(f"{name}: shares no frame with another camera: check the images' numbers")
+        board_poses = {key: board_pose(camera, d, board) for key, d in v.seen.items()}
+        seen.append(CalibratedViews(name, camera, v, board_poses))
     anchor = max(seen, key=lambda v: len(v.poses))
     poses = {v.name: _aligned(anchor, v, board) for v in seen}
-    priors = {name: start_prior(camera, deviations) for name, camera in cameras.items()}
+    priors = {v.name: start_prior(v.camera, deviations) for v in seen}
     return consistent_boards(seen, poses, board)._replace(priors=priors)
 
 
@@ -134,9 +132,7 @@ def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) ->
     """A camera of a start, with a lens. Raises ValueError if it is missing or its size is not the images'."""
     camera = start.cameras.get(name)
     if not isinstance(camera, Camera):
-        raise ValueError(
-            f"{name}: the start has no camera of this name with K and pose; it has {list(start.names)}"
-        )
+        raise ValueError(f"{name}: the start has no calibrated camera called so; it has {list(start.names)}")
     if camera.hw != views.hw:
         (h, w), (rows, columns) = camera.hw, views.hw
         raise ValueError(f"{name}: its images are {columns}x{rows} and the start states {w}x{h}")
@@ -169,27 +165,20 @@ def pair_pose(a: CalibratedViews, b: CalibratedViews, board: Board) -> RelativeP
     ]
     voted = max((_vote(a, b, pose, shared, board) for pose in candidates), key=lambda v: v.score)
     for _ in range(2):
-        poses = [nearest_pose(voted.pose, a.poses[k], b.poses[k], symmetries) for k in voted.agreeing]
-        averaged = _vote(a, b, average_pose(poses or [voted.pose]), shared, board)
+        poses = [nearest_pose(voted.a_from_b, a.poses[k], b.poses[k], symmetries) for k in voted.agreeing]
+        averaged = _vote(a, b, average_pose(poses or [voted.a_from_b]), shared, board)
         voted = max(voted, averaged, key=lambda v: v.score)
-    corners = sum(len(a.views.seen[k].ids) + len(b.views.seen[k].ids) for k in voted.agreeing)
-    return RelativePose(voted.pose, voted.agreeing, shared, corners)
-
-
-class _Candidate(NamedTuple):
-    pose: Pose
-    agreeing: tuple[FrameKey, ...]
-    score: tuple[int, float]
+    return voted
 
 
 def _vote(
-    a: CalibratedViews, b: CalibratedViews, a_from_b: Pose, keys: Sequence[FrameKey], board: Board
-) -> _Candidate:
-    """The frames that agree with a relative pose; the score is their number, then minus their total error."""
-    errors = _prediction_errors(a, b, a_from_b, keys, board)
+    a: CalibratedViews, b: CalibratedViews, a_from_b: Pose, shared: tuple[FrameKey, ...], board: Board
+) -> RelativePose:
+    """A relative pose with the frames that agree with it."""
+    errors = _prediction_errors(a, {key: a_from_b @ b.poses[key] for key in shared}, board).min(0)
     agree = errors < _tolerance(a)
-    frames = tuple(key for key, good in zip(keys, agree) if good)
-    return _Candidate(a_from_b, frames, (len(frames), -float(errors[agree].sum())))
+    frames = tuple(key for key, good in zip(shared, agree) if good)
+    return RelativePose(a_from_b, frames, shared, (len(frames), -float(errors[agree].sum())))
 
 
 def nearest_pose(a_from_b: Pose, a_from_board: Pose, b_from_board: Pose, symmetries: Sequence[Pose]) -> Pose:
@@ -220,22 +209,19 @@ def symmetry_poses(board: Board) -> list[Pose]:
 
 
 def _prediction_errors(
-    a: CalibratedViews, b: CalibratedViews, a_from_b: Pose, keys: Iterable[FrameKey], board: Board
-) -> np.ndarray:
-    """By frame: the median distance in a's image from points predicted by b's board pose, best numbering."""
-    detections, poses = zip(*((a.views.seen[key], b.poses[key]) for key in keys))
-    counts = [len(d.ids) for d in detections]
-    points = torch.from_numpy(board.points)
+    camera: CalibratedViews, cam_from_board: Mapping[FrameKey, Pose], board: Board
+) -> Float[np.ndarray, "s k"]:
+    """By numbering and frame: the median distance of a camera's points from those of board poses, pixels."""
+    found = [camera.views.seen[key] for key in cam_from_board]
+    ends, points = np.cumsum([len(d.ids) for d in found])[:-1], torch.from_numpy(board.points)
     errors = []
-    for symmetry in symmetry_poses(board):
-        X = torch.cat(
-            [(a_from_b @ pose @ symmetry).apply(points[d.ids]) for d, pose in zip(detections, poses)]
-        )
-        x, _, valid = a.camera.project_local(X)
-        distance = np.linalg.norm(x.numpy() - np.concatenate([d.x for d in detections]), axis=-1)
+    for image in board.symmetries:
+        X = torch.cat([p.apply(points[image[d.ids]]) for d, p in zip(found, cam_from_board.values())])
+        x, _, valid = camera.camera.project_local(X)
+        distance = np.linalg.norm(x.numpy() - np.concatenate([d.x for d in found]), axis=-1)
         distance = np.where(valid.numpy(), distance, np.inf)
-        errors.append([np.median(part) for part in np.split(distance, np.cumsum(counts)[:-1])])
-    return np.min(errors, axis=0)
+        errors.append([np.median(part) for part in np.split(distance, ends)])
+    return np.array(errors)
 
 
 def _tolerance(seen: CalibratedViews) -> float:
@@ -246,21 +232,30 @@ def _tolerance(seen: CalibratedViews) -> float:
 def _along_tree(
     cameras: Sequence[CalibratedViews], pairs: Mapping[tuple[str, str], RelativePose], board: Board
 ) -> dict[str, Pose]:
-    """Prim's algorithm from the first camera, by the number of corners."""
-    poses = {cameras[0].name: Pose.identity()}
+    """Prim's algorithm from the first camera, by the number of corners in agreeing frames."""
+    poses, seen = {cameras[0].name: Pose.identity()}, {c.name: c.views.seen for c in cameras}
+
+    def corners(edge: tuple[tuple[str, str], RelativePose]) -> int:
+        return sum(len(seen[name][key].ids) for name in edge[0] for key in edge[1].agreeing)
+
     consistent = {names: pair for names, pair in pairs.items() if pair.consistent}
     while len(poses) < len(cameras):
-        edges = {
-            names: pair for names, pair in consistent.items() if (names[0] in poses) != (names[1] in poses)
-        }
+        edges = _crossing(consistent, poses)
         if not edges:
-            raise ValueError(_connection_error(cameras, list(poses), pairs, board))
-        (a, b), pair = max(edges.items(), key=lambda edge: edge[1].corners)
+            raise ValueError(_connection_error(cameras, poses, pairs, board))
+        (a, b), pair = max(edges.items(), key=corners)
         if a in poses:
             poses[b] = pair.a_from_b.inverse() @ poses[a]
         else:
             poses[a] = pair.a_from_b @ poses[b]
     return poses
+
+
+def _crossing(
+    pairs: Mapping[tuple[str, str], RelativePose], joined: Collection[str]
+) -> dict[tuple[str, str], RelativePose]:
+    """The pairs of which one camera is among the joined ones."""
+    return {names: pair for names, pair in pairs.items() if (names[0] in joined) != (names[1] in joined)}
 
 
 def consistent_boards(cameras: Sequence[CalibratedViews], poses: dict[str, Pose], board: Board) -> InitialRig:
@@ -270,69 +265,41 @@ def consistent_boards(cameras: Sequence[CalibratedViews], poses: dict[str, Pose]
     left_out = []
     for key in dict.fromkeys(key for c in cameras for key in c.views.seen):
         views = sorted((c for c in cameras if key in c.views.seen), key=lambda c: -len(c.views.seen[key].ids))
-        anchor = max(views, key=lambda c: _agreement(c, views, key, poses, board))
-        boards[key] = poses[anchor.name].inverse() @ anchor.poses[key]
-        for camera in views:
-            error, numbered = _numbered(camera, key, poses[camera.name] @ boards[key], board)
-            if camera is anchor or error < 3 * _tolerance(camera):
-                seen[camera.name][key] = numbered
+        proposed = [poses[c.name].inverse() @ c.poses[key] for c in views]
+        errors = [
+            [_prediction_errors(c, {key: poses[c.name] @ pose}, board)[:, 0] for c in views]
+            for pose in proposed
+        ]
+        agreeing = [sum(e.min() < _tolerance(c) for e, c in zip(row, views)) for row in errors]
+        anchor = int(np.argmax(agreeing))
+        boards[key] = proposed[anchor]
+        for i, (camera, error) in enumerate(zip(views, errors[anchor])):
+            if i == anchor or error.min() < 3 * _tolerance(camera):
+                found = camera.views.seen[key]
+                numbers = board.symmetries[int(error.argmin())]
+                seen[camera.name][key] = Detection(numbers[found.ids], found.x)
             else:
                 left_out.append((camera.name, key))
     placed = {c.name: c.camera.replace(cam_from_world=poses[c.name]) for c in cameras}
-    return InitialRig(
-        placed, boards, {c.name: BoardViews(c.views.hw, seen[c.name]) for c in cameras}, left_out
-    )
-
-
-def _agreement(
-    anchor: CalibratedViews,
-    views: Sequence[CalibratedViews],
-    key: FrameKey,
-    poses: Mapping[str, Pose],
-    board: Board,
-) -> int:
-    """How many cameras agree with one camera's board pose."""
-    world_from_board = poses[anchor.name].inverse() @ anchor.poses[key]
-    errors = [(c, _numbered(c, key, poses[c.name] @ world_from_board, board)[0]) for c in views]
-    return sum(error < _tolerance(c) for c, error in errors)
-
-
-def _numbered(
-    camera: CalibratedViews, key: FrameKey, cam_from_board: Pose, board: Board
-) -> tuple[float, Detection]:
-    """The numbering of an image's points that fits a board pose best, and its median error in pixels."""
-    found = camera.views.seen[key]
-    choices = [Detection(image[found.ids], found.x) for image in board.symmetries]
-    errors = []
-    for choice in choices:
-        x, _, valid = camera.camera.project_local(
-            cam_from_board.apply(torch.from_numpy(board.points[choice.ids]))
-        )
-        errors.append(
-            float(np.median(np.where(valid.numpy(), np.linalg.norm(x.numpy() - choice.x, axis=-1), np.inf)))
-        )
-    best = int(np.argmin(errors))
-    return errors[best], choices[best]
+    views_of = {c.name: BoardViews(c.views.hw, seen[c.name]) for c in cameras}
+    return InitialRig(placed, boards, views_of, left_out)
 
 
 def _connection_error(
     cameras: Sequence[CalibratedViews],
-    joined: Sequence[str],
+    joined: Collection[str],
     pairs: Mapping[tuple[str, str], RelativePose],
     board: Board,
 ) -> str:
     """The error message if the cameras joined so far have no consistent edge to the rest."""
-    rest = [c.name for c in cameras if c.name not in joined]
-    crossing = {names: pair for names, pair in pairs.items() if (names[0] in joined) != (names[1] in joined)}
-    if not crossing:
-        see = "see" if len(rest) > 1 else "sees"
+    by_name = {c.name: c for c in cameras}
+    if not (crossing := _crossing(pairs, joined)):
+        rest = ", ".join(name for name in by_name if name not in joined)
         return (
-            f"{_listed(rest)} never {see} the board in the same frame as {_listed(joined)}: "
-            "take images with the board where both see it, and check that images of one moment have the "
-            "same number"
+            f"{rest}: never sees the board in the same frame as {' or '.join(joined)}: take images with the "
+            "board where both see it, and check that images of one moment have the same number"
         )
     (a, b), pair = max(crossing.items(), key=lambda edge: len(edge[1].shared))
-    by_name = {c.name: c for c in cameras}
     return (
         f"{a} and {b} contradict each other: only {len(pair.agreeing)} of the {len(pair.shared)} frames both "
         f"see fit one relative pose; {_explain_contradiction(by_name[a], by_name[b], board)}"
@@ -373,7 +340,3 @@ def _shifted(a: CalibratedViews, b: CalibratedViews, shift: int) -> CalibratedVi
     seen = {renamed[key]: d for key, d in b.views.seen.items() if key in renamed}
     poses = {renamed[key]: p for key, p in b.poses.items() if key in renamed}
     return CalibratedViews(b.name, b.camera, BoardViews(b.views.hw, seen), poses)
-
-
-def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -17,7 +17,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
-from torch import Tensor
 
 from arraygeom import Camera, Rig
 from arraygeom.distortion import term
@@ -25,6 +24,7 @@ from arraygeom.text import angle
 from arraygeom.viz import COLOURS, draw_rig, show_image
 
 from .adequacy import CELLS, Coverage, coverage_advice, coverages
+from .bundle import intrinsic_values, parameter_names
 from .detect import BoardViews
 from .photos import FrameKey, Photos
 from .rig import Calibration
@@ -33,6 +33,7 @@ from .uncertainty import (
     GRID,
     baseline_deviation,
     beta_covariance,
+    grid_points,
     intrinsics_of,
     rig_covariance,
     uncertainty,
@@ -54,6 +55,12 @@ td, th { padding: .2em .8em .2em 0; text-align: left; vertical-align: top; borde
 h2 { margin-top: 2em; font-size: 1.15em } img { max-width: 100% }
 .note { color: #8a3b00 } small { color: #666 }
 """
+ADEQUACY = (
+    "Left, middle: standard deviation (pixels, worst direction) of the projection of points at the nearest "
+    "and the furthest depth of the boards, after the motion of the camera that keeps the boards where they "
+    "were seen best. Right: how far cameras fitted to every other frame differ, where boards were seen "
+    "(grey: nowhere): where that is much more, the lens model or the boards are inadequate."
+)
 
 
 def report_html(
@@ -68,54 +75,48 @@ def report_html(
 
     With the points `detected` in `photos`, the images that fit worst are drawn.
     """
-    covers = coverages(calibration)
+    covers, known = coverages(calibration), calibration.fit.covariance is not None
     advice = by_cameras([*notes, *calibration.notes, *coverage_advice(calibration, covers)])
+    near, far = _depths(covers.values())
     parts = [
-        f"<h1>{escape(title)}</h1>",
-        f"<p>{escape(summary(calibration))}</p>",
-        "<ul>" + "".join(f'<li class="note">{escape(a)}</li>' for a in advice) + "</ul>"
-        if advice
-        else "<p>No advice.</p>",
-        "<h2>Cameras</h2>",
+        f"<h1>{escape(title)}</h1><p>{escape(summary(calibration))}</p><ul>",
+        *(f'<li class="note">{escape(a)}</li>' for a in advice or ["No advice."]),
+        "</ul><h2>Cameras</h2>",
         camera_table(calibration, covers),
-        "<h2>Pairs</h2>" + pair_table(calibration) if len(calibration.views) > 1 else "",
-        "<h2>The rig and the boards</h2>",
-        image(draw_scene(calibration)),
-        "<h2>Residuals of each image</h2><p>Root mean square, pixels.</p>",
-        image(draw_by_image(calibration)),
     ]
-    worst = draw_worst_images(calibration, detected, photos) if detected and photos else None
-    if worst is not None:
-        parts += [
-            "<h2>Images that fit worst</h2><p>Points used (dots), "
-            "left out (red circles), residuals (enlarged).</p>",
-            image(worst),
-        ]
+    if len(calibration.views) > 1:
+        parts.append("<h2>Pairs</h2>" + pair_table(calibration))
+    parts.append(_section("The rig and the boards", "", draw_scene(calibration)))
+    by_image = draw_by_image(calibration)
+    parts.append(_section("Residuals of each image", "Root mean square, pixels.", by_image))
+    worst = worst_images(calibration, detected) if detected and photos else []
+    if detected and photos and worst:
+        text = "Points used (dots), left out (red circles), residuals (enlarged)."
+        drawn = draw_images(calibration, worst, detected, photos)
+        parts.append(_section("Images that fit worst", text, drawn))
     for name in calibration.views:
-        parts += [
-            f"<h2>{escape(name)}: coverage and residuals</h2>",
-            image(draw_camera(calibration, name, covers[name])),
-        ]
-    if calibration.fit.covariance is not None:
-        parts += [
-            "<h2>Adequacy of each camera</h2>",
-            "<p>Left, middle: standard deviation (pixels, worst direction) of the projection of points at "
-            "the nearest and the furthest depth of the boards, after the motion of the camera that keeps "
-            "the boards where they were seen best. Right: how far cameras fitted to every other frame "
-            "differ, where boards were seen (grey: nowhere): where that is much more, "
-            "the lens model or the boards are inadequate.</p>",
-            image(draw_adequacy(calibration, depths(covers.values()))),
-        ]
-    if len(calibration.views) > 1 and calibration.fit.covariance is not None:
-        near, far = depths(covers.values())
-        parts += [
-            "<h2>Uncertainty of predicted positions</h2>",
-            "<p>Standard deviation (pixels, worst direction) of the positions predicted in the other "
-            f"cameras for pixels of the first, at {near:.3g} m (nearest board) and {far:.3g} m "
-            "(furthest).</p>",
-            image(draw_uncertainty(calibration, (near, far))),
-        ]
+        drawn = draw_camera(calibration, name, covers[name])
+        parts.append(_section(f"{name}: coverage and residuals", "", drawn))
+    if known:
+        drawn = draw_adequacy(calibration, (near, far))
+        parts.append(_section("Adequacy of each camera", ADEQUACY, drawn))
+    if known and len(calibration.views) > 1:
+        text = (
+            "Standard deviation (pixels, worst direction) of the positions predicted in the other cameras "
+            f"for pixels of the first, at {near:.3g} m (nearest board) and {far:.3g} m (furthest)."
+        )
+        drawn = draw_uncertainty(calibration, (near, far))
+        parts.append(_section("Uncertainty of predicted positions", text, drawn))
     return html_page(parts, title)
+
+
+def _section(title: str, text: str, figure: Figure) -> str:
+    """A figure under its title, with what it shows."""
+    FigureCanvasAgg(figure)
+    data = BytesIO()
+    figure.savefig(data, format="png", dpi=110)
+    image = f'<img alt="" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
+    return f"<h2>{escape(title)}</h2><p>{text}</p>{image}"
 
 
 def html_page(parts: Iterable[str], title: str, further: str = "") -> str:
@@ -150,7 +151,7 @@ def summary(calibration: Calibration) -> str:
     return text
 
 
-def depths(covers: Iterable[Coverage]) -> tuple[float, float]:
+def _depths(covers: Iterable[Coverage]) -> tuple[float, float]:
     """Depths of the nearest and the furthest board point, metres."""
     near, far = zip(*(c.depths for c in covers))
     return max(min(near), 1e-3), max(far)
@@ -161,29 +162,24 @@ def depths(covers: Iterable[Coverage]) -> tuple[float, float]:
 
 def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> str:
     """One row per camera: points, residuals, and parameters with standard deviations."""
-    residuals = calibration.fit.problem.residuals
-    head = (
-        "camera|images, points|error px, "
-        "together (alone)|noise px|focal length px|principal point px|lens|covered"
-    )
     rows = []
     for name, camera in calibration.fit.problem.cameras.items():
-        views, r, covered = calibration.views[name], residuals[name], covers[name]
+        r, covered = calibration.fit.problem.residuals[name], covers[name]
         rms = np.sqrt((r**2).sum(-1).mean())
-        rows.append(
-            (
-                f"{name} {camera.hw[1]}x{camera.hw[0]}",
-                f"{len(views.seen)}, {len(r)}",
-                f"{rms:.3f}" + (f" ({calibration.single[name]:.3f})" if name in calibration.single else ""),
-                f"{calibration.fit.sigma[name]:.3f}",
-                _with_deviations(calibration, name, camera, "focal"),
-                _with_deviations(calibration, name, camera, "centre"),
-                _with_deviations(calibration, name, camera, "distortion"),
-                f"{covered.share:.0%} of the image, {covered.depths[0]:.3g} to {covered.depths[1]:.3g} m, "
-                f"tilts {covered.tilts[0]:.0f} to {covered.tilts[1]:.0f} deg",
-            )
-        )
-    return _table(head.split("|"), rows)
+        row = {
+            "camera": f"{name} {camera.hw[1]}x{camera.hw[0]}",
+            "images, points": f"{len(calibration.views[name].seen)}, {len(r)}",
+            "error px, together (alone)": f"{rms:.3f}"
+            + (f" ({calibration.single[name]:.3f})" if name in calibration.single else ""),
+            "noise px": f"{calibration.fit.problem.sigma[name]:.3f}",
+            "focal length px": _with_deviations(calibration, name, camera, "focal"),
+            "principal point px": _with_deviations(calibration, name, camera, "centre"),
+            "lens": _with_deviations(calibration, name, camera, "distortion"),
+            "covered": f"{covered.share:.0%} of the image, {covered.depths[0]:.3g} to "
+            f"{covered.depths[1]:.3g} m, tilts {covered.tilts[0]:.0f} to {covered.tilts[1]:.0f} deg",
+        }
+        rows.append(row)
+    return _table(rows)
 
 
 def pair_table(calibration: Calibration) -> str:
@@ -192,21 +188,19 @@ def pair_table(calibration: Calibration) -> str:
     cameras = calibration.fit.problem.cameras
     rows = []
     for (a, b), errors in calibration.epipolar.items():
-        baseline = float((cameras[a].centre - cameras[b].centre).norm())
-        deviation = baseline_deviation(cameras, a, b, covariance) if covariance else None
-        held = calibration.held_out.get((a, b))
-        rows.append(
-            (
-                f"{a} – {b}",
-                f"{1e3 * baseline:.2f}" + (f" ± {1e3 * deviation:.2f}" if deviation is not None else ""),
-                f"{math.degrees(angle(cameras[b].R @ cameras[a].R.T)):.3f}",
-                _mean_and_quantile(errors),
-                "" if held is None or not len(held) else _mean_and_quantile(held),
-            )
-        )
-    return _table(
-        ["pair", "baseline mm", "rotation deg", "epipolar error px, mean, 95 %", "on held-out frames"], rows
-    )
+        baseline = f"{1e3 * float((cameras[a].centre - cameras[b].centre).norm()):.2f}"
+        if covariance is not None:
+            baseline += f" ± {1e3 * baseline_deviation(cameras, a, b, covariance):.2f}"
+        held = calibration.held_out.get((a, b), ())
+        row = {
+            "pair": f"{a} – {b}",
+            "baseline mm": baseline,
+            "rotation deg": f"{math.degrees(angle(cameras[b].R @ cameras[a].R.T)):.3f}",
+            "epipolar error px, mean, 95 %": _mean_and_quantile(errors),
+            "on held-out frames": _mean_and_quantile(np.asarray(held)) if len(held) else "",
+        }
+        rows.append(row)
+    return _table(rows)
 
 
 def _mean_and_quantile(errors: np.ndarray, between: str = ", ") -> str:
@@ -215,31 +209,25 @@ def _mean_and_quantile(errors: np.ndarray, between: str = ", ") -> str:
 
 def _with_deviations(calibration: Calibration, name: str, camera: Camera, kind: str) -> str:
     lens, deviations = camera.distortion, calibration.fit.deviations
-    values = {
-        "focal": camera.K.diagonal()[:2],
-        "centre": camera.K[:2, 2],
-        "distortion": camera.K.new_zeros(0) if lens is None else lens.coefficients,
-    }[kind].tolist()
     texts = []
-    for i, value in enumerate(values):
-        label = "" if kind != "distortion" or lens is None else f"{term(lens, i)} "
-        if f"{name}.{kind}.{i}" not in calibration.fit.names:
-            texts.append(f"{label}{value:.4g} (fixed)" if value or kind != "distortion" else "")
+    for entry, value in zip(parameter_names(camera), intrinsic_values(camera)):
+        entry_kind, index = entry.split(".")
+        if entry_kind != kind:
             continue
-        deviation = deviations.get(f"{name}.{kind}.{i}", math.nan)
-        texts.append(f"{label}{value:.{_digits(deviation)}f} ± {deviation:.2g}")
-    return ", ".join(t for t in texts if t)
+        label = f"{term(lens, int(index))} " if kind == "distortion" and lens is not None else ""
+        if f"{name}.{entry}" in calibration.fit.names:
+            deviation = deviations.get(f"{name}.{entry}", math.nan)
+            digits = int(np.clip(1 - np.floor(np.log10(deviation)), 0, 8)) if deviation > 0 else 4
+            texts.append(f"{label}{value:.{digits}f} ± {deviation:.2g}")
+        elif value or kind != "distortion":
+            texts.append(f"{label}{value:.4g} (fixed)")
+    return ", ".join(texts)
 
 
-def _digits(deviation: float) -> int:
-    """Significant decimals of a value with a standard deviation."""
-    return int(np.clip(1 - np.floor(np.log10(deviation)), 0, 8)) if deviation > 0 else 4
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    top = "".join(f"<th>{escape(h)}</th>" for h in head)
-    lines = ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
-    return f"<table><tr>{top}</tr>{''.join(lines)}</table>"
+def _table(rows: Sequence[Mapping[str, str]]) -> str:
+    top = "".join(f"<th>{escape(head)}</th>" for row in rows[:1] for head in row)
+    lines = ["".join(f"<td>{escape(cell)}</td>" for cell in row.values()) for row in rows]
+    return f"<table><tr>{'</tr><tr>'.join([top, *lines])}</tr></table>"
 
 
 # Figures ----------------------------------------------------------------------------------------------------
@@ -253,7 +241,9 @@ def draw_scene(calibration: Calibration) -> Figure:
     axes.set_position((0.0, 0.02, 0.46, 0.94))
     figure.set_layout_engine("none")
     above = figure.add_axes((0.55, 0.12, 0.43, 0.8))
-    corners = _outline(calibration)
+    (left, top, _), (right, bottom, _) = calibration.board.points.min(0), calibration.board.points.max(0)
+    outline = [[left, top], [right, top], [right, bottom], [left, bottom], [left, top]]
+    corners = torch.tensor([[*corner, 0.0] for corner in outline], dtype=torch.float64)
     for pose in calibration.fit.problem.board_poses.values():
         X = pose.apply(corners).numpy()
         above.plot(X[:, 0], X[:, 2], color="0.75", lw=0.8)
@@ -261,16 +251,8 @@ def draw_scene(calibration: Calibration) -> Figure:
         x, _, z = camera.centre.tolist()
         dx, _, dz = camera.R[2].tolist()
         above.plot(x, z, "o", ms=4, color=colour)
-        above.annotate(
-            escaped(name),
-            (x, z),
-            (0, -4),
-            textcoords="offset points",
-            fontsize=8,
-            color=colour,
-            va="top",
-            ha="center",
-        )
+        place: dict[str, Any] = {"textcoords": "offset points", "va": "top", "ha": "center"}
+        above.annotate(escaped(name), (x, z), (0, -4), fontsize=8, color=colour, **place)
         above.quiver(x, z, dx, dz, color=colour, width=0.004, scale=12)
     above.set(aspect="equal", xlabel="x (m)", ylabel="z (m)")
     above.set_title("from above, with the boards", fontsize=9)
@@ -312,10 +294,10 @@ def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figur
     left.set_title(f"points observed (red: none), {covered.share:.0%} covered", fontsize=9)
     show_image(middle, hw)
     _draw_field(middle, seen.x, r, hw)
-    limit = max(4 * calibration.fit.sigma[name], 1e-3)
+    limit = max(4 * calibration.fit.problem.sigma[name], 1e-3)
     right.plot(*np.clip(r, -limit, limit).T, ".", ms=1.5, color=COLOURS[0])
     right.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", xlabel="x (px)", ylabel="y (px)")
-    right.set_title(f"residuals, noise {calibration.fit.sigma[name]:.3f} px", fontsize=9)
+    right.set_title(f"residuals, noise {calibration.fit.problem.sigma[name]:.3f} px", fontsize=9)
     right.spines[["top", "right"]].set_visible(False)
     return figure
 
@@ -331,11 +313,7 @@ def _draw_field(axes: Any, x: np.ndarray, r: np.ndarray, hw: tuple[int, int]) ->
         return
     at = np.array([x[cell == c].mean(0) for c in filled])
     arrows = np.array([np.median(r[cell == c], axis=0) for c in filled])
-    longest = float(np.linalg.norm(arrows, axis=1).max())
-    magnify = 1.2 * hw[1] / columns / max(longest, 1e-9)
-    axes.quiver(
-        *at.T, *(magnify * arrows).T, angles="xy", scale_units="xy", scale=1, width=0.004, color=COLOURS[1]
-    )
+    longest = _draw_arrows(axes, at, arrows, 1.2 * hw[1] / columns, COLOURS[1])
     axes.set_title(f"median residuals, longest {longest:.3f} px", fontsize=9)
 
 
@@ -344,41 +322,16 @@ def draw_uncertainty(calibration: Calibration, at: tuple[float, float]) -> Figur
     covariance = rig_covariance(calibration.fit)
     assert covariance is not None
     alpha, *betas = calibration.views
-    h, w = calibration.views[alpha].hw
-    xs, ys = np.linspace(0, w - 1, 25), np.linspace(0, h - 1, 19)
-    x = np.stack(np.meshgrid(xs, ys), -1).reshape(-1, 2)
     figure = Figure(figsize=(8.4, 2.6 * len(betas) + 0.3), layout="constrained")
-    grid = figure.subplots(len(betas), len(at), squeeze=False)
-    for row, beta in zip(grid, betas):
+    for row, beta in zip(figure.subplots(len(betas), len(at), squeeze=False), betas):
         for axes, depth in zip(row, at):
+            x, _ = grid_points(calibration.rig[alpha], depth)
             pixels = beta_covariance(calibration.rig, covariance, alpha, beta, x, depth)
             usable = np.isfinite(pixels).all((1, 2))
-            deviation = np.full(len(x), np.nan)
-            deviation[usable] = worst_deviation(pixels[usable])
-            shown = axes.imshow(
-                deviation.reshape(len(ys), len(xs)), extent=_extent((h, w)), cmap="viridis", norm=LogNorm()
-            )
-            axes.set(xticks=[], yticks=[])
-            median = float(np.median(deviation[usable])) if usable.any() else float("nan")
-            axes.set_title(
-                f"{escaped(beta)} of {escaped(alpha)}, {depth:.3g} m: median {median:.2f} px", fontsize=9
-            )
-            figure.colorbar(shown, ax=axes, shrink=0.9)
+            title = f"{beta} of {alpha}, {depth:.3g} m"
+            hw = calibration.views[alpha].hw
+            _map(axes, figure, hw, x[usable], worst_deviation(pixels[usable]), title)
     return figure
-
-
-def image(figure: Figure) -> str:
-    """A figure as an embedded HTML image."""
-    FigureCanvasAgg(figure)
-    data = BytesIO()
-    figure.savefig(data, format="png", dpi=110)
-    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
-
-
-def _outline(calibration: Calibration) -> Tensor:
-    (left, top, _), (right, bottom, _) = calibration.board.points.min(0), calibration.board.points.max(0)
-    corners = [[left, top], [right, top], [right, bottom], [left, bottom], [left, top]]
-    return torch.tensor([[*corner, 0.0] for corner in corners], dtype=torch.float64)
 
 
 def _extent(hw: tuple[int, int]) -> tuple[float, float, float, float]:
@@ -395,39 +348,39 @@ def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figu
         for axes, depth in zip(row, depths):
             x, deviation = uncertainty(known, depth)
             _map(axes, figure, known.camera.hw, x, deviation, f"{name}: uncertainty at {depth:.2g} m")
-        if len(halves.get(name, ((), ()))[0]) > 3:
-            x, off = halves[name]
-            length = np.linalg.norm(off, axis=1)
-            _map(row[2], figure, known.camera.hw, x, length, f"{name}: halves of the frames")
+        x, off = halves.get(name, np.zeros((2, 0, 2)))
+        length = np.linalg.norm(off, axis=1)
+        _map(row[2], figure, known.camera.hw, x, length, f"{name}: halves of the frames")
+        if len(x):
             row[2].quiver(*x[::3].T, *off[::3].T, angles="xy", color="white", width=0.003)
-        else:
-            row[2].set_axis_off()
-            row[2].set_title("too few frames to compare halves", fontsize=9)
     return figure
 
 
 def _map(
     axes: Any, figure: Figure, hw: tuple[int, int], x: np.ndarray, value: np.ndarray, title: str
 ) -> None:
-    """Values at pixels of `grid_points`; what lies between pixels that are no neighbours is grey."""
+    """Draw values at pixels of `grid_points`; what lies between pixels that are no neighbours is grey."""
+    axes.set(xlim=(0, hw[1]), ylim=(hw[0], 0), aspect="equal", xticks=[], yticks=[], facecolor="0.85")
+    if len(x) < 4:
+        axes.set_title(escaped(f"{title}: too few points"), fontsize=9, loc="left")
+        return
     triangles = Triangulation(*x.T)
     spread = np.ptp(x[triangles.triangles], axis=1) * (np.array(GRID)[::-1] - 1) / (hw[1], hw[0])
     triangles.set_mask((spread > 1.5).any(1))
     drawn = axes.tripcolor(
         triangles, np.maximum(value, 1e-4), shading="gouraud", cmap="viridis", norm=LogNorm()
     )
-    axes.set(xlim=(0, hw[1]), ylim=(hw[0], 0), aspect="equal", xticks=[], yticks=[], facecolor="0.85")
     axes.set_title(escaped(f"{title}: median {np.median(value):.2g} px"), fontsize=9, loc="left")
     figure.colorbar(drawn, ax=axes, shrink=0.8)
 
 
-def draw_worst_images(
-    calibration: Calibration, detected: Mapping[str, BoardViews], photos: Photos
-) -> Figure | None:
-    """Images with most points left out or largest residuals: points (red: left out), residuals enlarged."""
-    chosen = _worst(calibration, detected)
-    if not chosen:
-        return None
+def draw_images(
+    calibration: Calibration,
+    chosen: Sequence[tuple[str, FrameKey]],
+    detected: Mapping[str, BoardViews],
+    photos: Photos,
+) -> Figure:
+    """Some images (camera, moment) with their points (red: left out) and residuals, enlarged."""
     columns = min(3, len(chosen))
     rows = -(-len(chosen) // columns)
     figure = Figure(figsize=(10.4, 2.9 * rows), layout="constrained")
@@ -439,14 +392,13 @@ def draw_worst_images(
     return figure
 
 
-def _worst(calibration: Calibration, detected: Mapping[str, BoardViews]) -> list[tuple[str, FrameKey]]:
+def worst_images(calibration: Calibration, detected: Mapping[str, BoardViews]) -> list[tuple[str, FrameKey]]:
+    """Images (camera, moment) that do not fit, then those with most points left out."""
     found = [(m.camera, m.frame) for m in misfits(calibration.fit)]
-    left_out = {
-        (name, key): len(d.ids)
-        - (len(calibration.views[name].seen[key].ids) if key in calibration.views[name].seen else 0)
-        for name, v in detected.items()
-        for key, d in v.seen.items()
-    }
+    left_out: dict[tuple[str, FrameKey], int] = {}
+    for name, v in detected.items():
+        used = {key: len(d.ids) for key, d in calibration.views[name].seen.items()}
+        left_out |= {(name, key): len(d.ids) - used.get(key, 0) for key, d in v.seen.items()}
     found += sorted((image for image, count in left_out.items() if count), key=lambda image: -left_out[image])
     return list(dict.fromkeys(found))[:DRAWN]
 
@@ -454,11 +406,11 @@ def _worst(calibration: Calibration, detected: Mapping[str, BoardViews]) -> list
 def _draw_image(
     axes: Any, calibration: Calibration, name: str, key: FrameKey, views: BoardViews, photos: Photos
 ) -> None:
-    photo = _photo(photos[name], key)
-    scale = THUMBNAIL / views.hw[1]
-    if photo is not None:
+    image_key = str(key).split(" board ")[0]  # of several boards in it
+    for photo in [photo for other, photo in photos[name].items() if str(other) == image_key]:
+        scale = THUMBNAIL / views.hw[1]
         small = cv2.resize(photo.read(), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        axes.imshow(small, cmap="gray", extent=(-0.5, views.hw[1] - 0.5, views.hw[0] - 0.5, -0.5))
+        axes.imshow(small, cmap="gray", extent=_extent(views.hw))
     used = calibration.views[name].seen.get(key)
     x = views.seen[key].x
     kept = np.zeros(len(x), dtype=bool) if used is None else (x[:, None] == used.x[None]).all(-1).any(1)
@@ -466,22 +418,20 @@ def _draw_image(
     axes.plot(*x[~kept].T, "o", ms=5, mfc="none", color="red")
     text = f"{name} {key}: {int((~kept).sum())} of {len(x)} left out"
     if key in calibration.frames and used is not None:
-        block = calibration.frames.index(key)
-        mine = calibration.fit.problem.seen[name].block == block
-        r = calibration.fit.problem.residuals[name][mine]
-        enlarge = 0.06 * views.hw[1] / max(float(np.linalg.norm(r, axis=1).max()), 1e-9)
-        at = calibration.fit.problem.seen[name].x[mine]
-        axes.quiver(
-            *at.T, *(enlarge * r).T, angles="xy", scale_units="xy", scale=1, width=0.004, color="orange"
-        )
-        text += f", {frame_rms(calibration.fit.problem)[name][key]:.2f} px"
+        problem = calibration.fit.problem
+        mine = problem.seen[name].block == calibration.frames.index(key)
+        r = problem.residuals[name][mine]
+        _draw_arrows(axes, problem.seen[name].x[mine], r, 0.06 * views.hw[1], "orange")
+        text += f", {frame_rms(problem)[name][key]:.2f} px"
     axes.set_title(escaped(text), fontsize=9)
 
 
-def _photo(photos: Mapping[FrameKey, Any], key: FrameKey) -> Any | None:
-    """The image of a view, which may be of one of several boards in it."""
-    by_text = {str(k): photo for k, photo in photos.items()}
-    return by_text.get(str(key).split(" board ")[0])
+def _draw_arrows(axes: Any, x: np.ndarray, r: np.ndarray, length: float, colour: str) -> float:
+    """Draw residuals, magnified so that the longest has a length in pixels. Returns the longest, pixels."""
+    longest = float(np.linalg.norm(r, axis=1).max())
+    arrows = length / max(longest, 1e-9) * r
+    axes.quiver(*x.T, *arrows.T, angles="xy", scale_units="xy", scale=1, width=0.004, color=colour)
+    return longest
 
 
 def escaped(text: str) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -54,11 +53,6 @@ class Calibration:
         """The reprojection error of all points of all images, pixels, outliers included."""
         return self.fit.problem.rms()
 
-    @property
-    def raised(self) -> float:
-        """The largest factor by which a standard deviation was raised to that of a jackknife over frames."""
-        return self.fit.raised
-
     @cached_property
     def held_out(self) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
         """By pair: epipolar errors (pixels) of all frames, each by a rig of the others; empty if too few."""
@@ -67,13 +61,6 @@ class Calibration:
     def deviations(self) -> dict[str, float]:
         """The standard deviation of each free parameter by name ("left.focal.0"), in its own unit."""
         return self.fit.deviations
-
-
-def _known_lens(lens: Any, name: str) -> Lens:
-    if lens not in LENSES:
-        raise ValueError(f"lens of '{name}': {lens!r} is none of {', '.join(LENSES)}")
-    known: Lens = lens
-    return known
 
 
 @torch_in_one_thread()
@@ -92,7 +79,10 @@ def calibrate(
     contradict each other. With `start`, a rig known to within `deviations`, one image of each camera is
     enough, and the world is the start's.
     """
-    models = {name: _known_lens(lens if isinstance(lens, str) else lens.get(name), name) for name in views}
+    models = dict.fromkeys(views, lens) if isinstance(lens, str) else lens
+    for name in views:
+        if models.get(name) not in LENSES:
+            raise ValueError(f"lens of '{name}': {models.get(name)!r} is none of {', '.join(LENSES)}")
     if start is None:
         singles = {
             name: calibrate_single(name, v, board, lens=models[name], final=len(views) == 1)
@@ -100,15 +90,16 @@ def calibrate(
         }
         fitted = solve_together(initial_rig(singles, board), board, singles)
     else:
-        singles = {}
-        initial = rig_near_start(start, views, board, models, deviations or StartDeviations())
+        singles, stated = {}, deviations or StartDeviations()
+        initial = rig_near_start(start, views, board, models, stated)
         fitted = solve_inliers(initial, initial.views, board, rounds=2)
-    solved = with_disagreement(fitted, board.extents, unchecked=bool(singles) and board.flat)
+    extents = [each.extent for each in board.members]
+    solved = with_disagreement(fitted, extents, unchecked=bool(singles) and board.flat)
     notes = [*solved.notes, *misfit_notes(solved)]
     if start is None:
         notes[:0] = left_out_notes(views, singles, fitted)
     else:
-        notes[:0] = start_notes(initial.views, fitted, deviations or StartDeviations())
+        notes[:0] = start_notes(initial.views, fitted, stated)
     rig = Rig(solved.problem.cameras)
     single = {name: alone.problem.rms() for name, alone in singles.items()}
     return Calibration(rig, board, solved, single, epipolar_errors(rig, solved.views), tuple(notes))

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -38,23 +39,17 @@ ITERATIONS, CONVERGED = 5, 1e-6
 """Steps of the motion at most, and the size of a last one (radians, metres)."""
 
 
-class CameraDifference(NamedTuple):
-    """One camera: pixels x of the first rig, depths there (metres), how far the second rig's are from them,
-    and the standard deviation of that by both calibrations (pixels, worst direction; NaN if unknown)."""
+class Difference(NamedTuple):
+    """Pixels x, depths there (metres), how much differs, and its standard deviation by both calibrations.
+
+    Of one camera, at pixels of the first rig: how far the second rig's are from them, (n, 2), and the
+    deviation in the worst direction, pixels. Of a pair, at pixels of its alpha: depth by the second rig over
+    that by the first, minus 1, (n). Deviations are NaN if unknown.
+    """
 
     x: Float[np.ndarray, "n 2"]
     depth: Float[np.ndarray, " n"]
-    change: Float[np.ndarray, "n 2"]
-    sigma: Float[np.ndarray, " n"]
-
-
-class DepthDifference(NamedTuple):
-    """Depth by one pair, at pixels x of its alpha: by the second rig over that by the first, minus 1, and its
-    standard deviation by both calibrations (NaN if unknown)."""
-
-    x: Float[np.ndarray, "n 2"]
-    depth: Float[np.ndarray, " n"]
-    change: Float[np.ndarray, " n"]
+    change: Float[np.ndarray, "n *k"]
     sigma: Float[np.ndarray, " n"]
 
 
@@ -82,11 +77,11 @@ class Significance(NamedTuple):
 class RigDifference:
     """Two rigs compared. motion: from the first one's world to the second one's. alpha: that of the depths.
 
-    significance: None without covariances.
+    depths: by the other cameras that see points of alpha. significance: None without covariances.
     """
 
-    cameras: Mapping[str, CameraDifference]
-    depths: Mapping[str, DepthDifference]
+    cameras: Mapping[str, Difference]
+    depths: Mapping[str, Difference]
     alpha: str
     motion: Pose
     significance: Significance | None
@@ -96,18 +91,11 @@ class RigDifference:
         lines = ["after the rigid motion of the whole rig that brings all pixels together best:"]
         for name, found in self.cameras.items():
             off = np.linalg.norm(found.change, axis=1)
-            lines.append(
-                f"{name}: pixels differ by {_rms(off):.3f} (RMS), {off.max():.3f} at "
-                f"most{_of(found.sigma, 3)}"
-            )
-        for name, depth in self.depths.items():
-            near, far = depth.depth.min(), depth.depth.max()
-            percent = 100 * depth.change
-            lines.append(
-                f"depth by {self.alpha} and {name}, {near:.3g} to {far:.3g} m: differs by "
-                f"{_rms(percent):.3f} % (RMS), "
-                f"{np.abs(percent).max():.3f} % at most{_of(100 * depth.sigma, 3)}"
-            )
+            lines.append(f"{name}: pixels differ by {_sizes(off, found.sigma)}")
+        for name, found in self.depths.items():
+            near, far = found.depth.min(), found.depth.max()
+            sizes = _sizes(100 * found.change, 100 * found.sigma, " %")
+            lines.append(f"depth by {self.alpha} and {name}, {near:.3g} to {far:.3g} m: differs by {sizes}")
         return "\n".join([*lines, self.verdict])
 
     @property
@@ -115,16 +103,10 @@ class RigDifference:
         """One line: whether the rig has moved."""
         found = self.significance
         if found is None:
-            return (
-                "verdict: none: no deviations are known; "
-                "differences may be those of two calibrations of one rig"
-            )
+            return "verdict: none: no deviations are known; one rig calibrated twice may differ so"
         test = f"chi-square {found.chi_square:.1f} of {found.freedom} parameters, p = {found.probability:.2g}"
         if not found.moved:
-            return (
-                "verdict: the same: the rigs differ no more than their "
-                f"calibrations' errors let them ({test})"
-            )
+            return f"verdict: the same: the rigs differ no more than their calibrations' errors ({test})"
         return (
             f"verdict: moved: the rigs differ by more than their calibrations' errors ({test}); "
             f"a rotation of {found.camera} by {found.degrees:.3f} degrees and a shift of "
@@ -154,22 +136,24 @@ def rig_difference(
     known = [c if c is not None else other for c, other in zip(covariances, covariances[::-1])]
     spread = None
     if known[0] is not None and known[1] is not None:
-        of_a, of_b = _root(known[0]), _root(known[1])
-        rows = [np.concatenate([p.of_a(known[0]) @ of_a, p.of_b(known[1]) @ of_b], -1) for p in parts]
-        spread = np.concatenate(rows).reshape(len(change), -1)
+        roots, blocks = [_root(known[0]), _root(known[1])], []
+        for part in parts:
+            by_a = -part.jacobians[0] @ known[0].of(part.name, a[part.name]) @ roots[0]
+            by_b = part.jacobians[1] @ known[1].of(part.name, b[part.name]) @ roots[1]
+            blocks.append(np.concatenate([by_a, by_b], -1))
+        spread = np.concatenate(blocks).reshape(len(change), -1)
         spread -= by_motion @ (by_motion.T @ spread)
-    significance = None if spread is None else _tested(change, spread, by_motion, b, parts, names)
+    significance = None if spread is None else _tested(change, spread, by_motion, b, parts)
     cameras = {}
-    end = 0
-    for (name, (x, _, z)), part in zip(grids.items(), parts):
-        start, end = end, end + part.change.size
+    for (name, (x, _, z)), part, rows in zip(grids.items(), parts, _rows(parts)):
         sigma = np.full(len(x), np.nan)
         if spread is not None:
-            mine = spread[start:end].reshape(len(x), 2, -1)
+            mine = spread[rows].reshape(len(x), 2, -1)
             sigma = worst_deviation(mine @ mine.swapaxes(-1, -2))
-        cameras[name] = CameraDifference(x, z, part.change, sigma)
+        cameras[name] = Difference(x, z, part.change, sigma)
     alpha, *betas = names
     depths = {name: _depths(a, b, alpha, name, grids[alpha], known) for name in betas}
+    depths = {name: found for name, found in depths.items() if len(found.x)}
     return RigDifference(cameras, depths, alpha, motion, significance)
 
 
@@ -178,11 +162,8 @@ def _same_cameras(a: Rig, b: Rig) -> tuple[str, ...]:
         listed = f"{', '.join(a.names)}; and {', '.join(b.names)}"
         raise ValueError(f"the rigs are of other cameras ({listed}): give two calibrations of the same")
     for name in a.names:
-        for rig in (a, b):
-            if not isinstance(rig[name], Camera):
-                raise ValueError(
-                    f"'{name}' is not calibrated in both rigs: what it sees where cannot be compared"
-                )
+        if not all(isinstance(rig[name], Camera) for rig in (a, b)):
+            raise ValueError(f"'{name}' is not calibrated in both rigs: what it sees cannot be compared")
         if a[name].hw != b[name].hw:
             (h, w), (h2, w2) = a[name].hw, b[name].hw
             raise ValueError(
@@ -211,16 +192,9 @@ class _Part(NamedTuple):
     """One camera: differences (n, 2), derivatives by motion (2 n, 6), by both cameras' numbers (n, 2, p)."""
 
     name: str
-    cameras: tuple[Camera, Camera]
     change: np.ndarray
     by_motion: np.ndarray
     jacobians: tuple[np.ndarray, np.ndarray]
-
-    def of_a(self, covariance: RigCovariance) -> np.ndarray:
-        return -self.jacobians[0] @ covariance.of(self.name, self.cameras[0])
-
-    def of_b(self, covariance: RigCovariance) -> np.ndarray:
-        return self.jacobians[1] @ covariance.of(self.name, self.cameras[1])
 
 
 def _projections(a: Rig, b: Rig, motion: Pose, name: str, X: np.ndarray) -> _Part:
@@ -235,7 +209,7 @@ def _projections(a: Rig, b: Rig, motion: Pose, name: str, X: np.ndarray) -> _Par
     lever = J_b[..., 3:6] @ cross_matrix(other.R @ motion.t).numpy()
     J_b = np.concatenate([J_b[..., :3] - lever, J_b[..., 3:]], -1)
     change = (moved.project(points).x - one.project(points).x).numpy()
-    return _Part(name, (one, other), change, by_motion.reshape(-1, 6), (J_a, J_b))
+    return _Part(name, change, by_motion.reshape(-1, 6), (J_a, J_b))
 
 
 def _same_lens(a: Camera, b: Camera) -> bool:
@@ -264,13 +238,14 @@ def _root(covariance: RigCovariance) -> np.ndarray:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
 
 
+def _rows(parts: list[_Part]) -> list[slice]:
+    """The rows of each camera among the coordinates of all."""
+    ends = np.cumsum([0, *(part.change.size for part in parts)]).tolist()
+    return [slice(start, end) for start, end in pairwise(ends)]
+
+
 def _tested(
-    change: np.ndarray,
-    spread: np.ndarray,
-    by_motion: np.ndarray,
-    b: Rig,
-    parts: list[_Part],
-    names: tuple[str, ...],
+    change: np.ndarray, spread: np.ndarray, by_motion: np.ndarray, b: Rig, parts: list[_Part]
 ) -> Significance:
     """The difference in directions in which calibrations' errors move pixels, in standard deviations."""
     U, s, _ = np.linalg.svd(spread, full_matrices=False)
@@ -278,11 +253,10 @@ def _tested(
     U, s = U[:, counts], s[counts]
     z = U.T @ change / s
     total, freedom = float(z @ z), int(counts.sum())
-    best, motion, gain, end = names[0], np.zeros(6), -1.0, 0
-    for part in parts:
-        start, end = end, end + part.change.size
+    best, motion, gain = "", np.zeros(6), -1.0
+    for part, rows in zip(parts, _rows(parts)):
         own = np.zeros((len(change), 6))
-        own[start:end] = part.jacobians[1][..., :6].reshape(-1, 6)
+        own[rows] = part.jacobians[1][..., :6].reshape(-1, 6)
         own -= by_motion @ (by_motion.T @ own)
         by_own = U.T @ own / s[:, None]
         found = np.linalg.lstsq(by_own, z, rcond=None)[0]
@@ -304,7 +278,7 @@ def _tested(
 
 def _depths(
     a: Rig, b: Rig, alpha: str, beta: str, grid: Grid, known: list[RigCovariance | None]
-) -> DepthDifference:
+) -> Difference:
     """Depth of points by the second rig, found from the pixels at which the first one has them."""
     x, X, z = grid
     there = a[beta].project(torch.from_numpy(X))
@@ -324,51 +298,31 @@ def _depths(
                 np.nan if covariance is None else beta_covariance(a, covariance, alpha, beta, x[at], float(d))
             )
             variance[at] += np.einsum("ni,nij,nj->n", along[at], of_y * np.ones((1, 2, 2)), along[at])
-    return DepthDifference(x[valid], z[valid], change[valid], np.sqrt(variance)[valid])
+    return Difference(x[valid], z[valid], change[valid], np.sqrt(variance)[valid])
 
 
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.square(values).mean())) if len(values) else float("nan")
-
-
-def _of(sigma: np.ndarray, digits: int) -> str:
-    return (
-        ""
-        if np.isnan(sigma).all()
-        else f" (both calibrations' deviations: {_rms(sigma[np.isfinite(sigma)]):.{digits}f})"
-    )
+def _sizes(values: np.ndarray, sigma: np.ndarray, unit: str = "") -> str:
+    """How large values are, and their standard deviations, if known."""
+    rms, most = np.sqrt(np.square(values).mean()), np.abs(values).max()
+    stated, known = "", sigma[np.isfinite(sigma)]
+    if len(known):
+        stated = f" (both calibrations' deviations: {np.sqrt(np.square(known).mean()):.3f})"
+    return f"{rms:.3f}{unit} (RMS), {most:.3f}{unit} at most{stated}"
 
 
 def draw_difference(found: RigDifference) -> Figure:
     """How far two rigs' pixels differ, at nearest and farthest depth, and depths by each pair, in percent."""
-    panels = []
-    for name, camera in found.cameras.items():
-        for depth in (camera.depth.min(), camera.depth.max()):
-            at = camera.depth == depth
-            panels.append(
-                (f"{name}, {depth:.3g} m: pixels", camera.x[at], np.linalg.norm(camera.change[at], axis=1))
-            )
-    for name, by_pair in found.depths.items():
-        for depth in (by_pair.depth.min(), by_pair.depth.max()):
-            at = by_pair.depth == depth
-            title = f"depth by {found.alpha} and {name}, {depth:.3g} m: %"
-            panels.append((title, by_pair.x[at], 100 * by_pair.change[at]))
-    figure = Figure(figsize=(9, 2.7 * len(panels) / 2), layout="constrained")
-    for i, (title, x, values) in enumerate(panels, 1):
-        axes: Any = figure.add_subplot(len(panels) // 2, 2, i)
-        signed = "%" in title
-        most = float(np.nanquantile(np.abs(values), 0.98)) if len(values) else 1.0
-        shown = axes.scatter(
-            *x.T,
-            c=values,
-            s=22,
-            marker="s",
-            cmap="RdBu" if signed else "viridis",
-            vmin=-most if signed else 0,
-            vmax=most,
-        )
-        figure.colorbar(shown, ax=axes)
-        axes.set_title(title.replace("$", r"\$"), fontsize=9)
-        axes.set(aspect="equal", xticks=[], yticks=[])
-        axes.invert_yaxis()
+    maps = [(f"{n}: pixels", c, np.linalg.norm(c.change, axis=1)) for n, c in found.cameras.items()]
+    maps += [(f"depth by {found.alpha} and {n}: %", d, 100 * d.change) for n, d in found.depths.items()]
+    figure = Figure(figsize=(9, 2.7 * len(maps)), layout="constrained")
+    for row, (title, at, values) in zip(figure.subplots(len(maps), 2, squeeze=False), maps):
+        for axes, depth in zip(row, (at.depth.min(), at.depth.max())):
+            x, shown = at.x[at.depth == depth], values[at.depth == depth]
+            most = float(np.nanquantile(np.abs(shown), 0.98))
+            cmap, least = ("viridis", 0.0) if at.change.ndim > 1 else ("RdBu", -most)
+            drawn = axes.scatter(*x.T, c=shown, s=22, marker="s", cmap=cmap, vmin=least, vmax=most)
+            figure.colorbar(drawn, ax=axes)
+            axes.set_title(f"{title}, {depth:.3g} m".replace("$", r"\$"), fontsize=9)
+            axes.set(aspect="equal", xticks=[], yticks=[])
+            axes.invert_yaxis()
     return figure

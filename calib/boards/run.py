@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import glob
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -20,9 +20,9 @@ from arraygeom.rig import depth_range
 
 from .adequacy import coverage_advice, coverages, next_views, point_counts
 from .board import Board
-from .detect import BoardViews, Detection, Progress, collect_folder, detected
+from .detect import BoardViews, DetectedImage, Detection, Progress, board_views, collect_folder, detected
 from .intrinsics import Lens
-from .photos import FrameKey, Photos, find_photos
+from .photos import FrameKey, Grey, Photos, find_photos
 from .poses import StartDeviations
 from .report import by_cameras, html_page, report_html, summary
 from .rig import Calibration, calibrate
@@ -71,7 +71,9 @@ def calibrate_photos(
     if nominal is not None:
         if lens == "auto":
             raise ValueError("--lens auto compares lenses on held-out frames: with --start name one")
-        patterns = patterns or _named_like(photos, nominal)
+        named = {name: f"{glob.escape(name)}.*" for name in nominal.names}
+        if not patterns and all(any(photos.glob(pattern)) for pattern in named.values()):
+            patterns = named  # a file called like each camera
     found = collect_folder(photos, target, patterns=patterns, progress=progress)
     comparisons = compare_lenses(found.views, target) if lens == "auto" else {}
     chosen = {name: comparisons[name].advised if lens == "auto" else lens for name in found.views}
@@ -98,12 +100,6 @@ def calibrate_photos(
     return CalibrationOutput(messages, [path for path in written if path.exists()])
 
 
-def _named_like(folder: Path, rig: Rig) -> dict[str, str] | None:
-    """A pattern for each camera if the folder holds a file called like each."""
-    patterns = {name: f"{glob.escape(name)}.*" for name in rig.names}
-    return patterns if all(any(folder.glob(pattern)) for pattern in patterns.values()) else None
-
-
 # While images are taken -------------------------------------------------------------------------------------
 
 
@@ -113,9 +109,7 @@ class Session:
 
     board: Board
     lens: Lens = "brown-conrady"
-    seen: dict[tuple[str, FrameKey], tuple[tuple[int, int], dict[FrameKey, Detection]]] = field(
-        default_factory=dict
-    )
+    seen: dict[tuple[str, FrameKey], DetectedImage] = field(default_factory=dict)
     calibration: Calibration | None = None
     problem: str = "waiting for images"
     photos: Photos = field(default_factory=dict)
@@ -135,17 +129,13 @@ class Session:
 
     def views(self) -> dict[str, BoardViews]:
         """The board points of all cameras."""
-        found = {}
-        for name in self.photos:
-            mine = [entry for (camera, _), entry in self.seen.items() if camera == name]
-            sizes = {hw for hw, _ in mine}
-            if len(sizes) > 1:
-                raise ValueError(
-                    f"{name}: its images differ in size: keep those of one camera at one setting"
-                )
-            if mine:
-                found[name] = BoardViews(sizes.pop(), {k: d for _, views in mine for k, d in views.items()})
-        return found
+        images = {name: self.images(name) for name in self.photos}
+        return {name: board_views(name, self.photos[name], found) for name, found in images.items() if found}
+
+    def images(self, name: str) -> dict[FrameKey, DetectedImage]:
+        """What was detected in the images of a camera, the last to arrive last."""
+        moments = self.photos[name]
+        return {key: found for (n, key), found in self.seen.items() if n == name and key in moments}
 
     def calibrate(self) -> None:
         """Calibrate with all that was detected."""
@@ -186,38 +176,39 @@ def watch(
 
 
 def _page(session: Session) -> str:
+    found, notes = session.calibration, [session.problem]
     parts = [f"<h1>{len(session.seen)} images</h1>"]
-    parts.append(f'<p class="note">{escape(session.problem)}</p>' if session.problem else _state(session))
+    if found is not None and not session.problem:
+        parts.append(f"<p>Reprojection error {found.rms:.3f} px, {len(found.frames)} frames.</p>")
+        notes = list(found.notes)
+    parts += [_note(note) for note in notes]
     parts += [_camera(session, name) for name in session.photos]
     return html_page(parts, "Calibration", '<meta http-equiv="refresh" content="2">')
 
 
-def _state(session: Session) -> str:
-    assert session.calibration is not None
-    found = session.calibration
-    return f"<p>Reprojection error {found.rms:.3f} px, {len(found.frames)} frames.</p>" + "".join(
-        f'<p class="note">{escape(note)}</p>' for note in found.notes
-    )
+def _note(text: str) -> str:
+    return f'<p class="note">{escape(text)}</p>'
 
 
 def _camera(session: Session, name: str) -> str:
-    keys = [key for camera, key in session.seen if camera == name]
-    count = sum(bool(session.seen[name, key][1]) for key in keys)
-    parts = [f"<h2>{escape(name)}: the board is in {count} of {len(keys)} images</h2>"]
+    images = session.images(name)
+    count = sum(bool(boards) for _, boards in images.values())
+    parts = [f"<h2>{escape(name)}: the board is in {count} of {len(images)} images</h2>"]
     if session.calibration is not None and name in session.calibration.views:
         parts.append(_advice(session.calibration, name))
-    if keys:
-        shown, cells = _drawn(session, name, keys[-1]), _coverage(session, name)
-        parts.append(f"<table><tr><td>{_picture(shown)}<br>the last: {escape(str(keys[-1]))}</td>")
-        parts.append(f"<td>{_picture(cells)}<br>where points were (red: nowhere)</td></tr></table>")
+    if images:
+        last = list(images)[-1]
+        shown = _drawn(session.photos[name][last].read(), images[last][1])
+        parts.append(f"<table><tr><td>{_picture(shown)}<br>the last: {escape(str(last))}</td>")
+        cells = _picture(_coverage(images.values()))
+        parts.append(f"<td>{cells}<br>where points were (red: nowhere)</td></tr></table>")
     return "".join(parts)
 
 
 def _advice(calibration: Calibration, name: str) -> str:
-    focal, deviation = calibration.rig[name].K[0, 0], calibration.deviations().get(f"{name}.focal.0")
-    parts = [
-        f"<p>Focal length {float(focal):.1f} px" + (f" ± {deviation:.2g}" if deviation else "") + ".</p>"
-    ]
+    deviation = calibration.deviations().get(f"{name}.focal.0")
+    stated = f" ± {deviation:.2g}" if deviation else ""
+    parts = [f"<p>Focal length {float(calibration.rig[name].K[0, 0]):.1f} px{stated}.</p>"]
     covered = coverages(calibration)[name]
     known = intrinsics_of(calibration.fit, name)
     if len(known.covariance):
@@ -226,27 +217,24 @@ def _advice(calibration: Calibration, name: str) -> str:
             f"<p><b>Next: {escape(best.text)}</b> (uncertainty of projection {best.before:.2g} px, "
             f"with it {best.after:.2g}).</p>"
         )
-    return "".join(parts) + "".join(f'<p class="note">{escape(text)}</p>' for text in covered.missing)
+    return "".join([*parts, *map(_note, covered.missing)])
 
 
-def _drawn(session: Session, name: str, key: FrameKey) -> np.ndarray:
-    """The last image with the points found in it."""
-    grey = session.photos[name][key].read()
+def _drawn(grey: Grey, boards: Mapping[FrameKey, Detection]) -> np.ndarray:
+    """An image with the points found in it."""
     scale = WIDTH / grey.shape[1]
-    small = cv2.cvtColor(
-        cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR
-    )
-    for found in session.seen[name, key][1].values():
+    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    small = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
+    for found in boards.values():
         for x, y in (found.x + 0.5) * scale - 0.5:
             cv2.circle(small, (round(float(x)), round(float(y))), 2, COLOURS[1], -1)
     return small
 
 
-def _coverage(session: Session, name: str) -> np.ndarray:
+def _coverage(images: Collection[DetectedImage]) -> np.ndarray:
     """Cells of the image with and without points."""
-    entries = [entry for (camera, _), entry in session.seen.items() if camera == name]
-    h, w = entries[0][0]
-    counts = point_counts([d.x for _, views in entries for d in views.values()], (h, w))
+    h, w = next(hw for hw, _ in images)
+    counts = point_counts([d.x for _, boards in images for d in boards.values()], (h, w))
     cells = np.where((counts > 0)[..., None], COLOURS[1], COLOURS[0]).astype(np.uint8)
     return cv2.resize(cells, (WIDTH, round(WIDTH * h / w)), interpolation=cv2.INTER_NEAREST)
 

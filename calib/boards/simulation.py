@@ -22,16 +22,13 @@ from arraygeom.atomic import write_atomically
 from arraygeom.viz import calibrated
 
 from .board import Board
-from .deformation import BoardDeformation
-from .target import draw_board
+from .target import MARGIN, draw_board
 
 FILLS = (0.35, 0.9)
 """Least and largest width of the board, as a share of the narrowest view."""
 TILT = 35.0
 """Largest rotation of the board about x and about y, degrees."""
 TRIES = 2000
-ITERATIONS = 12
-"""Of the search for the point of a bent board that a ray meets."""
 WALL = 90
 """Grey value of the background."""
 
@@ -78,9 +75,7 @@ def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
             found.append(Pose(R, centre - R @ middle))
         if len(found) == count:
             return stack(found)
-    raise ValueError(
-        f"the cameras see the board {board} together almost nowhere: take a larger or a smaller one"
-    )
+    raise ValueError(f"the cameras hardly see the board {board} together: take a larger or a smaller one")
 
 
 Rays = tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]
@@ -93,49 +88,24 @@ def photograph(
     *,
     dpi: float | None = None,
     rays: Rays | None = None,
-    deformation: BoardDeformation | None = None,
 ) -> UInt8[np.ndarray, "h w"]:
     """The image of a printed board by a camera, through its lens: the mean of four samples per pixel.
 
     The print is drawn at `dpi`, by default such that its pixels match the distance of the samples. `rays` are
-    `fine_rays(camera)`, if precomputed. The board is flat, or bent and stretched as `deformation` says.
+    `fine_rays(camera)`, if precomputed.
     """
     directions, valid = rays or fine_rays(camera)
     R, t = cam_from_board.R, cam_from_board.t
     distance = (R[:, 2] @ t) / (directions @ R[:, 2])
     on_board = (directions * distance[:, None] - t) @ R
-    flat = on_board[:, :2].numpy()
-    if deformation is not None:
-        flat = _on_deformed(deformation, (directions @ R).numpy(), (-t @ R).numpy(), max(board.extent))
     resolution = dpi or _resolution(camera, cam_from_board, board)
     print_, per_metre, origin = printed(board, resolution)
     hw = 2 * camera.hw[0], 2 * camera.hw[1]
-    on_print = (flat * per_metre + origin).astype(np.float32).reshape(*hw, 2)
+    on_print = (on_board[:, :2].numpy() * per_metre + origin).astype(np.float32).reshape(*hw, 2)
     on_print[~(valid & (distance > 0)).reshape(hw).numpy()] = -1
     u, v = cv2.split(on_print)
     image = cv2.remap(print_, u, v, cv2.INTER_LINEAR, borderValue=(WALL,))
     return np.asarray(cv2.resize(image, camera.hw[::-1], interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def _on_deformed(
-    deformation: BoardDeformation, along: np.ndarray, centre: np.ndarray, size: float
-) -> np.ndarray:
-    """Where rays from a centre meet a shaped board: positions (n, 2) on it as if it were flat, by iteration.
-
-    Rays that pass its plane farther than `size` (metres) from its middle are not followed.
-    """
-    found = (centre - along * (centre[2] / along[:, 2])[:, None])[:, :2]
-    near = np.flatnonzero(np.abs(found - deformation.middle[0]).max(1) < size)
-    flat, part = np.zeros((len(near), 3)), np.zeros(len(near), dtype=int)
-    flat[:, :2] = found[near]
-    for _ in range(ITERATIONS):
-        deformed = deformation.deformed(flat, part)
-        hit = centre + along[near] * ((deformed[:, 2] - centre[2]) / along[near, 2])[:, None]
-        flat[:, :2] = deformation.middle[0] + np.clip(
-            flat[:, :2] + (hit - deformed)[:, :2] - deformation.middle[0], -size, size
-        )
-    found[near] = flat[:, :2]
-    return found
 
 
 def fine_rays(camera: Camera) -> Rays:
@@ -155,13 +125,12 @@ def _resolution(camera: Camera, cam_from_board: Pose, board: Board) -> float:
 @lru_cache(maxsize=32)
 def printed(board: Board, dpi: float) -> tuple[UInt8[np.ndarray, "h w"], float, Float[np.ndarray, "2"]]:
     """The printed board: grey values, pixels per metre, and the pixel of its first point."""
-    margin = 0.012
-    figure = draw_board(board, margin=margin)
+    figure = draw_board(board)
     canvas = FigureCanvasAgg(figure)
     figure.set_dpi(dpi)
     canvas.draw()
     grey = np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., 0])
     per_metre = dpi / 0.0254
-    origin = np.full(2, (margin + board.offset) * per_metre - 0.5)
+    origin = np.full(2, (MARGIN + board.offset) * per_metre - 0.5)
     origin[1] += len(grey) - figure.get_size_inches()[1] * dpi  # the canvas is cut to whole pixels at its top
     return grey, per_metre, origin

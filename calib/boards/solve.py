@@ -5,7 +5,7 @@ Gauss-Newton with Marquardt's damping (Triggs et al. 2000).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,7 +21,6 @@ from .bundle import (
     BundleProblem,
     CameraPrior,
     InitialRig,
-    Masks,
     Solved,
     intrinsic_values,
     linearised,
@@ -31,8 +30,8 @@ from .bundle import (
     typical_sizes,
     with_default,
 )
-from .deformation import LEAST_GAIN, BoardDeformation, fewest_frames, is_significant
-from .detect import BoardViews
+from .deformation import LEAST_GAIN, BoardDeformation, is_significant
+from .detect import BoardViews, named
 from .intrinsics import (
     LEAST_SIGMA,
     RAYLEIGH_MEDIAN,
@@ -117,7 +116,7 @@ def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
     solved = _with_deformation(adjust(problem), flat)
     for _ in range(ROUNDS):
         returned, changed = observable(replace(solved.problem, free=full), final=False)
-        if _equal(returned.free, solved.problem.free):
+        if all(np.array_equal(mask, solved.problem.free[name]) for name, mask in returned.free.items()):
             break
         notes = changed
         solved = _with_deformation(adjust(returned), flat)
@@ -140,13 +139,16 @@ def solve_inliers(
     """`solve` in some rounds, each without the `detected` points that the one before shows to be outliers."""
     solved = solve(initial, board, final=final)
     for _ in range(rounds - 1):
-        views = {name: near_fit(solved, name, v, board) for name, v in detected.items()}
+        problem, boards, deformation = solved.problem, solved.problem.board_poses, solved.problem.deformation
+        points = board.points if deformation is None else deformation.deformed(board.points, board.part)
+        views = {}
+        for name, v in detected.items():
+            camera = problem.cameras[name]
+            poses = {key: camera.cam_from_world @ boards[key] for key in v.seen}
+            views[name] = without_outliers(v, camera, poses, points, sigma=problem.sigma[name])
         if all(v.count == solved.views[name].count for name, v in views.items()):
             break
-        problem = solved.problem
-        again = initial._replace(
-            cameras=problem.cameras, boards=problem.board_poses, views=views, deformation=problem.deformation
-        )
+        again = initial._replace(cameras=problem.cameras, boards=boards, views=views, deformation=deformation)
         solved = solve(again, board, final=final)
     return solved
 
@@ -154,12 +156,16 @@ def solve_inliers(
 def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, list[str]]:
     """The problem, unobservable parameters of lenses and principal points fixed at defaults, and notes.
 
-    The worst is fixed first. Once the fit is `final`, raises ValueError where a focal length is unobservable.
+    Judged by pixels and stated priors, in units of typical sizes; the worst is fixed first. Once the fit is
+    `final`, raises ValueError where a focal length is unobservable.
     """
     free = {name: mask.copy() for name, mask in problem.free.items()}
     cameras, notes = dict(problem.cameras), list[str]()
     candidates = [(name, int(i)) for name in cameras for i in np.flatnonzero(free[name])]
-    information = _relative_information(problem)
+    sizes = np.concatenate([typical_sizes(c)[free[name]] for name, c in cameras.items()])
+    stated = {name: prior for name, prior in problem.priors.items() if prior.pose is not None}
+    equations = normal_equations(replace(problem, priors=stated), linearised(problem))
+    information = equations.information() * sizes[:, None] * sizes
     while (worst := _worst(candidates, information)) is not None:
         name, index = candidates.pop(worst)
         entry = parameter_names(cameras[name])[index]
@@ -175,20 +181,6 @@ def observable(problem: BundleProblem, *, final: bool) -> tuple[BundleProblem, l
         cameras[name], fixed = with_default(cameras[name], entry)
         notes.append(f"{name}: {fixed}: the images do not determine it")
     return replace(problem, cameras=cameras, free=free), notes
-
-
-def _equal(a: Masks, b: Masks) -> bool:
-    return all((a[name] == b[name]).all() for name in a)
-
-
-def _relative_information(problem: BundleProblem) -> np.ndarray:
-    """Inverse covariance of the free parameters in units of typical sizes, by pixels and stated priors."""
-    sizes = np.concatenate(
-        [typical_sizes(camera)[problem.free[name]] for name, camera in problem.cameras.items()]
-    )
-    stated = {name: prior for name, prior in problem.priors.items() if prior.pose is not None}
-    information = normal_equations(replace(problem, priors=stated), linearised(problem)).information()
-    return information * sizes[:, None] * sizes
 
 
 def _worst(candidates: list[tuple[str, int]], information: np.ndarray) -> int | None:
@@ -208,7 +200,7 @@ def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
     if flat is None or solved.problem.deformation is not None:
         return solved
     trial, count = replace(solved.problem, deformation=flat), len(solved.problem.frames)
-    few = count < fewest_frames(len(flat))
+    few = count < 2 * len(flat) + 2
     try:
         agreed = jackknife(trial)
         if not few and not is_significant(agreed.step, agreed.deformations, count):
@@ -217,7 +209,7 @@ def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
     except np.linalg.LinAlgError:  # some parameters are not observable yet
         return solved
     left = deformed.problem.loss
-    gain = replace(solved.problem, sigma=deformed.sigma).loss - left
+    gain = replace(solved.problem, sigma=deformed.problem.sigma).loss - left
     return deformed if gain > (max(left, LEAST_GAIN) if few else LEAST_GAIN) else solved
 
 
@@ -306,15 +298,6 @@ def _covariance(problem: BundleProblem) -> Array | None:
 # Outliers ---------------------------------------------------------------------------------------------------
 
 
-def near_fit(solved: Solved, name: str, views: BoardViews, board: Board) -> BoardViews:
-    """A camera's views without the points that a solution shows to be outliers."""
-    problem = solved.problem
-    camera, boards, deformation = problem.cameras[name], problem.board_poses, problem.deformation
-    poses = {key: camera.cam_from_world @ boards[key] for key in views.seen}
-    points = board.points if deformation is None else deformation.deformed(board.points, board.part)
-    return without_outliers(views, camera, poses, points, sigma=solved.sigma[name])
-
-
 class FrameMisfit(NamedTuple):
     """A frame a camera does not fit: its residuals, and those of the camera's median frame (RMS, pixels)."""
 
@@ -341,27 +324,22 @@ def misfits(fit: Solved) -> list[FrameMisfit]:
     found = []
     for name, by_frame in frame_rms(fit.problem).items():
         typical = float(np.median(list(by_frame.values())))
-        limit = max(MISFIT * typical, CONSPICUOUS * 2**0.5 * max(fit.sigma[name], LEAST_SIGMA))
+        limit = max(MISFIT * typical, CONSPICUOUS * 2**0.5 * max(fit.problem.sigma[name], LEAST_SIGMA))
         found += [FrameMisfit(name, frame, rms, typical) for frame, rms in by_frame.items() if rms > limit]
     return sorted(found, key=lambda m: -m.rms / m.typical)
 
 
-def misfit_notes(fit: Solved) -> list[str]:
+def misfit_notes(fit: Solved) -> Iterator[str]:
     """A note if the adjustment went on changing, and one per camera on its frames that do not fit."""
-    notes = (
-        []
-        if fit.converged
-        else ["the adjustment has not come to rest: too few boards, or some that contradict it"]
-    )
+    if not fit.converged:
+        yield "the adjustment has not come to rest: too few boards, or some that contradict it"
     for name in fit.problem.cameras:
         if mine := [m for m in misfits(fit) if m.camera == name]:
-            listed = ", ".join(f"{m.frame} ({m.rms:.2f} px)" for m in mine[:LISTED])
-            more = f" and {len(mine) - LISTED} more" if len(mine) > LISTED else ""
-            notes.append(
-                f"{name}: frames that do not fit: {listed}{more}, others {mine[0].typical:.2f} px: "
+            listed = named([f"{m.frame} ({m.rms:.2f} px)" for m in mine], LISTED)
+            yield (
+                f"{name}: frames that do not fit: {listed}, others {mine[0].typical:.2f} px: "
                 "moved, blurred or wrongly detected? See the report"
             )
-    return notes
 
 
 # All cameras ------------------------------------------------------------------------------------------------
@@ -385,8 +363,8 @@ def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solv
         return solved
     priors = {name: _as_prior(name, alone) for name, alone in singles.items()}
     free = {name: prior.information.diagonal() > 0 for name, prior in priors.items()}
-    for index, mask in enumerate(free.values()):
-        mask[:6] = index > 0
+    for name, mask in free.items():
+        mask[:6] = name != next(iter(free))
     held = replace(initial.problem(board), priors=priors, deformation=solved.problem.deformation, free=free)
     notes = [note for alone in singles.values() for note in alone.notes]
     notes.append(f"{doubts}; so each camera's intrinsics keep close to its own calibration")

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,20 @@ FORMS = (
 )
 LARGEST = 100
 APRIL_TAGS = "apriltag_36h11"
+FIRST = r"from\d{1,4}"
+OPTIONS = {
+    "chessboard": {},
+    "circles": {},
+    "acircles": {},
+    "charuco": {
+        "length": r"[\d.]+ *[a-z]+",
+        "dictionary": r"\d+x\d+(_\d+)?|(aruco|april).*",
+        "legacy": "legacy",
+        "first": FIRST,
+    },
+    "aprilgrid": {"ratio": r"\d*\.?\d+", "border": "border[12]", "first": FIRST},
+}
+"""Patterns of what may follow the counts and the length of each kind of board."""
 COLUMNS = ("id", "x", "y", "z"), ("id", "corner", "x", "y", "z")
 """Of a file of points."""
 FEWEST_POINTS = 6
@@ -68,6 +82,8 @@ PAPERS = {
     "A0": (841, 1189),
 }
 """Sheets of printers, millimetres."""
+MARGIN = 0.012
+"""White around a board, metres."""
 BELOW = 14.0
 """Millimetres below a board, for its ruler and name."""
 
@@ -81,21 +97,30 @@ def parse_board(text: str) -> Board:
         text = _kalibr_target(Path(text))
     if ".csv" in text:
         return _known_points(text)
-    kind, _, rest = text.strip().lower().partition(":")
-    parts = rest.split(":")
-    if kind not in ("chessboard", "charuco", "circles", "acircles", "aprilgrid") or len(parts) < 2:
+    kind, *parts = text.strip().lower().split(":")
+    if kind not in OPTIONS or len(parts) < 2:
         raise ValueError(f"board '{text}' is not recognised: write it like {FORMS}")
+    columns, rows = _counts(text, parts[0], fewest=2 if kind == "aprilgrid" else 3)
+    length = _length(text, parts[1])
+    options = _options(text, parts[2:], OPTIONS[kind])
     if kind == "aprilgrid":
-        return _april_grid(text, parts)
-    columns, rows = _counts(text, parts[0])
-    spacing = _length(text, parts[1])
+        return _april_grid(text, columns, rows, length, options)
     if kind == "charuco":
-        return _charuco(text, columns, rows, spacing, parts[2:])
-    if len(parts) > 2:
-        raise ValueError(f"board '{text}': '{parts[2]}' is unexpected; write it like {FORMS}")
+        return _charuco(text, columns, rows, length, options)
     if kind == "chessboard":
-        return Chessboard(columns, rows, spacing)
-    return Circles(columns, rows, spacing, asymmetric=kind == "acircles")
+        return Chessboard(columns, rows, length)
+    return Circles(columns, rows, length, asymmetric=kind == "acircles")
+
+
+def _options(text: str, given: Sequence[str], patterns: Mapping[str, str]) -> dict[str, str]:
+    """Each option by the name of the pattern that it matches, once each. Raises ValueError for others."""
+    found: dict[str, str] = {}
+    for option in given:
+        name = next((n for n, p in patterns.items() if n not in found and re.fullmatch(p, option)), None)
+        if name is None:
+            raise ValueError(f"board '{text}': '{option}' is not recognised; write it like {FORMS}")
+        found[name] = option
+    return found
 
 
 def parse_boards(texts: Sequence[str]) -> Board:
@@ -106,9 +131,7 @@ def parse_boards(texts: Sequence[str]) -> Board:
     used: dict[str, set[int]] = {}
     for board in boards:
         if not isinstance(board, MarkedBoard):
-            raise ValueError(
-                f"board '{board}': several boards at once need markers: use charuco or aprilgrid"
-            )
+            raise ValueError(f"board '{board}': several boards need markers: use charuco or aprilgrid")
         taken = used.setdefault(board.dictionary, set())
         if taken & set(board.markers):
             raise ValueError(
@@ -121,48 +144,25 @@ def parse_boards(texts: Sequence[str]) -> Board:
     return Boards(first.columns, first.rows, first.spacing, tuple(boards))
 
 
-def _charuco(text: str, columns: int, rows: int, spacing: float, options: list[str]) -> Charuco:
-    lengths = [o for o in options if re.fullmatch(r"[\d.]+ *[a-z]+", o)]
-    names = [
-        o
-        for o in options
-        if re.fullmatch(r"\d+x\d+(_\d+)?", o) or o.startswith("aruco") or o.startswith("april")
-    ]
-    first, options = _first_marker(options)
-    recognised = {*lengths[:1], *names[:1], "legacy"}
-    if rest := [o for o in options if o not in recognised]:
-        raise ValueError(
-            f"board '{text}': '{rest[0]}' is not recognised; write it like charuco:8x6:30mm:22mm:4x4_50"
-        )
-    marker = _length(text, lengths[0]) if lengths else 0.75 * spacing
+def _charuco(text: str, columns: int, rows: int, spacing: float, options: Mapping[str, str]) -> Charuco:
+    marker = _length(text, options["length"]) if "length" in options else 0.75 * spacing
     if not marker < spacing:
-        raise ValueError(
-            f"board '{text}': markers of {millimetres(marker)} do not fit into squares that are no larger"
-        )
-    name = _smallest_dictionary(text, names[0] if names else "4x4", first + (columns * rows + 1) // 2)
-    return Charuco(columns - 1, rows - 1, spacing, name, first, marker=marker, legacy="legacy" in options)
+        raise ValueError(f"board '{text}': markers of {millimetres(marker)} do not fit into its squares")
+    first = int(options.get("first", "from0")[4:])
+    markers = range(first, first + columns * rows // 2)
+    name = _smallest_dictionary(text, options.get("dictionary", "4x4"), first + (columns * rows + 1) // 2)
+    return Charuco(columns - 1, rows - 1, spacing, name, markers, marker=marker, legacy="legacy" in options)
 
 
-def _first_marker(options: list[str]) -> tuple[int, list[str]]:
-    """The number in an option such as "from24", and the other options."""
-    numbers = [int(o.removeprefix("from")) for o in options if re.fullmatch(r"from\d{1,4}", o)]
-    return sum(numbers[:1]), [o for o in options if not re.fullmatch(r"from\d{1,4}", o)]
-
-
-def _april_grid(text: str, parts: list[str]) -> AprilGrid:
-    columns, rows = _counts(text, parts[0], fewest=2)
-    first, options = _first_marker(parts[2:])
-    ratios = [o for o in options if re.fullmatch(r"\d*\.?\d+", o) and 0.05 <= float(o) <= 1]
-    if rest := [o for o in options if o not in {*ratios[:1], "border1", "border2"}]:
-        raise ValueError(
-            f"board '{text}': '{rest[0]}' is not recognised; write it like aprilgrid:6x6:88mm:0.3"
-        )
-    if first + columns * rows > len(marker_dictionary(APRIL_TAGS).bytesList):
-        raise ValueError(f"board '{text}': the tag family 36h11 has no {first + columns * rows} tags")
-    tag = _length(text, parts[1])
-    gap = tag * float(ratios[0] if ratios else 0.3)
-    border = 1 if "border1" in options else 2
-    return AprilGrid(2 * columns, 2 * rows, 2 * gap, APRIL_TAGS, first, tag=tag, border=border)
+def _april_grid(text: str, columns: int, rows: int, tag: float, options: Mapping[str, str]) -> AprilGrid:
+    ratio, first = float(options.get("ratio", 0.3)), int(options.get("first", "from0")[4:])
+    if not 0.05 <= ratio <= 1:
+        raise ValueError(f"board '{text}': '{ratio:g}' is no share of a tag: write it like 0.3")
+    markers = range(first, first + columns * rows)
+    if markers.stop > len(marker_dictionary(APRIL_TAGS).bytesList):
+        raise ValueError(f"board '{text}': the tag family 36h11 has no {markers.stop} tags")
+    border = int(options.get("border", "border2")[-1])
+    return AprilGrid(2 * columns, 2 * rows, 2 * tag * ratio, APRIL_TAGS, markers, tag=tag, border=border)
 
 
 def _kalibr_target(path: Path) -> str:
@@ -182,9 +182,7 @@ def _kalibr_target(path: Path) -> str:
             return f"chessboard:{target['targetCols']}x{target['targetRows']}:{size:.6f}mm"
     except (KeyError, TypeError, ValueError, RecursionError, yaml.YAMLError):
         pass
-    raise ValueError(
-        f"{path}: not a target of Kalibr's that is known here: an aprilgrid, or a checkerboard of squares"
-    )
+    raise ValueError(f"{path}: not an aprilgrid of Kalibr's, nor a checkerboard of squares")
 
 
 def _counts(text: str, part: str, *, fewest: int = 3) -> tuple[int, int]:
@@ -212,9 +210,7 @@ def _smallest_dictionary(text: str, name: str, markers: int) -> str:
     for full in names:
         if hasattr(cv2.aruco, f"DICT_{full}") and len(marker_dictionary(full).bytesList) >= markers:
             return full.lower()
-    raise ValueError(
-        f"board '{text}': no dictionary '{name}' of OpenCV has the {markers} markers it needs; try 4x4"
-    )
+    raise ValueError(f"board '{text}': no dictionary '{name}' of OpenCV has {markers} markers; try 4x4")
 
 
 def _known_points(text: str) -> KnownPoints:
@@ -230,23 +226,23 @@ def _known_points(text: str) -> KnownPoints:
         table = csv.DictReader(lines, skipinitialspace=True)
         head = tuple(name.strip().lower() for name in table.fieldnames or ())
         if head not in COLUMNS:
-            raise ValueError(
-                f"{path}: its first line is '{','.join(head)[:60]}': write id,x,y,z or id,corner,x,y,z"
-            )
+            raise ValueError(f"{path}: begins '{','.join(head)[:60]}': write id,x,y,z or id,corner,x,y,z")
         rows = [_point(path, number, row, head) for number, row in enumerate(table, 2)]
-    ids = tuple(marker for marker, _ in rows)
-    _check_points(path, ids)
-    positions = tuple(position for _, position in rows)
+    if len(rows) < FEWEST_POINTS:
+        raise ValueError(f"{path}: has {len(rows)} points and {FEWEST_POINTS} is the least")
+    ids, positions = zip(*rows)
+    if twice := [marker for marker in ids if ids.count(marker) > 1]:
+        raise ValueError(f"{path}: marker {twice[0][0]} is there twice")
     name = _smallest_dictionary(text, dictionary.removeprefix(":").lower() or "4x4", max(ids)[0] + 1)
     apart = np.linalg.norm(np.array(positions)[:, None] - np.array(positions), axis=-1)
     spacing = float(np.median(np.sort(apart, axis=1)[:, 1]))
-    return KnownPoints(len(ids), 1, spacing, name, 0, file=str(path), ids=ids, positions=positions)
+    markers = sorted({marker for marker, _ in ids})
+    return KnownPoints(len(ids), 1, spacing, name, markers, file=str(path), ids=ids, positions=positions)
 
 
-Row = tuple[tuple[int, int], tuple[float, float, float]]
-
-
-def _point(path: Path, number: int, row: dict[str, str], head: tuple[str, ...]) -> Row:
+def _point(
+    path: Path, number: int, row: dict[str, str], head: tuple[str, ...]
+) -> tuple[tuple[int, int], tuple[float, float, float]]:
     try:
         values = dict(zip(head, row.values()))
         x, y, z = (float(values[axis]) for axis in "xyz")
@@ -258,19 +254,12 @@ def _point(path: Path, number: int, row: dict[str, str], head: tuple[str, ...]) 
     return (marker, corner), (x, y, z)
 
 
-def _check_points(path: Path, ids: Sequence[tuple[int, int]]) -> None:
-    if len(ids) < FEWEST_POINTS:
-        raise ValueError(f"{path}: has {len(ids)} points and {FEWEST_POINTS} is the least")
-    if twice := [marker for marker in ids if ids.count(marker) > 1]:
-        raise ValueError(f"{path}: marker {twice[0][0]} is there twice")
-
-
 # Printing ---------------------------------------------------------------------------------------------------
 
 
-def page_of(board: Board, *, margin: float = 0.012) -> tuple[float, float]:
+def page_of(board: Board) -> tuple[float, float]:
     """Width and height of the page that a board is drawn on, with margins and ruler, millimetres."""
-    width, height = (1e3 * (v + 2 * margin) for v in board.extent)
+    width, height = (1e3 * (v + 2 * MARGIN) for v in board.extent)
     return width, height + BELOW
 
 
@@ -289,22 +278,22 @@ def page_note(board: Board) -> str:
     return f"{size}: print it on {paper} or larger at 100 %, not fitted to the page, then measure its ruler"
 
 
-def draw_board(board: Board, *, margin: float = 0.012, paper: str | None = None) -> Figure:
-    """The board as a figure whose size in inches is the true one, with a white margin (metres), ruler below.
+def draw_board(board: Board, *, paper: str | None = None) -> Figure:
+    """The board as a figure whose size in inches is the true one, with a white margin, ruler below.
 
     Saved as PDF or SVG it prints at true size; the ruler serves to check it. On a sheet of `paper` ("A4") it
     is in the middle. Raises ValueError if it does not fit there.
     """
     width, height = (1e3 * v for v in board.extent)
-    page = page_of(board, margin=margin)
+    page = page_of(board)
     total = page if paper is None else _sheet(paper, page)
-    left, top = ((whole - part) / 2 + 1e3 * margin for whole, part in zip(total, page))
+    left, top = ((whole - part) / 2 + 1e3 * MARGIN for whole, part in zip(total, page))
     figure = Figure(figsize=(total[0] / 25.4, total[1] / 25.4), facecolor="white")
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(-left, total[0] - left), ylim=(total[1] - top, -top))
     axes.set_axis_off()
     board._draw(axes)
-    _draw_ruler(axes, str(board), width, height + 1e3 * margin + 2)
+    _draw_ruler(axes, str(board), width, height + 1e3 * MARGIN + 2)
     return figure
 
 
@@ -325,7 +314,7 @@ def _sheet(paper: str, page: tuple[float, float]) -> tuple[float, float]:
 
 
 def _draw_ruler(axes: Any, text: str, width: float, y: float) -> None:
-    """A line of a whole number of centimetres with a tick at each, and the board's name."""
+    """Draw a line of a whole number of centimetres with a tick at each, and the board's name."""
     length = max(10.0, 10 * (min(width, 100.0) // 10))
     axes.plot([0, length], [y, y], color="0.4", lw=0.6)
     for x in np.arange(0, length + 1, 10):

@@ -87,9 +87,7 @@ class RigCovariance:
         if not all(isinstance(name, str) for name in names) or not np.isfinite(matrix).all():
             raise ValueError(f"{path}: holds names that are no text, or NaN or infinity: calibrate again")
         if matrix.shape != (len(names), len(names)):
-            raise ValueError(
-                f"{path}: has {len(names)} names and a matrix of {matrix.shape}; is the file complete?"
-            )
+            raise ValueError(f"{path}: {len(names)} names, a matrix of {matrix.shape}: is the file complete?")
         return cls(names, matrix)
 
 
@@ -149,13 +147,17 @@ class Intrinsics(NamedTuple):
 
 
 def intrinsics_of(fit: Solved, name: str) -> Intrinsics:
-    """One camera of a fit that has a covariance."""
-    assert fit.covariance is not None
+    """One camera of a fit; none of its intrinsics is free where the fit has no covariance."""
     camera, seen = in_own_frame(fit.problem, name)
-    entries = [f"{name}.{entry}" for entry in parameter_names(camera)]
-    free = np.array([i >= 6 and entry in fit.names for i, entry in enumerate(entries)])
-    index = [fit.names.index(entry) for entry, is_free in zip(entries, free) if is_free]
-    return Intrinsics(camera, fit.covariance[np.ix_(index, index)], free, fit.sigma[name], seen)
+    entries, known = [f"{name}.{entry}" for entry in parameter_names(camera)], rig_covariance(fit)
+    free = np.array(
+        [i >= 6 and known is not None and entry in known.names for i, entry in enumerate(entries)]
+    )
+    covariance = np.zeros((0, 0))
+    if known is not None:
+        index = [known.names.index(entry) for entry, is_free in zip(entries, free) if is_free]
+        covariance = known.matrix[np.ix_(index, index)]
+    return Intrinsics(camera, covariance, free, fit.problem.sigma[name], seen)
 
 
 def in_own_frame(problem: BundleProblem, name: str) -> tuple[Camera, Float[np.ndarray, "m 3"]]:
@@ -282,35 +284,30 @@ def with_disagreement(
     parameters, as frames that disagree about a focal length say nothing of the lens.
     """
     problem, covariance, notes = solved.problem, solved.covariance, list[str]()
-    enough = len(problem.names) > 0 and len(problem.frames) >= FEWEST_TO_JACKKNIFE
-    raised = 1.0
-    if covariance is not None and unchecked and len(problem.frames) < FEWEST_TO_JACKKNIFE:
+    raised, frames = 1.0, len(problem.frames)
+    if covariance is not None and unchecked and frames < FEWEST_TO_JACKKNIFE:
         covariance, raised = UNCHECKED**2 * covariance, UNCHECKED
         notes.append(
-            f"{len(problem.frames)} frames are too few to check standard deviations: they are raised by "
+            f"{frames} frames are too few to check standard deviations: they are raised by "
             f"{UNCHECKED:.0f}, as more frames do of real boards; take {FEWEST_TO_JACKKNIFE} or more"
         )
-    if problem.deformation is None and (covariance is None or not enough):
-        return replace(solved, covariance=covariance, raised=raised, notes=(*solved.notes, *notes))
-    found = jackknife(problem)
-    if problem.deformation is not None:
+    checked = covariance is not None and len(covariance) > 0 and frames >= FEWEST_TO_JACKKNIFE
+    found = jackknife(problem) if checked or problem.deformation is not None else None
+    if found is not None and problem.deformation is not None:
         deviations = np.sqrt(found.deformations.diagonal()).reshape(problem.deformation.values.shape)
         notes += described(problem.deformation, deviations, extents)
-    if enough and covariance is not None and _excess(found.covariance, covariance) > CONSIDERABLE:
-        level = max(1.0, float(np.median(_ratio(found.left_out, covariance))))
-        before, covariance = covariance, (level**2 * covariance + found.left_out) / 2
-        raised = float(_ratio(covariance, before).max())
-        notes.append(
-            "frames disagree more than the points' noise explains: standard deviations are raised, "
-            f"by up to {raised:.1f}, to those of a jackknife over frames (is the board flat and printed true "
-            "to size, and were the images sharp?)"
-        )
+    if found is not None and checked and covariance is not None:
+        excess = np.trace(np.linalg.solve(covariance, found.covariance)) / len(covariance)
+        if excess**0.5 > CONSIDERABLE:
+            level = max(1.0, float(np.median(_ratio(found.left_out, covariance))))
+            before, covariance = covariance, (level**2 * covariance + found.left_out) / 2
+            raised = float(_ratio(covariance, before).max())
+            notes.append(
+                "frames disagree more than the points' noise explains: standard deviations are raised, "
+                f"by up to {raised:.1f}, to those of a jackknife over frames (is the board flat and printed "
+                "true to size, and were the images sharp?)"
+            )
     return replace(solved, covariance=covariance, raised=raised, notes=(*solved.notes, *notes))
-
-
-def _excess(a: np.ndarray, b: np.ndarray) -> float:
-    """The typical ratio of the standard deviations of two covariances, in all directions."""
-    return float(np.sqrt(np.trace(np.linalg.solve(b, a)) / len(b)))
 
 
 def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from arraygeom import Camera, Rig, epipolar_distance
 
 from .board import Board
 from .bundle import POSE, BundleProblem, Observations, Solved, camera_jacobian
-from .detect import BoardViews
+from .detect import BoardViews, named
 from .intrinsics import Lens
 from .poses import StartDeviations
 from .solve import calibrate_single, readjusted
@@ -30,14 +30,7 @@ FEWEST_LEFT = 3
 """Frames that every camera must keep."""
 FAR_FROM_START = 4.0
 """Standard deviations from the start beyond which a camera is named."""
-COMPARED: tuple[Lens, ...] = (
-    "none",
-    "kannala-brandt",
-    "brown-conrady",
-    "rational",
-    "thin-prism",
-    "tilted",
-)
+COMPARED: tuple[Lens, ...] = ("none", "kannala-brandt", "brown-conrady", "rational", "thin-prism", "tilted")
 """Models that are compared, by number of coefficients."""
 LENS_FOLDS = 4
 FEWEST_TO_COMPARE = 8
@@ -51,29 +44,21 @@ def epipolar_errors(
     """By pair: distances in undistorted pixels from beta's points to alpha's lines, and the reverse."""
     found = {}
     for a, b in combinations(views, 2):
-        xa, xb = _common(views[a], views[b])
-        if len(xa):
-            found[a, b] = _symmetric_distance(rig, a, b, xa, xb)
+        parts = []
+        for key in views[a].seen:
+            if key in views[b].seen:
+                one, other = views[a].seen[key], views[b].seen[key]
+                _, i, j = np.intersect1d(one.ids, other.ids, return_indices=True)
+                parts.append((one.x[i], other.x[j]))
+        if not any(len(x) for x, _ in parts):
+            continue
+        xa, xb = (torch.from_numpy(np.concatenate(part)) for part in zip(*parts))
+        pair, reverse = rig.pair(a, b), rig.pair(b, a)
+        (pa, va), (pb, vb) = pair.alpha.undistort(xa), pair.beta.undistort(xb)
+        forward = epipolar_distance(pair.fundamental, pa, pb).abs()
+        backward = epipolar_distance(reverse.fundamental, pb, pa).abs()
+        found[a, b] = ((forward + backward) / 2)[va & vb].numpy()
     return found
-
-
-def _symmetric_distance(rig: Rig, a: str, b: str, xa: np.ndarray, xb: np.ndarray) -> np.ndarray:
-    pair, reverse = rig.pair(a, b), rig.pair(b, a)
-    (pa, va), (pb, vb) = pair.alpha.undistort(torch.from_numpy(xa)), pair.beta.undistort(torch.from_numpy(xb))
-    forward = epipolar_distance(pair.fundamental, pa, pb).abs()
-    backward = epipolar_distance(reverse.fundamental, pb, pa).abs()
-    return ((forward + backward) / 2)[va & vb].numpy()
-
-
-def _common(a: BoardViews, b: BoardViews) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (n, 2) of the points both cameras observed in the same frames."""
-    parts: list[tuple[np.ndarray, np.ndarray]] = [(np.zeros((0, 2)), np.zeros((0, 2)))]
-    for key in a.seen:
-        if key in b.seen:
-            _, i, j = np.intersect1d(a.seen[key].ids, b.seen[key].ids, return_indices=True)
-            parts.append((a.seen[key].x[i], b.seen[key].x[j]))
-    xa, xb = (np.concatenate(part) for part in zip(*parts))
-    return xa, xb
 
 
 # Frames held out --------------------------------------------------------------------------------------------
@@ -158,10 +143,7 @@ class LensComparison:
     def advice(self) -> str:
         """The advised model and all errors, in a sentence."""
         if not self.errors:
-            return (
-                f"too few frames to compare lens models ({FEWEST_TO_COMPARE} "
-                "are needed): brown-conrady is used"
-            )
+            return f"too few frames to compare lenses (fewer than {FEWEST_TO_COMPARE}): brown-conrady is used"
         listed = ", ".join(f"{lens} {self.rms(lens):.3f}" for lens in COMPARED if lens in self.errors)
         return f"the images support the lens model {self.advised} (error on held-out frames, px: {listed})"
 
@@ -198,7 +180,7 @@ def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"
     fitted, judged = readjusted(problem.of_boards(~out)), problem.of_boards(out)
     (name,) = fitted.cameras
     if fitted.deformation is not None and judged.deformation is not None:
-        judged = replace(judged, deformation=fitted.deformation.of_blocks(judged.deformation.part))
+        judged = replace(judged, deformation=replace(fitted.deformation, part=judged.deformation.part))
     seen = Observations(judged.seen[name].block, judged.on_board(name), judged.seen[name].x)
     fixed = {name: np.zeros(len(judged.free[name]), dtype=bool)}
     posed = replace(
@@ -244,9 +226,7 @@ def _points_left_out(name: str, detected: BoardViews, used: BoardViews) -> Itera
     }
     worst = sorted((key for key in counts if counts[key]), key=lambda key: -counts[key])
     if worst:
-        listed = ", ".join(f"{counts[key]} of {key}" for key in worst[:5]) + (
-            ", ..." if len(worst) > 5 else ""
-        )
+        listed = named([f"{counts[key]} of {key}" for key in worst], 5)
         yield f"{name}: {sum(counts.values())} of {detected.count} points left out as outliers ({listed})"
 
 
@@ -254,12 +234,9 @@ def _gains(fit: Solved, deviations: StartDeviations) -> str:
     """What the images add to the start, by kind of parameter."""
     focal = np.mean([float(c.K[0, 0]) for c in fit.problem.cameras.values()])
     width = np.mean([c.hw[1] for c in fit.problem.cameras.values()])
-    kinds = {
-        "focal": ("focal lengths", deviations.focal * focal),
-        "centre": ("principal points", deviations.centre * width),
-    }
+    focal, width = deviations.focal * focal, deviations.centre * width
     texts = []
-    for kind, (label, before) in kinds.items():
+    for kind, label, before in (("focal", "focal lengths", focal), ("centre", "principal points", width)):
         found = [d for name, d in fit.deviations.items() if f".{kind}." in name]
         texts += [f"{label} ±{before:.3g} > ±{np.median(found):.3g} px"] if found else []
     positions = np.median(_position_deviations(fit))
@@ -272,28 +249,21 @@ def _position_deviations(fit: Solved) -> list[float]:
     assert fit.covariance is not None
     found = []
     for name, camera in fit.problem.cameras.items():
-        mine = [
-            fit.names.index(f"{name}.{kind}.{i}") for kind in ("rotation", "translation") for i in range(3)
-        ]
         derivatives = camera.cam_from_world.centre_jacobian.numpy()
-        covariance = derivatives @ fit.covariance[np.ix_(mine, mine)] @ derivatives.T
+        first = fit.names.index(f"{name}.rotation.0")
+        pose = slice(first, first + 6)
+        covariance = derivatives @ fit.covariance[pose, pose] @ derivatives.T
         found.append(float(np.sqrt(np.trace(covariance) / 3)))
     return found
 
 
-def _far(fit: Solved) -> list[str]:
+def _far(fit: Solved) -> Iterator[str]:
     """Which cameras lie far from the start."""
-    notes = []
     for name, camera in fit.problem.cameras.items():
         prior = fit.problem.priors[name]
         ratio = np.abs(prior.residual(camera)) / np.sqrt(np.linalg.inv(prior.information).diagonal())
-        parts = np.split(ratio[:10], [3, 6, 8])
-        kinds = zip(
-            ("orientation", "position", "focal length", "principal point"), (part.max() for part in parts)
-        )
+        parts = [part.max() for part in np.split(ratio[:10], [3, 6, 8])]
+        kinds = zip(("orientation", "position", "focal length", "principal point"), parts)
         if far := [f"{kind} ({worst:.0f} deviations)" for kind, worst in kinds if worst > FAR_FROM_START]:
             listed = ", ".join(far)
-            notes.append(
-                f"{name}: far from the start: {listed}: is the start right, or its deviations too small?"
-            )
-    return notes
+            yield f"{name}: far from the start: {listed}: is the start right, or its deviations too small?"

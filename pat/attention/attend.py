@@ -110,9 +110,8 @@ def attend_with_statistics(
 
     The statistics are float32 (float64 for float64 inputs) and differentiable, too.
     """
-    return Attended(
-        *_attend(query, key, value, locations, samples, interpolation, bias, backend, measured=True)
-    )
+    how = samples, interpolation, bias, backend
+    return Attended(*_attend(query, key, value, locations, *how, measured=True))
 
 
 def _attend(
@@ -128,7 +127,9 @@ def _attend(
     measured: bool,
 ) -> tuple[Tensor, ...]:
     """The values, and if `measured` the statistics."""
-    query, key, value = _autocast(query, key, value)
+    kind = query.device.type
+    if torch.is_autocast_enabled(kind):
+        query, key, value = (t.to(torch.get_autocast_dtype(kind)) for t in (query, key, value))
     _check(query, key, value, interpolation, backend)
     nearest = interpolation == "nearest"
     if isinstance(locations, Dense) and backend == "auto" and samples is None and not measured:
@@ -137,7 +138,7 @@ def _attend(
         values_alone = nearest and samples is None and not measured
         asked = values_alone and backend in ("auto", "local")
         if isinstance(locations, Local) and asked and _local_serves(query, key, value, locations, bias):
-            return _attend_local(query, key, value, locations, bias)
+            return (torch_op.compiled("cpu").forward_local(query, key, value, locations, bias),)
         alpha, beta = (View(hw=(t.shape[2], t.shape[3])) for t in (query, key))
         locations = lazily(locations, Pair(alpha, beta))
     if backend == "local":
@@ -151,13 +152,6 @@ def _attend(
     if not callable(locations):
         return run(query, key, value, locations, bias)
     return _attend_by_rows(query, key, value, locations, bias, run)
-
-
-def _autocast(*tensors: Tensor) -> list[Tensor]:
-    kind = tensors[0].device.type
-    if not torch.is_autocast_enabled(kind):
-        return list(tensors)
-    return [t.to(torch.get_autocast_dtype(kind)) for t in tensors]
 
 
 def _check(query: Tensor, key: Tensor, value: Tensor, interpolation: str, backend: str) -> None:
@@ -192,14 +186,6 @@ def _local_serves(query: Tensor, key: Tensor, value: Tensor, field: Local, bias:
     plain = torch_op.is_plain(*given) and not _missing(*given)
     of_samples = bias is None or (bias.shape == (field.size**2,) and bias.dtype == torch.float32)
     return whole and taken and plain and of_samples
-
-
-def _attend_local(
-    query: Tensor, key: Tensor, value: Tensor, field: Local, bias: Tensor | None
-) -> tuple[Tensor]:
-    from pat.attention import cpu
-
-    return (cpu.forward_local(query, key, value, field, bias),)
 
 
 def _attend_dense(query: Tensor, key: Tensor, value: Tensor, stride: int, bias: Tensor | None) -> Tensor:
@@ -251,9 +237,8 @@ def sample_positions(locations: Locations, query: Tensor, samples: int | None) -
 
 def samples_for(segments: Segments) -> int:
     """Enough samples for one on each beta pixel of the longest valid segment."""
-    needs_numbers(
-        "the number of samples of the longest segment (give `samples`)", segments.start, segments.end
-    )
+    what = "the number of samples of the longest segment (give `samples`)"
+    needs_numbers(what, segments.start, segments.end)
     lengths = torch.where(segments.valid, segments.length.detach(), 0)
     return int(lengths.max().ceil()) + 1
 

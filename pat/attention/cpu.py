@@ -52,13 +52,8 @@ def forward_local(query: Tensor, key: Tensor, value: Tensor, field: Local, bias:
     of_samples = np.zeros(field.size**2, np.float32) if bias is None else bias.detach().contiguous().numpy()
     tops = range(0, out.shape[2], kernels.ROWS)
     images = [*zip(*planes, out)]
-    in_parallel(
-        [
-            partial(kernels.attend_rows, *image, of_samples, field.size, step, top)
-            for image in images
-            for top in tops
-        ]
-    )
+    rows = [partial(kernels.attend_rows, *image, of_samples, field.size, step) for image in images]
+    in_parallel([partial(of_image, top) for of_image in rows for top in tops])
     return torch.from_numpy(out)
 
 
@@ -79,16 +74,10 @@ def backward(
     counted = accumulated(query)
     call = _call(inputs)
     upstream = _flat(channels_last(cotangents[0]))
-    statistics, statistics_upstream = (
-        t if t.numel() else t.new_zeros(4) for t in (saved[0], cotangents[1].to(counted).contiguous())
-    )
-    found = kernels.Saved(
-        statistics=_flat(statistics),
-        logsum=_flat(saved[1]),
-        value_upstream=upstream,
-        statistics_upstream=_flat(statistics_upstream),
-        step=4 if saved[0].numel() else 0,
-    )
+    measured = saved[0], cotangents[1].to(counted).contiguous()
+    statistics, statistics_upstream = (t if t.numel() else t.new_zeros(4) for t in measured)
+    step = 4 if saved[0].numel() else 0
+    found = kernels.Saved(_flat(statistics), _flat(saved[1]), upstream, _flat(statistics_upstream), step)
     query_out = _new(*((b, ha, wa, d) if wanted[0] else (0,)), dtype=query.dtype)
     key_out, value_out = (
         _new(*((b, *t.shape[2:], t.shape[1]) if want else (0,)), dtype=counted).zero_()
@@ -96,27 +85,17 @@ def backward(
     )
     points_out = query.new_zeros((b, *positions.points.shape[1:]) if wanted[3] else 0, dtype=counted)
     bias_out = query.new_zeros((b, ha, wa, positions.samples) if wanted[4] else 0, dtype=counted)
-    gradients = kernels.Gradients(
-        _flat(query_out),
-        _flat(points_out),
-        _flat(bias_out),
-        wants_query=wanted[0],
-        wants_points=wanted[3],
-        wants_bias=wanted[4],
-    )
+    by_query, by_points, by_bias = (_flat(t) for t in (query_out, points_out, bias_out))
+    gradients = kernels.Gradients(by_query, by_points, by_bias, wanted[0], wanted[3], wanted[4])
     taps = _tap_list(b * ha * wa, call)
     step = len(taps.tap_count)
     for first in range(0, b * ha * wa, step):
         last, here = min(first + step, b * ha * wa), taps._replace(first=first)
-        in_parallel(
-            [partial(kernels.backward, call, found, s, here, gradients) for s in _shares(first, last, call)]
-        )
-        in_parallel(
-            [
-                *_channel_tasks(here, here.key_weight, last, call.query, d, key_out),
-                *_channel_tasks(here, here.value_weight, last, upstream, call.value_channels, value_out),
-            ]
-        )
+        shares = _shares(first, last, call)
+        in_parallel([partial(kernels.backward, call, found, share, here, gradients) for share in shares])
+        for_keys = _channel_tasks(here, here.key_weight, last, call.query, d, key_out)
+        for_values = _channel_tasks(here, here.value_weight, last, upstream, call.value_channels, value_out)
+        in_parallel([*for_keys, *for_values])
     images = (
         (out.to(like.dtype).permute(0, 3, 1, 2) if want else like.new_empty(0))
         for out, like, want in zip((query_out, key_out, value_out), (query, key, value), wanted)
@@ -142,7 +121,7 @@ def _new(*shape: int, dtype: torch.dtype) -> Tensor:
 def _geometry(inputs: AttentionInputs) -> kernels.Geometry:
     query, positions = inputs.query, inputs.positions
     h, w = inputs.key.shape[2:]
-    number = _number(query)
+    number = np.float64 if accumulated(query) == torch.float64 else np.float32
     fractions = pad(sample_fractions(positions.samples, like=positions.points), (0, kernels.LANES))
     return kernels.Geometry(
         points=_flat(positions.points.contiguous()),
@@ -159,10 +138,6 @@ def _geometry(inputs: AttentionInputs) -> kernels.Geometry:
         last_y=number(h - 1),
         slack=number(EDGE_SLACK),
     )
-
-
-def _number(like: Tensor) -> type:
-    return np.float64 if accumulated(like) == torch.float64 else np.float32
 
 
 def _call(inputs: AttentionInputs) -> kernels.Call:

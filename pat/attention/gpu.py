@@ -242,18 +242,6 @@ def _update(x, y, w, keep, mass, mean_x, mean_y, squared, NUMBER):
 
 
 @compiled
-def _store_statistics(statistics, logsum, p, alive, top, mass, mean_x, mean_y, squared, NUMBER):
-    some = mass > 0
-    whole = tl.where(some, mass, 1.0).to(NUMBER)
-    spread = tl.sqrt(tl.maximum(squared / whole, 0.0))
-    tl.store(statistics + 4 * p, tl.where(some, mean_x, 0.0), mask=alive)
-    tl.store(statistics + 4 * p + 1, tl.where(some, mean_y, 0.0), mask=alive)
-    tl.store(statistics + 4 * p + 2, tl.where(some & (spread > LEAST), spread, 0.0), mask=alive)
-    tl.store(statistics + 4 * p + 3, tl.where(some, 1.0 / whole, 0.0), mask=alive)
-    tl.store(logsum + p, tl.where(some, top + tl.log(whole), float("-inf")), mask=alive)
-
-
-@compiled
 def _forward(
     query,
     key,
@@ -308,10 +296,17 @@ def _forward(
         mass, mean_x, mean_y, squared = _update(x, y, w, keep, mass, mean_x, mean_y, squared, NUMBER)
         best = tl.where(score > top, i, best)
         top = new_top
-    _store_statistics(statistics, logsum, p, alive, top, mass, mean_x, mean_y, squared, NUMBER)
+    some = mass > 0
+    whole = tl.where(some, mass, 1.0).to(NUMBER)
+    spread = tl.sqrt(tl.maximum(squared / whole, 0.0))
+    tl.store(statistics + 4 * p, tl.where(some, mean_x, 0.0), mask=alive)
+    tl.store(statistics + 4 * p + 1, tl.where(some, mean_y, 0.0), mask=alive)
+    tl.store(statistics + 4 * p + 2, tl.where(some & (spread > LEAST), spread, 0.0), mask=alive)
+    tl.store(statistics + 4 * p + 3, tl.where(some, 1.0 / whole, 0.0), mask=alive)
+    tl.store(logsum + p, tl.where(some, top + tl.log(whole), float("-inf")), mask=alive)
     tl.store(best_out + p, best, mask=alive)
     live = alive[:, None] & (cv < DV)[None, :]
-    seen = seen / tl.where(mass > 0, mass, 1.0).to(NUMBER)[:, None]
+    seen = seen / whole[:, None]
     tl.store(out + p[:, None] * DV + cv[None, :], seen.to(out.dtype.element_ty), mask=live)
 
 
@@ -351,52 +346,6 @@ def _upstream(statistics, statistics_upstream, p, alive, NUMBER):
     pull = tl.where(spread > 0, pull / tl.where(spread > 0, spread, 1.0), 0.0).to(NUMBER)
     gpeak = tl.load(statistics_upstream + 4 * p + 3, mask=alive, other=0)
     return mean_x, mean_y, spread, peak, gx, gy, gpeak, pull
-
-
-@compiled
-def _weight(
-    q, key, bias, p, alive, pixel, across, below, u, v, counts, lse, i, samples, c, D, NEAREST, BIASED, NUMBER
-):
-    """Sample i's inner products with the key around, and its weight."""
-    live = counts[:, None] & (c < D)[None, :]
-    s0, s1, s2, s3 = _dots(q, key, pixel, across, below, c, D, live, NEAREST, NUMBER)
-    score = _blend(s0, s1, s2, s3, u, v)
-    if BIASED:
-        score += tl.load(bias + p * samples + i, mask=alive, other=0)
-    w = tl.where(counts, tl.exp(tl.where(counts, score - lse, 0.0)), 0.0)
-    return s0, s1, s2, s3, w
-
-
-@compiled
-def _slope(v0, v1, v2, v3, u, v, x, y, is_best, mean, mean_x, mean_y, spread, peak, gx, gy, gpeak, pull):
-    """The gradient by a sample's weight, less its mean over weights; `mean` is that of the values' part."""
-    dx, dy = x - mean_x, y - mean_y
-    slope = _blend(v0, v1, v2, v3, u, v) - mean + gx * dx + gy * dy
-    return (
-        slope
-        + 0.5 * pull * (dx * dx + dy * dy - spread * spread)
-        + gpeak * (tl.where(is_best, 1.0, 0.0) - peak)
-    )
-
-
-@compiled
-def _by_position(s0, s1, s2, s3, v0, v1, v2, v3, u, v, x, y, w, by_score, height, width):
-    """The gradient by a bilinear sample's x and y, that of the statistics left out."""
-    across_s = (1 - v) * (s1 - s0) + v * (s3 - s2)
-    across_v = (1 - v) * (v1 - v0) + v * (v3 - v2)
-    below_s = (1 - u) * (s2 - s0) + u * (s3 - s1)
-    below_v = (1 - u) * (v2 - v0) + u * (v3 - v1)
-    dx = tl.where((x >= 0) & (x <= width - 1), by_score * across_s + w * across_v, 0.0)
-    dy = tl.where((y >= 0) & (y <= height - 1), by_score * below_s + w * below_v, 0.0)
-    return dx, dy
-
-
-@compiled
-def _store_points(out, p, alive, x_start, y_start, x_end, y_end):
-    tl.store(out + 4 * p, x_start, mask=alive)
-    tl.store(out + 4 * p + 1, y_start, mask=alive)
-    tl.store(out + 4 * p + 2, x_end, mask=alive)
-    tl.store(out + 4 * p + 3, y_end, mask=alive)
 
 
 @compiled
@@ -459,40 +408,28 @@ def _backward(
         pixel, across, below, u, v = _cell(x, y, height, width, NEAREST)
         pixel += first
         live, live_v = counts[:, None] & (c < D)[None, :], counts[:, None] & (cv < DV)[None, :]
-        s0, s1, s2, s3, w = _weight(
-            q,
-            key,
-            bias,
-            p,
-            alive,
-            pixel,
-            across,
-            below,
-            u,
-            v,
-            counts,
-            lse,
-            i,
-            samples,
-            c,
-            D,
-            NEAREST,
-            BIASED,
-            NUMBER,
-        )
+        s0, s1, s2, s3 = _dots(q, key, pixel, across, below, c, D, live, NEAREST, NUMBER)
+        score = _blend(s0, s1, s2, s3, u, v)
+        if BIASED:
+            score += tl.load(bias + p * samples + i, mask=alive, other=0)
+        w = tl.where(counts, tl.exp(tl.where(counts, score - lse, 0.0)), 0.0)
         v0, v1, v2, v3 = _dots(g, value, pixel, across, below, cv, DV, live_v, NEAREST, NUMBER)
-        by_score = w * _slope(
-            v0, v1, v2, v3, u, v, x, y, at_best == i, mean, mean_x, mean_y, spread, peak, gx, gy, gpeak, pull
-        )  # fmt: skip
+        # The gradient by the sample's weight, less its mean over weights.
+        dx, dy = x - mean_x, y - mean_y
+        slope = _blend(v0, v1, v2, v3, u, v) - mean + gx * dx + gy * dy
+        slope = slope + 0.5 * pull * (dx * dx + dy * dy - spread * spread)
+        by_score = w * (slope + gpeak * (tl.where(at_best == i, 1.0, 0.0) - peak))
         by_query += by_score[:, None] * _blended(key, pixel, across, below, u, v, c, D, live, NEAREST, NUMBER)
         _add_around(key_out, pixel, across, below, u, v, by_score, q, c, D, live, key_scale, NEAREST, FIXED)
         _add_around(value_out, pixel, across, below, u, v, w, g, cv, DV, live_v, value_scale, NEAREST, FIXED)
         dx, dy = w * (gx + pull * (x - mean_x)), w * (gy + pull * (y - mean_y))
         if not NEAREST:
-            more_x, more_y = _by_position(
-                s0, s1, s2, s3, v0, v1, v2, v3, u, v, x, y, w, by_score, height, width
-            )
-            dx, dy = dx + more_x, dy + more_y
+            across_s = (1 - v) * (s1 - s0) + v * (s3 - s2)
+            across_v = (1 - v) * (v1 - v0) + v * (v3 - v2)
+            below_s = (1 - u) * (s2 - s0) + u * (s3 - s1)
+            below_v = (1 - u) * (v2 - v0) + u * (v3 - v1)
+            dx += tl.where((x >= 0) & (x <= width - 1), by_score * across_s + w * across_v, 0.0)
+            dy += tl.where((y >= 0) & (y <= height - 1), by_score * below_s + w * below_v, 0.0)
         if WANTS_BIAS:
             tl.store(bias_out + p * samples + i, by_score, mask=counts)
         if STRAIGHT:
@@ -503,6 +440,9 @@ def _backward(
             tl.store(points_out + 2 * (p * samples + i), dx, mask=counts)
             tl.store(points_out + 2 * (p * samples + i) + 1, dy, mask=counts)
     if STRAIGHT:
-        _store_points(points_out, p, alive, x_start, y_start, x_end, y_end)
+        tl.store(points_out + 4 * p, x_start, mask=alive)
+        tl.store(points_out + 4 * p + 1, y_start, mask=alive)
+        tl.store(points_out + 4 * p + 2, x_end, mask=alive)
+        tl.store(points_out + 4 * p + 3, y_end, mask=alive)
     live = (p < pixels)[:, None] & (c < D)[None, :]
     tl.store(query_out + p[:, None] * D + c[None, :], by_query.to(query_out.dtype.element_ty), mask=live)

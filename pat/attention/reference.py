@@ -100,9 +100,8 @@ def attend(inputs: AttentionInputs) -> Attended:
 
 def _rows_at_once(query: Tensor, key: Tensor, value: Tensor, samples: int) -> int:
     """How many rows of alpha gather no more than `BAND_BYTES`."""
-    row_bytes = (
-        2 * query.shape[0] * query.shape[3] * samples * (key.shape[-1] + value.shape[-1]) * key.element_size()
-    )
+    channels = key.shape[-1] + value.shape[-1]
+    row_bytes = 2 * query.shape[0] * query.shape[3] * samples * channels * key.element_size()
     return max(1, BAND_BYTES // max(1, row_bytes))
 
 

@@ -81,10 +81,8 @@ def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
     """Where the largest weight is, (x, y) in beta's pixels; 0 if no sample counts. Equal ones: their mean."""
     query, key, _, locations, samples, interpolation = compared
     sharp = query.float() * SHARPENED
-    found = attend_with_statistics(
-        sharp, key.float(), key[:, :1].float(), locations, samples=samples, interpolation=interpolation
-    )
-    return found.position
+    given = sharp, key.float(), key[:, :1].float(), locations
+    return attend_with_statistics(*given, samples=samples, interpolation=interpolation).position
 
 
 class _LogSum(Function):

@@ -8,6 +8,7 @@ The gradient of the gradient is the reference's.
 from __future__ import annotations
 
 from types import ModuleType
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -65,22 +66,16 @@ def compiled(backend: str) -> ModuleType:
 @torch.library.custom_op(
     "pat::attend", mutates_args=(), schema=f"({INPUTS}, {OPTIONS}) -> (Tensor, Tensor, Tensor, Tensor)"
 )
-def _attend(
-    query: Tensor,
-    key: Tensor,
-    value: Tensor,
-    points: Tensor,
-    mask: Tensor,
-    bias: Tensor | None,
-    samples: int,
-    straight: bool,
-    nearest: bool,
-    measured: bool,
-    backend: str,
-    strict: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _attend(*given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    *_, measured, backend, _ = given
+    return compiled(backend).forward(_inputs(given[:6], given[6:9]), measured)
+
+
+def _inputs(tensors: Any, options: Any) -> AttentionInputs:
+    """The inputs of `INPUTS`, and the first three of `OPTIONS`."""
+    (query, key, value, points, mask, bias), (samples, straight, nearest) = tensors, options
     positions = SamplePositions(points, mask, samples, straight)
-    return compiled(backend).forward(AttentionInputs(query, key, value, positions, bias, nearest), measured)
+    return AttentionInputs(query, key, value, positions, bias, nearest)
 
 
 @_attend.register_fake
@@ -105,31 +100,10 @@ def _(info, in_dims, *inputs):
     mutates_args=(),
     schema=f"({INPUTS}, {SAVED}, {OPTIONS}, bool[] wanted) -> (Tensor, Tensor, Tensor, Tensor, Tensor)",
 )
-def _attend_backward(
-    query: Tensor,
-    key: Tensor,
-    value: Tensor,
-    points: Tensor,
-    mask: Tensor,
-    bias: Tensor | None,
-    statistics: Tensor,
-    logsum: Tensor,
-    best: Tensor,
-    out: Tensor | None,
-    value_cotangent: Tensor,
-    statistics_cotangent: Tensor,
-    samples: int,
-    straight: bool,
-    nearest: bool,
-    measured: bool,
-    backend: str,
-    strict: bool,
-    wanted: list[bool],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    positions = SamplePositions(points, mask, samples, straight)
-    inputs = AttentionInputs(query, key, value, positions, bias, nearest)
-    saved, cotangents = (statistics, logsum, best, out), (value_cotangent, statistics_cotangent)
-    return compiled(backend).backward(inputs, saved, cotangents, wanted)
+def _attend_backward(*given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    *_, backend, _, wanted = given
+    inputs = _inputs(given[:6], given[12:15])
+    return compiled(backend).backward(inputs, given[6:10], given[10:12], wanted)
 
 
 @_attend_backward.register_fake
@@ -154,27 +128,17 @@ def _channels_last_like(image: Tensor) -> Tensor:
 def _keep(ctx, inputs, output) -> None:
     query, key, value, points, mask, bias, *ctx.options = inputs
     backend = ctx.options[-2]
-    ctx.save_for_backward(
-        query, key, value, points, mask, bias, *output[1:], output[0] if backend == "triton" else None
-    )
+    out = output[0] if backend == "triton" else None
+    ctx.save_for_backward(query, key, value, points, mask, bias, *output[1:], out)
 
 
 def _differentiate(ctx, value_cotangent, statistics_cotangent, *_):
-    saved = ctx.saved_tensors
-    bias = saved[5]
-    needed = ctx.needs_input_grad
+    saved, needed = ctx.saved_tensors, ctx.needs_input_grad
     wanted = [*needed[:4], needed[5]]
     gradients = _attend_backward(*saved, value_cotangent, statistics_cotangent, *ctx.options, wanted)
-    q, k, v, p, b = (g if want else None for g, want in zip(gradients, wanted))
-    return (
-        q,
-        k,
-        v,
-        p,
-        None,
-        None if bias is None or b is None else b.to(bias.dtype),
-        *[None] * len(ctx.options),
-    )
+    *by_inputs, by_bias = (g if want else None for g, want in zip(gradients, wanted))
+    by_bias = by_bias if by_bias is None else by_bias.to(saved[5].dtype)
+    return *by_inputs, None, by_bias, *[None] * len(ctx.options)
 
 
 _attend.register_autograd(_differentiate, setup_context=_keep)
@@ -187,19 +151,19 @@ def _keep_again(ctx, inputs, output) -> None:
 
 def _differentiate_again(ctx, *cotangents):
     """The gradient of the gradient: the reference is run again, and its gradient differentiated."""
-    samples, straight, nearest, measured, backend, strict, wanted = ctx.options
+    *form, measured, backend, strict, wanted = ctx.options
     if strict:
         raise NotImplementedError(
             f"backend '{backend}' has no second-order gradients: ask for backend=\"reference\""
         )
     saved = [_input_again(t) for t in ctx.saved_tensors]
-    query, key, value, points, mask, bias, _, _, _, _, *upstream = saved
+    query, key, value, points, _, bias, *_ = saved
+    upstream = saved[10:]
     inputs = [t for t, want in zip((query, key, value, points, bias), wanted) if want]
     cotangents = [c for c, want in zip(cotangents, wanted) if want]
     higher = torch.is_grad_enabled()
     with torch.enable_grad():
-        positions = SamplePositions(points, mask, samples, straight)
-        out = reference.attend(AttentionInputs(query, key, value, positions, bias, nearest))
+        out = reference.attend(_inputs(saved[:6], form))
         outputs = [out.value, _side_by_side(out)] if measured else [out.value]
         given = upstream[: len(outputs)]
         first = torch.autograd.grad(outputs, inputs, given, create_graph=True, materialize_grads=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -65,7 +65,7 @@ class Align(Known):
 
         rig = options.load_rig_or_say_no_image(self.given[0], self.depth)
         alpha, files = files_by_camera(rig, self.alpha, self.given, image)
-        for i, one in enumerate(_in_order(files)):
+        for i, one in enumerate(options.by_frame(files)):
             views = ViewFiles(rig, one, alpha=alpha)
             if i == 0:
                 checked_rig(views, heal=False)
@@ -80,22 +80,23 @@ class Align(Known):
             raise ValueError("--depth: needs a rig: give one with --rig RIG")
         files = {name: find_images(path) for name, path in camera_names(self.given).items()}
         options.say_when_compiling()
+        first = {name: paths[0] for name, paths in files.items()}
         with options.working("finding the rig"):
-            of_first = {name: paths[0] for name, paths in files.items()}
-            array = array_from_images(of_first, alpha=self.alpha, weights=self.weights, say=say)
+            array = array_from_images(first, alpha=self.alpha, weights=self.weights, say=say)
         self.weights = array.weights
         self.normalise_radiometry |= array.match_levels
         files = {name: files[name] for name in array.rig.names}
-        for one in _in_order(files):
-            first = one == {name: paths[0] for name, paths in files.items()}
-            images = array.images if first else ViewFiles(array.recorded, one, alpha=array.alpha)
+        for i, one in enumerate(options.by_frame(files)):
+            images = ViewFiles(array.recorded, one, alpha=array.alpha) if i else array.images
             name = _name_of(files, array.alpha, one)
             yield _Frame(array.rig, array.recorded, images, one, array.alpha, array.notes, name, found=True)
 
     def _align(self, frame: _Frame) -> None:
+        from arraygeom.atomic import write_text
+
         from ..fusion.align import align
         from ..fusion.aligned_files import RecordedFiles, save_aligned
-        from ..fusion.aligned_page import write_aligned_page
+        from ..fusion.aligned_page import aligned_page
         from ..fusion.report import Facts
         from ..networks.weights import load_weights
         from ..support.locks import folder_lock
@@ -133,7 +134,8 @@ class Align(Known):
             if self.report and not frame.name:
                 texts = [str(message) for message in options.WARNED[warned:]]
                 facts = Facts(frame.notes, texts, time.monotonic() - begin)
-                written.append(write_aligned_page(self.out / "index.html", aligned, frame.recorded, facts))
+                write_text(self.out / "index.html", aligned_page(aligned, frame.recorded, facts))
+                written.append(self.out / "index.html")
         prefix = f"{frame.name}_" if frame.name else ""
         print((self.out / f"{prefix}visibility.txt").read_text(), end="")
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
@@ -154,16 +156,6 @@ class _Frame:
     found: bool = False
 
 
-def _in_order(files: Mapping[str, list[Path]]) -> Iterator[dict[str, Path]]:
-    """The first file of each camera, the second of each, and so on. Raises ValueError for unequal numbers."""
-    counts = {name: len(paths) for name, paths in files.items()}
-    if len(set(counts.values())) > 1:
-        listed = ", ".join(f"'{name}' {count}" for name, count in counts.items())
-        raise ValueError(f"every camera needs an image of every frame; there are {listed}")
-    for paths in zip(*files.values()):
-        yield dict(zip(files, paths))
-
-
-def _name_of(files: Mapping[str, list[Path]], alpha: str, one: Mapping[str, Path]) -> str:
+def _name_of(files: Mapping[str, Sequence[Path]], alpha: str, one: Mapping[str, Path]) -> str:
     """The name of a frame among several: that of alpha's file."""
     return one[alpha].stem if len(files[alpha]) > 1 else ""

@@ -73,9 +73,8 @@ class Evaluate:
         from ..evaluation.tables import write_csv
 
         write_text(self.out / "scores.md", text)
-        write_csv(
-            self.out / "scores.csv", StereoRow._fields, [row for found in rows.values() for row in found]
-        )
+        all_rows = [row for found in rows.values() for row in found]
+        write_csv(self.out / "scores.csv", StereoRow._fields, all_rows)
         print(text, end="")
         say(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, images in {self.out}")
 
@@ -167,15 +166,9 @@ class Render:
         """Render what is missing; exit status 1 if the job is not complete then."""
         from ..farm.job import RenderConfig, Shard, render
 
-        report = render(
-            RenderConfig.load(self.config),
-            scenes=self.scenes,
-            out=self.out,
-            workers=self.workers,
-            shard=Shard.parse(self.shard),
-            scheduler=self.scheduler,
-            console=options.console(),
-        )
+        how: dict[str, Any] = {"scenes": self.scenes, "out": self.out, "workers": self.workers}
+        how |= {"shard": Shard.parse(self.shard), "scheduler": self.scheduler}
+        report = render(RenderConfig.load(self.config), console=options.console(), **how)
         say(f"{self.out}: {report}" + ": the same command tries these again" * bool(report.failed))
         if report.failed:
             sys.exit(1)
@@ -226,10 +219,8 @@ class Settings:
 
         found = [s for s in all_settings(*self.rooms) if self.kind in ("all", s.kind)]
         for entry in found:
-            print(
-                f"{entry.kind:8}{entry.algorithm.removesuffix('Settings')}.{entry.name} "
-                f"= {entry.value}  {entry.why}"
-            )
+            name = f"{entry.algorithm.removesuffix('Settings')}.{entry.name}"
+            print(f"{entry.kind:8}{name} = {entry.value}  {entry.why}")
         print(f"{sum(s.numbers for s in found)} numbers under {len(found)} names")
 
 

@@ -60,9 +60,8 @@ class Calibrate:
         if not self.board:
             raise ValueError("which board is in the images? Give it, such as --board charuco:8x6:30mm")
         options.writable(self.out)
-        patterns = {
-            name: str(pattern) for name, pattern in options.files_by_name(self.camera, "--camera").items()
-        }
+        given = options.files_by_name(self.camera, "--camera")
+        patterns = {name: str(pattern) for name, pattern in given.items()}
         if self.watch:
             self._watch(patterns)
         found = calibrate_photos(

@@ -51,9 +51,8 @@ class Demo:
                 **classical_methods(network, recording),
             }
             say(f"{name}: fusion with the weights '{self.weights}'")
-            frame = fuse_with_progress(
-                self.weights, array.rig, array.images, alpha=ALPHA, noise=recording.noise
-            )
+            given = self.weights, array.rig, array.images
+            frame = fuse_with_progress(*given, alpha=ALPHA, noise=recording.noise)
             methods["fusion"] = frame.image.clamp(0, 1)
             scores = {method: score(image, array.ground_truth) for method, image in methods.items()}
             columns[name] = {method: f"{psnr:.2f} / {ssim:.3f}" for method, (psnr, ssim) in scores.items()}
@@ -81,9 +80,8 @@ def table_of(columns: dict[str, dict[str, str]]) -> str:
     wide = max(map(len, methods)) + 2
     lines = [" " * wide + "".join(f"{name:>18s}" for name in columns)]
     for method in methods:
-        lines.append(
-            f"{method:{wide}s}" + "".join(f"{scores.get(method, '-'):>18s}" for scores in columns.values())
-        )
+        scores = "".join(f"{found.get(method, '-'):>18s}" for found in columns.values())
+        lines.append(f"{method:{wide}s}{scores}")
     return "\n".join([*lines, ""])
 
 
@@ -106,9 +104,8 @@ class WarmUp:
 
         options.say_when_compiling()
         sample, begin = load_sample(), time.monotonic()
-        colour = sample.rig["colour"].replace(
-            distortion=Distortion("brown-conrady", torch.full((4,), -1e-3).double())
-        )
+        lens = Distortion("brown-conrady", torch.full((4,), -1e-3).double())
+        colour = sample.rig["colour"].replace(distortion=lens)
         rig = sample.rig.with_camera("colour", colour).with_camera("second", colour)
         images = {**sample.images, "second": sample.images["colour"]}
         noise = dict.fromkeys(images, NoiseLevel.of_electrons(300))

@@ -135,7 +135,6 @@ class Fuse(Known):
         rig = self._rig()
         alpha, found = files_by_camera(rig, self.alpha, self.given, self.image)
         found = self._frames(found)
-        self._choose_bits(found)
         views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=alpha)
         if self.sequence:
             return self._many(rig, found, alpha)
@@ -167,15 +166,11 @@ class Fuse(Known):
         levels = noise if isinstance(noise, dict) else {}
         for option, by_camera in {"--focal": focal, "--noise": levels}.items():
             if unknown := by_camera.keys() - cameras.keys():
-                raise ValueError(
-                    f"{option}: no camera '{min(unknown)}'; the images' names are {', '.join(cameras)}"
-                )
+                known = ", ".join(cameras)
+                raise ValueError(f"{option}: no camera '{min(unknown)}'; the images' names are {known}")
         videos = [path for path in cameras.values() if path.suffix.lower() in options.VIDEO_SUFFIXES]
-        if videos and len(videos) < len(cameras):
-            others = [path for path in cameras.values() if path not in videos]
-            raise ValueError(
-                f"{videos[0]} is a video and {others[0]} is not: give images alone, or videos alone"
-            )
+        if videos and (others := [path for path in cameras.values() if path not in videos]):
+            raise ValueError(f"{videos[0]} is a video and {others[0]} is not: give images alone, or videos")
         if not videos:
             return self._without_rig_from({name: find_images(path) for name, path in cameras.items()}, {})
         with TemporaryDirectory() as folder:
@@ -189,7 +184,6 @@ class Fuse(Known):
 
         self.sequence |= bool(rates)
         files = self._frames(files)
-        self._choose_bits(files)
         first = {name: paths[0] for name, paths in files.items()}
         focal = options.numbers_by_name(self.focal, "--focal")
         options.say_when_compiling()
@@ -210,29 +204,26 @@ class Fuse(Known):
         rig.save(self.out / FOUND_RIG)
         say(f"the rig that was found: {self.out / FOUND_RIG}")
 
-    def _choose_bits(self, files: Mapping[str, Sequence[Path]]) -> None:
-        """As many bits as the images have, unless asked otherwise."""
-        from ..media.images import has_many_bits
-
-        if self.bits is None:
-            deep = any(has_many_bits(paths[0]) for paths in files.values())
-            self.bits = 32 if self.kind == "exr" else 16 if deep else 8
-
     def _frames(self, files: dict[str, list[Path]]) -> dict[str, list[Path]]:
-        """The files of the frames that every camera has; all of them, of a sequence."""
+        """The files of the frames that every camera has; all of them, of a sequence. The result has as many
+        bits as these images, unless asked otherwise."""
         from ..fusion.frame_matching import matched_frames, warn_of_gaps
+        from ..media.images import has_many_bits
 
         if self.sequence:
             warn_of_gaps(files)
-            return files
-        return matched_frames(files)
+        else:
+            files = matched_frames(files)
+        if self.bits is None:
+            deep = any(has_many_bits(paths[0]) for paths in files.values())
+            self.bits = 32 if self.kind == "exr" else 16 if deep else 8
+        return files
 
     def _rig(self) -> Rig:
         rig = options.load_rig_or_say_no_image(self.given[0], self.depth)
-        for name, rate in options.numbers_by_name(self.frame_rate, "--frame-rate").items():
-            rig = with_sensor(rig, name, frame_rate=rate)
-        for name, offset in options.numbers_by_name(self.time_offset, "--time-offset").items():
-            rig = with_sensor(rig, name, time_offset=offset)
+        for entry, given in {"frame_rate": self.frame_rate, "time_offset": self.time_offset}.items():
+            for name, value in options.numbers_by_name(given, f"--{entry.replace('_', '-')}").items():
+                rig = with_sensor(rig, name, **{entry: value})
         return rig
 
     def _one(
@@ -248,25 +239,38 @@ class Fuse(Known):
         """Fuse one frame. `found` is what was found out about the rig, if it was found from the images;
         `healing` gives the rig healed by them, with which a frame is fused again."""
         from arraygeom import Camera
-        from arraygeom.atomic import sweep
+        from arraygeom.atomic import sweep, write_text
 
-        from ..fusion.report import write_report
+        from ..fusion.report import report_page
         from ..fusion.results import band_names, describe_bands, save_frame, view_of
         from ..support.locks import folder_lock
 
         if self.points and not isinstance(rig[alpha], Camera):
-            raise ValueError(
-                "--points needs a calibrated alpha, and the rig has only F for it: leave out --points"
-            )
+            raise ValueError("--points needs a calibrated alpha, and the rig has only F for it: leave it out")
         begin, store = time.monotonic(), self.out / ".tiles"
+
+        def fused(rig: Rig) -> Frame:
+            known, field = self.with_known(rig, alpha, files, options.field_named(self.field))
+            return fuse_with_progress(
+                self.weights or "mono-colour",
+                known,
+                images,
+                alpha=alpha,
+                device=self.device,
+                precision=self.precision,
+                settings=replace(self._settings(), field=field),
+                explain=self._note,
+                store=store,
+            )
+
         with folder_lock(self.out):
             sweep(self.out)
             if not self.resume:
                 shutil.rmtree(store, ignore_errors=True)
-            frame = self._fused(rig, images, alpha, files, store)
+            frame = fused(rig)
             if (healed := healing()) is not None and healed.text not in self._notes:
                 rig = self._healed(rig, healed)
-                frame = self._fused(rig, images, alpha, files, store)
+                frame = fused(rig)
             frame, gain = self._exposed(frame)
             if found is None and not frame.depth.isfinite().any():
                 self._note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
@@ -290,27 +294,11 @@ class Fuse(Known):
                 facts = self._facts(rig, found, time.monotonic() - begin)
                 if self.classical:
                     facts = facts._replace(classical=self._classical(rig, images, alpha, gain))
-                written.append(write_report(self.out / "index.html", frame, images, rig, alpha, facts))
+                write_text(self.out / "index.html", report_page(frame, images, rig, alpha, facts))
+                written.append(self.out / "index.html")
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
         if self.report:
             say(f"to see the result, open {self.out / 'index.html'} in a browser")
-
-    def _fused(
-        self, rig: Rig, images: Mapping[str, Tensor], alpha: str, files: Mapping[str, str | Path], store: Path
-    ) -> Frame:
-        """One frame, with a rig and what else is known of the scene."""
-        known, field = self.with_known(rig, alpha, files, options.field_named(self.field))
-        return fuse_with_progress(
-            self.weights or "mono-colour",
-            known,
-            images,
-            alpha=alpha,
-            device=self.device,
-            precision=self.precision,
-            settings=replace(self._settings(), field=field),
-            explain=self._note,
-            store=store,
-        )
 
     def _healed(self, rig: Rig, healed: Healed | None) -> Rig:
         """The rig, or the one that its images healed, which is written beside the results."""
@@ -370,9 +358,7 @@ class Fuse(Known):
         gain = exposure_gain(frame.image) if self.exposure == "auto" else 1.0
         if gain != 1:
             what = "dark" if gain > 1 else "overexposed"
-            self._note(
-                f"exposure: light times {gain:.2f}, as the image is {what} (--exposure keep leaves it)"
-            )
+            self._note(f"exposure: light times {gain:.2f}: the image is {what} (--exposure keep leaves it)")
         return frame._replace(image=exposed(frame.image, gain)), gain
 
     def _many(self, rig: Rig, files: dict[str, list[Path]], alpha: str) -> None:
@@ -380,11 +366,8 @@ class Fuse(Known):
         from ..support.jobs import Workers, cores
 
         self.refuse_several()
-        single = {
-            "--points": self.points,
-            "--classical": self.classical,
-            "--device cuda": self.device == "cuda",
-        }
+        single = {"--points": self.points, "--classical": self.classical}
+        single["--device cuda"] = self.device == "cuda"
         if named := [option for option, given in single.items() if given]:
             raise ValueError(f"{', '.join(named)}: for a single frame only: leave out for several")
         batch = Batch(
@@ -410,8 +393,8 @@ class Fuse(Known):
             video=self.video if self.sequence and self.video and self.bits != 32 else None,
             console=options.console(),
         )
-        video = self.out / "fused.mp4"
-        say(f"{self.out}: {report}" + f", and {video.name}" * (self.sequence and video.is_file()))
+        video = ", and fused.mp4" * (self.sequence and (self.out / "fused.mp4").is_file())
+        say(f"{self.out}: {report}{video}")
         if report.failed:
             sys.exit(1)
 
@@ -470,7 +453,7 @@ def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> t
                 f"{given[0]}: {options.NO_IMAGE}; if it is a rig, give --image NAME=FILE for each camera"
             )
         options.files_by_name(named)
-        options.refuse_missing_rig(given[0])
+        options.refuse_missing(given[0], rig=True)
         return named, True
     if image:
         files = " ".join(text.partition("=")[2] or text for text in image)
@@ -481,7 +464,7 @@ def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> t
             "or a rig, --alpha and each --image"
         )
     for path in given:
-        options.refuse_missing_image(path)
+        options.refuse_missing(path, rig=False)
     return (), False
 
 
@@ -498,7 +481,11 @@ def files_by_camera(
     if unknown := [path for path in given[1:] if path.stem not in rig.names]:
         raise ValueError(f"{unknown[0]}: no camera of the rig has its name: give --image NAME={unknown[0]}")
     found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
-    refuse_equal_files({name: paths[0] for name, paths in found.items()})
+    for (a, (first, *_)), (b, (second, *_)) in combinations(found.items(), 2):
+        if first.is_file() and second.is_file() and filecmp.cmp(first, second, shallow=False):
+            raise ValueError(
+                f"the images of '{a}' and '{b}' are the same image, {second}: give each camera its own"
+            )
     return rig.require(alpha), found
 
 
@@ -506,12 +493,3 @@ def is_rig_file(path: Path) -> bool:
     """Whether a file is meant as a rig: neither folder nor pattern, nor named as images and videos are."""
     suffixes = options.IMAGE_SUFFIXES | options.VIDEO_SUFFIXES
     return not (any(c in path.name for c in "*?[") or path.suffix.lower() in suffixes or path.is_dir())
-
-
-def refuse_equal_files(files: Mapping[str, Path]) -> None:
-    """Raise ValueError if two cameras are given one file, or a copy of it."""
-    for (a, first), (b, second) in combinations(files.items(), 2):
-        if first.is_file() and second.is_file() and filecmp.cmp(first, second, shallow=False):
-            raise ValueError(
-                f"the images of '{a}' and '{b}' are the same image, {second}: give each camera its own"
-            )

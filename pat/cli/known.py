@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 MATCHES_HELP = "Matched points to use: CSV (x0,y0,x1,y1 a line, of two images in order) or a COLMAP database."
 MatchesFile = Annotated[Path | None, arg(metavar="FILE", help=MATCHES_HELP, help_behavior_hint="")]
 
+NOISE = "NAME=ELECTRONS[,READ]|estimate|none"
 OUT_OF_RANGE = 0.9
 """Share of a depth map outside the rig's depth range from which its unit must be wrong."""
 
@@ -53,9 +54,7 @@ class Known:
     """First bring each beta to alpha's mean, contrast (other exposures, filters). Also: --match-levels."""
     response: Annotated[str, arg(metavar="fit|rec601|R,G,B")] = "fit"
     """How a mono alpha weighs red, green and blue; fit: found from matches, with gain and gamma."""
-    noise: UseAppendAction[
-        Annotated[tuple[str, ...], arg(metavar="NAME=ELECTRONS[,READ]|estimate|none")]
-    ] = ()
+    noise: UseAppendAction[Annotated[tuple[str, ...], arg(metavar=NOISE)]] = ()
     """Low light: a camera's electrons at white and read noise in electrons, or estimate: views are denoised.
     A frame is by default fused so where an image shows noise plainly."""
     strict: bool = False
@@ -103,9 +102,9 @@ class Known:
         """
         from arraygeom.undistortion import with_pixels
 
-        if self.depth_map is None and self.matches is None:
-            return rig, field
         if self.depth_map is None:
+            if self.matches is None:
+                return rig, field
             rig = with_pixels(rig)
             return rig, self._around_matches(rig, alpha, files, field)
         if self.matches is not None or field is not None:
@@ -149,9 +148,8 @@ class Known:
 
         assert self.matches is not None
         fields = dict.fromkeys(rig.betas(alpha), field)
-        for names, points in read_matches(
-            self.matches, files, {name: rig[name].hw for name in files}
-        ).items():
+        found = read_matches(self.matches, files, {name: rig[name].hw for name in files})
+        for names, points in found.items():
             if alpha not in names:
                 continue
             (a, b) = (names, points) if names[0] == alpha else (names[::-1], points[::-1])

@@ -17,7 +17,7 @@ from typing import Annotated, Any, ClassVar, NoReturn, Union
 import tyro
 
 from . import aligning, authors, calibration, demo, fusing, rigs
-from .options import WARNED, refuse_missing_rig, respelled, say, warn
+from .options import WARNED, refuse_missing, respelled, say, warn
 
 
 class Pat:
@@ -73,7 +73,7 @@ def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
             WARNED.clear()
             command = _command(arguments, group, prog)
             if isinstance(rig := getattr(command, "rig", None), Path):
-                refuse_missing_rig(rig)
+                refuse_missing(rig, rig=True)
             command.run()
     except KeyboardInterrupt:
         say("pat: interrupted; no file is left incomplete", style="red")
@@ -131,11 +131,8 @@ def _help(path: str, group: Any) -> str:
         parts = {"commands": Pat.users, "for the development of networks": Pat.authors}
     lines = [f"usage: {path} COMMAND ...", "", _first_line(group)]
     for title, commands in parts.items():
-        lines += [
-            "",
-            f"{title}:",
-            *(f"  {name:10s} {_first_line(command)}" for name, command in commands.items()),
-        ]
+        lines += ["", f"{title}:"]
+        lines += [f"  {name:10s} {_first_line(command)}" for name, command in commands.items()]
     lines += [
         "",
         f"`{path} COMMAND --help` explains a command's options; --debug shows an error's traceback.",
@@ -213,9 +210,8 @@ def reworded(box: str) -> str:
     lines = box.strip().splitlines()
     rows = [row.strip("│ ") for row in (lines[1:-1] if box.startswith("╭") else lines[2:])]
     said = [" ".join(text.split()) for text in re.split(r"[─-]{9,}", " ".join(rows))]
-    text = " ".join(
-        part for i, part in enumerate(said) if part and (i == 0 or part.startswith("Perhaps you meant"))
-    )
+    hints = [part for part in said[1:] if part.startswith("Perhaps you meant")]
+    text = " ".join(part for part in (*said[:1], *hints) if part)
     for pattern, words in REWORDED:
         text = re.sub(pattern, words, text)
     return text

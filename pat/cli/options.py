@@ -37,9 +37,8 @@ FIELD_NAMES = ("epipolar", "line", "homography", "rectified", "nearest", "local"
 FIELD_HELP = (
     f"Receptive field in the other cameras: {', '.join(FIELD_NAMES)}, or MODULE:OBJECT for your own; "
 )
-FieldName = Annotated[
-    str, arg(metavar="NAME|MODULE:OBJECT", help=f"{FIELD_HELP}auto takes what the rig allows.")
-]
+FIELD_HELP += "auto takes what the rig allows."
+FieldName = Annotated[str, arg(metavar="NAME|MODULE:OBJECT", help=FIELD_HELP)]
 
 
 def response_of(text: str) -> Any:
@@ -67,11 +66,11 @@ def noise_of(texts: Iterable[str], *, by_default: bool = False) -> Any:
         return "auto" if by_default else None
     if entries in (["estimate"], ["none"]):
         return None if entries == ["none"] else "estimate"
-    levels = []
     if {"estimate", "none"} & {*entries}:
         raise ValueError(
             f"--noise: got {', '.join(entries)}: give estimate or none alone, or NAME=ELECTRONS of each"
         )
+    levels = []
     for entry in entries:
         name, _, numbers = entry.partition("=")
         try:
@@ -80,10 +79,8 @@ def noise_of(texts: Iterable[str], *, by_default: bool = False) -> Any:
             raise ValueError(
                 f"--noise: '{entry}' is neither estimate nor none nor NAME=ELECTRONS[,READ], as mono=200,2"
             ) from None
-        if len(read) > 1:
-            raise ValueError(
-                f"--noise: '{entry}' has {len(read) + 1} numbers; wanted electrons at white and read noise"
-            )
+        if (more := len(read) + 1) > 2:
+            raise ValueError(f"--noise: '{entry}' has {more} numbers; wanted electrons at white, read noise")
         levels.append((name, NoiseLevel.of_electrons(electrons, sum(read))))
     return dict(_once("--noise", levels))
 
@@ -178,9 +175,7 @@ def device_of(name: str) -> str:
     if torch.cuda.is_available():
         return "cuda"
     if name == "cuda":
-        raise ValueError(
-            "--device cuda: no CUDA device is available: leave it out, or install torch for CUDA"
-        )
+        raise ValueError("--device cuda: no CUDA device is available: leave it out, or get torch for CUDA")
     return "cpu"
 
 
@@ -196,7 +191,7 @@ def field_named(name: str) -> ReceptiveField | None:
 
 def load_rig(path: Path, depth: tuple[float, float] | None = None) -> Rig:
     """The rig of a file, with other depth bounds if given."""
-    refuse_missing_rig(path)
+    refuse_missing(path, rig=True)
     from arraygeom import Rig
 
     rig = Rig.load(path)
@@ -218,23 +213,17 @@ def load_rig_or_say_no_image(path: Path, depth: tuple[float, float] | None) -> R
         ) from None
 
 
-def refuse_missing_rig(path: Path) -> None:
-    """Raise FileNotFoundError for a rig file that does not exist, before torch is imported to read it."""
-    if not path.exists():
-        _, _, file = str(path).partition("=")
-        named = file and Path(file).exists()
-        advice = "if it is an image, write --image before each NAME=FILE" if named else "check the path"
-        raise FileNotFoundError(f"{path}: no such rig file: {advice}")
-
-
-def refuse_missing_image(path: Path) -> None:
-    """Raise FileNotFoundError for an image, folder or video that does not exist, before torch is imported."""
-    if path.exists() or any(c in path.name for c in "*?["):
+def refuse_missing(path: Path, *, rig: bool) -> None:
+    """Raise FileNotFoundError for a rig file, or an image, folder or video, that does not exist, before torch
+    is imported to read it."""
+    if path.exists() or (not rig and any(c in path.name for c in "*?[")):
         return
     _, _, file = str(path).partition("=")
-    named = file and Path(file).exists()
-    advice = f"give {file} alone, cameras are called as their files are" if named else "check the path"
-    raise FileNotFoundError(f"{path}: no such image: {advice}")
+    advice = "check the path"
+    if file and Path(file).exists():
+        alone = f"give {file} alone, cameras are called as their files are"
+        advice = "if it is an image, write --image before each NAME=FILE" if rig else alone
+    raise FileNotFoundError(f"{path}: no such {'rig file' if rig else 'image'}: {advice}")
 
 
 def files_by_name(texts: Iterable[str], option: str = "--image") -> dict[str, Path]:
@@ -256,39 +245,41 @@ def read_images(rig: Rig, texts: Iterable[str], *, sized: bool = True) -> dict[s
     from ..media.images import read_image
 
     files = {rig.require(name): path for name, path in files_by_name(texts).items()}
-    return {
-        name: read_image(path, name=name, hw=rig[name].hw if sized else None) for name, path in files.items()
-    }
+    return {n: read_image(path, name=n, hw=rig[n].hw if sized else None) for n, path in files.items()}
 
 
 def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
     """Images of `--image NAME=FILE`: the first of every camera make a frame, the second ones the next.
 
-    Raises ValueError for cameras with unequal numbers of images.
+    Raises ValueError as `by_frame`.
     """
     from ..media.images import read_image
 
     files: dict[str, list[Path]] = {}
     for name, path in (_named_file("--image", text) for text in texts):
         files.setdefault(rig.require(name), []).append(path)
+    return [{n: read_image(path, name=n) for n, path in frame.items()} for frame in by_frame(files)]
+
+
+def by_frame(files: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]]:
+    """The first file of each camera, the second of each, and so on. Raises ValueError for unequal numbers."""
     counts = {name: len(paths) for name, paths in files.items()}
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"'{name}' {count}" for name, count in counts.items())
-        raise ValueError(f"--image: every camera needs an image of every frame; given are {listed}")
-    frames = zip(*files.values())
-    return [{n: read_image(path, name=n) for n, path in zip(files, frame)} for frame in frames]
+        raise ValueError(f"every camera needs an image of every frame; there are {listed}")
+    return [dict(zip(files, paths)) for paths in zip(*files.values())]
 
 
 def _named_file(option: str, text: str) -> tuple[str, Path]:
     name, _, path = text.partition("=")
-    if not (name and path):
-        file = path or text
-        if not Path(file).suffix:
-            raise ValueError(f"{option}: '{text}' is not NAME=FILE")
-        raise ValueError(
-            f"{option} {text}: which camera is it of? Give NAME=FILE, such as {Path(file).stem}={file}"
-        )
-    return name, Path(path)
+    if name and path:
+        return name, Path(path)
+    file = path or text
+    if not Path(file).suffix:
+        raise ValueError(f"{option}: '{text}' is not NAME=FILE")
+    raise ValueError(
+        f"{option} {text}: which camera is it of? Give NAME=FILE, such as {Path(file).stem}={file}"
+    )
 
 
 def _named_number(option: str, text: str) -> tuple[str, float]:
@@ -355,12 +346,8 @@ def working(title: str) -> Iterator[Callable[[str], None]]:
 
     from ..support.steps import steps_shown
 
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[step]}"),
-    )
+    title_column, step_column = TextColumn("{task.description}"), TextColumn("{task.fields[step]}")
+    columns = SpinnerColumn(), title_column, TimeElapsedColumn(), step_column
     terminal, printed = console().is_terminal, time.monotonic()
     with Progress(*columns, console=console(), transient=True, disable=not terminal) as bar:
         task = bar.add_task(title, total=None, step="")

@@ -190,25 +190,18 @@ class Info:
                 say(f"pat: {oddity}", style="yellow")
         alpha = None if self.alpha is None else rig.require(self.alpha)
         if alpha is None and len(rig.names) > MOST_CAMERAS:
-            alpha = rig.names[0]
-            say(
-                f"pairs with alpha '{alpha}' and its nearest cameras, "
-                f"of {len(rig.names)}: --alpha NAME for others"
-            )
+            alpha, count = rig.names[0], len(rig.names)
+            say(f"pairs with alpha '{alpha}' and its nearest cameras, of {count}: --alpha NAME for others")
         cameras, pairs = summarise_cameras(rig), summarise_pairs(rig, alpha)
         if self.json:
             document = {"cameras": [c._asdict() for c in cameras], "pairs": [p._asdict() for p in pairs]}
             return options.print_json(document)
         of_cameras = Table("camera", "pixels", "focal px", "view deg", "mm a pixel, near - far", box=None)
         for c in cameras:
-            wh = f"{c.wh[0]}x{c.wh[1]}"
-            of_cameras.add_row(
-                c.name, wh, _two(c.focal), _two(c.field_of_view, " x "), _two(c.footprint, " - ")
-            )
-        of_pairs = Table(
-            "alpha > beta", "baseline m", "rotation deg", "seen", "segment px, median - longest", box=None
-        )
-        of_pairs.add_column("depth step m, near - far")
+            further = _two(c.focal), _two(c.field_of_view, " x "), _two(c.footprint, " - ")
+            of_cameras.add_row(c.name, f"{c.wh[0]}x{c.wh[1]}", *further)
+        lengths = "segment px, median - longest", "depth step m, near - far"
+        of_pairs = Table("alpha > beta", "baseline m", "rotation deg", "seen", *lengths, box=None)
         for p in pairs:
             seen = "" if p.seen is None else f"{p.seen:.0%}"
             further = seen, _two(p.length, " - "), _two(p.depth_step, " - ")
@@ -246,10 +239,8 @@ class Convert:
             raise ValueError("--size: wanted width and height in pixels")
         rig = read_rig(self.source, format=self.read_as, hw=hw)
         for name in rig.names if hw is not None else ():
-            if rig[name].hw != hw:
-                raise ValueError(
-                    f"--size: the file states {rig[name].hw[1]}x{rig[name].hw[0]} for '{name}': leave it out"
-                )
+            if (stated := rig[name].hw) != hw:
+                raise ValueError(f"--size: the file has {stated[1]}x{stated[0]} for '{name}': leave it out")
         write_rig(rig, self.target, format=self.write_as)
         say(f"written: {self.target} ({len(rig.names)} cameras)")
 
@@ -350,10 +341,8 @@ class Refine:
         deviations = options.numbers_by_name(self.sigma, "--sigma")
         options.say_when_compiling()
         frames = options.read_frames(rig, self.image)
-        if self.matches is not None and len(frames) > 1:
-            raise ValueError(
-                f"--matches needs a single frame, and {len(frames)} are given: give one image of each camera"
-            )
+        if self.matches is not None and (count := len(frames)) > 1:
+            raise ValueError(f"--matches needs a single frame, and {count} are given: give an image a camera")
         matches = given_matches(self.matches, self.image, frames[0])
         with options.working("matching features and refining"):
             found = refine(
@@ -367,17 +356,13 @@ class Refine:
             )
         print(found.as_text())
         if not found.accepted:
-            refused = found.held_out[1].median < found.held_out[0].median / NEARER
-            if not refused:
-                return say(
-                    "no rig written" + (": --force writes it all the same" if found.objections else "")
-                )
-            files = " ".join(
-                {text.partition("=")[0]: text.partition("=")[2] for text in self.image[::-1]}.values()
-            )
+            force = ": --force writes it all the same" if found.objections else ""
+            if not found.held_out[1].median < found.held_out[0].median / NEARER:
+                return say(f"no rig written{force}")
+            first = {text.partition("=")[0]: text.partition("=")[2] for text in self.image[::-1]}
             say(
-                "no rig written, though points come far nearer to their lines: "
-                f"--force writes it all the same; or fuse without a rig: `pat fuse {files}`",
+                "no rig written, though points come far nearer to their lines: --force writes it all the "
+                f"same; or fuse without a rig: `pat fuse {' '.join(first.values())}`",
                 style="yellow",
             )
             sys.exit(REFUSED)
@@ -407,14 +392,11 @@ class RigFromImages:
         from ..media.images import read_image
 
         options.writable(self.out)
-        images = {
-            name: read_image(path, name=name) for name, path in options.files_by_name(self.image).items()
-        }
+        images = {n: read_image(path, name=n) for n, path in options.files_by_name(self.image).items()}
+        focal = options.numbers_by_name(self.focal, "--focal")
         with options.working("matching features and fitting lines"):
-            focal = options.numbers_by_name(self.focal, "--focal")
-            found = rig_from_images(
-                images, focal=focal, matches=given_matches(self.matches, self.image, images)
-            )
+            matches = given_matches(self.matches, self.image, images)
+            found = rig_from_images(images, focal=focal, matches=matches)
         print(found.as_text())
         found.rig.save(self.out)
         say(f"written: {self.out}")
@@ -453,7 +435,7 @@ class RigDiff:
         depth = self.depth or (a.depth or b.depth)
         if depth is None:
             raise ValueError(
-                "--depth: neither rig states between which depths it is used: give NEAR FAR in metres"
+                "--depth: neither rig states the depths it is used between: give NEAR FAR, metres"
             )
         near, far = (float(bound) for bound in depth)
         beside = [path.with_suffix(".covariance.json") for path in (self.first, self.second)]
@@ -461,15 +443,9 @@ class RigDiff:
         found = rig_difference(a, b, covariances=(covariances[0], covariances[1]), depth=(near, far))
         for path, covariance in zip(beside, covariances):
             if covariance is None and any(covariances):
-                say(
-                    f"pat: warning: {path}: not there: that rig counts as calibrated as well as the other",
-                    style="yellow",
-                )
+                options.warn(f"{path}: not there: that rig counts as calibrated as well as the other")
         if not any(covariances):
-            say(
-                "pat: warning: no covariance file beside the rigs: calibrate with `pat calibrate`",
-                style="yellow",
-            )
+            options.warn("no covariance file beside the rigs: calibrate with `pat calibrate`")
         print(found.as_text())
         if self.image:
             print(self._on_images(a, b))
@@ -485,11 +461,8 @@ class RigDiff:
         with options.working("matching points of the images"):
             pairs = given_matches(self.matches, self.image, images) or match_cameras(images)
         of_a, of_b = line_distances(a, pairs), line_distances(b, pairs)
-        medians = float(of_a.abs().median()), float(of_b.abs().median())
-        text = (
-            f"on the images: {len(of_a)} points, "
-            f"{medians[0]:.2f} px from A's lines and {medians[1]:.2f} px from B's"
-        )
+        medians = f"{of_a.abs().median():.2f} px from A's lines and {of_b.abs().median():.2f} px from B's"
+        text = f"on the images: {len(of_a)} points, {medians}"
         closer = float((of_a.abs() < of_b.abs()).float().mean())
         if nearer(of_b, of_a):
             return f"{text}: A fits better, at {closer:.0%} of them"

@@ -95,7 +95,7 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
     """
     root = _folder(root)
     scenes = _some(_middlebury_scenes(root), root)
-    return (_middlebury_pair(root, left, layout) for left, layout in scenes)
+    return (_middlebury_pair(root, *scene) for scene in scenes)
 
 
 def folder_pairs(root: str | Path, *, max_disparity: float = PAPER_DISPARITY) -> Iterator[StereoPair]:
@@ -155,19 +155,15 @@ def _middlebury_pair(root: Path, left: Path, layout: _Middlebury) -> StereoPair:
 
 
 def _named(root: Path) -> list[tuple[Path, Path]]:
-    """Left and right by their names."""
-    return [(left, right) for left in files_below(root) for right in _right_of(left, root)]
-
-
-def _right_of(left: Path, root: Path) -> list[Path]:
-    """The right image of `left`, or nothing."""
-    if left.suffix.lower() not in IMAGE_SUFFIXES:
-        return []
-    before, inside = root.as_posix(), left.as_posix()[len(root.as_posix()) :]
-    rights = (
-        Path(before + mark[1].join(inside.rsplit(mark[0], 1))) for mark in LEFT_AND_RIGHT if mark[0] in inside
-    )
-    return [right for right in rights if right.is_file()][:1]
+    """Left and right by their names: the first of `LEFT_AND_RIGHT` whose right image is there."""
+    before = root.as_posix()
+    found: list[tuple[Path, Path]] = []
+    for left in (file for file in files_below(root) if file.suffix.lower() in IMAGE_SUFFIXES):
+        inside = left.as_posix()[len(before) :]
+        marks = [(ours, theirs) for ours, theirs in LEFT_AND_RIGHT if ours in inside]
+        rights = (Path(before + theirs.join(inside.rsplit(ours, 1))) for ours, theirs in marks)
+        found += [(left, right) for right in rights if right.is_file()][:1]
+    return found
 
 
 def _pair_name(root: Path, left: Path) -> str:

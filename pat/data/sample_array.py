@@ -43,14 +43,11 @@ def load_motorcycle() -> SampleArray:
     """
     from skimage.data import stereo_motorcycle
 
-    left, right = (
-        torch.from_numpy(photo[:, :740].copy()).movedim(-1, 0) / 255 for photo in stereo_motorcycle()[:2]
-    )
+    photos = (photo[:, :740].copy() for photo in stereo_motorcycle()[:2])
+    left, right = (torch.from_numpy(photo).movedim(-1, 0) / 255 for photo in photos)
     K = torch.tensor([[994.978, 0, 311.193], [0, 994.978, 254.877], [0, 0, 1]], dtype=torch.float64)
     one = Camera(K=K, cam_from_world=Pose.identity(), hw=(500, 740))
     shifted = K + torch.tensor([[0, 0, 31.086], [0, 0, 0], [0, 0, 0]])
-    other = Camera(
-        K=shifted, cam_from_world=Pose(one.R, torch.tensor([-0.193001, 0, 0]).to(K)), hw=(500, 740)
-    )
+    other = one.replace(K=shifted, cam_from_world=Pose(one.R, torch.tensor([-0.193001, 0, 0]).to(K)))
     rig = Rig({ALPHA: one, BETA: other.resize((250, 370))}, depth=(1.8, 8.0), name="motorcycle")
     return SampleArray(rig, {ALPHA: luminance(left), BETA: avg_pool2d(right, 2)}, left)

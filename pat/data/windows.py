@@ -20,6 +20,8 @@ from arraygeom.sampling import sample
 from arraygeom.undistortion import pinhole_view, resampled
 from pat.synthesis.rendered import RENDER_FILE, Rendered, is_rendered
 
+AGAIN = "remove it and run 'pat render' again"
+
 
 def scene_folders(root: str | Path) -> list[Path]:
     """The complete scenes in a folder of a job, of scenes, or a scene itself, in order of their names.
@@ -34,14 +36,10 @@ def scene_folders(root: str | Path) -> list[Path]:
     inside = root / "scenes" if (root / "scenes").is_dir() else root
     folders = sorted(f for f in inside.iterdir() if f.is_dir() and not f.name.startswith("."))
     if not any(is_rendered(f) for f in folders):
-        raise ValueError(
-            f"{root}: holds no rendered scene: make some with 'pat render CONFIG --scenes N --out {root}'"
-        )
-    for folder in folders:
-        if not is_rendered(folder):
-            raise ValueError(
-                f"{folder}: is not a whole scene (no {RENDER_FILE}): remove it and run 'pat render' again"
-            )
+        make = f"make some with 'pat render CONFIG --scenes N --out {root}'"
+        raise ValueError(f"{root}: holds no rendered scene: {make}")
+    if broken := next((f for f in folders if not is_rendered(f)), None):
+        raise ValueError(f"{broken}: is not a whole scene (no {RENDER_FILE}): {AGAIN}")
     return folders
 
 
@@ -52,9 +50,7 @@ def reading(folder: Path) -> Iterator[None]:
         yield
     except (OSError, ValueError, KeyError, EOFError, BadZipFile, TypeError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(
-            f"{folder}: cannot be read ({reason}): remove it and run 'pat render' again"
-        ) from None
+        raise ValueError(f"{folder}: cannot be read ({reason}): {AGAIN}") from None
 
 
 def scene_rig(folder: Path) -> Rig:
@@ -79,11 +75,8 @@ def read_view(folder: Path, name: str) -> RenderedView:
         raise ValueError(f"{folder}: camera '{name}' is not calibrated")
     hw = (frame.depth.shape[-2], frame.depth.shape[-1])
     if hw != camera.hw or frame.rgb.shape[1:] != frame.depth.shape:
-        raise ValueError(
-            f"{folder}: the image of '{name}' is {hw[1]}x{hw[0]}, its rig says "
-            f"{camera.hw[1]}x{camera.hw[0]}: "
-            "remove it and run 'pat render' again"
-        )
+        text = f"the image of '{name}' is {hw[1]}x{hw[0]}, its rig says {camera.hw[1]}x{camera.hw[0]}"
+        raise ValueError(f"{folder}: {text}: {AGAIN}")
     return RenderedView(frame.rgb, frame.depth, camera.to(torch.float64))
 
 

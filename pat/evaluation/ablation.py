@@ -11,6 +11,7 @@ import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -167,15 +168,9 @@ def families() -> dict[str, FieldFamily]:
         "local 5x5": FieldFamily(lambda disparity: Local()),
         "dense": FieldFamily(lambda disparity: Dense()),
     }
-    rotated = {
-        f"rotated by {a:g} deg": FieldFamily(lambda disparity: Epipolar(), _rotated(a))
-        for a in (0.1, 0.3, 1.0)
-    }
-    shifted = {
-        f"centre off by {p:g} px": FieldFamily(lambda disparity: Epipolar(), _decentred(p))
-        for p in (1, 3, 10)
-    }
-    return exact | rotated | shifted
+    wrong = {f"rotated by {a:g} deg": partial(_rotated, a) for a in (0.1, 0.3, 1.0)}
+    wrong |= {f"centre off by {p:g} px": partial(_decentred, p) for p in (1, 3, 10)}
+    return exact | {name: FieldFamily(lambda disparity: Epipolar(), rig) for name, rig in wrong.items()}
 
 
 def disparity(network: FusionNetwork, pair: Pair) -> float:
@@ -218,17 +213,16 @@ def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
         incomplete = f"{broken[0]} is incomplete ({RENDER_FILE} is missing)" if broken else ""
         what = incomplete or f"{folder} holds no rendered scene"
         raise ValueError(f"{what}: render it with `pat render`")
-    names = (str(path.relative_to(folder)) for path in found)
-    return (_rendered_case(n, path, Generator().manual_seed(seed)) for n, path in zip(names, found))
 
+    def case(path: Path) -> AblationCase:
+        scene, g = Rendered(path), Generator().manual_seed(seed)
+        names = scene.rig.names[:2]
+        frames = [scene.frame(name) for name in names]
+        ground_truth, seen = (srgb_image(f.rgb) for f in frames)
+        rig = Rig(dict(zip((ALPHA, BETA), (scene.rig[name] for name in names))))
+        return _recorded(str(path.relative_to(folder)), rig, ground_truth, seen, frames[0].depth, g)
 
-def _rendered_case(name: str, folder: Path, g: Generator) -> AblationCase:
-    scene = Rendered(folder)
-    first, second = scene.rig.names[:2]
-    frames = [scene.frame(name) for name in (first, second)]
-    ground_truth, seen = (srgb_image(f.rgb) for f in frames)
-    rig = Rig({ALPHA: scene.rig[first], BETA: scene.rig[second]})
-    return _recorded(name, rig, ground_truth, seen, frames[0].depth, g)
+    return map(case, found)
 
 
 def _recorded(
@@ -365,9 +359,8 @@ def _cells(rows: Sequence[AblationRow], every: Sequence[AblationRow]) -> list[st
     groups = [[r.psnr for r in served if a <= r.ratio < b] for a, b in zip(RATIOS, (*RATIOS[1:-1], math.inf))]
     means = [f"{np.mean(g):.2f}" if g else "" for g in groups]
     note = "" if len(served) == len(rows) else f"{len(rows) - len(served)} scenes omitted"
-    error, within = (
-        np.mean([getattr(row, name) for row in served]) for name in ("end_point_error", "within_one")
-    )
+    error = np.mean([row.end_point_error for row in served])
+    within = np.mean([row.within_one for row in served])
     off = ["", ""] if math.isnan(error) else [f"{error:.2f}", f"{within:.1%}"]
     image = [f"{np.mean(psnr):.2f}{interval}", f"{np.mean(ssim):.4f}", f"{difference:+.2f}"]
     return [*image, *means, *off, note]
@@ -397,32 +390,17 @@ def _most_different(images: Mapping[str, Tensor], ground_truth: Tensor) -> tuple
     return slice(top, top + side), slice(left, left + side)
 
 
-def _rotated(degrees: float) -> Callable[[Rig, Generator], Rig]:
+def _rotated(degrees: float, rig: Rig, g: Generator) -> Rig:
     """Beta rotated about a random axis."""
-
-    def assumed(rig: Rig, g: Generator) -> Rig:
-        axis = torch.randn(3, generator=g, dtype=torch.float64)
-        rotation = Pose(
-            rotation_from_vector(axis / axis.norm() * math.radians(degrees)), torch.zeros(3).double()
-        )
-        beta = _camera(rig)
-        return rig.with_camera(BETA, beta.replace(cam_from_world=rotation @ beta.cam_from_world))
-
-    return assumed
+    axis, beta = torch.randn(3, generator=g, dtype=torch.float64), rig.pair(ALPHA, BETA).cameras[1]
+    R = rotation_from_vector(axis / axis.norm() * math.radians(degrees))
+    moved = Pose(R, torch.zeros(3).double()) @ beta.cam_from_world
+    return rig.with_camera(BETA, beta.replace(cam_from_world=moved))
 
 
-def _decentred(pixels: float) -> Callable[[Rig, Generator], Rig]:
+def _decentred(pixels: float, rig: Rig, g: Generator) -> Rig:
     """Beta's principal point shifted in a random direction."""
-
-    def assumed(rig: Rig, g: Generator) -> Rig:
-        angle = 2 * math.pi * float(torch.rand((), generator=g))
-        beta = _camera(rig)
-        K = beta.K.clone()
-        K[:2, 2] += K.new_tensor([pixels * math.cos(angle), pixels * math.sin(angle)])
-        return rig.with_camera(BETA, beta.replace(K=K))
-
-    return assumed
-
-
-def _camera(rig: Rig) -> Camera:
-    return rig.pair(ALPHA, BETA).cameras[1]
+    angle, beta = 2 * math.pi * float(torch.rand((), generator=g)), rig.pair(ALPHA, BETA).cameras[1]
+    K = beta.K.clone()
+    K[:2, 2] += K.new_tensor([pixels * math.cos(angle), pixels * math.sin(angle)])
+    return rig.with_camera(BETA, beta.replace(K=K))

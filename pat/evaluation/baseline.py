@@ -25,7 +25,7 @@ from torch import Tensor
 from arraygeom import Camera, Pair, Rig
 
 from ..fusion.results import Frame
-from ..fusion.steps import Undistort
+from ..fusion.steps import undistort
 from ..fusion.views import Views
 from ..media.colour import from_luma_chroma, luminance, luminance_of, to_bytes
 from ..media.figures import reduced
@@ -44,16 +44,8 @@ REGRESSION_RADIUS, REGRESSION_FLOOR = 3, 3e-3
 """Window and regulariser (variance of luminance) of the regression of colour on luminance."""
 
 
-class _Smoothing(NamedTuple):
-    """Strength of the edge-aware smoothing, and the difference of 8-bit luminance that counts as an edge."""
-
-    strength: float
-    edge: float
-
-
-DISPARITY_FILL = _Smoothing(50, 4)
-COLOUR_FILL = _Smoothing(300, 3)
-
+DISPARITY_FILL, COLOUR_FILL = (50, 4), (300, 3)
+"""Strength of the edge-aware smoothing, and the difference of 8-bit luminance that counts as an edge."""
 UNRECTIFIABLE = "the cameras look along the line between them: such a pair cannot be rectified"
 
 
@@ -73,14 +65,11 @@ def classical_view(
     Raises ValueError for cameras that are not calibrated, and for those that cannot be rectified.
     """
     if names := [name for name in images if not isinstance(rig[name], Camera)]:
-        raise ValueError(
-            f"{', '.join(names)}: not calibrated, and the classical baseline needs poses and depths"
-        )
+        raise ValueError(f"{', '.join(names)}: not calibrated, and the classical baseline needs poses")
     small = {name: reduced(image, longest).clamp(0, 1) for name, image in images.items()}
     for name, image in small.items():
-        h, w = image.shape[-2:]
-        rig = rig.resize(name, (h, w))
-    views, back = Undistort().do(Views.of(rig, small, alpha=alpha))
+        rig = rig.resize(name, (image.shape[-2], image.shape[-1]))
+    views, back = undistort(Views.of(rig, small, alpha=alpha))
     image = classical_baseline(views.rig, views.images, alpha)
     return back(Frame(image, *torch.zeros(3, *image.shape[-2:]))).image
 
@@ -146,15 +135,8 @@ def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Te
     from skimage.restoration import denoise_nl_means
 
     given = image.movedim(0, -1).numpy()
-    found = denoise_nl_means(
-        given,
-        patch_size=5,
-        patch_distance=6,
-        h=0.8 * deviation,
-        sigma=deviation,
-        fast_mode=True,
-        channel_axis=-1,
-    )
+    noise = {"h": 0.8 * deviation, "sigma": deviation}
+    found = denoise_nl_means(given, 5, 6, **noise, fast_mode=True, channel_axis=-1)
     return torch.from_numpy(np.ascontiguousarray(found.reshape(given.shape))).movedim(-1, 0).to(image)
 
 
@@ -175,9 +157,8 @@ def _rectified_plane(pair: Pair, depth: tuple[float, float]) -> _Plane:
     beta's principal point is shifted so that disparities start at 0 whichever camera is on the left.
     """
     pose = pair.beta_from_alpha
-    K_alpha, K_beta, R, t = (
-        x.detach().cpu().double().numpy() for x in (*(c.K for c in pair.cameras), pose.R, pose.t)
-    )
+    given = (*(c.K for c in pair.cameras), pose.R, pose.t)
+    K_alpha, K_beta, R, t = (x.detach().cpu().double().numpy() for x in given)
     hw = pair.alpha.hw
     rotation = _rectifying_rotation(R, t)
     focal = (K_alpha[0, 0] + K_alpha[1, 1]) / 2
@@ -188,9 +169,8 @@ def _rectified_plane(pair: Pair, depth: tuple[float, float]) -> _Plane:
     shift = -(rotation @ R.T @ t)[0] * focal / (np.array(depth) * [z.min(), z.max()])
     max_disparity = float(np.ptp(shift))
     K[:2, 2] = -corners.min(0) + [max_disparity, 0]
-    width, height = (
-        int(side) for side in np.ceil(np.ptp(corners, axis=0) + np.array([max_disparity + 1, 1]))
-    )
+    sides = np.ceil(np.ptp(corners, axis=0) + np.array([max_disparity + 1, 1]))
+    width, height = (int(side) for side in sides)
     if width * height > 8 * hw[0] * (hw[1] + max_disparity):
         raise ValueError(UNRECTIFIABLE)
     K_shifted = K.copy()
@@ -290,15 +270,8 @@ def _softened(mono: Image, sharpness: float) -> Image:
 def raw_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float) -> Image:
     """Semi-global matching, padded because OpenCV leaves `count` columns at the left without disparity."""
     count = 16 * int(np.ceil((min(max_disparity, left.shape[1]) + 1) / 16))
-    matcher = cv2.StereoSGBM.create(
-        0,
-        count,
-        BLOCK,
-        P1=8 * BLOCK**2,
-        P2=32 * BLOCK**2,
-        preFilterCap=31,
-        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-    )
+    costs = {"P1": 8 * BLOCK**2, "P2": 32 * BLOCK**2, "preFilterCap": 31}
+    matcher = cv2.StereoSGBM.create(0, count, BLOCK, **costs, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY)
     padded = (cv2.copyMakeBorder(x, 0, 0, count, count, cv2.BORDER_REPLICATE) for x in (left, right))
     return matcher.compute(*padded)[:, count:-count].astype(np.float32) / 16
 
@@ -329,11 +302,11 @@ def _regressed(chroma: Image, luma: Image, residual: Image) -> Image:
     return chroma + slope * np.clip(residual, -0.2, 0.2)[..., None]
 
 
-def _diffused(values: Image, weight: Image, guide: NDArray[np.uint8], how: _Smoothing) -> Image:
+def _diffused(values: Image, weight: Image, guide: NDArray[np.uint8], how: tuple[float, float]) -> Image:
     """The weighted mean of `values` over what is connected in `guide`. Weights must be positive."""
 
     def smooth(plane: Image) -> Image:
-        return cv2.ximgproc.fastGlobalSmootherFilter(guide, plane.astype(np.float32), how.strength, how.edge)
+        return cv2.ximgproc.fastGlobalSmootherFilter(guide, plane.astype(np.float32), *how)
 
     total = smooth(weight)
     planes = np.atleast_3d(values).transpose(2, 0, 1)

@@ -77,10 +77,8 @@ def save_demo_figure(panels: Mapping[str, Tensor], corner: tuple[int, int], path
     h, w = next(iter(panels.values())).shape[-2:]
     top, left = corner
     window = (..., slice(top, top + h // CROP), slice(left, left + w // CROP))
-    drawn = draw_panels(panels, columns=3, width=16)
-    crops = draw_panels(
-        {f"{name}, {CROP} x": image[window] for name, image in panels.items()}, columns=3, width=16
-    )
+    enlarged = {f"{name}, {CROP} x": image[window] for name, image in panels.items()}
+    drawn, crops = (draw_panels(images, columns=3, width=16) for images in (panels, enlarged))
     both = Image.new("RGB", (drawn.width, drawn.height + crops.height), "white")
     both.paste(drawn, (0, 0))
     both.paste(crops, (0, drawn.height))

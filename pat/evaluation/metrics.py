@@ -37,24 +37,15 @@ def score(image: Float[Tensor, "_ _ _"], ground_truth: Float[Tensor, "_ _ _"]) -
     11 pixels.
     """
     if image.shape != ground_truth.shape:
-        raise ValueError(
-            f"the image is {tuple(image.shape)} and the ground truth "
-            f"{tuple(ground_truth.shape)}: give equal shapes"
-        )
+        got, wanted = tuple(image.shape), tuple(ground_truth.shape)
+        raise ValueError(f"the image is {got} and the ground truth {wanted}: give equal shapes")
     if min(image.shape[-2:]) < SSIM_WINDOW:
         raise ValueError(f"SSIM needs sides of {SSIM_WINDOW} pixels or more, got {tuple(image.shape[-2:])}")
     ours, theirs = (x.detach().cpu().double().numpy() for x in (image, ground_truth))
     with np.errstate(divide="ignore"):
         psnr = -10 * np.log10(np.square(ours - theirs).mean())
-    ssim = structural_similarity(
-        theirs,
-        ours,
-        data_range=1,
-        channel_axis=0,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-    )
+    how = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    ssim = structural_similarity(theirs, ours, data_range=1, channel_axis=0, **how)
     return Score(float(psnr), float(ssim))
 
 

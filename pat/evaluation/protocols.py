@@ -49,17 +49,14 @@ def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
             "the mono + colour protocol needs equal sizes"
         )
     ground_truth = cut_to_multiple(pair.left, rate)
-    return MonoColourTask(
-        luminance(ground_truth), reduce_by(cut_to_multiple(pair.right, rate), rate), ground_truth
-    )
+    beta = reduce_by(cut_to_multiple(pair.right, rate), rate)
+    return MonoColourTask(luminance(ground_truth), beta, ground_truth)
 
 
 def reduce_by(image: Float[Tensor, "c h w"], rate: int) -> Float[Tensor, "c hr wr"]:
     """The mean of each `rate` x `rate` block, as a sensor with larger pixels sees it."""
     if rate < 1 or any(side % rate for side in image.shape[1:]):
-        raise ValueError(
-            f"cannot reduce {tuple(image.shape[1:])} by {rate}: give a rate that divides both sides"
-        )
+        raise ValueError(f"cannot reduce {tuple(image.shape[1:])} by {rate}: give a divisor of both sides")
     return avg_pool2d(image, rate)
 
 

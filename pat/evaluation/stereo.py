@@ -44,17 +44,6 @@ class StereoRow(NamedTuple):
     within_one: float | None = None
 
 
-class StereoSummary(NamedTuple):
-    """A method's means over pairs at one rate, with the 95% bootstrap interval of mean PSNR."""
-
-    rate: int
-    method: str
-    pairs: int
-    psnr: float
-    psnr_interval: tuple[float, float]
-    ssim: float
-
-
 def evaluate_sets(
     sets: Mapping[str, Iterable[StereoPair]],
     methods: Mapping[str, StereoMethod],
@@ -85,31 +74,13 @@ def evaluate_pairs(
     for pair in track(pairs, "evaluating", disable=not sys.stderr.isatty()):
         for rate in rates:
             task = mono_colour_task(pair, rate)
-            results = {
-                name: _result(name, method, pair, task, max_disparity) for name, method in methods.items()
-            }
+            results = {n: _result(n, method, pair, task, max_disparity) for n, method in methods.items()}
             rows += [_row(pair, rate, name, result, task.ground_truth) for name, result in results.items()]
             if images:
-                shown = [
-                    beta_alone(task.alpha, task.beta, 0.0),
-                    *(result.image for result in results.values()),
-                ]
-                strip = torch.cat([*shown, task.ground_truth], -1)
+                beta, shown = beta_alone(task.alpha, task.beta, 0.0), [r.image for r in results.values()]
+                strip = torch.cat([beta, *shown, task.ground_truth], -1)
                 write_image(images / f"{pair.name.replace('/', '-')}_x{rate}.png", strip)
     return rows
-
-
-def summarise(rows: Sequence[StereoRow]) -> list[StereoSummary]:
-    """One summary for each rate and method, in the order in which they appear."""
-    groups: dict[tuple[int, str], list[StereoRow]] = {}
-    for row in rows:
-        groups.setdefault((row.rate, row.method), []).append(row)
-    summaries = []
-    for (rate, method), group in sorted(groups.items(), key=lambda item: item[0][0]):
-        psnr, ssim = [row.psnr for row in group], float(np.mean([row.ssim for row in group]))
-        mean, interval = float(np.mean(psnr)), bootstrap_interval(psnr)
-        summaries.append(StereoSummary(rate, method, len(group), mean, interval, ssim))
-    return summaries
 
 
 PrintedScores = Mapping[int, tuple[float, float]]
@@ -122,9 +93,8 @@ def sets_markdown(
     """`markdown` of each data set under its name, then `structure_kept` and, with `depth`, its errors."""
     parts = []
     for name, found in rows.items():
-        parts += [
-            f"#### {name}\n\n{markdown(found, printed=printed.get(name, {}))}\n{structure_kept(found)}\n"
-        ]
+        scores = markdown(found, printed=printed.get(name, {}))
+        parts.append(f"#### {name}\n\n{scores}\n{structure_kept(found)}\n")
         parts += [errors] if depth and (errors := depth_markdown(found)) else []
     return "\n".join(parts)
 
@@ -142,13 +112,10 @@ def _table(rows: Sequence[StereoRow], printed: tuple[float, float] | None = None
     """The table of one rate."""
     methods = distinct(row.method for row in rows)
     scores = {(row.pair, row.method): f"{row.psnr:.2f} / {row.ssim:.4f}" for row in rows}
-    means = {summary.method: _mean_cell(summary) for summary in summarise(rows)}
     columns = [f"beta reduced {rows[0].rate}x" if rows[0].rate > 1 else "beta as it is", *methods]
-    lines = [
-        [pair, *(scores.get((pair, method), "") for method in methods)]
-        for pair in distinct(row.pair for row in rows)
-    ]
-    lines.append(["**mean**", *(means[method] for method in methods)])
+    pairs = distinct(row.pair for row in rows)
+    lines = [[pair, *(scores.get((pair, m), "") for m in methods)] for pair in pairs]
+    lines.append(["**mean**", *(_mean_cell([row for row in rows if row.method == m]) for m in methods)])
     if printed:
         columns.append("the paper, printed, on its own data")
         cells = [""] * (len(lines) - 1) + [f"{printed[0]:.2f} / {printed[1]:.4f}"]
@@ -156,10 +123,11 @@ def _table(rows: Sequence[StereoRow], printed: tuple[float, float] | None = None
     return markdown_table(columns, lines)
 
 
-def _mean_cell(summary: StereoSummary) -> str:
-    low, high = summary.psnr_interval
-    interval = f" ({low:.2f} to {high:.2f})" if summary.pairs > 1 else ""
-    return f"**{summary.psnr:.2f}**{interval} / **{summary.ssim:.4f}**"
+def _mean_cell(rows: Sequence[StereoRow]) -> str:
+    """Mean PSNR with its 95% bootstrap interval, and mean SSIM."""
+    psnr = [row.psnr for row in rows]
+    interval = " ({:.2f} to {:.2f})".format(*bootstrap_interval(psnr)) if len(psnr) > 1 else ""
+    return f"**{np.mean(psnr):.2f}**{interval} / **{np.mean([row.ssim for row in rows]):.4f}**"
 
 
 def depth_markdown(rows: Sequence[StereoRow]) -> str:
@@ -167,9 +135,8 @@ def depth_markdown(rows: Sequence[StereoRow]) -> str:
     known = [row for row in rows if row.end_point_error is not None]
     if not known:
         return ""
-    columns = [
-        (m, r) for m in distinct(row.method for row in known) for r in distinct(row.rate for row in known)
-    ]
+    methods, rates = distinct(row.method for row in known), distinct(row.rate for row in known)
+    columns = [(method, rate) for method in methods for rate in rates]
     groups = {key: [row for row in known if (row.method, row.rate) == key] for key in columns}
     lines = [
         [pair, *(_depth_cell([row for row in groups[key] if row.pair == pair]) for key in columns)]
@@ -182,19 +149,15 @@ def depth_markdown(rows: Sequence[StereoRow]) -> str:
 def _depth_cell(rows: Sequence[StereoRow]) -> str:
     if not rows:
         return ""
-    error, within = (
-        float(np.mean([getattr(row, name) for row in rows])) for name in ("end_point_error", "within_one")
-    )
-    return f"{error:.2f} px / {within:.1%}"
+    errors = np.array([row[-2:] for row in rows], float)  # end-point error, share within a pixel
+    return "{:.2f} px / {:.1%}".format(*errors.mean(0))
 
 
 def structure_kept(rows: Sequence[StereoRow]) -> str:
     """One line: on which pairs, if any, the SSIM of the fusion is below that of alpha alone."""
     ssim = {(row.pair, row.rate, row.method): row.ssim for row in rows}
     cases = [(pair, rate) for pair, rate, name in ssim if name == "fusion"]
-    lost = [
-        f"{pair} {rate}x" for pair, rate in cases if ssim[pair, rate, "fusion"] < ssim[pair, rate, "alpha"]
-    ]
+    lost = [f"{p} {r}x" for p, r in cases if ssim[p, r, "fusion"] < ssim[p, r, "alpha"]]
     kept = f"SSIM of fusion is at least that of alpha in {len(cases) - len(lost)} of {len(cases)} cases"
     return f"{kept}; **below it**: {', '.join(lost)}." if lost else f"{kept}."
 
@@ -206,10 +169,8 @@ def _result(
     result = given if isinstance(given, StereoResult) else StereoResult(given)
     image = result.image.detach().cpu()
     if image.shape != task.ground_truth.shape:
-        raise ValueError(
-            f"{name} on {pair.name}: gave {tuple(image.shape)}, wanted an image "
-            f"{tuple(task.ground_truth.shape)}"
-        )
+        wanted = tuple(task.ground_truth.shape)
+        raise ValueError(f"{name} on {pair.name}: gave {tuple(image.shape)}, wanted an image {wanted}")
     if not image.isfinite().all():
         raise ValueError(f"{name} on {pair.name}: gave NaN or infinite values")
     return StereoResult(image.float().clamp(0, 1), result.disparity)

@@ -45,14 +45,10 @@ SHIPPED = "pat-supervised"
 
 
 def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any]:
-    """The pixel, its depth, each beta's samples, weights and match; `error` or `problem` where none."""
-    try:
-        return _answer(scene, alpha, controls)
-    except (ValueError, TypeError, KeyError) as error:
-        return {"error": str(error)}
+    """The pixel, its depth, each beta's samples, weights and match, or `problem` where none.
 
-
-def _answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any]:
+    Raises ValueError, TypeError or KeyError for controls that cannot be.
+    """
     rig = scene.rig
     scene = scene.with_rig(moved_rig(rig, alpha, controls))
     backwards: list[Any] = []
@@ -62,9 +58,8 @@ def _answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, A
     betas: dict[str, Any] = {name: {"problem": text} for name, text in report.problems.items()}
     betas |= {name: drawn(beta) for name, beta in report.betas.items()}
     if controls["second"] != "none":
-        other = inspect_pixel(
-            scene, explorer_state(scene.rig, alpha, {**controls, "field": controls["second"]})
-        )
+        second = {**controls, "field": controls["second"]}
+        other = inspect_pixel(scene, explorer_state(scene.rig, alpha, second))
         for name, beta in betas.items():
             problem = other.problems.get(name)
             beta["second"] = {"problem": problem} if problem else drawn(other.betas[name])
@@ -96,9 +91,7 @@ def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
     own, cameras = rig[alpha], dict(rig.cameras)
     if all(controls[name] == DEFAULTS[name] for name in ("baseline", "rotation", "focal", "lens", "moved")):
         return rig
-    turn = rotation_from_vector(
-        torch.tensor([0.0, math.radians(controls["rotation"]), 0.0], dtype=torch.float64)
-    )
+    turned = torch.tensor([0.0, math.radians(controls["rotation"]), 0.0], dtype=torch.float64)
     for name in rig.betas(alpha):
         beta = rig[name]
         if not (isinstance(beta, Camera) and isinstance(own, Camera)):
@@ -109,7 +102,7 @@ def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
         K = torch.cat([beta.K[:2, :2] * controls["focal"], beta.K[:2, 2:]], 1)
         cameras[name] = beta.replace(
             K=torch.cat([K, beta.K[2:]]),
-            cam_from_world=Pose.from_centre(turn.to(beta.R) @ beta.R, centre),
+            cam_from_world=Pose.from_centre(rotation_from_vector(turned).to(beta.R) @ beta.R, centre),
             distortion=with_k1(beta, controls["lens"]),
         )
     return rig.replace(cameras=cameras)
@@ -138,14 +131,8 @@ def has_k1(camera: Camera) -> bool:
 def explorer_state(rig: Rig, alpha: str, controls: Controls) -> ExplorerState:
     """The state of the controls, for a rig that they have moved."""
     x = image_pixel(controls["x"][0], controls["x"][1], rig[alpha].hw)
-    return ExplorerState(
-        alpha,
-        x,
-        family=controls["field"],
-        near=controls["near"],
-        far=controls["far"],
-        weights=controls["weights"],
-    )
+    near, far, weights = (controls[name] for name in ("near", "far", "weights"))
+    return ExplorerState(alpha, x, controls["field"], near, far, weights)
 
 
 def drawn(beta: BetaReport) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Camera, ReceptiveField, Rig, pixel_grid
@@ -35,7 +35,12 @@ class Explorer:
 
     def answer(self, controls: Controls) -> dict[str, Any]:
         """What is drawn for a state of the controls."""
-        return {"error": self.error} if self.scene is None else answer(self.scene, self.alpha, controls)
+        if self.scene is None:
+            return {"error": self.error}
+        try:
+            return answer(self.scene, self.alpha, controls)
+        except (ValueError, TypeError, KeyError) as error:
+            return {"error": str(error)}
 
     def values(self) -> dict[str, Any]:
         """What the widget starts from."""
@@ -63,12 +68,11 @@ class Explorer:
         values = {**self.values(), "choices": []}
         if self.scene is not None and is_pinhole(self.scene.rig) and self.usual:
             values["ranges"] = [found for found in values["ranges"] if found[0] != "lens"]
-            write_text(
-                path, page(values, f"asksPinholes({json.dumps(geometry(self.scene.rig, self.alpha))})")
-            )
+            asks = f"asksPinholes({json.dumps(geometry(self.scene.rig, self.alpha))})"
         else:
             values["ranges"] = []
-            write_text(path, page(values, f"asksGrid({json.dumps(self.grid(columns))})"))
+            asks = f"asksGrid({json.dumps(self.grid(columns))})"
+        write_text(path, page(values, asks))
 
     @property
     def usual(self) -> bool:
@@ -98,12 +102,7 @@ def is_pinhole(rig: Rig) -> bool:
 def geometry(rig: Rig, alpha: str) -> dict[str, Any]:
     """The cameras in numbers, for the page's own computation."""
     cameras = {
-        name: {
-            "K": camera.K.tolist(),
-            "R": camera.R.tolist(),
-            "centre": camera.centre.tolist(),
-            "hw": list(camera.hw),
-        }
+        name: {k: getattr(camera, k).tolist() for k in ("K", "R", "centre")} | {"hw": list(camera.hw)}
         for name, camera in rig.cameras.items()
         if isinstance(camera, Camera)
     }
@@ -151,9 +150,8 @@ def opened(
     except ValueError as error:
         return Explorer(None, "", {**DEFAULTS, "x": [0, 0]}, str(error))
     h, w = rig[alpha].hw
-    return Explorer(
-        scene, alpha, {**DEFAULTS, "weights": weights, **controls, "x": list(x or (w // 2, h // 2))}
-    )
+    controls = {**DEFAULTS, "weights": weights, **controls, "x": list(x or (w // 2, h // 2))}
+    return Explorer(scene, alpha, controls)
 
 
 def checked(
@@ -188,21 +186,16 @@ def checkered_room(rig: Rig, alpha: str) -> dict[str, Float[Tensor, "1 h w"]]:
         raise ValueError("a synthetic room needs a calibrated rig with a depth range: give images")
     near, far = (float(d) for d in rig.depth)
     view = cameras[alpha]
-    rays, valid = valid_rays(view)
+    rays, valid = view.rays(pixel_grid(view.hw, dtype=torch.float64))
     rays = torch.where(valid[..., None], rays, 0.0)
     side = near * rays[..., :2].abs().amax((0, 1))
     half = torch.cat([side, side.new_tensor([min(far, DEEPEST * near)])])
     return {name: room_image(camera, view, half) for name, camera in cameras.items()}
 
 
-def valid_rays(camera: Camera) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
-    """The rays of all pixels in the camera's frame, and their validity."""
-    return camera.rays(pixel_grid(camera.hw, dtype=torch.float64))
-
-
 def room_image(camera: Camera, alpha: Camera, half: Float[Tensor, "3"]) -> Float[Tensor, "1 h w"]:
     """The room's image; `half` is half the room's size in alpha's axes, metres, with alpha in its middle."""
-    rays, valid = valid_rays(camera)
+    rays, valid = camera.rays(pixel_grid(camera.hw, dtype=torch.float64))
     R = alpha.R @ camera.R.T
     start = alpha.R @ (camera.centre - alpha.centre)
     directions = rays @ R.T

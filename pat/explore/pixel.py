@@ -122,7 +122,7 @@ class ExplorerScene:
     fields: Mapping[str, ReceptiveField] = field(default_factory=dict)
     networks: Mapping[str, PAT] = field(default_factory=dict)
     guides: dict[str, Tensor] = field(default_factory=dict)
-    features: dict[tuple[str, str, str], QueryAndKey] = field(default_factory=dict)
+    features: dict[tuple[str, str, bool], QueryAndKey] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, image in self.images.items():
@@ -131,36 +131,27 @@ class ExplorerScene:
             hw = self.rig[name].hw
             if tuple(image.shape[1:]) != hw:
                 got, wanted = f"{image.shape[2]}x{image.shape[1]}", f"{hw[1]}x{hw[0]}"
-                raise ValueError(
-                    f"the image of '{name}' is {got}, the rig says {wanted}: give the right image"
-                )
-            self.guides[name] = (luminance(image) if image.shape[0] == 3 else image.mean(0, keepdim=True))[
-                None
-            ]
+                raise ValueError(f"the image of '{name}' is {got}, the rig says {wanted}: give the right one")
+            grey = luminance(image) if image.shape[0] == 3 else image.mean(0, keepdim=True)
+            self.guides[name] = grey[None]
 
     def with_rig(self, rig: Rig) -> ExplorerScene:
         """The same images with a rig that was moved."""
         return dataclasses.replace(self, rig=rig)
 
-    def query(self, network: str, alpha: str) -> Float[Tensor, "1 d h w"]:
-        """What the network's attention compares of alpha's image."""
-        return self._once(network, alpha, self.images[alpha], "query").query
+    def query_and_key(self, network: str, camera: str, pair: Pair | None = None) -> QueryAndKey:
+        """What a network's attention compares of a camera's image; with a pair, of its beta.
 
-    def key(self, network: str, beta: str, pair: Pair) -> Float[Tensor, "1 d h w"]:
-        """What it compares of a beta's image, at alpha's resolution if the network wants that."""
-        image = self.images[beta]
-        if self._network(network).equal_resolution and (network, beta, "key") not in self.features:
-            image = at_alphas_resolution(image, pair)
-        return self._once(network, beta, image, "key").key
-
-    def _network(self, name: str) -> PAT:
-        return self.networks[name] if name in self.networks else shipped_attention(name)
-
-    def _once(self, network: str, camera: str, image: Tensor, part: str) -> QueryAndKey:
-        which = network, camera, part
+        That is at alpha's resolution if the network wants that.
+        """
+        which = network, camera, pair is not None
         if which not in self.features:
+            asked = self.networks[network] if network in self.networks else shipped_attention(network)
+            image = self.images[camera]
+            if pair and asked.equal_resolution:
+                image = at_alphas_resolution(image, pair)
             with torch.no_grad():
-                self.features[which] = self._network(network).query_and_key(image[None])
+                self.features[which] = asked.query_and_key(image[None])
         return self.features[which]
 
 
@@ -209,9 +200,8 @@ def with_depths(rig: Rig, state: ExplorerState) -> Rig:
     if rig.depth is None and (state.near is None or state.far is None):
         raise ValueError("the rig has no depth range: give near and far, both")
     near, far = rig.depth or (None, None)
-    return rig.replace(
-        depth=(near if state.near is None else state.near, far if state.far is None else state.far)
-    )
+    near, far = (old if new is None else new for old, new in ((near, state.near), (far, state.far)))
+    return rig.replace(depth=(near, far))
 
 
 def inspect_pixel(scene: ExplorerScene, state: ExplorerState) -> PixelReport:
@@ -255,22 +245,15 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
     if state.weights == WINDOWS:
         scores = SHARPNESS * correlations(scene.guides[state.alpha], scene.guides[name], pair, x, xy)
     else:
-        query = sampled(scene.query(state.weights, state.alpha), x)
-        key = scene.key(state.weights, name, pair)
+        query = sampled(scene.query_and_key(state.weights, state.alpha).query, x)
+        key = scene.query_and_key(state.weights, name, pair).key
         larger = xy.new_tensor([key.shape[-1] / pair.beta.hw[1], key.shape[-2] / pair.beta.hw[0]])
         scores = (query.T @ sampled(key, (xy + 0.5) * larger - 0.5))[0]
     weight = softmax(scores, valid)
     value = sampled(scene.images[name][None], xy) @ weight
-    return BetaReport(
-        xy,
-        valid,
-        ends_of(found),
-        weight,
-        depths(pair, x, xy, valid),
-        value,
-        float(weight.max()),
-        match_offset((scene.guides[state.alpha], scene.guides[name]), pair, x, (xy, weight), ends_of(found)),
-    )
+    depth, ends = depths(pair, x, xy, valid), ends_of(found)
+    offset = match_offset((scene.guides[state.alpha], scene.guides[name]), pair, x, (xy, weight), ends)
+    return BetaReport(xy, valid, ends, weight, depth, value, float(weight.max()), offset)
 
 
 ACROSS, STEP = 8, 0.25
@@ -350,9 +333,8 @@ def correlations(
 
 def jacobian(pair: Pair, x: Float[Tensor, "1 2"]) -> Float[Tensor, "2 2"]:
     """The Jacobian at x of the rough transfer to beta; the identity where there is none."""
-    ends = torch.cat(
-        [x, x + x.new_tensor([[0.5, 0.0], [0.0, 0.5]]), x - x.new_tensor([[0.5, 0.0], [0.0, 0.5]])]
-    )
+    half = x.new_tensor([[0.5, 0.0], [0.0, 0.5]])
+    ends = torch.cat([x, x + half, x - half])
     transformed, valid = rough_transfer(pair, ends)
     return (transformed[1:3] - transformed[3:5]).T if bool(valid.all()) else torch.eye(2, dtype=x.dtype)
 
@@ -415,10 +397,8 @@ def fused_colour(
     if not coloured:
         return own
     weights = sum(s.peak for s in coloured)
-    difference = sum(
-        (s.peak / weights) * (s.value - luminance(s.value[:, None, None]).reshape(1)) for s in coloured
-    )
-    return own + difference
+    differences = [s.value - luminance(s.value[:, None, None]).reshape(1) for s in coloured]
+    return own + sum((s.peak / weights) * difference for s, difference in zip(coloured, differences))
 
 
 def image_pixel(x: float, y: float, hw: HW) -> tuple[float, float]:

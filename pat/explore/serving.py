@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import sys
 import threading
 import webbrowser
@@ -32,8 +31,8 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
     page whose name is made to resolve to this machine must not read the images. Raises ValueError for a port
     that is none or in use.
     """
-    check_port(port)
-    page = explorer.served_page().encode()  # computes once what the first answer would wait for
+    if not 0 <= port <= 65535:
+        raise ValueError(f"--port {port}: wanted 1 to 65535, or 0 for a free one")
     turn = threading.Lock()
 
     class Handler(BaseHTTPRequestHandler):
@@ -45,9 +44,8 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
 
         def do_POST(self) -> None:
             length = self.headers.get("Content-Length", "")
-            if not (
-                self._is_own() and self.path == "/answer" and length.isdigit() and int(length) <= LARGEST
-            ):
+            short = length.isdigit() and int(length) <= LARGEST
+            if not (self._is_own() and self.path == "/answer" and short):
                 self._refuse()
                 return
             try:
@@ -62,15 +60,12 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
         def _is_own(self) -> bool:
             hosts = [f"{name}:{self.server.server_port}" for name in OWN_NAMES]  # type: ignore[attr-defined]
             origin = self.headers.get("Origin")
-            return self.headers.get("Host") in hosts and (
-                origin is None or origin.partition("://")[2] in hosts
-            )
+            of_page = origin is None or origin.partition("://")[2] in hosts
+            return self.headers.get("Host") in hosts and of_page
 
         def _refuse(self) -> None:
-            own = self._is_own()
-            self._send(
-                404 if own else 403, "text/plain", b"nothing here\n" if own else b"for localhost alone\n"
-            )
+            status, why = (404, b"nothing here\n") if self._is_own() else (403, b"for localhost alone\n")
+            self._send(status, "text/plain", why)
 
         def _send(self, status: int, kind: str, body: bytes) -> None:
             self.send_response(status)
@@ -82,7 +77,11 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
         def log_message(self, format: str, *args: Any) -> None:
             """Say nothing of each request."""
 
-    server = _Server(("127.0.0.1", port), Handler)
+    try:
+        server = _Server(("127.0.0.1", port), Handler)
+    except OSError as error:
+        raise ValueError(f"--port {port}: {error.strerror}: give another, or 0 for a free one") from None
+    page = explorer.served_page().encode()  # computes once what the first answer would wait for
     address = f"http://localhost:{server.server_port}"
     print(f"the explorer is at {address} (Ctrl+C ends it)", flush=True)
     if browser:
@@ -93,15 +92,3 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
         pass
     finally:
         server.server_close()
-
-
-def check_port(port: int) -> None:
-    """Raises ValueError for a number that is no port, or a port that is in use."""
-    if not 0 <= port <= 65535:
-        raise ValueError(f"--port {port}: wanted 1 to 65535, or 0 for a free one")
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError as error:
-            raise ValueError(f"--port {port}: {error.strerror}: give another, or 0 for a free one") from None

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -19,12 +19,13 @@ from arraygeom.pixels import HW
 from arraygeom.rig import Rig
 from pat.media.colour import linear_from_srgb
 from pat.support.schema import from_document
+from pat.synthesis.blender import compat
 from pat.synthesis.blender.lens import lens_for
 from pat.synthesis.blender.settings import RenderSettings
 from pat.synthesis.blender.task import fitted, render_here, shots
-from pat.synthesis.check import CheckLimits, SceneCheck, check_views
+from pat.synthesis.check import CheckLimits, check_views
 from pat.synthesis.generators import generator_named
-from pat.synthesis.layered import ArrayBatch, LayeredScenes
+from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.patterns import patterns
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rendered import RENDER_FILE, RenderedFrame, frame_file, save_frame
@@ -35,12 +36,8 @@ FARTHEST = 50.0
 """Layered scenes of rigs that see to infinity end at this many times the near bound."""
 
 
-@runtime_checkable
-class Renderer(Protocol):
-    """Renders scenes of one job."""
-
-    def render(self, seed: int, out: Path) -> SceneCheck:
-        """Render the scene of a seed into the folder `out`, made here, and check it. Raises ValueError."""
+Renderer = Callable[[int, Path], None]
+"""Renders and checks the scene of a seed into a folder, made here. Raises ValueError."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,17 +53,42 @@ class LayeredSettings:
     layers: tuple[int, int] = (5, 12)
     oversampling: int = 2
 
-    def check_rig(self, rig: Rig) -> None:
-        """Raises ValueError for a rig that cannot be rendered."""
-        rig_from_alpha(rig)
-
     def images(self, rig: Rig) -> list[HW]:
-        """The sizes of the images of a scene."""
-        return [camera.hw for camera in rig.cameras.values()]
+        """The sizes of the images of a scene. Raises ValueError for a rig that cannot be rendered."""
+        return [camera.hw for camera in rig_from_alpha(rig).cameras]
 
     def renderer(self, rig: Rig, limits: CheckLimits) -> Renderer:
         """A renderer that is ready."""
-        return LayeredRenderer(rig, self, limits)
+        seen = rig_from_alpha(rig)
+        if self.photos:
+            bank = PhotoBank.load(*self.photos, max_edge=self.edge)
+        else:
+            bank = PhotoBank(patterns(np.random.default_rng(0), 60))
+        scenes = LayeredScenes(bank, RigDistribution(), hw=seen.cameras[0].hw, layers=self.layers)
+
+        def render(seed: int, out: Path) -> None:
+            started = time.monotonic()
+            generator = torch.Generator().manual_seed(seed)
+            batch = scenes.render(seen, generator, oversampling=self.oversampling)
+            frames = {
+                name: RenderedFrame(time=0.0, rgb=linear_from_srgb(image)[0], depth=depth[0], index=index[0])
+                for name, image, depth, index in zip(rig.names, batch.images, batch.depth, batch.index)
+            }
+            files = {name: frame_file(rig, name) for name in rig.names}
+            out.mkdir(parents=True)
+            rig.save(out / "rig.yaml")
+            for name, frame in frames.items():
+                save_frame(out / files[name], frame)
+            about = {
+                "settings": {"backend": "layered"},
+                "versions": {"pat": version("arraygeom-pat"), "torch": torch.__version__},
+                "seconds": round(time.monotonic() - started, 3),
+                "frames": {name: [{"file": file, "time": 0.0}] for name, file in files.items()},
+                "check": check_views(rig, frames, limits),
+            }
+            (out / RENDER_FILE).write_text(json.dumps(about, indent=1), encoding="utf-8")
+
+        return render
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,9 +105,7 @@ class BlenderSettings:
 
     def __post_init__(self) -> None:
         if (self.generator == "photographs") != (self.photos is not None):
-            raise ValueError(
-                "the generator 'photographs' needs a folder `photos`, and only that one takes it"
-            )
+            raise ValueError("the generator 'photographs' needs a folder `photos`, no other one takes it")
         if ":" not in self.generator:
             generator_named(self.generator)
         self.render_settings()
@@ -96,54 +116,29 @@ class BlenderSettings:
         changes = {name: getattr(given, name) for name in self.settings}
         return RenderSettings.preset(self.preset, **{"threads": 1, **changes})
 
-    def check_rig(self, rig: Rig) -> None:
-        """Raises ValueError for a rig that cannot be rendered, and a generator that cannot be imported."""
+    def images(self, rig: Rig) -> list[HW]:
+        """The sizes of the images of a scene, one for each exposure.
+
+        Raises ValueError for a rig that cannot be rendered, and a generator that cannot be imported.
+        """
         generator_named(self.generator)
         for name, camera in rig.cameras.items():
             lens_for(camera, name)
-
-    def images(self, rig: Rig) -> list[HW]:
-        """The sizes of the images of a scene, one for each exposure."""
         settings = self.render_settings()
         rig = fitted(rig, settings)
         return [rig[shot.camera].hw for shot in shots(rig, settings)]
 
     def renderer(self, rig: Rig, limits: CheckLimits) -> Renderer:
-        """A renderer that is ready. Raises ValueError without Blender."""
-        return BlenderRenderer(rig, self, limits)
+        """A renderer that is ready; this process imports bpy. Raises ValueError without Blender."""
+        compat.load()
+        generator, settings = generator_named(self.generator), replace(self.render_settings(), limits=limits)
+        further = {} if self.photos is None else {"folder": self.photos}
 
+        def render(seed: int, out: Path) -> None:
+            scene = generator(seed, rig, moving=settings.duration, **further)
+            render_here(scene, rig, out, settings=settings)
 
-class LayeredRenderer:
-    """Layered scenes seen by a rig of pinholes."""
-
-    def __init__(self, rig: Rig, settings: LayeredSettings, limits: CheckLimits):
-        self.rig, self.settings, self.limits = rig, settings, limits
-        self.seen = rig_from_alpha(rig)
-        self.scenes = LayeredScenes(
-            _bank(settings), RigDistribution(), hw=self.seen.cameras[0].hw, layers=settings.layers
-        )
-
-    def render(self, seed: int, out: Path) -> SceneCheck:
-        """Render, write and check."""
-        started = time.monotonic()
-        batch = self.scenes.render(
-            self.seen, torch.Generator().manual_seed(seed), oversampling=self.settings.oversampling
-        )
-        frames = dict(zip(self.rig.names, _frames(batch)))
-        out.mkdir(parents=True)
-        self.rig.save(out / "rig.yaml")
-        for name, frame in frames.items():
-            save_frame(out / frame_file(self.rig, name), frame)
-        report = check_views(self.rig, frames, self.limits)
-        about = {
-            "settings": {"backend": "layered"},
-            "versions": {"pat": version("arraygeom-pat"), "torch": torch.__version__},
-            "seconds": round(time.monotonic() - started, 3),
-            "frames": {name: [{"file": frame_file(self.rig, name), "time": 0.0}] for name in self.rig.names},
-            "check": report.to_document(),
-        }
-        (out / RENDER_FILE).write_text(json.dumps(about, indent=1), encoding="utf-8")
-        return report
+        return render
 
 
 def rig_from_alpha(rig: Rig) -> RigBatch:
@@ -155,9 +150,7 @@ def rig_from_alpha(rig: Rig) -> RigBatch:
         if not isinstance(camera, Camera):
             raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")
         if camera.distortion is not None:
-            raise ValueError(
-                f"camera '{name}' has a lens model, layered scenes have none: use Blender, or omit it"
-            )
+            raise ValueError(f"camera '{name}' has a lens, layered scenes have none: use Blender, or omit it")
     if rig.depth is None:
         raise ValueError("the rig has no depth range: add `depth: [near, far]` in metres to its file")
     near, far = (float(d) for d in rig.depth)
@@ -165,36 +158,3 @@ def rig_from_alpha(rig: Rig) -> RigBatch:
     cameras = [c.to(torch.float64) for c in rig.cameras.values() if isinstance(c, Camera)]
     seen = [stack([in_frame_of(cameras[0], c)]) for c in cameras]
     return RigBatch(seen, torch.tensor([near], dtype=torch.float64), torch.tensor([far], dtype=torch.float64))
-
-
-def _bank(settings: LayeredSettings) -> PhotoBank:
-    if settings.photos:
-        return PhotoBank.load(*settings.photos, max_edge=settings.edge)
-    return PhotoBank(patterns(np.random.default_rng(0), 60))
-
-
-def _frames(batch: ArrayBatch) -> list[RenderedFrame]:
-    return [
-        RenderedFrame(time=0.0, rgb=linear_from_srgb(image)[0], depth=depth[0], index=index[0])
-        for image, depth, index in zip(batch.images, batch.depth, batch.index)
-    ]
-
-
-class BlenderRenderer:
-    """Blender's scenes seen by any calibrated rig. This process imports bpy."""
-
-    def __init__(self, rig: Rig, settings: BlenderSettings, limits: CheckLimits):
-        from pat.synthesis.blender import compat
-
-        compat.load()
-        self.rig, self.settings = rig, settings
-        self.render_settings = replace(settings.render_settings(), limits=limits)
-
-    def render(self, seed: int, out: Path) -> SceneCheck:
-        """Render, write and check."""
-        further = {} if self.settings.photos is None else {"folder": self.settings.photos}
-        moving = self.render_settings.duration
-        scene = generator_named(self.settings.generator)(seed, self.rig, moving=moving, **further)
-        rendered = render_here(scene, self.rig, out, settings=self.render_settings)
-        check = dict(rendered.about["check"])
-        return SceneCheck(views=check["views"], pairs=check["pairs"], reasons=tuple(check["reasons"]))

@@ -32,6 +32,7 @@ from pat.support.locks import folder_lock
 from pat.support.memory import resident
 from pat.support.schema import from_document, read_yaml, to_document
 from pat.synthesis.check import CheckLimits
+from pat.synthesis.rendered import Rendered
 
 from .backends import BlenderSettings, LayeredSettings, Renderer
 
@@ -91,14 +92,11 @@ class RenderConfig:
     def beside(self, folder: Path) -> RenderConfig:
         """The same with paths made absolute, as seen from a folder. Raises ValueError for missing ones."""
         photos = tuple(folder / p for p in self.layered.photos)
-        blender = (
-            self.blender
-            if self.blender.photos is None
-            else replace(self.blender, photos=folder / self.blender.photos)
-        )
-        config = replace(
-            self, rig=folder / self.rig, layered=replace(self.layered, photos=photos), blender=blender
-        )
+        blender = self.blender
+        if blender.photos is not None:
+            blender = replace(blender, photos=folder / blender.photos)
+        layered = replace(self.layered, photos=photos)
+        config = replace(self, rig=folder / self.rig, layered=layered, blender=blender)
         needed = [config.rig, *(photos if self.backend == "layered" else ())]
         needed += [blender.photos] if self.backend == "blender" and blender.photos else []
         for path in needed:
@@ -111,19 +109,16 @@ class RenderConfig:
         """Those of the backend that is used."""
         return self.layered if self.backend == "layered" else self.blender
 
-    def load_rig(self) -> Rig:
-        """The cameras. Raises ValueError, also if the backend cannot render them."""
-        rig = Rig.load(self.rig)
-        self.settings.check_rig(rig)
-        return rig
-
     def renderer(self) -> Renderer:
         """A ready renderer. Raises ValueError for a rig it cannot render, or if a library is missing."""
-        return self.settings.renderer(self.load_rig(), self.check)
+        return self.settings.renderer(Rig.load(self.rig), self.check)
 
     def scene_bytes(self) -> float:
-        """Approximate bytes of a scene on disk: 2 a colour and 4 for depth, before compression."""
-        return sum(10.0 * h * w for h, w in self.settings.images(self.load_rig())) + 20_000
+        """Approximate bytes of a scene on disk: 2 a colour and 4 for depth, before compression.
+
+        Raises ValueError for a rig that cannot be rendered.
+        """
+        return sum(10.0 * h * w for h, w in self.settings.images(Rig.load(self.rig))) + 20_000
 
     def identity(self) -> dict[str, Any]:
         """All that the scenes depend on."""
@@ -178,7 +173,7 @@ def render(
     """
     if scenes < 1 or workers < 1:
         raise ValueError(f"give at least one scene and one worker, got --scenes {scenes} --workers {workers}")
-    config.load_rig()
+    scene_bytes = config.scene_bytes()
     root = Path(out).absolute()
     work = root / ".work" / f"{shard.number}of{shard.count}"
     with folder_lock(work):
@@ -190,7 +185,7 @@ def render(
         write_manifest(config, root)
         given = json.dumps(to_document(config)), work
         folders = {i: root / "scenes" / f"{i:06d}" for i in shard.of(scenes)}
-        check_space(root, sum(not folder.exists() for folder in folders.values()), config.scene_bytes())
+        check_space(root, sum(not folder.exists() for folder in folders.values()), scene_bytes)
         return run_tasks(
             [Task(folder, make_scene, (*given, folder, i), f"scene {i}") for i, folder in folders.items()],
             workers=Workers(workers, scheduler, apart=True, timeout=config.limits.timeout),
@@ -211,10 +206,9 @@ def write_manifest(config: RenderConfig, root: Path) -> None:
         former = read_yaml(path).get("made from", {})
         other = [key for key in identity if former.get(key) != identity[key]]
         if other:
-            raise ValueError(
-                f"{root} holds scenes made from another {' and '.join(other)}: give another --out, "
-                f"or put {config.rig.name if other == ['rig'] else 'the configuration'} back"
-            )
+            changed = config.rig.name if other == ["rig"] else "the configuration"
+            text = f"{root} holds scenes made from another {' and '.join(other)}"
+            raise ValueError(f"{text}: give another --out, or put {changed} back")
         return
     manifest = {"format": FORMAT, "made from": identity, "versions": versions()}
     write_text(path, yaml.safe_dump(manifest, sort_keys=False, width=120, default_flow_style=None))
@@ -248,20 +242,21 @@ def make_scene(config_text: str, work: Path, scene: Path, index: int) -> None:
 
     Raises ValueError for one that is refused again and again, JobError if no scene can be made.
     """
-    config, renderer = _ready(config_text)
+    config, render_scene = _ready(config_text)
     reason = ""
     for attempt in range(config.limits.refusals):
-        seed = scene_seed(config, index, attempt)
+        seed = seed_for(config.seed, "scene", index, attempt)
         partial = work / f"{index:06d}-{uuid4().hex[:12]}"
         wall, cpu = time.monotonic(), time.process_time()
         try:
-            report = renderer.render(seed, partial)
-            if report.accepted:
+            render_scene(seed, partial)
+            check = Rendered(partial).about["check"]
+            if check["accepted"]:
                 facts = {
                     "scene": index,
                     "attempt": attempt,
                     "seed": seed,
-                    "check": report.to_document(),
+                    "check": check,
                     "seconds": round(time.monotonic() - wall, 3),
                     "cpu_seconds": round(time.process_time() - cpu, 3),
                     "memory_mb": round((resident() or math.nan) / 1e6, 1),
@@ -269,7 +264,7 @@ def make_scene(config_text: str, work: Path, scene: Path, index: int) -> None:
                 }
                 (partial / FACTS).write_text(json.dumps(facts, indent=1), encoding="utf-8")
                 return publish(partial, scene)
-            reason = "; ".join(report.reasons)
+            reason = "; ".join(check["reasons"])
         except ValueError as error:  # a camera inside an object, for instance
             reason = str(error)
         except OSError as error:
@@ -279,11 +274,6 @@ def make_scene(config_text: str, work: Path, scene: Path, index: int) -> None:
         finally:
             shutil.rmtree(partial, ignore_errors=True)
     raise ValueError(f"{config.limits.refusals} seeds were refused, the last one: {reason}")
-
-
-def scene_seed(config: RenderConfig, index: int, attempt: int) -> int:
-    """The seed of a scene; another one for every attempt that the self-check refused."""
-    return seed_for(config.seed, "scene", index, attempt)
 
 
 @lru_cache(maxsize=1)
@@ -329,6 +319,5 @@ def summarise(root: Path) -> str:
     memory, refused = max(f["memory_mb"] for f in facts), sum(f["attempt"] for f in facts)
     return (
         f"{text}\na scene took {seconds:.1f} s, {cpu:.1f} s of a core (medians); workers had up to "
-        f"{memory:.0f} MB; "
-        f"{refused} seeds were refused by the check"
+        f"{memory:.0f} MB; {refused} seeds were refused by the check"
     )

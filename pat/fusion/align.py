@@ -9,7 +9,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from functools import partial
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -23,7 +24,6 @@ from arraygeom.chunks import chunked
 from arraygeom.sampling import Interpolation, on_image
 from arraygeom.undistortion import pixels_between, recorded_pixels, resampled, with_pixels
 
-from ..matching.inputs import Beta
 from ..matching.match import Matcher, match
 from ..matching.matches import BetaMatches
 from ..matching.radiometry import Given
@@ -36,7 +36,7 @@ from .corrections import corrections_for, expected_work
 from .fuse import Progress
 from .inputs import FrameInputs, Placement, prepared
 from .low_light import Noise, denoised_views
-from .steps import EqualResolution, FusionStep, Radiometry, Undistort, Upright, has_lens, undone
+from .steps import FusionStep, equal_resolution, has_lens, normalise_betas, undistort, undone, upright
 from .tiles import fused_in_tiles, plan_frame
 from .views import Views, check_bands
 
@@ -222,52 +222,35 @@ def align(
 
 def _steps(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:
     """Those of a fusion that change where pixels are, and the radiometry that matching sees."""
-    resize = [EqualResolution(network)] if network.equal_resolution else []
-    return [Undistort(), Upright(), *resize, *([Radiometry()] if normalise else [])]
+    resize = [partial(equal_resolution, network)] if network.equal_resolution else []
+    return [undistort, upright, *resize, *([normalise_betas] if normalise else [])]
 
 
-class _Located(NamedTuple):
-    """Positions of alpha's recorded pixels (H, W, 2) in a beta as prepared, and which are on it."""
-
-    where: Float[Tensor, "h w 2"]
-    inside: Bool[Tensor, "h w"]
-
-
-def _located(inputs: FrameInputs, i: int, found: BetaMatches, recorded: View) -> _Located:
-    """Where alpha's pixels are in the i-th beta, by its matches."""
+def _located(
+    inputs: FrameInputs, i: int, found: BetaMatches, recorded: View
+) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
+    """Where alpha's recorded pixels are in the i-th beta as prepared, by its matches; which are on it."""
     h, w = inputs.hw
     beta = inputs.inputs.betas[i]
     hw = (beta.image.shape[-2], beta.image.shape[-1])
     if not has_lens(recorded):
         where, inside = found.positions(beta.field.straight, hw)
-        return _Located(where[0, :h, :w], inside[0, :h, :w])
+        return where[0, :h, :w], inside[0, :h, :w]
     pinhole = inputs.placements[i].pair.alpha
     assert isinstance(pinhole, LensView)
     assert isinstance(recorded, LensView)
     x, seen = pixels_between(pinhole, recorded)
     disparity = _between_pixels(found.disparity[0, :, :h, :w], x)
-    where, inside = chunked(
-        lambda x, disparity: _at_points(beta, found, x, disparity, hw), x, disparity, axis=0
-    )
-    return _Located(where, inside & seen)
 
+    def at_points(x: Float[Tensor, "h w 2"], disparity: Float[Tensor, "h w"]) -> tuple[Tensor, Tensor]:
+        segments, rows = beta.field.at(x.reshape(-1, 2)), (1, *x.shape[:2])
+        assert isinstance(segments, Segments)
+        parts = (part.unflatten(0, rows) for part in (segments.start, segments.end, segments.valid))
+        where, inside = replace(found, disparity=disparity[None, None]).positions(Segments(*parts), hw)
+        return where[0], inside[0]
 
-def _at_points(
-    beta: Beta,
-    found: BetaMatches,
-    x: Float[Tensor, "h w 2"],
-    disparity: Float[Tensor, "h w"],
-    hw: tuple[int, int],
-) -> tuple[Tensor, Tensor]:
-    """Positions in beta of some points between alpha's pixels, by their disparities."""
-    segments = beta.field.at(x.reshape(-1, 2))
-    assert isinstance(segments, Segments)
-    h, w = x.shape[:2]
-    parts = (
-        part.reshape(1, h, w, *part.shape[1:]) for part in (segments.start, segments.end, segments.valid)
-    )
-    where, inside = replace(found, disparity=disparity[None, None]).positions(Segments(*parts), hw)
-    return where[0], inside[0]
+    where, inside = chunked(at_points, x, disparity, axis=0)
+    return where, inside & seen
 
 
 def _between_pixels(disparity: Float[Tensor, "1 h w"], x: Float[Tensor, "h2 w2 2"]) -> Float[Tensor, "h2 w2"]:
@@ -294,7 +277,7 @@ def _aligned_view(
     camera: LensView,
     name: str,
     place: Placement,
-    located: _Located,
+    located: tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]],
     confidence: Float[Tensor, "h w"],
     seen: Bool[Tensor, "h w"],
     values: Any,
@@ -303,9 +286,9 @@ def _aligned_view(
 ) -> AlignedView:
     values, now = _as_array(values, name, camera.hw), place.pair.beta
     assert isinstance(now, LensView)
-    where, valid = chunked(lambda x: recorded_pixels(x, now, camera), located.where.double(), axis=0)
+    where, valid = chunked(lambda x: recorded_pixels(x, now, camera), located[0].double(), axis=0)
     where = where.float()
-    inside = located.inside & valid & on_image(where, camera.hw)
+    inside = located[1] & valid & on_image(where, camera.hw)
     visibility = torch.where(inside, torch.where(seen, SEEN, OCCLUDED), OUTSIDE).to(torch.uint8).numpy()
     taken = filled(resampled_values(values, where.numpy(), interpolation), visibility == SEEN, fill)
     return AlignedView(
@@ -322,11 +305,8 @@ def _of_alpha(rig: Rig, name: str, recorded: Recorded) -> AlignedView:
     """Alpha's own values, each at its own pixel."""
     hw = rig[name].hw
     values = _as_array(recorded[name], name, hw)
-    grid, ones = pixel_grid(hw).numpy(), np.ones(hw, np.float32)
-    visibility = np.full(hw, SEEN, np.uint8)
-    return AlignedView(
-        values, grid, visibility, ones, _band_names(name, len(values)), rig[name].sensor.response
-    )
+    planes = pixel_grid(hw).numpy(), np.full(hw, SEEN, np.uint8), np.ones(hw, np.float32)
+    return AlignedView(values, *planes, _band_names(name, len(values)), rig[name].sensor.response)
 
 
 def _as_array(values: Any, name: str, hw: tuple[int, int]) -> NDArray[Any]:
@@ -362,16 +342,13 @@ def resampled_values(
         taken = chunked(
             lambda x: sample(image, x[None].double(), interpolation=kind).values[0, 0], where, axis=0
         )
-        return _in_type(taken.numpy(), values.dtype)
+        found = taken.numpy()
+        if np.issubdtype(values.dtype, np.integer):
+            limits = np.iinfo(values.dtype)
+            found = np.clip(np.rint(found), limits.min, limits.max)
+        return found.astype(values.dtype)
 
     return np.stack([band(plane) for plane in values])
-
-
-def _in_type(values: NDArray[np.float64], dtype: Any) -> NDArray[Any]:
-    if np.issubdtype(dtype, np.integer):
-        limits = np.iinfo(dtype)
-        values = np.clip(np.rint(values), limits.min, limits.max)
-    return values.astype(dtype)
 
 
 def filled(values: NDArray[Any], valid: NDArray[np.bool_], fill: Fill) -> NDArray[Any]:
@@ -379,9 +356,8 @@ def filled(values: NDArray[Any], valid: NDArray[np.bool_], fill: Fill) -> NDArra
     if fill == "none" or not valid.any():
         nothing = np.nan if np.issubdtype(values.dtype, np.floating) else 0
         return np.where(valid, values, np.asarray(nothing, values.dtype))
-    _, labels = cv2.distanceTransformWithLabels(
-        (~valid).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE, labelType=cv2.DIST_LABEL_PIXEL
-    )
+    how = cv2.DIST_L2, cv2.DIST_MASK_PRECISE
+    _, labels = cv2.distanceTransformWithLabels((~valid).view(np.uint8), *how, labelType=cv2.DIST_LABEL_PIXEL)
     nearest = np.zeros(labels.max() + 1, np.int64)
     nearest[labels[valid]] = np.flatnonzero(valid)
     return values.reshape(len(values), -1)[:, nearest[labels]]

@@ -48,9 +48,8 @@ class RecordedFiles(Mapping[str, NDArray[Any]]):
     def __getitem__(self, name: str) -> NDArray[Any]:
         view = self.rig[name]
         pattern = view.sensor.bayer
-        values = read_recorded(
-            self.files[name], name=name, hw=view.hw, orientation="apply" if pattern is None else "ignore"
-        )
+        turned: Literal["apply", "ignore"] = "apply" if pattern is None else "ignore"
+        values = read_recorded(self.files[name], name=name, hw=view.hw, orientation=turned)
         if pattern is None or not np.issubdtype(values.dtype, np.integer):
             return values
         white = 2 ** (view.sensor.bits or 8 * values.dtype.itemsize) - 1
@@ -99,9 +98,8 @@ def _write_view(folder: Path, stem: str, view: AlignedView, positions: PositionF
     if positions == "npy":
         np.save(folder / f"{stem}_positions.npy", view.positions)
     elif positions == "tif":
-        write_bands(
-            folder / f"{stem}_positions.tif", view.positions.transpose(2, 0, 1), ("x", "y"), (None, None)
-        )
+        planes = view.positions.transpose(2, 0, 1)
+        write_bands(folder / f"{stem}_positions.tif", planes, ("x", "y"), (None, None))
 
 
 def _shares(aligned: Aligned) -> str:
@@ -110,10 +108,8 @@ def _shares(aligned: Aligned) -> str:
     for camera, view in aligned.items():
         if camera != aligned.alpha:
             outside, occluded, seen = np.bincount(view.visibility.ravel(), minlength=3) / view.visibility.size
-            lines.append(
-                f"{camera}: sees {seen:.1%} of {aligned.alpha}, {occluded:.1%} occluded or unmatched, "
-            )
-            lines[-1] += f"{outside:.1%} beyond its edge\n"
+            not_seen = f"{occluded:.1%} occluded or unmatched, {outside:.1%} beyond its edge"
+            lines.append(f"{camera}: sees {seen:.1%} of {aligned.alpha}, {not_seen}\n")
     return "".join(lines)
 
 
@@ -125,10 +121,8 @@ def write_bands(
     for i, (band, wave) in enumerate(zip(bands, wavelengths, strict=True)):
         items.append(f'<Item name="DESCRIPTION" sample="{i}" role="description">{escape(band)}</Item>')
         if wave is not None:
-            micrometres = f"{wave / 1000:g}"
-            items.append(
-                f'<Item name="CENTRAL_WAVELENGTH_UM" domain="IMAGERY" sample="{i}">{micrometres}</Item>'
-            )
+            of = f'name="CENTRAL_WAVELENGTH_UM" domain="IMAGERY" sample="{i}"'
+            items.append(f"<Item {of}>{wave / 1000:g}</Item>")
     described = f"<GDALMetadata>{''.join(items)}</GDALMetadata>"
     nothing = "nan" if np.issubdtype(values.dtype, np.floating) else "0"
     tifffile.imwrite(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,11 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arraygeom import Rig
-from arraygeom.atomic import write_text
 
-from ..media.figures import colour_depth, reduced
+from ..media.figures import colour_depth
 from .align import Aligned
-from .report import LONGEST, Facts, data_url, filled_page, rig_drawing, shares_layer
+from .report import Facts, data_url, filled_page, rig_drawing, shares_layer
 
 STRETCH = (1.0, 99.0)
 """Percentiles of a band's values that are shown black and white."""
@@ -27,29 +25,20 @@ NEAREST = 60.0
 RED, NEAR_INFRARED = 660.0, 840.0
 
 
-def write_aligned_page(path: Path, aligned: Aligned, rig: Rig, facts: Facts) -> Path:
-    """Write the page atomically; it needs no other file and no network. Returns the path."""
-    layers = {name: data_url(reduced(image, LONGEST)) for name, image in shown_layers(aligned, rig).items()}
-    overlays = {
-        f"not seen by {name}": shares_layer(torch.from_numpy(view.valid.astype(np.float32)))
-        for name, view in aligned.items()
-        if name != aligned.alpha
-    }
+def aligned_page(aligned: Aligned, rig: Rig, facts: Facts) -> str:
+    """The page; it needs no other file and no network."""
     h, w = aligned.depth.shape
-    seen = {name: view.valid.mean() for name, view in aligned.items() if name != aligned.alpha}
     figures = {"size": f"{w} x {h} pixels", "bands": ", ".join(aligned.bands)}
-    figures |= {f"seen by {name}": f"{share:.1%}" for name, share in seen.items()}
-    page = filled_page(
+    seen = {name: view.valid for name, view in aligned.items() if name != aligned.alpha}
+    return filled_page(
         f"{', '.join(aligned)} at the pixels of {aligned.alpha}",
         (h, w),
-        layers,
-        overlays,
-        figures,
+        {name: data_url(image) for name, image in shown_layers(aligned, rig).items()},
+        {f"not seen by {name}": shares_layer(torch.from_numpy(v).float()) for name, v in seen.items()},
+        figures | {f"seen by {name}": f"{valid.mean():.1%}" for name, valid in seen.items()},
         facts,
         RIG=rig_drawing(rig, aligned.alpha),
     )
-    write_text(path, page)
-    return path
 
 
 def shown_layers(aligned: Aligned, rig: Rig | None = None) -> dict[str, Float[Tensor, "_ h w"]]:
@@ -131,8 +120,7 @@ def _index_colours(index: NDArray[np.float32]) -> Float[Tensor, "3 h w"]:
     """-1 brown, 0 pale, 1 green; black where unknown."""
     stops = torch.tensor([[0.55, 0.32, 0.04], [0.96, 0.96, 0.86], [0.0, 0.41, 0.22]])
     value = torch.from_numpy(np.nan_to_num(index)).clamp(-1, 1)[..., None]
-    colour = torch.where(
-        value < 0, torch.lerp(stops[1], stops[0], -value), torch.lerp(stops[1], stops[2], value)
-    )
+    brown, green = torch.lerp(stops[1], stops[0], -value), torch.lerp(stops[1], stops[2], value)
+    colour = torch.where(value < 0, brown, green)
     known = torch.from_numpy(np.isfinite(index))[..., None]
     return torch.where(known, colour, 0.0).movedim(-1, 0)

@@ -67,9 +67,7 @@ def sums_of_alike(
     h, w = guide.shape[-2:]
     around = radius + 1
     mirrored = [(0, 0), (around, around), (around, around)]
-    planes = [
-        np.pad(image.detach().float().cpu().numpy(), mirrored, mode="reflect") for image in (guide, values)
-    ]
+    planes = [np.pad(x.detach().float().cpu().numpy(), mirrored, mode="reflect") for x in (guide, values)]
     out = np.zeros((len(values), h, w), np.float32)
     sharpness = np.float32(1 / (8 * 9 * len(guide) * scale**2))
 

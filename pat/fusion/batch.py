@@ -119,9 +119,8 @@ class Batch:
         stamps = {name: [_stamp(file) for file in files] for name, files in self.files.items()}
         if self.sequence:
             return dict.fromkeys(self.names, _digest(stamps))
-        return {
-            name: _digest({n: found[i] for n, found in stamps.items()}) for i, name in enumerate(self.names)
-        }
+        frames = ({n: found[i] for n, found in stamps.items()} for i in range(len(self.names)))
+        return dict(zip(self.names, map(_digest, frames)))
 
     def fused_file(self, i: int) -> Path:
         """The file of a fused frame."""
@@ -188,11 +187,9 @@ class Batch:
         entries["rig"] = rig_text(self.rig)
         entries["files"] = {name: [str(file) for file in files] for name, files in self.files.items()}
         entries["out"] = str(self.out)
-        settings = {
-            entry.name: getattr(self.settings, entry.name) for entry in dataclasses.fields(FuseSettings)
-        }
-        settings |= {"field": field_document(settings["field"]), "noise": noise_document(settings["noise"])}
-        entries["settings"] = settings
+        settings = vars(self.settings)
+        written = {"field": field_document(settings["field"]), "noise": noise_document(settings["noise"])}
+        entries["settings"] = {**settings, **written}
         return json.dumps({"format": PLAN_FORMAT, **entries})
 
     @classmethod
@@ -203,9 +200,7 @@ class Batch:
             if entries.pop("format") != PLAN_FORMAT:
                 raise ValueError("another version's")
             entries["rig"] = rig_of_text(entries["rig"], source)
-            entries["files"] = {
-                name: [Path(file) for file in files] for name, files in entries["files"].items()
-            }
+            entries["files"] = {n: [Path(file) for file in files] for n, files in entries["files"].items()}
             entries["out"] = Path(entries["out"])
             settings = entries["settings"]
             settings["field"] = field_of(settings["field"])
@@ -252,9 +247,8 @@ class Batch:
                 frame = self._frame(i)
             view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
             bands = band_names(frame, (name for name in self.rig.betas(self.alpha) if name in self.files))
-            save_frame(
-                frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i], bands=bands
-            )
+            how: dict[str, Any] = {"bits": self.bits, "kind": self.kind, "view": view}
+            save_frame(frame, self.out, name=self.names[i], bands=bands, **how)
 
     def _frame(self, i: int) -> Frame:
         if not self.sequence:
@@ -269,10 +263,8 @@ def noise_document(noise: Noise | None) -> str | dict[str, Any] | None:
     """Noise levels as their entries by camera; "estimate" and None as they are."""
     if noise is None or isinstance(noise, str):
         return noise
-    return {
-        name: {"shot": float(level.shot), "read": float(level.read), "added_to": level.added_to}
-        for name, level in noise.items()
-    }
+    names = ("shot", "read", "added_to")
+    return {name: dict(zip(names, (float(n.shot), float(n.read), n.added_to))) for name, n in noise.items()}
 
 
 def field_document(field: ReceptiveField | None) -> dict[str, Any] | None:
@@ -284,8 +276,7 @@ def field_document(field: ReceptiveField | None) -> dict[str, Any] | None:
         raise ValueError(
             f"a batch's field is written to a file, which {field!r} cannot be: give one of {known}"
         )
-    names = [entry.name for entry in dataclasses.fields(field)]  # type: ignore[arg-type]
-    entries = {name: getattr(field, name) for name in names}
+    entries = vars(field)
     inner = {"field": field_document(entries["field"])} if "field" in entries else {}
     return {"kind": type(field).__name__, **entries, **inner}
 
@@ -347,9 +338,8 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
     path = Path(text)
     label = f"{name}: " if name else ""
     if path.is_dir():
-        found = [
-            p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")
-        ]
+        shown = (p for p in path.iterdir() if not p.name.startswith("."))
+        found = [p for p in shown if p.suffix.lower() in IMAGE_SUFFIXES]
     elif any(c in path.name for c in "*?["):
         found = list(path.parent.glob(path.name))
     else:

@@ -41,9 +41,8 @@ def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs
     """Warn if the mean confidence is low where the segments of all betas are valid.
 
     Below `UNFIT_CONFIDENCE` by a `LowConfidenceWarning`. Of bands that are each another beta's, by that of
-    the median
-    band: some bands of nine are unlike alpha whatever the rig. Only for networks whose confidence is a
-        trained probability.
+    the median band: some bands of nine are unlike alpha whatever the rig. Only for networks whose confidence
+    is a trained probability.
     """
     if not network.uses_matches:
         return
@@ -51,24 +50,19 @@ def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs
     if not mean < LOW_CONFIDENCE:
         return
     several = " of the median band" if frame.by_band is not None else ""
-    found = f"mean confidence {mean:.2f}{several} where the views overlap"
-    advice = noise_advice(inputs.inputs)
-    if mean < UNFIT_CONFIDENCE:
-        text = (
-            f"{found}: the rig does not fit the images, or they hardly match: check it with `pat rig doctor`"
-        )
-        warn(text + advice, LowConfidenceWarning)
-    else:
-        text = f"{found}: little texture, noise, or a rig that `pat rig doctor` finds wrong"
-        warn(text + advice)
+    unfit = mean < UNFIT_CONFIDENCE
+    why = "little texture, noise, or a rig that `pat rig doctor` finds wrong"
+    if unfit:
+        why = "the rig does not fit the images, or they hardly match: check it with `pat rig doctor`"
+    text = f"mean confidence {mean:.2f}{several} where the views overlap: {why}{noise_advice(inputs.inputs)}"
+    warn(text, LowConfidenceWarning if unfit else UserWarning)
 
 
 def noise_advice(inputs: Inputs) -> str:
     """What to do about noise that the middle of an image shows plainly; empty if there is hardly any."""
     found = max(shown_noise(image[0]) for image in (inputs.alpha, *(beta.image for beta in inputs.betas)))
-    if found < PLAIN_NOISE:
-        return ""
-    return f"; noise of {255 * found:.0f}/255 shows: try `--noise estimate` first"
+    advice = f"; noise of {255 * found:.0f}/255 shows: try `--noise estimate` first"
+    return "" if found < PLAIN_NOISE else advice
 
 
 @contextmanager

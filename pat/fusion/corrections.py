@@ -76,17 +76,12 @@ class Corrections:
     def applied(self, inputs: Inputs, hw: HW) -> Inputs:
         """The inputs put right; `hw` is alpha's size without padding."""
         if not self.response.is_rec601:
-            betas = tuple(
-                replace(b, image=self.response.of_beta(b.image)) if _is_rgb(b) else b for b in inputs.betas
-            )
-            inputs = replace(inputs, alpha=self.response.of_alpha(inputs.alpha), betas=betas)
+            of_beta = self.response.of_beta
+            betas = (replace(b, image=of_beta(b.image)) if _is_rgb(b) else b for b in inputs.betas)
+            inputs = replace(inputs, alpha=self.response.of_alpha(inputs.alpha), betas=tuple(betas))
         moves = self.misalignments or (Misalignment(),) * len(inputs.betas)
-        return replace(
-            inputs,
-            betas=tuple(
-                replace(b, field=m.applied(b.field, hw)) for b, m in zip(inputs.betas, moves, strict=True)
-            ),
-        )
+        moved = zip(inputs.betas, moves, strict=True)
+        return replace(inputs, betas=tuple(replace(b, field=m.applied(b.field, hw)) for b, m in moved))
 
     def described(self, betas: Sequence[str], hw: HW) -> list[str]:
         """A line for each thing that is put right, for betas by name; `hw` is alpha's size."""
@@ -171,15 +166,12 @@ def _reduced_frame(frame: FrameInputs) -> FrameInputs:
     def whole(x: Tensor) -> Tensor:
         return (x + 0.5) * factor - 0.5
 
-    betas = tuple(
-        Beta(
-            padded(avg_pool2d(beta.image, factor), inputs.multiple),
-            _reduced_field(beta.field, alpha, whole, factor),
-            track=beta.track and track_in(beta.track, whole, 1 / factor, offset),
-        )
-        for beta in inputs.betas
-    )
-    return frame._replace(inputs=replace(inputs, alpha=alpha, betas=betas), hw=hw)
+    betas = []
+    for beta in inputs.betas:
+        image = padded(avg_pool2d(beta.image, factor), inputs.multiple)
+        track = beta.track and track_in(beta.track, whole, 1 / factor, offset)
+        betas.append(Beta(image, _reduced_field(beta.field, alpha, whole, factor), track=track))
+    return frame._replace(inputs=replace(inputs, alpha=alpha, betas=tuple(betas)), hw=hw)
 
 
 def _reduced_field(
@@ -210,9 +202,8 @@ class _Matches(NamedTuple):
     @property
     def place(self) -> Float[Tensor, "h w 2"]:
         """The matches in beta's width and height, from its middle."""
-        return (self.position + 0.5) / self.position.new_tensor(
-            [self.luma.shape[1], self.luma.shape[0]]
-        ) - 0.5
+        h, w = self.luma.shape
+        return (self.position + 0.5) / self.position.new_tensor([w, h]) - 0.5
 
     @property
     def misalignment(self) -> Misalignment:
@@ -229,8 +220,7 @@ def _matches(frame: FrameInputs, found: Corrections) -> list[_Matches]:
 
 def _of_beta(alpha: Tensor, before: Beta, beta: Beta, found: BetaMatches, hw: HW) -> _Matches:
     h, w = hw
-    size = (beta.image.shape[-2], beta.image.shape[-1])
-    positions, valid = found.positions(beta.field.straight, size)
+    positions, valid = found.positions(beta.field.straight, (beta.image.shape[-2], beta.image.shape[-1]))
     where = positions[0, :h, :w]
     luma = combined_bands(beta.image)
     seen = sample(torch.cat([before.image, luma], 1), where.reshape(1, -1, 2).to(luma)).values

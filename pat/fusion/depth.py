@@ -68,9 +68,8 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
     for i, (found, beta) in enumerate(zip(matches.betas, inputs.betas)):
         if found.certainty is not None:
             whole = interpolate(found.certainty.float(), scale_factor=FINE, mode="bilinear").to(confidence[i])
-            confidence[i] = torch.where(
-                beta.field.straight.valid & (output.confidence[i] > 0), whole[:, 0], 0.0
-            )
+            seen = beta.field.straight.valid & (output.confidence[i] > 0)
+            confidence[i] = torch.where(seen, whole[:, 0], 0.0)
             deviation[i] = whole[:, 1] / DEVIATIONS
     overall = output.overall if output.overall is None else torch.stack(confidence).amax(0)
     return output._replace(confidence=confidence, deviation=deviation, overall=overall)

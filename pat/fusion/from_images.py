@@ -107,10 +107,9 @@ def array_from_images(
     tagged = None if images else _tagged_rig(files, note)
     if tagged is not None and focal:
         raise ValueError("focal: the images' tags state the focal lengths: leave it out")
-    images = {name: images[name] if name in images else _read(name, files[name], note) for name in sources}
-    images = {
-        name: _textured(f"{name}: {files.get(name, 'the image')}", image) for name, image in images.items()
-    }
+    for name in files:
+        images[name] = _read(name, files[name], note)
+    images = {name: _textured(f"{name}: {files.get(name, 'the image')}", images[name]) for name in sources}
     alpha = _chosen_alpha(images, alpha, note)
     if tagged is not None:
         images = {name: read_view(tagged, name, files[name], like=tagged[alpha].sensor) for name in images}
@@ -122,10 +121,8 @@ def array_from_images(
         by_tags = {n: by_exif for n in images if n in files and (by_exif := focal_length(files[n]))}
         lengths = {n: length for n, length in (by_tags | dict(focal or {})).items() if n in images}
         for name, length in lengths.items():
-            note(
-                f"{name}: focal length {length:.0f} pixels, "
-                f"{'as given' if name in (focal or {}) else 'by EXIF'}"
-            )
+            by = "as given" if name in (focal or {}) else "by EXIF"
+            note(f"{name}: focal length {length:.0f} pixels, {by}")
         rig, names = found_rig(images, alpha, lengths, load_weights(weights), note)
     else:
         rig, names = _translated_rig(tagged, images, alpha, note)
@@ -187,11 +184,8 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
     straight, pinhole = without_lenses(Rig({name: tagged[name] for name in images}), images)
     shown = {name: pixels_between(tagged[name], straight[name])[1][None].float() for name in images}
     lengths = {name: float(straight[name].K[0, 0]) for name in images}
-    longest = max(images[alpha].shape[-2:])
-    factors = {
-        name: min(lengths[alpha] / length * min(MATCHED / longest, 1.0), 1.0)
-        for name, length in lengths.items()
-    }
+    finest = lengths[alpha] * min(MATCHED / max(images[alpha].shape[-2:]), 1.0)
+    factors = {name: min(finest / length, 1.0) for name, length in lengths.items()}
     reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
     masks = {name: scaled(mask, factors[name])[0] > 0.99 for name, mask in shown.items()}
     found, facts = centres_found(resized_rig(straight, reduced), reduced, masks, alpha=alpha)
@@ -200,11 +194,9 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
     for name in images.keys() - {*found.names}:
         note(f"{name}: left out, too little in common with the others")
     note(f"depths are multiples of the baseline {alpha} to {found.betas(alpha)[0]}")
-    rig = developed_rig(tagged, images)
-    cameras = {
-        n: rig[n].replace(cam_from_world=found[n].cam_from_world) for n in (alpha, *found.betas(alpha))
-    }
-    return Rig(cameras, depth=found.depth, name=UNSCALED), list(cameras)
+    rig, names = developed_rig(tagged, images), [alpha, *found.betas(alpha)]
+    cameras = {name: rig[name].replace(cam_from_world=found[name].cam_from_world) for name in names}
+    return Rig(cameras, depth=found.depth, name=UNSCALED), names
 
 
 @stage()
@@ -286,36 +278,27 @@ def _calibrated(
                 f"its points show no parallax, beside {alpha} it is too near, or its scene too far or flat"
             )
             continue
-        if pair.exact:
-            note(f"{alpha} > {name}: {pair.points} points, {pair.distance:.2f} px from their lines; refining")
-        else:
-            note(
-                f"{alpha} > {name}: lines by F; depths are rough, by poses whose lines are "
-                f"{pair.distance:.2f} px off"
-            )
+        exact = f"{pair.points} points, {pair.distance:.2f} px from their lines; refining"
+        rough = f"lines by F; depths are rough, by poses whose lines are {pair.distance:.2f} px off"
+        note(f"{alpha} > {name}: {exact if pair.exact else rough}")
         pairs[name] = pair
         if pair.exact or len(betas) > 1:
             pairs[name], depths[name] = _refined(pair, images, network, links)
         if pairs[name] is not pair:
-            note(
-                f"{alpha} > {name}: {pairs[name].points} points, "
-                f"{pairs[name].distance:.2f} px from their lines"
-            )
-    if _distorted(found.rig):
+            points, distance = pairs[name].points, pairs[name].distance
+            note(f"{alpha} > {name}: {points} points, {distance:.2f} px from their lines")
+    if any(getattr(view, "distortion", None) is not None for view in found.rig.cameras.values()):
         note(describe_lenses(found.rig))
+    known = {alpha, *betas}
     if not pairs:
-        return _without(found.rig, found.rig.cameras.keys() - {alpha, *betas})
+        cameras = {name: view for name, view in found.rig.cameras.items() if name in known}
+        links = {pair: link for pair, link in found.rig.links.items() if known >= {*pair}}
+        return found.rig.replace(cameras=cameras, links=links)
     first = next(iter(pairs))
     assumed = [name for name in (alpha, *pairs) if name not in focal]
-    note(
-        "depths are multiples of the baseline"
-        + (f" {alpha} to {first}" if len(betas) > 1 else "")
-        + (
-            f"; focal lengths assumed of {', '.join(assumed)}: depths are only proportional"
-            if assumed
-            else ""
-        )
-    )
+    of = f" {alpha} to {first}" if len(betas) > 1 else ""
+    rough = f"; focal lengths assumed of {', '.join(assumed)}: depths are only proportional"
+    note(f"depths are multiples of the baseline{of}{rough if assumed else ''}")
     scales = {name: _relative_scale(depths[first], depths[name]) if name in depths else 1.0 for name in pairs}
     rig = joined(pairs, scales)
     for name in betas:
@@ -349,21 +332,9 @@ def _refined(
 
 def _relative_scale(first: Frame, other: Frame) -> float:
     """The factor that brings another pair's depths to those of the first."""
-    both = (
-        (first.confidence > 0.5) & (other.confidence > 0.5) & first.depth.isfinite() & other.depth.isfinite()
-    )
+    sure = (first.confidence > 0.5) & (other.confidence > 0.5)
+    both = sure & first.depth.isfinite() & other.depth.isfinite()
     return float((first.depth[both] / other.depth[both]).median()) if both.any() else 1.0
-
-
-def _distorted(rig: Rig) -> bool:
-    return any(getattr(view, "distortion", None) is not None for view in rig.cameras.values())
-
-
-def _without(rig: Rig, names: set[str]) -> Rig:
-    cameras = {name: view for name, view in rig.cameras.items() if name not in names}
-    return rig.replace(
-        cameras=cameras, links={pair: v for pair, v in rig.links.items() if not names & {*pair}}
-    )
 
 
 def resized_rig(rig: Rig, images: Images) -> Rig:
@@ -378,9 +349,8 @@ def scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 
     if factor >= 1:
         return image
     hw = [max(round(n * factor), 16) for n in image.shape[-2:]]
-    return interpolate(image[None], size=hw, mode="bicubic", antialias=True, align_corners=False)[0].clamp(
-        0, 1
-    )
+    reduced = interpolate(image[None], size=hw, mode="bicubic", antialias=True, align_corners=False)
+    return reduced[0].clamp(0, 1)
 
 
 def _read(name: str, path: Path, note: Say) -> Float[Tensor, "c h w"]:
@@ -410,11 +380,11 @@ def _chosen_alpha(images: Images, alpha: str | None, note: Say) -> str:
     grey = [name for name, image in images.items() if len(image) == 1]
     chosen = max(grey or images, key=lambda name: math.prod(images[name].shape[-2:]))
     h, w = images[chosen].shape[-2:]
-    why = (
-        "the only grey image" if len(grey) == 1 else "the largest grey image" if grey else "the largest image"
-    )
-    equal = [name for name in grey or images if images[name].shape[-2:] == (h, w)]
-    why = "the first of images of one size" if len(equal) > 1 else why
+    why = "the largest grey image" if grey else "the largest image"
+    if len(grey) == 1:
+        why = "the only grey image"
+    elif sum(images[name].shape[-2:] == (h, w) for name in grey or images) > 1:
+        why = "the first of images of one size"
     note(
         f"alpha, whose view and detail the result has: {chosen} ({w}x{h}, {why}; --alpha NAME takes another)"
     )
@@ -436,12 +406,8 @@ def _ordered_betas(images: Images, alpha: str, note: Say) -> list[str]:
 
 def show_colour(names: Sequence[str], bands: Sequence[int]) -> bool:
     """Whether cameras of a band each record, by their names, red, green and blue, in this order."""
-    waves = [_wavelength(name) for name in names]
-    return (
-        set(bands) == {1}
-        and len(waves) == 3
-        and all(low <= w <= high for w, (low, high) in zip(waves, COLOURS))
-    )
+    shown = [low <= _wavelength(name) <= high for name, (low, high) in zip(names, COLOURS)]
+    return set(bands) == {1} and len(names) == 3 and all(shown)
 
 
 def _wavelength(name: str) -> float:

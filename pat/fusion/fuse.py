@@ -99,7 +99,7 @@ def fuse(
     fuse` (`pat.fusion.from_images.array_from_images`, which also gives them), and depths are multiples of the
     baseline. Frames too large for the memory allowed are fused in tiles of alpha, each with the part of every
     beta that its segments touch, and a halo: equal to the whole to 1e-4. Distorted images are first resampled
-    to pinhole views (`pat.fusion.steps.Undistort`), rotated betas made upright, and betas resized to alpha's
+    to pinhole views (`pat.fusion.steps.undistort`), rotated betas made upright, and betas resized to alpha's
     angular resolution; the result is at alpha's own pixels all the same. Where alpha is known to measure the
     luminance of linear light and one beta the colours, the result is as bright in that sense
     (`pat.media.raw.as_bright`).
@@ -147,8 +147,8 @@ def fuse(
     if noise == "auto" and low_light.noisy and explain:
         explain(low_light.described())
     betas, in_colour, noisy = views.betas, views.alpha_in_colour, bool(low_light.noisy)
-    steps = steps_for(network, normalise=settings.match_levels or grey_world)
-    inputs, undo = prepared(network, views, steps)
+    normalise = settings.match_levels or grey_world
+    inputs, undo = prepared(network, views, steps_for(network, normalise=normalise))
     held = bytes_beside(inputs.inputs, [views.own, *(images.values() if isinstance(images, dict) else ())])
     del views  # whose images are there again, padded
     LOG.info("planning")
@@ -173,18 +173,17 @@ def fuse(
         with torch.set_grad_enabled(differentiable):
             matches = matcher(inputs.inputs) if network.uses_matches else None
             LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
-            done = fused_in_tiles(
-                network, inputs, matches, plan.tiles, found=noisy, progress=progress, store=store
-            )
+            how: dict[str, Any] = {"found": noisy, "progress": progress, "store": store}
+            done = fused_in_tiles(network, inputs, matches, plan.tiles, **how)
             del matches
         warn_of_confidence(network, done.frame, inputs)
         frame = done.frame._replace(depth=background_filled(done.frame, inputs.inputs))
         if luminance != "alpha":
             frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
         del inputs, right  # the segments of a large frame: what follows needs memory, too
-        frame = low_light.corrected(
-            found.undone(frame), done.found, steps, found.response, keep_alpha=settings.keep_alpha
-        )
+        taken = steps_for(network, normalise=False), found.response
+        frame = found.undone(frame)
+        frame = low_light.corrected(frame, done.found, *taken, keep_alpha=settings.keep_alpha)
         LOG.info("back to the pixels of %s", alpha)
         frame = undone(frame, undo)
         if in_colour and len(frame.image) == 3 and frame.by_band is None and not noisy:

@@ -69,10 +69,7 @@ def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | N
     held-out points then lie about as near to their lines as to those of an F of their own, and far nearer
     than before."""
     small = {name: scaled(image, min(MATCHED / max(image.shape[-2:]), 1.0)) for name, image in images.items()}
-    reduced = Rig(
-        {name: rig[name] for name in (alpha, *small)}, depth=rig.depth, links=rig.links, name=rig.name
-    )
-    reduced = resized_rig(reduced, small)
+    reduced = resized_rig(rig.replace(cameras={name: rig[name] for name in (alpha, *small)}), small)
     try:
         pairs = related(reduced, match_cameras(small, alpha=alpha))
         found = refine_matches(reduced, [pairs], force=True)
@@ -80,23 +77,19 @@ def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | N
         return None
     before, after = (statistics.median for statistics in found.held_out)
     best = SETTINGS.of_own * own_distance(reduced, pairs) + SETTINGS.slack
-    if not found.accepted or after > best or after * SETTINGS.nearer > before:
-        return None
-    if share_outside(found.rig, pairs) > OUTSIDE:
+    far = after > best or after * SETTINGS.nearer > before
+    if not found.accepted or far or share_outside(found.rig, pairs) > OUTSIDE:
         return None
     cameras = dict(rig.cameras)
     for name in small:
         cameras[name] = found.rig.resize(name, rig[name].hw)[name].replace(sensor=rig[name].sensor)
-    changed = (
-        "" if found.depth is None else f"; depth changes by {found.depth.change:.0%} (median), and is rough"
-    )
     text = (
-        f"the rig is healed by these images: points lay {before:.1f} px from their lines, "
-        f"{after:.2f} px now{changed} "
-        "(--no-align leaves the rig as it is)"
+        f"the rig is healed by these images: points lay {before:.1f} px from their lines, {after:.2f} px now"
     )
-    depth = _depth_range(found.rig, pairs)
-    return Healed(rig.replace(cameras=cameras, depth=depth), text)
+    if found.depth is not None:
+        text += f"; depth changes by {found.depth.change:.0%} (median), and is rough"
+    healed = rig.replace(cameras=cameras, depth=_depth_range(found.rig, pairs))
+    return Healed(healed, f"{text} (--no-align leaves the rig as it is)")
 
 
 def _depth_range(rig: Rig, pairs: Pairs) -> tuple[float, float] | None:

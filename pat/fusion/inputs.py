@@ -78,7 +78,7 @@ def prepared(
     LOG.info("preparing %d images", len(views.images))
     undo: list[Undo] = []
     for step in steps:
-        views, back = step.do(views)
+        views, back = step(views)
         undo.insert(0, back)
     return frame_inputs(network, views), undo
 
@@ -111,9 +111,8 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
 
 def bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:
     """Memory of images whose pixels are not those of the inputs: the caller's."""
-    own = {
-        image.untyped_storage().data_ptr() for image in (inputs.alpha, *(beta.image for beta in inputs.betas))
-    }
+    held = inputs.alpha, *(beta.image for beta in inputs.betas)
+    own = {image.untyped_storage().data_ptr() for image in held}
     parts = {image.untyped_storage().data_ptr(): image.nbytes for image in images}
     return float(sum(nbytes for place, nbytes in parts.items() if place not in own))
 

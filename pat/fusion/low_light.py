@@ -29,7 +29,7 @@ from ..sensors import NoiseLevel
 from ..support.settings import physics, size, tuned
 from .averaging import averaged_with_alike
 from .results import Frame
-from .steps import FusionStep, Radiometry
+from .steps import FusionStep
 from .views import Views
 
 LOG = logging.getLogger(__name__)
@@ -120,7 +120,8 @@ class LowLight:
         """A frame fused from the denoised views, corrected by what all of them recorded.
 
         `found` is where its pixels are in each beta, x and y, and the confidence of that. `steps` were taken
-        before it was fused and are not undone yet; `response` says what brings betas to alpha's exposure.
+        before it was fused, but for radiometry: values keep their scale; they are not undone yet. `response`
+        says what brings betas to alpha's exposure.
         With `keep_alpha`, or if alpha has no noise, the luma is alpha's as recorded. Betas that are not all
         RGB are denoised one by one alone.
         """
@@ -128,32 +129,27 @@ class LowLight:
             return frame
         LOG.info("denoising the fused image")
         alpha, image, views = self.views.alpha, frame.image, self.prepared(steps)
-        given = self._stepped(self.given.images, steps)[alpha] if keep_alpha else None
         own = views.pop(alpha)
-        betas = list(views.values())
-        if all(view.recorded.shape[1] == 3 for view in betas):
-            image = jointly_denoised(image, own, [exposed(view, response) for view in betas], found)
+        if all(view.recorded.shape[1] == 3 for view in views.values()):
+            betas = [exposed(view, response) for view in views.values()]
+            image = jointly_denoised(image, own, betas, found)
             if keep_alpha or alpha not in self.noisy:
                 image = image - luminance(image - frame.image)
-        return frame._replace(image=image if given is None else image + given - own.denoised[0])
+        if keep_alpha:
+            image = image + self._stepped(self.given.images, steps)[alpha] - own.denoised[0]
+        return frame._replace(image=image)
 
     def prepared(self, steps: Sequence[FusionStep]) -> dict[str, NoisyView]:
-        """Every view as recorded, denoised, and its deviation, after the steps before it is fused.
-
-        Except for `Radiometry`: values keep their scale.
-        """
-        recorded = {name: image[None] for name, image in self.views.images.items()}
-        views = {
-            name: self.noisy.get(name) or NoisyView(image, image, torch.zeros_like(image))
-            for name, image in recorded.items()
-        }
+        """Every view as recorded, denoised, and its deviation, after the steps before it is fused."""
+        quiet = {n: NoisyView(x[None], x[None], 0 * x[None]) for n, x in self.views.images.items()}
+        views = {**quiet, **self.noisy}
         parts = [self._stepped({name: view[i][0] for name, view in views.items()}, steps) for i in range(3)]
         return {name: NoisyView(*(part[name][None] for part in parts)) for name in parts[0]}
 
     def _stepped(self, images: Mapping[str, Tensor], steps: Sequence[FusionStep]) -> Mapping[str, Tensor]:
         views = self.views.replace(images)
         for step in steps:
-            views = views if isinstance(step, Radiometry) else step.do(views).views
+            views = step(views).views
         return views.images
 
 
@@ -175,21 +171,16 @@ def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:
     if not noisy:
         without = replace(views, images={})
         return views, LowLight(without, without, {})
-    denoised = replace(
-        views, images={**views.images, **{name: view.denoised[0] for name, view in noisy.items()}}
-    )
+    denoised = views.replace({name: view.denoised[0] for name, view in noisy.items()})
     return denoised, LowLight(views, denoised, noisy, time.perf_counter() - begin)
 
 
 def warn_of_noise(name: str, image: Float[Tensor, "c h w"], view: NoisyView) -> None:
     """Warn if the noise that is stated of an image is far more than it shows."""
     shown = NoiseLevel.estimated(image[None])
-    if shown == NoiseLevel():
-        return
-    stated, found = (
-        255 * float(deviation.mean()) for deviation in (view.deviation, shown.deviation(image[None]))
-    )
-    if stated > SETTINGS.far_more * max(found, 255 * SETTINGS.least_deviation):
+    deviations = view.deviation, shown.deviation(image[None])
+    stated, found = (255 * float(deviation.mean()) for deviation in deviations)
+    if shown != NoiseLevel() and stated > SETTINGS.far_more * max(found, 255 * SETTINGS.least_deviation):
         warn(
             f"noise of '{name}': a standard deviation of {stated:.0f}/255 is stated, "
             f"its image shows {found:.1f}/255: detail will be lost; state electrons at white, "

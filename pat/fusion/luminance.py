@@ -77,9 +77,8 @@ def with_own_colours(frame: Frame, own: Float[Tensor, "3 h w"]) -> Frame:
     own = own.to(frame.image)
     step = max(int((frame.confidence.numel() / OWN_COLOUR.pixels) ** 0.5), 1)
     some = (..., slice(None, None, step), slice(None, None, step))
-    terms, values = (
-        to_luma_chroma(image[some])[1].flatten(1).detach().double() for image in (own, frame.image)
-    )
+    chroma = (to_luma_chroma(image[some])[1] for image in (own, frame.image))
+    terms, values = (part.flatten(1).detach().double() for part in chroma)
     weight = (frame.confidence[some].flatten().detach() > OWN_COLOUR.seen).double()
     same = torch.eye(2, dtype=torch.float64, device=own.device)
     change = same + least_squares(terms, (values - terms).T, weight, OWN_COLOUR.prior * same)

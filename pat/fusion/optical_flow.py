@@ -50,7 +50,10 @@ def flow_between(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Flow:
     unlike = (warped(b, there) - a).abs()[0]
     likeness = torch.from_numpy(cv2.boxFilter(unlike.numpy(), -1, (5, 5)))
     weight = torch.exp(-returned.square().sum(0) / SETTINGS.astray**2 - (likeness / SETTINGS.unlike).square())
-    return Flow(there, weight * _inside(there))
+    h, w = there.shape[-2:]
+    x = pixel_grid((h, w)) + there.movedim(0, -1)
+    inside = ((x >= 0) & (x <= x.new_tensor([w - 1, h - 1]))).all(-1)
+    return Flow(there, weight * inside.float())
 
 
 def warped(image: Float[Tensor, "c h w"], step: Float[Tensor, "2 h w"]) -> Float[Tensor, "c h w"]:
@@ -65,9 +68,3 @@ def _steps(a: Tensor, b: Tensor) -> Float[Tensor, "2 h w"]:
     engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow = engine.calc(to_bytes(a[0]), to_bytes(b[0]), np.empty(0, np.float32))
     return torch.from_numpy(np.ascontiguousarray(flow.transpose(2, 0, 1)))
-
-
-def _inside(step: Tensor) -> Tensor:
-    h, w = step.shape[-2:]
-    x = pixel_grid((h, w)) + step.movedim(0, -1)
-    return ((x >= 0) & (x <= x.new_tensor([w - 1, h - 1]))).all(-1).float()

@@ -16,7 +16,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Camera, Rig
-from arraygeom.atomic import write_text
 from arraygeom.threads import in_parallel
 from arraygeom.viz import COLOURS, frustum, frustum_size
 
@@ -50,36 +49,29 @@ class Facts(NamedTuple):
     classical: Float[Tensor, "_ _ _"] | None = None
 
 
-def write_report(
-    path: Path, frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig: Rig, alpha: str, facts: Facts
-) -> Path:
-    """Write the page atomically: images under a slider, overlays, the rig, figures. Returns the path.
-
-    `images` are alpha's and the betas'; the page needs no other file and no network.
-    """
-    page = report_page(frame, images, rig, alpha, facts)
-    write_text(path, page)
-    return path
-
-
 def report_page(
     frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig: Rig, alpha: str, facts: Facts
 ) -> str:
-    """The page as text."""
-    shown = {f"alpha: {alpha}": images[alpha]}
-    shown |= {f"beta: {name}": images[name] for name in rig.betas(alpha) if name in images}
+    """The page: images under a slider, overlays, the rig, figures; it needs no other file and no network.
+
+    `images` are alpha's and the betas'.
+    """
+    layers = {f"alpha: {alpha}": images[alpha]}
+    layers |= {f"beta: {name}": images[name] for name in rig.betas(alpha) if name in images}
     if facts.classical is not None:
-        shown["classical"] = picture_of(facts.classical)
-    shown["fused"] = picture_of(frame.image)
-    overlays = {"confidence": lambda: shares_layer(frame.confidence)}
+        layers["classical"] = facts.classical
+    layers["fused"] = frame.image
+    overlays: dict[str, Callable[[], str]] = {"confidence": lambda: shares_layer(frame.confidence)}
     known = frame.depth[frame.depth.isfinite()]
     if len(known):
-        overlays["depth"] = lambda: data_url(reduced(colour_depth(frame.depth), LONGEST))
-    layers = {
-        name: partial(lambda image: data_url(reduced(picture_of(image), LONGEST)), x)
-        for name, x in shown.items()
-    }
-    urls = _all_of({**layers, **overlays})
+        overlays["depth"] = lambda: data_url(colour_depth(frame.depth))
+    urls: dict[str, str] = {}
+
+    def make(name: str) -> None:
+        urls[name] = overlays[name]() if name in overlays else data_url(picture_of(layers[name]))
+
+    most = how_many_fit(100 * LONGEST**2)
+    in_parallel([partial(make, name) for name in (*layers, *overlays)], most=most)
     return filled_page(
         f"{' + '.join(name for name in rig.names if name in images)}, fused",
         frame.depth.shape,
@@ -106,7 +98,7 @@ def filled_page(
     parts = {"LEGEND": "", **parts, "TITLE": html.escape(title), "RATIO": f"{w} / {h}"}
     rows = [f"<tr><th>{html.escape(key)}<td>{html.escape(value)}" for key, value in figures.items()]
     parts["FACTS"] = "\n".join(rows)
-    parts["NOTES"] = _listed("What was found", facts.notes)
+    parts["NOTES"] = _listed("What was found", facts.notes, kind="notes")
     parts["WARNINGS"] = _listed("Warnings", facts.warnings, kind="warnings")
     named = {name: html.escape(name) for name in (*layers, *overlays)}
     parts["LAYERS"] = "\n".join(
@@ -117,22 +109,15 @@ def filled_page(
         f'<img class="overlay" id="{named[name]}" alt="{named[name]}" src="{url}" hidden>'
         for name, url in overlays.items()
     )
-    parts["SWITCHES"] = "\n".join(_switch(name) for name in overlays)
+    said = {**named, "confidence": "confidence (covered where it is low)"}
+    parts["SWITCHES"] = "\n".join(
+        f'<label><input type="checkbox" data-overlay="{named[name]}"> {said[name]}</label>'
+        for name in overlays
+    )
     page = PAGE.read_text(encoding="utf-8")
     for name, text in parts.items():
         page = page.replace(f"{{{{{name}}}}}", text)
     return page
-
-
-def _all_of(texts: Mapping[str, Callable[[], str]]) -> dict[str, str]:
-    """Texts by name, made on several threads."""
-    made = {}
-
-    def make(name: str) -> None:
-        made[name] = texts[name]()
-
-    in_parallel([partial(make, name) for name in texts], most=how_many_fit(100 * LONGEST**2))
-    return made
 
 
 def rig_drawing(rig: Rig, alpha: str) -> str:
@@ -150,8 +135,11 @@ def rig_drawing(rig: Rig, alpha: str) -> str:
     drawn = []
     for i, name in enumerate(cameras):
         colour = COLOURS[i % len(COLOURS)]
-        drawn += [_polyline((line - low) / extent * 300 + 30, colour) for line in lines[name]]
-        x, y = (lines[name][0][0] - low) / extent * 300 + 30
+        shown = [(line - low) / extent * 300 + 30 for line in lines[name]]
+        for line in shown:
+            text = " ".join(f"{x:.1f},{y:.1f}" for x, y in line)
+            drawn.append(f'<polyline points="{text}" fill="none" stroke="{colour}" stroke-width="1.5"/>')
+        x, y = shown[0][0]
         label = html.escape(name) + (" (alpha)" if name == alpha else "")
         drawn.append(
             f'<text x="{x:.1f}" y="{y + 18:.1f}" fill="{colour}" text-anchor="middle">{label}</text>'
@@ -162,11 +150,6 @@ def rig_drawing(rig: Rig, alpha: str) -> str:
         f'above">{"".join(drawn)}</svg>'
         "<p>The cameras from above, each with the field of view that it has.</p>"
     )
-
-
-def _polyline(points: Float[np.ndarray, "n 2"], colour: str) -> str:
-    text = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
-    return f'<polyline points="{text}" fill="none" stroke="{colour}" stroke-width="1.5"/>'
 
 
 def _figures(frame: Frame, known: Tensor, facts: Facts) -> dict[str, str]:
@@ -199,8 +182,8 @@ def _depth_legend(known: Float[Tensor, " n"], unit: str) -> str:
 
 
 def data_url(image: Float[Tensor, "c h w"]) -> str:
-    """The URL of an image as JPEG, grey or in colour."""
-    pixels = to_bytes(image.detach().cpu().expand(3, -1, -1).flip(0)).transpose(1, 2, 0)
+    """The URL of an image as JPEG, grey or in colour, of at most `LONGEST` pixels."""
+    pixels = to_bytes(reduced(image, LONGEST).detach().cpu().expand(3, -1, -1).flip(0)).transpose(1, 2, 0)
     _, content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     return f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode()}"
 
@@ -214,13 +197,7 @@ def shares_layer(confidence: Float[Tensor, "h w"]) -> str:
     return f"data:image/png;base64,{base64.b64encode(content.tobytes()).decode()}"
 
 
-def _switch(name: str) -> str:
-    said = {"confidence": "confidence (covered where it is low)"}.get(name, name)
-    name, said = html.escape(name), html.escape(said)
-    return f'<label><input type="checkbox" data-overlay="{name}"> {said}</label>'
-
-
-def _listed(title: str, lines: Iterable[str], *, kind: str = "notes") -> str:
+def _listed(title: str, lines: Iterable[str], *, kind: str) -> str:
     """A section of the page with a list; empty without lines."""
     items = "".join(f"<li>{html.escape(line)}" for line in lines)
     return f'<section class="{kind}"><h2>{title}</h2><ul>{items}</ul></section>' if items else ""

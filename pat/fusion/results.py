@@ -77,17 +77,14 @@ def save_frame(
     depths = {f"{prefix}depth{part}" for part in (".tif", ".png", "_16.png", "_nearest.tif", "_farthest.tif")}
     stale = depths | (set() if name else {"points.ply", "index.html"})
     with write_together(out, last=last, stale=stale) as folder:
-        tasks: list[Callable[[], object]] = [
-            partial(write_image, folder / f"{prefix}confidence.png", frame.confidence[None])
-        ]
+        confidence = partial(write_image, folder / f"{prefix}confidence.png", frame.confidence[None])
+        tasks: list[Callable[[], object]] = [confidence]
         if frame.depth.isfinite().any():
             for part, depth in zip(("", "_nearest", "_farthest"), (frame.depth, *frame.depth_interval)):
                 path = folder / f"{prefix}depth{part}.tif"
                 tasks.append(partial(write_image, path, depth[None], bits=32, unknown=True))
-            near = view.depth[0] if view is not None and view.depth else None
-            tasks.append(
-                partial(write_depth, folder / f"{prefix}depth_16.png", frame.depth, near=near and float(near))
-            )
+            near = float(view.depth[0]) if view is not None and view.depth else None
+            tasks.append(partial(write_depth, folder / f"{prefix}depth_16.png", frame.depth, near=near))
             tasks.append(lambda: write_image(folder / f"{prefix}depth.png", colour_depth(frame.depth)))
         if view is not None:
             view.save(folder / "view.yaml")
@@ -184,15 +181,12 @@ class Frame(NamedTuple):
         inverse = 1 / self.depth
         farthest = inverse - self.half_width
         beyond = farthest <= 0
-        return 1 / (inverse + self.half_width), torch.where(
-            beyond, torch.inf, 1 / torch.where(beyond, 1.0, farthest)
-        )
+        farthest = torch.where(beyond, torch.inf, 1 / torch.where(beyond, 1.0, farthest))
+        return 1 / (inverse + self.half_width), farthest
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Frame:
         """The frame whose every part is changed, such as moved to another device."""
-        by_band = None if self.by_band is None else change(self.by_band)
-        planes = change(self.depth), change(self.confidence), change(self.half_width)
-        return Frame(change(self.image), *planes, by_band)
+        return Frame(*(part if part is None else change(part) for part in self))  # type: ignore[arg-type]
 
     def __repr__(self) -> str:
         """Sizes, the range of depth and the mean confidence, in a line."""

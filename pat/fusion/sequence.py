@@ -127,9 +127,8 @@ class SequenceFusion:
         could.
         """
         own = self.grey(i)
-        sources = [
-            self._warped(i, own, key, colour) for key in self._around(i, keys) if (colour := fetch(key))
-        ]
+        fetched = ((key, fetch(key)) for key in self._around(i, keys))
+        sources = [self._warped(i, own, key, colour) for key, colour in fetched if colour]
         if not sources:
             raise ValueError(f"frame {i}: none of the key frames around it could be fused")
         return mixed(self.base(i), sources)
@@ -137,8 +136,8 @@ class SequenceFusion:
     def keys_of(self, frames: Iterable[int]) -> list[KeyFrame]:
         """The key frames that some frames get their colour from."""
         keys = self.timeline.key_frames()
-        found = {key.alpha: key for i in frames for key in self._around(i, keys)}
-        return [found[i] for i in sorted(found)]
+        wanted = {key.alpha for i in frames for key in self._around(i, keys)}
+        return [key for key in keys if key.alpha in wanted]
 
     def _around(self, i: int, keys: Sequence[KeyFrame]) -> list[KeyFrame]:
         """The key frames within reach, or the nearest one."""
@@ -167,17 +166,17 @@ class SequenceFusion:
         count = len(self.frames[self.alpha])
         if abs(steps) < SETTINGS.synchronous or count < 2:
             return field, weight
-        other = min(max(index + (round(steps) or (1 if steps > 0 else -1)), 0), count - 1)
-        other = other if other != index else index - (1 if steps > 0 else -1)
+        towards = 1 if steps > 0 else -1
+        other = min(max(index + (round(steps) or towards), 0), count - 1)
+        other = other if other != index else index - towards
         LOG.info("motion of key frame %d", index)
         flow = flow_between(self.grey(index), self.grey(other))
         step = flow.step * (steps / (other - index))
-        return Moved(Widened(field, along=self._room(step, time - self._time(index))), step), flow.weight
-
-    def _room(self, step: Tensor, gap: float) -> float:
-        if self.speed is not None:
-            return self.speed * abs(gap)
-        return SETTINGS.unknown_motion * float(step.norm(dim=0).flatten()[::16].quantile(0.995))
+        if self.speed is None:
+            room = SETTINGS.unknown_motion * float(step.norm(dim=0).flatten()[::16].quantile(0.995))
+        else:
+            room = self.speed * abs(time - self._time(index))
+        return Moved(Widened(field, along=room), step), flow.weight
 
     def _fused(
         self, i: int, betas: Mapping[str, int], fields: Mapping[str, ReceptiveField], *, alone: bool = False
@@ -245,10 +244,8 @@ class SequenceFusion:
 
     def _images_at(self, key: KeyFrame) -> dict[str, Tensor]:
         """Alpha's image and those of the betas, as recorded."""
-        return {
-            self.alpha: self.recorded(key.alpha),
-            **{name: self.frames[name][j] for name, j in key.betas.items()},
-        }
+        betas = {name: self.frames[name][j] for name, j in key.betas.items()}
+        return {self.alpha: self.recorded(key.alpha), **betas}
 
     def _found_at(self, key: KeyFrame) -> Corrections:
         gaps = (self._time(key.alpha) - self.timeline.time(name, j) for name, j in key.betas.items())
@@ -332,6 +329,5 @@ def fuse_sequence(
     def colour(number: int) -> KeyColour:
         return job.colour(keys[number])
 
-    numbers = {key.alpha: number for number, key in enumerate(keys)}
     for i in range(len(frames[alpha])):
-        yield job.frame(i, keys, lambda key: colour(numbers[key.alpha]))
+        yield job.frame(i, keys, lambda key: colour(keys.index(key)))

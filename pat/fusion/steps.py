@@ -1,14 +1,14 @@
 """What is done to views before they are fused, and undone to the fused frame afterwards.
 
-A step's `do` takes views and returns them changed, with a function that takes the fused frame back.
+A step takes views and returns them changed, with a function that takes the fused frame back.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -52,160 +52,121 @@ class Done(NamedTuple):
     """Views after a step, and how to take the fused frame back to those before it."""
 
     views: Views
-    undo: Undo
+    undo: Undo = lambda frame: frame
 
 
-@runtime_checkable
-class FusionStep(Protocol):
-    """One step."""
-
-    def do(self, views: Views) -> Done:
-        """Change the views."""
-        ...
+FusionStep = Callable[[Views], Done]
 
 
 def steps_for(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:
     """The steps that a network needs, in order."""
-    resize = [EqualResolution(network)] if network.equal_resolution else []
-    radiometry = [Radiometry(undone=not network.keeps_luminance)] if normalise else []
-    return [Undistort(), LinearLuminance(), Upright(), *resize, *radiometry, JoinBands(network.joins_bands)]
+    resize = [partial(equal_resolution, network)] if network.equal_resolution else []
+    radiometry = [partial(normalise_betas, undone=not network.keeps_luminance)] if normalise else []
+    return [undistort, linear_luminance, upright, *resize, *radiometry, partial(join, network.joins_bands)]
 
 
-def _as_it_is(frame: Frame) -> Frame:
-    return frame
-
-
-@dataclass(frozen=True)
-class Undistort:
+def undistort(views: Views) -> Done:
     """Pinhole views in place of views with lenses (up to 62 degrees off axis), unless a field goes through
     lenses, or a camera has no pinhole view.
 
     Undone, the frame is at alpha's own pixels: the fusion's difference from alpha is resampled and added to
     alpha's own image, and what the pinhole view leaves out has confidence 0.
     """
-
-    def do(self, views: Views) -> Done:
-        """Resample every image with a lens."""
-        cameras = [views.rig[name] for name in views.images]
-        as_recorded = any(
-            isinstance(innermost(f), Curved | ThroughLenses) for f in views.fields.values()
-        ) or not all(c.has_pinhole_view for c in cameras)
-        if as_recorded or not any(map(has_lens, cameras)):
-            return Done(views, _as_it_is)
-        rig, images = without_lenses(views.rig, views.images)
-        lens, pinhole = views.rig[views.alpha], rig[views.alpha]
-        fields = {name: _for_pinhole(field, lens, pinhole) for name, field in views.fields.items()}
-        straight, own = images[views.alpha], views.own
-        done = Views(rig, images, views.alpha, fields)
-        return Done(done, lambda frame: _distorted(frame, straight, own, pinhole, lens))
+    cameras = [views.rig[name] for name in views.images]
+    through_lenses = any(isinstance(innermost(f), Curved | ThroughLenses) for f in views.fields.values())
+    if through_lenses or not all(c.has_pinhole_view for c in cameras) or not any(map(has_lens, cameras)):
+        return Done(views)
+    rig, images = without_lenses(views.rig, views.images)
+    lens, pinhole = views.rig[views.alpha], rig[views.alpha]
+    fields = {name: _for_pinhole(field, lens, pinhole) for name, field in views.fields.items()}
+    straight, own = images[views.alpha], views.own
+    done = Views(rig, images, views.alpha, fields)
+    return Done(done, lambda frame: _distorted(frame, straight, own, pinhole, lens))
 
 
-@dataclass(frozen=True)
-class LinearLuminance:
-    """The result as bright as alpha's camera saw it, if it measured the luminance of light (`as_bright`)."""
-
-    def do(self, views: Views) -> Done:
-        """Leave the views as they are; undone, a frame in RGB betas' colours is made as bright as alpha."""
-        own, sensor = views.own, views.rig[views.alpha].sensor
-        if sensor.response != LIGHT or 3 not in [views.images[name].shape[0] for name in views.betas]:
-            return Done(views, _as_it_is)
-        return Done(views, lambda frame: frame._replace(image=as_bright(frame.image, own, sensor)))
+def linear_luminance(views: Views) -> Done:
+    """The views as they are; undone, a frame in RGB betas' colours is as bright as alpha's camera saw it, if
+    that measured the luminance of light (`as_bright`)."""
+    own, sensor = views.own, views.rig[views.alpha].sensor
+    if sensor.response != LIGHT or 3 not in [len(views.images[name]) for name in views.betas]:
+        return Done(views)
+    return Done(views, lambda frame: frame._replace(image=as_bright(frame.image, own, sensor)))
 
 
-@dataclass(frozen=True)
-class Upright:
+def upright(views: Views) -> Done:
     """Betas rotated by about a quarter or half a turn against alpha are rotated back."""
-
-    def do(self, views: Views) -> Done:
-        """Rotate images and rig."""
-        for name in views.betas:
-            k = quarter_turns(views.pair(name))
-            if k:
-                rotated = views.images[name].rot90(k, (-2, -1))
-                views = views.replace({name: rotated}, rig=views.rig.rot90(name, k))
-        return Done(views, _as_it_is)
+    for name in views.betas:
+        if k := quarter_turns(views.pair(name)):
+            rotated = views.images[name].rot90(k, (-2, -1))
+            views = views.replace({name: rotated}, rig=views.rig.rot90(name, k))
+    return Done(views)
 
 
-@dataclass(frozen=True)
-class EqualResolution:
+def equal_resolution(network: FusionNetwork, views: Views) -> Done:
     """Betas at about alpha's angular resolution where views meet, less large parts alpha cannot see."""
-
-    network: FusionNetwork
-
-    def do(self, views: Views) -> Done:
-        """Crop and resize."""
-        for name in views.betas:
-            views = _resized(self._cropped(views, name), name)
-        return Done(views, _as_it_is)
-
-    def _cropped(self, views: Views, name: str) -> Views:
-        """A calibrated beta less what no search segment touches, if much: it would be enlarged for nothing.
-
-        Not where the field may depend on the images' sizes.
-        """
-        pair, field = views.pair(name), views.fields.get(name)
-        h, w = pair.beta.hw
-        follows = field is None or isinstance(field, (Epipolar, EpipolarLine))
-        if not follows or pair.link is not None or not pair.calibrated or resolution_ratio(pair) > 0.8:
-            return views
-        found = (field or default_field(pair))(pair, coarse_grid(pair.alpha.hw).reshape(-1, 2))
-        top, bottom, left, right = box_around(
-            ends_of(found), (h, w), self.network.beta_halo, self.network.multiple
-        )
-        if (bottom - top) * (right - left) > 0.75 * h * w:
-            return views
-        rig = views.rig.transformed(name, shift_matrix(left, top), (bottom - top, right - left))
-        return views.replace({name: views.images[name][..., top:bottom, left:right]}, rig=rig)
+    for name in views.betas:
+        views = _cropped(network, views, name)
+        image = at_alphas_resolution(views.images[name], views.pair(name))
+        if image is not views.images[name]:
+            rig = views.rig.resize(name, (image.shape[-2], image.shape[-1]))
+            views = views.replace({name: image}, rig=rig)
+    return Done(views)
 
 
-@dataclass(frozen=True)
-class Radiometry:
+def _cropped(network: FusionNetwork, views: Views, name: str) -> Views:
+    """A calibrated beta less what no search segment touches, if much: it would be enlarged for nothing.
+
+    Not where the field may depend on the images' sizes.
+    """
+    pair, field = views.pair(name), views.fields.get(name)
+    h, w = pair.beta.hw
+    follows = field is None or isinstance(field, (Epipolar, EpipolarLine))
+    if not follows or pair.link is not None or not pair.calibrated or resolution_ratio(pair) > 0.8:
+        return views
+    found = (field or default_field(pair))(pair, coarse_grid(pair.alpha.hw).reshape(-1, 2))
+    top, bottom, left, right = box_around(ends_of(found), (h, w), network.beta_halo, network.multiple)
+    if (bottom - top) * (right - left) > 0.75 * h * w:
+        return views
+    rig = views.rig.transformed(name, shift_matrix(left, top), (bottom - top, right - left))
+    return views.replace({name: views.images[name][..., top:bottom, left:right]}, rig=rig)
+
+
+def normalise_betas(views: Views, *, undone: bool = False) -> Done:
     """Each beta with alpha's mean and standard deviation: for cameras of other exposures or filters.
 
     `undone`: bands have their own scale in the result, as measurements need it; else that is as bright as
     alpha.
     """
+    done = views.replace({n: normalised(views.images[n], views.own) for n in views.betas})
+    if not undone:
+        return Done(done)
+    own, scales = moments(views.own), [moments(views.images[name]) for name in views.betas]
+    bands = [len(views.images[name]) for name in views.betas]
 
-    undone: bool = False
+    def back(frame: Frame) -> Frame:
+        parts = zip(frame.image.split(bands), scales)
+        return frame._replace(image=torch.cat([own.matched(part, scale) for part, scale in parts]))
 
-    def do(self, views: Views) -> Done:
-        """Normalise the betas."""
-        done = views.replace({n: normalised(views.images[n], views.own) for n in views.betas})
-        if not self.undone:
-            return Done(done, _as_it_is)
-        own = moments(views.own)
-        scales = [(moments(views.images[name]), len(views.images[name])) for name in views.betas]
-
-        def back(frame: Frame) -> Frame:
-            parts = frame.image.split([bands for _, bands in scales])
-            return frame._replace(
-                image=torch.cat([own.matched(part, scale) for part, (scale, _) in zip(parts, scales)])
-            )
-
-        return Done(done, back)
+    return Done(done, back)
 
 
-@dataclass(frozen=True)
-class JoinBands:
-    """Betas that differ at most in sensors as one of several bands; undone, bands in the rig's order."""
+def join(which: JoinsBands, views: Views) -> Done:
+    """Betas that differ at most in sensors as one of several bands, under the first one's name; undone, bands
+    in the rig's order."""
+    names, bands = views.betas, {name: len(views.images[name]) for name in views.betas}
+    groups = co_located(views.rig, names, views.fields, which)
+    if len(groups) == len(names) or (which == "neighbours" and 3 in bands.values()):
+        return Done(views)
+    come = [(name, band) for group in groups for name in group for band in range(bands[name])]
+    order = [come.index((name, band)) for name in names for band in range(bands[name])]
+    joined = {group[0]: torch.cat([views.images[name] for name in group]) for group in groups}
 
-    which: JoinsBands
+    def back(frame: Frame) -> Frame:
+        by_band = frame.confidence.expand(len(order), -1, -1) if frame.by_band is None else frame.by_band
+        return frame._replace(image=frame.image[order], by_band=by_band[order])
 
-    def do(self, views: Views) -> Done:
-        """Concatenate the bands of co-located betas under the first one's name."""
-        names, bands = views.betas, {name: len(views.images[name]) for name in views.betas}
-        groups = co_located(views.rig, names, views.fields, self.which)
-        if len(groups) == len(names) or (self.which == "neighbours" and 3 in bands.values()):
-            return Done(views, _as_it_is)
-        order = _band_order(names, groups, bands)
-        joined = {group[0]: torch.cat([views.images[name] for name in group]) for group in groups}
-        done = Views(views.rig, {views.alpha: views.own, **joined}, views.alpha, views.fields)
-        return Done(done, lambda frame: _reordered(frame, order))
-
-
-def _reordered(frame: Frame, order: list[int]) -> Frame:
-    by_band = frame.confidence.expand(len(order), -1, -1) if frame.by_band is None else frame.by_band
-    return frame._replace(image=frame.image[order], by_band=by_band[order])
+    done = Views(views.rig, {views.alpha: views.own, **joined}, views.alpha, views.fields)
+    return Done(done, back)
 
 
 def co_located(rig: Rig, names: Sequence[str], fields: Fields, which: JoinsBands) -> list[list[str]]:
@@ -216,7 +177,8 @@ def co_located(rig: Rig, names: Sequence[str], fields: Fields, which: JoinsBands
     groups: list[list[str]] = []
     for name in names:
         near = [] if which == "no" else groups[-1:] if which == "neighbours" else groups
-        home = [g for g in near if fields.get(g[0]) is fields.get(name) and _same_view(rig[g[0]], rig[name])]
+        alike = [g for g in near if fields.get(g[0]) is fields.get(name)]
+        home = [g for g in alike if _same_view(rig[g[0]], rig[name])]
         if home:
             home[0].append(name)
         else:
@@ -227,12 +189,6 @@ def co_located(rig: Rig, names: Sequence[str], fields: Fields, which: JoinsBands
 def _same_view(one: View, other: View) -> bool:
     """Whether two calibrated cameras differ at most in their sensors."""
     return isinstance(one, Camera) and one.replace(sensor=other.sensor) == other
-
-
-def _band_order(names: Sequence[str], groups: Sequence[Sequence[str]], bands: Mapping[str, int]) -> list[int]:
-    """Which of the groups' bands, one after the other, are those of the betas in the order of their names."""
-    joined = [(name, band) for group in groups for name in group for band in range(bands[name])]
-    return [joined.index((name, band)) for name in names for band in range(bands[name])]
 
 
 def without_lenses(rig: Rig, images: Images) -> tuple[Rig, dict[str, Tensor]]:
@@ -268,10 +224,10 @@ def undone(frame: Frame, undo: Sequence[Undo]) -> Frame:
 
 def _for_pinhole(field: ReceptiveField | None, lens: View, pinhole: View) -> ReceptiveField | None:
     """The field for the pinhole view of alpha: displacements are between pixels of that, too."""
-    if not (isinstance(field, Moved) and isinstance(lens, LensView) and isinstance(pinhole, LensView)):
+    if not (isinstance(field, Moved) and has_lens(lens)):
         return field
-    if lens.distortion is None:
-        return field
+    assert isinstance(lens, LensView)
+    assert isinstance(pinhole, LensView)
     x, seen = pixels_between(lens, pinhole)
     rays, valid = lens.to(torch.float64).rays(field.points(x))
     there = map_homogeneous(pinhole.K.double()[:2], rays[..., :2] / rays[..., 2:])
@@ -282,8 +238,10 @@ def _for_pinhole(field: ReceptiveField | None, lens: View, pinhole: View) -> Rec
 
 def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens: View) -> Frame:
     """The frame at the pixels of alpha's own image."""
-    if not (isinstance(pinhole, LensView) and isinstance(lens, LensView) and lens.distortion is not None):
+    if not has_lens(lens):
         return frame
+    assert isinstance(lens, LensView)
+    assert isinstance(pinhole, LensView)
     shown = torch.cat([frame.image - straight, frame.confidence[None]])
     inverse = torch.stack([(1 / frame.depth).nan_to_num(0.0), frame.half_width.nan_to_num(0.0)])
     back = resampled(shown, pinhole, lens, interpolation="bilinear").values[0]
@@ -294,20 +252,9 @@ def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens:
     half_width = torch.where(known, half_width, torch.nan)
     by_band = frame.by_band
     if by_band is not None:
-        bands = [
-            resampled(b[None].float(), pinhole, lens, interpolation="bilinear").values[0, 0] for b in by_band
-        ]
-        by_band = torch.stack([band.to(by_band) for band in bands])
+        bands = (resampled(b[None].float(), pinhole, lens, interpolation="bilinear") for b in by_band)
+        by_band = torch.stack([band.values[0, 0].to(by_band) for band in bands])
     return Frame(own + back[:-1], depth, back[-1], half_width, by_band)
-
-
-def _resized(views: Views, name: str) -> Views:
-    """Beta resized so that its pixels are about the size of alpha's where the views meet."""
-    image = at_alphas_resolution(views.images[name], views.pair(name))
-    if image is views.images[name]:
-        return views
-    h, w = image.shape[-2:]
-    return views.replace({name: image}, rig=views.rig.resize(name, (h, w)))
 
 
 def at_alphas_resolution(image: Float[Tensor, "c h w"], pair: Pair) -> Float[Tensor, "c h2 w2"]:

@@ -21,7 +21,7 @@ from arraygeom.threads import convolutions_in_parallel
 
 from ..matching.inputs import Inputs
 from ..matching.matches import Matches
-from ..networks.protocol import FusionNetwork, FusionOutput, matched_for
+from ..networks.protocol import FusionNetwork, matched_for
 from ..support.tensor_files import write_tensors
 from .depth import certain, measured_depth
 from .inputs import FrameInputs
@@ -92,17 +92,15 @@ def plan_frame(
     `kept` are bytes that the caller holds beside the frame.
     Raises ValueError as `tiles_within`.
     """
-    pieces = frame.inputs.pieces
-    large = math.prod(frame.hw) > LARGE
-    slow = math.prod(frame.hw) > ESTIMATED
-    probe = Probe.of(network, frame) if (large and limit) or (slow and estimate) else None
-    held = kept + held_memory(frame, probe.matches if probe else 0.0, whole_frame=not stored)
+    pieces, pixels, of_frame = frame.inputs.pieces, math.prod(frame.hw), frame_bytes(frame.inputs)
+    wanted = (pixels > LARGE and limit) or (pixels > ESTIMATED and estimate)
+    probe = Probe.of(network, frame) if wanted else None
+    for_each = (probe.matches if probe else 0.0) + (0.0 if stored else of_frame)
+    held = kept + LIBRARIES + frame.inputs.nbytes + pixels * for_each
     matching = MATCHING_BYTES * max(area(tile.outer) for tile in pieces) if network.uses_matches else 0.0
     tiles = tiles_within(network, frame, limit, held, matching)
     work = max(matching, *(working_memory(network, frame.inputs, tile) for tile in tiles))
-    held = max(
-        held + work, LIBRARIES + kept + math.prod(frame.hw) * (frame_bytes(frame.inputs) + WRITING_BYTES)
-    )
+    held = max(held + work, LIBRARIES + kept + pixels * (of_frame + WRITING_BYTES))
     seconds = (1 + before) * probe.seconds(pieces, tiles) + after if probe else None
     return Plan(tiles, SLACK * held, seconds, len(pieces))
 
@@ -143,17 +141,6 @@ def working_memory(network: FusionNetwork, inputs: Inputs, tile: Tile) -> float:
     return network.working_bytes(area(tile.outer), betas)
 
 
-def held_memory(frame: FrameInputs, matches: float, *, whole_frame: bool) -> float:
-    """Bytes of the process that do not depend on the tiles: libraries, images, fields, `matches` for each
-    pixel, and the fused frame if it is kept in memory."""
-    pixels = math.prod(frame.hw)
-    return (
-        LIBRARIES
-        + frame.inputs.nbytes
-        + pixels * (matches + (frame_bytes(frame.inputs) if whole_frame else 0.0))
-    )
-
-
 def frame_bytes(inputs: Inputs) -> float:
     """Bytes of a fused frame for each pixel."""
     bands = inputs.bands or sum(beta.image.shape[1] for beta in inputs.betas)
@@ -175,27 +162,22 @@ class Probe(NamedTuple):
         """Match and fuse a small piece, as loops may have to be compiled, and then one to measure."""
         side = min(max(math.sqrt(math.prod(frame.hw) * PROBED), PROBE[0]), PROBE[1])
         for n in (PROBE[0], int(side)):
-            tile = _middle(frame.hw, n, network.multiple)
+            top, left = (max((size - n) // 2, 0) // network.multiple * network.multiple for size in frame.hw)
+            box = (top, min(top + n, frame.hw[0]), left, min(left + n, frame.hw[1]))
+            tile = Tile(box, box)
             inputs = frame.inputs.cut(_to_multiple(tile.outer, network.multiple))
             begin = time.perf_counter()
             matches = matched_for(network, inputs)
             middle = time.perf_counter()
             _fused(network, inputs, matches, frame, tile)
             end = time.perf_counter()
-        pixels = area(tile.outer)
-        nbytes = matches.nbytes if matches else 0
+        pixels, nbytes = area(tile.outer), matches.nbytes if matches else 0
         return cls(nbytes / pixels, (middle - begin) / pixels, (end - middle) / pixels)
 
     def seconds(self, pieces: list[Tile], tiles: list[Tile]) -> float:
         """About how long a frame will take here, if the machine stays as busy as it was."""
         matching, fusing = (sum(area(tile.outer) for tile in some) for some in (pieces, tiles))
         return self.matching * matching + self.fusing * fusing
-
-
-def _middle(hw: HW, side: int, multiple: int) -> Tile:
-    top, left = (max((n - side) // 2, 0) // multiple * multiple for n in hw)
-    box = (top, min(top + side, hw[0]), left, min(left + side, hw[1]))
-    return Tile(box, box)
 
 
 def _to_multiple(box: Box, multiple: int) -> Box:
@@ -239,24 +221,14 @@ def _fused(
     part = replace(inputs, betas=tuple(replace(beta, field=beta.field.cut(box)) for beta in inputs.betas))
     hw = bottom - top, right - left
     depth, half_width, confidence = measured_depth(output, part, frame.placements, hw, (left, top))
-    return FusedTile(
-        output.image[0], depth, confidence, half_width, _found(output, part), _by_band(output, part)
-    )
-
-
-def _by_band(output: FusionOutput, part: Inputs) -> Tensor:
-    """Each band's confidence (C, h, w) as float16, if each is another beta's; else none, (0, h, w)."""
-    bands = [beta.image.shape[1] for beta in part.betas]
-    if len(bands) == 1 or sum(bands) != output.image.shape[1]:
-        return output.image[0, :0].half()
-    return torch.cat([c.expand(n, -1, -1) for c, n in zip(output.confidence, bands)]).half()
-
-
-def _found(output: FusionOutput, part: Inputs) -> Tensor:
-    """Positions in whole betas, and their confidences, (betas, 3, h, w)."""
     corners = [p.new_tensor(beta.offset)[:, None, None] for beta, p in zip(part.betas, output.position)]
-    parts = zip(output.position, corners, output.confidence)
-    return torch.stack([torch.cat([p[0] + corner, c]) for p, corner, c in parts]).to(output.image)
+    seen = zip(output.position, corners, output.confidence)
+    found = torch.stack([torch.cat([p[0] + corner, c]) for p, corner, c in seen]).to(output.image)
+    bands = [beta.image.shape[1] for beta in part.betas]
+    by_band = output.image[0, :0]
+    if len(bands) > 1 and sum(bands) == output.image.shape[1]:
+        by_band = torch.cat([c.expand(n, -1, -1) for c, n in zip(output.confidence, bands)])
+    return FusedTile(output.image[0], depth, confidence, half_width, found, by_band.half())
 
 
 def fused_in_tiles(
@@ -277,48 +249,26 @@ def fused_in_tiles(
         return made if found else made._replace(found=made.found[:0])
 
     shown = progress(tiles, len(tiles)) if progress else tiles
-    if not store or len(tiles) == 1:
-        return _joined(frame.hw, ((tile, make(tile)) for tile in shown))
-    files = TileStore.of(store, network, frame.inputs)
-    for tile in shown:
-        files.write(tile, make)
-    return _joined(frame.hw, ((tile, files.read(tile)) for tile in tiles))
+    parts = ((tile, make(tile)) for tile in shown)
+    if store and len(tiles) > 1:
+        digest = _digest(network, frame.inputs)
+        files = {t: store / f"{digest}_{'_'.join(map(str, (*t.inner, *t.outer)))}.safetensors" for t in tiles}
+        for tile in shown:
+            if not files[tile].exists():
+                write_tensors(files[tile], make(tile)._asdict())
+        parts = ((tile, FusedTile(**load_file(file))) for tile, file in files.items())
+    # A single tile is the frame as it is, with its gradients.
+    return FusedTile(*assembled(frame.hw, ((Tile(tile.inner, tile.inner), part) for tile, part in parts)))
 
 
-def _joined(hw: HW, parts: Iterable[tuple[Tile, FusedTile]]) -> FusedTile:
-    """The frame from the inner parts of its tiles; a single one as it is, with its gradients."""
-    return FusedTile(*assembled(hw, ((Tile(tile.inner, tile.inner), part) for tile, part in parts)))
-
-
-class TileStore(NamedTuple):
-    """Finished tiles in a folder; `digest` is of all that they depend on and is part of their names."""
-
-    folder: Path
-    digest: str
-
-    @classmethod
-    def of(cls, folder: Path, network: FusionNetwork, inputs: Inputs) -> TileStore:
-        """The store for one frame's tiles."""
-        digest = hashlib.sha256(f"{type(network).__name__} {FusedTile._fields}".encode())
-        parameters = network.state_dict().values() if isinstance(network, nn.Module) else ()
-        fields = [tensor for beta in inputs.betas for tensor in _sparse(beta.field, inputs.hw)]
-        for tensor in (*parameters, inputs.alpha, *(b.image for b in inputs.betas), *fields):
-            digest.update(tensor.detach().cpu().contiguous().numpy())
-        return cls(folder, digest.hexdigest()[:16])
-
-    def write(self, tile: Tile, make: Callable[[Tile], FusedTile]) -> None:
-        """Make a tile, unless it is there."""
-        file = self._file(tile)
-        if file.exists():
-            return
-        write_tensors(file, make(tile)._asdict())
-
-    def read(self, tile: Tile) -> FusedTile:
-        """A tile that was made."""
-        return FusedTile(**load_file(self._file(tile)))
-
-    def _file(self, tile: Tile) -> Path:
-        return self.folder / f"{self.digest}_{'_'.join(map(str, (*tile.inner, *tile.outer)))}.safetensors"
+def _digest(network: FusionNetwork, inputs: Inputs) -> str:
+    """Of all that a frame's tiles depend on."""
+    digest = hashlib.sha256(f"{type(network).__name__} {FusedTile._fields}".encode())
+    parameters = network.state_dict().values() if isinstance(network, nn.Module) else ()
+    fields = [tensor for beta in inputs.betas for tensor in _sparse(beta.field, inputs.hw)]
+    for tensor in (*parameters, inputs.alpha, *(b.image for b in inputs.betas), *fields):
+        digest.update(tensor.detach().cpu().contiguous().numpy())
+    return digest.hexdigest()[:16]
 
 
 def _sparse(field: Any, hw: HW) -> list[Tensor]:

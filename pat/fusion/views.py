@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -62,8 +63,8 @@ class Views:
         checked = {name: _checked(rig, images, name) for name in (alpha, *names)}
         fields = field if isinstance(field, Mapping) else dict.fromkeys(names, field)
         rig = rig if depth is None else rig.replace(depth=depth)
-        own = grey_alpha(alpha, checked[alpha])
-        return cls(rig, {**checked, alpha: own}, alpha, fields, is_in_colour(checked[alpha]))
+        images = {**checked, alpha: grey_alpha(alpha, checked[alpha])}
+        return cls(rig, images, alpha, fields, is_in_colour(checked[alpha]))
 
     @property
     def own(self) -> Float[Tensor, "1 h w"]:
@@ -190,9 +191,8 @@ def read_view(rig: Rig, name: str, path: str | Path, *, like: Sensor) -> Float[T
     """
     view = rig[name]
     raw = view.sensor.bayer is not None
-    image = read_image(
-        path, name=name, bits=view.sensor.bits, hw=view.hw, orientation="ignore" if raw else "apply"
-    )
+    turned: Literal["apply", "ignore"] = "ignore" if raw else "apply"
+    image = read_image(path, name=name, bits=view.sensor.bits, hw=view.hw, orientation=turned)
     if view.sensor.bayer and image.shape[0] != 1:
         raise ValueError(
             f"{name}: {path}: is in colour, and the rig says raw {view.sensor.bayer}: drop 'bayer'"

@@ -110,7 +110,8 @@ def typical_facts(found: BetaMatches) -> Float[Tensor, "b 2"]:
 def measured(found: BetaMatches, typical: Float[Tensor, "b 2"]) -> Float[Tensor, "b n h2 w2"]:
     """The `MEASURED` numbers of each pixel, at half the size; `typical` is of the whole frame."""
     facts = [found.facts, *(box_mean(found.facts, radius) for radius in SETTINGS.around)]
-    apart = [_logarithm(max_pool2d(_range(found.disparity, radius), FINE), 0.1) for radius in SETTINGS.apart]
+    ranges = (max_pool2d(_range(found.disparity, radius), FINE) for radius in SETTINGS.apart)
+    apart = [(part.clamp(min=0) + 0.1).log() for part in ranges]
     blurs = torch.tensor(found.comparison.whole.blurs).T  # of alpha and of beta, of each of the batch
     same = torch.cat([blurs.to(typical), typical], 1)[..., None, None]
     return torch.cat([*facts, *apart, same.expand(*same.shape[:2], *found.facts.shape[-2:])], 1)
@@ -122,7 +123,3 @@ def _range(x: Tensor, radius: int) -> Tensor:
     rows, columns = ((side, 1), 1, (radius, 0)), ((1, side), 1, (0, radius))
     greatest, negative = (max_pool2d(max_pool2d(x, *rows), *columns) for x in (x, -x))
     return greatest + negative
-
-
-def _logarithm(x: Tensor, least: float) -> Tensor:
-    return (x.clamp(min=0) + least).log()

@@ -121,19 +121,17 @@ def _transferred_piece(piece: Inputs, found: Matches, sharing: Sequence[bool]) -
         weights = [weight * math.exp(prior) for _, weight, prior in counting]
         mixed = sum(w * colour for w, (colour, _, _) in zip(weights, counting)) / torch.stack(weights).sum(0)
         shared = [diffused_from(mixed, alpha, torch.stack([weight for _, weight, _ in counting]).amax(0))]
-    own = [
-        diffused_from(colour, alpha, weight) for (colour, weight), counts in zip(alone, sharing) if not counts
-    ]
+    others = [one for one, counts in zip(alone, sharing) if not counts]
+    own = [diffused_from(colour, alpha, weight) for colour, weight in others]
     return [*shared, *own, *(colour for colour, _ in alone)]
 
 
 def transferred_bands(alpha: Tensor, beta: Beta, found: BetaMatches) -> tuple[Tensor, Tensor]:
     """A beta's bands minus alpha at its matches (B, C, H, W), and their weight (B, 1, H, W), 0 to 1."""
-    mix, level = found.comparison.mix, found.comparison.whole
-    if mix is not None:
-        return _colours_of_bands(alpha, beta, found, mix)
-    where = beta.field.straight, found.disparity, found.facts
-    return matched_colours(alpha, combined_bands(beta.image), beta.image, *where, level)
+    if found.comparison.mix is not None:
+        return _colours_of_bands(alpha, beta, found, found.comparison.mix)
+    where = beta.field.straight, found.disparity, found.facts, found.comparison.whole
+    return matched_colours(alpha, combined_bands(beta.image), beta.image, *where)
 
 
 def matched_colours(
@@ -147,10 +145,8 @@ def matched_colours(
 ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
     """Beta's bands minus alpha at the matches, colour as in alpha's light, with the detail that alpha has and
     beta has not; their weight, 0 to 1."""
-    bands = beta.shape[1]
-    seen, valid = at_matches(
-        torch.cat([beta, guide, normalisation.normalised(guide)], 1), segments, disparity
-    )
+    bands, planes = beta.shape[1], torch.cat([beta, guide, normalisation.normalised(guide)], 1)
+    seen, valid = at_matches(planes, segments, disparity)
     values, own, brightness = seen.split([bands, 1, 1], 1)
     consistent = is_consistent(facts)
     brightness = normalised(brightness, alpha, valid * consistent, largest_gain=NORMALISATION.largest_gain)
@@ -159,13 +155,10 @@ def matched_colours(
     if bands > 1:
         colour, bright = _scaled_to_alpha(values - own, own, alpha, weight)
         noise = colour_noise(brightness - soft, soft, weight * consistent)
-        colour = (
-            _without_noise(colour, bright, noise) if float(noise.amax()) > SETTINGS.least_noise else colour
-        )
-        radii = [
-            max(SETTINGS.detail_radius, round(SETTINGS.radius_of_blur * blur))
-            for blur in normalisation.blurs[0]
-        ]
+        if float(noise.amax()) > SETTINGS.least_noise:
+            colour = _without_noise(colour, bright, noise)
+        least, step = SETTINGS.detail_radius, SETTINGS.radius_of_blur
+        radii = [max(least, round(step * blur)) for blur in normalisation.blurs[0]]
         detailed = _each_detailed(colour, bright, alpha, radii)
         matched = torch.lerp(colour, detailed, explained_share(own, soft, valid * consistent)) + own - alpha
     else:
@@ -235,9 +228,8 @@ def colour_noise(
     fine = box_mean((parts - box_mean(parts, radius)).square(), radius)
     fine = torch.where(weight > 0.5, fine, torch.nan)[..., ::4, ::4].flatten(2)
     least, of_texture = fine.nanquantile(SETTINGS.lowest, 2).nan_to_num(0.0).split(1, 1)
-    return (SETTINGS.noise_share * (least - SETTINGS.texture_share * of_texture)).clamp(min=0)[
-        ..., None, None
-    ]
+    variance = SETTINGS.noise_share * (least - SETTINGS.texture_share * of_texture)
+    return variance.clamp(min=0)[..., None, None]
 
 
 def _without_noise(colour: Tensor, brightness: Tensor, noise: Tensor) -> Tensor:
@@ -297,8 +289,6 @@ def _diffused(
     products = smoothed([weight * brightness * p for p in colour], guide, how)
     out = np.empty((FILLS, *colour.shape), np.float32)
     planes = zip(totals[3:], products, *out)
-    floor = SETTINGS.floor
-    in_parallel(
-        [partial(kernels.regression, brightness, *totals[:3], c, p, floor, *o) for c, p, *o in planes]
-    )
+    regression = partial(kernels.regression, brightness, *totals[:3])
+    in_parallel([partial(regression, c, p, SETTINGS.floor, *o) for c, p, *o in planes])
     return out

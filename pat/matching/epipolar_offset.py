@@ -99,10 +99,8 @@ def fit_misalignment(
     `alpha` and `beta` are of equal brightness and sharpness; `position` are the matches in beta, `weight` is
     0 to 1.
     """
-    own, other, where, across, counts = (
-        t.detach().cpu().float().numpy() for t in (alpha, beta, position, normal, weight)
-    )
-    views = _Windows.of(own, other, where, across, counts)
+    given = (t.detach().cpu().float().numpy() for t in (alpha, beta, position, normal, weight))
+    views = _Windows.of(*given)
     height, width = alpha.shape
     coefficients = np.zeros(3)
     for _ in range(SETTINGS.steps):
@@ -146,10 +144,8 @@ class _Windows(NamedTuple):
         columns, rows = (np.ascontiguousarray(displaced[..., i], np.float32) for i in range(2))
         height, width = self.beta.shape
         inside = (columns > 2) & (rows > 2) & (columns < width - 3) & (rows < height - 3)
-        planes = (self.beta, *self.gradients)
-        value, gx, gy = (
-            cv2.remap(p, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for p in planes
-        )
+        planes, beyond = (self.beta, *self.gradients), cv2.BORDER_REPLICATE
+        value, gx, gy = (cv2.remap(p, columns, rows, cv2.INTER_LINEAR, borderMode=beyond) for p in planes)
         return value, gx, gy, self.weight * inside.astype(np.float32)
 
     def _mean(self, plane: Image, weight: Image) -> Image:
@@ -170,10 +166,8 @@ class _Windows(NamedTuple):
         along_segment = gx * self.normal[..., 1] - gy * self.normal[..., 0]
         rest = self.alpha - value
         rest = rest - self._mean(rest, weight)
-        strength, mixed, other = (
-            self._mean(a * b, weight)
-            for a, b in ((across, across), (across, along_segment), (along_segment, along_segment))
-        )
+        products = across * across, across * along_segment, along_segment * along_segment
+        strength, mixed, other = (self._mean(product, weight) for product in products)
         towards, aside = self._mean(across * rest, weight), self._mean(along_segment * rest, weight)
         strength = strength - mixed**2 / (other + 1e-6)
         towards = towards - mixed * aside / (other + 1e-6)
@@ -184,17 +178,15 @@ class _Windows(NamedTuple):
         found = towards[some][useful] / (strength[some][useful] + SETTINGS.contrast / 10)
         counts = strength[some][useful] / (strength[some][useful] + SETTINGS.contrast)
         limit = SETTINGS.farthest
-        return _robust_plane(
-            self.design[:, ::4, ::4][:, useful], np.clip(found, -limit, limit), counts, SETTINGS.deviation
-        )
+        return _robust_plane(self.design[:, ::4, ::4][:, useful], np.clip(found, -limit, limit), counts)
 
 
-def _robust_plane(design: NDArray, values: NDArray, weight: NDArray, least: float) -> NDArray[np.float64]:
-    """Weighted least squares with Cauchy's weights; the deviation is at least this."""
+def _robust_plane(design: NDArray, values: NDArray, weight: NDArray) -> NDArray[np.float64]:
+    """Weighted least squares with Cauchy's weights."""
     terms, wanted, counts = (torch.from_numpy(x).double() for x in (design, values, weight))
 
     def weigh(rest: Tensor) -> Tensor:
-        return counts * cauchy(rest, 2 * normal_deviation(rest, least))
+        return counts * cauchy(rest, 2 * normal_deviation(rest, SETTINGS.deviation))
 
     eye = torch.eye(len(terms), dtype=torch.float64)
     return robust_least_squares(terms, wanted, 0 * eye[0], weigh, precision=1e-3 * eye).coefficients.numpy()

@@ -46,16 +46,12 @@ def box_mean(x: Tensor, radius: int) -> Tensor:
 def _box_mean_of_numbers(x: Tensor, radius: int) -> Tensor:
     """The same by OpenCV's running sums: a third of the time."""
     planes = x.detach().contiguous().flatten(0, -3).numpy()
-    counts = [
-        np.minimum(np.arange(n), radius) + np.minimum(np.arange(n)[::-1], radius) + 1
-        for n in planes.shape[1:]
-    ]
-    share = (1 / (counts[0][:, None] * counts[1])).astype(planes.dtype)
-    out = np.empty_like(planes)
+    before = (np.minimum(np.arange(n), radius) for n in planes.shape[1:])
+    rows, columns = (some + some[::-1] + 1 for some in before)
+    share = (1 / (rows[:, None] * columns)).astype(planes.dtype)
+    out, side = np.empty_like(planes), (2 * radius + 1,) * 2
     for plane, target in zip(planes, out):
-        sums = cv2.boxFilter(
-            plane, -1, (2 * radius + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT
-        )
+        sums = cv2.boxFilter(plane, -1, side, normalize=False, borderType=cv2.BORDER_CONSTANT)
         np.multiply(sums, share, out=target)
     return torch.from_numpy(out).view(x.shape)
 

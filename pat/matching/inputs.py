@@ -164,10 +164,8 @@ def box_around(points: Float[Tensor, "n 2"], hw: HW, halo: int, multiple: int) -
     """The part of an image around points (x, y), with a halo, corners at whole multiples or the end."""
     if not len(points):
         return 0, multiple, 0, multiple
-    low, high = points.amin(0) - halo, points.amax(0) + halo
-    (x0, y0), (x1, y1) = (
-        torch.div(v, multiple, rounding_mode="floor").long() * multiple for v in (low, high + multiple)
-    )
+    corners = torch.stack([points.amin(0) - halo, points.amax(0) + halo + multiple])
+    (x0, y0), (x1, y1) = torch.div(corners, multiple, rounding_mode="floor").long() * multiple
     return max(int(y0), 0), min(int(y1), hw[0]), max(int(x0), 0), min(int(x1), hw[1])
 
 
@@ -179,4 +177,4 @@ def _ends_in(field: FieldOnGrid, box: Box, step: int) -> Float[Tensor, "n 2"]:
         y, x = torch.meshgrid(rows, columns, indexing="ij")
         return ends_of(field.at(torch.stack([x, y], -1).reshape(-1, 2).float()))
     some = (slice(None), rows[:, None], columns)
-    return ends_of(Segments(field.pixels.start[some], field.pixels.end[some], field.pixels.valid[some]))
+    return ends_of(field.pixels[some])

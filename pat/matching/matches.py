@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -67,18 +68,10 @@ class BetaMatches:
         top, bottom, left, right = box
         half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
         whole = (..., slice(top, bottom), slice(left, right))
-        bands, diffused = (part if part is None else part[whole] for part in (self.bands, self.diffused))
-        certainty = self.certainty if self.certainty is None else self.certainty[half]
-        facts = self.facts[half]
-        disparity = self.disparity[whole]
-        return replace(
-            self, disparity=disparity, facts=facts, bands=bands, diffused=diffused, certainty=certainty
-        )
-
-    def stored(self) -> BetaMatches:
-        """The same with colours as float16; differences from alpha are rounded by 1e-4 at most."""
-        bands, diffused = self.colours
-        return replace(self, bands=bands.half(), diffused=diffused.half())
+        names = {"disparity": whole, "bands": whole, "diffused": whole, "facts": half, "certainty": half}
+        parts = {name: getattr(self, name) for name in names}
+        cut: dict[str, Any] = {n: part if part is None else part[names[n]] for n, part in parts.items()}
+        return replace(self, **cut)
 
 
 @dataclass(frozen=True)

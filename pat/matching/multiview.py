@@ -135,18 +135,15 @@ class MatchedBeta:
     @property
     def inverse_depth(self) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
         """Of the matches, and where these are consistent and have one."""
-        found = depth_from_track(
-            self.track, self.segments.end + self.disparity[..., None] * self.extent.towards
-        )
+        x = self.segments.end + self.disparity[..., None] * self.extent.towards
+        found = depth_from_track(self.track, x)
         known = found.valid & self.segments.valid & (self.facts[0] < CONSISTENT)
         return torch.where(known, 1 / torch.where(known, found.depth, 1.0), 0.0), known
 
     def _seen(self, inverse_depth: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
         """Beta's pixels as by `Track.at`, x and y apart, which takes a fraction of the time."""
-        x, y, z = (
-            torch.addcmul(p, inverse_depth, d)
-            for p, d in zip(self.track.a.unbind(-1), self.track.b.unbind(-1))
-        )
+        parts = zip(self.track.a.unbind(-1), self.track.b.unbind(-1))
+        x, y, z = (torch.addcmul(p, inverse_depth, d) for p, d in parts)
         z = torch.where(z > FRONT, z, 1.0)
         return x / z, y / z
 
@@ -154,10 +151,6 @@ class MatchedBeta:
         """How far along its segment from the end the point of an inverse depth is, pixels; not clipped."""
         (x, y), (u, v) = self._seen(inverse_depth), self.extent.towards.unbind(-1)
         return torch.addcmul(x * u, y, v) - self._end
-
-    def differs(self, inverse_depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-        """Pixels from the match to the point of an inverse depth."""
-        return (self.disparity_of(inverse_depth) - self.disparity).abs()
 
     def depth_buffer(self) -> Float[Tensor, "n"]:
         """The nearest inverse depth at each pixel of half of beta's size (alpha's pixels leave no holes in
@@ -243,9 +236,8 @@ def ambiguities(inputs: Inputs, found: Sequence[BetaMatches]) -> list[Ambiguity]
     sampled = [_Sampled.of(inputs.betas[i], found[i], rows) for i in range(len(found))]
     reference = max(sampled, key=lambda one: float((one.known * one.pixels_per_w).sum()))
     columns = torch.arange(0, inputs.hw[1], SETTINGS.sampled_columns).to(reference.w)
-    y, x = torch.meshgrid(
-        reference.w.new_tensor([row for pair in rows for row in range(*pair)]), columns, indexing="ij"
-    )
+    sampled_rows = reference.w.new_tensor([row for pair in rows for row in range(*pair)])
+    y, x = torch.meshgrid(sampled_rows, columns, indexing="ij")
     return [NO_AMBIGUITY if one is reference else one.against(reference, x, y) for one in sampled]
 
 
@@ -309,7 +301,6 @@ def _agree(terms: Tensor, own: Tensor, rise: Tensor, solutions: Float[Tensor, "k
 
 def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
     """Inverse depth diffused to where no match is consistent, and without outliers."""
-
     guide = to_bytes(inputs.alpha[0, 0])
     plane, known = (part.cpu().numpy() for part in (agreement.inverse_depth, agreement.known))
 
@@ -339,9 +330,8 @@ def _of_beta(
     for top, bottom in strips:
         view, half = at((top, bottom)), slice(top // FINE, bottom // FINE)
         inverse_depth = agreement.inverse_depth[0, top:bottom].to(buffer)
-        disparity[0, 0, top:bottom] = (
-            view.disparity_of(inverse_depth).clamp(min=0).minimum(view.extent.length)
-        )
+        there = view.disparity_of(inverse_depth).clamp(min=0)
+        disparity[0, 0, top:bottom] = there.minimum(view.extent.length)
         unlike = (view.hidden(inverse_depth, buffer) / (FINE * SETTINGS.farthest)).clamp(0, 1)
         unlike = torch.where(agreement.known[0, top:bottom], unlike, 1.0)
         facts[0, :1, half] = avg_pool2d(unlike[None], FINE)
@@ -353,6 +343,5 @@ def _supported(
     views: Sequence[MatchedBeta], weights: Tensor, inverse_depth: Tensor
 ) -> Float[Tensor, "betas h w"]:
     """The weights of the betas whose matches are near a proposed inverse depth."""
-    return torch.stack(
-        [w * (view.differs(inverse_depth) < SETTINGS.support) for view, w in zip(views, weights)]
-    )
+    apart = [(view.disparity_of(inverse_depth) - view.disparity).abs() for view in views]
+    return torch.stack([w * (pixels < SETTINGS.support) for pixels, w in zip(apart, weights)])

@@ -140,8 +140,7 @@ class Normalisation(NamedTuple):
 
     def equally_sharp(self, alpha: Tensor, normalised: Tensor) -> tuple[Tensor, Tensor]:
         """Both (or parts of them), the sharper one blurred."""
-        own, other = (blurred(p, blurs) for p, blurs in zip((alpha, normalised), self.blurs))
-        return own, other
+        return blurred(alpha, self.blurs[0]), blurred(normalised, self.blurs[1])
 
     def views(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> ComparedViews:
         """Alpha and beta's brightness, or parts of them, as they are compared."""

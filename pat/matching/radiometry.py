@@ -19,12 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import pixel_grid
-from arraygeom.robust import (
-    cauchy,
-    least_squares,
-    normal_deviation,
-    robust_least_squares,
-)
+from arraygeom.robust import cauchy, least_squares, normal_deviation, robust_least_squares
 
 from ..media.colour import REC601
 from ..support.settings import physics, size, tuned
@@ -153,8 +148,7 @@ class Response(NamedTuple):
     def _brightening(self, beta: Tensor) -> Float[Tensor, "h w"]:
         h, w = beta.shape[-2:]
         grid = pixel_grid((h, w), dtype=torch.float64, device=beta.device) + 0.5
-        where = (grid / grid.new_tensor([w, h]) - 0.5).reshape(-1, 2)
-        terms = _shading_terms(where)
+        terms = _shading_terms((grid / grid.new_tensor([w, h]) - 0.5).reshape(-1, 2))
         return (terms.new_tensor(self.shading) @ terms).exp().reshape(h, w).to(beta)
 
     def undone(self, image: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h w"]:
@@ -174,9 +168,8 @@ def stated_response(weights: Sequence[float]) -> Response:
     """The response of an alpha that is weights . beta. Raises ValueError unless three, none negative."""
     values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
     if values.shape != (3,) or not bool((values >= 0).all() & (values.sum() > 0) & values.isfinite().all()):
-        raise ValueError(
-            f"a response is three weights, of red, green and blue, none negative; got {tuple(weights)}"
-        )
+        given = tuple(weights)
+        raise ValueError(f"a response is three weights, of red, green and blue, none negative; got {given}")
     return Response(values / values.sum(), gain=float(values.sum()))
 
 

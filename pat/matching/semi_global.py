@@ -152,10 +152,10 @@ def matched_by_labels(
     own, other = (numpy_of(image[:, 0]) for image in (views.alpha, views.beta))
     found, measured = _matched_blocks(own, other, geometry, windows, settings, facts)
     consistent = (measured[..., 0] < settings.consistent).astype(np.float32)
-    dense = (
-        filled(d[None], c + 1e-5, g, settings.fill)[0] for d, c, g in zip(found, consistent, views.guides)
-    )
-    smooth = [cv2.medianBlur(np.where(c > 0, d, fill), 5) for d, c, fill in zip(found, consistent, dense)]
+    smooth = []
+    for d, c, guide in zip(found, consistent, views.guides):
+        dense = filled(d[None], c + 1e-5, guide, settings.fill)[0]
+        smooth.append(cv2.medianBlur(np.where(c > 0, d, dense), 5))
     return torch.from_numpy(np.stack(smooth)), torch.from_numpy(measured)
 
 
@@ -187,27 +187,26 @@ def _matched_blocks(
     disparity, place = np.empty(own.shape, np.float32), np.empty(own.shape, np.int32)
     measured = np.empty((*own.shape, facts), np.float32)
     planes: list[tuple[NDArray, ...]] = [()] * (2 * len(own))
-    in_parallel([partial(_prepare, planes, i, image) for i, image in enumerate((*own, *other))])
+
+    def prepare(i: int, image: NDArray) -> None:
+        planes[i] = planes_of(image)
+
+    in_parallel([partial(prepare, *one) for one in enumerate((*own, *other))])
     images, tasks, nbytes = [], [], 1.0
     for i, (mine, its) in enumerate(zip(planes[: len(own)], planes[len(own) :])):
         views = own[i], windows.first[i], *(g[i] for g in geometry), *mine
         images.append(_Image(views, flat(its), (rows, columns), (disparity[i], measured[i], place[i]), []))
         boxes = _boxes(hw, geometry.along[i], windows.first.shape[-1] * windows.labels, settings)
         tasks += [partial(_block, images[-1], box, windows, settings) for box in boxes]
-        largest = max(_pixels_in(outer, hw) for _, outer in boxes)
-        nbytes = max(
-            nbytes, largest * (settings.pixel_bytes + settings.label_bytes * math.prod(windows.lanes))
-        )
+        largest = max(math.prod(min(s.stop, n) - s.start for s, n in zip(outer, hw)) for _, outer in boxes)
+        for_each = settings.pixel_bytes + settings.label_bytes * math.prod(windows.lanes)
+        nbytes = max(nbytes, largest * for_each)
     in_parallel(tasks, most=how_many_fit(nbytes))
     for image, fact, its in zip(images, measured[..., 0], place):
         label = (reduce(np.minimum, image.claims)[its] & 0xFFFF).astype(np.float32)
         apart = np.minimum(np.abs(label - fact) / kernels.FARTHEST, 1)
         fact[:] = np.where(its < rows * columns, apart, 1)
     return disparity, measured
-
-
-def _prepare(planes: list[tuple[NDArray, ...]], i: int, image: NDArray) -> None:
-    planes[i] = planes_of(image)
 
 
 def flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
@@ -223,10 +222,6 @@ def _boxes(hw: Sequence[int], along: NDArray, labels: int, settings: SemiGlobalS
     across, down = np.abs(along).max((0, 1))
     sides = (side, settings.long_block) if across > down else (settings.long_block, side)
     return list(inner_and_outer(hw, margin, *sides))
-
-
-def _pixels_in(box: tuple[slice, slice], hw: Sequence[int]) -> int:
-    return math.prod(min(s.stop, n) - s.start for s, n in zip(box, hw))
 
 
 def inner_and_outer(
@@ -254,9 +249,9 @@ def _block(image: _Image, box: tuple, windows: Windows, settings: SemiGlobalSett
         claims = image.claims.pop()
     except IndexError:
         claims = np.full(math.prod(image.hw) + 1, 2**31 - 1, np.int32)
-    parts = [np.ascontiguousarray(plane[inner]) for plane in image.found]
-    corner = (i.start - o.start for i, o in zip(inner, outer))
-    kernels.winners(total, *labels, *segments, *image.hw, *corner, jump, claims, *parts)
+    parts = tuple(np.ascontiguousarray(plane[inner]) for plane in image.found)
+    corner = inner[0].start - outer[0].start, inner[1].start - outer[1].start
+    kernels.winners(total, *labels, segments, image.hw, corner, jump, claims, parts)
     image.claims.append(claims)
     for plane, part in zip(image.found, parts):
         plane[inner] = part

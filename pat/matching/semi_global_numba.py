@@ -233,13 +233,8 @@ def _sweep(way, shape, planes, guide, reach, pad, small, large, paths, fewest, j
             dx, dy = ((1 - k) * step, -step) if k < 3 else (-step, 0)
             if row > 0 or k == 3:
                 left, right = max(-dx, 0), width - max(dx, 0)
-                _jumps(
-                    guide[y, left:right],
-                    guide[y + dy, left + dx : right + dx],
-                    small,
-                    large,
-                    jumps[k, left:right],
-                )
+                there = guide[y + dy, left + dx : right + dx]
+                _jumps(guide[y, left:right], there, small, large, jumps[k, left:right])
         from_above, from_behind = width + 2 * height + 1 - row, 2 * (width + 2 * height + 1 - row)
         for i in range(width):
             x = i if way == 0 else width - 1 - i
@@ -263,18 +258,10 @@ def _advance(known, p, q, before, now, jump, is_first):
     base, leap, lowest = _repeat(fewest[before]), _repeat(np.int16(fewest[before] + jump)), _repeat(WALL)
     stride = lanes + pad
     start, end = pad + before * runs * stride, pad + now * runs * stride
+    ours, theirs = from_index(first, runs * p), from_index(first, runs * q)
     for lane in range(0, runs * lanes, LANES):
         at = p * runs * lanes + lane
-        stay = _reached(
-            paths,
-            start + lane,
-            from_index(first, runs * p),
-            from_index(first, runs * q),
-            reach,
-            stride,
-            runs,
-            penalty,
-        )
+        stay = _reached(paths, start + lane, ours, theirs, reach, stride, runs, penalty)
         path = _add(_costs_at(cost, at), _subtract(_less(stay, leap), base))
         _keep(paths, end + lane, stride, runs, penalty, path)
         lowest = _less(lowest, path)
@@ -310,32 +297,18 @@ def _keep(paths, start, stride, runs, penalty, path):
 
 
 @compiled(nogil=True, cache=True)
-def winners(
-    total,
-    first,
-    count,
-    end,
-    along,
-    length,
-    cut,
-    rows,
-    columns,
-    top,
-    left,
-    large,
-    claims,
-    disparity,
-    facts,
-    positions,
-):
-    """Of each pixel of a part that begins at `top`, `left`: the best label, to a fraction (disparity); facts
+def winners(total, first, count, segments, hw, corner, large, claims, found):
+    """Of each pixel of a part that begins at a corner: the best label, to a fraction (disparity); facts
     (h, w, 1 or 3): the whole label, its margin to the second best, and its cost; where it is in beta, pixels
     counted row by row (positions; rows * columns: not on it). `total` is in parts, the larger penalty `large`
     the unit of the facts.
 
     `claims`, of each pixel of beta and one more, keeps the least cost with which a pixel of alpha matches it,
-    and that pixel's label: 16 bits of either.
+    and that pixel's label: 16 bits of either. `segments` are end, along, length and cut, as of `costs`;
+    `found` are disparity, facts and positions.
     """
+    (end, along, length, cut), (rows, columns), (top, left) = segments, hw, corner
+    disparity, facts, positions = found
     height, width, measured = facts.shape[0], facts.shape[1], facts.shape[2] > 1
     _, _, runs, lanes = total.shape
     nowhere, most = rows * columns, np.float32(8 * PARTS) * large
@@ -352,10 +325,8 @@ def winners(
                 sums, start, at = total[here][run], starts[run], places[run * lanes :]
                 within = _count_within(far, start, count)
                 for k in range(within):
-                    claim, place = (
-                        np.int32(sums[k]) << 16 | np.int32(start + k),
-                        at[k] if at[k] >= 0 else nowhere,
-                    )
+                    claim = np.int32(sums[k]) << 16 | np.int32(start + k)
+                    place = at[k] if at[k] >= 0 else nowhere
                     claims[place] = min(claims[place], claim)
                     best = min(best, claim)
                 # The very first label is taken if there is no other.

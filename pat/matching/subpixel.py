@@ -22,17 +22,13 @@ from arraygeom import Segments
 
 from ..support.settings import size, tuned
 from .filters import box_mean, filled, numpy_of
-from .inputs import Beta, Inputs
-from .matches import BetaMatches, Matches
+from .inputs import Inputs
+from .matches import Matches
 from .normalisation import ComparedViews
 from .positions import FINE, Extent, at_matches, matches
 from .semi_global import CONSISTENT, SemiGlobalSettings, Windows, geometry_of, matched_by_labels
 
-FULL_SIZE = SemiGlobalSettings(
-    step=20.0,
-    jump=80.0,
-    margin=48,
-)
+FULL_SIZE = SemiGlobalSettings(step=20.0, jump=80.0, margin=48)
 """Penalties chosen on Middlebury's tune half; half the size, where a label is two pixels, has others."""
 
 
@@ -88,23 +84,20 @@ def _precise(
     step = (common / (slope + SETTINGS.flat)).clamp(-SETTINGS.most_step, SETTINGS.most_step)
     weight = torch.where(consistent, slope / (slope + SETTINGS.flat), 0.0) + 1e-5
     planes = zip(numpy_of(torch.where(near, start + step, start)), numpy_of(weight[:, 0]), guides)
-    smooth = np.stack(
-        [filled(d, w, _surfaces(d[0], brightness), SETTINGS.surface) for d, w, brightness in planes]
-    )
-    return torch.from_numpy(smooth).to(disparity)
+    smooth = [filled(d, w, _surfaces(d[0], brightness), SETTINGS.surface) for d, w, brightness in planes]
+    return torch.from_numpy(np.stack(smooth)).to(disparity)
 
 
 def following(inputs: Inputs, found: Matches) -> Matches:
     """The matches, which follow images and segments that have gradients."""
-    return Matches(tuple(_following(inputs.alpha, *one) for one in zip(inputs.betas, found.betas)))
-
-
-def _following(alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaMatches:
-    segments = beta.field.straight
-    if not any(x.requires_grad for x in (alpha, beta.image, segments.start, segments.end)):
-        return found
-    views = found.comparison.views(alpha, beta.image)
-    return replace(found, disparity=with_gradients(views, segments, found.disparity))
+    betas, alpha = [], inputs.alpha
+    for beta, one in zip(inputs.betas, found.betas):
+        segments = beta.field.straight
+        if any(x.requires_grad for x in (alpha, beta.image, segments.start, segments.end)):
+            views = one.comparison.views(alpha, beta.image)
+            one = replace(one, disparity=with_gradients(views, segments, one.disparity))
+        betas.append(one)
+    return Matches(tuple(betas))
 
 
 def with_gradients(
@@ -133,10 +126,8 @@ def _compared(
     """Of each pixel, both less their mean around it: how much brighter beta is a pixel farther along its
     segment than at its match, and how much brighter alpha is than beta there."""
     across, down = (torch.gradient(other, dim=side)[0] for side in (3, 2))
-    still, extent = (
-        Segments(segments.start.detach(), segments.end.detach(), segments.valid),
-        Extent.of(segments),
-    )
+    still = Segments(segments.start.detach(), segments.end.detach(), segments.valid)
+    extent = Extent.of(segments)
     seen, across, down = at_matches(torch.cat([other, across, down], 1), still, disparity)[0].split(1, 1)
     if segments.end.requires_grad or segments.start.requires_grad:
         # Along these slopes: those of bicubic sampling itself are half as much again at whole pixels.
@@ -160,12 +151,7 @@ def _runs(half: NDArray[np.float32]) -> NDArray[np.int32]:
     """First labels (h, w, 2) of both runs at full size, from disparity at half the size: around the least of
     its neighbourhood and around the greatest, or, where these are near each other, one beside the other."""
     window, run = np.ones((SETTINGS.neighbourhood,) * 2, np.uint8), SETTINGS.run
-    low, high = (
-        np.rint(_doubled(f(half, window))).astype(np.int32) - run // 2 for f in (cv2.erode, cv2.dilate)
-    )
+    extremes = (f(half, window).repeat(FINE, 0).repeat(FINE, 1) for f in (cv2.erode, cv2.dilate))
+    low, high = (np.rint(plane).astype(np.int32) - run // 2 for plane in extremes)
     low = np.maximum(np.where(high < low + run, (low + high) // 2 - run // 2, low), 0)
     return np.stack([low, np.maximum(high, low + run)], -1)
-
-
-def _doubled(plane: NDArray) -> NDArray:
-    return plane.repeat(FINE, 0).repeat(FINE, 1)

@@ -63,7 +63,7 @@ def along_tangents(
         warn(f"the field in '{name}' is a set of positions without an order: each pixel is matched alone")
     with torch.no_grad():
         labels = torch.from_numpy(_labels(alpha, guide, grid, ordered=ordered))
-    lines = grid.tangents(labels) if ordered else _around(grid.chosen(labels), to_bytes(alpha[:, 0])[0])
+    lines = grid.tangents(labels) if ordered else _around(grid.chosen(labels))
     longest = float(torch.where(lines.valid, lines.length.detach(), 0.0).max())
     planes = torch.cat([lines.start, lines.end], -1).movedim(-1, 0)[None]
 
@@ -89,12 +89,9 @@ class _BlockCentres:
         grid = (pixel_grid((h, w), dtype=torch.float64)[rows, columns] + 0.5) * FINE - 0.5
         found = self.field.at(grid.reshape(-1, 2))
         if not isinstance(found, Positions):
-            raise TypeError(
-                "this field gives segments for some pixels and positions for others: give one kind"
-            )
-        return Positions(
-            *(t.reshape(*grid.shape[:2], *t.shape[t.ndim - n :]) for t, n in ((found.xy, 2), (found.mask, 1)))
-        )
+            raise TypeError("this field gives segments for some pixels, positions for others: give one kind")
+        parts = (found.xy, 2), (found.mask, 1)
+        return Positions(*(t.reshape(*grid.shape[:2], *t.shape[t.ndim - n :]) for t, n in parts))
 
     def by_rows(self) -> list[slice]:
         """Rows that are asked for at once."""
@@ -167,10 +164,8 @@ def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool)
 def _places(grid: _BlockCentres, box: tuple[slice, ...], hw: tuple[int, ...]) -> NDArray[np.int32]:
     """Where positions are in the reduced beta, pixels counted row by row; -1 for those that do not count."""
     (h, w), (rows, columns) = hw, box
-    parts = []
-    for top, bottom in spans(
-        min(rows.stop, grid.hw[0]) - rows.start, max(1, AT_ONCE // (w * grid.field.samples))
-    ):
+    parts, at_once = [], max(1, AT_ONCE // (w * grid.field.samples))
+    for top, bottom in spans(min(rows.stop, grid.hw[0]) - rows.start, at_once):
         found = grid.at(slice(rows.start + top, rows.start + bottom), columns)
         x, y = ((found.xy + 0.5) / FINE - 0.5).round().int().unbind(-1)
         inside = found.mask & (x >= 0) & (y >= 0) & (x < w) & (y < h)
@@ -213,7 +208,7 @@ def _tangents(found: Positions, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]
     return start, end, mask.any(-1)
 
 
-def _around(found: Chosen, guide: NDArray[np.uint8]) -> Segments:
+def _around(found: Chosen) -> Segments:
     """Segments along x around positions chosen alone, which a median makes agree with their neighbours."""
     xy = found.xy.detach().float().numpy()
     smooth = np.stack([cv2.medianBlur(np.ascontiguousarray(xy[..., i]), 5) for i in range(2)], -1)

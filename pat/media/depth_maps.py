@@ -50,15 +50,11 @@ def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = 
     else:
         planes = read_recorded(path)
         if len(planes) != 1:
-            raise ValueError(
-                f"{path}: has {len(planes)} channels, a depth map has one: give depth, not its picture"
-            )
+            raise ValueError(f"{path}: has {len(planes)} channels: give depth, with one, not its picture")
         values = planes[0]
     if hw is not None and values.shape != tuple(hw):
         (h, w), (height, width) = values.shape, hw
-        raise ValueError(
-            f"{path}: is {w}x{h}, alpha's image is {width}x{height}: give the depth of alpha's pixels"
-        )
+        raise ValueError(f"{path}: is {w}x{h}, alpha's image is {width}x{height}: give alpha's own depth")
     if values.dtype == np.uint8:
         raise ValueError(f"{path}: has 8 bits, too few for depth: give PFM, float TIFF, or PNG of 16 bits")
     if scale is None:

@@ -73,14 +73,11 @@ def _png(content: bytes) -> ImageHeader:
 def _pnm(content: bytes) -> ImageHeader | None:
     """By hand: Pillow does not state the bits."""
     gap = rb"(?:\s|#[^\n]*\n)+"
-    found = re.match(
-        rb"P[1-6]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})\s(?:\s*(\d{1,5})\s)?", content[:4096]
-    )
-    return (
-        ImageHeader((int(found[2]), int(found[1])), bits=16 if int(found[3] or 0) > 255 else 8)
-        if found
-        else None
-    )
+    form = rb"P[1-6]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})\s(?:\s*(\d{1,5})\s)?"
+    found = re.match(form, content[:4096])
+    if found is None:
+        return None
+    return ImageHeader((int(found[2]), int(found[1])), bits=16 if int(found[3] or 0) > 255 else 8)
 
 
 def _tiff(content: bytes) -> ImageHeader | None:
@@ -114,22 +111,14 @@ def focal_length(path: str | Path) -> float | None:
         with Image.open(path) as image:
             width, height = image.size
             tags = image.getexif().get_ifd(_EXIF)
-        return _by_sensor(tags, width) or _by_film(tags, width, height)
+        focal, resolution = (_number(tags.get(tag)) for tag in (_FOCAL, _PLANE_RESOLUTION))
+        unit = _MM.get(int(_number(tags.get(_PLANE_UNIT)) or 2))
+        if focal and resolution and unit:
+            return focal * resolution / unit * width / (_number(tags.get(_WIDTH)) or width)
+        film = _number(tags.get(_FOCAL_35MM))
+        return film * math.hypot(width, height) / _DIAGONAL_35MM if film else None
     except (*DAMAGED, Image.DecompressionBombError):
         return None
-
-
-def _by_sensor(tags: dict[int, object], width: int) -> float | None:
-    focal, resolution = (_number(tags.get(tag)) for tag in (_FOCAL, _PLANE_RESOLUTION))
-    unit = _MM.get(int(_number(tags.get(_PLANE_UNIT)) or 2))
-    if not (focal and resolution and unit):
-        return None
-    return focal * resolution / unit * width / (_number(tags.get(_WIDTH)) or width)
-
-
-def _by_film(tags: dict[int, object], width: int, height: int) -> float | None:
-    equivalent = _number(tags.get(_FOCAL_35MM))
-    return equivalent * math.hypot(width, height) / _DIAGONAL_35MM if equivalent else None
 
 
 def _number(value: object) -> float | None:

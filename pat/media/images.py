@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,8 +35,6 @@ MOST_PIXELS = 2**28
 """Images with more are read only where their size is expected: some 3 GiB in colour."""
 
 _LZW = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW]
-
-
 _HEIF = tuple(b"ftyp" + brand for brand in (b"heic", b"heix", b"mif1", b"msf1", b"heim", b"heis"))
 
 
@@ -133,9 +132,7 @@ def write_image(
     path = Path(path)
     planes = image.detach().cpu().numpy()
     if planes.shape[0] not in (1, 3):
-        raise ValueError(
-            f"{path}: an image has 1 or 3 channels, got {planes.shape[0]}: write channels one by one"
-        )
+        raise ValueError(f"{path}: an image has 1 or 3 channels, got {len(planes)}: write them one by one")
     if not (unknown and bits == 32) and not np.isfinite(planes).all():
         raise ValueError(f"{path}: the image to write has NaN or infinite values")
     if path.suffix.lower() == ".exr":
@@ -156,13 +153,7 @@ def has_many_bits(path: Path) -> bool:
 
 def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
     """The image of a HEIC or HEIF file, upright, as a PNG file; its size is compared before it is decoded."""
-    try:
-        import pillow_heif
-    except ImportError:
-        raise ValueError(
-            f"{label}: reading HEIC needs the package pillow-heif: "
-            "pip install 'arraygeom-pat[heic]', or save it as PNG"
-        ) from None
+    pillow_heif = _of_extra("pillow_heif", "heic", f"{label}: reading HEIC")
     problem = f"{label}: not a HEIC image that can be read (%s): save it as PNG"
     try:
         stored = pillow_heif.open_heif(path, convert_hdr_to_8bit=True)
@@ -178,18 +169,11 @@ def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
 
 def _png_of_raw(path: Path, label: str) -> bytes:
     """A camera's raw file as PNG: developed to sRGB in 16 bits with the camera's white balance, upright."""
-    try:
-        import rawpy
-    except ImportError:
-        raise ValueError(
-            f"{label}: reading raw files needs the package rawpy: "
-            "pip install 'arraygeom-pat[raw]', or save it as TIFF"
-        ) from None
+    rawpy = _of_extra("rawpy", "raw", f"{label}: reading raw files")
+    how = {"use_camera_wb": True, "no_auto_bright": True, "output_bps": 16, "gamma": (2.4, 12.92)}
     try:
         with rawpy.imread(str(path)) as raw:
-            colours = raw.postprocess(
-                use_camera_wb=True, no_auto_bright=True, output_bps=16, gamma=(2.4, 12.92)
-            )
+            colours = raw.postprocess(**how)
     except (rawpy.LibRawError, OSError) as error:
         raise ValueError(f"{label}: not a raw file that can be read ({error}): save it as TIFF") from None
     return cv2.imencode(".png", colours[..., ::-1])[1].tobytes()
@@ -212,15 +196,12 @@ def _applied(header: ImageHeader, orientation: str, label: str) -> int:
 
 def _check_header(got: HW, wanted: HW | None, label: str) -> None:
     if wanted is None and got[0] * got[1] > MOST_PIXELS:
-        raise ValueError(
-            f"{label}: is {got[1]}x{got[0]}, more than {MOST_PIXELS / 1e6:.0f} million pixels: reduce it"
-        )
+        most = f"{MOST_PIXELS / 1e6:.0f} million pixels"
+        raise ValueError(f"{label}: is {got[1]}x{got[0]}, more than {most}: reduce it")
     if wanted is not None and got != wanted:
         (h, w), (wanted_h, wanted_w) = got, wanted
-        raise ValueError(
-            f"{label}: is {w}x{h}, the rig says {wanted_w}x{wanted_h}: "
-            "resize the rig, or give the right image"
-        )
+        text = f"{label}: is {w}x{h}, the rig says {wanted_w}x{wanted_h}"
+        raise ValueError(f"{text}: resize the rig, or give the right image")
 
 
 def _upright(values: NDArray, orientation: int) -> NDArray:
@@ -290,9 +271,7 @@ def _opaque(values: NDArray, label: str) -> NDArray:
         raise ValueError(f"{label}: has {values.shape[2]} channels: give a grey (1) or RGB (3) image")
     full = np.iinfo(values.dtype).max if np.issubdtype(values.dtype, np.integer) else 1.0
     if (values[..., 3] != full).any():
-        raise ValueError(
-            f"{label}: has an alpha channel with transparent pixels: flatten it and save it without alpha"
-        )
+        raise ValueError(f"{label}: has transparent pixels: flatten it and save it without alpha channel")
     return values[..., :3]
 
 
@@ -336,13 +315,15 @@ def _counts(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArr
 
 def exr_writer(path: Path) -> Any:
     """The package OpenEXR, to write to `path`. Raises ValueError where it is not installed."""
+    return _of_extra("OpenEXR", "synthesis", f"{path}: writing EXR")
+
+
+def _of_extra(package: str, extra: str, purpose: str) -> Any:
     try:
-        import OpenEXR
+        return import_module(package)
     except ImportError:
-        raise ValueError(
-            f"{path}: writing EXR needs the package OpenEXR: pip install 'arraygeom-pat[synthesis]'"
-        ) from None
-    return OpenEXR
+        install = f"pip install 'arraygeom-pat[{extra}]'"
+        raise ValueError(f"{purpose} needs the package {package}: {install}, or another format") from None
 
 
 def _write_exr(path: Path, planes: NDArray, bits: int) -> None:

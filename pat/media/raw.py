@@ -80,9 +80,8 @@ def _missing(image: Tensor, light: Tensor) -> Tensor:
     shift = torch.zeros_like(light)
     for _ in range(4):
         value = image + shift
-        slope = torch.where(
-            value <= 0.04045, 1 / 12.92, 2.4 / 1.055 * ((value.clamp(min=0) + 0.055) / 1.055) ** 1.4
-        )
+        curved = 2.4 / 1.055 * ((value.clamp(min=0) + 0.055) / 1.055) ** 1.4
+        slope = torch.where(value <= 0.04045, 1 / 12.92, curved)
         shift = shift - (luminance(linear_from_srgb(value)) - light) / luminance(slope)
     return shift
 

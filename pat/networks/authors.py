@@ -22,8 +22,6 @@ from torch import Tensor
 from .configs import PATConfig
 
 PREFIX = "module."
-ORDER = ("pam.fusion.weight", "post.0.weight")
-"""Theirs takes the attended betas first and alpha last; here alpha is first."""
 
 
 class Authors(NamedTuple):
@@ -60,14 +58,12 @@ def config_of(given: Mapping[str, Tensor]) -> PATConfig:
             raise ValueError(f"{name} is missing")
     dim, in_channels = given["init_feature.0.weight"].shape[:2]
     scale = round((len(given["upscale.4.weight"]) / max(dim, 1)) ** 0.5)
-    out_channels = len(given["upscale.7.weight"])
-    sizes = {
+    sizes: dict[str, Any] = {
         "betas": betas,
         "in_channels": in_channels,
-        "out_channels": out_channels,
-        "dim": dim,
-        "scale": scale,
+        "out_channels": len(given["upscale.7.weight"]),
     }
+    sizes |= {"dim": dim, "scale": scale}
     if min(sizes.values()) < 1 or max(sizes.values()) > 1024:
         raise ValueError(f"it has {', '.join(f'{name} {n}' for name, n in sizes.items())}")
     layout: dict[str, Any] = {"block_bias": False, "fusion_bias": True, "values_after_block": True}
@@ -93,17 +89,12 @@ def renamed(given: Mapping[str, Tensor], config: PATConfig) -> dict[str, Tensor]
     if more:
         raise ValueError(f"{more[0]} is one weight too many")
     state = {ours: given[theirs].float() for theirs, ours in names.items()}
-    theirs, ours = ORDER
-    state[ours] = alpha_first(given[theirs].float(), config)
+    # Their fusion takes the attended betas first and alpha last; here alpha's columns are first.
+    state["post.0.weight"] = state["post.0.weight"].roll(config.dim, 1)
     for name, tensor in state.items():
         if not tensor.isfinite().all():
             raise ValueError(f"{name} holds something other than finite numbers")
     return state
-
-
-def alpha_first(weight: Tensor, config: PATConfig) -> Tensor:
-    """The columns of their fusion (D, (m + 1) D, 1, 1), with alpha's moved to the front."""
-    return weight.roll(config.dim, 1)
 
 
 def _names(betas: int) -> Iterator[tuple[str, str]]:

@@ -72,8 +72,7 @@ def refined(
     The noise is white and of this standard deviation. Brightness is the mean of the network's and the
     filtered one; colour is filtered three times.
     """
-    whole = [_refined(*parts) for parts in zip(estimate, recorded, deviation)]
-    return torch.stack(whole)
+    return torch.stack([_refined(*parts) for parts in zip(estimate, recorded, deviation)])
 
 
 def _refined(estimate: Tensor, recorded: Tensor, deviation: Tensor) -> Float[Tensor, "c h w"]:
@@ -125,10 +124,7 @@ def collaboratively_filtered(
     margin = SIDE - STEP
     across, down = (-(-(size + margin) // STEP) for size in (w, h))
     first = RADIUS + margin
-    padding = [
-        (0, 0),
-        *((first, STEP * count + RADIUS + margin - size) for count, size in ((down, h), (across, w))),
-    ]
+    padding = [(0, 0), (first, STEP * down + first - h), (first, STEP * across + first - w)]
     planes = [
         np.pad(x.detach().float().cpu().numpy(), padding, mode="symmetric")
         for x in (image, expected, deviation.square(), guide)
@@ -153,9 +149,8 @@ def collaboratively_filtered(
 
 
 _PHASES = np.outer(np.arange(SIDE), 2 * np.arange(SIDE) + 1) * np.pi / (2 * SIDE)
-COSINES = (np.cos(_PHASES) * np.where(np.arange(SIDE) > 0, 2, 1)[:, None] ** 0.5 / SIDE**0.5).astype(
-    np.float32
-)
+_LENGTHS = np.where(np.arange(SIDE) > 0, 2, 1)[:, None] ** 0.5
+COSINES = (np.cos(_PHASES) * _LENGTHS / SIDE**0.5).astype(np.float32)
 """The cosine transform (DCT-II) as an orthogonal matrix. By scipy it would add to the time of every start."""
 WINDOW = np.outer(np.kaiser(SIDE, 2.0), np.kaiser(SIDE, 2.0)).astype(np.float32)
 """What a block's pixels count when blocks are put together."""

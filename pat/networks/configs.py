@@ -72,5 +72,3 @@ class BandwisePATConfig(GuidedPATConfig):
 
 CONFIGS = {"PAT": PATConfig, "GuidedPAT": GuidedPATConfig, "BandwisePAT": BandwisePATConfig}
 """By the name of the network."""
-MODULES = {"PAT": "paper", "GuidedPAT": "guided", "BandwisePAT": "bandwise"}
-"""Where each is defined, beside this module."""

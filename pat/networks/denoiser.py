@@ -107,11 +107,7 @@ class ColourDenoising(nn.Module):
         share = noise.square() / (noise.square() + SETTINGS.colour_noise**2)
         share = torch.cat([torch.zeros_like(share[:, :1]), share[:, 1:]], 1)
         base = torch.lerp(bands, blurred, share)
-        given = [
-            pixel_unshuffle(bands, 2),
-            SETTINGS.scale * avg_pool2d(noise, 2),
-            avg_pool2d(bands[:, 1:], 2),
-        ]
+        given = pixel_unshuffle(bands, 2), SETTINGS.scale * avg_pool2d(noise, 2), avg_pool2d(bands[:, 1:], 2)
         found = pixel_shuffle(self.network(torch.cat(given, 1)).float(), 2)
         return 0.5 + rgb_of_opponent(base - noise * found)[..., :h, :w]
 

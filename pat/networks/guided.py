@@ -106,9 +106,8 @@ class BetaEstimate(NamedTuple):
     def beyond(self, base: Float[Tensor, "b c h w"], band: int) -> BetaEstimate:
         """One band, counted from a base instead of from alpha; `base` (B, C, H, W) is bands minus alpha."""
         of = slice(band, band + 1)
-        return self._replace(
-            colour=(self.colour - base)[:, of], diffused=(self.diffused - base[:, None])[:, :, of]
-        )
+        colour, diffused = (self.colour - base)[:, of], (self.diffused - base[:, None])[:, :, of]
+        return self._replace(colour=colour, diffused=diffused)
 
 
 class Encoded(NamedTuple):
@@ -146,20 +145,13 @@ class GuidedPAT(nn.Module):
         self.fine_key = nn.Conv2d(w2, 4 * c.fine_dim, 1)
         self.judge = UNet(w4 + 9, c.widths[1:], c.judge_dim)
         self.confidence = ConfidenceHead(c.judge_dim + w2 + 4 + 12, c.confidence_dim)
-        self.propagation = nn.ModuleList(
-            Propagation(w4, c.propagation_dim, spacing) for spacing in c.propagation_steps
-        )
+        rounds = (Propagation(w4, c.propagation_dim, spacing) for spacing in c.propagation_steps)
+        self.propagation = nn.ModuleList(rounds)
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
         """In what is recalled; or around attention, one beta after the other, and the estimates of others."""
         most = max(betas, default=0)
         return max(350.0 * alpha, 145.0 * alpha + 100.0 * most) + 130.0 * alpha * max(len(betas) - 1, 0)
-
-    def _in_parts(self, inputs: Inputs) -> bool:
-        """Whether each beta has some bands, in order; else those with all of them show the same colours."""
-        return (
-            all(beta.image.shape[1] != self.config.bands for beta in inputs.betas) or len(inputs.betas) == 1
-        )
 
     def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
         """Fuse alpha (B, 1, H, W) with the betas. The image has the betas' bands.
@@ -170,17 +162,14 @@ class GuidedPAT(nn.Module):
 
     def explain(self, inputs: Inputs, matches: Matches) -> tuple[FusionOutput, list[BetaEstimate]]:
         """The same, with the estimate of each beta, which training supervises."""
-        parts = self._in_parts(inputs)
-        bands = sum(beta.image.shape[1] for beta in inputs.betas)
-        if parts and bands != self.config.bands:
-            raise ValueError(f"the betas have {bands} bands in all, this network makes {self.config.bands}")
+        wanted, bands = self.config.bands, [beta.image.shape[1] for beta in inputs.betas]
+        # Each beta has some bands, in order; else those with all of them show the same colours.
+        parts = len(bands) == 1 or wanted not in bands
+        if parts and sum(bands) != wanted:
+            raise ValueError(f"the betas have {sum(bands)} bands in all, this network makes {wanted}")
         alpha, own = inputs.alpha, self.encoder(inputs.alpha)
         estimates = [self.estimate(own, alpha, *one) for one in zip(inputs.betas, matches.betas)]
-        used = (
-            estimates
-            if parts
-            else [combined([e for e in estimates if e.colour.shape[1] == self.config.bands])]
-        )
+        used = estimates if parts else [combined([e for e, n in zip(estimates, bands) if n == wanted])]
         residual = self.blended(own, alpha, used)
         if self.config.keep_luminance:
             residual = residual - inputs.luminance * luminance(residual)
@@ -213,7 +202,7 @@ class GuidedPAT(nn.Module):
         """The estimate of one beta of any bands."""
         of, exactly = found.comparison.combined, alpha.dtype if self.training else torch.float64
         bands, diffused = found.colours
-        segments = _in_type(beta.field.straight, exactly)
+        segments = beta.field.straight.to(exactly)
         extent = Extent.of(segments)
         position = matches(segments, found.disparity, beyond_edge=True, extent=extent).movedim(-1, 1)
         window = window_around(found.disparity, segments, self.config.window, extent)
@@ -258,12 +247,9 @@ def _joined(bands: list[Tensor]) -> Tensor:
 
 def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]) -> FusionOutput:
     """The image with the position in each beta, its deviation, and its confidence."""
-    return FusionOutput(
-        image,
-        [s.position for s in estimates],
-        [s.deviation for s in estimates],
-        [s.confidence for s in estimates],
-    )
+    found = zip(*((s.position, s.deviation, s.confidence) for s in estimates))
+    position, deviation, confidence = map(list, found)
+    return FusionOutput(image, position, deviation, confidence)
 
 
 def combined(estimates: Sequence[BetaEstimate]) -> BetaEstimate:
@@ -343,11 +329,6 @@ def window_around(
     return Segments(middle + step, middle - step, segments.valid.expand(middle.shape[:-1]))
 
 
-def _in_type(segments: Segments, kind: torch.dtype) -> Segments:
-    """Segments as numbers of another type."""
-    return Segments(segments.start.to(kind), segments.end.to(kind), segments.valid)
-
-
 class Encoder(nn.Module):
     """Features of one grey image, the same weights for every view."""
 
@@ -356,9 +337,8 @@ class Encoder(nn.Module):
         w2, w4, w8, _ = widths
         self.at_half = nn.Sequential(conv(4, w2), ResidualBlock(w2))
         self.at_quarter = nn.Sequential(conv(w2, w4, stride=2), ResidualBlock(w4))
-        self.at_eighth = nn.Sequential(
-            conv(w4, w8, stride=2), ResidualBlock(w8), ResidualBlock(w8, dilation=3)
-        )
+        eighth = conv(w4, w8, stride=2), ResidualBlock(w8), ResidualBlock(w8, dilation=3)
+        self.at_eighth = nn.Sequential(*eighth)
         self.up = nn.Conv2d(w8, w4, 1)
         self.merge = ResidualBlock(w4)
 

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, interpolate
 
-from arraygeom import Segments
 from arraygeom.fields.grid import FieldOnGrid
 
 from ..attention.scores import Compared
@@ -85,7 +85,8 @@ class PAT(nn.Module):
         attended = [c.attended() for c in compared]
         image = self.post(torch.cat([own, *(a.value for a in attended)], 1))
         if self.config.residual:
-            image = image + self._enlarged(inputs.alpha)
+            alpha, s = inputs.alpha.expand(-1, self.config.out_channels, -1, -1), self.config.scale
+            image = image + (alpha if s == 1 else interpolate(alpha, scale_factor=s, mode="bicubic"))
         position, deviation, confidence = (list(part) for part in list(zip(*attended))[1:])
         return FusionOutput(image, position, deviation, confidence), compared
 
@@ -105,25 +106,14 @@ class PAT(nn.Module):
                 f"images must have 1 or {wanted} channels for this network, got {image.shape[1]}"
             )
         image = image.expand(-1, wanted, -1, -1)
-        return (
-            torch.cat([image, normalised(image.mean(1, keepdim=True))], 1)
-            if self.config.normalised
-            else image
-        )
-
-    def _enlarged(self, alpha: Tensor) -> Tensor:
-        alpha = alpha.expand(-1, self.config.out_channels, -1, -1)
-        if self.config.scale == 1:
-            return alpha
-        return nn.functional.interpolate(
-            alpha, scale_factor=self.config.scale, mode="bicubic", align_corners=False
-        )
+        more = [normalised(image.mean(1, keepdim=True))] if self.config.normalised else []
+        return torch.cat([image, *more], 1) if more else image
 
 
 def normalised(image: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
     """The image less its mean in 9x9 pixels, over its standard deviation there, with a floor of .01."""
     mean, squares = (
-        nn.functional.avg_pool2d(x, SURROUNDINGS, 1, SURROUNDINGS // 2, count_include_pad=False)
+        avg_pool2d(x, SURROUNDINGS, 1, SURROUNDINGS // 2, count_include_pad=False)
         for x in (image, image * image)
     )
     return (image - mean) / ((squares - mean * mean).clamp(min=0) + FLOOR**2).sqrt()
@@ -168,14 +158,9 @@ class AttentionEngine(nn.Module):
         for f, to_key, to_value, field in zip(others, self.key, self.value, fields):
             after = self.before(f)
             value = to_value(after if self.values_after_block else f)
-            locations = field.at if field.pixels is None else _segments(field.pixels, query)
+            locations = field.at if field.pixels is None else field.pixels.to(query)
             found.append(Compared(query, to_key(after), value, locations, field.samples, how))
         return found
-
-
-def _segments(segments: Segments, like: Tensor) -> Segments:
-    """Segments in the type of features."""
-    return Segments(segments.start.to(like), segments.end.to(like), segments.valid)
 
 
 class PostFusion(nn.Sequential):

@@ -6,7 +6,6 @@ import dataclasses
 import json
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Union
 
@@ -18,7 +17,7 @@ from ..support.schema import from_document
 from ..support.tensor_files import undamaged, write_tensors
 from .bandwise import BandwisePAT
 from .blocks import in_bfloat16
-from .configs import CONFIGS, MODULES
+from .configs import CONFIGS
 from .denoiser import DenoiserConfig, LowLightNetwork
 from .guided import GuidedPAT
 from .paper import PAT, AttentionEngine
@@ -27,8 +26,7 @@ SHIPPED = Path(__file__).parent / "shipped"
 DENOISER = Path(__file__).parent / "denoisers" / "low-light.safetensors"
 FORMAT = "pat-weights 1"
 NETWORKS: Mapping[str, tuple[Any, Any]] = {
-    name: (getattr(import_module(f"pat.networks.{MODULES[name]}"), name), kind)
-    for name, kind in CONFIGS.items()
+    network.__name__: (network, CONFIGS[network.__name__]) for network in (PAT, GuidedPAT, BandwisePAT)
 }
 DENOISERS = {"LowLightNetwork": (LowLightNetwork, DenoiserConfig)}
 
@@ -122,11 +120,8 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             network, config = _described(path, metadata, networks)
-            names = list(file.keys())
-            _check_shapes(
-                path, network, config, {name: tuple(file.get_slice(name).get_shape()) for name in names}
-            )
-            state = {name: file.get_tensor(name) for name in names}
+            _check_shapes(path, network, config, {n: file.get_slice(n).get_shape() for n in file.keys()})  # noqa: SIM118
+            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         if zipfile.is_zipfile(path):
             raise ValueError(
@@ -148,11 +143,7 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
 
 def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
     """The first tensor missing, too many, or of another shape than the network's; empty if all fit."""
-    return _misfit(network, {k: tuple(v.shape) for k, v in state.items()})
-
-
-def _misfit(network: nn.Module, given: Mapping[str, tuple[int, ...]]) -> str:
-    own = {k: tuple(v.shape) for k, v in network.state_dict().items()}
+    own, given = ({k: tuple(v.shape) for k, v in s.items()} for s in (network.state_dict(), state))
     for name in [*own, *given]:
         if own.get(name) != given.get(name):
             return f"{name} is {given.get(name, 'missing')}, wanted {own.get(name, 'none')}"
@@ -181,21 +172,18 @@ def _described(
             f"{path}: a checkpoint of training: the weights are in best.safetensors, a folder above"
         )
     if metadata.get("format") != FORMAT or metadata.get("network") not in networks:
-        found = (
-            f"it is '{metadata.get('format')}' of a {metadata.get('network')}"
-            if metadata
-            else "it says nothing"
-        )
-        raise ValueError(
-            f"{path}: not weights of this package ('{FORMAT}' is wanted in the file's metadata, {found})"
-        )
+        said = f"it is '{metadata.get('format')}' of a {metadata.get('network')}"
+        found = f"'{FORMAT}' is wanted in the file's metadata, {said if metadata else 'it says nothing'}"
+        raise ValueError(f"{path}: not weights of this package ({found})")
     network, kind = networks[metadata["network"]]
     try:
         config: Any = from_document(kind, json.loads(metadata["config"]))  # type: ignore[arg-type]
         for name, value in dataclasses.asdict(config).items():
             _check_numbers(name, value)
     except (KeyError, RecursionError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: its configuration does not fit this version ({error})") from None
+        reason, _, _ = str(error).partition("; did you mean")  # nobody writes such a file by hand
+        advice = "train it again, or take the weights that this version ships"
+        raise ValueError(f"{path}: does not fit this version ({reason}): {advice}") from None
     return network, config
 
 
@@ -209,13 +197,13 @@ def _check_numbers(name: str, value: object) -> None:
 
 
 def _check_shapes(
-    path: Path, network: Callable[..., nn.Module], config: object, shapes: Mapping[str, tuple[int, ...]]
+    path: Path, network: Callable[..., nn.Module], config: object, shapes: Mapping[str, Sequence[int]]
 ) -> None:
     """Compare the shapes with the network's before it, or any tensor, takes memory."""
     try:
         with torch.device("meta"):
             made = network(config)
-            wrong = _misfit(made, shapes)
+            wrong = misfit(made, {name: torch.empty(tuple(shape)) for name, shape in shapes.items()})
     except Exception as error:  # whatever a constructor runs into, the cause is the configuration
         raise ValueError(
             f"{path}: its configuration makes no network ({' '.join(str(error).split())[:200]})"

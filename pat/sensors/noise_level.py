@@ -81,10 +81,8 @@ class NoiseLevel:
         linear = self.added_to == "light"
         light = linear_from_srgb(image) if linear else image
         shot = torch.as_tensor(self.shot).to(light)
-        counted = (
-            torch.poisson((light.clamp(min=0) / shot.clamp(min=1e-9)).clamp(max=1e7), generator=generator)
-            * shot
-        )
+        expected = (light.clamp(min=0) / shot.clamp(min=1e-9)).clamp(max=1e7)
+        counted = torch.poisson(expected, generator=generator) * shot
         light = torch.where(shot > 1e-7, counted, light) + self.read * normal(light.shape, light, generator)
         return srgb_from_linear(light.clamp(0, 1)) if linear else light.clamp(0, 1)
 
@@ -147,15 +145,12 @@ def _fitted(
     added_to: AddedTo, value: Float[Tensor, " n"], variance: Float[Tensor, " n"]
 ) -> tuple[NoiseLevel, float]:
     """The level by least squares of relative errors, and its mean squared logarithmic error."""
-    signal = linear_from_srgb(value) if added_to == "light" else value
-    slope = (
-        (srgb_from_linear(signal * 1.01 + 1e-4) - value) / (0.01 * signal + 1e-4)
-        if added_to == "light"
-        else 1.0
-    )
-    design = (
-        torch.stack([signal, torch.ones_like(signal)], -1) * (slope**2 / variance.clamp(min=1e-10))[:, None]
-    )
+    signal, slope = value, torch.ones_like(value)
+    if added_to == "light":
+        signal = linear_from_srgb(value)
+        slope = (srgb_from_linear(signal * 1.01 + 1e-4) - value) / (0.01 * signal + 1e-4)
+    weight = slope**2 / variance.clamp(min=1e-10)
+    design = torch.stack([signal, torch.ones_like(signal)], -1) * weight[:, None]
     from scipy.optimize import nnls  # here, as it takes long to import
 
     (shot, read), _ = nnls(design.numpy(), np.ones(len(value)))

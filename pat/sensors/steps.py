@@ -45,8 +45,7 @@ class BoxBlur(Step):
             raise ValueError(f"the width of a box blur must be an odd number of pixels, got {self.width}")
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        kernel = image.new_full((self.width,), 1 / self.width)
-        return convolved(convolved(image, kernel[None]), kernel[:, None])
+        return _separably(image, image.new_full((self.width,), 1 / self.width))
 
 
 @dataclass(frozen=True)
@@ -59,8 +58,7 @@ class GaussianBlur(Step):
         r = math.ceil(4 * float(torch.as_tensor(self.sigma).detach()))
         x = torch.arange(-r, r + 1, dtype=image.dtype, device=image.device)
         kernel = torch.exp(-0.5 * (x / max(self.sigma, 1e-6)) ** 2)
-        kernel = kernel / kernel.sum()
-        return convolved(convolved(image, kernel[None]), kernel[:, None])
+        return _separably(image, kernel / kernel.sum())
 
 
 @dataclass(frozen=True)
@@ -118,10 +116,8 @@ class Noise(Step):
 
     def __post_init__(self) -> None:
         if self.full_well <= 0 or self.read < 0:
-            raise ValueError(
-                "noise: wanted full_well > 0 and read >= 0 electrons, "
-                f"got {self.full_well:g} and {self.read:g}"
-            )
+            got = f"{self.full_well:g} and {self.read:g}"
+            raise ValueError(f"noise: wanted full_well > 0 and read >= 0 electrons, got {got}")
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         if self.counts == "poisson":
@@ -170,11 +166,14 @@ class Jitter(Step):
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         b, c = image.shape[:2]
-        gain = self.gain * normal((b, 1), image, generator) + self.normalisation * normal(
-            (b, c), image, generator
-        )
+        gain = self.gain * normal((b, 1), image, generator)
+        gain = gain + self.normalisation * normal((b, c), image, generator)
         gamma = self.gamma * normal((b, 1, 1, 1), image, generator)
         return (image.clamp(min=1e-6) ** gamma.exp() * gain.exp()[..., None, None]).clamp(0, 1)
+
+
+def _separably(image: Tensor, kernel: Tensor) -> Tensor:
+    return convolved(convolved(image, kernel[None]), kernel[:, None])
 
 
 def convolved(image: Tensor, kernel: Tensor) -> Tensor:

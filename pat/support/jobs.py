@@ -33,6 +33,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from arraygeom.extras import needs
 from arraygeom.warned import warn
 
 from .steps import about, steps_shown
@@ -86,9 +87,7 @@ class JobReport:
     def __str__(self) -> str:
         warned = {file for files in self.warned.values() for file in files}
         further = {"there already": self.kept, "failed": self.failed, "with warnings": warned}
-        return ", ".join(
-            [f"{len(self.made)} made", *(f"{len(n)} {what}" for what, n in further.items() if n)]
-        )
+        return ", ".join([f"{len(self.made)} made", *(f"{len(n)} {w}" for w, n in further.items() if n)])
 
 
 class JobError(ValueError):
@@ -140,9 +139,8 @@ def run_tasks(
     console = console or Console(stderr=True)
     here = workers.count == 1 and not workers.apart
     run = _on_dask if workers.scheduler else _in_this_process if here else _in_processes
-    for outcome in followed(
-        run(left, workers), title=title, total=len(tasks), done=len(there), console=console
-    ):
+    made = run(left, workers)
+    for outcome in followed(made, title=title, total=len(tasks), done=len(there), console=console):
         if outcome.error is None:
             report.made.append(outcome.makes)
             report.warn(outcome, named[outcome.makes])
@@ -243,10 +241,8 @@ class _Process:
                 if died is not None:
                     died.join()
                     code = died.exitcode
-                    error = (
-                        "its process died "
-                        f"({signal.Signals(-code).name if code < 0 else f'exit status {code}'})"
-                    )
+                    how = signal.Signals(-code).name if code < 0 else f"exit status {code}"
+                    error = f"its process died ({how})"
                 continue
             if outcome is None:
                 self.end()
@@ -262,9 +258,8 @@ class _Process:
         if self.process is None:
             spawn = get_context("spawn")
             self.pipe, theirs = spawn.Pipe()
-            self.process = spawn.Process(
-                target=_serve, args=(theirs, self.workers.threads, os.getpid()), daemon=True
-            )
+            given = theirs, self.workers.threads, os.getpid()
+            self.process = spawn.Process(target=_serve, args=given, daemon=True)
             self.process.start()
             theirs.close()
         self.pipe.send(task)
@@ -307,14 +302,12 @@ AHEAD = 4
 def _on_dask(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
     """Outcomes as they come; Dask repeats what dead workers were running; what kills several is one too.
 
-    Raises ValueError without Dask or scheduler.
+    Raises ImportError without Dask, ValueError without scheduler.
     """
     if not tasks:
         return
-    try:
+    with needs("cluster", "a scheduler"):
         from distributed import Client, as_completed
-    except ImportError:
-        raise ValueError("a scheduler needs Dask: pip install 'arraygeom-pat[cluster]'") from None
     try:
         client = Client(workers.scheduler, timeout=20)
     except (OSError, ValueError) as error:

@@ -69,9 +69,8 @@ def _locked(folder: Path) -> BaseFileLock:
         lock.release()
         raise _in_use(folder, owner, f"wait for it, or remove {owner_file} if it has ended")
     try:
-        owner_file.write_text(
-            json.dumps({"pid": os.getpid(), "host": socket.gethostname()}), encoding="utf-8"
-        )
+        ours = {"pid": os.getpid(), "host": socket.gethostname()}
+        owner_file.write_text(json.dumps(ours), encoding="utf-8")
     except OSError as error:
         lock.release()
         raise _unusable(folder, error) from None
@@ -95,9 +94,6 @@ def _in_use(folder: Path, owner: dict[str, object], advice: str) -> ValueError:
 def _unusable(folder: Path, error: OSError) -> ValueError:
     at = Path(error.filename) if error.filename else folder
     blocked = next((path for path in (folder, *folder.parents) if path.exists() and not path.is_dir()), None)
-    reason = (
-        f"{blocked} is a file"
-        if blocked
-        else f"{at.parent if at.name in (LOCK, OWNER) else at}: {error.strerror}"
-    )
+    at = at.parent if at.name in (LOCK, OWNER) else at
+    reason = f"{blocked} is a file" if blocked else f"{at}: {error.strerror}"
     return ValueError(f"{folder}: cannot write there ({reason}): give another folder")

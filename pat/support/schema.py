@@ -24,7 +24,7 @@ def to_document(value: Any, *, defaults: bool = False) -> Any:
         return {
             f.name: to_document(v, defaults=defaults)
             for f, v in entries.items()
-            if defaults or not _default(f, v)
+            if defaults or v != _default(f)
         }
     if isinstance(value, tuple | list):
         return [to_document(v, defaults=defaults) for v in value]
@@ -63,10 +63,10 @@ def parse_yaml(text: str | bytes, name: str) -> Any:
         raise ValueError(f"{name}: not valid YAML{at}: {problem}") from None
 
 
-def _default(field: dataclasses.Field[Any], value: Any) -> bool:
-    if field.default is not dataclasses.MISSING:
-        return bool(value == field.default)
-    return field.default_factory is not dataclasses.MISSING and bool(value == field.default_factory())
+def _default(field: dataclasses.Field[Any]) -> Any:
+    """The default of a field; MISSING of one that is required."""
+    made = field.default_factory
+    return field.default if made is dataclasses.MISSING else made()
 
 
 def _read(kind: Any, value: Any, entry: str) -> Any:
@@ -80,7 +80,7 @@ def _read(kind: Any, value: Any, entry: str) -> Any:
     if origin is tuple:
         return _read_tuple(arguments, value, entry)
     if origin in (dict, Mapping):
-        return _read_mapping(arguments, value, entry)
+        return {k: _read(arguments[1], v, _below(entry, k)) for k, v in _mapping(value, entry).items()}
     if origin in (typing.Union, types.UnionType):
         return _read_union(arguments, value, entry)
     return _read_plain(kind, value, entry)
@@ -93,15 +93,12 @@ def _short(value: object) -> str:
 
 
 def _read_dataclass(kind: Any, value: Any, entry: str) -> Any:
-    if not isinstance(value, dict):
-        raise ValueError(f"{entry or kind.__name__}: is {_short(value)}; wanted a mapping")
     fields = {f.name: f for f in dataclasses.fields(kind) if f.init}
-    for key in value:
+    for key in _mapping(value, entry or kind.__name__):
         if key not in fields:
             raise ValueError(f"{_below(entry, key)}: unknown key{near(key, fields)}")
     for name, field in fields.items():
-        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-        if required and name not in value:
+        if name not in value and _default(field) is dataclasses.MISSING:
             raise ValueError(f"{_below(entry, name)}: missing")
     types_ = typing.get_type_hints(kind)
     made = {k: _read(types_[k], v, _below(entry, k)) for k, v in value.items()}
@@ -122,10 +119,10 @@ def _read_tuple(arguments: tuple[Any, ...], value: Any, entry: str) -> tuple[Any
     return tuple(_read(k, v, f"{entry}[{i}]") for i, (k, v) in enumerate(zip(kinds, value)))
 
 
-def _read_mapping(arguments: tuple[Any, ...], value: Any, entry: str) -> dict[Any, Any]:
+def _mapping(value: Any, entry: str) -> dict[Any, Any]:
     if not isinstance(value, dict):
         raise ValueError(f"{entry}: is {_short(value)}; wanted a mapping")
-    return {k: _read(arguments[1], v, _below(entry, k)) for k, v in value.items()}
+    return value
 
 
 def _read_union(arguments: tuple[Any, ...], value: Any, entry: str) -> Any:

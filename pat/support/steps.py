@@ -15,8 +15,6 @@ from threading import get_ident
 from arraygeom.progress import progress
 
 PACKAGES = ("arraygeom", "calib", "pat")
-
-
 EARLIEST = 0.1
 """Share of a stage that is done before the time left is estimated."""
 LEAST = 1.5

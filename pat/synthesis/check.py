@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
 
@@ -41,63 +41,44 @@ class CheckLimits:
     overlap: float = 0.1
 
 
-@dataclass(frozen=True, kw_only=True)
-class SceneCheck:
-    """Figures by view and by "alpha > beta", and the reasons for refusal (none if accepted)."""
-
-    views: dict[str, dict[str, float]] = field(default_factory=dict)
-    pairs: dict[str, dict[str, float]] = field(default_factory=dict)
-    reasons: tuple[str, ...] = ()
-
-    @property
-    def accepted(self) -> bool:
-        """Whether there is no reason for refusal."""
-        return not self.reasons
-
-    def to_document(self) -> dict[str, Any]:
-        """For a file: `accepted`, `reasons`, `views`, `pairs`."""
-        return {
-            "accepted": self.accepted,
-            "reasons": list(self.reasons),
-            "views": self.views,
-            "pairs": self.pairs,
-        }
-
-
 def check_views(
-    rig: Rig, frames: Mapping[str, RenderedFrame], limits: CheckLimits | None = None
-) -> SceneCheck:
-    """Check one frame of every camera against each other and against the limits.
+    rig: Rig, frames: Mapping[str, RenderedFrame], limits: CheckLimits = CheckLimits()
+) -> dict[str, Any]:
+    """Check one frame of every camera against each other and against the limits, for a file.
 
-    Pairs of frames of different times are left out.
+    `views` and `pairs` are figures by view and by "alpha > beta", pairs of frames of different times left
+    out; `reasons` are those for refusal, and without any the scene is `accepted`.
     """
-    limits = limits or CheckLimits()
     views = {name: view_figures(frame) for name, frame in frames.items()}
     together = [(a, b) for a, b in permutations(frames, 2) if frames[a].time == frames[b].time]
     pairs = {
         f"{a} > {b}": pair_figures(_camera(rig, a), frames[a], _camera(rig, b), frames[b])
         for a, b in together
     }
-    reasons = [r for name, figures in views.items() for r in _view_reasons(name, figures, limits)]
-    reasons += [r for name, figures in pairs.items() for r in _pair_reasons(name, figures, limits)]
-    reasons += _overlap_reasons(pairs, {a for a, _ in together}, limits)
-    return SceneCheck(views=views, pairs=pairs, reasons=tuple(reasons))
+    seen = {
+        a: max(pairs[f"{x} > {y}"]["visible"] for x, y in together if x == a) for a, _ in sorted(together)
+    }
+    best = {name: {"visible": share} for name, share in seen.items()}
+    judged = (views, _VIEW), (pairs, _PAIR), (best, _BEST)
+    reasons = [reason for figures, bounds in judged for reason in _reasons(figures, bounds, limits)]
+    return {"accepted": not reasons, "reasons": reasons, "views": views, "pairs": pairs}
 
 
 def view_figures(frame: RenderedFrame) -> dict[str, float]:
     """Brightness, texture and depths of one image."""
     finite = frame.depth.isfinite()
     depths = frame.depth[finite] if finite.any() else frame.depth.new_tensor([torch.inf])
-    figures = {
-        "mean": frame.rgb.mean(),
-        "dark": (frame.rgb.amax(0) < 0.004).float().mean(),
-        "bright": (frame.rgb.amin(0) > 1).float().mean(),
-        "texture": texture(frame.rgb),
-        "covered": finite.float().mean(),
-        "near": depths.min(),
-        "far": depths.max(),
-    }
-    return _rounded(figures)
+    return _rounded(
+        {
+            "mean": frame.rgb.mean(),
+            "dark": (frame.rgb.amax(0) < 0.004).float().mean(),
+            "bright": (frame.rgb.amin(0) > 1).float().mean(),
+            "texture": texture(frame.rgb),
+            "covered": finite.float().mean(),
+            "near": depths.min(),
+            "far": depths.max(),
+        }
+    )
 
 
 def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
@@ -140,9 +121,8 @@ def pair_figures(alpha: Camera, here: RenderedFrame, beta: Camera, there: Render
         "contradicted": (clean & ~visible & ~nearer).sum() / total,
     }
     if visible.any():
-        figures |= dict(
-            zip(("median", "p95", "p99"), error[visible].quantile(error.new_tensor([0.5, 0.95, 0.99])))
-        )
+        for name, share in ("median", 0.5), ("p95", 0.95), ("p99", 0.99):
+            figures[name] = error[visible].quantile(share)
         figures["colour"], figures["shift"] = _compared(here, x[visible], there, target[visible])
     return _rounded(figures)
 
@@ -177,33 +157,31 @@ def _camera(rig: Rig, name: str) -> Camera:
     return camera
 
 
-def _view_reasons(name: str, figures: Mapping[str, float], limits: CheckLimits) -> Iterator[str]:
-    if figures["dark"] > limits.dark:
-        yield f"{name}: {figures['dark']:.0%} of the image is black (at most {limits.dark:.0%})"
-    if figures["bright"] > limits.bright:
-        yield f"{name}: {figures['bright']:.0%} of the image is saturated (at most {limits.bright:.0%})"
-    if figures["texture"] < limits.texture:
-        yield f"{name}: {figures['texture']:.0%} of the image has texture (at least {limits.texture:.0%})"
+_VIEW = (
+    ("dark", "dark", 1, "{:.0%} of the image is black (at most {:.0%})"),
+    ("bright", "bright", 1, "{:.0%} of the image is saturated (at most {:.0%})"),
+    ("texture", "texture", -1, "{:.0%} of the image has texture (at least {:.0%})"),
+)
+_PAIR = (
+    ("p95", "error", 1, "depth misses pixels by {:.3f} (at most {:g})"),
+    ("shift", "shift", 1, "colours are displaced by {:.2f} pixels (at most {:g})"),
+    ("contradicted", "contradicted", 1, "{:.1%} of the points are seen through"),
+)
+_BEST = (("visible", "overlap", -1, "the other cameras see {:.0%} of what it sees (at least {:.0%})"),)
+"""Of figures: their limits, whether these are the most (1) or the least, and the words of a refusal."""
 
 
-def _pair_reasons(name: str, figures: Mapping[str, float], limits: CheckLimits) -> Iterator[str]:
-    if figures.get("p95", 0.0) > limits.error:
-        yield f"{name}: depth misses pixels by {figures['p95']:.3f} (at most {limits.error:g})"
-    if figures.get("shift", 0.0) > limits.shift:
-        yield f"{name}: colours are displaced by {figures['shift']:.2f} pixels (at most {limits.shift:g})"
-    if figures["contradicted"] > limits.contradicted:
-        yield f"{name}: {figures['contradicted']:.1%} of the points are seen through"
-
-
-def _overlap_reasons(
-    pairs: Mapping[str, Mapping[str, float]], names: set[str], limits: CheckLimits
+def _reasons(
+    figures: Mapping[str, Mapping[str, float]],
+    bounds: Sequence[tuple[str, str, int, str]],
+    limits: CheckLimits,
 ) -> list[str]:
-    """Views of which no other view sees enough."""
-    best = {n: max(f["visible"] for p, f in pairs.items() if p.startswith(f"{n} > ")) for n in sorted(names)}
+    """The figures, by name, that are beyond their limits."""
     return [
-        f"{name}: the other cameras see {share:.0%} of what it sees (at least {limits.overlap:.0%})"
-        for name, share in best.items()
-        if share < limits.overlap
+        f"{name}: {words.format(found[figure], getattr(limits, limit))}"
+        for name, found in figures.items()
+        for figure, limit, sign, words in bounds
+        if figure in found and sign * found[figure] > sign * getattr(limits, limit)
     ]
 
 

@@ -72,14 +72,9 @@ class Setting:
         self.near, self.far = near, far if math.isfinite(far) else 10 * near
         self.centres = np.stack([c.centre.double().numpy() for c in self.cameras])
 
-    @property
-    def focal(self) -> float:
-        """The longest focal length, pixels."""
-        return max(float(c.K[:2, :2].abs().max()) for c in self.cameras)
-
     def metres(self, depth: float, pixels: float) -> float:
         """Width of so many pixels at a depth, in the camera with the finest resolution."""
-        return float(pixels * depth / self.focal)
+        return float(pixels * depth / max(float(c.K[:2, :2].abs().max()) for c in self.cameras))
 
     def camera(self) -> Camera:
         """One of the cameras, drawn."""
@@ -132,16 +127,12 @@ def _room(setting: Setting) -> _Room:
     local = (setting.centres - setting.centres[0]) @ R
     back = local[:, 2].min() - 2 * setting.near
     rays = [_rays(c) for c in setting.cameras]
-    half = (
-        np.tan(_half_view(setting.cameras)) * rng.uniform(0.5, 0.9, 2) * setting.far
-        + np.abs(local[:, :2]).max()
-    )
+    widest = np.max([[math.atan(tangent) for tangent in _half_view(c)] for c in setting.cameras], axis=0)
+    half = np.tan(widest) * rng.uniform(0.5, 0.9, 2) * setting.far + np.abs(local[:, :2]).max()
     front = setting.far
     for _ in range(30):
-        centre, extent = (
-            np.array([0, 0, (front + back) / 2]),
-            np.array([2 * half[0], 2 * half[1], front - back]),
-        )
+        centre = np.array([0, 0, (front + back) / 2])
+        extent = np.array([2 * half[0], 2 * half[1], front - back])
         room = _Room(R, setting.centres[0] + R @ centre, extent)
         nearest, farthest = _wall_depths(room, setting.cameras, rays)
         if farthest <= 0.98 * setting.far and nearest >= setting.near:
@@ -158,13 +149,9 @@ def _rays(camera: Camera) -> NDArray:
     return np.asarray(directions[np.isfinite(directions).all(1)])
 
 
-def _half_view(cameras: Sequence[Camera]) -> NDArray:
-    """Half the widest view across and down, radians."""
-    angles = [
-        [math.atan(n / 2 / float(f)) for n, f in zip((c.hw[1], c.hw[0]), c.K[:2, :2].abs().amax(1))]
-        for c in cameras
-    ]
-    return np.max(angles, axis=0)
+def _half_view(camera: Camera) -> list[float]:
+    """Tangents of half the view across and down."""
+    return [n / 2 / float(f) for n, f in zip(camera.hw[::-1], camera.K[:2, :2].abs().amax(1))]
 
 
 def _wall_depths(room: _Room, cameras: Sequence[Camera], rays: Sequence[NDArray]) -> tuple[float, float]:
@@ -188,11 +175,8 @@ def _lights(setting: Setting, room: _Room) -> tuple[Light, ...]:
     lights = [_lamp(setting, room, target, float(share)) for share in shares]
     if rng.uniform() < 0.6:
         direction = room.R @ np.array([rng.uniform(-1, 1), rng.uniform(0.2, 1), rng.uniform(0.3, 1)])
-        lights.append(
-            _tinted(
-                rng, Light(kind="sun", power=float(rng.uniform(0.8, 2)), direction=vec(direction), size=0.05)
-            )
-        )
+        sun = Light(kind="sun", power=float(rng.uniform(0.8, 2)), direction=vec(direction), size=0.05)
+        lights.append(_tinted(rng, sun))
     return tuple(lights)
 
 
@@ -202,12 +186,11 @@ def _lamp(setting: Setting, room: _Room, target: NDArray, irradiance: float) -> 
     squared = float(((target - where) ** 2).sum())
     if rng.uniform() < 0.5:
         size = float(rng.uniform(0.05, 0.2) * room.extent.min())
-        power, direction = irradiance * math.pi * squared, vec(target - where)
-        return _tinted(
-            rng, Light(kind="area", power=power, position=vec(where), direction=direction, size=size)
-        )
-    power, size = irradiance * 4 * math.pi * squared, float(rng.uniform(0.01, 0.03) * room.extent.min())
-    return _tinted(rng, Light(kind="point", power=power, position=vec(where), size=size))
+        light = Light(kind="area", power=irradiance * math.pi * squared, direction=vec(target - where))
+    else:
+        size = float(rng.uniform(0.01, 0.03) * room.extent.min())
+        light = Light(kind="point", power=irradiance * 4 * math.pi * squared)
+    return _tinted(rng, replace(light, position=vec(where), size=size))
 
 
 def _tinted(rng: Generator, light: Light) -> Light:
@@ -226,31 +209,27 @@ def _object(
     rng, camera = setting.rng, setting.camera()
     depth = float(1 / rng.uniform(1 / (0.75 * setting.far), 1 / (1.25 * setting.near)))
     centre = setting.ahead(camera, rng.uniform(-0.95, 0.95, 2), depth)
-    view = depth * min(
-        n / 2 / float(f) for n, f in zip((camera.hw[1], camera.hw[0]), camera.K[:2, :2].abs().amax(1))
-    )
+    view = depth * min(_half_view(camera))
     radius = float(min(view * rng.uniform(0.2, 0.55), 0.85 * (setting.nearest(centre) - setting.near)))
     if not radius > 0.05 * view or not room.holds(centre, 0.4 * radius) or _crowded(centre, radius, others):
         return None
     shape = _SHAPES[int(rng.integers(len(_SHAPES)))]
     extent = _extent(rng, shape, radius)
     relief = _relief(rng, extent) if rng.uniform() < 0.4 else None
-    key = Key(
-        position=vec(centre), rotation=vec(Rotation.random(random_state=rng).as_rotvec()), extent=vec(extent)
-    )
+    rotation = vec(Rotation.random(random_state=rng).as_rotvec())
+    key = Key(position=vec(centre), rotation=rotation, extent=vec(extent))
     material = _material(rng, surface(setting, depth, _PATTERNS), setting.metres(depth, 1))
     keys = (key,) if moving == 0 else _path(setting, key, radius, moving)
-    return Object(
-        name=f"{shape}{len(others) + 1}", shape=shape, motion=Motion(keys), material=material, relief=relief
-    )
+    name = f"{shape}{len(others) + 1}"
+    return Object(name=name, shape=shape, motion=Motion(keys), material=material, relief=relief)
 
 
 def _crowded(centre: NDArray, radius: float, others: list[Object]) -> bool:
     """Whether much of the object would be inside another one."""
-    keys = [o.motion.keys[0] for o in others]
-    return any(
-        np.linalg.norm(centre - k.position) < 0.5 * (radius + np.linalg.norm(k.extent) / 2) for k in keys
-    )
+    for key in (other.motion.keys[0] for other in others):
+        if np.linalg.norm(centre - key.position) < 0.5 * (radius + np.linalg.norm(key.extent) / 2):
+            return True
+    return False
 
 
 def _extent(rng: Generator, shape: Shape, radius: float) -> NDArray:
@@ -277,17 +256,10 @@ def _path(setting: Setting, start: Key, radius: float, duration: float) -> tuple
         position = np.asarray(keys[-1].position) + rng.normal(size=3) * 0.4 * radius
         if setting.nearest(position) - 1.2 * radius < setting.near:
             position = np.asarray(keys[-1].position)
-        rotation = Rotation.from_rotvec(np.radians(rng.uniform(-35, 35, 3))) * Rotation.from_rotvec(
-            keys[-1].rotation
-        )
-        extent = np.asarray(start.extent) * rng.uniform(0.8, 1.2, 3)
-        key = Key(
-            position=vec(position),
-            rotation=vec(rotation.as_rotvec()),
-            extent=vec(extent),
-            time=k * duration / 3,
-        )
-        keys.append(key)
+        step = Rotation.from_rotvec(np.radians(rng.uniform(-35, 35, 3)))
+        rotation = vec((step * Rotation.from_rotvec(keys[-1].rotation)).as_rotvec())
+        extent = vec(np.asarray(start.extent) * rng.uniform(0.8, 1.2, 3))
+        keys.append(Key(position=vec(position), rotation=rotation, extent=extent, time=k * duration / 3))
     return tuple(keys)
 
 

@@ -44,11 +44,10 @@ def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0)
     def image(setting: Setting, depth: float, kinds: tuple[TextureKind, ...]) -> Texture:
         rng, tint = setting.rng, float(setting.rng.uniform(0.75, 1.0))
         width = setting.metres(depth, rng.uniform(150, 400))
-        paint = Paint((tint, tint, tint), float(rng.uniform(0.8, 1.0)))
+        paints = (Paint((tint, tint, tint), float(rng.uniform(0.8, 1.0))),)
         shift = (float(rng.uniform()), float(rng.uniform()), 0.0)
-        return Texture(
-            kind="image", image=_bright_one(rng, files), scale=1 / width, paints=(paint,), offset=shift
-        )
+        file = _bright_one(rng, files)
+        return Texture(kind="image", image=file, scale=1 / width, paints=paints, offset=shift)
 
     return furnished("photographs", seed, rig, image, moving)
 
@@ -58,13 +57,10 @@ def generator_named(name: str) -> Callable[..., Scene]:
 
     Raises ValueError for a name that is neither.
     """
-    if name == "abstract":
-        return abstract
-    if name == "photographs":
-        return photographs
-    if ":" not in name:
+    ours: dict[str, Callable[..., Scene]] = {"abstract": abstract, "photographs": photographs}
+    if name not in ours and ":" not in name:
         raise ValueError(f"no generator is called '{name}': use abstract, photographs or MODULE:FUNCTION")
-    return imported(name, "generator")  # type: ignore[no-any-return]
+    return ours.get(name) or imported(name, "generator")
 
 
 # Surfaces ---------------------------------------------------------------------------------------------------
@@ -103,11 +99,9 @@ def _near_infrared(rng: Generator, rgb: Vec3) -> float:
     kind = rng.choice(["dye", "pigment", "soot"], p=[0.5, 0.4, 0.1])
     if kind == "dye":
         return float(rng.uniform(0.45, 0.8))
-    return (
-        float(rng.uniform(0.03, 0.1))
-        if kind == "soot"
-        else float(np.clip(r * rng.uniform(0.8, 1.2), 0.02, 0.9))
-    )
+    if kind == "soot":
+        return float(rng.uniform(0.03, 0.1))
+    return float(np.clip(r * rng.uniform(0.8, 1.2), 0.02, 0.9))
 
 
 @lru_cache(maxsize=8)

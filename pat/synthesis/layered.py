@@ -30,6 +30,8 @@ from .rigs import RigBatch, random_rigs
 
 _FAINT = 1 / 256
 _MAX_OVERSAMPLING = 4
+_CHUNK = 1 << 16
+"""Pixels painted at once."""
 
 
 @dataclass(frozen=True)
@@ -131,9 +133,8 @@ class LayeredScenes:
     def _shade(self, layers: Layers, camera: Camera, front: _Front) -> Tensor:
         """The image (B, 3, h, w): each pixel's two foremost layers, mixed by the opacity of the first."""
         H = (layers.texel_from_plane @ plane_from_camera(layers, camera)).float().to(self.device)
-        colour = self._colours(
-            layers, H, camera.hw, front.first, torch.ones_like(front.opacity, dtype=torch.bool)
-        )
+        everywhere = torch.ones_like(front.opacity, dtype=torch.bool)
+        colour = self._colours(layers, H, camera.hw, front.first, everywhere)
         edge = front.opacity < 1 - _FAINT
         behind = self._colours(layers, H, camera.hw, front.second, edge)
         colour[:, edge] = torch.lerp(behind, colour[:, edge], front.opacity[edge])
@@ -164,10 +165,6 @@ class LayeredScenes:
         r, g, b = self.photos.lookup(texture, torch.stack([u, v], -1), level)
         p = paint.unbind(2)
         return (p[0] * r[:, None] + p[1] * g[:, None] + p[2] * b[:, None] + p[3]).mT.clamp(0, 1)
-
-
-_CHUNK = 1 << 16
-"""Pixels painted at once."""
 
 
 @dataclass(frozen=True)

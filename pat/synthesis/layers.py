@@ -57,10 +57,9 @@ def draw_layers(
     R = _painters(planes.normal)
     metres_per_pixel = 1 / (planes.inverse_depth * rigs.cameras[0].K[:, :1, 0])
     texture, texel_from_plane = _texture(R, metres_per_pixel, planes.facing, photos, g)
+    t = R.new_tensor([0, 0, 1]) - matvec(R, planes.ray / planes.inverse_depth[..., None])
     return Layers(
-        plane_from_world=Pose(
-            R, R.new_tensor([0, 0, 1]) - matvec(R, planes.ray / planes.inverse_depth[..., None])
-        ),
+        plane_from_world=Pose(R, t),
         present=(torch.arange(shape[1]) < number) & (planes.facing > _GRAZING),
         solid=planes.solid,
         outline=torch.randint(shapes, shape, generator=g),
@@ -84,8 +83,12 @@ class _Planes(NamedTuple):
 
 def _planes(rigs: RigBatch, shape: tuple[int, int], g: Generator) -> _Planes:
     alpha = rigs.cameras[0]
-    ray, normal = _anchors(alpha, shape, g), _normals(shape, g)
-    ground, wall = _roles(shape, g)
+    wh = torch.tensor(alpha.hw[::-1], dtype=torch.float64)
+    ray = _rays(alpha, uniform((-0.15, 1.15), (*shape, 2), g) * wh)  # up to 15 % of the image outside it
+    normal = _normals(shape, g)
+    ground, wall = torch.zeros(2, *shape, dtype=torch.bool)
+    ground[:, 1:2] = torch.rand(shape[0], 1, generator=g) < 0.5
+    wall[:, 2:3] = torch.rand(shape[0], 1, generator=g) < 0.25
     ray[ground] = _ground_anchor(alpha)[ground.any(1)]
     normal[ground] = _tilted((0.0, 1.0, 0.0), 0.05, int(ground.sum()), g)
     normal[wall] = _tilted((1.0, 0.0, 0.4), 0.2, int(wall.sum()), g)
@@ -111,13 +114,6 @@ def _rays(camera: Camera, pixel: Tensor) -> Tensor:
     return to_homogeneous(pixel) @ torch.linalg.inv(camera.K).mT
 
 
-def _anchors(alpha: Camera, shape: tuple[int, int], g: Generator) -> Tensor:
-    """Rays through the layers' middles, up to 15 % of the image outside it."""
-    h, w = alpha.hw
-    size = torch.tensor([w, h], dtype=torch.float64)
-    return _rays(alpha, uniform((-0.15, 1.15), (*shape, 2), g) * size)
-
-
 def _ground_anchor(alpha: Camera) -> Tensor:
     """The ray through the middle of the bottom or the top row, whichever is farther from the horizon."""
     h, w = alpha.hw
@@ -128,9 +124,8 @@ def _ground_anchor(alpha: Camera) -> Tensor:
 
 def _normals(shape: tuple[int, int], g: Generator) -> Tensor:
     """Unit normals: half of the things nearly face the camera, the others slant by up to 60 degrees."""
-    slant = torch.where(
-        torch.rand(shape, generator=g) < 0.5, uniform((0.001, 0.15), shape, g), uniform((0.1, 1.0), shape, g)
-    )
+    facing = torch.rand(shape, generator=g) < 0.5
+    slant = torch.where(facing, uniform((0.001, 0.15), shape, g), uniform((0.1, 1.0), shape, g))
     slant[:, 0] *= 0.4
     angle = uniform((0, 2 * math.pi), shape, g)
     return torch.stack([slant.sin() * angle.cos(), slant.sin() * angle.sin(), slant.cos()], -1)
@@ -159,14 +154,6 @@ def _not_nearer(rigs: RigBatch, q: Tensor, normal: Tensor, ray: Tensor, radius: 
     slope = normal[..., :2].norm(dim=-1) / (normal * ray).sum(-1).clamp(min=1e-3)
     grown = 1 + slope * radius / rigs.cameras[0].K[:, :1, 0]
     return torch.minimum(q, 1 / (rigs.near[:, None] * grown))
-
-
-def _roles(shape: tuple[int, int], g: Generator) -> tuple[Tensor, Tensor]:
-    """Which layer is the ground and which a wall."""
-    ground, wall = torch.zeros(2, *shape, dtype=torch.bool)
-    ground[:, 1:2] = torch.rand(shape[0], 1, generator=g) < 0.5
-    wall[:, 2:3] = torch.rand(shape[0], 1, generator=g) < 0.25
-    return ground, wall
 
 
 def _painters(normal: Tensor) -> Tensor:
@@ -208,9 +195,8 @@ def _texture(
     texture = torch.where(torch.rand(shape, generator=g) < 0.5, photo, other)
     s = log_uniform((0.5, 3.0), shape, g) / metres_per_pixel
     angle = torch.where(torch.rand(shape, generator=g) < 0.8, 0.1, 3.0) * _randn(shape, g)
-    A = _affine(
-        _upright(R) + angle, s * (torch.randint(2, shape, generator=g) * 2 - 1), s * facing.clamp(min=0.1)
-    )
+    mirror = torch.randint(2, shape, generator=g) * 2 - 1
+    A = _affine(_upright(R) + angle, s * mirror, s * facing.clamp(min=0.1))
     A[..., :2, 2] = uniform((0, 1), (*shape, 2), g) * photos.wh.cpu()[texture, 0]
     return texture, A
 

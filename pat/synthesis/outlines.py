@@ -78,9 +78,8 @@ def _box(rng: np.random.Generator) -> np.ndarray:
 def _cloud(rng: np.random.Generator) -> np.ndarray:
     """Thresholded noise inside a disc: foliage, holes, islands."""
     n = int(rng.integers(4, 14))
-    noise = cv2.resize(
-        rng.normal(0, 1, (n, n)).astype(np.float32), (_FINE, _FINE), interpolation=cv2.INTER_CUBIC
-    )
+    coarse = rng.normal(0, 1, (n, n)).astype(np.float32)
+    noise = cv2.resize(coarse, (_FINE, _FINE), interpolation=cv2.INTER_CUBIC)
     y, x = np.mgrid[-1 : 1 : _FINE * 1j, -1 : 1 : _FINE * 1j]
     return (noise + 2 * (0.75 - np.hypot(x, y)) > 0.2).astype(np.uint8)
 

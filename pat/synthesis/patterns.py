@@ -22,8 +22,7 @@ def recoloured(images: list[np.ndarray], rng: np.random.Generator, count: int) -
 
     The correlation of colour and luminance of photographs does not hold here.
     """
-    mixed = (_mixed(images, rng) for _ in range(count))
-    return [to_bytes(image) for image in mixed]
+    return [to_bytes(_mixed(images, rng)) for _ in range(count)]
 
 
 def _mixed(images: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
@@ -91,13 +90,9 @@ def _dots(rng: np.random.Generator) -> np.ndarray:
 
 def _cloud(rng: np.random.Generator) -> np.ndarray:
     """Noise of several octaves, its colours independent of one another."""
-    octaves = [
-        cv2.resize(
-            rng.normal(0, 1, (2**k, 2**k, 3)).astype(np.float32),
-            (_SIDE, _SIDE),
-            interpolation=cv2.INTER_CUBIC,
-        )
-        * rng.uniform(0.4, 0.9) ** k
-        for k in range(1, 8)
-    ]
+    octaves: list[np.ndarray] = []
+    for k in range(1, 8):
+        noise = rng.normal(0, 1, (2**k, 2**k, 3)).astype(np.float32)
+        wide = cv2.resize(noise, (_SIDE, _SIDE), interpolation=cv2.INTER_CUBIC)
+        octaves.append(wide * rng.uniform(0.4, 0.9) ** k)
     return _colours(rng, 1)[0] + 0.2 * sum(octaves)

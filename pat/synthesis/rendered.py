@@ -80,10 +80,8 @@ class Rendered:
         """One frame of a camera, as float32 (index: int64)."""
         entry = self.about["frames"][self.rig.require(camera)][number]
         with np.load(self.folder / entry["file"]) as arrays:
-            tensors = {
-                k: torch.from_numpy(arrays[k].astype(np.int64 if k == "index" else np.float32))
-                for k in arrays
-            }
+            kinds = {k: np.int64 if k == "index" else np.float32 for k in arrays}
+            tensors = {k: torch.from_numpy(arrays[k].astype(kind)) for k, kind in kinds.items()}
         return RenderedFrame(time=entry["time"], **tensors)
 
 

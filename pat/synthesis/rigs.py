@@ -64,9 +64,8 @@ def _rectified_beta(rigs: RigDistribution, alpha: Camera, near: Tensor, far: Ten
     side = {"left": torch.ones_like(drawn), "right": -torch.ones_like(drawn), "either": drawn}[rigs.alpha]
     t = torch.zeros_like(alpha.t)
     t[:, 0] = -side * _baseline(rigs, alpha, near, g)
-    return alpha.replace(cam_from_world=Pose(alpha.R, t)).resize(
-        scaled(alpha.hw, one_of(rigs.resolutions, g))
-    )
+    hw = scaled(alpha.hw, one_of(rigs.resolutions, g))
+    return alpha.replace(cam_from_world=Pose(alpha.R, t)).resize(hw)
 
 
 def _general_beta(rigs: RigDistribution, alpha: Camera, near: Tensor, far: Tensor, g: Generator) -> Camera:

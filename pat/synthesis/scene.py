@@ -82,13 +82,6 @@ class ObjectPose(NamedTuple):
     position: Float[NDArray, "3"]
     extent: Float[NDArray, "3"]
 
-    @property
-    def matrix(self) -> Float[NDArray, "4 4"]:
-        """The same as one affine map."""
-        M = np.eye(4)
-        M[:3, :3], M[:3, 3] = self.R * self.extent, self.position
-        return M
-
 
 @dataclass(frozen=True, kw_only=True)
 class Key:
@@ -163,9 +156,7 @@ class Object:
 
     def __post_init__(self) -> None:
         if (self.shape == "lathe") != (len(self.profile) > 1):
-            raise ValueError(
-                f"'{self.name}': a lathe, and nothing else, needs a profile of two points or more"
-            )
+            raise ValueError(f"'{self.name}': a lathe, and nothing else, needs a profile of 2 points or more")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,9 +197,8 @@ class Scene:
 
     def to_yaml(self) -> str:
         """The text of a scene file."""
-        return yaml.safe_dump(
-            {"format": FORMAT, **to_document(self)}, sort_keys=False, width=120, default_flow_style=None
-        )
+        document = {"format": FORMAT, **to_document(self)}
+        return yaml.safe_dump(document, sort_keys=False, width=120, default_flow_style=None)
 
     @classmethod
     def from_yaml(cls, text: str, source: str = "scene") -> Scene:

@@ -107,9 +107,8 @@ def _lengths(points: NDArray) -> tuple[float, float]:
 
 def _welded(loose: Mesh, extent: NDArray) -> Mesh:
     """Corners that coincide made one, and faces without area gone."""
-    _, first, new = np.unique(
-        np.round(loose.vertices / extent, 6), axis=0, return_index=True, return_inverse=True
-    )
+    corners = np.round(loose.vertices / extent, 6)
+    _, first, new = np.unique(corners, axis=0, return_index=True, return_inverse=True)
     faces, uv = _triangles_last(new.reshape(-1)[loose.faces], loose.uv)
     keep = np.array([len(set(f)) >= 3 for f in faces.tolist()])
     return Mesh(loose.vertices[first], faces[keep], uv[keep])
@@ -138,9 +137,8 @@ def _noise(points: NDArray, seed: int) -> NDArray:
     """Smooth noise in -1..1 with features about 1 across: plane waves of random directions."""
     waves, rng = 24, np.random.default_rng(seed)
     direction = rng.normal(size=(waves, 3))
-    direction *= (2 * np.pi * rng.uniform(0.35, 0.8, (waves, 1))) / np.linalg.norm(
-        direction, axis=1, keepdims=True
-    )
+    length = np.linalg.norm(direction, axis=1, keepdims=True)
+    direction *= (2 * np.pi * rng.uniform(0.35, 0.8, (waves, 1))) / length
     total = np.cos(points @ direction.T + rng.uniform(0, 2 * np.pi, waves)).sum(1)
     return np.tanh(total / math.sqrt(waves / 2) / 1.5)
 
@@ -150,48 +148,31 @@ def _quad(origin: Vec3, along_s: Vec3, along_t: Vec3) -> Patch:
     return lambda s, t: tuple(o[i] + a[i] * s + b[i] * t for i in range(3))  # type: ignore[return-value]
 
 
-def _sphere(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    polar, azimuth = np.pi * t, 2 * np.pi * s
-    return 0.5 * np.sin(polar) * np.cos(azimuth), -0.5 * np.cos(polar), 0.5 * np.sin(polar) * np.sin(azimuth)
+def _revolved(radius: Callable[[NDArray], NDArray], y: Callable[[NDArray], NDArray], sign: int = 1) -> Patch:
+    """What a profile, by its radius and y along t, sweeps around the y axis; with `sign` -1 backwards."""
 
-
-def _disc(y: float, sign: int) -> Patch:
     def patch(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         azimuth = 2 * np.pi * s * sign
-        return 0.5 * t * np.cos(azimuth), np.full_like(s, y), 0.5 * t * np.sin(azimuth)
+        return radius(t) * np.cos(azimuth), y(t), radius(t) * np.sin(azimuth)
 
     return patch
-
-
-def _side(top: float) -> Patch:
-    """The side of a cylinder (`top` 1) or cone (0) whose axis is y, its top at y = -0.5."""
-
-    def patch(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        radius, azimuth = 0.5 * (top + (1 - top) * t), 2 * np.pi * s
-        return radius * np.cos(azimuth), t - 0.5, radius * np.sin(azimuth)
-
-    return patch
-
-
-def _torus(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    azimuth, tube = 2 * np.pi * s, 2 * np.pi * t
-    radius = 0.5 * (1 - TORUS) + 0.5 * TORUS * np.cos(tube)
-    return radius * np.cos(azimuth), 0.5 * np.sin(tube), radius * np.sin(azimuth)
 
 
 def _lathe(profile: tuple[tuple[float, float], ...]) -> _Surface:
     """The surface that a profile sweeps around the y axis; corners of the profile are points of it."""
-    radii, heights = np.array(profile).T
-
-    def patch(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        at, azimuth = t * (len(radii) - 1), 2 * np.pi * s
-        radius = np.interp(at, np.arange(len(radii)), radii)
-        height = np.interp(at, np.arange(len(radii)), heights)
-        return radius * np.cos(azimuth), height, radius * np.sin(azimuth)
-
-    return _Surface(patch, (_ROUND, len(radii) - 1))
+    at = np.arange(len(profile))
+    radius, y = (lambda t, v=v: np.interp(t * (len(profile) - 1), at, v) for v in np.array(profile).T)
+    return _Surface(_revolved(radius, y), (_ROUND, len(profile) - 1))
 
 
+_SPHERE = _revolved(lambda t: 0.5 * np.sin(np.pi * t), lambda t: -0.5 * np.cos(np.pi * t))
+_TORUS = _revolved(
+    lambda t: 0.5 * (1 - TORUS) + 0.5 * TORUS * np.cos(2 * np.pi * t), lambda t: 0.5 * np.sin(2 * np.pi * t)
+)
+_CYLINDER = _revolved(lambda t: np.full_like(t, 0.5), lambda t: t - 0.5)
+_CONE = _revolved(lambda t: 0.5 * t, lambda t: t - 0.5)
+_TOP = _revolved(lambda t: 0.5 * t, lambda t: np.full_like(t, -0.5))
+_BOTTOM = _revolved(lambda t: 0.5 * t, lambda t: np.full_like(t, 0.5), -1)
 _CUBE = (
     _quad((-0.5, -0.5, -0.5), (1, 0, 0), (0, 1, 0)),
     _quad((0.5, -0.5, 0.5), (-1, 0, 0), (0, 1, 0)),
@@ -205,14 +186,10 @@ SURFACES: dict[Shape, tuple[_Surface, ...]] = {
     "plane": (_Surface(_quad((-0.5, -0.5, 0), (1, 0, 0), (0, 1, 0)), (_FLAT, _FLAT)),),
     "cube": tuple(_Surface(q, (_FLAT, _FLAT)) for q in _CUBE),
     "room": tuple(_Surface(q, (_FLAT, _FLAT)) for q in _CUBE),
-    "sphere": (_Surface(_sphere, (_ROUND, _ROUND // 2)),),
-    "cylinder": (
-        _Surface(_side(1), (_ROUND, _FLAT)),
-        _Surface(_disc(-0.5, 1), (_ROUND, _FLAT)),
-        _Surface(_disc(0.5, -1), (_ROUND, _FLAT)),
-    ),
-    "cone": (_Surface(_side(0), (_ROUND, _FLAT), weld=False), _Surface(_disc(0.5, -1), (_ROUND, _FLAT))),
-    "torus": (_Surface(_torus, (_ROUND, _ROUND // 2)),),
+    "sphere": (_Surface(_SPHERE, (_ROUND, _ROUND // 2)),),
+    "cylinder": tuple(_Surface(p, (_ROUND, _FLAT)) for p in (_CYLINDER, _TOP, _BOTTOM)),
+    "cone": (_Surface(_CONE, (_ROUND, _FLAT), weld=False), _Surface(_BOTTOM, (_ROUND, _FLAT))),
+    "torus": (_Surface(_TORUS, (_ROUND, _ROUND // 2)),),
 }
 
 _INSIDE: dict[Shape, Callable[[float, float, float], bool]] = {

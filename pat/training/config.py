@@ -151,9 +151,8 @@ class TrainConfig:
                 raise ValueError(f"{name} is a share of the batches, 0 to 1, got {share:g}")
             if bool(share) != bool(folders):
                 found = "there is no folder" if share else f"{folders[0]} is given"
-                raise ValueError(
-                    f"{name} is {share:g} and {found}: give both `{name}` and `{name}_from`, or neither"
-                )
+                both = f"give both `{name}` and `{name}_from`, or neither"
+                raise ValueError(f"{name} is {share:g} and {found}: {both}")
         total = self.rendered + self.pairs + self.measured
         if total > 1:
             raise ValueError(f"rendered, pairs and measured are shares of the batches, {total:g} in all")
@@ -171,9 +170,8 @@ def load_config(name: str | Path) -> TrainConfig:
     """
     path = next((p for p in (RECIPES / f"{name}.yaml", Path(name)) if p.is_file()), None)
     if path is None:
-        raise FileNotFoundError(
-            f"no recipe '{name}' (it is a file or a name of the package){near(name, recipes())}"
-        )
+        known = near(name, recipes())
+        raise FileNotFoundError(f"no recipe '{name}' (it is a file or a name of the package){known}")
     return parse_config(path.read_text(encoding="utf-8"), str(path))
 
 
@@ -210,8 +208,7 @@ def save_config(config: TrainConfig, path: Path) -> None:
     """Write `config_text` atomically."""
     from arraygeom.atomic import write_text
 
-    text = config_text(config)
-    write_text(path, text)
+    write_text(path, config_text(config))
 
 
 def command_line(arguments: list[str]) -> TrainConfig:

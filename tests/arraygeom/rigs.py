@@ -5,9 +5,10 @@ import math
 import torch
 from torch import Tensor
 
-from arraygeom import Camera, Pose, Rig, intrinsics, rotation_from_vector
+from arraygeom import Camera, Distortion, Pair, Pose, Rig, intrinsics, rotation_from_vector
 
 HW_ALPHA, HW_BETA = (48, 64), (40, 60)
+PAIRS_HW = (800, 1280)
 
 
 def uniform(g: torch.Generator, low: float, high: float, *shape: int) -> Tensor:
@@ -60,3 +61,22 @@ def two_cameras(
 def half_rotation() -> Tensor:
     """Looking back: half a turn about y."""
     return rotation_from_vector(torch.tensor([0.0, math.pi, 0.0], dtype=torch.float64))
+
+
+def pairs(lens: Distortion | None = None) -> list[Pair]:
+    """One alpha and three betas about 10 cm apart, turned by a degree or two."""
+    K = intrinsics(900.0, PAIRS_HW)
+    places = torch.tensor(
+        [[0, 0, 0], [0.1, 0.02, 0], [-0.1, 0.01, 0.03], [0.02, 0.12, -0.02]], dtype=torch.float64
+    )
+    cameras = [
+        Camera(
+            K=K,
+            cam_from_world=Pose.from_centre(rotation_from_vector(0.3 * p), p),
+            hw=PAIRS_HW,
+            distortion=lens,
+        )
+        for p in places
+    ]
+    depth = (torch.tensor(1.0, dtype=torch.float64), torch.tensor(20.0, dtype=torch.float64))
+    return [Pair(cameras[0], beta, depth) for beta in cameras[1:]]

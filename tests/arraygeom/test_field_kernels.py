@@ -7,9 +7,8 @@ import torch
 
 from arraygeom import Curved, Distortion, NearestVoxels, Pair, pixel_grid
 from arraygeom.compiled import can_compile
-from tests.arraygeom.rigs import random_rig
+from tests.arraygeom.rigs import pairs, random_rig
 from tests.arraygeom.test_curved import fisheye_rig
-from tests.benchmarks.bench_fields import pairs
 
 BROWN = [-0.2, 0.05, 0.001, -0.0005, 0.01, 0.02, 0.01, 0.003, 0.001, 0.002, -0.001, 0.0005]
 LENSES = {

@@ -135,7 +135,7 @@ def rendered(boards: Path) -> Iterator[Figure]:
     worst = int(np.abs(relative).argmax())
     square = float(errors @ np.linalg.solve(found.fit.covariance, errors))
     yield Figure("rendered photographs", f"{len(found.frames)} frames, 4 cameras", "10 or more")
-    noise = ", ".join(f"{name} {sigma:.3f}" for name, sigma in found.fit.sigma.items())
+    noise = ", ".join(f"{name} {sigma:.3f}" for name, sigma in found.fit.problem.sigma.items())
     yield Figure("noise of corners", f"{noise} px", "")
     yield Figure("worst rotation", f"{degrees:.4f} degrees", "at most 0.02")
     yield Figure("worst position", f"{1e3 * metres:.3f} mm", "at most 0.2")

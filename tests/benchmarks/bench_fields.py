@@ -16,7 +16,6 @@ import torch
 import tyro
 
 from arraygeom import (
-    Camera,
     Curved,
     Distortion,
     Epipolar,
@@ -25,34 +24,18 @@ from arraygeom import (
     Local,
     NearestVoxels,
     Pair,
-    Pose,
     ReceptiveField,
     Rectified,
     Widened,
-    intrinsics,
     pixel_grid,
-    rotation_from_vector,
     sampling_locations,
 )
+from tests.arraygeom.rigs import PAIRS_HW as HW
+from tests.arraygeom.rigs import pairs
 from tests.benchmarks.printed import timed
 
-HW = (800, 1280)
 RUNS = 5
 SAMPLE = 500
-
-
-def pairs(lens: Distortion | None = None) -> list[Pair]:
-    """One alpha and three betas about 10 cm apart, turned by a degree or two."""
-    K = intrinsics(900.0, HW)
-    places = torch.tensor(
-        [[0, 0, 0], [0.1, 0.02, 0], [-0.1, 0.01, 0.03], [0.02, 0.12, -0.02]], dtype=torch.float64
-    )
-    cameras = [
-        Camera(K=K, cam_from_world=Pose.from_centre(rotation_from_vector(0.3 * p), p), hw=HW, distortion=lens)
-        for p in places
-    ]
-    depth = (torch.tensor(1.0, dtype=torch.float64), torch.tensor(20.0, dtype=torch.float64))
-    return [Pair(cameras[0], beta, depth) for beta in cameras[1:]]
 
 
 def pixel_by_pixel(pair: Pair, x: np.ndarray, *, count: int = 96, window: int = 80) -> np.ndarray:

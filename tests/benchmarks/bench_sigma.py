@@ -78,7 +78,7 @@ def rows(data: Path) -> Iterator[str]:
         cells = f"{np.median(ratio):.2f}", f"{np.mean(near):.0%}", f"{np.mean(focal):.2f}"
         count = len(found.fit.problem.frames)
         yield markdown_row(
-            [name, count, f"{found.rms:.3f}", len(ratio), *cells, f"{found.raised:.1f}", shape or "flat"]
+            [name, count, f"{found.rms:.3f}", len(ratio), *cells, f"{found.fit.raised:.1f}", shape or "flat"]
         )
     yield "\n".join(["", "Stated / jackknife of the parameters that are not within 30 %:", "", *notes])
 

@@ -15,17 +15,16 @@ from statistics import median
 import torch
 import tyro
 
-from arraygeom.fields import FIELDS
 from pat.evaluation.ablation import sample_photographs
 from pat.networks.weights import Network, new_network, set_precision
 from pat.training.config import TrainConfig, load_config
 from pat.training.losses import Objective
-from pat.training.samples import Sample, SampleSource, source_of
+from pat.training.samples import Sample, SampleSource
 from tests.benchmarks.printed import spread, timed
 
 
 def source(config: TrainConfig) -> SampleSource:
-    return source_of(config, sample_photographs(), 0, FIELDS[config.field]())
+    return SampleSource(config, sample_photographs(), 0)
 
 
 def stepped(objective: Objective, given: Sample, repeats: int) -> list[float]:

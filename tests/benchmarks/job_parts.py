@@ -26,7 +26,7 @@ STAGES = {
     "attention": ["pat.attention.attend._attend"],
     "network": ["pat.networks.guided.GuidedPAT.forward"],
     "depth": ["pat.fusion.tiles.measured_depth", "pat.fusion.fuse.background_filled"],
-    "write": ["pat.fusion.results.save_frame", "pat.fusion.report.write_report"],
+    "write": ["pat.fusion.results.save_frame", "pat.fusion.report.report_page"],
 }
 """What is counted as each part, without the parts within it."""
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..scene import Light, Material, Object, Paint, Scene, Texture, TextureKind, World
+from ..scene import Light, Object, Paint, Scene, Texture, TextureKind, World
 from ..shapes import mesh
 from . import compat
 
@@ -41,13 +41,18 @@ def build(bpy: Any, scene: Scene, world: Any) -> BuiltScene:
         stage.objects.append(item)
     for light in scene.lights:
         _light(bpy, light, stage)
-    _world(world, scene.world, stage)
+    sky, shown = world.node_tree.nodes["Background"].inputs["Color"], scene.world
+    stage.paints.append(lambda spectrum: _set_colour(sky, "default_value", spectrum, shown))
     return stage
 
 
 def colour(spectrum: Spectrum, rgb: tuple[float, float, float], nir: float) -> tuple[float, float, float]:
     """What a spectrum's image shows: near infrared in all three channels."""
     return rgb if spectrum == "rgb" else (nir, nir, nir)
+
+
+def _set_colour(item: Any, name: str, spectrum: Spectrum, shown: Paint | World) -> None:
+    setattr(item, name, (*colour(spectrum, shown.rgb, shown.nir), 1.0))
 
 
 def _object(bpy: Any, thing: Object) -> Any:
@@ -65,10 +70,13 @@ def _object(bpy: Any, thing: Object) -> Any:
     return item
 
 
+_SIZES = {"area": "size", "sun": "angle", "point": "shadow_soft_size"}
+
+
 def _light(bpy: Any, light: Light, stage: BuiltScene) -> None:
     data = bpy.data.lights.new(light.kind, light.kind.upper())
     data.energy = light.power
-    _set_size(data, light)
+    setattr(data, _SIZES[light.kind], light.size)
     item = bpy.data.objects.new(light.kind, data)
     item.location = light.position
     item.rotation_mode = "QUATERNION"
@@ -76,15 +84,6 @@ def _light(bpy: Any, light: Light, stage: BuiltScene) -> None:
     item.visible_camera = False
     bpy.context.scene.collection.objects.link(item)
     stage.paints.append(lambda spectrum: setattr(data, "color", colour(spectrum, light.rgb, light.nir)))
-
-
-def _set_size(data: Any, light: Light) -> None:
-    if light.kind == "area":
-        data.size = light.size
-    elif light.kind == "sun":
-        data.angle = light.size
-    else:
-        data.shadow_soft_size = light.size
 
 
 def _towards(direction: tuple[float, float, float]) -> tuple[float, float, float, float]:
@@ -95,15 +94,6 @@ def _towards(direction: tuple[float, float, float]) -> tuple[float, float, float
     q = np.array([1 - d[2], d[1], -d[0], 0.0])
     w, x, y, z = q / np.linalg.norm(q)
     return w, x, y, z
-
-
-def _world(world: Any, given: World, stage: BuiltScene) -> None:
-    background = world.node_tree.nodes["Background"]
-
-    def paint(spectrum: Spectrum) -> None:
-        background.inputs["Color"].default_value = (*colour(spectrum, given.rgb, given.nir), 1.0)
-
-    stage.paints.append(paint)
 
 
 # Materials --------------------------------------------------------------------------------------------------
@@ -129,12 +119,9 @@ class _Nodes:
             socket.default_value = value
 
     def vector(self, operation: str, *values: Any) -> Any:
-        return self._computed("VectorMath", operation, values)
+        return self.number(operation, *values, kind="VectorMath")
 
-    def number(self, operation: str, *values: Any) -> Any:
-        return self._computed("Math", operation, values)
-
-    def _computed(self, kind: str, operation: str, values: tuple[Any, ...]) -> Any:
+    def number(self, operation: str, *values: Any, kind: str = "Math") -> Any:
         node = self.new(kind, operation=operation)
         for socket, value in zip(node.inputs, values):
             self.give(socket, value)
@@ -156,7 +143,14 @@ def _material(bpy: Any, thing: Object, stage: BuiltScene) -> Any:
     nodes = _Nodes(made.node_tree)
     shader = made.node_tree.nodes["Principled BSDF"]
     paint, height = _texture(bpy, nodes, material.texture, stage)
-    for name, value in _principled(material).items():
+    inputs = {
+        "Roughness": material.roughness,
+        "Specular IOR Level": material.specular,
+        "Metallic": material.metallic,
+        "Transmission Weight": material.transmission,
+        "Emission Strength": material.emission,
+    }
+    for name, value in inputs.items():
         shader.inputs[name].default_value = value
     nodes.give(shader.inputs["Base Color"], paint)
     if material.emission:
@@ -167,16 +161,6 @@ def _material(bpy: Any, thing: Object, stage: BuiltScene) -> Any:
         nodes.give(bump.inputs["Height"], height)
         nodes.give(shader.inputs["Normal"], bump.outputs[0])
     return made
-
-
-def _principled(material: Material) -> dict[str, float]:
-    return {
-        "Roughness": material.roughness,
-        "Specular IOR Level": material.specular,
-        "Metallic": material.metallic,
-        "Transmission Weight": material.transmission,
-        "Emission Strength": material.emission,
-    }
 
 
 def _texture(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene) -> tuple[Any, Any]:
@@ -206,7 +190,7 @@ def _set_ramp(ramp: Any, texture: Texture) -> None:
 
 def _paint_ramp(ramp: Any, paints: tuple[Paint, ...], spectrum: Spectrum) -> None:
     for stop, paint in zip(ramp.elements, paints):
-        stop.color = (*colour(spectrum, paint.rgb, paint.nir), 1.0)
+        _set_colour(stop, "color", spectrum, paint)
 
 
 def _coordinates(nodes: _Nodes, texture: Texture, source: str = "Object", scale: float = 1.0) -> Any:
@@ -274,9 +258,8 @@ def _image(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene) -> Any:
     node = nodes.new("TexImage", image=image, extension="MIRROR")
     w, h = 1 / texture.scale, image.size[1] / image.size[0] / texture.scale
     onto = (1 / w, -1 / h, 0), (texture.offset[0], 1 + texture.offset[1], 0)
-    nodes.give(
-        node.inputs["Vector"], nodes.vector("MULTIPLY_ADD", nodes.new("TexCoord").outputs["UV"], *onto)
-    )
+    where = nodes.vector("MULTIPLY_ADD", nodes.new("TexCoord").outputs["UV"], *onto)
+    nodes.give(node.inputs["Vector"], where)
     rgb = node.outputs["Color"]
     infrared = nodes.vector("SUBTRACT", _infrared(nodes, rgb), rgb)
     mix = nodes.vector("MULTIPLY_ADD", infrared, (0, 0, 0), rgb)

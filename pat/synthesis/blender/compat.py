@@ -13,8 +13,6 @@ LIBRARIES = "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1"
 PYTHONS = "Python 3.11 (bpy 4.5 and 5.0) or 3.13 (5.1 and newer)"
 INSTALL = "pip install 'arraygeom-pat[synthesis]'"
 
-_INDEX = "Object Index.X", "IndexOB.X"
-
 
 def load() -> Any:
     """The module bpy. Raises ValueError with what to install, in one line."""
@@ -23,21 +21,15 @@ def load() -> Any:
     except ModuleNotFoundError as error:
         if error.name != "bpy":
             raise ValueError(f"Blender needs the Python package {error.name}: {INSTALL}") from None
-        raise ValueError(_not_installed(sys.version_info[:2])) from None
+        text, (major, minor, *_) = "rendering needs Blender as a Python module", sys.version_info
+        if (major, minor) in ((3, 11), (3, 13)):
+            raise ValueError(f"{text}: {INSTALL}") from None
+        raise ValueError(f"{text}, which exists for {PYTHONS}; this is {major}.{minor}") from None
     except ImportError as error:
         library = str(error).partition(":")[0]
         raise ValueError(
             f"Blender needs system libraries ({library} is missing): apt-get install -y {LIBRARIES}"
         ) from None
-
-
-def _not_installed(version: tuple[int, int]) -> str:
-    if version in ((3, 11), (3, 13)):
-        return f"rendering needs Blender as a Python module: {INSTALL}"
-    return (
-        f"rendering needs Blender as a Python module, which exists for {PYTHONS}; "
-        f"this is {version[0]}.{version[1]}"
-    )
 
 
 def new_scene(bpy: Any) -> Any:
@@ -75,7 +67,7 @@ def factor(node: Any) -> Any:
 
 def index_name(channels: Mapping[str, Any]) -> str:
     """The channel of the object index among those of a file."""
-    return next(name for name in _INDEX if name in channels)
+    return next(name for name in ("Object Index.X", "IndexOB.X") if name in channels)
 
 
 def use_gpu(bpy: Any) -> bool:

@@ -48,9 +48,8 @@ class Lens(NamedTuple):
         """Values as they are at the nearest pixels; 0 where the lens sees nothing."""
         if self.x is None or self.valid is None:
             return image
-        return torch.where(
-            self.valid, sample(image[None], self.x[None].to(image), interpolation="nearest").values[0], 0
-        )
+        values = sample(image[None], self.x[None].to(image), interpolation="nearest").values[0]
+        return torch.where(self.valid, values, 0)
 
     def depth(self, depth: Float[Tensor, "h1 w1"], index: Int[Tensor, "h1 w1"]) -> Float[Tensor, "h2 w2"]:
         """Depth along exact rays, exact on planes: beside edges the nearest pixel's surface is extrapolated.
@@ -90,9 +89,7 @@ def lens_for(camera: View, name: str) -> Lens:
     if not isinstance(camera, Camera):
         raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")
     if camera.K.ndim != 2:
-        raise ValueError(
-            f"camera '{name}' is batched over {tuple(camera.K.shape[:-2])}: render one rig at a time"
-        )
+        raise ValueError(f"camera '{name}' is batched {tuple(camera.K.shape[:-2])}: render one rig at a time")
     camera = camera.to(dtype=torch.float64, device="cpu")
     upright = _upright(camera, name)
     if camera.distortion is None:
@@ -109,14 +106,10 @@ def _upright(camera: Camera, name: str) -> Camera:
     Q = torch.stack([torch.stack([c, -s, zero]), torch.stack([s, c, zero]), torch.stack([zero, zero, one])])
     K = K @ Q.T
     if abs(float(K[0, 1])) > 1e-9 * float(K[0, 0].abs()):
-        raise ValueError(
-            f"camera '{name}' has skew (K[0, 1] = {float(K[0, 1]):.4g}), "
-            "which Blender's cameras cannot have: set it to 0, or calibrate without skew"
-        )
+        skew = f"skew (K[0, 1] = {float(K[0, 1]):.4g}), which Blender's cameras cannot have"
+        raise ValueError(f"camera '{name}' has {skew}: set it to 0, or calibrate without skew")
     if not (K[0, 0] > 0 and K[1, 1] > 0):
-        raise ValueError(
-            f"camera '{name}' mirrors its image (K has determinant below 0): flip the image instead"
-        )
+        raise ValueError(f"camera '{name}' mirrors its image (K has det below 0): flip the image instead")
     K = K.clone()
     K[0, 1] = K[1, 0] = 0
     return camera.replace(K=K, cam_from_world=Pose(Q @ camera.R, Q @ camera.t), distortion=None)
@@ -127,23 +120,18 @@ def _wide(camera: Camera, upright: Camera, name: str) -> Lens:
     rays, valid = camera.rays(pixel_grid(camera.hw, dtype=torch.float64))
     rays = rays @ (upright.R @ camera.R.T).T
     if not valid.any():
-        raise ValueError(
-            f"camera '{name}': its lens model is not valid for any pixel; check the coefficients"
-        )
+        raise ValueError(f"camera '{name}': its lens model is valid for no pixel; check the coefficients")
     angle = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])[valid].max()
     if angle > WIDEST:
-        raise ValueError(
-            f"camera '{name}' sees {math.degrees(angle):.0f} degrees off its axis; "
-            f"a plane image covers at most {math.degrees(WIDEST):.0f}: crop the camera"
-        )
+        seen, most = (f"{math.degrees(a):.0f}" for a in (angle, WIDEST))
+        text = f"camera '{name}' sees {seen} degrees off its axis; a plane image covers at most {most}"
+        raise ValueError(f"{text}: crop the camera")
     plane = rays[..., :2] / rays[..., 2:].clamp(min=1e-6)
     f = float(_finest(plane, valid))
     low, high = (f * plane[valid].amin(0)).floor() - _MARGIN, (f * plane[valid].amax(0)).ceil() + _MARGIN
     w, h = (int(n) for n in high - low + 1)
     if w * h > _MOST_PIXELS:
-        raise ValueError(
-            f"camera '{name}': its lens needs an undistorted image of {w}x{h} pixels: crop the camera"
-        )
+        raise ValueError(f"camera '{name}': its lens needs an image of {w}x{h} pixels: crop the camera")
     K = torch.tensor([[f, 0, -float(low[0])], [0, f, -float(low[1])], [0, 0, 1]], dtype=torch.float64)
     x = map_homogeneous(K[:2], plane)
     return Lens(upright.replace(K=K, hw=(h, w)), x, valid)

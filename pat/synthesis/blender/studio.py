@@ -50,7 +50,13 @@ class Studio:
         self.blender.frame_set(1)
         self._aim(camera)
         self.stage.show(spectrum)
-        return self._shoot()
+        path = self.scratch / "layers.exr"
+        self.blender.render.filepath = str(path)
+        with quietly():
+            self.bpy.ops.render.render(write_still=True)
+        channels = read_layers(path)
+        path.unlink()
+        return channels
 
     def close(self) -> None:
         """Drop Blender's persistent data: until then one of its threads spins, half a core."""
@@ -66,9 +72,8 @@ class Studio:
         cycles.use_denoising = s.denoise != "none"
         cycles.denoiser = "OPENIMAGEDENOISE"
         cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
-        cycles.denoising_quality, cycles.denoising_prefilter = (
-            ("HIGH", "ACCURATE") if s.denoise == "accurate" else ("FAST", "FAST")
-        )
+        cycles.denoising_quality = "HIGH" if s.denoise == "accurate" else "FAST"
+        cycles.denoising_prefilter = "ACCURATE" if s.denoise == "accurate" else "FAST"
         self._light_paths()
         render.use_persistent_data = True
         render.dither_intensity = 0
@@ -113,15 +118,6 @@ class Studio:
         data.shift_y = (float(K[1, 2]) + 0.5 - h / 2) * aspect / w
         data.clip_start, data.clip_end = 1e-3, 1e5
         self.camera.matrix_world = _blender_pose(camera).T.tolist()
-
-    def _shoot(self) -> dict[str, Tensor]:
-        path = self.scratch / "layers.exr"
-        self.blender.render.filepath = str(path)
-        with quietly():
-            self.bpy.ops.render.render(write_still=True)
-        channels = read_layers(path)
-        path.unlink()
-        return channels
 
 
 def read_layers(path: Path) -> dict[str, Tensor]:

@@ -79,7 +79,7 @@ def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) 
             "versions": {"blender": studio.bpy.app.version_string, "pat": version("arraygeom-pat")},
             "seconds": round(time.monotonic() - started, 3),
             "frames": files,
-            "check": check_views(rig, first, settings.limits).to_document(),
+            "check": check_views(rig, first, settings.limits),
         }
         (folder / RENDER_FILE).write_text(json.dumps(about, indent=1), encoding="utf-8")
     return Rendered(out)
@@ -112,10 +112,8 @@ def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
         centre = rig[shot.camera].centre.detach().cpu().double().numpy()
         for item in scene.objects:
             if inside(item, centre, shot.time):
-                raise ValueError(
-                    f"camera '{shot.camera}' is inside the object '{item.name}' "
-                    f"at {shot.time:g} s: move one of them"
-                )
+                where = f"inside the object '{item.name}' at {shot.time:g} s"
+                raise ValueError(f"camera '{shot.camera}' is {where}: move one of them")
 
 
 def take(studio: Studio, lens: Lens, shot: Shot) -> RenderedFrame:
@@ -124,9 +122,7 @@ def take(studio: Studio, lens: Lens, shot: Shot) -> RenderedFrame:
     index = found[compat.index_name(found)].round().int()
     depth = torch.where(found["Depth.Z"] < NOTHING, found["Depth.Z"], torch.inf)
     if not (index > 0).any():
-        raise ValueError(
-            f"camera '{shot.camera}' sees nothing of the scene at {shot.time:g} s: rotate it or move it"
-        )
+        raise ValueError(f"camera '{shot.camera}' sees nothing at {shot.time:g} s: rotate it or move it")
     nir = None
     if studio.settings.infrared:
         nir = lens.resampled(studio.channels(lens.pinhole, shot.time, "nir")["Combined.R"][None])
@@ -161,17 +157,7 @@ def _scratch() -> Iterator[Path]:
     where = _SHARED_MEMORY if os.access(_SHARED_MEMORY, os.W_OK) else None
     for left in _SHARED_MEMORY.glob(f"{_SCRATCH}*") if where else ():
         owner = left.name.removeprefix(_SCRATCH).partition("-")[0]
-        if owner.isdecimal() and not _alive(int(owner)):
+        if owner.isdecimal() and not Path(f"/proc/{owner}").exists():
             shutil.rmtree(left, ignore_errors=True)
     with tempfile.TemporaryDirectory(dir=where, prefix=f"{_SCRATCH}{os.getpid()}-") as folder:
         yield Path(folder)
-
-
-def _alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return True

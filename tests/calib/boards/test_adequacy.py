@@ -12,7 +12,7 @@ from calib.boards.bundle import camera_jacobian, parameter_names
 from calib.boards.intrinsics import board_pose
 from calib.boards.report import by_cameras
 from calib.boards.rig import calibrate
-from calib.boards.run import watch
+from calib.boards.run import _advice, watch
 from calib.boards.simulation import simulate_photos
 from calib.boards.solve import misfit_notes
 from calib.boards.target import parse_board
@@ -44,10 +44,8 @@ def test_lenses_that_there_are_not():
 def test_an_adjustment_that_goes_on_is_said(found):
     """It was known, and read by nobody."""
     going = "the adjustment has not come to rest"
-    assert [going in " ".join(misfit_notes(replace(found.fit, converged=c))) for c in (True, False)] == [
-        False,
-        True,
-    ]
+    for converged in (True, False):
+        assert (going in " ".join(misfit_notes(replace(found.fit, converged=converged)))) != converged
 
 
 def test_projections_are_off_by_what_is_said(found):
@@ -58,9 +56,8 @@ def test_projections_are_off_by_what_is_said(found):
     parts = []
     for points in (torch.from_numpy(known.seen), X):
         off = true.project_local(points).x - known.camera.project_local(points).x
-        parts.append(
-            (off.numpy().ravel(), camera_jacobian(known.camera, points.numpy())[..., :6].reshape(-1, 6))
-        )
+        by_pose = camera_jacobian(known.camera, points.numpy())[..., :6].reshape(-1, 6)
+        parts.append((off.numpy().ravel(), by_pose))
     (at_boards, pose), (off, by_pose) = parts
     off = off - by_pose @ np.linalg.lstsq(pose, at_boards, rcond=None)[0]
     off = np.linalg.norm(off.reshape(-1, 2), axis=1)
@@ -77,9 +74,8 @@ def test_points_far_beyond_the_boards_are_less_certain(found):
 
 def test_halves_are_compared_only_where_boards_were_seen():
     """Boards in the middle of the image: nothing is said of its corners, where the lens is extrapolated."""
-    fit = calibrate(
-        see(Rig({"cam": TRUE}), board_poses(10, spread=0.05, depth=(1.6, 2.4)), noise=0.2), BOARD
-    ).fit
+    boards = board_poses(10, spread=0.05, depth=(1.6, 2.4))
+    fit = calibrate(see(Rig({"cam": TRUE}), boards, noise=0.2), BOARD).fit
     x, _ = half_difference(fit, 1.5)["cam"]
     seen = fit.problem.seen["cam"].x
     assert 20 < len(x) < 200
@@ -113,18 +109,15 @@ FISHEYES = {
 def test_fisheyes_of_each_model_are_found(lens):
     model, coefficients, focal = FISHEYES[lens]
     true = camera(focal, (480, 640), lens=coefficients, model=model)
-    found = calibrate(
-        see(Rig({"a": true}), board_poses(12, depth=(0.4, 0.9), spread=0.7), noise=0.05), BOARD, lens=lens
-    )
+    boards = board_poses(12, depth=(0.4, 0.9), spread=0.7)
+    found = calibrate(see(Rig({"a": true}), boards, noise=0.05), BOARD, lens=lens)
     assert found.rms == pytest.approx(0.05 * 2**0.5, rel=0.1)
     if lens == "double-sphere":  # whose xi and focal length stand for one another: it is fixed at 0
         assert [note for note in found.notes if "xi" in note]
     else:
         assert len(found.fit.names) == 4 + len(coefficients), "all of them are determined"
-        assert (
-            np.abs(errors_of(found.fit, Rig({"a": true})) / np.sqrt(found.fit.covariance.diagonal())).max()
-            < 4
-        )
+        deviations = np.sqrt(found.fit.covariance.diagonal())
+        assert np.abs(errors_of(found.fit, Rig({"a": true})) / deviations).max() < 4
 
 
 @pytest.mark.parametrize(
@@ -145,10 +138,8 @@ def test_one_fisheye_by_another_model(lens):
 
 
 def test_halves_differ_by_no_more_than_their_uncertainty(found):
-    (x, off), (_, deviation) = (
-        half_difference(found.fit, 1.5)["cam"],
-        uncertainty(intrinsics_of(found.fit, "cam"), 1.5),
-    )
+    x, off = half_difference(found.fit, 1.5)["cam"]
+    _, deviation = uncertainty(intrinsics_of(found.fit, "cam"), 1.5)
     assert len(x) == len(off)
     assert 0.3 < np.median(np.linalg.norm(off, axis=1)) / np.median(deviation) < 6
 
@@ -182,12 +173,8 @@ def test_tilts_are_named_by_the_edge_that_is_nearer():
 def test_the_simplest_of_equal_lenses_is_advised():
     g = np.random.default_rng(0)
     base = g.uniform(0.9, 1.1, 20)
-    errors = {
-        "none": 4 * base,
-        "brown-conrady": base + g.normal(0, 1e-3, 20),
-        "rational": base,
-        "tilted": 1.2 * base,
-    }
+    brown = base + g.normal(0, 1e-3, 20)
+    errors = {"none": 4 * base, "brown-conrady": brown, "rational": base, "tilted": 1.2 * base}
     assert LensComparison(errors).advised == "brown-conrady"
     assert LensComparison({**errors, "rational": 0.8 * base}).advised == "rational"
     assert "brown-conrady 1.0" in LensComparison(errors).advice
@@ -211,11 +198,8 @@ def test_a_lens_that_sees_the_board_behind_it_gives_no_pose():
     ],
 )
 def test_the_lens_that_the_images_support_is_advised(lens, advised):
-    views = see(
-        Rig({"c": camera(420.0, (480, 640), lens=lens)}),
-        board_poses(12, seed=3, spread=0.7, depth=(0.6, 1.6)),
-        noise=0.05,
-    )
+    boards = board_poses(12, seed=3, spread=0.7, depth=(0.6, 1.6))
+    views = see(Rig({"c": camera(420.0, (480, 640), lens=lens)}), boards, noise=0.05)
     assert compare_lenses(views, BOARD)["c"].advised == advised
 
 
@@ -279,3 +263,10 @@ def test_what_was_detected_is_shown_before_it_is_calibrated(tmp_path, monkeypatc
 def test_notes_of_several_cameras_are_one():
     notes = ["a: no points: here", "b: no points: here", "held to the start", "b: bent", "a: no points: here"]
     assert by_cameras(notes) == ["a, b: no points: here", "held to the start", "b: bent"]
+
+
+def test_what_a_fit_does_not_determine_gives_no_advice(found):
+    """The watched folder's page failed on it."""
+    said = _advice(replace(found, fit=replace(found.fit, covariance=None)), "cam")
+    assert "Focal length" in said
+    assert "Next: " not in said

@@ -30,7 +30,6 @@ from tests.calib.board_scenes import (
     camera,
     errors_of,
     four_cameras,
-    pose_errors,
     scene_of,
     see,
     tensor,
@@ -62,8 +61,7 @@ def shaken(problem, size, seed=0):
 @pytest.fixture(scope="module")
 def small():
     """Two cameras, eight boards, noise of 0.1 px; the ground truth."""
-    rig = four_cameras()
-    rig = Rig({name: rig[name] for name in ("mono", "colour")})
+    rig = Rig({name: four_cameras()[name] for name in ("mono", "colour")})
     boards = board_poses(8, spread=0.2)
     return rig, boards, scene_of(rig, boards, see(rig, boards, noise=0.1))
 
@@ -71,25 +69,20 @@ def small():
 @pytest.mark.parametrize(
     ("lens", "model"),
     [
-        ((), ""),
+        ((), "none"),
         ((-0.3, 0.1, 0.001, -0.002, 0.02), "brown-conrady"),
         ((5.7, 1.6, 6e-5, -7e-5, -0.1, 6.0, 3.1, 0.0), "brown-conrady"),
         ((0.02, -0.01, 0.003, 0.0), "kannala-brandt"),
     ],
 )
 def test_derivatives_are_those_of_finite_differences(lens, model):
-    c = camera(
-        (520.0, 530.0), (480, 640), (0.1, -0.2, 0.3), (4.0, -9.0, 70.0), lens, model or "brown-conrady"
-    )
+    c = camera((520.0, 530.0), (480, 640), (0.1, -0.2, 0.3), (4.0, -9.0, 70.0), lens, model)
     X = np.random.default_rng(0).normal((0.0, 0.1, 2.0), (0.4, 0.3, 0.3), (40, 3))
     found = camera_jacobian(c, X)
-    for i, name in enumerate(parameter_names(c)):
-        step = torch.zeros(found.shape[-1], dtype=torch.float64)
-        step[i] = 1e-6
+    for i, step in enumerate(1e-6 * torch.eye(found.shape[-1], dtype=torch.float64)):
         ends = [changed(c, s * step).project(torch.from_numpy(X)).x.numpy() for s in (1, -1)]
-        assert np.abs((ends[0] - ends[1]) / 2e-6 - found[..., i]).max() < 1e-5 * (
-            1 + np.abs(found[..., i]).max()
-        ), name
+        expected = (ends[0] - ends[1]) / 2e-6
+        assert np.abs(expected - found[..., i]).max() < 1e-5 * (1 + np.abs(found[..., i]).max()), i
 
 
 def test_derivatives_of_boards(small):
@@ -155,7 +148,7 @@ def test_the_least_squares_are_scipys(small):
 
     def residuals(change):
         moved = fit.problem.stepped(change[:count], change[count:].reshape(-1, 6))
-        return np.concatenate([(r / fit.sigma[n]).ravel() for n, r in moved.residuals.items()])
+        return np.concatenate([(r / fit.problem.sigma[n]).ravel() for n, r in moved.residuals.items()])
 
     theirs = least_squares(residuals, np.zeros(count + 48), x_scale="jac", max_nfev=4)
     assert 2 * theirs.cost == pytest.approx(float((residuals(np.zeros(count + 48)) ** 2).sum()), rel=2e-3)
@@ -185,13 +178,11 @@ def test_outliers_have_no_influence(small):
     x = problem.seen["mono"].x.copy()
     x[::40] += np.random.default_rng(1).uniform(20, 60, x[::40].shape)
     fit = adjust(replace(problem, seen={**problem.seen, "mono": problem.seen["mono"]._replace(x=x)}))
-    deviations = np.sqrt(clean.covariance.diagonal())
-    for i, name in enumerate(clean.names):
-        camera_name, kind, index = name.split(".")
-        if kind == "focal":
-            a, b = (f.problem.cameras[camera_name].K[int(index), int(index)] for f in (fit, clean))
-            assert abs(float(a - b)) < 1.5 * deviations[i]
-    assert fit.sigma["mono"] == pytest.approx(0.1, rel=0.25)
+    for name, c in clean.problem.cameras.items():
+        change = (fit.problem.cameras[name].K - c.K).diagonal()[:2].abs().tolist()
+        assert change[0] < 1.5 * clean.deviations[f"{name}.focal.0"]
+        assert change[1] < 1.5 * clean.deviations[f"{name}.focal.1"]
+    assert fit.problem.sigma["mono"] == pytest.approx(0.1, rel=0.25)
 
 
 def test_an_unobservable_scale_has_no_covariance(small):
@@ -215,35 +206,22 @@ def test_fixed_numbers_stay_bit_identical(small):
     fit, started = adjust(started, rounds=1), started.cameras
     assert torch.equal(fit.problem.cameras["mono"].R, started["mono"].R)
     assert torch.equal(fit.problem.cameras["colour"].K.diagonal(), started["colour"].K.diagonal())
-    assert torch.equal(
-        fit.problem.cameras["colour"].distortion.coefficients, started["colour"].distortion.coefficients
-    )
+    assert fit.problem.cameras["colour"].distortion == started["colour"].distortion
 
 
 @pytest.mark.slow
 def test_the_covariance_is_true():
     """Thirty draws of noise: squared errors in the covariance's units are chi-square, each number's too."""
     rig, boards = four_cameras(), board_poses(24)
-    squares, relative, worst = [], [], []
+    squares, relative = [], []
     for draw in range(30):
         ground_truth = scene_of(rig, boards, see(rig, boards, noise=0.15, seed=draw))
         fit = adjust(ground_truth)
         error = errors_of(fit, rig)
         squares.append(error @ np.linalg.solve(fit.covariance, error))
         relative.append(error / np.sqrt(fit.covariance.diagonal()))
-        worst.append(pose_errors(fit, rig))
     count = len(error)
     low, high = chi2.ppf([0.001, 0.999], 30 * count)
-    print(
-        "chi-square",
-        np.sum(squares),
-        "of",
-        30 * count,
-        "worst",
-        np.abs(relative).max(),
-        "poses",
-        np.max(worst, axis=0),
-    )
     assert low < np.sum(squares) < high
     assert 0.9 < np.sqrt(np.mean(np.square(relative))) < 1.1
     assert np.abs(np.mean(relative, axis=0)).max() < 4 / np.sqrt(30)
@@ -253,7 +231,6 @@ def test_the_covariance_is_true():
 def test_fifteen_cameras_fit_better_than_published(shared_data):
     problem = fifteen_cameras(shared_data).problem
     rms, mean = rms_and_mean(adjust(problem).problem)
-    print("rms", rms, "mean", mean)
     assert rms < FIFTEEN_RMS
     assert mean < 0.6
 
@@ -268,7 +245,6 @@ def test_caliscopes_tracks_fit_better_than_published(shared_data):
     free = {name: np.arange(15) < (6 if i else 0) for i, name in enumerate(published.cameras)}
     squares, robust = (adjust(replace(published, free=free), rounds=rounds) for rounds in (0, 4))
     before, after = rms_and_mean(published), rms_and_mean(squares.problem)
-    print("before", before, "least squares", after, "robust", rms_and_mean(robust.problem))
     assert before[0] == pytest.approx(CALISCOPE_RMS, abs=1e-3)
     assert after[0] < before[0]
     assert rms_and_mean(robust.problem)[1] < before[1]
@@ -278,7 +254,6 @@ def test_caliscopes_tracks_fit_better_than_published(shared_data):
 def test_caliscopes_corners_through_all_of_calibrate(shared_data):
     """Rigid boards, cameras not quite synchronised, nothing known before: at most its own RMS."""
     found = calibrate(caliscope_views(shared_data), parse_board(CALISCOPE_BOARD))
-    print("rms", found.rms)
     assert found.rms < CALISCOPE_RMS
     assert any("taken at the same moments" in note for note in found.notes)
 

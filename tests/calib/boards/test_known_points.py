@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Pose, Rig
+from arraygeom import Pose, Rig, rotation_from_vector
 from calib.boards.board import marker_dictionary
 from calib.boards.detect import detect
 from calib.boards.rig import calibrate
@@ -32,18 +32,10 @@ def written(folder, points, head="id,x,y,z"):
 
 
 def seen(board, count=1, noise=0.1):
-    cameras = four_cameras().cameras
-    rig = Rig({name: cameras[name] for name in ("mono", "colour")})
-    vectors = torch.zeros(count, 3, dtype=torch.float64)
-    shift = torch.linspace(0, 0.2, count, dtype=torch.float64)[:, None]
-    poses = Pose(
-        torch.eye(3, dtype=torch.float64).expand(count, 3, 3),
-        vectors + shift + vectors.new_tensor([0, 0, 2.2]),
-    )
-    poses = poses.perturbed(
-        rotation=torch.linspace(-0.5, 0.5, count, dtype=torch.float64)[:, None] * vectors.new_ones(3)
-    )
-    return rig, see(rig, poses, board, noise=noise)
+    rig = Rig({name: four_cameras()[name] for name in ("mono", "colour")})
+    turn, shift = (np.linspace(*ends, count)[:, None] * np.ones(3) for ends in ((-0.5, 0.5), (0.0, 0.2)))
+    R = rotation_from_vector(torch.from_numpy(turn))
+    return rig, see(rig, Pose(R, torch.from_numpy(shift + np.array([0, 0, 2.2]))), board, noise=noise)
 
 
 def test_one_image_of_a_room_is_enough(room):
@@ -57,15 +49,14 @@ def test_one_image_of_a_room_is_enough(room):
 
 
 def test_markers_on_a_wall_need_several_images(tmp_path):
-    wall = parse_board(
-        str(written(tmp_path, in_a_room(40, relief=0.002) @ np.linalg.qr(np.ones((3, 3)) + np.eye(3))[0]))
-    )
+    turned = in_a_room(40, relief=0.002) @ np.linalg.qr(np.ones((3, 3)) + np.eye(3))[0]
+    wall = parse_board(str(written(tmp_path, turned)))
     assert wall.flat
     with pytest.raises(ValueError, match="1 of"):
         calibrate(seen(wall)[1], wall)
     rig, views = seen(wall, count=8)
-    errors = errors_of((found := calibrate(views, wall)).fit, rig) / np.sqrt(found.fit.covariance.diagonal())
-    assert np.abs(errors).max() < 4
+    fit = calibrate(views, wall).fit
+    assert np.abs(errors_of(fit, rig) / np.sqrt(fit.covariance.diagonal())).max() < 4
 
 
 def test_centres_and_corners_of_markers_are_found(tmp_path):
@@ -74,18 +65,11 @@ def test_centres_and_corners_of_markers_are_found(tmp_path):
     for number in range(6):
         left, top = 40 + 200 * (number % 3), 60 + 220 * (number // 3)
         squares[number] = np.array([[0, 0], [90, 12], [80, 130], [-5, 150]]) + np.array([left, top])
-        marker = cv2.copyMakeBorder(
-            cv2.aruco.generateImageMarker(marker_dictionary("4x4_50"), number, 120),
-            *[20] * 4,
-            cv2.BORDER_CONSTANT,
-            value=200,
-        )
-        H, _ = cv2.findHomography(
-            np.array([[20, 20], [139, 20], [139, 139], [20, 139]], float), squares[number].astype(float)
-        )
-        cv2.warpPerspective(
-            marker, H, (640, 480), image, borderMode=cv2.BORDER_TRANSPARENT, flags=cv2.INTER_LINEAR
-        )
+        marker = cv2.aruco.generateImageMarker(marker_dictionary("4x4_50"), number, 120)
+        marker = np.pad(marker, 20, constant_values=200)
+        corners = np.array([[20, 20], [139, 20], [139, 139], [20, 139]], float)
+        H, _ = cv2.findHomography(corners, squares[number].astype(float))
+        cv2.warpPerspective(marker, H, (640, 480), image, cv2.INTER_LINEAR, cv2.BORDER_TRANSPARENT)
     board = parse_board(str(written(tmp_path, in_a_room(6))))
     found = detect(image, board)
     assert found.ids.tolist() == list(range(6))

@@ -9,7 +9,7 @@ import torch
 
 from arraygeom import Pose, Rig, View, rotation_from_vector
 from calib.boards.bundle import changed, parameter_names
-from calib.boards.rig_diff import _projections, rig_difference
+from calib.boards.rig_diff import _projections, draw_difference, rig_difference
 from calib.boards.solve import adjust
 from calib.boards.uncertainty import rig_covariance
 from pat.cli.main import main
@@ -67,28 +67,28 @@ def test_two_hundred_recalibrations(rig, capsys):
     assert moved >= 0.95
 
 
+TURNED = rotation_from_vector(torch.tensor([0.3, -0.2, 0.5]).double())
+WORLD = Pose(TURNED, torch.tensor([1.0, 2.0, -0.5]).double())
+"""Another world than the rig's, from it."""
+
+
+def set_up_in(world, rig):
+    poses = {n: c.cam_from_world @ world.inverse() for n, c in rig.cameras.items()}
+    return Rig({n: c.replace(cam_from_world=poses[n]) for n, c in rig.cameras.items()})
+
+
 def test_a_motion_of_the_whole_rig_is_no_difference(rig):
-    world = Pose(
-        rotation_from_vector(torch.tensor([0.3, -0.2, 0.5]).double()), torch.tensor([1.0, 2.0, -0.5]).double()
-    )
-    cameras = {
-        n: c.replace(cam_from_world=c.cam_from_world @ world.inverse()) for n, c in rig.cameras.items()
-    }
-    found = rig_difference(rig, Rig(cameras), depth=DEPTH)
+    found = rig_difference(rig, set_up_in(WORLD, rig), depth=DEPTH)
     assert max(np.abs(camera.change).max() for camera in found.cameras.values()) < 1e-6
-    assert torch.allclose(found.motion.matrix, world.matrix, atol=1e-8)
+    assert torch.allclose(found.motion.matrix, WORLD.matrix, atol=1e-8)
     assert np.abs(found.depths["nir"].change).max() < 1e-8
 
 
 def row_of_five(rig):
     """Five cameras alike in two rows."""
-    centres = torch.tensor(
-        [[0.0, 0, 0], [0.2, 0, 0], [0.4, 0, 0], [0, 0.2, 0], [0.2, 0.2, 0]], dtype=torch.float64
-    )
-    R = torch.eye(3, dtype=torch.float64)
-    return Rig(
-        {f"c{i}": rig["mono"].replace(cam_from_world=Pose.from_centre(R, c)) for i, c in enumerate(centres)}
-    )
+    centres = torch.tensor([[0.0, 0, 0], [0.2, 0, 0], [0.4, 0, 0], [0, 0.2, 0], [0.2, 0.2, 0]]).double()
+    poses = [Pose.from_centre(torch.eye(3, dtype=torch.float64), c) for c in centres]
+    return Rig({f"c{i}": rig["mono"].replace(cam_from_world=pose) for i, pose in enumerate(poses)})
 
 
 @pytest.mark.parametrize("name", ["c0", "c4"])
@@ -188,28 +188,25 @@ def test_mistakes_are_named(files, capsys, one, other, message):
 
 def test_derivatives_are_those_of_the_difference(rig):
     """Of the second rig's parameters in its own world, which is turned and shifted, by differences."""
-    world = Pose(
-        rotation_from_vector(torch.tensor([0.3, -0.2, 0.5]).double()), torch.tensor([1.0, 2.0, -0.5]).double()
-    )
-    other = Rig(
-        {n: c.replace(cam_from_world=c.cam_from_world @ world.inverse()) for n, c in rig.cameras.items()}
-    )
-    X = rig["nir"].unproject(
-        torch.tensor([[100.0, 80], [500, 400]]).double(), torch.tensor([1.5, 3.0]).double()
-    )
-    part = _projections(rig, other, world, "nir", X.numpy())
-    for i, entry in enumerate(parameter_names(other["nir"])):
-        step = torch.zeros(len(parameter_names(other["nir"])), dtype=torch.float64)
-        step[i] = 1e-6
+    other, pixels = set_up_in(WORLD, rig), torch.tensor([[100.0, 80], [500, 400]]).double()
+    X = rig["nir"].unproject(pixels, torch.tensor([1.5, 3.0]).double()).numpy()
+    part = _projections(rig, other, WORLD, "nir", X)
+    for i, step in enumerate(1e-6 * torch.eye(len(parameter_names(other["nir"])), dtype=torch.float64)):
         moved = other.with_camera("nir", changed(other["nir"], step))
-        by_step = (_projections(rig, moved, world, "nir", X.numpy()).change - part.change) / 1e-6
-        assert np.allclose(part.jacobians[1][..., i], by_step, rtol=1e-3, atol=1e-3 * abs(by_step).max()), (
-            entry
-        )
-    for i in range(6):
-        step = torch.zeros(6, dtype=torch.float64)
-        step[i] = 1e-6
-        by_step = (
-            _projections(rig, other, world.perturbed(*step.split(3)), "nir", X.numpy()).change - part.change
-        ) / 1e-6
-        assert np.allclose(part.by_motion[:, i], by_step.ravel(), rtol=1e-3, atol=1e-3 * abs(by_step).max())
+        by_step = (_projections(rig, moved, WORLD, "nir", X).change - part.change) / 1e-6
+        assert np.allclose(part.jacobians[1][..., i], by_step, rtol=1e-3, atol=1e-3 * abs(by_step).max()), i
+    for i, step in enumerate(1e-6 * torch.eye(6, dtype=torch.float64)):
+        moved = WORLD.perturbed(*step.split(3))
+        by_step = (_projections(rig, other, moved, "nir", X).change - part.change).ravel() / 1e-6
+        assert np.allclose(part.by_motion[:, i], by_step, rtol=1e-3, atol=1e-3 * abs(by_step).max())
+
+
+def test_cameras_that_look_away_from_each_other_have_no_depths(rig):
+    """The picture and the text failed on an empty list."""
+    back = torch.tensor([0.0, math.pi, 0.0], dtype=torch.float64)
+    pose = rig["nir"].cam_from_world.perturbed(back, torch.zeros(3, dtype=torch.float64))
+    apart = rig.with_camera("nir", rig["nir"].replace(cam_from_world=pose))
+    found = rig_difference(apart, apart, depth=DEPTH)
+    assert found.depths == {}
+    assert "depth by" not in found.as_text()
+    assert len(draw_difference(found).axes) == 8

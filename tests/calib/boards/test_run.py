@@ -161,18 +161,6 @@ def test_photographs_of_four_cameras(tmp_path):
     result = calibrate({name: found.views[name] for name in rig.names}, parse_board(BOARD))
     error = errors_of(result.fit, rig) / np.sqrt(result.fit.covariance.diagonal())
     degrees, metres = pose_errors(result.fit, rig)
-    print(
-        result.rms,
-        result.fit.sigma,
-        "worst",
-        np.abs(error).max(),
-        "degrees",
-        degrees,
-        "metres",
-        metres,
-        result.notes,
-    )
-    print(dict(zip(result.fit.names, error.round(2))))
     assert np.abs(error).max() < 3.5
     assert degrees < 0.15
     assert metres < 1e-3
@@ -181,16 +169,8 @@ def test_photographs_of_four_cameras(tmp_path):
 @pytest.mark.slow
 def test_opencvs_pairs(shared_data, tmp_path, capsys):
     """RMS 0.195 px left and 0.217 px together, f 535.9 and baseline 83.2 mm are published."""
-    main(
-        [
-            "calibrate",
-            str(shared_data / "calibration/opencv_stereo"),
-            "--board",
-            "chessboard:9x6:25mm",
-            "-o",
-            str(tmp_path / "rig.yaml"),
-        ]
-    )
+    folder = shared_data / "calibration/opencv_stereo"
+    main(["calibrate", str(folder), "--board", "chessboard:9x6:25mm", "-o", str(tmp_path / "rig.yaml")])
     rig = Rig.load(tmp_path / "rig.yaml")
     assert float(rig["left"].K[0, 0]) == pytest.approx(535.9, rel=0.01)
     assert 1e3 * float(rig["right"].centre.norm()) == pytest.approx(83.2, rel=0.005)
@@ -209,7 +189,6 @@ def test_bumblebees_pairs(shared_data, tmp_path, capsys):
         assert float(rig[name].K[0, 0]) == pytest.approx(float(published[name].K[0, 0]), rel=0.003)
     ours, theirs = (r.pair("left", "right").beta_from_alpha for r in (rig, published))
     assert float(ours.t.norm()) == pytest.approx(float(theirs.t.norm()), rel=0.003)
-    print("rotated by", float((ours.R - theirs.R).norm()) / 2**0.5)
     assert float((ours.R - theirs.R).norm()) / 2**0.5 < np.radians(0.35), (
         "eleven small boards know it to 0.1 degrees"
     )
@@ -230,14 +209,6 @@ def test_action_cameras(camera_name, focal, shared_data):
     board = parse_board("chessboard:4x7:60mm")
     found = collect_folder(folder, board, patterns={"cam": f"{camera_name}/*.jpg"})
     alone = calibrate_single("cam", found.views["cam"], board)
-    print(
-        camera_name,
-        alone.problem.cameras["cam"].K,
-        alone.problem.rms(),
-        len(found.views["cam"].seen),
-        found.notes,
-        alone.notes,
-    )
     assert float(alone.problem.cameras["cam"].K[0, 0]) == pytest.approx(focal, rel=0.015)
 
 

@@ -9,11 +9,10 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig
-from calib.boards.bundle import CameraPrior, intrinsic_values, parameter_sizes
+from calib.boards.bundle import CameraPrior, changed, intrinsic_values
 from calib.boards.poses import StartDeviations, start_prior
 from calib.boards.rig import calibrate
 from calib.boards.simulation import photograph
-from calib.boards.target import parse_board
 from calib.images.matches import match_cameras
 from calib.images.residuals import line_distances
 from experiments.alignment import nine_band_calibration
@@ -28,9 +27,8 @@ STATED = StartDeviations(position=1e-3, rotation=1.0, focal=0.02, centre=0.01)
 def four() -> Rig:
     """Cameras of one kind on a square of 80 mm, all parallel, at nominal values."""
     corners = [(x, y, 0.0) for y in (0.0, 0.08) for x in (0.0, 0.08)]
-    return Rig(
-        {f"c{i}": camera(1400.0, (480, 640), corner, offset=(0.0, 0.0)) for i, corner in enumerate(corners)}
-    )
+    cameras = [camera(1400.0, (480, 640), corner, offset=(0.0, 0.0)) for corner in corners]
+    return Rig({f"c{i}": c for i, c in enumerate(cameras)})
 
 
 def drawn(start: Rig, seed: int) -> Rig:
@@ -50,18 +48,18 @@ def one_board(seed: int) -> Pose:
     return board_poses(1, seed=seed, depth=(1.6, 1.9), spread=0.02)
 
 
+def calibrated(rig, *, seed=0, start=None):
+    """What one image of each camera says of a rig that is near a start."""
+    views = see(rig, one_board(seed), noise=0.1, seed=seed)
+    return calibrate(views, BOARD, lens="none", start=start or four(), deviations=STATED)
+
+
 def test_the_stated_deviations_hold():
     """One image a camera: errors of all parameters in stated deviations, over rigs drawn around the start."""
     errors = []
     for seed in range(6):
         rig = drawn(four(), seed)
-        found = calibrate(
-            see(rig, one_board(seed), noise=0.1, seed=seed),
-            BOARD,
-            lens="none",
-            start=four(),
-            deviations=STATED,
-        )
+        found = calibrated(rig, seed=seed)
         errors.append(errors_of(found.fit, rig) / np.sqrt(found.fit.covariance.diagonal()))
         assert len(errors[-1]) == 40
         assert not any("far from the start" in note for note in found.notes)
@@ -71,9 +69,7 @@ def test_the_stated_deviations_hold():
 
 def test_what_one_board_leaves_open_is_said():
     """One board does not show where a camera is: the deviation of its position stays as it was stated."""
-    found = calibrate(
-        see(drawn(four(), 0), one_board(0), noise=0.1), BOARD, lens="none", start=four(), deviations=STATED
-    )
+    found = calibrated(drawn(four(), 0))
     focal, centre, position = (
         tuple(map(float, re.search(rf"{kind} ±([\d.]+) > ±([\d.]+)", found.notes[0]).groups()))
         for kind in ("focal lengths", "principal points", "positions")
@@ -86,26 +82,18 @@ def test_what_one_board_leaves_open_is_said():
 
 def test_a_wrong_start_is_named():
     wrong = four().perturbed({"c2.focal": torch.full((2,), 250.0, dtype=torch.float64)})
-    found = calibrate(
-        see(four(), one_board(0), noise=0.1), BOARD, lens="none", start=wrong, deviations=STATED
-    )
+    found = calibrated(four(), start=wrong)
     assert any(note.startswith("c2: far from the start: focal length") for note in found.notes)
 
 
 def test_the_priors_derivatives_are_those_of_finite_differences():
-    rig = drawn(four(), 1)
-    prior, at = start_prior(four()["c3"], STATED), rig["c3"]
-    sizes = parameter_sizes(at)
+    prior, at = start_prior(four()["c3"], STATED), drawn(four(), 1)["c3"]
     information, slope = prior.equations(at)
     steps = np.concatenate([np.full(6, 1e-6), np.full(4, 1e-3)])
     for i, step in enumerate(steps):
         change = torch.zeros(10, dtype=torch.float64)
         change[i] = step
-        moved = [
-            Rig({"": at}).perturbed(dict(zip(sizes, (sign * change).split(list(sizes.values())))))[""]
-            for sign in (1, -1)
-        ]
-        loss = [prior.loss(c) for c in moved]
+        loss = [prior.loss(changed(at, sign * change)) for sign in (1, -1)]
         assert -slope[i] == pytest.approx((loss[0] - loss[1]) / (2 * step), rel=1e-3, abs=1e-3)
     assert np.linalg.eigvalsh(information).min() > 0
     still = CameraPrior(intrinsic_values(at), prior.information, at.cam_from_world)
@@ -120,9 +108,7 @@ def photos(tmp_path):
     (tmp_path / "photos").mkdir()
     boards, rig = one_board(0), drawn(start, 3)
     for name, c in rig.cameras.items():
-        image = photograph(
-            c, c.cam_from_world @ Pose(boards.R[0], boards.t[0]), parse_board("charuco:9x7:60mm"), dpi=60
-        )
+        image = photograph(c, c.cam_from_world @ boards[0], BOARD, dpi=60)
         cv2.imwrite(str(tmp_path / "photos" / f"{name}.png"), image)
     return tmp_path
 
@@ -177,8 +163,6 @@ def test_the_nine_band_array(shared_data):
     off = [float((found.rig[b].centre - found.rig[a].centre).norm()) - GRID for a, b in neighbours()]
     assert np.abs(off).max() < 5e-4
     assert found.rms < 0.11
-    images = {
-        name: read_image(shared_data / "nine_band_array" / "scene" / f"{name}.png")
-        for name in ("Cam-3", "Cam-6")
-    }
+    folder = shared_data / "nine_band_array" / "scene"
+    images = {name: read_image(folder / f"{name}.png") for name in ("Cam-3", "Cam-6")}
     assert float(line_distances(found.rig, match_cameras(images)).abs().median()) < 0.25

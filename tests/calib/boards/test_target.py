@@ -127,4 +127,4 @@ def test_legacy_boards_differ():
 
 def test_the_figure_is_as_large_as_the_board():
     board = parse_board("chessboard:9x6:25mm")
-    assert draw_board(board, margin=0.01).get_size_inches() * 25.4 == pytest.approx([270, 209])
+    assert draw_board(board).get_size_inches() * 25.4 == pytest.approx([274, 213])

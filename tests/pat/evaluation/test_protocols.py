@@ -43,5 +43,5 @@ def test_pairs_that_cannot_serve_are_named(left, right, complaint):
 
 @pytest.mark.parametrize("rate", [0, 5])
 def test_a_rate_that_does_not_divide_is_refused(rate):
-    with pytest.raises(ValueError, match="divides both sides"):
+    with pytest.raises(ValueError, match="divisor of both sides"):
         reduce_by(torch.rand(3, 12, 12), rate)

@@ -18,7 +18,6 @@ from pat.evaluation.stereo import (
     markdown,
     sets_markdown,
     structure_kept,
-    summarise,
 )
 from pat.evaluation.tables import write_csv
 from pat.media.images import read_image, write_image
@@ -73,14 +72,6 @@ ROWS = [
     StereoRow("a", 4, "ours", 28.0, 0.8),
     StereoRow("b", 2, "ours", 34.0, 0.96),
 ]
-
-
-def test_summaries_are_means_by_rate_and_method():
-    two, four = summarise(ROWS)
-    assert (two.rate, two.method, two.pairs, two.psnr) == (2, "ours", 2, 32)
-    assert two.ssim == pytest.approx(0.93)
-    assert two.psnr_interval == (30, 34)
-    assert (four.psnr, four.pairs) == (28, 1)
 
 
 def depth_errors(cells):

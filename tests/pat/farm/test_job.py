@@ -17,8 +17,9 @@ import yaml
 from arraygeom import Camera, Pose, Rig, intrinsics
 from arraygeom.distortion import Distortion
 from pat.cli.main import main
-from pat.farm.backends import LayeredRenderer, rig_from_alpha
-from pat.farm.job import RenderConfig, Shard, check_space, publish, render, scene_seed, write_manifest
+from pat.farm.backends import LayeredSettings, rig_from_alpha
+from pat.farm.job import RenderConfig, Shard, check_space, publish, render, write_manifest
+from pat.sensors import seed_for
 from pat.support.jobs import JobError
 from pat.synthesis.rendered import Rendered
 
@@ -216,11 +217,11 @@ def test_more_scenes_than_disk_are_refused_before_the_first(config, tmp_path, mo
 
 
 def test_a_disk_that_fills_stops_the_job_cleanly(config, tmp_path, monkeypatch):
-    def full(self, seed, out):
+    def full(seed, out):
         out.mkdir()
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(LayeredRenderer, "render", full)
+    monkeypatch.setattr(LayeredSettings, "renderer", lambda *_: full)
     monkeypatch.setattr("pat.support.jobs._in_processes", jobs_here)
     with pytest.raises(JobError, match="is full: free space"):
         render(RenderConfig.load(config), scenes=3, out=tmp_path / "data")
@@ -262,9 +263,8 @@ def test_shards_share_the_scenes_out():
             Shard.parse(text)
 
 
-def test_seeds_are_of_the_scene_and_the_attempt_alone(config):
-    chosen = RenderConfig.load(config)
-    assert len({scene_seed(chosen, i, k) for i in range(20) for k in range(3)}) == 60
+def test_seeds_are_of_the_scene_and_the_attempt_alone():
+    assert len({seed_for(1, "scene", i, k) for i in range(20) for k in range(3)}) == 60
 
 
 def test_rigs_that_layers_cannot_show_are_refused():

@@ -203,11 +203,11 @@ def test_a_wide_beta_is_enlarged_only_where_alpha_sees():
     hw, wide = (64, 96), (300, 440)
     rig, network = rig_of(hw, wide, focal=300.0, beta_focal=100.0), network_of("GuidedPAT")
     images = {"mono": texture(1, hw), "colour": texture(3, wide)}
-    views = pat.fusion.steps.EqualResolution(network).do(Views.of(rig, images, alpha="mono")).views
+    views = pat.fusion.steps.equal_resolution(network, Views.of(rig, images, alpha="mono")).views
     assert math.prod(views.images["colour"].shape[1:]) < 0.6 * 9 * math.prod(wide)
     cut = fuse(network, rig, images, alpha="mono")
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(pat.fusion.steps.EqualResolution, "_cropped", lambda step, views, name: views)
+        patched.setattr(pat.fusion.steps, "_cropped", lambda network, views, name: views)
         whole = fuse(network, rig, images, alpha="mono")
     # What the views have in common sets the levels at which they are compared: that is where the two differ.
     assert (cut.image - whole.image).abs().mean() < 5e-2

@@ -10,7 +10,7 @@ from arraygeom import Distortion, Rig, View
 from pat.data.sample_array import SAMPLE, load_sample
 from pat.evaluation.baseline import classical_view
 from pat.evaluation.metrics import score
-from pat.fusion.report import Facts, report_page, rig_drawing, write_report
+from pat.fusion.report import Facts, report_page, rig_drawing
 from pat.fusion.results import Frame
 from pat.media.figures import reduced
 
@@ -30,7 +30,8 @@ def page(tmp_path_factory):
         ("weights: <mono> & more",), ("the rig may be wrong: check it",), 12.0, 2.0**30, classical=baseline
     )
     path = tmp_path_factory.mktemp("report") / "index.html"
-    return write_report(path, frame, sample.images, sample.rig, "mono", facts)
+    path.write_text(report_page(frame, sample.images, sample.rig, "mono", facts), encoding="utf-8")
+    return path
 
 
 def test_the_page_needs_no_other_file(page):

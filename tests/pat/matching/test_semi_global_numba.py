@@ -122,9 +122,8 @@ def test_winners_are_those_of_their_slow_twin(views, runs, count, spread):
         np.empty(HW, np.int32),
         np.empty((*HW, 3), np.float32),
     )
-    kernels.winners(
-        total, first, count, end, along, length, cut, *BETA, 0, 0, LARGE, claims, disparity, facts, positions
-    )
+    segments, results = (end, along, length, cut), (disparity, facts, positions)
+    kernels.winners(total, first, count, segments, BETA, (0, 0), LARGE, claims, results)
     labels, sums = labels_of(first, count), total[..., :count].reshape(*HW, -1)
     wanted = np.full(off + 1, 2**31 - 1)
     for y, x in np.ndindex(HW):
@@ -165,14 +164,14 @@ def test_labels_beyond_a_segment_are_unseen_where_beta_ends_and_nowhere_else(cut
     ends, along = np.array([[[2.0, 0.0]]], np.float32), np.array([[[-1.0, 0.0]]], np.float32)
     length, edge = np.full((1, 1), 2, np.float32), np.full((1, 1), cut, np.float32)
     costs, labels = np.empty((1, 1, 1, kernels.LANES), np.uint8), (np.zeros((1, 1, 1), np.int32), 5)
-    segments = ends, along, length, edge, 1, 9
-    kernels.costs(own, other, *labels, *segments, costs)
+    segments = ends, along, length, edge
+    kernels.costs(own, other, *labels, *segments, 1, 9, costs)
     unlike = 48 + int(cost.TRUNCATED)
     assert costs.ravel()[:5].tolist() == [unlike] * 3 + [beyond] * 2
     disparity, facts = np.empty((1, 1), np.float32), np.empty((1, 1, 1), np.float32)
     claims, place = np.full(10, 2**31 - 1, np.int32), np.empty((1, 1), np.int32)
     total = (kernels.PARTS * costs.astype(int)).astype(np.int16)
-    kernels.winners(total, *labels, *segments, 0, 0, LARGE, claims, disparity, facts, place)
+    kernels.winners(total, *labels, segments, (1, 9), (0, 0), LARGE, claims, (disparity, facts, place))
     assert (disparity[0, 0] > 2) == (cut == 1)
     assert (place[0, 0] == 9) == (cut == 1)
     assert claims[[0, 1, 2]].tolist() == [(unlike * kernels.PARTS << 16) + label for label in (2, 1, 0)]

@@ -104,6 +104,7 @@ def weights_file(path, config, network="GuidedPAT", state=None) -> None:
         ("GuidedPAT", '{"window": NaN}', "window: is NaN"),
         ("GuidedPAT", '{"window": Infinity}', "window is inf"),
         ("GuidedPAT", {"nonsense": 1}, "nonsense: unknown key"),
+        ("GuidedPAT", {"fine_head": 8}, r"\(fine_head: unknown key\): train it again, or take the weights"),
         ("BandwisePAT", {"bands": 3}, "one band at a time"),
         ("PAT", {"dim": 1024, "betas": 1024, "scale": 1024}, "do not fit the PAT"),
         ("PAT", {"betas": -1}, "betas is -1"),

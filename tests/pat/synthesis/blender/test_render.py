@@ -145,8 +145,9 @@ def predicted_centre(camera: Camera, square: Object) -> torch.Tensor:
     outline = torch.cat(
         [torch.stack(p, -1) for p in ((side, low), (-low, side), (-side, -low), (low, -side))]
     )
-    X = torch.nn.functional.pad(outline, (0, 1)) @ torch.from_numpy(square.motion.at(0).matrix[:3, :3]).T
-    a = camera.project(X + torch.from_numpy(square.motion.at(0).position)).x
+    pose = square.motion.at(0)
+    X = torch.nn.functional.pad(outline, (0, 1)) @ torch.from_numpy(pose.R * pose.extent).T
+    a = camera.project(X + torch.from_numpy(pose.position)).x
     b = a.roll(-1, 0)
     twice_area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     return ((a + b) * twice_area[:, None]).sum(0) / (3 * twice_area.sum())
