@@ -20,6 +20,7 @@ from arraygeom.threads import torch_in_one_thread
 from .lenses import describe_lenses
 from .matches import (
     AGREE,
+    FittedLink,
     Pairs,
     PointMatches,
     agreeing_pairs,
@@ -40,25 +41,24 @@ JOINED = 1.0
 class UncalibratedRig(NamedTuple):
     """An uncalibrated rig, with statistics of each of its links.
 
-    points: their number. distance: median distance of held-out points from their lines, pixels of beta.
-    displacement: pixels of beta to either side of the rough map that contain the points. by_focal: whether
-    focal lengths were used. matches: the points.
+    fits: with the points that agree, and how far they are from the rough map. distance: median distance of
+    held-out points from their lines, pixels of beta. by_focal: whether focal lengths were used. matches: all
+    points.
     """
 
     rig: Rig
-    points: dict[tuple[str, str], int]
+    fits: dict[tuple[str, str], FittedLink]
     distance: dict[tuple[str, str], float]
-    displacement: dict[tuple[str, str], float]
     by_focal: dict[tuple[str, str], bool]
     matches: dict[tuple[str, str], PointMatches]
 
     def as_text(self) -> str:
         """One line per link, and one on lenses if there are any."""
         lines = [
-            f"{a} > {b}: {self.points[a, b]} points, held-out ones {self.distance[a, b]:.2f} px from their "
-            f"lines, all within {self.displacement[a, b]:.0f} px of the rough map"
+            f"{a} > {b}: {len(fit.matches.alpha)} points, held-out ones {self.distance[a, b]:.2f} px from "
+            f"their lines, all within {fit.displacement:.0f} px of the rough map"
             + (", with the given focal lengths" if self.by_focal[a, b] else "")
-            for a, b in self.rig.links
+            for (a, b), fit in self.fits.items()
         ]
         return "\n".join([*lines, *filter(None, [describe_lenses(self.rig)])])
 
@@ -91,24 +91,20 @@ def rig_from_images(
     matched_at = (matching := matching_time(images, pairs)) / (matching + JOINED * pairs)
     with part(0, matched_at):
         matched = match_cameras(images, alpha=alpha) if matches is None else agreeing_pairs(matches)
-    found = UncalibratedRig(Rig({name: View(hw=hw) for name, hw in sizes.items()}), {}, {}, {}, {}, matched)
-    links = {}
+    distance, by_focal, links = {}, {}, {}
     for names, points in matched.items():
-        F, distance, by_focal = _fundamental(points, *(K.get(name) for name in names))
+        F, distance[names], by_focal[names] = _fundamental(points, *(K.get(name) for name in names))
         links[names] = fit_link(points, F, within=AGREE).link
-        found.distance[names], found.by_focal[names] = distance, by_focal
-    rig = found.rig.replace(links=links)
+    rig = Rig({name: View(hw=hw) for name, hw in sizes.items()}, links=links)
     with part(matched_at, 1):
         refined = refine_matches(rig, [matched])
     if refined.accepted:
         rig = refined.rig
         _, held_out = split([matched])
-        found.distance.update({names: median_off(rig, {names: m}) for names, m in held_out.items()})
-    for names, points in matched.items():
-        fit = with_map(rig.pair(*names), points)
-        links[names] = fit.link
-        found.points[names], found.displacement[names] = len(fit.matches.alpha), fit.displacement
-    return found._replace(rig=rig.replace(links=links))
+        distance |= {names: median_off(rig, {names: m}) for names, m in held_out.items()}
+    fits = {names: with_map(rig.pair(*names), points) for names, points in matched.items()}
+    rig = rig.replace(links={names: fit.link for names, fit in fits.items()})
+    return UncalibratedRig(rig, fits, distance, by_focal, matched)
 
 
 def _fundamental(

@@ -110,19 +110,13 @@ def contrast_equalised(image: Float[Tensor, "_ h w"]) -> UInt8[NDArray, "h w"]:
     return cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clip(0, 1) * 255).astype(np.uint8))
 
 
-def _mutual(a: SiftFeatures, b: SiftFeatures) -> tuple[list[int], list[int]]:
-    """Indices in both of the mutually nearest features that pass the ratio test."""
-    if len(a.points) < 2 or len(b.points) < 2:
-        return [], []
-    forward, backward = _nearest(a.descriptors, b.descriptors), _nearest(b.descriptors, a.descriptors)
-    i = torch.arange(len(forward))
-    mutual = (forward >= 0) & (backward[forward] == i)
-    return i[mutual].tolist(), forward[mutual].tolist()
-
-
 def _match(a: SiftFeatures, b: SiftFeatures) -> PointMatches:
     """Points of the mutually nearest features, beta's refined by patches around them."""
-    i, j = _mutual(a, b)
+    if len(a.points) < 2 or len(b.points) < 2:
+        return PointMatches(*torch.zeros(2, 0, 2, dtype=torch.float64))
+    forward, backward = _nearest(a.descriptors, b.descriptors), _nearest(b.descriptors, a.descriptors)
+    mutual = (forward >= 0) & (backward[forward] == torch.arange(len(forward)))
+    i, j = mutual.nonzero()[:, 0].numpy(), forward[mutual].numpy()
     ratio, angle = b.sizes[j] / a.sizes[i], b.directions[j] - a.directions[i]
     c, s = ratio * np.cos(angle), ratio * np.sin(angle)
     maps = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], 1)

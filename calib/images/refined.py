@@ -77,25 +77,23 @@ class Refinement:
     def as_text(self) -> str:
         """The changes, the distances of held-out points and what happens to depth, as text."""
         given, refined = self.held_out
-        lines = [f"held-out points ({given.points}) lie {given} from their lines before, {refined} after"]
-        lines += [] if self.depth is None else [str(self.depth)]
         verdict = "accepted all the same" if self.accepted else "not accepted"
-        lines += [f"{verdict}: {objection}" for objection in self.objections]
-        lines += [f"changed: {change}" for change in self.changes]
-        lines += [sentence] if self.accepted and (sentence := describe_lenses(self.rig)) else []
-        if not self.accepted:
-            lines.append("the rig is unchanged")
+        lines = [
+            f"held-out points ({given.points}) lie {given} from their lines before, {refined} after",
+            "" if self.depth is None else str(self.depth),
+            *(f"{verdict}: {objection}" for objection in self.objections),
+            *(f"changed: {change}" for change in self.changes),
+            describe_lenses(self.rig) if self.accepted else "the rig is unchanged",
+        ]
         if self.unobservable:
             lines.append(f"fixed, as these images do not determine them: {', '.join(self.unobservable)}")
         if self.kept:
-            kept = ", ".join(self.kept)
-            lines.append(
-                f"kept, as they would change depth without the images determining it: combinations of {kept}"
-            )
+            why = "as they would change depth without the images determining it"
+            lines.append(f"kept, {why}: combinations of {', '.join(self.kept)}")
         if self.photometric is not None:
             before, after, accepted = self.photometric
             verdict = "accepted" if accepted else "not accepted"
             lines.append(
                 f"photometric error on held-out pixels: {before:.4f} before, {after:.4f} after: {verdict}"
             )
-        return "\n".join(lines)
+        return "\n".join(filter(None, lines))

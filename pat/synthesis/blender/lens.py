@@ -89,7 +89,7 @@ def lens_for(camera: View, name: str) -> Lens:
     if not isinstance(camera, Camera):
         raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")
     if camera.K.ndim != 2:
-        raise ValueError(f"camera '{name}' is a batch {tuple(camera.K.shape[:-2])}: render one rig at a time")
+        raise ValueError(f"camera '{name}' is batched {tuple(camera.K.shape[:-2])}: render one rig at a time")
     camera = camera.to(dtype=torch.float64, device="cpu")
     upright = _upright(camera, name)
     if camera.distortion is None:

@@ -17,7 +17,7 @@ def test_lines_and_map_come_from_images_alone():
     assert line_distances(found.rig, points).abs().median() < 0.5
     assert found.distance["left", "right"] < 0.3
     assert found.rig.pair("left", "right").link.H is not None
-    assert 3 < found.displacement["left", "right"] < 12
+    assert 3 < found.fits["left", "right"].displacement < 12
 
 
 def test_focal_lengths_are_used_where_they_help():
