@@ -240,7 +240,8 @@ class Convert:
         rig = read_rig(self.source, format=self.read_as, hw=hw)
         for name in rig.names if hw is not None else ():
             if (stated := rig[name].hw) != hw:
-                raise ValueError(f"--size: the file has {stated[1]}x{stated[0]} for '{name}': leave it out")
+                h, w = stated
+                raise ValueError(f"--size: the file states {w}x{h} for '{name}': leave it out")
         write_rig(rig, self.target, format=self.write_as)
         say(f"written: {self.target} ({len(rig.names)} cameras)")
 
