@@ -74,7 +74,7 @@ def warp(
 def plane_sweep(
     pair: Pair,
     image: Float[Tensor, "b c h w"],
-    depths: Float[Tensor, "d"],
+    depths: Float[Tensor, " d"],
     *,
     interpolation: Interpolation = "bilinear",
 ) -> Sampled:

@@ -38,7 +38,7 @@ def reprojection_residuals(
     X: Float[Tensor, "*n 3"],
     x: Real[Tensor, "v *n 2"],
     *,
-    seen: Bool[Tensor, "v *n"] | None = None,
+    seen: Bool[Tensor, " v *n"] | None = None,
 ) -> Float[Tensor, "v *n 2"]:
     """Pixels x minus where the cameras see the world points X; zero where one is not `seen` or cannot be."""
     projected = [camera.project(X) for camera in cameras]
@@ -52,7 +52,7 @@ class Bundle(NamedTuple):
 
     rig: Rig
     X: Float[Tensor, "n 3"]
-    cost: Float[Tensor, "s"]
+    cost: Float[Tensor, " s"]
 
 
 def bundle_adjusted(

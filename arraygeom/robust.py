@@ -31,8 +31,8 @@ Precision = Float[Tensor, "k k"] | Callable[[Tensor], Float[Tensor, "k k"]]
 class RobustFit(NamedTuple):
     """Coefficients, the values less what they explain, and the weights with which they were solved for."""
 
-    coefficients: Float[Tensor, "k *m"]
-    rest: Float[Tensor, "n *m"]
+    coefficients: Float[Tensor, " k *m"]
+    rest: Float[Tensor, " n *m"]
     weight: Float[Tensor, " n"]
 
 
@@ -52,8 +52,8 @@ def gaussian(rest: Float[Tensor, " n"], scale: float) -> Float[Tensor, " n"]:
 
 
 def normal_equations(
-    terms: Float[Tensor, "k n"], values: Float[Tensor, "n *m"], weight: Float[Tensor, " n"]
-) -> tuple[Float[Tensor, "k k"], Float[Tensor, "k *m"]]:
+    terms: Float[Tensor, "k n"], values: Float[Tensor, " n *m"], weight: Float[Tensor, " n"]
+) -> tuple[Float[Tensor, "k k"], Float[Tensor, " k *m"]]:
     """The matrix and the right side whose solution is that of weighted least squares."""
     weighted = terms * weight
     return weighted @ terms.T, weighted @ values
@@ -61,10 +61,10 @@ def normal_equations(
 
 def least_squares(
     terms: Float[Tensor, "k n"],
-    values: Float[Tensor, "n *m"],
+    values: Float[Tensor, " n *m"],
     weight: Float[Tensor, " n"],
     precision: Float[Tensor, "k k"] | None = None,
-) -> Float[Tensor, "k *m"]:
+) -> Float[Tensor, " k *m"]:
     """The coefficients c of the least sum of weight (values - c terms)^2, plus c precision c.
 
     Without the precision of a prior the terms may depend on each other: of all solutions it is the shortest.
@@ -79,8 +79,8 @@ def least_squares(
 
 def robust_least_squares(
     terms: Float[Tensor, "k n"],
-    values: Float[Tensor, "n *m"],
-    start: Float[Tensor, "k *m"],
+    values: Float[Tensor, " n *m"],
+    start: Float[Tensor, " k *m"],
     weigh: Weigh,
     *,
     precision: Precision | None = None,

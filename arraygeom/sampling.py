@@ -18,7 +18,7 @@ class Sampled(NamedTuple):
     """Values (B, C, *n) and whether each position (B, *n) was on the image's area."""
 
     values: Float[Tensor, "b c *n"]
-    valid: Bool[Tensor, "b *n"]
+    valid: Bool[Tensor, " b *n"]
 
 
 def to_grid(x: Real[Tensor, "*n 2"], hw: HW) -> Float[Tensor, "*n 2"]:

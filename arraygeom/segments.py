@@ -141,7 +141,7 @@ FLAT = 1e-6
 """An image limit that moves by less than this along a whole segment, in pixels, is either inside or not."""
 
 
-def sample_fractions(samples: int, *, like: Tensor) -> Float[Tensor, "l"]:
+def sample_fractions(samples: int, *, like: Tensor) -> Float[Tensor, " l"]:
     """Where the samples of a segment are: l / (L - 1) for l = 0 .. L - 1, and 0.5 if there is only one."""
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")

@@ -92,7 +92,7 @@ def field_of_view(camera: Camera) -> tuple[float, float]:
     return halves[0] + halves[1], halves[2] + halves[3]
 
 
-def _angles(a: Float[Tensor, "n 3"], b: Float[Tensor, "1 3"]) -> Float[Tensor, "n"]:
+def _angles(a: Float[Tensor, "n 3"], b: Float[Tensor, "1 3"]) -> Float[Tensor, " n"]:
     cross = torch.linalg.cross(a, b.expand_as(a)).norm(dim=-1)
     return torch.rad2deg(torch.atan2(cross, (a * b).sum(-1)))
 

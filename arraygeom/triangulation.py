@@ -35,7 +35,7 @@ def triangulate(
     cameras: Sequence[Camera],
     x: Real[Tensor, "v *n 2"],
     *,
-    seen: Bool[Tensor, "v *n"] | None = None,
+    seen: Bool[Tensor, " v *n"] | None = None,
     deviation: float = 1.0,
     residual: float | None = None,
 ) -> Triangulated:

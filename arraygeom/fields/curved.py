@@ -368,7 +368,7 @@ def visible_pieces(nodes: Float[Tensor, "*n k 2"], seen: Tensor, hw: HW, longest
     return Pieces(first, last, torch.where(seen, length, 0.0))
 
 
-def along_pieces(pieces: Pieces, u: Float[Tensor, "l"]) -> Float[Tensor, "*n l"]:
+def along_pieces(pieces: Pieces, u: Float[Tensor, " l"]) -> Float[Tensor, "*n l"]:
     """Where on the whole polyline (first node 0, last 1) fractions u of the visible length are."""
     first, last, length = pieces
     ends = length.cumsum(-1)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..camera import Camera
+from ..distortion import Distortion
 from ..pose import Pose
 from ..rig import Rig
 from .source import Entry, RigSource, pose_of

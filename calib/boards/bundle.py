@@ -39,7 +39,7 @@ TYPICAL_FOCAL_ERROR, TYPICAL_CENTRE_ERROR = 0.1, 0.1
 CENTRE_DEVIATION, ASPECT_DEVIATION = 0.03, 0.01
 """Standard deviations of the principal point about the centre (share of the width), and of aspect ratio."""
 Array = np.ndarray
-Masks = Mapping[str, Bool[np.ndarray, "_"]]
+Masks = Mapping[str, Bool[np.ndarray, " _"]]
 """By camera, which of its parameters are meant, in the order of `parameter_names`."""
 
 
@@ -345,8 +345,8 @@ def normal_equations(problem: BundleProblem, parts: Mapping[str, Linearised]) ->
 
 
 def block_sums(
-    block: Int[np.ndarray, " n"], values: Float[np.ndarray, "n *k"], count: int
-) -> Float[np.ndarray, "b *k"]:
+    block: Int[np.ndarray, " n"], values: Float[np.ndarray, " n *k"], count: int
+) -> Float[np.ndarray, " b *k"]:
     """Sums of values by their block, of which there are so many."""
     marks = csr_array((np.ones(len(block)), (block, np.arange(len(block)))), (count, len(block)))
     return np.asarray(marks @ values.reshape(len(values), -1)).reshape(count, *values.shape[1:])

@@ -35,7 +35,7 @@ class Calibration:
     board: Board
     fit: Solved = field(repr=False)
     single: Mapping[str, float]
-    epipolar: Mapping[tuple[str, str], Float[np.ndarray, "_"]] = field(repr=False)
+    epipolar: Mapping[tuple[str, str], Float[np.ndarray, " _"]] = field(repr=False)
     notes: tuple[str, ...] = field(default=())
 
     @property
@@ -54,7 +54,7 @@ class Calibration:
         return self.fit.problem.rms()
 
     @cached_property
-    def held_out(self) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
+    def held_out(self) -> dict[tuple[str, str], Float[np.ndarray, " _"]]:
         """By pair: epipolar errors (pixels) of all frames, each by a rig of the others; empty if too few."""
         return held_out_errors(self.fit, self.views)
 

@@ -49,7 +49,7 @@ class Difference(NamedTuple):
 
     x: Float[np.ndarray, "n 2"]
     depth: Float[np.ndarray, " n"]
-    change: Float[np.ndarray, "n *k"]
+    change: Float[np.ndarray, " n *k"]
     sigma: Float[np.ndarray, " n"]
 
 

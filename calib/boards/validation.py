@@ -40,7 +40,7 @@ EQUAL = 0.01
 
 def epipolar_errors(
     rig: Rig, views: Mapping[str, BoardViews]
-) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
+) -> dict[tuple[str, str], Float[np.ndarray, " _"]]:
     """By pair: distances in undistorted pixels from beta's points to alpha's lines, and the reverse."""
     found = {}
     for a, b in combinations(views, 2):
@@ -66,7 +66,7 @@ def epipolar_errors(
 
 def held_out_errors(
     fit: Solved, views: Mapping[str, BoardViews]
-) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
+) -> dict[tuple[str, str], Float[np.ndarray, " _"]]:
     """Epipolar errors of all frames, each by a rig calibrated without it; empty if there are too few.
 
     Frames are held out in five parts.

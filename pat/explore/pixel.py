@@ -91,11 +91,11 @@ class BetaReport(NamedTuple):
     """
 
     xy: Float[Tensor, "l 2"]
-    valid: Bool[Tensor, "l"]
+    valid: Bool[Tensor, " l"]
     ends: Float[Tensor, "2 2"] | None
-    weight: Float[Tensor, "l"]
-    depth: Float[Tensor, "l"]
-    value: Float[Tensor, "c"]
+    weight: Float[Tensor, " l"]
+    depth: Float[Tensor, " l"]
+    value: Float[Tensor, " c"]
     peak: float
     offset: MatchOffset | None = None
 
@@ -105,7 +105,7 @@ class PixelReport(NamedTuple):
 
     betas: dict[str, BetaReport]
     problems: dict[str, str]
-    colour: Float[Tensor, "c"]
+    colour: Float[Tensor, " c"]
     depth: float
 
 
@@ -270,7 +270,7 @@ def match_offset(
     guides: tuple[Tensor, Tensor],
     pair: Pair,
     x: Float[Tensor, "1 2"],
-    samples: tuple[Float[Tensor, "l 2"], Float[Tensor, "l"]],
+    samples: tuple[Float[Tensor, "l 2"], Float[Tensor, " l"]],
     ends: Float[Tensor, "2 2"] | None,
 ) -> MatchOffset | None:
     """The images' own match near the segment, by the correlation of windows around both pixels.
@@ -323,7 +323,7 @@ def correlations(
     pair: Pair,
     x: Float[Tensor, "1 2"],
     xy: Float[Tensor, "l 2"],
-) -> Float[Tensor, "l"]:
+) -> Float[Tensor, " l"]:
     """Normalised correlations (-1 to 1) of alpha's window at x with beta's at each of xy."""
     steps = (pixel_grid((2 * RADIUS + 1, 2 * RADIUS + 1), dtype=x.dtype) - RADIUS).reshape(-1, 2)
     transformed = steps @ jacobian(pair, x).T
@@ -353,7 +353,7 @@ FLAT = 1e-4
 """A window with less contrast than this has no features."""
 
 
-def softmax(scores: Float[Tensor, "l"], valid: Bool[Tensor, "l"]) -> Float[Tensor, "l"]:
+def softmax(scores: Float[Tensor, " l"], valid: Bool[Tensor, " l"]) -> Float[Tensor, " l"]:
     """Over the valid samples; all zero without any."""
     if not bool(valid.any()):
         return torch.zeros_like(scores)
@@ -361,8 +361,8 @@ def softmax(scores: Float[Tensor, "l"], valid: Bool[Tensor, "l"]) -> Float[Tenso
 
 
 def depths(
-    pair: Pair, x: Float[Tensor, "1 2"], xy: Float[Tensor, "l 2"], valid: Bool[Tensor, "l"]
-) -> Float[Tensor, "l"]:
+    pair: Pair, x: Float[Tensor, "1 2"], xy: Float[Tensor, "l 2"], valid: Bool[Tensor, " l"]
+) -> Float[Tensor, " l"]:
     """The depth in alpha of each sample, NaN where it has none or the pair is not calibrated."""
     if pair.link is not None or not pair.calibrated:
         return torch.full_like(xy[:, 0], torch.nan)
@@ -383,14 +383,14 @@ def joint_depth(betas: Mapping[str, BetaReport]) -> float:
 
 def sampled(
     image: Float[Tensor, "1 c h w"], x: Float[Tensor, "*l 2"], extended: bool = False
-) -> Float[Tensor, "c *l"]:
+) -> Float[Tensor, " c *l"]:
     """The image's values at positions, in their precision; the image is not copied."""
     return sample(image, x[None].to(image), extended=extended).values[0].to(x)
 
 
 def fused_colour(
     scene: ExplorerScene, betas: Mapping[str, BetaReport], state: ExplorerState
-) -> Float[Tensor, "c"]:
+) -> Float[Tensor, " c"]:
     """Alpha's luminance with the colour differences of the betas in colour, each weighted by its peak."""
     own = sampled(scene.guides[state.alpha], pixel_of(state))[:, 0]
     coloured = [s for s in betas.values() if len(s.value) == 3 and s.peak > 0]

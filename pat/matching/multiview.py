@@ -152,16 +152,18 @@ class MatchedBeta:
         (x, y), (u, v) = self._seen(inverse_depth), self.extent.towards.unbind(-1)
         return torch.addcmul(x * u, y, v) - self._end
 
-    def depth_buffer(self) -> Float[Tensor, "n"]:
+    def depth_buffer(self) -> Float[Tensor, " n"]:
         """The nearest inverse depth at each pixel of half of beta's size (alpha's pixels leave no holes in
         it), row by row, and one more for what is outside: all empty."""
         return self.disparity.new_zeros(math.prod(-(-n // FINE) for n in self.hw) + 1)
 
-    def enter(self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, "n"]) -> None:
+    def enter(self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, " n"]) -> None:
         """Enter points into a depth buffer."""
         buffer.scatter_reduce_(0, self._index(inverse_depth).flatten(), inverse_depth.flatten(), "amax")
 
-    def hidden(self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
+    def hidden(
+        self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, " n"]
+    ) -> Float[Tensor, "h w"]:
         """By how many pixels the nearest point at the same pixel of beta differs; infinite off the image."""
         index = self._index(inverse_depth)
         (x, y), (u, v) = self._seen(buffer[index]), self._seen(inverse_depth)

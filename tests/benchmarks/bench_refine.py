@@ -116,7 +116,7 @@ def rendered_rigs(draws: int, g: torch.Generator, scenes: Path | None) -> Iterat
     head = (
         "rendered | draw | true rig | made worse | by points | and by the fusion's error | from images alone"
     )
-    yield markdown_header(columns(head))
+    yield markdown_header(head.split(" | "))
     network, sample = load_weights("mono-colour"), load_sample()
     found = rendered_cases(scenes) if scenes else ()
     ours = AblationCase("sample array", sample.rig, sample.images, sample.ground_truth, torch.empty(0))

@@ -18,6 +18,7 @@ import numpy as np
 import tyro
 
 from calib.boards.poses import StartDeviations
+from calib.boards.rig import Calibration
 from calib.boards.uncertainty import baseline_deviation, rig_covariance
 from calib.images.matches import PointMatches, match_cameras
 from calib.images.residuals import line_distances
@@ -45,9 +46,15 @@ def scene_matches(folder: Path) -> dict[tuple[str, str], PointMatches]:
 
 def rows(folder: Path) -> Iterator[str]:
     yield markdown_header(
-        columns(
-            "positions stated | RMS px | baselines off by, mm | their sigma, mm | f | scene px | worst pair"
-        )
+        [
+            "positions stated",
+            "RMS px",
+            "baselines off by, mm",
+            "their sigma, mm",
+            "f",
+            "scene px",
+            "worst pair",
+        ]
     )
     matches = scene_matches(folder)
     for position in (5e-4, 5e-3):
