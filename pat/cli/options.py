@@ -266,7 +266,7 @@ def by_frame(files: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]]:
     counts = {name: len(paths) for name, paths in files.items()}
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"'{name}' {count}" for name, count in counts.items())
-        raise ValueError(f"every camera needs an image of every frame; there are {listed}")
+        raise ValueError(f"--image: every camera needs an image of every frame; there are {listed}")
     return [dict(zip(files, paths)) for paths in zip(*files.values())]
 
 

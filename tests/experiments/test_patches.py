@@ -51,7 +51,7 @@ def rendered(tmp_path_factory):
     root = tmp_path_factory.mktemp("data")
     renderer = LayeredSettings(layers=(4, 7), oversampling=1).renderer(make_rig(), CheckLimits())
     for seed in range(3):
-        renderer.render(seed, root / "scenes" / f"{seed:06d}")
+        renderer(seed, root / "scenes" / f"{seed:06d}")
     return root
 
 
@@ -183,7 +183,7 @@ def test_scenes_that_cannot_be_read_are_reported(broken):
 
 def test_images_of_changing_size_are_reported(broken):
     shutil.rmtree(broken / "scenes/000002")
-    LayeredSettings(oversampling=1).renderer(make_rig(160), CheckLimits()).render(2, broken / "scenes/000002")
+    LayeredSettings(oversampling=1).renderer(make_rig(160), CheckLimits())(2, broken / "scenes/000002")
     with pytest.raises(ValueError, match=r"000002: .*mono 160x96, .*mono 128x96"):
         ScenePatches(broken, patches=SMALL)[12]
 
