@@ -151,8 +151,9 @@ class TrainConfig:
                 raise ValueError(f"{name} is a share of the batches, 0 to 1, got {share:g}")
             if bool(share) != bool(folders):
                 found = "there is no folder" if share else f"{folders[0]} is given"
-                both = f"give both `{name}` and `{name}_from`, or neither"
-                raise ValueError(f"{name} is {share:g} and {found}: {both}")
+                raise ValueError(
+                    f"{name} is {share:g} and {found}: give both `{name}` and `{name}_from`, or neither"
+                )
         total = self.rendered + self.pairs + self.measured
         if total > 1:
             raise ValueError(f"rendered, pairs and measured are shares of the batches, {total:g} in all")
@@ -170,8 +171,9 @@ def load_config(name: str | Path) -> TrainConfig:
     """
     path = next((p for p in (RECIPES / f"{name}.yaml", Path(name)) if p.is_file()), None)
     if path is None:
-        known = near(name, recipes())
-        raise FileNotFoundError(f"no recipe '{name}' (it is a file or a name of the package){known}")
+        raise FileNotFoundError(
+            f"no recipe '{name}' (it is a file or a name of the package){near(name, recipes())}"
+        )
     return parse_config(path.read_text(encoding="utf-8"), str(path))
 
 
@@ -208,7 +210,8 @@ def save_config(config: TrainConfig, path: Path) -> None:
     """Write `config_text` atomically."""
     from arraygeom.atomic import write_text
 
-    write_text(path, config_text(config))
+    text = config_text(config)
+    write_text(path, text)
 
 
 def command_line(arguments: list[str]) -> TrainConfig:

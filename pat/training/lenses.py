@@ -50,8 +50,7 @@ def through_lenses(
 
 def lens_over(pinhole: Camera, g: Generator, lost: float = 0.0) -> Camera:
     """A camera with a random lens, as many pixels, that covers the pinhole's view but for lost borders."""
-    grid = pixel_grid(pinhole.hw, dtype=torch.float64)
-    x = torch.cat([grid[0], grid[-1], grid[:, 0], grid[:, -1]])
+    x = border(pinhole)
     rays, _ = pinhole.rays(x)
     widest = float(rays[..., :2].square().sum(-1).max())
     k1 = (2 * float(torch.rand((), generator=g)) - 1) * min(STRONGEST, STRETCHED / (3 * widest))
@@ -61,6 +60,12 @@ def lens_over(pinhole: Camera, g: Generator, lost: float = 0.0) -> Camera:
     cut = lost * torch.rand(2, 2, generator=g, dtype=torch.float64) * (high - low)
     low, high = low + cut[0], high - cut[1]
     return lens.transformed(filling(low, high, pinhole.hw), pinhole.hw)
+
+
+def border(camera: Camera) -> Float[Tensor, "n 2"]:
+    """The pixels on the border of an image."""
+    x = pixel_grid(camera.hw, dtype=torch.float64)
+    return torch.cat([x[0], x[-1], x[:, 0], x[:, -1]])
 
 
 def filling(low: Float[Tensor, "2"], high: Float[Tensor, "2"], hw: tuple[int, int]) -> Float[Tensor, "3 3"]:

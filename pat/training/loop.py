@@ -6,27 +6,25 @@ import json
 import math
 import time
 from contextlib import closing, nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import cast
+from typing import Literal
 
 import torch
-from torch import Tensor
-from torch.nn.parallel import DistributedDataParallel
-from torch.nn.utils import clip_grad_norm_
 from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from arraygeom.atomic import sweep
-from pat.networks.weights import Network, new_network, save_weights, set_precision
+from pat.networks.weights import new_network, save_weights, set_precision
 from pat.support.locks import folder_lock
 from pat.support.tensor_files import write_tensors
 
 from .checkpoints import Checkpoint, collect, newest_checkpoint, restore, write_checkpoint
 from .config import TrainConfig, config_text, difference, parse_config, save_config
+from .learner import Learner
 from .losses import Objective, validation
-from .processes import Process, process
-from .samples import Sample, alone, made_ahead, scenes
+from .processes import process
+from .samples import Sample, SampleSource, made_ahead, scenes
 from .watch import Watch
 
 BEST, CHECKPOINTS = "best.safetensors", "checkpoints"
@@ -53,8 +51,33 @@ def train(config: TrainConfig) -> Path:
         if here.first:
             for folder in (config.out, config.out / CHECKPOINTS, config.out / "images"):
                 sweep(folder)
-        run = Run(config, here, former)
-        with closing(run.watch) if run.watch else nullcontext():
+        groups = here.share(config.groups)
+        torch.manual_seed(config.seed)
+        network = new_network(config.network, config.start).to(here.device)
+        average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / config.average))
+        set_precision(network, config.precision, compiled=config.compile)  # not the average's
+        objective = Objective(network, config.loss, attention=config.attention)
+        together = here.together(objective)
+        adam = Adam(network.parameters(), betas=config.momenta)
+        learner = Learner(network, average, objective, together, adam, config.clip, here)
+        with here.before_others():  # a cache of photographs is there for the others
+            learn, examine = scenes(config, device=str(here.device))
+        examined = list(examine(8)) if here.first else []
+        step, best, minutes = 0, -math.inf, 0.0
+        if former:
+            restore(former, network, adam, average)
+            step, best, minutes = (former.facts[k] for k in ("step", "best", "minutes"))
+        if here.first:
+            save_config(config, config.out / "config.yaml")
+        rates = config.rate, config.schedule, config.warmup
+        schedule = Schedule(config.steps, config.minutes, *rates, config.validate, config.save)
+        batch = config.batch * config.groups
+        watch = Watch(config.out, step, batch, tensorboard=config.tensorboard) if here.first else None
+        began = time.monotonic() - 60 * minutes
+        with closing(watch) if watch else nullcontext():
+            run = Run(
+                learner, learn, groups, examined, schedule, config.out, config, watch, step, best, began
+            )
             run.work()
         here.wait()
     return config.out / BEST
@@ -71,46 +94,54 @@ def former_run(config: TrainConfig) -> Checkpoint | None:
     return checkpoint
 
 
-def rate_at(config: TrainConfig, step: int, done: float) -> float:
-    """The learning rate of a step, when so much of the run is done.
+@dataclass(frozen=True)
+class Schedule:
+    """How long a run is, its learning rate, and after how many steps it validates and saves."""
 
-    >>> rate_at(TrainConfig(rate=1e-3, schedule="halving", warmup=0), 1, 0.5)
-    0.0005
-    """
-    done = min(done, 1)
-    halving = config.schedule == "halving"
-    fall = 0.5 ** int(done * 80 / 30) if halving else 0.5 + 0.5 * math.cos(math.pi * done)
-    return config.rate * (min(step / config.warmup, fall) if config.warmup else fall)
+    steps: int
+    minutes: float
+    rate: float
+    shape: Literal["cosine", "halving"]
+    warmup: int
+    validate: int
+    save: int
+
+    def done(self, step: int, minutes: float) -> float:
+        """How much of the run is done, 1 at the end."""
+        return max(step / self.steps, minutes / self.minutes)
+
+    def rate_at(self, step: int, done: float) -> float:
+        """The learning rate of a step.
+
+        >>> Schedule(100, math.inf, 1e-3, "halving", warmup=0, validate=10, save=10).rate_at(1, 0.5)
+        0.0005
+        """
+        if self.shape == "halving":
+            fall = 0.5 ** int(min(done, 1) * 80 / 30)
+        else:
+            fall = 0.5 + 0.5 * math.cos(math.pi * min(done, 1))
+        return self.rate * (min(step / self.warmup, fall) if self.warmup else fall)
 
 
+@dataclass
 class Run:
-    """A run under way: what it learns with and from.
+    """A run under way: what it learns with and from, and what it leaves in `out`.
 
-    `together` is the objective whose gradients all processes share, `groups` of each step are this one's. The
-    first process alone has a `watch`, and something `examined`.
+    `groups` of each step are this process's; `examined` is validated on. Of the first process only: `watch`.
     """
 
-    def __init__(self, config: TrainConfig, here: Process, former: Checkpoint | None):
-        self.config, self.here, self.groups = config, here, here.share(config.groups)
-        torch.manual_seed(config.seed)
-        self.network = new_network(config.network, config.start).to(here.device)
-        self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / config.average))
-        set_precision(self.network, config.precision, compiled=config.compile)  # not the average's
-        self.averaged = cast(Network, self.average.module)
-        self.objective = Objective(self.network, config.loss, attention=config.attention)
-        self.together = here.together(self.objective)
-        self.adam = Adam(self.network.parameters(), betas=config.momenta)
-        with here.before_others():  # a cache of photographs is there for the others
-            self.samples, examine = scenes(config, device=str(here.device))
-        self.examined = list(examine(8)) if here.first else []
-        self.step, self.best, self.loss, minutes = 0, -math.inf, math.nan, 0.0
-        if former:
-            restore(former, self.network, self.adam, self.average)
-            self.step, self.best, minutes = (former.facts[k] for k in ("step", "best", "minutes"))
-        if here.first:
-            save_config(config, config.out / "config.yaml")
-        self.watch = Watch(config, self.step) if here.first else None
-        self.began = time.monotonic() - 60 * minutes
+    learner: Learner
+    samples: SampleSource
+    groups: list[int]
+    examined: list[Sample]
+    schedule: Schedule
+    out: Path
+    recipe: TrainConfig
+    watch: Watch | None
+    step: int
+    best: float
+    began: float
+    loss: float = math.nan
 
     @property
     def minutes(self) -> float:
@@ -120,92 +151,69 @@ class Run:
     def work(self) -> None:
         """Step until done."""
         given = self.samples.steps(self.groups, start=self.step)
-        config = self.config
-        for samples in made_ahead(given, self.network):
+        validate, save = self.schedule.validate, self.schedule.save
+        for samples in made_ahead(given, self.learner.network):
             self.step += 1
-            done = max(self.step / config.steps, self.minutes / config.minutes)
-            done = self.here.agreed(done)
+            done = self.learner.here.agreed(self.schedule.done(self.step, self.minutes))
             self._advance(samples, done)
-            if self.step % config.validate == 0 or done >= 1:
+            if self.step % validate == 0 or done >= 1:
                 self._validate()
-            elif self.watch and EARLY <= self.step < config.validate and self.step & (self.step - 1) == 0:
-                self.watch.show(self.averaged, self.examined, self.step)
-            if self.step % config.save == 0 or done >= 1:
+            elif self.watch and EARLY <= self.step < validate and self.step & (self.step - 1) == 0:
+                self.watch.show(self.learner.averaged, self.examined, self.step)
+            if self.step % save == 0 or done >= 1:
                 self._save(done=done >= 1)
             if done >= 1:
                 return
 
     def _advance(self, given: list[Sample], done: float) -> None:
         """One step of the optimiser. Raises FloatingPointError if loss or gradients are not finite."""
-        rate = rate_at(self.config, self.step, done)
-        loss, norm = self._gradients(given)
+        rate = self.schedule.rate_at(self.step, done)
+        loss, norm = self.learner.gradients(given)
         if not (torch.isfinite(norm) and torch.isfinite(loss)):
             raise FloatingPointError(self._offence(given))
-        for group in self.adam.param_groups:
-            group["lr"] = rate
-        self.adam.step()
-        self.average.update_parameters(self.network)
+        self.learner.update(rate)
         self.loss = float(loss)
         if self.watch:
             self.watch.step(self.step, self.loss, float(norm), rate, done=done)
-
-    def _gradients(self, given: list[Sample]) -> tuple[Tensor, Tensor]:
-        """The mean loss of all processes' groups, and the norm of its gradients, which are then clipped."""
-        self.adam.zero_grad()
-        losses = []
-        for part in given:  # processes exchange gradients with the last
-            wait = isinstance(self.together, DistributedDataParallel) and part is not given[-1]
-            with self.together.no_sync() if wait else nullcontext():  # type: ignore[operator]
-                loss = self.together(part)
-                (loss / len(given)).backward()
-            losses.append(loss.detach())
-        norm = clip_grad_norm_(self.network.parameters(), self.config.clip)
-        return self.here.mean(torch.stack(losses).mean()), norm
 
     def _validate(self) -> None:
         """Measure, show, and keep the weights if they are the best so far."""
         if self.watch is None:
             return
-        facts = validation(self.averaged, self.examined)
+        facts = validation(self.learner.averaged, self.examined)
         facts |= {"step": self.step, "loss": self.loss, "minutes": self.minutes}
         self.watch.validated(facts)
-        self.watch.show(self.averaged, self.examined, self.step)
+        self.watch.show(self.learner.averaged, self.examined, self.step)
         if facts["psnr"] > self.best:
             self.best = facts["psnr"]
-            recipe = {"recipe": json.dumps(asdict(self.config), default=str), "validation": json.dumps(facts)}
-            save_weights(self.averaged, self.config.out / BEST, facts=recipe)
+            recipe = {"recipe": json.dumps(asdict(self.recipe), default=str), "validation": json.dumps(facts)}
+            save_weights(self.learner.averaged, self.out / BEST, facts=recipe)
 
     def _save(self, *, done: bool) -> None:
         if self.watch:
             self.watch.steps.flush()
             facts = {"step": self.step, "best": self.best, "minutes": self.minutes, "done": done}
-            recipe = {"recipe": config_text(self.config)}
-            state = collect(self.network, self.adam, self.average, {**facts, **recipe})
-            write_checkpoint(self.config.out / CHECKPOINTS, state)
+            learner = self.learner
+            state = collect(
+                learner.network, learner.adam, learner.average, facts | {"recipe": config_text(self.recipe)}
+            )
+            write_checkpoint(self.out / CHECKPOINTS, state)
 
     def _offence(self, given: list[Sample]) -> str:
         """Save the groups of a failed step; the error message names the samples."""
         found = []
         for group, part in zip(self.groups, given):
-            bad = [i for i in range(len(part.alpha)) if not self._is_finite(alone(part, i))]
+            bad = self.learner.offenders(part)
             found += [f"sample {i} of group {group}" for i in bad]
             if bad or len(given) == 1:
-                path = self.config.out / f"offending-step-{self.step}-group-{group}.safetensors"
+                path = self.out / f"offending-step-{self.step}-group-{group}.safetensors"
                 save_sample(part, path, facts={"step": str(self.step), "samples": str(bad)})
         who = ", ".join(found) or "no single sample of this process"
         return (
             f"step {self.step}: the loss or its gradient is not finite, by {who}; the batch is in "
-            f"{self.config.out}/offending-step-{self.step}-*.safetensors: inspect it, or lower `rate` "
-            f"(now {self.config.rate:g}); the last checkpoint and the best weights are as they were"
+            f"{self.out}/offending-step-{self.step}-*.safetensors: inspect it, or lower `rate` "
+            f"(now {self.schedule.rate:g}); the last checkpoint and the best weights are as they were"
         )
-
-    def _is_finite(self, given: Sample) -> bool:
-        """Whether loss and gradients are."""
-        self.objective.zero_grad()
-        loss = self.objective(given)
-        loss.backward()
-        gradients = [p.grad for p in self.objective.parameters() if p.grad is not None]
-        return bool(loss.isfinite()) and all(bool(g.isfinite().all()) for g in gradients)
 
 
 def save_sample(given: Sample, path: Path, *, facts: dict[str, str]) -> None:

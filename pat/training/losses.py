@@ -45,7 +45,9 @@ def structure_loss(image: Tensor, ground_truth: Tensor) -> Tensor:
 
 IMAGE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "psnr": image_loss,
-    "psnr-ssim": lambda image, truth: image_loss(image, truth) + structure_loss(image, truth),
+    "psnr-ssim": lambda image, ground_truth: (
+        image_loss(image, ground_truth) + structure_loss(image, ground_truth)
+    ),
     "mse": mse_loss,
 }
 
@@ -56,7 +58,9 @@ class Objective(nn.Module):
     def __init__(self, network: Network, loss: str, *, attention: float = 0.0) -> None:
         super().__init__()
         if attention and not isinstance(network, Comparing):
-            raise ValueError(f"attention: {type(network).__name__} has none to supervise: leave it at 0")
+            raise ValueError(
+                f"attention: {type(network).__name__} has no attention to supervise: leave it at 0"
+            )
         self.network = network
         self.image_loss = IMAGE_LOSSES[loss]
         self.attention = attention
@@ -102,7 +106,7 @@ def validation(network: FusionNetwork, samples: list[Sample]) -> dict[str, float
         fused, compared = _compared(network, given)
         error = (fused.image.clamp(0, 1) - given.ground_truth).square().flatten(1).mean(1)
         psnr.append(-10 * error.clamp(min=1e-8).log10().mean())
-        for where, visible in zip(given.position[:1], given.visible):
+        for where, visible in list(zip(given.position, given.visible))[:1]:
             off = (fused.position[0] - where.movedim(-1, 1)).norm(dim=1)
             near.append((off[visible] < 1.5).float().mean())
             for one in compared[:1]:

@@ -30,7 +30,9 @@ class Process:
     def share(self, groups: int) -> list[int]:
         """This process's groups of a step. Raises ValueError where they cannot be distributed evenly."""
         if groups % self.count:
-            raise ValueError(f"{groups} groups cannot be shared by {self.count} processes: take a multiple")
+            raise ValueError(
+                f"{groups} groups cannot be shared by {self.count} processes: give --groups a multiple"
+            )
         return list(range(self.rank, groups, self.count))
 
     def together(self, objective: nn.Module) -> nn.Module:
@@ -90,7 +92,9 @@ def _device(name: str) -> torch.device:
     try:
         device = torch.device(name)
     except RuntimeError:
-        raise ValueError(f"torch knows no device '{name}': give auto, cpu, cuda or cuda:N") from None
+        raise ValueError(
+            f"device '{name}' is not one that torch knows: give auto, cpu, cuda or cuda:N"
+        ) from None
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"device '{name}': there is no GPU that torch can use; give --device cpu")
     if device.type == "cuda" and device.index is None:

@@ -8,13 +8,14 @@ where it stopped, and processes share a step without communication.
 
 from __future__ import annotations
 
+import dataclasses
 import random
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -47,12 +48,6 @@ FEW = 8
 """With fewer cached than this, a new one is always made."""
 SCENE, RECORDING = 0, 1
 """Purpose of a random generator, beside the seed and a number."""
-FOLDERS: dict[str, tuple[type[Crops], str]] = {
-    "rendered": (RenderedCrops, "general"),
-    "pairs": (PairCrops, "rectified"),
-    "measured": (MeasuredPairs, "rectified"),
-}
-"""Scenes of folders by their entry in a recipe, and the rigs whose resolutions their betas have."""
 
 
 class Sample(NamedTuple):
@@ -73,6 +68,21 @@ class Sample(NamedTuple):
         return Inputs.of(self.alpha, self.betas, self.fields)
 
 
+class Mixture(NamedTuple):
+    """What steps record: entries as of `TrainConfig`, and the shares of `sources` other than photographs."""
+
+    reuse: float
+    filtered: float
+    rectified: float
+    sources: Mapping[str, float]
+
+    @classmethod
+    def of(cls, config: TrainConfig) -> Mixture:
+        """That of a recipe."""
+        sources = {"rendered": config.rendered, "pairs": config.pairs, "measured": config.measured}
+        return cls(config.reuse, config.filtered, config.rectified, sources)
+
+
 class Planned(NamedTuple):
     """The scenes that a step records: their number, and the kind of their rigs."""
 
@@ -83,16 +93,17 @@ class Planned(NamedTuple):
     """The number of the scenes to drop from the cache."""
 
 
-def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
+def plan(mixture: Mixture, seed: int) -> Iterator[Planned]:
     """What each step records, from step 0: new scenes, or some of the last `CACHED` again."""
     draw = random.Random(seed)
     cached: list[Planned] = []
     for number in range(2**62):
-        if len(cached) < FEW or draw.random() < 1 / config.reuse:
-            kind = _folder(config, draw)
-            if kind is None:
-                kind = "rectified" if draw.random() < config.rectified else "general"
-            betas = 3 if draw.random() < config.filtered else 1
+        new = len(cached) < FEW or draw.random() < 1 / mixture.reuse
+        if new:
+            kind = _source(mixture.sources, draw) or (
+                "rectified" if draw.random() < mixture.rectified else "general"
+            )
+            betas = 3 if draw.random() < mixture.filtered else 1
             dropped = cached.pop() if len(cached) > CACHED else None
             cached.insert(0, Planned(number, kind, betas, None))
             yield cached[0]._replace(dropped=dropped.scenes if dropped else None)
@@ -100,48 +111,34 @@ def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
             yield cached[int(draw.random() * len(cached))]
 
 
-def _folder(config: TrainConfig, draw: random.Random) -> str | None:
-    """The kind of folders that scenes are of, if not photographs. Draws only where there is a choice."""
-    drawn = draw.random() if any(getattr(config, kind) for kind in FOLDERS) else 1.0
-    for kind in FOLDERS:
-        drawn -= getattr(config, kind)
+def _source(shares: Mapping[str, float], draw: random.Random) -> str | None:
+    """The source of scenes, if not photographs. Draws only where there is a choice."""
+    if not any(shares.values()):
+        return None
+    drawn = draw.random()
+    for kind, share in shares.items():
+        drawn -= share
         if drawn < 0:
             return kind
     return None
 
 
+@dataclass
 class SampleSource:
-    """Samples of a recipe by the number of the step; called with a count: the first group of so many steps.
+    """Samples by the number of the step: called with a count it gives the first group of that many steps.
 
-    Scenes are of `photos`, which may be None where all are of folders, or of those items of the folders that
-    `choose` selects by their number. `field` is by default the recipe's.
+    Scenes are of `layered`, by the kind of their rigs and the number of betas, or of `folders`, by their
+    kind; `batch` of them are a group's.
     """
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        photos: PhotoBank | None,
-        seed: int,
-        *,
-        field: ReceptiveField | None = None,
-        device: str = "cpu",
-        choose: Callable[[int], bool] = lambda i: True,
-    ):
-        self.config, self.seed, self.field = config, seed, field or FIELDS[config.field]()
-        rigs = {"rectified": config.rectified_rigs, "general": config.general_rigs}
-        how: dict[str, Any] = {"hw": config.hw, "seed": seed, "device": device}
-        self.layered = {
-            (kind, n): LayeredScenes(photos, replace(rigs[kind], betas=n), **how)
-            for kind in rigs
-            for n in (1, 3)
-            if photos is not None
-        }
-        self.folders = {
-            name: kind(roots, resolutions=rigs[like].resolutions, choose=choose, **how)
-            for name, (kind, like) in FOLDERS.items()
-            if (roots := getattr(config, f"{name}_from"))
-        }
-        self.cache: dict[tuple[int, int], ArrayBatch] = {}
+    layered: Mapping[tuple[str, int], LayeredScenes]
+    folders: Mapping[str, Crops]
+    mixture: Mixture
+    batch: int
+    seed: int
+    field: ReceptiveField
+    recording: RecordingConfig
+    cache: dict[tuple[int, int], ArrayBatch] = dataclasses.field(default_factory=dict)
 
     def __call__(self, count: int) -> Iterator[Sample]:
         """The first group of the first `count` steps."""
@@ -149,7 +146,7 @@ class SampleSource:
 
     def steps(self, groups: list[int], *, start: int = 0) -> Iterator[list[Sample]]:
         """The samples of these groups, step by step, from step `start` on."""
-        for step, planned in enumerate(plan(self.config, self.seed)):
+        for step, planned in enumerate(plan(self.mixture, self.seed)):
             for key in [key for key in self.cache if key[0] == planned.dropped]:
                 del self.cache[key]
             if step >= start:
@@ -157,17 +154,17 @@ class SampleSource:
 
     def sample(self, planned: Planned, step: int, group: int) -> Sample:
         """One group of one step."""
-        key = planned.scenes, group
-        if key not in self.cache:
-            self.cache[key] = self._made(planned, _generator(self.seed, SCENE, *key))
+        if (planned.scenes, group) not in self.cache:
+            g = _generator(self.seed, SCENE, planned.scenes, group)
+            self.cache[planned.scenes, group] = self._made(planned, g)
         g = _generator(self.seed, RECORDING, step, group)
-        return degraded(self.cache[key], g, field=self.field, recording=self.config.recording)
+        return degraded(self.cache[planned.scenes, group], g, field=self.field, recording=self.recording)
 
     def _made(self, planned: Planned, g: Generator) -> ArrayBatch:
-        batch, betas = self.config.batch, planned.betas
         if planned.kind in self.folders:
-            return self.folders[planned.kind].sample(batch, g, number=planned.scenes, betas=betas)
-        return self.layered[planned.kind, betas].sample(batch, g)
+            crops = self.folders[planned.kind]
+            return crops.sample(self.batch, g, number=planned.scenes, betas=planned.betas)
+        return self.layered[planned.kind, planned.betas].sample(self.batch, g)
 
 
 def made_ahead(samples: Iterator[list[Sample]], network: FusionNetwork) -> Iterator[list[Sample]]:
@@ -192,10 +189,50 @@ def scenes(
 ) -> tuple[SampleSource, SampleSource]:
     """Sources of samples to learn from and to validate on, from different photographs, scenes and pairs."""
     layered = config.rendered + config.pairs + config.measured < 1
-    learned, unseen = photographs(config) if layered else (None, None)
-    n, source = config.held_out, partial(SampleSource, config, field=field, device=device)
-    learn = source(learned, config.seed + 1, choose=lambda i: i % n != 0)
-    return learn, source(unseen, config.seed + 2, choose=lambda i: i % n == 0)
+    bank, unseen = photographs(config) if layered else (None, None)
+    look, n = field or FIELDS[config.field](), config.held_out
+
+    def source(photos: PhotoBank | None, seed: int, choose: Callable[[int], bool]) -> SampleSource:
+        return source_of(config, photos, seed, look, device, crops(config, seed, device, choose))
+
+    learn = source(bank, config.seed + 1, lambda i: i % n != 0)
+    return learn, source(unseen, config.seed + 2, lambda i: i % n == 0)
+
+
+def source_of(
+    config: TrainConfig,
+    photos: PhotoBank | None,
+    seed: int,
+    field: ReceptiveField,
+    device: str = "cpu",
+    folders: Mapping[str, Crops] = {},
+) -> SampleSource:
+    """A recipe's samples. `photos` may be None where all batches come from `folders`, by kind of scenes."""
+    kinds = {"rectified": config.rectified_rigs, "general": config.general_rigs}
+    layered = {
+        (kind, betas): LayeredScenes(
+            photos, replace(rigs, betas=betas), hw=config.hw, seed=seed, device=device
+        )
+        for kind, rigs in kinds.items()
+        for betas in (1, 3)
+        if photos is not None
+    }
+    return SampleSource(layered, folders, Mixture.of(config), config.batch, seed, field, config.recording)
+
+
+def crops(config: TrainConfig, seed: int, device: str, choose: Callable[[int], bool]) -> dict[str, Crops]:
+    """Windows of rendered scenes and of pairs, by kind; of each the items chosen by their number."""
+    general, rectified = config.general_rigs.resolutions, config.rectified_rigs.resolutions
+    sources: dict[str, tuple[type[Crops], tuple[Path, ...], tuple[float, ...]]] = {
+        "rendered": (RenderedCrops, config.rendered_from, general),
+        "pairs": (PairCrops, config.pairs_from, rectified),
+        "measured": (MeasuredPairs, config.measured_from, rectified),
+    }
+    return {
+        name: kind(folders, hw=config.hw, resolutions=resolutions, seed=seed, device=device, choose=choose)
+        for name, (kind, folders, resolutions) in sources.items()
+        if folders
+    }
 
 
 def photographs(config: TrainConfig) -> tuple[PhotoBank, PhotoBank]:
@@ -292,8 +329,10 @@ def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
     alpha, beta = pair.cameras
     drawn = torch.randn(len(beta.K), 3, generator=g, dtype=torch.float64).to(beta.K)
     rotation = rotation_from_vector(drawn * pixels / beta.K[:, :1, 0])
-    pose = Pose(rotation, torch.zeros_like(beta.t)) @ beta.cam_from_world
-    return Pair(alpha, beta.replace(cam_from_world=pose), pair.depth)
+    moved: Camera = beta.replace(
+        cam_from_world=Pose(rotation, torch.zeros_like(beta.t)) @ beta.cam_from_world
+    )
+    return Pair(alpha, moved, pair.depth)
 
 
 def transfer(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -33,6 +33,7 @@ from pat.sensors import generator_for
 from pat.synthesis.layered import ArrayBatch
 from pat.synthesis.rigs import below, in_frame_of, one_of, scaled
 
+T = TypeVar("T")
 ACTIVE = 8
 """Scenes, or pairs, that samples are drawn from at a time; their images stay in memory."""
 GROUPS_PER_EXCHANGE = 8
@@ -62,40 +63,19 @@ class Crops:
         choose: Callable[[int], bool] = lambda i: True,
     ):
         self.hw, self.resolutions, self.seed, self.device = hw, resolutions, seed, device
-        found = [item for root in roots for item in self._listed(root)]
-        self.items = [item for i, item in enumerate(found) if choose(i)]
-        if not self.items:
-            given = f"{self.what} of {', '.join(map(str, roots))}: {len(found)}"
-            raise ValueError(f"{given} are too few to learn from some and to hold others out: give more")
-        self._check()
+        self._find(roots, choose)
+
+    def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
+        """List the items, and refuse what cannot be used."""
+        raise NotImplementedError
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
-        """Windows of group `number`, of the items active then.
-
-        If an item has fewer other cameras than betas are wanted, several betas are of the same camera.
-        `depth` is NaN where it is not known, and there is none of pairs without disparities.
-        """
-        active = active_items(number, len(self.items), self.seed)
-        sizes = [scaled(self.hw, one_of(self.resolutions, generator)) for _ in range(betas)]
-        with torch.no_grad():
-            drawn = [self._drawn(one_of(active, generator), sizes, generator) for _ in range(batch)]
-            return self._batched(drawn, sizes)
-
-    # A kind of folders: its items, what is refused or kept of them, windows of an item and of several.
-
-    what: str
-
-    def _listed(self, root: Path) -> Sequence[Any]:
+        """Windows of group `number`, of the items active then."""
         raise NotImplementedError
 
-    def _check(self) -> None:
-        raise NotImplementedError
-
-    def _drawn(self, item: int, sizes: list[HW], g: Generator) -> Any:
-        raise NotImplementedError
-
-    def _batched(self, drawn: list[Any], sizes: list[HW]) -> ArrayBatch:
-        raise NotImplementedError
+    def beta_sizes(self, betas: int, generator: Generator) -> list[HW]:
+        """Sizes of betas, drawn."""
+        return [scaled(self.hw, one_of(self.resolutions, generator)) for _ in range(betas)]
 
 
 class RenderedCrops(Crops):
@@ -105,19 +85,28 @@ class RenderedCrops(Crops):
     for one of which no image is as large as `hw`; when it is read, for one whose images cannot be read.
     """
 
-    what = "rendered scenes"
-
-    def _listed(self, root: Path) -> list[Path]:
-        return scene_folders(root)
-
-    def _check(self) -> None:
-        rigs = [scene_rig(folder) for folder in self.items]
+    def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
+        found = [folder for root in roots for folder in scene_folders(root)]
+        self.folders = chosen(found, choose, f"rendered scenes of {', '.join(map(str, roots))}")
+        rigs = [scene_rig(folder) for folder in self.folders]
         self.names = [rig.names for rig in rigs]
-        self.alphas = [large_enough(folder, rig, self.hw) for folder, rig in zip(self.items, rigs)]
-        cached = lru_cache(3 * ACTIVE)
-        self._view = cached(lambda scene, name: undistorted(read_view(self.items[scene], name)))
+        self.alphas = [large_enough(folder, rig, self.hw) for folder, rig in zip(self.folders, rigs)]
+        self._view = lru_cache(3 * ACTIVE)(
+            lambda scene, name: undistorted(read_view(self.folders[scene], name))
+        )
 
-    def _drawn(self, scene: int, sizes: list[HW], g: Generator) -> list[RenderedView]:
+    def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
+        """Windows of group `number`, of the scenes active then.
+
+        If a scene has fewer other cameras than betas are wanted, several betas are of the same camera.
+        """
+        scenes = active_items(number, len(self.folders), self.seed)
+        sizes = self.beta_sizes(betas, generator)
+        with torch.no_grad():
+            drawn = [self._windows(one_of(scenes, generator), sizes, generator) for _ in range(batch)]
+        return batched(drawn, self.device)
+
+    def _windows(self, scene: int, sizes: list[HW], g: Generator) -> list[RenderedView]:
         """Alpha's window and one of each beta."""
         name = one_of(self.alphas[scene], g)
         names = [n for n in self.names[scene] if n != name]
@@ -129,9 +118,6 @@ class RenderedCrops(Crops):
         alpha = finite_window(whole, top, left, size, self.hw)
         betas = [self._view(scene, order[i % len(order)]) for i in range(len(sizes))]
         return [alpha, *(beside(alpha, beta, small, self.hw, g) for beta, small in zip(betas, sizes))]
-
-    def _batched(self, drawn: list[list[RenderedView]], sizes: list[HW]) -> ArrayBatch:
-        return batched(drawn, self.device)
 
 
 def active_items(number: int, count: int, seed: int) -> list[int]:
@@ -151,17 +137,30 @@ def _order(count: int, seed: int, epoch: int) -> list[int]:
     return torch.randperm(count, generator=generator_for(seed, "order", epoch)).tolist()
 
 
+def chosen(found: list[T], choose: Callable[[int], bool], what: str) -> list[T]:
+    """Those chosen by their number. Raises ValueError if none is."""
+    items = [item for i, item in enumerate(found) if choose(i)]
+    if not items:
+        raise ValueError(
+            f"{what}: {len(found)} are too few to learn from some and to hold others out: give more"
+        )
+    return items
+
+
 def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
     """The cameras of a scene that can be alpha. Raises ValueError if none can, or there is no other."""
     sizes = {name: pinhole_of(c).hw for name, c in rig.cameras.items() if isinstance(c, Camera)}
     count = len(rig.names)
     if len(sizes) < max(count, 2):
-        found = f"{len(sizes)} of {count} cameras are calibrated"
-        raise ValueError(f"{folder}: {found}: all must be, two at least")
+        raise ValueError(
+            f"{folder}: has {len(sizes)} calibrated cameras of {count}: all must be, two at least"
+        )
     names = [name for name, size in sizes.items() if size[0] >= hw[0] and size[1] >= hw[1]]
     if not names:
         listed = ", ".join(f"{name} {w}x{h}" for name, (h, w) in sizes.items())
-        raise ValueError(f"{folder}: none as large as the samples, {hw[1]}x{hw[0]} ({listed}): lower `hw`")
+        raise ValueError(
+            f"{folder}: no image is as large as the samples, {hw[1]}x{hw[0]} ({listed}): lower `hw`"
+        )
     return names
 
 
@@ -196,8 +195,9 @@ def finite_window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> 
     """A `window` whose infinite depths are replaced by those of a distance `SKY`."""
     cut = window(view, top, left, size, hw)
     rays, _ = cut.camera.rays(pixel_grid(hw, dtype=torch.float64))
-    sky = (SKY / rays.norm(dim=-1)).to(cut.depth)
-    return cut._replace(depth=torch.where(cut.depth.isposinf(), sky, cut.depth))
+    return cut._replace(
+        depth=torch.where(cut.depth.isposinf(), (SKY / rays.norm(dim=-1)).to(cut.depth), cut.depth)
+    )
 
 
 def bounds(depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b 2"]:
@@ -212,5 +212,10 @@ def batched(drawn: Sequence[Sequence[RenderedView]], device: str) -> ArrayBatch:
     views = list(zip(*drawn))
     images = [srgb_image(torch.stack([v.rgb for v in same])).to(device) for same in views]
     depth = [torch.stack([v.depth for v in same]).to(device) for same in views]
-    placed = [stack([in_frame_of(a.camera, v.camera) for a, v in zip(views[0], same)]) for same in views]
-    return ArrayBatch(images, depth, [c.to(device, torch.float32) for c in placed], bounds(depth[0]))
+    cameras = [
+        stack([in_frame_of(alpha.camera, v.camera) for alpha, v in zip(views[0], same)]).to(
+            device, torch.float32
+        )
+        for same in views
+    ]
+    return ArrayBatch(images, depth, cameras, bounds(depth[0]))

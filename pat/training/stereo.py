@@ -6,9 +6,11 @@ apart, with the pair's range of disparities.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -22,9 +24,9 @@ from pat.data.pairs import MIDDLEBURY, PairFiles, pair_files
 from pat.data.windows import reduced
 from pat.media.images import read_image
 from pat.synthesis.layered import ArrayBatch
-from pat.synthesis.rigs import below
+from pat.synthesis.rigs import below, one_of
 
-from .scenes import ACTIVE, Crops
+from .scenes import ACTIVE, Crops, active_items, chosen
 
 COUNTERPART = {"disp2.png": "disp6.png", "disp1.png": "disp5.png"}
 """Files of the disparity of the right image, by those of the left."""
@@ -38,7 +40,7 @@ class Pictures(NamedTuple):
     left: Tensor
     right: Tensor
     largest: float
-    disparities: tuple[Tensor, ...]
+    disparities: tuple[Tensor, ...] = ()
 
 
 class PairCrops(Crops):
@@ -48,24 +50,43 @@ class PairCrops(Crops):
     are smaller than `hw`; when it is read, for an image that cannot be read.
     """
 
-    what = "stereo pairs"
-    measured = False
+    def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
+        found = [pair for root in roots for pair in pair_files(root)]
+        self.pairs = chosen(found, choose, f"stereo pairs of {', '.join(map(str, roots))}")
+        for pair in self.pairs:
+            self.check(pair)
+        self._pictures = lru_cache(ACTIVE)(lambda i: self.read(self.pairs[i]))
 
-    def _listed(self, root: Path) -> list[PairFiles]:
-        return pair_files(root)
+    def check(self, pair: PairFiles) -> None:
+        """Raise ValueError for a pair that cannot be used."""
+        check_pair(pair, self.hw)
 
-    def _check(self) -> None:
-        for pair in self.items:
-            check_pair(pair, self.hw)
-            if self.measured:
-                disparity_files(pair)
-        self._pictures = lru_cache(ACTIVE)(lambda i: read_pair(self.items[i], measured=self.measured))
+    def read(self, pair: PairFiles) -> Pictures:
+        """The images of a pair."""
+        return Pictures(read_image(pair.left), read_image(pair.right), pair.max_disparity)
 
-    def _drawn(
-        self, item: int, sizes: list[HW], g: Generator
-    ) -> tuple[list[Tensor], list[Tensor], float, float]:
+    def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
+        """Windows of group `number`, of the pairs active then. Several betas are of the same camera.
+
+        `depth` is NaN where it is not known, and there is none without disparities.
+        """
+        active = active_items(number, len(self.pairs), self.seed)
+        sizes = self.beta_sizes(betas, generator)
+        drawn = [self._window(one_of(active, generator), generator) for _ in range(batch)]
+        images, disparities, sides, largest = zip(*drawn)
+        alpha, beta = (torch.stack(same) for same in zip(*images))
+        side, nearest = (torch.tensor(numbers, dtype=torch.float64) for numbers in (sides, largest))
+        shown = [alpha, *(reduced(beta, size).clamp(max=1) for size in sizes)]
+        cameras = assumed_cameras(shown, side, nearest, self.device)
+        if not disparities[0]:
+            return cameras
+        near, far = (depth_of(torch.stack(same), self.hw[1]) for same in zip(*disparities))
+        depth = [near, *(coarser(far, size) for size in sizes)]
+        return replace(cameras, depth=[d.to(self.device) for d in depth])
+
+    def _window(self, i: int, g: Generator) -> tuple[list[Tensor], list[Tensor], float, float]:
         """Alpha and beta, their disparities, 1 where alpha is left, -1 where right, the largest disparity."""
-        pictures, (h, w) = self._pictures(item), self.hw
+        pictures, (h, w) = self._pictures(i), self.hw
         whole = pictures.left.shape[1:]
         times = 1 + below(min(REDUCED, whole[0] // h, whole[1] // w), g)
         top, left = (below(n - times * m + 1, g) for n, m in zip(whole, self.hw))
@@ -73,31 +94,9 @@ class PairCrops(Crops):
         cut = [p[None, :, *window] for p in (pictures.left, pictures.right)]
         images = [reduced(p, self.hw)[0].clamp(max=1) for p in cut]
         disparities = [d[window][::times, ::times] / times for d in pictures.disparities]
-        largest = pictures.largest / times
         if below(2, g):
-            return images, disparities, 1.0, largest
-        return images[::-1], disparities[::-1], -1.0, largest
-
-    def _batched(self, drawn: list[Any], sizes: list[HW]) -> ArrayBatch:
-        """Cameras are a metre apart, and of a focal length that puts the nearest points where they are."""
-        images, disparities, sides, largest = zip(*drawn)
-        alpha, beta = (torch.stack(same) for same in zip(*images))
-        shown = [alpha, *(reduced(beta, size).clamp(max=1) for size in sizes)]
-        side, nearest = (torch.tensor(numbers, dtype=torch.float64) for numbers in (sides, largest))
-        batch, (h, w), t = len(drawn), self.hw, torch.zeros(len(drawn), 3, dtype=torch.float64)
-        R, K = torch.eye(3, dtype=torch.float64).expand(batch, 3, 3), intrinsics(float(w), self.hw)
-        left = Camera(K=K.expand(batch, 3, 3), cam_from_world=Pose(R, t), hw=(h, w))
-        right = left.replace(cam_from_world=Pose(R, torch.stack([-side, t[:, 1], t[:, 2]], -1)))
-        cameras = [c.to(self.device, torch.float32) for c in (left, *(right.resize(hw) for hw in sizes))]
-        near = w / nearest
-        bounds = torch.stack([near, torch.full_like(near, torch.inf)], -1).to(self.device, torch.float32)
-        depth: list[Tensor] = []
-        if self.measured:
-            stacked = (torch.stack(same) for same in zip(*disparities))
-            ours, theirs = (torch.where(d > 0, w / d, torch.nan) for d in stacked)
-            depth = [ours, *(coarser(theirs, size) for size in sizes)]
-        placed, depth = ([x.to(self.device) for x in made] for made in (shown, depth))
-        return ArrayBatch(placed, depth, cameras, bounds)
+            return images, disparities, 1.0, pictures.largest / times
+        return images[::-1], disparities[::-1], -1.0, pictures.largest / times
 
 
 class MeasuredPairs(PairCrops):
@@ -106,25 +105,35 @@ class MeasuredPairs(PairCrops):
     Raises ValueError as `PairCrops`, and for a pair without the disparity of both images.
     """
 
-    measured = True
+    def check(self, pair: PairFiles) -> None:
+        """Raise ValueError for a pair that cannot be used."""
+        super().check(pair)
+        disparity_files(pair)
 
-
-def read_pair(pair: PairFiles, *, measured: bool) -> Pictures:
-    """The images of a pair, and if `measured` their disparities."""
-    images = read_image(pair.left), read_image(pair.right)
-    files = disparity_files(pair) if measured else ()
-    known = (read_image(path)[0] * 255 / (255 / pair.max_disparity) for path in files)
-    return Pictures(*images, pair.max_disparity, tuple(known))
+    def read(self, pair: PairFiles) -> Pictures:
+        """The images and disparities of a pair."""
+        left, right = (read_image(path)[0] * 255 for path in disparity_files(pair))
+        scale = 255 / pair.max_disparity
+        return super().read(pair)._replace(disparities=(left / scale, right / scale))
 
 
 def disparity_files(pair: PairFiles) -> tuple[Path, Path]:
     """Of the left and of the right image. Raises ValueError where one is missing."""
     for layout in MIDDLEBURY.values():
-        names = layout.ground_truth, COUNTERPART.get(layout.ground_truth, "-")
-        left, right = (pair.left.with_name(name) for name in names)
-        if pair.left.name == layout.left and left.is_file() and right.is_file():
-            return left, right
-    raise ValueError(f"{pair.left.parent}: wanted both images' true disparities, disp1.png and disp5.png")
+        files = [
+            pair.left.with_name(name)
+            for name in (layout.ground_truth, COUNTERPART.get(layout.ground_truth, "-"))
+        ]
+        if pair.left.name == layout.left and all(file.is_file() for file in files):
+            return files[0], files[1]
+    raise ValueError(
+        f"{pair.left.parent}: wanted the true disparity of both images beside them, disp1.png and disp5.png"
+    )
+
+
+def depth_of(disparity: Float[Tensor, "b h w"], width: int) -> Float[Tensor, "b h w"]:
+    """Of the cameras of `assumed_cameras`, in metres; NaN where the disparity is 0."""
+    return torch.where(disparity > 0, width / disparity, torch.nan)
 
 
 def coarser(depth: Float[Tensor, "b h w"], hw: HW) -> Float[Tensor, "b hs ws"]:
@@ -134,17 +143,38 @@ def coarser(depth: Float[Tensor, "b h w"], hw: HW) -> Float[Tensor, "b hs ws"]:
     return depth[:, rows][:, :, columns]
 
 
+def assumed_cameras(
+    images: list[Tensor], side: Float[Tensor, " b"], disparity: Float[Tensor, " b"], device: str
+) -> ArrayBatch:
+    """The images, alpha first, cameras a metre apart that put the nearest points `disparity` pixels apart."""
+    batch, _, h, w = images[0].shape
+    K = intrinsics(float(w), (h, w)).expand(batch, 3, 3)
+    t = torch.zeros(batch, 3, dtype=torch.float64)
+    alpha = Camera(
+        K=K, cam_from_world=Pose(torch.eye(3, dtype=torch.float64).expand(batch, 3, 3), t), hw=(h, w)
+    )
+    beta = alpha.replace(cam_from_world=Pose(alpha.R, torch.stack([-side, t[:, 1], t[:, 2]], -1)))
+    betas = [beta.resize((p.shape[-2], p.shape[-1])) for p in images[1:]]
+    cameras = [camera.to(device, torch.float32) for camera in (alpha, *betas)]
+    near = w / disparity
+    bounds = torch.stack([near, torch.full_like(near, torch.inf)], -1).to(device, torch.float32)
+    return ArrayBatch([p.to(device) for p in images], [], cameras, bounds)
+
+
 def check_pair(pair: PairFiles, hw: HW) -> None:
     """Raises ValueError unless both images are in colour, of one size, and at least `hw`."""
     left, right = _header(pair.left), _header(pair.right)
     if left != right:
-        other = f"{pair.right.name} {_described(right)}"
-        raise ValueError(f"{pair.left} is {_described(left)} and {other}: pairs must be alike")
+        raise ValueError(
+            f"{pair.left} is {_described(left)} and {pair.right.name} "
+            f"{_described(right)}: pairs must be alike"
+        )
     if left[2] == 1:
         raise ValueError(f"{pair.left} is grey: pairs to train on must be in colour")
     if left[0] < hw[0] or left[1] < hw[1]:
-        wanted = f"smaller than the samples, {hw[1]}x{hw[0]}: lower `hw`"
-        raise ValueError(f"{pair.left} is {_described(left)}, {wanted}")
+        raise ValueError(
+            f"{pair.left} is {_described(left)}, smaller than the samples, {hw[1]}x{hw[0]}: lower `hw`"
+        )
 
 
 def _header(file: Path) -> tuple[int, int, int]:
@@ -153,7 +183,9 @@ def _header(file: Path) -> tuple[int, int, int]:
         with Image.open(file) as image:
             return image.height, image.width, 1 if image.mode[0] in "1LIF" else 3
     except (OSError, UnidentifiedImageError):
-        raise ValueError(f"{file}: not an image that can be read: give a whole PNG or JPEG file") from None
+        raise ValueError(
+            f"{file}: not an image that can be read: give a whole PNG, TIFF or JPEG file"
+        ) from None
 
 
 def _described(header: tuple[int, int, int]) -> str:

@@ -23,11 +23,9 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom.atomic import write_text
-from arraygeom.extras import needs
 from pat.media.images import write_image
 from pat.networks.protocol import FusionNetwork
 
-from .config import TrainConfig
 from .losses import explained
 from .samples import Sample
 
@@ -40,16 +38,12 @@ class Watch:
     """Progress reports, of the first process alone.
 
     `steps.csv` has a line for each step and `log.jsonl` one for each validation. Lines of steps after
-    `step`, where the run continues, are removed.
+    `step`, where the run continues, are removed. A step sees so many `scenes`.
     """
 
-    def __init__(self, config: TrainConfig, step: int) -> None:
-        self.out, self.scenes, self.ticked = config.out, config.batch * config.groups, time.monotonic()
-        self.board: Any = None
-        if config.tensorboard:
-            with needs("tensorboard", "--tensorboard"):
-                from torch.utils.tensorboard import SummaryWriter
-            self.board = SummaryWriter(self.out / "tensorboard")
+    def __init__(self, out: Path, step: int, scenes: int, *, tensorboard: bool) -> None:
+        self.out, self.scenes, self.ticked = out, scenes, time.monotonic()
+        self.board = _board(out / "tensorboard") if tensorboard else None
         _keep_lines(self.out / "steps.csv", step, lambda line: int(line.partition(",")[0]), header=HEADER)
         _keep_lines(self.out / "log.jsonl", step, lambda line: json.loads(line)["step"])
         self.steps = (self.out / "steps.csv").open("a", encoding="utf-8")
@@ -90,7 +84,7 @@ class Watch:
 
     def show(self, network: FusionNetwork, samples: list[Sample], step: int) -> None:
         """Images of the validation: beta, alpha, fused, ground truth, confidence, side by side."""
-        sheet = torch.cat([_row(network, given) for given in samples[:SHOWN]], -2)
+        sheet = contact_sheet(network, samples[:SHOWN])
         write_image(self.out / "images" / f"step-{step:06d}.png", sheet)
         if self.board:
             self.board.add_image("validation", sheet, step)
@@ -104,8 +98,12 @@ class Watch:
 
 
 @torch.no_grad()
-def _row(network: FusionNetwork, given: Sample) -> Float[Tensor, "3 _ _"]:
-    """Of the first scene of a group: beta (three bands or one), alpha, fused, truth, confidence."""
+def contact_sheet(network: FusionNetwork, samples: list[Sample]) -> Float[Tensor, "3 _ _"]:
+    """A row for the first scene of each group: beta (three bands or one), alpha, fused, truth, confidence."""
+    return torch.cat([_row(network, given) for given in samples], -2).cpu()
+
+
+def _row(network: FusionNetwork, given: Sample) -> Tensor:
     fused, _ = explained(network, given)
     beta = torch.cat([b[:1] for b in given.betas], 1)
     confidence = torch.stack([c[:1] for c in fused.confidence], 1).amin(1, keepdim=True)
@@ -113,11 +111,21 @@ def _row(network: FusionNetwork, given: Sample) -> Float[Tensor, "3 _ _"]:
     columns = [beta, given.alpha[:1], fused.image[:1], given.ground_truth[:1], confidence]
     three = [c[:, :3] if c.shape[1] > 2 else c[:, :1].expand(-1, 3, -1, -1) for c in columns]
     row = [interpolate(c.float(), hw, mode="bilinear", align_corners=False) for c in three]
-    return torch.cat(row, -1)[0].clamp(0, 1).cpu()
+    return torch.cat(row, -1)[0].clamp(0, 1)
 
 
 def _keep_lines(path: Path, step: int, step_of: Any, *, header: str = "") -> None:
     """Remove the lines of steps after `step`, and a last line cut short."""
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.is_file() else []
-    earlier = [line for line in lines[bool(header) :] if line.endswith("\n") and step_of(line) <= step]
+    lines = (
+        path.read_text(encoding="utf-8").splitlines(keepends=True)[bool(header) :] if path.is_file() else []
+    )
+    earlier = [line for line in lines if line.endswith("\n") and step_of(line) <= step]
     write_text(path, header + "".join(earlier))
+
+
+def _board(folder: Path) -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        raise ValueError("tensorboard is not installed: pip install 'arraygeom-pat[tensorboard]'") from None
+    return SummaryWriter(folder)

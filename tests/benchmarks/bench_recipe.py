@@ -22,13 +22,14 @@ from unittest.mock import patch
 import torch
 import tyro
 
+from arraygeom.fields import FIELDS
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.networks.weights import load_weights
 from pat.synthesis.photos import PhotoBank
 from pat.training import loop, losses
 from pat.training.config import TrainConfig, load_config
 from pat.training.losses import validation
-from pat.training.samples import Sample, SampleSource, photographs
+from pat.training.samples import Sample, SampleSource, photographs, source_of
 from tests.benchmarks.printed import print_tables
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
@@ -119,7 +120,7 @@ class Bench:
         return Found(facts["psnr"], facts["matched"], seconds)
 
     def _source(self, config: TrainConfig, bank: PhotoBank, seed: int) -> SampleSource:
-        return SampleSource(config, bank, seed)
+        return source_of(config, bank, seed, FIELDS[config.field]())
 
 
 def unmatched(seen: object, given: Sample) -> torch.Tensor:

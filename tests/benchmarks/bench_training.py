@@ -15,16 +15,17 @@ from statistics import median
 import torch
 import tyro
 
+from arraygeom.fields import FIELDS
 from pat.evaluation.ablation import sample_photographs
 from pat.networks.weights import Network, new_network, set_precision
 from pat.training.config import TrainConfig, load_config
 from pat.training.losses import Objective
-from pat.training.samples import Sample, SampleSource
+from pat.training.samples import Sample, SampleSource, source_of
 from tests.benchmarks.printed import spread, timed
 
 
 def source(config: TrainConfig) -> SampleSource:
-    return SampleSource(config, sample_photographs(), 0)
+    return source_of(config, sample_photographs(), 0, FIELDS[config.field]())
 
 
 def stepped(objective: Objective, given: Sample, repeats: int) -> list[float]:

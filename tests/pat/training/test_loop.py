@@ -1,6 +1,7 @@
 """Runs: what they leave, going on after any stop, several processes, numbers that are not finite."""
 
 import json
+import math
 import os
 import resource
 import shutil
@@ -20,10 +21,10 @@ from safetensors import safe_open
 from pat.networks.configs import PATConfig
 from pat.networks.weights import load_weights, new_network, save_weights
 from pat.support.locks import folder_lock
-from pat.training import loop, samples
+from pat.training import loop
 from pat.training.checkpoints import newest_checkpoint
-from pat.training.config import TrainConfig, save_config
-from pat.training.loop import rate_at, train
+from pat.training.config import save_config
+from pat.training.loop import Schedule, train
 from pat.training.losses import Objective, validation
 from pat.training.processes import Process
 from pat.training.samples import made_ahead, scenes
@@ -208,7 +209,7 @@ def test_groups_must_be_shared_evenly():
 
 def test_a_sample_that_is_not_finite_is_named_and_saved(folder, whole, monkeypatch):
     config = replace(whole, out=folder / "nan")
-    ordinary = samples.SampleSource.sample
+    ordinary = loop.SampleSource.sample
 
     def poisoned(self, planned, step, group):
         given = ordinary(self, planned, step, group)
@@ -216,7 +217,7 @@ def test_a_sample_that_is_not_finite_is_named_and_saved(folder, whole, monkeypat
             given.ground_truth[1, :, 5, 5] = torch.nan
         return given
 
-    monkeypatch.setattr(samples.SampleSource, "sample", poisoned)
+    monkeypatch.setattr(loop.SampleSource, "sample", poisoned)
     with pytest.raises(FloatingPointError, match=r"step 5: .*, by sample 1 of group 1; "):
         train(config)
     (file,) = config.out.glob("offending-*")
@@ -289,11 +290,11 @@ def test_half_precision_and_compiled_parts_train(folder, whole):
 
 
 def test_schedules():
-    warm = TrainConfig(rate=1.0, warmup=4)
-    assert [rate_at(warm, s, s / 100) for s in (1, 2)] == [0.25, 0.5]
-    assert rate_at(warm, 50, 0.5) == pytest.approx(0.5)
-    halving = TrainConfig(rate=1.0, schedule="halving", warmup=0)
-    assert [rate_at(halving, 1, done) for done in (0.3, 0.4, 0.8)] == [1, 0.5, 0.25]
+    warm = Schedule(8, math.inf, 1.0, "cosine", warmup=4, validate=4, save=4)
+    assert [warm.rate_at(s, s / 100) for s in (1, 2)] == [0.25, 0.5]
+    assert warm.rate_at(50, 0.5) == pytest.approx(0.5)
+    halving = Schedule(8, math.inf, 1.0, "halving", warmup=0, validate=4, save=4)
+    assert [halving.rate_at(1, done) for done in (0.3, 0.4, 0.8)] == [1, 0.5, 0.25]
 
 
 def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_again(folder, whole):

@@ -97,5 +97,5 @@ def test_recipes_that_cannot_be_are_refused(text, message):
 
 def test_a_network_without_attention_of_its_own_is_not_supervised_by_it():
     network = GuidedPAT(GuidedPATConfig(widths=(8, 12, 12, 16)))
-    with pytest.raises(ValueError, match="GuidedPAT has none to supervise"):
+    with pytest.raises(ValueError, match="GuidedPAT has no attention to supervise"):
         Objective(network, "psnr", attention=1.0)

@@ -34,7 +34,7 @@ from pat.training.config import RecordingConfig, TrainConfig, parse_config, save
 from pat.training.lenses import lens_over, through_lenses
 from pat.training.loop import train
 from pat.training.losses import explained, match_loss, validation
-from pat.training.samples import degraded, pair_of, plan, scenes, transfer
+from pat.training.samples import Mixture, degraded, pair_of, plan, scenes, transfer
 from pat.training.scenes import (
     ACTIVE,
     GROUPS_PER_EXCHANGE,
@@ -101,7 +101,7 @@ def stereo(folder, *, count: int = 4, hw: tuple[int, int] = (80, 120), disparity
 
 def test_without_these_sources_steps_are_what_they_were():
     """The weights of the package were trained on this sequence."""
-    kinds = "".join(f"{p.kind[0]}{p.betas}" for p in islice(plan(TrainConfig(), 1), 20))
+    kinds = "".join(f"{p.kind[0]}{p.betas}" for p in islice(plan(Mixture.of(TrainConfig()), 1), 20))
     assert kinds == "r1g1r1g1r3g1g3r1g1r1g3r3r1r1r3g3r1g1r1r1"
 
 
@@ -109,7 +109,7 @@ def test_shares_are_shares():
     config = TrainConfig(
         rendered=0.3, rendered_from=(Path("a"),), pairs=0.2, pairs_from=(Path("b"),), reuse=1.0
     )
-    kinds = [p.kind for p in islice(plan(config, 0), 2000)]
+    kinds = [p.kind for p in islice(plan(Mixture.of(config), 0), 2000)]
     assert kinds.count("rendered") / 2000 == pytest.approx(0.3, abs=0.03)
     assert kinds.count("pairs") / 2000 == pytest.approx(0.2, abs=0.03)
     assert kinds.count("rectified") == pytest.approx(kinds.count("general"), rel=0.2)
@@ -271,7 +271,7 @@ def test_what_is_wrong_with_scenes(broken, tmp_path):
 
     (tmp_path / "empty").mkdir()
     assert "holds no rendered scene" in said(tmp_path / "empty")
-    assert "000000: none as large as the samples, 256x128 (mono 128x96, wide 112x80" in said(
+    assert "000000: no image is as large as the samples, 256x128 (mono 128x96, wide 112x80" in said(
         broken, (128, 256)
     )
     assert "4 are too few to learn from some and to hold others out" in said(broken, choose=lambda i: i > 10)
@@ -290,7 +290,7 @@ def test_what_is_wrong_with_scenes(broken, tmp_path):
     (scene / "render.json").unlink()
     assert "000002: is not a whole scene (no render.json)" in said(broken)
     rig.replace(cameras={"mono": rig["mono"]}).save(broken / "scenes" / "000000" / "rig.yaml")
-    assert "1 of 1 cameras are calibrated: all must be, two at least" in said(broken / "scenes" / "000000")
+    assert "has 1 calibrated cameras of 1: all must be, two at least" in said(broken / "scenes" / "000000")
 
 
 # Stereo pairs ----------------------------------------------------------------------------------------------
@@ -344,7 +344,7 @@ def test_nobody_knows_where_a_pairs_points_are(tmp_path):
 
 def test_middleburys_collections_say_their_largest_disparity(shared_data):
     crops = PairCrops([shared_data / "middlebury"], hw=(96, 192))
-    assert {round(pair.max_disparity) for pair in crops.items} >= {64, 85, 128}
+    assert {round(pair.max_disparity) for pair in crops.pairs} >= {64, 85, 128}
     assert crops.sample(2, generator(), number=0).images[0].std() > 0.05
 
 
@@ -458,7 +458,7 @@ def mixed(rendered, tmp_path_factory):
 
 
 def test_a_run_on_all_sources_goes_on_bit_for_bit(mixed, monkeypatch):
-    kinds = {p.kind for p in islice(plan(mixed, mixed.seed + 1), mixed.steps)}
+    kinds = {p.kind for p in islice(plan(Mixture.of(mixed), mixed.seed + 1), mixed.steps)}
     assert {"rendered", "pairs"} == kinds
     config = replace(mixed, out=mixed.out.with_name("stopped"))
     stopped(config, 5, monkeypatch)
@@ -482,7 +482,7 @@ def test_two_processes_on_all_sources_are_as_one(mixed):
 def test_photographs_are_not_needed_where_everything_comes_from_folders(mixed):
     learn, examine = scenes(mixed)
     assert len(list(learn(3))) == 3
-    assert {str(f) for f in learn.folders["rendered"].items}.isdisjoint(
-        map(str, examine.folders["rendered"].items)
+    assert {str(f) for f in learn.folders["rendered"].folders}.isdisjoint(
+        map(str, examine.folders["rendered"].folders)
     )
-    assert set(learn.folders["pairs"].items).isdisjoint(examine.folders["pairs"].items)
+    assert set(learn.folders["pairs"].pairs).isdisjoint(examine.folders["pairs"].pairs)
