@@ -32,7 +32,12 @@ class Batched:
     def __init_subclass__(cls, **options: Any) -> None:
         """Every kind is a pytree, and may be read by `torch.load(weights_only=True)`."""
         super().__init_subclass__(**options)
-        register_pytree_node(cls, _flattened, _unflattened, flatten_with_keys_fn=_flattened_with_keys)  # type: ignore[arg-type]
+        register_pytree_node(
+            cls,
+            _flattened,
+            _unflattened,
+            flatten_with_keys_fn=_flattened_with_keys,  # type: ignore[arg-type]
+        )
         torch.serialization.add_safe_globals([cls])
 
     @property

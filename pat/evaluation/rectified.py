@@ -11,6 +11,7 @@ from torch import Tensor
 
 from arraygeom import Pair, Rectification, Rig, apply_homography, intrinsics, pixel_grid, rectify, sample
 from arraygeom.pixels import HW, product
+from arraygeom.sampling import Interpolation
 
 LARGEST = 6.0
 """A canvas of more times alpha's pixels is refused: a camera nearly ahead stretches it without bound."""
@@ -25,7 +26,7 @@ class Warped(NamedTuple):
     original: Pair
 
     def back(
-        self, image: Float[Tensor, "c h w"], *, interpolation: str = "bicubic"
+        self, image: Float[Tensor, "c h w"], *, interpolation: Interpolation = "bicubic"
     ) -> Float[Tensor, "c ha wa"]:
         """An image of the canvas at alpha's pixels."""
         return warped(image, self.rectification.H_alpha, self.original.alpha.hw, interpolation=interpolation)
@@ -73,7 +74,7 @@ def whole_alpha(pair: Pair) -> Rectification:
     return rectify(pair, K=intrinsics(focal, (h, w), tuple(-low - 0.5)), hw=(rows, columns))
 
 
-def warped(image: Tensor, H: Tensor, hw: HW, *, interpolation: str = "bicubic") -> Tensor:
+def warped(image: Tensor, H: Tensor, hw: HW, *, interpolation: Interpolation = "bicubic") -> Tensor:
     """An image (C, h, w) at H x for the pixels x of an image of size hw; its border is repeated beyond."""
     x = apply_homography(H, pixel_grid(hw, dtype=torch.float64)).x
-    return sample(image[None], x[None].float(), interpolation=interpolation, extended=True).values[0]  # type: ignore[arg-type]
+    return sample(image[None], x[None].float(), interpolation=interpolation, extended=True).values[0]

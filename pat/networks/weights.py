@@ -120,8 +120,9 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             network, config = _described(path, metadata, networks)
-            _check_shapes(path, network, config, {n: file.get_slice(n).get_shape() for n in file.keys()})  # noqa: SIM118
-            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            names = file.keys()
+            _check_shapes(path, network, config, {name: file.get_slice(name).get_shape() for name in names})
+            state = {name: file.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:
         if zipfile.is_zipfile(path):
             raise ValueError(
