@@ -125,7 +125,8 @@ def _rig(document: Entry) -> Rig:
     if document.get("depth").value is not None:
         near, far = depth = tuple(document["depth"].numbers((2,), infinite=True))
         if not 0 < near <= far:
-            raise document["depth"].fail(f"is [{near:g}, {far:g}]; wanted [near, far] with 0 < near <= far")
+            stated = f"[{near * metres:g}, {far * metres:g}] m"
+            raise document["depth"].fail(f"is {stated}; wanted [near, far] with 0 < near <= far")
     rig = Rig(cameras, depth=depth, links=links, name=str(document.get("name", "").value))
     return rig if metres == 1.0 else rig.scaled(metres)
 

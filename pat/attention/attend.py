@@ -110,8 +110,9 @@ def attend_with_statistics(
 
     The statistics are float32 (float64 for float64 inputs) and differentiable, too.
     """
-    how = samples, interpolation, bias, backend
-    return Attended(*_attend(query, key, value, locations, *how, measured=True))
+    return Attended(
+        *_attend(query, key, value, locations, samples, interpolation, bias, backend, measured=True)
+    )
 
 
 def _attend(

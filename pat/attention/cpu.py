@@ -76,8 +76,13 @@ def backward(
     upstream = _flat(channels_last(cotangents[0]))
     measured = saved[0], cotangents[1].to(counted).contiguous()
     statistics, statistics_upstream = (t if t.numel() else t.new_zeros(4) for t in measured)
-    step = 4 if saved[0].numel() else 0
-    found = kernels.Saved(_flat(statistics), _flat(saved[1]), upstream, _flat(statistics_upstream), step)
+    found = kernels.Saved(
+        statistics=_flat(statistics),
+        logsum=_flat(saved[1]),
+        value_upstream=upstream,
+        statistics_upstream=_flat(statistics_upstream),
+        step=4 if saved[0].numel() else 0,
+    )
     query_out = _new(*((b, ha, wa, d) if wanted[0] else (0,)), dtype=query.dtype)
     key_out, value_out = (
         _new(*((b, *t.shape[2:], t.shape[1]) if want else (0,)), dtype=counted).zero_()
@@ -85,8 +90,14 @@ def backward(
     )
     points_out = query.new_zeros((b, *positions.points.shape[1:]) if wanted[3] else 0, dtype=counted)
     bias_out = query.new_zeros((b, ha, wa, positions.samples) if wanted[4] else 0, dtype=counted)
-    by_query, by_points, by_bias = (_flat(t) for t in (query_out, points_out, bias_out))
-    gradients = kernels.Gradients(by_query, by_points, by_bias, wanted[0], wanted[3], wanted[4])
+    gradients = kernels.Gradients(
+        _flat(query_out),
+        _flat(points_out),
+        _flat(bias_out),
+        wants_query=wanted[0],
+        wants_points=wanted[3],
+        wants_bias=wanted[4],
+    )
     taps = _tap_list(b * ha * wa, call)
     step = len(taps.tap_count)
     for first in range(0, b * ha * wa, step):

@@ -166,9 +166,15 @@ class Render:
         """Render what is missing; exit status 1 if the job is not complete then."""
         from ..farm.job import RenderConfig, Shard, render
 
-        how: dict[str, Any] = {"scenes": self.scenes, "out": self.out, "workers": self.workers}
-        how |= {"shard": Shard.parse(self.shard), "scheduler": self.scheduler}
-        report = render(RenderConfig.load(self.config), console=options.console(), **how)
+        report = render(
+            RenderConfig.load(self.config),
+            scenes=self.scenes,
+            out=self.out,
+            workers=self.workers,
+            shard=Shard.parse(self.shard),
+            scheduler=self.scheduler,
+            console=options.console(),
+        )
         say(f"{self.out}: {report}" + ": the same command tries these again" * bool(report.failed))
         if report.failed:
             sys.exit(1)

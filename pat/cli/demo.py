@@ -51,8 +51,9 @@ class Demo:
                 **classical_methods(network, recording),
             }
             say(f"{name}: fusion with the weights '{self.weights}'")
-            given = self.weights, array.rig, array.images
-            frame = fuse_with_progress(*given, alpha=ALPHA, noise=recording.noise)
+            frame = fuse_with_progress(
+                self.weights, array.rig, array.images, alpha=ALPHA, noise=recording.noise
+            )
             methods["fusion"] = frame.image.clamp(0, 1)
             scores = {method: score(image, array.ground_truth) for method, image in methods.items()}
             columns[name] = {method: f"{psnr:.2f} / {ssim:.3f}" for method, (psnr, ssim) in scores.items()}

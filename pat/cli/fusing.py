@@ -135,6 +135,7 @@ class Fuse(Known):
         rig = self._rig()
         alpha, found = files_by_camera(rig, self.alpha, self.given, self.image)
         found = self._frames(found)
+        self._choose_bits(found)
         views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=alpha)
         if self.sequence:
             return self._many(rig, found, alpha)
@@ -184,6 +185,7 @@ class Fuse(Known):
 
         self.sequence |= bool(rates)
         files = self._frames(files)
+        self._choose_bits(files)
         first = {name: paths[0] for name, paths in files.items()}
         focal = options.numbers_by_name(self.focal, "--focal")
         options.say_when_compiling()
@@ -204,20 +206,22 @@ class Fuse(Known):
         rig.save(self.out / FOUND_RIG)
         say(f"the rig that was found: {self.out / FOUND_RIG}")
 
-    def _frames(self, files: dict[str, list[Path]]) -> dict[str, list[Path]]:
-        """The files of the frames that every camera has; all of them, of a sequence. The result has as many
-        bits as these images, unless asked otherwise."""
-        from ..fusion.frame_matching import matched_frames, warn_of_gaps
+    def _choose_bits(self, files: Mapping[str, Sequence[Path]]) -> None:
+        """As many bits as the images have, unless asked otherwise."""
         from ..media.images import has_many_bits
 
-        if self.sequence:
-            warn_of_gaps(files)
-        else:
-            files = matched_frames(files)
         if self.bits is None:
             deep = any(has_many_bits(paths[0]) for paths in files.values())
             self.bits = 32 if self.kind == "exr" else 16 if deep else 8
-        return files
+
+    def _frames(self, files: dict[str, list[Path]]) -> dict[str, list[Path]]:
+        """The files of the frames that every camera has; all of them, of a sequence."""
+        from ..fusion.frame_matching import matched_frames, warn_of_gaps
+
+        if self.sequence:
+            warn_of_gaps(files)
+            return files
+        return matched_frames(files)
 
     def _rig(self) -> Rig:
         rig = options.load_rig_or_say_no_image(self.given[0], self.depth)
@@ -366,8 +370,11 @@ class Fuse(Known):
         from ..support.jobs import Workers, cores
 
         self.refuse_several()
-        single = {"--points": self.points, "--classical": self.classical}
-        single["--device cuda"] = self.device == "cuda"
+        single = {
+            "--points": self.points,
+            "--classical": self.classical,
+            "--device cuda": self.device == "cuda",
+        }
         if named := [option for option, given in single.items() if given]:
             raise ValueError(f"{', '.join(named)}: for a single frame only: leave out for several")
         batch = Batch(

@@ -79,8 +79,8 @@ def noise_of(texts: Iterable[str], *, by_default: bool = False) -> Any:
             raise ValueError(
                 f"--noise: '{entry}' is neither estimate nor none nor NAME=ELECTRONS[,READ], as mono=200,2"
             ) from None
-        if (more := len(read) + 1) > 2:
-            raise ValueError(f"--noise: '{entry}' has {more} numbers; wanted electrons at white, read noise")
+        if (count := 1 + len(read)) > 2:
+            raise ValueError(f"--noise: '{entry}' has {count} numbers; wanted electrons at white, read noise")
         levels.append((name, NoiseLevel.of_electrons(electrons, sum(read))))
     return dict(_once("--noise", levels))
 
@@ -251,14 +251,18 @@ def read_images(rig: Rig, texts: Iterable[str], *, sized: bool = True) -> dict[s
 def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
     """Images of `--image NAME=FILE`: the first of every camera make a frame, the second ones the next.
 
-    Raises ValueError as `by_frame`.
+    Raises ValueError for cameras with unequal numbers of images.
     """
     from ..media.images import read_image
 
     files: dict[str, list[Path]] = {}
     for name, path in (_named_file("--image", text) for text in texts):
         files.setdefault(rig.require(name), []).append(path)
-    return [{n: read_image(path, name=n) for n, path in frame.items()} for frame in by_frame(files)]
+    try:
+        frames = by_frame(files)
+    except ValueError as error:
+        raise ValueError(f"--image: {error}") from None
+    return [{n: read_image(path, name=n) for n, path in frame.items()} for frame in frames]
 
 
 def by_frame(files: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]]:
@@ -266,7 +270,9 @@ def by_frame(files: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]]:
     counts = {name: len(paths) for name, paths in files.items()}
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"'{name}' {count}" for name, count in counts.items())
-        raise ValueError(f"--image: every camera needs an image of every frame; there are {listed}")
+        raise ValueError(
+            f"every camera needs an image of every frame; there are {listed}: give each camera as many"
+        )
     return [dict(zip(files, paths)) for paths in zip(*files.values())]
 
 

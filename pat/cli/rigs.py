@@ -342,8 +342,10 @@ class Refine:
         deviations = options.numbers_by_name(self.sigma, "--sigma")
         options.say_when_compiling()
         frames = options.read_frames(rig, self.image)
-        if self.matches is not None and (count := len(frames)) > 1:
-            raise ValueError(f"--matches needs a single frame, and {count} are given: give an image a camera")
+        if self.matches is not None and len(frames) > 1:
+            raise ValueError(
+                f"--matches needs a single frame, and {len(frames)} are given: give one image of each camera"
+            )
         matches = given_matches(self.matches, self.image, frames[0])
         with options.working("matching features and refining"):
             found = refine(

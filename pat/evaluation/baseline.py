@@ -44,8 +44,14 @@ REGRESSION_RADIUS, REGRESSION_FLOOR = 3, 3e-3
 """Window and regulariser (variance of luminance) of the regression of colour on luminance."""
 
 
-DISPARITY_FILL, COLOUR_FILL = (50, 4), (300, 3)
-"""Strength of the edge-aware smoothing, and the difference of 8-bit luminance that counts as an edge."""
+class _Smoothing(NamedTuple):
+    """Strength of the edge-aware smoothing, and the difference of 8-bit luminance that counts as an edge."""
+
+    strength: float
+    edge: float
+
+
+DISPARITY_FILL, COLOUR_FILL = _Smoothing(50, 4), _Smoothing(300, 3)
 UNRECTIFIABLE = "the cameras look along the line between them: such a pair cannot be rectified"
 
 
@@ -65,7 +71,9 @@ def classical_view(
     Raises ValueError for cameras that are not calibrated, and for those that cannot be rectified.
     """
     if names := [name for name in images if not isinstance(rig[name], Camera)]:
-        raise ValueError(f"{', '.join(names)}: not calibrated, and the classical baseline needs poses")
+        raise ValueError(
+            f"{', '.join(names)}: not calibrated, and the classical baseline needs poses and depths"
+        )
     small = {name: reduced(image, longest).clamp(0, 1) for name, image in images.items()}
     for name, image in small.items():
         rig = rig.resize(name, (image.shape[-2], image.shape[-1]))
@@ -135,8 +143,15 @@ def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Te
     from skimage.restoration import denoise_nl_means
 
     given = image.movedim(0, -1).numpy()
-    noise = {"h": 0.8 * deviation, "sigma": deviation}
-    found = denoise_nl_means(given, 5, 6, **noise, fast_mode=True, channel_axis=-1)
+    found = denoise_nl_means(
+        given,
+        patch_size=5,
+        patch_distance=6,
+        h=0.8 * deviation,
+        sigma=deviation,
+        fast_mode=True,
+        channel_axis=-1,
+    )
     return torch.from_numpy(np.ascontiguousarray(found.reshape(given.shape))).movedim(-1, 0).to(image)
 
 
@@ -302,11 +317,11 @@ def _regressed(chroma: Image, luma: Image, residual: Image) -> Image:
     return chroma + slope * np.clip(residual, -0.2, 0.2)[..., None]
 
 
-def _diffused(values: Image, weight: Image, guide: NDArray[np.uint8], how: tuple[float, float]) -> Image:
+def _diffused(values: Image, weight: Image, guide: NDArray[np.uint8], how: _Smoothing) -> Image:
     """The weighted mean of `values` over what is connected in `guide`. Weights must be positive."""
 
     def smooth(plane: Image) -> Image:
-        return cv2.ximgproc.fastGlobalSmootherFilter(guide, plane.astype(np.float32), *how)
+        return cv2.ximgproc.fastGlobalSmootherFilter(guide, plane.astype(np.float32), how.strength, how.edge)
 
     total = smooth(weight)
     planes = np.atleast_3d(values).transpose(2, 0, 1)

@@ -64,13 +64,17 @@ def whole_alpha(pair: Pair) -> Rectification:
     corners = torch.tensor([[-0.5, -0.5], [w - 0.5, -0.5], [-0.5, h - 0.5], [w - 0.5, h - 0.5]]).to(alpha.K)
     rays = product(rough.R_alpha, alpha.rays(corners)[0][..., None])[..., 0]
     if not bool((rays[..., 2] > 0).all()):
-        raise ValueError("the baseline is too near an optical axis: part of alpha is behind the plane")
+        raise ValueError(
+            "the baseline is too near an optical axis: part of alpha lies behind the rectified image"
+        )
     focal = alpha.K[:2, :2].det().abs().sqrt()
     x = focal * rays[..., :2] / rays[..., 2:]
     low, high = x.amin(0), x.amax(0)
     columns, rows = (int(n) for n in (high - low).ceil())
     if rows * columns > LARGEST * h * w:
-        raise ValueError(f"the baseline is near an optical axis: {columns}x{rows} pixels if rectified")
+        raise ValueError(
+            f"the baseline is near an optical axis: the rectified image has {columns}x{rows} pixels"
+        )
     return rectify(pair, K=intrinsics(focal, (h, w), tuple(-low - 0.5)), hw=(rows, columns))
 
 

@@ -149,7 +149,7 @@ def depth_markdown(rows: Sequence[StereoRow]) -> str:
 def _depth_cell(rows: Sequence[StereoRow]) -> str:
     if not rows:
         return ""
-    errors = np.array([row[-2:] for row in rows], float)  # end-point error, share within a pixel
+    errors = np.array([(row.end_point_error, row.within_one) for row in rows], float)
     return "{:.2f} px / {:.1%}".format(*errors.mean(0))
 
 

@@ -111,7 +111,9 @@ class RenderConfig:
 
     def renderer(self) -> Renderer:
         """A ready renderer. Raises ValueError for a rig it cannot render, or if a library is missing."""
-        return self.settings.renderer(Rig.load(self.rig), self.check)
+        rig = Rig.load(self.rig)
+        self.settings.images(rig)  # refuses rigs
+        return self.settings.renderer(rig, self.check)
 
     def scene_bytes(self) -> float:
         """Approximate bytes of a scene on disk: 2 a colour and 4 for depth, before compression.
@@ -245,7 +247,7 @@ def make_scene(config_text: str, work: Path, scene: Path, index: int) -> None:
     config, render_scene = _ready(config_text)
     reason = ""
     for attempt in range(config.limits.refusals):
-        seed = seed_for(config.seed, "scene", index, attempt)
+        seed = scene_seed(config, index, attempt)
         partial = work / f"{index:06d}-{uuid4().hex[:12]}"
         wall, cpu = time.monotonic(), time.process_time()
         try:
@@ -274,6 +276,11 @@ def make_scene(config_text: str, work: Path, scene: Path, index: int) -> None:
         finally:
             shutil.rmtree(partial, ignore_errors=True)
     raise ValueError(f"{config.limits.refusals} seeds were refused, the last one: {reason}")
+
+
+def scene_seed(config: RenderConfig, index: int, attempt: int) -> int:
+    """The seed of a scene; another one for every attempt that the self-check refused."""
+    return seed_for(config.seed, "scene", index, attempt)
 
 
 @lru_cache(maxsize=1)

@@ -247,8 +247,9 @@ class Batch:
                 frame = self._frame(i)
             view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
             bands = band_names(frame, (name for name in self.rig.betas(self.alpha) if name in self.files))
-            how: dict[str, Any] = {"bits": self.bits, "kind": self.kind, "view": view}
-            save_frame(frame, self.out, name=self.names[i], bands=bands, **how)
+            save_frame(
+                frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i], bands=bands
+            )
 
     def _frame(self, i: int) -> Frame:
         if not self.sequence:

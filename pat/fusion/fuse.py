@@ -173,8 +173,9 @@ def fuse(
         with torch.set_grad_enabled(differentiable):
             matches = matcher(inputs.inputs) if network.uses_matches else None
             LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
-            how: dict[str, Any] = {"found": noisy, "progress": progress, "store": store}
-            done = fused_in_tiles(network, inputs, matches, plan.tiles, **how)
+            done = fused_in_tiles(
+                network, inputs, matches, plan.tiles, found=noisy, progress=progress, store=store
+            )
             del matches
         warn_of_confidence(network, done.frame, inputs)
         frame = done.frame._replace(depth=background_filled(done.frame, inputs.inputs))

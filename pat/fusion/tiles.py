@@ -249,7 +249,6 @@ def fused_in_tiles(
         return made if found else made._replace(found=made.found[:0])
 
     shown = progress(tiles, len(tiles)) if progress else tiles
-    parts = ((tile, make(tile)) for tile in shown)
     if store and len(tiles) > 1:
         digest = _digest(network, frame.inputs)
         files = {t: store / f"{digest}_{'_'.join(map(str, (*t.inner, *t.outer)))}.safetensors" for t in tiles}
@@ -257,6 +256,8 @@ def fused_in_tiles(
             if not files[tile].exists():
                 write_tensors(files[tile], make(tile)._asdict())
         parts = ((tile, FusedTile(**load_file(file))) for tile, file in files.items())
+    else:
+        parts = ((tile, make(tile)) for tile in shown)
     # A single tile is the frame as it is, with its gradients.
     return FusedTile(*assembled(frame.hw, ((Tile(tile.inner, tile.inner), part) for tile, part in parts)))
 

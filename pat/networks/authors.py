@@ -58,12 +58,13 @@ def config_of(given: Mapping[str, Tensor]) -> PATConfig:
             raise ValueError(f"{name} is missing")
     dim, in_channels = given["init_feature.0.weight"].shape[:2]
     scale = round((len(given["upscale.4.weight"]) / max(dim, 1)) ** 0.5)
-    sizes: dict[str, Any] = {
+    sizes = {
         "betas": betas,
         "in_channels": in_channels,
         "out_channels": len(given["upscale.7.weight"]),
+        "dim": dim,
+        "scale": scale,
     }
-    sizes |= {"dim": dim, "scale": scale}
     if min(sizes.values()) < 1 or max(sizes.values()) > 1024:
         raise ValueError(f"it has {', '.join(f'{name} {n}' for name, n in sizes.items())}")
     layout: dict[str, Any] = {"block_bias": False, "fusion_bias": True, "values_after_block": True}

@@ -86,7 +86,9 @@ class PAT(nn.Module):
         image = self.post(torch.cat([own, *(a.value for a in attended)], 1))
         if self.config.residual:
             alpha, s = inputs.alpha.expand(-1, self.config.out_channels, -1, -1), self.config.scale
-            image = image + (alpha if s == 1 else interpolate(alpha, scale_factor=s, mode="bicubic"))
+            if s > 1:
+                alpha = interpolate(alpha, scale_factor=s, mode="bicubic", align_corners=False)
+            image = image + alpha
         position, deviation, confidence = (list(part) for part in list(zip(*attended))[1:])
         return FusionOutput(image, position, deviation, confidence), compared
 
@@ -106,8 +108,9 @@ class PAT(nn.Module):
                 f"images must have 1 or {wanted} channels for this network, got {image.shape[1]}"
             )
         image = image.expand(-1, wanted, -1, -1)
-        more = [normalised(image.mean(1, keepdim=True))] if self.config.normalised else []
-        return torch.cat([image, *more], 1) if more else image
+        if not self.config.normalised:
+            return image
+        return torch.cat([image, normalised(image.mean(1, keepdim=True))], 1)
 
 
 def normalised(image: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:

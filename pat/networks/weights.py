@@ -120,7 +120,7 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             network, config = _described(path, metadata, networks)
-            names = file.keys()
+            names = list(file.keys())
             _check_shapes(path, network, config, {name: file.get_slice(name).get_shape() for name in names})
             state = {name: file.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:

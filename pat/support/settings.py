@@ -8,20 +8,30 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import field, fields, is_dataclass
-from functools import partial
 from importlib import import_module
 from pkgutil import iter_modules
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 Kind = Literal["physics", "size", "tuned"]
 
 
+def physics(value: Any, why: str) -> Any:
+    """A field whose value follows from what is measured; `why` says from what."""
+    return _entry("physics", value, why)
+
+
+def size(value: Any, why: str) -> Any:
+    """A field that says how much is done at a time."""
+    return _entry("size", value, why)
+
+
+def tuned(value: Any, why: str) -> Any:
+    """A field whose value was chosen; `why` says on what, and what it does."""
+    return _entry("tuned", value, why)
+
+
 def _entry(kind: Kind, value: Any, why: str) -> Any:
-    """A field with its kind; `why` says from what its value follows, or on what it was chosen and why."""
     return field(default=value, metadata={"kind": kind, "why": why})
-
-
-physics, size, tuned = (partial(_entry, kind) for kind in get_args(Kind))
 
 
 class SettingEntry(NamedTuple):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
@@ -55,12 +55,14 @@ def check_views(
         f"{a} > {b}": pair_figures(_camera(rig, a), frames[a], _camera(rig, b), frames[b])
         for a, b in together
     }
-    seen = {
-        a: max(pairs[f"{x} > {y}"]["visible"] for x, y in together if x == a) for a, _ in sorted(together)
-    }
-    best = {name: {"visible": share} for name, share in seen.items()}
-    judged = (views, _VIEW), (pairs, _PAIR), (best, _BEST)
-    reasons = [reason for figures, bounds in judged for reason in _reasons(figures, bounds, limits)]
+    reasons = [r for name, figures in views.items() for r in _view_reasons(name, figures, limits)]
+    reasons += [r for name, figures in pairs.items() for r in _pair_reasons(name, figures, limits)]
+    for name in sorted({a for a, _ in together}):
+        seen = max(pairs[f"{a} > {b}"]["visible"] for a, b in together if a == name)
+        if seen < limits.overlap:
+            reasons.append(
+                f"{name}: the other cameras see {seen:.0%} of what it sees (at least {limits.overlap:.0%})"
+            )
     return {"accepted": not reasons, "reasons": reasons, "views": views, "pairs": pairs}
 
 
@@ -157,32 +159,22 @@ def _camera(rig: Rig, name: str) -> Camera:
     return camera
 
 
-_VIEW = (
-    ("dark", "dark", 1, "{:.0%} of the image is black (at most {:.0%})"),
-    ("bright", "bright", 1, "{:.0%} of the image is saturated (at most {:.0%})"),
-    ("texture", "texture", -1, "{:.0%} of the image has texture (at least {:.0%})"),
-)
-_PAIR = (
-    ("p95", "error", 1, "depth misses pixels by {:.3f} (at most {:g})"),
-    ("shift", "shift", 1, "colours are displaced by {:.2f} pixels (at most {:g})"),
-    ("contradicted", "contradicted", 1, "{:.1%} of the points are seen through"),
-)
-_BEST = (("visible", "overlap", -1, "the other cameras see {:.0%} of what it sees (at least {:.0%})"),)
-"""Of figures: their limits, whether these are the most (1) or the least, and the words of a refusal."""
+def _view_reasons(name: str, figures: Mapping[str, float], limits: CheckLimits) -> Iterator[str]:
+    if figures["dark"] > limits.dark:
+        yield f"{name}: {figures['dark']:.0%} of the image is black (at most {limits.dark:.0%})"
+    if figures["bright"] > limits.bright:
+        yield f"{name}: {figures['bright']:.0%} of the image is saturated (at most {limits.bright:.0%})"
+    if figures["texture"] < limits.texture:
+        yield f"{name}: {figures['texture']:.0%} of the image has texture (at least {limits.texture:.0%})"
 
 
-def _reasons(
-    figures: Mapping[str, Mapping[str, float]],
-    bounds: Sequence[tuple[str, str, int, str]],
-    limits: CheckLimits,
-) -> list[str]:
-    """The figures, by name, that are beyond their limits."""
-    return [
-        f"{name}: {words.format(found[figure], getattr(limits, limit))}"
-        for name, found in figures.items()
-        for figure, limit, sign, words in bounds
-        if figure in found and sign * found[figure] > sign * getattr(limits, limit)
-    ]
+def _pair_reasons(name: str, figures: Mapping[str, float], limits: CheckLimits) -> Iterator[str]:
+    if figures.get("p95", 0.0) > limits.error:
+        yield f"{name}: depth misses pixels by {figures['p95']:.3f} (at most {limits.error:g})"
+    if figures.get("shift", 0.0) > limits.shift:
+        yield f"{name}: colours are displaced by {figures['shift']:.2f} pixels (at most {limits.shift:g})"
+    if figures["contradicted"] > limits.contradicted:
+        yield f"{name}: {figures['contradicted']:.1%} of the points are seen through"
 
 
 def _rounded(figures: Mapping[str, Tensor]) -> dict[str, float]:

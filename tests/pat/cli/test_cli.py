@@ -130,7 +130,7 @@ def test_mistakes_are_one_line_and_leave_nothing(changes, message, small, capsys
             lambda rig: rig["cameras"]["mono"].update(rotation=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]),
             "not a rotation",
         ),
-        (lambda rig: rig.update(depth=[20, 2]), "depth: is [20, 2]; wanted [near, far]"),
+        (lambda rig: rig.update(depth=[20, 2]), "depth: is [20, 2] m; wanted [near, far]"),
         (lambda rig: rig["cameras"]["mono"].pop("size"), "cameras.mono.size"),
         (
             lambda rig: rig["cameras"]["colour"].update(position=[100, 0, 0], translation=[0, 0, 0]),

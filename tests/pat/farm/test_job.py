@@ -18,8 +18,7 @@ from arraygeom import Camera, Pose, Rig, intrinsics
 from arraygeom.distortion import Distortion
 from pat.cli.main import main
 from pat.farm.backends import LayeredSettings, rig_from_alpha
-from pat.farm.job import RenderConfig, Shard, check_space, publish, render, write_manifest
-from pat.sensors import seed_for
+from pat.farm.job import RenderConfig, Shard, check_space, publish, render, scene_seed, write_manifest
 from pat.support.jobs import JobError
 from pat.synthesis.rendered import Rendered
 
@@ -263,8 +262,18 @@ def test_shards_share_the_scenes_out():
             Shard.parse(text)
 
 
-def test_seeds_are_of_the_scene_and_the_attempt_alone():
-    assert len({seed_for(1, "scene", i, k) for i in range(20) for k in range(3)}) == 60
+def test_seeds_are_of_the_scene_and_the_attempt_alone(config):
+    chosen = RenderConfig.load(config)
+    assert len({scene_seed(chosen, i, k) for i in range(20) for k in range(3)}) == 60
+
+
+@pytest.mark.parametrize("backend", ["layered", "blender"])
+def test_no_renderer_is_made_for_a_rig_it_cannot_render(backend, config, tmp_path, monkeypatch):
+    monkeypatch.setattr("pat.farm.backends.compat.load", lambda: None)
+    (tmp_path / "rig.yaml").write_text("cameras: {mono: {size: [96, 64]}}")
+    write(config, backend=backend)
+    with pytest.raises(ValueError, match="camera 'mono' is not calibrated"):
+        RenderConfig.load(config).renderer()
 
 
 def test_rigs_that_layers_cannot_show_are_refused():
