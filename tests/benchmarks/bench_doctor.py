@@ -228,7 +228,7 @@ def main(
     out: Path | None = None,
 ) -> None:
     """Print the table, of some mistakes or of all."""
-    print_tables("Which remedies the doctor names", [confusions(data, cases, seed, only)], out)
+    print_tables("Which mistakes the doctor names", [confusions(data, cases, seed, only)], out)
 
 
 if __name__ == "__main__":
