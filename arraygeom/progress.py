@@ -38,11 +38,12 @@ def stage(name: str = "", *, new: bool = False) -> Iterator[None]:
 @contextmanager
 def part(begin: float, end: float) -> Iterator[None]:
     """A block that is a part of the current stage or part, from one share of it (0..1) to another."""
-    if (inner := _CURRENT.get()) is not None:
-        stage, first, last = inner
-        length = last - first
-        inner = _Part(stage, first + begin * length, first + end * length)
-    token = _CURRENT.set(inner)
+    outer = _CURRENT.get()
+    if outer is None:
+        yield
+        return
+    length = outer.end - outer.begin
+    token = _CURRENT.set(_Part(outer.stage, outer.begin + begin * length, outer.begin + end * length))
     try:
         yield
     finally:

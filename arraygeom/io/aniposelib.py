@@ -25,7 +25,7 @@ def read(source: RigSource) -> Rig:
     """Every camera that is not marked `ignore`, under its name, or else that of its table."""
     document = source.toml()
     tables = document["cameras"] if isinstance(document.get("cameras").value, dict) else document
-    cameras = [(k, fields) for k, fields in tables.items() if fields.value and isinstance(fields.value, dict)]
+    cameras = [(k, fields) for k, fields in tables.items() if isinstance(fields.value, dict)]
     if not any("matrix" in fields for _, fields in cameras):
         raise source.fail("matrix", "is in no table; is this a camera array of aniposelib or caliscope?")
     used = [(k, f) for k, f in cameras if k != "metadata" and not f.get("ignore", False).value]

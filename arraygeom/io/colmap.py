@@ -77,7 +77,7 @@ def read(source: RigSource) -> Rig:
     cameras: dict[int, LensView] = {}
     for entry, i, model in read_cameras(_file(folder, "cameras", suffix)):
         if i in cameras:
-            raise entry.fail(f"camera {i} occurs twice; keep one")
+            raise entry.source.fail(f"camera {i}", "occurs twice; keep one")
         cameras[i] = _intrinsics(entry, model)
     images = list(read_images(_file(folder, "images", suffix)))
     rigs = folder / f"rigs{suffix}"

@@ -79,7 +79,8 @@ def _camera(entry: Entry, pose: Pose) -> Camera:
     if kind.value not in (PERSPECTIVE, FISHEYE):
         raise kind.fail(f"is {kind.value}; perspective (0) and fisheye (1) are read")
     if kind.value == FISHEYE and not bool(lens.numbers()[4:].any()):
-        lens.value = lens.numbers()[:4]  # padded with zeros to fourteen numbers by some versions
+        # Padded with zeros to fourteen numbers by some versions.
+        lens = entry.at(lens.numbers()[:4], "distortionCoeff")
     return Camera(
         K=entry["intrinsicMatrix"].intrinsics(),
         cam_from_world=pose,

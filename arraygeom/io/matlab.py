@@ -98,8 +98,8 @@ def _camera(fields: Entry, pose: Pose) -> Camera:
     if FISHEYE in fisheye:
         K, lens = _fisheye(fisheye)
         return Camera(K=K, cam_from_world=pose, hw=_size(fisheye, K), distortion=lens)
-    columns = fields["K"] if "K" in fields else fields["IntrinsicMatrix"].transposed(3)
-    K = columns.intrinsics(first_pixel=1.0)
+    stated = fields["K", "IntrinsicMatrix"]
+    K = (stated if "K" in fields else stated.transposed(3)).intrinsics(first_pixel=1.0)
     return Camera(K=K, cam_from_world=pose, hw=_size(fields, K), distortion=_lens(fields))
 
 

@@ -111,6 +111,8 @@ def _rig(document: Entry) -> Rig:
         raise document["format"].fail(f"is {short(document['format'].value)}, wanted '{FORMAT}'")
     metres = UNITS[_one_of(document.get("units", "metres"), UNITS)]
     origin = float(_one_of(document.get("first_pixel_centre", 0), (0, 0.5, 1)))
+    if not document.get("cameras").value:
+        raise document.get("cameras").fail("missing or empty: name at least one camera")
     cameras = {name: _camera(fields, origin) for name, fields in document["cameras"].items()}
     links: dict[tuple[str, str], Link] = {}
     for fields in document["links"].each() if document.get("links").value else []:
@@ -242,7 +244,9 @@ def _sensor(fields: Entry) -> Sensor:
         known["bits"] = int(bits)
     if black and (bits is None or black >= 2**bits - 1):
         problem = "needs 'bits', the number of bits of a count: add it"
-        raise stated["black_level"].fail(problem if bits is None else "is not between 0 and white")
+        raise stated["black_level"].fail(
+            problem if bits is None else f"is {black:g}, which is not between 0 and white"
+        )
     if "gain" in stated:
         gain = stated["gain"]
         several = isinstance(gain.value, list)
@@ -261,10 +265,16 @@ def _response(fields: Entry) -> Band | Curve:
 
 def _link(fields: Entry, cameras: Mapping[str, View]) -> tuple[tuple[str, str], Link]:
     _check_keys(fields, ("alpha", "beta", "F", "H"))
-    alpha, beta = (str(_one_of(fields.get(key), cameras)) for key in ("alpha", "beta"))
+    alpha, beta = (_camera_named(fields.get(key), cameras) for key in ("alpha", "beta"))
     H = fields.get("H")
     link = Link(fields.get("F").numbers((3, 3)), None if H.value is None else H.numbers((3, 3)))
     return (alpha, beta), link
+
+
+def _camera_named(entry: Entry, cameras: Mapping[str, View]) -> str:
+    if (name := str(entry.value)) not in cameras:
+        raise entry.fail(f"is '{name}', which is no camera of this rig ({', '.join(cameras)})")
+    return name
 
 
 def _check_keys(entry: Entry, allowed: tuple[str, ...]) -> None:

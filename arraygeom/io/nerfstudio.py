@@ -67,7 +67,7 @@ def _camera(fields: Entry) -> Camera:
 def _focal(fields: Entry, axis: str, size: int) -> float:
     """Stated, or from the field of view in radians."""
     stated = fields[f"fl_{axis}", f"camera_angle_{axis}"]
-    if stated.name.endswith(f"fl_{axis}"):
+    if fields.get(f"fl_{axis}").value is not None:
         return stated.number()
     angle = stated.number()
     if not 0 < angle < math.pi:

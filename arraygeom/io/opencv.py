@@ -89,7 +89,7 @@ _HEADER = "%YAML:1.0\n---\n"
 
 def _camera(nodes: Entry, i: str, pose: Pose) -> Camera:
     K = nodes[tuple(name.format(i) for name in K_NAMES)].intrinsics()
-    c = nodes.get(next((name.format(i) for name in D_NAMES if name.format(i) in nodes), D_NAMES[0]))
+    c = nodes.get(next((name.format(i) for name in D_NAMES if name.format(i) in nodes), D_NAMES[0].format(i)))
     fisheye = bool(nodes.get(f"fisheye_model{i}", nodes.get("fisheye_model", 0).value).value)
     lens = c.kannala_brandt() if fisheye else c.brown_conrady()
     return Camera(K=K, cam_from_world=pose, hw=_size(nodes, i, K), distortion=lens)

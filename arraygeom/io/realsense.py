@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 
 from ..camera import Camera
-from ..distortion import KANNALA_BRANDT, Distortion
+from ..distortion import Distortion
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
@@ -88,7 +88,7 @@ def _lens(fields: Entry) -> Distortion | None:
     if kind.value == "Brown Conrady" or (kind.value == "Modified Brown Conrady" and not c[2:4].any()):
         return listed.brown_conrady()
     if kind.value == "Kannala Brandt4" and not c[4:].any():  # printed as five numbers
-        return Distortion(KANNALA_BRANDT, c[:4])
+        return fields.at(c[:4], "Coeffs").kannala_brandt()
     raise kind.fail(
         f"is '{kind.value}' with these coefficients; Brown Conrady, Kannala Brandt4, "
         "and Modified Brown Conrady without tangential terms are read"

@@ -67,11 +67,11 @@ def _pose(info: Entry) -> Pose:
 
 
 def _lens(info: Entry) -> Distortion | None:
-    model, c = info["distortion_model"], info.get("distortion_coefficients")
+    model, c = info["distortion_model"], "distortion_coefficients"
     if model.value in ("plumb_bob", "rational_polynomial"):
-        return c["data"].brown_conrady()
+        return info[c]["data"].brown_conrady()
     if model.value in ("equidistant", "fisheye"):
-        return c["data"].kannala_brandt()
+        return info[c]["data"].kannala_brandt()
     if model.value in ("", "none"):
         return None
     raise model.fail(f"is '{model.value}'; supported: plumb_bob, rational_polynomial, equidistant")

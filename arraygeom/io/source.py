@@ -25,6 +25,7 @@ from ..warned import warn
 
 # Of a rotation vector, in radians; it may go round a few times.
 LARGEST_ANGLE = 1e3
+NO_MAPPING = "is not a mapping of names to values, or an empty one; is the file whole?"
 
 
 class RigFileError(ValueError):
@@ -86,14 +87,14 @@ class RigSource:
         """The file as a JSON object without repeated keys."""
         text = self.text()
         try:
-            return self.at(load_json(text)).mapping()
+            document = load_json(text)
         except json.JSONDecodeError as error:
-            where, problem = f"line {error.lineno}", f"is not JSON ({error.msg}); is the file whole?"
-        except RigFileError:
-            raise
+            raise self.fail(
+                f"line {error.lineno}", f"is not JSON ({error.msg}); is the file whole?"
+            ) from None
         except ValueError as error:
-            where, problem = None, str(error)
-        raise self.fail(where, problem)
+            raise self.fail(None, str(error)) from None
+        return self.at(document).mapping()
 
     def toml(self) -> Entry:
         """The file as TOML."""
@@ -124,9 +125,10 @@ class RigSource:
                 raise self.fail(name, "occurs twice; keep one")
             if value.startswith("[") and not value.endswith("]"):
                 raise self.fail(name, "has no closing bracket; is the file whole?")
-            value = value[1:-1] if value.startswith("[") else value
+            if value.startswith("["):
+                value = re.sub("[;,]", " ", value[1:-1])
             entries[name] = self.at(value, name).words().numbers()
-        return self.at(entries).mapping()
+        return self.at(entries)
 
     def size_unstated(self, K: Tensor) -> HW:
         """The size for a format that states none: as given by the user, else guessed, with a warning."""
@@ -167,28 +169,34 @@ class Entry:
 
     def mapping(self) -> Entry:
         """This, a mapping with something in it."""
-        if not isinstance(self.value, Mapping) or not self.value:
-            raise self.fail("is not a mapping of names to values, or an empty one; is the file whole?")
+        if not self._named():
+            raise self.fail(NO_MAPPING)
         return self
 
+    def _named(self) -> Mapping[Any, Any]:
+        """What a mapping has by name."""
+        if not isinstance(self.value, Mapping):
+            raise self.fail(NO_MAPPING)
+        return self.value
+
     def __contains__(self, key: str) -> bool:
-        return key in self.mapping().value
+        return key in self._named()
 
     def __getitem__(self, keys: str | tuple[str, ...]) -> Entry:
         """What a mapping has under the first of the keys that is there."""
         keys = (keys,) if isinstance(keys, str) else keys
         for key in keys:
-            if (value := self.mapping().value.get(key)) is not None:
+            if (value := self._named().get(key)) is not None:
                 return self.at(value, key)
         raise self.fail(f"has no {' or '.join(keys)}")
 
     def get(self, key: str, default: Any = None) -> Entry:
         """What a mapping has under a key, or the default."""
-        return self.at(self.mapping().value.get(key, default), key)
+        return self.at(self._named().get(key, default), key)
 
     def items(self) -> list[tuple[str, Entry]]:
         """All that a mapping has."""
-        return [(str(key), self.at(value, str(key))) for key, value in self.mapping().value.items()]
+        return [(str(key), self.at(value, str(key))) for key, value in self._named().items()]
 
     def each(self) -> list[Entry]:
         """The parts of a list."""
@@ -200,27 +208,27 @@ class Entry:
         """What a mapping has under these keys, as one list."""
         return self.at([self[key].value for key in keys], ", ".join(keys))
 
-    def tensor(self, *, infinite: bool = False) -> Tensor:
-        """Finite numbers (or infinite ones too), nested in lists or not, as a float64 tensor."""
+    def tensor(self, *, infinite: bool = False, also: str = "") -> Tensor:
+        """Finite numbers (or infinite ones too), nested in lists or not, as a float64 tensor. `also` ends the
+        message where it holds something else."""
         tensor = float64_of(self.value)
         if tensor is None:
-            raise self.fail(f"holds something other than numbers: {short(self.value)}")
+            raise self.fail(f"holds something other than numbers: {short(self.value)}{also}")
         if tensor.isnan().any() or (tensor.isinf().any() and not infinite):
             raise self.fail("holds NaN or infinity; did the calibration fail?")
         return tensor
 
     def numbers(self, shape: tuple[int, ...] | None = None, *, infinite: bool = False) -> Tensor:
         """Its numbers as a tensor of a shape (any nesting that has as many), or a vector."""
-        tensor = self.tensor(infinite=infinite)
+        wanted = "" if shape is None else f", wanted {' x '.join(map(str, shape))}"
+        tensor = self.tensor(infinite=infinite, also=wanted)
         if shape is not None and tensor.numel() != torch.Size(shape).numel():
-            wanted = " x ".join(map(str, shape))
-            raise self.fail(f"has {tensor.numel()} numbers, wanted {wanted}; is the file whole?")
+            raise self.fail(f"has {tensor.numel()} numbers{wanted}; is the file whole?")
         return tensor.reshape(shape or (-1,))
 
     def words(self) -> Entry:
-        """The numbers that a text, or several, consist of, between spaces, commas or semicolons."""
+        """The numbers that a text, or several, consist of, between spaces."""
         text = self.value if isinstance(self.value, str) else " ".join(self.value)
-        text = re.sub("[,;]", " ", text)
         try:
             return Entry(self.source, [float(word) for word in text.split()], self.name)
         except ValueError:
@@ -271,7 +279,9 @@ class Entry:
             if numbers.abs().max() > LARGEST_ANGLE:
                 raise self.fail(f"is a rotation vector of {numbers.abs().max():.3g}; it is in radians")
             return rotation_from_vector(numbers)
-        R = self.numbers((3, 3))
+        if numbers.numel() != 9:
+            raise self.fail(f"has {numbers.numel()} numbers, wanted 3 x 3, or 3 of a rotation vector")
+        R = numbers.reshape(3, 3)
         error = float(rotation_error(R))
         if torch.linalg.det(R) < 0:
             raise self.fail("is a reflection (determinant -1), not a rotation; was an axis flipped?")

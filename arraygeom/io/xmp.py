@@ -139,7 +139,7 @@ class _Image(NamedTuple):
     def numbers(self, name: str, namespace: str = PIX4D) -> Tensor | None:
         """The numbers of a tag, None if it is not stated."""
         text = self.tags.text(namespace, name)
-        return None if text is None else self.source.at(text, name).words().numbers()
+        return None if text is None else self.source.at(re.sub("[,;]", " ", text), name).words().numbers()
 
     def needed(self, name: str, count: int) -> Tensor:
         """So many numbers of a tag of Pix4D's."""
@@ -228,7 +228,7 @@ class _Image(NamedTuple):
         dated, _, numbers = text.rpartition(";")
         if not dated:
             raise self.source.fail("DewarpData", "is not a date and nine numbers: give a rig file instead")
-        listed = self.source.at(numbers, "DewarpData").words()
+        listed = self.source.at(numbers.replace(",", " "), "DewarpData").words()
         fx, fy, cx, cy, *c = listed.numbers((9,)).tolist()
         middle = [
             (self.numbers(f"CalibratedOpticalCenter{axis}", DJI), n / 2) for axis, n in (("X", w), ("Y", h))

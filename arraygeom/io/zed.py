@@ -73,7 +73,7 @@ def _pose(stereo: Entry, name: str) -> Pose:
 def _camera(fields: Entry, hw: HW, pose: Pose) -> Camera:
     fisheye = "k4" in fields and "p1" not in fields
     keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
-    c = fields.at([fields.get(key, "0").value for key in keys], ", ".join(keys)).words()
+    c = fields.at([fields.get(key, "0").words().number() for key in keys], ", ".join(keys))
     return Camera(
         K=fields.listed("fx", "fy", "cx", "cy").words().focal_and_centre(),
         cam_from_world=pose,

@@ -107,8 +107,9 @@ def test_disparities_of_a_rectified_pair_without_calibration():
     disparity = torch.full(HW, 6.0)
     disparity[20, 50] = math.nan
     x = torch.tensor([[40.0, 20.0], [50.0, 20.0]], dtype=torch.float64)
-    positions = pixel_grid(HW) - torch.stack([disparity, torch.zeros(HW)], -1)
-    found = AroundMatches(positions, 2.0, field=Rectified(20.0))(pair, x)
+    found = AroundMatches(AroundMatches.from_disparity(disparity).positions, 2.0, field=Rectified(20.0))(
+        pair, x
+    )
     assert found.start[0].tolist() == pytest.approx([32.0, 20.0])
     assert found.end[0].tolist() == pytest.approx([36.0, 20.0])
     assert found.length[1] == 20

@@ -8,7 +8,7 @@ import torch
 from torch.autograd import gradcheck, gradgradcheck
 
 from arraygeom import Camera, Curved, Pose, Rig, intrinsics, unchecked
-from arraygeom.distortion import COEFFICIENT_COUNTS, Distortion
+from arraygeom.distortion import COEFFICIENT_COUNTS, LENS_TERMS, Distortion
 from arraygeom.lenses import PolynomialFisheye
 from arraygeom.lenses.central import MODELS
 from arraygeom.lenses.model import LensModel
@@ -121,6 +121,8 @@ def directions(n: int = 3000, seed: int = 0) -> torch.Tensor:
 
 def test_every_model_is_tested_and_has_names_and_sizes_for_refinement():
     assert {"brown-conrady", "kannala-brandt", *FORMULAS} == {"polynomial-fisheye", *COEFFICIENT_COUNTS}
+    for name, counts in COEFFICIENT_COUNTS.items():
+        assert len(LENS_TERMS[name]) == counts[-1]
     for name, model in MODELS.items():
         assert COEFFICIENT_COUNTS[name] == (len(model.harmless),)
 

@@ -364,6 +364,17 @@ def test_an_image_upside_down_survives_the_native_file(tmp_path):
     assert torch.equal(Rig.load(tmp_path / "rig.yaml")["a"].K, rig["a"].K)
 
 
+def test_links_name_cameras_that_are_numbers(tmp_path):
+    F = "F: [[0, 0, 0], [0, 0, -1], [0, 1, 0]]"
+    cameras = "cameras: {0: {size: [640, 400]}, 1: {size: [640, 400]}}"
+    text = f"{cameras}\nlinks:\n  - {{alpha: 0, beta: 1, {F}}}\n"
+    (tmp_path / "rig.yaml").write_text(text)
+    assert set(Rig.load(tmp_path / "rig.yaml").links) == {("0", "1")}
+    (tmp_path / "rig.yaml").write_text(text.replace("beta: 1", "beta: 2"))
+    with pytest.raises(RigFileError, match=r"beta: is '2', which is no camera of this rig \(0, 1\)"):
+        Rig.load(tmp_path / "rig.yaml")
+
+
 def test_lenses_of_uncalibrated_cameras_come_back(tmp_path):
     lens = Distortion("brown-conrady", torch.tensor([-0.05, 0.01, 1e-3, -2e-3], dtype=torch.float64))
     views = {

@@ -279,6 +279,15 @@ OTHER_MAKERS = {
         "STEREO.rx_hd, cv_hd, rz_hd: has 2 numbers, wanted 3",
     ),
     "twice": ("zed.conf", "RX_HD", "CV_HD", "is not an INI file"),
+    "no k1": ("zed.conf", "k1=-0.171", "k1=", "RIGHT_CAM_HD.k1: has 0 numbers, wanted 1"),
+    "two in one": ("zed.conf", "k2=0.026", "k2=0.026 0.026", "RIGHT_CAM_HD.k2: has 2 numbers, wanted 1"),
+    "a comma": ("calib_cam_to_cam.txt", "0.1 0.001", "0.1 0,001", "D_01: holds something other than numbers"),
+    "no coefficients": (
+        "opencv_stereo/intrinsics.yml",
+        "D1: ",
+        "fisheye_model1: 1\nE1: ",
+        "D1: holds something other than numbers: None",
+    ),
     "too few": ("mrcal/b.cameramodel", "-0.2, 0.1, ", "", "intrinsics: has 6 numbers, wanted 8"),
     "a call": (
         "mrcal/b.cameramodel",
@@ -296,6 +305,29 @@ def test_files_of_box_cameras_and_of_mrcal(case, tmp_path):
     text = (FIXTURES / name).read_text()
     assert old in text
     assert re.search(wanted, refusal(copied(FIXTURES / name, tmp_path, text.replace(old, new, 1))))
+
+
+CUT = {
+    "aniposelib": (FIXTURES / "aniposelib.toml", r"(?s)(\[cam_1\]\n).*", r"\1", "cam_1: has no matrix"),
+    "kitti": (FIXTURES / "kitti_calib.txt", "(?m)^P", "Q", "P0: is missing; is this a KITTI"),
+    "zed": (FIXTURES / "zed.conf", r"(?s)\[STEREO\].*", "[STEREO]\n", "STEREO: has no"),
+}
+
+
+@pytest.mark.parametrize("format", CUT)
+def test_what_is_cut_away_is_named(format, tmp_path):
+    """Such a camera was left out without a word, or called an empty mapping."""
+    file, cut, left, wanted = CUT[format]
+    assert wanted in refusal(copied(file, tmp_path, re.sub(cut, left, file.read_text())), format)
+
+
+def test_three_coefficients_of_a_fisheye_are_read(tmp_path):
+    text = (FIXTURES / "realsense.txt").read_text()
+    stated = "Brown Conrady\n  Coeffs:     \t-0.2  \t0.1  \t0.001  \t-0.002  \t0  "
+    assert stated in text
+    changed = text.replace(stated, "Kannala Brandt4\n  Coeffs:     \t-0.2  \t0.1  \t0.001")
+    lens = read_rig(copied(FIXTURES / "realsense.txt", tmp_path, changed))["Color"].distortion
+    assert lens.coefficients.tolist() == [-0.2, 0.1, 0.001, 0.0]
 
 
 def test_reflections_and_rounded_rotations(tmp_path):
