@@ -86,7 +86,7 @@ class Board:
 
     def _draw(self, axes: Any) -> None:
         """Draw the board with its corner at (0, 0), in millimetres, y down."""
-        raise ValueError(f"{self}: is no board to print: print boards one by one, and no points in space")
+        raise ValueError(f"{self} cannot be printed: print boards one by one; points in space have no print")
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class AprilGrid(MarkedBoard):
     def points(self) -> Float[np.ndarray, "n 3"]:
         """Positions of the tags' corners on the board, metres, row by row."""
         grid = unit_grid(self.columns, self.rows)
-        return (grid // 2) * (self.tag + self.offset) + (grid % 2) * self.tag
+        return (grid // 2) * (self.tag + self.gap) + (grid % 2) * self.tag
 
     @cached_property
     def corners(self) -> Int[np.ndarray, "m 4"]:
@@ -190,17 +190,22 @@ class AprilGrid(MarkedBoard):
         return np.stack([a[:, ::2], a[:, 1::2], b[:, 1::2], b[:, ::2]], -1).reshape(-1, 4)
 
     @property
-    def offset(self) -> float:
-        """The gap between two tags, metres, which small squares fill at their corners."""
+    def gap(self) -> float:
+        """The space between two tags, metres."""
         return self.spacing / 2
+
+    @property
+    def offset(self) -> float:
+        """The gap, metres: small squares at the tags' corners."""
+        return self.gap
 
     def __str__(self) -> str:
         tail = (":border1" if self.border == 1 else "") + self._from
         tags = f"{self.columns // 2}x{self.rows // 2}"
-        return f"aprilgrid:{tags}:{millimetres(self.tag)}:{self.offset / self.tag:.6g}{tail}"
+        return f"aprilgrid:{tags}:{millimetres(self.tag)}:{self.gap / self.tag:.6g}{tail}"
 
     def _draw(self, axes: Any) -> None:
-        tag, gap = 1e3 * self.tag, 1e3 * self.offset
+        tag, gap = 1e3 * self.tag, 1e3 * self.gap
         for number, corners in zip(self.markers, self.corners):
             left, top = 1e3 * self.points[corners[0], :2] + gap
             self._draw_marker(axes, number, left, top, tag, border=self.border, turns=2)
@@ -248,12 +253,17 @@ class Circles(Board):
         return grid * self.spacing
 
     @property
-    def offset(self) -> float:
+    def radius(self) -> float:
         """Radius of the printed circles, metres."""
         return 0.3 * self.spacing * (2**0.5 if self.asymmetric else 1)
 
+    @property
+    def offset(self) -> float:
+        """A circle's radius, metres."""
+        return self.radius
+
     def _draw(self, axes: Any) -> None:
-        radius = 1e3 * self.offset
+        radius = 1e3 * self.radius
         for x, y in (1e3 * self.points[:, :2] + radius).tolist():
             axes.add_patch(Circle((x, y), radius, facecolor="black", edgecolor="none"))
 

@@ -230,7 +230,7 @@ def _clear(board: Board) -> float:
         return (1 - board.marker / board.spacing) / 2
     if isinstance(board, AprilGrid):
         black = board.border * board.tag / (marker_dictionary(board.dictionary).markerSize + 2 * board.border)
-        return min(black, board.offset) / board.spacing
+        return min(black, board.gap) / board.spacing
     return 0.5
 
 
@@ -292,20 +292,27 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
             f"add ':border{3 - border}' to the board's name"
         )
     if isinstance(board, KnownPoints):
-        return f"only {len(ids)} of its markers are visible: is their dictionary {board.dictionary}?"
+        return (
+            f"{len(ids)} of its markers are visible, too few, "
+            f"or not of {board.dictionary}: name their dictionary"
+        )
     if len(ids) >= 4 and max(ids) > last:
         return (
             f"markers up to number {max(ids)} are visible and the board has "
             f"{board.markers[0]} to {last}: is its size right?"
         )
     if len(ids) >= 4:
+        legacy = " A board drawn by OpenCV before 4.6 needs ':legacy' at the end of its name"
         return (
-            f"{len(ids)} of its markers are visible, but not at their positions: is the size right (across x "
-            "down)? A charuco board drawn by OpenCV before 4.6 needs ':legacy' at the end of its name"
+            f"{len(ids)} of its markers are visible, but not at their positions: "
+            f"is the size right (across x down)?{legacy if isinstance(board, Charuco) else ''}"
         )
     for name in OTHER_DICTIONARIES:
         if len(seen := _tags(grey, name, 1)) >= 6:
-            return f"{len(seen)} markers of the dictionary {name} are visible: name that one"
+            return (
+                f"{len(seen)} markers of the dictionary {name} are visible, "
+                f"not of {board.dictionary}: name that one"
+            )
     return None
 
 
@@ -346,15 +353,18 @@ def collect_folder(
     none of them, or if they show a board of another size.
     """
     photos = find_photos(Path(folder), patterns=patterns)
-    jobs = [job for moments in photos.values() for job in moments.items()]
+    jobs = [(name, key, photo) for name, moments in photos.items() for key, photo in moments.items()]
     with ThreadPoolExecutor(2) as pool:
-        results = pool.map(lambda job: detected(job[1], job[0], board), jobs)
-        found = iter(list(progress(results, len(jobs)) if progress else results))
+        results = pool.map(lambda job: detected(job[2], job[1], board), jobs)
+        found = list(progress(results, len(jobs)) if progress else results)
+    by_camera: dict[str, dict[FrameKey, DetectedImage]] = {name: {} for name in photos}
+    for (name, key, _), image in zip(jobs, found):
+        by_camera[name][key] = image
     views, notes = {}, list[str]()
     for name, moments in photos.items():
-        images = dict(zip(moments, found))
+        images = by_camera[name]
         views[name] = board_views(name, moments, images)
-        seen = [key for key, (_, boards) in images.items() if boards]
+        seen = {key: boards for key, (_, boards) in images.items() if boards}
         notes += _missing(name, moments, seen, board)
     return CollectedViews(views, photos, tuple(notes))
 

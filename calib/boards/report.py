@@ -349,10 +349,13 @@ def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figu
             x, deviation = uncertainty(known, depth)
             _map(axes, figure, known.camera.hw, x, deviation, f"{name}: uncertainty at {depth:.2g} m")
         x, off = halves.get(name, np.zeros((2, 0, 2)))
+        if len(x) < 4:
+            row[2].set_axis_off()
+            row[2].set_title("too few frames to compare halves", fontsize=9)
+            continue
         length = np.linalg.norm(off, axis=1)
         _map(row[2], figure, known.camera.hw, x, length, f"{name}: halves of the frames")
-        if len(x):
-            row[2].quiver(*x[::3].T, *off[::3].T, angles="xy", color="white", width=0.003)
+        row[2].quiver(*x[::3].T, *off[::3].T, angles="xy", color="white", width=0.003)
     return figure
 
 
@@ -407,7 +410,8 @@ def _draw_image(
     axes: Any, calibration: Calibration, name: str, key: FrameKey, views: BoardViews, photos: Photos
 ) -> None:
     image_key = str(key).split(" board ")[0]  # of several boards in it
-    for photo in [photo for other, photo in photos[name].items() if str(other) == image_key]:
+    photo = next((photo for other, photo in photos[name].items() if str(other) == image_key), None)
+    if photo is not None:
         scale = THUMBNAIL / views.hw[1]
         small = cv2.resize(photo.read(), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         axes.imshow(small, cmap="gray", extent=_extent(views.hw))

@@ -200,7 +200,7 @@ def _with_deformation(solved: Solved, flat: BoardDeformation | None) -> Solved:
     if flat is None or solved.problem.deformation is not None:
         return solved
     trial, count = replace(solved.problem, deformation=flat), len(solved.problem.frames)
-    few = count < 2 * len(flat) + 2
+    few = count < 2 * len(flat) + 2  # fewer frames agree on so many values by chance
     try:
         agreed = jackknife(trial)
         if not few and not is_significant(agreed.step, agreed.deformations, count):

@@ -50,8 +50,8 @@ from .board import (
 
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 FORMS = (
-    "chessboard:9x6:25mm (inner corners), charuco:8x6:30mm (squares), circles:7x5:20mm, "
-    "acircles:4x11:20mm or aprilgrid:6x6:88mm:0.3 (tags)"
+    "chessboard:9x6:25mm (inner corners), charuco:8x6:30mm:22mm:4x4_50 (squares, markers, dictionary), "
+    "circles:7x5:20mm, acircles:4x11:20mm or aprilgrid:6x6:88mm:0.3 (tags, space between them)"
 )
 LARGEST = 100
 APRIL_TAGS = "apriltag_36h11"
@@ -113,12 +113,14 @@ def parse_board(text: str) -> Board:
 
 
 def _options(text: str, given: Sequence[str], patterns: Mapping[str, str]) -> dict[str, str]:
-    """Each option by the name of the pattern that it matches, once each. Raises ValueError for others."""
+    """Each option by the name of the pattern that it matches. Raises ValueError for others, and for two."""
     found: dict[str, str] = {}
     for option in given:
-        name = next((n for n, p in patterns.items() if n not in found and re.fullmatch(p, option)), None)
+        name = next((n for n, p in patterns.items() if re.fullmatch(p, option)), None)
         if name is None:
             raise ValueError(f"board '{text}': '{option}' is not recognised; write it like {FORMS}")
+        if name in found:
+            raise ValueError(f"board '{text}': '{found[name]}' and '{option}' say the same: give one")
         found[name] = option
     return found
 
@@ -157,7 +159,7 @@ def _charuco(text: str, columns: int, rows: int, spacing: float, options: Mappin
 def _april_grid(text: str, columns: int, rows: int, tag: float, options: Mapping[str, str]) -> AprilGrid:
     ratio, first = float(options.get("ratio", 0.3)), int(options.get("first", "from0")[4:])
     if not 0.05 <= ratio <= 1:
-        raise ValueError(f"board '{text}': '{ratio:g}' is no share of a tag: write it like 0.3")
+        raise ValueError(f"board '{text}': '{ratio:g}' is not from 0.05 to 1 of a tag")
     markers = range(first, first + columns * rows)
     if markers.stop > len(marker_dictionary(APRIL_TAGS).bytesList):
         raise ValueError(f"board '{text}': the tag family 36h11 has no {markers.stop} tags")
@@ -236,7 +238,7 @@ def _known_points(text: str) -> KnownPoints:
     name = _smallest_dictionary(text, dictionary.removeprefix(":").lower() or "4x4", max(ids)[0] + 1)
     apart = np.linalg.norm(np.array(positions)[:, None] - np.array(positions), axis=-1)
     spacing = float(np.median(np.sort(apart, axis=1)[:, 1]))
-    markers = sorted({marker for marker, _ in ids})
+    markers = tuple(sorted({marker for marker, _ in ids}))
     return KnownPoints(len(ids), 1, spacing, name, markers, file=str(path), ids=ids, positions=positions)
 
 

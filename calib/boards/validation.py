@@ -234,9 +234,12 @@ def _gains(fit: Solved, deviations: StartDeviations) -> str:
     """What the images add to the start, by kind of parameter."""
     focal = np.mean([float(c.K[0, 0]) for c in fit.problem.cameras.values()])
     width = np.mean([c.hw[1] for c in fit.problem.cameras.values()])
-    focal, width = deviations.focal * focal, deviations.centre * width
+    stated = (
+        ("focal", "focal lengths", deviations.focal * focal),
+        ("centre", "principal points", deviations.centre * width),
+    )
     texts = []
-    for kind, label, before in (("focal", "focal lengths", focal), ("centre", "principal points", width)):
+    for kind, label, before in stated:
         found = [d for name, d in fit.deviations.items() if f".{kind}." in name]
         texts += [f"{label} ±{before:.3g} > ±{np.median(found):.3g} px"] if found else []
     positions = np.median(_position_deviations(fit))

@@ -42,7 +42,7 @@ HEALTHY_MISFIT = 0.2
 EQUAL = (1.4, 0.03)
 """Explanations are equal whose misfit is less than 1.4 times the best one's plus 0.03 px."""
 LARGEST_REMAINDER = (0.33, 0.2)
-"""A mistake is named if its remedy leaves no more than the first share of the misfit: many wrong remedies
+"""A mistake is named if its rig leaves no more than the first share of the misfit: many wrong hypotheses
 improve a drifted rig somewhat. Nor is one as good as another that leaves less than the second share of what
 it leaves."""
 MARGIN, TIE = 12.0, 2.0
@@ -52,7 +52,7 @@ MOST_COMPARED = 10
 """Explanations whose evidence is computed: those that leave least."""
 EXPLAINED, ROUGHLY = (2 * HEALTHY_MISFIT, 0.06), 0.9
 """A mistake explains the points if no more than so many pixels, or that share of the misfit, are left; pixels
-of those whose remedy is approximate."""
+of those whose rig is approximate."""
 SAME_DEPTH, SAME_DISTANCE = 1e-3, 1e-3
 """Rigs are the same whose depths (relative) and distances from lines (pixels) differ by less, in median."""
 BARREL, PINCUSHION = -0.6, 0.4

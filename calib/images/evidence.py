@@ -28,10 +28,9 @@ from .parameters import SIGMA, UNCERTAIN, apply_change, free_parameters
 from .refinement import systematic_columns
 from .residuals import (
     FEW,
-    depths_of_pair,
-    epipolar_residuals,
     lines_basis,
     match_depths,
+    residuals_and_depths,
     sampson_of_pairs,
     share,
     stack_key,
@@ -151,7 +150,7 @@ def _observations(pairs: Sequence[Pair], matches: PointMatches) -> PointObservat
         groups.setdefault(stack_key(pair), []).append(i)
     for group in groups.values():
         pair = stacked([pairs[i] for i in group])
-        (_, line, valid), depths = epipolar_residuals(pair, matches), depths_of_pair(pair, matches)
+        (_, line, valid), depths = residuals_and_depths(pair, matches)
         line = torch.where(valid, line.detach(), LARGEST_DISTANCE)
         off[group] = line.nan_to_num(LARGEST_DISTANCE).clamp(-LARGEST_DISTANCE, LARGEST_DISTANCE)
         depth[group] = torch.where(depths.observable, depths.depth, torch.nan)

@@ -226,7 +226,7 @@ class FittedLink(NamedTuple):
 
     link: F, and a similarity H that is centred on the points along their lines.
     matches: the consistent ones.
-    displacement: pixels of beta to either side of H x that contain 98% of them.
+    displacement: pixels of beta along their lines, to either side of H x, that contain 98% of them.
     """
 
     link: Link
@@ -251,7 +251,7 @@ def with_map(pair: Pair, matches: PointMatches) -> FittedLink:
 
 
 def _with_rough_map(matches: PointMatches, F: Tensor) -> FittedLink:
-    """H by RANSAC, then shifted along the mean direction of the lines."""
+    """H by RANSAC to 30 px, then shifted along the mean direction of the lines into the points' middle."""
     if len(matches.alpha) < ENOUGH:
         raise ValueError(
             f"only {len(matches.alpha)} points seen in both images agree with F: does it belong to them?"
@@ -304,10 +304,10 @@ def seen_depths(pair: Pair, matches: PointMatches) -> tuple[float, float]:
 
 
 def depth_seen(rig: Rig, pairs: Pairs) -> tuple[float, float] | None:
-    """`seen_depths` of all calibrated pairs together; None if no pair has enough points."""
+    """`seen_depths` of all pairs related by their poses, together; None if none has enough points."""
     found = []
     for names, matches in pairs.items():
-        if (pair := rig.pair(*names)).calibrated:
+        if (pair := rig.pair(*names)).calibrated and pair.link is None:
             with suppress(ValueError):
                 found.append(seen_depths(pair, matches))
     return (min(near for near, _ in found), max(far for _, far in found)) if found else None

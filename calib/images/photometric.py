@@ -8,7 +8,7 @@ depends on the rig alone. Bilinear sampling propagates the gradient to the segme
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,10 +18,22 @@ from torch.nn.functional import avg_pool2d, interpolate, pad, unfold
 from arraygeom import Positions, Rig, Segments, pixel_grid
 from arraygeom.fields import recorded_field
 
-Attend = Callable[[Tensor, Tensor, Tensor, Segments | Positions], Any]
-"""Attention from queries to keys and values along a field: `pat.attention.attend_with_statistics`.
 
-Of its result `value`, (1, D, h, w), and `peak`, the largest weight (1, h, w), count."""
+@runtime_checkable
+class PhotometricMatch(Protocol):
+    """The result of attention: values (1, D, h, w) and the largest weight (1, h, w) as a confidence."""
+
+    @property
+    def value(self) -> Tensor:
+        """The weighted value."""
+
+    @property
+    def peak(self) -> Tensor:
+        """The largest weight."""
+
+
+Attend = Callable[[Tensor, Tensor, Tensor, Segments | Positions], PhotometricMatch]
+"""Attention from queries to keys and values along a field: `pat.attention.attend_with_statistics`."""
 LARGEST = 480
 """Images are reduced to this many pixels along their longer side."""
 PIXELS = 6000
@@ -65,7 +77,7 @@ def photometric_errors(
     pair, x = rig.pair(*names).to(torch.float32), views[alpha].grid
     locations = recorded_field(pair, samples=64, nodes=16)(pair, x)
     columns, rows = x[0, :, 0].long(), x[:, 0, 1].long()
-    query, own = (image[:, :, rows][..., columns] for image in views[alpha][:2])
+    query, own = (image[:, :, rows][..., columns] for image in (views[alpha].keys, views[alpha].values))
     found = attend(query, views[beta].keys, views[beta].values, locations)
     valid = locations.mask.any(-1) if isinstance(locations, Positions) else locations.valid
     confidence = found.peak[0].detach().sqrt()

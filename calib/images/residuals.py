@@ -66,6 +66,16 @@ def epipolar_residuals(pair: Pair, matches: PointMatches) -> EpipolarResiduals:
     With cameras, rays replace pixels and E replaces F, so that lenses are respected to first order in the
     distance. Raises ValueError if neither cameras nor F are known.
     """
+    return _residuals(pair, matches)[0]
+
+
+def residuals_and_depths(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, MatchDepths]:
+    """The residuals and, by the same rays, the depths; these not differentiable."""
+    residuals, (a, b) = _residuals(pair, matches)
+    return residuals, _depths(pair, a.detach(), b.detach(), residuals.valid)
+
+
+def _residuals(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, tuple[Tensor, Tensor]]:
     alpha, beta = (x.detach().requires_grad_() for x in _for_each(pair, matches))
     with torch.enable_grad():
         (a, b), F, valid = _rays(pair, alpha, beta)
@@ -74,7 +84,7 @@ def epipolar_residuals(pair: Pair, matches: PointMatches) -> EpipolarResiduals:
     across = at_beta.square().sum(-1)
     both = (across + at_alpha.square().sum(-1)).clamp(min=1e-300)
     line = algebraic / across.clamp(min=1e-300).sqrt()
-    return EpipolarResiduals(algebraic / both.sqrt(), line, valid)
+    return EpipolarResiduals(algebraic / both.sqrt(), line, valid), (a, b)
 
 
 def sampson_of_pairs(rig: Rig, pairs: Pairs) -> list[Float[Tensor, " n"]]:
@@ -85,13 +95,15 @@ def sampson_of_pairs(rig: Rig, pairs: Pairs) -> list[Float[Tensor, " n"]]:
 
 def match_depths(rig: Rig, pairs: Pairs) -> MatchDepths:
     """Of all points of all pairs: depths where rays are closest to each other, differentiable in the rig."""
-    found = [depths_of_pair(rig.pair(*names), matches) for names, matches in pairs.items()]
+    found = []
+    for names, matches in pairs.items():
+        pair = rig.pair(*names)
+        (a, b), _, valid = _rays(pair, *_for_each(pair, matches))
+        found.append(_depths(pair, a, b, valid))
     return MatchDepths(*(torch.cat(part) for part in zip(*found)))
 
 
-def depths_of_pair(pair: Pair, matches: PointMatches) -> MatchDepths:
-    """Those of one pair."""
-    (a, b), _, valid = _rays(pair, *_for_each(pair, matches))
+def _depths(pair: Pair, a: Tensor, b: Tensor, valid: Tensor) -> MatchDepths:
     if not pair.calibrated or pair.link is not None:
         never = torch.zeros_like(valid)
         return MatchDepths(torch.full_like(a[..., 2], torch.nan), never, never)

@@ -265,11 +265,11 @@ def initial_poses(
     _, _, axes = torch.linalg.svd(flow - flow.median(0).values)
     t = torch.cat([axes[0], axes.new_zeros(1)])
     found = [Pose(R, t), Pose(R, -t)]
-    seen, threshold = (x.numpy(), y.numpy(), np.eye(3)), 1 / float(K_beta[0, 0])
-    fitted, _ = cv2.findEssentialMat(*seen, method=cv2.RANSAC, threshold=threshold)
+    a, b, threshold = x.numpy(), y.numpy(), 1 / float(K_beta[0, 0])
+    fitted, _ = cv2.findEssentialMat(a, b, np.eye(3), method=cv2.RANSAC, threshold=threshold)
     for E in ((K_beta.T @ link.F @ K).numpy(), fitted):
         if E is not None and E.shape == (3, 3):
-            _, R_of_E, t_of_E, _ = cv2.recoverPose(E, *seen)
+            _, R_of_E, t_of_E, _ = cv2.recoverPose(E, a, b, np.eye(3))
             found.append(Pose(torch.from_numpy(R_of_E), torch.from_numpy(t_of_E[:, 0])))
     return found
 

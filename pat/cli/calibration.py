@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from calib.boards.poses import StartDeviations
 
 BOARDS = (
-    "charuco:8x6:30mm (squares), chessboard:9x6:25mm (inner corners), circles:7x5:20mm, acircles:4x11:20mm, "
-    "aprilgrid:6x6:88mm:0.3 (tags), or Kalibr's target file."
+    "charuco:8x6:30mm (squares; then, if wanted, markers and dictionary, :22mm:4x4_50), chessboard:9x6:25mm "
+    "(inner corners), circles:7x5:20mm, acircles:4x11:20mm, aprilgrid:6x6:88mm:0.3 (tags, space between "
+    "them), or Kalibr's target file."
 )
 BoardName = Annotated[str, arg(metavar="BOARD", help=BOARDS)]
 

@@ -232,7 +232,7 @@ def main(
     """Print the table, of some mistakes or of all."""
     refuse_unknown("--only: no mistake", only, MISTAKES)
     cv2.setRNGSeed(seed)
-    print_tables("Which hypotheses the doctor names", [confusions(data, cases, seed, only)], out)
+    print_tables("Which mistakes the doctor names", [confusions(data, cases, seed, only)], out)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ def test_mistakes_with_a_stereo_head_are_named(shared_data, kind):
     (pair, *_) = bumblebee(shared_data, ("chair01",))
     rig, images = MISTAKES[kind](pair.rig, pair.images, np.random.default_rng(3))
     found = diagnose(rig, images)
-    assert kind in (found.named.kind, *(remedy.kind for remedy in found.equal)), found.verdict
+    assert kind in (found.named.kind, *(h.kind for h in found.equal)), found.verdict
 
 
 @pytest.mark.slow
@@ -49,7 +49,7 @@ def test_a_published_rig_that_does_not_fit_is_given_no_name(shared_data):
     found = diagnose_matches(rig, {name: camera.hw for name, camera in rig.cameras.items()}, matches)
     assert not found.healthy
     assert found.named.kind == "nothing", found.verdict
-    assert "one-pixel shift" in [remedy.kind for remedy in found.equal]
+    assert "one-pixel shift" in [h.kind for h in found.equal]
 
 
 @pytest.mark.slow

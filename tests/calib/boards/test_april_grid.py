@@ -72,6 +72,13 @@ def test_mirrored_images_and_other_borders_are_explained():
     assert "add ':border2'" in explain([image], parse_board("aprilgrid:5x4:50mm:0.3:border1"))
 
 
+def test_another_size_of_a_grid_is_explained():
+    image = photograph(camera(700.0, (480, 640)), pose(), parse_board("aprilgrid:5x4:50mm:0.3:border1"))
+    said = explain([image], parse_board("aprilgrid:4x6:50mm:0.3:border1"))
+    assert "not at their positions" in said
+    assert said.endswith("is the size right (across x down)?")
+
+
 def test_two_boards_in_one_image(tmp_path):
     """Each board has its own poses; together they cover more."""
     boards = parse_boards(["charuco:6x5:40mm:30mm:5x5", "charuco:6x5:40mm:30mm:5x5:from15"])

@@ -94,8 +94,9 @@ def test_no_board_is_no_board():
     ("shown", "asked", "words"),
     [
         ("charuco:8x6:30mm", "charuco:5x4:30mm", "markers up to number"),
-        ("charuco:8x6:30mm:22mm:5x5", "charuco:8x6:30mm", "markers of the dictionary 5x5"),
+        ("charuco:8x6:30mm:22mm:5x5", "charuco:8x6:30mm", "not of 4x4_50: name that one"),
         ("charuco:8x6:30mm:legacy", "charuco:8x6:30mm", "':legacy'"),
+        ("charuco:8x6:30mm:22mm:5x5", "charuco:8x6:30mm", "markers of the dictionary 5x5"),
         ("chessboard:9x6:25mm", "chessboard:11x8:25mm", "9x6 inner corners"),
     ],
 )

@@ -7,8 +7,9 @@ import torch
 
 from arraygeom import Pose, Rig, rotation_from_vector
 from calib.boards.board import marker_dictionary
-from calib.boards.detect import detect
+from calib.boards.detect import detect, explain
 from calib.boards.rig import calibrate
+from calib.boards.simulation import printed
 from calib.boards.target import parse_board
 from tests.calib.board_scenes import errors_of, four_cameras, see
 
@@ -36,6 +37,18 @@ def seen(board, count=1, noise=0.1):
     turn, shift = (np.linspace(*ends, count)[:, None] * np.ones(3) for ends in ((-0.5, 0.5), (0.0, 0.2)))
     R = rotation_from_vector(torch.from_numpy(turn))
     return rig, see(rig, Pose(R, torch.from_numpy(shift + np.array([0, 0, 2.2]))), board, noise=noise)
+
+
+def test_a_room_has_no_print(room):
+    with pytest.raises(ValueError, match=r"Targets\.csv:4x4_50 cannot be printed"):
+        printed(room, 50)
+
+
+def test_another_dictionary_is_asked_for(room):
+    grey = np.random.default_rng(0).integers(0, 256, (240, 320)).astype(np.uint8)
+    assert explain([grey], room) == (
+        "0 of its markers are visible, too few, or not of 4x4_50: name their dictionary"
+    )
 
 
 def test_one_image_of_a_room_is_enough(room):

@@ -53,6 +53,10 @@ def test_points_are_numbered_as_opencv_numbers_them():
         ("charuco:8x6:30mm:9x9", "'9x9'"),
         ("charuco:40x40:30mm:4x4_50", "800 markers"),
         ("charuco:8x6:30mm:22mm:blue", "'blue'"),
+        ("charuco:8x6:30mm:22mm:blue", "charuco:8x6:30mm:22mm:4x4_50 (squares, markers, dictionary)"),
+        ("charuco:8x6:30mm:22mm:20mm", "'22mm' and '20mm' say the same: give one"),
+        ("aprilgrid:6x6:88mm:0.3:border1:border2", "'border1' and 'border2' say the same: give one"),
+        ("aprilgrid:6x6:88mm:1.5", "'1.5' is not from 0.05 to 1 of a tag"),
     ],
 )
 def test_wrong_names_are_explained(text, message):

@@ -87,7 +87,7 @@ def test_a_small_shift_is_offered_but_not_named(kind):
     found = diagnose_matches(MISTAKES[kind](rig), sizes(rig), seen_points(rig, noise=0.01))
     assert not found.healthy
     assert found.named.kind == "nothing"
-    assert kind in [remedy.kind for remedy in found.equal]
+    assert kind in [h.kind for h in found.equal]
     assert "drift" in found.verdict
 
 
@@ -106,7 +106,7 @@ def test_a_drifted_rig_is_not_given_a_name(field, draw):
     "repair", [MISTAKES["x and y exchanged"], each(lambda c: c.resize((360, 480)).replace(hw=c.hw))]
 )
 def test_a_drift_that_a_mistake_would_explain_is_not_named(repair):
-    """The smallest drift that leaves the points on their lines once the remedy is applied too."""
+    """The smallest drift that leaves the points on their lines by the repaired rig too."""
     g = np.random.default_rng([2, 77])
     rig = simulated_rig("narrow", 2, g)
     points = simulated_matches(rig, "narrow", g, wrong=0.0)
@@ -202,7 +202,7 @@ def test_what_cannot_be_distinguished_is_said():
     """Equal cameras side by side: an inverted pose is the same as images swapped."""
     rig = rectified_pair()
     found = diagnose_matches(each(posed(Pose.inverse))(rig), sizes(rig), seen_points(rig))
-    kinds = {found.named.kind, *(remedy.kind for remedy in found.equal)}
+    kinds = {found.named.kind, *(h.kind for h in found.equal)}
     assert {"pose inverted", "cameras swapped"} <= kinds
     assert found.before.front < 0.1
     assert found.after.front > 0.9
@@ -215,7 +215,7 @@ def test_nothing_is_certain_where_repairs_of_equal_lines_give_other_depths():
     found = diagnose_matches(each(posed(Pose.inverse))(rig), sizes(rig), seen_points(rig))
     assert {"pose inverted", "cameras swapped"} <= {
         found.named.kind,
-        *(remedy.kind for remedy in found.equal),
+        *(h.kind for h in found.equal),
     }
     assert not found.certain
 
