@@ -36,6 +36,7 @@ from calib.images.guided_matches import ALIKE, guided_matches
 from calib.images.matches import seen_depths
 from calib.images.refinement import EXTRA_FREE, FREE, refine
 from experiments.evaluation.halves import of_half
+from experiments.names import refuse_unknown
 from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair, middlebury_pairs
 from pat.evaluation.protocols import rectified_rig
 from pat.evaluation.tables import markdown_table
@@ -123,9 +124,7 @@ def evaluate_alignment(
 
     Raises ValueError for a name that there is not, FileNotFoundError for missing images.
     """
-    for name in names:
-        if name not in SCENES:
-            raise ValueError(f"no scene '{name}': there are {', '.join(SCENES)}")
+    refuse_unknown("no scene", names, SCENES)
     rows: list[AlignmentRow] = []
     for name in names:
         for scene in SCENES[name](data):
@@ -183,11 +182,23 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
         offsets, locatable = zip(*(local_offsets(own, other, x) for other in others))
         located = locatable[0] | locatable[1]
         near = [float((off[located] <= HALF_PIXEL).mean()) for off in offsets]
-        medians = [float(np.median(off[located])) for off in offsets]
-        shares = float(seen.mean()), float(located.mean()), near[0], near[1], medians[0], medians[1]
-        truths = near[2] if len(near) > 2 else None, true, filled
-        off = sampling_error(view, values)
-        rows.append(AlignmentRow(scene.name, name, *shares, *truths, off, str(view.values.dtype)))
+        rows.append(
+            AlignmentRow(
+                scene.name,
+                name,
+                seen=float(seen.mean()),
+                located=float(located.mean()),
+                aligned=near[0],
+                homography=near[1],
+                median=float(np.median(offsets[0][located])),
+                median_homography=float(np.median(offsets[1][located])),
+                by_truth=near[2] if len(near) > 2 else None,
+                true=true,
+                filled=filled,
+                off=sampling_error(view, values),
+                dtype=str(view.values.dtype),
+            )
+        )
     return rows
 
 

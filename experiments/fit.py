@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from torch import Tensor, nn
@@ -36,21 +37,26 @@ def fit(
     """Train a network for so many steps, or the rest of the run in `out`; returns it with averaged weights.
 
     The rate falls along half a cosine; `average` is the time constant in steps. The averaged network is
-    validated by `examine`, and given to `keep` with each checkpoint. Raises RuntimeError if a gradient is not
-    finite, ValueError for a folder with another run.
+    validated by `examine`, and given to `keep` with each checkpoint; what is logged with a validation is the
+    mean loss since the last checkpoint. Raises RuntimeError if a gradient is not finite, ValueError for a
+    folder with another run.
     """
     averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / average))
     adam = Adam(network.parameters(), lr=rate, betas=(0.9, 0.99))
-    former, step = newest_checkpoint(out / "checkpoints"), 0
+    step = 0
+    former = newest_checkpoint(out / "checkpoints")
     if former:
         if former.facts["recipe"] != recipe:
             other = former.facts["recipe"]
             raise ValueError(f"{out} holds a run of another recipe ({other}): give another --out")
         restore(former, network, adam, averaged)
         step = former.facts["step"]
-    if step == 0 and (facts := examine(averaged.module)):
-        _log(out, {"step": 0} | facts)
+    if step == 0:
+        facts = examine(averaged.module)
+        if facts:
+            _log(out, step, steps, facts)
     given = losses(step)
+    since_save: list[float] = []
     while step < steps:
         for group in adam.param_groups:
             group["lr"] = rate * min(0.5 + 0.5 * math.cos(math.pi * step / steps), (step + 1) / 100)
@@ -60,21 +66,24 @@ def fit(
         nn.utils.clip_grad_norm_(network.parameters(), 1.0, error_if_nonfinite=True)
         adam.step()
         averaged.update_parameters(network)
+        since_save.append(float(loss.detach()))
         step += 1
         done = step == steps
         if step % validate == 0 or done:
-            _log(out, {"step": step, "loss": float(loss.detach())} | examine(averaged.module))
+            _log(out, step, steps, {"mean loss": fmean(since_save)} | examine(averaged.module))
         if step % save == 0 or done:
+            since_save = []
             keep(averaged.module, step)
             state = {"step": step, "best": 0.0, "minutes": 0.0, "done": done, "recipe": recipe}
             write_checkpoint(out / "checkpoints", collect(network, adam, averaged, state))
     return averaged.module
 
 
-def _log(out: Path, facts: dict[str, float]) -> None:
-    """Print a line of a run's log.jsonl."""
-    line = json.dumps({name: round(value, 4) for name, value in facts.items()})
-    print(line, flush=True)
+def _log(out: Path, step: int, steps: int, facts: dict[str, float]) -> None:
+    """Print the figures of a step, and append them to the run's log.jsonl."""
+    figures = ", ".join(f"{name} {value:.4f}" for name, value in facts.items())
+    print(f"{out.name}: step {step} of {steps}, {figures}", flush=True)
+    line = json.dumps({"step": step} | {name: round(value, 4) for name, value in facts.items()})
     out.mkdir(parents=True, exist_ok=True)
     with (out / "log.jsonl").open("a", encoding="utf-8") as file:
         file.write(line + "\n")

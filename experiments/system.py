@@ -25,6 +25,7 @@ from arraygeom.atomic import write_text
 from arraygeom.io.native import write as rig_text
 from experiments.flicker import flicker
 from experiments.hdr import merged, missed, tone_curve, usable_range
+from experiments.names import refuse_unknown
 from experiments.peaks import watch_peak
 from pat.evaluation.baseline import classical_baseline
 from pat.evaluation.metrics import score
@@ -117,8 +118,7 @@ class SystemResult(NamedTuple):
 
 def load_system(name: str) -> ArraySystem:
     """A system by name. Raises ValueError listing the names."""
-    if name not in NAMES:
-        raise ValueError(f"no system '{name}': there are {', '.join(NAMES)}")
+    refuse_unknown("no system", [name], NAMES)
     module = importlib.import_module(f"experiments.{name.replace('-', '_')}")
     return ArraySystem(name, Rig.load(Path(module.__file__ or "").with_name("rig.yaml")), module)
 
@@ -182,7 +182,8 @@ def recorded(
         with safe_open(cache, "pt") as file:
             if file.metadata()["key"] == key:
                 say(f"using the recording in {out}")
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+                names = file.keys()  # not a mapping: it cannot be iterated
+                tensors = {name: file.get_tensor(name) for name in names}
                 return SystemRecording.of(tensors), _files(out, json.loads(file.metadata()["counts"]))
     say(f"rendering and recording {', '.join(f'{n} {rig[n].hw[1]}x{rig[n].hw[0]}' for n in rig.names)}")
     cache.unlink(missing_ok=True)
@@ -296,7 +297,8 @@ def _sequence(job: SystemRun) -> tuple[list[str], Panels]:
     frames = {name: ImageFiles(paths, rig, name, alpha=alpha) for name, paths in job.files.items()}
     settings = FuseSettings(max_memory=job.max_memory)
     fusion = SequenceFusion(load_weights(job.weights), rig, frames, alpha, settings=settings)
-    colours, fused, alone = fused_frames(fusion, len(ground_truth))
+    colours, fused = fused_frames(fusion, len(ground_truth))
+    alone = [fusion.alone(i) for i in range(len(fused))]
     for i, frame in enumerate(fused):
         save_frame(frame, out / "frames", name=f"{i:03d}", view=view_of(rig, alpha, bits=8))
     write_video(out / "fused.mp4", [f.image for f in fused], rate=10)
@@ -318,12 +320,11 @@ def _sequence(job: SystemRun) -> tuple[list[str], Panels]:
     return lines, panels
 
 
-def fused_frames(fusion: SequenceFusion, count: int) -> tuple[set[int], list[Frame], list[Frame]]:
-    """The numbers of the key frames, all frames with colour propagated from these, each fused alone."""
+def fused_frames(fusion: SequenceFusion, count: int) -> tuple[set[int], list[Frame]]:
+    """The numbers of the key frames, and all frames with colour propagated from these."""
     keys = fusion.timeline.key_frames()
     colours = {key.alpha: fusion.colour(key) for key in keys}
-    frames = [fusion.frame(i, keys, lambda key: colours[key.alpha]) for i in range(count)]
-    return set(colours), frames, [fusion.alone(i) for i in range(count)]
+    return set(colours), [fusion.frame(i, keys, lambda key: colours[key.alpha]) for i in range(count)]
 
 
 def _images(fusion: SequenceFusion, i: int) -> dict[str, Tensor]:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import torch
 from tyro.conf import Positional, arg
 
 from arraygeom import ReceptiveField
 from arraygeom.atomic import write_text
+from experiments.names import refuse_unknown
 from experiments.patches.dataset import ScenePatches
 from experiments.patches.show import draw_patches
 from experiments.sensors import read_chains
@@ -36,13 +37,7 @@ from .outside import evaluate_outside, outside_markdown
 from .sweep_report import write_report
 
 Half = Literal["tune", "report", "all"]
-
-
-def known(option: str, names: Iterable[str], among: Iterable[str]) -> None:
-    """Raises ValueError for the first of some names that there is not; the option, "--only: no condition"."""
-    for name in names:
-        if name not in among:
-            raise ValueError(f"{option} '{name}': there are {', '.join(among)}")
+T = TypeVar("T")
 
 
 def finished(path: Path, text: str, more: str = "") -> None:
@@ -52,7 +47,7 @@ def finished(path: Path, text: str, more: str = "") -> None:
     say(f"written: {path}{more}")
 
 
-def with_truth(found: Sequence, half: str) -> Sequence:
+def with_truth(found: Sequence[T], half: str) -> Sequence[T]:
     """Raises ValueError where no pair of a half has a true disparity."""
     if not found:
         raise ValueError(f"--half {half}: none of its pairs has a true disparity: give the other half")
@@ -132,7 +127,7 @@ class Conditions(Pairs):
     def run(self) -> None:
         """Write and print the tables. Raises ValueError for no images, and a condition that is none."""
         names = self.only or tuple(conditions.CONDITIONS)
-        known("--only: no condition", names, conditions.CONDITIONS)
+        refuse_unknown("--only: no condition", names, conditions.CONDITIONS)
         pairs, network = self.pairs(), load_weights(self.weights)
         rows = conditions.evaluate_conditions(pairs, network, names, progress=progress("evaluating"))
         conditions.save_condition_curves(rows, self.out / "conditions.png")
@@ -174,7 +169,7 @@ class Certainty:
     def run(self) -> None:
         """Write and print the tables. Raises ValueError for a condition that is none."""
         names = self.conditions or certainty.FITTED_ON
-        known("--conditions: no condition", names, conditions.CONDITIONS)
+        refuse_unknown("--conditions: no condition", names, conditions.CONDITIONS)
         writable(self.out, folder=True)
         pairs = list(of_half(middlebury_pairs(self.middlebury), self.half))
         shown = progress("fusing")(pairs, len(pairs))
@@ -207,7 +202,7 @@ class OnScenes:
         """The network, once its attention alone is known to find the points and such fields to exist."""
         if self.scenes < 1:
             raise ValueError(f"--scenes: {self.scenes}: give at least 1")
-        known("--without: no field", self.without, fields)
+        refuse_unknown("--without: no field", self.without, fields)
         writable(self.out, folder=True)
         network: Network = load_weights(self.weights)
         if not isinstance(network, Comparing):
@@ -251,8 +246,9 @@ class Sweeps(OnScenes):
         network = self.comparing(sweeps.FIELDS)
         chosen = {name: field for name, field in sweeps.FIELDS.items() if name not in self.without}
         rigs = list(sweeps.points(self.sweeps or tuple(sweeps.SWEEPS), hw=self.hw))
-        shown, of = progress("ablating")(rigs, len(rigs)), {"scenes": self.scenes, "seed": self.seed}
-        write_report(sweeps.ablate(network, shown, chosen, photos=self.bank(), **of), self.out)
+        shown = progress("ablating")(rigs, len(rigs))
+        rows = sweeps.ablate(network, shown, chosen, scenes=self.scenes, photos=self.bank(), seed=self.seed)
+        write_report(rows, self.out)
         self.say_written()
 
 

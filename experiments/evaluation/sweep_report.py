@@ -66,15 +66,14 @@ def _tables(rows: Sequence[Row], sweep: str) -> str:
     values, fields = distinct(row.value for row in some), distinct(row.field for row in some)
     parts = []
     for measure, (label, form) in MEASURES.items():
-
-        def cell(field: str, value: float, measure: str = measure, form: str = form) -> str:
-            drawn = _drawn(some, field, value, measure)
-            return form.format(np.mean(drawn)) if drawn else ""
-
-        lines = [[field, *(cell(field, value) for value in values)] for field in fields]
+        lines = [[field, *(_cell(_drawn(some, field, v, measure), form) for v in values)] for field in fields]
         parts.append(markdown_table([label, *(f"{v:g}" for v in values)], lines))
     notes = distinct(f"{row.field} at {row.value:g}: {row.note}" for row in some if row.note)
     return "\n".join(parts) + "".join(f"\n{note}." for note in notes) + "\n" * bool(notes)
+
+
+def _cell(values: Sequence[float], form: str) -> str:
+    return form.format(np.mean(values)) if values else ""
 
 
 def curves(rows: Sequence[Row]) -> Figure:

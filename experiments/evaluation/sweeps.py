@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -39,6 +39,7 @@ from arraygeom import (
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.fields.straight import covering_displacement
 from arraygeom.pixels import HW
+from experiments.names import refuse_unknown
 from pat.attention.scores import peak_position
 from pat.evaluation.ablation import sample_photographs
 from pat.evaluation.metrics import score
@@ -114,6 +115,15 @@ class Row(NamedTuple):
     note: str = ""
 
 
+@runtime_checkable
+class Way(Protocol):
+    """Something other than a field: it is given the network, the calibration and the images."""
+
+    def fuse(self, network: Comparing, rig: Rig, images: Mapping[str, Tensor]) -> Result:
+        """The result at alpha's view. Raises ValueError for a rig that it is not for."""
+        ...
+
+
 @dataclass(frozen=True)
 class Directly:
     """Images as they are, beta resized to about alpha's angular resolution as `fuse` does, with a field.
@@ -172,7 +182,7 @@ class Rows:
         return Rectified(2 * max(float(covering_displacement(pair)), 1.0), alpha_is="either")(pair, x)
 
 
-FIELDS: dict[str, ReceptiveField | Resampled] = {
+FIELDS: dict[str, ReceptiveField | Way] = {
     "calibrated segments": Epipolar(),
     "rectified, warped": Resampled(),
     "rows": Rows(),
@@ -185,7 +195,7 @@ FIELDS: dict[str, ReceptiveField | Resampled] = {
 def ablate(
     network: Comparing,
     rigs: Mapping[str, Rig] | Iterable[Point],
-    fields: Mapping[str, ReceptiveField | Resampled] = FIELDS,
+    fields: Mapping[str, ReceptiveField | Way] = FIELDS,
     *,
     scenes: int = 6,
     photos: PhotoBank | None = None,
@@ -194,7 +204,7 @@ def ablate(
     """Each field on so many scenes of each rig; `rigs` by name, or points of sweeps (`points`).
 
     A rig has two calibrated pinhole cameras, alpha first, and a depth range: its scenes lie in it. `fields`
-    are fields, one's own included, or images that are rectified. Raises ValueError for another kind of rig.
+    are fields, one's own included, or ways. Raises ValueError for another kind of rig.
     """
     given = [Point(name, 0.0, rig, rig) for name, rig in rigs.items()] if isinstance(rigs, Mapping) else rigs
     bank = photos or sample_photographs()
@@ -222,11 +232,11 @@ def _row(
     network: Comparing,
     point: Point,
     name: str,
-    field: ReceptiveField | Resampled,
+    field: ReceptiveField | Way,
     number: int,
     scene: RecordedScene,
 ) -> Row:
-    way = field if isinstance(field, Resampled) else Directly(field)
+    way = field if isinstance(field, Way) else Directly(field)
     began = time.perf_counter()
     try:
         result = way.fuse(network, two(point.assumed), scene.images)
@@ -302,9 +312,8 @@ SWEEPS: dict[str, tuple[str, tuple[float, ...]]] = {
 
 def points(sweeps: Sequence[str] = tuple(SWEEPS), *, hw: HW = SIZE) -> Iterator[Point]:
     """The rigs of sweeps. Raises ValueError for a sweep that there is not."""
+    refuse_unknown("no sweep", sweeps, SWEEPS)
     for name in sweeps:
-        if name not in SWEEPS:
-            raise ValueError(f"no sweep '{name}': there are {', '.join(SWEEPS)}")
         for value in SWEEPS[name][1]:
             yield point(name, value, hw=hw)
 

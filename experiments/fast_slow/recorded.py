@@ -40,8 +40,11 @@ def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], 
     field = HomographyDisplacement(array.displacement)
     settings = FuseSettings(field=field, match_levels=True)
     job = SequenceFusion(load_weights(weights), rig, frames, FAST, settings=settings)
-    say("fusing all frames, with colour propagated and each alone")
-    _, fused, alone = fused_frames(job, len(FAST_FRAMES))
+    keys = [str(FAST_FRAMES[key.alpha]) for key in job.timeline.key_frames()]
+    say(f"fusing key frames {', '.join(keys)}, then all")
+    _, fused = fused_frames(job, len(FAST_FRAMES))
+    say("fusing each frame alone, to compare")
+    alone = [job.alone(i) for i in range(len(FAST_FRAMES))]
     table = _table(fused, alone, frames[FAST])
     written = _write(out, array, frames, fused, alone)
     write_text(out / "scores.md", table)

@@ -97,7 +97,11 @@ def train_features(config: FeatureTraining) -> Path:
             losses,
             config.out,
             recipe,
-            **{name: getattr(config, name) for name in ("steps", "rate", "save", "validate", "average")},
+            steps=config.steps,
+            rate=config.rate,
+            save=config.save,
+            validate=config.validate,
+            average=config.average,
             examine=partial(validated, kept=kept),
             keep=keep,
         )

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 import tyro
@@ -85,9 +85,17 @@ def train_denoiser(config: DenoiserTraining) -> Path:
 
 def _fit(config: DenoiserTraining, part: int, network: nn.Module, losses: Losses) -> None:
     """Train the first or the second part, and leave the averaged weights in the network."""
-    out, save = config.out / ("views", "fused")[part], config.save
-    rates: dict[str, Any] = {"steps": config.steps[part], "rate": config.rate, "save": save, "validate": save}
-    network.load_state_dict(fit(network, losses, out, recipe_text(config), **rates).state_dict())
+    averaged = fit(
+        network,
+        losses,
+        config.out / ("views", "fused")[part],
+        recipe_text(config),
+        steps=config.steps[part],
+        rate=config.rate,
+        save=config.save,
+        validate=config.save,
+    )
+    network.load_state_dict(averaged.state_dict())
 
 
 def view_losses(

@@ -64,11 +64,10 @@ class LitStep(Step):
 
 
 def exposed(step: Step, light: OpticalImage, generator: Generator) -> OpticalImage:
-    """The images after any step; those that change the grid of pixels have a `pixel_matrix`."""
+    """The images after any step."""
     if isinstance(step, LitStep):
         return step.expose(light, generator)
-    matrix = getattr(step, "pixel_matrix", lambda hw: torch.eye(3, dtype=torch.float64))
-    return light.resampled(matrix(light.hw), step.apply(light.image, generator))
+    return light.resampled(step.pixel_matrix(light.hw), step.apply(light.image, generator))
 
 
 class Recorded(NamedTuple):

@@ -24,6 +24,11 @@ class Step(ABC):
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c2 h2 w2"]:
         """The images after the step."""
 
+    def pixel_matrix(self, hw: HW) -> Float[Tensor, "3 3"]:
+        """A with x_after ~ A x_before for images of height and width `hw` (float64): the identity if the step
+        keeps the grid of pixels."""
+        return torch.eye(3, dtype=torch.float64)
+
 
 def record(
     image: Float[Tensor, "b c h w"], steps: Sequence[Step], generator: Generator

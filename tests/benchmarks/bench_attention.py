@@ -22,7 +22,7 @@ import time
 from collections.abc import Callable
 from datetime import date
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 import tyro
@@ -362,9 +362,16 @@ def table(device: str, *, quick: bool) -> list[str]:
 def bars(done: dict, rates: dict) -> list[str]:
     """What was asked for, of the CPU, against what was measured."""
 
-    def get(what: str, *how: Any, hw: tuple[int, int] = LARGE, samples: int = 80, **more: str) -> float:
-        backward, method, interpolation = (*how, "nearest")[:3]
-        job = Job("cpu", method, interpolation, *hw, samples, backward, **more)
+    def get(
+        what: str,
+        backward: bool,
+        method: str,
+        interpolation: str = "nearest",
+        hw: tuple[int, int] = LARGE,
+        samples: int = 80,
+        dtype: str = "float32",
+    ) -> float:
+        job = Job("cpu", method, interpolation, *hw, samples, backward, dtype)
         return done.get(job.name, {}).get(what, math.nan)
 
     own = {(b, i): get("time", b, "cpu", i) for b in (False, True) for i in ("nearest", "bilinear")}

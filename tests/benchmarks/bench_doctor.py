@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 import tyro
@@ -26,6 +27,7 @@ from arraygeom import Camera, Pose, Rig, pixel_grid, sample
 from calib.images.doctor import Diagnosis, diagnose_matches
 from calib.images.hypotheses import ROTATIONS, TRANSPOSE, on_cameras
 from calib.images.matches import match_cameras, seen_depths
+from experiments.names import refuse_unknown
 from pat.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.bench_names import negated, shifted
 from tests.benchmarks.printed import DATA, print_tables
@@ -228,6 +230,8 @@ def main(
     out: Path | None = None,
 ) -> None:
     """Print the table, of some mistakes or of all."""
+    refuse_unknown("--only: no mistake", only, MISTAKES)
+    cv2.setRNGSeed(seed)
     print_tables("Which mistakes the doctor names", [confusions(data, cases, seed, only)], out)
 
 

@@ -28,7 +28,7 @@ from calib.images.hypotheses import swap
 from calib.images.matches import match_cameras
 from calib.images.refinement import refine_matches
 from pat.evaluation.tables import markdown_row
-from tests.benchmarks.printed import DATA, head, print_tables
+from tests.benchmarks.printed import DATA, head, print_tables, reproducible
 from tests.calib.real import RealPair, bumblebee, syntim
 from tests.calib.simulated import simulated_matches, simulated_rig
 
@@ -163,6 +163,7 @@ def main(
     out: Path | None = None,
 ) -> None:
     """Print the tables."""
+    reproducible()
     tables = {"simulated": lambda: simulated(draws), "real": lambda: real(data, draws)}
     print_tables("Depth of drifted rigs after refinement", (tables[name]() for name in only), out)
 

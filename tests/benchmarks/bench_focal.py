@@ -24,7 +24,7 @@ from calib.images.from_images import rig_from_images
 from calib.images.self_calibration import FOCAL_SHARE
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.fusion.from_images import MATCHED, resized_rig, scaled
-from tests.benchmarks.printed import DATA, print_tables
+from tests.benchmarks.printed import DATA, print_tables, reproducible
 from tests.calib.real import RealPair, ball, bumblebee, hilti, kitti, lund, middlebury, named, syntim
 
 TUNE = ("SYNTIM Color", "SYNTIM Poly", "chess", "fox")
@@ -92,6 +92,7 @@ def rows(data: Path) -> Iterator[str]:
 
 def main(data: Path = DATA, out: Path | None = None) -> None:
     """Print the table."""
+    reproducible()
     print_tables("Focal lengths found from two images", [rows(data)], out)
 
 

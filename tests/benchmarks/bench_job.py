@@ -130,7 +130,8 @@ def measured(
                     raise
                 print(f"old: {str(error).splitlines()[-1]}", flush=True)
                 continue
-            found[way] += [one] if i >= others else []
+            if i >= others:
+                found[way].append(one)
     if others:
         found["cold"] = [run(ways["pat fuse"], Path(tempfile.mkdtemp(dir=work)))]
     if case.cap is None:

@@ -33,7 +33,7 @@ from calib.images.matches import match_cameras, seen_depths
 from calib.images.residuals import median_off
 from pat.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.bench_drift import drifted, error
-from tests.benchmarks.printed import DATA, print_tables
+from tests.benchmarks.printed import DATA, print_tables, reproducible
 from tests.calib.real import every_pair
 from tests.calib.simulated import simulated_matches, simulated_rig
 
@@ -259,6 +259,7 @@ def main(
         real: Eleven real pairs instead of simulated rigs.
         tune: Eleven others, by which numbers were chosen.
     """
+    reproducible()
     if real or tune:
         pairs = real_cases(data, TUNE if tune else REAL)
         cases = {name: lambda g, lens, case=case: case for name, case in pairs}

@@ -33,7 +33,7 @@ from calib.boards.rig import calibrate
 from calib.boards.target import parse_board
 from calib.boards.validation import FOLDS, epipolar_errors
 from pat.evaluation.tables import markdown_row
-from tests.benchmarks.printed import DATA, head, print_tables
+from tests.benchmarks.printed import DATA, head, print_tables, reproducible
 from tests.calib.rendered import BOARD
 from tests.calib.tracks import CALISCOPE_BOARD, caliscope_views
 
@@ -175,7 +175,9 @@ def rows(data: Path, boards: Path) -> Iterator[str]:
 def main(data: Path = DATA, boards: Path = Path("out/boards"), out: Path | None = None) -> None:
     """Print the table."""
     if not hasattr(cv2, "calibrateMultiview"):
-        raise SystemExit("this OpenCV has no calibrateMultiview: use an environment with OpenCV 5")
+        version = cv2.__version__
+        raise SystemExit(f"OpenCV {version} has no calibrateMultiview: use an environment with OpenCV 5")
+    reproducible()
     title = f"Boards calibrated here and by OpenCV {cv2.__version__}"
     print_tables(title, [rows(data, boards)], out)
 

@@ -30,7 +30,7 @@ from pat.training import loop, losses
 from pat.training.config import TrainConfig, load_config
 from pat.training.losses import validation
 from pat.training.samples import Sample, SampleSource, photographs, source_of
-from tests.benchmarks.printed import print_tables
+from tests.benchmarks.printed import print_tables, reproducible
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -151,6 +151,7 @@ def lines(args: Args) -> Iterator[str]:
 
 
 def main(args: Args) -> None:
+    reproducible()
     print_tables("Choices of the small network's recipe", [lines(args)], args.out)
 
 

@@ -21,7 +21,7 @@ from arraygeom import Rig
 from calib.boards.detect import BoardViews, Detection
 from calib.boards.rig import Calibration, calibrate
 from pat.evaluation.tables import markdown_row
-from tests.benchmarks.printed import head, print_tables
+from tests.benchmarks.printed import head, print_tables, reproducible
 from tests.calib.board_scenes import BOARD, board_poses, errors_of, four_cameras, see
 
 NOISE = 0.1
@@ -89,6 +89,7 @@ def main(
     draws: int = 20, first: int = 0, shares: tuple[float, ...] = (0.0, 0.05, 0.2), out: Path | None = None
 ) -> None:
     """Print the table of so many draws, from the number `first` on."""
+    reproducible()
     title = "Board calibration with wrong corners"
     print_tables(title, [rows(range(first, first + draws), shares)], out)
 

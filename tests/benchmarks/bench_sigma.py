@@ -21,7 +21,7 @@ from calib.boards.rig import Calibration, calibrate
 from calib.boards.solve import readjusted
 from calib.boards.target import parse_board
 from pat.evaluation.tables import markdown_row
-from tests.benchmarks.printed import DATA, head, print_tables
+from tests.benchmarks.printed import DATA, head, print_tables, reproducible
 
 
 def sets(data: Path) -> Iterator[tuple[str, Calibration]]:
@@ -85,6 +85,7 @@ def rows(data: Path) -> Iterator[str]:
 
 def main(data: Path = DATA, out: Path | None = None) -> None:
     """Print the table."""
+    reproducible()
     print_tables("Stated sigma on real boards", [rows(data)], out)
 
 

@@ -23,9 +23,9 @@ from calib.boards.uncertainty import baseline_deviation, rig_covariance
 from calib.images.matches import PointMatches, match_cameras
 from calib.images.residuals import line_distances
 from experiments.alignment import nine_band_calibration
-from pat.evaluation.tables import markdown_header, markdown_row
+from pat.evaluation.tables import markdown_row
 from pat.media.images import read_image
-from tests.benchmarks.printed import DATA, print_tables
+from tests.benchmarks.printed import DATA, head, print_tables, reproducible
 
 ROWS = ((0, 1, 2), (3, 4, 5), (6, 7, 8))
 GRID = 0.04
@@ -45,16 +45,8 @@ def scene_matches(folder: Path) -> dict[tuple[str, str], PointMatches]:
 
 
 def rows(folder: Path) -> Iterator[str]:
-    yield markdown_header(
-        [
-            "positions stated",
-            "RMS px",
-            "baselines off by, mm",
-            "their sigma, mm",
-            "f",
-            "scene px",
-            "worst pair",
-        ]
+    yield head(
+        "positions stated | RMS px | baselines off by, mm | their sigma, mm | f | scene px | worst pair"
     )
     matches = scene_matches(folder)
     for position in (5e-4, 5e-3):
@@ -78,6 +70,7 @@ def _cells(found: Calibration, matches: Mapping[tuple[str, str], PointMatches]) 
 
 def main(data: Path = DATA, out: Path | None = None) -> None:
     """Print the table."""
+    reproducible()
     title = "An array from one image of a board by each camera"
     print_tables(title, [rows(data / "nine_band_array")], out)
 

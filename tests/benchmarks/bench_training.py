@@ -1,4 +1,4 @@
-"""Samples a second of a training step of our networks, and of making the scenes; where the time goes.
+"""Samples a second of a training step of recipes' networks, in each precision, and of making their scenes.
 
     python -m tests.benchmarks.bench_training
 

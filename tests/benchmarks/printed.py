@@ -31,7 +31,8 @@ def timed(
         for way, seconds in zip(ways, found):
             began = clock()
             way()
-            seconds += [clock() - began] if i else []
+            if i > 0:
+                seconds.append(clock() - began)
     return found
 
 
@@ -41,13 +42,14 @@ def spread(seconds: list[float], digits: int = 2) -> str:
     return f"{middle} ({least} to {most})"
 
 
-def print_tables(title: str, tables: Iterable[Iterable[str]], out: Path | None) -> None:
-    """Print each table's rows as they come, a blank line between tables; write them to `out` if given.
-
-    They are made on one thread, and what OpenCV draws at random is the same each time.
-    """
+def reproducible() -> None:
+    """Let this process compute on one thread, and OpenCV draw the same random numbers each time."""
     torch.set_num_threads(1)
     cv2.setRNGSeed(0)
+
+
+def print_tables(title: str, tables: Iterable[Iterable[str]], out: Path | None) -> None:
+    """Print each table's rows as they come, a blank line between tables; write them to `out` if given."""
     lines: list[str] = []
     for table in tables:
         for row in table:

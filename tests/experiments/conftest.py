@@ -23,7 +23,7 @@ def refusal(capsys):
 
     def said(*arguments, group=Experiments) -> str:
         with pytest.raises(SystemExit) as stop:
-            main(list(arguments), **{} if group is None else {"group": group})
+            main(list(arguments), group=group)
         assert stop.value.code == 2
         return capsys.readouterr().err
 

@@ -21,7 +21,7 @@ from arraygeom import (
 from arraygeom import rotation_from_vector as rotation
 from experiments.__main__ import Experiments
 from experiments.showcase import SLOW, SYNTIM, published_matrices, showcase
-from pat.cli.main import main
+from pat.cli.main import Pat, main
 from pat.media.images import read_image, write_image
 from pat.networks.configs import GuidedPATConfig
 from pat.networks.guided import GuidedPAT
@@ -214,7 +214,7 @@ def test_evaluate_writes_and_prints_the_tables(data, tmp_path, capsys):
     ],
 )
 def test_evaluate_says_what_is_wrong(arguments, complaint, tmp_path, refusal):
-    assert complaint in refusal("evaluate", *arguments, "--out", str(tmp_path / "out"), group=None)
+    assert complaint in refusal("evaluate", *arguments, "--out", str(tmp_path / "out"), group=Pat)
     assert not (tmp_path / "out").exists()
 
 

@@ -91,6 +91,16 @@ def test_ones_own_field_on_ones_own_rig(network, bank):
     assert all(0 <= r.peaks <= 1 for r in rows)
 
 
+def test_ones_own_way_is_given_calibration_and_images(network, bank):
+    class Own:
+        def fuse(self, network, rig, images):
+            return Resampled().fuse(network, rig, images)
+
+    rigs = {"mine": point("baseline", 12, hw=HW).rig}
+    ours, own = ablate(network, rigs, {"ours": Resampled(), "own": Own()}, scenes=1, photos=bank)
+    assert (ours.psnr, ours.ssim, ours.peaks) == (own.psnr, own.ssim, own.peaks)
+
+
 def test_what_was_resampled_comes_back(network, bank):
     """A network that returns alpha: its picture survives both resamplings, and so do matches' positions."""
 

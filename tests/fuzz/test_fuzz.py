@@ -21,6 +21,7 @@ from pat.networks.weights import load_weights, save_weights
 from pat.support.memory import keep_freed
 from pat.support.tensor_files import write_tensors
 from pat.synthesis.photos import read_photographs
+from pat.training import checkpoints
 from pat.training.checkpoints import FORMAT, collect, newest_checkpoint, restore, write_checkpoint
 from tests.fuzz import cases, sandbox
 from tests.fuzz.run import faults_of
@@ -141,6 +142,14 @@ def test_checkpoints_with_wrong_facts_are_damaged(wrong, tmp_path):
     write_tensors(path, {}, {"format": FORMAT, "facts": json.dumps(FACTS | wrong)})
     with pytest.raises(ValueError, match="no checkpoint there can be read"):
         newest_checkpoint(tmp_path)
+
+
+def test_a_checkpoint_read_with_facts_of_other_types_is_a_fault(tmp_path, monkeypatch):
+    path = write_checkpoint(tmp_path, collect(*cases.training(), FACTS))
+    assert cases.use_checkpoint(path, random.Random(0)) == "read"
+    monkeypatch.setitem(checkpoints.FACTS, "done", (bool, str))
+    write_checkpoint(tmp_path, collect(*cases.training(), FACTS | {"done": "no"}))
+    assert cases.use_checkpoint(path, random.Random(0)).startswith("facts of other types")
 
 
 @pytest.mark.timeout(60)

@@ -51,9 +51,8 @@ def test_every_step_has_a_name():
 
 
 def test_a_chain_from_a_file_runs():
-    chain = read_chain(
-        ["decode-srgb", {"vignetting": {"falloff": [-0.2]}}, "mosaic", "demosaic", "encode-srgb"]
-    )
+    text = "[decode-srgb, {vignetting: {falloff: [-0.2]}}, mosaic, demosaic, encode-srgb, {quantise: 8}]"
+    chain = read_chain(yaml.safe_load(text))
     assert record(torch.rand(1, 3, 8, 8), chain, torch.Generator()).image.shape == (1, 3, 8, 8)
 
 

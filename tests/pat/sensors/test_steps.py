@@ -108,6 +108,7 @@ def test_maps_of_several_steps_compose():
     pixels = record(image, [Resample(0.5), BoxBlur(3), Resample((45, 20))], generator()).pixels
     direct = Resample((45, 20)).pixel_matrix((60, 80))
     torch.testing.assert_close(pixels, direct)
+    assert torch.equal(BoxBlur(3).pixel_matrix((60, 80)), torch.eye(3, dtype=torch.float64))
 
 
 def test_blurs_keep_flat_images_and_diffuse_a_point_as_stated():
