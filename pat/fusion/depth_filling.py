@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from numpy.typing import NDArray
 from torch import Tensor
 
 from arraygeom.chunks import chunked
@@ -18,6 +15,7 @@ from arraygeom.chunks import chunked
 from ..matching.filters import numpy_of
 from ..matching.inputs import Inputs
 from ..matching.positions import FINE
+from ..matching.surfaces import Plane, Planes, repeated
 from ..support.settings import physics, tuned
 from .results import Frame
 
@@ -39,10 +37,6 @@ class FillSettings:
         2.0,
         "Middlebury, tune half, of 1.5 to 10: change of inverse depth that is as far as `reach` when planes "
         "are first fitted, in half-widths of its interval: its width",
-    )
-    level: float = tuned(
-        0.005,
-        "Middlebury, tune half: variance of position, in squares of `reach`, below which planes are level",
     )
     one_side: float = physics(
         0.9,
@@ -106,26 +100,16 @@ def _filled_rows(
     certain = torch.where(known, confidence, 0.0)
     kept = certain >= least
     filled = torch.where(kept, inverse, _background(inverse, kept))
-    y, x = torch.meshgrid(*(torch.arange(n, device=depth.device) % FINE for n in depth.shape), indexing="ij")
     for apart in (_far_by_depth, _far_by_slope):
         whole = inverse, torch.where(kept, certain, 0.0), alpha, filled
         matched, weight, grey, guess = (numpy_of(t[::FINE, ::FINE]) for t in whole)
-        guide = np.stack([grey, *apart(guess)], -1)
-        planes = (torch.from_numpy(t).to(inverse) for t in _planes(matched, weight, guide))
-        value, right, down, around = (_repeated(plane, inverse) for plane in planes)
+        planes = Planes.through(matched, weight, np.stack([grey, *apart(guess)], -1), SETTINGS.reach)
+        seen = planes.at_pixels(depth.shape), repeated(planes.around, depth.shape)
+        value, around = (torch.from_numpy(t).to(inverse) for t in seen)
         kept = certain >= SETTINGS.share * around
-        filled = torch.where(kept, inverse, value + x * right + y * down)
+        filled = torch.where(kept, inverse, value)
     changed = known & ~kept & (filled > 0)
     return torch.where(changed, 1 / torch.where(changed, filled * unit, 1.0), depth)
-
-
-def _repeated(plane: Float[Tensor, "h2 w2"], like: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """What is known of every second pixel for those to its right and below it, too."""
-    return plane.repeat_interleave(FINE, 0).repeat_interleave(FINE, 1)[: like.shape[0], : like.shape[1]]
-
-
-Plane = NDArray[np.float32]
-"""One number a pixel (h, w)."""
 
 
 def _far_by_depth(inverse: Plane) -> list[Plane]:
@@ -136,36 +120,6 @@ def _far_by_depth(inverse: Plane) -> list[Plane]:
 def _far_by_slope(inverse: Plane) -> list[Plane]:
     """A guide whose changes of 1 are those of slopes, by a half-width in two pixels: planes are whole."""
     return [np.diff(inverse, axis=axis, append=inverse.take([-1], axis)) for axis in (0, 1)]
-
-
-def _planes(inverse: Plane, weight: Plane, guide: NDArray[np.float32]) -> tuple[Plane, Plane, Plane, Plane]:
-    """Planes through weighted inverse depth: value, slopes a pixel of alpha, and the confidence around.
-
-    Of every second pixel; a change of 1 in the guide (h, w, c) is as far as `reach`. No confidence is
-    around what no weight reaches.
-    """
-    reach = SETTINGS.reach / FINE
-    y, x = np.mgrid[: weight.shape[0], : weight.shape[1]].astype(np.float32)
-    x, y = ((t - t.mean()) / reach for t in (x, y))
-    centre = np.median(inverse[weight > 0]) if weight.any() else 0.0
-    z = inverse - centre
-    terms = (1, x, y, x * x, x * y, y * y, z, x * z, y * z, weight)
-    sums = _spread([term * weight for term in terms], guide)
-    total = np.maximum(sums[0], np.finfo(np.float32).tiny)
-    mx, my, mxx, mxy, myy, mz, mxz, myz, around = sums[1:] / total
-    xx, yy, xy = mxx - mx * mx + SETTINGS.level, myy - my * my + SETTINGS.level, mxy - mx * my
-    xz, yz = mxz - mx * mz, myz - my * mz
-    determinant = xx * yy - xy * xy
-    right, down = (xz * yy - yz * xy) / determinant, (yz * xx - xz * xy) / determinant
-    value = mz + right * (x - mx) + down * (y - my)
-    return value + centre, right / (FINE * reach), down / (FINE * reach), around
-
-
-def _spread(planes: Sequence[Plane], guide: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Weighted sums around each pixel, those beyond an edge of the guide weighing less; four at a time."""
-    over = cv2.ximgproc.createDTFilter(guide, SETTINGS.reach / FINE, 1.0, cv2.ximgproc.DTF_RF)
-    found = [over.filter(cv2.merge(planes[first : first + 4])) for first in range(0, len(planes), 4)]
-    return np.asarray(np.concatenate(found, -1).transpose(2, 0, 1), np.float32)
 
 
 def _background(inverse: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:

@@ -8,7 +8,6 @@ size.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import cv2
 import numpy as np
@@ -21,12 +20,13 @@ from torch.nn.functional import avg_pool2d, interpolate
 from arraygeom import Segments
 
 from ..support.settings import size, tuned
-from .filters import box_mean, filled, numpy_of
+from .filters import box_mean, numpy_of
 from .inputs import Inputs
 from .matches import Matches
 from .normalisation import ComparedViews
 from .positions import FINE, Extent, at_matches, matches
 from .semi_global import CONSISTENT, SemiGlobalSettings, Windows, geometry_of, matched_by_labels
+from .surfaces import Plane, Planes
 
 FULL_SIZE = SemiGlobalSettings(step=20.0, jump=80.0, margin=48)
 """Penalties chosen on Middlebury's tune half; half the size, where a label is two pixels, has others."""
@@ -39,18 +39,21 @@ class SubpixelSettings:
     run: int = size(5, "Labels in a run, of which each pixel has two")
     neighbourhood: int = size(5, "Side of the neighbourhood at half the size, pixels")
     same: float = tuned(0.7, "Middlebury: nearer matches at both sizes are of one surface, pixels")
-    step_radius: int = size(3, "Window of the step to a fraction of a pixel")
+    step_radius: int = size(2, "Window of the step to a fraction of a pixel, where both views are sharp")
     gradient_radius: int = size(6, "Window around a pixel whose brightness moves its match, in gradients")
-    most_step: float = tuned(0.25, "Middlebury, tune half: the most pixels of that step")
+    most_step: float = tuned(0.25, "Middlebury, tune half: the most pixels of that step, there")
     flat: float = tuned(
         3e-6,
         "Middlebury: slope of brightness (its square) along the segment at which that step is half as long, "
-        "and a match weighs half in the smoothing of surfaces",
+        "and a match weighs half in its surface",
     )
-    surface: tuple[float, float] = tuned(
-        (30.0, 4.0), "Middlebury: strength of that smoothing, and the 8-bit difference that counts as an edge"
+    reach: float = tuned(24.0, "Middlebury, tune half, of 16 to 32: pixels to which matches of a surface count")
+    step: float = tuned(
+        0.5,
+        "Middlebury, tune half, of .5 to 1: change of disparity that is as far as `reach`, pixels, where both "
+        "views are sharp",
     )
-    pixel: float = tuned(8.0, "Middlebury: how many such levels a pixel of disparity counts")
+    surfaces: int = size(3, "How often surfaces are fitted, from the second on within the ones before")
 
 
 SETTINGS = SubpixelSettings()
@@ -75,17 +78,33 @@ def _precise(
 ) -> Float[Tensor, "b 1 h w"]:
     """Disparity to a fraction of a pixel: where that of half the size (`rough`) is near, the mean of both;
     from there a step of least squares of the brightness around each pixel (Lucas and Kanade 1981); and the
-    result smoothed within surfaces, where brightness says little of the position more than elsewhere."""
-    own, other, guides = views
+    result on planes within surfaces. The less sharp beta is, the wider are windows, and the farther may steps
+    be."""
+    own, other, guides, blurs = views
     near = consistent & ((disparity - rough).abs() < SETTINGS.same)
     start = torch.where(near, (disparity + rough) / 2, disparity)
-    rise, rest = _compared(own, other, segments, start)
-    common, slope = box_mean(torch.cat([rise * rest, rise.square()], 1), SETTINGS.step_radius).split(1, 1)
-    step = (common / (slope + SETTINGS.flat)).clamp(-SETTINGS.most_step, SETTINGS.most_step)
-    weight = torch.where(consistent, slope / (slope + SETTINGS.flat), 0.0) + 1e-5
-    planes = zip(numpy_of(torch.where(near, start + step, start)), numpy_of(weight[:, 0]), guides)
-    smooth = [filled(d, w, _surfaces(d[0], brightness), SETTINGS.surface) for d, w, brightness in planes]
-    return torch.from_numpy(np.stack(smooth)).to(disparity)
+    compared = _compared(own, other, segments, start)
+    found = []
+    for i, blur in enumerate(blurs):
+        one = slice(i, i + 1)
+        common, slope = _agreement(*(part[one] for part in compared), round(SETTINGS.step_radius * (1 + blur)))
+        most = SETTINGS.most_step * (1 + blur)
+        moved = start[one] + near[one] * (common / (slope + SETTINGS.flat)).clamp(-most, most)
+        weight = torch.where(consistent[one], slope / (slope + SETTINGS.flat), 0.0) + 1e-5
+        planes = numpy_of(moved[0, 0]), numpy_of(weight[0, 0]), guides[i]
+        found.append(_surfaces(*planes, SETTINGS.step * (1 + blur)))
+    return torch.from_numpy(np.stack(found))[:, None].to(disparity)
+
+
+def _surfaces(
+    disparity: Plane, weight: Plane, brightness: NDArray[np.uint8], step: float
+) -> NDArray[np.float32]:
+    """Disparity on planes through it, within what is connected in alpha and has no such step of disparity."""
+    every, whole = (slice(None, None, FINE),) * 2, disparity
+    for _ in range(SETTINGS.surfaces):
+        guide = np.stack([brightness[every] / np.float32(255), whole[every] / np.float32(step)], -1)
+        whole = Planes.through(disparity[every], weight[every], guide, SETTINGS.reach).at_pixels(disparity.shape)
+    return whole
 
 
 def following(inputs: Inputs, found: Matches) -> Matches:
@@ -115,16 +134,22 @@ def with_gradients(
 def _step(views: ComparedViews, segments: Segments, disparity: Tensor) -> Float[Tensor, "b 1 h w"]:
     """One step towards the best agreement, pixels; its gradients hold where it is zero."""
     rise, rest = _compared(views.alpha, views.beta, segments, disparity)
-    rise = rise.detach()
-    common, slope = box_mean(torch.cat([rise * rest, rise.square()], 1), SETTINGS.gradient_radius).split(1, 1)
+    common, slope = _agreement(rise.detach(), rest, SETTINGS.gradient_radius)
     return common / (slope.detach() + SETTINGS.flat)
+
+
+def _agreement(rise: Tensor, rest: Tensor, radius: int) -> tuple[Tensor, Tensor]:
+    """What rise and rest have in common within squares, and the rise's own, both less their means around."""
+    rise, rest = (part - box_mean(part, 2 * radius) for part in (rise, rest))
+    common, slope = box_mean(torch.cat([rise * rest, rise.square()], 1), radius).split(1, 1)
+    return common, slope
 
 
 def _compared(
     own: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"], segments: Segments, disparity: Tensor
 ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"]]:
-    """Of each pixel, both less their mean around it: how much brighter beta is a pixel farther along its
-    segment than at its match, and how much brighter alpha is than beta there."""
+    """Of each pixel: how much brighter beta is a pixel farther along its segment than at its match, and how
+    much brighter alpha is than beta there."""
     across, down = (torch.gradient(other, dim=side)[0] for side in (3, 2))
     still = Segments(segments.start.detach(), segments.end.detach(), segments.valid)
     extent = Extent.of(segments)
@@ -134,17 +159,7 @@ def _compared(
         x, y = matches(segments, disparity, extent=extent).to(other)[:, None].unbind(-1)
         seen = seen + across.detach() * (x - x.detach()) + down.detach() * (y - y.detach())
     towards = extent.towards.movedim(-1, 1).to(other).detach()
-    mean = partial(box_mean, radius=2 * SETTINGS.step_radius)
-    rise, rest = across * towards[:, :1] + down * towards[:, 1:], own - seen
-    return rise - mean(rise), rest - mean(rest)
-
-
-def _surfaces(disparity: NDArray[np.float32], brightness: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A guide (h, w, 3) whose edges are those of disparity and of brightness. Disparity as two triangular
-    waves, one of which has a slope where the other turns: it may be larger than 8 bits hold."""
-    levels = (disparity * SETTINGS.pixel).astype(np.int32)
-    waves = ((n ^ -(n >> 8 & 1)).astype(np.uint8) for n in (levels, levels + 128))
-    return np.stack([brightness, *waves], -1)
+    return across * towards[:, :1] + down * towards[:, 1:], own - seen
 
 
 def _runs(half: NDArray[np.float32]) -> NDArray[np.int32]:

@@ -34,7 +34,7 @@ def rows(moved: torch.Tensor, slope: torch.Tensor | float = 0.0) -> Segments:
 def views(shift: torch.Tensor) -> ComparedViews:
     x = pixel_grid((H, W), dtype=torch.float64)
     beta = looked_at(x + torch.stack([DISPARITY + shift, 0 * shift]))
-    return ComparedViews(looked_at(x), beta, np.zeros((1, H, W), np.uint8))
+    return ComparedViews(looked_at(x), beta, np.zeros((1, H, W), np.uint8), [0.0])
 
 
 def found(moved: torch.Tensor, shift: torch.Tensor, slope: torch.Tensor | float = 0.0) -> torch.Tensor:
