@@ -53,7 +53,7 @@ class SubpixelSettings:
         "Middlebury, tune half, of .5 to 1: change of disparity that is as far as `reach`, pixels, where both "
         "views are sharp",
     )
-    surfaces: int = size(3, "How often surfaces are fitted, from the second on within the ones before")
+    surfaces: int = size(2, "How often surfaces are fitted, the second time within the first ones")
 
 
 SETTINGS = SubpixelSettings()
