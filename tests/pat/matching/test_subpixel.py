@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Segments, pixel_grid
 from pat.matching.normalisation import Comparison
@@ -93,10 +93,45 @@ def test_a_slope_with_little_texture_is_found_to_a_fraction_of_a_pixel_in_noise(
     assert float((found[0, 0] - disparity).abs()[8:-8, 24:-8].mean()) < 0.2
 
 
-def test_surfaces_apart_have_an_edge_between_them_however_large_their_disparities():
-    disparity = np.linspace(0, 400, 3001, dtype=np.float32)[None]
-    levels = _surfaces(disparity, np.zeros(disparity.shape, np.uint8)).astype(int)[0]
-    for pixels, steps in ((0.4, 3), (4.0, 30), (20.0, 150)):
-        apart = np.abs(levels[steps:] - levels[:-steps]).max(1)
-        assert apart.max() <= 8 * pixels + 1
-        assert apart.min() >= min(0.5 * 8 * pixels - 1, 30)
+def two_slopes() -> tuple[np.ndarray, np.ndarray]:
+    """Disparity of two slanted surfaces, the right one 5 pixels nearer; the same with noise."""
+    y, x = np.mgrid[:H, :W].astype(np.float32)
+    disparity = np.where(x < 81, 8 + x / 20 + y / 30, 18 - x / 25).astype(np.float32)
+    noise = np.random.default_rng(0).normal(0, 0.3, disparity.shape)
+    return disparity, (disparity + noise).astype(np.float32)
+
+
+@pytest.mark.parametrize("blur", [0.0, 3.0])
+def test_matches_lie_on_slanted_surfaces_and_steps_of_disparity_stay(blur):
+    disparity, noisy = two_slopes()
+    found = _surfaces(noisy, np.ones_like(noisy), np.zeros(noisy.shape, np.uint8), 0.5 * (1 + blur))
+    error = np.abs(found - disparity)
+    assert error.mean() < 0.5 * np.abs(noisy - disparity).mean()
+    assert np.delete(error[:, 74:88], [6, 7], 1).max() < 1.5 + blur  # planes are of every second pixel
+    assert error[8:-8, 8:70].mean() < (0.1 if blur else 0.15)
+
+
+def test_a_match_that_counts_little_takes_the_place_of_those_around():
+    disparity, noisy = two_slopes()
+    wrong = (slice(40, 48), slice(30, 40))
+    noisy[wrong] += 3
+    weight = np.ones_like(noisy)
+    weight[wrong] = 1e-5
+    found = _surfaces(noisy, weight, np.zeros(noisy.shape, np.uint8), 4.0)
+    assert np.abs(found - disparity)[wrong].mean() < 0.3
+
+
+def test_a_blurred_beta_is_matched_to_a_pixel():
+    """Disparity of a slope, beta reduced 8 times and enlarged: one of its pixels is 8 of alpha's."""
+    g = torch.Generator().manual_seed(7)
+    scene = blurred(torch.rand(1, 1, 192, 8 * 512, generator=g), 24.0)
+    scene = 0.5 + 0.15 * (scene - scene.mean()) / scene.std()
+    x = torch.arange(384.0).expand(192, -1)
+    disparity = 16 + x / 48
+    rows, start = torch.arange(192)[:, None], 8 * 64
+    beta = scene[..., start : start + 8 * 384 : 8]
+    alpha = scene[0, 0][rows, (start + 8 * (x - disparity)).round().long().clamp(min=0)][None, None]
+    coarse = interpolate(avg_pool2d(beta, 8), scale_factor=8, mode="bicubic", align_corners=False)
+    _, _, segments = beside(alpha, 0, 384)
+    found, _ = matched(alpha, coarse, *segments, Comparison.of(alpha, coarse))
+    assert float(((found[0, 0] - disparity).abs()[16:-16, 64:-16] < 1).float().mean()) > 0.78
