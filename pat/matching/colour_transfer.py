@@ -37,7 +37,7 @@ class ColourTransferSettings:
     """Brightness is 0 to 1. Middlebury and SYNTIM are the pairs of their tune halves."""
 
     likeness: float = tuned(
-        0.08, "Middlebury: difference of brightness at which the weight of a match falls to 1 / e"
+        0.06, "Middlebury: difference of brightness at which likeness, and with it a match's weight, is 1 / e"
     )
     inconsistent: float = tuned(
         0.25, "Middlebury: weight of a match that is not consistent, before the likeness"
@@ -48,7 +48,7 @@ class ColourTransferSettings:
         "strength, and 8-bit difference that counts as an edge, of the smoothing that diffuses colour",
     )
     surroundings: int = tuned(
-        24, "Middlebury: within how many pixels the brightness of both views is compared"
+        48, "Middlebury: within how many pixels the brightness of both views is compared"
     )
     saturation: float = tuned(0.6, "Middlebury: the power of its ratio by which colour grows")
     most_brighter: float = size(
@@ -201,13 +201,13 @@ def match_weight(
 ) -> Float[Tensor, "b 1 h w"]:
     """The weight of a match whose brightness differs from alpha's by `unlike`; always more than 0."""
     least = SETTINGS.inconsistent
-    return (least + (1 - least) * consistent) * valid * likeness(unlike, SETTINGS.likeness) + 1e-4
+    return (least + (1 - least) * consistent) * valid * likeness(unlike) + 1e-4
 
 
-def likeness(unlike: Float[Tensor, "b 1 h w"], scale: float) -> Float[Tensor, "b 1 h w"]:
-    """1 where two images are equally bright around a pixel, 1 / e where they differ by `scale` there."""
+def likeness(unlike: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
+    """1 where two images are equally bright around a pixel, 0 where they are not."""
     unlike = avg_pool2d(unlike.abs(), 3, 1, 1, count_include_pad=False)
-    return torch.exp(-(unlike / scale).square())
+    return torch.exp(-(unlike / SETTINGS.likeness).square())
 
 
 def diffused_from(

@@ -39,19 +39,15 @@ class GuidedSettings:
 
     coarse: int = size(4, "Context is computed at this part of the size")
     least_weight: float = size(1e-3, "The least weight of a pixel in propagation")
-    confidence_offsets: tuple[float, float] = tuned(
-        (0.2, 2.0),
+    confidence_offset: float = tuned(
+        2.0,
         "Middlebury, tune half: goes with the next training: added to the logit of the confidence where "
-        "colour is blended: where beta's brightness is unlike alpha's, and where it is the same",
+        "colour is blended, where beta's brightness is alpha's",
     )
     exact_offset: float = tuned(
         1.0,
         "Middlebury, tune half: goes with the next training: added to the logit of taking the "
         "semi-global match's colour instead of the attended one",
-    )
-    likeness: float = tuned(
-        0.06,
-        "Middlebury, tune half: difference of brightness at which likeness falls to 1 / e",
     )
     likest: float = tuned(
         3.0,
@@ -100,8 +96,7 @@ class BetaEstimate(NamedTuple):
     @property
     def blending(self) -> Float[Tensor, "b 1 h w"]:
         """The weight of `colour` in the image, 0 to 1."""
-        unlike, alike = SETTINGS.confidence_offsets
-        return (self.logit + unlike + (alike - unlike) * self.likeness).sigmoid()
+        return (self.logit + SETTINGS.confidence_offset * self.likeness).sigmoid()
 
     def beyond(self, base: Float[Tensor, "b c h w"], band: int) -> BetaEstimate:
         """One band, counted from a base instead of from alpha; `base` (B, C, H, W) is bands minus alpha."""
@@ -217,7 +212,7 @@ class GuidedPAT(nn.Module):
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
         logit = torch.where(peak[:, None] > 0, logit, SETTINGS.nowhere)
         colour = torch.lerp(value - alpha, bands.to(value), (exact + SETTINGS.exact_offset).sigmoid())
-        alike = likeness(facts[0], SETTINGS.likeness)
+        alike = likeness(facts[0])
         return BetaEstimate(
             attended, deviation, peak, colour, diffused, logit, choice, position, alike, found.prior
         )
