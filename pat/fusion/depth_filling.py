@@ -95,7 +95,7 @@ def _filled_rows(
 
     `least` is the confidence from which matches count before any plane is known.
     """
-    known = depth.isfinite()
+    (h, w), known = depth.shape, depth.isfinite()
     inverse = torch.where(known, 1 / depth.detach(), 0.0) / unit
     certain = torch.where(known, confidence, 0.0)
     kept = certain >= least
@@ -104,7 +104,7 @@ def _filled_rows(
         whole = inverse, torch.where(kept, certain, 0.0), alpha, filled
         matched, weight, grey, guess = (numpy_of(t[::FINE, ::FINE]) for t in whole)
         planes = Planes.through(matched, weight, np.stack([grey, *apart(guess)], -1), SETTINGS.reach)
-        seen = planes.at_pixels(depth.shape), repeated(planes.around, depth.shape)
+        seen = planes.at_pixels((h, w)), repeated(planes.around, (h, w))
         value, around = (torch.from_numpy(t).to(inverse) for t in seen)
         kept = certain >= SETTINGS.share * around
         filled = torch.where(kept, inverse, value)

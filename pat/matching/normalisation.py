@@ -106,8 +106,8 @@ def _weighted_mean(image: Tensor, weight: Tensor) -> Float[Tensor, "*b 1 1 1"]:
 
 
 class ComparedViews(NamedTuple):
-    """Alpha and beta for comparison, (B, 1, ., .), equally bright and sharp; alpha in 8 bits (B, h, w), and the
-    standard deviation, in pixels, by which each of the batch was blurred to be as sharp as beta."""
+    """Alpha and beta for comparison, (B, 1, ., .), equally bright and sharp; alpha in 8 bits (B, h, w); and
+    the standard deviation, in pixels, by which each alpha was blurred to be as sharp as beta."""
 
     alpha: Tensor
     beta: Tensor
@@ -146,7 +146,9 @@ class Normalisation(NamedTuple):
 
     def views(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> ComparedViews:
         """Alpha and beta's brightness, or parts of them, as they are compared."""
-        return ComparedViews(*self.equally_sharp(alpha, self.normalised(beta)), to_bytes(alpha[:, 0]), self.blurs[0])
+        return ComparedViews(
+            *self.equally_sharp(alpha, self.normalised(beta)), to_bytes(alpha[:, 0]), self.blurs[0]
+        )
 
 
 def _levelled(image: Tensor, level: Tensor) -> Tensor:

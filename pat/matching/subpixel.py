@@ -47,11 +47,13 @@ class SubpixelSettings:
         "Middlebury: slope of brightness (its square) along the segment at which that step is half as long, "
         "and a match weighs half in its surface",
     )
-    reach: float = tuned(24.0, "Middlebury, tune half, of 16 to 32: pixels to which matches of a surface count")
+    reach: float = tuned(
+        24.0, "Middlebury, tune half, of 16 to 32: pixels to which matches of a surface count"
+    )
     step: float = tuned(
         0.5,
-        "Middlebury, tune half, of .5 to 1: change of disparity that is as far as `reach`, pixels, where both "
-        "views are sharp",
+        "Middlebury, tune half, of .5 to 1: change of disparity, pixels, that is as far as `reach`, where "
+        "both views are sharp",
     )
     surfaces: int = size(2, "How often surfaces are fitted, the second time within the first ones")
 
@@ -83,13 +85,13 @@ def _precise(
     own, other, guides, blurs = views
     near = consistent & ((disparity - rough).abs() < SETTINGS.same)
     start = torch.where(near, (disparity + rough) / 2, disparity)
-    compared = _compared(own, other, segments, start)
+    rise, rest = _compared(own, other, segments, start)
     found = []
     for i, blur in enumerate(blurs):
         one = slice(i, i + 1)
-        common, slope = _agreement(*(part[one] for part in compared), round(SETTINGS.step_radius * (1 + blur)))
-        most = SETTINGS.most_step * (1 + blur)
-        moved = start[one] + near[one] * (common / (slope + SETTINGS.flat)).clamp(-most, most)
+        common, slope = _agreement(rise[one], rest[one], round(SETTINGS.step_radius * (1 + blur)))
+        step = (common / (slope + SETTINGS.flat) / (1 + blur)).clamp(-SETTINGS.most_step, SETTINGS.most_step)
+        moved = start[one] + near[one] * (1 + blur) * step
         weight = torch.where(consistent[one], slope / (slope + SETTINGS.flat), 0.0) + 1e-5
         planes = numpy_of(moved[0, 0]), numpy_of(weight[0, 0]), guides[i]
         found.append(_surfaces(*planes, SETTINGS.step * (1 + blur)))
@@ -100,10 +102,10 @@ def _surfaces(
     disparity: Plane, weight: Plane, brightness: NDArray[np.uint8], step: float
 ) -> NDArray[np.float32]:
     """Disparity on planes through it, within what is connected in alpha and has no such step of disparity."""
-    every, whole = (slice(None, None, FINE),) * 2, disparity
+    (h, w), every, whole = disparity.shape, (slice(None, None, FINE),) * 2, disparity
     for _ in range(SETTINGS.surfaces):
         guide = np.stack([brightness[every] / np.float32(255), whole[every] / np.float32(step)], -1)
-        whole = Planes.through(disparity[every], weight[every], guide, SETTINGS.reach).at_pixels(disparity.shape)
+        whole = Planes.through(disparity[every], weight[every], guide, SETTINGS.reach).at_pixels((h, w))
     return whole
 
 

@@ -2,8 +2,7 @@
 
 Blocks of 8 x 8 pixels are stacked with those most alike near them. A cosine transform of each and a Hadamard
 transform over the stack gather what they have in common in few coefficients, and noise spreads over all of
-them. Coefficients are kept if they are large (first pass), or weighted by how strong they are in an earlier
-estimate (Wiener's filter).
+them. Coefficients are weighted by how strong they are in an earlier estimate (Wiener's filter).
 """
 
 from __future__ import annotations
@@ -33,25 +32,20 @@ class CollaborativeSettings:
     alike: int = size(16, "Blocks in a group")
     radius: int = size(16, "How far away alike blocks are looked for, pixels")
     rows: int = size(16, "Rows of blocks that a thread works on at once")
-    threshold: float = tuned(
-        2.9,
-        "Middlebury, tune half: "
-        "coefficients of so many standard deviations of the noise are kept in the first pass",
-    )
     as_recorded: float = tuned(
         0.5,
-        "Middlebury, tune half: later passes look for alike blocks in an estimate with so much of the noise "
-        "left: where an image is flat the noise makes blocks alike that lie apart, as is needed",
+        "Middlebury, tune half: alike blocks are looked for in an estimate with so much of the noise left: "
+        "where an image is flat the noise makes blocks alike that lie apart, as is needed",
     )
     kept: float = tuned(
-        0.5, "Middlebury, tune half: share of the network's brightness that is kept: its errors are others"
+        0.3, "Middlebury, tune half: share of the network's brightness that is kept: its errors are others"
     )
 
 
 SETTINGS = CollaborativeSettings()
 SIDE, STEP, ALIKE, RADIUS, ROWS = SETTINGS.side, SETTINGS.step, SETTINGS.alike, SETTINGS.radius, SETTINGS.rows
 """For the compiled loops, which read no attributes."""
-THRESHOLD, AS_RECORDED, KEPT = SETTINGS.threshold, SETTINGS.as_recorded, SETTINGS.kept
+AS_RECORDED, KEPT = SETTINGS.as_recorded, SETTINGS.kept
 CELLS = SIDE // STEP
 
 
@@ -69,32 +63,25 @@ def refined(
 ) -> Float[Tensor, "b c h w"]:
     """A network's estimate of an image of one band or of three (RGB), from what was recorded with noise.
 
-    The noise is white and of this standard deviation. Brightness is the mean of the network's and the
-    filtered one; colour is filtered three times.
+    The noise is white and of this standard deviation. Brightness is a mean of the network's and the filtered
+    one; colour is filtered twice.
     """
     return torch.stack([_refined(*parts) for parts in zip(estimate, recorded, deviation)])
 
 
 def _refined(estimate: Tensor, recorded: Tensor, deviation: Tensor) -> Float[Tensor, "c h w"]:
     if len(estimate) == 1:
-        return torch.lerp(_filtered(estimate, recorded, deviation, recorded[:1]), estimate, KEPT)
+        return torch.lerp(_filtered(recorded, estimate, deviation), estimate, KEPT)
     bands, noise = opponent(recorded[None])[0], opponent_deviation(deviation[None])[0]
     found = opponent(estimate[None])[0]
-    result = _filtered(found, bands, noise, bands[:1])
-    result = wiener_filtered(bands, result, noise, _guide(result[:1], bands[:1]))
+    result = _filtered(bands, _filtered(bands, found, noise), noise)
     result = torch.cat([torch.lerp(result[:1], found[:1], KEPT), result[1:]])
     return rgb_of_opponent(result[None])[0]
 
 
-def _filtered(estimate: Tensor, recorded: Tensor, deviation: Tensor, guide: Tensor) -> Float[Tensor, "c h w"]:
-    """By a first pass, and Wiener's filter after it."""
-    first = collaboratively_filtered(recorded, estimate, guide, deviation, threshold=THRESHOLD)
-    first = (first + estimate) / 2
-    return wiener_filtered(recorded, first, deviation, _guide(first[:1], guide))
-
-
-def _guide(estimate: Tensor, recorded: Tensor) -> Tensor:
-    return torch.lerp(estimate, recorded, AS_RECORDED)
+def _filtered(recorded: Tensor, expected: Tensor, deviation: Tensor) -> Float[Tensor, "c h w"]:
+    """By Wiener's filter; blocks are alike by the first band."""
+    return wiener_filtered(recorded, expected, deviation, torch.lerp(expected[:1], recorded[:1], AS_RECORDED))
 
 
 def wiener_filtered(
@@ -103,22 +90,11 @@ def wiener_filtered(
     deviation: Float[Tensor, "c h w"],
     guide: Float[Tensor, "g h w"],
 ) -> Float[Tensor, "c h w"]:
-    """An image without white noise of this standard deviation; `expected` estimates it without noise."""
-    return collaboratively_filtered(image, expected, guide, deviation, threshold=0.0)
+    """An image without white noise of this standard deviation, each band by itself; `expected` estimates it
+    without noise.
 
-
-def collaboratively_filtered(
-    image: Float[Tensor, "c h w"],
-    expected: Float[Tensor, "c h w"],
-    guide: Float[Tensor, "g h w"],
-    deviation: Float[Tensor, "c h w"],
-    *,
-    threshold: float,
-) -> Float[Tensor, "c h w"]:
-    """An image without white noise of this standard deviation, each band by itself.
-
-    Blocks are alike where `guide` is. With a threshold `expected` is not used. Beyond the edges images are
-    mirrored. Computed in float32 on the CPU, on as many threads as torch may use; back on the image's device.
+    Blocks are alike where `guide` is. Beyond the edges images are mirrored. Computed in float32 on the CPU,
+    on as many threads as torch may use; back on the image's device.
     """
     h, w = image.shape[-2:]
     margin = SIDE - STEP
@@ -135,7 +111,7 @@ def collaboratively_filtered(
         found = np.zeros((bottom - top, across, ALIKE, 2), np.int16)
         find_alike(planes[3], top, found)
         sums = np.zeros((2, len(image), high, planes[0].shape[2]), np.float32)
-        filter_groups(*planes[:3], top, found, COSINES, WINDOW, np.float32(threshold), sums)
+        filter_groups(*planes[:3], top, found, COSINES, WINDOW, sums)
         return sums
 
     total = np.zeros((2, *planes[0].shape), np.float32)
@@ -229,7 +205,7 @@ def group_transform(blocks):
 
 
 @compiled(nogil=True, cache=True, fastmath=True)
-def filter_groups(image, expected, variance, top, found, cosines, window, threshold, out):
+def filter_groups(image, expected, variance, top, found, cosines, window, out):
     """Add to `out` (2, c, rows, w), from its first row of blocks: filtered blocks, weighted, and weights."""
     rows, columns = found.shape[:2]
     seen = np.empty((SIDE * SIDE, ALIKE), np.float32)
@@ -250,17 +226,13 @@ def filter_groups(image, expected, variance, top, found, cosines, window, thresh
                             known[SIDE * i + j, n] = expected[c, y + i, x + j]
                 block_transform(seen, spare, cosines)
                 group_transform(seen)
-                if threshold == 0:
-                    block_transform(known, spare, cosines)
-                    group_transform(known)
+                block_transform(known, spare, cosines)
+                group_transform(known)
                 total = np.float32(1)
                 for i in range(SIDE * SIDE):
                     for n in range(ALIKE):
-                        if threshold == 0:
-                            power = known[i, n] * known[i, n]
-                            share = power / (power + noise)
-                        else:
-                            share = np.float32(seen[i, n] * seen[i, n] > threshold * threshold * noise)
+                        power = known[i, n] * known[i, n]
+                        share = power / (power + noise)
                         seen[i, n] *= share
                         total += share * share
                 group_transform(seen)

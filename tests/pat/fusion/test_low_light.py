@@ -98,7 +98,7 @@ def test_alphas_values_are_kept(network, given):
 
 
 def test_tiles_are_denoised_as_the_whole(network, fused, monkeypatch):
-    """But for coefficients at the threshold and equal blocks: rounding chooses, then a match may differ."""
+    """But for equal blocks: rounding chooses, then a match may differ."""
     _, images, noise = in_low_light(200, load_sample)
     view, level = images[ALPHA][None, :, 120:280], noise[ALPHA]
     views = view, level.deviation(view)

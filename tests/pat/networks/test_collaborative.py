@@ -12,7 +12,6 @@ from pat.networks.collaborative import (
     SIDE,
     STEP,
     WINDOW,
-    collaboratively_filtered,
     refined,
     wiener_filtered,
 )
@@ -36,7 +35,7 @@ def to_groups(blocks):
     return np.einsum("mn,nij->mij", HADAMARD, dctn(blocks, axes=(1, 2), norm="ortho"))
 
 
-def directly(image, expected, guide, deviation, threshold):
+def directly(image, expected, guide, deviation):
     """The same as it is defined, block by block."""
     n, (h, w) = RADIUS + SIDE, image.shape[1:]
     margins = [(0, 0), (n, n + SIDE), (n, n + SIDE)]
@@ -57,7 +56,7 @@ def directly(image, expected, guide, deviation, threshold):
                     for t in (seen, known)
                 )
                 variance = np.mean([noise[c, i + 4, j + 4] for i, j in places])
-                share = blocks**2 > threshold**2 * variance if threshold else model**2 / (model**2 + variance)
+                share = model**2 / (model**2 + variance)
                 blocks = idctn(
                     np.einsum("nm,mij->nij", HADAMARD.T, blocks * share), axes=(1, 2), norm="ortho"
                 )
@@ -69,16 +68,14 @@ def directly(image, expected, guide, deviation, threshold):
     return torch.from_numpy(total[inside] / weights[inside]).float()
 
 
-@pytest.mark.parametrize("threshold", [0.0, 2.9])
-def test_is_as_defined(threshold):
+def test_is_as_defined():
     clean = torch.rand(2, 21, 26, generator=generator_for(5))
     # In sixteenths: exact sums, so that of blocks equally alike, such as mirrored ones, both choose the
     # first.
     guide = torch.randint(17, (1, 21, 26), generator=generator_for(6)) / 16
     image, deviation = clean + noise_of(clean.shape, 7, 0.05), 0.05 + 0.02 * clean
-    found = collaboratively_filtered(image, clean, guide, deviation, threshold=threshold)
-    wanted = directly(image, clean, guide, deviation, threshold)
-    torch.testing.assert_close(found, wanted, atol=1e-5, rtol=0)
+    found = wiener_filtered(image, clean, deviation, guide)
+    torch.testing.assert_close(found, directly(image, clean, guide, deviation), atol=1e-5, rtol=0)
 
 
 def test_noise_goes_and_detail_stays():
