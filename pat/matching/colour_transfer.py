@@ -37,7 +37,7 @@ class ColourTransferSettings:
     """Brightness is 0 to 1. Middlebury and SYNTIM are the pairs of their tune halves."""
 
     likeness: float = tuned(
-        0.06, "Middlebury: difference of brightness at which likeness, and with it a match's weight, is 1 / e"
+        0.07, "Middlebury: difference of brightness at which likeness, and with it a match's weight, is 1 / e"
     )
     inconsistent: float = tuned(
         0.25, "Middlebury: weight of a match that is not consistent, before the likeness"

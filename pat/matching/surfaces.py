@@ -29,7 +29,7 @@ class SurfaceSettings:
 
     level: float = tuned(
         0.005,
-        "Middlebury, tune half: variance of position, in squares of their reach, below which planes are level",
+        "Middlebury, tune half: variance of position, in squares of the reach, below which planes are level",
     )
 
 
