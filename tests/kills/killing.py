@@ -79,7 +79,10 @@ def started(arguments: list[str], log: Path, announced: Path | None = None) -> i
             return ended.code if isinstance(ended.code, int) else 0
         return 0
 
-    return forked(act, log)
+    child = forked(act, log)
+    while os.getpgid(child) != child:  # a kill at once would find no group
+        time.sleep(0.001)
+    return child
 
 
 def status_of(child: int, seconds: float | None = None) -> int | None:
