@@ -50,7 +50,7 @@ class SubpixelSettings:
     reach: float = tuned(
         24.0, "Middlebury, tune half, of 16 to 32: pixels to which matches of a surface count"
     )
-    step: float = tuned(
+    edge: float = tuned(
         0.5,
         "Middlebury, tune half, of .5 to 1: change of disparity, pixels, that is as far as `reach`, where "
         "both views are sharp",
@@ -94,17 +94,15 @@ def _precise(
         moved = start[one] + near[one] * (1 + blur) * step
         weight = torch.where(consistent[one], slope / (slope + SETTINGS.flat), 0.0) + 1e-5
         planes = numpy_of(moved[0, 0]), numpy_of(weight[0, 0]), guides[i]
-        found.append(_surfaces(*planes, SETTINGS.step * (1 + blur)))
+        found.append(_surfaces(*planes, SETTINGS.edge * (1 + blur)))
     return torch.from_numpy(np.stack(found))[:, None].to(disparity)
 
 
-def _surfaces(
-    disparity: Plane, weight: Plane, brightness: NDArray[np.uint8], step: float
-) -> NDArray[np.float32]:
-    """Disparity on planes through it, within what is connected in alpha and has no such step of disparity."""
+def _surfaces(disparity: Plane, weight: Plane, brightness: NDArray[np.uint8], edge: float) -> Plane:
+    """Disparity on planes through it, within what neither alpha nor such a change of disparity parts."""
     (h, w), every, whole = disparity.shape, (slice(None, None, FINE),) * 2, disparity
     for _ in range(SETTINGS.surfaces):
-        guide = np.stack([brightness[every] / np.float32(255), whole[every] / np.float32(step)], -1)
+        guide = np.stack([brightness[every] / np.float32(255), whole[every] / np.float32(edge)], -1)
         whole = Planes.through(disparity[every], weight[every], guide, SETTINGS.reach).at_pixels((h, w))
     return whole
 
