@@ -10,92 +10,62 @@ fused image is sheared back.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from arraygeom import pixel_grid
-from arraygeom.robust import cauchy, least_squares, normal_deviation, robust_least_squares
+from arraygeom.robust import cauchy, normal_deviation, robust_least_squares
 
-from ..media.colour import REC601
+from ..media.colour import OPPONENT, REC601
 from ..support.settings import physics, size, tuned
 
 
 @dataclass(frozen=True)
 class ResponseSettings:
-    """Middlebury is the nine pairs of its tune half.
+    """What is expected of cameras, and of light, which differs between two views of a surface.
 
-    A misfit is a sum of squares over independent observations, in standard deviations. In a scene of one hue
-    several responses explain alpha.
+    Widths of what cameras do are standard deviations, not chosen on images.
     """
 
-    usual: tuple[float, float, float] = tuned(
-        (0.32, 0.48, 0.20), "Middlebury: weights of a usual sensor that is not Rec. 601's: it sees more blue"
+    sensor: tuple[float, float, float] = physics(
+        (0.33, 0.39, 0.28), "Weights of an unfiltered sensor, which sees more blue than Rec. 601's luma"
     )
     prior: float = tuned(0.2, "Middlebury: standard deviation of weights about these")
-    independent: float = tuned(
-        20.0, "Middlebury: as how many independent observations, or materials, all points count"
+    negative: float = physics(0.05, "Of negative weights, which no sensor has")
+    exposure: float = physics(0.5, "Of a gain, a share of it: of a stop to either side")
+    bend: float = physics(0.35, "Of a gamma's logarithm: from 1 / 2.2 to 2.2 are 2.2 of it to either side")
+    vignetting: float = physics(
+        0.3, "Of the coefficients of its logarithm: cos^4 of 30 degrees in the corners is .6"
     )
-    error: float = tuned(
-        0.012, "Middlebury: standard deviation of one of those, at least: light differs between views"
+    rare: float = tuned(0.05, "Middlebury: the probability of anything that is not as usual")
+    light: float = tuned(0.03, "Middlebury: standard deviation of light between the views, a share of it")
+    near: float = tuned(
+        0.25, "Middlebury: by how much colour, or place in widths of beta, differs where light is another"
     )
-    outlier: float = tuned(2.0, "Middlebury: residuals of this many robust deviations count half")
+    unlike: float = tuned(0.004, "Middlebury: standard deviation by which groups of points differ besides")
+    independent: float = tuned(10.0, "Middlebury: a group counts as so many independent points")
+    groups: int = size(256, "Groups, at most, of points that are alike in colour and place")
+    points_of_group: int = size(8, "Points of a group, at least")
     points: tuple[int, int] = size((6000, 300), "Pixels used at most, and the fewest that are enough")
+    outlier: float = physics(2.385, "Deviations that count half: 95 % efficient if errors are normal")
+    least_deviation: float = size(1e-3, "What points deviate by at least")
     gammas: tuple[float, ...] = size(
         (0.4, 0.5, 0.6, 0.7, 0.77, 0.85, 0.92, 1.0, 1.08, 1.18, 1.3, 1.45, 1.6, 1.8, 2.0, 2.3, 2.6),
         "Gammas that are tried",
     )
-    unlikely: tuple[float, float, float] = tuned(
-        (22.0, 12.0, 45.0),
-        "Middlebury: by how much another gain, other weights, and both must lower the misfit to be taken",
-    )
-    light: tuple[float, float] = tuned(
-        (0.035, 0.12),
-        "Middlebury: logarithm of a gain up to which light that differs between the views may be its cause: "
-        "where a sensor might, and where none would",
-    )
-    greenest: float = tuned(
-        0.62,
-        "Middlebury: share of green beyond which weights are of no sensor, if they have less blue than Rec. "
-        "601's, and alpha is brighter than luma where an unfiltered sensor would be darker, or the other "
-        "way round: that is light too",
-    )
-    negative: float = physics(0.05, "Standard deviation of negative weights, which no sensor has")
-    sensor: tuple[float, float, float] = physics(
-        (0.33, 0.39, 0.28), "Weights of an unfiltered sensor, which sees more blue than Rec. 601"
-    )
-    alike: float = tuned(
-        2.0, "Middlebury: a gain explains alpha as well as weights do if its misfit is up to this much larger"
-    )
-    equal_weights: tuple[float, float] = tuned(
-        (8.0, 0.006),
-        "Middlebury: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other weights, "
-        "to be taken in their place: a sensor without filters; light may differ by a gain of this standard "
-        "deviation",
-    )
-    least_change: float = physics(
-        0.01, "Root mean square change of luma up to which the weights are left at Rec. 601's"
-    )
-    equal: float = tuned(
-        1.1, "Middlebury: the error over the least one up to which a gamma explains alpha as well"
-    )
-    better: float = tuned(
-        0.8,
-        "Middlebury: the error with another gamma than 1, or with vignetting, over that without, to be taken",
-    )
-    shading: tuple[float, float] = tuned(
-        (0.08, 0.7),
-        "Middlebury: logarithm of vignetting below which, at the points, there is none; "
-        "above which, in a corner, no lens is",
-    )
+    steps: int = size(2, "How often vignetting is taken out and looked for again")
     explained: float = tuned(0.5, "Middlebury: share of alpha's variance that must be explained")
 
 
 SETTINGS = ResponseSettings()
+HUES = torch.tensor(OPPONENT[1:], dtype=torch.float64).T
+"""What weights may change by while their sum stays, (3, 2), of unit length."""
 
 
 class Response(NamedTuple):
@@ -178,52 +148,31 @@ def fit(
     alpha: Float[Tensor, " n"],
     where: Float[Tensor, "n 2"] | None = None,
 ) -> Response:
-    """The response by robust least squares over points: the most plausible of those that explain alpha.
+    """The most probable response, by points: weights, gain, gamma and vignetting are each as usual or not.
 
     `where` are the points in beta, in its width and height, from its middle: with them vignetting is found
     too. Rec. 601's where there are too few points, or where a combination of bands does not explain alpha.
+
+    Each explanation is judged by its evidence, the probability of alpha under all responses that it allows
+    (MacKay 1992): what allows more must explain more. Light differs between views as a smooth function of
+    colour and place (a Gaussian process, as Kennedy and O'Hagan 2001 model what a model lacks).
     """
     most, fewest = SETTINGS.points
     step = max(alpha.numel() // most, 1)
     x, y = bands[:, ::step].double().cpu(), alpha[::step].double().cpu()
+    place = y.new_zeros(len(y), 2) if where is None else where[::step].double().cpu()
     unclipped = (y > 0.02) & (y < 0.98) & (x > 0.01).all(0) & (x < 0.98).all(0)
-    x, y = x[:, unclipped], y[unclipped]
-    if len(y) < fewest:
+    if int(unclipped.sum()) < fewest:
         return Response.rec601()
-    gamma, found = _best_gamma(x, y)
-    shading: tuple[float, ...] = ()
+    groups = _Groups.of(x[:, unclipped], y[unclipped], place[unclipped])
+    shading = y.new_zeros(len(groups.terms))
+    found = [groups.explained_by(shading, vignetted=False)]
     if where is not None:
-        terms = _shading_terms(where[::step].double().cpu()[unclipped])
-        slopes = _shading(x, y, terms)
-        even = x * (slopes @ terms).exp()
-        other_gamma, other = _best_gamma(even, y)
-        if other.error < SETTINGS.better * found.error and _plausible(slopes, terms):
-            x, gamma, found, shading = even, other_gamma, other, tuple(slopes.tolist())
-    if found.explained < SETTINGS.explained:
-        return Response.rec601()
-    return _decided(x**gamma, y, gamma, found)[1]._replace(shading=shading)
-
-
-class _Fit(NamedTuple):
-    """`counts`: what the square of each point's residual counts, 1 / variance of independent observations."""
-
-    weights: Float[Tensor, "3"]
-    counts: Float[Tensor, " n"]
-    error: float
-    explained: float
-
-
-def _best_gamma(x: Tensor, y: Tensor) -> tuple[float, _Fit]:
-    """1, or the gamma that explains alpha clearly better; of several, that of the most plausible response."""
-    trials = {gamma: _weighted_fit(x**gamma, y) for gamma in SETTINGS.gammas}
-    least = min(trial.error for trial in trials.values())
-    if least > SETTINGS.better * trials[1.0].error:
-        return 1.0, trials[1.0]
-    equal = {gamma: trial for gamma, trial in trials.items() if trial.error <= SETTINGS.equal * least}
-    linear, most = trials[1.0], max(float(trial.counts.sum()) for trial in equal.values())
-    equal[1.0] = linear._replace(counts=linear.counts * (most / linear.counts.sum()))
-    gamma = min(equal, key=lambda g: _decided(x**g, y, g, equal[g])[0])
-    return gamma, trials[gamma]
+        for _ in range(SETTINGS.steps):
+            shading = shading + _best(groups.explained_by(shading, vignetted=True)).further
+        found.append(groups.explained_by(shading, vignetted=True))
+    response = _best(chain(*found)).response
+    return response if response.explained >= SETTINGS.explained else Response.rec601()
 
 
 def _shading_terms(where: Float[Tensor, "n 2"]) -> Float[Tensor, "5 n"]:
@@ -232,123 +181,149 @@ def _shading_terms(where: Float[Tensor, "n 2"]) -> Float[Tensor, "5 n"]:
     return torch.stack([u, v, u * u, u * v, v * v])
 
 
-def _plausible(slopes: Tensor, terms: Tensor) -> bool:
-    """Whether a lens may shade its image so: noticeably at the points, not absurdly in the corners."""
-    corners = _shading_terms(torch.tensor([[u, v] for u in (-0.5, 0.5) for v in (-0.5, 0.5)]).to(terms))
-    seen, extreme = (float((slopes @ t).abs().max()) for t in (terms, corners))
-    least, most = SETTINGS.shading
-    return seen > least and extreme < most
+class _Kind(NamedTuple):
+    """A kind of response: weights, whether they may be others about these, and whether the gain is free."""
+
+    weights: tuple[float, float, float]
+    others: bool
+    gain: bool
+
+    def evidence(
+        self, gram: Float[Tensor, "g m m"], further: Float[Tensor, " s"]
+    ) -> tuple[Float[Tensor, " g"], Float[Tensor, "g m-1"]]:
+        """The logarithm of alpha's probability by each gamma, and the most probable coefficients.
+
+        `gram` are the inner products of bands, shading and alpha, whitened; `further` is the expected shading.
+        """
+        (products, with_alpha), square = (gram[:, :-1, p] for p in (slice(-1), -1)), gram[:, -1, -1]
+        grey = gram.new_tensor([*self.weights, *(0.0 for _ in further)])
+        gain = torch.ones_like(square)
+        if self.gain:
+            gain = with_alpha @ grey / (grey @ products @ grey)
+        mean = gain[:, None] * grey
+        mean[:, 3:] = further
+        free = [SETTINGS.exposure * grey[:3, None]] * self.gain + [SETTINGS.prior * HUES] * self.others
+        width = torch.cat([grey.new_zeros(3, 0), *free], 1)
+        shades = SETTINGS.vignetting * torch.eye(len(further)).to(grey)
+        root = torch.stack([torch.block_diag(g * width, shades) for g in gain])
+        towards = root.mT @ (with_alpha - (products @ mean[..., None])[..., 0])[..., None]
+        information = torch.eye(root.shape[-1]).to(grey) + root.mT @ products @ root
+        change = torch.linalg.solve(information, towards)
+        coefficients = mean + (root @ change)[..., 0]
+        misfit = square - (mean * (2 * with_alpha - (products @ mean[..., None])[..., 0])).sum(-1)
+        misfit = misfit - (towards * change).sum((-2, -1))
+        negative = (coefficients[:, :3] / coefficients[:, :3].sum(-1, keepdim=True)).clamp(max=0)
+        misfit = misfit + (negative / SETTINGS.negative).square().sum(-1) + torch.logdet(information)
+        return self._prior(gain) - misfit / 2, coefficients
+
+    def _prior(self, like: Tensor) -> Float[Tensor, " g"]:
+        """The logarithm of the probability of this kind and each gamma; with the gain that is 1, so is the gamma."""
+        unusual = (self.weights != REC601) + self.gain
+        gammas = like.new_tensor(SETTINGS.gammas)
+        others = torch.exp(-(gammas.log() / SETTINGS.bend).square() / 2) * (gammas != 1)
+        share = SETTINGS.rare * others / others.sum() * self.gain
+        return torch.where(gammas == 1, 1 - SETTINGS.rare, share).log() + unusual * math.log(SETTINGS.rare)
+
+    def response(self, coefficients: Tensor, gamma: float, explained: float) -> Response:
+        """The response of this kind that has these coefficients of the bands."""
+        gain = float(coefficients.sum()) if self.gain else 1.0
+        weights = coefficients / gain if self.others else coefficients.new_tensor(self.weights)
+        return Response(weights, gain, gamma, explained)
 
 
-def _shading(x: Tensor, y: Tensor, terms: Tensor) -> Float[Tensor, "5"]:
-    """Coefficients of alpha's logarithm over what explains it, by least squares with the fit's weights."""
-    slopes = terms.new_zeros(len(terms))
-    design = torch.cat([terms, torch.ones_like(terms[:1])])
-    for _ in range(3):
-        even = x * (slopes @ terms).exp()
-        found = _weighted_fit(even, y)
-        ratio = (y / (found.weights @ even).clamp(min=0.01)).log()
-        counts = found.counts * y.square()
-        ridge = 1e-4 * counts.sum() * torch.eye(len(design)).to(y)
-        slopes = slopes + least_squares(design, ratio, counts, ridge)[:-1]
-    return slopes
+KINDS = tuple(
+    _Kind(weights, others, gain)
+    for weights, others in ((REC601, False), ((1 / 3, 1 / 3, 1 / 3), False), (SETTINGS.sensor, True))
+    for gain in (False, True)
+)
+"""Luma, a sensor without filters, or any other; beta exposed as alpha, or otherwise: equally likely."""
 
 
-CHANGES = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]], dtype=torch.float64)
-"""What weights may change by while their sum stays."""
+class _Explanation(NamedTuple):
+    """A response of some kind, the logarithm of its probability, and the shading that it asks for further."""
+
+    evidence: float
+    response: Response
+    further: Float[Tensor, "5"]
 
 
-def _weighted_fit(x: Tensor, y: Tensor) -> _Fit:
-    """Weights s (usual ones + d), d's sum 0, robustly. Nothing is assumed of s; d is drawn to 0."""
-    usual = x.new_tensor(SETTINGS.usual)
-    terms = torch.stack([usual @ x, *(CHANGES.T @ x)])
-    start = x.new_tensor([float(y.median() / terms[0].median()), 0.0, 0.0])
-
-    def weigh(rest: Tensor) -> Tensor:
-        deviation = normal_deviation(rest, SETTINGS.error / 3)
-        share = cauchy(rest, SETTINGS.outlier * deviation)
-        return share * (SETTINGS.independent / share.sum() / max(deviation, SETTINGS.error) ** 2)
-
-    drawn = torch.block_diag(x.new_zeros(1, 1), CHANGES.T @ CHANGES)
-
-    def precision(found: Tensor) -> Tensor:
-        return drawn / (SETTINGS.prior * float(found[0])) ** 2
-
-    (scale, *change), rest, counts = robust_least_squares(terms, y, start, weigh, precision=precision)
-    centred = y - counts @ y / counts.sum()
-    explained = 1 - float(counts @ rest.square() / (counts @ centred.square()).clamp(min=1e-12))
-    error = float(torch.log1p((rest / 0.02).square()).mean())
-    return _Fit(scale * usual + CHANGES @ torch.stack(change), counts, error, max(explained, 0.0))
+def _best(found: Iterable[_Explanation]) -> _Explanation:
+    return max(found, key=lambda explanation: explanation.evidence)
 
 
-class _Points(NamedTuple):
-    """Bands (raised to a power) and alpha at points, and what the squares of their residuals count."""
+class _Groups(NamedTuple):
+    """Means of points that are alike in colour and place.
+
+    x, y: bands and alpha; level: alpha as a smooth function of colour and place; terms: of `_shading_terms`;
+    counts: of points, wrong ones hardly; spread: the covariance of y's errors, which are light that differs
+    and noise, as its Cholesky factor.
+    """
 
     x: Float[Tensor, "3 n"]
     y: Float[Tensor, " n"]
+    level: Float[Tensor, " n"]
+    terms: Float[Tensor, "5 n"]
     counts: Float[Tensor, " n"]
+    spread: Float[Tensor, "n n"]
 
-    def explained(self, rest: Tensor, terms: Tensor, precision: Tensor) -> tuple[float, Tensor]:
-        """The misfit of the terms that explain a rest of alpha best, and their coefficients."""
-        found = least_squares(terms, rest, self.counts, precision)
-        return float(self.counts @ (rest - found @ terms).square() + found @ precision @ found), found
+    @classmethod
+    def of(cls, x: Tensor, y: Tensor, where: Tensor) -> _Groups:
+        """Of points. Those are wrong that no smooth function of colour and place explains."""
+        grey, least = x.mean(0), SETTINGS.least_deviation
+        design = torch.cat([x, x * grey, x * grey.square(), _shading_terms(where) * grey])
+        ridge = 1e-6 * len(y) * torch.eye(len(design)).to(y)
+        start = y.new_zeros(len(design))
+        start[:3] = y.median() / grey.median() / 3
 
+        def weigh(rest: Tensor) -> Tensor:
+            return cauchy(rest, SETTINGS.outlier * normal_deviation(rest, least))
 
-def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit) -> tuple[float, Response]:
-    """The most plausible of four explanations of alpha, and its misfit.
+        _, rest, weight = robust_least_squares(design, y, start, weigh, precision=ridge)
+        group = _grouped(torch.cat([x, where.T]), SETTINGS.groups)
+        counts = torch.bincount(group, weight)
+        planes = torch.cat([x, where.T, y[None], (y - rest)[None]])
+        means = torch.stack([torch.bincount(group, weight * plane) for plane in planes]) / counts
+        at, level = means[:5].T / SETTINGS.near, means[6]
+        alike = torch.exp(-torch.cdist(at, at).square() / 2)
+        light = SETTINGS.light**2 * level[:, None] * level * alike
+        variance = torch.bincount(group, weight * rest.square()) / counts
+        noise = variance / SETTINGS.independent + SETTINGS.unlike**2
+        spread = torch.linalg.cholesky(light + torch.diag(noise))
+        return cls(means[:3], means[5], level, _shading_terms(means[3:5].T), counts, spread)
 
-    They are luma as it is, another gain, other weights of sum 1, or both. In a scene of one hue several fit,
-    and what each must gain to be taken decides.
-    """
-    points, rec601 = _Points(x, y, found.counts), Response.rec601().weights
-    usual = x.new_tensor(SETTINGS.usual)
-    grey, hues, free = usual @ x, CHANGES.T @ x, x.new_zeros(1, 1)
-    precision = CHANGES.T @ CHANGES / SETTINGS.prior**2
-    scale = float(found.weights.sum())
-    only_gain, (gain,) = points.explained(y, (rec601 @ x)[None], free)
-    only_weights, change = points.explained(y - grey, hues, precision)
-    scaled = torch.block_diag(free, precision / scale**2)
-    both, (total, *rest) = points.explained(y, torch.stack([grey, *hues]), scaled)
-    weights, further = usual + CHANGES @ change, usual + CHANGES @ torch.stack(rest) / total
-    trials = [
-        (only_gain + SETTINGS.unlikely[0], rec601, float(gain)),
-        (both + SETTINGS.unlikely[2] + _negative(further), further, float(total)),
-    ]
-    if gamma == 1:
-        trials.append((only_weights + SETTINGS.unlikely[1] + _negative(weights), weights, 1.0))
-        trials.append((float(points.counts @ (y - rec601 @ x).square()), rec601, 1.0))
-    misfit, chosen, exposure = min(trials, key=lambda trial: trial[0])
-    as_well = only_gain < only_weights + SETTINGS.alike
-    unchanged = float(((chosen - rec601) @ x).square().mean().sqrt()) < SETTINGS.least_change
-    if exposure == 1 and (unchanged or _is_light(points, float(gain), as_well, (weights, further))):
-        chosen = rec601
-    elif chosen is not rec601:
-        chosen, exposure = _or_equal(points, chosen, exposure)
-    return misfit, Response(chosen, exposure, gamma, found.explained)
-
-
-def _is_light(points: _Points, gain: float, as_well: bool, weights: Sequence[Tensor]) -> bool:
-    """Whether light that differs between the views may be why other weights explain alpha better: a small
-    gain explains it as well, or no sensor has such weights."""
-    rec601, sensor = Response.rec601().weights, points.x.new_tensor(SETTINGS.sensor)
-    unlike_sensors = (gain - 1) * float(((sensor - rec601) @ points.x) @ points.counts) < 0
-    no_sensor = any(bool((w[1] > SETTINGS.greenest) & (w[2] < rec601[2])) for w in weights)
-    small = as_well and abs(math.log(gain)) < SETTINGS.light[unlike_sensors]
-    return small or (unlike_sensors and no_sensor)
-
-
-def _negative(weights: Tensor) -> float:
-    """How unlikely negative weights are, as a misfit."""
-    return float((weights.clamp(max=0) / SETTINGS.negative).square().sum())
+    def explained_by(self, shading: Tensor, *, vignetted: bool) -> list[_Explanation]:
+        """The best of each kind, with this shading taken out of beta; if vignetted, with what is left of it."""
+        gammas = torch.tensor(SETTINGS.gammas).to(self.y)[:, None, None]
+        bands = (self.x * (shading @ self.terms).exp()) ** gammas
+        parts = [bands, gammas * self.level * self.terms] if vignetted else [bands]
+        model = torch.cat(parts, 1)
+        both = torch.cat([model, self.y.expand(len(gammas), 1, -1)], 1)
+        white = torch.linalg.solve_triangular(self.spread, both.mT, upper=False)
+        drawn = -shading if vignetted else shading[:0]
+        rare = SETTINGS.rare if vignetted else 1 - SETTINGS.rare
+        found = []
+        for kind in KINDS:
+            evidence, coefficients = kind.evidence(white.mT @ white, drawn)
+            best = int(evidence.argmax())
+            rest = self.y - coefficients[best] @ model[best]
+            unlike = self.y - self.counts @ self.y / self.counts.sum()
+            explained = 1 - float(self.counts @ rest.square() / (self.counts @ unlike.square()))
+            response = kind.response(coefficients[best, :3], SETTINGS.gammas[best], max(explained, 0.0))
+            response = response._replace(shading=tuple(shading.tolist()) if vignetted else ())
+            found.append(
+                _Explanation(float(evidence[best]) + math.log(rare), response, coefficients[best, 3:])
+            )
+        return found
 
 
-def _or_equal(points: _Points, weights: Tensor, gain: float) -> tuple[Tensor, float]:
-    """1/3 of each band if they explain alpha about as well, with the gain that fits best unless that is 1."""
-    more, deviation = SETTINGS.equal_weights
-    precision = points.x.new_full((1, 1), deviation**-2 if gain == 1 else 0.0)
-    equal = torch.full_like(weights, 1 / 3)
-    shades = [gain * (w @ points.x) for w in (weights, equal)]
-    (misfit, _), (of_equal, (light,)) = (points.explained(points.y - s, s[None], precision) for s in shades)
-    if of_equal > misfit + more:
-        return weights, gain
-    return equal, gain if gain == 1 else gain * (1 + float(light))
+def _grouped(at: Float[Tensor, "k n"], most: int) -> Int[Tensor, " n"]:
+    """Which of at most so many groups points are in, of points near each other: halves of halves, each cut
+    across where it is widest."""
+    parts = [torch.arange(at.shape[1])]
+    for _ in range(int(math.log2(min(most, at.shape[1] // SETTINGS.points_of_group)))):
+        ordered = [part[at[at[:, part].std(1).argmax(), part].argsort()] for part in parts]
+        parts = [half for part in ordered for half in part.tensor_split(2)]
+    group = torch.empty(at.shape[1], dtype=torch.long)
+    for label, part in enumerate(parts):
+        group[part] = label
+    return group

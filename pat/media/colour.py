@@ -14,6 +14,8 @@ REC601 = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in luma, on sRGB-encoded values (ITU-R BT.601)."""
 REC709 = (0.2126, 0.7152, 0.0722)
 """Weights of red, green and blue in luminance, on linear values (ITU-R BT.709)."""
+OPPONENT = ((3**-0.5, 3**-0.5, 3**-0.5), (2**-0.5, 0.0, -(2**-0.5)), (6**-0.5, -2 * 6**-0.5, 6**-0.5))
+"""Brightness and two colour differences, orthogonal and of unit length, of red, green and blue."""
 
 
 def luminance(

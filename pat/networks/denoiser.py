@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pad, pixel_shuffle, pixel_unshuffle
 
+from ..media.colour import OPPONENT
 from ..support.settings import size, tuned
 from .guided import UNet
 
@@ -32,10 +33,6 @@ class DenoiserSettings:
 
 
 SETTINGS = DenoiserSettings()
-
-
-OPPONENT = ((3**-0.5, 3**-0.5, 3**-0.5), (2**-0.5, 0.0, -(2**-0.5)), (6**-0.5, -2 * 6**-0.5, 6**-0.5))
-"""Brightness and two colour differences, orthogonal and of unit length, of red, green and blue."""
 
 
 @dataclass(frozen=True)
