@@ -154,8 +154,9 @@ def fit(
     too. Rec. 601's where there are too few points, or where a combination of bands does not explain alpha.
 
     Each explanation is judged by its evidence, the probability of alpha under all responses that it allows
-    (MacKay 1992): what allows more must explain more. Light differs between views as a smooth function of
-    colour and place (a Gaussian process, as Kennedy and O'Hagan 2001 model what a model lacks).
+    (MacKay 1992): what allows more must explain more. Light differs between the views as a smooth function of
+    colour and place, and with brightness (a Gaussian process, by which Kennedy and O'Hagan 2001 model what a
+    model lacks).
     """
     most, fewest = SETTINGS.points
     step = max(alpha.numel() // most, 1)
@@ -195,29 +196,31 @@ class _Kind(NamedTuple):
 
         `gram` are the inner products of bands, shading and alpha, whitened; `further` is the expected shading.
         """
-        (products, with_alpha), square = (gram[:, :-1, p] for p in (slice(-1), -1)), gram[:, -1, -1]
-        grey = gram.new_tensor([*self.weights, *(0.0 for _ in further)])
-        gain = torch.ones_like(square)
+        bands_and_shades = gram.shape[-1] - 1
+        grey = gram.new_zeros(bands_and_shades)
+        grey[:3] = gram.new_tensor(self.weights)
+        products, with_alpha = gram[:, :-1].split([bands_and_shades, 1], -1)
+        gain = gram.new_ones(len(gram))
         if self.gain:
-            gain = with_alpha @ grey / (grey @ products @ grey)
+            gain = (grey @ with_alpha)[:, 0] / (grey @ products @ grey)
         mean = gain[:, None] * grey
         mean[:, 3:] = further
         free = [SETTINGS.exposure * grey[:3, None]] * self.gain + [SETTINGS.prior * HUES] * self.others
         width = torch.cat([grey.new_zeros(3, 0), *free], 1)
         shades = SETTINGS.vignetting * torch.eye(len(further)).to(grey)
         root = torch.stack([torch.block_diag(g * width, shades) for g in gain])
-        towards = root.mT @ (with_alpha - (products @ mean[..., None])[..., 0])[..., None]
+        rest = torch.cat([-mean, torch.ones_like(mean[:, :1])], 1)[..., None]
+        towards = root.mT @ (gram @ rest)[:, :-1]
         information = torch.eye(root.shape[-1]).to(grey) + root.mT @ products @ root
         change = torch.linalg.solve(information, towards)
         coefficients = mean + (root @ change)[..., 0]
-        misfit = square - (mean * (2 * with_alpha - (products @ mean[..., None])[..., 0])).sum(-1)
-        misfit = misfit - (towards * change).sum((-2, -1))
         negative = (coefficients[:, :3] / coefficients[:, :3].sum(-1, keepdim=True)).clamp(max=0)
+        misfit = (rest.mT @ gram @ rest - towards.mT @ change)[:, 0, 0]
         misfit = misfit + (negative / SETTINGS.negative).square().sum(-1) + torch.logdet(information)
         return self._prior(gain) - misfit / 2, coefficients
 
     def _prior(self, like: Tensor) -> Float[Tensor, " g"]:
-        """The logarithm of the probability of this kind and each gamma; with the gain that is 1, so is the gamma."""
+        """The logarithm of the probability of this kind, by each gamma: 1 where the gain is."""
         unusual = (self.weights != REC601) + self.gain
         gammas = like.new_tensor(SETTINGS.gammas)
         others = torch.exp(-(gammas.log() / SETTINGS.bend).square() / 2) * (gammas != 1)
@@ -281,10 +284,11 @@ class _Groups(NamedTuple):
         _, rest, weight = robust_least_squares(design, y, start, weigh, precision=ridge)
         group = _grouped(torch.cat([x, where.T]), SETTINGS.groups)
         counts = torch.bincount(group, weight)
-        planes = torch.cat([x, where.T, y[None], (y - rest)[None]])
+        planes = torch.cat([x, where.T, y[None], (y - rest).clamp(min=0.02)[None]])
         means = torch.stack([torch.bincount(group, weight * plane) for plane in planes]) / counts
         at, level = means[:5].T / SETTINGS.near, means[6]
-        alike = torch.exp(-torch.cdist(at, at).square() / 2)
+        brighter = (level / level.mean()).log()
+        alike = torch.exp(-torch.cdist(at, at).square() / 2) + brighter[:, None] * brighter
         light = SETTINGS.light**2 * level[:, None] * level * alike
         variance = torch.bincount(group, weight * rest.square()) / counts
         noise = variance / SETTINGS.independent + SETTINGS.unlike**2
@@ -292,7 +296,7 @@ class _Groups(NamedTuple):
         return cls(means[:3], means[5], level, _shading_terms(means[3:5].T), counts, spread)
 
     def explained_by(self, shading: Tensor, *, vignetted: bool) -> list[_Explanation]:
-        """The best of each kind, with this shading taken out of beta; if vignetted, with what is left of it."""
+        """The best of each kind, with this shading taken out of beta, and if vignetted, what is left of it."""
         gammas = torch.tensor(SETTINGS.gammas).to(self.y)[:, None, None]
         bands = (self.x * (shading @ self.terms).exp()) ** gammas
         parts = [bands, gammas * self.level * self.terms] if vignetted else [bands]
