@@ -48,8 +48,8 @@ class ResponseSettings:
     near: float = tuned(
         0.25, "Middlebury: by how much colour, or place in widths of beta, differs where light is another"
     )
-    unlike: float = tuned(0.004, "Middlebury: standard deviation by which groups of points differ besides")
-    independent: float = tuned(10.0, "Middlebury: a group counts as so many independent points")
+    unlike: float = tuned(0.003, "Middlebury: standard deviation by which groups of points differ besides")
+    independent: float = tuned(3.0, "Middlebury: a group counts as so many independent points")
     groups: int = size(256, "Groups, at most, of points that are alike in colour and place")
     points_of_group: int = size(8, "Points of a group, at least")
     points: tuple[int, int] = size((6000, 300), "Pixels used at most, and the fewest that are enough")
