@@ -134,6 +134,7 @@ CONDITIONS: dict[str, Condition] = {
     "alpha random": Condition(alpha=_random_weights),
     "beta x .6": Condition(beta=lambda beta: 0.6 * beta),
     "beta x .6, gamma 1.3": Condition(beta=lambda beta: 0.6 * beta**1.3),
+    "alpha random, beta x .6": Condition(alpha=_random_weights, beta=lambda beta: 0.6 * beta),
     "beta vignetted": Condition(beta=_vignetted),
     "rows off 1 px": Condition(right=_moved(rows=1)),
     "rows off 3 px": Condition(right=_moved(rows=3)),
