@@ -258,8 +258,8 @@ class _Groups(NamedTuple):
     """Means of points that are alike in colour and place.
 
     x, y: bands and alpha; level: alpha as a smooth function of colour and place; terms: of `_shading_terms`;
-    counts: of points, wrong ones hardly; spread: the covariance of y's errors, which are light that differs
-    and noise, as its Cholesky factor.
+    counts: of points, wrong ones hardly; variance: of a group's points about what is smooth; spread: the
+    covariance of y's errors, which are light that differs and noise, as its Cholesky factor.
     """
 
     x: Float[Tensor, "3 n"]
@@ -267,6 +267,7 @@ class _Groups(NamedTuple):
     level: Float[Tensor, " n"]
     terms: Float[Tensor, "5 n"]
     counts: Float[Tensor, " n"]
+    variance: Float[Tensor, " n"]
     spread: Float[Tensor, "n n"]
 
     @classmethod
@@ -293,7 +294,7 @@ class _Groups(NamedTuple):
         variance = torch.bincount(group, weight * rest.square()) / counts
         noise = variance / SETTINGS.independent + SETTINGS.unlike**2
         spread = torch.linalg.cholesky(light + torch.diag(noise))
-        return cls(means[:3], means[5], level, _shading_terms(means[3:5].T), counts, spread)
+        return cls(means[:3], means[5], level, _shading_terms(means[3:5].T), counts, variance, spread)
 
     def explained_by(self, shading: Tensor, *, vignetted: bool) -> list[_Explanation]:
         """The best of each kind, with this shading taken out of beta, and if vignetted, what is left of it."""
@@ -311,7 +312,8 @@ class _Groups(NamedTuple):
             best = int(evidence.argmax())
             rest = self.y - coefficients[best] @ model[best]
             unlike = self.y - self.counts @ self.y / self.counts.sum()
-            explained = 1 - float(self.counts @ rest.square() / (self.counts @ unlike.square()))
+            left, whole = (self.counts @ (part.square() + self.variance) for part in (rest, unlike))
+            explained = 1 - float(left / whole)
             response = kind.response(coefficients[best, :3], SETTINGS.gammas[best], max(explained, 0.0))
             response = response._replace(shading=tuple(shading.tolist()) if vignetted else ())
             found.append(
