@@ -46,15 +46,14 @@ class ResponseSettings:
     rare: float = tuned(0.05, "Middlebury: the probability of anything that is not as usual")
     light: float = tuned(0.03, "Middlebury: standard deviation of light between the views, a share of it")
     near: float = tuned(
-        0.25, "Middlebury: by how much colour, or place in widths of beta, differs where light is another"
+        0.2, "Middlebury: by how much colour, or place in widths of beta, differs where light is another"
     )
-    unlike: float = tuned(0.003, "Middlebury: standard deviation by which groups of points differ besides")
+    least: float = tuned(0.005, "Middlebury: standard deviation of a point, at least")
     independent: float = tuned(3.0, "Middlebury: a group counts as so many independent points")
-    groups: int = size(256, "Groups, at most, of points that are alike in colour and place")
+    groups: int = tuned(256, "Middlebury: groups, at most, of points that are alike in colour and place")
     points_of_group: int = size(8, "Points of a group, at least")
     points: tuple[int, int] = size((6000, 300), "Pixels used at most, and the fewest that are enough")
     outlier: float = physics(2.385, "Deviations that count half: 95 % efficient if errors are normal")
-    least_deviation: float = size(1e-3, "What points deviate by at least")
     gammas: tuple[float, ...] = size(
         (0.4, 0.5, 0.6, 0.7, 0.77, 0.85, 0.92, 1.0, 1.08, 1.18, 1.3, 1.45, 1.6, 1.8, 2.0, 2.3, 2.6),
         "Gammas that are tried",
@@ -273,7 +272,7 @@ class _Groups(NamedTuple):
     @classmethod
     def of(cls, x: Tensor, y: Tensor, where: Tensor) -> _Groups:
         """Of points. Those are wrong that no smooth function of colour and place explains."""
-        grey, least = x.mean(0), SETTINGS.least_deviation
+        grey, least = x.mean(0), SETTINGS.least
         design = torch.cat([x, x * grey, x * grey.square(), _shading_terms(where) * grey])
         ridge = 1e-6 * len(y) * torch.eye(len(design)).to(y)
         start = y.new_zeros(len(design))
@@ -292,7 +291,7 @@ class _Groups(NamedTuple):
         alike = torch.exp(-torch.cdist(at, at).square() / 2) + brighter[:, None] * brighter
         light = SETTINGS.light**2 * level[:, None] * level * alike
         variance = torch.bincount(group, weight * rest.square()) / counts
-        noise = variance / SETTINGS.independent + SETTINGS.unlike**2
+        noise = (variance + least**2) / SETTINGS.independent
         spread = torch.linalg.cholesky(light + torch.diag(noise))
         return cls(means[:3], means[5], level, _shading_terms(means[3:5].T), counts, variance, spread)
 
