@@ -193,7 +193,7 @@ class _Kind(NamedTuple):
     ) -> tuple[Float[Tensor, " g"], Float[Tensor, "g m-1"]]:
         """The logarithm of alpha's probability by each gamma, and the most probable coefficients.
 
-        `gram` are the inner products of bands, shading and alpha, whitened; `further` is the expected shading.
+        `gram`: the inner products of bands, shading and alpha, whitened; `further`: the expected shading.
         """
         bands_and_shades = gram.shape[-1] - 1
         grey = gram.new_zeros(bands_and_shades)
@@ -296,7 +296,7 @@ class _Groups(NamedTuple):
         return cls(means[:3], means[5], level, _shading_terms(means[3:5].T), counts, variance, spread)
 
     def explained_by(self, shading: Tensor, *, vignetted: bool) -> list[_Explanation]:
-        """The best of each kind, with this shading taken out of beta, and if vignetted, what is left of it."""
+        """The best of each kind, this shading taken out of beta; if vignetted, with what is left of it."""
         gammas = torch.tensor(SETTINGS.gammas).to(self.y)[:, None, None]
         bands = (self.x * (shading @ self.terms).exp()) ** gammas
         parts = [bands, gammas * self.level * self.terms] if vignetted else [bands]
