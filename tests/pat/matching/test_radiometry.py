@@ -117,7 +117,7 @@ def test_a_gain_is_not_biased_by_the_noise_of_what_it_is_measured_by():
 @pytest.mark.parametrize("weights", [REC601, (1 / 3, 1 / 3, 1 / 3), (0.2, 0.4, 0.4)])
 @pytest.mark.parametrize("vignetted", [False, True])
 def test_gain_weights_and_vignetting_are_found_together(weights, vignetted):
-    """Two cameras, exposed unlike each other; eight materials are each lit a little otherwise in one of them."""
+    """Two cameras, exposed unlike each other; eight materials, each lit a little otherwise in one of them."""
     g = torch.Generator().manual_seed(0)
     material = torch.randint(8, (4000,), generator=g)
     colours = torch.rand(3, 8, generator=g)[:, material] * 0.6 + 0.2
