@@ -29,7 +29,6 @@ from pat.matching.positions import FINE
 from pat.networks.protocol import FusionNetwork
 
 from .conditions import CONDITIONS, regions_of, save_curves
-from .outside import SOURCES
 
 PIXELS = 6000
 """Of a pair under a condition that take part, drawn evenly: every pair counts the same."""
@@ -38,9 +37,7 @@ BINS = 15
 FITTED_ON = (
     "ideal", "x1", "x4", "x8", "alpha = .6/.3/.1", "alpha random", "beta x .6",
     "1000 electrons", "200 electrons", "50 electrons",
-    "OpenCV's SGBM, own where it has none", "true depth to 5 %, as a prior",
 )  # fmt: skip
-"""Names of conditions, or of sources of disparity, with which ideal cameras are fused."""
 STEPS, BATCH, RATE, DECAY = 2000, 4096, 1e-2, 5e-2
 
 
@@ -103,29 +100,25 @@ def judged(
 def judged_pair(network: FusionNetwork, pair: StereoPair, condition: str) -> Judged:
     """One of them. A match is right if beta sees the point and it is within a pixel."""
     assert pair.disparity is not None
-    task, noise = CONDITIONS.get(condition, CONDITIONS["ideal"]).recorded(pair)
-    alpha, beta, _ = task
+    (alpha, beta, _), noise = CONDITIONS[condition].recorded(pair)
     h, w = hw_of(alpha)
-    field = SOURCES[condition](pair, task) if condition in SOURCES else rectified_field(PAPER_DISPARITY)
     rig = rectified_rig((h, w), {"beta": hw_of(beta)}, PAPER_DISPARITY)
     stated = None if noise is None else {"alpha": noise, "beta": noise}
-    kept: list[tuple[BetaMatches, Tensor]] = []
+    kept: list[BetaMatches] = []
 
     def matcher(inputs: Inputs) -> Matches:
-        found, beta = match(inputs), inputs.betas[0]
-        where, _ = found.betas[0].positions(beta.field.straight, hw_of(beta.image))
-        kept.append((found.betas[0], where[0, :h, :w, 0]))
+        found = match(inputs)
+        kept.extend(found.betas)
         return found
 
-    images = {"alpha": alpha, "beta": beta}
+    images, field = {"alpha": alpha, "beta": beta}, rectified_field(PAPER_DISPARITY)
     frame = fuse(network, rig, images, alpha="alpha", field=field, noise=stated, matcher=matcher)
     value, known = (x[:h, :w] for x in pair.disparity)
     places = known.nonzero()
     y, x = places[torch.randperm(len(places), generator=Generator().manual_seed(0))[:PIXELS]].unbind(-1)
-    ((found, column),) = kept
-    disparity = torch.arange(w) - column
+    (found,) = kept
     numbers = measured(found, typical_facts(found))[0, :, y // FINE, x // FINE].T
-    right = regions_of(pair, (h, w))["seen"] & ((disparity - value).abs() <= 1)
+    right = regions_of(pair, (h, w))["seen"] & ((found.disparity[0, 0, :h, :w] - value).abs() <= 1)
     error = (w / frame.depth - value).abs().nan_to_num(float(w))
     return Judged(pair.name, condition, numbers, right[y, x], error[y, x])
 

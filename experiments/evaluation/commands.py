@@ -33,7 +33,7 @@ from pat.synthesis.photos import PhotoBank
 
 from . import certainty, conditions, fields, paper, sweeps
 from .halves import of_half
-from .outside import SOURCES, evaluate_outside, outside_markdown
+from .outside import evaluate_outside, outside_markdown
 from .sweep_report import write_report
 
 Half = Literal["tune", "report", "all"]
@@ -169,7 +169,7 @@ class Certainty:
     def run(self) -> None:
         """Write and print the tables. Raises ValueError for a condition that is none."""
         names = self.conditions or certainty.FITTED_ON
-        refuse_unknown("--conditions: no condition", names, conditions.CONDITIONS | SOURCES)
+        refuse_unknown("--conditions: no condition", names, conditions.CONDITIONS)
         writable(self.out, folder=True)
         pairs = list(of_half(middlebury_pairs(self.middlebury), self.half))
         shown = progress("fusing")(pairs, len(pairs))
