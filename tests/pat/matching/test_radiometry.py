@@ -162,6 +162,18 @@ def test_leaves_lit_more_brightly_are_not_taken_for_a_sensor_of_green_alone(monk
     assert fit(x, alpha).weights[1] > 0.65
 
 
+def test_a_band_that_no_combination_explains_leaves_rec601(monkeypatch):
+    """As near infrared: materials reflect it as they like, and shadows alone are common to all bands."""
+    g = torch.Generator().manual_seed(0)
+    material = torch.randint(12, (4000,), generator=g)
+    shadow = 0.4 + 0.6 * torch.rand(4000, generator=g)
+    colours, other = 0.2 + 0.7 * torch.rand(3, 12, generator=g), 0.2 + 0.7 * torch.rand(12, generator=g)
+    x, alpha = colours[:, material] * shadow, (colours.mean(0) + other)[material] / 2 * shadow
+    assert fit(x, alpha).is_rec601
+    monkeypatch.setattr(radiometry, "SETTINGS", replace(SETTINGS, explained=0.5))
+    assert not fit(x, alpha).is_rec601
+
+
 def test_a_gamma_needs_a_range_of_brightness():
     """Dark surfaces whose light varies: a gamma explains them better, as anything would."""
     g = torch.Generator().manual_seed(1)
