@@ -61,8 +61,8 @@ class ResponseSettings:
     steps: int = size(2, "How often vignetting is taken out and looked for again")
     explained: float = tuned(
         0.8,
-        "Share of alpha's variance that must be explained: of Middlebury's tune half at least .88 is, of near "
-        "infrared at most .74",
+        "Share of alpha's variance that must be explained: of Middlebury's tune half at least .88 is, "
+        "of near infrared at most .74",
     )
 
 
