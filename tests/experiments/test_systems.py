@@ -125,6 +125,13 @@ def test_recordings_are_files_as_cameras_write_them(tiny, tmp_path):
     assert float(rows["fusion"]) > float(rows["alpha alone"]) + 2
 
 
+def test_near_infrared_is_not_taken_for_a_response(tmp_path):
+    """By a response that explains .6 of it the image was 10 dB worse. Too small an image hides it."""
+    table = run_system("visible-nir", tmp_path).table
+    rows = {line.split("|")[1].strip(): line.split("|")[2] for line in table.splitlines() if "|" in line}
+    assert float(rows["fusion"]) > float(rows["classical"]) + 3
+
+
 @pytest.mark.slow
 def test_a_system_is_fused_apart_under_a_cap_and_recorded_once(tiny, tmp_path):
     said = []
