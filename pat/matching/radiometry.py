@@ -242,7 +242,7 @@ KINDS = tuple(
     for weights, others in ((REC601, False), ((1 / 3, 1 / 3, 1 / 3), False), (SETTINGS.sensor, True))
     for gain in (False, True)
 )
-"""Luma, a sensor without filters, or any other; beta exposed as alpha, or otherwise. Luma and one exposure are
+"""Luma, a sensor without filters, or any other; beta exposed as alpha, or otherwise. The first of each is
 as usual."""
 
 
