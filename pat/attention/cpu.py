@@ -49,13 +49,13 @@ def forward_local(query: Tensor, key: Tensor, value: Tensor, field: Local, bias:
     view of the same size, the nearest look-up, float32. `bias`: (samples), the same for all pixels."""
     b, dv, h, w = value.shape
     window = kernels.Window(h, w, field.size, round(field.spacing))
-    out = torch.empty_like(value, memory_format=torch.contiguous_format)
-    of_samples = np.zeros(field.size**2, np.float32) if bias is None else bias.detach().contiguous().numpy()
+    out = torch.empty(b, dv, h, max(w, kernels.LANES))
+    of_samples = np.zeros(field.size**2, np.float32) if bias is None else _flat(bias.contiguous())
     for i in range(b):
-        images = [_rows(t[i].detach(), window) for t in (query, key, value)]
-        call = partial(kernels.attend_rows, *images, out[i].numpy(), of_samples, window)
+        images = tuple(_rows(t[i].detach(), window) for t in (query, key, value))
+        call = partial(kernels.attend_rows, images, of_samples, _flat(out[i]), window)
         in_parallel([partial(call, top) for top in range(0, h, kernels.ROWS)])
-    return out
+    return out[..., :w]
 
 
 def _rows(image: Tensor, window: kernels.Window) -> kernels.Rows:

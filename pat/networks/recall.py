@@ -30,14 +30,12 @@ from .blocks import enlarge
 class RecallSettings:
     """Pixels are those of half the size, but for `last`."""
 
-    around: tuple[tuple[int, int, float], ...] = tuned(
-        ((0, 2, 1.0), (1, 5, 0.8), (4, 10, 0.6)),
-        "Middlebury, tune half: the radius of two means, and spacing and weight of 3 x 3 pixels of these, "
-        "at each size",
+    radii: tuple[int, ...] = tuned((2, 4, 8), "Middlebury, tune half: of what is around a pixel")
+    pixel: float = tuned(
+        0.02, "Middlebury, tune half: difference of alpha that counts as one standard deviation"
     )
-    difference: float = tuned(
-        0.03, "Middlebury, tune half: squared distance of keys at which the weight falls to 1 / e"
-    )
+    mean: float = tuned(0.04, "Middlebury, tune half: the same of means around, at each radius")
+    slope: float = tuned(0.1, "Middlebury, tune half: the same of slopes there")
     distance: float = tuned(10.0, "Middlebury, tune half: pixels at which the weight falls to 1 / e")
     certainty: int = tuned(
         3, "Middlebury, tune half: the power of confidence, squared, that a pixel counts by"
@@ -134,13 +132,14 @@ def nearness() -> Float[Tensor, " n"]:
 
 
 def surroundings(alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b d h/2 w/2"]:
-    """Alpha's own four pixels, and smoothed ones around them: keys that are near where alpha looks alike."""
-    alpha = alpha * (2 / SETTINGS.difference) ** 0.5
-    half, parts = avg_pool2d(alpha, 2), [pixel_unshuffle(alpha, 2)]
-    h, w = half.shape[-2:]
-    for radius, spacing, weight in SETTINGS.around:
-        smooth = weight * (box_mean(box_mean(half, radius), radius) if radius else half)
-        around = pad(smooth, (spacing,) * 4, mode="replicate")
-        shifts = range(0, 2 * spacing + 1, spacing)
-        parts += [around[..., y : y + h, x : x + w] for y in shifts for x in shifts]
+    """Alpha, and how bright it is around and how that changes to the right and downwards, at each radius (a
+    local jet, Koenderink and van Doorn 1987): keys that are near where alpha looks alike."""
+    half = avg_pool2d(alpha, 2)
+    parts, (h, w) = [half / SETTINGS.pixel], half.shape[-2:]
+    for r in SETTINGS.radii:
+        square = box_mean(half, r)
+        beside = pad(square, (r,) * 4, mode="replicate")
+        across = beside[..., r : r + h, 2 * r :] - beside[..., r : r + h, :w]
+        down = beside[..., 2 * r :, r : r + w] - beside[..., :h, r : r + w]
+        parts += [box_mean(square, r) / SETTINGS.mean, across / SETTINGS.slope, down / SETTINGS.slope]
     return torch.cat(parts, 1)
