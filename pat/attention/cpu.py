@@ -47,25 +47,14 @@ def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Te
 def forward_local(query: Tensor, key: Tensor, value: Tensor, field: Local, bias: Tensor | None) -> Tensor:
     """Values (b, dv, h, w), channels first, of windows of a whole number of pixels around the same pixel of a
     view of the same size, the nearest look-up, float32. `bias`: (samples), the same for all pixels."""
-    b, dv, h, w = value.shape
-    window = kernels.Window(h, w, field.size, round(field.spacing))
-    out = torch.empty(b, dv, h, max(w, kernels.LANES))
-    of_samples = np.zeros(field.size**2, np.float32) if bias is None else _flat(bias.contiguous())
-    for i in range(b):
-        images = tuple(_rows(t[i].detach(), window) for t in (query, key, value))
-        call = partial(kernels.attend_rows, images, of_samples, _flat(out[i]), window)
-        in_parallel([partial(call, top) for top in range(0, h, kernels.ROWS)])
-    return out[..., :w]
-
-
-def _rows(image: Tensor, window: kernels.Window) -> kernels.Rows:
-    """An image (channels, h, w) as the kernels of windows know it."""
-    c, h, w = image.shape
-    lanes = kernels.LANES
-    margin, stride = window.size // 2 * window.spacing + lanes, (-(-w // lanes) | 1) * lanes
-    numbers = torch.zeros(2 * margin + h * c * stride)
-    numbers[margin:-margin].view(h, c, stride)[..., :w].copy_(image.transpose(0, 1))
-    return kernels.Rows(numbers.numpy(), margin, c, stride)
+    planes = [x.detach().contiguous().numpy() for x in (query, key, value)]
+    out, step = np.empty_like(planes[2]), round(field.spacing)
+    of_samples = np.zeros(field.size**2, np.float32) if bias is None else bias.detach().contiguous().numpy()
+    tops = range(0, out.shape[2], kernels.ROWS)
+    images = [*zip(*planes, out)]
+    rows = [partial(kernels.attend_rows, *image, of_samples, field.size, step) for image in images]
+    in_parallel([partial(of_image, top) for of_image in rows for top in tops])
+    return torch.from_numpy(out)
 
 
 def backward(

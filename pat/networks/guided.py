@@ -125,8 +125,8 @@ class GuidedPAT(nn.Module):
     equal_resolution = True
     joins_bands: JoinsBands = "neighbours"
     uses_matches = True
-    halo = 544
-    """Encoder 85, judge 176, confidence 8, what is recalled 228 (propagated 148), smoothing 34: the sum,
+    halo = 528
+    """Encoder 85, judge 176, confidence 8, what is recalled 224 (propagated 148), smoothing 34: the sum,
     rounded up."""
     beta_halo = 96
 

@@ -134,7 +134,7 @@ def nearness() -> Float[Tensor, " n"]:
 def surroundings(alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b d h/2 w/2"]:
     """Alpha, and how bright it is around and how that changes to the right and downwards, at each radius (a
     local jet, Koenderink and van Doorn 1987): keys that are near where alpha looks alike."""
-    half = avg_pool2d(alpha, 2)
+    half = avg_pool2d(alpha - 0.5, 2)  # for small numbers, of which float32 has more digits
     parts, (h, w) = [half / SETTINGS.pixel], half.shape[-2:]
     for r in SETTINGS.radii:
         square = box_mean(half, r)

@@ -21,12 +21,11 @@ from .channels import scatter
 from .emit import LANES, compiled, separate_cache
 from .forward import forward
 from .layout import Call, Geometry, Gradients, Outputs, Saved, Share, TapList, block_scratch
-from .local import ROWS, Rows, Window, attend_rows
+from .local import ROWS, attend_rows
 
 __all__ = [
     "LANES",
     "ROWS",
-    "Rows",
     "SOURCES",
     "Call",
     "Geometry",

