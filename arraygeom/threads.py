@@ -83,7 +83,8 @@ def _convolved(
     seen, above = dilation[0] * (weight.shape[2] - 1), padding[0]
     width = x.shape[3] + 2 * padding[1] - dilation[1] * (weight.shape[3] - 1)
     order = torch.contiguous_format if x.is_contiguous() and weight.is_contiguous() else torch.channels_last
-    out = x.new_empty(1, len(weight), x.shape[2] + 2 * above - seen, width).to(memory_format=order)
+    shape = 1, len(weight), x.shape[2] + 2 * above - seen, width
+    out = torch.empty(shape, dtype=x.dtype, memory_format=order)
     rows = math.ceil(out.shape[2] / (STRIPS * threads()))
 
     @torch.no_grad()  # of the thread that computes it

@@ -45,14 +45,16 @@ def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Te
 
 
 def forward_local(query: Tensor, key: Tensor, value: Tensor, field: Local, bias: Tensor | None) -> Tensor:
-    """Values (b, dv, h, w), channels first, of windows of a whole number of pixels around the same pixel of a
-    view of the same size, the nearest look-up, float32. `bias`: (samples), the same for all pixels."""
+    """Values (b, dv, h, w), channels first, of windows of a whole number of pixels around the same pixel of
+    a view of the same size, the nearest look-up, float32. `bias`: (samples), the same for all; -inf costs
+    nothing."""
     planes = [x.detach().contiguous().numpy() for x in (query, key, value)]
     out, step = np.empty_like(planes[2]), round(field.spacing)
     of_samples = np.zeros(field.size**2, np.float32) if bias is None else bias.detach().contiguous().numpy()
     tops = range(0, out.shape[2], kernels.ROWS)
     images = [*zip(*planes, out)]
-    rows = [partial(kernels.attend_rows, *image, of_samples, field.size, step) for image in images]
+    which = np.flatnonzero(of_samples != -np.inf)
+    rows = [partial(kernels.attend_rows, *image, of_samples, which, field.size, step) for image in images]
     in_parallel([partial(of_image, top) for of_image in rows for top in tops])
     return torch.from_numpy(out)
 

@@ -13,6 +13,8 @@ from functools import cache
 from pathlib import Path
 from typing import cast
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Float
 from safetensors.torch import load_file
@@ -22,7 +24,7 @@ from torch.nn.functional import max_pool2d
 from arraygeom.chunks import ROWS, Tile, assembled, tiles_of
 
 from ..support.settings import size
-from .filters import box_mean
+from .filters import box_mean, numpy_of
 from .matches import BetaMatches, Matches
 from .positions import FINE
 from .semi_global import CONSISTENT
@@ -117,9 +119,8 @@ def measured(found: BetaMatches, typical: Float[Tensor, "b 2"]) -> Float[Tensor,
     return torch.cat([*facts, *apart, same.expand(*same.shape[:2], *found.facts.shape[-2:])], 1)
 
 
-def _range(x: Tensor, radius: int) -> Tensor:
+def _range(x: Float[Tensor, "b 1 h w"], radius: int) -> Float[Tensor, "b 1 h w"]:
     """The greatest less the least value within squares around each pixel."""
-    side = 2 * radius + 1
-    rows, columns = ((side, 1), 1, (radius, 0)), ((1, side), 1, (0, radius))
-    greatest, negative = (max_pool2d(max_pool2d(x, *rows), *columns) for x in (x, -x))
-    return greatest + negative
+    window = np.ones((2 * radius + 1,) * 2, np.uint8)
+    ranges = [cv2.dilate(plane, window) - cv2.erode(plane, window) for plane in numpy_of(x[:, 0])]
+    return torch.from_numpy(np.stack(ranges))[:, None].to(x)

@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments
 from arraygeom.threads import in_parallel
@@ -206,8 +205,7 @@ def match_weight(
 
 def likeness(unlike: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
     """1 where two images are equally bright around a pixel, 0 where they are not."""
-    unlike = avg_pool2d(unlike.abs(), 3, 1, 1, count_include_pad=False)
-    return torch.exp(-(unlike / SETTINGS.likeness).square())
+    return torch.exp(-(box_mean(unlike.abs(), 1) / SETTINGS.likeness).square())
 
 
 def diffused_from(

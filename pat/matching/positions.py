@@ -26,9 +26,7 @@ class Extent(NamedTuple):
     def of(cls, segments: Segments) -> Extent:
         """That of segments; the vector is zero where one is a point."""
         length = segments.length
-        divisor = torch.where(length > 0, length, 1.0)
-        x, y = (segments.start - segments.end).unbind(-1)
-        return cls(length, torch.stack([x / divisor, y / divisor], -1))
+        return cls(length, (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None])
 
 
 def reduced(segments: Segments, factor: int) -> Segments:
@@ -53,16 +51,17 @@ def matches(
     if disparity.shape[-2:] != length.shape[-2:]:
         disparity = interpolate(disparity, scale_factor=FINE, mode="bilinear")
     far = disparity[:, 0].to(length).clamp(min=0)
-    return segments.end + (far if beyond_edge else far.minimum(length))[..., None] * towards
+    return torch.addcmul(segments.end, (far if beyond_edge else far.minimum(length))[..., None], towards)
 
 
 def at_matches(
     beta: Float[Tensor, "b c hb wb"],
     segments: Segments,
     disparity: Float[Tensor, "b 1 _ _"],
+    extent: Extent | None = None,
 ) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
     """What beta shows at the matches, at its edge where these are beyond it, and where they are not."""
-    hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, disparity).to(beta)
+    hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, disparity, extent=extent).to(beta)
     position = middle.reshape(len(beta), -1, 2)
     inside = position.clamp(min=0).minimum(position.new_tensor([hw[1] - 1, hw[0] - 1]))
     values = sample(beta, inside, interpolation="bicubic").values

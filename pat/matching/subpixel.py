@@ -153,12 +153,14 @@ def _compared(
     across, down = (torch.gradient(other, dim=side)[0] for side in (3, 2))
     still = Segments(segments.start.detach(), segments.end.detach(), segments.valid)
     extent = Extent.of(segments)
-    seen, across, down = at_matches(torch.cat([other, across, down], 1), still, disparity)[0].split(1, 1)
+    fixed = Extent(*(part.detach() for part in extent))
+    there = at_matches(torch.cat([other, across, down], 1), still, disparity, fixed)[0]
+    seen, across, down = there.split(1, 1)
     if segments.end.requires_grad or segments.start.requires_grad:
         # Along these slopes: those of bicubic sampling itself are half as much again at whole pixels.
         x, y = matches(segments, disparity, extent=extent).to(other)[:, None].unbind(-1)
         seen = seen + across.detach() * (x - x.detach()) + down.detach() * (y - y.detach())
-    towards = extent.towards.movedim(-1, 1).to(other).detach()
+    towards = fixed.towards.movedim(-1, 1).to(other)
     return across * towards[:, :1] + down * towards[:, 1:], own - seen
 
 

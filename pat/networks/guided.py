@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -191,7 +192,8 @@ class GuidedPAT(nn.Module):
             colour, weight = step(own.quarter, colour, weight)
         propagated = fitted(enlarge(colour), alpha, estimate.colour, confidence)
         choices = propagated, *estimate.diffused.to(colour).unbind(1)
-        return torch.stack([w * c for w, c in zip(estimate.choice.softmax(1).split(1, 1), choices)]).sum(0)
+        weights = estimate.choice.softmax(1).split(1, 1)
+        return reduce(torch.add, (w * c for w, c in zip(weights, choices)))
 
     def estimate(self, own: Encoded, alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaEstimate:
         """The estimate of one beta of any bands."""

@@ -49,14 +49,14 @@ class RecallSettings:
         0.04, "Middlebury, tune half: difference of alpha at which smoothing's weight falls to 1 / e"
     )
     least_weight: float = size(1e-3, "The least weight of a pixel")
-    side: int = size(33, "A pixel looks at so many in each row and column")
-    spacing: int = size(6, "The distance of these: 96 pixels to each side in all")
+    side: int = size(17, "A pixel looks at so many in each row and column")
+    spacing: int = size(6, "The distance of these, twice as much in a window of twice the size around that")
     rounds: tuple[int, ...] = size((1, 2, 4), "Spacings of smoothing what is filled in, at half the size")
     last: tuple[int, ...] = size((2, 1), "Spacings of smoothing what is doubtful in the end, at full size")
 
 
 SETTINGS = RecallSettings()
-FIELD = Local(SETTINGS.side, spacing=SETTINGS.spacing)
+FIELD = Local(2 * SETTINGS.side - 1, spacing=SETTINGS.spacing)
 
 
 def with_examples(
@@ -89,7 +89,7 @@ def recalled(
     weight, keys = avg_pool2d(certain, 2), surroundings(alpha)
     seen = avg_pool2d(colour * certain, 2) / (weight + SETTINGS.least_weight)
     counts = (weight.square() + SETTINGS.least_weight).log() * SETTINGS.certainty
-    scores = counts - torch.linalg.vector_norm(keys, dim=1, keepdim=True).square() / 2
+    scores = counts - keys.square().sum(1, keepdim=True) / 2
     query, key = torch.cat([keys, torch.ones_like(weight)], 1), torch.cat([keys, scores], 1)
     del keys
     return attend(query, key, seen, FIELD, interpolation="nearest", bias=nearness().to(alpha))
@@ -125,10 +125,11 @@ def smoothed_within(
 
 
 def nearness() -> Float[Tensor, " n"]:
-    """What is added to the score of each pixel of the field: the less the farther off it is."""
-    side = SETTINGS.side
-    offsets = pixel_grid((side, side)).flatten(0, 1) - (side - 1) / 2
-    return offsets.norm(dim=-1) * (-SETTINGS.spacing / SETTINGS.distance)
+    """What is added to the score of each pixel of the field: the less the farther off it is; -inf where none
+    is looked at."""
+    steps = pixel_grid((FIELD.size,) * 2).flatten(0, 1) - FIELD.size // 2
+    looked_at = (steps.abs().amax(-1) <= SETTINGS.side // 2) | (steps % 2 == 0).all(-1)
+    return torch.where(looked_at, steps.norm(dim=-1) * (-SETTINGS.spacing / SETTINGS.distance), -torch.inf)
 
 
 def surroundings(alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b d h/2 w/2"]:

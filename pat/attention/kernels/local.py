@@ -20,18 +20,18 @@ LOWEST = np.finfo(np.float32).min
 
 
 @compiled(nogil=True, cache=True, fastmath={"contract"})
-def attend_rows(query, key, value, out, bias, size, spacing, top):
-    """`ROWS` rows of `out`, from `top` on, of one image (channels, h, w): the mean of the values at `size` x
-    `size` pixels, `spacing` apart, by the softmax of inner products and the samples' bias. What is outside
-    the image does not count."""
+def attend_rows(query, key, value, out, bias, which, size, spacing, top):
+    """`ROWS` rows of `out`, from `top` on, of one image (channels, h, w): the mean of the values at some
+    (`which`) of `size` x `size` pixels, `spacing` apart, by the softmax of inner products and the samples'
+    bias. What is outside the image does not count."""
     channels, height, width = query.shape
-    scores = np.empty((size * size, -(-width // LANES) * LANES), np.float32)
+    scores = np.empty((len(which), -(-width // LANES) * LANES), np.float32)
     total = np.empty(scores.shape[1], np.float32)
     for y in range(top, min(top + ROWS, height)):
         scores[:] = -np.inf
-        for t in range(size * size):
+        for i, t in enumerate(which):
             row, first, last, step = _sampled(t, y, size, spacing, height, width)
-            score = scores[t, first:last]
+            score = scores[i, first:last]
             score[:] = bias[t]
             for c in range(channels):
                 own, other = query[c, y, first:last], key[c, row, first + step : last + step]
@@ -41,9 +41,9 @@ def attend_rows(query, key, value, out, bias, size, spacing, top):
         for c in range(len(value)):
             mean = out[c, y]
             mean[:] = 0
-            for t in range(size * size):
+            for i, t in enumerate(which):
                 row, first, last, step = _sampled(t, y, size, spacing, height, width)
-                weight, other = scores[t, first:last], value[c, row, first + step : last + step]
+                weight, other = scores[i, first:last], value[c, row, first + step : last + step]
                 inner = mean[first:last]
                 for x in range(last - first):
                     inner[x] += weight[x] * other[x]

@@ -38,6 +38,17 @@ def test_a_bias_counts_for_each_sample(field):
     assert torch.allclose(local, without, atol=1e-5) == (field.size == 1)
 
 
+@pytest.mark.parametrize("left", [0, 1, 12])
+def test_a_bias_may_leave_samples_out(left):
+    given, bias = features(), torch.full((25,), -torch.inf)
+    bias[torch.randperm(25, generator=torch.Generator().manual_seed(1))[:left]] = 0.5
+    local, reference = (
+        attend(*given, Local(5), bias=bias, interpolation="nearest", backend=backend)
+        for backend in ("local", "reference")
+    )
+    torch.testing.assert_close(local, reference, rtol=1e-5, atol=1e-5)
+
+
 @pytest.mark.parametrize("score", [torch.nan, torch.inf, -torch.inf])
 def test_scores_without_a_number_do_what_they_do_in_the_reference(score):
     query, key, value = (t.abs() for t in features())

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from pat.networks.recall import SETTINGS, fitted, nearness, recalled, smoothed_within, with_less_noise
+from pat.networks.recall import FIELD, SETTINGS, fitted, nearness, recalled, smoothed_within, with_less_noise
 
 HW = (64, 160)
 RED, BLUE = torch.tensor([0.3, -0.1, -0.1]), torch.tensor([-0.1, -0.1, 0.3])
@@ -42,12 +42,21 @@ def test_a_pixel_counts_where_all_bands_are_certain(stripes):
 
 
 def test_nearer_pixels_count_more():
-    near = nearness().view(SETTINGS.side, -1)
-    middle = SETTINGS.side // 2
+    near = nearness().view(FIELD.size, FIELD.size)
+    middle = FIELD.size // 2
     assert near[middle, middle] == near.max() == 0
     off = SETTINGS.spacing / SETTINGS.distance
     assert near[middle, middle + 1] == pytest.approx(-off)
     assert near[0, 0] == pytest.approx(-off * middle * 2**0.5)
+
+
+def test_far_pixels_are_looked_at_half_as_densely():
+    near = nearness().view(FIELD.size, FIELD.size)
+    middle, reach = FIELD.size // 2, SETTINGS.side // 2
+    inner = near[middle - reach : middle + reach + 1, middle - reach : middle + reach + 1]
+    assert inner.isfinite().all()
+    assert near[::2, ::2].isfinite().all()
+    assert near.isfinite().sum() == 2 * SETTINGS.side**2 - (reach + 1) ** 2
 
 
 def test_gradients_reach_alpha_and_colour(stripes):
