@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal, NamedTuple
 
 import torch
@@ -10,6 +11,8 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from .pixels import HW, floating, within
+from .threads import in_parallel
+from .tracing import followed
 
 Interpolation = Literal["bilinear", "nearest", "bicubic"]
 
@@ -39,6 +42,8 @@ def on_image(x: Real[Tensor, "*n 2"], hw: HW) -> Bool[Tensor, "*n"]:
 
 SLACK = 1e-3
 """Rounding allowed to positions on the area's edge, pixels."""
+PIECE = 2**15
+"""Positions that a thread looks up at a time."""
 
 
 def sample(
@@ -64,12 +69,29 @@ def sample(
         x = torch.minimum((x + 0.5).floor().clamp(min=0), x.new_tensor([hw[1] - 1, hw[0] - 1]))
     grid = to_grid(torch.where(valid[..., None], x, 0.0), hw).reshape(batch, 1, -1, 2)
     try:
-        values = grid_sample(
-            image.to(dtype), grid.to(dtype), mode=interpolation, padding_mode="border", align_corners=False
-        )
+        values = _looked_up(image.to(dtype), grid.to(dtype), interpolation)
     except NotImplementedError:
         raise NotImplementedError(
             "sample has no forward mode (jvp, jacfwd, hessian): use grad, vjp or jacrev"
         ) from None
     values = values.reshape(batch, image.shape[1], *x.shape[1:-1])
     return Sampled(torch.where(valid[:, None], values, 0.0).to(image.dtype), valid)
+
+
+def _looked_up(
+    image: Float[Tensor, "b c h w"], grid: Float[Tensor, "b 1 n 2"], interpolation: Interpolation
+) -> Float[Tensor, "b c 1 n"]:
+    """torch's look-up; of many numbers without gradients on all threads, where torch's takes one an image."""
+    look_up = partial(grid_sample, mode=interpolation, padding_mode="border", align_corners=False)
+    gradients = torch.is_grad_enabled() and (image.requires_grad or grid.requires_grad)
+    if gradients or followed() or image.device.type != "cpu" or grid.shape[2] < 2 * PIECE:
+        return look_up(image, grid)
+    out = image.new_empty(*image.shape[:2], 1, grid.shape[2])
+
+    @torch.no_grad()  # of the thread that looks up
+    def piece(first: int) -> None:
+        here = slice(first, first + PIECE)
+        out[..., here] = look_up(image, grid[:, :, here])
+
+    in_parallel([partial(piece, first) for first in range(0, grid.shape[2], PIECE)])
+    return out
