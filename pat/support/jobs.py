@@ -182,12 +182,13 @@ def followed(
 def _in_this_process(tasks: Iterable[Task], workers: Workers) -> Iterator[TaskOutcome]:
     import torch
 
-    before = torch.get_num_threads()
-    try:
-        for task in tasks:
-            yield attempt(task, workers.threads)
-    finally:
-        torch.set_num_threads(before)
+    for task in tasks:
+        before = torch.get_num_threads()
+        try:
+            outcome = attempt(task, workers.threads)
+        finally:
+            torch.set_num_threads(before)  # and not where a failed job's traceback keeps what is left of this
+        yield outcome
 
 
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}

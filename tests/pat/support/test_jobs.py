@@ -11,6 +11,7 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
+import torch
 from rich.console import Console
 
 from pat.support.jobs import JobError, Task, Workers, followed, run_tasks
@@ -38,6 +39,18 @@ def test_errors_stop_or_are_skipped(tmp_path):
     assert not (tmp_path / "b.txt").exists()
     report = run_tasks(tasks(tmp_path, "a", "bad", "b"), resume=True, on_error="skip")
     assert str(report) == "1 made, 1 there already, 1 failed"
+
+
+def test_a_job_that_failed_leaves_torch_its_threads(tmp_path):
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        with pytest.raises(JobError) as kept:
+            run_tasks(tasks(tmp_path, "bad", "b"), workers=Workers(threads=1))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert kept.traceback
 
 
 def test_a_message_names_what_a_task_is_about(tmp_path):
