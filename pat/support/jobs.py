@@ -187,7 +187,7 @@ def _in_this_process(tasks: Iterable[Task], workers: Workers) -> Iterator[TaskOu
         try:
             outcome = attempt(task, workers.threads)
         finally:
-            torch.set_num_threads(before)  # and not where a failed job's traceback keeps what is left of this
+            torch.set_num_threads(before)  # not at this generator's end: a failed job's traceback keeps it
         yield outcome
 
 
