@@ -13,6 +13,7 @@ from torch import Tensor
 
 from arraygeom import pixel_grid, sample
 
+from ..matching.likeness import likeness
 from ..media.colour import to_bytes
 from ..support.settings import tuned
 
@@ -26,7 +27,6 @@ class FlowSettings:
         "Source not recorded: "
         "flow that does not lead back to within this many pixels has a weight below 1 / e",
     )
-    unlike: float = tuned(0.08, "Source not recorded: so is flow between pixels whose values differ by this")
 
 
 SETTINGS = FlowSettings()
@@ -47,9 +47,8 @@ def flow_between(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Flow:
     b = b * (a.mean() / b.mean().clamp(min=1e-6))
     there, back = _steps(a, b), _steps(b, a)
     returned = there + warped(back, there)
-    unlike = (warped(b, there) - a).abs()[0]
-    likeness = torch.from_numpy(cv2.boxFilter(unlike.numpy(), -1, (5, 5)))
-    weight = torch.exp(-returned.square().sum(0) / SETTINGS.astray**2 - (likeness / SETTINGS.unlike).square())
+    alike = likeness((warped(b, there) - a)[None])[0, 0]
+    weight = alike * torch.exp(-returned.square().sum(0) / SETTINGS.astray**2)
     h, w = there.shape[-2:]
     x = pixel_grid((h, w)) + there.movedim(0, -1)
     inside = ((x >= 0) & (x <= x.new_tensor([w - 1, h - 1]))).all(-1)

@@ -23,11 +23,12 @@ from torch import Tensor
 from arraygeom import Moved, ReceptiveField, Rig, Widened
 from arraygeom.fields.default import straight_field
 
+from ..matching.likeness import UNLIKE
 from ..matching.normalisation import mean_moments
 from ..matching.radiometry import Response
 from ..networks.protocol import FusionNetwork
 from ..sensors import NoiseLevel
-from ..support.settings import physics, size, tuned
+from ..support.settings import physics, size
 from .corrections import Corrections
 from .frames import CachedFrames, Frames
 from .fuse import FuseSettings, corrections_of, fuse
@@ -54,9 +55,6 @@ class SequenceSettings:
     intervals: float = size(2.0, "Colour is warped from key frames up to this many intervals of theirs away")
     neighbours: int = size(4, "Radiometry is normalised over this many key frames before and after")
     floor: float = size(1e-3, "The confidence that every source has at least when colours are mixed")
-    disagreement: float = tuned(
-        0.1, "Source not recorded: where sources' colours are this far apart, confidence falls to 1 / e"
-    )
 
 
 SETTINGS = SequenceSettings()
@@ -295,7 +293,7 @@ def mixed(own: Float[Tensor, "1 h w"], sources: Sequence[KeyContribution]) -> Fr
     known = weights.sum(0) > 0
     inverse, half_width = (weights[:, None] * found).sum(0) / weights.sum(0).clamp(min=1e-12)
     depth = torch.where(known, 1 / torch.where(known, inverse, 1.0), torch.nan)
-    agreeing = torch.exp(-apart / SETTINGS.disagreement**2)
+    agreeing = torch.exp(-apart / UNLIKE**2)
     return Frame(own + colour, depth, confidence * agreeing, torch.where(known, half_width, torch.nan))
 
 

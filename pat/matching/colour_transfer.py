@@ -21,6 +21,7 @@ from ..support.settings import size, tuned
 from . import semi_global_numba as kernels
 from .filters import LocalMoments, box_mean, numpy_of, smoothed
 from .inputs import Beta, Inputs
+from .likeness import likeness
 from .matches import BetaMatches, Matches, is_consistent
 from .normalisation import SETTINGS as NORMALISATION
 from .normalisation import Normalisation, combined_bands, explained_share, normalised
@@ -35,9 +36,6 @@ FILLS = 2
 class ColourTransferSettings:
     """Brightness is 0 to 1. Middlebury and SYNTIM are the pairs of their tune halves."""
 
-    likeness: float = tuned(
-        0.07, "Middlebury: difference of brightness at which likeness, and with it a match's weight, is 1 / e"
-    )
     inconsistent: float = tuned(
         0.25, "Middlebury: weight of a match that is not consistent, before the likeness"
     )
@@ -201,11 +199,6 @@ def match_weight(
     """The weight of a match whose brightness differs from alpha's by `unlike`; always more than 0."""
     least = SETTINGS.inconsistent
     return (least + (1 - least) * consistent) * valid * likeness(unlike) + 1e-4
-
-
-def likeness(unlike: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
-    """1 where two images are equally bright around a pixel, 0 where they are not."""
-    return torch.exp(-(box_mean(unlike.abs(), 1) / SETTINGS.likeness).square())
 
 
 def diffused_from(

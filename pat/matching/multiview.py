@@ -37,11 +37,6 @@ from .semi_global import CONSISTENT, DISPARITY_FILL
 class MultiviewSettings:
     """Of the agreement of several betas."""
 
-    support: float = tuned(
-        1.5,
-        "Source not recorded: a beta supports an inverse depth that is less than this many of "
-        "its pixels from its own match",
-    )
     farthest: float = size(
         8.0,
         "A difference of disparities of this many half-size pixels is 1 in the facts, "
@@ -69,7 +64,8 @@ class MultiviewSettings:
 
 
 SETTINGS = MultiviewSettings()
-
+NEAR = CONSISTENT * SETTINGS.farthest
+"""A beta supports an inverse depth that is less than this many of its pixels from its own match."""
 
 STRIP = 1 << 16
 """Alpha's pixels compared at a time, in rows: what is computed on the way stays in a core's cache."""
@@ -297,8 +293,8 @@ def _most_agreed(terms: Float[Tensor, "n k"], own: Float[Tensor, " n"], rise: Te
 
 
 def _agree(terms: Tensor, own: Tensor, rise: Tensor, solutions: Float[Tensor, "k m"]) -> Float[Tensor, "n m"]:
-    """1 where a solution is less than `SETTINGS.support` pixels from what is measured."""
-    return ((terms @ solutions - own[:, None]).abs() * rise[:, None] < SETTINGS.support).to(own)
+    """1 where a solution is less than `NEAR` pixels from what is measured."""
+    return ((terms @ solutions - own[:, None]).abs() * rise[:, None] < NEAR).to(own)
 
 
 def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
@@ -346,4 +342,4 @@ def _supported(
 ) -> Float[Tensor, "betas h w"]:
     """The weights of the betas whose matches are near a proposed inverse depth."""
     apart = [(view.disparity_of(inverse_depth) - view.disparity).abs() for view in views]
-    return torch.stack([w * (pixels < SETTINGS.support) for pixels, w in zip(apart, weights)])
+    return torch.stack([w * (pixels < NEAR) for pixels, w in zip(apart, weights)])

@@ -50,7 +50,9 @@ class ResponseSettings:
     )
     least: float = tuned(0.005, "Middlebury: standard deviation of a point, at least")
     independent: float = tuned(3.0, "Middlebury: a group counts as so many independent points")
-    groups: int = tuned(256, "Middlebury: groups, at most, of points that are alike in colour and place")
+    groups: int = size(
+        256, "Groups, at most, of points that are alike in colour and place; half or twice as many do as well"
+    )
     points_of_group: int = size(8, "Points of a group, at least")
     points: tuple[int, int] = size((6000, 300), "Pixels used at most, and the fewest that are enough")
     outlier: float = physics(2.385, "Deviations that count half: 95 % efficient if errors are normal")

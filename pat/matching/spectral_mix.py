@@ -18,16 +18,13 @@ from arraygeom.robust import RobustFit, gaussian, least_squares, robust_least_sq
 
 from ..support.settings import size, tuned
 from .filters import box_mean
+from .likeness import UNLIKE
 
 
 @dataclass(frozen=True)
 class MixSettings:
     """Brightness is 0 to 1."""
 
-    outlier: float = tuned(
-        0.06,
-        "Source not recorded: difference from alpha at which a match counts 1 / e in the second of two fits",
-    )
     equal: float = size(
         1e-4, "How strongly the combination is drawn to one of equal parts: share of the bands' mean variance"
     )
@@ -37,11 +34,6 @@ class MixSettings:
         "the combination counts half",
     )
     smooth: int = size(4, "See `misfit`")
-    alike: float = tuned(
-        0.08,
-        "Source not recorded: where the combination's black and white are so near to alpha's, black is "
-        "taken for black and white for white, and the difference for that of two exposures",
-    )
     diluted: float = tuned(
         0.8,
         "Source not recorded: wrong matches make least squares' weights too small; they are enlarged until "
@@ -122,7 +114,8 @@ def _mix(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, 
     misfit = _smooth_misfit(rest.view_as(alpha), share.view_as(alpha))
     gain = explained / (1 + (misfit / SETTINGS.misfit) ** 6)
     offset = share @ (alpha.flatten() - weights @ bands[order].flatten(1))
-    if max(abs(weights.sum() + offset - 1), abs(offset)) < SETTINGS.alike:
+    if max(abs(weights.sum() + offset - 1), abs(offset)) < UNLIKE:
+        # Black is about as bright as black, and white as white: what is left is of two exposures.
         weights, offset, slopes = weights / weights.sum(), 0 * offset, slopes * weights.sum()
     back = order.argsort()
     return weights[back], offset, slopes[back], gain
@@ -137,7 +130,7 @@ def _combination(x: Tensor, y: Tensor, weight: Tensor) -> RobustFit:
     precision, beyond = ridge * torch.eye(len(x)).to(x), y - equal @ x
 
     def weigh(rest: Tensor) -> Tensor:
-        robust = weight * gaussian(rest, SETTINGS.outlier)
+        robust = weight * gaussian(rest, UNLIKE)
         return robust / robust.sum()
 
     start = least_squares(x, beyond, share, precision)

@@ -22,8 +22,9 @@ from torch.nn.functional import avg_pool2d, conv2d, pad, pixel_unshuffle
 from arraygeom import Local, Segments
 
 from ..attention import attend, attend_with_statistics
-from ..matching.colour_transfer import FILLS, likeness
+from ..matching.colour_transfer import FILLS
 from ..matching.inputs import Beta, Inputs
+from ..matching.likeness import likeness
 from ..matching.matches import BetaMatches, Matches
 from ..matching.positions import FINE, Extent, matches
 from ..media.colour import luminance
@@ -36,24 +37,14 @@ from .recall import fitted, with_examples, with_less_noise
 
 @dataclass(frozen=True)
 class GuidedSettings:
-    """What is added to trained logits, as matches are better than when the weights were trained."""
+    """Of what is done with the network's answers."""
 
     coarse: int = size(4, "Context is computed at this part of the size")
     least_weight: float = size(1e-3, "The least weight of a pixel in propagation")
-    confidence_offset: float = tuned(
+    alike: float = tuned(
         2.0,
-        "Middlebury, tune half: goes with the next training: added to the logit of the confidence where "
-        "colour is blended, where beta's brightness is alpha's",
-    )
-    exact_offset: float = tuned(
-        1.0,
-        "Middlebury, tune half: goes with the next training: added to the logit of taking the "
-        "semi-global match's colour instead of the attended one",
-    )
-    likest: float = tuned(
-        3.0,
-        "Source not recorded: how much more a beta's colour counts, as a logit, where it is as "
-        "bright as alpha than where it is unlike it",
+        "Middlebury, tune half: added to the logit of the confidence where beta is as bright as alpha, when "
+        "colour is blended",
     )
     nowhere: float = size(-10.0, "The logit of the confidence where there is no valid segment")
 
@@ -95,9 +86,14 @@ class BetaEstimate(NamedTuple):
         return avg_pool2d(avg_pool2d(found, 2, 1), 2, 1)[:, 0] * (self.peak > 0)
 
     @property
+    def odds(self) -> Float[Tensor, "b 1 h w"]:
+        """The logit by which `colour` counts against what is filled in, and against other betas' colours."""
+        return self.logit + SETTINGS.alike * self.likeness
+
+    @property
     def blending(self) -> Float[Tensor, "b 1 h w"]:
         """The weight of `colour` in the image, 0 to 1."""
-        return (self.logit + SETTINGS.confidence_offset * self.likeness).sigmoid()
+        return self.odds.sigmoid()
 
     def beyond(self, base: Float[Tensor, "b c h w"], band: int) -> BetaEstimate:
         """One band, counted from a base instead of from alpha; `base` (B, C, H, W) is bands minus alpha."""
@@ -213,7 +209,7 @@ class GuidedPAT(nn.Module):
         judged = self._judged(own, found, torch.cat(facts, 1), segments.valid[:, None])
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
         logit = torch.where(peak[:, None] > 0, logit, SETTINGS.nowhere)
-        colour = torch.lerp(value - alpha, bands.to(value), (exact + SETTINGS.exact_offset).sigmoid())
+        colour = torch.lerp(value - alpha, bands.to(value), exact.sigmoid())
         alike = likeness(facts[0])
         return BetaEstimate(
             attended, deviation, peak, colour, diffused, logit, choice, position, alike, found.prior
@@ -258,7 +254,7 @@ def combined(estimates: Sequence[BetaEstimate]) -> BetaEstimate:
     if len(estimates) == 1:
         return estimates[0]
     logits = torch.stack([e.logit for e in estimates])
-    weights = torch.stack([e.logit + SETTINGS.likest * e.likeness + e.prior for e in estimates]).softmax(0)
+    weights = torch.stack([e.odds + e.prior for e in estimates]).softmax(0)
 
     def mean(parts: Sequence[Tensor]) -> Tensor:
         return sum(w * p for w, p in zip(weights, parts)) + torch.zeros_like(parts[0])

@@ -30,7 +30,7 @@ from .blocks import enlarge
 class RecallSettings:
     """Pixels are those of half the size, but for `last`."""
 
-    radii: tuple[int, ...] = tuned((2, 4, 8), "Middlebury, tune half: of what is around a pixel")
+    scales: int = tuned(3, "Middlebury, tune half: sizes of what is around a pixel, radii 2, 4, 8")
     pixel: float = tuned(
         0.02, "Middlebury, tune half: difference of alpha that counts as one standard deviation"
     )
@@ -137,7 +137,7 @@ def surroundings(alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b d h/2 w/2"
     local jet, Koenderink and van Doorn 1987): keys that are near where alpha looks alike."""
     half = avg_pool2d(alpha - 0.5, 2)  # for small numbers, of which float32 has more digits
     parts, (h, w) = [half / SETTINGS.pixel], half.shape[-2:]
-    for r in SETTINGS.radii:
+    for r in (2 << i for i in range(SETTINGS.scales)):
         square = box_mean(half, r)
         beside = pad(square, (r,) * 4, mode="replicate")
         across = beside[..., r : r + h, 2 * r :] - beside[..., r : r + h, :w]

@@ -9,6 +9,7 @@ import torch
 from arraygeom import Segments, pixel_grid
 from pat.matching import colour_transfer as warped
 from pat.matching.colour_transfer import SETTINGS, _diffused, colour_noise, match_weight
+from pat.matching.likeness import UNLIKE
 from pat.matching.normalisation import explained_share
 from pat.media.colour import luminance
 from tests.pat.matching.matched_scenes import beside, blurred, faint, semi_global_matching
@@ -111,7 +112,7 @@ def test_colour_at_matches_does_not_hang_on_what_the_other_image_shows_elsewhere
 
 def test_a_match_of_other_brightness_has_less_weight():
     unlike = torch.zeros(1, 1, 5, 12)
-    unlike[..., 6:] = -SETTINGS.likeness
+    unlike[..., 6:] = -UNLIKE
     weight = match_weight(unlike, torch.ones_like(unlike), torch.ones_like(unlike, dtype=torch.bool))
     torch.testing.assert_close(weight[..., :5], torch.full((1, 1, 5, 5), 1.0001))
     torch.testing.assert_close(weight[..., 7:], torch.full((1, 1, 5, 5), float(np.exp(-1)) + 1e-4))

@@ -16,8 +16,10 @@ from pat.fusion.views import Views
 from pat.matching import inputs as inputs_module
 from pat.matching import multiview as several
 from pat.matching.match import located, match
-from pat.matching.multiview import SETTINGS, MatchedBeta
+from pat.matching.multiview import NEAR as AGREES
+from pat.matching.multiview import MatchedBeta
 from pat.media.colour import luminance
+from pat.networks.guided import SETTINGS as GUIDED
 from pat.networks.guided import BetaEstimate, combined
 from pat.networks.weights import load_weights
 
@@ -91,7 +93,8 @@ def test_of_betas_of_equal_confidence_that_as_bright_as_alpha_counts_more(networ
         )
         for e, v in ((one, 1.0), (other, 0.0))
     )
-    assert combined([bright, dark]).colour.min() > 0.9
+    odds = torch.tensor(GUIDED.alike).sigmoid()
+    torch.testing.assert_close(combined([bright, dark]).colour, odds.expand_as(one.colour))
     assert combined([dark, dark._replace(colour=bright.colour)]).colour.mean() == pytest.approx(0.5)
 
 
@@ -212,7 +215,7 @@ def test_the_depth_buffer_finds_what_is_hidden():
     column = (track.at(depths)[1, 7, 0] + 0.5).div(2).floor()
     same = ((track.at(depths)[1, :, 0] + 0.5).div(2).floor() == column) & (depths[1] < 0.4)
     assert same.sum() <= 1
-    assert (found[1][same] > SETTINGS.support).all()
+    assert (found[1][same] > AGREES).all()
     assert (found[torch.tensor([0, 2, 3])] == 0).all()
     assert replace(segments, valid=~segments.valid).valid.sum() == 0
 

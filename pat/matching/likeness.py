@@ -1,0 +1,30 @@
+"""Whether two views are equally bright: what matches, colours and motion are judged by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..support.settings import tuned
+from .filters import box_mean
+
+
+@dataclass(frozen=True)
+class LikenessSettings:
+    """Brightness is 0 to 1."""
+
+    unlike: float = tuned(
+        0.07, "Middlebury: difference of brightness at which likeness, and the weight by it, is 1 / e"
+    )
+
+
+SETTINGS = LikenessSettings()
+UNLIKE = SETTINGS.unlike
+
+
+def likeness(difference: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
+    """1 where two images are equally bright around a pixel, 0 where they are not."""
+    return torch.exp(-(box_mean(difference.abs(), 1) / UNLIKE).square())
