@@ -52,15 +52,13 @@ class ColourTransferSettings:
         2.0, "Matched surroundings whose brightness differs by a larger factor are of different things"
     )
     detail_radius: int = tuned(
-        2, "Source not recorded: window of the regression that gives matched colour the detail that beta lost"
+        2,
+        "Middlebury, reduced 4 and 8 times: window of the regression that gives matched colour the detail "
+        "that beta lost; in standard deviations of the blur by which beta is less sharp than alpha, where "
+        "that is more: within a smaller window beta shows one value",
     )
     floor: float = tuned(
         1e-4, "Middlebury: regulariser of colour's regressions on brightness, a variance of that"
-    )
-    radius_of_blur: float = tuned(
-        1.5,
-        "Middlebury, reduced 4 and 8 times: the window's radius for each pixel of standard deviation by "
-        "which beta is less sharp than alpha: within a smaller window beta shows one value",
     )
     noise_share: float = tuned(
         20.0,
@@ -154,8 +152,7 @@ def matched_colours(
         noise = colour_noise(brightness - soft, soft, weight * consistent)
         if float(noise.amax()) > SETTINGS.least_noise:
             colour = _without_noise(colour, bright, noise)
-        least, step = SETTINGS.detail_radius, SETTINGS.radius_of_blur
-        radii = [max(least, round(step * blur)) for blur in normalisation.blurs[0]]
+        radii = [round(SETTINGS.detail_radius * max(1.0, blur)) for blur in normalisation.blurs[0]]
         detailed = _each_detailed(colour, bright, alpha, radii)
         matched = torch.lerp(colour, detailed, explained_share(own, soft, valid * consistent)) + own - alpha
     else:
