@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import pytest
 
 from pat.cli.authors import Settings
+from pat.matching.semi_global import HALF_SIZE
+from pat.matching.subpixel import FULL_SIZE
 from pat.support.settings import all_settings, listed, physics, size, tuned
 
 
@@ -38,3 +40,10 @@ def test_fewer_than_120_numbers_were_tuned():
     assert len({s.algorithm for s in found}) > 5
     assert sum(s.numbers for s in found) < 120
     assert all(len(s.why) > 20 for s in found)
+
+
+def test_of_settings_that_a_room_has_twice_what_differs_is_counted():
+    found = [s.value for s in all_settings("pat.matching") if s.algorithm == "SemiGlobalSettings"]
+    steps = [s.value for s in all_settings("pat.matching") if s.name == "step" and s.kind == "tuned"]
+    assert set(steps) == {HALF_SIZE.step, FULL_SIZE.step} and len(steps) == 2
+    assert found.count(HALF_SIZE.consistent) == 1
