@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from ..media.colour import luminance, to_bytes
-from ..support.settings import size, tuned
+from ..support.settings import size
 from .filters import blurred
 from .spectral_mix import SpectralMix
 
@@ -33,11 +33,7 @@ class NormalisationSettings:
     blurs: tuple[float, ...] = size(
         (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0),
         "Standard deviations, in pixels, "
-        "with which the sharper image is tried until it is as sharp as the other",
-    )
-    sharper: float = tuned(
-        1.05,
-        "Middlebury, tune half: contrast over the other's up to which an image is no sharper",
+        "with which the sharper image is tried until it is no sharper than the other",
     )
 
 
@@ -159,25 +155,32 @@ def _levelled(image: Tensor, level: Tensor) -> Tensor:
 def equalising_blurs(
     image: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"]
 ) -> tuple[list[float], list[float]]:
-    """Standard deviations to blur either with until it is no sharper.
+    """Standard deviations to blur either with until it is as sharp as the other; 0 for the less sharp.
 
-    Detail that only one has cannot be matched. Sharpness is the mean difference of neighbouring pixels; 0 for
-    an image that has hardly more than the other.
+    Detail that only one has cannot be matched.
     """
-    own, its = ([float(_contrast(p)) for p in images] for images in (image, other))
-    return [_least_blur(p, c) for p, c in zip(image, its)], [_least_blur(p, c) for p, c in zip(other, own)]
+    own, its = ([_sharpness(p) for p in images] for images in (image, other))
+    return [_equal_blur(p, s) for p, s in zip(image, its)], [_equal_blur(p, s) for p, s in zip(other, own)]
 
 
-def _least_blur(image: Tensor, contrast: float) -> float:
-    """The least of the blurs after which there is no more contrast than that."""
-    for blur in (0.0, *SETTINGS.blurs):
-        if float(_contrast(blurred(image[None], [blur])[0])) <= SETTINGS.sharper * contrast:
-            return blur
-    return SETTINGS.blurs[-1]
+def _equal_blur(image: Float[Tensor, "1 h w"], wanted: float) -> float:
+    """The blur after which an image is so sharp: sharpness falls exponentially between two of the blurs."""
+    less, before = 0.0, _sharpness(image)
+    if before <= wanted:
+        return less
+    for blur in SETTINGS.blurs:
+        after = _sharpness(blurred(image[None], [blur])[0])
+        if after <= wanted:
+            return less + (blur - less) * math.log(before / wanted) / math.log(before / after)
+        less, before = blur, after
+    return less
 
 
-def _contrast(image: Float[Tensor, "1 h w"]) -> Tensor:
-    return image.diff(dim=-1).abs().mean() + image.diff(dim=-2).abs().mean()
+def _sharpness(image: Float[Tensor, "1 h w"]) -> float:
+    """The mean second difference of pixels in a row and a column: of the finest detail, which blur takes
+    first. The first difference is of coarser detail, too."""
+    across, down = (float(image.diff(n=2, dim=axis).abs().mean()) for axis in (-1, -2))
+    return across + down + 1e-9
 
 
 class Comparison(NamedTuple):
