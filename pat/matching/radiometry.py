@@ -60,6 +60,9 @@ class ResponseSettings:
         (0.4, 0.5, 0.6, 0.7, 0.77, 0.85, 0.92, 1.0, 1.08, 1.18, 1.3, 1.45, 1.6, 1.8, 2.0, 2.3, 2.6),
         "Gammas that are tried",
     )
+    closer: tuple[float, ...] = size(
+        (0.08, 0.04, 0.02), "By how much the logarithms of further ones differ from that of the best, in turn"
+    )
     steps: int = size(2, "How often vignetting is taken out and looked for again")
     explained: float = tuned(
         0.8,
@@ -101,7 +104,7 @@ class Response(NamedTuple):
     def __str__(self) -> str:
         red, green, blue = self.weights.tolist()
         gain = "" if self.gain == 1 else f" x {self.gain:.2f}"
-        gamma = "" if self.gamma == 1 else f" of beta to the power {self.gamma:g}"
+        gamma = "" if self.gamma == 1 else f" of beta to the power {self.gamma:.2f}"
         shading = ", of beta freed of vignetting" if self.shading else ""
         return f"alpha is {red:.2f} R + {green:.2f} G + {blue:.2f} B{gain}{gamma}{shading}"
 
@@ -197,7 +200,8 @@ class _Kind(NamedTuple):
     def evidence(
         self, gram: Float[Tensor, "g m m"], further: Float[Tensor, " s"]
     ) -> tuple[Float[Tensor, " g"], Float[Tensor, "g m-1"]]:
-        """The logarithm of alpha's probability by each gamma, and the most probable coefficients.
+        """The logarithm of alpha's probability, up to a constant, if beta has each gamma, and the most
+        probable coefficients.
 
         `gram`: the inner products of bands, shading and alpha, whitened; `further`: the expected shading.
         """
@@ -222,12 +226,11 @@ class _Kind(NamedTuple):
         negative = (coefficients[:, :3] / coefficients[:, :3].sum(-1, keepdim=True)).clamp(max=0)
         misfit = (rest.mT @ gram @ rest - towards.mT @ change)[:, 0, 0]
         misfit = misfit + (negative / SETTINGS.negative).square().sum(-1) + torch.logdet(information)
-        return self._prior(gain) - misfit / 2, coefficients
+        return -misfit / 2, coefficients
 
-    def _prior(self, like: Tensor) -> Float[Tensor, " g"]:
+    def prior(self, gammas: Float[Tensor, " g"]) -> Float[Tensor, " g"]:
         """The logarithm of the probability of this kind, by each gamma: 1 where the gain is."""
         unusual = (self.weights != REC601) + self.gain
-        gammas = like.new_tensor(SETTINGS.gammas)
         others = torch.exp(-(gammas.log() / SETTINGS.bend).square() / 2) * (gammas != 1)
         share = SETTINGS.rare * others / others.sum() * self.gain
         return torch.where(gammas == 1, 1 - SETTINGS.rare, share).log() + unusual * math.log(SETTINGS.rare)
@@ -263,12 +266,15 @@ def _best(found: Iterable[_Explanation]) -> _Explanation:
 class _Groups(NamedTuple):
     """Means of points that are alike in colour and place.
 
-    x, y: bands and alpha; level: alpha as a smooth function of colour and place; terms: of `_shading_terms`;
+    points: bands and `_shading_terms` of each point, (8, p); share: of its group's weight; group: which it is
+    in. Of groups y: alpha; level: alpha as a smooth function of colour and place; terms: of `_shading_terms`;
     counts: of points, wrong ones hardly; variance: of a group's points about what is smooth; spread: the
     covariance of y's errors, which are light that differs and noise, as its Cholesky factor.
     """
 
-    x: Float[Tensor, "3 n"]
+    points: Float[Tensor, "8 p"]
+    share: Float[Tensor, " p"]
+    group: Int[Tensor, " p"]
     y: Float[Tensor, " n"]
     level: Float[Tensor, " n"]
     terms: Float[Tensor, "5 n"]
@@ -300,32 +306,63 @@ class _Groups(NamedTuple):
         variance = torch.bincount(group, weight * rest.square()) / counts
         noise = (variance + least**2) / SETTINGS.independent
         spread = torch.linalg.cholesky(light + torch.diag(noise))
-        return cls(means[:3], means[5], level, _shading_terms(means[3:5].T), counts, variance, spread)
+        points, terms = torch.cat([x, _shading_terms(where)]), _shading_terms(means[3:5].T)
+        return cls(points, weight / counts[group], group, means[5], level, terms, counts, variance, spread)
 
     def explained_by(self, shading: Tensor, *, vignetted: bool) -> list[_Explanation]:
-        """The best of each kind, this shading taken out of beta; if vignetted, with what is left of it."""
-        gammas = torch.tensor(SETTINGS.gammas).to(self.y)[:, None, None]
-        bands = (self.x * (shading @ self.terms).exp()) ** gammas
-        parts = [bands, gammas * self.level * self.terms] if vignetted else [bands]
-        model = torch.cat(parts, 1)
-        both = torch.cat([model, self.y.expand(len(gammas), 1, -1)], 1)
-        white = torch.linalg.solve_triangular(self.spread, both.mT, upper=False)
+        """The most probable of each kind, without a gamma and with one, this shading taken out of beta; if
+        vignetted, with what is left of it."""
+        gammas = self.y.new_tensor(SETTINGS.gammas)
+        _, gram = self._modelled(gammas, shading, vignetted)
         drawn = -shading if vignetted else shading[:0]
-        rare = SETTINGS.rare if vignetted else 1 - SETTINGS.rare
+        rare = math.log(SETTINGS.rare if vignetted else 1 - SETTINGS.rare)
         found = []
         for kind in KINDS:
-            evidence, coefficients = kind.evidence(white.mT @ white, drawn)
-            best = int(evidence.argmax())
-            rest = self.y - coefficients[best] @ model[best]
-            unlike = self.y - self.counts @ self.y / self.counts.sum()
-            left, whole = (self.counts @ (part.square() + self.variance) for part in (rest, unlike))
-            explained = 1 - float(left / whole)
-            response = kind.response(coefficients[best, :3], SETTINGS.gammas[best], max(explained, 0.0))
-            response = response._replace(shading=tuple(shading.tolist()) if vignetted else ())
-            found.append(
-                _Explanation(float(evidence[best]) + math.log(rare), response, coefficients[best, 3:])
-            )
+            evidence = kind.evidence(gram, drawn)[0] + kind.prior(gammas) + rare
+            for some in (gammas == 1, gammas != 1)[: 1 + kind.gain]:
+                gamma = gammas[some][evidence[some].argmax()]
+                if len(gammas[some]) > 1:
+                    gamma = self._most_probable(gamma, kind, shading, vignetted)
+                (model,), there = self._modelled(gamma[None], shading, vignetted)
+                (coefficients,) = kind.evidence(there, drawn)[1]
+                explained = self._explained_by(coefficients @ model)
+                response = kind.response(coefficients[:3], float(gamma), explained)
+                response = response._replace(shading=tuple(shading.tolist()) if vignetted else ())
+                found.append(_Explanation(float(evidence[some].logsumexp(0)), response, coefficients[3:]))
         return found
+
+    def _most_probable(
+        self, gamma: Float[Tensor, ""], kind: _Kind, shading: Tensor, vignetted: bool
+    ) -> Float[Tensor, ""]:
+        """The gamma of most evidence near this one, by parabolas through the logarithms of three."""
+        drawn = -shading if vignetted else shading[:0]
+        for step in SETTINGS.closer:
+            x = gamma.log() + step * torch.arange(-1.0, 2.0).to(gamma)
+            _, gram = self._modelled(x.exp(), shading, vignetted)
+            low, middle, high = kind.evidence(gram, drawn)[0] - (x / SETTINGS.bend).square() / 2
+            bend = (low + high - 2 * middle).clamp(max=-1e-6)
+            gamma = (x[1] + step * ((low - high) / (2 * bend)).clamp(-1, 1)).exp()
+        return gamma
+
+    def _modelled(
+        self, gammas: Float[Tensor, " g"], shading: Tensor, vignetted: bool
+    ) -> tuple[Float[Tensor, "g k n"], Float[Tensor, "g m m"]]:
+        """What alpha is made of if beta has each gamma: bands and, if vignetted, further shading; and the
+        inner products of these and alpha, whitened."""
+        gammas, (bands, terms) = gammas[:, None, None], self.points.split([3, 5])
+        bands = self.share * (bands * (shading @ terms).exp()) ** gammas
+        bands = bands.new_zeros(*bands.shape[:2], len(self.y)).index_add_(-1, self.group, bands)
+        model = torch.cat([bands, gammas * self.level * self.terms] if vignetted else [bands], 1)
+        both = torch.cat([model, self.y.expand(len(gammas), 1, -1)], 1)
+        white = torch.linalg.solve_triangular(self.spread, both.mT, upper=False)
+        return model, white.mT @ white
+
+    def _explained_by(self, model: Float[Tensor, " n"]) -> float:
+        """The share of alpha's variance that a model of the groups explains."""
+        unlike = self.y - self.counts @ self.y / self.counts.sum()
+        parts = (self.counts @ (part.square() + self.variance) for part in (self.y - model, unlike))
+        left, whole = map(float, parts)
+        return max(1 - left / whole, 0.0)
 
 
 def _grouped(at: Float[Tensor, "k n"], most: int) -> Int[Tensor, " n"]:

@@ -33,7 +33,7 @@ def test_neutral_stays_neutral_and_luma_becomes_what_alpha_sees(response):
     torch.testing.assert_close(response.of_beta(grey), response.gain * grey)
 
 
-@pytest.mark.parametrize("gamma", [0.77, 1.0, 1.3])
+@pytest.mark.parametrize("gamma", [0.77, 0.81, 1.0, 1.3])
 @pytest.mark.parametrize("weights", [REC601, WEIGHTS, (0.6, 0.3, 0.1)])
 def test_a_response_is_recovered_from_colourful_points(weights, gamma):
     g = torch.Generator().manual_seed(0)
@@ -41,7 +41,7 @@ def test_a_response_is_recovered_from_colourful_points(weights, gamma):
     alpha = 0.8 * (torch.tensor(weights)[:, None] * x**gamma).sum(0) + 0.01 * torch.randn(4000, generator=g)
     alpha[::20] = torch.rand(200, generator=g)  # wrong matches
     found = fit(x, alpha)
-    assert found.gamma == gamma
+    assert found.gamma == (gamma if gamma == 1 else pytest.approx(gamma, rel=0.03))
     assert found.gain == pytest.approx(0.8, abs=0.03)
     assert (found.weights - torch.tensor(weights)).abs().max() < 0.03
     assert found.is_rec601 is False
@@ -199,7 +199,7 @@ def test_fusion_of_another_response():
     plain, _ = psnr("rec601")
     stated, frame = psnr(WEIGHTS)
     torch.testing.assert_close(combined(frame.image), images[ALPHA], atol=1e-4, rtol=0)
-    assert stated > ideal - 1.0
+    assert stated > ideal - 1.2
     assert stated > plain + 2.0
 
 
