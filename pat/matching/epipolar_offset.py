@@ -43,6 +43,9 @@ class AlignmentSettings:
     least: float = tuned(
         0.2, "Middlebury: largest displacement of a pixel below which the rig is taken to be right"
     )
+    better: float = tuned(
+        0.98, "Middlebury: residual with the displacement over that without, up to which it is accepted"
+    )
     windows: int = size(50, "Fewest windows with texture")
 
 
@@ -91,7 +94,7 @@ def fit_misalignment(
     normal: Float[Tensor, "h w 2"],
     weight: Float[Tensor, "h w"],
 ) -> Misalignment:
-    """How far across its segments beta is, from matches; none if that is little, or explains them no better.
+    """How far across its segments beta is, from matches; none if that explains the images hardly better.
 
     `alpha` and `beta` are of equal brightness and sharpness; `position` are the matches in beta, `weight` is
     0 to 1.
@@ -110,7 +113,7 @@ def fit_misalignment(
     found = Misalignment(*(float(c) / width for c in coefficients))
     if found.largest((height, width)) < SETTINGS.least:
         return Misalignment()
-    accepted = views.residual(coefficients) < views.residual(np.zeros(3))
+    accepted = views.residual(coefficients) < SETTINGS.better * views.residual(np.zeros(3))
     return found if accepted else Misalignment()
 
 
