@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from .threads import in_order
 from .tracing import transformations
 
 ROWS = 256
@@ -59,6 +60,8 @@ def chunked(
 ) -> Any:
     """`function(*tensors)`, computed for some rows at a time; with several axes, for one tile at a time.
 
+    Of tensors on the CPU parts are computed `in_order` on several threads.
+
     The tensors are cut along the axis, and so is what the function gives: a tensor or several, as long as
     what it is given or shorter by a whole factor, of which `rows` and `halo` are multiples. Each part is
     given `halo` more rows on either side, as far as there are any; what the function gives for those is
@@ -70,10 +73,12 @@ def chunked(
     axes = [axis] if isinstance(axis, int) else axis
     lengths = [tensors[0].shape[a] for a in axes]
 
-    def part(box: Box) -> Any:
-        return function(*(_cut(t, box, axes) for t in tensors))
+    def part(tile: Tile) -> Any:
+        return function(*(_cut(t, tile.outer, axes) for t in tensors))
 
-    return assembled(lengths, ((tile, part(tile.outer)) for tile in tiles_of(lengths, rows, halo)), axes)
+    tiles = list(tiles_of(lengths, rows, halo))
+    made = in_order(part, tiles) if tensors[0].device.type == "cpu" else map(part, tiles)
+    return assembled(lengths, zip(tiles, made), axes)
 
 
 def assembled(

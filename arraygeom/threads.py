@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import lru_cache, partial
@@ -19,6 +20,8 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
+
+from .tracing import followed
 
 WORTH_STRIPS = 10**8
 """Multiplications of a convolution from which on strips are worth their while: some milliseconds."""
@@ -126,6 +129,35 @@ def in_parallel(tasks: Sequence[Callable[[], object]], *, most: int | None = Non
         wait(waiting)
     for future in waiting:
         future.result()
+
+
+def in_order(function: Callable[[Any], Any], parts: Iterable[Any]) -> Iterator[Any]:
+    """`map(function, parts)`, a few parts ahead on as many `threads` as there are; torch in each alone.
+
+    In this thread where torch itself takes several, or has to see each operation (`followed`, a function
+    mode, autocast): it does so in one thread only. An error is raised once no part is computed any more.
+    """
+    count = threads()
+    seen = followed() or torch._C._len_torch_function_stack() or torch.is_autocast_enabled("cpu")
+    if count < 2 or seen or torch.get_num_threads() > 1:
+        yield from map(function, parts)
+        return
+    graph, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+
+    def work(part: Any) -> Any:
+        with _torch_threads(1), torch.inference_mode(inference), torch.set_grad_enabled(graph):
+            return function(part)
+
+    ahead: deque[Future[Any]] = deque()
+    try:
+        for part in parts:
+            ahead.append(_pool(os.getpid(), count).submit(work, part))
+            if len(ahead) > count:
+                yield ahead.popleft().result()
+        while ahead:
+            yield ahead.popleft().result()
+    finally:
+        wait([future for future in ahead if not future.cancel()])
 
 
 @contextmanager

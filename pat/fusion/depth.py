@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -11,10 +12,12 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom import Segments, depth_from_track, pixel_grid
+from arraygeom.chunks import ROWS, Tile, assembled, tiles_of
 from arraygeom.epipolar import Depth, Track
 from arraygeom.pixels import HW
+from arraygeom.threads import in_order
 
-from ..matching.inputs import Inputs
+from ..matching.inputs import Beta, Inputs
 from ..matching.matches import Matches
 from ..matching.positions import FINE
 from ..networks.protocol import FusionOutput
@@ -84,12 +87,30 @@ def measured_depth(
     beyond the far end may otherwise stand for any distance. `corner` is the (x, y) of the part's first pixel
     in alpha; `hw` the size of the part without padding.
     """
+
+    def of_rows(tile: Tile) -> FoundDepth:
+        (top, bottom), (left, above) = tile.inner, corner
+        box = top, bottom, 0, hw[1]
+        betas = tuple(replace(beta, field=beta.field.cut(box)) for beta in part.betas)
+        return _measured(output.cut(box), betas, placements, (bottom - top, hw[1]), (left, above + top))
+
+    tiles = list(tiles_of(hw[:1], ROWS, 0))
+    return FoundDepth(*assembled(hw[:1], zip(tiles, in_order(of_rows, tiles)), axes=[-2]))
+
+
+def _measured(
+    output: FusionOutput,
+    betas: Sequence[Beta],
+    placements: list[Placement],
+    hw: HW,
+    corner: tuple[int, int],
+) -> FoundDepth:
     h, w = hw
     like = output.position[0]
     x = (pixel_grid(hw, dtype=like.dtype, device=like.device) + like.new_tensor(corner)).reshape(-1, 2)
     total, widths, weights = like.new_zeros(3, h, w)
     found_in_betas = zip(output.position, output.deviation, output.confidence)
-    for beta, place, (position, deviation, confidence) in zip(part.betas, placements, found_in_betas):
+    for beta, place, (position, deviation, confidence) in zip(betas, placements, found_in_betas):
         if not place.has_depth:
             continue
         pair, offset = place.pair, like.new_tensor(beta.offset)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arraygeom import Segments
+from arraygeom.chunks import chunked
 from arraygeom.threads import in_parallel
 
 from ..media.colour import to_bytes
@@ -240,7 +241,11 @@ def _detailed(
     colour: Tensor, brightness: Tensor, alpha: Tensor, radius: int = SETTINGS.detail_radius
 ) -> Tensor:
     """Colour (B, C, H, W) moved along its local regression on brightness by what alpha's has beyond it."""
-    return colour + local_slope(colour, brightness, radius) * SETTINGS.detail(alpha - brightness)
+
+    def of(colour: Tensor, brightness: Tensor, alpha: Tensor) -> Tensor:
+        return colour + local_slope(colour, brightness, radius) * SETTINGS.detail(alpha - brightness)
+
+    return chunked(of, colour, brightness, alpha, halo=radius)
 
 
 def local_slope(

@@ -6,7 +6,6 @@ is far away. Planes are found for every second pixel.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from arraygeom.pixels import HW
 
 from ..support.settings import tuned
+from . import surfaces_numba as kernels
 from .positions import FINE
 
 Plane = NDArray[np.float32]
@@ -52,36 +52,23 @@ class Planes(NamedTuple):
         around what none reaches.
         """
         reach /= FINE
-        y, x = np.mgrid[: weight.shape[0], : weight.shape[1]].astype(np.float32)
-        x, y = ((t - t.mean()) / reach for t in (x, y))
-        centre = np.median(values[weight > 0]) if weight.any() else 0.0
-        z = values - centre
-        terms = (1, x, y, x * x, x * y, y * y, z, x * z, y * z, weight)
-        sums = _spread([term * weight for term in terms], guide, reach)
-        total = np.maximum(sums[0], np.finfo(np.float32).tiny)
-        mx, my, mxx, mxy, myy, mz, mxz, myz, around = sums[1:] / total
-        level = SETTINGS.level
-        xx, yy, xy = mxx - mx * mx + level, myy - my * my + level, mxy - mx * my
-        xz, yz = mxz - mx * mz, myz - my * mz
-        determinant = xx * yy - xy * xy
-        right, down = (xz * yy - yz * xy) / determinant, (yz * xx - xz * xy) / determinant
-        value = mz + right * (x - mx) + down * (y - my) + centre
-        return cls(value, right / (FINE * reach), down / (FINE * reach), around)
+        values, weight = (np.ascontiguousarray(plane, np.float32) for plane in (values, weight))
+        centre = float(np.average(values, weights=weight + np.finfo(np.float32).tiny))  # for small numbers
+        terms = np.empty((3, *values.shape, 4), np.float32)
+        kernels.weighted_terms(values, weight, centre, reach, terms)
+        over = cv2.ximgproc.createDTFilter(guide, reach, 1.0, cv2.ximgproc.DTF_RF)
+        sums = (over.filter(part) for part in terms)
+        found = np.empty((4, *values.shape), np.float32)
+        kernels.planes_through(*sums, centre, reach, SETTINGS.level, found)
+        return cls(*found)
 
     def at_pixels(self, hw: HW) -> Plane:
         """The values at all pixels."""
-        y, x = np.ogrid[: hw[0], : hw[1]]
-        value, right, down = (repeated(part, hw) for part in self[:3])
-        return np.asarray(value + (x % FINE) * right + (y % FINE) * down, np.float32)
+        out = np.empty(hw, np.float32)
+        kernels.at_pixels(*self[:3], out)
+        return out
 
 
 def repeated(plane: Plane, hw: HW) -> Plane:
     """What is known of every second pixel for those to its right and below it, too."""
     return plane.repeat(FINE, 0).repeat(FINE, 1)[: hw[0], : hw[1]]
-
-
-def _spread(planes: Sequence[Plane], guide: NDArray[np.float32], reach: float) -> Plane:
-    """Weighted sums around each pixel, those beyond an edge of the guide weighing less; four at a time."""
-    over = cv2.ximgproc.createDTFilter(guide, reach, 1.0, cv2.ximgproc.DTF_RF)
-    found = [over.filter(cv2.merge(planes[first : first + 4])) for first in range(0, len(planes), 4)]
-    return np.asarray(np.concatenate(found, -1).transpose(2, 0, 1), np.float32)

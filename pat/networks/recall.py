@@ -34,7 +34,11 @@ class RecallSettings:
     pixel: float = tuned(
         0.02, "Middlebury, tune half: difference of alpha that counts as one standard deviation"
     )
-    mean: float = tuned(0.04, "Middlebury, tune half: the same of means around, at each radius")
+    alike: float = tuned(
+        0.04,
+        "Middlebury, tune half: the same of means around, at each radius; and the difference at which "
+        "smoothing's weight falls to 1 / e",
+    )
     slope: float = tuned(0.1, "Middlebury, tune half: the same of slopes there")
     distance: float = tuned(10.0, "Middlebury, tune half: pixels at which the weight falls to 1 / e")
     certainty: int = tuned(
@@ -44,9 +48,6 @@ class RecallSettings:
         0.5,
         "Middlebury, tune half: of what no beta sees, so much is by example; of what is doubtful, so much "
         "is smoothed in the end",
-    )
-    alike: float = tuned(
-        0.04, "Middlebury, tune half: difference of alpha at which smoothing's weight falls to 1 / e"
     )
     least_weight: float = size(1e-3, "The least weight of a pixel")
     side: int = size(17, "A pixel looks at so many in each row and column")
@@ -142,5 +143,5 @@ def surroundings(alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b d h/2 w/2"
         beside = pad(square, (r,) * 4, mode="replicate")
         across = beside[..., r : r + h, 2 * r :] - beside[..., r : r + h, :w]
         down = beside[..., 2 * r :, r : r + w] - beside[..., :h, r : r + w]
-        parts += [box_mean(square, r) / SETTINGS.mean, across / SETTINGS.slope, down / SETTINGS.slope]
+        parts += [box_mean(square, r) / SETTINGS.alike, across / SETTINGS.slope, down / SETTINGS.slope]
     return torch.cat(parts, 1)

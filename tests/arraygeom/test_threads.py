@@ -8,7 +8,13 @@ import pytest
 import torch
 
 from arraygeom import threads as threads_module
-from arraygeom.threads import convolutions_in_parallel, in_parallel, threads, torch_in_one_thread
+from arraygeom.threads import (
+    convolutions_in_parallel,
+    in_order,
+    in_parallel,
+    threads,
+    torch_in_one_thread,
+)
 
 
 class Noted(list):
@@ -133,3 +139,59 @@ def test_convolutions_are_torchs_own_where_its_threads_sleep(two_threads, monkey
     with torch.no_grad(), torch_in_one_thread(), convolutions_in_parallel():
         found = layer(x)
     assert found.equal(layer(x))
+
+
+def test_parts_are_computed_on_all_threads_and_come_in_order(two_threads):
+    """Each with torch alone, and with gradients or not as where they were asked for."""
+    both, weight = threading.Barrier(2, timeout=300), torch.ones(3, requires_grad=True)
+
+    def part(i):
+        if i < 2:
+            both.wait()  # two at once, or never
+        time.sleep(0.01 * (5 - i))
+        assert torch.get_num_threads() == 1
+        return i, weight * i
+
+    with torch_in_one_thread():
+        made = list(in_order(part, range(5)))
+        both.reset()
+        with torch.no_grad():
+            plain = list(in_order(part, range(5)))
+    assert [i for i, _ in made] == [i for i, _ in plain] == list(range(5))
+    sum(x.sum() for _, x in made).backward()
+    assert weight.grad.equal(torch.full((3,), 10.0))
+    assert not any(x.requires_grad for _, x in plain)
+
+
+def test_few_parts_are_made_ahead(two_threads):
+    begun = []
+    with torch_in_one_thread():
+        made = in_order(begun.append, range(100))
+        next(made)
+        assert len(begun) <= 3
+        made.close()
+        assert len(begun) <= 3
+
+
+def test_an_error_in_a_part_is_raised_once_no_part_is_computed(two_threads):
+    begun, done = threading.Event(), []
+
+    def part(i):
+        if i == 0:
+            begun.wait(300)
+            raise OSError("full")
+        begun.set()
+        time.sleep(0.2)
+        done.append(i)
+
+    with torch_in_one_thread(), pytest.raises(OSError, match="full"):
+        list(in_order(part, range(9)))
+    assert done
+    assert done == sorted(done)
+
+
+def test_parts_stay_in_the_thread_that_torch_has_to_see(two_threads):
+    here = threading.get_ident()
+    with torch_in_one_thread(), torch.device("cpu"):
+        assert set(in_order(lambda _: threading.get_ident(), range(4))) == {here}
+    assert set(in_order(lambda _: threading.get_ident(), range(4))) == {here}

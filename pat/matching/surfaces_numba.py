@@ -1,0 +1,66 @@
+"""Compiled loops of `surfaces`, each in one thread and without Python's lock."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from arraygeom.compiled import compiled, separate_cache
+
+from .positions import FINE
+
+TINY = np.finfo(np.float32).tiny
+
+
+@compiled(nogil=True, cache=True)
+def weighted_terms(values, weight, centre, reach, out):
+    """Into out (3, h, w, 4): weights; weights times x, y, x x, x y, y y, z, x z, y z and themselves; and 0.
+
+    x and y are counted from the middle in `reach` pixels, z from `centre`.
+    """
+    (height, width), centre, reach = values.shape, np.float32(centre), np.float32(reach)
+    one, two, three = out
+    for r in range(height):
+        y = (np.float32(r) - np.float32(0.5) * np.float32(height - 1)) / reach
+        for c in range(width):
+            x = (np.float32(c) - np.float32(0.5) * np.float32(width - 1)) / reach
+            w, z = weight[r, c], values[r, c] - centre
+            wx, wy = w * x, w * y
+            one[r, c, 0], one[r, c, 1], one[r, c, 2], one[r, c, 3] = w, wx, wy, wx * x
+            two[r, c, 0], two[r, c, 1], two[r, c, 2], two[r, c, 3] = wx * y, wy * y, w * z, wx * z
+            three[r, c, 0], three[r, c, 1], three[r, c, 2], three[r, c, 3] = wy * z, w * w, 0, 0
+
+
+@compiled(nogil=True, cache=True)
+def planes_through(one, two, three, centre, reach, level, out):
+    """Into out (4, h, w): value, slopes a pixel to the right and down, and the mean weight, by smoothed
+    `weighted_terms`."""
+    (height, width), centre, reach = one.shape[:2], np.float32(centre), np.float32(reach)
+    level = np.float32(level)
+    for r in range(height):
+        y = (np.float32(r) - np.float32(0.5) * np.float32(height - 1)) / reach
+        for c in range(width):
+            x = (np.float32(c) - np.float32(0.5) * np.float32(width - 1)) / reach
+            share = np.float32(1) / max(one[r, c, 0], TINY)
+            mx, my, mz = one[r, c, 1] * share, one[r, c, 2] * share, two[r, c, 2] * share
+            xx, yy = one[r, c, 3] * share - mx * mx + level, two[r, c, 1] * share - my * my + level
+            xy, xz = two[r, c, 0] * share - mx * my, two[r, c, 3] * share - mx * mz
+            yz = three[r, c, 0] * share - my * mz
+            within = np.float32(1) / (xx * yy - xy * xy)
+            right, down = (xz * yy - yz * xy) * within, (yz * xx - xz * xy) * within
+            out[0, r, c] = mz + right * (x - mx) + down * (y - my) + centre
+            out[1, r, c], out[2, r, c] = right / (FINE * reach), down / (FINE * reach)
+            out[3, r, c] = three[r, c, 1] * share
+
+
+@compiled(nogil=True, cache=True)
+def at_pixels(value, right, down, out):
+    """Planes of every second pixel at all pixels, `out` (h, w)."""
+    height, width = out.shape
+    for r in range(height):
+        for c in range(width):
+            y, x = r // FINE, c // FINE
+            out[r, c] = value[y, x] + np.float32(c % FINE) * right[y, x] + np.float32(r % FINE) * down[y, x]
+
+
+for _entry in (weighted_terms, planes_through, at_pixels):
+    separate_cache(_entry)
