@@ -23,6 +23,7 @@ from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.sampling import sample
 
+from ..matching.epipolar_offset import SETTINGS as ALIGNMENT
 from ..matching.epipolar_offset import Misalignment, fit_misalignment
 from ..matching.filters import blurred
 from ..matching.inputs import Beta, Inputs, track_in
@@ -51,10 +52,6 @@ class PrePassSettings:
         0.1,
         "The first value tried, which held: by how much a match must be better than others to "
         "count, as of `BetaMatches.facts`",
-    )
-    blur: float = tuned(
-        1.0,
-        "Source not recorded: standard deviation of the blur of what is compared, pixels of the pre-pass",
     )
     passes: int = size(3, "Pre-passes at most: matches are better where what was found is put right")
     settled: float = size(
@@ -230,7 +227,7 @@ def _of_beta(alpha: Tensor, before: Beta, beta: Beta, found: BetaMatches, hw: HW
     own = whole.softened(alpha)[:, :, :h, :w]
     seen_there, wanted = (moments(image, weight[None, None]) for image in (values[-1:][None], own))
     bright = seen_there.matched(luma, wanted, NORMALISATION.largest_gain)
-    soft = blurred(values[:-1][:, None], [SETTINGS.blur] * (len(values) - 1))[:, 0]
+    soft = blurred(values[:-1][:, None], [ALIGNMENT.blur] * (len(values) - 1))[:, 0]
     normal = normals(beta.field.straight)[0, :h, :w]
     return _Matches(soft, own[0, 0], bright[0, 0], where, normal.to(where), weight)
 
@@ -243,7 +240,7 @@ def _reliable(found: BetaMatches) -> Bool[Tensor, "b 1 h w"]:
 
 def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
     h, w = frame.hw
-    own = blurred(frame.inputs.alpha[:, :, :h, :w], [SETTINGS.blur])[0, 0]
+    own = blurred(frame.inputs.alpha[:, :, :h, :w], [ALIGNMENT.blur])[0, 0]
     colour = [(m, m.weight > 0) for m in matches if len(m.before) == 3]
     points = [found.before[:, counts] for found, counts in colour]
     places = [found.place[counts] for found, counts in colour]

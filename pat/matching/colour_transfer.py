@@ -27,6 +27,7 @@ from .matches import BetaMatches, Matches, is_consistent
 from .normalisation import SETTINGS as NORMALISATION
 from .normalisation import Normalisation, combined_bands, explained_share, normalised
 from .positions import at_matches
+from .semi_global import DISPARITY_FILL
 from .spectral_mix import SpectralMix
 
 FILLS = 2
@@ -40,10 +41,10 @@ class ColourTransferSettings:
     inconsistent: float = tuned(
         0.25, "Middlebury: weight of a match that is not consistent, before the likeness"
     )
-    fill: tuple[float, float] = tuned(
-        (300.0, 3.0),
-        "Source not recorded: "
-        "strength, and 8-bit difference that counts as an edge, of the smoothing that diffuses colour",
+    fill: float = tuned(
+        100.0,
+        "Middlebury, tune half: strength of the smoothing that diffuses colour; edges are those at which "
+        "disparity's stops",
     )
     surroundings: int = tuned(
         48, "Middlebury: within how many pixels the brightness of both views is compared"
@@ -270,7 +271,7 @@ def _diffused(
     brightness: NDArray,
     weight: NDArray,
     guide: NDArray[np.uint8],
-    how: tuple[float, float] = SETTINGS.fill,
+    how: tuple[float, float] = (SETTINGS.fill, DISPARITY_FILL[1]),
 ) -> NDArray[np.float32]:
     """Colour (c, h, w) over what is connected in the guide, (fills, c, h, w): by its weighted regression on
     brightness (h, w), and as it is.

@@ -23,6 +23,7 @@ from arraygeom.robust import cauchy, normal_deviation, robust_least_squares
 
 from ..support.settings import size, tuned
 from .positions import normals
+from .subpixel import SETTINGS as SUBPIXEL
 
 Image = NDArray[Any]
 
@@ -31,11 +32,14 @@ Image = NDArray[Any]
 class AlignmentSettings:
     """Lengths are pixels of the images given, brightness is 0 to 1. Middlebury is its tune half."""
 
-    blur: float = tuned(1.5, "Middlebury: standard deviation of the blur before gradients")
+    blur: float = tuned(
+        1.0,
+        "Middlebury, tune half: standard deviation of the blur before gradients, and before colours are "
+        "compared that a response is found from",
+    )
     radius: int = tuned(7, "Middlebury: of the windows, to either side")
     steps: int = size(6, "Gauss-Newton steps at most")
     finest: float = size(5e-3, "A step below this ends them")
-    contrast: float = tuned(2e-5, "Middlebury: mean squared gradient of a window that counts half")
     farthest: float = size(2.0, "A window's displacement in one step is at most this")
     deviation: float = size(
         0.05, "The standard deviation of windows' displacements about the plane, at least"
@@ -172,11 +176,11 @@ class _Windows(NamedTuple):
         strength = strength - mixed**2 / (other + 1e-6)
         towards = towards - mixed * aside / (other + 1e-6)
         some = (slice(None, None, 4), slice(None, None, 4))
-        useful = (strength[some] > SETTINGS.contrast / 10) & (weight[some] > 0.3)
+        useful = (strength[some] > SUBPIXEL.flat / 10) & (weight[some] > 0.3)
         if useful.sum() < SETTINGS.windows:
             return None
-        found = towards[some][useful] / (strength[some][useful] + SETTINGS.contrast / 10)
-        counts = strength[some][useful] / (strength[some][useful] + SETTINGS.contrast)
+        found = towards[some][useful] / (strength[some][useful] + SUBPIXEL.flat / 10)
+        counts = strength[some][useful] / (strength[some][useful] + SUBPIXEL.flat)
         limit = SETTINGS.farthest
         return _robust_plane(self.design[:, ::4, ::4][:, useful], np.clip(found, -limit, limit), counts)
 

@@ -45,7 +45,7 @@ class SubpixelSettings:
     flat: float = tuned(
         3e-6,
         "Middlebury: slope of brightness (its square) along the segment at which that step is half as long, "
-        "and a match weighs half in its surface",
+        "and a match weighs half in its surface; and across it, at which a displacement of beta counts half",
     )
     reach: float = tuned(
         24.0, "Middlebury, tune half, of 16 to 32: pixels to which matches of a surface count"
