@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
@@ -131,13 +131,14 @@ def in_parallel(tasks: Sequence[Callable[[], object]], *, most: int | None = Non
         future.result()
 
 
-def in_order(function: Callable[[Any], Any], parts: Iterable[Any]) -> Iterator[Any]:
+def in_order(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[Any]:
     """`map(function, parts)`, a few parts ahead on as many `threads` as there are; torch in each alone.
 
-    In this thread where torch itself takes several, or has to see each operation (`followed`, a function
-    mode, autocast): it does so in one thread only. An error is raised once no part is computed any more.
+    A single part is computed in this thread, and so are all where torch itself takes several threads, or has to
+    see each operation (`followed`, a function mode, autocast), which it does in one thread only. An error is
+    raised once no part is computed any more.
     """
-    count = threads()
+    count = min(threads(), len(parts))
     seen = followed() or torch._C._len_torch_function_stack() or torch.is_autocast_enabled("cpu")
     if count < 2 or seen or torch.get_num_threads() > 1:
         yield from map(function, parts)

@@ -194,4 +194,6 @@ def test_parts_stay_in_the_thread_that_torch_has_to_see(two_threads):
     here = threading.get_ident()
     with torch_in_one_thread(), torch.device("cpu"):
         assert set(in_order(lambda _: threading.get_ident(), range(4))) == {here}
+    with torch_in_one_thread():  # else what it computes would have one thread
+        assert set(in_order(lambda _: threading.get_ident(), range(1))) == {here}
     assert set(in_order(lambda _: threading.get_ident(), range(4))) == {here}
