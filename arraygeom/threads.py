@@ -134,9 +134,9 @@ def in_parallel(tasks: Sequence[Callable[[], object]], *, most: int | None = Non
 def in_order(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[Any]:
     """`map(function, parts)`, a few parts ahead on as many `threads` as there are; torch in each alone.
 
-    A single part is computed in this thread, and so are all where torch itself takes several threads, or has to
-    see each operation (`followed`, a function mode, autocast), which it does in one thread only. An error is
-    raised once no part is computed any more.
+    A single part is computed in this thread, and so are all where torch itself takes several threads, or has
+    to see each operation (`followed`, a function mode, autocast), which it does in one thread only. An error
+    is raised once no part is computed any more.
     """
     count = min(threads(), len(parts))
     seen = followed() or torch._C._len_torch_function_stack() or torch.is_autocast_enabled("cpu")

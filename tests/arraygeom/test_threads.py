@@ -174,20 +174,21 @@ def test_few_parts_are_made_ahead(two_threads):
 
 
 def test_an_error_in_a_part_is_raised_once_no_part_is_computed(two_threads):
-    begun, done = threading.Event(), []
+    both, begun, done = threading.Event(), [], []
 
     def part(i):
         if i == 0:
-            begun.wait(300)
+            both.wait(300)
             raise OSError("full")
-        begun.set()
+        begun.append(i)
+        both.set()
         time.sleep(0.2)
         done.append(i)
 
     with torch_in_one_thread(), pytest.raises(OSError, match="full"):
         list(in_order(part, range(9)))
-    assert done
-    assert done == sorted(done)
+    assert begun
+    assert sorted(begun) == sorted(done)
 
 
 def test_parts_stay_in_the_thread_that_torch_has_to_see(two_threads):
