@@ -138,11 +138,14 @@ def in_order(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[A
     to see each operation (`followed`, a function mode, autocast), which it does in one thread only. An error
     is raised once no part is computed any more.
     """
-    count = min(threads(), len(parts))
-    seen = followed() or torch._C._len_torch_function_stack() or torch.is_autocast_enabled("cpu")
-    if count < 2 or seen or torch.get_num_threads() > 1:
-        yield from map(function, parts)
-        return
+    if followed() or torch._C._len_torch_function_stack() or torch.is_autocast_enabled("cpu"):
+        return map(function, parts)
+    several = min(threads(), len(parts)) > 1 and torch.get_num_threads() == 1
+    return _ahead(function, parts) if several else map(function, parts)
+
+
+def _ahead(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[Any]:
+    count = threads()
     graph, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
     def work(part: Any) -> Any:
