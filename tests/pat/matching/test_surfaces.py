@@ -1,9 +1,10 @@
 """Planes through what is known around each pixel."""
 
+import cv2
 import numpy as np
 import pytest
 
-from pat.matching.surfaces import Planes
+from pat.matching.surfaces import SETTINGS, Planes
 
 H, W = 120, 160
 
@@ -15,20 +16,33 @@ def whole_and_every_second(right: float, down: float) -> tuple[np.ndarray, np.nd
     return whole, whole[::2, ::2]
 
 
-def test_a_plane_is_found_from_a_part_of_its_pixels():
-    """A diagonal band, in which positions across and down go together."""
-    whole, values = whole_and_every_second(1 / 20, -1 / 30)
-    y, x = np.mgrid[: H // 2, : W // 2]
-    weight = (np.abs(x * 0.75 - y) < 12).astype(np.float32) * np.float32(0.5)
-    guide = np.zeros((*values.shape, 1), np.float32)
-    planes = Planes.through(np.where(weight > 0, values, 1000), weight, guide, 60.0)
-    inside = weight > 0
-    # A little flatter: planes are level where positions hardly differ.
-    assert planes.right[inside] == pytest.approx(1 / 20, rel=0.2)
-    assert planes.down[inside] == pytest.approx(-1 / 30, rel=0.2)
-    assert planes.around[inside] == pytest.approx(0.5, abs=1e-4)
-    found = planes.at_pixels((H, W))
-    assert np.abs(found - whole)[inside.repeat(2, 0).repeat(2, 1)].max() < 0.1
+def test_planes_are_the_weighted_least_squares_around_each_pixel():
+    """Solved again at some pixels, from means by the same filter; in a diagonal band, where positions across
+    and down go together. A slope counts as the variance of positions and `level` say."""
+    rng, reach = np.random.default_rng(0), 24.0
+    _, values = whole_and_every_second(1 / 20, -1 / 30)
+    y, x = np.mgrid[: H // 2, : W // 2].astype(np.float32)
+    weight = (rng.random(values.shape) * (np.abs(x * 0.75 - y) < 12)).astype(np.float32)
+    values = values + rng.normal(0, 0.3, values.shape).astype(np.float32)
+    guide = (values[..., None] / 8).astype(np.float32)
+    planes = Planes.through(values, weight, guide, reach)
+    over = cv2.ximgproc.createDTFilter(guide, reach / 2, 1.0, cv2.ximgproc.DTF_RF)
+    total = over.filter(weight)
+
+    def mean(part):
+        return over.filter((part * weight).astype(np.float32)) / total
+
+    position, z = np.stack([x, y], -1) / (reach / 2), values - values.mean()
+    middle = np.stack([mean(position[..., i]) for i in range(2)], -1)
+    assert planes.around == pytest.approx(mean(weight), rel=1e-3)
+    for r, c in [(10, 14), (30, 40), (45, 60), (28, 44)]:
+        away = position - middle[r, c]
+        spread = [[mean(away[..., i] * away[..., j])[r, c] for i in range(2)] for j in range(2)]
+        common = [mean(away[..., i] * z)[r, c] for i in range(2)]
+        slope = np.linalg.solve(np.array(spread) + SETTINGS.level * np.eye(2), common)
+        value = mean(z)[r, c] + slope @ (position - middle)[r, c] + values.mean()
+        found = planes.value[r, c], planes.right[r, c] * reach, planes.down[r, c] * reach
+        assert found == pytest.approx((value, *slope), abs=5e-3)
 
 
 def test_all_pixels_of_odd_sides_lie_on_the_plane():
@@ -42,7 +56,7 @@ def test_all_pixels_of_odd_sides_lie_on_the_plane():
 
 
 def test_an_edge_of_the_guide_parts_planes():
-    whole, values = whole_and_every_second(0.05, 0.0)
+    _, values = whole_and_every_second(0.05, 0.0)
     step = np.where(np.arange(W // 2) < 40, 0, 7).astype(np.float32)
     guide = np.broadcast_to(step / 7 * 50, values.shape)[..., None].astype(np.float32)
     planes = Planes.through(values + step, np.ones_like(values), guide, 24.0)
