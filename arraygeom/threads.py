@@ -145,6 +145,7 @@ def in_order(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[A
 
 
 def _ahead(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[Any]:
+    """`in_order` on several threads: at most as many parts ahead as there are threads."""
     count = threads()
     graph, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 

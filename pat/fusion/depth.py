@@ -95,7 +95,8 @@ def measured_depth(
         return _measured(output.cut(box), betas, placements, (bottom - top, hw[1]), (left, above + top))
 
     tiles = list(tiles_of(hw[:1], ROWS, 0))
-    return FoundDepth(*assembled(hw[:1], zip(tiles, in_order(of_rows, tiles)), axes=[-2]))
+    made = in_order(of_rows, tiles) if output.image.device.type == "cpu" else map(of_rows, tiles)
+    return FoundDepth(*assembled(hw[:1], zip(tiles, made), axes=[-2]))
 
 
 def _measured(
@@ -105,6 +106,7 @@ def _measured(
     hw: HW,
     corner: tuple[int, int],
 ) -> FoundDepth:
+    """`measured_depth` of some rows."""
     h, w = hw
     like = output.position[0]
     x = (pixel_grid(hw, dtype=like.dtype, device=like.device) + like.new_tensor(corner)).reshape(-1, 2)
