@@ -1,35 +1,30 @@
 """Training of the denoisers: `python -m experiments.low_light.training --photos DIR --out runs/low-light`.
 
-First those of single views, on photographs with noise of random kind and level; then that of the fused image,
-on layered scenes that are recorded with such noise, denoised view by view, and fused.
+On windows of photographs with noise of random kind and level.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import torch
 import tyro
-from torch import Generator, Tensor, nn
+from jaxtyping import Float
+from torch import Generator, Tensor
 
-from experiments.fit import Losses, fit, recipe_text
+from experiments.fit import fit, recipe_text
 from pat.media.colour import luminance
 from pat.networks.denoiser import LowLightNetwork
-from pat.networks.weights import load_denoiser, load_weights, save_weights
-from pat.sensors import generator_for
+from pat.networks.weights import load_denoiser, save_weights
+from pat.sensors import NoiseLevel, generator_for
 from pat.support.locks import folder_lock
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rigs import below
 from pat.training.losses import image_loss
-
-from .noisy_scenes import NoisyScenes, flipped, noise_levels, noisy
-
-VIEWS, FUSED = "views.safetensors", "best.safetensors"
 
 
 @dataclass(frozen=True)
@@ -42,15 +37,13 @@ class DenoiserTraining:
     """Folder for weights and checkpoints."""
     start: Path | None = None
     """File of weights to go on from."""
-    fusion: str = "mono-colour"
-    """Weights by which the scenes of the second part are fused."""
-    steps: tuple[int, int] = (6000, 6000)
-    """Steps of the denoisers of single views, and of that of the fused image."""
-    batch: int = 32
-    """Windows in a batch."""
-    side: int = 64
+    steps: int = 7000
+    """Steps of training."""
+    batch: int = 64
+    """Windows in a batch, of each network."""
+    side: int = 128
     """Side of a window, pixels."""
-    rate: float = 2e-3
+    rate: float = 1e-3
     """Learning rate of Adam, which falls along half a cosine."""
     save: int = 250
     """Steps between checkpoints."""
@@ -58,72 +51,50 @@ class DenoiserTraining:
     """Random seed."""
     cache: Path | None = None
     """File (.npz) that caches the photographs."""
-    precision: Literal["float32", "bfloat16"] = "bfloat16"
-    """Precision of convolutions."""
+    device: str = "cpu"
+    """Where training runs."""
 
 
 def train_denoiser(config: DenoiserTraining) -> Path:
-    """Train both parts; returns the file of the weights.
+    """Train both networks; returns the file of the weights.
 
     Raises ValueError where there are no photographs, or the folder holds a run of another recipe.
     """
     with folder_lock(config.out):
         torch.manual_seed(config.seed)
         network = load_denoiser(config.start).requires_grad_(True) if config.start else LowLightNetwork()
+        network = network.to(config.device)
         bank = PhotoBank.load(*config.photos, cache=config.cache, seed=config.seed)
-        if config.steps[0]:
-            single = nn.ModuleDict({"band": network.band, "colour": network.colour})
-            _fit(config, 0, single, partial(view_losses, config, bank, network))
-            _save(network, config, config.out / VIEWS)
-        network.eval().requires_grad_(False)
-        network.fused.train().requires_grad_(True)
-        scenes = NoisyScenes(bank, load_weights(config.fusion), network, config.seed)
-        _fit(config, 1, network.fused, partial(fused_losses, config, scenes, network))
-        _save(network, config, config.out / FUSED)
-    return config.out / FUSED
+        averaged = fit(
+            network,
+            partial(losses, config, bank, network),
+            config.out / "training",
+            recipe_text(config),
+            steps=config.steps,
+            rate=config.rate,
+            save=config.save,
+            validate=config.save,
+        )
+        facts = {"recipe": recipe_text(config)}
+        network.load_state_dict(averaged.state_dict())
+        save_weights(network.cpu().half(), config.out / "best.safetensors", facts=facts)
+    return config.out / "best.safetensors"
 
 
-def _fit(config: DenoiserTraining, part: int, network: nn.Module, losses: Losses) -> None:
-    """Train the first or the second part, and leave the averaged weights in the network."""
-    averaged = fit(
-        network,
-        losses,
-        config.out / ("views", "fused")[part],
-        recipe_text(config),
-        steps=config.steps[part],
-        rate=config.rate,
-        save=config.save,
-        validate=config.save,
-    )
-    network.load_state_dict(averaged.state_dict())
-
-
-def view_losses(
+def losses(
     config: DenoiserTraining, bank: PhotoBank, network: LowLightNetwork, start: int
 ) -> Iterator[Tensor]:
-    """Of the denoisers of single views, on photographs."""
+    """Of each step from one on."""
     for step in itertools.count(start):
         g = generator_for(config.seed, "views", step)
-        halves = windows(bank, config.batch, config.side, g).split(-(-config.batch // 2))
-        parts = [(d, x) for c in halves for d, x in ((network.band, luminance(c)), (network.colour, c))]
-        given = [(d, x, *noisy(x, noise_levels(len(x), g), g)) for d, x in parts]
-        with _autocast(config):
-            found = [image_loss(d(recorded, deviation), x) for d, x, recorded, deviation in given]
+        colours = windows(bank, config.batch, config.side, g)
+        found = []
+        for denoiser, ideal in ((network.band, luminance(colours)), (network.colour, colours)):
+            recorded, deviation = noisy(ideal, noise_levels(len(ideal), g), g)
+            with torch.autocast(config.device, torch.bfloat16, enabled=config.device != "cpu"):
+                image = denoiser(recorded.to(config.device), deviation.to(config.device))
+            found.append(image_loss(image, ideal.to(config.device)))
         yield torch.stack(found).mean()
-
-
-def fused_losses(
-    config: DenoiserTraining, scenes: NoisyScenes, network: LowLightNetwork, start: int
-) -> Iterator[Tensor]:
-    """Of the denoiser of the fused image, on layered scenes."""
-    for scene in scenes.steps(config.batch, config.side, start=start):
-        with _autocast(config):
-            image = network(scene.image, scene.alpha, scene.beta, scene.confidence)
-        yield image_loss(image, scene.ground_truth)
-
-
-def _autocast(config: DenoiserTraining) -> torch.autocast:
-    return torch.autocast("cpu", torch.bfloat16, enabled=config.precision == "bfloat16")
 
 
 def windows(bank: PhotoBank, count: int, side: int, g: Generator) -> Tensor:
@@ -139,11 +110,26 @@ def windows(bank: PhotoBank, count: int, side: int, g: Generator) -> Tensor:
     return torch.stack(found)
 
 
-def _save(network: LowLightNetwork, config: DenoiserTraining, path: Path) -> None:
-    """Write weights in half precision."""
-    copy = LowLightNetwork(network.config)
-    copy.load_state_dict(network.state_dict())
-    save_weights(copy.half(), path, facts={"recipe": recipe_text(config)})
+def noise_levels(count: int, g: Generator) -> NoiseLevel:
+    """Random levels: 15 to 3,000 electrons at white, up to 5 of read noise, or 1 to 60 of 255 anywhere."""
+    draw, light = torch.rand(4, count, 1, 1, 1, generator=g), bool(below(2, g))
+    electrons, constant = 15 * 200 ** draw[0], (draw[2] < 0.3) & (not light)
+    shot = torch.where(constant, 0.0, 1 / electrons)
+    read = torch.where(constant, 60 ** draw[3] / 255, 5 * draw[1].square() / electrons)
+    return NoiseLevel(shot, read, "light" if light else "values")
+
+
+def noisy(image: Tensor, level: NoiseLevel, g: Generator) -> tuple[Tensor, Tensor]:
+    """The image as recorded, unbiased, and its deviation as one would state it, up to some 8 % wrong."""
+    recorded = level.recorded(image, g)
+    wrong = (0.08 * torch.randn(len(image), 1, 1, 1, generator=g)).exp()
+    return level.unbiased(recorded), level.deviation(recorded) * wrong
+
+
+def flipped(image: Float[Tensor, "c n n"], flips: Sequence[int]) -> Float[Tensor, "c n n"]:
+    """A square image upside down, left to right and transposed, each where its number is not 0."""
+    image = image.flip([axis for axis in (1, 2) if flips[axis - 1]])
+    return image.mT if flips[2] else image
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Fusion of noisy views: denoised one by one before they are matched, and jointly once they are fused."""
+"""Fusion of noisy views: denoised before they are matched, and their colours averaged once they are fused."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -21,9 +21,8 @@ from arraygeom.threads import convolutions_in_parallel
 from arraygeom.warned import warn
 
 from ..matching.radiometry import Response
-from ..media.colour import luminance
 from ..networks.collaborative import without_noise
-from ..networks.denoiser import LowLightNetwork, NoisyView
+from ..networks.denoiser import LowLightNetwork
 from ..networks.weights import load_denoiser
 from ..sensors import NoiseLevel
 from ..support.settings import physics, size, tuned
@@ -58,9 +57,8 @@ class LowLightSettings:
         "noise that a demosaicing has smoothed shows as half or less",
     )
     found_bytes: float = size(12.0, "Of a position in a beta and its confidence")
-    jointly: float = size(
-        0.25,
-        "The time of the joint correction over that of denoising the views before, about (.22 was measured)",
+    averaging: float = size(
+        0.25, "The time of averaging colours over that of denoising the views before, about"
     )
 
 
@@ -74,6 +72,14 @@ in_tiles = partial(chunked, rows=1024, halo=128, axis=(-2, -1))
 def shipped_denoiser() -> LowLightNetwork:
     """The network that ships with the package."""
     return load_denoiser()
+
+
+class NoisyView(NamedTuple):
+    """A view as recorded but unbiased, without noise, and that noise's standard deviation; (1, C, H, W)."""
+
+    recorded: Tensor
+    denoised: Tensor
+    deviation: Tensor
 
 
 @dataclass(frozen=True)
@@ -92,7 +98,7 @@ class LowLight:
     @property
     def seconds_left(self) -> float:
         """About how long the correction will take."""
-        return SETTINGS.jointly * self.seconds if self.noisy else 0.0
+        return SETTINGS.averaging * self.seconds if self.noisy else 0.0
 
     def described(self) -> str:
         """Which views are denoised, and by how much they deviate."""
@@ -117,13 +123,13 @@ class LowLight:
         *,
         keep_alpha: bool = False,
     ) -> Frame:
-        """A frame fused from the denoised views, corrected by what all of them recorded.
+        """A frame fused from the denoised views, its colours averaged with those that betas recorded.
 
         `found` is where its pixels are in each beta, x and y, and the confidence of that. `steps` were taken
         before it was fused, but for radiometry: values keep their scale; they are not undone yet. `response`
         says what brings betas to alpha's exposure.
-        With `keep_alpha`, or if alpha has no noise, the luma is alpha's as recorded. Betas that are not all
-        RGB are denoised one by one alone.
+        With `keep_alpha` the luma is alpha's as recorded. Betas that are not all RGB are denoised one by one
+        alone.
         """
         if not self.noisy:
             return frame
@@ -131,10 +137,7 @@ class LowLight:
         alpha, image, views = self.views.alpha, frame.image, self.prepared(steps)
         own = views.pop(alpha)
         if all(view.recorded.shape[1] == 3 for view in views.values()):
-            betas = [exposed(view, response) for view in views.values()]
-            image = jointly_denoised(image, own, betas, found)
-            if keep_alpha or alpha not in self.noisy:
-                image = image - luminance(image - frame.image)
+            image = colours_averaged(image, [exposed(view, response) for view in views.values()], found)
         if keep_alpha:
             image = image + self._stepped(self.given.images, steps)[alpha] - own.denoised[0]
         return frame._replace(image=image)
@@ -235,26 +238,20 @@ def denoised(
     return torch.cat([in_tiles(partial(without_noise, network.band), *band) for band in bands], 1)
 
 
-@convolutions_in_parallel()
 @torch.no_grad()
-def jointly_denoised(
-    image: Float[Tensor, "3 h w"],
-    alpha: NoisyView,
-    betas: Sequence[NoisyView],
-    found: Float[Tensor, "n 3 h w"],
+def colours_averaged(
+    image: Float[Tensor, "3 h w"], betas: Sequence[NoisyView], found: Float[Tensor, "n 3 h w"]
 ) -> Float[Tensor, "3 h w"]:
-    """The image fused from denoised views, corrected by alpha and the RGB betas as they were recorded."""
+    """The image fused from denoised views with means of its colours and of those that RGB betas recorded."""
     beta, confidence = warped(betas, found)
-    network, deviation = shipped_denoiser(), float(beta.deviation.mean())
+    deviation = float(beta.deviation.mean())
+    if not deviation:
+        return image
 
-    def joint(part: Tensor, *seen: Tensor) -> Tensor:
-        beta, confidence = NoisyView(*seen[3:6]), seen[6]
-        fused = network(part, NoisyView(*seen[:3]), beta, confidence)
-        if not deviation:
-            return fused
-        return averaged_with_alike(fused[0], beta.recorded[0], confidence[0], deviation)[None]
+    def averaged(part: Tensor, recorded: Tensor, confidence: Tensor) -> Tensor:
+        return averaged_with_alike(part[0], recorded[0], confidence[0], deviation)[None]
 
-    return in_tiles(joint, image[None], *alpha, *beta, confidence)[0]
+    return in_tiles(averaged, image[None], beta.recorded, confidence)[0]
 
 
 def warped(

@@ -90,6 +90,37 @@ def enlarge(x: Float[Tensor, "b d h w"], factor: int = 2) -> Float[Tensor, "b d 
     return nn.functional.interpolate(x, scale_factor=factor, mode="bilinear", align_corners=False)
 
 
+class UNet(nn.Module):
+    """Three scales down and up again, `blocks` residual blocks at each, twice as many at the smallest."""
+
+    def __init__(self, inputs: int, widths: tuple[int, ...], outputs: int, *, blocks: int = 1) -> None:
+        super().__init__()
+        a, b, c = widths
+        dilations = (1, 2) * blocks
+        self.first = nn.Sequential(conv(inputs, a), *_residual(a, blocks))
+        self.second = nn.Sequential(conv(a, b, stride=2), *_residual(b, blocks))
+        self.third = nn.Sequential(conv(b, c, stride=2), *(ResidualBlock(c, dilation=d) for d in dilations))
+        self.up_b, self.up_a = nn.Conv2d(c, b, 1), nn.Conv2d(b, a, 1)
+        self.back_b, self.back_a = (_in_turn(_residual(n, blocks)) for n in (b, a))
+        self.last = nn.Conv2d(a, outputs, 3, padding=1)
+
+    def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
+        """The same size; sides are multiples of 4."""
+        first = self.first(x)
+        second = self.second(first)
+        second = self.back_b(second + enlarge(self.up_b(self.third(second))))
+        return self.last(self.back_a(first + enlarge(self.up_a(second))))
+
+
+def _residual(dim: int, count: int) -> list[ResidualBlock]:
+    return [ResidualBlock(dim) for _ in range(count)]
+
+
+def _in_turn(blocks: list[ResidualBlock]) -> nn.Module:
+    """One block is itself, as weights of networks with one have it."""
+    return nn.Sequential(*blocks) if len(blocks) > 1 else blocks[0]
+
+
 def in_bfloat16(part: nn.Module) -> None:
     """Let a part compute in bfloat16 where autocast does, with float32 output."""
     forward = part.forward

@@ -20,7 +20,7 @@ from arraygeom.threads import in_parallel
 
 from ..attention.kernels import compiled, separate_cache
 from ..support.settings import size, tuned
-from .denoiser import opponent, opponent_deviation, over_flips, rgb_of_opponent
+from .denoiser import opponent, opponent_deviation, rgb_of_opponent
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class CollaborativeSettings:
         "where an image is flat the noise makes blocks alike that lie apart, as is needed",
     )
     kept: float = tuned(
-        0.3, "Middlebury, tune half: share of the network's brightness that is kept: its errors are others"
+        0.5, "Middlebury, tune half: share of the network's brightness that is kept: its errors are others"
     )
 
 
@@ -53,7 +53,7 @@ def without_noise(
     network: Callable[..., Tensor], recorded: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b c h w"]:
     """What a denoiser of `LowLightNetwork` makes of images of one band or of three (RGB), `refined`."""
-    return refined(over_flips(network, recorded, deviation), recorded, deviation)
+    return refined(network(recorded, deviation), recorded, deviation)
 
 
 def refined(

@@ -41,7 +41,8 @@ class GuidedPATConfig:
 
     Attention reaches `window` pixels to either side of the match, with `taps` samples. Colour is propagated
     within alpha in one round for each of `propagation_steps`, the spacing of 7 x 7 pixels at 1/4.
-    `keep_luminance` lets the network add colour to alpha, and never luminance.
+    `keep_luminance` lets the network add colour to alpha, never luminance. `completion` has widths at 1/2,
+    1/4 and 1/8, of what completes colours in the end; none without such a part.
     """
 
     widths: tuple[int, int, int, int] = (16, 32, 40, 48)
@@ -54,6 +55,7 @@ class GuidedPATConfig:
     propagation_steps: tuple[int, ...] = (1, 3, 8)
     bands: int = 3
     keep_luminance: bool = True
+    completion: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -29,10 +29,11 @@ from ..matching.matches import BetaMatches, Matches
 from ..matching.positions import FINE, Extent, matches
 from ..media.colour import luminance
 from ..support.settings import size, tuned
-from .blocks import ResidualBlock, channels_last, conv, enlarge, stacked
+from .blocks import ResidualBlock, UNet, channels_last, conv, enlarge, stacked
+from .completion import Completion
 from .configs import GuidedPATConfig
 from .protocol import FusionOutput, JoinsBands, required
-from .recall import fitted, with_examples, with_less_noise
+from .recall import by_example, fitted, with_examples, with_less_noise
 
 
 @dataclass(frozen=True)
@@ -139,11 +140,13 @@ class GuidedPAT(nn.Module):
         self.confidence = ConfidenceHead(c.judge_dim + w2 + 4 + 12, c.confidence_dim)
         rounds = (Propagation(w4, c.propagation_dim, spacing) for spacing in c.propagation_steps)
         self.propagation = nn.ModuleList(rounds)
+        self.completion = Completion(c.completion) if c.completion else None
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
-        """In what is recalled; or around attention, one beta after the other, and the estimates of others."""
-        most = max(betas, default=0)
-        return max(350.0 * alpha, 145.0 * alpha + 100.0 * most) + 130.0 * alpha * max(len(betas) - 1, 0)
+        """In what is recalled or completed; or around attention, one beta after the other, and the estimates of
+        others."""
+        most, last = max(betas, default=0), 350.0 if self.completion is None else 600.0
+        return max(last * alpha, 145.0 * alpha + 100.0 * most) + 130.0 * alpha * max(len(betas) - 1, 0)
 
     def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
         """Fuse alpha (B, 1, H, W) with the betas. The image has the betas' bands.
@@ -174,13 +177,17 @@ class GuidedPAT(nn.Module):
         """What all bands have more than alpha: where the betas see it, and where not."""
         confidence = _joined([s.blending.expand_as(s.colour) for s in estimates])
         colour = _joined([s.colour for s in estimates])
-        unseen = _joined([self._unseen(own, alpha, s) for s in estimates])
-        unseen = with_examples(unseen, alpha, colour, confidence)
-        return with_less_noise(alpha, torch.lerp(unseen, colour, confidence), confidence)
+        unseen, *fills = map(_joined, zip(*(self._fills(own, alpha, s) for s in estimates)))
+        found = by_example(alpha, colour, confidence)
+        unseen = with_examples(unseen, found, confidence)
+        mixed = with_less_noise(alpha, torch.lerp(unseen, colour, confidence), confidence)
+        if self.completion is None or len(estimates) > 1:  # bands of several certainties: it has seen none
+            return mixed
+        return self.completion(alpha, confidence[:, :1], mixed, (colour, *fills, found))
 
-    def _unseen(self, own: Encoded, alpha: Tensor, estimate: BetaEstimate) -> Tensor:
-        """Colour for where beta does not see the point: propagated at 1/4 of the size to pixels that are
-        similar in alpha, or diffused."""
+    def _fills(self, own: Encoded, alpha: Tensor, estimate: BetaEstimate) -> tuple[Tensor, ...]:
+        """Colour for where beta does not see the point: the choice; and what it is of, propagated at 1/4 of
+        the size to pixels that are similar in alpha, or diffused."""
         confidence = estimate.logit.sigmoid()
         weight = avg_pool2d(confidence, SETTINGS.coarse)
         colour = avg_pool2d(estimate.colour * confidence, SETTINGS.coarse) / (weight + SETTINGS.least_weight)
@@ -189,7 +196,7 @@ class GuidedPAT(nn.Module):
         propagated = fitted(enlarge(colour), alpha, estimate.colour, confidence)
         choices = propagated, *estimate.diffused.to(colour).unbind(1)
         weights = estimate.choice.softmax(1).split(1, 1)
-        return reduce(torch.add, (w * c for w, c in zip(weights, choices)))
+        return reduce(torch.add, (w * c for w, c in zip(weights, choices))), *choices
 
     def estimate(self, own: Encoded, alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaEstimate:
         """The estimate of one beta of any bands."""
@@ -234,8 +241,8 @@ class GuidedPAT(nn.Module):
         return pixels.reshape(b, 2 * h, 2 * w, c // 4).movedim(-1, 1)
 
 
-def _joined(bands: list[Tensor]) -> Tensor:
-    return torch.cat(bands, 1) if len(bands) > 1 else bands[0]
+def _joined(bands: Sequence[Tensor]) -> Tensor:
+    return torch.cat(list(bands), 1) if len(bands) > 1 else bands[0]
 
 
 def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]) -> FusionOutput:
@@ -340,24 +347,3 @@ class Encoder(nn.Module):
         half = self.at_half(channels_last(pixel_unshuffle(image - 0.5, 2)))
         quarter = self.at_quarter(half)
         return Encoded(half, self.merge(quarter + enlarge(self.up(self.at_eighth(quarter)))))
-
-
-class UNet(nn.Module):
-    """Three scales down and up again, residual blocks at each."""
-
-    def __init__(self, inputs: int, widths: tuple[int, ...], outputs: int) -> None:
-        super().__init__()
-        a, b, c = widths
-        self.first = nn.Sequential(conv(inputs, a), ResidualBlock(a))
-        self.second = nn.Sequential(conv(a, b, stride=2), ResidualBlock(b))
-        self.third = nn.Sequential(conv(b, c, stride=2), ResidualBlock(c), ResidualBlock(c, dilation=2))
-        self.up_b, self.up_a = nn.Conv2d(c, b, 1), nn.Conv2d(b, a, 1)
-        self.back_b, self.back_a = ResidualBlock(b), ResidualBlock(a)
-        self.last = nn.Conv2d(a, outputs, 3, padding=1)
-
-    def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
-        """The same size; sides are multiples of 4."""
-        first = self.first(x)
-        second = self.second(first)
-        second = self.back_b(second + enlarge(self.up_b(self.third(second))))
-        return self.last(self.back_a(first + enlarge(self.up_a(second))))

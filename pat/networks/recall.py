@@ -60,14 +60,17 @@ SETTINGS = RecallSettings()
 FIELD = Local(2 * SETTINGS.side - 1, spacing=SETTINGS.spacing)
 
 
+def by_example(
+    alpha: Float[Tensor, "b 1 h w"], colour: Float[Tensor, "b c h w"], confidence: Float[Tensor, "b c h w"]
+) -> Float[Tensor, "b c h w"]:
+    """The colour of what is seen and looks alike in alpha, smoothed together with colour that is certain."""
+    return fitted(recalled(alpha, colour, confidence), alpha, colour, confidence)
+
+
 def with_examples(
-    unseen: Float[Tensor, "b c h w"],
-    alpha: Float[Tensor, "b 1 h w"],
-    colour: Float[Tensor, "b c h w"],
-    confidence: Float[Tensor, "b c h w"],
+    unseen: Float[Tensor, "b c h w"], found: Float[Tensor, "b c h w"], confidence: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b c h w"]:
     """Colour for where no beta sees the point, in part by example, the less certain a pixel is the more."""
-    found = fitted(recalled(alpha, colour, confidence), alpha, colour, confidence)
     return torch.lerp(unseen, found, SETTINGS.share * (1 - confidence))
 
 

@@ -53,16 +53,16 @@ FILL_NAMES = ("propagated", "diffused by brightness", "diffused")
 def filled_by(network: GuidedPAT, fill: int | None) -> None:
     """Let a network fill in one way, the number of `BetaEstimate.choice`; None: by its own choice."""
     if fill is None:
-        vars(network).pop("_unseen", None)
+        vars(network).pop("_fills", None)
         return
 
-    def alone(self: GuidedPAT, own: Encoded, alpha: Tensor, estimate: BetaEstimate) -> Tensor:
+    def alone(self: GuidedPAT, own: Encoded, alpha: Tensor, estimate: BetaEstimate) -> tuple[Tensor, ...]:
         chosen = one_hot(torch.tensor(fill), 1 + FILLS).to(estimate.choice)[:, None, None]
-        return GuidedPAT._unseen(
+        return GuidedPAT._fills(
             self, own, alpha, estimate._replace(choice=(1e4 * chosen).expand_as(estimate.choice))
         )
 
-    vars(network)["_unseen"] = MethodType(alone, network)
+    vars(network)["_fills"] = MethodType(alone, network)
 
 
 def images_of(network: GuidedPAT, pair: StereoPair) -> tuple[dict[str, Tensor], Tensor]:

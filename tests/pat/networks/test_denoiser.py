@@ -5,7 +5,7 @@ import torch
 
 from pat.evaluation.baseline import non_local_means
 from pat.media.colour import luminance
-from pat.networks.denoiser import DenoiserConfig, LowLightNetwork, NoisyView, over_flips
+from pat.networks.denoiser import DenoiserConfig, LowLightNetwork
 from pat.networks.weights import DENOISER, SHIPPED, load_denoiser, load_weights, save_weights
 from pat.sensors import NoiseLevel, generator_for
 from tests.pat.layered_array import load_sample
@@ -21,10 +21,8 @@ def drawn(*shape):
 
 def test_without_noise_images_stay_as_they_are():
     network, image = load_denoiser(), drawn(2, 3, 37, 50)
-    torch.testing.assert_close(network.colour(image, 0 * image), image, atol=1e-6, rtol=0)
+    assert torch.equal(network.colour(image, 0 * image), image)
     assert torch.equal(network.band(image[:, :1], 0 * image[:, :1]), image[:, :1])
-    alpha, beta = NoisyView(image[:, :1], image[:, :1], 0 * image[:, :1]), NoisyView(image, image, 0 * image)
-    assert torch.equal(network(image, alpha, beta, torch.ones(2, 1, 37, 50)), image)
 
 
 @pytest.mark.parametrize("electrons", [200, 50])
@@ -54,35 +52,13 @@ def denoised(part, electrons):
     )
 
 
-def test_results_over_flips_are_flipped_as_the_images_are():
-    torch.manual_seed(0)
-    network, image = torch.nn.Conv2d(1, 1, 3, padding=1), torch.rand(1, 1, 6, 7)
-    for axes in ((-1,), (-2,)):
-        assert not torch.allclose(network(image.flip(axes)), network(image).flip(axes), atol=1e-2)
-        torch.testing.assert_close(
-            over_flips(network, image.flip(axes)), over_flips(network, image).flip(axes)
-        )
-
-
-def test_a_fused_image_takes_the_betas_brightness_as_its_own():
-    """The same scene twice as dark in beta corrects the image all the same."""
-    network, image = load_denoiser(), drawn(1, 3, 32, 48)
-    deviation = torch.full_like(image, 0.05)
-    alpha = NoisyView(luminance(image), luminance(image), deviation[:, :1])
-    beta = NoisyView(image + 0.05 * torch.randn_like(image), image, deviation)
-    dark = NoisyView(*(0.5 * part for part in beta))
-    confidence = torch.ones(1, 1, 32, 48)
-    one, other = (network(image, alpha, view, confidence) for view in (beta, dark))
-    torch.testing.assert_close(one, other, atol=2e-3, rtol=0)
-
-
 def test_the_shipped_network_is_small_and_described():
-    assert DENOISER.stat().st_size < 1e6
+    assert DENOISER.stat().st_size < 1e7
     assert DENOISER.with_suffix(".md").is_file()
 
 
 def test_written_and_read_back(tmp_path):
-    narrow = LowLightNetwork(DenoiserConfig((4, 4, 4), (4, 4, 4), (4, 4, 4)))
+    narrow = LowLightNetwork(DenoiserConfig((4, 4, 4), blocks=1))
     save_weights(narrow, tmp_path / "w.safetensors")
     again = load_denoiser(tmp_path / "w.safetensors")
     assert again.config == narrow.config

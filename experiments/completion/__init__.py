@@ -1,0 +1,1 @@
+"""What completes colours (`pat.networks.completion`), trained on photographs cut into surfaces."""

@@ -1,0 +1,93 @@
+"""What the fusion of pairs gives to the completion, kept as one small file each.
+
+Planes of 8 bits, below each other in one grey image: alpha, confidence, and chroma of the ground truth, of
+the image as it is, and of the candidates' differences from that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from arraygeom.atomic import write_atomically
+from pat.data.pairs import StereoPair
+from pat.evaluation.protocols import mono_colour_task, rectified_fusion
+from pat.media.colour import to_luma_chroma
+from pat.networks.completion import CANDIDATES, Completion, differences
+from pat.networks.guided import GuidedPAT
+from pat.sensors.noise_level import NoiseLevel
+
+RATES = (1, 2, 2, 2, 4, 4, 8)
+"""By which beta is reduced, one of them at random."""
+NOISY = 0.15
+"""Share of recordings in low light, 50 to 2,000 electrons at white."""
+READ_NOISE = 2.0
+QUALITY = 88
+"""Of the compression."""
+LEVELS = 180.0
+"""Levels of 8 bits to 1, of chroma."""
+PLANES = 2 + 2 * (2 + CANDIDATES)
+
+
+class Recorder(Completion):
+    """In a completion's place: keeps what it is given, and leaves the image as it is."""
+
+    def __init__(self) -> None:
+        super().__init__((1, 1, 1))
+
+    def forward(
+        self, alpha: Tensor, confidence: Tensor, mixed: Tensor, candidates: Sequence[Tensor]
+    ) -> Tensor:
+        """The image as it is."""
+        self.given = alpha, confidence, mixed, candidates
+        return mixed
+
+
+def captured(network: GuidedPAT, pair: StereoPair, seed: int) -> Float[Tensor, "p h w"]:
+    """The planes of a pair recorded at random, left as alpha; its largest disparity must be known."""
+    assert pair.max_disparity is not None
+    rng, g = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+    alpha, beta, truth = mono_colour_task(pair, int(rng.choice(RATES)))
+    noise: dict[str, Any] = {}
+    if rng.random() < NOISY:
+        level = NoiseLevel.of_electrons(float(np.exp(rng.uniform(np.log(50), np.log(2000)))), READ_NOISE)
+        alpha, beta = (level.recorded(image[None], g)[0] for image in (alpha, beta))
+        noise = {"noise": {"alpha": level, "beta": level}}
+    recorder = network.completion = Recorder()
+    rectified_fusion(network, response="rec601", align=False, **noise)(alpha, beta, pair.max_disparity)
+    own, confidence, mixed, candidates = recorder.given
+    colours = [to_luma_chroma(c)[1] for c in (mixed, *differences(confidence, mixed, candidates))]
+    h, w = truth.shape[1:]
+    given = torch.cat([own, confidence, *colours], 1)[0, :, :h, :w]
+    return torch.cat([given[:2], to_luma_chroma(truth)[1], given[2:]])
+
+
+def write_planes(planes: Float[Tensor, "p h w"], path: Path) -> None:
+    """Keep them, as WebP. Raises OSError if that fails."""
+    levels = torch.cat([planes[:2] * 255, planes[2:] * LEVELS + 128]).round().clamp(0, 255).byte()
+    written, data = cv2.imencode(".webp", levels.flatten(0, 1).numpy(), [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
+    if not written:
+        raise OSError(f"{path}: cannot be compressed")
+    with write_atomically(path) as temporary:
+        temporary.write_bytes(data.tobytes())
+
+
+def read_planes(path: Path) -> Tensor:
+    """Planes as bytes (p, h, w); `values` makes numbers of them. Raises ValueError for another file."""
+    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if grey is None or len(grey) % PLANES:
+        raise ValueError(f"{path}: not {PLANES} planes below each other; capture again")
+    return torch.from_numpy(grey).unflatten(0, (PLANES, -1))
+
+
+def values(planes: Tensor) -> Float[Tensor, "*b p h w"]:
+    """Numbers of planes that were read."""
+    light, colours = planes.float().split([2, PLANES - 2], -3)
+    return torch.cat([light / 255, (colours - 128) / LEVELS], -3)

@@ -1,0 +1,202 @@
+"""Training of the completion: `python -m experiments.completion.training --photos DIR --stereo DIR`.
+
+First frames are fused and what the completion is given is kept, of photographs cut into surfaces and of
+rectified pairs; then it is trained on random windows of those. The weights are the fusion's with it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from jaxtyping import Float
+from torch import Generator, Tensor
+from torch.nn.functional import interpolate
+
+from experiments.evaluation.halves import of_half
+from experiments.fit import fit, recipe_text
+from pat.data.pairs import StereoPair, middlebury_pairs
+from pat.media.colour import from_luma_chroma
+from pat.networks.completion import CANDIDATES, Completion
+from pat.networks.guided import GuidedPAT
+from pat.networks.weights import load_weights, save_weights
+from pat.sensors import generator_for
+from pat.support.folders import files_below
+from pat.support.locks import folder_lock
+from pat.synthesis.rigs import below
+from pat.training.losses import image_loss
+
+from .capture import captured, read_planes, values, write_planes
+from .pairs import HW, photo_pair
+
+ENLARGED = (1.1, 1.3)
+"""Pairs are enlarged so many times."""
+
+
+@dataclass(frozen=True)
+class CompletionTraining:
+    """A recipe. The same command continues a run that stopped."""
+
+    photos: tuple[Path, ...]
+    """Folders of photographs."""
+    stereo: Path | None = None
+    """Folder of Middlebury's pairs; those of the tune half are used."""
+    out: Path = Path("runs/completion")
+    """Folder for what is captured, checkpoints, and weights."""
+    fusion: str = "mono-colour"
+    """Weights that the completion is for; one that they have is replaced."""
+    captured: int = 850
+    """Photographs' pairs that are fused."""
+    widths: tuple[int, int, int] = (64, 96, 128)
+    """Channels at 1/2, 1/4 and 1/8 of the size."""
+    steps: int = 8000
+    """Steps of training."""
+    batch: int = 16
+    """Windows in a batch, a quarter of them of pairs if there are some."""
+    side: int = 256
+    """Side of a window, pixels."""
+    rate: float = 1e-3
+    """Learning rate."""
+    save: int = 250
+    """Steps between checkpoints."""
+    seed: int = 0
+    """Random seed."""
+    device: str = "cpu"
+    """Where training runs."""
+
+
+def train_completion(config: CompletionTraining) -> Path:
+    """Capture what is not yet, and train; returns the file of the weights.
+
+    Raises ValueError where there are no photographs, or the folder holds a run of another recipe.
+    """
+    with folder_lock(config.out):
+        torch.manual_seed(config.seed)
+        network = load_weights(config.fusion)
+        assert isinstance(network, GuidedPAT)
+        photos, pairs = (kept(config, network, kind) for kind in ("photos", "pairs"))
+        completion = Completion(config.widths).to(config.device)
+        averaged = fit(
+            completion,
+            partial(losses, config, photos, pairs, completion),
+            config.out / "training",
+            recipe_text(config),
+            steps=config.steps,
+            rate=config.rate,
+            save=config.save,
+            validate=config.save,
+        )
+        made = GuidedPAT(replace(network.config, completion=config.widths))
+        completion.load_state_dict(averaged.state_dict())
+        network.completion = completion.cpu()
+        made.load_state_dict(network.state_dict())
+        assert made.completion is not None
+        made.completion.half()
+        save_weights(made, config.out / "best.safetensors", facts={"recipe": recipe_text(config)})
+    return config.out / "best.safetensors"
+
+
+def kept(config: CompletionTraining, network: GuidedPAT, kind: str) -> list[Tensor]:
+    """Planes of photographs' pairs, or of stereo pairs, captured where they are not yet."""
+    folder = config.out / kind
+    folder.mkdir(parents=True, exist_ok=True)
+    found = []
+    for i, pair in enumerate(photo_pairs(config) if kind == "photos" else enlarged_pairs(config)):
+        file = folder / f"{i:05}.webp"
+        if not file.exists():
+            write_planes(captured(network, pair(), i)[:, : HW[0], -HW[1] :], file)
+        found.append(read_planes(file))
+    return found
+
+
+def photo_pairs(config: CompletionTraining) -> Iterator[partial[StereoPair]]:
+    """Those of photographs, made when they are called."""
+    suffixes = {".jpg", ".jpeg", ".png"}
+    files = [f for root in config.photos for f in files_below(root) if f.suffix.lower() in suffixes]
+    if not files:
+        raise ValueError(f"no photograph in {', '.join(map(str, config.photos))}: check the folders")
+    for i in range(config.captured):
+        other = int(np.random.default_rng(i).integers(len(files)))
+        yield partial(photo_pair, files[i % len(files)], files[other], i)
+
+
+def enlarged_pairs(config: CompletionTraining) -> Iterator[partial[StereoPair]]:
+    """Stereo pairs and their mirror images, each side as alpha, enlarged."""
+    pairs = of_half(middlebury_pairs(config.stereo), "tune") if config.stereo else ()
+    for pair in pairs:
+        for left, right in ((pair.left, pair.right), (pair.right.flip(-1), pair.left.flip(-1))):
+            for scale in ENLARGED:
+                yield partial(_enlarged, replace(pair, left=left, right=right), scale)
+
+
+def _enlarged(pair: StereoPair, scale: float) -> StereoPair:
+    def larger(image: Tensor) -> Tensor:
+        found = interpolate(image[None], scale_factor=scale, mode="bicubic")[0].clamp(0, 1)
+        h, w = (side // 8 * 8 for side in found.shape[1:])
+        return found[:, :h, :w]
+
+    assert pair.max_disparity is not None
+    left, right = map(larger, (pair.left, pair.right))
+    return StereoPair(pair.name, left, right, max_disparity=scale * pair.max_disparity)
+
+
+def losses(
+    config: CompletionTraining,
+    photos: Sequence[Tensor],
+    pairs: Sequence[Tensor],
+    network: Completion,
+    start: int,
+) -> Iterator[Tensor]:
+    """Of each step from one on: minus the mean PSNR of windows, as `image_loss`."""
+    for step in itertools.count(start):
+        g = generator_for(config.seed, "completion", step)
+        of = [pairs if pairs and i % 4 == 0 else photos for i in range(config.batch)]
+        planes = varied(torch.stack([window(some, config.side, g) for some in of]), g).to(config.device)
+        facts, truth = torch.cat([planes[:, :2], planes[:, 4:]], 1), planes[:, 2:4]
+        with torch.autocast(config.device, torch.bfloat16, enabled=config.device != "cpu"):
+            answer = network.answer(facts).float()
+        own, shares = answer.split([2, CANDIDATES], 1)
+        _, confidence, mixed, apart = facts.split([1, 1, 2, 2 * CANDIDATES], 1)
+        change = (shares[:, :, None] * apart.unflatten(1, (-1, 2))).sum(1) + (1 - confidence) * own
+        yield image_loss(*(from_luma_chroma(0 * confidence, c) for c in (mixed + change, truth)))
+
+
+def window(frames: Sequence[Tensor], side: int, g: Generator) -> Float[Tensor, "p n n"]:
+    """A random part of one of the frames; in three of ten cases at alpha's left, which no beta sees."""
+    frame = frames[below(len(frames), g)]
+    y, x = (below(n - side + 1, g) for n in frame.shape[1:])
+    x = 0 if below(10, g) < 3 else x
+    return values(frame[:, y : y + side, x : x + side])
+
+
+def varied(planes: Float[Tensor, "b p n n"], g: Generator) -> Float[Tensor, "b p n n"]:
+    """Flipped and transposed; colours of half of them of another hue, and all more or less saturated."""
+    for axes in ((-1,), (-2,)):
+        planes = planes.flip(axes) if below(2, g) else planes
+    planes = planes.mT if below(2, g) else planes
+    light, chroma = planes.split([2, planes.shape[1] - 2], 1)
+    b = len(planes)
+    angle = 2 * math.pi * torch.rand(b, generator=g) * torch.randint(2, (b,), generator=g)
+    size = (0.8 * torch.rand(b, generator=g) - 0.4).exp()
+    c, s = size * angle.cos(), size * angle.sin()
+    root = hue_axes()
+    turned = root.T @ torch.stack([torch.stack([c, -s], -1), torch.stack([s, c], -1)], -2) @ root.T.inverse()
+    found = torch.einsum("bij,bkjyx->bkiyx", turned, chroma.unflatten(1, (-1, 2))).flatten(1, 2)
+    return torch.cat([light, found], 1)
+
+
+def hue_axes() -> Float[Tensor, "2 2"]:
+    """Axes of chroma whose squares add up to those of red, green and blue: the inverse of that root."""
+    rgb = from_luma_chroma(torch.zeros(1, 1, 2), torch.eye(2)[:, None])[:, 0]
+    return torch.linalg.cholesky(rgb.T @ rgb).inverse()
+
+
+if __name__ == "__main__":
+    print(train_completion(tyro.cli(CompletionTraining, prog="python -m experiments.completion.training")))

@@ -1,0 +1,83 @@
+"""Colour completed: what no beta sees, and what is doubtful, by a network that has seen many photographs.
+
+Each way of filling in is right somewhere. The network weighs them pixel by pixel, the image as it is one of
+them, and adds what none of them has. It is trained apart from the rest, on what the rest gives for
+photographs cut into surfaces at random depths (`experiments.completion`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import pixel_shuffle, pixel_unshuffle
+
+from ..media.colour import from_luma_chroma, to_luma_chroma
+from ..support.settings import tuned
+from .blocks import UNet, channels_last
+
+CANDIDATES = 5
+"""Size: matched, propagated, diffused in two ways, by example."""
+BLOCKS = 2
+"""Size: residual blocks at each scale."""
+
+
+@dataclass(frozen=True)
+class CompletionSettings:
+    """Of what is done with the network's answer."""
+
+    strength: float = tuned(
+        0.5,
+        "Middlebury, tune half, of pairs that training did not see: so much of the change is taken: "
+        "photographs cut into surfaces need more of it than pairs do",
+    )
+
+
+SETTINGS = CompletionSettings()
+
+
+class Completion(nn.Module):
+    """A U-Net from half the size down, its widths at 1/2, 1/4 and 1/8; colours are bands minus alpha."""
+
+    def __init__(self, widths: tuple[int, ...]) -> None:
+        super().__init__()
+        self.unet = UNet(4 * (4 + 2 * CANDIDATES), widths, 4 * (3 + CANDIDATES), blocks=BLOCKS)
+        nn.init.zeros_(self.unet.last.weight)
+        start = torch.tensor([0.0, 0.0, 3.0] + [0.0] * CANDIDATES)  # the image as it is, mostly
+        self.unet.last.bias = nn.Parameter(start.repeat_interleave(4))
+
+    def forward(
+        self,
+        alpha: Float[Tensor, "b 1 h w"],
+        confidence: Float[Tensor, "b 1 h w"],
+        mixed: Float[Tensor, "b 3 h w"],
+        candidates: Sequence[Float[Tensor, "b 3 h w"]],
+    ) -> Float[Tensor, "b 3 h w"]:
+        """Colour in place of `mixed`. Where a match is certain, it is nearly that."""
+        apart = differences(confidence, mixed, candidates)
+        facts = [alpha, confidence, *(to_luma_chroma(colour)[1] for colour in (mixed, *apart))]
+        own, *shares = self.answer(torch.cat(facts, 1)).split([2] + [1] * CANDIDATES, 1)
+        change = sum(share * difference for share, difference in zip(shares, apart))
+        own = (1 - confidence) * from_luma_chroma(torch.zeros_like(alpha), own)
+        return mixed + SETTINGS.strength * (change + own)
+
+    def answer(self, facts: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
+        """The chroma to add where a match is not certain, and the candidates' shares; `facts` are alpha, the
+        confidence, and chroma of the image and of what each candidate differs by."""
+        middle = facts.new_tensor([0.5] + [0.0] * (facts.shape[1] - 1))[:, None, None]
+        found = pixel_shuffle(self.unet(channels_last(pixel_unshuffle(facts - middle, 2))), 2)
+        own, weights = found.split([2, 1 + CANDIDATES], 1)
+        return torch.cat([own, weights.softmax(1)[:, 1:]], 1)
+
+
+def differences(
+    confidence: Float[Tensor, "b 1 h w"],
+    mixed: Float[Tensor, "b 3 h w"],
+    candidates: Sequence[Float[Tensor, "b 3 h w"]],
+) -> list[Float[Tensor, "b 3 h w"]]:
+    """What the matched colour, and each other one the less certain that is, differs by from the image."""
+    matched, *fills = (candidate - mixed for candidate in candidates)
+    return [matched, *((1 - confidence) * fill for fill in fills)]
