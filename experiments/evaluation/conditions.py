@@ -349,13 +349,16 @@ Curves = Mapping[str, list[tuple[float, float]]]
 
 def save_curves(plots: Mapping[str, Curves], path: Path, *, ylabel: str) -> None:
     """Curves in one figure, a plot beside the other by the title of its x axis, written atomically."""
+    from matplotlib import colormaps
+
     figure = new_figure(figsize=(5 * len(plots), 4), layout="constrained")
     for i, (title, curves) in enumerate(plots.items()):
         axes = figure.add_subplot(1, len(plots), i + 1, xlabel=title, ylabel=ylabel)
+        axes.set_prop_cycle(color=colormaps["tab20"](range(20)))
         for name, points in curves.items():
             axes.plot(*zip(*points), marker="o", label=name)
         axes.grid(alpha=0.3)
-        axes.legend()
+        axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
     save_figure(figure, path)
 
 

@@ -125,7 +125,7 @@ class GuidedPAT(nn.Module):
     uses_matches = True
     halo = 528
     """Encoder 85, judge 176, confidence 8, what is recalled 224 (propagated 148), smoothing 34: the sum,
-    rounded up."""
+    rounded up. The completion reaches 156 further, by so little that 528 do."""
     beta_halo = 96
 
     def __init__(self, config: GuidedPATConfig = GuidedPATConfig()) -> None:
@@ -143,9 +143,9 @@ class GuidedPAT(nn.Module):
         self.completion = Completion(c.completion) if c.completion else None
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
-        """In what is recalled or completed; or around attention, one beta after the other, and the estimates of
-        others."""
-        most, last = max(betas, default=0), 350.0 if self.completion is None else 600.0
+        """In what is recalled or completed; or around attention, one beta after the other, and the estimates
+        of others."""
+        most, last = max(betas, default=0), 350.0 if self.completion is None else 640.0
         return max(last * alpha, 145.0 * alpha + 100.0 * most) + 130.0 * alpha * max(len(betas) - 1, 0)
 
     def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
