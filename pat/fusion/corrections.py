@@ -74,11 +74,12 @@ class Corrections:
         """The inputs put right; `hw` is alpha's size without padding."""
         if not self.response.is_rec601:
             of_beta = self.response.of_beta
-            betas = (replace(b, image=of_beta(b.image)) if _is_rgb(b) else b for b in inputs.betas)
-            inputs = replace(inputs, alpha=self.response.of_alpha(inputs.alpha), betas=tuple(betas))
+            even = (replace(b, image=of_beta(b.image)) if _is_rgb(b) else b for b in inputs.betas)
+            inputs = replace(inputs, alpha=self.response.of_alpha(inputs.alpha), betas=tuple(even))
         moves = self.misalignments or (Misalignment(),) * len(inputs.betas)
         moved = zip(inputs.betas, moves, strict=True)
-        return replace(inputs, betas=tuple(replace(b, field=m.applied(b.field, hw)) for b, m in moved))
+        betas = tuple(replace(b, field=m.applied(b.field, hw)) for b, m in moved)
+        return replace(inputs, betas=betas, sees_luma=self.response.explains)
 
     def described(self, betas: Sequence[str], hw: HW) -> list[str]:
         """A line for each thing that is put right, for betas by name; `hw` is alpha's size."""

@@ -55,7 +55,8 @@ class Inputs:
     Parts of betas are cut at whole multiples of `multiple` pixels, `beta_halo` pixels around the segments.
     `luminance` is alpha's share of the result's, for networks that keep it; the rest is beta's. `bands` are
     those of the result: so many, whose luminance (the mean, if they are not three) is what alpha sees, or
-    None: those of all betas, of which alpha may see any combination.
+    None: those of all betas, of which alpha may see any combination. `sees_luma` is whether RGB betas' luma
+    is about what alpha sees, as far as is known: not in the near infrared.
     """
 
     alpha: Float[Tensor, "b c h w"]
@@ -64,6 +65,7 @@ class Inputs:
     beta_halo: int = 0
     luminance: float = 1.0
     bands: int | None = None
+    sees_luma: bool = True
 
     @classmethod
     def of(cls, alpha: Tensor, images: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> Inputs:

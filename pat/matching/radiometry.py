@@ -101,6 +101,11 @@ class Response(NamedTuple):
         """Whether images need not be changed."""
         return self.gain == self.gamma == 1.0 and not self.shading and self.weights.tolist() == list(REC601)
 
+    @property
+    def explains(self) -> bool:
+        """Whether this is about what alpha sees."""
+        return self.explained >= SETTINGS.explained
+
     def __str__(self) -> str:
         red, green, blue = self.weights.tolist()
         gain = "" if self.gain == 1 else f" x {self.gain:.2f}"
@@ -181,7 +186,7 @@ def fit(
             shading = shading + _best(groups.explained_by(shading, vignetted=True)).further
         found.append(groups.explained_by(shading, vignetted=True))
     response = _best(chain(*found)).response
-    return response if response.explained >= SETTINGS.explained else Response.rec601()
+    return response if response.explains else Response.rec601()._replace(explained=response.explained)
 
 
 def _shading_terms(where: Float[Tensor, "n 2"]) -> Float[Tensor, "5 n"]:

@@ -165,23 +165,31 @@ class GuidedPAT(nn.Module):
         alpha, own = inputs.alpha, self.encoder(inputs.alpha)
         estimates = [self.estimate(own, alpha, *one) for one in zip(inputs.betas, matches.betas)]
         used = estimates if parts else [combined([e for e, n in zip(estimates, bands) if n == wanted])]
-        residual = self.blended(own, alpha, used)
+        residual = self.blended(own, alpha, used, complete=inputs.sees_luma)
         if self.config.keep_luminance:
             residual = residual - inputs.luminance * luminance(residual)
         output = output_of(alpha + residual, estimates)
         return (output if parts else output._replace(overall=used[0].confidence)), estimates
 
     def blended(
-        self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], estimates: Sequence[BetaEstimate]
+        self,
+        own: Encoded,
+        alpha: Float[Tensor, "b 1 h w"],
+        estimates: Sequence[BetaEstimate],
+        *,
+        complete: bool = False,
     ) -> Float[Tensor, "b c h w"]:
-        """What all bands have more than alpha: where the betas see it, and where not."""
+        """What all bands have more than alpha: where the betas see it, and where not.
+
+        The completion, if there is one, has seen bands of one certainty alone, and alphas that see luma.
+        """
         confidence = _joined([s.blending.expand_as(s.colour) for s in estimates])
         colour = _joined([s.colour for s in estimates])
         unseen, *fills = map(_joined, zip(*(self._fills(own, alpha, s) for s in estimates)))
         found = by_example(alpha, colour, confidence)
         unseen = with_examples(unseen, found, confidence)
         mixed = with_less_noise(alpha, torch.lerp(unseen, colour, confidence), confidence)
-        if self.completion is None or len(estimates) > 1:  # bands of several certainties: it has seen none
+        if self.completion is None or len(estimates) > 1 or not complete:
             return mixed
         return self.completion(alpha, confidence[:, :1], mixed, (colour, *fills, found))
 

@@ -3,6 +3,9 @@
 import pytest
 import torch
 
+from pat.fusion.corrections import Corrections
+from pat.matching.inputs import Inputs
+from pat.matching.radiometry import fit
 from pat.media.colour import luminance
 from pat.networks.completion import CANDIDATES, SETTINGS, Completion
 from pat.networks.guided import BetaEstimate, Encoded, GuidedPAT
@@ -61,7 +64,23 @@ def test_bands_of_several_betas_are_not_completed(shipped, monkeypatch):
     monkeypatch.setattr(network, "_fills", lambda own, alpha, e: (e.colour,) * (CANDIDATES - 1))
     plane = drawn(1)
     estimate = BetaEstimate(*[plane] * len(BetaEstimate._fields[:-1]))
-    assert network.blended(Encoded(plane, plane), plane, [estimate] * 3).shape == (1, 3, 48, 64)
+    assert network.blended(Encoded(plane, plane), plane, [estimate] * 3, complete=True).shape == (
+        1,
+        3,
+        48,
+        64,
+    )
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_colours_are_completed_if_alpha_sees_luma(alike):
+    """Not an alpha in the near infrared, whose pixels say little of colours: training had none."""
+    g = torch.Generator().manual_seed(0)
+    bands = torch.rand(3, 4000, generator=g) * 0.8 + 0.1
+    alpha = luminance(bands[..., None])[0, :, 0] if alike else torch.rand(4000, generator=g) * 0.8 + 0.1
+    corrections = Corrections(fit(bands, alpha))
+    assert corrections.applied(Inputs(drawn(1), ()), (48, 64)).sees_luma == alike
+    assert corrections.response.is_rec601
 
 
 def test_a_network_may_be_without(shipped):
