@@ -24,7 +24,7 @@ from experiments.evaluation.halves import of_half
 from experiments.fit import fit, recipe_text
 from pat.data.pairs import StereoPair, middlebury_pairs
 from pat.media.colour import from_luma_chroma
-from pat.networks.completion import CANDIDATES, Completion
+from pat.networks.completion import CANDIDATES, Completion, features
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import load_weights, save_weights
 from pat.sensors import generator_for
@@ -160,8 +160,9 @@ def losses(
         of = [pairs if pairs and i % 4 == 0 else photos for i in range(config.batch)]
         planes = varied(torch.stack([window(some, config.side, g) for some in of]), g).to(config.device)
         facts, truth = torch.cat([planes[:, :2], planes[:, 4:]], 1), planes[:, 2:4]
+        given = features(facts[:, :1], facts[:, 1:2], [facts[:, 2:]])
         with torch.autocast(config.device, torch.bfloat16, enabled=config.device != "cpu"):
-            answer = network.answer(facts).float()
+            answer = network.answer(given).float()
         own, shares = answer.split([2, CANDIDATES], 1)
         _, confidence, mixed, apart = facts.split([1, 1, 2, 2 * CANDIDATES], 1)
         change = (shares[:, :, None] * apart.unflatten(1, (-1, 2))).sum(1) + (1 - confidence) * own

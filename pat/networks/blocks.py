@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -10,9 +11,13 @@ from torch import Tensor, nn
 from torch.nn.functional import pixel_unshuffle
 from torch.utils._pytree import tree_map
 
+from arraygeom.chunks import chunked
 from arraygeom.fields.protocol import compilable
 
 from .unshuffle_numba import unshuffle
+
+ROWS = 64
+"""Rows at a time of a U-Net's largest stages."""
 
 
 class ResidualBlock(nn.Module):
@@ -96,7 +101,7 @@ class UNet(nn.Module):
     def __init__(self, inputs: int, widths: tuple[int, ...], outputs: int, *, blocks: int = 1) -> None:
         super().__init__()
         a, b, c = widths
-        dilations = (1, 2) * blocks
+        dilations, self.halo = (1, 2) * blocks, 2 * blocks + 1
         self.first = nn.Sequential(conv(inputs, a), *_residual(a, blocks))
         self.second = nn.Sequential(conv(a, b, stride=2), *_residual(b, blocks))
         self.third = nn.Sequential(conv(b, c, stride=2), *(ResidualBlock(c, dilation=d) for d in dilations))
@@ -106,10 +111,19 @@ class UNet(nn.Module):
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
         """The same size; sides are multiples of 4."""
-        first = self.first(x)
+        first = self._in_rows(self.first, x)
         second = self.second(first)
         second = self.back_b(second + enlarge(self.up_b(self.third(second))))
-        return self.last(self.back_a(first + enlarge(self.up_a(second))))
+        return self._in_rows(self._finished, first, enlarge(self.up_a(second)))
+
+    def _finished(self, first: Tensor, more: Tensor) -> Tensor:
+        return self.last(self.back_a(first + more))
+
+    def _in_rows(self, stage: Callable[..., Tensor], *images: Tensor) -> Tensor:
+        """A stage at the largest size, which takes most of the memory, of some rows at a time."""
+        if torch.is_grad_enabled():
+            return stage(*images)
+        return chunked(stage, *images, rows=ROWS, halo=self.halo)
 
 
 def _residual(dim: int, count: int) -> list[ResidualBlock]:

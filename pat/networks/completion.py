@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import pixel_shuffle, pixel_unshuffle
+from torch.nn.functional import pixel_shuffle
 
 from ..media.colour import from_luma_chroma, to_luma_chroma
 from ..support.settings import tuned
-from .blocks import UNet, channels_last
+from .blocks import UNet, stacked
 
 CANDIDATES = 5
 """Size: matched, propagated, diffused in two ways, by example."""
@@ -57,20 +57,28 @@ class Completion(nn.Module):
         candidates: Sequence[Float[Tensor, "b 3 h w"]],
     ) -> Float[Tensor, "b 3 h w"]:
         """Colour in place of `mixed`. Where a match is certain, it is nearly that."""
+        colours = differences(confidence, mixed, candidates)
+        given = features(alpha, confidence, [to_luma_chroma(colour)[1] for colour in (mixed, *colours)])
+        del colours
+        own, *shares = self.answer(given).split([2] + [1] * CANDIDATES, 1)
         apart = differences(confidence, mixed, candidates)
-        facts = [alpha, confidence, *(to_luma_chroma(colour)[1] for colour in (mixed, *apart))]
-        own, *shares = self.answer(torch.cat(facts, 1)).split([2] + [1] * CANDIDATES, 1)
         change = sum(share * difference for share, difference in zip(shares, apart))
         own = (1 - confidence) * from_luma_chroma(torch.zeros_like(alpha), own)
         return mixed + SETTINGS.strength * (change + own)
 
-    def answer(self, facts: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
-        """The chroma to add where a match is not certain, and the candidates' shares; `facts` are alpha, the
-        confidence, and chroma of the image and of what each candidate differs by."""
-        middle = facts.new_tensor([0.5] + [0.0] * (facts.shape[1] - 1))[:, None, None]
-        found = pixel_shuffle(self.unet(channels_last(pixel_unshuffle(facts - middle, 2))), 2)
-        own, weights = found.split([2, 1 + CANDIDATES], 1)
+    def answer(self, given: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o 2*h 2*w"]:
+        """The chroma to add where a match is not certain, and the candidates' shares, by `features`."""
+        own, weights = pixel_shuffle(self.unet(given), 2).split([2, 1 + CANDIDATES], 1)
         return torch.cat([own, weights.softmax(1)[:, 1:]], 1)
+
+
+def features(
+    alpha: Float[Tensor, "b 1 h w"],
+    confidence: Float[Tensor, "b 1 h w"],
+    colours: Sequence[Float[Tensor, "b _ h w"]],
+) -> Float[Tensor, "b i h/2 w/2"]:
+    """What the network is given; `colours` are chroma of the image and of what each candidate differs by."""
+    return stacked(alpha[:, :0, ::2, ::2], alpha - 0.5, confidence, *colours)
 
 
 def differences(

@@ -145,7 +145,7 @@ class GuidedPAT(nn.Module):
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
         """In what is recalled or completed; or around attention, one beta after the other, and the estimates
         of others."""
-        most, last = max(betas, default=0), 350.0 if self.completion is None else 640.0
+        most, last = max(betas, default=0), 350.0 if self.completion is None else 580.0
         return max(last * alpha, 145.0 * alpha + 100.0 * most) + 130.0 * alpha * max(len(betas) - 1, 0)
 
     def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
