@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -18,6 +18,44 @@ from pat.training.checkpoints import collect, newest_checkpoint, restore, write_
 
 Losses = Callable[[int], Iterator[Tensor]]
 """The loss of each step from a given one on, computed when it is asked for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """What training runs of windows have in common. The same command continues a run that stopped."""
+
+    out: Path
+    """Folder for weights, checkpoints, and what else a run keeps."""
+    steps: int
+    """Steps of training."""
+    batch: int
+    """Windows in a batch."""
+    side: int
+    """Side of a window, pixels."""
+    rate: float = 1e-3
+    """Learning rate of Adam, which falls along half a cosine."""
+    save: int = 250
+    """Steps between checkpoints."""
+    seed: int = 0
+    """Random seed."""
+    device: str = "cpu"
+    """Where training runs."""
+
+    def train(self, network: nn.Module, losses: Losses) -> None:
+        """Train a network, or the rest of a run, and leave the averaged weights in it, on the CPU."""
+        recipe = recipe_text(self)
+        averaged = fit(
+            network,
+            losses,
+            self.out / "training",
+            recipe,
+            steps=self.steps,
+            rate=self.rate,
+            save=self.save,
+            validate=self.save,
+        )
+        network.load_state_dict(averaged.state_dict())
+        network.cpu()
 
 
 def fit(

@@ -21,7 +21,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
 from experiments.evaluation.halves import of_half
-from experiments.fit import fit, recipe_text
+from experiments.fit import Recipe, recipe_text
 from pat.data.pairs import StereoPair, middlebury_pairs
 from pat.media.colour import from_luma_chroma
 from pat.networks.completion import CANDIDATES, Completion, features
@@ -40,16 +40,15 @@ ENLARGED = (1.1, 1.3)
 """Pairs are enlarged so many times."""
 
 
-@dataclass(frozen=True)
-class CompletionTraining:
-    """A recipe. The same command continues a run that stopped."""
+@dataclass(frozen=True, kw_only=True)
+class CompletionTraining(Recipe):
+    """A recipe; a quarter of the windows are of stereo pairs if there are some."""
 
     photos: tuple[Path, ...]
     """Folders of photographs."""
     stereo: Path | None = None
     """Folder of Middlebury's pairs; those of the tune half are used."""
     out: Path = Path("runs/completion")
-    """Folder for what is captured, checkpoints, and weights."""
     fusion: str = "mono-colour"
     """Weights that the completion is for; one that they have is replaced."""
     captured: int = 850
@@ -57,19 +56,8 @@ class CompletionTraining:
     widths: tuple[int, int, int] = (64, 96, 128)
     """Channels at 1/2, 1/4 and 1/8 of the size."""
     steps: int = 8000
-    """Steps of training."""
     batch: int = 16
-    """Windows in a batch, a quarter of them of pairs if there are some."""
     side: int = 256
-    """Side of a window, pixels."""
-    rate: float = 1e-3
-    """Learning rate."""
-    save: int = 250
-    """Steps between checkpoints."""
-    seed: int = 0
-    """Random seed."""
-    device: str = "cpu"
-    """Where training runs."""
 
 
 def train_completion(config: CompletionTraining) -> Path:
@@ -83,19 +71,9 @@ def train_completion(config: CompletionTraining) -> Path:
         assert isinstance(network, GuidedPAT)
         photos, pairs = (kept(config, network, kind) for kind in ("photos", "pairs"))
         completion = Completion(config.widths).to(config.device)
-        averaged = fit(
-            completion,
-            partial(losses, config, photos, pairs, completion),
-            config.out / "training",
-            recipe_text(config),
-            steps=config.steps,
-            rate=config.rate,
-            save=config.save,
-            validate=config.save,
-        )
+        config.train(completion, partial(losses, config, photos, pairs, completion))
         made = GuidedPAT(replace(network.config, completion=config.widths))
-        completion.load_state_dict(averaged.state_dict())
-        network.completion = completion.cpu()
+        network.completion = completion
         made.load_state_dict(network.state_dict())
         assert made.completion is not None
         made.completion.half()

@@ -16,7 +16,7 @@ import tyro
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from experiments.fit import fit, recipe_text
+from experiments.fit import Recipe, recipe_text
 from pat.media.colour import luminance
 from pat.networks.denoiser import LowLightNetwork
 from pat.networks.weights import load_denoiser, save_weights
@@ -27,32 +27,20 @@ from pat.synthesis.rigs import below
 from pat.training.losses import image_loss
 
 
-@dataclass(frozen=True)
-class DenoiserTraining:
-    """A recipe. The same command continues a run that stopped; its result is an uninterrupted run's."""
+@dataclass(frozen=True, kw_only=True)
+class DenoiserTraining(Recipe):
+    """A recipe; windows of a batch are of each network."""
 
     photos: tuple[Path, ...] = ()
     """Folders of photographs."""
     out: Path = Path("runs/low-light")
-    """Folder for weights and checkpoints."""
     start: Path | None = None
     """File of weights to go on from."""
     steps: int = 7000
-    """Steps of training."""
     batch: int = 64
-    """Windows in a batch, of each network."""
     side: int = 128
-    """Side of a window, pixels."""
-    rate: float = 1e-3
-    """Learning rate of Adam, which falls along half a cosine."""
-    save: int = 250
-    """Steps between checkpoints."""
-    seed: int = 0
-    """Random seed."""
     cache: Path | None = None
     """File (.npz) that caches the photographs."""
-    device: str = "cpu"
-    """Where training runs."""
 
 
 def train_denoiser(config: DenoiserTraining) -> Path:
@@ -65,19 +53,9 @@ def train_denoiser(config: DenoiserTraining) -> Path:
         network = load_denoiser(config.start).requires_grad_(True) if config.start else LowLightNetwork()
         network = network.to(config.device)
         bank = PhotoBank.load(*config.photos, cache=config.cache, seed=config.seed)
-        averaged = fit(
-            network,
-            partial(losses, config, bank, network),
-            config.out / "training",
-            recipe_text(config),
-            steps=config.steps,
-            rate=config.rate,
-            save=config.save,
-            validate=config.save,
-        )
+        config.train(network, partial(losses, config, bank, network))
         facts = {"recipe": recipe_text(config)}
-        network.load_state_dict(averaged.state_dict())
-        save_weights(network.cpu().half(), config.out / "best.safetensors", facts=facts)
+        save_weights(network.half(), config.out / "best.safetensors", facts=facts)
     return config.out / "best.safetensors"
 
 

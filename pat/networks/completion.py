@@ -15,12 +15,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import pixel_shuffle
 
+from ..matching.colour_transfer import FILLS
 from ..media.colour import from_luma_chroma, to_luma_chroma
 from ..support.settings import tuned
 from .blocks import UNet, stacked
 
-CANDIDATES = 5
-"""Size: matched, propagated, diffused in two ways, by example."""
+CANDIDATES = 3 + FILLS
+"""Size: matched, propagated, diffused in each way, by example."""
 BLOCKS = 2
 """Size: residual blocks at each scale."""
 

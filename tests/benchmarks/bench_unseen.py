@@ -51,9 +51,11 @@ FILL_NAMES = ("propagated", "diffused by brightness", "diffused")
 
 
 def filled_by(network: GuidedPAT, fill: int | None) -> None:
-    """Let a network fill in one way, the number of `BetaEstimate.choice`; None: by its own choice."""
+    """Let a network fill in one way, the number of `BetaEstimate.choice`, and complete nothing; None: as it
+    does."""
     if fill is None:
-        vars(network).pop("_fills", None)
+        for name in ("_fills", "blended"):
+            vars(network).pop(name, None)
         return
 
     def alone(self: GuidedPAT, own: Encoded, alpha: Tensor, estimate: BetaEstimate) -> tuple[Tensor, ...]:
@@ -63,6 +65,7 @@ def filled_by(network: GuidedPAT, fill: int | None) -> None:
         )
 
     vars(network)["_fills"] = MethodType(alone, network)
+    vars(network)["blended"] = lambda *given, complete: GuidedPAT.blended(network, *given)
 
 
 def images_of(network: GuidedPAT, pair: StereoPair) -> tuple[dict[str, Tensor], Tensor]:

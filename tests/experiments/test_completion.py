@@ -72,13 +72,13 @@ def test_a_photograph_must_be_one(tmp_path):
     with pytest.raises(ValueError, match="not an image"):
         photo_pair(tmp_path / "a.png", tmp_path / "a.png", 0)
     with pytest.raises(ValueError, match="no photograph"):
-        train_completion(CompletionTraining((tmp_path / "empty",), out=tmp_path / "out"))
+        train_completion(CompletionTraining(photos=(tmp_path / "empty",), out=tmp_path / "out"))
 
 
 @pytest.mark.slow
 def test_a_completion_is_captured_and_trained(tmp_path):
     config = CompletionTraining(
-        (photographs(tmp_path / "photos"),),
+        photos=(photographs(tmp_path / "photos"),),
         out=tmp_path / "out",
         captured=2,
         widths=(4, 4, 4),

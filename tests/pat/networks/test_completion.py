@@ -70,6 +70,7 @@ def test_bands_of_several_betas_are_not_completed(shipped, monkeypatch):
         48,
         64,
     )
+    network.blended(Encoded(plane, plane), plane, [estimate], complete=False)  # alpha sees something else
 
 
 @pytest.mark.parametrize("alike", [True, False])
