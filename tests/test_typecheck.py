@@ -12,7 +12,7 @@ from torch import Tensor
 
 from arraygeom import Camera, Pose, intrinsics, sample
 from pat.media.colour import from_luma_chroma
-from pat.networks.blocks import enlarge
+from pat.support.blocks import enlarge
 
 from .typecheck import WITH_ARGUMENTS, jaxtyped, of_types
 

@@ -34,6 +34,8 @@ QUALITY = 88
 LEVELS = 180.0
 """Levels of 8 bits to 1, of chroma."""
 PLANES = 2 + 2 * (2 + CANDIDATES)
+HIGHEST = 16383 // PLANES
+"""Rows of a frame at most, as WebP has them."""
 
 
 class Recorder(Completion):
@@ -50,18 +52,23 @@ class Recorder(Completion):
         return mixed
 
 
-def captured(network: GuidedPAT, pair: StereoPair, seed: int) -> Float[Tensor, "p h w"]:
-    """The planes of a pair recorded at random, left as alpha; its largest disparity must be known."""
+def fused_at_random(network: GuidedPAT, pair: StereoPair, seed: int, **options: Any) -> Tensor:
+    """Fuse a pair recorded at random, left as alpha, its largest disparity known; returns left as it is."""
     assert pair.max_disparity is not None
     rng, g = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     alpha, beta, truth = mono_colour_task(pair, int(rng.choice(RATES)))
-    noise: dict[str, Any] = {}
     if rng.random() < NOISY:
         level = NoiseLevel.of_electrons(float(np.exp(rng.uniform(np.log(50), np.log(2000)))), READ_NOISE)
         alpha, beta = (level.recorded(image[None], g)[0] for image in (alpha, beta))
-        noise = {"noise": {"alpha": level, "beta": level}}
+        options = {**options, "noise": {"alpha": level, "beta": level}}
+    rectified_fusion(network, response="rec601", align=False, **options)(alpha, beta, pair.max_disparity)
+    return truth
+
+
+def captured(network: GuidedPAT, pair: StereoPair, seed: int) -> Float[Tensor, "p h w"]:
+    """The planes of a pair recorded at random, left as alpha; its largest disparity must be known."""
     recorder = network.completion = Recorder()
-    rectified_fusion(network, response="rec601", align=False, **noise)(alpha, beta, pair.max_disparity)
+    truth = fused_at_random(network, pair, seed)
     own, confidence, mixed, candidates = recorder.given
     colours = [to_luma_chroma(c)[1] for c in (mixed, *differences(confidence, mixed, candidates))]
     h, w = truth.shape[1:]

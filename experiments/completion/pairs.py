@@ -1,25 +1,116 @@
-"""Stereo pairs of single photographs: cut into their regions, each a surface at a depth of its own.
+"""Pairs to learn from: of single photographs, and real ones in other colours and sizes.
 
-Edges of depth are then edges of things, as in real pairs, and what is hidden is texture of photographs. Left
-is the photograph itself.
+A photograph is cut into its regions, each a surface at a depth of its own. Edges of depth are then edges of
+things, as in real pairs, and what is hidden is texture of photographs. Left is the photograph itself.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float
 from numpy.typing import NDArray
 from skimage.segmentation import felzenszwalb
+from torch import Tensor
+from torch.nn.functional import interpolate
 
-from pat.data.pairs import StereoPair
+from experiments.evaluation.halves import of_half
+from experiments.fit import Recipe
+from pat.data.pairs import Disparity, StereoPair, folder_pairs, middlebury_pairs
+from pat.media.images import read_image
+from pat.support.folders import files_below
 
 Image = NDArray[np.float32]
 HW = (320, 448)
 MOST = 80.0
 """Disparity, pixels."""
+MARGIN = 15.0
+"""Pixels by which the disparities that are searched exceed those there are."""
+Made = partial[StereoPair]
+"""A pair that is made when it is called."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairTraining(Recipe):
+    """What is learned from pairs."""
+
+    photos: tuple[Path, ...]
+    """Folders of photographs."""
+    stereo: Path | None = None
+    """Folder of Middlebury's pairs; those of the tune half are used."""
+    others: tuple[Path, ...] = ()
+    """Folders of other pairs, of the tune half too."""
+    captured: int = 850
+    """Photographs' pairs that are fused."""
+    varied: int = 600
+    """And real ones, in other colours and sizes."""
+
+    def photo_pairs(self) -> Iterator[Made]:
+        """Those of photographs. Raises ValueError where there are none."""
+        suffixes = {".jpg", ".jpeg", ".png"}
+        files = [f for root in self.photos for f in files_below(root) if f.suffix.lower() in suffixes]
+        if not files:
+            raise ValueError(f"no photograph in {', '.join(map(str, self.photos))}: check the folders")
+        for i in range(self.captured):
+            other = int(np.random.default_rng(i).integers(len(files)))
+            yield partial(photo_pair, files[i % len(files)], files[other], i)
+
+    def real_pairs(self) -> Iterator[Made]:
+        """Stereo pairs and their mirror images, each side as alpha, in turns."""
+        pairs = [*of_half(middlebury_pairs(self.stereo), "tune")] if self.stereo else []
+        both = [pair for one in pairs for pair in (one, _mirrored(one, self.stereo))]
+        for root in self.others:
+            both += [p for one in of_half(folder_pairs(root), "tune") for p in (one, _mirrored(one))]
+        for i in range(self.varied if both else 0):
+            yield partial(varied_pair, both[i % len(both)], i)
+
+
+def _mirrored(pair: StereoPair, root: Path | None = None) -> StereoPair:
+    """The mirror image, right as alpha, with Middlebury's true disparity of that."""
+    left, right = pair.right.flip(-1), pair.left.flip(-1)
+    if root is None or pair.max_disparity is None:
+        return replace(pair, left=left, right=right)
+    stated = read_image(root / pair.name / "disp5.png")[0].flip(-1) * pair.max_disparity
+    return replace(pair, left=left, right=right, disparity=Disparity(stated, stated > 0))
+
+
+def varied_pair(pair: StereoPair, seed: int) -> StereoPair:
+    """A pair of another size and in other colours: bands exchanged, mixed, brighter and darker."""
+    rng = np.random.default_rng(seed)
+    size, wide = pair.left.shape[1:], pair.left.shape[2] > 1.5 * HW[1]
+    scale = rng.uniform(0.6, 1.0) if wide else rng.uniform(0.9, 1.45)
+    height, width = (max(round(n * scale), least) // 8 * 8 for n, least in zip(size, HW))
+
+    def larger(image: Tensor, mode: str = "bicubic") -> Tensor:
+        smooth = {"antialias": True} if mode == "bicubic" else {}
+        return interpolate(image[None], (height, width), mode=mode, **smooth)[0]
+
+    images = _recoloured([larger(image).clamp(0, 1) for image in (pair.left, pair.right)], rng)
+    most, truth = pair.max_disparity, None
+    if pair.disparity is not None:
+        value, valid = (larger(part[None].float(), "nearest")[0] for part in pair.disparity)
+        truth = Disparity(value * width / size[1], valid > 0)
+        most = float(pair.disparity.value.max())
+    assert most is not None
+    return StereoPair(f"{pair.name} {seed}", *images, most * width / size[1] + MARGIN, truth)
+
+
+def _recoloured(images: Sequence[Float[Tensor, "3 h w"]], rng: np.random.Generator) -> list[Tensor]:
+    """Images with their bands exchanged, other curves, and mixed; 0..1."""
+    drawn = rng.permutation(3), rng.uniform(0.65, 1.5, (3, 1, 1)), np.eye(3) + rng.normal(0, 0.25, (3, 3))
+    bands, curve, mix = map(torch.from_numpy, drawn)
+    changed = [x[bands].clamp(min=1e-4) ** curve.float() for x in images]
+    changed = [torch.einsum("ij,jyx->iyx", mix.float(), x) for x in changed]
+    of_all = torch.cat([x.flatten(1)[:, ::7] for x in changed], 1)
+    low, high = torch.quantile(of_all, torch.tensor([0.002, 0.998]), dim=1)[:, :, None, None]
+    low = low.clamp(max=0)
+    return [((x - low) / (high - low).clamp(min=1)).clamp(0, 1) for x in changed]
 
 
 def photo_pair(path: Path, behind: Path, seed: int) -> StereoPair:
@@ -37,7 +128,10 @@ def photo_pair(path: Path, behind: Path, seed: int) -> StereoPair:
     planes = _planes(regions, rng)
     right = _seen_from_right(left, other, regions, planes)
     one, two = (torch.from_numpy(np.ascontiguousarray(x)).movedim(-1, 0) for x in (left, right))
-    return StereoPair(f"{path.stem} {seed}", one, two, max_disparity=MOST + 20)
+    (base, sx, sy), (y, x) = planes[regions, :3].transpose(2, 0, 1), np.indices(regions.shape)
+    truth = torch.from_numpy((base + sx * x + sy * y).astype(np.float32))
+    known = Disparity(truth, torch.ones_like(truth, dtype=torch.bool))
+    return StereoPair(f"{path.stem} {seed}", one, two, MOST + MARGIN, known)
 
 
 def _window(path: Path, rng: np.random.Generator) -> Image:

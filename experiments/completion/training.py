@@ -13,46 +13,32 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
 import tyro
 from jaxtyping import Float
 from torch import Generator, Tensor
-from torch.nn.functional import interpolate
 
-from experiments.evaluation.halves import of_half
-from experiments.fit import Recipe, recipe_text
-from pat.data.pairs import StereoPair, middlebury_pairs
+from experiments.fit import recipe_text
 from pat.media.colour import from_luma_chroma
 from pat.networks.completion import CANDIDATES, Completion, features
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import load_weights, save_weights
 from pat.sensors import generator_for
-from pat.support.folders import files_below
 from pat.support.locks import folder_lock
 from pat.synthesis.rigs import below
 from pat.training.losses import image_loss
 
-from .capture import captured, read_planes, values, write_planes
-from .pairs import HW, photo_pair
-
-ENLARGED = (1.1, 1.3)
-"""Pairs are enlarged so many times."""
+from .capture import HIGHEST, captured, read_planes, values, write_planes
+from .pairs import PairTraining
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompletionTraining(Recipe):
-    """A recipe; a quarter of the windows are of stereo pairs if there are some."""
+class CompletionTraining(PairTraining):
+    """A recipe; half of the windows are of real pairs if there are some."""
 
-    photos: tuple[Path, ...]
-    """Folders of photographs."""
-    stereo: Path | None = None
-    """Folder of Middlebury's pairs; those of the tune half are used."""
     out: Path = Path("runs/completion")
     fusion: str = "mono-colour"
     """Weights that the completion is for; one that they have is replaced."""
-    captured: int = 850
-    """Photographs' pairs that are fused."""
     widths: tuple[int, int, int] = (64, 96, 128)
     """Channels at 1/2, 1/4 and 1/8 of the size."""
     steps: int = 8000
@@ -86,43 +72,12 @@ def kept(config: CompletionTraining, network: GuidedPAT, kind: str) -> list[Tens
     folder = config.out / kind
     folder.mkdir(parents=True, exist_ok=True)
     found = []
-    for i, pair in enumerate(photo_pairs(config) if kind == "photos" else enlarged_pairs(config)):
+    for i, pair in enumerate(config.photo_pairs() if kind == "photos" else config.real_pairs()):
         file = folder / f"{i:05}.webp"
         if not file.exists():
-            write_planes(captured(network, pair(), i)[:, : HW[0], -HW[1] :], file)
+            write_planes(captured(network, pair(), i)[:, :HIGHEST], file)
         found.append(read_planes(file))
     return found
-
-
-def photo_pairs(config: CompletionTraining) -> Iterator[partial[StereoPair]]:
-    """Those of photographs, made when they are called."""
-    suffixes = {".jpg", ".jpeg", ".png"}
-    files = [f for root in config.photos for f in files_below(root) if f.suffix.lower() in suffixes]
-    if not files:
-        raise ValueError(f"no photograph in {', '.join(map(str, config.photos))}: check the folders")
-    for i in range(config.captured):
-        other = int(np.random.default_rng(i).integers(len(files)))
-        yield partial(photo_pair, files[i % len(files)], files[other], i)
-
-
-def enlarged_pairs(config: CompletionTraining) -> Iterator[partial[StereoPair]]:
-    """Stereo pairs and their mirror images, each side as alpha, enlarged."""
-    pairs = of_half(middlebury_pairs(config.stereo), "tune") if config.stereo else ()
-    for pair in pairs:
-        for left, right in ((pair.left, pair.right), (pair.right.flip(-1), pair.left.flip(-1))):
-            for scale in ENLARGED:
-                yield partial(_enlarged, replace(pair, left=left, right=right), scale)
-
-
-def _enlarged(pair: StereoPair, scale: float) -> StereoPair:
-    def larger(image: Tensor) -> Tensor:
-        found = interpolate(image[None], scale_factor=scale, mode="bicubic")[0].clamp(0, 1)
-        h, w = (side // 8 * 8 for side in found.shape[1:])
-        return found[:, :h, :w]
-
-    assert pair.max_disparity is not None
-    left, right = map(larger, (pair.left, pair.right))
-    return StereoPair(pair.name, left, right, max_disparity=scale * pair.max_disparity)
 
 
 def losses(
@@ -135,7 +90,7 @@ def losses(
     """Of each step from one on: minus the mean PSNR of windows, as `image_loss`."""
     for step in itertools.count(start):
         g = generator_for(config.seed, "completion", step)
-        of = [pairs if pairs and i % 4 == 0 else photos for i in range(config.batch)]
+        of = [pairs if pairs and i % 2 == 0 else photos for i in range(config.batch)]
         planes = varied(torch.stack([window(some, config.side, g) for some in of]), g).to(config.device)
         facts, truth = torch.cat([planes[:, :2], planes[:, 4:]], 1), planes[:, 2:4]
         given = features(facts[:, :1], facts[:, 1:2], [facts[:, 2:]])

@@ -16,6 +16,7 @@ from arraygeom import Segments
 
 from ..support.settings import size
 from .certainty import with_certainty
+from .choice import chosen
 from .colour_transfer import transferred
 from .inputs import Inputs
 from .matches import BetaMatches, Matches, is_consistent
@@ -59,12 +60,13 @@ def match(inputs: Inputs) -> Matches:
 @torch.no_grad()
 def located(inputs: Inputs) -> Matches:
     """Where alpha's pixels are in each beta, no colours; of several calibrated betas, where all agree."""
-    alone = Matches(tuple(located_in_one(one) for one in inputs.by_beta))
+    alone = Matches(tuple(chosen(one, located_in_one(one)) for one in inputs.by_beta))
     return agreed(inputs, with_certainty(alone)) if inputs.can_agree else alone
 
 
 def located_in_one(inputs: Inputs) -> BetaMatches:
-    """The matches in the one beta: at half the size for the whole frame, then at full size around those."""
+    """Semi-global matches in the one beta: at half the size for the whole frame, then at full size around
+    those."""
     LOG.info("matching a beta")
     comparison = Comparison.of(inputs.alpha, inputs.betas[0].image, seen_mix(inputs))
     halves = comparison.half_views(inputs.alpha, inputs.betas[0].image)

@@ -17,8 +17,8 @@ from torch.nn.functional import pixel_shuffle
 
 from ..matching.colour_transfer import FILLS
 from ..media.colour import from_luma_chroma, to_luma_chroma
+from ..support.blocks import UNet, stacked
 from ..support.settings import tuned
-from .blocks import UNet, stacked
 
 CANDIDATES = 3 + FILLS
 """Size: matched, propagated, diffused in each way, by example."""

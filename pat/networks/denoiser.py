@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from torch.nn.functional import pad, pixel_shuffle, pixel_unshuffle
 
 from ..media.colour import OPPONENT
+from ..support.blocks import UNet, channels_last
 from ..support.settings import size
-from .blocks import UNet, channels_last
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,8 @@ from ..matching.likeness import likeness
 from ..matching.matches import BetaMatches, Matches
 from ..matching.positions import FINE, Extent, matches
 from ..media.colour import luminance
+from ..support.blocks import ResidualBlock, UNet, channels_last, conv, enlarge, stacked
 from ..support.settings import size, tuned
-from .blocks import ResidualBlock, UNet, channels_last, conv, enlarge, stacked
 from .completion import Completion
 from .configs import GuidedPATConfig
 from .protocol import FusionOutput, JoinsBands, required

@@ -20,8 +20,8 @@ from arraygeom.fields.grid import FieldOnGrid
 from ..attention.scores import Compared
 from ..matching.inputs import Inputs
 from ..matching.matches import Matches
+from ..support.blocks import ResidualASPP, ResidualBlock
 from .authors import read_authors
-from .blocks import ResidualASPP, ResidualBlock
 from .configs import PATConfig
 from .protocol import FusionOutput, JoinsBands
 

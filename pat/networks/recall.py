@@ -22,8 +22,8 @@ from arraygeom.pixels import pixel_grid
 
 from ..attention import attend
 from ..matching.filters import box_mean
+from ..support.blocks import enlarge
 from ..support.settings import size, tuned
-from .blocks import enlarge
 
 
 @dataclass(frozen=True)

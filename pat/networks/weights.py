@@ -13,10 +13,10 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
+from ..support.blocks import in_bfloat16
 from ..support.schema import from_document
 from ..support.tensor_files import undamaged, write_tensors
 from .bandwise import BandwisePAT
-from .blocks import in_bfloat16
 from .configs import CONFIGS
 from .denoiser import DenoiserConfig, LowLightNetwork
 from .guided import GuidedPAT

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pat.networks.blocks import plain, stacked
+from pat.support.blocks import plain, stacked
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

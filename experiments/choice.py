@@ -1,0 +1,191 @@
+"""Training of the choice between disparities: `python -m experiments.choice --photos DIR --stereo DIR`.
+
+First pairs with true disparity are matched, photographs cut into surfaces and real ones, and what the choice
+is by is kept; then it is trained on random windows of those. Everything is exact: the score of a candidate
+is to be high if it is near the true disparity.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+import tyro
+from jaxtyping import Float
+from safetensors.torch import load_file
+from torch import Generator, Tensor
+
+from arraygeom import Segments, pixel_grid
+from experiments.completion.capture import fused_at_random
+from experiments.completion.pairs import Made, PairTraining
+from experiments.fit import recipe_text
+from pat.data.pairs import StereoPair
+from pat.matching.certainty import typical_facts
+from pat.matching.choice import Choice, candidates, features
+from pat.matching.inputs import Inputs
+from pat.matching.match import located_in_one, match
+from pat.matching.matches import BetaMatches, Matches
+from pat.matching.normalisation import ComparedViews, Comparison, Normalisation
+from pat.matching.positions import FINE
+from pat.media.colour import to_bytes
+from pat.networks.guided import GuidedPAT
+from pat.networks.weights import load_weights
+from pat.sensors import generator_for
+from pat.support.locks import folder_lock
+from pat.support.tensor_files import write_tensors
+from pat.synthesis.rigs import below
+
+NEAR = 0.8
+"""A candidate so many pixels from the true disparity scores half."""
+FAR = 0.05
+"""Of the score, for which all candidates compete, however far off."""
+OTHER = 0.35
+"""Share of windows whose alpha is of another response than beta, so that brightness tells less."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChoiceTraining(PairTraining):
+    """A recipe; half of the windows are of real pairs if there are some."""
+
+    out: Path = Path("runs/choice")
+    fusion: str = "mono-colour"
+    """Weights of the fusion, which corrects and denoises before it matches."""
+    steps: int = 8000
+    batch: int = 16
+    side: int = 256
+    rate: float = 1.5e-3
+
+
+class Kept(NamedTuple):
+    """Of a pair: alpha and beta as they were compared (1, h, w), what matching found and its facts, the true
+    disparity, 0 where it is not known, (1, h, w); and blurs (2,)."""
+
+    alpha: Tensor
+    beta: Tensor
+    disparity: Tensor
+    facts: Tensor
+    truth: Tensor
+    blurs: Tensor
+
+    def rows(self, top: int, count: int) -> Kept:
+        """Some of all rows; the blurs are the same."""
+        half = slice(top // FINE, (top + count) // FINE)
+        cut = {n: getattr(self, n)[:, top : top + count] for n in ("alpha", "beta", "disparity", "truth")}
+        return Kept(**cut, facts=self.facts[:, half], blurs=self.blurs)
+
+    def upside_down(self) -> Kept:
+        """The mirror image."""
+        return Kept(*(part.flip(-2) for part in self[:-1]), self.blurs)
+
+
+def train_choice(config: ChoiceTraining) -> Path:
+    """Match what is not yet, and train; returns the file of the weights.
+
+    Raises ValueError where there are no photographs, or the folder holds a run of another recipe.
+    """
+    with folder_lock(config.out):
+        torch.manual_seed(config.seed)
+        network = load_weights(config.fusion)
+        assert isinstance(network, GuidedPAT)
+        photos = kept(config.out / "photos", network, config.photo_pairs())
+        pairs = kept(config.out / "pairs", network, config.real_pairs())
+        choice = Choice().to(config.device)
+        config.train(choice, partial(losses, config, photos, pairs, choice))
+        state = choice.half().state_dict()
+        write_tensors(config.out / "best.safetensors", state, {"recipe": recipe_text(config)})
+    return config.out / "best.safetensors"
+
+
+def kept(folder: Path, network: GuidedPAT, pairs: Iterator[Made]) -> list[Kept]:
+    """Of pairs with true disparity, matched where they are not yet."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found = []
+    for i, make in enumerate(pairs):
+        file = folder / f"{i:05}.safetensors"
+        if not file.exists():
+            pair = make()
+            if pair.disparity is None:
+                continue
+            write_tensors(file, matched(network, pair, i)._asdict())
+        found.append(Kept(**load_file(file)))
+    return found
+
+
+def matched(network: GuidedPAT, pair: StereoPair, seed: int) -> Kept:
+    """What matching finds in a pair recorded at random, left as alpha, before anything is chosen."""
+    assert pair.disparity is not None
+    given: list[tuple[ComparedViews, BetaMatches]] = []
+
+    def matcher(inputs: Inputs) -> Matches:
+        found = located_in_one(inputs)
+        given.append((found.comparison.views(inputs.alpha, inputs.betas[0].image), found))
+        return match(inputs)
+
+    truth = fused_at_random(network, pair, seed, matcher=matcher)
+    ((views, found),) = given
+    h, w = (n // FINE * FINE for n in truth.shape[1:])
+    whole = (views.alpha, views.beta, found.disparity)
+    alpha, beta, disparity = (part[0, :, :h, :w].half() for part in whole)
+    value, valid = (part[None, :h, :w] for part in pair.disparity)
+    facts = found.facts[0, :, : h // FINE, : w // FINE].half()
+    blurs = torch.tensor(found.comparison.whole.blurs)[:, 0]
+    return Kept(*(p.contiguous() for p in (alpha, beta, disparity, facts, (value * valid).half(), blurs)))
+
+
+def losses(
+    config: ChoiceTraining, photos: Sequence[Kept], pairs: Sequence[Kept], network: Choice, start: int
+) -> Iterator[Tensor]:
+    """Of each step from one on: the cross-entropy of how near candidates are to the true disparity."""
+    for step in itertools.count(start):
+        g = generator_for(config.seed, "choice", step)
+        of = [pairs if pairs and i % 2 == 0 else photos for i in range(config.batch)]
+        windows = [window(some[below(len(some), g)], config.side, g) for some in of]
+        given, options, truth = (torch.cat(parts).to(config.device) for parts in zip(*windows))
+        with torch.autocast(config.device, torch.bfloat16, enabled=config.device != "cpu"):
+            scores = network(given).float().log_softmax(1)
+        apart = (options - truth).abs()
+        near = (1 - FAR) / (1 + (apart / NEAR) ** 4) + FAR / (1 + apart)
+        known = truth[:, 0] > 0
+        yield -(scores + near.log()).logsumexp(1)[known].mean()
+
+
+def window(one: Kept, side: int, g: Generator) -> tuple[Tensor, Tensor, Tensor]:
+    """Features, candidates and true disparities of a random square; in three of ten cases at alpha's left."""
+    h, w = one.alpha.shape[-2:]
+    one = one.rows(FINE * below((h - side) // FINE + 1, g), side)
+    one = one.upside_down() if below(2, g) else one
+    alpha, beta, disparity, facts, truth = (part.float()[None] for part in one[:-1])
+    level = Normalisation(torch.zeros(3, 1, 1, 1, 1), ([float(one.blurs[0])], [float(one.blurs[1])]))
+    found = BetaMatches(disparity, facts, Comparison(None, level, level))
+    views = ComparedViews(another_response(alpha, g), beta, to_bytes(alpha[:, 0]), level.blurs[0])
+    options = candidates(found)
+    given = features(views, rows_of((side, w)), found, options, typical_facts(found))
+    x = 0 if below(10, g) < 3 else FINE * below((w - side) // FINE + 1, g)
+    half = given[..., x // FINE : (x + side) // FINE]
+    return half, options[..., x : x + side], truth[..., x : x + side]
+
+
+def rows_of(hw: tuple[int, int]) -> Segments:
+    """Segments of rectified pixels, alpha on the left."""
+    end = pixel_grid(hw)[None]
+    start = end - end.new_tensor([float(hw[1]), 0.0])
+    return Segments(start, end, torch.ones(end.shape[:-1], dtype=torch.bool))
+
+
+def another_response(alpha: Float[Tensor, "b 1 h w"], g: Generator) -> Float[Tensor, "b 1 h w"]:
+    """Some images with other curves, not even rising."""
+    share, often, phase, other = torch.rand(4, generator=g).tolist()
+    if other > OTHER:
+        return alpha
+    curved = alpha + 0.35 * torch.sin(2 * math.pi * ((0.4 + 1.6 * often) * alpha + phase))
+    return torch.lerp(alpha, curved, share)
+
+
+if __name__ == "__main__":
+    print(train_choice(tyro.cli(ChoiceTraining, prog="python -m experiments.choice")))

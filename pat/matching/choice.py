@@ -1,0 +1,151 @@
+"""Which disparity a pixel has: that found there, or one found beside it.
+
+Semi-global matching is wrong beside edges of depth, in what beta does not see, and where nothing is to be
+compared; and nearly always the right disparity is that of a pixel not far off. So each pixel has candidates:
+its own, those of pixels around it at fixed distances, and the nearest consistent ones in its row and its
+column. A U-Net gives their scores by what alpha shows, what matching found, and how alike alpha is to beta at
+each. It was trained on what matching finds in pairs with true disparity (`experiments.choice`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from safetensors.torch import load_file
+from torch import Tensor, nn
+from torch.nn.functional import pad, pixel_shuffle
+
+from arraygeom import Segments
+
+from ..support.blocks import UNet, stacked
+from ..support.settings import size
+from . import choice_numba as kernels
+from .certainty import typical_facts
+from .filters import numpy_of
+from .inputs import Inputs
+from .matches import BetaMatches
+from .normalisation import ComparedViews
+from .positions import Extent, enlarged
+from .semi_global import CONSISTENT
+
+FITTED = Path(__file__).with_name("choice.safetensors")
+
+
+@dataclass(frozen=True)
+class ChoiceSettings:
+    """Between what is chosen, and by what."""
+
+    around: tuple[int, ...] = size((2, 5, 10), "Distances, in pixels, of those around a pixel")
+    scales: tuple[float, float] = size(
+        (6.0, 1 / 6), "Differences of disparity, in pixels, and of brightness that count as half of the most"
+    )
+    widths: tuple[int, int, int] = size((32, 48, 64), "Channels at 1/2, 1/4 and 1/8 of the size")
+    multiple: int = size(8, "Images are padded to multiples of this")
+    blur: float = size(6.375, "A blur, in pixels, of this counts as 1")
+
+
+SETTINGS = ChoiceSettings()
+AROUND = [(s * y, s * x) for s in SETTINGS.around for y, x in ((0, 1), (0, -1), (1, 0), (-1, 0))]
+CANDIDATES = 1 + 4 + len(AROUND)
+FACTS = 7
+"""Facts of matching, those that are typical of the pair, and the blurs of its views, at half the size."""
+
+
+class Choice(nn.Module):
+    """Scores of candidates."""
+
+    def __init__(self, widths: tuple[int, ...] = SETTINGS.widths) -> None:
+        super().__init__()
+        self.unet = UNet(FACTS + 4 * (1 + 2 * CANDIDATES), widths, 4 * CANDIDATES)
+        nn.init.zeros_(self.unet.last.weight)
+
+    def forward(self, given: Float[Tensor, "b i h2 w2"]) -> Float[Tensor, "b n h w"]:
+        """By `features`."""
+        return pixel_shuffle(self.unet(given), 2)
+
+
+@cache
+def fitted_choice() -> Choice:
+    """The one that ships."""
+    network = Choice()
+    network.load_state_dict(load_file(FITTED))
+    return network.float().eval().requires_grad_(False)
+
+
+@torch.no_grad()
+def chosen(inputs: Inputs, found: BetaMatches) -> BetaMatches:
+    """Matches in the one beta, of each pixel that of the candidate of the highest score.
+
+    As they are where each segment is around what is known of its own pixel: those of others say nothing.
+    """
+    if inputs.betas[0].around:
+        return found
+    typical = typical_facts(found)
+
+    def of(piece: Inputs, part: BetaMatches) -> Tensor:
+        (beta,) = piece.betas
+        views = found.comparison.views(piece.alpha, beta.image)
+        options = candidates(part)
+        given = features(views, beta.field.straight, part, options, typical)
+        best = fitted_choice()(given).argmax(1, keepdim=True)[..., : options.shape[-2], : options.shape[-1]]
+        return options.gather(1, best)
+
+    return replace(found, disparity=inputs.in_pieces(of, found))
+
+
+def candidates(found: BetaMatches) -> Float[Tensor, "b n h w"]:
+    """Disparities of each pixel to choose from; the first is its own."""
+    own = found.disparity
+    consistent = enlarged(found.facts[:, :1] < CONSISTENT)
+    along = [_nearest(own, consistent, axis, back) for axis in (-2, -1) for back in (False, True)]
+    (h, w), most = own.shape[-2:], max(SETTINGS.around)
+    wide = pad(own, (most,) * 4, mode="replicate")
+    beside = [wide[..., most + y : most + y + h, most + x : most + x + w] for y, x in AROUND]
+    return torch.cat([own, *along, *beside], 1)
+
+
+def _nearest(
+    x: Float[Tensor, "b 1 h w"], known: Bool[Tensor, "b 1 h w"], axis: int, back: bool
+) -> Float[Tensor, "b 1 h w"]:
+    """The value of the nearest known pixel before (or after) along an axis; the pixel's own if none is."""
+    if back:
+        return _nearest(x.flip(axis), known.flip(axis), axis, False).flip(axis)
+    shape = [1] * x.ndim
+    shape[axis] = -1
+    index = torch.arange(x.shape[axis], device=x.device).view(shape)
+    last = torch.where(known, index, -1).cummax(axis).values
+    return torch.where(last >= 0, x.gather(axis, last.clamp(min=0)), x)
+
+
+def features(
+    views: ComparedViews,
+    segments: Segments,
+    found: BetaMatches,
+    options: Float[Tensor, "b n h w"],
+    typical: Float[Tensor, "b 2"],
+) -> Float[Tensor, "b i h2 w2"]:
+    """What the scores are by, padded to multiples of 4; `typical` facts are of the whole frame."""
+    extent = Extent.of(segments)
+    apart, unlike = (torch.empty(options.shape) for _ in range(2))
+    for i in range(len(options)):
+        one = min(i, len(segments.end) - 1)
+        planes = (views.alpha[i, 0], views.beta[i, 0], segments.end[one], extent.towards[one], options[i])
+        kernels.compared(*map(numpy_of, planes), SETTINGS.scales, apart[i].numpy(), unlike[i].numpy())
+    half = _at_half(found, typical)
+    own = views.alpha - 0.5
+    whole = [part.to(own) for part in (own, apart[:, 1:], unlike, apart[:, :1])]
+    h, w = (-n % SETTINGS.multiple for n in own.shape[-2:])
+    if h or w:
+        half = pad(half, (0, w // 2, 0, h // 2), mode="replicate")
+        whole = [pad(part, (0, w, 0, h), mode="replicate") for part in whole]
+    return stacked(half, *whole)
+
+
+def _at_half(found: BetaMatches, typical: Tensor) -> Float[Tensor, "b 7 h2 w2"]:
+    blurs = torch.tensor(found.comparison.whole.blurs).T.to(typical) / SETTINGS.blur
+    same = torch.cat([typical, blurs], 1)[..., None, None].expand(-1, -1, *found.facts.shape[-2:])
+    return torch.cat([found.facts, same], 1) - 0.4

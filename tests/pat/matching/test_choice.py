@@ -1,0 +1,159 @@
+"""The choice between disparities: candidates, what scores are by, and that what is chosen is nearer the truth."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from skimage.data import stereo_motorcycle
+from torch.nn.functional import grid_sample
+
+from arraygeom import Segments, pixel_grid
+from pat.data.sample_array import load_motorcycle
+from pat.fusion.fuse import fuse
+from pat.matching import choice
+from pat.matching.certainty import typical_facts
+from pat.matching.choice import AROUND, CANDIDATES, candidates, chosen, features
+from pat.matching.inputs import Inputs
+from pat.matching.match import located_in_one, match
+from pat.matching.matches import BetaMatches
+from pat.matching.normalisation import ComparedViews, Comparison, Normalisation
+from pat.networks.weights import load_weights
+
+
+def matches_of(disparity, unlike):
+    """Matches of these disparities (h, w), matching back from beta disagrees as told (h / 2, w / 2)."""
+    level = Normalisation(torch.zeros(3, 1, 1, 1, 1), ([0.6], [0.0]))
+    facts = torch.stack([unlike, 0 * unlike + 0.5, 0 * unlike + 0.25])[None]
+    return BetaMatches(disparity[None, None], facts, Comparison(None, level, level))
+
+
+def test_candidates_are_the_nearest_consistent_ones_and_those_around():
+    disparity = torch.arange(24.0 * 32).view(24, 32)
+    unlike = torch.ones(12, 16)
+    unlike[6, 8] = 0.0  # pixels 12, 13 of rows and 16, 17 of columns
+    found = candidates(matches_of(disparity, unlike))[0]
+    assert found.shape == (CANDIDATES, 24, 32)
+    assert torch.equal(found[0], disparity)
+    above, below, left, right = found[1:5]
+    assert above[20, 16] == disparity[13, 16]
+    assert below[3, 17] == disparity[12, 17]
+    assert left[12, 30] == disparity[12, 17]
+    assert right[13, 2] == disparity[13, 16]
+    assert above[3, 16] == disparity[3, 16]
+    assert left[5, 30] == disparity[5, 30]
+    for (y, x), plane in zip(AROUND, found[5:]):
+        assert plane[12, 14] == disparity[12 + y, 14 + x]
+    assert found[5 + AROUND.index((0, 10)), 4, 30] == disparity[4, 31]
+
+
+def test_what_scores_are_by():
+    """Alpha and beta at each candidate, along segments that are no rows; out of beta its edge."""
+    g = torch.Generator().manual_seed(0)
+    h, w = 24, 32
+    own, other = torch.rand(1, 1, h, w, generator=g), torch.rand(1, 1, 30, 40, generator=g)
+    end = pixel_grid((h, w))[None] + torch.tensor([5.0, 2.0])
+    segments = Segments(end + torch.tensor([-6.0, 8.0]), end, torch.ones(1, h, w, dtype=torch.bool))
+    found = matches_of(8 * torch.rand(h, w, generator=g), torch.zeros(h // 2, w // 2))
+    options = candidates(found)
+    given = features(ComparedViews(own, other, None, [0.6]), segments, found, options, typical_facts(found))
+    assert given.shape == (1, choice.FACTS + 4 * (1 + 2 * CANDIDATES), h // 2, w // 2)
+    assert (given[0, :7, 3, 4] + 0.4).tolist() == pytest.approx(
+        [0, 0.5, 0.25, 0.5, 0.25, 0.6 / choice.SETTINGS.blur, 0]
+    )
+    planes = torch.nn.functional.pixel_shuffle(given[:, 7:], 2)[0]
+    torch.testing.assert_close(planes[0], own[0, 0] - 0.5)
+    apart = (options[0, 1:] - options[0, :1]) / 6
+    torch.testing.assert_close(planes[1:CANDIDATES], apart / (1 + apart.abs()), atol=1e-5, rtol=0)
+    there = end + options[0, ..., None] * torch.tensor([-0.6, 0.8])
+    grid = 2 * there / torch.tensor([39.0, 29.0]) - 1
+    seen = grid_sample(other.expand(CANDIDATES, -1, -1, -1), grid, padding_mode="border", align_corners=True)
+    unlike = 6 * (own[0] - seen[:, 0])
+    torch.testing.assert_close(
+        planes[CANDIDATES : 2 * CANDIDATES], unlike / (1 + unlike.abs()), atol=1e-4, rtol=0
+    )
+    x, y = there[0].unbind(-1)
+    on = (x >= -0.5) & (x <= 39.5) & (y >= -0.5) & (y <= 29.5)
+    assert torch.equal(planes[-1] > 0, on)
+    assert 0 < float(on.float().mean()) < 1
+
+
+@pytest.fixture(scope="module")
+def motorcycle():
+    """Inputs and matches of a real pair before anything is chosen."""
+    array, found = load_motorcycle(), []
+
+    def matcher(inputs):
+        found.append((inputs, located_in_one(inputs)))
+        return match(inputs)
+
+    fuse(load_weights("mono-colour-small"), array.rig, array.images, alpha="mono", matcher=matcher)
+    return found[0]
+
+
+def test_what_is_chosen_is_nearer_the_truth(motorcycle):
+    """A pair that it was not trained on: fewer are wrong by more than a pixel, and by more than three."""
+    inputs, before = motorcycle
+    after = chosen(inputs, before)
+    truth = torch.from_numpy(stereo_motorcycle()[2][:, :740].copy())
+    known = truth.isfinite() & (truth > 0)
+    segments = inputs.betas[0].field.straight
+    h, w = truth.shape
+    end = segments.end[0, :h, :w, 0].float()
+    true = end - (torch.arange(w) - truth)
+
+    def wrong(found, pixels):
+        return float(((found.disparity[0, 0, :h, :w] - true).abs() > pixels)[known].float().mean())
+
+    assert wrong(before, 1) < 0.5
+    assert wrong(after, 1) < wrong(before, 1)
+    assert wrong(after, 3) < wrong(before, 3)
+
+
+def test_pieces_choose_as_the_whole(motorcycle, monkeypatch):
+    inputs, before = motorcycle
+    whole = chosen(inputs, before).disparity
+    monkeypatch.setattr("pat.matching.inputs.SETTINGS", replace(choice_pieces(), at_once=100_000))
+    assert len(inputs.pieces) > 1
+    pieces = chosen(inputs, before).disparity
+    assert float((pieces != whole).float().mean()) < 1e-3
+
+
+def choice_pieces():
+    from pat.matching.inputs import SETTINGS
+
+    return SETTINGS
+
+
+def test_what_is_known_of_a_pixel_stays_its_own(motorcycle):
+    inputs, before = motorcycle
+    around = replace(inputs, betas=(replace(inputs.betas[0], around=True),))
+    assert chosen(around, before) is before
+
+
+def test_sides_need_not_be_multiples(monkeypatch):
+    """A network that wants the candidate five columns to the right."""
+    want = 5 + AROUND.index((0, 5))
+
+    class Wanting(torch.nn.Module):
+        def forward(self, given):
+            b, _, h, w = given.shape
+            scores = torch.zeros(b, CANDIDATES, 2 * h, 2 * w)
+            scores[:, want] = 1.0
+            return scores
+
+    monkeypatch.setattr(choice, "fitted_choice", Wanting)
+    h, w = 22, 34
+    disparity = torch.arange(float(h * w)).view(h, w)
+    found = matches_of(disparity, torch.zeros(h // 2, w // 2))
+    g = torch.Generator().manual_seed(1)
+    from arraygeom import Rectified
+    from arraygeom.fields.grid import FieldOnGrid
+    from pat.evaluation.protocols import rectified_rig
+
+    rig = rectified_rig((h, w), {"beta": (h, w)}, 30.0)
+    field = FieldOnGrid.of(Rectified(30.0, alpha_is="left"), rig.pair("alpha", "beta"), hw=(h, w), blocks=True)
+    inputs = Inputs.of(torch.rand(1, 1, h, w, generator=g), [torch.rand(1, 3, h, w, generator=g)], [field])
+    made = chosen(inputs, found).disparity[0, 0]
+    assert torch.equal(made[:, :-5], disparity[:, 5:])
+    assert math.isfinite(float(made.sum()))
