@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from safetensors.torch import load_file
 from torch import Tensor, nn
-from torch.nn.functional import pad, pixel_shuffle
+from torch.nn.functional import avg_pool2d, pad, pixel_shuffle
 
 from arraygeom import Segments
 
@@ -29,7 +29,7 @@ from .filters import numpy_of
 from .inputs import Inputs
 from .matches import BetaMatches
 from .normalisation import ComparedViews
-from .positions import Extent, enlarged
+from .positions import FINE, Extent, enlarged
 from .semi_global import CONSISTENT
 
 FITTED = Path(__file__).with_name("choice.safetensors")
@@ -60,7 +60,7 @@ class Choice(nn.Module):
 
     def __init__(self, widths: tuple[int, ...] = SETTINGS.widths) -> None:
         super().__init__()
-        self.unet = UNet(FACTS + 4 * (1 + 2 * CANDIDATES), widths, 4 * CANDIDATES)
+        self.unet = UNet(FACTS + 4 * (1 + 2 * CANDIDATES), widths, 4 * (CANDIDATES + 2))
         nn.init.zeros_(self.unet.last.weight)
 
     def forward(self, given: Float[Tensor, "b i h2 w2"]) -> Float[Tensor, "b n h w"]:
@@ -86,15 +86,18 @@ def chosen(inputs: Inputs, found: BetaMatches) -> BetaMatches:
         return found
     typical = typical_facts(found)
 
-    def of(piece: Inputs, part: BetaMatches) -> Tensor:
+    def of(piece: Inputs, part: BetaMatches) -> tuple[Tensor, Tensor]:
         (beta,) = piece.betas
         views = found.comparison.views(piece.alpha, beta.image)
         options = candidates(part)
         given = features(views, beta.field.straight, part, options, typical)
-        best = fitted_choice()(given).argmax(1, keepdim=True)[..., : options.shape[-2], : options.shape[-1]]
-        return options.gather(1, best)
+        h, w = options.shape[-2:]
+        scores, seen, width = fitted_choice()(given)[..., :h, :w].split([CANDIDATES, 1, 1], 1)
+        certainty = torch.cat([avg_pool2d(seen.sigmoid(), FINE).clamp(min=1e-3), avg_pool2d(width, FINE).exp()], 1)
+        return options.gather(1, scores.argmax(1, keepdim=True)), certainty
 
-    return replace(found, disparity=inputs.in_pieces(of, found))
+    disparity, certainty = inputs.in_pieces(of, found)
+    return replace(found, chosen=disparity, certainty=certainty)
 
 
 def candidates(found: BetaMatches) -> Float[Tensor, "b n h w"]:

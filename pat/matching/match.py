@@ -54,13 +54,14 @@ def match(inputs: Inputs) -> Matches:
     found = located(inputs)
     if torch.is_grad_enabled():
         found = following(inputs, found)
-    return transferred(inputs, with_certainty(found))
+    best = (chosen(*one) for one in zip(inputs.by_beta, found.betas))
+    return transferred(inputs, Matches(tuple(best)))
 
 
 @torch.no_grad()
 def located(inputs: Inputs) -> Matches:
     """Where alpha's pixels are in each beta, no colours; of several calibrated betas, where all agree."""
-    alone = Matches(tuple(chosen(one, located_in_one(one)) for one in inputs.by_beta))
+    alone = Matches(tuple(map(located_in_one, inputs.by_beta)))
     return agreed(inputs, with_certainty(alone)) if inputs.can_agree else alone
 
 

@@ -36,6 +36,8 @@ class BetaMatches:
         not; None before they are transferred.
     diffused: (B, fills, C, H, W), the same diffused from pixels of high weight to the others.
     prior: how much more, as a logit, its colours count than another beta's.
+    chosen: (B, 1, H, W), of the disparities found there and around that of what alpha sees, which may be
+        hidden in beta or fill in for what is; None before one is chosen.
     certainty: (B, 2, H / 2, W / 2), the probability that beta sees the point and the match is within a pixel
         of it, and the half-width, in pixels of beta, of the interval around the match in which the true
         position is in 9 of 10 cases; None where it is not known.
@@ -47,7 +49,13 @@ class BetaMatches:
     bands: Tensor | None = None
     diffused: Tensor | None = None
     prior: float = 0.0
+    chosen: Tensor | None = None
     certainty: Tensor | None = None
+
+    @property
+    def surface(self) -> Float[Tensor, "b 1 h w"]:
+        """The disparity of what alpha sees, as far as it is known: the one that was chosen."""
+        return self.disparity if self.chosen is None else self.chosen
 
     @property
     def colours(self) -> tuple[Tensor, Tensor]:
@@ -60,7 +68,7 @@ class BetaMatches:
 
     def positions(self, segments: Segments, hw: HW) -> tuple[Float[Tensor, "b h w 2"], Bool[Tensor, "b h w"]]:
         """Matches in a beta of this size (x, y), by segments of alpha's pixels; whether they are on it."""
-        where = matches(segments, self.disparity, beyond_edge=True)
+        where = matches(segments, self.surface, beyond_edge=True)
         return where, segments.valid & on_image(where, hw)
 
     def cut(self, box: Box) -> BetaMatches:
@@ -68,7 +76,7 @@ class BetaMatches:
         top, bottom, left, right = box
         half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
         whole = (..., slice(top, bottom), slice(left, right))
-        names = {"disparity": whole, "bands": whole, "diffused": whole, "facts": half, "certainty": half}
+        names = {"disparity": whole, "chosen": whole, "bands": whole, "diffused": whole, "facts": half, "certainty": half}
         parts = {name: getattr(self, name) for name in names}
         cut: dict[str, Any] = {n: part if part is None else part[names[n]] for n, part in parts.items()}
         return replace(self, **cut)
@@ -89,7 +97,7 @@ class Matches:
     def nbytes(self) -> int:
         """Memory held, of a large frame: colours as float16, those that betas share counted once."""
         colours = {id(part): part.numel() for found in self.betas for part in found.colours}
-        planes = [found.disparity.nbytes + found.facts.nbytes * 5 // 3 for found in self.betas]
+        planes = [2 * found.disparity.nbytes + found.facts.nbytes * 5 // 3 for found in self.betas]
         return 2 * sum(colours.values()) + sum(planes)
 
     def cut(self, box: Box) -> Matches:

@@ -212,7 +212,7 @@ class GuidedPAT(nn.Module):
         bands, diffused = found.colours
         segments = beta.field.straight.to(exactly)
         extent = Extent.of(segments)
-        position = matches(segments, found.disparity, beyond_edge=True, extent=extent).movedim(-1, 1)
+        position = matches(segments, found.surface, beyond_edge=True, extent=extent).movedim(-1, 1)
         window = window_around(found.disparity, segments, self.config.window, extent)
         del extent
         other = self.encoder(of(beta.image))
