@@ -20,14 +20,16 @@ import tyro
 from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Generator, Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
 
 from arraygeom import Segments, pixel_grid
 from experiments.completion.capture import fused_at_random
 from experiments.completion.pairs import Made, PairTraining
+from experiments.evaluation.conditions import regions_of
 from experiments.fit import recipe_text
 from pat.data.pairs import StereoPair
-from pat.matching.certainty import typical_facts
-from pat.matching.choice import Choice, candidates, features
+from pat.matching.certainty import SETTINGS, typical_facts
+from pat.matching.choice import CANDIDATES, Choice, candidates, features
 from pat.matching.inputs import Inputs
 from pat.matching.match import located_in_one, match
 from pat.matching.matches import BetaMatches, Matches
@@ -56,6 +58,8 @@ class ChoiceTraining(PairTraining):
     out: Path = Path("runs/choice")
     fusion: str = "mono-colour"
     """Weights of the fusion, which corrects and denoises before it matches."""
+    without: tuple[str, ...] = ()
+    """Parts of the names of pairs to leave out, which then say what its certainty is worth."""
     steps: int = 8000
     batch: int = 16
     side: int = 256
@@ -64,24 +68,28 @@ class ChoiceTraining(PairTraining):
 
 class Kept(NamedTuple):
     """Of a pair: alpha and beta as they were compared (1, h, w), what matching found and its facts, the true
-    disparity, 0 where it is not known, (1, h, w); and blurs (2,)."""
+    disparity, 0 where it is not known, and whether beta sees the point (1, h, w); and blurs (2,)."""
 
     alpha: Tensor
     beta: Tensor
     disparity: Tensor
     facts: Tensor
     truth: Tensor
+    seen: Tensor
     blurs: Tensor
 
     def rows(self, top: int, count: int) -> Kept:
         """Some of all rows; the blurs are the same."""
         half = slice(top // FINE, (top + count) // FINE)
-        cut = {n: getattr(self, n)[:, top : top + count] for n in ("alpha", "beta", "disparity", "truth")}
+        cut = {
+            n: getattr(self, n)[:, top : top + count] for n in ("alpha", "beta", "disparity", "truth", "seen")
+        }
         return Kept(**cut, facts=self.facts[:, half], blurs=self.blurs)
 
     def upside_down(self) -> Kept:
         """The mirror image."""
-        return Kept(*(part.flip(-2) for part in self[:-1]), self.blurs)
+        flipped = {n: part.flip(-2) for n, part in self._asdict().items() if n != "blurs"}
+        return self._replace(**flipped)
 
 
 def train_choice(config: ChoiceTraining) -> Path:
@@ -94,7 +102,7 @@ def train_choice(config: ChoiceTraining) -> Path:
         network = load_weights(config.fusion)
         assert isinstance(network, GuidedPAT)
         photos = kept(config.out / "photos", network, config.photo_pairs())
-        pairs = kept(config.out / "pairs", network, config.real_pairs())
+        pairs = kept(config.out / "pairs", network, config.real_pairs(), config.without)
         choice = Choice().to(config.device)
         config.train(choice, partial(losses, config, photos, pairs, choice))
         state = choice.half().state_dict()
@@ -102,7 +110,7 @@ def train_choice(config: ChoiceTraining) -> Path:
     return config.out / "best.safetensors"
 
 
-def kept(folder: Path, network: GuidedPAT, pairs: Iterator[Made]) -> list[Kept]:
+def kept(folder: Path, network: GuidedPAT, pairs: Iterator[Made], without: Sequence[str] = ()) -> list[Kept]:
     """Of pairs with true disparity, matched where they are not yet."""
     folder.mkdir(parents=True, exist_ok=True)
     found = []
@@ -110,7 +118,7 @@ def kept(folder: Path, network: GuidedPAT, pairs: Iterator[Made]) -> list[Kept]:
         file = folder / f"{i:05}.safetensors"
         if not file.exists():
             pair = make()
-            if pair.disparity is None:
+            if pair.disparity is None or any(part in pair.name for part in without):
                 continue
             write_tensors(file, matched(network, pair, i)._asdict())
         found.append(Kept(**load_file(file)))
@@ -135,32 +143,42 @@ def matched(network: GuidedPAT, pair: StereoPair, seed: int) -> Kept:
     value, valid = (part[None, :h, :w] for part in pair.disparity)
     facts = found.facts[0, :, : h // FINE, : w // FINE].half()
     blurs = torch.tensor(found.comparison.whole.blurs)[:, 0]
-    return Kept(*(p.contiguous() for p in (alpha, beta, disparity, facts, (value * valid).half(), blurs)))
+    seen = regions_of(pair, (h, w))["seen"][None]
+    planes = alpha, beta, disparity, facts, (value * valid).half(), seen, blurs
+    return Kept(*(part.contiguous() for part in planes))
 
 
 def losses(
     config: ChoiceTraining, photos: Sequence[Kept], pairs: Sequence[Kept], network: Choice, start: int
 ) -> Iterator[Tensor]:
-    """Of each step from one on: the cross-entropy of how near candidates are to the true disparity."""
+    """Of each step from one on: the cross-entropy of how near candidates are to the true disparity, of the
+    statement that the best one is right, and how far it is off beyond or within what is stated."""
     for step in itertools.count(start):
         g = generator_for(config.seed, "choice", step)
         of = [pairs if pairs and i % 2 == 0 else photos for i in range(config.batch)]
         windows = [window(some[below(len(some), g)], config.side, g) for some in of]
-        given, options, truth = (torch.cat(parts).to(config.device) for parts in zip(*windows))
+        given, options, truth, seen = (torch.cat(parts).to(config.device) for parts in zip(*windows))
         with torch.autocast(config.device, torch.bfloat16, enabled=config.device != "cpu"):
-            scores = network(given).float().log_softmax(1)
+            scores, logit, width = network(given).float().split([CANDIDATES, 1, 1], 1)
         apart = (options - truth).abs()
         near = (1 - FAR) / (1 + (apart / NEAR) ** 4) + FAR / (1 + apart)
-        known = truth[:, 0] > 0
-        yield -(scores + near.log()).logsumexp(1)[known].mean()
+        wrong = -(scores.log_softmax(1) + near.log()).logsumexp(1, keepdim=True)
+        off = apart.gather(1, scores.argmax(1, keepdim=True))
+        right = (seen & (off <= 1)).to(logit)
+        stated = binary_cross_entropy_with_logits(logit, right, reduction="none")
+        beyond = off.clamp(min=0.02).log() - width
+        interval = torch.maximum(SETTINGS.covered * beyond, (SETTINGS.covered - 1) * beyond)
+        yield (wrong + 0.5 * (stated + interval))[truth > 0].mean()
 
 
-def window(one: Kept, side: int, g: Generator) -> tuple[Tensor, Tensor, Tensor]:
-    """Features, candidates and true disparities of a random square; in three of ten cases at alpha's left."""
+def window(one: Kept, side: int, g: Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Features, candidates, true disparities and what beta sees of a random square; in three of ten cases at
+    alpha's left."""
     h, w = one.alpha.shape[-2:]
     one = one.rows(FINE * below((h - side) // FINE + 1, g), side)
     one = one.upside_down() if below(2, g) else one
-    alpha, beta, disparity, facts, truth = (part.float()[None] for part in one[:-1])
+    alpha, beta, disparity, facts, truth = (part.float()[None] for part in one[:-2])
+    seen = one.seen[None]
     level = Normalisation(torch.zeros(3, 1, 1, 1, 1), ([float(one.blurs[0])], [float(one.blurs[1])]))
     found = BetaMatches(disparity, facts, Comparison(None, level, level))
     views = ComparedViews(another_response(alpha, g), beta, to_bytes(alpha[:, 0]), level.blurs[0])
@@ -168,7 +186,8 @@ def window(one: Kept, side: int, g: Generator) -> tuple[Tensor, Tensor, Tensor]:
     given = features(views, rows_of((side, w)), found, options, typical_facts(found))
     x = 0 if below(10, g) < 3 else FINE * below((w - side) // FINE + 1, g)
     half = given[..., x // FINE : (x + side) // FINE]
-    return half, options[..., x : x + side], truth[..., x : x + side]
+    columns = slice(x, x + side)
+    return half, options[..., columns], truth[..., columns], seen[..., columns]
 
 
 def rows_of(hw: tuple[int, int]) -> Segments:

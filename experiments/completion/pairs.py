@@ -91,14 +91,14 @@ def varied_pair(pair: StereoPair, seed: int) -> StereoPair:
         smooth = {"antialias": True} if mode == "bicubic" else {}
         return interpolate(image[None], (height, width), mode=mode, **smooth)[0]
 
-    images = _recoloured([larger(image).clamp(0, 1) for image in (pair.left, pair.right)], rng)
+    left, right = _recoloured([larger(image).clamp(0, 1) for image in (pair.left, pair.right)], rng)
     most, truth = pair.max_disparity, None
     if pair.disparity is not None:
         value, valid = (larger(part[None].float(), "nearest")[0] for part in pair.disparity)
         truth = Disparity(value * width / size[1], valid > 0)
         most = float(pair.disparity.value.max())
     assert most is not None
-    return StereoPair(f"{pair.name} {seed}", *images, most * width / size[1] + MARGIN, truth)
+    return StereoPair(f"{pair.name} {seed}", left, right, most * width / size[1] + MARGIN, truth)
 
 
 def _recoloured(images: Sequence[Float[Tensor, "3 h w"]], rng: np.random.Generator) -> list[Tensor]:

@@ -8,12 +8,14 @@ the pairs that it did not see.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
+from safetensors import safe_open
 from torch import Generator, Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
@@ -22,6 +24,7 @@ from pat.evaluation.protocols import hw_of, rectified_field, rectified_rig
 from pat.evaluation.tables import distinct, markdown_table
 from pat.fusion.fuse import fuse
 from pat.matching.certainty import SETTINGS, CertaintyNetwork, measured, typical_facts
+from pat.matching.choice import Choice, read_choice
 from pat.matching.inputs import Inputs
 from pat.matching.match import match
 from pat.matching.matches import BetaMatches, Matches
@@ -89,15 +92,35 @@ class Reliability(NamedTuple):
 
 
 def judged(
-    network: FusionNetwork, pairs: Iterable[StereoPair], conditions: Sequence[str]
+    network: FusionNetwork,
+    pairs: Iterable[StereoPair],
+    conditions: Sequence[str],
+    choices: Sequence[Path] = (),
 ) -> Iterator[Judged]:
-    """Every pair with true disparity under every condition, fused as `fuse` does."""
+    """Every pair with true disparity under every condition, fused as `fuse` does.
+
+    With `choices`, files of those trained without some pairs, each pair's is one that has not seen it. Raises
+    ValueError for a pair that all have seen.
+    """
     for pair in pairs:
         if pair.disparity is not None:
-            yield from (judged_pair(network, pair, name) for name in conditions)
+            choice = unseeing(choices, pair.name) if choices else None
+            yield from (judged_pair(network, pair, name, choice) for name in conditions)
 
 
-def judged_pair(network: FusionNetwork, pair: StereoPair, condition: str) -> Judged:
+def unseeing(choices: Sequence[Path], pair: str) -> Choice:
+    """The first that was trained without the pair. Raises ValueError if none was."""
+    for path in choices:
+        with safe_open(path, "pt") as file:
+            recipe = json.loads((file.metadata() or {}).get("recipe", "{}"))
+        if any(part in pair for part in recipe.get("without", ())):
+            return read_choice(path)
+    raise ValueError(f"no choice was trained without {pair}: train one (--without) and give its file")
+
+
+def judged_pair(
+    network: FusionNetwork, pair: StereoPair, condition: str, choice: Choice | None = None
+) -> Judged:
     """One of them. A match is right if beta sees the point and it is within a pixel."""
     assert pair.disparity is not None
     (alpha, beta, _), noise = CONDITIONS[condition].recorded(pair)
@@ -107,7 +130,7 @@ def judged_pair(network: FusionNetwork, pair: StereoPair, condition: str) -> Jud
     kept: list[BetaMatches] = []
 
     def matcher(inputs: Inputs) -> Matches:
-        found = match(inputs)
+        found = match(inputs, choice)
         kept.extend(found.betas)
         return found
 
@@ -118,7 +141,7 @@ def judged_pair(network: FusionNetwork, pair: StereoPair, condition: str) -> Jud
     y, x = places[torch.randperm(len(places), generator=Generator().manual_seed(0))[:PIXELS]].unbind(-1)
     (found,) = kept
     numbers = measured(found, typical_facts(found))[0, :, y // FINE, x // FINE].T
-    right = regions_of(pair, (h, w))["seen"] & ((found.disparity[0, 0, :h, :w] - value).abs() <= 1)
+    right = regions_of(pair, (h, w))["seen"] & ((found.surface[0, 0, :h, :w] - value).abs() <= 1)
     error = (w / frame.depth - value).abs().nan_to_num(float(w))
     return Judged(pair.name, condition, numbers, right[y, x], error[y, x])
 

@@ -163,6 +163,8 @@ class Certainty:
     """The network that fuses."""
     fit: MaybePath = None
     """Fit to these pairs, and write that here."""
+    choices: tuple[Path, ...] = ()
+    """Files of choices trained without some pairs: a pair is judged by one that has not seen it."""
     out: Out = Path("out/certainty")
     """Folder for certainty.md, the tables, and reliability.png."""
 
@@ -173,7 +175,9 @@ class Certainty:
         writable(self.out, folder=True)
         pairs = list(of_half(middlebury_pairs(self.middlebury), self.half))
         shown = progress("fusing")(pairs, len(pairs))
-        found = with_truth(list(certainty.judged(load_weights(self.weights), shown, names)), self.half)
+        found = with_truth(
+            list(certainty.judged(load_weights(self.weights), shown, names, self.choices)), self.half
+        )
         if self.fit:
             write_tensors(self.fit, certainty.widened(found).state_dict())
             held = certainty.held(found, certainty.by_thirds(found))

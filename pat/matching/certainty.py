@@ -1,9 +1,10 @@
 """How certain matches are: the probability of each, and how far from it the true position may be.
 
-Both are read off what matching found: its facts at a pixel and around it, how much disparities differ there,
-by how much one image had to be blurred to be compared, and what facts the pair's consistent matches have. A
-small network does it, which was fitted to pairs with true disparity (`python -m experiments certainty`).
-It knows nothing of the image, so it holds for any network that uses the matches.
+Both are read off what matching found: its facts at a pixel and around it, what the choice between disparities
+says of its own, how much disparities differ there, by how much one image had to be blurred to be compared,
+and what facts the pair's consistent matches have. A small network does it, which was fitted to pairs with
+true disparity (`python -m experiments certainty`). It knows nothing of the image but by the choice, so it
+holds for any network that uses the matches.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class CertaintySettings:
 
 
 SETTINGS = CertaintySettings()
-MEASURED = 3 * (1 + len(SETTINGS.around)) + len(SETTINGS.apart) + 4
+MEASURED = 3 * (1 + len(SETTINGS.around)) + len(SETTINGS.apart) + 4 + 2
 """How many numbers of a pixel certainty is read off."""
 
 
@@ -77,16 +78,21 @@ def fitted_network() -> CertaintyNetwork:
 
 
 @torch.no_grad()
-def with_certainty(matches: Matches) -> Matches:
-    """The matches, with the certainty of each.
+def with_certainty(matches: Matches, before: Matches | None = None) -> Matches:
+    """The matches, one chosen at each pixel, with the certainty of each.
 
-    Of matches on which several betas agree, whose certainty alone was known before: a beta sees a point only
-    if both say so.
+    Of matches on which several betas agree, whose certainty alone was known `before`: a beta sees a point
+    only if both say so.
     """
-    return Matches(tuple(map(_judged, matches.betas)))
+    judged = [replace(found, certainty=_certainty(found)) for found in matches.betas]
+    for found, own in zip(judged, before.betas if before else ()):
+        if own.certainty is not None:
+            assert found.certainty is not None
+            found.certainty[:, :1] = found.certainty[:, :1].minimum(own.certainty[:, :1])
+    return Matches(tuple(judged))
 
 
-def _judged(found: BetaMatches) -> BetaMatches:
+def _certainty(found: BetaMatches) -> Float[Tensor, "b 2 h2 w2"]:
     typical, (h, w) = typical_facts(found), found.disparity.shape[-2:]
     bare = replace(found, bands=None, diffused=None, certainty=None)
 
@@ -96,10 +102,7 @@ def _judged(found: BetaMatches) -> BetaMatches:
         return torch.stack([logit.sigmoid(), half_width.exp()], 1)
 
     halo = FINE * max(SETTINGS.around + SETTINGS.apart)
-    certainty = assembled((h, w), ((tile, of(tile)) for tile in tiles_of((h, w), (FINE * ROWS, w), halo)))
-    if found.certainty is not None:
-        certainty[:, :1] = certainty[:, :1].minimum(found.certainty[:, :1])
-    return replace(found, certainty=certainty)
+    return assembled((h, w), ((tile, of(tile)) for tile in tiles_of((h, w), (FINE * ROWS, w), halo)))
 
 
 def typical_facts(found: BetaMatches) -> Float[Tensor, "b 2"]:
@@ -111,12 +114,14 @@ def typical_facts(found: BetaMatches) -> Float[Tensor, "b 2"]:
 
 def measured(found: BetaMatches, typical: Float[Tensor, "b 2"]) -> Float[Tensor, "b n h2 w2"]:
     """The `MEASURED` numbers of each pixel, at half the size; `typical` is of the whole frame."""
+    assert found.stated is not None
     facts = [found.facts, *(box_mean(found.facts, radius) for radius in SETTINGS.around)]
-    ranges = (max_pool2d(_range(found.disparity, radius), FINE) for radius in SETTINGS.apart)
+    ranges = (max_pool2d(_range(found.surface, radius), FINE) for radius in SETTINGS.apart)
     apart = [(part.clamp(min=0) + 0.1).log() for part in ranges]
     blurs = torch.tensor(found.comparison.whole.blurs).T  # of alpha and of beta, of each of the batch
     same = torch.cat([blurs.to(typical), typical], 1)[..., None, None]
-    return torch.cat([*facts, *apart, same.expand(*same.shape[:2], *found.facts.shape[-2:])], 1)
+    same = same.expand(*same.shape[:2], *found.facts.shape[-2:])
+    return torch.cat([*facts, *apart, same, found.stated], 1)
 
 
 def _range(x: Float[Tensor, "b 1 h w"], radius: int) -> Float[Tensor, "b 1 h w"]:

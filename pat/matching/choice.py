@@ -27,7 +27,7 @@ from . import choice_numba as kernels
 from .certainty import typical_facts
 from .filters import numpy_of
 from .inputs import Inputs
-from .matches import BetaMatches
+from .matches import BetaMatches, Matches
 from .normalisation import ComparedViews
 from .positions import FINE, Extent, enlarged
 from .semi_global import CONSISTENT
@@ -56,7 +56,8 @@ FACTS = 7
 
 
 class Choice(nn.Module):
-    """Scores of candidates."""
+    """Scores of candidates; the logit of that beta sees the point and the best one is right to a pixel, and
+    the logarithm of how far it may be off, pixels."""
 
     def __init__(self, widths: tuple[int, ...] = SETTINGS.widths) -> None:
         super().__init__()
@@ -71,33 +72,41 @@ class Choice(nn.Module):
 @cache
 def fitted_choice() -> Choice:
     """The one that ships."""
+    return read_choice(FITTED)
+
+
+def read_choice(path: Path) -> Choice:
+    """One that was trained."""
     network = Choice()
-    network.load_state_dict(load_file(FITTED))
+    network.load_state_dict(load_file(path))
     return network.float().eval().requires_grad_(False)
 
 
-@torch.no_grad()
-def chosen(inputs: Inputs, found: BetaMatches) -> BetaMatches:
-    """Matches in the one beta, of each pixel that of the candidate of the highest score.
+def chosen(inputs: Inputs, matches: Matches, network: Choice | None = None) -> Matches:
+    """The matches in each beta, with the disparity of each pixel's candidate of the highest score.
 
-    As they are where each segment is around what is known of its own pixel: those of others say nothing.
+    Not where each segment is around what is known of its own pixel: those of others say nothing.
     """
-    if inputs.betas[0].around:
-        return found
+    best = network or fitted_choice()
+    return Matches(tuple(_chosen(*one, best) for one in zip(inputs.by_beta, matches.betas)))
+
+
+def _chosen(inputs: Inputs, found: BetaMatches, network: Choice) -> BetaMatches:
     typical = typical_facts(found)
 
     def of(piece: Inputs, part: BetaMatches) -> tuple[Tensor, Tensor]:
         (beta,) = piece.betas
-        views = found.comparison.views(piece.alpha, beta.image)
-        options = candidates(part)
-        given = features(views, beta.field.straight, part, options, typical)
-        h, w = options.shape[-2:]
-        scores, seen, width = fitted_choice()(given)[..., :h, :w].split([CANDIDATES, 1, 1], 1)
-        certainty = torch.cat([avg_pool2d(seen.sigmoid(), FINE).clamp(min=1e-3), avg_pool2d(width, FINE).exp()], 1)
-        return options.gather(1, scores.argmax(1, keepdim=True)), certainty
+        views, options = found.comparison.views(piece.alpha, beta.image), candidates(part)
+        with torch.no_grad():
+            given = features(views, beta.field.straight, part, options, typical)
+            scores, stated = network(given)[..., : options.shape[-2], : options.shape[-1]].split(
+                [CANDIDATES, 2], 1
+            )
+            best = scores.argmax(1, keepdim=True)
+        return options.gather(1, best), avg_pool2d(stated, FINE)
 
-    disparity, certainty = inputs.in_pieces(of, found)
-    return replace(found, chosen=disparity, certainty=certainty)
+    disparity, stated = inputs.in_pieces(of, replace(found, bands=None, diffused=None, certainty=None))
+    return replace(found, chosen=None if inputs.betas[0].around else disparity, stated=stated)
 
 
 def candidates(found: BetaMatches) -> Float[Tensor, "b n h w"]:

@@ -16,7 +16,7 @@ from arraygeom import Segments
 
 from ..support.settings import size
 from .certainty import with_certainty
-from .choice import chosen
+from .choice import Choice, chosen
 from .colour_transfer import transferred
 from .inputs import Inputs
 from .matches import BetaMatches, Matches, is_consistent
@@ -45,24 +45,23 @@ Matcher = Callable[[Inputs], Matches]
 """What `fuse` asks for matches of inputs, sides whole multiples of `inputs.multiple`: `match` or yours."""
 
 
-def match(inputs: Inputs) -> Matches:
+def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
     """Match alpha with every beta, say how certain each match is, and transfer the betas' bands to alpha's
-    view; with gradients as `transferred`, and of the positions.
+    view; with gradients as `transferred`, and of the positions. `choice` is another one than ships.
 
     Raises ValueError for a beta whose field is not of straight segments.
     """
-    found = located(inputs)
+    found = located(inputs, choice)
     if torch.is_grad_enabled():
         found = following(inputs, found)
-    best = (chosen(*one) for one in zip(inputs.by_beta, found.betas))
-    return transferred(inputs, Matches(tuple(best)))
+    return transferred(inputs, with_certainty(chosen(inputs, found, choice), found))
 
 
 @torch.no_grad()
-def located(inputs: Inputs) -> Matches:
+def located(inputs: Inputs, choice: Choice | None = None) -> Matches:
     """Where alpha's pixels are in each beta, no colours; of several calibrated betas, where all agree."""
     alone = Matches(tuple(map(located_in_one, inputs.by_beta)))
-    return agreed(inputs, with_certainty(alone)) if inputs.can_agree else alone
+    return agreed(inputs, with_certainty(chosen(inputs, alone, choice))) if inputs.can_agree else alone
 
 
 def located_in_one(inputs: Inputs) -> BetaMatches:

@@ -38,6 +38,8 @@ class BetaMatches:
     prior: how much more, as a logit, its colours count than another beta's.
     chosen: (B, 1, H, W), of the disparities found there and around that of what alpha sees, which may be
         hidden in beta or fill in for what is; None before one is chosen.
+    stated: (B, 2, H / 2, W / 2), what the choice says of it: the logit of that it is right, and the logarithm
+        of how far it may be off, pixels; None before one is chosen.
     certainty: (B, 2, H / 2, W / 2), the probability that beta sees the point and the match is within a pixel
         of it, and the half-width, in pixels of beta, of the interval around the match in which the true
         position is in 9 of 10 cases; None where it is not known.
@@ -50,6 +52,7 @@ class BetaMatches:
     diffused: Tensor | None = None
     prior: float = 0.0
     chosen: Tensor | None = None
+    stated: Tensor | None = None
     certainty: Tensor | None = None
 
     @property
@@ -76,7 +79,15 @@ class BetaMatches:
         top, bottom, left, right = box
         half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
         whole = (..., slice(top, bottom), slice(left, right))
-        names = {"disparity": whole, "chosen": whole, "bands": whole, "diffused": whole, "facts": half, "certainty": half}
+        names = {
+            "disparity": whole,
+            "chosen": whole,
+            "bands": whole,
+            "diffused": whole,
+            "facts": half,
+            "stated": half,
+            "certainty": half,
+        }
         parts = {name: getattr(self, name) for name in names}
         cut: dict[str, Any] = {n: part if part is None else part[names[n]] for n, part in parts.items()}
         return replace(self, **cut)
@@ -97,7 +108,7 @@ class Matches:
     def nbytes(self) -> int:
         """Memory held, of a large frame: colours as float16, those that betas share counted once."""
         colours = {id(part): part.numel() for found in self.betas for part in found.colours}
-        planes = [2 * found.disparity.nbytes + found.facts.nbytes * 5 // 3 for found in self.betas]
+        planes = [2 * found.disparity.nbytes + found.facts.nbytes * 7 // 3 for found in self.betas]
         return 2 * sum(colours.values()) + sum(planes)
 
     def cut(self, box: Box) -> Matches:

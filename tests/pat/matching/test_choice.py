@@ -1,4 +1,4 @@
-"""The choice between disparities: candidates, what scores are by, and that what is chosen is nearer the truth."""
+"""The choice between disparities: candidates, what scores are by, what is chosen."""
 
 import math
 from dataclasses import replace
@@ -152,7 +152,9 @@ def test_sides_need_not_be_multiples(monkeypatch):
     from pat.evaluation.protocols import rectified_rig
 
     rig = rectified_rig((h, w), {"beta": (h, w)}, 30.0)
-    field = FieldOnGrid.of(Rectified(30.0, alpha_is="left"), rig.pair("alpha", "beta"), hw=(h, w), blocks=True)
+    field = FieldOnGrid.of(
+        Rectified(30.0, alpha_is="left"), rig.pair("alpha", "beta"), hw=(h, w), blocks=True
+    )
     inputs = Inputs.of(torch.rand(1, 1, h, w, generator=g), [torch.rand(1, 3, h, w, generator=g)], [field])
     made = chosen(inputs, found).disparity[0, 0]
     assert torch.equal(made[:, :-5], disparity[:, 5:])
