@@ -10,7 +10,7 @@ each. It was trained on what matching finds in pairs with true disparity (`exper
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import torch
@@ -20,8 +20,10 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pad, pixel_shuffle
 
 from arraygeom import Segments
+from arraygeom.chunks import spans
+from arraygeom.threads import convolutions_in_parallel, in_parallel
 
-from ..support.blocks import UNet, stacked
+from ..support.blocks import UNet
 from ..support.settings import size
 from . import choice_numba as kernels
 from .certainty import typical_facts
@@ -31,6 +33,7 @@ from .matches import BetaMatches, Matches
 from .normalisation import ComparedViews
 from .positions import FINE, Extent, enlarged
 from .semi_global import CONSISTENT
+from .surfaces import Plane
 
 FITTED = Path(__file__).with_name("choice.safetensors")
 
@@ -51,6 +54,8 @@ class ChoiceSettings:
 SETTINGS = ChoiceSettings()
 AROUND = [(s * y, s * x) for s in SETTINGS.around for y, x in ((0, 1), (0, -1), (1, 0), (-1, 0))]
 CANDIDATES = 1 + 4 + len(AROUND)
+STRIP = 16
+"""Size: rows, at half the size, that a thread compares at a time."""
 FACTS = 7
 """Facts of matching, those that are typical of the pair, and the blurs of its views, at half the size."""
 
@@ -97,7 +102,7 @@ def _chosen(inputs: Inputs, found: BetaMatches, network: Choice) -> BetaMatches:
     def of(piece: Inputs, part: BetaMatches) -> tuple[Tensor, Tensor]:
         (beta,) = piece.betas
         views, options = found.comparison.views(piece.alpha, beta.image), candidates(part)
-        with torch.no_grad():
+        with torch.no_grad(), convolutions_in_parallel():
             given = features(views, beta.field.straight, part, options, typical)
             scores, stated = network(given)[..., : options.shape[-2], : options.shape[-1]].split(
                 [CANDIDATES, 2], 1
@@ -140,21 +145,28 @@ def features(
     options: Float[Tensor, "b n h w"],
     typical: Float[Tensor, "b 2"],
 ) -> Float[Tensor, "b i h2 w2"]:
-    """What the scores are by, padded to multiples of 4; `typical` facts are of the whole frame."""
-    extent = Extent.of(segments)
-    apart, unlike = (torch.empty(options.shape) for _ in range(2))
-    for i in range(len(options)):
-        one = min(i, len(segments.end) - 1)
-        planes = (views.alpha[i, 0], views.beta[i, 0], segments.end[one], extent.towards[one], options[i])
-        kernels.compared(*map(numpy_of, planes), SETTINGS.scales, apart[i].numpy(), unlike[i].numpy())
+    """What the scores are by, padded to whole multiples; `typical` facts are of the whole frame."""
+    extent, (h, w) = Extent.of(segments), options.shape[-2:]
     half = _at_half(found, typical)
-    own = views.alpha - 0.5
-    whole = [part.to(own) for part in (own, apart[:, 1:], unlike, apart[:, :1])]
-    h, w = (-n % SETTINGS.multiple for n in own.shape[-2:])
-    if h or w:
-        half = pad(half, (0, w // 2, 0, h // 2), mode="replicate")
-        whole = [pad(part, (0, w, 0, h), mode="replicate") for part in whole]
-    return stacked(half, *whole)
+    sides = [-(-n // SETTINGS.multiple) * SETTINGS.multiple // FINE for n in (h, w)]
+    given = torch.empty(len(options), *sides, FACTS + 4 * (1 + 2 * CANDIDATES))
+    padded = pad(half, (0, sides[1] - half.shape[-1], 0, sides[0] - half.shape[-2]), mode="replicate")
+    given[..., :FACTS] = padded.movedim(1, -1)
+    for i, image in enumerate(given):
+        one = min(i, len(segments.end) - 1)
+        parts = views.alpha[i, 0], views.beta[i, 0], segments.end[one], extent.towards[one], options[i]
+        compared = partial(_compared_rows, *map(numpy_of, parts), image[..., FACTS:].numpy())
+        in_parallel([partial(compared, *span) for span in spans(sides[0], STRIP)])
+    return given.movedim(-1, 1).to(views.alpha)
+
+
+def _compared_rows(
+    own: Plane, other: Plane, end: Plane, towards: Plane, options: Plane, out: Plane, top: int, bottom: int
+) -> None:
+    """`kernels.compared` of some rows of half the size."""
+    rows = slice(FINE * top, FINE * bottom)
+    parts = own[rows], other, end[rows], towards[rows], options[:, rows]
+    kernels.compared(*parts, SETTINGS.scales, out[top:bottom])
 
 
 def _at_half(found: BetaMatches, typical: Tensor) -> Float[Tensor, "b 7 h2 w2"]:

@@ -6,6 +6,9 @@ import numpy as np
 
 from arraygeom.compiled import compiled, separate_cache
 
+COLUMNS = 32
+"""Columns whose numbers are written at a time: they stay in a core's first cache."""
+
 
 @compiled(inline="always")
 def soft(x):
@@ -14,36 +17,42 @@ def soft(x):
 
 
 @compiled(nogil=True, cache=True)
-def compared(own, other, end, towards, candidates, scales, apart, unlike):
-    """Of each pixel's candidates (n, h, w), disparities the first of which is its own: into `apart` (n, h, w)
-    by how much they differ from that, and into `unlike` by how much alpha `own` (h, w) is brighter than beta
-    `other` there; `scales` are what counts as a half of either, 1 at most.
+def compared(own, other, end, towards, candidates, scales, out):
+    """Into `out` (h / 2, w / 2, 4 + 8 n), 2 x 2 pixels as channels: alpha `own` (h, w); of its candidates (n,
+    h, w), disparities the first of which is the pixel's own, by how much they differ from that; by how much
+    alpha is brighter than beta `other` there; and whether the first is on beta. Where h or w are less than
+    `out` is, the last row or column again.
 
-    `apart[0]` is whether the first is on beta.
+    `scales` are the differences of disparity and of brightness that count as a half, 1 at most.
     """
     n, height, width = candidates.shape
     rows, columns = other.shape
-    pixels, level = np.float32(1) / scales[0], np.float32(1) / scales[1]
-    right, bottom, zero, one = np.float32(columns - 1), np.float32(rows - 1), np.float32(0), np.float32(1)
-    for r in range(height):
-        for k in range(n):
-            for c in range(width):
-                far = candidates[k, r, c]
-                x = end[r, c, 0] + far * towards[r, c, 0]
-                y = end[r, c, 1] + far * towards[r, c, 1]
-                if k:
-                    apart[k, r, c] = soft((far - candidates[0, r, c]) * pixels)
-                else:
-                    half = np.float32(0.5)
-                    on = -half <= x and x <= right + half and -half <= y and y <= bottom + half
-                    apart[0, r, c] = one if on else zero
-                x, y = min(max(x, zero), right), min(max(y, zero), bottom)
-                left, top = min(int(x), max(columns - 2, 0)), min(int(y), max(rows - 2, 0))
-                u, v = x - np.float32(left), y - np.float32(top)
-                beside, below = min(left + 1, columns - 1), min(top + 1, rows - 1)
-                above = other[top, left] + u * (other[top, beside] - other[top, left])
-                under = other[below, left] + u * (other[below, beside] - other[below, left])
-                unlike[k, r, c] = soft((own[r, c] - above - v * (under - above)) * level)
+    pixels, level = np.float32(1) / np.float32(scales[0]), np.float32(1) / np.float32(scales[1])
+    right, bottom, zero, half = np.float32(columns - 1), np.float32(rows - 1), np.float32(0), np.float32(0.5)
+    for row in range(2 * out.shape[0]):
+        r = min(row, height - 1)
+        for first in range(0, 2 * out.shape[1], COLUMNS):
+            for k in range(n):
+                for column in range(first, min(first + COLUMNS, 2 * out.shape[1])):
+                    c = min(column, width - 1)
+                    target = out[row // 2, column // 2]
+                    at = 2 * (row % 2) + column % 2
+                    far = candidates[k, r, c]
+                    x = end[r, c, 0] + far * towards[r, c, 0]
+                    y = end[r, c, 1] + far * towards[r, c, 1]
+                    if k:
+                        target[4 * k + at] = soft((far - candidates[0, r, c]) * pixels)
+                    else:
+                        on = -half <= x and x <= right + half and -half <= y and y <= bottom + half
+                        target[at] = own[r, c] - half
+                        target[8 * n + at] = np.float32(on)
+                    x, y = min(max(x, zero), right), min(max(y, zero), bottom)
+                    left, top = min(int(x), max(columns - 2, 0)), min(int(y), max(rows - 2, 0))
+                    u, v = x - np.float32(left), y - np.float32(top)
+                    beside, below = min(left + 1, columns - 1), min(top + 1, rows - 1)
+                    above = other[top, left] + u * (other[top, beside] - other[top, left])
+                    under = other[below, left] + u * (other[below, beside] - other[below, left])
+                    target[4 * (n + k) + at] = soft((own[r, c] - above - v * (under - above)) * level)
 
 
 separate_cache(compared)
