@@ -42,6 +42,9 @@ class CertaintySettings:
     )
     apart: tuple[int, int] = size((1, 4), "Radii, at full size, in which disparities are compared")
     width: int = size(16, "Numbers in each of the two hidden layers")
+    least: float = size(
+        1e-3, "The least probability, where a segment is: a disparity is chosen there, and gives depth"
+    )
     covered: float = size(0.9, "The share of true positions that an interval is to cover")
 
 
@@ -99,7 +102,7 @@ def _certainty(found: BetaMatches) -> Float[Tensor, "b 2 h2 w2"]:
     def of(tile: Tile) -> Tensor:
         numbers = measured(bare.cut(tile.outer), typical).movedim(1, -1)
         logit, half_width = fitted_network().to(numbers)(numbers).unbind(-1)
-        return torch.stack([logit.sigmoid(), half_width.exp()], 1)
+        return torch.stack([logit.sigmoid().clamp(min=SETTINGS.least), half_width.exp()], 1)
 
     halo = FINE * max(SETTINGS.around + SETTINGS.apart)
     return assembled((h, w), ((tile, of(tile)) for tile in tiles_of((h, w), (FINE * ROWS, w), halo)))
