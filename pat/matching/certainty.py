@@ -81,18 +81,13 @@ def fitted_network() -> CertaintyNetwork:
 
 
 @torch.no_grad()
-def with_certainty(matches: Matches, before: Matches | None = None) -> Matches:
-    """The matches, one chosen at each pixel, with the certainty of each.
+def with_certainty(matches: Matches) -> Matches:
+    """The matches, with the certainty of each, once the choice has said what it thinks of them.
 
-    Of matches on which several betas agree, whose certainty alone was known `before`: a beta sees a point
-    only if both say so.
+    Of matches on which several betas agree, whose certainty alone was known before: a beta sees a point only
+    if both say so.
     """
-    judged = [replace(found, certainty=_certainty(found)) for found in matches.betas]
-    for found, own in zip(judged, before.betas if before else ()):
-        if own.certainty is not None:
-            assert found.certainty is not None
-            found.certainty[:, :1] = found.certainty[:, :1].minimum(own.certainty[:, :1])
-    return Matches(tuple(judged))
+    return Matches(tuple(replace(found, certainty=_certainty(found)) for found in matches.betas))
 
 
 def _certainty(found: BetaMatches) -> Float[Tensor, "b 2 h2 w2"]:
@@ -105,7 +100,10 @@ def _certainty(found: BetaMatches) -> Float[Tensor, "b 2 h2 w2"]:
         return torch.stack([logit.sigmoid().clamp(min=SETTINGS.least), half_width.exp()], 1)
 
     halo = FINE * max(SETTINGS.around + SETTINGS.apart)
-    return assembled((h, w), ((tile, of(tile)) for tile in tiles_of((h, w), (FINE * ROWS, w), halo)))
+    certainty = assembled((h, w), ((tile, of(tile)) for tile in tiles_of((h, w), (FINE * ROWS, w), halo)))
+    if found.certainty is not None:
+        certainty[:, :1] = certainty[:, :1].minimum(found.certainty[:, :1])
+    return certainty
 
 
 def typical_facts(found: BetaMatches) -> Float[Tensor, "b 2"]:

@@ -155,18 +155,18 @@ def features(
     for i, image in enumerate(given):
         one = min(i, len(segments.end) - 1)
         parts = views.alpha[i, 0], views.beta[i, 0], segments.end[one], extent.towards[one], options[i]
-        compared = partial(_compared_rows, *map(numpy_of, parts), image[..., FACTS:].numpy())
+        planes = tuple(map(numpy_of, parts))
+        compared = partial(_compared_rows, planes, image[..., FACTS:].numpy())
         in_parallel([partial(compared, *span) for span in spans(sides[0], STRIP)])
     return given.movedim(-1, 1).to(views.alpha)
 
 
-def _compared_rows(
-    own: Plane, other: Plane, end: Plane, towards: Plane, options: Plane, out: Plane, top: int, bottom: int
-) -> None:
+def _compared_rows(planes: tuple[Plane, ...], out: Plane, top: int, bottom: int) -> None:
     """`kernels.compared` of some rows of half the size."""
-    rows = slice(FINE * top, FINE * bottom)
-    parts = own[rows], other, end[rows], towards[rows], options[:, rows]
-    kernels.compared(*parts, SETTINGS.scales, out[top:bottom])
+    (own, other, end, towards, options), rows = planes, slice(FINE * top, FINE * bottom)
+    kernels.compared(
+        own[rows], other, end[rows], towards[rows], options[:, rows], SETTINGS.scales, out[top:bottom]
+    )
 
 
 def _at_half(found: BetaMatches, typical: Tensor) -> Float[Tensor, "b 7 h2 w2"]:

@@ -51,17 +51,26 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
 
     Raises ValueError for a beta whose field is not of straight segments.
     """
-    found = located(inputs, choice)
+    found = in_each_beta(inputs)
+    if inputs.can_agree:
+        found = agreed(inputs, with_certainty(chosen(inputs, found, choice)))
     if torch.is_grad_enabled():
         found = following(inputs, found)
-    return transferred(inputs, with_certainty(chosen(inputs, found, choice), found))
+    if not inputs.can_agree:
+        found = chosen(inputs, found, choice)
+    return transferred(inputs, with_certainty(found))
+
+
+def located(inputs: Inputs) -> Matches:
+    """Where alpha's pixels are in each beta, no colours; of several calibrated betas, where all agree."""
+    alone = in_each_beta(inputs)
+    return agreed(inputs, alone) if inputs.can_agree else alone
 
 
 @torch.no_grad()
-def located(inputs: Inputs, choice: Choice | None = None) -> Matches:
-    """Where alpha's pixels are in each beta, no colours; of several calibrated betas, where all agree."""
-    alone = Matches(tuple(map(located_in_one, inputs.by_beta)))
-    return agreed(inputs, with_certainty(chosen(inputs, alone, choice))) if inputs.can_agree else alone
+def in_each_beta(inputs: Inputs) -> Matches:
+    """The matches in each beta as if it were the only one."""
+    return Matches(tuple(map(located_in_one, inputs.by_beta)))
 
 
 def located_in_one(inputs: Inputs) -> BetaMatches:

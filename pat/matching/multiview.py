@@ -211,7 +211,10 @@ class Agreement(NamedTuple):
 
 
 def agreed(inputs: Inputs, matches: Matches) -> Matches:
-    """The matches of each beta, with `disparity` and `facts` from the inverse depths on which all agree."""
+    """The matches of each beta, with `disparity` and `facts` from the inverse depths on which all agree.
+
+    Those are better than what was chosen for each beta alone.
+    """
     found = matches.betas
     between = ambiguities(inputs, found)
 
@@ -334,7 +337,7 @@ def _of_beta(
         unlike = torch.where(agreement.known[0, top:bottom], unlike, 1.0)
         facts[0, :1, half] = avg_pool2d(unlike[None], FINE)
         facts[0, 1:, half] = agreement.facts[:, half]
-    return replace(own, disparity=disparity, facts=facts)
+    return replace(own, disparity=disparity, facts=facts, chosen=None)
 
 
 def _supported(

@@ -23,7 +23,9 @@ def a_match(facts, disparity=None, blurs=((0.6,), (0.0,))):
     planes = torch.tensor(facts)[None, :, None, None].expand(1, 3, 4, 4).clone()
     disparity = torch.full((1, 1, 8, 8), 5.0) if disparity is None else disparity
     normalisation = Normalisation(torch.zeros(3, 1, 1, 1, 1), tuple(map(list, blurs)))
-    return BetaMatches(disparity, planes, Comparison(None, normalisation, normalisation))
+    comparison = Comparison(None, normalisation, normalisation)
+    stated = torch.tensor([2.0, -1.0])[None, :, None, None].expand(1, 2, 4, 4)
+    return BetaMatches(disparity, planes, comparison, stated=stated)
 
 
 def test_what_certainty_is_read_off():
@@ -35,7 +37,7 @@ def test_what_certainty_is_read_off():
     near, far = numbers[9, 0], numbers[10, 0]
     torch.testing.assert_close(near.exp() - 0.1, torch.tensor([0.0, 0.0, 4.0, 4.0]))
     torch.testing.assert_close(far.exp() - 0.1, torch.tensor([0.0, 4.0, 4.0, 4.0]))
-    assert numbers[11:, 0, 0].tolist() == pytest.approx([0.6, 0.0, 0.5, 0.25])
+    assert numbers[11:, 0, 0].tolist() == pytest.approx([0.6, 0.0, 0.5, 0.25, 2.0, -1.0])
 
 
 def test_typical_facts_are_of_consistent_matches():

@@ -164,7 +164,7 @@ def test_shared_colour_counts_once(network, scene):
     matches = match(frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs)
     one, other = matches.betas
     assert one.diffused is other.diffused
-    assert matches.nbytes == H * W * (2 * (4 + 3 + 2) + 2 * 2 * 3 + 2 * 6)
+    assert matches.nbytes == H * W * (2 * (8 + 3 + 4) + 2 * 2 * 3 + 2 * 6)
     one, other = matches.cut((0, 32, 0, 64)).betas
     assert one.diffused is other.diffused
 
