@@ -1,0 +1,115 @@
+"""What the choice between disparities learns from: true positions, and a step of training."""
+
+import json
+
+import pytest
+import torch
+from safetensors import safe_open
+from skimage.data import data_dir
+
+from experiments.choice import ChoiceTraining, Kept, losses, rows_of, train_choice, window
+from experiments.completion.pairs import HW, photo_pair, varied_pair
+from experiments.evaluation.certainty import unseeing
+from pat.data.pairs import Disparity, StereoPair
+from pat.matching.choice import CANDIDATES, FACTS, Choice, read_choice
+from pat.support.tensor_files import write_tensors
+
+
+def warped(pair):
+    """What right shows at left's pixels moved by the true disparity, and where that is on it."""
+    h, w = pair.left.shape[1:]
+    x = torch.arange(w) - pair.disparity.value
+    there = x.round().long().clamp(0, w - 1).expand(3, h, w)
+    return pair.right.gather(2, there), (x >= 0) & pair.disparity.valid
+
+
+def test_photographs_pairs_have_the_disparity_they_were_made_with(tmp_path):
+    for name in ("astronaut", "coffee"):
+        (tmp_path / f"{name}.png").symlink_to(f"{data_dir}/{name}.png")
+    pair = photo_pair(tmp_path / "astronaut.png", tmp_path / "coffee.png", 3)
+    seen, on = warped(pair)
+    apart = (seen - pair.left).abs().amax(0)
+    assert float((apart < 0.1)[on].float().mean()) > 0.75
+    assert pair.disparity.value.min() > 0
+
+
+def test_varied_pairs_are_of_the_same_scene():
+    """Of another size; disparity with it, and both images in the same other colours."""
+    g = torch.Generator().manual_seed(0)
+    left = torch.nn.functional.interpolate(torch.rand(1, 3, 40, 56, generator=g), HW, mode="bicubic")[0]
+    left = left.clamp(0, 1)
+    pair = StereoPair("a", left, left.roll(-8, -1), 20.0, Disparity(torch.full(HW, 8.0), torch.ones(HW) > 0))
+    for seed in range(4):
+        made = varied_pair(pair, seed)
+        size = made.left.shape[-1] / HW[1]
+        torch.testing.assert_close(made.disparity.value.mean(), torch.tensor(8 * size))
+        assert made.max_disparity > 8 * size
+        seen, on = warped(made)
+        on[:, :20] = False
+        assert float((seen - made.left).abs()[:, on].mean()) < 0.02
+        assert seed == 0 or float((made.left.mean((1, 2)) - left.mean((1, 2))).abs().max()) > 0.01
+
+
+def kept(h=64, w=96):
+    """A pair whose matches are right but in a square, which a neighbour's would be right for."""
+    g = torch.Generator().manual_seed(1)
+    truth = torch.full((1, h, w), 7.0)
+    disparity = truth.clone()
+    disparity[:, 20:24, 60:64] = 15.0
+    facts, seen = torch.zeros(3, h // 2, w // 2), torch.ones(1, h, w) > 0
+    alpha = torch.rand(1, h, w, generator=g)
+    return Kept(alpha, alpha.roll(-7, -1), disparity, facts, truth, seen, torch.zeros(2))
+
+
+def test_a_window_has_the_true_position_among_its_candidates():
+    given, options, truth, seen = window(kept(), 64, torch.Generator().manual_seed(0))
+    assert given.shape == (1, FACTS + 4 * (1 + 2 * CANDIDATES), 32, 32)
+    assert options.shape == (1, CANDIDATES, 64, 64)
+    assert bool(((options - truth).abs() < 0.1).any(1).all())
+    assert bool(seen.all())
+
+
+def test_segments_are_rows():
+    segments = rows_of((4, 6))
+    assert segments.end[0, 2, 3].tolist() == [3.0, 2.0]
+    assert segments.start[0, 2, 3].tolist() == [-3.0, 2.0]
+
+
+def test_training_learns_to_choose():
+    config = ChoiceTraining(photos=(), batch=2, side=64)
+    torch.manual_seed(0)
+    network = Choice((8, 8, 8))
+    adam = torch.optim.Adam(network.parameters(), 3e-3)
+    found = []
+    for loss, _ in zip(losses(config, [kept()], [], network, 0), range(30)):
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        found.append(float(loss))
+    assert found[-1] < 0.5 * found[0]
+
+
+def test_a_pair_is_judged_by_a_choice_that_has_not_seen_it(tmp_path):
+    for name, without in (("a", ["Cloth1"]), ("b", ["Wood1"])):
+        facts = {"recipe": json.dumps({"without": without})}
+        write_tensors(tmp_path / f"{name}.safetensors", Choice().half().state_dict(), facts)
+    files = [tmp_path / "a.safetensors", tmp_path / "b.safetensors"]
+    wanted = read_choice(files[1]).state_dict()
+    for name, tensor in unseeing(files, "2006_third/Wood1").state_dict().items():
+        assert torch.equal(tensor, wanted[name])
+    with pytest.raises(ValueError, match="--without"):
+        unseeing(files, "2006_third/Midd1")
+
+
+@pytest.mark.slow
+def test_a_choice_is_trained(tmp_path):
+    (tmp_path / "photos").mkdir()
+    for name in ("astronaut", "coffee"):
+        (tmp_path / "photos" / f"{name}.png").symlink_to(f"{data_dir}/{name}.png")
+    config = ChoiceTraining(
+        photos=(tmp_path / "photos",), out=tmp_path / "out", captured=2, steps=2, batch=2, side=64
+    )
+    made = train_choice(config)
+    assert bool(read_choice(made).unet.last.weight.isfinite().all())
+    with safe_open(made, "pt") as file:
+        assert json.loads(file.metadata()["recipe"])["captured"] == 2
