@@ -240,13 +240,14 @@ def _located(
     assert isinstance(pinhole, LensView)
     assert isinstance(recorded, LensView)
     x, seen = pixels_between(pinhole, recorded)
-    disparity = _between_pixels(found.disparity[0, :, :h, :w], x)
+    disparity = _between_pixels(found.surface[0, :, :h, :w], x)
 
     def at_points(x: Float[Tensor, "h w 2"], disparity: Float[Tensor, "h w"]) -> tuple[Tensor, Tensor]:
         segments, rows = beta.field.at(x.reshape(-1, 2)), (1, *x.shape[:2])
         assert isinstance(segments, Segments)
         parts = (part.unflatten(0, rows) for part in (segments.start, segments.end, segments.valid))
-        where, inside = replace(found, disparity=disparity[None, None]).positions(Segments(*parts), hw)
+        bare = replace(found, disparity=disparity[None, None], chosen=None)
+        where, inside = bare.positions(Segments(*parts), hw)
         return where[0], inside[0]
 
     where, inside = chunked(at_points, x, disparity, axis=0)

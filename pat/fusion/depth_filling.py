@@ -25,8 +25,9 @@ class FillSettings:
     """Of the depth of pixels whose own match is not certain."""
 
     share: float = tuned(
-        0.7,
-        "Middlebury, tune half: share of the confidence around it below which a match is left for a plane",
+        0.4,
+        "Middlebury, tune half, of .2 to .7: share of the confidence around it below which a match is left for "
+        "a plane",
     )
     reach: float = tuned(
         80.0,

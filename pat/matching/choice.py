@@ -104,7 +104,7 @@ def _chosen(inputs: Inputs, found: BetaMatches, network: Choice) -> BetaMatches:
         views, options = found.comparison.views(piece.alpha, beta.image), candidates(part)
         with torch.no_grad(), convolutions_in_parallel():
             given = features(views, beta.field.straight, part, options, typical)
-            scores, stated = network(given)[..., : options.shape[-2], : options.shape[-1]].split(
+            scores, stated = network.to(given)(given)[..., : options.shape[-2], : options.shape[-1]].split(
                 [CANDIDATES, 2], 1
             )
             best = scores.argmax(1, keepdim=True)

@@ -101,10 +101,10 @@ def test_depth_beyond_the_border_is_that_of_the_slanted_plane_beside_it(step):
 
 
 def test_a_match_is_left_if_those_around_it_are_far_more_certain():
-    """As certain as the mean of the frame is not enough."""
+    """Thrice as certain as half of the frame is not enough."""
     inverse, alpha = two_planes()
     confidence = torch.where(alpha > 0.5, 0.9, 0.1)
-    confidence[90, 80] = confidence.mean()
+    confidence[90, 80] = 0.3
     depth = 1 / inverse
     depth[90, 80] = 1 / (inverse[90, 80] + 0.015)
     found = background_filled(frame_of(depth, confidence), fields_along([4.0, 0.0], alpha=alpha))
