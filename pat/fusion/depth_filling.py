@@ -26,8 +26,8 @@ class FillSettings:
 
     share: float = tuned(
         0.4,
-        "Middlebury, tune half, of .2 to .7: share of the confidence around it below which a match is left for "
-        "a plane",
+        "Middlebury, tune half, of .2 to .7: share of the confidence around it below which a match is "
+        "left for a plane",
     )
     reach: float = tuned(
         80.0,
