@@ -20,7 +20,7 @@ import tyro
 from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Generator, Tensor
-from torch.nn.functional import binary_cross_entropy_with_logits
+from torch.nn.functional import binary_cross_entropy_with_logits, pixel_shuffle
 
 from arraygeom import Segments, pixel_grid
 from experiments.completion.capture import fused_at_random
@@ -159,7 +159,8 @@ def losses(
         windows = [window(some[below(len(some), g)], config.side, g) for some in of]
         given, options, truth, seen = (torch.cat(parts).to(config.device) for parts in zip(*windows))
         with torch.autocast(config.device, torch.bfloat16, enabled=config.device != "cpu"):
-            scores, logit, width = network(given).float().split([CANDIDATES, 1, 1], 1)
+            answer = pixel_shuffle(network(given).float().flatten(1, 2), FINE)
+            scores, logit, width = answer.split([CANDIDATES, 1, 1], 1)
         apart = (options - truth).abs()
         near = (1 - FAR) / (1 + (apart / NEAR) ** 4) + FAR / (1 + apart)
         wrong = -(scores.log_softmax(1) + near.log()).logsumexp(1, keepdim=True)

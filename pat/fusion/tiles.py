@@ -34,7 +34,7 @@ LIBRARIES = 0.46 * 2**30
 """What Python, torch and the compiled loops take, bytes (430 MiB were measured)."""
 SLACK = 1.05
 """What a process may take over what is counted here: freed blocks smaller than a page cannot be returned."""
-MATCHING_BYTES = 330.0
+MATCHING_BYTES = 360.0
 """Working memory of matching for each pixel of alpha, measured."""
 FRAME_BYTES = 12.0
 """A fused frame's for each pixel: depth, confidence and half-width."""

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from safetensors.torch import load_file
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, pad, pixel_shuffle
+from torch.nn.functional import pad, pixel_shuffle
 
 from arraygeom import Segments
 from arraygeom.chunks import spans
@@ -69,9 +69,9 @@ class Choice(nn.Module):
         self.unet = UNet(FACTS + 4 * (1 + 2 * CANDIDATES), widths, 4 * (CANDIDATES + 2))
         nn.init.zeros_(self.unet.last.weight)
 
-    def forward(self, given: Float[Tensor, "b i h2 w2"]) -> Float[Tensor, "b n h w"]:
-        """By `features`."""
-        return pixel_shuffle(self.unet(given), 2)
+    def forward(self, given: Float[Tensor, "b i h2 w2"]) -> Float[Tensor, "b n 4 h2 w2"]:
+        """By `features`, of 2 x 2 pixels."""
+        return self.unet(given).unflatten(1, (CANDIDATES + 2, FINE * FINE))
 
 
 @cache
@@ -100,15 +100,15 @@ def _chosen(inputs: Inputs, found: BetaMatches, network: Choice) -> BetaMatches:
     typical = typical_facts(found)
 
     def of(piece: Inputs, part: BetaMatches) -> tuple[Tensor, Tensor]:
-        (beta,) = piece.betas
-        views, options = found.comparison.views(piece.alpha, beta.image), candidates(part)
+        (beta,), (h, w) = piece.betas, part.disparity.shape[-2:]
+        views = found.comparison.views(piece.alpha, beta.image)
         with torch.no_grad(), convolutions_in_parallel():
-            given = features(views, beta.field.straight, part, options, typical)
-            scores, stated = network.to(given)(given)[..., : options.shape[-2], : options.shape[-1]].split(
-                [CANDIDATES, 2], 1
-            )
-            best = scores.argmax(1, keepdim=True)
-        return options.gather(1, best), avg_pool2d(stated, FINE)
+            given = features(views, beta.field.straight, part, candidates(part), typical)
+            answer = network.to(given)(given)
+            del given  # it takes most of the memory; so would candidates
+            scores, stated = answer.split([CANDIDATES, 2], 1)
+            best = pixel_shuffle(scores.argmax(1).float(), FINE)[..., :h, :w].long()
+        return candidates(part).gather(1, best), stated.mean(2)[..., : h // FINE, : w // FINE]
 
     disparity, stated = inputs.in_pieces(of, replace(found, bands=None, diffused=None, certainty=None))
     return replace(found, chosen=None if inputs.betas[0].around else disparity, stated=stated)

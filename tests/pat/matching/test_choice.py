@@ -140,7 +140,7 @@ def test_sides_need_not_be_multiples():
     class Wanting(Choice):
         def forward(self, given):
             b, _, h, w = given.shape
-            scores = torch.zeros(b, CANDIDATES + 2, 2 * h, 2 * w)
+            scores = torch.zeros(b, CANDIDATES + 2, 4, h, w)
             scores[:, want] = 1.0
             return scores
 
