@@ -69,6 +69,15 @@ def test_a_window_has_the_true_position_among_its_candidates():
     assert bool(seen.all())
 
 
+def test_upside_down_all_planes_are():
+    one = kept()
+    found = one.upside_down()
+    assert torch.equal(found.disparity[:, 40:44, 60:64], torch.full((1, 4, 4), 15.0))
+    assert torch.equal(found.alpha.flip(-2), one.alpha)
+    assert torch.equal(found.beta.flip(-2), one.beta)
+    assert found.blurs is one.blurs
+
+
 def test_segments_are_rows():
     segments = rows_of((4, 6))
     assert segments.end[0, 2, 3].tolist() == [3.0, 2.0]

@@ -1,5 +1,7 @@
 """align: recorded values at alpha's pixels, any type, through lenses, rotations; files; what is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import tifffile
@@ -13,6 +15,8 @@ from pat.fusion.aligned_files import RecordedFiles, save_aligned, write_bands
 from pat.fusion.aligned_page import aligned_page, ndvi
 from pat.fusion.report import Facts
 from pat.fusion.steps import without_lenses
+from pat.matching.match import match
+from pat.matching.matches import Matches
 from pat.media.images import read_image, read_recorded
 
 HW = (96, 160)
@@ -64,6 +68,21 @@ def test_positions_are_of_the_recorded_image(lens, turns):
     assert view.valid[inner].mean() > 0.8
     assert np.abs(view.values[0] - images["mono"][0].numpy())[inner][view.valid[inner]].mean() < 0.02
     assert np.nanmedian(np.abs(found.depth[inner] - DEPTH)) < 0.1
+
+
+@pytest.mark.parametrize("lens", [None, LENS])
+def test_positions_are_those_that_were_chosen(lens):
+    rig, images = array(lens, 0)
+
+    def farther(inputs):
+        (found,) = match(inputs).betas
+        return Matches((replace(found, chosen=found.chosen + 4),))
+
+    found, moved = (
+        align(rig, images, alpha="mono", correct=False, matcher=matcher)["nir"].positions
+        for matcher in (match, farther)
+    )
+    assert np.nanmedian(np.linalg.norm(moved - found, axis=-1)) == pytest.approx(4, abs=0.2)
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,14 @@ def test_what_certainty_is_read_off():
     assert numbers[11:, 0, 0].tolist() == pytest.approx([0.6, 0.0, 0.5, 0.25, 2.0, -1.0])
 
 
+def test_what_is_surely_hidden_keeps_a_little_certainty():
+    """Else the disparity that was chosen for it gave no depth."""
+    found = a_match([1.0, 0.0, 1.0])
+    found = replace(found, stated=torch.tensor([-60.0, 4.0])[None, :, None, None].expand(1, 2, 4, 4))
+    (beta,) = with_certainty(Matches((found,))).betas
+    torch.testing.assert_close(beta.certainty[:, 0], torch.full((1, 4, 4), certainty.SETTINGS.least))
+
+
 def test_typical_facts_are_of_consistent_matches():
     found = a_match([0.0, 0.5, 0.25])
     found.facts[:, :, :, :2] = torch.tensor([1.0, 0.0, 1.0])[None, :, None, None]

@@ -113,6 +113,23 @@ def test_what_is_chosen_is_nearer_the_truth(motorcycle):
     assert wrong(after.chosen, 3) < 0.95 * wrong(after.disparity, 3)
 
 
+def test_depth_is_of_what_was_chosen_and_colour_of_the_match():
+    array = load_motorcycle()
+
+    def farther(inputs):
+        (found,) = match(inputs).betas
+        return Matches((replace(found, chosen=found.chosen + 4),))
+
+    one, other = (
+        fuse(load_weights("mono-colour-small"), array.rig, array.images, alpha="mono", matcher=matcher)
+        for matcher in (match, farther)
+    )
+    pixel = 1 / (994.978 * 0.193001)
+    nearer = ((1 / other.depth - 1 / one.depth) / pixel).nanmedian()
+    assert float(nearer) == pytest.approx(4, abs=0.2)
+    assert torch.equal(other.image, one.image)
+
+
 def test_pieces_choose_as_the_whole(motorcycle, monkeypatch):
     inputs, before = motorcycle
     (whole,) = chosen(inputs, before).betas
