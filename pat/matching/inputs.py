@@ -25,7 +25,7 @@ class InputsSettings:
     """Of the pieces in which large frames are matched at full size, the same whatever memory is allowed."""
 
     halo: int = size(128, "Their halo, pixels")
-    at_once: int = size(1_600_000, "Pixels of alpha matched at once")
+    at_once: int = size(1_200_000, "Pixels of alpha matched at once")
 
 
 SETTINGS = InputsSettings()
