@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-import tyro
 from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Generator, Tensor
@@ -26,7 +25,7 @@ from arraygeom import Segments, pixel_grid
 from experiments.completion.capture import fused_at_random
 from experiments.completion.pairs import Made, PairTraining
 from experiments.evaluation.conditions import regions_of
-from experiments.fit import recipe_text
+from experiments.fit import command, recipe_text
 from pat.data.pairs import StereoPair
 from pat.matching.certainty import SETTINGS, typical_facts
 from pat.matching.choice import CANDIDATES, Choice, candidates, features
@@ -37,7 +36,6 @@ from pat.matching.normalisation import ComparedViews, Comparison, Normalisation
 from pat.matching.positions import FINE
 from pat.media.colour import to_bytes
 from pat.networks.guided import GuidedPAT
-from pat.networks.weights import load_weights
 from pat.sensors import generator_for
 from pat.support.locks import folder_lock
 from pat.support.tensor_files import write_tensors
@@ -56,8 +54,6 @@ class ChoiceTraining(PairTraining):
     """A recipe; half of the windows are of real pairs if there are some."""
 
     out: Path = Path("runs/choice")
-    fusion: str = "mono-colour"
-    """Weights of the fusion, which corrects and denoises before it matches."""
     without: tuple[str, ...] = ()
     """Parts of the names of pairs to leave out, which then say what its certainty is worth."""
     steps: int = 8000
@@ -99,8 +95,7 @@ def train_choice(config: ChoiceTraining) -> Path:
     """
     with folder_lock(config.out):
         torch.manual_seed(config.seed)
-        network = load_weights(config.fusion)
-        assert isinstance(network, GuidedPAT)
+        network = config.network()
         photos = kept(config.out / "photos", network, config.photo_pairs())
         pairs = kept(config.out / "pairs", network, config.real_pairs(), config.without)
         choice = Choice().to(config.device)
@@ -208,4 +203,4 @@ def another_response(alpha: Float[Tensor, "b 1 h w"], g: Generator) -> Float[Ten
 
 
 if __name__ == "__main__":
-    print(train_choice(tyro.cli(ChoiceTraining, prog="python -m experiments.choice")))
+    command(train_choice, ChoiceTraining, "python -m experiments.choice")

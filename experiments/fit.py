@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import tyro
 from torch import Tensor, nn
 from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
@@ -56,6 +58,15 @@ class Recipe:
         )
         network.load_state_dict(averaged.state_dict())
         network.cpu()
+
+
+def command(train: Callable[[Any], Path], recipe: type[Recipe], prog: str) -> None:
+    """Train by a command line, and print the file of the weights; what is wrong with it ends in one line."""
+    config = tyro.cli(recipe, prog=prog)
+    try:
+        print(train(config))
+    except (ValueError, OSError) as error:
+        sys.exit(f"{prog}: {error}")
 
 
 def fit(

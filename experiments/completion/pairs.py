@@ -24,6 +24,8 @@ from experiments.evaluation.halves import of_half
 from experiments.fit import Recipe
 from pat.data.pairs import Disparity, StereoPair, folder_pairs, middlebury_pairs
 from pat.media.images import read_image
+from pat.networks.guided import GuidedPAT
+from pat.networks.weights import load_weights
 from pat.support.folders import files_below
 
 Image = NDArray[np.float32]
@@ -50,6 +52,14 @@ class PairTraining(Recipe):
     """Photographs' pairs that are fused."""
     varied: int = 600
     """And real ones, in other colours and sizes."""
+    fusion: str = "mono-colour"
+    """Weights of the fusion that what is learned is for."""
+
+    def network(self) -> GuidedPAT:
+        """What fuses the pairs."""
+        network = load_weights(self.fusion)
+        assert isinstance(network, GuidedPAT)
+        return network
 
     def photo_pairs(self) -> Iterator[Made]:
         """Those of photographs. Raises ValueError where there are none."""

@@ -14,15 +14,14 @@ from functools import partial
 from pathlib import Path
 
 import torch
-import tyro
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from experiments.fit import recipe_text
+from experiments.fit import command, recipe_text
 from pat.media.colour import from_luma_chroma
 from pat.networks.completion import CANDIDATES, Completion, features
 from pat.networks.guided import GuidedPAT
-from pat.networks.weights import load_weights, save_weights
+from pat.networks.weights import save_weights
 from pat.sensors import generator_for
 from pat.support.locks import folder_lock
 from pat.synthesis.rigs import below
@@ -37,8 +36,6 @@ class CompletionTraining(PairTraining):
     """A recipe; half of the windows are of real pairs if there are some."""
 
     out: Path = Path("runs/completion")
-    fusion: str = "mono-colour"
-    """Weights that the completion is for; one that they have is replaced."""
     widths: tuple[int, int, int] = (64, 96, 128)
     """Channels at 1/2, 1/4 and 1/8 of the size."""
     steps: int = 8000
@@ -53,8 +50,7 @@ def train_completion(config: CompletionTraining) -> Path:
     """
     with folder_lock(config.out):
         torch.manual_seed(config.seed)
-        network = load_weights(config.fusion)
-        assert isinstance(network, GuidedPAT)
+        network = config.network()
         photos, pairs = (kept(config, network, kind) for kind in ("photos", "pairs"))
         completion = Completion(config.widths).to(config.device)
         config.train(completion, partial(losses, config, photos, pairs, completion))
@@ -133,4 +129,4 @@ def hue_axes() -> Float[Tensor, "2 2"]:
 
 
 if __name__ == "__main__":
-    print(train_completion(tyro.cli(CompletionTraining, prog="python -m experiments.completion.training")))
+    command(train_completion, CompletionTraining, "python -m experiments.completion.training")

@@ -109,12 +109,13 @@ def judged(
 
 
 def unseeing(choices: Sequence[Path], pair: str) -> Choice:
-    """The first that was trained without the pair. Raises ValueError if none was."""
+    """The first that was trained without the pair. Raises ValueError if none was, or for another file."""
     for path in choices:
+        choice = read_choice(path)
         with safe_open(path, "pt") as file:
             recipe = json.loads((file.metadata() or {}).get("recipe", "{}"))
         if any(part in pair for part in recipe.get("without", ())):
-            return read_choice(path)
+            return choice
     raise ValueError(f"no choice was trained without {pair}: train one (--without) and give its file")
 
 

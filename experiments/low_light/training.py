@@ -12,11 +12,10 @@ from functools import partial
 from pathlib import Path
 
 import torch
-import tyro
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from experiments.fit import Recipe, recipe_text
+from experiments.fit import Recipe, command, recipe_text
 from pat.media.colour import luminance
 from pat.networks.denoiser import LowLightNetwork
 from pat.networks.weights import load_denoiser, save_weights
@@ -111,4 +110,4 @@ def flipped(image: Float[Tensor, "c n n"], flips: Sequence[int]) -> Float[Tensor
 
 
 if __name__ == "__main__":
-    print(train_denoiser(tyro.cli(DenoiserTraining, prog="python -m experiments.low_light.training")))
+    command(train_denoiser, DenoiserTraining, "python -m experiments.low_light.training")

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import pad, pixel_shuffle
@@ -81,9 +82,12 @@ def fitted_choice() -> Choice:
 
 
 def read_choice(path: Path) -> Choice:
-    """One that was trained."""
+    """One that was trained. Raises ValueError for a file of anything else."""
     network = Choice()
-    network.load_state_dict(load_file(path))
+    try:
+        network.load_state_dict(load_file(path))
+    except (RuntimeError, SafetensorError):
+        raise ValueError(f"{path}: not the weights of a choice: train one by experiments.choice") from None
     return network.float().eval().requires_grad_(False)
 
 
@@ -105,7 +109,7 @@ def _chosen(inputs: Inputs, found: BetaMatches, network: Choice) -> BetaMatches:
         with torch.no_grad(), convolutions_in_parallel():
             given = features(views, beta.field.straight, part, candidates(part), typical)
             answer = network.to(given)(given)
-            del given  # it takes most of the memory; so would candidates
+            del given  # most of the memory; candidates are made twice for the same reason
             scores, stated = answer.split([CANDIDATES, 2], 1)
             best = pixel_shuffle(scores.argmax(1).float(), FINE)[..., :h, :w].long()
         return candidates(part).gather(1, best), stated.mean(2)[..., : h // FINE, : w // FINE]
@@ -170,6 +174,7 @@ def _compared_rows(planes: tuple[Plane, ...], out: Plane, top: int, bottom: int)
 
 
 def _at_half(found: BetaMatches, typical: Tensor) -> Float[Tensor, "b 7 h2 w2"]:
+    """The `FACTS` of each pixel, about -.4 to .6."""
     blurs = torch.tensor(found.comparison.whole.blurs).T.to(typical) / SETTINGS.blur
     same = torch.cat([typical, blurs], 1)[..., None, None].expand(-1, -1, *found.facts.shape[-2:])
     return torch.cat([found.facts, same], 1) - 0.4

@@ -10,6 +10,7 @@ from skimage.data import data_dir
 from experiments.choice import ChoiceTraining, Kept, losses, rows_of, train_choice, window
 from experiments.completion.pairs import HW, photo_pair, varied_pair
 from experiments.evaluation.certainty import unseeing
+from experiments.fit import command
 from pat.data.pairs import Disparity, StereoPair
 from pat.matching.choice import CANDIDATES, FACTS, Choice, read_choice
 from pat.support.tensor_files import write_tensors
@@ -108,6 +109,21 @@ def test_a_pair_is_judged_by_a_choice_that_has_not_seen_it(tmp_path):
         assert torch.equal(tensor, wanted[name])
     with pytest.raises(ValueError, match="--without"):
         unseeing(files, "2006_third/Midd1")
+
+
+def test_a_choice_must_be_one(tmp_path):
+    write_tensors(tmp_path / "other.safetensors", {"a": torch.zeros(3)})
+    (tmp_path / "text.safetensors").write_text("none")
+    for name in ("other", "text"):
+        with pytest.raises(ValueError, match=f"{name}.safetensors: not the weights of a choice"):
+            unseeing([tmp_path / f"{name}.safetensors"], "2006_third/Wood1")
+
+
+def test_a_wrong_folder_ends_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["choice", "--photos", str(tmp_path), "--out", str(tmp_path / "out")])
+    with pytest.raises(SystemExit) as stop:
+        command(train_choice, ChoiceTraining, "choice")
+    assert str(stop.value) == f"choice: no photograph in {tmp_path}: check the folders"
 
 
 @pytest.mark.slow
