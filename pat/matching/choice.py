@@ -111,7 +111,7 @@ def _chosen(inputs: Inputs, found: BetaMatches, network: Choice) -> BetaMatches:
             answer = network.to(given)(given)
             del given  # most of the memory; candidates are made twice for the same reason
             scores, stated = answer.split([CANDIDATES, 2], 1)
-            best = pixel_shuffle(scores.argmax(1).float(), FINE)[..., :h, :w].long()
+            best = pixel_shuffle(scores.max(1).indices.float(), FINE)[..., :h, :w].long()
         return candidates(part).gather(1, best), stated.mean(2)[..., : h // FINE, : w // FINE]
 
     disparity, stated = inputs.in_pieces(of, replace(found, bands=None, diffused=None, certainty=None))

@@ -10,9 +10,9 @@ fused image is sheared back.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain
+from operator import attrgetter, itemgetter
 from typing import Literal, NamedTuple
 
 import torch
@@ -183,9 +183,9 @@ def fit(
     found = [groups.explained_by(shading, vignetted=False)]
     if where is not None:
         for _ in range(SETTINGS.steps):
-            shading = shading + _best(groups.explained_by(shading, vignetted=True)).further
+            shading = shading + groups.explained_by(shading, vignetted=True).further
         found.append(groups.explained_by(shading, vignetted=True))
-    response = _best(chain(*found)).response
+    response = max(found, key=attrgetter("evidence")).response
     return response if response.explains else Response.rec601()._replace(explained=response.explained)
 
 
@@ -257,15 +257,11 @@ as usual."""
 
 
 class _Explanation(NamedTuple):
-    """A response of some kind, the logarithm of its probability, and the shading that it asks for further."""
+    """A response, the logarithm of its probability, and the shading that it asks for further."""
 
     evidence: float
     response: Response
     further: Float[Tensor, "5"]
-
-
-def _best(found: Iterable[_Explanation]) -> _Explanation:
-    return max(found, key=lambda explanation: explanation.evidence)
 
 
 class _Groups(NamedTuple):
@@ -314,8 +310,8 @@ class _Groups(NamedTuple):
         points, terms = torch.cat([x, _shading_terms(where)]), _shading_terms(means[3:5].T)
         return cls(points, weight / counts[group], group, means[5], level, terms, counts, variance, spread)
 
-    def explained_by(self, shading: Tensor, *, vignetted: bool) -> list[_Explanation]:
-        """The most probable of each kind, without a gamma and with one, this shading taken out of beta; if
+    def explained_by(self, shading: Tensor, *, vignetted: bool) -> _Explanation:
+        """The most probable of all kinds, without a gamma and with one, this shading taken out of beta; if
         vignetted, with what is left of it."""
         gammas = self.y.new_tensor(SETTINGS.gammas)
         _, gram = self._modelled(gammas, shading, vignetted)
@@ -325,16 +321,17 @@ class _Groups(NamedTuple):
         for kind in KINDS:
             evidence = kind.evidence(gram, drawn)[0] + kind.prior(gammas) + rare
             for some in (gammas == 1, gammas != 1)[: 1 + kind.gain]:
-                gamma = gammas[some][evidence[some].argmax()]
-                if len(gammas[some]) > 1:
-                    gamma = self._most_probable(gamma, kind, shading, vignetted)
-                (model,), there = self._modelled(gamma[None], shading, vignetted)
-                (coefficients,) = kind.evidence(there, drawn)[1]
-                explained = self._explained_by(coefficients @ model)
-                response = kind.response(coefficients[:3], float(gamma), explained)
-                response = response._replace(shading=tuple(shading.tolist()) if vignetted else ())
-                found.append(_Explanation(float(evidence[some].logsumexp(0)), response, coefficients[3:]))
-        return found
+                best = gammas[some][evidence[some].argmax()]
+                found.append((float(evidence[some].logsumexp(0)), kind, best, int(some.sum()) > 1))
+        evidence, kind, gamma, bent = max(found, key=itemgetter(0))
+        if bent:
+            gamma = self._most_probable(gamma, kind, shading, vignetted)
+        (model,), there = self._modelled(gamma[None], shading, vignetted)
+        (coefficients,) = kind.evidence(there, drawn)[1]
+        explained = self._explained_by(coefficients @ model)
+        response = kind.response(coefficients[:3], float(gamma), explained)
+        response = response._replace(shading=tuple(shading.tolist()) if vignetted else ())
+        return _Explanation(evidence, response, coefficients[3:])
 
     def _most_probable(
         self, gamma: Float[Tensor, ""], kind: _Kind, shading: Tensor, vignetted: bool
