@@ -20,6 +20,8 @@ from pat.training.checkpoints import collect, newest_checkpoint, restore, write_
 
 Losses = Callable[[int], Iterator[Tensor]]
 """The loss of each step from a given one on, computed when it is asked for."""
+AVERAGE = 300
+"""Time constant of the averaged weights, steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,17 +47,8 @@ class Recipe:
 
     def train(self, network: nn.Module, losses: Losses) -> None:
         """Train a network, or the rest of a run, and leave the averaged weights in it, on the CPU."""
-        recipe = recipe_text(self)
-        averaged = fit(
-            network,
-            losses,
-            self.out / "training",
-            recipe,
-            steps=self.steps,
-            rate=self.rate,
-            save=self.save,
-            validate=self.save,
-        )
+        out = self.out / "training"
+        averaged = fit(network, losses, out, recipe_text(self), self.steps, self.rate, self.save)
         network.load_state_dict(averaged.state_dict())
         network.cpu()
 
@@ -70,27 +63,14 @@ def command(train: Callable[[Any], Path], recipe: type[Recipe], prog: str) -> No
 
 
 def fit(
-    network: nn.Module,
-    losses: Losses,
-    out: Path,
-    recipe: str,
-    *,
-    steps: int,
-    rate: float,
-    save: int,
-    validate: int,
-    average: int = 300,
-    examine: Callable[[Any], dict[str, float]] = lambda network: {},
-    keep: Callable[[Any, int], None] = lambda network, step: None,
+    network: nn.Module, losses: Losses, out: Path, recipe: str, steps: int, rate: float, save: int
 ) -> nn.Module:
     """Train a network for so many steps, or the rest of the run in `out`; returns it with averaged weights.
 
-    The rate falls along half a cosine; `average` is the time constant in steps. The averaged network is
-    validated by `examine`, and given to `keep` with each checkpoint; what is logged with a validation is the
-    mean loss since the last checkpoint. Raises RuntimeError if a gradient is not finite, ValueError for a
-    folder with another run.
+    The rate falls along half a cosine. The mean loss is logged with each checkpoint, every `save` steps.
+    Raises RuntimeError if a gradient is not finite, ValueError for a folder with another run.
     """
-    averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / average))
+    averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / AVERAGE))
     adam = Adam(network.parameters(), lr=rate, betas=(0.9, 0.99))
     step = 0
     former = newest_checkpoint(out / "checkpoints")
@@ -100,10 +80,6 @@ def fit(
             raise ValueError(f"{out} holds a run of another recipe ({other}): give another --out")
         restore(former, network, adam, averaged)
         step = former.facts["step"]
-    if step == 0:
-        facts = examine(averaged.module)
-        if facts:
-            _log(out, step, steps, facts)
     given = losses(step)
     since_save: list[float] = []
     while step < steps:
@@ -118,27 +94,23 @@ def fit(
         since_save.append(float(loss.detach()))
         step += 1
         done = step == steps
-        if step % validate == 0 or done:
-            _log(out, step, steps, {"mean loss": fmean(since_save)} | examine(averaged.module))
         if step % save == 0 or done:
+            _log(out, step, steps, fmean(since_save))
             since_save = []
-            keep(averaged.module, step)
             state = {"step": step, "best": 0.0, "minutes": 0.0, "done": done, "recipe": recipe}
             write_checkpoint(out / "checkpoints", collect(network, adam, averaged, state))
     return averaged.module
 
 
-def _log(out: Path, step: int, steps: int, facts: dict[str, float]) -> None:
-    """Print the figures of a step, and append them to the run's log.jsonl."""
-    figures = ", ".join(f"{name} {value:.4f}" for name, value in facts.items())
-    print(f"{out.name}: step {step} of {steps}, {figures}", flush=True)
-    line = json.dumps({"step": step} | {name: round(value, 4) for name, value in facts.items()})
+def _log(out: Path, step: int, steps: int, loss: float) -> None:
+    """Print the mean loss, and append it to the run's log.jsonl."""
+    print(f"{out.name}: step {step} of {steps}, mean loss {loss:.4f}", flush=True)
     out.mkdir(parents=True, exist_ok=True)
     with (out / "log.jsonl").open("a", encoding="utf-8") as file:
-        file.write(line + "\n")
+        file.write(json.dumps({"step": step, "mean loss": round(loss, 4)}) + "\n")
 
 
-def recipe_text(config: Any, *unseen: str) -> str:
+def recipe_text(config: Any) -> str:
     """A recipe without the entries that may differ between a run and its continuation."""
-    left_out = {"out", "cache", "save", "validate", *unseen}
+    left_out = {"out", "cache", "save"}
     return json.dumps({k: v for k, v in asdict(config).items() if k not in left_out}, default=str)
