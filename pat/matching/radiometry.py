@@ -323,7 +323,7 @@ class _Groups(NamedTuple):
             for some in (gammas == 1, gammas != 1)[: 1 + kind.gain]:
                 best = gammas[some][evidence[some].argmax()]
                 found.append((float(evidence[some].logsumexp(0)), kind, best, int(some.sum()) > 1))
-        evidence, kind, gamma, bent = max(found, key=itemgetter(0))
+        most, kind, gamma, bent = max(found, key=itemgetter(0))
         if bent:
             gamma = self._most_probable(gamma, kind, shading, vignetted)
         (model,), there = self._modelled(gamma[None], shading, vignetted)
@@ -331,7 +331,7 @@ class _Groups(NamedTuple):
         explained = self._explained_by(coefficients @ model)
         response = kind.response(coefficients[:3], float(gamma), explained)
         response = response._replace(shading=tuple(shading.tolist()) if vignetted else ())
-        return _Explanation(evidence, response, coefficients[3:])
+        return _Explanation(most, response, coefficients[3:])
 
     def _most_probable(
         self, gamma: Float[Tensor, ""], kind: _Kind, shading: Tensor, vignetted: bool
