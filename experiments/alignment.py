@@ -163,8 +163,8 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
     if truth is not None:
         expected = pixel_grid((h, w)).numpy().copy()
         expected[..., 0] -= truth.value.numpy()
-        occluded = occluded_pixels(truth)
-        visible = truth.valid.numpy() & (expected[..., 0] >= 0) & ~occluded
+        regions = truth.regions()
+        occluded, visible = regions.occluded.numpy(), regions.seen.numpy() & (expected[..., 0] >= 0)
     candidates = corners[patch_mean(visible.astype(float), corners) > 1 - 1e-6]
     rows = []
     for name in scene.rig.betas(scene.alpha):
@@ -310,19 +310,6 @@ def _correlation(a: NDArray[Any], b: NDArray[Any], H: NDArray[Any]) -> float:
 def _gradients(image: NDArray[np.uint8], factor: float) -> NDArray[np.float32]:
     small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA).astype(np.float32)
     return np.asarray(np.hypot(cv2.Sobel(small, -1, 1, 0), cv2.Sobel(small, -1, 0, 1)), np.float32)
-
-
-def occluded_pixels(truth: Disparity) -> Bool[np.ndarray, "h w"]:
-    """Pixels of the left image that the right one does not see, by the left one's true disparities: another
-    of their row, nearer by more than a pixel, falls on the same pixel."""
-    disparity, valid = truth.value.numpy(), truth.valid.numpy()
-    h, w = disparity.shape
-    nearest = np.zeros((h, w + 1))
-    target = np.rint(np.arange(w) - disparity).astype(int)
-    inside = valid & (target >= 0)
-    rows = np.broadcast_to(np.arange(h)[:, None], (h, w))
-    np.maximum.at(nearest, (rows[inside], target[inside]), disparity[inside])
-    return np.asarray(inside & (nearest[rows, target.clip(0)] > disparity + 1))
 
 
 def patch_mean(plane: NDArray[Any], x: NDArray[Any]) -> Float[np.ndarray, " n"]:

@@ -214,14 +214,8 @@ def regions_of(pair: StereoPair, hw: tuple[int, int]) -> dict[str, Bool[Tensor, 
     found["cropped"] = torch.arange(w).expand(h, w) >= LEFT_CROP
     if pair.disparity is None:
         return found
-    value, known = (t[:h, :w] for t in pair.disparity)
-    column = torch.arange(w) - value
-    beyond = known & (column < -0.5)
-    nearest = torch.zeros(h, w).scatter_reduce(
-        1, column.round().long().clamp(0, w - 1), value * known, "amax"
-    )
-    hidden = nearest.gather(1, column.round().long().clamp(0, w - 1)) > value + 1
-    return found | {"seen": known & ~beyond & ~hidden, "occluded": known & ~beyond & hidden, "beyond": beyond}
+    cut = Disparity(*(plane[:h, :w] for plane in pair.disparity))
+    return found | cut.regions()._asdict()
 
 
 def chroma_bound(task: MonoColourTask, rate: int) -> Float[Tensor, "3 h w"]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -27,6 +28,24 @@ class Disparity(NamedTuple):
 
     value: Float[Tensor, "h w"]
     valid: Bool[Tensor, "h w"]
+
+    def regions(self) -> DisparityRegions:
+        """Where left's pixels of known disparity are in right: another is in front if it is on the same pixel
+        of right and its disparity is greater by more than 1."""
+        column = (torch.arange(self.value.shape[1]) - self.value).round()
+        on_right = self.valid & (column >= 0)
+        index = torch.where(on_right, column, 0).long()
+        front = torch.zeros_like(self.value).scatter_reduce(1, index, self.value * on_right, "amax")
+        hidden = front.gather(1, index) > self.value + 1
+        return DisparityRegions(on_right & ~hidden, on_right & hidden, self.valid & ~on_right)
+
+
+class DisparityRegions(NamedTuple):
+    """Of left's pixels: those seen in right, behind others there, and beyond right's left edge."""
+
+    seen: Bool[Tensor, "h w"]
+    occluded: Bool[Tensor, "h w"]
+    beyond: Bool[Tensor, "h w"]
 
 
 @dataclass(frozen=True)

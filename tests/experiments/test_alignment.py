@@ -14,7 +14,6 @@ from experiments.alignment import (
     alignment_rows,
     ecc_homography,
     local_offsets,
-    occluded_pixels,
 )
 from pat.data.pairs import Disparity
 from pat.evaluation.protocols import rectified_rig
@@ -66,14 +65,6 @@ def test_the_homography_is_found():
     found = ecc_homography(own, other)
     corners = np.array([[[50.0, 50], [590, 50], [590, 430], [50, 430]]])
     assert np.abs(cv2.perspectiveTransform(corners, found) - cv2.perspectiveTransform(corners, H)).max() < 1.0
-
-
-def test_a_post_occludes_what_is_beside_it():
-    disparity = torch.full((4, 100), 10.0)
-    disparity[:, 60:70] = 20.0
-    occluded = occluded_pixels(Disparity(disparity, torch.ones(4, 100, dtype=torch.bool)))
-    assert occluded[:, 50:60].all()
-    assert occluded.sum() == 4 * 10
 
 
 def test_a_shifted_band_is_aligned_and_measured():

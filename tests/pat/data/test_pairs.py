@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from pat.data import folder_pairs, middlebury_pairs
+from pat.data.pairs import Disparity
 from pat.media.images import write_image
 
 READERS = [middlebury_pairs, folder_pairs]
@@ -71,3 +72,22 @@ def warping_error(pair, scale):
     inside = (found >= 0) & (found < pair.right.shape[2])
     difference = pair.left[:, rows, columns] - pair.right[:, rows, found.clamp(0, pair.right.shape[2] - 1)]
     return float(difference[:, inside].abs().median())
+
+
+def test_a_post_occludes_what_is_beside_it():
+    value = torch.full((4, 100), 10.0)
+    value[:, 60:70] = 20.0
+    value[0, 55] = 0.0
+    valid = torch.ones(4, 100, dtype=torch.bool)
+    valid[0, 55] = False
+    seen, occluded, beyond = Disparity(value, valid).regions()
+    assert occluded[1:, 50:60].all() and int(occluded.sum()) == 4 * 10 - 1  # noqa: PT018
+    assert beyond[:, :10].all() and not beyond[:, 10:].any()  # noqa: PT018
+    assert bool((seen.int() + occluded.int() + beyond.int() == valid.int()).all())
+
+
+def test_what_is_beyond_the_edge_hides_nothing_at_it():
+    """Disparities of 12 beyond the edge were counted as on its first column."""
+    value = torch.full((1, 40), 12.0)
+    value[:, 10:] = 10.0
+    assert not Disparity(value, value > 0).regions().occluded.any()
