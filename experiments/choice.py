@@ -37,7 +37,6 @@ from pat.matching.positions import FINE
 from pat.media.colour import to_bytes
 from pat.networks.guided import GuidedPAT
 from pat.sensors import generator_for
-from pat.support.locks import folder_lock
 from pat.support.tensor_files import write_tensors
 from pat.synthesis.rigs import below
 
@@ -93,8 +92,7 @@ def train_choice(config: ChoiceTraining) -> Path:
 
     Raises ValueError where there are no photographs, or the folder holds a run of another recipe.
     """
-    with folder_lock(config.out):
-        torch.manual_seed(config.seed)
+    with config.folder():
         network = config.network()
         photos = kept(config.out / "photos", network, config.photo_pairs())
         pairs = kept(config.out / "pairs", network, config.real_pairs(), config.without)

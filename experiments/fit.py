@@ -6,16 +6,20 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import torch
 import tyro
 from torch import Tensor, nn
 from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from arraygeom.atomic import write_atomically
+from pat.support.locks import folder_lock
 from pat.training.checkpoints import collect, newest_checkpoint, restore, write_checkpoint
 
 Losses = Callable[[int], Iterator[Tensor]]
@@ -45,10 +49,22 @@ class Recipe:
     device: str = "cpu"
     """Where training runs."""
 
+    @contextmanager
+    def folder(self) -> Iterator[None]:
+        """The run's folder, with its recipe, for one process. Raises ValueError if it holds another run."""
+        with folder_lock(self.out):
+            file, recipe = self.out / "recipe.json", recipe_text(self)
+            if not file.exists():
+                with write_atomically(file) as temporary:
+                    temporary.write_text(recipe, encoding="utf-8")
+            elif (other := file.read_text(encoding="utf-8")) != recipe:
+                raise ValueError(f"{self.out} holds a run of another recipe ({other}): give another --out")
+            torch.manual_seed(self.seed)
+            yield
+
     def train(self, network: nn.Module, losses: Losses) -> None:
         """Train a network, or the rest of a run, and leave the averaged weights in it, on the CPU."""
-        out = self.out / "training"
-        averaged = fit(network, losses, out, recipe_text(self), self.steps, self.rate, self.save)
+        averaged = fit(network, losses, self.out / "training", self.steps, self.rate, self.save)
         network.load_state_dict(averaged.state_dict())
         network.cpu()
 
@@ -62,22 +78,17 @@ def command(train: Callable[[Any], Path], recipe: type[Recipe], prog: str) -> No
         sys.exit(f"{prog}: {error}")
 
 
-def fit(
-    network: nn.Module, losses: Losses, out: Path, recipe: str, steps: int, rate: float, save: int
-) -> nn.Module:
+def fit(network: nn.Module, losses: Losses, out: Path, steps: int, rate: float, save: int) -> nn.Module:
     """Train a network for so many steps, or the rest of the run in `out`; returns it with averaged weights.
 
     The rate falls along half a cosine. The mean loss is logged with each checkpoint, every `save` steps.
-    Raises RuntimeError if a gradient is not finite, ValueError for a folder with another run.
+    Raises RuntimeError if a gradient is not finite.
     """
     averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / AVERAGE))
     adam = Adam(network.parameters(), lr=rate, betas=(0.9, 0.99))
     step = 0
     former = newest_checkpoint(out / "checkpoints")
     if former:
-        if former.facts["recipe"] != recipe:
-            other = former.facts["recipe"]
-            raise ValueError(f"{out} holds a run of another recipe ({other}): give another --out")
         restore(former, network, adam, averaged)
         step = former.facts["step"]
     given = losses(step)
@@ -97,7 +108,7 @@ def fit(
         if step % save == 0 or done:
             _log(out, step, steps, fmean(since_save))
             since_save = []
-            state = {"step": step, "best": 0.0, "minutes": 0.0, "done": done, "recipe": recipe}
+            state = {"step": step, "best": 0.0, "minutes": 0.0, "done": done, "recipe": ""}
             write_checkpoint(out / "checkpoints", collect(network, adam, averaged, state))
     return averaged.module
 
@@ -112,5 +123,5 @@ def _log(out: Path, step: int, steps: int, loss: float) -> None:
 
 def recipe_text(config: Any) -> str:
     """A recipe without the entries that may differ between a run and its continuation."""
-    left_out = {"out", "cache", "save"}
+    left_out = {"out", "cache", "save", "device"}
     return json.dumps({k: v for k, v in asdict(config).items() if k not in left_out}, default=str)

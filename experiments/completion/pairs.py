@@ -104,7 +104,7 @@ def varied_pair(pair: StereoPair, seed: int) -> StereoPair:
     left, right = _recoloured([larger(image).clamp(0, 1) for image in (pair.left, pair.right)], rng)
     most, truth = pair.max_disparity, None
     if pair.disparity is not None:
-        value, valid = (larger(part[None].float(), "nearest")[0] for part in pair.disparity)
+        value, valid = (larger(part[None].float(), "nearest-exact")[0] for part in pair.disparity)
         truth = Disparity(value * width / size[1], valid > 0)
         most = float(pair.disparity.value.max())
     assert most is not None

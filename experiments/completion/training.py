@@ -23,7 +23,6 @@ from pat.networks.completion import CANDIDATES, Completion, features
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import save_weights
 from pat.sensors import generator_for
-from pat.support.locks import folder_lock
 from pat.synthesis.rigs import below
 from pat.training.losses import image_loss
 
@@ -48,8 +47,7 @@ def train_completion(config: CompletionTraining) -> Path:
 
     Raises ValueError where there are no photographs, or the folder holds a run of another recipe.
     """
-    with folder_lock(config.out):
-        torch.manual_seed(config.seed)
+    with config.folder():
         network = config.network()
         photos, pairs = (kept(config, network, kind) for kind in ("photos", "pairs"))
         completion = Completion(config.widths).to(config.device)

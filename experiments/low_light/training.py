@@ -20,7 +20,6 @@ from pat.media.colour import luminance
 from pat.networks.denoiser import LowLightNetwork
 from pat.networks.weights import load_denoiser, save_weights
 from pat.sensors import NoiseLevel, generator_for
-from pat.support.locks import folder_lock
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rigs import below
 from pat.training.losses import image_loss
@@ -47,8 +46,7 @@ def train_denoiser(config: DenoiserTraining) -> Path:
 
     Raises ValueError where there are no photographs, or the folder holds a run of another recipe.
     """
-    with folder_lock(config.out):
-        torch.manual_seed(config.seed)
+    with config.folder():
         network = load_denoiser(config.start).requires_grad_(True) if config.start else LowLightNetwork()
         network = network.to(config.device)
         bank = PhotoBank.load(*config.photos, cache=config.cache, seed=config.seed)

@@ -32,10 +32,11 @@ class Disparity(NamedTuple):
     def regions(self) -> DisparityRegions:
         """Where left's pixels of known disparity are in right: another is in front if it is on the same pixel
         of right and its disparity is greater by more than 1."""
-        column = (torch.arange(self.value.shape[1]) - self.value).round()
+        column = (torch.arange(self.value.shape[1]).to(self.value) - self.value).round()
         on_right = self.valid & (column >= 0)
         index = torch.where(on_right, column, 0).long()
-        front = torch.zeros_like(self.value).scatter_reduce(1, index, self.value * on_right, "amax")
+        known = torch.where(on_right, self.value, 0)
+        front = torch.zeros_like(known).scatter_reduce(1, index, known, "amax")
         hidden = front.gather(1, index) > self.value + 1
         return DisparityRegions(on_right & ~hidden, on_right & hidden, self.valid & ~on_right)
 

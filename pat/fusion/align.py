@@ -22,6 +22,7 @@ from torch import Tensor
 from arraygeom import Band, LensView, ReceptiveField, Rig, Segments, View, pixel_grid, sample
 from arraygeom.chunks import chunked
 from arraygeom.sampling import Interpolation, on_image
+from arraygeom.threads import torch_in_one_thread
 from arraygeom.undistortion import pixels_between, recorded_pixels, resampled, with_pixels
 
 from ..matching.match import Matcher, match
@@ -31,6 +32,7 @@ from ..media.images import Images
 from ..networks.protocol import FusionNetwork
 from ..networks.weights import load_weights, weights_for
 from ..support.memory import limited, parse_bytes
+from ..support.precision import without_autocast
 from .checks import warn_of_confidence
 from .corrections import corrections_for, expected_work
 from .fuse import Progress
@@ -137,6 +139,8 @@ class Aligned(Mapping[str, AlignedView]):
         return np.concatenate([view.values for view in self.views.values()])
 
 
+@torch_in_one_thread()
+@without_autocast()
 def align(
     rig: Rig,
     images: Images,
@@ -173,7 +177,8 @@ def align(
         fill: "none" invents no values; "propagate" gives pixels that a camera does not see its nearest seen
             value.
 
-    Raises ValueError as `fuse`, and for recorded values of another size than the rig says.
+    Raises ValueError as `fuse`, and for recorded values that are missing, no numbers, or of another size than
+    the rig says.
     """
     if interpolation not in INTERPOLATIONS or fill not in ("none", "propagate"):
         raise ValueError(
@@ -185,7 +190,14 @@ def align(
     limit = None if max_memory is None else parse_bytes(max_memory)
     rig = with_pixels(rig if depth is None else rig.replace(depth=depth))
     views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, field=field), noise)
-    betas = views.betas
+    betas, own = views.betas, images if recorded is None else recorded
+    for name in (alpha, *betas):
+        if name not in own:
+            raise ValueError(
+                f"there are no recorded values of '{name}': give those of every camera with an image"
+            )
+        if isinstance(own, dict):  # others may be read from files, which takes time
+            _as_array(own[name], name, rig[name].hw)
     network = network or load_weights(weights_for([len(views.images[name]) for name in betas]))
     check_bands(views, network.bands)
     inputs, undo = prepared(network, views, _steps(network, normalise=match_levels))
@@ -206,7 +218,6 @@ def align(
         done = fused_in_tiles(network, inputs, matches, plan.tiles, progress=progress)
         warn_of_confidence(network, done.frame, inputs)
         depths = undone(done.frame, undo).depth
-        own = recorded if recorded is not None else images
         aligned = {alpha: _of_alpha(rig, alpha, own)}
         for i, name in enumerate(betas):
             LOG.info("aligning %s", name)
@@ -217,7 +228,7 @@ def align(
             aligned[name] = _aligned_view(
                 rig[name], name, place, located, confidence, seen, own[name], interpolation, fill
             )
-    return Aligned(alpha, aligned, depths.numpy())
+    return Aligned(alpha, aligned, depths.cpu().numpy())
 
 
 def _steps(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:
@@ -288,15 +299,15 @@ def _aligned_view(
     values, now = _as_array(values, name, camera.hw), place.pair.beta
     assert isinstance(now, LensView)
     where, valid = chunked(lambda x: recorded_pixels(x, now, camera), located[0].double(), axis=0)
-    where = where.float()
-    inside = located[1] & valid & on_image(where, camera.hw)
+    where, confidence = where.float().cpu(), confidence.float().cpu()
+    inside, seen = (located[1] & valid).cpu() & on_image(where, camera.hw), seen.cpu()
     visibility = torch.where(inside, torch.where(seen, SEEN, OCCLUDED), OUTSIDE).to(torch.uint8).numpy()
     taken = filled(resampled_values(values, where.numpy(), interpolation), visibility == SEEN, fill)
     return AlignedView(
         taken,
         torch.where(inside[..., None], where, torch.nan).numpy(),
         visibility,
-        torch.where(inside, confidence.float(), 0.0).numpy(),
+        torch.where(inside, confidence, 0.0).numpy(),
         _band_names(name, len(values)),
         camera.sensor.response,
     )
@@ -311,8 +322,10 @@ def _of_alpha(rig: Rig, name: str, recorded: Recorded) -> AlignedView:
 
 
 def _as_array(values: Any, name: str, hw: tuple[int, int]) -> NDArray[Any]:
-    """Recorded values as NumPy's. Raises ValueError for another shape than (C, H, W)."""
+    """Recorded values as NumPy's. Raises ValueError for another shape than (C, H, W), and without numbers."""
     array = values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"the recorded values of '{name}' are {array.dtype}: give integers or real numbers")
     if array.ndim != 3 or array.shape[1:] != tuple(hw):
         (h, w), got = hw, "x".join(map(str, array.shape))
         raise ValueError(
@@ -335,21 +348,24 @@ def resampled_values(
     In float64: float32 would round positions by 1e-4 pixels in an image of 4000. Beyond the edge values are
     0.
     """
-    kind = INTERPOLATIONS[interpolation]
-    where = torch.from_numpy(positions)
+    kind, where = INTERPOLATIONS[interpolation], torch.from_numpy(positions)
 
-    def band(plane: NDArray[Any]) -> NDArray[Any]:
+    def sampled(plane: NDArray[Any]) -> NDArray[np.float64]:
         image = torch.from_numpy(plane.astype(np.float64))[None, None]
         taken = chunked(
             lambda x: sample(image, x[None].double(), interpolation=kind).values[0, 0], where, axis=0
         )
-        found = taken.numpy()
-        if np.issubdtype(values.dtype, np.integer):
-            limits = np.iinfo(values.dtype)
-            found = np.clip(np.rint(found), limits.min, limits.max)
-        return found.astype(values.dtype)
+        return taken.numpy()
 
-    return np.stack([band(plane) for plane in values])
+    if interpolation == "nearest":
+        numbers = 1 + np.arange(values[0].size).reshape(values[0].shape)
+        which = sampled(numbers).astype(np.int64)
+        return np.where(which > 0, values.reshape(len(values), -1)[:, which - 1], np.zeros((), values.dtype))
+    if values.dtype.kind not in "iu":
+        return np.stack([sampled(plane).astype(values.dtype) for plane in values])
+    limits = np.iinfo(values.dtype)
+    most = np.nextafter(float(limits.max), 0) if limits.bits > 53 else limits.max
+    return np.stack([np.clip(np.rint(sampled(p)), limits.min, most).astype(values.dtype) for p in values])
 
 
 def filled(values: NDArray[Any], valid: NDArray[np.bool_], fill: Fill) -> NDArray[Any]:

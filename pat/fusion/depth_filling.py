@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -13,10 +15,10 @@ from torch import Tensor
 from arraygeom.chunks import chunked
 
 from ..matching.filters import numpy_of
-from ..matching.inputs import Inputs
 from ..matching.positions import FINE
 from ..matching.surfaces import Plane, Planes, repeated
 from ..support.settings import physics, tuned
+from .inputs import FrameInputs, Placement
 from .results import Frame
 
 
@@ -51,16 +53,16 @@ ROWS, HALO = 512, 128
 """Size: rows of a part, and beside it that its planes see: matches there count a sixth of those at hand."""
 
 
-def background_filled(frame: Frame, inputs: Inputs) -> Float[Tensor, "h w"]:
+def background_filled(frame: Frame, given: FrameInputs) -> Float[Tensor, "h w"]:
     """Depth that is far less certain than around it replaced by that of the plane through the background.
 
     What a beta does not see is occluded: farther away than what is beside it, along the segments' rows or
     columns. Planes of inverse depth are fitted to matches weighted by confidence; what lies beyond an edge of
     alpha or a step of depth is far away (Gastal and Oliveira, Domain transform, 2011). What is unknown stays
     NaN. Betas on several sides see what is occluded in one of them: depth is then as it is; so it is where it
-    is known from elsewhere. No gradient passes through planes.
+    is known from elsewhere. Planes end at the bounds that were searched. No gradient passes through planes.
     """
-    depth, confidence = frame.depth, frame.confidence
+    depth, confidence, inputs = frame.depth, frame.confidence, given.inputs
     if any(beta.around for beta in inputs.betas):
         return depth
     steps = [beta.field.pixels for beta in inputs.betas if beta.field.pixels is not None]
@@ -78,11 +80,22 @@ def background_filled(frame: Frame, inputs: Inputs) -> Float[Tensor, "h w"]:
     unit = float(half_width[known & (confidence >= least)].nanmedian())
     if not unit > 0:
         return depth
-    fill = partial(_filled_rows, least=least, unit=unit)
+    farthest, nearest = (inverse / unit for inverse in _searched(given.placements))
+    fill = partial(_filled_rows, least=least, unit=unit, bounds=(farthest, nearest))
     planes = depth, confidence, inputs.alpha[0, 0, : depth.shape[0], : depth.shape[1]]
     if apart.sum(0).abs().argmax() == 1:
         return chunked(fill, *(plane.mT for plane in planes), rows=ROWS, halo=HALO).mT
     return chunked(fill, *planes, rows=ROWS, halo=HALO)
+
+
+def _searched(placements: Sequence[Placement]) -> tuple[float, float]:
+    """The least and the greatest inverse depth that was looked for; any, where nothing says."""
+    stated = [place.pair.depth for place in placements if place.has_depth]
+    known = [(float(far), float(near)) for near, far in filter(None, stated)]
+    if not known or len(known) < len(stated):
+        return 0.0, math.inf
+    far, near = zip(*known)
+    return 1 / max(far), 1 / min(near)
 
 
 def _filled_rows(
@@ -91,10 +104,12 @@ def _filled_rows(
     alpha: Float[Tensor, "h w"],
     least: float,
     unit: float,
+    bounds: tuple[float, float],
 ) -> Float[Tensor, "h w"]:
     """Depth of matches and planes; planes are computed for every second pixel, in units of inverse depth.
 
-    `least` is the confidence from which matches count before any plane is known.
+    `least` is the confidence from which matches count before any plane is known; `bounds` are planes', in
+    these units.
     """
     (h, w), known = depth.shape, depth.isfinite()
     inverse = torch.where(known, 1 / depth.detach(), 0.0) / unit
@@ -108,7 +123,7 @@ def _filled_rows(
         seen = planes.at_pixels((h, w)), repeated(planes.around, (h, w))
         value, around = (torch.from_numpy(t).to(inverse) for t in seen)
         kept = certain >= SETTINGS.share * around
-        filled = torch.where(kept, inverse, value)
+        filled = torch.where(kept, inverse, value.clamp(*bounds))
     changed = known & ~kept & (filled > 0)
     return torch.where(changed, 1 / torch.where(changed, filled * unit, 1.0), depth)
 

@@ -21,6 +21,7 @@ from ..matching.radiometry import Given
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
 from ..support.memory import limited, parse_bytes, planned
+from ..support.precision import without_autocast
 from .checks import warn_of_confidence
 from .corrections import Corrections, corrections_for, expected_work
 from .depth_filling import background_filled
@@ -77,6 +78,7 @@ class FuseSettings:
 
 
 @torch_in_one_thread()
+@without_autocast()
 def fuse(
     network: FusionNetwork | ImageSources,
     rig: Rig | None = None,
@@ -178,7 +180,7 @@ def fuse(
             )
             del matches
         warn_of_confidence(network, done.frame, inputs)
-        frame = done.frame._replace(depth=background_filled(done.frame, inputs.inputs))
+        frame = done.frame._replace(depth=background_filled(done.frame, inputs))
         if luminance != "alpha":
             frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
         del inputs, right  # the segments of a large frame: what follows needs memory, too
@@ -214,6 +216,7 @@ def _with_rig(
 
 
 @torch_in_one_thread()
+@without_autocast()
 def corrections_of(
     network: FusionNetwork,
     rig: Rig,

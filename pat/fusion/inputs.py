@@ -22,7 +22,7 @@ from ..matching.normalisation import combined_bands
 from ..matching.tangents import along_tangents
 from ..networks.protocol import FusionNetwork
 from .steps import FusionStep, Undo, innermost
-from .views import Views
+from .views import Views, check_precision
 
 LOG = logging.getLogger(__name__)
 
@@ -73,8 +73,9 @@ def prepared(
 ) -> tuple[FrameInputs, list[Undo]]:
     """The network's inputs after these steps, and how a frame is taken back to the views, last step first.
 
-    Raises ValueError as `frame_inputs`.
+    Raises ValueError as `frame_inputs`, and for images of another precision than the network's weights.
     """
+    check_precision(views, network)
     LOG.info("preparing %d images", len(views.images))
     undo: list[Undo] = []
     for step in steps:

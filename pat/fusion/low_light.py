@@ -231,11 +231,12 @@ def denoised(
     image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b c h w"]:
     """An image without noise of this standard deviation; bands other than three are denoised one by one."""
-    network = shipped_denoiser()
+    network, given = shipped_denoiser(), image.dtype
+    image, deviation = image.float(), deviation.float()
     if image.shape[1] == 3:
-        return in_tiles(partial(without_noise, network.colour), image, deviation)
+        return in_tiles(partial(without_noise, network.colour), image, deviation).to(given)
     bands = zip(image.split(1, 1), deviation.split(1, 1))
-    return torch.cat([in_tiles(partial(without_noise, network.band), *band) for band in bands], 1)
+    return torch.cat([in_tiles(partial(without_noise, network.band), *band) for band in bands], 1).to(given)
 
 
 @torch.no_grad()

@@ -7,11 +7,11 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from arraygeom import Pair, ReceptiveField, Rig, Sensor
 from arraygeom.warned import warn
@@ -100,6 +100,18 @@ def grey_alpha(name: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "1 h w
         text = "is in colour: colours come from the betas, its own only where they do not see"
         warn(f"the image of alpha, '{name}', {text}")
     return grey(image)
+
+
+def check_precision(views: Views, network: Any) -> None:
+    """Refuse images of another precision than a network's weights. Raises ValueError that says what to do."""
+    weights = next(network.parameters(), None) if isinstance(network, nn.Module) else None
+    for name, image in views.images.items():
+        if weights is not None and image.dtype != weights.dtype:
+            of_images, of_weights = (str(t.dtype).removeprefix("torch.") for t in (image, weights))
+            raise ValueError(
+                f"the image of '{name}' is {of_images}, the network's weights are {of_weights}: "
+                f"give images of {of_weights}, or call network.to(torch.{of_images})"
+            )
 
 
 def check_bands(views: Views, wanted: int | None) -> None:

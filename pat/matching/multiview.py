@@ -26,7 +26,7 @@ from arraygeom.epipolar import FRONT, Track
 
 from ..media.colour import to_bytes
 from ..support.settings import size, tuned
-from .filters import filled
+from .filters import filled, numpy_of
 from .inputs import Beta, Inputs
 from .matches import BetaMatches, Matches
 from .positions import FINE, Extent, enlarged
@@ -303,7 +303,7 @@ def _agree(terms: Tensor, own: Tensor, rise: Tensor, solutions: Float[Tensor, "k
 def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
     """Inverse depth diffused to where no match is consistent, and without outliers."""
     guide = to_bytes(inputs.alpha[0, 0])
-    plane, known = (part.cpu().numpy() for part in (agreement.inverse_depth, agreement.known))
+    plane, known = numpy_of(agreement.inverse_depth), agreement.known.cpu().numpy()
 
     def of(tile: Tile) -> Tensor:
         top, bottom, left, right = tile.outer

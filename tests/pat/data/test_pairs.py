@@ -77,7 +77,7 @@ def warping_error(pair, scale):
 def test_a_post_occludes_what_is_beside_it():
     value = torch.full((4, 100), 10.0)
     value[:, 60:70] = 20.0
-    value[0, 55] = 0.0
+    value[0, 55] = torch.nan
     valid = torch.ones(4, 100, dtype=torch.bool)
     valid[0, 55] = False
     seen, occluded, beyond = Disparity(value, valid).regions()
@@ -91,3 +91,11 @@ def test_what_is_beyond_the_edge_hides_nothing_at_it():
     value = torch.full((1, 40), 12.0)
     value[:, 10:] = 10.0
     assert not Disparity(value, value > 0).regions().occluded.any()
+
+
+def test_what_is_not_known_hides_nothing_and_nothing_of_it():
+    value = torch.tensor([[torch.nan, 1.0, 0.0, 3.0, torch.inf]])
+    seen, occluded, beyond = Disparity(value, value.isfinite()).regions()
+    assert occluded.tolist() == [[False, True, False, False, False]]
+    assert seen.tolist() == [[False, False, True, True, False]]
+    assert not beyond.any()

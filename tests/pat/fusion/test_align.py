@@ -10,7 +10,7 @@ import torch
 from arraygeom import Band, Camera, Distortion, Pose, Rig, Sensor, View, intrinsics, sample
 from arraygeom.undistortion import recorded_pixels, straight_pixels
 from pat import align
-from pat.fusion.align import OUTSIDE, SEEN, filled
+from pat.fusion.align import OUTSIDE, SEEN, filled, resampled_values
 from pat.fusion.aligned_files import RecordedFiles, save_aligned, write_bands
 from pat.fusion.aligned_page import aligned_page, ndvi
 from pat.fusion.report import Facts
@@ -109,6 +109,24 @@ def test_values_are_samples_of_what_was_recorded(interpolation, kind):
             assert np.isin(view.values[:, view.valid], recorded).all()
 
 
+@pytest.mark.parametrize("kind", [np.int64, np.uint64, np.float32, np.bool_])
+def test_nearest_values_are_those_recorded_of_any_type(kind):
+    """Integers of 64 bits went through float64."""
+    values = np.arange(12).reshape(1, 3, 4)
+    values = values % 2 == 0 if kind is np.bool_ else (np.iinfo(np.int64).max - values).astype(kind)
+    positions = np.stack(np.meshgrid(np.arange(4), np.arange(3)), -1).astype(np.float32) + np.float32(0.3)
+    taken = resampled_values(values, positions, "nearest")
+    assert taken.dtype == values.dtype
+    assert np.array_equal(taken, values)
+    assert not resampled_values(values, positions + 9, "nearest").any()
+
+
+def test_the_greatest_integers_stay_so():
+    values = np.full((1, 4, 5), np.iinfo(np.int64).max)
+    taken = resampled_values(values, np.full((1, 1, 2), 1.25, np.float32), "bilinear")
+    assert int(taken[0, 0, 0]) == pytest.approx(np.iinfo(np.int64).max, rel=1e-12)
+
+
 def test_without_a_view_there_are_no_values_unless_filled():
     rig, images = array()
     view = align(rig, images, alpha="mono", correct=False)["nir"]
@@ -189,6 +207,12 @@ def test_mistakes_are_named(tmp_path):
     rig, images = array()
     with pytest.raises(ValueError, match=r"'nir' .*1x4x4.*\(C, 96, 160\)"):
         align(rig, images, alpha="mono", recorded={**images, "nir": np.zeros((1, 4, 4))}, correct=False)
+    for recorded, said in (
+        ({"mono": images["mono"]}, "no recorded values of 'nir'"),
+        ({**images, "nir": images["nir"].numpy().astype(complex)}, "'nir' are complex128"),
+    ):
+        with pytest.raises(ValueError, match=said):  # before anything is matched
+            align(rig, images, alpha="mono", recorded=recorded, matcher=lambda inputs: pytest.fail("matched"))
     with pytest.raises(KeyError, match="there are: mono, nir"):
         align(rig, images, alpha="mono", correct=False).band("red")
 

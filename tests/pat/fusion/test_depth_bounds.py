@@ -7,7 +7,7 @@ from arraygeom import Camera, Epipolar, Pose, Rig, Segments, intrinsics
 from arraygeom.fields.grid import FieldOnGrid
 from pat.fusion.depth import measured_depth
 from pat.fusion.depth_filling import background_filled
-from pat.fusion.inputs import Placement
+from pat.fusion.inputs import FrameInputs, Placement
 from pat.fusion.results import Frame
 from pat.matching.inputs import Beta, Inputs
 from pat.networks.protocol import FusionOutput
@@ -43,9 +43,10 @@ def test_positions_beyond_a_segment_are_its_ends(share):
         assert (depth[seen] < FAR * 1.001).all()
 
 
-def fields_along(*steps, alpha=None):
+def fields_along(*steps, alpha=None, pairs=()):
     alpha = torch.zeros(6, 6) if alpha is None else alpha
-    return Inputs(alpha[None, None], tuple(beta_along(step) for step in steps))
+    inputs = Inputs(alpha[None, None], tuple(beta_along(step) for step in steps))
+    return FrameInputs(inputs, [Placement(p, lambda x: x) for p in pairs], tuple(alpha.shape))
 
 
 def beta_along(step):
@@ -73,6 +74,20 @@ def test_depth_of_low_confidence_is_that_of_the_background_beside_it(step):
         depth, confidence, wanted = depth.mT, confidence.mT, wanted.mT
     found = background_filled(frame_of(depth, confidence), fields_along(step))
     torch.testing.assert_close(found, wanted, equal_nan=True, rtol=1e-3, atol=0)
+
+
+def test_planes_end_at_the_bounds_that_were_searched():
+    """Planes of a floor that runs into the distance were continued beyond the far bound."""
+    inverse = torch.linspace(1 / 2, 1 / 18, 100).repeat(40, 1)
+    depth = torch.cat([1 / inverse, torch.full((40, 30), 10.0)], 1)  # the last ones wrong, and not confident
+    confidence = torch.where(torch.arange(130) < 100, 1.0, 0.1).repeat(40, 1)
+    frame, alpha = frame_of(depth, confidence), torch.zeros(40, 130)
+    anywhere = background_filled(frame, fields_along([4.0, 0.0], alpha=alpha))
+    assert anywhere[:, 100:].max() > 1.1 * FAR
+    found = background_filled(frame, fields_along([4.0, 0.0], alpha=alpha, pairs=[pair()]))
+    assert found[:, 100:].max() == pytest.approx(FAR)
+    within = (anywhere < 0.99 * FAR) & (anywhere != 10)  # beyond infinity depth is as it was
+    torch.testing.assert_close(found[within], anywhere[within], rtol=1e-3, atol=0)
 
 
 def two_planes():
