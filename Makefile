@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme conditions certainty without-rig paper-network test test-long check format bench bench-job train notebooks docs drawings wheel fuzz kills transformations
+.PHONY: help env synthesis demo showcase readme conditions certainty without-rig alignment paper-network test test-long check format bench bench-job train notebooks docs drawings wheel fuzz kills transformations
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
@@ -16,6 +16,7 @@ help:
 	@echo "make readme     run both and put what they print into docs/results.md"
 	@echo "make conditions measure other responses, low light and misalignment into docs/results.md; half an hour"
 	@echo "make certainty  measure how well stated confidence holds into docs/weights.md; ten minutes"
+	@echo "make alignment  measure how well bands are aligned into docs/results.md; ten minutes"
 	@echo "make paper-network  measure the paper's network, narrow and briefly trained, into docs/results.md"
 	@echo "make without-rig  fuse with rigs found from the images, against known ones, into docs/results.md"
 	@echo "make test       the tests"
@@ -65,6 +66,11 @@ certainty: $(READY)
 without-rig: $(READY)
 	@$(BIN)/python -m experiments evaluate --middlebury $(DATA)/middlebury --without-rig --rates 2 --half report --out out/without-rig
 	@$(BIN)/python -m docs.update_readme --document docs/results.md --block without-rig=out/without-rig/scores.md
+
+alignment: $(READY)
+	@$(BIN)/python -m experiments alignment --data $(DATA) --scenes middlebury motorcycle rededge sequoia nine-band \
+		--out out/alignment
+	@$(BIN)/python -m docs.update_readme --document docs/results.md --block alignment=out/alignment/alignment.md
 
 paper-network: $(READY)
 	@$(BIN)/python -m experiments evaluate --middlebury $(DATA)/middlebury --rates 2 --half report \

@@ -335,19 +335,20 @@ def shown_band(values: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def alignment_markdown(rows: Sequence[AlignmentRow]) -> str:
-    """A line for each beta, and for the pairs with true disparity one of their means."""
-    known = [row for row in rows if row.true is not None]
-    lines = [_line(row) for row in rows if row.true is None]
-    for name in dict.fromkeys(row.beta for row in known):
-        mine = [row for row in known if row.beta == name]
+    """A line for each beta; of the pairs of a set (SET/NAME) one of their means."""
+    lines, pairs = [], [row for row in rows if "/" in row.scene]
+    for name in dict.fromkeys(row.beta for row in pairs):
+        mine = [row for row in pairs if row.beta == name]
         means: dict[str, Any] = {
             n: float(np.mean([getattr(row, n) for row in mine])) for n in (*SHARES, *MEDIANS)
         }
-        scene, off = f"{len(mine)} stereo pairs", max(row.off for row in mine)
+        scene, off = f"{len(mine)} pairs", max(row.off for row in mine)
         lines.append(_line(mine[0]._replace(scene=scene, off=off, **means)))
+    lines += [_line(row) for row in rows if row not in pairs]
     columns = [
-        *("scene", "beta", "corners seen", "located", "within .5 px", "homography", "by the truth"),
-        *("of the truth", "occluded, filled", "median px, both", "values off", "type"),
+        *("", "seen", "located", "within .5 px", "by a homography", "by the true disparities"),
+        *("positions within .5 px of the true ones", "occluded pixels filled"),
+        *("median px, alignment / homography", "values off"),
     ]
     return markdown_table(columns, lines)
 
@@ -356,7 +357,7 @@ def _line(row: AlignmentRow) -> list[str]:
     found = [getattr(row, share) for share in SHARES]
     shares = ["" if share is None else f"{share:.1%}" for share in found]
     medians = f"{row.median:.2f} / {row.median_homography:.2f}"
-    return [row.scene, row.beta, *shares, medians, f"{row.off:.1g}", row.dtype]
+    return [f"{row.scene}, {row.beta}", *shares, medians, f"{row.off:.1g} ({row.dtype})"]
 
 
 # Scenes -----------------------------------------------------------------------------------------------------

@@ -94,7 +94,8 @@ def read_choice(path: Path) -> Choice:
 def chosen(inputs: Inputs, matches: Matches, network: Choice | None = None) -> Matches:
     """The matches in each beta, with the disparity of each pixel's candidate of the highest score.
 
-    Not where each segment is around what is known of its own pixel: those of others say nothing.
+    Where each segment is around what is known of its own pixel, disparities of others say nothing: the choice
+    states how certain a match is, and changes none.
     """
     best = network or fitted_choice()
     return Matches(tuple(_chosen(*one, best) for one in zip(inputs.by_beta, matches.betas)))

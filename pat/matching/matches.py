@@ -120,10 +120,14 @@ class Matches:
         return Matches(tuple(replace(part, diffused=shared[key]) for key, part in parts))
 
     def check(self, hw: HW, betas: int) -> None:
-        """Raises ValueError unless they are of an alpha of this size and of so many betas."""
+        """Raises ValueError unless they are finite, of an alpha of this size and of so many betas."""
         if self.hw != hw or len(self.betas) != betas:
             (h, w), (height, width) = self.hw, hw
             raise ValueError(
                 f"these matches are of {w}x{h} pixels in {len(self.betas)} betas, "
                 f"the images are {width}x{height} with {betas}: match these images"
+            )
+        if not all(bool(part.disparity.isfinite().all()) for part in self.betas):
+            raise ValueError(
+                "these matches have disparities that are NaN or infinite: give any, with little certainty"
             )

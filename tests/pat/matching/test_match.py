@@ -120,3 +120,17 @@ def test_a_network_without_matches_is_not_matched_for(flat):
     frame = fuse(Plain(), rig, images, alpha="mono", matcher=never)
     assert frame.image.shape == (3, H, W)
     assert float(frame.depth.nanmedian()) == pytest.approx(2 / (1 / 2 + 1 / 50), rel=0.01)
+
+
+def test_disparities_that_are_not_numbers_are_refused(network, flat):
+    """A few made the whole image and all depth NaN, without a word."""
+    rig, images = flat
+
+    def holed(inputs):
+        found = match(inputs)
+        disparity = found.betas[0].disparity.clone()
+        disparity[..., 10:20, 10:20] = torch.nan
+        return Matches((replace(found.betas[0], disparity=disparity, chosen=None),))
+
+    with pytest.raises(ValueError, match="NaN or infinite: give any, with little certainty"):
+        fuse(network, rig, images, alpha="mono", matcher=holed)
