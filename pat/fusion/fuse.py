@@ -24,6 +24,7 @@ from ..support.memory import limited, parse_bytes, planned
 from ..support.precision import without_autocast
 from .checks import warn_of_confidence
 from .corrections import Corrections, corrections_for, expected_work
+from .depth_edges import beside_edges
 from .depth_filling import background_filled
 from .inputs import bytes_beside, prepared
 from .low_light import LowLight, Noise, denoised_views
@@ -180,7 +181,8 @@ def fuse(
             )
             del matches
         warn_of_confidence(network, done.frame, inputs)
-        frame = done.frame._replace(depth=background_filled(done.frame, inputs))
+        depth = beside_edges(background_filled(done.frame, inputs), done.frame, inputs)
+        frame = done.frame._replace(depth=depth)
         if luminance != "alpha":
             frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
         del inputs, right  # the segments of a large frame: what follows needs memory, too

@@ -1,0 +1,73 @@
+"""Depth whose edges are alpha's: beside them, the weighted median of what is around.
+
+Matching compares squares, and is off by pixels beside an edge of depth. There each pixel takes the depth that
+is the median of those around, weighted by how alike alpha is there (Ma, He, Wei, Sun and Wu, Constant time
+weighted median filtering for stereo matching and beyond, 2013).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from arraygeom.chunks import chunked, spans
+from arraygeom.threads import in_parallel
+
+from ..matching.filters import numpy_of
+from ..support.settings import size, tuned
+from . import depth_edges_numba as kernels
+from .inputs import FrameInputs
+from .results import Frame
+
+
+@dataclass(frozen=True)
+class EdgeSettings:
+    """Of depth beside its edges."""
+
+    radius: int = size(5, "Pixels to each side of what counts around a pixel")
+    near: int = size(2, "Pixels to an edge of depth up to which depth is chosen anew")
+    alike: float = tuned(
+        0.1, "Middlebury, tune half, of .02 to .2: difference of alpha that counts as one standard deviation"
+    )
+
+
+SETTINGS = EdgeSettings()
+ROWS, STRIP = 512, 16
+"""Size: rows of a part, and of what a thread takes of it at a time."""
+
+
+def beside_edges(depth: Float[Tensor, "h w"], frame: Frame, given: FrameInputs) -> Float[Tensor, "h w"]:
+    """A frame's depth, near its edges that of a pixel beside that looks alike in alpha.
+
+    An edge is where inverse depth changes by more than the width of its interval. Not where the search was
+    around what is known of each pixel. Gradients are those of the pixel whose depth is taken.
+    """
+    known = depth.isfinite() & (frame.confidence > 0)
+    if any(beta.around for beta in given.inputs.betas) or not bool(known.any()):
+        return depth
+    likely = known & (frame.confidence >= frame.confidence[known].mean())
+    step = 2 * float(frame.half_width[likely].detach().nanmedian())
+    if not step > 0:
+        return depth
+    alpha = given.inputs.alpha[0, 0, : depth.shape[0], : depth.shape[1]]
+    halo = SETTINGS.near + SETTINGS.radius
+    return chunked(partial(_taken, step=step), depth, alpha, rows=ROWS, halo=halo)
+
+
+def _taken(depth: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"], step: float) -> Float[Tensor, "h w"]:
+    inverse, grey = numpy_of(1 / depth), numpy_of(alpha)
+    square, known = np.ones((2 * SETTINGS.near + 1,) * 2, np.uint8), np.isfinite(inverse)
+    greatest = cv2.dilate(np.where(known, inverse, 0), square)
+    least = cv2.erode(np.where(known, inverse, np.float32(np.inf)), square)
+    where = known & (greatest > least + np.float32(step))
+    weights = 4096 * np.exp(-np.square(np.arange(256) / (255 * SETTINGS.alike)) / 2)
+    out = np.empty(inverse.shape, np.int64)
+    rows = partial(kernels.weighted_medians, inverse, grey, where, weights.astype(np.int32), SETTINGS.radius)
+    in_parallel([partial(rows, *span, out) for span in spans(len(out), STRIP)])
+    return depth.flatten()[torch.from_numpy(out).to(depth.device)]
