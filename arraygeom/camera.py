@@ -232,6 +232,14 @@ class Camera(LensView):
             check_batches("K and cam_from_world", self.K.shape[:-2], self.cam_from_world.batch_shape)
             check_origin(self.cam_from_world.t)
 
+    def scaled(self, factor: float) -> Camera:
+        """The camera with all lengths times a positive factor. Raises ValueError as `LensModel.scaled`."""
+        K, lens = self.K, self.distortion
+        if lens is not None and lens.even == "distance":  # parallel rays: the image plane is in metres
+            K = torch.cat([K[..., :2] / K.new_tensor([factor, factor, 1.0])[:, None], K[..., 2:]], -1)
+        pose = Pose(self.R, self.t * factor)
+        return self.replace(K=K, cam_from_world=pose, distortion=lens and lens.scaled(factor))
+
     @property
     def R(self) -> Float[Tensor, "*b 3 3"]:
         """Rotation of `cam_from_world`."""

@@ -229,6 +229,8 @@ def depth_from_track(
     """
     a, b = track
     x = floating(x)
+    finite = x.isfinite().all(-1)
+    x = torch.where(finite[..., None], x, 0.0)
     # faster than axes of length 2
     (X, Y, Z), (DX, DY, DZ), (column, row) = a.unbind(-1), b.unbind(-1), x.unbind(-1)
     along_x, along_y = DX * Z - X * DZ, DY * Z - Y * DZ
@@ -236,7 +238,7 @@ def depth_from_track(
     moves = slope.abs() > FLAT * FLAT
     w = ((column * Z - X) * along_x + (row * Z - Y) * along_y) / torch.where(moves, slope, 1.0)
     z_ratio = Z + w * DZ
-    valid = moves & (w > 0) & (z_ratio > FRONT)
+    valid = finite & moves & (w > 0) & (z_ratio > FRONT)
     depth = torch.where(valid, 1 / torch.where(valid, w, 1.0), 0.0)
     if deviation is None:
         return Depth(depth, torch.zeros_like(w), valid)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from .pixels import map_homogeneous, product, to_homogeneous
 from .robust import LocalModel, levenberg_marquardt
-from .tracing import needs_numbers
+from .tracing import needs_numbers, traced
 
 
 class TransformedPoints(NamedTuple):
@@ -73,13 +73,16 @@ SMALLEST_SCALE = 1e-9
 def fit_similarity(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Tensor, "3 3"]:
     """The similarity (rotation, scale, shift) that takes x nearest to y, least squares; n >= 2.
 
-    Umeyama 1991 in two dimensions, in closed form: as complex numbers y = a x + b.
+    Umeyama 1991 in two dimensions, in closed form: as complex numbers y = a x + b. Raises ValueError for
+    points that are all one.
     """
     dtype = torch.promote_types(x.dtype, y.dtype)
     x, y = x.double(), y.double()
     x_mean, y_mean = x.mean(0), y.mean(0)
     u, v = x - x_mean, y - y_mean
     squared = u.square().sum()
+    if not traced() and not bool(squared > 0):
+        raise ValueError("a similarity needs two points that differ: all of x are one")
     a = (u * v).sum() / squared
     b = (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum() / squared
     linear = torch.stack([torch.stack([a, -b]), torch.stack([b, a])])

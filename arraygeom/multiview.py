@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .camera import Camera, Projected
 from .epipolar import beside
-from .pixels import floating, pixel_grid
+from .pixels import HW, floating, pixel_grid
 from .pose import Pose
 from .rig import Pair, Rig
 from .sampling import Interpolation, Sampled, sample
@@ -64,6 +64,8 @@ def warp(
     beta and on its image. Occlusion is not looked for. A batch of pairs (B) takes depths (B, *d, Ha, Wa), or
     (1, ...) for the same in each. Differentiable in image, depth and cameras.
     """
+    for what, plane, view in (("image", image, pair.beta), ("depth", depth, pair.alpha)):
+        _check_size(f"the {what} given", plane, view.hw)
     seen = _in_beta(pair, depth)
     batch = max(len(image), len(depth))
     values, inside = sample(image.expand(batch, *image.shape[1:]), seen.x, interpolation=interpolation)
@@ -85,6 +87,11 @@ def plane_sweep(
     planes = depths[:, None, None, None].expand(-1, len(image), *pair.alpha.hw)
     swept = [warp(pair, image, plane, interpolation=interpolation) for plane in planes]
     return Sampled(torch.stack([s.values for s in swept], 2), torch.stack([s.valid for s in swept], 1))
+
+
+def _check_size(what: str, plane: Tensor, hw: HW) -> None:
+    if tuple(plane.shape[-2:]) != tuple(hw):
+        raise ValueError(f"{what} is {tuple(plane.shape[-2:])}, its camera {tuple(hw)}: resize one")
 
 
 def _in_beta(pair: Pair, depth: Tensor, x: Tensor | None = None) -> Projected:
@@ -127,11 +134,11 @@ def consistent_depth(
     MVSNet). Valid where `views` others agree. Depths that are not finite or not positive are unknown.
     Differentiable in depths and cameras.
     """
-    own = floating(depths[rig.require(alpha)])
-    if own.shape != rig[alpha].hw:
-        raise ValueError(
-            f"the depth map of '{alpha}' is {tuple(own.shape)}, its camera {rig[alpha].hw}: resize one"
-        )
+    if rig.require(alpha) not in depths:
+        raise ValueError(f"there is no depth map of '{alpha}', only of {', '.join(depths)}")
+    for name, given in depths.items():
+        _check_size(f"the depth map of '{name}'", given, rig[name].hw)
+    own = floating(depths[alpha])
     x = pixel_grid(rig[alpha].hw, dtype=own.dtype, device=own.device)
     total, count = own, torch.ones_like(own)
     for name, other in depths.items():

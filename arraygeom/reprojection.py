@@ -86,7 +86,7 @@ def bundle_adjusted(
     for _ in range(steps):
         trial, moved = _stepped(rig, X, x, seen, names, damping)
         cost = _cost(trial, moved, x, seen)
-        better = bool(cost <= (1 + ROUNDED) * costs[-1])
+        better = bool(cost <= (1 + ROUNDED) * costs[-1] + x.numel() * ROUNDED**2)
         rig, X = (trial, moved) if better else (rig, X)
         costs.append(cost if better else costs[-1])
         damping = max(damping / 10, LEAST_DAMPING) if better else damping * 10
@@ -94,7 +94,8 @@ def bundle_adjusted(
 
 
 ROUNDED = 1e-9
-"""A step that raises the cost by no more than this share is made: at the optimum gradients need it."""
+"""A step that raises the cost by no more than this share, or this many pixels each, is made: at the optimum
+gradients need it."""
 
 
 def _cost(rig: Rig, X: Tensor, x: Tensor, seen: Tensor | None) -> Tensor:
@@ -107,7 +108,8 @@ def _stepped(
     """Rig and points after one damped Gauss-Newton step."""
     cameras = list(rig.cameras.values())
     r = reprojection_residuals(cameras, X, x, seen=seen)
-    used = r.any(-1)[..., None, None]
+    used = torch.stack([c.project(X).valid for c in cameras])
+    used = (used if seen is None else used & seen)[..., None, None]
     slopes = [projection_slopes(c, X, (X - c.centre).norm(dim=-1))[1] for c in cameras]
     by_X = torch.where(used, torch.stack(slopes), 0.0)
     zeros = rig.parameters(free=names)

@@ -333,11 +333,12 @@ class Rig(Batched):
         return self.with_camera(name, self[name].transformed(A, hw)).replace(links=links)
 
     def scaled(self, factor: float) -> Rig:
-        """The rig with all lengths (translations, depth range) times a positive factor: another unit, say."""
+        """The rig with all lengths (of cameras, depth range) times a positive factor: another unit, say.
+
+        Raises ValueError for a camera model that does not say which of its numbers are lengths.
+        """
         cameras = {
-            name: view.replace(cam_from_world=Pose(view.R, view.t * factor))
-            if isinstance(view, Camera)
-            else view
+            name: view.scaled(factor) if isinstance(view, Camera) else view
             for name, view in self.cameras.items()
         }
         depth = None if self.depth is None else (self.depth[0] * factor, self.depth[1] * factor)

@@ -6,6 +6,7 @@ The one loader of each in the project. Both build plain values only, so nothing 
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 import yaml
@@ -130,3 +131,10 @@ class _SafeLoader(_Base):  # type: ignore[misc]
                 raise _refused(problem, key_node.start_mark)
             lines |= dict.fromkeys(spellings, line)
         return dict(super().construct_mapping(node, deep))
+
+
+_SafeLoader.add_implicit_resolver(  # YAML 1.2's numbers, as other libraries write them: PyYAML wants 1.0e-3
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"),
+    list("-+.0123456789"),
+)

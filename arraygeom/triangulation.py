@@ -166,10 +166,12 @@ def _sighted(
     cameras: Sequence[Camera], x: Tensor, seen: Tensor | None
 ) -> tuple[list[_Sight], _Chart, Tensor]:
     """What is seen of each point, its first view's chart, and where in it the rays meet in least squares."""
+    finite = x.isfinite().all(-1)
+    x = torch.where(finite[..., None], x, 0.0)
     centres, directions, usable = (
         torch.stack(part) for part in zip(*(world_rays(c, p) for c, p in zip(cameras, x)))
     )
-    usable = usable if seen is None else usable & seen
+    usable = usable & finite if seen is None else usable & finite & seen
     focal = [beside(c.K[..., :2, :2].det().abs(), x.ndim - 2).expand_as(u) for c, u in zip(cameras, usable)]
     first = usable.to(torch.uint8).argmax(0)[None, ..., None].expand(1, *x.shape[1:-1], 3)
     origin, d = (t.gather(0, first)[0] for t in (centres, directions))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..camera import LensView, View
 from ..checks import check_above, check_field
-from ..epipolar import segments_between
+from ..epipolar import beside, segments_between
 from ..pixels import HW, floating, pixel_grid
 from ..rig import Pair
 from ..segments import Segments
@@ -39,11 +39,12 @@ class AroundDepth:
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Segments from near to far, inside beta's image and in front of it. Raises ValueError for lenses."""
         require_pinholes(pair)
+        _check_size(self.depth, self.view or pair.alpha)
 
         def around(x: Tensor) -> Segments:
             depth = _at_nearest(self.depth, x, pair.alpha, self.view).to(x)
             known = depth.isfinite() & (depth > 0)
-            near, far = (bound.to(x) for bound in pair.depth_range)
+            near, far = (beside(bound.to(x), x.ndim - 1) for bound in pair.depth_range)
             near = torch.where(known, depth / (1 + self.tolerance), near)
             far = torch.where(known, depth * (1 + self.tolerance), far)
             return segments_between(pinhole_track(pair, x), near, far, pair.beta.hw)
@@ -108,6 +109,7 @@ class AroundMatches:
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Parts of the segments of `field`. Raises ValueError unless it is of straight segments."""
         x = floating(x)
+        _check_size(self.positions, pair.alpha if self.views is None else self.views[0])
         whole = (self.field or straight_field(pair))(pair, x)
         if not isinstance(whole, Segments):
             raise ValueError(
@@ -129,7 +131,7 @@ class AroundMatches:
         return Segments(start, end, whole.valid)
 
 
-def _check_size(plane: Tensor, view: LensView | None) -> None:
+def _check_size(plane: Tensor, view: View | None) -> None:
     """Raise ValueError for a plane of another size than its view."""
     if view is not None and tuple(plane.shape[:2]) != tuple(view.hw):
         (h, w), (height, width) = plane.shape[:2], view.hw

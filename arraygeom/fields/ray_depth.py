@@ -49,7 +49,7 @@ def ray_depth(
             apart = _apart(curve, fraction, x_beta)
             best = apart.argmin(-1, keepdim=True)
             low, high = (fraction.gather(-1, (best + step).clamp(0, count - 1)) for step in (-1, 1))
-        there = fraction.gather(-1, best)
+        there = _nearest(curve, fraction.gather(-1, best).detach(), x_beta)
         inverse = curve.inverse_depth(there)[:, 0]
         valid = curve.valid & apart.gather(-1, best)[:, 0].isfinite() & (inverse > 0)
         depth = torch.where(valid, 1 / torch.where(valid, inverse, 1.0), 0.0)
@@ -62,6 +62,20 @@ def ray_depth(
     x = floating(x)
     sigma = torch.zeros_like(x[:, 0]) if deviation is None else deviation.to(x)
     return Depth(*chunked(of, x, floating(x_beta), sigma, rows=ROWS, axis=0))
+
+
+def _nearest(
+    curve: RayCurve, fraction: Float[Tensor, "n 1"], x_beta: Float[Tensor, "n 2"]
+) -> Float[Tensor, "n 1"]:
+    """The fraction one Gauss-Newton step nearer to positions, which its gradients are by."""
+    with torch.no_grad():
+        ends = torch.cat([(fraction + step).clamp(0, 1) for step in (-PART, PART)], -1)
+        along = curve.at(ends)[0].diff(dim=-2)[:, 0] / ends.diff(dim=-1)
+        squared = along.square().sum(-1, keepdim=True)
+        moves = squared.isfinite() & (squared > 1e-12)
+    off = ((x_beta.to(fraction) - curve.at(fraction)[0][:, 0]) * along).sum(-1, keepdim=True)
+    step = torch.where(moves, off, 0.0) / torch.where(moves, squared, 1.0)
+    return (fraction + step.clamp(-PART, PART)).clamp(0, 1)
 
 
 def _inverse_depth_per_pixel(curve: RayCurve, fraction: Float[Tensor, "n 1"]) -> Float[Tensor, " n"]:

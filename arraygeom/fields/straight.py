@@ -108,7 +108,7 @@ class HomographyDisplacement:
         require_straight(pair)
         F, H, hw = pair.fundamental, pair.homography, pair.beta.hw
         x, given = floating(x), self.displacement
-        reach = (covering_displacement(pair) if given is None else torch.tensor(given)).to(x)
+        reach = (covering_displacement(pair) if given is None else torch.as_tensor(given)).to(x)
         reach = reach[(..., *[None] * (x.ndim - 1 - reach.ndim))] if reach.ndim else reach
 
         def around(x: Tensor) -> Segments:

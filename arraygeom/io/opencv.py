@@ -97,8 +97,9 @@ def _camera(nodes: Entry, i: str, pose: Pose) -> Camera:
 
 def _size(nodes: Entry, i: str, K: Tensor) -> HW:
     for suffix in (i, ""):
-        if f"image_width{suffix}" in nodes and f"image_height{suffix}" in nodes:
-            return nodes.listed(f"image_width{suffix}", f"image_height{suffix}").size()
+        for width, height in (("image_width", "image_height"), ("image_Width", "image_Height")):
+            if f"{width}{suffix}" in nodes and f"{height}{suffix}" in nodes:
+                return nodes.listed(f"{width}{suffix}", f"{height}{suffix}").size()
         for name in ("image_size", "imageSize", "size"):
             if f"{name}{suffix}" in nodes:
                 return nodes[f"{name}{suffix}"].size()

@@ -69,6 +69,10 @@ class LensModel(Batched):
         """Points of a pinhole to those of the image plane."""
         return self.project(to_homogeneous(floating(xy)))
 
+    def scaled(self: AnyLens, factor: float) -> AnyLens:
+        """The same with all lengths times a factor: as it is where rays meet, which are of no length."""
+        return self
+
     def with_coefficients(self: AnyLens, coefficients: Float[Tensor, "*b n"]) -> AnyLens:
         """The same with other numbers."""
         raise NotImplementedError
@@ -84,6 +88,8 @@ class CameraModel(LensModel):
     """
 
     registered: ClassVar[str] = ""
+    lengths: ClassVar[tuple[str, ...] | None] = None
+    """Which of its numbers are metres, or metres a second; to be stated where rays do not meet."""
 
     def __init_subclass__(cls, *, name: str = "", **rest: Any) -> None:
         super().__init_subclass__(**rest)
@@ -105,6 +111,13 @@ class CameraModel(LensModel):
         numbers = [t.flatten(t.ndim - axes) if axes else t[..., None] for t, axes in self._own().values()]
         batch = broadcast_shapes(*(t.shape[:-1] for t in numbers))
         return torch.cat([t.expand(*batch, -1) for t in numbers], -1) if numbers else torch.zeros(0).double()
+
+    def scaled(self: AnyLens, factor: float) -> AnyLens:
+        """The same model with its `lengths` times a factor. Raises ValueError if it does not state them."""
+        names = self.lengths  # type: ignore[attr-defined]
+        if names is None and not self.central:
+            raise ValueError(f"{self.model} does not say which of its numbers are lengths: state `lengths`")
+        return dataclasses.replace(self, **{n: getattr(self, n) * factor for n in names or ()})  # type: ignore
 
     def with_coefficients(self: AnyLens, coefficients: Float[Tensor, "*b n"]) -> AnyLens:
         """The same model with other numbers."""

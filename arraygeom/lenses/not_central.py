@@ -29,6 +29,7 @@ class Orthographic(CameraModel, name="orthographic"):
     """Parallel rays along the axis, as of a telecentric lens: (x, y) metres, focal length pixels a metre."""
 
     central: ClassVar[bool] = False
+    lengths: ClassVar = ()
     even: ClassVar[Literal["pixels", "distance"]] = "distance"
 
     @property
@@ -92,6 +93,7 @@ class RollingShutter(BehindModel, name="rolling-shutter"):
 
     item_axes: ClassVar = {"velocity": 1, "rotation": 1}
     central: ClassVar[bool] = False
+    lengths: ClassVar = ("velocity",)
     velocity: Float[Tensor, "*b 3"]
     rotation: Float[Tensor, "*b 3"]
     readout: Float[Tensor, "*b"]
@@ -186,6 +188,7 @@ class FlatPort(BehindModel, name="flat-port"):
     """
 
     central: ClassVar[bool] = False
+    lengths: ClassVar = ("distance", "thickness")
     distance: Float[Tensor, "*b"]
     thickness: Float[Tensor, "*b"]
     glass: Float[Tensor, "*b"]

@@ -193,7 +193,8 @@ def _attend_dense(query: Tensor, key: Tensor, value: Tensor, stride: int, bias: 
     """Attention to every `stride`-th pixel of beta by torch's own, which keeps no weights."""
     (b, _, ha, wa), dv = query.shape, value.shape[1]
     q, k, v = (t.flatten(2).mT for t in (query, key[..., ::stride, ::stride], value[..., ::stride, ::stride]))
-    mask = None if bias is None else bias.expand(b, ha, wa, k.shape[1]).flatten(1, 2).to(q)
+    bias = _bias(bias, query, k.shape[1])
+    mask = None if bias is None else bias.flatten(1, 2).to(q)
     return scaled_dot_product_attention(q, k, v, attn_mask=mask, scale=1.0).mT.reshape(b, dv, ha, wa)
 
 

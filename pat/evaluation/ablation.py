@@ -353,17 +353,24 @@ def _cells(rows: Sequence[AblationRow], every: Sequence[AblationRow]) -> list[st
     if not served:
         return [""] * (len(RATIOS) + 4) + [rows[0].note]
     reference = {row.scene: row.psnr for row in every if row.family == "calibrated"}
+    gains = [row.psnr - reference.get(row.scene, math.nan) for row in served]
+    off, near = zip(*((row.end_point_error, row.within_one) for row in served))
+    gain, error, within = map(_mean, (gains, off, near))
     psnr, ssim = [row.psnr for row in served], [row.ssim for row in served]
     interval = " ({:.2f} to {:.2f})".format(*bootstrap_interval(psnr)) if len(psnr) > 1 else ""
-    difference = np.mean([row.psnr - reference[row.scene] for row in served]) if reference else math.nan
     groups = [[r.psnr for r in served if a <= r.ratio < b] for a, b in zip(RATIOS, (*RATIOS[1:-1], math.inf))]
     means = [f"{np.mean(g):.2f}" if g else "" for g in groups]
     note = "" if len(served) == len(rows) else f"{len(rows) - len(served)} scenes omitted"
-    error = np.mean([row.end_point_error for row in served])
-    within = np.mean([row.within_one for row in served])
-    off = ["", ""] if math.isnan(error) else [f"{error:.2f}", f"{within:.1%}"]
-    image = [f"{np.mean(psnr):.2f}{interval}", f"{np.mean(ssim):.4f}", f"{difference:+.2f}"]
-    return [*image, *means, *off, note]
+    depth = ["", ""] if math.isnan(error) else [f"{error:.2f}", f"{within:.1%}"]
+    gained = "" if math.isnan(gain) else f"{gain:+.2f}"
+    image = [f"{np.mean(psnr):.2f}{interval}", f"{np.mean(ssim):.4f}", gained]
+    return [*image, *means, *depth, note]
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Of those that are known; NaN if none is."""
+    known = [value for value in values if not math.isnan(value)]
+    return float(np.mean(known)) if known else math.nan
 
 
 def _crops(

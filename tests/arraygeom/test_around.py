@@ -17,6 +17,7 @@ from arraygeom import (
     intrinsics,
     pinhole_view,
     pixel_grid,
+    stack,
 )
 from arraygeom.fields import AroundDepth, AroundMatches, Epipolar
 
@@ -126,3 +127,21 @@ def test_wrong_uses_are_refused():
     field = AroundMatches(torch.zeros(*HW, 2), 1.0, (rig["a"], rig["b"]))
     with pytest.raises(ValueError, match="without K"):
         field(linked, torch.zeros(1, 2))
+
+
+def test_a_batch_of_rigs_is_a_loop():
+    rigs = [rig_of(), rig_of().replace(depth=(2.0, 9.0))]
+    x = torch.tensor([[10.0, 20.0], [30.0, 40.0]], dtype=torch.float64)
+    plane = torch.full(HW, math.nan)
+    plane[20, 10] = 4.0
+    field = AroundDepth(plane, 0.1)
+    found = field(stack(rigs).pair("a", "b"), x.expand(2, -1, -1))
+    for i, rig in enumerate(rigs):
+        torch.testing.assert_close(found.end[i], field(rig.pair("a", "b"), x).end)
+
+
+def test_planes_of_another_size_are_refused_without_a_view_too():
+    pair, x = rig_of().pair("a", "b"), torch.zeros(1, 2)
+    for field in (AroundDepth(torch.ones(45, 45)), AroundMatches(torch.ones(45, 45, 2))):
+        with pytest.raises(ValueError, match="45x45 pixels, alpha has 90x60"):
+            field(pair, x)

@@ -283,3 +283,28 @@ def test_a_file_that_lacks_a_number_of_its_model_says_which(tmp_path):
     (tmp_path / "rig.yaml").write_text("\n".join(line for line in text.splitlines() if "water" not in line))
     with pytest.raises(ValueError, match="water"):
         Rig.load(tmp_path / "rig.yaml")
+
+
+@pytest.mark.parametrize("factor", [1000.0, 1e-3])
+def test_another_unit_changes_no_pixel(factor):
+    """Lengths of models stayed as they were: velocities, distances, parallel rays."""
+    t = partial(torch.tensor, dtype=torch.float64)
+    moving = RollingShutter(velocity=t([1.0, 0.2, 0.1]), rotation=t([0.1, 0.2, 0.3]), readout=t(0.02))
+    port = FlatPort(distance=t(0.05), thickness=t(0.01), glass=t(1.5), water=t(1.33))
+    X = t([[0.1, -0.05, 2.0], [0.2, 0.1, 3.0]])
+    for model in (None, Orthographic(), moving, port):
+        camera = Camera(
+            K=intrinsics(80.0, (40, 60)), hw=(40, 60), cam_from_world=Pose.identity(), distortion=model
+        )
+        rig = Rig({"a": camera}).scaled(factor)
+        torch.testing.assert_close(rig["a"].project(factor * X).x, camera.project(X).x)
+
+
+def test_a_model_that_does_not_state_its_lengths_cannot_be_in_another_unit():
+    class Mine(CameraModel):
+        central = False
+
+    with pytest.raises(
+        ValueError, match="Mine does not say which of its numbers are lengths: state `lengths`"
+    ):
+        Mine().scaled(10.0)

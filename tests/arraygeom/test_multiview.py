@@ -192,3 +192,14 @@ def test_float32_rays_at_12_megapixels():
     x = torch.rand(1000, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([4000.0, 3000])
     exact, single = world_rays(camera, x.double()), world_rays(camera.to(torch.float32), x)
     assert float((exact.direction - single.direction).abs().max()) * 4000 < 1e-3
+
+
+def test_planes_of_another_size_than_their_camera_are_refused():
+    camera = Camera(K=intrinsics(10.0, (8, 10)), hw=(8, 10), cam_from_world=Pose.identity())
+    rig = Rig({"a": camera, "b": camera})
+    with pytest.raises(ValueError, match=r"the image given is \(4, 5\), its camera \(8, 10\): resize one"):
+        warp(rig.pair("a", "b"), torch.ones(1, 3, 4, 5), torch.ones(1, 8, 10))
+    with pytest.raises(ValueError, match="depth map of 'b' is"):
+        consistent_depth(rig, {"a": torch.ones(8, 10), "b": torch.ones(4, 5)}, "a")
+    with pytest.raises(ValueError, match="no depth map of 'a', only of b"):
+        consistent_depth(rig, {"b": torch.ones(8, 10)}, "a")

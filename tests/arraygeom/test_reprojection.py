@@ -106,3 +106,15 @@ def test_batches_and_wrong_shapes_are_refused():
     with pytest.raises(ValueError, match="3 cameras, 12 points, 2"):
         bundle_adjusted(rig, X, x[:2], free=["*"])
     assert triangulate(list(rig.cameras.values()), x, residual=torch.inf).valid.all()
+
+
+def test_points_that_fit_exactly_count_too():
+    """A residual of 0 was taken for a point that is not seen: no gradients, and long ways to the optimum."""
+    rig, X, _ = bundle(noise=0.0)
+    exact = torch.stack([camera.project(X).x for camera in rig.cameras.values()]).requires_grad_()
+    found = bundle_adjusted(rig, X, exact, free=("*.rotation",), steps=1)
+    (slope,) = torch.autograd.grad(found.X[:, 2].sum(), exact)
+    near = bundle_adjusted(rig, X, exact + 1e-9 * torch.randn(exact.shape), free=("*.rotation",), steps=1)
+    (wanted,) = torch.autograd.grad(near.X[:, 2].sum(), exact)
+    assert slope.abs().sum() > 1
+    torch.testing.assert_close(slope, wanted, rtol=1e-4, atol=1e-4)

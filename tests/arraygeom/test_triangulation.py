@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from arraygeom import Camera, Distortion, Pair, Pose, depth_of, intrinsics, stack, triangulate
+from arraygeom.fields.ray_depth import ray_depth
 from tests.arraygeom.rigs import random_camera, uniform
 from tests.oracles import Oracle
 
@@ -208,3 +209,42 @@ def test_two_noisy_views_are_opencvs_optimal_triangulation():
 
     ours = cost([c.project(found.X).x for c in cameras])
     assert (ours <= cost([torch.from_numpy(c[0]) for c in corrected]) + 1e-12).all()
+
+
+def test_what_is_not_a_number_leaves_no_gradient():
+    """One match that is NaN, and said not to be seen, made the cameras' gradients NaN."""
+    cameras = array_of(3)
+    _, x = seen_points(cameras)
+    x[2, 0] = torch.nan
+    seen = torch.ones(x.shape[:-1], dtype=torch.bool)
+    seen[2, 0] = False
+    K = cameras[0].K.clone().requires_grad_()
+    found = triangulate([cameras[0].replace(K=K), *cameras[1:]], x, seen=seen)
+    assert found.valid.all()
+    found.X.sum().backward()
+    assert K.grad.isfinite().all()
+    K.grad = None
+    x = x[:2].clone()
+    x[1, 1] = torch.inf
+    depth = depth_of(Pair(cameras[0].replace(K=K), cameras[1]), x[0], x[1])
+    assert not depth.valid[1]
+    assert depth.valid[2:].all()
+    depth.depth.sum().backward()
+    assert K.grad.isfinite().all()
+
+
+def test_depth_along_a_curve_has_the_gradients_of_depth_along_a_line():
+    """Only those of the curve's ends were there."""
+    cameras = wide_pair()
+    x = torch.tensor([[2000.0, 1500.0], [2600.0, 1700.0]], dtype=torch.float64)
+    near, far = (torch.tensor(d, dtype=torch.float64) for d in (0.5, 50.0))
+    t = cameras[1].t.clone().requires_grad_()
+    pair = Pair(cameras[0], cameras[1].replace(cam_from_world=Pose(cameras[1].R, t)), depth=(near, far))
+    points = cameras[0].rays(x)[0] * torch.tensor([[3.0], [6.0]], dtype=torch.float64)
+    x_beta = pair.beta.project_local(pair.beta_from_alpha.apply(points)).x.detach().requires_grad_()
+    slopes = []
+    for function in (depth_of, ray_depth):
+        found = function(pair, x, x_beta)
+        assert found.valid.all()
+        slopes.append(torch.autograd.grad(found.depth.sum(), (x_beta, t), retain_graph=True))
+    torch.testing.assert_close(slopes[1], slopes[0], rtol=2e-3, atol=2e-3)
