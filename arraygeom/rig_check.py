@@ -51,7 +51,8 @@ def unit_oddity(rig: Rig) -> str | None:
     if longest > LARGEST_BASELINE:
         return (
             f"has cameras {longest:.3g} m apart: is this file in millimetres? "
-            "Then convert it (`pat rig convert`) and write units: millimetres, or read it with scale=0.001; "
+            "Then convert it (`pat rig convert`) and write units: millimetres, which its depth is in, too, "
+            "or read it with scale=0.001; "
             "if its scale is arbitrary, all is well"
         )
     if 0 < longest < SMALLEST_BASELINE:

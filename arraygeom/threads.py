@@ -40,6 +40,13 @@ def threads() -> int:
 
 
 @contextmanager
+def limited_to(count: int | None) -> Iterator[None]:
+    """Let torch and loops take so many threads; None: as many as they may."""
+    with _torch_threads(torch.get_num_threads() if count is None else count):
+        yield
+
+
+@contextmanager
 def torch_in_one_thread() -> Iterator[None]:
     """Let torch's own loops run in the calling thread alone; `in_parallel` takes as many `threads` as before.
 

@@ -59,6 +59,11 @@ class FieldOnGrid:
         # Explicit positions of a whole frame may not fit into memory: one point shows which kind the field
         # gives.
         kind = at(torch.full((1, 2), 0.25, dtype=torch.float64, device=device))
+        if not isinstance(kind, Segments | Positions):
+            name = getattr(field, "__name__", type(field).__name__)
+            raise ValueError(
+                f"the field {name} gave a {type(kind).__name__}: fields give Segments or Positions"
+            )
         if isinstance(kind, Positions):
             return cls(at, kind.xy.shape[-2], None)
         pixels = _on_grid(at, hw, device=device)

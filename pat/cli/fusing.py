@@ -122,8 +122,12 @@ class Fuse(Known):
         options.device_of(self.device)
         if self.classical and not self.report:
             raise ValueError("--classical needs the page: leave out --no-report")
+        if self.workers < 1 or (self.threads is not None and self.threads < 1):
+            raise ValueError("--workers and --threads are 1 or more")
+        from arraygeom.threads import limited_to
+
         self._notes: list[str] = []
-        with self.judged():
+        with self.judged(), limited_to(self.threads):
             self._with_rig() if with_rig else self._without_rig()
 
     def _with_rig(self) -> None:
@@ -393,8 +397,9 @@ class Fuse(Known):
             settings=self._settings(),
         )
         several = self.workers > 1 or self.scheduler is not None
+        threads = self.threads if self.threads is not None else 1 if several else cores()
         report = batch.run(
-            workers=Workers(self.workers, self.scheduler, self.threads or (1 if several else cores())),
+            workers=Workers(self.workers, self.scheduler, threads),
             resume=self.resume,
             on_error=self.on_error,
             video=self.video if self.sequence and self.video and self.bits != 32 else None,

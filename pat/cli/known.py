@@ -142,7 +142,7 @@ class Known:
     def _around_matches(
         self, rig: Rig, alpha: str, files: Mapping[str, str | Path], field: ReceptiveField | None
     ) -> Mapping[str, ReceptiveField | None]:
-        from arraygeom import LensView
+        from arraygeom import LensView, depth_of
         from arraygeom.fields import AroundMatches
         from arraygeom.io.point_matches import read_matches
 
@@ -156,5 +156,13 @@ class Known:
             own, beta = rig[a[0]], rig[a[1]]
             assert isinstance(own, LensView)
             assert isinstance(beta, LensView)
+            if rig.pair(a[0], a[1]).calibrated:
+                found_depth = depth_of(rig.pair(a[0], a[1]), *b)
+                behind = float((~found_depth.valid).float().mean())
+                if behind > OUT_OF_RANGE:
+                    raise ValueError(
+                        f"{self.matches}: {behind:.0%} of the matches of '{a[0]}' and '{a[1]}' are behind "
+                        "the cameras by the rig: are its columns in the order of the images?"
+                    )
             fields[a[1]] = AroundMatches.from_points(*b, own.hw, views=(own, beta), field=field)
         return fields

@@ -109,8 +109,9 @@ class Batch:
             del entries[name]
         del entries["settings"]["max_memory"]
         entries["weights"] = f"{self.weights} (SHA-256 {digest[:16]})"
-        entries["frames"] = {name: len(paths) for name, paths in files.items()}
-        entries["first"] = {name: paths[0] for name, paths in files.items()}
+        if self.sequence:
+            entries["frames"] = {name: len(paths) for name, paths in files.items()}
+            entries["first"] = {name: paths[0] for name, paths in files.items()}
         return yaml.safe_dump(entries, sort_keys=False)
 
     @property
@@ -164,9 +165,10 @@ class Batch:
         Frames whose images are not those of before are removed.
         """
         text, file = self.dependencies, self.out / SETTINGS
-        if resume and file.is_file() and file.read_text(encoding="utf-8") != text:
+        changed = _differing(text, file.read_text(encoding="utf-8")) if resume and file.is_file() else []
+        if changed:
             raise ValueError(
-                f"{file}: the frames there were made with other settings: "
+                f"{file}: the frames there were made with other settings ({', '.join(changed)}): "
                 "give the same ones, or another --out"
             )
         now, before = self.inputs, _read_inputs(self.out / INPUTS) if resume else {}
@@ -298,6 +300,20 @@ def fuse_key(plan: Path, key: KeyFrame) -> None:
 def fuse_one(plan: Path, i: int) -> None:
     """The task of a frame."""
     _planned(plan, plan.stat().st_mtime_ns).fuse_one(i)
+
+
+def _differing(now: str, before: str) -> list[str]:
+    """Names of the settings (YAML) that are not as before."""
+    try:
+        stated, former = yaml.safe_load(now), yaml.safe_load(before)
+    except yaml.YAMLError:
+        return ["unreadable"]
+    if not isinstance(former, dict):
+        return ["unreadable"]
+    names = [name for name, value in stated.items() if former.get(name) != value]
+    if names == ["settings"] and isinstance(former.get("settings"), dict):
+        names = [n for n, value in stated["settings"].items() if former["settings"].get(n) != value]
+    return names
 
 
 def _stamp(file: Path) -> str:

@@ -87,6 +87,8 @@ def array_from_images(
     line: fewer than two images, an image of one colour, images that do not show the same things, a focal
     length of no camera.
     """
+    if isinstance(sources, str | Path):
+        raise ValueError(f"an array has two images or more, got {sources}: give a list of them")
     if not isinstance(sources, Mapping):
         sources = camera_names([Path(path) for path in sources])
     if len(sources) < 2:

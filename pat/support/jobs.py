@@ -110,6 +110,10 @@ class Workers:
     apart: bool = False
     timeout: float | None = None
 
+    def __post_init__(self) -> None:
+        if self.count < 1 or self.threads < 1:
+            raise ValueError(f"{self.count} processes of {self.threads} threads: give 1 or more of each")
+
 
 HERE = Workers()
 """This process, one thread."""

@@ -40,7 +40,8 @@ def folder(tmp_path_factory):
     cv2.imwrite(str(folder / "depth.png"), (depth.numpy() * 5000).astype(np.uint16))
     y, x = np.mgrid[4:H:8, 24:W:8]
     d = np.where(depth.numpy()[y, x] == WALL, FAR, NEAR)
-    np.savetxt(folder / "matches.csv", np.stack([x, y, x - d, y], -1).reshape(-1, 4), delimiter=",")
+    for file, columns in (("matches.csv", [x, y, x - d, y]), ("exchanged.csv", [x - d, y, x, y])):
+        np.savetxt(folder / file, np.stack(columns, -1).reshape(-1, 4), delimiter=",")
     return folder
 
 
@@ -107,6 +108,8 @@ def test_rig_commands_take_matches(folder, capsys):
         (["--depth-map", "{}/none.png"], "no such depth map"),
         (["--matches", "{}/mono.png"], "neither CSV nor a COLMAP database"),
         (["--depth-map", "{}/depth.tif", "--depth-tolerance", "-1"], "tolerance is -1.0"),
+        (["--matches", "{}/exchanged.csv"], "behind the cameras by the rig: are its columns in the order"),
+        (["--threads", "0"], "--workers and --threads are 1 or more"),
     ],
 )
 def test_bad_input_is_one_line(folder, options, expected, capsys):

@@ -102,6 +102,23 @@ def test_other_settings_are_not_mixed_in(material, tmp_path):
         batch(material, tmp_path / "out", match_levels=True).run(resume=True)
 
 
+def test_frames_that_came_later_are_made_and_what_differs_is_named(material, tmp_path):
+    """A folder that had grown counted as other settings."""
+    whole = batch(material, tmp_path / "out")
+    part = replace(whole, files={name: files[:2] for name, files in whole.files.items()})
+    assert len(part.run().made) == 2
+    more = replace(whole, files={name: files[:3] for name, files in whole.files.items()})
+    report = more.run(resume=True)
+    assert (len(report.made), len(report.kept)) == (1, 2)
+    with pytest.raises(ValueError, match=r"other settings \(alpha\): give"):
+        replace(more, alpha="slow").run(resume=True)
+    with pytest.raises(ValueError, match=r"other settings \(keep_alpha\): give"):
+        replace(more, settings=FuseSettings(keep_alpha=True)).run(resume=True)
+    (tmp_path / "out" / "settings.yaml").write_text("[")
+    with pytest.raises(ValueError, match=r"other settings \(unreadable\)"):
+        more.run(resume=True)
+
+
 def spoiled(material, tmp_path, i) -> dict[str, list[Path]]:
     """The files, one of alpha's cut in half."""
     files = {"fast": find_images(material / "fast"), "slow": [find_images(material / "slow")[0]] * 7}

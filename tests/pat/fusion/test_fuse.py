@@ -143,6 +143,18 @@ def test_halos_are_wide_enough_for_the_weights(folder, shared_data):
     assert (tiled.confidence - whole.confidence).abs().max() < 3e-5
 
 
+def test_what_is_no_field_or_no_list_is_refused_in_a_line():
+    rig, images = rig_of((64, 96), (64, 96)), {"mono": texture(1, (64, 96)), "colour": texture(3, (64, 96))}
+
+    def ends(pair, x):
+        return x, x
+
+    with pytest.raises(ValueError, match="the field ends gave a tuple: fields give Segments or Positions"):
+        fuse(network_of("GuidedPAT"), rig, images, alpha="mono", field=ends)
+    with pytest.raises(ValueError, match=r"got mono\.png: give a list"):
+        fuse("mono.png")
+
+
 def test_precision_is_that_of_the_weights():
     rig, images = rig_of((64, 96), (64, 96)), {"mono": texture(1, (64, 96)), "colour": texture(3, (64, 96))}
     network, double = network_of("GuidedPAT"), {name: image.double() for name, image in images.items()}
