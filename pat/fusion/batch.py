@@ -29,6 +29,7 @@ from arraygeom.atomic import sweep, write_text
 from arraygeom.fields import FIELDS
 from arraygeom.io.native import read_text as rig_of_text
 from arraygeom.io.native import write as rig_text
+from arraygeom.safe_yaml import load_yaml
 
 from ..media.images import read_image
 from ..media.raw import developed_rig
@@ -305,7 +306,7 @@ def fuse_one(plan: Path, i: int) -> None:
 def _differing(now: str, before: str) -> list[str]:
     """Names of the settings (YAML) that are not as before."""
     try:
-        stated, former = yaml.safe_load(now), yaml.safe_load(before)
+        stated, former = load_yaml(now), load_yaml(before)
     except yaml.YAMLError:
         return ["unreadable"]
     if not isinstance(former, dict):

@@ -145,10 +145,10 @@ def _read_plain(kind: Any, value: Any, entry: str) -> Any:
         if math.isnan(value):
             raise ValueError(f"{entry}: is NaN; wanted a number")
         return float(value)
-    if kind is float and isinstance(value, str) and _is_number(value):
-        return float(value)
-    if kind is int and isinstance(value, str) and _is_number(value) and float(value).is_integer():
-        return int(float(value))
+    if kind in (int, float) and isinstance(value, str) and _is_number(value):
+        value = float(value)
+    if kind is int and isinstance(value, float) and value.is_integer():
+        return int(value)
     if kind is Path and isinstance(value, str):
         return Path(value).expanduser()
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
@@ -160,7 +160,7 @@ _PLAIN = {float: "a number", int: "a whole number", str: "text", bool: "true or 
 
 
 def _is_number(text: str) -> bool:
-    """YAML takes 1e-3 for text, because it has no point."""
+    """YAML takes inf for text: it writes .inf."""
     try:
         return not math.isnan(float(text))
     except ValueError:
