@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom.homography import apply_homography, infinite_homography, plane_homography
+from arraygeom.homography import apply_homography, fit_similarity, infinite_homography, plane_homography
 from tests.oracles import Oracle
 
 cv2 = Oracle("cv2")
@@ -101,3 +101,8 @@ def test_gradients(scene):
 
     inputs = [v.detach()[:2].clone().requires_grad_() for v in (x, *scene.values())]
     assert torch.autograd.gradcheck(transformed, inputs)
+
+
+def test_a_similarity_of_one_point_is_refused():
+    with pytest.raises(ValueError, match="two points that differ"):
+        fit_similarity(torch.ones(3, 2), torch.rand(3, 2))

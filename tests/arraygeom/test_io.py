@@ -422,3 +422,17 @@ def test_a_lens_without_focal_length_states_its_scale(tmp_path):
     )
     with pytest.raises(RigFileError, match=r"distortion\.scale: unknown key"):
         Rig.load(path)
+
+
+def test_opencv_24s_samples_state_their_size(tmp_path):
+    """`image_Width` was not read: twice the principal point was taken."""
+    K = "<rows>3</rows><cols>3</cols><dt>d</dt><data>500. 0. 300. 0. 500. 250. 0. 0. 1.</data>"
+    D = "<rows>5</rows><cols>1</cols><dt>d</dt><data>0. 0. 0. 0. 0.</data>"
+    path = tmp_path / "out.xml"
+    path.write_text(
+        '<?xml version="1.0"?><opencv_storage><image_Width>640</image_Width><image_Height>480</image_Height>'
+        f'<Camera_Matrix type_id="opencv-matrix">{K}</Camera_Matrix>'
+        f'<Distortion_Coefficients type_id="opencv-matrix">{D}</Distortion_Coefficients></opencv_storage>'
+    )
+    (camera,) = Rig.load(path).cameras.values()
+    assert camera.hw == (480, 640)

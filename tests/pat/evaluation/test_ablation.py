@@ -112,6 +112,18 @@ def test_rows_are_grouped_by_focal_ratio():
     assert "| other | 29.00 | 0.8000 | -1.00 | 29.00 |  |  |  |  | 1 scenes omitted |" in lines
 
 
+def test_a_figure_that_is_missing_empties_no_column():
+    rows = [AblationRow("a", 1.2, "calibrated", note="cannot"), AblationRow("a", 1.2, "other", 29.0, 0.8)]
+    rows += [
+        AblationRow("b", 2.5, "calibrated", 34.0, 0.9),
+        AblationRow("b", 2.5, "other", 33.0, 0.8, 1.5, 0.4),
+    ]
+    (line,) = [line for line in markdown(rows).splitlines() if line.startswith("| other")]
+    assert "| -1.00 |" in line
+    assert "| 1.50 | 40.0% |" in line
+    assert "nan" not in markdown(rows[:2])
+
+
 def test_the_true_depth_has_no_error(case):
     assert point_errors(case, case.depth) == (0, 1)
     error, within = point_errors(case, torch.full_like(case.depth, torch.nan))

@@ -483,3 +483,11 @@ def test_an_image_that_is_not_needed_again_is_not_kept():
     assert undo
     assert inputs.hw == hw
     assert kept() is None
+
+
+def test_several_betas_of_float64_are_fused():
+    rig, images = rig_of((64, 96), (64, 96)), {"mono": texture(1, (64, 96)), "colour": texture(3, (64, 96))}
+    beside = rig["colour"].replace(cam_from_world=Pose(rig["mono"].R, rig["colour"].t * -1))
+    both = Rig({**rig.cameras, "other": beside}, depth=rig.depth)
+    images = {name: image.double() for name, image in {**images, "other": images["colour"]}.items()}
+    assert fuse(network_of("GuidedPAT").double(), both, images, alpha="mono").image.dtype == torch.float64
