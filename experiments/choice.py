@@ -1,7 +1,7 @@
 """Training of the choice between disparities: `python -m experiments.choice --photos DIR --stereo DIR`.
 
-First pairs with true disparity are matched, photographs cut into surfaces and real ones, and what the choice
-is by is kept; then it is trained on random windows of those. Everything is exact: the score of a candidate
+First pairs with true disparity are matched, made of photographs and real ones, and what the choice is by is
+kept; then it is trained on random windows of those. Everything is exact: the score of a candidate
 is to be high if it is near the true disparity.
 """
 
@@ -23,7 +23,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, pixel_shuffle
 
 from arraygeom import Segments, pixel_grid
 from experiments.completion.capture import fused_at_random
-from experiments.completion.pairs import Made, PairTraining
+from experiments.completion.samples import KINDS, Made, PairTraining
 from experiments.evaluation.conditions import regions_of
 from experiments.fit import command, recipe_text
 from pat.data.pairs import StereoPair
@@ -50,7 +50,7 @@ OTHER = 0.35
 
 @dataclass(frozen=True, kw_only=True)
 class ChoiceTraining(PairTraining):
-    """A recipe; half of the windows are of real pairs if there are some."""
+    """A recipe; as many windows are of each kind of pairs that there are."""
 
     out: Path = Path("runs/choice")
     without: tuple[str, ...] = ()
@@ -94,10 +94,9 @@ def train_choice(config: ChoiceTraining) -> Path:
     """
     with config.folder():
         network = config.network()
-        photos = kept(config.out / "photos", network, config.photo_pairs())
-        pairs = kept(config.out / "pairs", network, config.real_pairs(), config.without)
+        found = [kept(config.out / kind, network, config.pairs(kind), config.without) for kind in KINDS]
         choice = Choice().to(config.device)
-        config.train(choice, partial(losses, config, photos, pairs, choice))
+        config.train(choice, partial(losses, config, found, choice))
         state = choice.half().state_dict()
         write_tensors(config.out / "best.safetensors", state, {"recipe": recipe_text(config)})
     return config.out / "best.safetensors"
@@ -142,13 +141,14 @@ def matched(network: GuidedPAT, pair: StereoPair, seed: int) -> Kept:
 
 
 def losses(
-    config: ChoiceTraining, photos: Sequence[Kept], pairs: Sequence[Kept], network: Choice, start: int
+    config: ChoiceTraining, found: Sequence[Sequence[Kept]], network: Choice, start: int
 ) -> Iterator[Tensor]:
     """Of each step from one on: the cross-entropy of how near candidates are to the true disparity, of the
     statement that the best one is right, and how far it is off beyond or within what is stated."""
+    kinds = [some for some in found if some]
     for step in itertools.count(start):
         g = generator_for(config.seed, "choice", step)
-        of = [pairs if pairs and i % 2 == 0 else photos for i in range(config.batch)]
+        of = [kinds[i % len(kinds)] for i in range(config.batch)]
         windows = [window(some[below(len(some), g)], config.side, g) for some in of]
         given, options, truth, seen = (torch.cat(parts).to(config.device) for parts in zip(*windows))
         with torch.autocast(config.device, torch.bfloat16, enabled=config.device != "cpu"):

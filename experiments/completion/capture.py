@@ -65,10 +65,11 @@ def fused_at_random(network: GuidedPAT, pair: StereoPair, seed: int, **options: 
     return truth
 
 
-def captured(network: GuidedPAT, pair: StereoPair, seed: int) -> Float[Tensor, "p h w"]:
-    """The planes of a pair recorded at random, left as alpha; its largest disparity must be known."""
+def captured(network: GuidedPAT, pair: StereoPair, seed: int, **options: Any) -> Float[Tensor, "p h w"]:
+    """The planes of a pair recorded at random, left as alpha, its largest disparity known; options are those
+    of `fuse`."""
     recorder = network.completion = Recorder()
-    truth = fused_at_random(network, pair, seed)
+    truth = fused_at_random(network, pair, seed, **options)
     own, confidence, mixed, candidates = recorder.given
     colours = [to_luma_chroma(c)[1] for c in (mixed, *differences(confidence, mixed, candidates))]
     h, w = truth.shape[1:]

@@ -6,9 +6,8 @@ things, as in real pairs, and what is hidden is texture of photographs. Left is 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,13 +19,8 @@ from skimage.segmentation import felzenszwalb
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from experiments.evaluation.halves import of_half
-from experiments.fit import Recipe
-from pat.data.pairs import Disparity, StereoPair, folder_pairs, middlebury_pairs
+from pat.data.pairs import Disparity, StereoPair
 from pat.media.images import read_image
-from pat.networks.guided import GuidedPAT
-from pat.networks.weights import load_weights
-from pat.support.folders import files_below
 
 Image = NDArray[np.float32]
 HW = (320, 448)
@@ -34,54 +28,9 @@ MOST = 80.0
 """Disparity, pixels."""
 MARGIN = 15.0
 """Pixels by which the disparities that are searched exceed those there are."""
-Made = partial[StereoPair]
-"""A pair that is made when it is called."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PairTraining(Recipe):
-    """What is learned from pairs."""
-
-    photos: tuple[Path, ...]
-    """Folders of photographs."""
-    stereo: Path | None = None
-    """Folder of Middlebury's pairs; those of the tune half are used."""
-    others: tuple[Path, ...] = ()
-    """Folders of other pairs, of the tune half too."""
-    captured: int = 850
-    """Photographs' pairs that are fused."""
-    varied: int = 600
-    """And real ones, in other colours and sizes."""
-    fusion: str = "mono-colour"
-    """Weights of the fusion that what is learned is for."""
-
-    def network(self) -> GuidedPAT:
-        """What fuses the pairs."""
-        network = load_weights(self.fusion)
-        assert isinstance(network, GuidedPAT)
-        return network
-
-    def photo_pairs(self) -> Iterator[Made]:
-        """Those of photographs. Raises ValueError where there are none."""
-        suffixes = {".jpg", ".jpeg", ".png"}
-        files = [f for root in self.photos for f in files_below(root) if f.suffix.lower() in suffixes]
-        if not files:
-            raise ValueError(f"no photograph in {', '.join(map(str, self.photos))}: check the folders")
-        for i in range(self.captured):
-            other = int(np.random.default_rng(i).integers(len(files)))
-            yield partial(photo_pair, files[i % len(files)], files[other], i)
-
-    def real_pairs(self) -> Iterator[Made]:
-        """Stereo pairs and their mirror images, each side as alpha, in turns."""
-        pairs = [*of_half(middlebury_pairs(self.stereo), "tune")] if self.stereo else []
-        both = [pair for one in pairs for pair in (one, _mirrored(one, self.stereo))]
-        for root in self.others:
-            both += [p for one in of_half(folder_pairs(root), "tune") for p in (one, _mirrored(one))]
-        for i in range(self.varied if both else 0):
-            yield partial(varied_pair, both[i % len(both)], i)
-
-
-def _mirrored(pair: StereoPair, root: Path | None = None) -> StereoPair:
+def mirrored(pair: StereoPair, root: Path | None = None) -> StereoPair:
     """The mirror image, right as alpha, with Middlebury's true disparity of that."""
     left, right = pair.right.flip(-1), pair.left.flip(-1)
     if root is None or pair.max_disparity is None:
@@ -101,7 +50,7 @@ def varied_pair(pair: StereoPair, seed: int) -> StereoPair:
         smooth = {"antialias": True} if mode == "bicubic" else {}
         return interpolate(image[None], (height, width), mode=mode, **smooth)[0]
 
-    left, right = _recoloured([larger(image).clamp(0, 1) for image in (pair.left, pair.right)], rng)
+    left, right = recoloured([larger(image).clamp(0, 1) for image in (pair.left, pair.right)], rng)
     most, truth = pair.max_disparity, None
     if pair.disparity is not None:
         value, valid = (larger(part[None].float(), "nearest-exact")[0] for part in pair.disparity)
@@ -111,7 +60,7 @@ def varied_pair(pair: StereoPair, seed: int) -> StereoPair:
     return StereoPair(f"{pair.name} {seed}", left, right, most * width / size[1] + MARGIN, truth)
 
 
-def _recoloured(images: Sequence[Float[Tensor, "3 h w"]], rng: np.random.Generator) -> list[Tensor]:
+def recoloured(images: Sequence[Float[Tensor, "3 h w"]], rng: np.random.Generator) -> list[Tensor]:
     """Images with their bands exchanged, other curves, and mixed; 0..1."""
     drawn = rng.permutation(3), rng.uniform(0.65, 1.5, (3, 1, 1)), np.eye(3) + rng.normal(0, 0.25, (3, 3))
     bands, curve, mix = map(torch.from_numpy, drawn)
@@ -129,7 +78,7 @@ def photo_pair(path: Path, behind: Path, seed: int) -> StereoPair:
     Raises ValueError for a file that is no image.
     """
     rng = np.random.default_rng(seed)
-    left, other = (_window(file, rng) for file in (path, behind))
+    left, other = (window_of(file, rng) for file in (path, behind))
     if rng.random() < 0.4:
         left = _with_objects(left, other[::-1, ::-1], rng)
     regions = felzenszwalb(
@@ -144,7 +93,7 @@ def photo_pair(path: Path, behind: Path, seed: int) -> StereoPair:
     return StereoPair(f"{path.stem} {seed}", one, two, MOST + MARGIN, known)
 
 
-def _window(path: Path, rng: np.random.Generator) -> Image:
+def window_of(path: Path, rng: np.random.Generator) -> Image:
     """A random window of a photograph, red, green, blue, at a random size; mirrored half of the time."""
     read = cv2.imread(str(path))
     if read is None:

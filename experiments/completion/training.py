@@ -17,7 +17,9 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
+from experiments.evaluation.certainty import unseeing
 from experiments.fit import command, recipe_text
+from pat.matching.match import match
 from pat.media.colour import from_luma_chroma
 from pat.networks.completion import CANDIDATES, Completion, features
 from pat.networks.guided import GuidedPAT
@@ -27,16 +29,19 @@ from pat.synthesis.rigs import below
 from pat.training.losses import image_loss
 
 from .capture import HIGHEST, captured, read_planes, values, write_planes
-from .pairs import PairTraining
+from .samples import KINDS, PairTraining
 
 
 @dataclass(frozen=True, kw_only=True)
 class CompletionTraining(PairTraining):
-    """A recipe; half of the windows are of real pairs if there are some."""
+    """A recipe; as many windows are of each kind of pairs that there are."""
 
     out: Path = Path("runs/completion")
     widths: tuple[int, int, int] = (64, 96, 128)
     """Channels at 1/2, 1/4 and 1/8 of the size."""
+    choices: tuple[Path, ...] = ()
+    """Files of choices between disparities trained without some pairs (`--without`): of a pair, what the one
+    that has not seen it gives is learned."""
     steps: int = 8000
     batch: int = 16
     side: int = 256
@@ -49,9 +54,9 @@ def train_completion(config: CompletionTraining) -> Path:
     """
     with config.folder():
         network = config.network()
-        photos, pairs = (kept(config, network, kind) for kind in ("photos", "pairs"))
+        frames = [kept(config, network, kind) for kind in KINDS]
         completion = Completion(config.widths).to(config.device)
-        config.train(completion, partial(losses, config, photos, pairs, completion))
+        config.train(completion, partial(losses, config, frames, completion))
         made = GuidedPAT(replace(network.config, completion=config.widths))
         network.completion = completion
         made.load_state_dict(network.state_dict())
@@ -62,30 +67,34 @@ def train_completion(config: CompletionTraining) -> Path:
 
 
 def kept(config: CompletionTraining, network: GuidedPAT, kind: str) -> list[Tensor]:
-    """Planes of photographs' pairs, or of stereo pairs, captured where they are not yet."""
+    """Planes of pairs of a kind, captured where they are not yet."""
     folder = config.out / kind
     folder.mkdir(parents=True, exist_ok=True)
     found = []
-    for i, pair in enumerate(config.photo_pairs() if kind == "photos" else config.real_pairs()):
+    for i, make in enumerate(config.pairs(kind)):
         file = folder / f"{i:05}.webp"
         if not file.exists():
-            write_planes(captured(network, pair(), i)[:, :HIGHEST], file)
+            pair = make()
+            learned = config.choices and kind != "photos" and pair.disparity is not None
+            best = unseeing(config.choices, pair.name) if learned else None
+            planes = captured(network, pair, i, matcher=partial(match, choice=best))
+            write_planes(planes[:, :HIGHEST], file)
         found.append(read_planes(file))
     return found
 
 
 def losses(
     config: CompletionTraining,
-    photos: Sequence[Tensor],
-    pairs: Sequence[Tensor],
+    frames: Sequence[Sequence[Tensor]],
     network: Completion,
     start: int,
 ) -> Iterator[Tensor]:
     """Of each step from one on: minus the mean PSNR of windows, as `image_loss`."""
+    kinds = [some for some in frames if some]
     for step in itertools.count(start):
         g = generator_for(config.seed, "completion", step)
-        of = [pairs if pairs and i % 2 == 0 else photos for i in range(config.batch)]
-        planes = varied(torch.stack([window(some, config.side, g) for some in of]), g).to(config.device)
+        parts = [window(kinds[i % len(kinds)], config.side, g) for i in range(config.batch)]
+        planes = varied(torch.stack(parts), g).to(config.device)
         facts, truth = torch.cat([planes[:, :2], planes[:, 4:]], 1), planes[:, 2:4]
         given = features(facts[:, :1], facts[:, 1:2], [facts[:, 2:]])
         with torch.autocast(config.device, torch.bfloat16, enabled=config.device != "cpu"):

@@ -9,6 +9,7 @@ from skimage.data import data_dir
 
 from experiments.choice import ChoiceTraining, Kept, losses, rows_of, train_choice, window
 from experiments.completion.pairs import HW, photo_pair, varied_pair
+from experiments.completion.shapes import shape_pair
 from experiments.evaluation.certainty import unseeing
 from experiments.fit import command
 from pat.data.pairs import Disparity, StereoPair
@@ -32,6 +33,36 @@ def test_photographs_pairs_have_the_disparity_they_were_made_with(tmp_path):
     apart = (seen - pair.left).abs().amax(0)
     assert float((apart < 0.1)[on].float().mean()) > 0.75
     assert pair.disparity.value.min() > 0
+
+
+def stepped(unknown=0):
+    """A pair of two surfaces, 12 and 20 px off, whose images say nothing; beside a step nothing is known."""
+    value = torch.full(HW, 12.0)
+    value[100:220, 200:300] = 20.0
+    valid = torch.ones(HW) > 0
+    valid[:, 200 - unknown : 200] = False
+    grey = torch.full((3, *HW), 0.5)
+    return StereoPair("a", grey, grey, 30.0, Disparity(value, valid))
+
+
+def test_shapes_in_other_textures_have_the_disparity_they_were_made_with(tmp_path):
+    """Surfaces are whole, with one step between them: right shows left's pixels moved by what is stated."""
+    files = []
+    for name in ("astronaut", "coffee"):
+        files.append(tmp_path / f"{name}.png")
+        files[-1].symlink_to(f"{data_dir}/{name}.png")
+    for seed in range(4):
+        pair = shape_pair(stepped(unknown=9), files, seed)
+        seen, on = warped(pair)
+        apart = (seen - pair.left).abs().amax(0)
+        assert float((apart < 0.1)[on].float().mean()) > 0.85
+        across = pair.disparity.value.diff(dim=1).abs()
+        assert 0 < float((across > 0.5).float().mean()) < 2 / HW[1]
+        assert pair.disparity.value.min() >= 2
+        assert pair.disparity.value.max() <= 80
+        assert torch.equal(pair.right, shape_pair(stepped(unknown=9), files, seed).right)
+    with pytest.raises(ValueError, match="a: its disparity is not known"):
+        shape_pair(StereoPair("a", pair.left, pair.left, 30.0, None), files, 0)
 
 
 def test_varied_pairs_are_of_the_same_scene():
@@ -91,7 +122,7 @@ def test_training_learns_to_choose():
     network = Choice((8, 8, 8))
     adam = torch.optim.Adam(network.parameters(), 3e-3)
     found = []
-    for loss, _ in zip(losses(config, [kept()], [], network, 0), range(30)):
+    for loss, _ in zip(losses(config, [[kept()]], network, 0), range(30)):
         adam.zero_grad()
         loss.backward()
         adam.step()

@@ -1,0 +1,87 @@
+"""What the completion and the choice between disparities learn from, before it is fused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from experiments.evaluation.halves import of_half
+from experiments.fit import Recipe
+from pat.data.pairs import StereoPair, folder_pairs, middlebury_pairs
+from pat.networks.guided import GuidedPAT
+from pat.networks.weights import load_weights
+from pat.support.folders import files_below
+
+from .pairs import mirrored, photo_pair, varied_pair
+from .shapes import shape_pair
+
+Made = partial[StereoPair]
+"""A pair that is made when it is called."""
+KINDS = ("pairs", "shapes", "photos")
+"""Real pairs, real shapes in other textures, photographs cut into surfaces."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairTraining(Recipe):
+    """What is learned from pairs."""
+
+    photos: tuple[Path, ...]
+    """Folders of photographs."""
+    stereo: Path | None = None
+    """Folder of Middlebury's pairs; those of the tune half are used."""
+    others: tuple[Path, ...] = ()
+    """Folders of other pairs, of the tune half too."""
+    captured: int = 700
+    """Photographs' pairs that are fused."""
+    shaped: int = 540
+    """Real shapes in other textures."""
+    varied: int = 520
+    """And real pairs, in other colours and sizes."""
+    fusion: str = "mono-colour"
+    """Weights of the fusion that what is learned is for."""
+
+    def network(self) -> GuidedPAT:
+        """What fuses the pairs."""
+        network = load_weights(self.fusion)
+        assert isinstance(network, GuidedPAT)
+        return network
+
+    def pairs(self, kind: str) -> Iterator[Made]:
+        """Those of one of the `KINDS`. Raises ValueError where there are no photographs."""
+        if kind == "photos":
+            return self._photo_pairs()
+        return self._shape_pairs() if kind == "shapes" else self._real_pairs()
+
+    def _photo_pairs(self) -> Iterator[Made]:
+        files = self._photographs()
+        for i in range(self.captured):
+            other = int(np.random.default_rng(i).integers(len(files)))
+            yield partial(photo_pair, files[i % len(files)], files[other], i)
+
+    def _shape_pairs(self) -> Iterator[Made]:
+        files, known = self._photographs(), self._middlebury()
+        for i in range(self.shaped if known else 0):
+            yield partial(shape_pair, known[i % len(known)], files, i)
+
+    def _real_pairs(self) -> Iterator[Made]:
+        """Each side as alpha, in turns."""
+        both = self._middlebury()
+        for root in self.others:
+            both += [p for one in of_half(folder_pairs(root), "tune") for p in (one, mirrored(one))]
+        for i in range(self.varied if both else 0):
+            yield partial(varied_pair, both[i % len(both)], i)
+
+    def _photographs(self) -> list[Path]:
+        suffixes = {".jpg", ".jpeg", ".png"}
+        files = [f for root in self.photos for f in files_below(root) if f.suffix.lower() in suffixes]
+        if not files:
+            raise ValueError(f"no photograph in {', '.join(map(str, self.photos))}: check the folders")
+        return files
+
+    def _middlebury(self) -> list[StereoPair]:
+        pairs = [*of_half(middlebury_pairs(self.stereo), "tune")] if self.stereo else []
+        return [pair for one in pairs for pair in (one, mirrored(one, self.stereo))]
