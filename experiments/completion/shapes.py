@@ -45,7 +45,7 @@ def shape_pair(pair: StereoPair, photos: Sequence[Path], seed: int) -> StereoPai
         [cv2.GaussianBlur((which == i).astype(np.float32), (3, 3), 0.55) for i in range(len(disparity))]
     )
     left = np.einsum("nyx,nyxc->yxc", shares / shares.sum(0), textures)
-    right = _seen_from_right(which, disparity, textures, hidden)
+    right = seen_from_right(which, disparity, textures, hidden)
     one, two = (torch.from_numpy(x.clip(0, 1).astype(np.float32)).movedim(-1, 0) for x in (left, right))
     if rng.random() < 0.5:
         one, two = recoloured([one, two], rng)
@@ -134,7 +134,7 @@ def _texture(picture: Image, rng: np.random.Generator) -> Image:
     return picture.clip(0, 1).astype(np.float32)
 
 
-def _seen_from_right(which: NDArray, disparity: NDArray, textures: NDArray, hidden: Image) -> Image:
+def seen_from_right(which: NDArray, disparity: NDArray, textures: NDArray, hidden: Image) -> Image:
     """Right: the nearest of the samples of left that come to a place; `hidden` where none do."""
     (h, w), fine = HW, HW[1] * SAMPLES
     x = (np.arange(fine) + 0.5) / SAMPLES - 0.5
