@@ -90,14 +90,16 @@ def held_out_errors(
 def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """By camera: pixels (n, 2) near points of both halves, how far (n, 2) projections of their fits differ.
 
-    Halves are every other frame; elsewhere a lens model is extrapolated. Empty if there are too few frames.
+    Halves are every other frame; elsewhere a lens model is extrapolated. Empty if there are too few frames,
+    or a camera sees no board in one of the halves.
     """
     count = len(fit.problem.frames)
-    if count < FEWEST_TO_HALVE:
-        return {}
     even = np.arange(count) % 2 == 0
+    parts = [fit.problem.of_boards(kept) for kept in (even, ~even)]
+    if count < FEWEST_TO_HALVE or not all(len(seen.x) for half in parts for seen in half.seen.values()):
+        return {}
     try:
-        halves = [readjusted(fit.problem.of_boards(kept)) for kept in (even, ~even)]
+        halves = [readjusted(half) for half in parts]
     except np.linalg.LinAlgError:
         return {}
     found = {}
