@@ -116,3 +116,18 @@ def test_wrong_files_are_explained(text, message, tmp_path):
         parse_board(str(path))
     with pytest.raises(FileNotFoundError):
         parse_board(str(tmp_path / "none.csv"))
+
+
+def test_spreadsheets_mark_the_beginning_of_their_files(tmp_path):
+    """The mark of UTF-8 was part of the first column's name, unseen in the message that refused it."""
+    path = written(tmp_path, in_a_room(8))
+    plain = parse_board(str(path)).positions
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    assert parse_board(str(path)).positions == plain
+
+
+@pytest.mark.parametrize("content", [b"id,x,y,z\n\xe9,1,2,3\n", b'id,x,y,z\n"' + b"a" * 200_000])
+def test_files_that_are_no_csv_are_named(content, tmp_path):
+    (tmp_path / "targets.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=r"targets\.csv: not a CSV file"):
+        parse_board(str(tmp_path / "targets.csv"))
