@@ -105,7 +105,10 @@ class NextView(NamedTuple):
 
 
 def next_views(known: Intrinsics, board: Board, depth: float, *, count: int = 2) -> list[NextView]:
-    """The views that lower a camera's uncertainty of projection most, one after the other."""
+    """The views that lower a camera's uncertainty of projection most, one after the other.
+
+    None where the image shows hardly any of the board in each: a strip, or points far apart in depth.
+    """
     _, change = moved_pixels(known, depth)
 
     def median(information: np.ndarray) -> float:
@@ -115,7 +118,7 @@ def next_views(known: Intrinsics, board: Board, depth: float, *, count: int = 2)
     gains = {text: _gain(known, X) for text, X in proposed_views(known.camera, board.members[0]).items()}
     candidates = {text: gain for text, gain in gains.items() if gain is not None}
     information, found = np.linalg.inv(known.covariance), list[NextView]()
-    for _ in range(count):
+    for _ in range(count if candidates else 0):
         after = {text: median(information + gain) for text, gain in candidates.items()}
         best = min(after, key=lambda text: after[text])
         found.append(NextView(best, median(information), after[best]))
@@ -168,8 +171,8 @@ def coverage_advice(calibration: Calibration, covers: Mapping[str, Coverage]) ->
     for name, covered in covers.items():
         yield from (f"{name}: {text}" for text in covered.missing)
         known = intrinsics_of(calibration.fit, name)
-        if covered.missing and len(known.covariance):
-            views = next_views(known, calibration.board, float(np.mean(covered.depths)))
+        depth, lacking = float(np.mean(covered.depths)), covered.missing and len(known.covariance)
+        if lacking and (views := next_views(known, calibration.board, depth)):
             listed = "; then ".join(view.text for view in views)
             gain = f"uncertainty from {views[0].before:.2g} to {views[-1].after:.2g} px"
             yield f"{name}: two more views would help most: {listed} ({gain})"

@@ -212,11 +212,11 @@ def _advice(calibration: Calibration, name: str) -> str:
     covered = coverages(calibration)[name]
     known = intrinsics_of(calibration.fit, name)
     if len(known.covariance):
-        (best,) = next_views(known, calibration.board, float(np.mean(covered.depths)), count=1)
-        parts.append(
+        parts += [
             f"<p><b>Next: {escape(best.text)}</b> (uncertainty of projection {best.before:.2g} px, "
             f"with it {best.after:.2g}).</p>"
-        )
+            for best in next_views(known, calibration.board, float(np.mean(covered.depths)), count=1)
+        ]
     return "".join([*parts, *map(_note, covered.missing)])
 
 
