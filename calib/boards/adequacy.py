@@ -131,7 +131,7 @@ def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarra
     found, (h, w) = {}, camera.hw
     middle = torch.from_numpy(board.middle)
     for fill in FILLS:
-        depth = float(camera.K[0, 0]) * max(board.extent) / (fill * w)
+        depth = float(camera.K[0, :2].norm()) * max(board.extent) / (fill * w)
         for row, column in np.ndindex(3, 3):
             share = 0.5 + np.array([column - 1, row - 1]) * (0.5 - 0.4 * fill)
             pixel = torch.from_numpy(share * (w - 1, h - 1))

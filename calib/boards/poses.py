@@ -80,10 +80,10 @@ def start_prior(camera: Camera, deviations: StartDeviations) -> CameraPrior:
     information = typical_prior(camera).information.copy()
     information[:3, :3] = np.eye(3) / np.radians(deviations.rotation) ** 2
     information[3:6, 3:6] = np.eye(3) / deviations.position**2
-    focal = camera.K.diagonal()[:2].numpy()
-    information[6:8, 6:8] += np.full((2, 2), 0.25) / (deviations.focal * float(focal.mean())) ** 2
+    mean = intrinsic_values(camera)
+    information[6:8, 6:8] += np.full((2, 2), 0.25) / (deviations.focal * float(mean[6:8].mean())) ** 2
     information[8:10, 8:10] = np.eye(2) / (deviations.centre * camera.hw[1]) ** 2
-    return CameraPrior(intrinsic_values(camera), information, camera.cam_from_world)
+    return CameraPrior(mean, information, camera.cam_from_world)
 
 
 def initial_rig(singles: Mapping[str, Solved], board: Board) -> InitialRig:

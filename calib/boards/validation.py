@@ -14,7 +14,7 @@ from jaxtyping import Float
 from arraygeom import Camera, Rig, epipolar_distance
 
 from .board import Board
-from .bundle import POSE, BundleProblem, Observations, Solved, camera_jacobian
+from .bundle import POSE, BundleProblem, Observations, Solved, camera_jacobian, intrinsic_values
 from .detect import BoardViews, named
 from .intrinsics import Lens
 from .poses import StartDeviations
@@ -234,7 +234,7 @@ def _points_left_out(name: str, detected: BoardViews, used: BoardViews) -> Itera
 
 def _gains(fit: Solved, deviations: StartDeviations) -> str:
     """What the images add to the start, by kind of parameter."""
-    focal = np.mean([float(c.K[0, 0]) for c in fit.problem.cameras.values()])
+    focal = np.mean([intrinsic_values(c)[6] for c in fit.problem.cameras.values()])
     width = np.mean([c.hw[1] for c in fit.problem.cameras.values()])
     stated = (
         ("focal", "focal lengths", deviations.focal * focal),

@@ -67,6 +67,18 @@ def test_the_stated_deviations_hold():
     assert np.abs(errors).max() < 4
 
 
+def test_images_that_are_turned_have_their_start():
+    """Their focal lengths are beside K's diagonal, where 0 was taken for one."""
+    turned = {}
+    for kind, rig in (("true", drawn(four(), 0)), ("start", four())):
+        turned[kind] = Rig({name: c.rot90(1) for name, c in rig.cameras.items()})
+    found = calibrated(turned["true"], start=turned["start"])
+    for name, c in found.rig.cameras.items():
+        deviation = found.deviations()[f"{name}.focal.0"]
+        assert (c.K - turned["true"][name].K)[:2, :2].abs().max() < 4 * deviation
+    assert "focal lengths ±28" in found.notes[0]
+
+
 def test_what_one_board_leaves_open_is_said():
     """One board does not show where a camera is: the deviation of its position stays as it was stated."""
     found = calibrated(drawn(four(), 0))
