@@ -14,9 +14,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch.nn.functional import pad
 
 from arraygeom import Camera, Distortion, Pose, Rig
-from arraygeom.distortion import pinhole_coefficients
+from arraygeom.distortion import BROWN_CONRADY, pinhole_coefficients
 
 from .board import Board
 from .bundle import CameraPrior, InitialRig, Solved, intrinsic_values, typical_prior
@@ -129,7 +130,11 @@ def rig_near_start(
 
 
 def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) -> Camera:
-    """A camera of a start, with a lens. Raises ValueError if it is missing or its size is not the images'."""
+    """A camera of a start, with a lens: its own, if it has one.
+
+    Brown and Conrady's has all the terms that are wanted. Raises ValueError if the camera is missing or its
+    size is not the images'.
+    """
     camera = start.cameras.get(name)
     if not isinstance(camera, Camera):
         raise ValueError(f"{name}: the start has no calibrated camera called so; it has {list(start.names)}")
@@ -137,9 +142,13 @@ def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) ->
         (h, w), (rows, columns) = camera.hw, views.hw
         raise ValueError(f"{name}: its images are {columns}x{rows} and the start states {w}x{h}")
     model, count = LENSES[model_name]
-    if camera.distortion is None and count:
+    own = camera.distortion
+    if own is None and count:
         lens = Distortion(model, torch.zeros(count, dtype=torch.float64))
         camera = camera.replace(distortion=lens.with_coefficients(pinhole_coefficients(lens)))
+    elif own is not None and own.model == model == BROWN_CONRADY:
+        missing = max(0, count - own.coefficients.shape[-1])
+        camera = camera.replace(distortion=own.with_coefficients(pad(own.coefficients, (0, missing))))
     return camera.to(torch.float64)
 
 

@@ -16,7 +16,7 @@ from arraygeom import Camera, Rig, epipolar_distance
 from .board import Board
 from .bundle import POSE, BundleProblem, Observations, Solved, camera_jacobian, intrinsic_values
 from .detect import BoardViews, named
-from .intrinsics import Lens
+from .intrinsics import LENSES, Lens
 from .poses import StartDeviations
 from .solve import calibrate_single, readjusted
 from .uncertainty import compensation, covered, grid_points, in_own_frame
@@ -210,10 +210,16 @@ def left_out_notes(
 
 
 def start_notes(
-    detected: Mapping[str, BoardViews], solved: Solved, deviations: StartDeviations
+    detected: Mapping[str, BoardViews], solved: Solved, deviations: StartDeviations, lens: Mapping[str, Lens]
 ) -> Iterator[str]:
-    """Notes on a rig that was known roughly: what images add, what lies far from it, what was left out."""
+    """Notes on a rig that was known roughly: what images add, what lies far from it, what was left out.
+
+    And which cameras have a lens of the start's that is not the one wanted.
+    """
     yield _gains(solved, deviations)
+    for name, camera in solved.problem.cameras.items():
+        if (own := camera.distortion) is not None and own.model != LENSES[lens[name]][0]:
+            yield f"{name}: keeps the start's lens, {own.model}"
     yield from _far(solved)
     for name, key in solved.left_out:
         yield f"{name}: left out {key}: its board contradicts the start"
