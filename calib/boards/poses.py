@@ -113,7 +113,7 @@ def rig_near_start(
     """Cameras at the start's positions, rotated to agree on the boards, and boards in the start's world.
 
     The camera with most images keeps its orientation. Raises ValueError if the start has no such camera, or
-    one of another size, or if a camera shares no moment with another.
+    one of another size, if a camera shares no moment with another, or if none of its images fits the start.
     """
     seen = []
     for name, v in views.items():
@@ -126,7 +126,13 @@ def rig_near_start(
     anchor = max(seen, key=lambda v: len(v.poses))
     poses = {v.name: _aligned(anchor, v, board) for v in seen}
     priors = {v.name: start_prior(v.camera, deviations) for v in seen}
-    return consistent_boards(seen, poses, board)._replace(priors=priors)
+    initial = consistent_boards(seen, poses, board)
+    if lost := [name for name, v in initial.views.items() if not v.seen]:
+        raise ValueError(
+            f"{lost[0]}: its boards are nowhere near where the start and the other cameras put them: "
+            "are the start's positions right, and in metres?"
+        )
+    return initial._replace(priors=priors)
 
 
 def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) -> Camera:

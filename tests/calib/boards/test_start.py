@@ -116,6 +116,12 @@ def test_a_wrong_start_is_named():
     assert any(note.startswith("c2: far from the start: focal length") for note in found.notes)
 
 
+def test_a_start_in_millimetres_is_refused():
+    """No image of a camera was left, which ended in a TypeError."""
+    with pytest.raises(ValueError, match=r"c1: its boards are nowhere near .* in metres"):
+        calibrated(four(), start=four().scaled(1000.0))
+
+
 def test_the_priors_derivatives_are_those_of_finite_differences():
     prior, at = start_prior(four()["c3"], STATED), drawn(four(), 1)["c3"]
     information, slope = prior.equations(at)
