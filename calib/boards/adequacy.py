@@ -65,7 +65,7 @@ def coverage(views: BoardViews, cam_from_board: Mapping[FrameKey, Pose], board: 
     tilts = np.degrees([np.arccos(min(1.0, abs(float(pose.R[2, 2])))) for pose in poses.values()])
     (near, far), (least, most) = ((float(v.min()), float(v.max())) for v in (np.concatenate(depths), tilts))
     found = Coverage(cells, (near, far), (least, most), ())
-    return found._replace(missing=tuple(_missing(found)))
+    return found._replace(missing=tuple(_missing(found, board)))
 
 
 def point_counts(parts: Iterable[Float[np.ndarray, "_ 2"]], hw: HW) -> Int[np.ndarray, "r c"]:
@@ -77,7 +77,7 @@ def point_counts(parts: Iterable[Float[np.ndarray, "_ 2"]], hw: HW) -> Int[np.nd
     return counts.astype(np.int64)
 
 
-def _missing(found: Coverage) -> Iterator[str]:
+def _missing(found: Coverage, board: Board) -> Iterator[str]:
     thirds = found.cells.reshape(3, CELLS[0] // 3, CELLS[1])
     empty = [
         POSITIONS[i][j]
@@ -92,7 +92,7 @@ def _missing(found: Coverage) -> Iterator[str]:
     near, far = found.depths
     if far < DEEP_ENOUGH * near:
         yield f"boards at one depth only ({near:.3g} to {far:.3g} m): take some closer, some further"
-    if found.tilts[1] < TILTED_ENOUGH:
+    if board.flat and found.tilts[1] < TILTED_ENOUGH:
         yield f"boards tilted by {found.tilts[1]:.0f} degrees at most: tilt it by 20 to 40"
 
 
@@ -107,7 +107,7 @@ class NextView(NamedTuple):
 def next_views(known: Intrinsics, board: Board, depth: float, *, count: int = 2) -> list[NextView]:
     """The views that lower a camera's uncertainty of projection most, one after the other.
 
-    None where the image shows hardly any of the board in each: a strip, or points far apart in depth.
+    None where the image shows hardly any of the board in each, as a strip does, and of points in space.
     """
     _, change = moved_pixels(known, depth)
 
@@ -116,7 +116,7 @@ def next_views(known: Intrinsics, board: Board, depth: float, *, count: int = 2)
         return float(np.median(np.sqrt(np.einsum("nif,fg,nig->n", change, covariance, change))))
 
     gains = {text: _gain(known, X) for text, X in proposed_views(known.camera, board.members[0]).items()}
-    candidates = {text: gain for text, gain in gains.items() if gain is not None}
+    candidates = {text: gain for text, gain in gains.items() if gain is not None and board.flat}
     information, found = np.linalg.inv(known.covariance), list[NextView]()
     for _ in range(count if candidates else 0):
         after = {text: median(information + gain) for text, gain in candidates.items()}

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig, rotation_from_vector
+from calib.boards.adequacy import coverage_advice, coverages
 from calib.boards.board import marker_dictionary
 from calib.boards.detect import detect, explain
 from calib.boards.rig import calibrate
@@ -59,6 +60,13 @@ def test_one_image_of_a_room_is_enough(room):
     assert np.abs(errors).max() < 4
     assert float((found.rig["colour"].centre - rig["colour"].centre).norm()) < 0.01
     assert found.rig["mono"].K[0, 0] == pytest.approx(1150, rel=0.01)
+
+
+def test_nobody_is_told_to_tilt_a_room(room):
+    calibration = calibrate(seen(room)[1], room)
+    said = " ".join(coverage_advice(calibration, coverages(calibration)))
+    assert "no points at the" in said
+    assert "tilt" not in said
 
 
 def test_markers_on_a_wall_need_several_images(tmp_path):
