@@ -10,7 +10,7 @@ from arraygeom import Pose, Rig
 from calib.boards.adequacy import coverage_advice, coverages, next_views, proposed_views
 from calib.boards.bundle import camera_jacobian, parameter_names
 from calib.boards.intrinsics import board_pose
-from calib.boards.report import by_cameras, report_html
+from calib.boards.report import by_cameras, draw_adequacy, report_html
 from calib.boards.rig import calibrate
 from calib.boards.run import _advice, watch
 from calib.boards.simulation import simulate_photos
@@ -290,3 +290,10 @@ def test_images_that_show_no_view_of_the_board_have_none_proposed():
     assert "no points at the" in said
     assert "views would help" not in said
     assert "Next: " not in _advice(strip, "cam")
+
+
+def test_maps_of_uncertainty_show_the_images_area(found):
+    """They began half a pixel inside it, and ended half a pixel outside."""
+    for axes in draw_adequacy(found, (0.9, 2.4)).axes[:3]:
+        assert axes.get_xlim() == (-0.5, 639.5)
+        assert axes.get_ylim() == (479.5, -0.5)
