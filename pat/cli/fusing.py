@@ -66,7 +66,7 @@ class Fuse(Known):
     """Find how far the other cameras lie off their search segments, and put that right."""
     exposure: Annotated[Literal["auto", "keep"] | None, optional("{auto,keep}")] = None
     """Brightness of the fused image: auto makes a dark or overexposed one as bright as a photograph; keep
-    leaves it as alpha has it. By default auto without a rig, and keep with one."""
+    leaves it as alpha has it. By default auto of a single frame without a rig, else keep."""
     keep_alpha: bool = False
     """With --noise, leave alpha's values as recorded; always so if alpha has hardly any noise."""
     luminance: Literal["alpha", "mix", "beta"] = "alpha"
@@ -197,9 +197,9 @@ class Fuse(Known):
             array = array_from_images(first, alpha=self.alpha, weights=self.weights, focal=focal, say=say)
         self.weights = array.weights
         self.normalise_radiometry |= array.match_levels
-        measured = load_weights(array.weights).bands is None
-        self.exposure = self.exposure or ("keep" if measured else "auto")
         if max(map(len, files.values())) == 1:
+            measured = load_weights(array.weights).bands is None
+            self.exposure = self.exposure or ("keep" if measured else "auto")
             return self._one(array.rig, array.images, array.alpha, first, found=array.notes)
         rig = array.recorded
         for name, rate in rates.items():
@@ -225,6 +225,9 @@ class Fuse(Known):
         if self.sequence:
             warn_of_gaps(files)
             return files
+        timed = {"--frame-rate": self.frame_rate, "--time-offset": self.time_offset, "--speed": self.speed}
+        if named := [option for option, value in timed.items() if value not in ((), None)]:
+            raise ValueError(f"{', '.join(named)}: for a --sequence only: give that, or leave out")
         return matched_frames(files)
 
     def _rig(self) -> Rig:
@@ -378,6 +381,7 @@ class Fuse(Known):
             "--points": self.points,
             "--classical": self.classical,
             "--device cuda": self.device == "cuda",
+            "--exposure auto": self.exposure == "auto",
         }
         if named := [option for option, given in single.items() if given]:
             raise ValueError(f"{', '.join(named)}: for a single frame only: leave out for several")

@@ -321,6 +321,24 @@ def test_other_names_given_twice(small, capsys):
     assert "'mono=' is not NAME=FILE" in fails([*arguments(small), "--image", "mono="], capsys)
 
 
+def test_what_only_sequences_have_is_refused_of_frames(small, capsys):
+    timed = ["--frame-rate", "mono=30", "--time-offset", "mono=0", "--speed", "0"]
+    said = "--frame-rate, --time-offset, --speed: for a --sequence only: give that, or leave out"
+    assert said in fails([*arguments(small), *timed], capsys)
+    images = [str(small / f"{name}.png") for name in ("mono", "colour")]
+    assert "--speed: for a --sequence only" in fails(["fuse", *images, "--speed", "3"], capsys)
+
+
+def test_exposure_is_refused_of_several_frames(small, capsys):
+    for name in ("mono", "colour"):
+        (small / f"{name}s").mkdir()
+        for i in range(2):
+            shutil.copy(small / f"{name}.png", small / f"{name}s" / f"{i}.png")
+    folders = {name: small / f"{name}s" for name in ("mono", "colour")}
+    several = arguments(small, **folders, extra=["--exposure", "auto"])
+    assert "--exposure auto: for a single frame only" in fails(several, capsys)
+
+
 def test_a_rig_is_an_argument_or_an_option_and_o_is_out_everywhere(small, capsys):
     rig = str(small / "rig.yaml")
     main(["rig", "info", rig])
