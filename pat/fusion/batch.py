@@ -34,7 +34,7 @@ from arraygeom.safe_yaml import load_yaml
 from ..media.images import read_image
 from ..media.raw import developed_rig
 from ..media.suffixes import IMAGE_SUFFIXES
-from ..media.video import write_video
+from ..media.video import check_video, write_video
 from ..networks.weights import Network, Precision, find_weights, load_weights
 from ..sensors import NoiseLevel
 from ..support.jobs import HERE, JobReport, OnError, Task, Workers, run_tasks
@@ -142,6 +142,8 @@ class Batch:
         Raises JobError if a frame fails and the job is to stop, ValueError to resume with other settings, and
         for a folder that another command is writing to, or that cannot be written to.
         """
+        if video is not None:
+            check_video(video)
         plan, many = self.out / KEYS / PLAN, range(len(self.names))
         how: dict[str, Any] = {"workers": workers, "resume": resume, "on_error": on_error, "console": console}
         with folder_lock(self.out):

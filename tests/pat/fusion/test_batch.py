@@ -149,6 +149,12 @@ def test_a_missing_beta_of_a_key_frame_leaves_the_other_key_frames(material, tmp
         job.run()
 
 
+def test_a_video_that_cannot_be_is_refused_before_frames_are_made(material, tmp_path):
+    with pytest.raises(ValueError, match="a video of -3 frames a second"):
+        batch(material, tmp_path / "out", sequence=True).run(video=-3.0)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_full_disk_leaves_whole_files_only(material, tmp_path, monkeypatch):
     """The third file to be flushed does not fit."""
     flush, count = arraygeom.atomic.flush, iter(range(100))
