@@ -21,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Moved, ReceptiveField, Rig, Widened
+from arraygeom.checks import check_above
 from arraygeom.fields.default import straight_field
 
 from ..matching.likeness import UNLIKE
@@ -84,6 +85,7 @@ class SequenceFusion:
     settings: FuseSettings = FuseSettings()  # noqa: RUF009
 
     def __post_init__(self) -> None:
+        check_above(0, speed=self.speed)
         cached = {n: f if isinstance(f, CachedFrames) else CachedFrames(f) for n, f in self.frames.items()}
         object.__setattr__(self, "frames", cached)
 
@@ -158,7 +160,7 @@ class SequenceFusion:
 
     def _field(self, name: str, index: int, time: float) -> tuple[ReceptiveField, Tensor]:
         """The field of a beta that records at `time`, and the weight of the motion until then."""
-        field = self._common_field or straight_field(self.rig.pair(self.alpha, name))
+        field = self._given_field(name) or straight_field(self.rig.pair(self.alpha, name))
         weight = torch.ones(self.rig[self.alpha].hw)
         steps = (time - self._time(index)) * self.timeline.rate(self.alpha)
         count = len(self.frames[self.alpha])
@@ -186,7 +188,6 @@ class SequenceFusion:
         match_levels = self.settings.match_levels
         if match_levels and not alone:
             images = {name: self._normalised(name, image, i) for name, image in images.items()}
-        common = dict.fromkeys(betas, self._common_field) if self._common_field else {}
         return fuse(
             self.network,
             self.rig,
@@ -194,16 +195,15 @@ class SequenceFusion:
             alpha=self.alpha,
             settings=self.settings,
             corrections=self._corrections,
-            field={**common, **fields},
+            field={**{name: self._given_field(name) for name in betas}, **fields},
             match_levels=match_levels and alone,
             noise=self._noise,
         )
 
-    @property
-    def _common_field(self) -> ReceptiveField | None:
-        """The field of all betas."""
-        assert not isinstance(self.settings.field, Mapping)
-        return self.settings.field
+    def _given_field(self, name: str) -> ReceptiveField | None:
+        """A beta's field, where one is given."""
+        field = self.settings.field
+        return field.get(name) if isinstance(field, Mapping) else field
 
     @cached_property
     def _corrections(self) -> Corrections:

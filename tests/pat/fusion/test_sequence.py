@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 import torch
 
-from arraygeom import Epipolar, Moved, Rig, Sensor, View, Widened, pixel_grid
+from arraygeom import Epipolar, Moved, Rectified, Rig, Sensor, View, Widened, pixel_grid
 from experiments.flicker import flicker
 from pat.fusion.fuse import FuseSettings
 from pat.fusion.optical_flow import flow_between, warped
@@ -88,6 +88,24 @@ def test_colours_mix_by_confidence_which_disagreement_lowers():
     assert frame.confidence[0, 0] < 0.5 * frame.confidence[0, 1]
     torch.testing.assert_close(frame.depth, 1 / sure)
     torch.testing.assert_close(frame.half_width, 0.1 * sure)
+
+
+def test_a_speed_that_is_none_is_refused_at_once():
+    frames, _ = moving.recording(2)
+    for speed in (-3.0, float("nan")):
+        with pytest.raises(ValueError, match="speed is"):
+            SequenceFusion(load_weights("mono-colour"), moving.rig(), frames, "fast", speed)
+
+
+def test_a_field_may_be_given_for_each_beta():
+    frames, _ = moving.recording(2)
+    given = {"alpha": "fast", "align": False, "response": "rec601"}
+    rows, *of_all = (
+        next(fuse_sequence(load_weights("mono-colour"), moving.rig(), frames, field=field, **given))
+        for field in ({"slow": Rectified(20, alpha_is="left")}, Rectified(20, alpha_is="left"), None)
+    )
+    assert torch.equal(rows.image, of_all[0].image)
+    assert not torch.equal(rows.image, of_all[1].image)
 
 
 @pytest.fixture(scope="module")
