@@ -49,8 +49,10 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, r
 
 
 def check_video(rate: float) -> None:
-    """Raise, before frames are made, what writing them would: ImportError without the extra `video`, ValueError
-    for a rate that players do not show."""
+    """Raise, before frames are made, what writing them would.
+
+    ImportError without the extra `video`, ValueError for a rate that players do not show.
+    """
     with needs("video", "writing video"):
         import av  # noqa: F401
     if not 1e-3 <= rate <= 1e3:
