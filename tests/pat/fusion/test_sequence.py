@@ -5,9 +5,9 @@ from functools import partial
 import pytest
 import torch
 
-from arraygeom import Epipolar, Moved, Rectified, Rig, Sensor, View, Widened, pixel_grid
+from arraygeom import Distortion, Epipolar, Moved, Rectified, Rig, Sensor, View, Widened, pixel_grid
 from experiments.flicker import flicker
-from pat.fusion.fuse import FuseSettings
+from pat.fusion.fuse import FuseSettings, fuse
 from pat.fusion.optical_flow import flow_between, warped
 from pat.fusion.sequence import KeyContribution, SequenceFusion, fuse_sequence, mixed
 from pat.fusion.timeline import Timeline
@@ -61,6 +61,18 @@ def test_moved_samples_where_points_will_be():
     torch.testing.assert_close(there.end, wanted.end)
     wide = Moved(Widened(Epipolar(), along=4.0), step)(pair, x)
     assert torch.allclose(wide.length[wide.valid], wanted.length[wide.valid] + 8.0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "distortion", [None, Distortion("brown-conrady", torch.tensor([-0.1, 0, 0, 0]).double())]
+)
+def test_a_displacement_of_another_size_is_refused(distortion):
+    rig = moving.rig()
+    rig = rig.with_camera("fast", rig["fast"].replace(distortion=distortion))
+    images = {"fast": torch.rand(1, *moving.HW), "slow": torch.rand(3, *moving.HW)}
+    field = Moved(Epipolar(), torch.zeros(2, 48, 80))
+    with pytest.raises(ValueError, match="displacement is of 80x48 pixels, alpha has 160x96"):
+        fuse(load_weights("mono-colour"), rig, images, alpha="fast", field=field)
 
 
 def test_flow_finds_a_shift_and_its_weight_the_border():
