@@ -321,6 +321,14 @@ def test_other_names_given_twice(small, capsys):
     assert "'mono=' is not NAME=FILE" in fails([*arguments(small), "--image", "mono="], capsys)
 
 
+def test_what_train_refuses_is_one_line_too(capsys):
+    said = fails(["train", "mono-colour", "--steps", "0"], capsys)
+    assert said == "pat: steps must be at least 1, got 0 (`pat train --help` explains)"
+    assert fails(["train", "--stepps", "5"], capsys).startswith(
+        "pat: unknown here: --stepps, 5; did you mean"
+    )
+
+
 def test_what_only_sequences_have_is_refused_of_frames(small, capsys):
     timed = ["--frame-rate", "mono=30", "--time-offset", "mono=0", "--speed", "0"]
     said = "--frame-rate, --time-offset, --speed: for a --sequence only: give that, or leave out"
