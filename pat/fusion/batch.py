@@ -112,7 +112,6 @@ class Batch:
         entries["weights"] = f"{self.weights} (SHA-256 {digest[:16]})"
         if self.sequence:
             entries["frames"] = {name: len(paths) for name, paths in files.items()}
-            entries["first"] = {name: paths[0] for name, paths in files.items()}
         return yaml.safe_dump(entries, sort_keys=False)
 
     @property
