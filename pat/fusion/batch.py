@@ -33,7 +33,7 @@ from arraygeom.safe_yaml import load_yaml
 
 from ..media.images import read_image
 from ..media.raw import developed_rig
-from ..media.suffixes import IMAGE_SUFFIXES
+from ..media.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from ..media.video import check_video, write_video
 from ..networks.weights import Network, Precision, find_weights, load_weights
 from ..sensors import NoiseLevel
@@ -352,19 +352,23 @@ def _network(weights: str, precision: Precision) -> Network:
 def find_images(text: str | Path, *, name: str = "") -> list[Path]:
     """The images of a folder, a pattern such as "a/mono_*.png", or one file; numbers in names count as such.
 
-    Raises FileNotFoundError if there is none.
+    Raises FileNotFoundError if there is none, ValueError for a video.
     """
     path = Path(text)
     label = f"{name}: " if name else ""
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        raise ValueError(
+            f"{label}{path}: is a video, which only `pat fuse` without a rig reads: save its frames"
+        )
     if path.is_dir():
         shown = (p for p in path.iterdir() if not p.name.startswith("."))
         found = [p for p in shown if p.suffix.lower() in IMAGE_SUFFIXES]
     elif any(c in path.name for c in "*?["):
         found = list(path.parent.glob(path.name))
     else:
-        found = [path]
+        found = [path] if path.exists() else []
     if not found:
-        raise FileNotFoundError(f"{label}{path}: no images there: check the path")
+        raise FileNotFoundError(f"{label}{path}: no image there: check the path")
     return sorted(found, key=_natural)
 
 
