@@ -219,16 +219,34 @@ class Fuse(Known):
             self.bits = 32 if self.kind == "exr" else 16 if deep else 8
 
     def _frames(self, files: dict[str, list[Path]]) -> dict[str, list[Path]]:
-        """The files of the frames that every camera has; all of them, of a sequence."""
+        """The files of the frames that every camera has; all of them, of a sequence.
+
+        Raises ValueError for options that are not of so many frames.
+        """
         from ..fusion.frame_matching import matched_frames, warn_of_gaps
 
+        timed = {"--frame-rate": self.frame_rate, "--time-offset": self.time_offset, "--speed": self.speed}
         if self.sequence:
             warn_of_gaps(files)
-            return files
-        timed = {"--frame-rate": self.frame_rate, "--time-offset": self.time_offset, "--speed": self.speed}
-        if named := [option for option, value in timed.items() if value not in ((), None)]:
+        elif named := [option for option, value in timed.items() if value not in ((), None)]:
             raise ValueError(f"{', '.join(named)}: for a --sequence only: give that, or leave out")
-        return matched_frames(files)
+        else:
+            files = matched_frames(files)
+        if self.sequence or max(map(len, files.values())) > 1:
+            self.refuse_several()
+        return files
+
+    def refuse_several(self) -> None:
+        """Raise ValueError for options of single frames."""
+        super().refuse_several()
+        single = {
+            "--points": self.points,
+            "--classical": self.classical,
+            "--device cuda": self.device == "cuda",
+            "--exposure auto": self.exposure == "auto",
+        }
+        if named := [option for option, given in single.items() if given]:
+            raise ValueError(f"{', '.join(named)}: for a single frame only: leave out for several")
 
     def _rig(self) -> Rig:
         rig = options.load_rig_or_say_no_image(self.given[0], self.depth)
@@ -376,15 +394,6 @@ class Fuse(Known):
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 
-        self.refuse_several()
-        single = {
-            "--points": self.points,
-            "--classical": self.classical,
-            "--device cuda": self.device == "cuda",
-            "--exposure auto": self.exposure == "auto",
-        }
-        if named := [option for option, given in single.items() if given]:
-            raise ValueError(f"{', '.join(named)}: for a single frame only: leave out for several")
         batch = Batch(
             rig,
             files,

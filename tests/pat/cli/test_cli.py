@@ -337,14 +337,29 @@ def test_what_only_sequences_have_is_refused_of_frames(small, capsys):
     assert "--speed: for a --sequence only" in fails(["fuse", *images, "--speed", "3"], capsys)
 
 
-def test_exposure_is_refused_of_several_frames(small, capsys):
+def test_what_several_frames_do_not_have_is_refused_before_a_rig_is_looked_for(small, capsys, monkeypatch):
+    monkeypatch.setattr("pat.fusion.from_images.array_from_images", None)
     for name in ("mono", "colour"):
         (small / f"{name}s").mkdir()
         for i in range(2):
             shutil.copy(small / f"{name}.png", small / f"{name}s" / f"{i}.png")
     folders = {name: small / f"{name}s" for name in ("mono", "colour")}
-    several = arguments(small, **folders, extra=["--exposure", "auto"])
-    assert "--exposure auto: for a single frame only" in fails(several, capsys)
+    single = ["--exposure", "auto", "--points"]
+    for several in (arguments(small, **folders), ["fuse", *map(str, folders.values())]):
+        said = fails([*several, *single], capsys)
+        assert said == "pat: --points, --exposure auto: for a single frame only: leave out for several"
+
+
+def test_a_file_that_is_missing_or_a_video_is_named(small, capsys):
+    (small / "several").mkdir()
+    for name in ("several/0.png", "several/1.png", "clip.mp4"):
+        shutil.copy(small / "mono.png", small / name)
+    for name, said in {
+        "none": "none: no image there",
+        "clip.mp4": "clip.mp4: is a video, which only",
+    }.items():
+        given = arguments(small, mono=small / "several", colour=small / name)
+        assert f"colour: {small}/{said}" in fails(given, capsys)
 
 
 def test_a_rig_is_an_argument_or_an_option_and_o_is_out_everywhere(small, capsys):
