@@ -264,6 +264,28 @@ def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
         fuse(network, rig, images | {"mono": images["mono"] * 0.9}, alpha="mono", store=tmp_path)
 
 
+def test_tiles_of_another_luminance_or_scale_are_not_taken(tmp_path, monkeypatch):
+    """A rig of other units has the same segments, and another depth."""
+    hw, beta_hw = (34, 130), (30, 110)
+    network, rig = network_of("GuidedPAT"), rig_of(hw, beta_hw)
+    images = {"mono": texture(1, hw), "colour": texture(3, beta_hw)}
+    monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(hw, 64, 16)))
+    larger = rig.replace(depth=tuple(2 * bound for bound in rig.depth))
+    for name in rig.names:
+        larger = larger.with_camera(
+            name, rig[name].replace(cam_from_world=Pose(rig[name].R, 2 * rig[name].t))
+        )
+
+    def stored(rig, **changes):
+        fuse(network, rig, images, alpha="mono", store=tmp_path, align=False, response="rec601", **changes)
+        return len(list(tmp_path.iterdir()))
+
+    count = stored(rig)
+    assert stored(rig) == count
+    assert stored(rig, luminance="beta") == 2 * count
+    assert stored(larger) == 3 * count
+
+
 def test_resolution_ratio_is_that_of_pixels_an_angle():
     rig = rig_of((60, 80), (60, 80), focal=100.0, beta_focal=50.0)
     assert abs(resolution_ratio(rig.pair("mono", "colour")) - 0.5) < 0.01
