@@ -85,10 +85,11 @@ class Explorer:
             return {"columns": 1, "rows": 1, "answers": {"0,0": {"error": self.error}}}
         h, w = self.scene.rig[self.alpha].hw
         rows = max(1, round(columns * h / w))
+        xs, ys = ([(i + 0.5) * side / n - 0.5 for i in range(n)] for side, n in ((w, columns), (h, rows)))
         answers = {
-            f"{i},{j}": self.answer({**self.controls, "x": [(i + 0.5) * w / columns, (j + 0.5) * h / rows]})
-            for i in range(columns)
-            for j in range(rows)
+            f"{i},{j}": self.answer({**self.controls, "x": [x, y]})
+            for i, x in enumerate(xs)
+            for j, y in enumerate(ys)
         }
         return {"columns": columns, "rows": rows, "answers": answers}
 
