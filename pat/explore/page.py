@@ -17,7 +17,7 @@ from arraygeom.atomic import write_text
 
 from ..networks.paper import PAT
 from .answers import DEFAULTS, Controls, answer, choices, shown_cameras, slider_ranges
-from .pixel import WINDOWS, ExplorerScene
+from .pixel import WINDOWS, ExplorerScene, shipped_attention
 
 MODULE, PINHOLE = (Path(__file__).with_name(name) for name in ("widget.js", "pinhole.js"))
 GRID = 24
@@ -146,6 +146,8 @@ def opened(
     networks = {} if network is None or isinstance(network, str) else {"network": network}
     weights = WINDOWS if network is None else network if isinstance(network, str) else "network"
     try:
+        if isinstance(network, str):
+            shipped_attention(network)  # refuses others
         images, alpha = checked(rig, images, alpha)
         scene = ExplorerScene(rig, images, fields or {}, networks)
     except ValueError as error:

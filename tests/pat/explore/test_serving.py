@@ -93,3 +93,12 @@ def test_a_saved_grid_answers_for_the_pixels_of_its_cells():
     assert {place: answer["x"] for place, answer in grid["answers"].items()} == {
         f"{i},{j}": [i, j] for i in range(8) for j in range(6)
     }
+
+
+def test_weights_without_attention_are_refused_and_no_page_is_written(tmp_path, capsys):
+    for weights, said in {"mono-colour": "are not of the paper's network", "foo": "no weights 'foo'"}.items():
+        page = tmp_path / f"{weights}.html"
+        with pytest.raises(SystemExit):
+            main([*EXPLORE, "--weights", weights, "--save", str(page)])
+        assert said in " ".join(capsys.readouterr().err.split())
+        assert not page.exists()
