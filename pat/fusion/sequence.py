@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, TypeVar
@@ -263,8 +264,15 @@ class SequenceFusion:
         keys = self.timeline.key_frames()
         nearest = min(range(len(keys)), key=lambda k: abs(keys[k].alpha - i))
         around = keys[max(nearest - SETTINGS.neighbours, 0) : nearest + SETTINGS.neighbours + 1]
-        own = mean_moments([self.frames[name][k.betas[name]] for k in around])
-        return own.matched(image, mean_moments([self.grey(k.alpha) for k in around]))
+        own = mean_moments(readable(self.frames[name].__getitem__, [k.betas[name] for k in around]))
+        return own.matched(image, mean_moments(readable(self.grey, [k.alpha for k in around])))
+
+
+def readable(read: Callable[[int], Tensor], numbers: Iterable[int]) -> Iterator[Tensor]:
+    """Those of some images that can be read: what cannot is reported when it is fused."""
+    for i in numbers:
+        with suppress(OSError, ValueError):
+            yield read(i)
 
 
 class KeyContribution(NamedTuple):

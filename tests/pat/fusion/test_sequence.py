@@ -109,6 +109,25 @@ def test_a_speed_that_is_none_is_refused_at_once():
             SequenceFusion(load_weights("mono-colour"), moving.rig(), frames, "fast", speed)
 
 
+def test_an_image_that_cannot_be_read_costs_its_own_key_frame_alone():
+    """Levels are matched over those around, which it made fail too."""
+
+    class Damaged(list):
+        def __getitem__(self, i):
+            if i == 1:
+                raise OSError("slow_1.png is damaged")
+            return super().__getitem__(i)
+
+    frames, _ = moving.recording(13, 0.003)
+    frames = frames | {"slow": Damaged(frames["slow"])}
+    settings = FuseSettings(match_levels=True, align=False, response="rec601")
+    job = SequenceFusion(load_weights("mono-colour"), moving.rig(0.003), frames, "fast", settings=settings)
+    first, second, *_ = job.timeline.key_frames()
+    assert job.colour(first).added.isfinite().all()
+    with pytest.raises(OSError, match="slow_1"):
+        job.colour(second)
+
+
 def test_a_field_may_be_given_for_each_beta():
     frames, _ = moving.recording(2)
     given = {"alpha": "fast", "align": False, "response": "rec601"}
