@@ -128,6 +128,14 @@ def test_an_image_that_cannot_be_read_costs_its_own_key_frame_alone():
         job.colour(second)
 
 
+def test_a_response_that_is_none_is_refused_of_sequences_too():
+    """It was taken for an image that cannot be read, and left out."""
+    frames, _ = moving.recording(2)
+    given = {"alpha": "fast", "response": (-1.0, 0.0, 0.0)}
+    with pytest.raises(ValueError, match="three weights"):
+        next(fuse_sequence(load_weights("mono-colour"), moving.rig(), frames, **given))
+
+
 def test_a_field_may_be_given_for_each_beta():
     frames, _ = moving.recording(2)
     given = {"alpha": "fast", "align": False, "response": "rec601"}
