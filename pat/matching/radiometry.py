@@ -160,11 +160,11 @@ def given_response(given: Given) -> Response:
     """The response that is given, Rec. 601's if it is to be fitted. Raises ValueError for what is none."""
     if isinstance(given, Response):
         return given
-    if given in ("fit", "rec601"):
-        return Response.rec601()
-    if isinstance(given, str):
+    if not isinstance(given, str):
+        return stated_response(given)
+    if given not in ("fit", "rec601"):
         raise ValueError(f"response is 'fit', 'rec601' or three weights; got {given!r}")
-    return stated_response(given)
+    return Response.rec601()
 
 
 def fit(
