@@ -271,8 +271,8 @@ class Camera(LensView):
         if not self.central:
             start = self.ray_origins(x)
             X = X + start - rays * (start[..., 2] / torch.where(valid, z, 1.0))[..., None]
-        X = torch.where(valid[..., None], X, torch.nan)
-        return self.cam_from_world.inverse().apply(X)
+        X = self.cam_from_world.inverse().apply(torch.where(valid[..., None], X, 0.0))
+        return torch.where(valid[..., None], X, torch.nan)
 
     def to_kornia(self) -> PinholeCamera | CameraModel:
         """The same camera in kornia: a `PinholeCamera`, batched (B, 4, 4), or with a lens a `CameraModel`.

@@ -9,7 +9,7 @@ from jaxtyping import Float, Real
 from torch import Tensor
 
 from ..checks import check_field
-from ..pixels import floating
+from ..pixels import HW, floating
 from ..rig import Pair
 from ..sampling import sample
 from .protocol import ReceptiveField, SamplingLocations
@@ -35,8 +35,20 @@ class Moved:
             )
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
-        """The field's sampling locations for the points where alpha's pixels x will be."""
+        """The field's sampling locations for the points where alpha's pixels x will be.
+
+        Raises ValueError if alpha has another size than the displacement.
+        """
+        self.require(pair.alpha.hw)
         return self.field(pair, self.points(x))
+
+    def require(self, hw: HW) -> None:
+        """Raise ValueError unless the displacement is of an alpha of this size."""
+        if tuple(self.displacement.shape[1:]) != tuple(hw):
+            (h, w), (height, width) = self.displacement.shape[1:], hw
+            raise ValueError(
+                f"displacement is of {w}x{h} pixels, alpha has {width}x{height}: give it at alpha's pixels"
+            )
 
     def points(self, x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
         """Where alpha's pixels are when beta records."""

@@ -111,7 +111,7 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
 def recognise(path: str | Path) -> str:
     """The name of a file's or folder's format. Raises RigFileError if it is none that is known."""
     path = Path(path)
-    head = path.read_bytes()[:4096].decode("utf-8", errors="replace") if path.is_file() else ""
+    head = path.read_bytes()[:4096].decode("utf-8-sig", errors="replace") if path.is_file() else ""
     if path.is_file() and not head.strip():
         raise RigFileError(path, None, "is empty")
     for name, reader in READERS.items():

@@ -59,7 +59,7 @@ def _csv(path: Path, files: Mapping[str, Path]) -> PointPairs:
             f"{path}: x0 y0 x1 y1 relate two images, and {len(files)} are given: give two, or a database"
         )
     try:
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+        lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
     except UnicodeDecodeError:
         raise ValueError(f"{path}: neither CSV nor a COLMAP database: give x0,y0,x1,y1 a line") from None
     lines = lines if lines and _numbers(lines[0]) else lines[1:]

@@ -65,7 +65,7 @@ def coverage(views: BoardViews, cam_from_board: Mapping[FrameKey, Pose], board: 
     tilts = np.degrees([np.arccos(min(1.0, abs(float(pose.R[2, 2])))) for pose in poses.values()])
     (near, far), (least, most) = ((float(v.min()), float(v.max())) for v in (np.concatenate(depths), tilts))
     found = Coverage(cells, (near, far), (least, most), ())
-    return found._replace(missing=tuple(_missing(found)))
+    return found._replace(missing=tuple(_missing(found, board)))
 
 
 def point_counts(parts: Iterable[Float[np.ndarray, "_ 2"]], hw: HW) -> Int[np.ndarray, "r c"]:
@@ -77,7 +77,7 @@ def point_counts(parts: Iterable[Float[np.ndarray, "_ 2"]], hw: HW) -> Int[np.nd
     return counts.astype(np.int64)
 
 
-def _missing(found: Coverage) -> Iterator[str]:
+def _missing(found: Coverage, board: Board) -> Iterator[str]:
     thirds = found.cells.reshape(3, CELLS[0] // 3, CELLS[1])
     empty = [
         POSITIONS[i][j]
@@ -92,7 +92,7 @@ def _missing(found: Coverage) -> Iterator[str]:
     near, far = found.depths
     if far < DEEP_ENOUGH * near:
         yield f"boards at one depth only ({near:.3g} to {far:.3g} m): take some closer, some further"
-    if found.tilts[1] < TILTED_ENOUGH:
+    if board.flat and found.tilts[1] < TILTED_ENOUGH:
         yield f"boards tilted by {found.tilts[1]:.0f} degrees at most: tilt it by 20 to 40"
 
 
@@ -105,7 +105,10 @@ class NextView(NamedTuple):
 
 
 def next_views(known: Intrinsics, board: Board, depth: float, *, count: int = 2) -> list[NextView]:
-    """The views that lower a camera's uncertainty of projection most, one after the other."""
+    """The views that lower a camera's uncertainty of projection most, one after the other.
+
+    None where the image shows hardly any of the board in each, as a strip does, and of points in space.
+    """
     _, change = moved_pixels(known, depth)
 
     def median(information: np.ndarray) -> float:
@@ -113,9 +116,9 @@ def next_views(known: Intrinsics, board: Board, depth: float, *, count: int = 2)
         return float(np.median(np.sqrt(np.einsum("nif,fg,nig->n", change, covariance, change))))
 
     gains = {text: _gain(known, X) for text, X in proposed_views(known.camera, board.members[0]).items()}
-    candidates = {text: gain for text, gain in gains.items() if gain is not None}
+    candidates = {text: gain for text, gain in gains.items() if gain is not None and board.flat}
     information, found = np.linalg.inv(known.covariance), list[NextView]()
-    for _ in range(count):
+    for _ in range(count if candidates else 0):
         after = {text: median(information + gain) for text, gain in candidates.items()}
         best = min(after, key=lambda text: after[text])
         found.append(NextView(best, median(information), after[best]))
@@ -128,7 +131,7 @@ def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarra
     found, (h, w) = {}, camera.hw
     middle = torch.from_numpy(board.middle)
     for fill in FILLS:
-        depth = float(camera.K[0, 0]) * max(board.extent) / (fill * w)
+        depth = float(camera.K[0, :2].norm()) * max(board.extent) / (fill * w)
         for row, column in np.ndindex(3, 3):
             share = 0.5 + np.array([column - 1, row - 1]) * (0.5 - 0.4 * fill)
             pixel = torch.from_numpy(share * (w - 1, h - 1))
@@ -168,8 +171,8 @@ def coverage_advice(calibration: Calibration, covers: Mapping[str, Coverage]) ->
     for name, covered in covers.items():
         yield from (f"{name}: {text}" for text in covered.missing)
         known = intrinsics_of(calibration.fit, name)
-        if covered.missing and len(known.covariance):
-            views = next_views(known, calibration.board, float(np.mean(covered.depths)))
+        depth, lacking = float(np.mean(covered.depths)), covered.missing and len(known.covariance)
+        if lacking and (views := next_views(known, calibration.board, depth)):
             listed = "; then ".join(view.text for view in views)
             gain = f"uncertainty from {views[0].before:.2g} to {views[-1].after:.2g} px"
             yield f"{name}: two more views would help most: {listed} ({gain})"

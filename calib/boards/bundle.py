@@ -376,8 +376,9 @@ def parameter_names(camera: Camera) -> list[str]:
 def intrinsic_values(camera: Camera) -> Float[np.ndarray, " p"]:
     """The parameters' values, in the order of `parameter_names`; 0 for those of the pose."""
     lens = () if camera.distortion is None else camera.distortion.coefficients.tolist()
-    K = camera.K.detach().numpy()
-    return np.array([*(0.0,) * 6, K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens])
+    K = camera.K.detach()[:2]
+    focal = K[:, :2].abs().amax(0)  # beside the diagonal if the image is rotated
+    return np.array([*(0.0,) * 6, *focal.tolist(), *K[:, 2].tolist(), *lens])
 
 
 def changed(camera: Camera, change: torch.Tensor) -> Camera:

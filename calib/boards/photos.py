@@ -104,6 +104,8 @@ def _common_prefix(lists: list[list[str]]) -> int:
 
 
 def _by_pattern(folder: Path, patterns: Mapping[str, str]) -> dict[str, list[Path]]:
+    if wrong := [pattern for pattern in patterns.values() if Path(pattern).is_absolute()]:
+        raise ValueError(f"'{wrong[0]}' is a whole path: give a pattern of names in {folder}, as 'left*.jpg'")
     cameras = {name: _usable(folder.glob(pattern)) for name, pattern in patterns.items()}
     if empty := [name for name, files in cameras.items() if not files]:
         raise ValueError(f"{empty[0]}: no image or video in {folder} is called '{patterns[empty[0]]}'")

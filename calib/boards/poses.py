@@ -14,9 +14,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch.nn.functional import pad
 
 from arraygeom import Camera, Distortion, Pose, Rig
-from arraygeom.distortion import pinhole_coefficients
+from arraygeom.distortion import BROWN_CONRADY, pinhole_coefficients
 
 from .board import Board
 from .bundle import CameraPrior, InitialRig, Solved, intrinsic_values, typical_prior
@@ -80,10 +81,10 @@ def start_prior(camera: Camera, deviations: StartDeviations) -> CameraPrior:
     information = typical_prior(camera).information.copy()
     information[:3, :3] = np.eye(3) / np.radians(deviations.rotation) ** 2
     information[3:6, 3:6] = np.eye(3) / deviations.position**2
-    focal = camera.K.diagonal()[:2].numpy()
-    information[6:8, 6:8] += np.full((2, 2), 0.25) / (deviations.focal * float(focal.mean())) ** 2
+    mean = intrinsic_values(camera)
+    information[6:8, 6:8] += np.full((2, 2), 0.25) / (deviations.focal * float(mean[6:8].mean())) ** 2
     information[8:10, 8:10] = np.eye(2) / (deviations.centre * camera.hw[1]) ** 2
-    return CameraPrior(intrinsic_values(camera), information, camera.cam_from_world)
+    return CameraPrior(mean, information, camera.cam_from_world)
 
 
 def initial_rig(singles: Mapping[str, Solved], board: Board) -> InitialRig:
@@ -112,7 +113,7 @@ def rig_near_start(
     """Cameras at the start's positions, rotated to agree on the boards, and boards in the start's world.
 
     The camera with most images keeps its orientation. Raises ValueError if the start has no such camera, or
-    one of another size, or if a camera shares no moment with another.
+    one of another size, if a camera shares no moment with another, or if none of its images fits the start.
     """
     seen = []
     for name, v in views.items():
@@ -125,11 +126,21 @@ def rig_near_start(
     anchor = max(seen, key=lambda v: len(v.poses))
     poses = {v.name: _aligned(anchor, v, board) for v in seen}
     priors = {v.name: start_prior(v.camera, deviations) for v in seen}
-    return consistent_boards(seen, poses, board)._replace(priors=priors)
+    initial = consistent_boards(seen, poses, board)
+    if lost := [name for name, v in initial.views.items() if not v.seen]:
+        raise ValueError(
+            f"{lost[0]}: its boards are nowhere near where the start and the other cameras put them: "
+            "are the start's positions right, and in metres?"
+        )
+    return initial._replace(priors=priors)
 
 
 def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) -> Camera:
-    """A camera of a start, with a lens. Raises ValueError if it is missing or its size is not the images'."""
+    """A camera of a start, with a lens: its own, if it has one.
+
+    Brown and Conrady's has all the terms that are wanted. Raises ValueError if the camera is missing or its
+    size is not the images'.
+    """
     camera = start.cameras.get(name)
     if not isinstance(camera, Camera):
         raise ValueError(f"{name}: the start has no calibrated camera called so; it has {list(start.names)}")
@@ -137,9 +148,13 @@ def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) ->
         (h, w), (rows, columns) = camera.hw, views.hw
         raise ValueError(f"{name}: its images are {columns}x{rows} and the start states {w}x{h}")
     model, count = LENSES[model_name]
-    if camera.distortion is None and count:
+    own = camera.distortion
+    if own is None and count:
         lens = Distortion(model, torch.zeros(count, dtype=torch.float64))
         camera = camera.replace(distortion=lens.with_coefficients(pinhole_coefficients(lens)))
+    elif own is not None and own.model == model == BROWN_CONRADY:
+        missing = max(0, count - own.coefficients.shape[-1])
+        camera = camera.replace(distortion=own.with_coefficients(pad(own.coefficients, (0, missing))))
     return camera.to(torch.float64)
 
 

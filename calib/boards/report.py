@@ -363,7 +363,8 @@ def _map(
     axes: Any, figure: Figure, hw: tuple[int, int], x: np.ndarray, value: np.ndarray, title: str
 ) -> None:
     """Draw values at pixels of `grid_points`; what lies between pixels that are no neighbours is grey."""
-    axes.set(xlim=(0, hw[1]), ylim=(hw[0], 0), aspect="equal", xticks=[], yticks=[], facecolor="0.85")
+    show_image(axes, hw)
+    axes.set_facecolor("0.85")
     if len(x) < 4:
         axes.set_title(escaped(f"{title}: too few points"), fontsize=9, loc="left")
         return

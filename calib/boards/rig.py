@@ -77,7 +77,7 @@ def calibrate(
     `lens` is the model of all cameras, or of each by name. Raises ValueError, with advice, for another model,
     if a camera has too few images or only parallel boards, if cameras are not connected, or if frames
     contradict each other. With `start`, a rig known to within `deviations`, one image of each camera is
-    enough, and the world is the start's.
+    enough, and the world is the start's; so are its lenses.
     """
     models = dict.fromkeys(views, lens) if isinstance(lens, str) else lens
     for name in views:
@@ -99,7 +99,7 @@ def calibrate(
     if start is None:
         notes[:0] = left_out_notes(views, singles, fitted)
     else:
-        notes[:0] = start_notes(initial.views, fitted, stated)
+        notes[:0] = start_notes(initial.views, fitted, stated, models)
     rig = Rig(solved.problem.cameras)
     single = {name: alone.problem.rms() for name, alone in singles.items()}
     return Calibration(rig, board, solved, single, epipolar_errors(rig, solved.views), tuple(notes))

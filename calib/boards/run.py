@@ -59,8 +59,8 @@ def calibrate_photos(
 
     Several boards may be in the images at once. The lens "auto" is, for each camera, the model that its
     images support. `start` is the file of a rig known to within `deviations`: one image of each camera is
-    enough then, such as one called like the camera.
-    Raises ValueError and OSError for unusable images, and then writes nothing.
+    enough then, such as one called like the camera; its depth range stays, unless `depth` is given. Raises
+    ValueError and OSError for unusable images, and then writes nothing.
     """
     if out.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(f"{out}: a rig file's name ends in .yaml")
@@ -79,7 +79,8 @@ def calibrate_photos(
     chosen = {name: comparisons[name].advised if lens == "auto" else lens for name in found.views}
     calibration = calibrate(found.views, target, lens=chosen, start=nominal, deviations=deviations)
     lenses = [f"{name}: {c.advice}" for name, c in comparisons.items()]
-    rig = calibration.rig.replace(depth=depth, name=out.stem)
+    stated = depth if depth is not None or nominal is None else nominal.depth
+    rig = calibration.rig.replace(depth=stated, name=out.stem)
     written = [out.with_suffix(".html"), out.with_suffix(".covariance.json"), out]
     report = report_html(
         calibration,
@@ -212,11 +213,11 @@ def _advice(calibration: Calibration, name: str) -> str:
     covered = coverages(calibration)[name]
     known = intrinsics_of(calibration.fit, name)
     if len(known.covariance):
-        (best,) = next_views(known, calibration.board, float(np.mean(covered.depths)), count=1)
-        parts.append(
+        parts += [
             f"<p><b>Next: {escape(best.text)}</b> (uncertainty of projection {best.before:.2g} px, "
             f"with it {best.after:.2g}).</p>"
-        )
+            for best in next_views(known, calibration.board, float(np.mean(covered.depths)), count=1)
+        ]
     return "".join([*parts, *map(_note, covered.missing)])
 
 

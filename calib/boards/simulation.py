@@ -61,7 +61,7 @@ def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
     Raises ValueError if there are too few such poses.
     """
     cameras, random = list(calibrated(rig).values()), np.random.default_rng(seed)
-    narrow = max(float(c.K[0, 0]) / c.hw[1] for c in cameras)
+    narrow = max(float(c.K[0, :2].norm()) / c.hw[1] for c in cameras)
     middle = torch.from_numpy(board.middle)
     found: list[Pose] = []
     for _ in range(TRIES):
@@ -118,7 +118,7 @@ def _resolution(camera: Camera, cam_from_board: Pose, board: Board) -> float:
     """Dots per inch at which a dot is half a pixel at the board's centre, in steps of a tenth."""
     middle = torch.from_numpy(board.middle)
     depth = max(float(cam_from_board.apply(middle[None])[0, 2]), 1e-3)
-    exact = 2 * float(camera.K[0, 0]) / depth * 0.0254
+    exact = 2 * float(camera.K[0, :2].norm()) / depth * 0.0254
     return float(min(max(1.1 ** round(math.log(exact, 1.1)), 20.0), 300.0))
 
 

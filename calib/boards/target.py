@@ -224,12 +224,16 @@ def _known_points(text: str) -> KnownPoints:
     path = Path(f"{file}.csv")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file of points")
-    with path.open(encoding="utf-8", newline="") as lines:
-        table = csv.DictReader(lines, skipinitialspace=True)
-        head = tuple(name.strip().lower() for name in table.fieldnames or ())
-        if head not in COLUMNS:
-            raise ValueError(f"{path}: begins '{','.join(head)[:60]}': write id,x,y,z or id,corner,x,y,z")
-        rows = [_point(path, number, row, head) for number, row in enumerate(table, 2)]
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as lines:
+            table = csv.DictReader(lines, skipinitialspace=True)
+            names, points = table.fieldnames or (), list(table)
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: not a CSV file ({error}): save the table as CSV, UTF-8") from None
+    head = tuple(name.strip().lower() for name in names)
+    if head not in COLUMNS:
+        raise ValueError(f"{path}: begins '{','.join(head)[:60]}': write id,x,y,z or id,corner,x,y,z")
+    rows = [_point(path, number, row, head) for number, row in enumerate(points, 2)]
     if len(rows) < FEWEST_POINTS:
         raise ValueError(f"{path}: has {len(rows)} points and {FEWEST_POINTS} is the least")
     ids, positions = zip(*rows)

@@ -14,9 +14,9 @@ from jaxtyping import Float
 from arraygeom import Camera, Rig, epipolar_distance
 
 from .board import Board
-from .bundle import POSE, BundleProblem, Observations, Solved, camera_jacobian
+from .bundle import POSE, BundleProblem, Observations, Solved, camera_jacobian, intrinsic_values
 from .detect import BoardViews, named
-from .intrinsics import Lens
+from .intrinsics import LENSES, Lens
 from .poses import StartDeviations
 from .solve import calibrate_single, readjusted
 from .uncertainty import compensation, covered, grid_points, in_own_frame
@@ -90,14 +90,16 @@ def held_out_errors(
 def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """By camera: pixels (n, 2) near points of both halves, how far (n, 2) projections of their fits differ.
 
-    Halves are every other frame; elsewhere a lens model is extrapolated. Empty if there are too few frames.
+    Halves are every other frame; elsewhere a lens model is extrapolated. Empty if there are too few frames,
+    or a camera sees no board in one of the halves.
     """
     count = len(fit.problem.frames)
-    if count < FEWEST_TO_HALVE:
-        return {}
     even = np.arange(count) % 2 == 0
+    parts = [fit.problem.of_boards(kept) for kept in (even, ~even)]
+    if count < FEWEST_TO_HALVE or not all(len(seen.x) for half in parts for seen in half.seen.values()):
+        return {}
     try:
-        halves = [readjusted(fit.problem.of_boards(kept)) for kept in (even, ~even)]
+        halves = [readjusted(half) for half in parts]
     except np.linalg.LinAlgError:
         return {}
     found = {}
@@ -208,10 +210,16 @@ def left_out_notes(
 
 
 def start_notes(
-    detected: Mapping[str, BoardViews], solved: Solved, deviations: StartDeviations
+    detected: Mapping[str, BoardViews], solved: Solved, deviations: StartDeviations, lens: Mapping[str, Lens]
 ) -> Iterator[str]:
-    """Notes on a rig that was known roughly: what images add, what lies far from it, what was left out."""
+    """Notes on a rig that was known roughly: what images add, what lies far from it, what was left out.
+
+    And which cameras have a lens of the start's that is not the one wanted.
+    """
     yield _gains(solved, deviations)
+    for name, camera in solved.problem.cameras.items():
+        if (own := camera.distortion) is not None and own.model != LENSES[lens[name]][0]:
+            yield f"{name}: keeps the start's lens, {own.model}"
     yield from _far(solved)
     for name, key in solved.left_out:
         yield f"{name}: left out {key}: its board contradicts the start"
@@ -232,7 +240,7 @@ def _points_left_out(name: str, detected: BoardViews, used: BoardViews) -> Itera
 
 def _gains(fit: Solved, deviations: StartDeviations) -> str:
     """What the images add to the start, by kind of parameter."""
-    focal = np.mean([float(c.K[0, 0]) for c in fit.problem.cameras.values()])
+    focal = np.mean([intrinsic_values(c)[6] for c in fit.problem.cameras.values()])
     width = np.mean([c.hw[1] for c in fit.problem.cameras.values()])
     stated = (
         ("focal", "focal lengths", deviations.focal * focal),

@@ -48,7 +48,7 @@ def centres_found(
     scale is kept. `shown` says what of each image its camera recorded. Cameras that match with none are left
     out. Raises ValueError if none matches.
     """
-    stated = [float(rig.pair(alpha, name).beta_from_alpha.t.norm()) for name in rig.betas(alpha)]
+    stated = {name: float(rig.pair(alpha, name).beta_from_alpha.t.norm()) for name in rig.betas(alpha)}
     pairs: dict[tuple[str, str], PointMatches] = {}
     for a, b in combinations(rig.names, 2):
         infinite = rig[b].K @ rig[b].R @ rig[a].R.mT @ torch.linalg.inv(rig[a].K)
@@ -69,8 +69,8 @@ def centres_found(
         near = {pair: matches for pair, matches in near.items() if len(matches.alpha) >= ENOUGH}
         free = [f"{name}.{kind}" for name in rig.betas(alpha) for kind in SIGMA]
         rig = refine_matches(rig, [near], free=free, sigma=SIGMA, keep_depth=False).rig
-    first = float(rig.pair(alpha, rig.betas(alpha)[0]).beta_from_alpha.t.norm())
-    rig = rig.scaled((stated[0] if any(stated) else 1.0) / first)
+    first = rig.betas(alpha)[0]
+    rig = rig.scaled((stated[first] or 1.0) / float(rig.pair(alpha, first).beta_from_alpha.t.norm()))
     facts = {}
     for name in rig.betas(alpha):
         own = {pair: matches for pair, matches in near.items() if name in pair}

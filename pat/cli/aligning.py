@@ -101,7 +101,7 @@ class Align(Known):
         from ..networks.weights import load_weights
         from ..support.locks import folder_lock
 
-        begin, warned = time.monotonic(), len(options.WARNED)
+        begin = time.monotonic()
         settings = self.settings()
         options.say_when_compiling()
         with folder_lock(self.out):
@@ -132,7 +132,7 @@ class Align(Known):
                 frame.recorded.save(self.out / "rig.yaml")
                 written.append(self.out / "rig.yaml")
             if self.report and not frame.name:
-                texts = [str(message) for message in options.WARNED[warned:]]
+                texts = [str(message) for message in options.WARNED]
                 facts = Facts(frame.notes, texts, time.monotonic() - begin)
                 write_text(self.out / "index.html", aligned_page(aligned, frame.recorded, facts))
                 written.append(self.out / "index.html")

@@ -66,7 +66,7 @@ class Fuse(Known):
     """Find how far the other cameras lie off their search segments, and put that right."""
     exposure: Annotated[Literal["auto", "keep"] | None, optional("{auto,keep}")] = None
     """Brightness of the fused image: auto makes a dark or overexposed one as bright as a photograph; keep
-    leaves it as alpha has it. By default auto without a rig, and keep with one."""
+    leaves it as alpha has it. By default auto of a single frame without a rig, else keep."""
     keep_alpha: bool = False
     """With --noise, leave alpha's values as recorded; always so if alpha has hardly any noise."""
     luminance: Literal["alpha", "mix", "beta"] = "alpha"
@@ -197,9 +197,9 @@ class Fuse(Known):
             array = array_from_images(first, alpha=self.alpha, weights=self.weights, focal=focal, say=say)
         self.weights = array.weights
         self.normalise_radiometry |= array.match_levels
-        measured = load_weights(array.weights).bands is None
-        self.exposure = self.exposure or ("keep" if measured else "auto")
         if max(map(len, files.values())) == 1:
+            measured = load_weights(array.weights).bands is None
+            self.exposure = self.exposure or ("keep" if measured else "auto")
             return self._one(array.rig, array.images, array.alpha, first, found=array.notes)
         rig = array.recorded
         for name, rate in rates.items():
@@ -219,13 +219,34 @@ class Fuse(Known):
             self.bits = 32 if self.kind == "exr" else 16 if deep else 8
 
     def _frames(self, files: dict[str, list[Path]]) -> dict[str, list[Path]]:
-        """The files of the frames that every camera has; all of them, of a sequence."""
+        """The files of the frames that every camera has; all of them, of a sequence.
+
+        Raises ValueError for options that are not of so many frames.
+        """
         from ..fusion.frame_matching import matched_frames, warn_of_gaps
 
+        timed = {"--frame-rate": self.frame_rate, "--time-offset": self.time_offset, "--speed": self.speed}
         if self.sequence:
             warn_of_gaps(files)
-            return files
-        return matched_frames(files)
+        elif named := [option for option, value in timed.items() if value not in ((), None)]:
+            raise ValueError(f"{', '.join(named)}: for a --sequence only: give that, or leave out")
+        else:
+            files = matched_frames(files)
+        if self.sequence or max(map(len, files.values())) > 1:
+            self.refuse_several()
+        return files
+
+    def refuse_several(self) -> None:
+        """Raise ValueError for options of single frames."""
+        super().refuse_several()
+        single = {
+            "--points": self.points,
+            "--classical": self.classical,
+            "--device cuda": self.device == "cuda",
+            "--exposure auto": self.exposure == "auto",
+        }
+        if named := [option for option, given in single.items() if given]:
+            raise ValueError(f"{', '.join(named)}: for a single frame only: leave out for several")
 
     def _rig(self) -> Rig:
         rig = options.load_rig_or_say_no_image(self.given[0], self.depth)
@@ -373,14 +394,6 @@ class Fuse(Known):
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 
-        self.refuse_several()
-        single = {
-            "--points": self.points,
-            "--classical": self.classical,
-            "--device cuda": self.device == "cuda",
-        }
-        if named := [option for option, given in single.items() if given]:
-            raise ValueError(f"{', '.join(named)}: for a single frame only: leave out for several")
         batch = Batch(
             rig,
             files,

@@ -66,6 +66,8 @@ class Known:
         """How frames are fused. Raises ValueError for options that are none."""
         from ..fusion.fuse import FuseSettings
 
+        if self.depth_scale is not None and self.depth_map is None:
+            raise ValueError("--depth-scale: needs --depth-map")
         return FuseSettings(
             field=options.field_named(self.field),
             max_memory=self.max_memory,

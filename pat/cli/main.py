@@ -119,8 +119,6 @@ def _command(arguments: list[str], group: Any, prog: str) -> Any:
             raise ValueError(f"no command '{path} {word}'{near(word, command.commands)}")
         path, command, arguments = f"{path} {word}", command.commands[word], arguments[1:]
     arguments = respelled(arguments, command)
-    if hasattr(command, "parse"):
-        return command.parse(arguments)
     return parsed(command, path, arguments)
 
 
@@ -164,6 +162,7 @@ def _choices(given: str, option: str, choices: str) -> str:
 
 
 REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
+    (r"^Error parsing TrainConfig: ", ""),
     (r"^Error parsing (\S+): ", r"\1: "),
     (
         r"no type matching (?:\{None\}\|)?\{(.+?)\} could be instantiated from \[(.*?)\].*",
@@ -193,6 +192,8 @@ def parsed(command: Any, prog: str, arguments: list[str]) -> Any:
     said = io.StringIO()
     try:
         with redirect_stderr(said):
+            if hasattr(command, "parse"):
+                return command.parse(arguments)
             return tyro.cli(command, prog=prog, args=arguments, config=(tyro.conf.DisallowNone,))
     except SystemExit as stop:
         if not stop.code:

@@ -314,13 +314,14 @@ def console() -> Console:
 
 
 WARNED: list[Warning | str] = []
-"""What a command has warned of."""
+"""What a command has warned of, once each."""
 
 
 def warn(message: Warning | str, *_: Any, **__: Any) -> None:
-    """A warning as one line, without its position in the code."""
-    WARNED.append(message)
-    say(f"pat: warning: {message}", style="yellow")
+    """A warning as one line, without its position in the code; not again if it was said before."""
+    if str(message) not in map(str, WARNED):
+        WARNED.append(message)
+        say(f"pat: warning: {message}", style="yellow")
 
 
 def say(text: object, style: str | None = None) -> None:

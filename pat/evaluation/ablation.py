@@ -77,8 +77,8 @@ RIGS = RigDistribution(
 """Rigs of the layered scenes: beta's focal length is 1/3 to 1 of alpha's, in images of equal sizes."""
 DENSE_LIMIT = 2**31
 """Bytes that explicit positions may take; the dense field of larger images is omitted."""
-RATIOS = (1.0, 1.5, 2.0, 3.0)
-"""Groups of focal ratios in the table."""
+RATIOS = (1.0, 1.5, 2.0)
+"""Where groups of focal ratios begin in the table; those below are one more."""
 CROP = 96
 """Side of the crops in the figure, pixels."""
 SHOWN = 4
@@ -333,7 +333,8 @@ def unsupported(field: ReceptiveField | None, rig: Rig) -> str:
 
 def markdown(rows: Sequence[AblationRow]) -> str:
     """One line a family: mean PSNR, its 95% bootstrap interval, SSIM, dB to calibrated, by focal ratio."""
-    bins = [f"ratio {low:g} to {high:g}" for low, high in pairwise(RATIOS)]
+    between = [f"ratio {low:g} to {high:g}" for low, high in pairwise(RATIOS)]
+    bins = [f"ratio below {RATIOS[0]:g}", *between, f"ratio from {RATIOS[-1]:g}"]
     columns = ["family", "PSNR", "SSIM", "against calibrated", *bins, "off, px", "within 1 px", ""]
     names = list(dict.fromkeys(row.family for row in rows))
     lines = [[name, *_cells([row for row in rows if row.family == name], rows)] for name in names]
@@ -351,14 +352,14 @@ def markdown(rows: Sequence[AblationRow]) -> str:
 def _cells(rows: Sequence[AblationRow], every: Sequence[AblationRow]) -> list[str]:
     served = [row for row in rows if not math.isnan(row.psnr)]
     if not served:
-        return [""] * (len(RATIOS) + 4) + [rows[0].note]
+        return [""] * (len(RATIOS) + 6) + [rows[0].note]
     reference = {row.scene: row.psnr for row in every if row.family == "calibrated"}
     gains = [row.psnr - reference.get(row.scene, math.nan) for row in served]
     off, near = zip(*((row.end_point_error, row.within_one) for row in served))
     gain, error, within = map(_mean, (gains, off, near))
     psnr, ssim = [row.psnr for row in served], [row.ssim for row in served]
     interval = " ({:.2f} to {:.2f})".format(*bootstrap_interval(psnr)) if len(psnr) > 1 else ""
-    groups = [[r.psnr for r in served if a <= r.ratio < b] for a, b in zip(RATIOS, (*RATIOS[1:-1], math.inf))]
+    groups = [[r.psnr for r in served if a <= r.ratio < b] for a, b in pairwise((0, *RATIOS, math.inf))]
     means = [f"{np.mean(g):.2f}" if g else "" for g in groups]
     note = "" if len(served) == len(rows) else f"{len(rows) - len(served)} scenes omitted"
     depth = ["", ""] if math.isnan(error) else [f"{error:.2f}", f"{within:.1%}"]

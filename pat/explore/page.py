@@ -17,7 +17,7 @@ from arraygeom.atomic import write_text
 
 from ..networks.paper import PAT
 from .answers import DEFAULTS, Controls, answer, choices, shown_cameras, slider_ranges
-from .pixel import WINDOWS, ExplorerScene
+from .pixel import WINDOWS, ExplorerScene, shipped_attention
 
 MODULE, PINHOLE = (Path(__file__).with_name(name) for name in ("widget.js", "pinhole.js"))
 GRID = 24
@@ -85,10 +85,11 @@ class Explorer:
             return {"columns": 1, "rows": 1, "answers": {"0,0": {"error": self.error}}}
         h, w = self.scene.rig[self.alpha].hw
         rows = max(1, round(columns * h / w))
+        xs, ys = ([(i + 0.5) * side / n - 0.5 for i in range(n)] for side, n in ((w, columns), (h, rows)))
         answers = {
-            f"{i},{j}": self.answer({**self.controls, "x": [(i + 0.5) * w / columns, (j + 0.5) * h / rows]})
-            for i in range(columns)
-            for j in range(rows)
+            f"{i},{j}": self.answer({**self.controls, "x": [x, y]})
+            for i, x in enumerate(xs)
+            for j, y in enumerate(ys)
         }
         return {"columns": columns, "rows": rows, "answers": answers}
 
@@ -145,6 +146,8 @@ def opened(
     networks = {} if network is None or isinstance(network, str) else {"network": network}
     weights = WINDOWS if network is None else network if isinstance(network, str) else "network"
     try:
+        if isinstance(network, str):
+            shipped_attention(network)  # refuses others
         images, alpha = checked(rig, images, alpha)
         scene = ExplorerScene(rig, images, fields or {}, networks)
     except ValueError as error:

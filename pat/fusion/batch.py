@@ -33,8 +33,8 @@ from arraygeom.safe_yaml import load_yaml
 
 from ..media.images import read_image
 from ..media.raw import developed_rig
-from ..media.suffixes import IMAGE_SUFFIXES
-from ..media.video import write_video
+from ..media.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from ..media.video import check_video, write_video
 from ..networks.weights import Network, Precision, find_weights, load_weights
 from ..sensors import NoiseLevel
 from ..support.jobs import HERE, JobReport, OnError, Task, Workers, run_tasks
@@ -112,7 +112,6 @@ class Batch:
         entries["weights"] = f"{self.weights} (SHA-256 {digest[:16]})"
         if self.sequence:
             entries["frames"] = {name: len(paths) for name, paths in files.items()}
-            entries["first"] = {name: paths[0] for name, paths in files.items()}
         return yaml.safe_dump(entries, sort_keys=False)
 
     @property
@@ -142,6 +141,8 @@ class Batch:
         Raises JobError if a frame fails and the job is to stop, ValueError to resume with other settings, and
         for a folder that another command is writing to, or that cannot be written to.
         """
+        if video is not None:
+            check_video(video)
         plan, many = self.out / KEYS / PLAN, range(len(self.names))
         how: dict[str, Any] = {"workers": workers, "resume": resume, "on_error": on_error, "console": console}
         with folder_lock(self.out):
@@ -351,19 +352,23 @@ def _network(weights: str, precision: Precision) -> Network:
 def find_images(text: str | Path, *, name: str = "") -> list[Path]:
     """The images of a folder, a pattern such as "a/mono_*.png", or one file; numbers in names count as such.
 
-    Raises FileNotFoundError if there is none.
+    Raises FileNotFoundError if there is none, ValueError for a video.
     """
     path = Path(text)
     label = f"{name}: " if name else ""
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        raise ValueError(
+            f"{label}{path}: is a video, which only `pat fuse` without a rig reads: save its frames"
+        )
     if path.is_dir():
         shown = (p for p in path.iterdir() if not p.name.startswith("."))
         found = [p for p in shown if p.suffix.lower() in IMAGE_SUFFIXES]
     elif any(c in path.name for c in "*?["):
         found = list(path.parent.glob(path.name))
     else:
-        found = [path]
+        found = [path] if path.exists() else []
     if not found:
-        raise FileNotFoundError(f"{label}{path}: no images there: check the path")
+        raise FileNotFoundError(f"{label}{path}: no image there: check the path")
     return sorted(found, key=_natural)
 
 

@@ -32,7 +32,7 @@ from ..matching.matches import BetaMatches
 from ..matching.normalisation import SETTINGS as NORMALISATION
 from ..matching.normalisation import Normalisation, combined_bands, moments
 from ..matching.positions import enlarged, normals, reduced
-from ..matching.radiometry import Given, Response, fit, stated_response
+from ..matching.radiometry import Given, Response, fit, given_response
 from ..matching.semi_global import CONSISTENT
 from ..networks.protocol import FusionNetwork
 from ..support.settings import size, tuned
@@ -136,13 +136,9 @@ def expected_work(frame: FrameInputs, response: Given, *, align: bool) -> float:
 
 
 def _given(response: Given, inputs: Inputs) -> Response:
-    if isinstance(response, Response):
-        return response
-    if isinstance(response, str):
-        return Response.rec601()
-    if not any(map(_is_rgb, inputs.betas)):
+    if not isinstance(response, str | Response) and not any(map(_is_rgb, inputs.betas)):
         raise ValueError("a response needs betas in red, green and blue: leave it out for other bands")
-    return stated_response(response)
+    return given_response(response)
 
 
 def _is_rgb(beta: Beta) -> bool:

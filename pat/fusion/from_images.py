@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -153,7 +154,10 @@ def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
 def frames_of_videos(
     videos: Mapping[str, Path], folder: Path
 ) -> tuple[dict[str, list[Path]], dict[str, float]]:
-    """The frames of videos as image files in a folder, and the frames a second, by camera."""
+    """The frames of videos as image files in a folder, and the frames a second, by camera.
+
+    Files have their video's time: a job that is resumed knows by it that they are the same.
+    """
     files: dict[str, list[Path]] = {}
     rates: dict[str, float] = {}
     for name, path in videos.items():
@@ -162,6 +166,7 @@ def frames_of_videos(
         for i, image in enumerate(frames):
             files[name].append(folder / name / f"{i:06d}.png")
             write_image(files[name][-1], image)
+            os.utime(files[name][-1], ns=(path.stat().st_mtime_ns,) * 2)
         if not files[name]:
             raise ValueError(f"{path}: a video without frames")
     return files, rates

@@ -17,7 +17,7 @@ from arraygeom.chunks import Tile
 from arraygeom.threads import torch_in_one_thread
 
 from ..matching.match import Matcher, match
-from ..matching.radiometry import Given
+from ..matching.radiometry import Given, given_response
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
 from ..support.memory import limited, parse_bytes, planned
@@ -27,7 +27,7 @@ from .corrections import Corrections, corrections_for, expected_work
 from .depth_edges import beside_edges
 from .depth_filling import background_filled
 from .inputs import bytes_beside, prepared
-from .low_light import LowLight, Noise, denoised_views
+from .low_light import LowLight, Noise, check_noise, denoised_views
 from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail, with_own_colours
 from .results import Frame
 from .steps import steps_for, undone
@@ -65,6 +65,8 @@ class FuseSettings:
         of.
     luminance: the image's: "alpha", which the network keeps exactly, that of "beta" in alpha's detail, where
         alpha sees another part of the spectrum, or their "mix".
+
+    Raises ValueError for a noise or a response that is none.
     """
 
     depth: tuple[float, float] | None = None
@@ -76,6 +78,10 @@ class FuseSettings:
     noise: Noise | None = None
     keep_alpha: bool = False
     luminance: Luminance = "alpha"
+
+    def __post_init__(self) -> None:
+        check_noise(self.noise)
+        given_response(self.response)
 
 
 @torch_in_one_thread()
@@ -204,7 +210,7 @@ def _with_rig(
     explain: Callable[[str], None] | None,
 ) -> tuple[FusionNetwork, Rig, Images, str, bool]:
     """Network, rig, images, alpha, and whether to match levels; all found where the first is images alone."""
-    if rig is not None and images is not None and alpha is not None:
+    if isinstance(rig, Rig) and images is not None and alpha is not None and not isinstance(network, str):
         return network, rig, images, alpha, False
     if rig is not None or images is not None or not isinstance(network, Mapping | Sequence):
         raise TypeError(

@@ -199,8 +199,15 @@ def shown_noise(image: Float[Tensor, "c h w"]) -> float:
     return float(NoiseLevel.estimated(part).deviation(part).mean())
 
 
+def check_noise(noise: Noise | None) -> None:
+    """Raise ValueError for a word that is none."""
+    if isinstance(noise, str) and noise not in ("estimate", "auto"):
+        raise ValueError(f"noise is 'estimate', 'auto' or a NoiseLevel of each camera; got {noise!r}")
+
+
 def noise_levels(images: Mapping[str, Tensor], noise: Noise | None) -> Mapping[str, NoiseLevel]:
     """The level of each camera that has noise: as stated, or estimated from its image (C, H, W)."""
+    check_noise(noise)
     if noise == "auto" and max(map(shown_noise, images.values())) < SETTINGS.plain:
         return {}
     if isinstance(noise, str):

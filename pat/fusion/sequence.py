@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, TypeVar
@@ -21,6 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Moved, ReceptiveField, Rig, Widened
+from arraygeom.checks import check_above
 from arraygeom.fields.default import straight_field
 
 from ..matching.likeness import UNLIKE
@@ -84,6 +86,7 @@ class SequenceFusion:
     settings: FuseSettings = FuseSettings()  # noqa: RUF009
 
     def __post_init__(self) -> None:
+        check_above(0, speed=self.speed)
         cached = {n: f if isinstance(f, CachedFrames) else CachedFrames(f) for n, f in self.frames.items()}
         object.__setattr__(self, "frames", cached)
 
@@ -158,7 +161,7 @@ class SequenceFusion:
 
     def _field(self, name: str, index: int, time: float) -> tuple[ReceptiveField, Tensor]:
         """The field of a beta that records at `time`, and the weight of the motion until then."""
-        field = self._common_field or straight_field(self.rig.pair(self.alpha, name))
+        field = self._given_field(name) or straight_field(self.rig.pair(self.alpha, name))
         weight = torch.ones(self.rig[self.alpha].hw)
         steps = (time - self._time(index)) * self.timeline.rate(self.alpha)
         count = len(self.frames[self.alpha])
@@ -186,7 +189,6 @@ class SequenceFusion:
         match_levels = self.settings.match_levels
         if match_levels and not alone:
             images = {name: self._normalised(name, image, i) for name, image in images.items()}
-        common = dict.fromkeys(betas, self._common_field) if self._common_field else {}
         return fuse(
             self.network,
             self.rig,
@@ -194,16 +196,15 @@ class SequenceFusion:
             alpha=self.alpha,
             settings=self.settings,
             corrections=self._corrections,
-            field={**common, **fields},
+            field={**{name: self._given_field(name) for name in betas}, **fields},
             match_levels=match_levels and alone,
             noise=self._noise,
         )
 
-    @property
-    def _common_field(self) -> ReceptiveField | None:
-        """The field of all betas."""
-        assert not isinstance(self.settings.field, Mapping)
-        return self.settings.field
+    def _given_field(self, name: str) -> ReceptiveField | None:
+        """A beta's field, where one is given."""
+        field = self.settings.field
+        return field.get(name) if isinstance(field, Mapping) else field
 
     @cached_property
     def _corrections(self) -> Corrections:
@@ -263,8 +264,15 @@ class SequenceFusion:
         keys = self.timeline.key_frames()
         nearest = min(range(len(keys)), key=lambda k: abs(keys[k].alpha - i))
         around = keys[max(nearest - SETTINGS.neighbours, 0) : nearest + SETTINGS.neighbours + 1]
-        own = mean_moments([self.frames[name][k.betas[name]] for k in around])
-        return own.matched(image, mean_moments([self.grey(k.alpha) for k in around]))
+        own = mean_moments(readable(self.frames[name].__getitem__, [k.betas[name] for k in around]))
+        return own.matched(image, mean_moments(readable(self.grey, [k.alpha for k in around])))
+
+
+def readable(read: Callable[[int], Tensor], numbers: Iterable[int]) -> Iterator[Tensor]:
+    """Those of some images that can be read: what cannot is reported when it is fused."""
+    for i in numbers:
+        with suppress(OSError, ValueError):
+            yield read(i)
 
 
 class KeyContribution(NamedTuple):

@@ -228,6 +228,7 @@ def _for_pinhole(field: ReceptiveField | None, lens: View, pinhole: View) -> Rec
         return field
     assert isinstance(lens, LensView)
     assert isinstance(pinhole, LensView)
+    field.require(lens.hw)
     x, seen = pixels_between(lens, pinhole)
     rays, valid = lens.to(torch.float64).rays(field.points(x))
     there = map_homogeneous(pinhole.K.double()[:2], rays[..., :2] / rays[..., 2:])

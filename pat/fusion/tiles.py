@@ -250,7 +250,7 @@ def fused_in_tiles(
 
     shown = progress(tiles, len(tiles)) if progress else tiles
     if store and len(tiles) > 1:
-        digest = _digest(network, frame.inputs)
+        digest = _digest(network, frame)
         files = {t: store / f"{digest}_{'_'.join(map(str, (*t.inner, *t.outer)))}.safetensors" for t in tiles}
         for tile in shown:
             if not files[tile].exists():
@@ -262,12 +262,16 @@ def fused_in_tiles(
     return FusedTile(*assembled(frame.hw, ((Tile(tile.inner, tile.inner), part) for tile, part in parts)))
 
 
-def _digest(network: FusionNetwork, inputs: Inputs) -> str:
+def _digest(network: FusionNetwork, frame: FrameInputs) -> str:
     """Of all that a frame's tiles depend on."""
-    digest = hashlib.sha256(f"{type(network).__name__} {FusedTile._fields}".encode())
+    inputs = frame.inputs
+    how = type(network).__name__, FusedTile._fields, inputs.luminance, inputs.bands, inputs.sees_luma
+    digest = hashlib.sha256(f"{how}".encode())
     parameters = network.state_dict().values() if isinstance(network, nn.Module) else ()
     fields = [tensor for beta in inputs.betas for tensor in _sparse(beta.field, inputs.hw)]
-    for tensor in (*parameters, inputs.alpha, *(b.image for b in inputs.betas), *fields):
+    cameras = [camera for place in frame.placements if place.has_depth for camera in place.pair.cameras]
+    poses = [tensor for camera in cameras for tensor in (camera.K, camera.R, camera.t)]
+    for tensor in (*parameters, inputs.alpha, *(b.image for b in inputs.betas), *fields, *poses):
         digest.update(tensor.detach().cpu().contiguous().numpy())
     return digest.hexdigest()[:16]
 

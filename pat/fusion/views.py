@@ -49,7 +49,7 @@ class Views:
 
         Raises ValueError for a camera that the rig lacks, no image of alpha or of any beta, an image of
         another size than the rig says, of another type, or with values that are not finite or far outside
-        0..1.
+        0..1. TypeError for what is no tensor.
         """
         for name in (alpha, *images):
             rig.require(name)
@@ -140,6 +140,10 @@ def check_bands(views: Views, wanted: int | None) -> None:
 
 def _checked(rig: Rig, images: Images, name: str) -> Tensor:
     image, (h, w) = images[name], rig[name].hw
+    if not isinstance(image, Tensor):
+        raise TypeError(
+            f"the image of '{name}' is a {type(image).__name__}: give a tensor, as `read_image` does"
+        )
     if image.ndim != 3 or image.dtype not in (torch.float32, torch.float64):
         got = f"{str(image.dtype).removeprefix('torch.')} of shape {tuple(image.shape)}"
         raise ValueError(f"the image of '{name}' is {got}: wanted float32 (C, H, W) in 0..1")

@@ -9,6 +9,7 @@ holds for any network that uses the matches.
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -93,10 +94,11 @@ def with_certainty(matches: Matches) -> Matches:
 def _certainty(found: BetaMatches) -> Float[Tensor, "b 2 h2 w2"]:
     typical, (h, w) = typical_facts(found), found.disparity.shape[-2:]
     bare = replace(found, bands=None, diffused=None, certainty=None)
+    network = deepcopy(fitted_network()).to(found.facts)  # another thread may need it in another precision
 
     def of(tile: Tile) -> Tensor:
         numbers = measured(bare.cut(tile.outer), typical).movedim(1, -1)
-        logit, half_width = fitted_network().to(numbers)(numbers).unbind(-1)
+        logit, half_width = network(numbers).unbind(-1)
         return torch.stack([logit.sigmoid().clamp(min=SETTINGS.least), half_width.exp()], 1)
 
     halo = FINE * max(SETTINGS.around + SETTINGS.apart)

@@ -9,6 +9,7 @@ each. It was trained on what matching finds in pairs with true disparity (`exper
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -103,13 +104,14 @@ def chosen(inputs: Inputs, matches: Matches, network: Choice | None = None) -> M
 
 def _chosen(inputs: Inputs, found: BetaMatches, network: Choice) -> BetaMatches:
     typical = typical_facts(found)
+    network = deepcopy(network).to(found.facts)  # another thread may need it in another precision
 
     def of(piece: Inputs, part: BetaMatches) -> tuple[Tensor, Tensor]:
         (beta,), (h, w) = piece.betas, part.disparity.shape[-2:]
         views = found.comparison.views(piece.alpha, beta.image)
         with torch.no_grad(), convolutions_in_parallel():
             given = features(views, beta.field.straight, part, candidates(part), typical)
-            answer = network.to(given)(given)
+            answer = network(given)
             del given  # most of the memory; candidates are made twice for the same reason
             scores, stated = answer.split([CANDIDATES, 2], 1)
             best = pixel_shuffle(scores.max(1).indices.float(), FINE)[..., :h, :w].long()

@@ -156,6 +156,17 @@ def stated_response(weights: Sequence[float]) -> Response:
     return Response(values / values.sum(), gain=float(values.sum()))
 
 
+def given_response(given: Given) -> Response:
+    """The response that is given, Rec. 601's if it is to be fitted. Raises ValueError for what is none."""
+    if isinstance(given, Response):
+        return given
+    if not isinstance(given, str):
+        return stated_response(given)
+    if given not in ("fit", "rec601"):
+        raise ValueError(f"response is 'fit', 'rec601' or three weights; got {given!r}")
+    return Response.rec601()
+
+
 def fit(
     bands: Float[Tensor, "3 n"],
     alpha: Float[Tensor, " n"],

@@ -69,13 +69,15 @@ def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = 
 def _pfm(path: Path) -> NDArray[np.float32]:
     """A grey PFM file: "Pf", width and height, scale (negative: little-endian), rows from the bottom up."""
     content = path.read_bytes()
-    head = re.match(rb"Pf\s+(\d+)\s+(\d+)\s+(-?[0-9.eE+-]+)\s", content)
+    head = re.match(rb"Pf\s+(\d+)\s+(\d+)\s+(-?[0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)\s", content)
     if head is None:
         raise ValueError(f"{path}: not a grey PFM file: give one that begins with 'Pf', or float TIFF")
     w, h, scale = int(head[1]), int(head[2]), float(head[3])
+    if (size := len(content) - head.end()) != 4 * h * w:
+        raise ValueError(
+            f"{path}: has {size} bytes of values, {w}x{h} are {4 * h * w}: the file is not whole"
+        )
     values = np.frombuffer(content, "<f4" if scale < 0 else ">f4", offset=head.end())
-    if values.size != h * w:
-        raise ValueError(f"{path}: has {values.size} values, {w}x{h} are {h * w}: the file is not whole")
     return values.reshape(h, w)[::-1].astype(np.float32)
 
 

@@ -125,12 +125,16 @@ def write_image(
 
     8 and 16 bits are rounded, after values are clipped to 0..1; 32 bits (.tif and .exr only) keep floats as
     they are. With `profile`, PNG and JPEG files in colour say by an ICC profile that they are sRGB.
-    An .exr file needs the extra `synthesis`. Raises ValueError for
-    an image with another number of channels or with values that are not finite (allowed with `unknown`, for
-    maps of 32 bits in which some pixels are not known), and for a format that cannot hold it.
+    An .exr file needs the extra `synthesis`.
+
+    Raises ValueError for an image of whole numbers, with another number of channels or with values that are
+    not finite (allowed with `unknown`, for maps of 32 bits in which some pixels are not known), and for a
+    format that cannot hold it.
     """
     path = Path(path)
     planes = image.detach().cpu().numpy()
+    if planes.dtype.kind != "f":
+        raise ValueError(f"{path}: the image to write is {planes.dtype}: give floats in 0..1")
     if planes.shape[0] not in (1, 3):
         raise ValueError(f"{path}: an image has 1 or 3 channels, got {len(planes)}: write them one by one")
     if not (unknown and bits == 32) and not np.isfinite(planes).all():

@@ -23,13 +23,14 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, r
     """Write images (grey or RGB, sRGB values, clipped to 0..1) as H.264 (.mp4, .mkv), atomically.
 
     An odd last row or column is left out: 4:2:0 has none. Raises ValueError for no frames, frames of
-    different sizes, and other suffixes.
+    different sizes, and other suffixes, and as `check_video`.
     """
     path = Path(path)
     if path.suffix.lower() not in (".mp4", ".mkv"):
         raise ValueError(f"{path}: a video's name ends in .mp4 or .mkv")
-    with needs("video", "writing video"):
-        import av
+    check_video(rate)
+    import av
+
     with write_atomically(path) as temporary, av.open(str(temporary), "w") as file:
         stream = None
         for frame in frames:
@@ -45,6 +46,17 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, r
         if stream is None:
             raise ValueError(f"{path}: a video needs at least one frame")
         file.mux(stream.encode())
+
+
+def check_video(rate: float) -> None:
+    """Raise, before frames are made, what writing them would.
+
+    ImportError without the extra `video`, ValueError for a rate that players do not show.
+    """
+    with needs("video", "writing video"):
+        import av  # noqa: F401
+    if not 1e-3 <= rate <= 1e3:
+        raise ValueError(f"a video of {rate:g} frames a second: give .001 to 1000")
 
 
 class Video(NamedTuple):

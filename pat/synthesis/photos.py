@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from zipfile import BadZipFile
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+from arraygeom.atomic import write_atomically
 
 from ..media.images import decoded_photograph
 from ..media.suffixes import PHOTO_SUFFIXES
@@ -57,15 +60,15 @@ class PhotoBank:
 
         `cache` names an .npz file that is written on the first call and read
         on later ones; it is not checked against the folders. `choose` selects images by number, to hold
-        some out. Raises ValueError where no image is found.
+        some out. Raises ValueError where no image is found, and for a file that is no cache.
         """
         if cache and Path(cache).exists():
-            with np.load(cache) as archive:
-                images = list(archive.values())
+            images = _cached(Path(cache))
         else:
             images = read_photographs(folders, max_edge)
             if cache:
-                np.savez(cache, *images)
+                with write_atomically(cache) as temporary, temporary.open("wb") as file:
+                    np.savez(file, *images)
         images = [p for i, p in enumerate(images) if choose(i)]
         rng = np.random.default_rng(seed)
         extra = patterns(rng, 48) + recoloured(images, rng, 48)
@@ -131,6 +134,17 @@ def _mirrored(i: Tensor, n: Tensor) -> Tensor:
     i = i - period * torch.div(i.float(), period.float()).floor().int()
     i = torch.where(i < n, i, period - 1 - i)
     return torch.minimum(i.clamp_(min=0), n - 1)
+
+
+def _cached(file: Path) -> list[np.ndarray]:
+    """The images of a cache. Raises ValueError, which names the file, for a damaged or another one."""
+    try:
+        with np.load(file) as archive:
+            return list(archive.values())
+    except (BadZipFile, AttributeError, EOFError, OSError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{file}: not a cache of photographs ({error}): remove it, or name another"
+        ) from None
 
 
 def read_photographs(folders: tuple[str | Path, ...], max_edge: int) -> list[np.ndarray]:

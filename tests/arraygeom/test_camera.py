@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Camera, Pose, intrinsics, rotation_from_vector
+from arraygeom import Camera, Distortion, Pose, intrinsics, rotation_from_vector
 from tests.arraygeom.rigs import random_camera, random_rig, scene_points, uniform
 from tests.arraygeom.test_pixels import blob, centroid
 from tests.oracles import Oracle
@@ -127,6 +127,20 @@ def test_gradients_of_projection_and_its_inverse():
 
     inputs = [v.detach().clone().requires_grad_() for v in (c.K, torch.zeros(3, dtype=torch.float64), c.t, X)]
     assert torch.autograd.gradcheck(there_and_back, inputs)
+
+
+def test_a_pixel_without_a_ray_leaves_gradients_of_the_pose_to_the_others():
+    """The NaN of a pixel outside the lens's range, times no gradient at all, was every gradient of R."""
+    lens = Distortion("kannala-brandt", torch.zeros(4, dtype=torch.float64))
+    w = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    pose = Pose(rotation_from_vector(w), torch.zeros(3, dtype=torch.float64))
+    seen = Camera(K=intrinsics(20.0, (60, 100)), cam_from_world=pose, hw=(60, 100), distortion=lens)
+    x = torch.tensor([[60.0, 20.0], [1e4, 0.0]], dtype=torch.float64)
+    X = seen.unproject(x, torch.full((2,), 2.0, dtype=torch.float64))
+    assert X.isnan().all(-1).tolist() == [False, True]
+    (slope,) = torch.autograd.grad(X[0].sum(), w)
+    assert slope.isfinite().all()
+    assert slope.any()
 
 
 def test_contains_is_the_images_area():

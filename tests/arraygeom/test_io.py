@@ -72,6 +72,15 @@ def test_hand_written_pairs(file, format, names, options):
     assert_is_the_pair(read_rig(FIXTURES / file, format=format, **options), names)
 
 
+@pytest.mark.parametrize("file", sorted({path.name for path in FIXTURES.glob("*.*")} - {"README.md"}))
+def test_a_mark_at_the_beginning_of_a_file_changes_nothing(file, tmp_path):
+    """Editors write one; of some formats it hid the first line."""
+    (tmp_path / file).write_text((FIXTURES / file).read_text(encoding="utf-8"), encoding="utf-8-sig")
+    assert recognise(tmp_path / file) == recognise(FIXTURES / file)
+    marked, plain = (read_rig(folder / file, hw=(720, 1280)) for folder in (tmp_path, FIXTURES))
+    assert marked.names == plain.names
+
+
 @pytest.mark.parametrize("file", ["opencv_mono.xml", "opencv_mono.json", "ros/right.yaml"])
 def test_single_cameras(file):
     rig = read_rig(FIXTURES / file)

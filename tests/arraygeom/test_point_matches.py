@@ -39,10 +39,11 @@ def database(path, *, verified=True, first="a.png"):
 @pytest.mark.parametrize("between", [",", " ", "\t", ";"])
 def test_csv(tmp_path, text, between):
     rows = "\n".join(between.join(map(str, row)) for row in np.hstack(POINTS))
-    (tmp_path / "m.csv").write_text(text.format(rows))
-    found = read_matches(tmp_path / "m.csv", FILES, SIZES)["mono", "colour"]
-    for one, points in zip(found, POINTS):
-        assert np.array_equal(one.numpy(), points)
+    for encoding in ("utf-8", "utf-8-sig"):  # a spreadsheet's mark once cost the first row
+        (tmp_path / "m.csv").write_text(text.format(rows), encoding=encoding)
+        found = read_matches(tmp_path / "m.csv", FILES, SIZES)["mono", "colour"]
+        for one, points in zip(found, POINTS):
+            assert np.array_equal(one.numpy(), points)
 
 
 @pytest.mark.parametrize("verified", [True, False])

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig
-from calib.boards.adequacy import next_views, proposed_views
+from calib.boards.adequacy import coverage_advice, coverages, next_views, proposed_views
 from calib.boards.bundle import camera_jacobian, parameter_names
 from calib.boards.intrinsics import board_pose
-from calib.boards.report import by_cameras
+from calib.boards.report import by_cameras, draw_adequacy, report_html
 from calib.boards.rig import calibrate
 from calib.boards.run import _advice, watch
 from calib.boards.simulation import simulate_photos
@@ -92,6 +92,16 @@ def test_halves_are_compared_only_where_both_saw_boards():
     halves = [seen[block % 2 == half] for half in (0, 1)]
     assert len(x) > 5
     assert all(np.linalg.norm(half - each, axis=1).min() < 32 for half in halves for each in x)
+
+
+def test_a_camera_of_half_the_rate_is_in_one_half_alone():
+    """Its boards are all in even frames: the report of the calibration, which was good, was not made."""
+    rig = Rig({"fast": TRUE, "slow": camera(700.0, (480, 640), (0.1, 0.0, 0.0))})
+    views = see(rig, board_poses(12, spread=0.2), noise=0.2)
+    views["slow"] = views["slow"].only(range(0, 12, 2))
+    calibration = calibrate(views, BOARD)
+    assert half_difference(calibration.fit, 1.5) == {}
+    assert "Adequacy of each camera" in report_html(calibration)
 
 
 FISHEYES = {
@@ -270,3 +280,20 @@ def test_what_a_fit_does_not_determine_gives_no_advice(found):
     said = _advice(replace(found, fit=replace(found.fit, covariance=None)), "cam")
     assert "Focal length" in said
     assert "Next: " not in said
+
+
+def test_images_that_show_no_view_of_the_board_have_none_proposed():
+    """A strip shows less than the board's height: its report ended in "min() arg is an empty sequence"."""
+    views = see(Rig({"cam": camera(1150.0, (160, 1600))}), board_poses(12, spread=0.1, depth=(6, 14)))
+    strip = calibrate(views, BOARD)
+    said = " ".join(coverage_advice(strip, coverages(strip)))
+    assert "no points at the" in said
+    assert "views would help" not in said
+    assert "Next: " not in _advice(strip, "cam")
+
+
+def test_maps_of_uncertainty_show_the_images_area(found):
+    """They began half a pixel inside it, and ended half a pixel outside."""
+    for axes in draw_adequacy(found, (0.9, 2.4)).axes[:3]:
+        assert axes.get_xlim() == (-0.5, 639.5)
+        assert axes.get_ylim() == (479.5, -0.5)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig, rotation_from_vector
+from calib.boards.adequacy import coverage_advice, coverages
 from calib.boards.board import marker_dictionary
 from calib.boards.detect import detect, explain
 from calib.boards.rig import calibrate
@@ -59,6 +60,13 @@ def test_one_image_of_a_room_is_enough(room):
     assert np.abs(errors).max() < 4
     assert float((found.rig["colour"].centre - rig["colour"].centre).norm()) < 0.01
     assert found.rig["mono"].K[0, 0] == pytest.approx(1150, rel=0.01)
+
+
+def test_nobody_is_told_to_tilt_a_room(room):
+    calibration = calibrate(seen(room)[1], room)
+    said = " ".join(coverage_advice(calibration, coverages(calibration)))
+    assert "no points at the" in said
+    assert "tilt" not in said
 
 
 def test_markers_on_a_wall_need_several_images(tmp_path):
@@ -116,3 +124,18 @@ def test_wrong_files_are_explained(text, message, tmp_path):
         parse_board(str(path))
     with pytest.raises(FileNotFoundError):
         parse_board(str(tmp_path / "none.csv"))
+
+
+def test_spreadsheets_mark_the_beginning_of_their_files(tmp_path):
+    """The mark of UTF-8 was part of the first column's name, unseen in the message that refused it."""
+    path = written(tmp_path, in_a_room(8))
+    plain = parse_board(str(path)).positions
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    assert parse_board(str(path)).positions == plain
+
+
+@pytest.mark.parametrize("content", [b"id,x,y,z\n\xe9,1,2,3\n", b'id,x,y,z\n"' + b"a" * 200_000])
+def test_files_that_are_no_csv_are_named(content, tmp_path):
+    (tmp_path / "targets.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=r"targets\.csv: not a CSV file"):
+        parse_board(str(tmp_path / "targets.csv"))

@@ -58,6 +58,13 @@ def test_boards_are_tilted_and_at_several_depths(rig):
     assert torch.equal(boards.t, again.t)
 
 
+def test_images_that_are_turned_show_boards_as_large(rig):
+    """The board was sought at no distance at all: by a focal length that is beside K's diagonal."""
+    turned = Rig({name: c.rot90(1) for name, c in rig.cameras.items()})
+    depths = [board_poses(each, BOARD, 8).t[:, 2].mean() for each in (rig, turned)]
+    assert 0.5 < depths[1] / depths[0] < 2
+
+
 def test_cameras_with_no_common_view_are_named(rig, monkeypatch):
     monkeypatch.setattr("calib.boards.simulation.TRIES", 200)
     apart = Rig({"a": rig["a"], "b": camera(260.0, (220, 300), (5.0, 0, 0), (0, 170, 0))})

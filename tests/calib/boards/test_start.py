@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Pose, Rig
+from arraygeom import Distortion, Pose, Rig
 from calib.boards.bundle import CameraPrior, changed, intrinsic_values
 from calib.boards.poses import StartDeviations, start_prior
 from calib.boards.rig import calibrate
@@ -19,7 +19,7 @@ from experiments.alignment import nine_band_calibration
 from pat.cli.main import main
 from pat.media.images import read_image
 from tests.benchmarks.bench_start import GRID, neighbours
-from tests.calib.board_scenes import BOARD, board_poses, camera, errors_of, see
+from tests.calib.board_scenes import BOARD, board_poses, camera, errors_of, see, tensor
 
 STATED = StartDeviations(position=1e-3, rotation=1.0, focal=0.02, centre=0.01)
 
@@ -67,6 +67,36 @@ def test_the_stated_deviations_hold():
     assert np.abs(errors).max() < 4
 
 
+def test_images_that_are_turned_have_their_start():
+    """Their focal lengths are beside K's diagonal, where 0 was taken for one."""
+    turned = {}
+    for kind, rig in (("true", drawn(four(), 0)), ("start", four())):
+        turned[kind] = Rig({name: c.rot90(1) for name, c in rig.cameras.items()})
+    found = calibrated(turned["true"], start=turned["start"])
+    for name, c in found.rig.cameras.items():
+        deviation = found.deviations()[f"{name}.focal.0"]
+        assert (c.K - turned["true"][name].K)[:2, :2].abs().max() < 4 * deviation
+    assert "focal lengths ±28" in found.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("own", "wanted", "terms", "kept"),
+    [
+        (("brown-conrady", (-0.1, 0.0, 0.0, 0.0)), "rational", 8, False),
+        (("brown-conrady", (-0.1, *[0.0] * 7)), "brown-conrady", 8, False),
+        (("kannala-brandt", (0.02, 0.0, 0.0, 0.0)), "brown-conrady", 4, True),
+        (("brown-conrady", (-0.1, 0.0, 0.0, 0.0)), "none", 4, True),
+    ],
+)
+def test_the_lens_that_is_wanted_of_a_start_with_another(own, wanted, terms, kept):
+    """It was left out without a word: a rational lens had the four terms of the start."""
+    lens = Distortion(own[0], tensor(*own[1]))
+    rig = Rig({name: c.replace(distortion=lens) for name, c in four().cameras.items()})
+    found = calibrate(see(rig, one_board(0), noise=0.1), BOARD, lens=wanted, start=rig, deviations=STATED)
+    assert [c.distortion.coefficients.numel() for c in found.rig.cameras.values()] == [terms] * 4
+    assert (f"c0: keeps the start's lens, {own[0]}" in found.notes) == kept
+
+
 def test_what_one_board_leaves_open_is_said():
     """One board does not show where a camera is: the deviation of its position stays as it was stated."""
     found = calibrated(drawn(four(), 0))
@@ -86,6 +116,12 @@ def test_a_wrong_start_is_named():
     assert any(note.startswith("c2: far from the start: focal length") for note in found.notes)
 
 
+def test_a_start_in_millimetres_is_refused():
+    """No image of a camera was left, which ended in a TypeError."""
+    with pytest.raises(ValueError, match=r"c1: its boards are nowhere near .* in metres"):
+        calibrated(four(), start=four().scaled(1000.0))
+
+
 def test_the_priors_derivatives_are_those_of_finite_differences():
     prior, at = start_prior(four()["c3"], STATED), drawn(four(), 1)["c3"]
     information, slope = prior.equations(at)
@@ -103,7 +139,7 @@ def test_the_priors_derivatives_are_those_of_finite_differences():
 @pytest.fixture
 def photos(tmp_path):
     """One photograph of a board by each of two cameras, called like them, and the start."""
-    start = Rig({name: four()[name] for name in ("c0", "c1")})
+    start = Rig({name: four()[name] for name in ("c0", "c1")}, depth=(1.5, 20.0))
     start.save(tmp_path / "start.yaml")
     (tmp_path / "photos").mkdir()
     boards, rig = one_board(0), drawn(start, 3)
@@ -125,7 +161,9 @@ def test_one_photograph_of_each_camera(photos, capsys):
     said = capsys.readouterr().out
     assert "2 cameras, 1 frames" in said
     assert "positions ±1 >" in said
-    centres = [c.centre for c in Rig.load(photos / "rig.yaml").cameras.values()]
+    rig = Rig.load(photos / "rig.yaml")
+    assert [float(bound) for bound in rig.depth] == [1.5, 20.0]  # the start's, which was lost
+    centres = [c.centre for c in rig.cameras.values()]
     assert float((centres[0] - centres[1]).norm()) == pytest.approx(0.08, abs=3e-3)
 
 

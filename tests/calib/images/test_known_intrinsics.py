@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from kornia.geometry import axis_angle_to_rotation_matrix
 
 from arraygeom import Camera, Pose, Rig, intrinsics
-from calib.images.known_intrinsics import SIGMA
+from calib.images.known_intrinsics import SIGMA, centres_found
 from calib.images.matches import PointMatches, line_distance
 from calib.images.refinement import refine_matches
 
@@ -35,3 +36,29 @@ def test_poses_before_a_flat_scene_are_fitted_until_lines_are():
     found = refine_matches(rig, [pairs], free=free, sigma=SIGMA, keep_depth=False).rig
     for pair, matches in pairs.items():
         assert line_distance(matches, found.pair(*pair).fundamental).median() < 0.15
+
+
+@pytest.mark.parametrize("lost", ["b", "c"])
+def test_lengths_are_those_stated_of_cameras_that_match(lost, monkeypatch):
+    """With the first beta left out, the next one's baseline became as long as that of the one left out."""
+    torch.manual_seed(0)
+    K, hw = intrinsics(700.0, (480, 640)), (480, 640)
+    centres = {"a": (0.0, 0.0, 0.0), "b": (0.3, 0.0, 0.0), "c": (0.0, 0.1, 0.0), "d": (0.1, 0.1, 0.0)}
+    eye = torch.eye(3, dtype=torch.float64)
+    poses = {name: Pose.from_centre(eye, eye.new_tensor(centre)) for name, centre in centres.items()}
+    rig = Rig({name: Camera(K=K, cam_from_world=pose, hw=hw) for name, pose in poses.items()})
+    points = torch.rand(300, 3, dtype=torch.float64) * 2 - eye.new_tensor([1.0, 1.0, -2.0])
+    seen = [camera.project(points).x + 0.05 * torch.randn(300, 2) for camera in rig.cameras.values()]
+
+    def matched(one, other, *_, **__):
+        i, j = int(one[0, 0, 0]), int(other[0, 0, 0])
+        count = 0 if list(centres).index(lost) in (i, j) else 300
+        return PointMatches(seen[i][:count], seen[j][:count])
+
+    monkeypatch.setattr("calib.images.known_intrinsics.guided_matches", matched)
+    images = {name: torch.full((1, *hw), float(i)) for i, name in enumerate(centres)}
+    shown = dict.fromkeys(centres, torch.ones(hw, dtype=torch.bool))
+    found, _ = centres_found(rig, images, shown, alpha="a")
+    assert lost not in found
+    for name in found.names:
+        assert (found[name].centre - rig[name].centre).norm() < 3e-3

@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 import tifffile
 import torch
+from PIL import Image
 
 from arraygeom import Rig
 from pat.cli.main import main
+from pat.media.profiles import srgb_profile
 from tests.arraygeom.test_xmp import FISHEYE, PERSPECTIVE, image_of
 from tests.pat.cli.test_known import FAR, NEAR, ON_POST, H, W, folder  # noqa: F401
 
@@ -49,6 +51,19 @@ def test_files(folder, counts, capsys):  # noqa: F811
     expected = {"aligned.tif", "colour_confidence.png", "depth.tif", "visibility.txt", "index.html"}
     assert expected <= {path.name for path in out.iterdir()}
     assert "colour: sees " in capsys.readouterr().out
+
+
+def test_warnings_are_said_once_and_are_on_the_page(folder, tmp_path, capsys):  # noqa: F811
+    """Reading an image with a colour profile resets Python's record of what was warned of."""
+    orientation = Image.Exif()
+    orientation[274] = 3
+    for name in ("mono", "colour"):
+        turned = Image.open(folder / f"{name}.png").rotate(180)
+        turned.save(tmp_path / f"{name}.png", exif=orientation, icc_profile=srgb_profile())
+    out = align(folder, tmp_path, "--no-correct", "--response", "rec601")
+    said = capsys.readouterr().err.split("pat: warning: ")[1:]
+    assert len(said) == len(set(said)) == 2
+    assert (out / "index.html").read_text().count("orientation tag 3 is applied") == 2
 
 
 def test_options(folder, counts):  # noqa: F811

@@ -321,6 +321,47 @@ def test_other_names_given_twice(small, capsys):
     assert "'mono=' is not NAME=FILE" in fails([*arguments(small), "--image", "mono="], capsys)
 
 
+def test_what_train_refuses_is_one_line_too(capsys):
+    said = fails(["train", "mono-colour", "--steps", "0"], capsys)
+    assert said == "pat: steps must be at least 1, got 0 (`pat train --help` explains)"
+    assert fails(["train", "--stepps", "5"], capsys).startswith(
+        "pat: unknown here: --stepps, 5; did you mean"
+    )
+
+
+def test_what_only_sequences_have_is_refused_of_frames(small, capsys):
+    timed = ["--frame-rate", "mono=30", "--time-offset", "mono=0", "--speed", "0"]
+    said = "--frame-rate, --time-offset, --speed: for a --sequence only: give that, or leave out"
+    assert said in fails([*arguments(small), *timed], capsys)
+    images = [str(small / f"{name}.png") for name in ("mono", "colour")]
+    assert "--speed: for a --sequence only" in fails(["fuse", *images, "--speed", "3"], capsys)
+
+
+def test_what_several_frames_do_not_have_is_refused_before_a_rig_is_looked_for(small, capsys, monkeypatch):
+    monkeypatch.setattr("pat.fusion.from_images.array_from_images", None)
+    for name in ("mono", "colour"):
+        (small / f"{name}s").mkdir()
+        for i in range(2):
+            shutil.copy(small / f"{name}.png", small / f"{name}s" / f"{i}.png")
+    folders = {name: small / f"{name}s" for name in ("mono", "colour")}
+    single = ["--exposure", "auto", "--points"]
+    for several in (arguments(small, **folders), ["fuse", *map(str, folders.values())]):
+        said = fails([*several, *single], capsys)
+        assert said == "pat: --points, --exposure auto: for a single frame only: leave out for several"
+
+
+def test_a_file_that_is_missing_or_a_video_is_named(small, capsys):
+    (small / "several").mkdir()
+    for name in ("several/0.png", "several/1.png", "clip.mp4"):
+        shutil.copy(small / "mono.png", small / name)
+    for name, said in {
+        "none": "none: no image there",
+        "clip.mp4": "clip.mp4: is a video, which only",
+    }.items():
+        given = arguments(small, mono=small / "several", colour=small / name)
+        assert f"colour: {small}/{said}" in fails(given, capsys)
+
+
 def test_a_rig_is_an_argument_or_an_option_and_o_is_out_everywhere(small, capsys):
     rig = str(small / "rig.yaml")
     main(["rig", "info", rig])

@@ -108,8 +108,16 @@ def test_rows_are_grouped_by_focal_ratio():
     rows = [AblationRow("a", 1.2, "calibrated", 30.0, 0.9), AblationRow("b", 2.5, "calibrated", 34.0, 0.9)]
     rows += [AblationRow("a", 1.2, "other", 29.0, 0.8), AblationRow("b", 2.5, "other", note="cannot")]
     lines = markdown(rows).splitlines()
-    assert "| calibrated | 32.00 (30.00 to 34.00) | 0.9000 | +0.00 | 30.00 |  | 34.00 |  |  |  |" in lines
-    assert "| other | 29.00 | 0.8000 | -1.00 | 29.00 |  |  |  |  | 1 scenes omitted |" in lines
+    header = "| ratio below 1 | ratio 1 to 1.5 | ratio 1.5 to 2 | ratio from 2 |"
+    assert any(header in line for line in lines)
+    assert "| calibrated | 32.00 (30.00 to 34.00) | 0.9000 | +0.00 |  | 30.00 |  | 34.00 |  |  |  |" in lines
+    assert "| other | 29.00 | 0.8000 | -1.00 |  | 29.00 |  |  |  |  | 1 scenes omitted |" in lines
+    narrow = AblationRow("c", 0.5, "calibrated", 31.0, 0.9)
+    assert (
+        "| calibrated | 31.00 | 0.9000 | +0.00 | 31.00 |  |  |  |  |  |  |" in markdown([narrow]).splitlines()
+    )
+    empty = markdown([AblationRow("d", 1.2, "other", note="cannot")]).splitlines()[-1]
+    assert empty.count("|") == lines[-1].count("|")
 
 
 def test_a_figure_that_is_missing_empties_no_column():

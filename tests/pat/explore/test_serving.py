@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from pat.cli.main import main
-from pat.data.sample_array import SAMPLE
+from pat.data.sample_array import SAMPLE, load_sample
+from pat.explore.page import opened
 
 ROOT = Path(__file__).parents[3]
 IMAGES = [a for n in ("mono", "colour") for a in ("--image", f"{n}={SAMPLE / n}.png")]
@@ -81,3 +82,23 @@ def test_a_port_in_use_is_one_line(server, capsys):
         capsys.readouterr().err
         == f"pat: --port {port}: Address already in use: give another, or 0 for a free one\n"
     )
+
+
+def test_a_saved_grid_answers_for_the_pixels_of_its_cells():
+    """A column a pixel: each cell's is its own. Half a pixel off, every other one was its neighbour's."""
+    rig = load_sample().rig
+    for name in rig.names:
+        rig = rig.resize(name, (6, 8))
+    grid = opened(rig).grid(columns=8)
+    assert {place: answer["x"] for place, answer in grid["answers"].items()} == {
+        f"{i},{j}": [i, j] for i in range(8) for j in range(6)
+    }
+
+
+def test_weights_without_attention_are_refused_and_no_page_is_written(tmp_path, capsys):
+    for weights, said in {"mono-colour": "are not of the paper's network", "foo": "no weights 'foo'"}.items():
+        page = tmp_path / f"{weights}.html"
+        with pytest.raises(SystemExit):
+            main([*EXPLORE, "--weights", weights, "--save", str(page)])
+        assert said in " ".join(capsys.readouterr().err.split())
+        assert not page.exists()

@@ -18,10 +18,12 @@ from arraygeom.io.native import write as rig_text
 from pat.cli.main import main
 from pat.fusion.batch import KEYS, PLAN, Batch, find_images, fuse_one
 from pat.fusion.checks import LowConfidenceWarning
+from pat.fusion.from_images import frames_of_videos
 from pat.fusion.fuse import FuseSettings
 from pat.fusion.results import Frame
 from pat.media.images import read_image, write_image
 from pat.media.raw import LIGHT
+from pat.media.video import write_video
 from pat.networks.configs import GuidedPATConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import save_weights
@@ -149,6 +151,12 @@ def test_a_missing_beta_of_a_key_frame_leaves_the_other_key_frames(material, tmp
         job.run()
 
 
+def test_a_video_that_cannot_be_is_refused_before_frames_are_made(material, tmp_path):
+    with pytest.raises(ValueError, match="a video of -3 frames a second"):
+        batch(material, tmp_path / "out", sequence=True).run(video=-3.0)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_full_disk_leaves_whole_files_only(material, tmp_path, monkeypatch):
     """The third file to be flushed does not fit."""
     flush, count = arraygeom.atomic.flush, iter(range(100))
@@ -222,6 +230,20 @@ def test_frames_whose_images_changed_are_made_again(sequence, material, tmp_path
     assert contents(tmp_path / "out")["fast_11_fused.png"] != before["fast_11_fused.png"]
     (tmp_path / "out" / "inputs.json").unlink()
     assert len(job.run(resume=True).made) == count
+
+
+def test_a_job_of_videos_is_resumed(material, tmp_path):
+    """Their frames are in another folder each time."""
+    videos = {name: tmp_path / f"{name}.mp4" for name in ("fast", "slow")}
+    for name, path in videos.items():
+        write_video(path, map(read_image, find_images(material / name)[:2]))
+
+    def job(folder):
+        files, _ = frames_of_videos(videos, tmp_path / folder)
+        return batch(material, tmp_path / "out", sequence=True, files=files)
+
+    assert len(job("once").run().made) == 2
+    assert len(job("again").run(resume=True).kept) == 2
 
 
 def test_one_command_at_a_time_writes_to_a_folder(material, tmp_path, monkeypatch):

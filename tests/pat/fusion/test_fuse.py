@@ -1,6 +1,8 @@
 """fuse: tiles equal the whole, sizes and pitches are followed, mistakes are named."""
 
 import math
+import subprocess
+import sys
 import weakref
 
 import pytest
@@ -143,6 +145,47 @@ def test_halos_are_wide_enough_for_the_weights(folder, shared_data):
     assert (tiled.confidence - whole.confidence).abs().max() < 3e-5
 
 
+WRONG = """
+import torch
+from pat import fuse, load_weights
+from pat.data.sample_array import SAMPLE, load_sample
+from pat.media.images import write_image
+
+sample, network = load_sample(), load_weights("mono-colour")
+rig, images = sample.rig, sample.images
+for use in (
+    lambda: fuse(network, rig, {name: f"{name}.png" for name in images}, alpha="mono"),
+    lambda: fuse(network, rig, {name: image.numpy() for name, image in images.items()}, alpha="mono"),
+    lambda: fuse(network, SAMPLE / "rig.yaml", images, alpha="mono"),
+    lambda: fuse("mono-colour", rig, images, alpha="mono"),
+    lambda: fuse(network, rig, images, alpha="mono", noise="much"),
+    lambda: fuse(network, rig, images, alpha="mono", response="luma"),
+    lambda: write_image("x.png", torch.zeros(3, 8, 8, dtype=torch.uint8)),
+):
+    try:
+        print("taken", use())
+    except (TypeError, ValueError) as error:
+        print(error)
+"""
+
+
+def test_what_is_not_what_it_should_be_is_refused_in_a_line():
+    """Apart, where nothing else checks types."""
+    done = subprocess.run([sys.executable, "-c", WRONG], capture_output=True, text=True)
+    expected = (
+        "the image of 'mono' is a str: give a tensor",
+        "the image of 'mono' is a ndarray: give a tensor",
+        "fuse takes a network, a rig, images and alpha=NAME",
+        "fuse takes a network, a rig, images and alpha=NAME",
+        "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got 'much'",
+        "response is 'fit', 'rec601' or three weights; got 'luma'",
+        "x.png: the image to write is uint8: give floats in 0..1",
+    )
+    lines = done.stdout.splitlines()
+    assert len(lines) == len(expected), done.stderr
+    assert all(line.startswith(said) for line, said in zip(lines, expected))
+
+
 def test_what_is_no_field_or_no_list_is_refused_in_a_line():
     rig, images = rig_of((64, 96), (64, 96)), {"mono": texture(1, (64, 96)), "colour": texture(3, (64, 96))}
 
@@ -262,6 +305,28 @@ def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
     made.clear()
     with pytest.raises(KeyboardInterrupt):
         fuse(network, rig, images | {"mono": images["mono"] * 0.9}, alpha="mono", store=tmp_path)
+
+
+def test_tiles_of_another_luminance_or_scale_are_not_taken(tmp_path, monkeypatch):
+    """A rig of other units has the same segments, and another depth."""
+    hw, beta_hw = (34, 130), (30, 110)
+    network, rig = network_of("GuidedPAT"), rig_of(hw, beta_hw)
+    images = {"mono": texture(1, hw), "colour": texture(3, beta_hw)}
+    monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(hw, 64, 16)))
+    larger = rig.replace(depth=tuple(2 * bound for bound in rig.depth))
+    for name in rig.names:
+        larger = larger.with_camera(
+            name, rig[name].replace(cam_from_world=Pose(rig[name].R, 2 * rig[name].t))
+        )
+
+    def stored(rig, **changes):
+        fuse(network, rig, images, alpha="mono", store=tmp_path, align=False, response="rec601", **changes)
+        return len(list(tmp_path.iterdir()))
+
+    count = stored(rig)
+    assert stored(rig) == count
+    assert stored(rig, luminance="beta") == 2 * count
+    assert stored(larger) == 3 * count
 
 
 def test_resolution_ratio_is_that_of_pixels_an_angle():

@@ -5,9 +5,9 @@ from functools import partial
 import pytest
 import torch
 
-from arraygeom import Epipolar, Moved, Rig, Sensor, View, Widened, pixel_grid
+from arraygeom import Distortion, Epipolar, Moved, Rectified, Rig, Sensor, View, Widened, pixel_grid
 from experiments.flicker import flicker
-from pat.fusion.fuse import FuseSettings
+from pat.fusion.fuse import FuseSettings, fuse
 from pat.fusion.optical_flow import flow_between, warped
 from pat.fusion.sequence import KeyContribution, SequenceFusion, fuse_sequence, mixed
 from pat.fusion.timeline import Timeline
@@ -63,6 +63,18 @@ def test_moved_samples_where_points_will_be():
     assert torch.allclose(wide.length[wide.valid], wanted.length[wide.valid] + 8.0, atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    "distortion", [None, Distortion("brown-conrady", torch.tensor([-0.1, 0, 0, 0]).double())]
+)
+def test_a_displacement_of_another_size_is_refused(distortion):
+    rig = moving.rig()
+    rig = rig.with_camera("fast", rig["fast"].replace(distortion=distortion))
+    images = {"fast": torch.rand(1, *moving.HW), "slow": torch.rand(3, *moving.HW)}
+    field = Moved(Epipolar(), torch.zeros(2, 48, 80))
+    with pytest.raises(ValueError, match="displacement is of 80x48 pixels, alpha has 160x96"):
+        fuse(load_weights("mono-colour"), rig, images, alpha="fast", field=field)
+
+
 def test_flow_finds_a_shift_and_its_weight_the_border():
     a = moving.WALL[1:2, :96, 20:180]
     b = moving.WALL[1:2, 2:98, 25:185]
@@ -88,6 +100,51 @@ def test_colours_mix_by_confidence_which_disagreement_lowers():
     assert frame.confidence[0, 0] < 0.5 * frame.confidence[0, 1]
     torch.testing.assert_close(frame.depth, 1 / sure)
     torch.testing.assert_close(frame.half_width, 0.1 * sure)
+
+
+def test_a_speed_that_is_none_is_refused_at_once():
+    frames, _ = moving.recording(2)
+    for speed in (-3.0, float("nan")):
+        with pytest.raises(ValueError, match="speed is"):
+            SequenceFusion(load_weights("mono-colour"), moving.rig(), frames, "fast", speed)
+
+
+def test_an_image_that_cannot_be_read_costs_its_own_key_frame_alone():
+    """Levels are matched over those around, which it made fail too."""
+
+    class Damaged(list):
+        def __getitem__(self, i):
+            if i == 1:
+                raise OSError("slow_1.png is damaged")
+            return super().__getitem__(i)
+
+    frames, _ = moving.recording(13, 0.003)
+    frames = frames | {"slow": Damaged(frames["slow"])}
+    settings = FuseSettings(match_levels=True, align=False, response="rec601")
+    job = SequenceFusion(load_weights("mono-colour"), moving.rig(0.003), frames, "fast", settings=settings)
+    first, second, *_ = job.timeline.key_frames()
+    assert job.colour(first).added.isfinite().all()
+    with pytest.raises(OSError, match="slow_1"):
+        job.colour(second)
+
+
+def test_a_response_that_is_none_is_refused_of_sequences_too():
+    """It was taken for an image that cannot be read, and left out."""
+    frames, _ = moving.recording(2)
+    given = {"alpha": "fast", "response": (-1.0, 0.0, 0.0)}
+    with pytest.raises(ValueError, match="three weights"):
+        next(fuse_sequence(load_weights("mono-colour"), moving.rig(), frames, **given))
+
+
+def test_a_field_may_be_given_for_each_beta():
+    frames, _ = moving.recording(2)
+    given = {"alpha": "fast", "align": False, "response": "rec601"}
+    rows, *of_all = (
+        next(fuse_sequence(load_weights("mono-colour"), moving.rig(), frames, field=field, **given))
+        for field in ({"slow": Rectified(20, alpha_is="left")}, Rectified(20, alpha_is="left"), None)
+    )
+    assert torch.equal(rows.image, of_all[0].image)
+    assert not torch.equal(rows.image, of_all[1].image)
 
 
 @pytest.fixture(scope="module")

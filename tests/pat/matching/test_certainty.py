@@ -10,7 +10,7 @@ from experiments.evaluation.certainty import Reliability
 from pat.data.sample_array import load_motorcycle, load_sample
 from pat.fusion.fuse import fuse
 from pat.fusion.results import Frame
-from pat.matching import certainty
+from pat.matching import certainty, choice
 from pat.matching.certainty import MEASURED, measured, typical_facts, with_certainty
 from pat.matching.match import match
 from pat.matching.matches import BetaMatches, Matches
@@ -38,6 +38,19 @@ def test_what_certainty_is_read_off():
     torch.testing.assert_close(near.exp() - 0.1, torch.tensor([0.0, 0.0, 4.0, 4.0]))
     torch.testing.assert_close(far.exp() - 0.1, torch.tensor([0.0, 4.0, 4.0, 4.0]))
     assert numbers[11:, 0, 0].tolist() == pytest.approx([0.6, 0.0, 0.5, 0.25, 2.0, -1.0])
+
+
+def test_other_threads_find_the_networks_as_they_were():
+    """Moved in place to float64, they broke matching in float32 beside."""
+    sample = load_sample()
+    rig = sample.rig.replace(
+        cameras={name: sample.rig[name].crop(0, 0, (64, 96)) for name in sample.rig.names}
+    )
+    images = {name: image[:, :64, :96].double() for name, image in sample.images.items()}
+    frame = fuse(load_weights("mono-colour").double(), rig, images, alpha="mono")
+    assert frame.image.dtype == torch.float64
+    for network in (certainty.fitted_network(), choice.fitted_choice()):
+        assert {weight.dtype for weight in network.parameters()} == {torch.float32}
 
 
 def test_what_is_surely_hidden_keeps_a_little_certainty():

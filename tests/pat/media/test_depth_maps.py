@@ -63,6 +63,12 @@ def test_what_is_no_depth_map_is_refused(tmp_path):
     (tmp_path / "short.pfm").write_bytes(b"Pf\n30 20\n-1\n" + bytes(100))
     with pytest.raises(ValueError, match="not whole"):
         read_depth(tmp_path / "short.pfm")
+    (tmp_path / "cut.pfm").write_bytes(b"Pf\n30 20\n-1\n" + bytes(101))
+    with pytest.raises(ValueError, match=r"cut.pfm: .* not whole"):
+        read_depth(tmp_path / "cut.pfm")
+    (tmp_path / "scale.pfm").write_bytes(b"Pf\n30 20\n-1.0.2\n" + bytes(2400))
+    with pytest.raises(ValueError, match=r"scale.pfm: not a grey PFM"):
+        read_depth(tmp_path / "scale.pfm")
     (tmp_path / "colour.pfm").write_bytes(b"PF\n30 20\n-1\n" + bytes(7200))
     with pytest.raises(ValueError, match="not a grey PFM"):
         read_depth(tmp_path / "colour.pfm")

@@ -61,4 +61,7 @@ def test_what_goes_wrong_leaves_no_file(tmp_path):
         write_video(tmp_path / "a.mp4", [])
     with pytest.raises(ValueError, match=r"ends in .mp4"):
         write_video(tmp_path / "a.gif", frames(2))
+    for rate in (-3.0, 0.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=r"frames a second: give .001 to 1000"):
+            write_video(tmp_path / "a.mp4", frames(2), rate=rate)
     assert os.listdir(tmp_path) == []

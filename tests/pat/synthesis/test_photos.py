@@ -1,3 +1,6 @@
+import errno
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -69,3 +72,22 @@ def test_a_folder_of_colour_and_grey_with_its_cache(tmp_path, images):
 def test_an_empty_folder_is_an_error(tmp_path):
     with pytest.raises(ValueError, match="no image"):
         PhotoBank.load(tmp_path)
+
+
+def test_a_cache_is_whole_or_not_there_and_another_file_is_named(tmp_path, images, monkeypatch):
+    cv2.imwrite(str(tmp_path / "a.png"), images[0])
+    cache = tmp_path / "cache.npz"
+
+    def full(file, *arrays):
+        (Path(file) if isinstance(file, str | Path) else Path(file.name)).write_bytes(b"PK")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(np, "savez", full)
+        with pytest.raises(OSError, match="No space"):
+            PhotoBank.load(tmp_path, cache=cache)
+    assert not cache.exists()
+    for content in (b"PK", b"PK\x03\x04 cut short", b"text", b""):
+        cache.write_bytes(content)
+        with pytest.raises(ValueError, match=r"cache.npz: not a cache of photographs .*: remove it"):
+            PhotoBank.load(tmp_path, cache=cache)
