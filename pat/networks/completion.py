@@ -2,7 +2,8 @@
 
 Each way of filling in is right somewhere. The network weighs them pixel by pixel, the image as it is one of
 them, and adds what none of them has. It is trained apart from the rest, on what the rest gives for
-photographs cut into surfaces at random depths (`experiments.completion`).
+photographs cut into surfaces, for real shapes in the textures of photographs, and for stereo pairs
+(`experiments.completion`).
 """
 
 from __future__ import annotations
