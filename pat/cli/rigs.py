@@ -442,7 +442,9 @@ class RigDiff:
             )
         near, far = (float(bound) for bound in depth)
         beside = [path.with_suffix(".covariance.json") for path in (self.first, self.second)]
-        covariances = [RigCovariance.load(path) if path.is_file() else None for path in beside]
+        covariances = [
+            RigCovariance.load(path, rig) if path.is_file() else None for path, rig in zip(beside, (a, b))
+        ]
         found = rig_difference(a, b, covariances=(covariances[0], covariances[1]), depth=(near, far))
         for path, covariance in zip(beside, covariances):
             if covariance is None and any(covariances):
