@@ -274,7 +274,7 @@ class Doctor:
     """Print JSON instead of text."""
 
     def run(self) -> None:
-        from arraygeom.atomic import write_text
+        from arraygeom.atomic import write_atomically
         from calib.images.doctor import diagnose
 
         if self.out is not None:
@@ -297,7 +297,8 @@ class Doctor:
         kept = ""
         if self.out.exists():
             former = self.out.with_name(f"{self.out.name}.old")
-            write_text(former, self.out.read_text(encoding="utf-8"))
+            with write_atomically(former) as temporary:
+                temporary.write_bytes(self.out.read_bytes())
             kept = f"; the former file: {former}"
         found.named.rig.save(self.out)
         say(f"written: {self.out} ({found.named.words}: undone{kept})")

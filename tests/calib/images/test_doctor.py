@@ -282,6 +282,10 @@ def test_command_line(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "likely mistake" in said
     assert said.count("median depth") == 1
+    given = (tmp_path / "rig.yaml").read_bytes() + b"# Gr\xf6\xdfe\r\n"  # not UTF-8: kept as it is
+    (tmp_path / "other.yaml").write_bytes(given)
+    main(["rig", "doctor", str(tmp_path / "rig.yaml"), *files, "--fix", str(tmp_path / "other.yaml")])
+    assert (tmp_path / "other.yaml.old").read_bytes() == given
     main(["rig", "doctor", str(tmp_path / "rig.yaml"), *files, "--fix", str(tmp_path / "rig.yaml")])
     assert "former file" in capsys.readouterr().err
     assert (tmp_path / "rig.yaml").read_text() == (tmp_path / "fixed.yaml").read_text()
