@@ -40,11 +40,18 @@ def reprojection_residuals(
     *,
     seen: Bool[Tensor, " v *n"] | None = None,
 ) -> Float[Tensor, "v *n 2"]:
-    """Pixels x minus where the cameras see the world points X; zero where one is not `seen` or cannot be."""
+    """Pixels x minus where the cameras see the world points X; zero where one is not `seen` or cannot be.
+
+    Pixels that are NaN are not seen.
+    """
     projected = [camera.project(X) for camera in cameras]
-    used = torch.stack([p.valid for p in projected])
-    used = used if seen is None else used & seen
+    used = _used(projected, x, seen)
     return torch.where(used[..., None], x - torch.stack([p.x for p in projected]), 0.0)
+
+
+def _used(projected: Sequence[Projected], x: Tensor, seen: Tensor | None) -> Tensor:
+    used = torch.stack([p.valid for p in projected]) & x.isfinite().all(-1)
+    return used if seen is None else used & seen
 
 
 class Bundle(NamedTuple):
@@ -108,8 +115,7 @@ def _stepped(
     """Rig and points after one damped Gauss-Newton step."""
     cameras = list(rig.cameras.values())
     r = reprojection_residuals(cameras, X, x, seen=seen)
-    used = torch.stack([c.project(X).valid for c in cameras])
-    used = (used if seen is None else used & seen)[..., None, None]
+    used = _used([c.project(X) for c in cameras], x, seen)[..., None, None]
     slopes = [projection_slopes(c, X, (X - c.centre).norm(dim=-1))[1] for c in cameras]
     by_X = torch.where(used, torch.stack(slopes), 0.0)
     zeros = rig.parameters(free=names)

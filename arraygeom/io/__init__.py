@@ -22,6 +22,7 @@ from ..rig_check import unit_oddity
 from ..sensor import Sensor
 from ..warned import warn
 from . import kitti
+from .export import at_origin, calibrated
 from .source import RigFileError, RigFileWarning, RigSource, UnknownRigFormat
 
 FORMATS = (
@@ -89,9 +90,9 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
 def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
     """Write a rig atomically. Formats of several files make a folder, the last of them once others are there.
 
-    What a format leaves out of the rig (all but the native one: the depth range, links, what a sensor
-    records) is named by one RigFileWarning. Raises ValueError for an unknown format, for a rig that the
-    format cannot hold, and a batch.
+    What a format leaves out of the rig is named by one RigFileWarning: all but the native one the depth
+    range, links, what a sensor records; OpenCV's where the first camera is in the world. Raises ValueError
+    for an unknown format, for a rig that the format cannot hold, and a batch.
     """
     if format not in WRITERS:
         raise ValueError(f"cannot write rig format '{format}' (known: {', '.join(WRITERS)})")
@@ -125,7 +126,9 @@ def _left_out(rig: Rig, format: str) -> str:
     """What only the native format holds and this rig states."""
     kept = {"time_offset": 0.0} if format == "kalibr" else {}
     sensors = (dataclasses.replace(view.sensor, **kept) for view in rig.cameras.values())
+    first = calibrated(rig, format)[0][1]
     stated = {
+        "place in the world": format == "opencv" and not at_origin(first.cam_from_world),
         "depth range": rig.depth is not None,
         "links": bool(rig.links),
         "sensors": any(sensor != Sensor() for sensor in sensors),

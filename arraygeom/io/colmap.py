@@ -184,7 +184,7 @@ def _cameras_text(source: RigSource) -> Iterator[tuple[Entry, int, str]]:
 
 
 def _images_text(source: RigSource) -> Iterator[Posed]:
-    """Every other line; those between hold the points, and may be blank."""
+    """Every other line; those between hold the points, X Y POINT3D_ID each, and may be blank."""
     for entry in _lines(source, "images", every=2):
         fields = entry.value.split(maxsplit=9)
         if len(fields) != 10:
@@ -222,6 +222,9 @@ def _lines(source: RigSource, what: str, every: int = 1) -> list[Entry]:
     lines = [(n, line) for n, line in enumerate(source.text().splitlines(), 1) if not line.startswith("#")]
     first = next((i for i, (_, line) in enumerate(lines) if line.strip()), 0)
     found = [source.at(line, f"line {n}") for n, line in lines[first::every] if line.strip()]
+    for n, line in lines[first + 1 :: 2] if every == 2 else ():
+        if len(line.split(maxsplit=10)) == 10:  # those of points have a multiple of three
+            raise source.fail(f"line {n}", "wanted the points of the image above: add a line, blank if none")
     for line in source.text().splitlines()[:8]:
         head, _, rest = line.partition(f"Number of {what}:")
         stated = rest.split(",")[0].strip()

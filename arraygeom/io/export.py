@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from ..camera import Camera
 from ..distortion import BROWN_CONRADY
 from ..lenses.model import LensModel
+from ..pose import Pose
 from ..rig import Rig
 
 
@@ -56,3 +58,8 @@ def brown_conrady(name: str, lens: LensModel | None, *, at_most: int) -> list[fl
 def pose_rows(R: Tensor, t: Tensor) -> list[list[float]]:
     """The 4 x 4 matrix of a pose."""
     return [[*row, x] for row, x in zip(R.tolist(), t.tolist())] + [[0.0, 0.0, 0.0, 1.0]]
+
+
+def at_origin(pose: Pose) -> bool:
+    """Whether a camera's frame is the world's."""
+    return pose_rows(pose.R, pose.t) == torch.eye(4).tolist()

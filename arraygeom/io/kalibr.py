@@ -13,7 +13,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
 
 from ..camera import Camera
@@ -23,7 +22,7 @@ from ..lenses.model import LensModel
 from ..pose import Pose
 from ..rig import Rig
 from ..sensor import Sensor
-from .export import brown_conrady, calibrated, focal_and_centre, pose_rows
+from .export import at_origin, brown_conrady, calibrated, focal_and_centre, pose_rows
 from .source import Entry, RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); T_cn_cnm1 chained, world = cam0 (or the IMU); metres"
@@ -63,8 +62,7 @@ def write(rig: Rig) -> str:
     Raises ValueError for what the format cannot hold.
     """
     cameras = calibrated(rig, "Kalibr")
-    first = cameras[0][1].cam_from_world
-    at_origin = pose_rows(first.R, first.t) == torch.eye(4).tolist()
+    has_imu = not at_origin(cameras[0][1].cam_from_world)
     document, before = {}, None
     for i, (name, camera) in enumerate(cameras):
         entry = _entry(name, camera)
@@ -72,7 +70,7 @@ def write(rig: Rig) -> str:
         if before is not None:
             relative = pose @ before.inverse()
             entry["T_cn_cnm1"] = pose_rows(relative.R, relative.t)
-        if not at_origin:
+        if has_imu:
             entry["T_cam_imu"] = pose_rows(pose.R, pose.t)
         if camera.sensor.time_offset:
             entry["timeshift_cam_imu"] = camera.sensor.time_offset

@@ -3,11 +3,12 @@
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; rectified, with cam1 at
 `baseline` millimetres to the right of cam0; Z = baseline f / (d + doffs), with doffs the difference of the
 principal points. Where the file states the range of disparities (vmin, vmax), the rig's depth range follows
-from it.
+from it, to infinity where d + doffs may be 0 or less.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -43,5 +44,6 @@ def read(source: RigSource) -> Rig:
     if "vmin" in entries and "vmax" in entries:
         low, high = (entries[k].number() + doffs for k in ("vmin", "vmax"))
         scale = metres * float(Ks[0][0, 0])
-        depth = (scale / high, scale / low) if 0 < low <= high else None
+        if low <= high and high > 0:
+            depth = scale / high, scale / low if low > 0 else math.inf
     return source.rig(zip(("cam0", "cam1"), cameras), depth=depth)

@@ -2,14 +2,14 @@
 
 CSV: x0 y0 x1 y1 a line, in the order of two images given, first pixel's centre at 0; a header may name the
 columns. COLMAP: verified matches where there are any; the first pixel's centre is at 0.5 (shift -0.5); images
-by file name.
+by file name, and by folder where several are called alike.
 """
 
 from __future__ import annotations
 
 import re
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -95,13 +95,8 @@ def _database(path: Path, files: Mapping[str, Path]) -> PointPairs:
 
 
 def _colmap(database: sqlite3.Connection, path: Path, files: Mapping[str, Path]) -> PointPairs:
-    ids = {Path(name).name: number for number, name in database.execute("SELECT image_id, name FROM images")}
-    if missing := [file.name for file in files.values() if file.name not in ids]:
-        known = ", ".join(list(ids)[:5])
-        raise ValueError(
-            f"{path}: has no image {missing[0]} (it has {known}, ...): give the images it was made of"
-        )
-    names = {ids[file.name]: name for name, file in files.items()}
+    images = [(Path(name), number) for name, number in database.execute("SELECT name, image_id FROM images")]
+    names = {_image(path, file, images): name for name, file in files.items()}
     found: PointPairs = {}
     for table in ("two_view_geometries", "matches"):
         for (a, b), pairs in _matches(database, table, names):
@@ -110,6 +105,17 @@ def _colmap(database: sqlite3.Connection, path: Path, files: Mapping[str, Path])
     if not found:
         raise ValueError(f"{path}: has no matches between {', '.join(files)}: match these images first")
     return found
+
+
+def _image(path: Path, file: Path, images: Sequence[tuple[Path, int]]) -> int:
+    """The number of the image called like a file; its folder too, where several are called so."""
+    alike = [(name, number) for name, number in images if name.name == file.name]
+    end = file.absolute().parts
+    below = [(len(name.parts), number) for name, number in alike if end[-len(name.parts) :] == name.parts]
+    if len(alike) != 1 and not below:
+        known = ", ".join(str(name) for name, _ in alike or images[:5])
+        raise ValueError(f"{path}: has no image {file} (it has {known}, ...): give the images it was made of")
+    return max(below)[1] if below else alike[0][1]
 
 
 def _matches(

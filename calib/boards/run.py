@@ -94,7 +94,7 @@ def calibrate_photos(
     with write_together(out.parent, last=out.name, stale=[path.name for path in written[:2]]) as folder:
         write_text(folder / written[0].name, report)
         if covariance is not None:
-            covariance.save(folder / written[1].name)
+            covariance.save(folder / written[1].name, rig)
         rig.save(folder / out.name)
     advice = coverage_advice(calibration, coverages(calibration))
     messages = [summary(calibration), *by_cameras([*lenses, *found.notes, *calibration.notes, *advice])]

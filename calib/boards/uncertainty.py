@@ -19,9 +19,11 @@ from jaxtyping import Bool, Float
 
 from arraygeom import Camera, Pose, Rig
 from arraygeom.atomic import write_text
+from arraygeom.io.native import read_text, write
 from arraygeom.io.source import float64_of
 from arraygeom.pixels import HW
 from arraygeom.safe_yaml import load_json
+from arraygeom.sensor import Sensor
 
 from .bundle import (
     Array,
@@ -65,14 +67,17 @@ class RigCovariance:
         entries = np.array([f"{name}.{entry}" for entry in parameter_names(camera)])
         return (entries[:, None] == np.array(self.names, dtype=str)).astype(np.float64)
 
-    def save(self, path: str | Path) -> None:
-        """Write it as JSON, atomically."""
+    def save(self, path: str | Path, rig: Rig) -> None:
+        """Write it as JSON, atomically, and the rig that it is of."""
         document = {"format": FORMAT, "names": list(self.names), "covariance": self.matrix.tolist()}
-        write_text(path, json.dumps(document))
+        write_text(path, json.dumps(document | {"rig": write(_geometry(rig))}))
 
     @classmethod
-    def load(cls, path: str | Path) -> RigCovariance:
-        """Read what `save` wrote. Raises FileNotFoundError, or ValueError for another file."""
+    def load(cls, path: str | Path, rig: Rig | None = None) -> RigCovariance:
+        """Read what `save` wrote. Raises FileNotFoundError, or ValueError for another file.
+
+        And for one that says that it is of another rig than `rig`, if given.
+        """
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such covariance file")
@@ -81,6 +86,7 @@ class RigCovariance:
             names, numbers = tuple(document["names"]), float64_of(document["covariance"])
             if numbers is None:
                 raise TypeError
+            stated = rig if rig is None or "rig" not in document else read_text(str(document["rig"]), path)
         except (ValueError, KeyError, OverflowError, RecursionError, TypeError):
             raise ValueError(f"{path}: is not a covariance file of this program") from None
         matrix = numbers.numpy()
@@ -88,7 +94,16 @@ class RigCovariance:
             raise ValueError(f"{path}: holds names that are no text, or NaN or infinity: calibrate again")
         if matrix.shape != (len(names), len(names)):
             raise ValueError(f"{path}: {len(names)} names, a matrix of {matrix.shape}: is the file complete?")
+        if rig is not None and stated is not None and _geometry(rig) != _geometry(stated):
+            raise ValueError(
+                f"{path}: is not of the rig beside it, which was changed since: remove it, or calibrate again"
+            )
         return cls(names, matrix)
+
+
+def _geometry(rig: Rig) -> Rig:
+    """The rig's cameras without what their sensors record."""
+    return Rig({name: view.replace(sensor=Sensor()) for name, view in rig.cameras.items()})
 
 
 def rig_covariance(fit: Solved) -> RigCovariance | None:

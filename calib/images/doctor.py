@@ -32,6 +32,7 @@ from .hypotheses import (
 from .matches import Images, Pairs, PointMatches, agreeing_pairs, cameras_of, depth_seen, match_cameras
 from .parameters import SIGMA
 from .residuals import image_parts, line_distances, related
+from .self_calibration import length_unit
 
 LOG = logging.getLogger(__name__)
 
@@ -95,9 +96,10 @@ class Diagnosis:
 
     def as_text(self) -> str:
         """The verdict, and the statistics before and after, as text."""
-        lines = [self.verdict, f"as given: {self.before}"]
+        unit = length_unit(self.named.rig)
+        lines = [self.verdict, f"as given: {self.before.as_text(unit)}"]
         if self.named.kind != "nothing":
-            lines.append(f"repaired: {self.after}")
+            lines.append(f"repaired: {self.after.as_text(unit)}")
         return "\n".join([*lines, f"from {self.matches} points seen in two images"])
 
     def as_json(self) -> str:
@@ -287,8 +289,9 @@ def _depth_range(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
     """The depth range of the points, for a rig that has another."""
     if rig.depth is None or (bounds := depth_seen(rig, pairs)) is None:
         return []
+    (near, far), unit = bounds, length_unit(rig)
     words = (
-        f"the depth range excludes the scene, which is {bounds[0]:.3g} to {bounds[1]:.3g} m away: "
+        f"the depth range excludes the scene, which is {near:.3g} to {far:.3g} {unit} away: "
         "correct `depth` in the file"
     )
     return [Hypothesis("depth range", words, rig.replace(depth=bounds))]

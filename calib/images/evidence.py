@@ -67,7 +67,7 @@ class FitStatistics(NamedTuple):
     inside: share of those in front that lie in the rig's depth range; NaN without one.
     handed: share of the triangles of neighbouring points whose orientation changes between the images, or
     not, as the rig implies: mirrored images change it.
-    depth: median depth in metres of the points in front; NaN if too few.
+    depth: median depth, in the rig's unit, of the points in front; NaN if too few.
     """
 
     off: float
@@ -83,14 +83,15 @@ class FitStatistics(NamedTuple):
         wrong = (self.front < 0.5) + (self.inside < 0.5) + (self.handed < 0.5)
         return self.misfit + WRONG_SIDE_PENALTY * wrong
 
-    def __str__(self) -> str:
+    def as_text(self, unit: str = "m") -> str:
+        """The statistics in words, depth in the unit of the rig's lengths."""
         parts = [f"{self.off:.2f} px from the lines, {self.misfit:.2f} px of it due to the rig"]
         if not math.isnan(self.front):
             parts.append(f"{self.front:.0%} in front")
         if not math.isnan(self.inside):
             parts.append(f"{self.inside:.0%} within the depth range")
         if not math.isnan(self.depth):
-            parts.append(f"median depth {self.depth:.3g} m")
+            parts.append(f"median depth {self.depth:.3g} {unit}")
         if self.handed < 0.5:
             parts.append("one image mirrored relative to the other")
         return ", ".join(parts)

@@ -56,17 +56,13 @@ def centres_found(
         matches = guided_matches(images[a], images[b], infinite, window=window, shown=(shown[a], shown[b]))
         if (found := _consistent(rig, a, b, matches)) is not None:
             pairs[a, b] = found
-    names = _connected(alpha, list(pairs))
-    if len(names) < 2:
-        raise ValueError(
-            "the images hardly match, so their cameras' translations stay unknown: give a rig file"
-        )
-    rig = Rig({name: rig[name] for name in rig.names if name in names})
-    pairs = {pair: matches for pair, matches in pairs.items() if set(pair) <= names}
+    rig, pairs = _matched(rig, alpha, pairs)
     rig = _with_centres(rig, alpha, pairs)
     for within in ROUNDS:
+        pairs = {pair: matches for pair, matches in pairs.items() if {*pair} <= {*rig.names}}
         near = {pair: near_lines(m, rig.pair(*pair).fundamental, within=within) for pair, m in pairs.items()}
         near = {pair: matches for pair, matches in near.items() if len(matches.alpha) >= ENOUGH}
+        rig, near = _matched(rig, alpha, near)
         free = [f"{name}.{kind}" for name in rig.betas(alpha) for kind in SIGMA]
         rig = refine_matches(rig, [near], free=free, sigma=SIGMA, keep_depth=False).rig
     first = rig.betas(alpha)[0]
@@ -111,12 +107,19 @@ def _consistent(rig: Rig, a: str, b: str, matches: PointMatches) -> PointMatches
     return matches.only(best) if enough else None
 
 
-def _connected(alpha: str, pairs: list[tuple[str, str]]) -> set[str]:
-    """The cameras that pairs connect with alpha."""
+def _matched(
+    rig: Rig, alpha: str, pairs: dict[tuple[str, str], PointMatches]
+) -> tuple[Rig, dict[tuple[str, str], PointMatches]]:
+    """The cameras that pairs connect with alpha, and their pairs. Raises ValueError if there are none."""
     names = {alpha}
     for _ in pairs:
         names |= {name for pair in pairs if names & set(pair) for name in pair}
-    return names
+    if len(names) < 2:
+        raise ValueError(
+            "the images hardly match, so their cameras' translations stay unknown: give a rig file"
+        )
+    rig = Rig({name: rig[name] for name in rig.names if name in names})
+    return rig, {pair: matches for pair, matches in pairs.items() if set(pair) <= names}
 
 
 def _with_centres(rig: Rig, alpha: str, pairs: Mapping[tuple[str, str], PointMatches]) -> Rig:

@@ -260,12 +260,21 @@ def median_off(rig: Rig, pairs: Pairs) -> float:
 def split(
     frames: Sequence[Pairs],
 ) -> tuple[dict[tuple[str, str], PointMatches], dict[tuple[str, str], PointMatches]]:
-    """Points to use and points to hold out: whole frames if several, else squares of alpha's image."""
+    """Points to use and points to hold out: whole frames if several, else squares of alpha's image.
+
+    Raises ValueError for points of which none are left to use, as all are in one square.
+    """
     if len(frames) > 1:
         held_out = max(1, len(frames) // HELD_OUT)
         return _joined(frames[:-held_out]), _joined(frames[-held_out:])
     (pairs,) = frames
-    marks = {names: held_out_parts(matches) == 0 for names, matches in pairs.items()}
+    parts = {names: held_out_parts(matches) for names, matches in pairs.items()}
+    marks = {names: part == part.unique()[:1] for names, part in parts.items()}
+    if all(bool(mark.all()) for mark in marks.values()):
+        raise ValueError(
+            "all points seen in two images are in one spot, so that none can be held out: "
+            "take images with detail all over"
+        )
     return (
         {names: matches.only(~marks[names]) for names, matches in pairs.items()},
         {names: matches.only(marks[names]) for names, matches in pairs.items() if bool(marks[names].any())},
@@ -273,7 +282,7 @@ def split(
 
 
 def held_out_parts(matches: PointMatches) -> Int[Tensor, " n"]:
-    """Which of `HELD_OUT` parts, each of squares of alpha, a point is in; that of number 0 is held out."""
+    """Which of `HELD_OUT` parts, each of squares of alpha, a point is in; the first with any is held out."""
     column, row = (matches.alpha / CELL).floor().long().unbind(-1)
     return (column + 2 * row) % HELD_OUT
 

@@ -184,6 +184,11 @@ UNSCALED = "found from images: lengths are multiples of the baseline, not metres
 """The name of a rig of unknown scale."""
 
 
+def length_unit(rig: Rig) -> str:
+    """What lengths of a rig are in: "m", or "baselines" of one of unknown scale."""
+    return "baselines" if rig.name == UNSCALED else "m"
+
+
 def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig:
     """One rig of pairs with one alpha, by beta; each pair's lengths times its scale. Named `UNSCALED`.
 

@@ -353,14 +353,14 @@ class Fuse(Known):
 
     def _facts(self, rig: Rig, found: tuple[str, ...] | None, seconds: float) -> Facts:
         """What the page says."""
-        from calib.images.self_calibration import UNSCALED
+        from calib.images.self_calibration import length_unit
 
         from ..fusion.report import Facts
         from ..support.memory import peak_memory
 
         notes = [f"weights: {self.weights or 'mono-colour'}", *self._notes, *(found or ())]
-        unit = "baselines" if rig.name == UNSCALED else "m"
-        return Facts(notes, [str(message) for message in options.WARNED], seconds, peak_memory(), unit)
+        warned = [str(message) for message in options.WARNED]
+        return Facts(notes, warned, seconds, peak_memory(), length_unit(rig))
 
     def _note(self, line: str) -> None:
         """Say a line, and keep it for the page."""

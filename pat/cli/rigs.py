@@ -180,13 +180,14 @@ class Info:
 
         from arraygeom.rig_check import unit_oddity
         from arraygeom.summary import summarise_cameras, summarise_pairs
+        from calib.images.self_calibration import length_unit
 
         rig = load_rig(self.rig, self.depth)
         if rig.name:
             say(rig.name)
-        unit = unit_oddity(rig)  # which reading the file has warned of
+        warned = unit_oddity(rig)  # by reading the file
         for oddity in rig.check():
-            if unit is None or not oddity.endswith(unit):
+            if warned is None or not oddity.endswith(warned):
                 say(f"pat: {oddity}", style="yellow")
         alpha = None if self.alpha is None else rig.require(self.alpha)
         if alpha is None and len(rig.names) > MOST_CAMERAS:
@@ -196,12 +197,15 @@ class Info:
         if self.json:
             document = {"cameras": [c._asdict() for c in cameras], "pairs": [p._asdict() for p in pairs]}
             return options.print_json(document)
-        of_cameras = Table("camera", "pixels", "focal px", "view deg", "mm a pixel, near - far", box=None)
+        unit = length_unit(rig)
+        fine, baseline = ("mm", "baseline m") if unit == "m" else (f"{unit}/1000", "baseline")
+        footprint = f"{fine} a pixel, near - far"
+        of_cameras = Table("camera", "pixels", "focal px", "view deg", footprint, box=None)
         for c in cameras:
             further = _two(c.focal), _two(c.field_of_view, " x "), _two(c.footprint, " - ")
             of_cameras.add_row(c.name, f"{c.wh[0]}x{c.wh[1]}", *further)
-        lengths = "segment px, median - longest", "depth step m, near - far"
-        of_pairs = Table("alpha > beta", "baseline m", "rotation deg", "seen", *lengths, box=None)
+        lengths = "segment px, median - longest", f"depth step {unit}, near - far"
+        of_pairs = Table("alpha > beta", baseline, "rotation deg", "seen", *lengths, box=None)
         for p in pairs:
             seen = "" if p.seen is None else f"{p.seen:.0%}"
             further = seen, _two(p.length, " - "), _two(p.depth_step, " - ")
@@ -270,7 +274,7 @@ class Doctor:
     """Print JSON instead of text."""
 
     def run(self) -> None:
-        from arraygeom.atomic import write_text
+        from arraygeom.atomic import write_atomically
         from calib.images.doctor import diagnose
 
         if self.out is not None:
@@ -293,7 +297,8 @@ class Doctor:
         kept = ""
         if self.out.exists():
             former = self.out.with_name(f"{self.out.name}.old")
-            write_text(former, self.out.read_text(encoding="utf-8"))
+            with write_atomically(former) as temporary:
+                temporary.write_bytes(self.out.read_bytes())
             kept = f"; the former file: {former}"
         found.named.rig.save(self.out)
         say(f"written: {self.out} ({found.named.words}: undone{kept})")
@@ -442,7 +447,9 @@ class RigDiff:
             )
         near, far = (float(bound) for bound in depth)
         beside = [path.with_suffix(".covariance.json") for path in (self.first, self.second)]
-        covariances = [RigCovariance.load(path) if path.is_file() else None for path in beside]
+        covariances = [
+            RigCovariance.load(path, rig) if path.is_file() else None for path, rig in zip(beside, (a, b))
+        ]
         found = rig_difference(a, b, covariances=(covariances[0], covariances[1]), depth=(near, far))
         for path, covariance in zip(beside, covariances):
             if covariance is None and any(covariances):

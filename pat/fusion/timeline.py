@@ -66,7 +66,7 @@ class Timeline:
     def key_frames(self) -> list[KeyFrame]:
         """Key frames: for each of the fastest beta the nearest of alpha, if that is within half an interval.
 
-        Raises ValueError if there is none: then the recordings do not overlap.
+        Raises ValueError for a beta without a frame near any of them: then the recordings do not overlap.
         """
         fastest = max(self.betas, key=self.rate)
         found: dict[int, float] = {}
@@ -76,10 +76,13 @@ class Timeline:
             gap = abs(self.time(self.alpha, index) - time)
             if gap <= 0.5 * self.interval + 1e-9:
                 found[index] = min(gap, found.get(index, gap))
-        if not found:
-            raise ValueError(
-                "no frame of a beta is near one of alpha in time: check 'frame_rate' and 'time_offset'"
-            )
+        for name in self.betas:
+            within = 0.5 * max(1 / self.rate(name), self.interval) + 1e-9
+            times = (self.time(self.alpha, i) for i in found)
+            if not any(abs(self.time(name, self.nearest(name, t)) - t) <= within for t in times):
+                raise ValueError(
+                    f"no frame of '{name}' is near one of alpha in time: check 'frame_rate' and 'time_offset'"
+                )
         return [KeyFrame(i, self.at(i)) for i in sorted(found)]
 
     def at(self, index: int) -> dict[str, int]:

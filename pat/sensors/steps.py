@@ -59,6 +59,10 @@ class GaussianBlur(Step):
 
     sigma: float | Tensor
 
+    def __post_init__(self) -> None:
+        if not 0 <= float(torch.as_tensor(self.sigma).detach()) < math.inf:
+            raise ValueError(f"gaussian blur: sigma must be 0 or more pixels, got {self.sigma}")
+
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         r = math.ceil(4 * float(torch.as_tensor(self.sigma).detach()))
         x = torch.arange(-r, r + 1, dtype=image.dtype, device=image.device)
@@ -150,6 +154,10 @@ class Quantise(Step):
     """Clipped to 0..1 and rounded to 2^bits levels. The gradient passes as if nothing were rounded."""
 
     bits: int = 8
+
+    def __post_init__(self) -> None:
+        if self.bits < 1:
+            raise ValueError(f"quantise: bits must be 1 or more, got {self.bits}")
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         levels = 2**self.bits - 1

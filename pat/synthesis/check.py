@@ -133,7 +133,7 @@ def _chosen(frame: RenderedFrame, most: int) -> tuple[Tensor, Tensor, Tensor]:
     """Pixels with finite depth, evenly subsampled: x (n, 2), depth and index."""
     grid = pixel_grid((frame.depth.shape[0], frame.depth.shape[1]), dtype=torch.float64)
     finite = frame.depth.isfinite()
-    step = max(1, int(finite.sum()) // most)
+    step = max(1, -(-int(finite.sum()) // most))
     return grid[finite][::step], frame.depth[finite][::step].double(), frame.index[finite][::step]
 
 

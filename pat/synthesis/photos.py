@@ -60,7 +60,7 @@ class PhotoBank:
 
         `cache` names an .npz file that is written on the first call and read
         on later ones; it is not checked against the folders. `choose` selects images by number, to hold
-        some out. Raises ValueError where no image is found, and for a file that is no cache.
+        some out. Raises ValueError where no image is found or chosen, and for a file that is no cache.
         """
         if cache and Path(cache).exists():
             images = _cached(Path(cache))
@@ -69,10 +69,14 @@ class PhotoBank:
             if cache:
                 with write_atomically(cache) as temporary, temporary.open("wb") as file:
                     np.savez(file, *images)
-        images = [p for i, p in enumerate(images) if choose(i)]
+        chosen = [p for i, p in enumerate(images) if choose(i)]
+        if not chosen:
+            raise ValueError(
+                f"{len(images)} photographs are too few to learn from some and to hold others out: give more"
+            )
         rng = np.random.default_rng(seed)
-        extra = patterns(rng, 48) + recoloured(images, rng, 48)
-        return cls(images + extra, photos=len(images))
+        extra = patterns(rng, 48) + recoloured(chosen, rng, 48)
+        return cls(chosen + extra, photos=len(chosen))
 
     def __len__(self) -> int:
         return len(self.wh)

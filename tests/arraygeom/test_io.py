@@ -113,6 +113,16 @@ def test_middlebury():
     assert rig["cam1"].hw == (600, 1024)
 
 
+@pytest.mark.parametrize("least", [-40, -41])
+def test_middlebury_to_infinity(least, tmp_path):
+    """Without disparity points are at infinity: the near bound was dropped too."""
+    text = (FIXTURES / "middlebury.txt").read_text()
+    (tmp_path / "calib.txt").write_text(re.sub("vmin *= *10", f"vmin={least}", text))
+    near, far = read_rig(tmp_path / "calib.txt").depth
+    assert float(near) == pytest.approx(1.0)
+    assert far == torch.inf
+
+
 def test_syntim():
     """No distortion: b sees the point at 310.25 + 400 * 0.2, 244.75 - 404 * 0.1."""
     for file in ("cam_syntim_g", "cam_syntim_d"):

@@ -426,3 +426,11 @@ def test_colmap_models_that_lost_entries(tmp_path):
     lines = file.read_text().splitlines(keepends=True)
     message = refusal(copied(file, tmp_path, "".join(lines[:6])), "colmap")
     assert message.endswith("announces 2 images and holds 1; was it cut off?")
+
+
+def test_colmap_images_without_lines_of_points(tmp_path):
+    """Every second image was taken for the points of the one above, and left out without a word."""
+    file = FIXTURES / "colmap" / "images.txt"
+    text = "".join(line for line in file.read_text().splitlines(keepends=True) if line.endswith(".png\n"))
+    message = refusal(copied(file, tmp_path, text), "colmap")
+    assert message.endswith("line 2: wanted the points of the image above: add a line, blank if none")

@@ -17,16 +17,14 @@ POINTS = (
 )
 
 
-def database(path, *, verified=True, first="a.png"):
+def database(path, *, verified=True, names=("set/a.png", "set/b.png")):
     """A COLMAP database (by its documentation): pixels from .5, numbers of keypoints in another order."""
     with sqlite3.connect(path) as file:
         file.execute("CREATE TABLE images (image_id INTEGER, name TEXT)")
         file.execute("CREATE TABLE keypoints (image_id INTEGER, rows INTEGER, cols INTEGER, data BLOB)")
         for table in ("matches", "two_view_geometries"):
             file.execute(f"CREATE TABLE {table} (pair_id INTEGER, rows INTEGER, cols INTEGER, data BLOB)")
-        for number, (name, points) in enumerate(
-            ((f"set/{first}", POINTS[0]), ("set/b.png", POINTS[1][::-1])), 1
-        ):
+        for number, (name, points) in enumerate(zip(names, (POINTS[0], POINTS[1][::-1])), 1):
             six = np.concatenate([points + 0.5, np.zeros((len(points), 4))], 1).astype(np.float32)
             file.execute("INSERT INTO images VALUES (?, ?)", (number, name))
             file.execute("INSERT INTO keypoints VALUES (?, ?, 6, ?)", (number, len(points), six.tobytes()))
@@ -60,6 +58,17 @@ def test_colmap_pairs_are_of_the_cameras_whatever_their_order(tmp_path):
     assert list(read_matches(tmp_path / "database.db", turned, SIZES)) == [("mono", "colour")]
 
 
+def test_images_of_colmap_called_alike_are_told_by_their_folders(tmp_path):
+    """As all rigs' images are: both files were taken for one image, and no matches found between them."""
+    database(tmp_path / "database.db", names=("mono/1.png", "colour/1.png"))
+    files = {name: Path(f"photos/{name}/1.png") for name in FILES}
+    found = read_matches(tmp_path / "database.db", files, SIZES)["mono", "colour"]
+    for one, points in zip(found, POINTS):
+        assert torch.allclose(one, torch.from_numpy(points))
+    with pytest.raises(ValueError, match=r"no image photos/1.png \(it has mono/1.png, colour/1.png"):
+        read_matches(tmp_path / "database.db", {**files, "mono": Path("photos/1.png")}, SIZES)
+
+
 def test_what_is_refused(tmp_path):
     path = tmp_path / "m.csv"
     path.write_text("1,2,3,4\n1,2,300,4\n")
@@ -84,6 +93,6 @@ def test_what_is_refused(tmp_path):
         read_matches(path, FILES, SIZES)
     with pytest.raises(FileNotFoundError, match=r"none\.csv"):
         read_matches(tmp_path / "none.csv", FILES, SIZES)
-    database(tmp_path / "other.db", first="c.png")
-    with pytest.raises(ValueError, match=r"a.png .*c.png, b.png"):
+    database(tmp_path / "other.db", names=("set/c.png", "set/b.png"))
+    with pytest.raises(ValueError, match=r"a.png .*set/c.png, set/b.png"):
         read_matches(tmp_path / "other.db", FILES, SIZES)

@@ -269,6 +269,10 @@ def test_numbers_that_a_format_leaves_out_are_named(tmp_path):
         write_rig(rig, tmp_path / "chain.yaml", format="kalibr")
     assert len(found) == 1
     write_rig(Rig(rig.cameras), tmp_path / "chain.yaml", format="kalibr")
+    with pytest.warns(RigFileWarning, match="do not hold the rig's place in the world: use the native"):
+        write_rig(Rig({"beta": rig["beta"]}), tmp_path / "camera.yml", format="opencv")
+    placed = rig["beta"].replace(cam_from_world=Pose.identity())
+    write_rig(Rig({"beta": placed}), tmp_path / "camera.yml", format="opencv")
 
 
 ZERO = """image_width: 64

@@ -118,3 +118,14 @@ def test_points_that_fit_exactly_count_too():
     (wanted,) = torch.autograd.grad(near.X[:, 2].sum(), exact)
     assert slope.abs().sum() > 1
     torch.testing.assert_close(slope, wanted, rtol=1e-4, atol=1e-4)
+
+
+def test_pixels_that_are_nan_are_not_seen():
+    """The cost was NaN, no step was made, and the rig came back as it was."""
+    rig, X, x = bundle()
+    seen = torch.ones(x.shape[:-1], dtype=torch.bool)
+    seen[1, 3] = False
+    wanted = bundle_adjusted(rig, X, x, free=FREE, seen=seen)
+    found = bundle_adjusted(rig, X, torch.where(seen[..., None], x, torch.nan), free=FREE)
+    assert found.cost.equal(wanted.cost)
+    assert found.X.equal(wanted.X)

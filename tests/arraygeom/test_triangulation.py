@@ -231,6 +231,14 @@ def test_what_is_not_a_number_leaves_no_gradient():
     assert depth.valid[2:].all()
     depth.depth.sum().backward()
     assert K.grad.isfinite().all()
+    near, far = (torch.tensor(d, dtype=torch.float64) for d in (0.5, 50.0))
+    pair = Pair(cameras[0], cameras[1].replace(K=K), depth=(near, far))
+    depth = ray_depth(pair, x[0], x[1], deviation=torch.ones_like(x[0, :, 0]))
+    assert not depth.valid[1]
+    K.grad = None
+    (depth.depth + depth.deviation).sum().backward()
+    assert K.grad.isfinite().all()
+    assert K.grad.any()
 
 
 def test_depth_along_a_curve_has_the_gradients_of_depth_along_a_line():

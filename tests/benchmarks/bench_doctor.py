@@ -172,7 +172,7 @@ def subjects(data: Path) -> Iterator[Subject]:
         cameras = {name: pair.rig[name] for name in names}
         rig = Rig(cameras, depth=depth)
         found = diagnose_matches(rig, {n: c.hw for n, c in cameras.items()}, matches)
-        print(f"{pair.name:28s} {found.matches:4d} points, {found.before}", flush=True)
+        print(f"{pair.name:28s} {found.matches:4d} points, {found.before.as_text()}", flush=True)
         if found.matches >= MANY:
             yield Subject(pair._replace(rig=rig), matches, found.before.penalised_misfit)
         else:
@@ -213,7 +213,8 @@ def confusions(data: Path, cases: int, seed: int, kinds: Sequence[str]) -> Itera
             equal = label == kind or kind in [r.kind for r in found.equal]
             if label != kind:
                 label += " (or the true one)" if equal else ""
-                misses.append(f"{kind}: {name}: {found.verdict}; before {found.before}; after {found.after}")
+                before, after = found.before.as_text(), found.after.as_text()
+                misses.append(f"{kind}: {name}: {found.verdict}; before {before}; after {after}")
             totals += Counter({"right": label == kind, "right or equal": equal, "all": 1})
             named[label] += 1
         spoken = ", ".join(f"{label} {count}" for label, count in named.most_common())

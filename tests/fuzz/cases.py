@@ -346,7 +346,7 @@ def use_checkpoint(path: Path, _: random.Random) -> str:
 
 def covariance_seeds(folder: Path) -> Iterator[Seed]:
     folder.mkdir(parents=True, exist_ok=True)
-    RigCovariance(("a.focal.0", "a.focal.1"), np.eye(2)).save(folder / "covariance.json")
+    RigCovariance(("a.focal.0", "a.focal.1"), np.eye(2)).save(folder / "covariance.json", Rig({}))
     yield Seed("covariance", "json", folder / "covariance.json")
 
 

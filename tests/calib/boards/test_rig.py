@@ -83,7 +83,7 @@ def test_held_out_frames_are_no_worse(found):
 
 def test_the_covariance_is_kept_in_a_file(found, tmp_path):
     covariance = rig_covariance(found.fit)
-    covariance.save(tmp_path / "c.json")
+    covariance.save(tmp_path / "c.json", found.rig)
     again = RigCovariance.load(tmp_path / "c.json")
     assert again.names == covariance.names
     assert (again.matrix == covariance.matrix).all()

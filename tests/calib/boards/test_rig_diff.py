@@ -1,6 +1,7 @@
 """`pat rig diff`: simulated recalibrations of a rig that moved and one that did not; what is refused."""
 
 import math
+import shutil
 from itertools import pairwise
 
 import numpy as np
@@ -119,7 +120,7 @@ def files(rig, tmp_path_factory):
     for name, seed, one in (("a", 0, rig), ("b", 1, rig), ("turned", 2, turned(rig, 0))):
         made, covariance = recalibrated(one, seed)
         made.save(folder / f"{name}.yaml")
-        covariance.save(folder / f"{name}.covariance.json")
+        covariance.save(folder / f"{name}.covariance.json", made)
     bare = Rig.load(folder / "a.yaml")
     bare.save(folder / "bare.yaml")
     bare.replace(depth=None).save(folder / "no_depth.yaml")
@@ -150,6 +151,20 @@ def test_without_deviations_there_is_no_verdict(files, capsys):
     said = capsys.readouterr()
     assert "verdict: the same" in said.out
     assert "bare.covariance.json: not there: that rig counts as calibrated as well" in said.err
+
+
+def test_a_covariance_is_of_the_rig_it_was_found_with(files, tmp_path, capsys):
+    """Of a rig that was repaired in its place, lengths in another unit, it stood for the repaired one's."""
+    for path in files.glob("a.*"):
+        shutil.copy(path, tmp_path)
+    rig = Rig.load(tmp_path / "a.yaml")
+    rig.replace(depth=(2.0, 5.0)).save(tmp_path / "a.yaml")  # nothing that the covariance is of
+    diff(tmp_path, "a", "a")
+    assert "verdict: the same" in capsys.readouterr().out
+    rig.scaled(1000.0).save(tmp_path / "a.yaml")
+    with pytest.raises(SystemExit):
+        diff(tmp_path, "a", "a")
+    assert "a.covariance.json: is not of the rig beside it, which was changed" in capsys.readouterr().err
 
 
 def test_images_say_which_rig_fits(tmp_path, capsys):

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from calib.images.hypotheses import TRANSPOSE, on_cameras, swap
 from calib.images.least_squares import most_probable
 from calib.images.parameters import UNCERTAIN, apply_change, free_parameters
 from calib.images.residuals import sampson_of_pairs
+from calib.images.self_calibration import UNSCALED
 from pat.cli.main import main
 from pat.media.images import write_image
 from tests.benchmarks.bench_drift import drifted
@@ -262,6 +264,14 @@ def test_bad_input_is_one_clear_line():
         diagnose(rig, {"left": images["left"], "rihgt": images["right"]})
 
 
+def test_depths_of_a_rig_of_unknown_scale_are_not_in_metres():
+    rig, images = rectified_pair(), rectified_images()
+    rig = rig.replace(name=UNSCALED, depth=tuple(20 * float(bound) for bound in rig.depth))
+    text = diagnose(rig, images).as_text()
+    assert re.search(r"median depth \S+ baselines", text)
+    assert re.search(r"excludes the scene, which is \S+ to \S+ baselines away", text)
+
+
 def test_command_line(tmp_path, capsys):
     rig, images = rectified_pair(), rectified_images()
     files = [f"--image={name}={tmp_path / name}.png" for name in images]
@@ -272,6 +282,10 @@ def test_command_line(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "likely mistake" in said
     assert said.count("median depth") == 1
+    given = (tmp_path / "rig.yaml").read_bytes() + b"# Gr\xf6\xdfe\r\n"  # not UTF-8: kept as it is
+    (tmp_path / "other.yaml").write_bytes(given)
+    main(["rig", "doctor", str(tmp_path / "rig.yaml"), *files, "--fix", str(tmp_path / "other.yaml")])
+    assert (tmp_path / "other.yaml.old").read_bytes() == given
     main(["rig", "doctor", str(tmp_path / "rig.yaml"), *files, "--fix", str(tmp_path / "rig.yaml")])
     assert "former file" in capsys.readouterr().err
     assert (tmp_path / "rig.yaml").read_text() == (tmp_path / "fixed.yaml").read_text()

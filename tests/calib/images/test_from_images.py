@@ -1,9 +1,11 @@
 """Rigs from images alone."""
 
 import pytest
+import torch
 
 from arraygeom import Rig
 from calib.images.from_images import rig_from_images
+from calib.images.matches import PointMatches
 from calib.images.residuals import line_distances
 from pat.cli.main import main
 from pat.media.images import write_image
@@ -51,3 +53,18 @@ def test_command_line(tmp_path, capsys):
     main(["rig", "start", *files, "--out", str(tmp_path / "rig.yaml")])
     assert "left > right" in capsys.readouterr().out
     assert ("left", "right") in Rig.load(tmp_path / "rig.yaml").links
+
+
+def test_points_in_one_spot_are_held_out_too():
+    """Where none was in a square that is held out, this ended in an error of tuples or of torch."""
+    torch.manual_seed(0)
+    images = {name: torch.zeros(1, 240, 320) for name in "ab"}
+
+    def matches(extent):
+        alpha = 25 + torch.rand(60, 2).double() * torch.tensor(extent)
+        moved = torch.tensor([1.0, 0]) * (10 + 40 * torch.rand(60, 1))
+        return {("a", "b"): PointMatches(alpha, alpha + moved + 0.05 * torch.randn(60, 2))}
+
+    assert rig_from_images(images, matches=matches((22, 46))).distance["a", "b"] < 1
+    with pytest.raises(ValueError, match="in one spot, so that none can be held out"):
+        rig_from_images(images, matches=matches((22, 22)))

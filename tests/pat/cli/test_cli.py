@@ -12,6 +12,7 @@ import torch
 import yaml
 
 from arraygeom import Pose, Rig
+from calib.images.self_calibration import UNSCALED
 from pat.cli.fusing import Fuse
 from pat.cli.main import Pat, command_paths, main
 from pat.cli.options import respelled
@@ -229,6 +230,14 @@ def test_rig_info_says_a_mistaken_unit_once(small, tmp_path, capsys):
     Rig.load(small / "rig.yaml").scaled(1e3).save(tmp_path / "large.yaml")
     main(["rig", "info", str(tmp_path / "large.yaml")])
     assert capsys.readouterr().err.count("is this file in millimetres?") == 1
+
+
+def test_rig_info_says_no_metres_of_a_rig_of_unknown_scale(small, tmp_path, capsys):
+    Rig.load(small / "rig.yaml").replace(name=UNSCALED, depth=(2.0, 8.0)).save(tmp_path / "rig.yaml")
+    main(["rig", "info", str(tmp_path / "rig.yaml")])
+    text = " ".join(capsys.readouterr().out.split())
+    assert text.count("baselines") == 2
+    assert not re.search(r"\bm?m\b", text)
 
 
 def test_rig_info_as_json(small, capsys):

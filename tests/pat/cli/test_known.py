@@ -1,5 +1,7 @@
 """`--depth-map` and `--matches` of fuse, align and the rig commands, on a wall with a post before it."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import torch
 from torch.nn.functional import interpolate
 
 from arraygeom import Camera, Pose, Rig, intrinsics
+from pat.cli.known import Known
 from pat.cli.main import main
 from pat.fusion.align import OCCLUDED
 from pat.fusion.align import align as aligned
@@ -118,3 +121,11 @@ def test_bad_input_is_one_line(folder, options, expected, capsys):
         run(folder, "fuse", *(word.format(folder) for word in options))
     assert stop.value.code == 2
     assert expected in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_large_depth_map_in_another_unit_is_told_what_it_holds(folder, monkeypatch):
+    """Torch's quantiles are of 2^24 numbers at most: of larger maps its words were the message."""
+    monkeypatch.setattr("pat.media.depth_maps.read_depth", lambda *_, **__: torch.full((4097, 4097), 1e4))
+    rig = Rig.load(folder / "rig.yaml")
+    with pytest.raises(ValueError, match=r"holds 1e\+04 to 1e\+04 m, the rig's depth range"):
+        Known(depth_map=Path("large.tif")).with_known(rig, rig.names[0], {}, None)

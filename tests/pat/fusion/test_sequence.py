@@ -51,6 +51,20 @@ def test_clocks_that_do_not_fit_are_named(line, message):
         line()
 
 
+def test_a_beta_that_recorded_at_another_time_is_named():
+    """Its first or last frame was used for all of the sequence, if another beta's times fitted."""
+    line = clocks(30.0, 30.0, 0.0, 9, 9)
+    for offset, count in ((0.0, 1), (0.12, 3), (5.0, 3), (-5.0, 3)):
+        sensor = Sensor(frame_rate=10.0, time_offset=offset)
+        rig = line.rig.with_camera("c", View(hw=(4, 4), sensor=sensor))
+        three = Timeline(rig, {**line.counts, "c": count}, "a")
+        if abs(offset) < 1:
+            assert len(three.key_frames()) == 9
+        else:
+            with pytest.raises(ValueError, match="no frame of 'c' is near one of alpha in time"):
+                three.key_frames()
+
+
 def test_moved_samples_where_points_will_be():
     pair = moving.rig().pair("fast", "slow")
     x = pixel_grid(moving.HW)[10:20, 30:40].reshape(-1, 2)

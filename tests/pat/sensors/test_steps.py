@@ -1,3 +1,5 @@
+import math
+
 import cv2
 import numpy as np
 import pytest
@@ -240,6 +242,11 @@ def test_mistakes_are_named():
         run(noise_image(1, 3, 4, 4), Spectral(Curve((1500.0, 1600.0), (1.0, 1.0))))
     with pytest.raises(ValueError, match="full_well > 0"):
         Noise(0)
+    with pytest.raises(ValueError, match="bits must be 1 or more, got 0"):  # every value was NaN
+        Quantise(0)
+    for sigma in (-1.0, math.nan):
+        with pytest.raises(ValueError, match="sigma must be 0 or more pixels"):
+            GaussianBlur(sigma)
     with pytest.raises(ValueError, match="must keep the size"):
         augment(
             noise_image(1, 1, 8, 8),

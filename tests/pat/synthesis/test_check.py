@@ -6,7 +6,7 @@ import torch
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.pixels import pixel_grid
 from arraygeom.rig import Rig
-from pat.synthesis.check import CheckLimits, check_views
+from pat.synthesis.check import CheckLimits, _chosen, check_views
 from pat.synthesis.rendered import RenderedFrame
 from tests.pat.synthesis.scenes import LENS, posed
 
@@ -107,3 +107,10 @@ def test_frames_of_different_times_are_not_compared(rig, frames):
 
 def test_limits_can_be_set(rig, frames):
     assert not check_views(rig, frames, CheckLimits(overlap=0.99))["accepted"]
+
+
+def test_no_more_pixels_than_stated_are_checked(frames):
+    """It was up to twice as many."""
+    frame = dataclasses.replace(frames["a"], depth=torch.ones(HW))
+    for most in (HW[0] * HW[1], 3000, 2400, 7):
+        assert most / 2 < len(_chosen(frame, most)[0]) <= most

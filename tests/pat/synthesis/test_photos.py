@@ -74,6 +74,14 @@ def test_an_empty_folder_is_an_error(tmp_path):
         PhotoBank.load(tmp_path)
 
 
+def test_too_few_photographs_to_hold_some_out_are_said_to_be(tmp_path, images):
+    """The message was numpy's, "high <= 0"."""
+    cv2.imwrite(str(tmp_path / "only.png"), images[0])
+    assert PhotoBank.load(tmp_path, choose=lambda i: i % 20 == 0).photos == 1
+    with pytest.raises(ValueError, match="1 photographs are too few to learn from some"):
+        PhotoBank.load(tmp_path, choose=lambda i: i % 20 != 0)
+
+
 def test_a_cache_is_whole_or_not_there_and_another_file_is_named(tmp_path, images, monkeypatch):
     cv2.imwrite(str(tmp_path / "a.png"), images[0])
     cache = tmp_path / "cache.npz"
