@@ -341,9 +341,9 @@ def test_what_cameras_record_comes_back(tmp_path):
         ("bits: 12.5", "wanted a whole number from 1 to 16"),
         ("black_level: 64", "needs 'bits'"),
         ("bits: 6, black_level: 64", "not between 0 and white"),
-        ("exposure: 0", "wanted a number above 0"),
+        ("exposure: 0", "wanted a finite number above 0"),
         ("gain: [1, 2]", r"a\.gain: has 2 numbers, wanted 3"),
-        ("gain: [1, 2, -1]", "gain is -1.0: wanted a number above 0"),
+        ("gain: [1, 2, -1]", "gain is -1.0: wanted a finite number above 0"),
         ("frame_rate: fast", "other than numbers: 'fast'"),
     ],
 )

@@ -116,7 +116,7 @@ def test_colours_mix_by_confidence_which_disagreement_lowers():
 
 def test_a_speed_that_is_none_is_refused_at_once():
     frames, _ = moving.recording(2)
-    for speed in (-3.0, float("nan")):
+    for speed in (-3.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match="speed is"):
             SequenceFusion(load_weights("mono-colour"), moving.rig(), frames, "fast", speed)
 
