@@ -48,6 +48,15 @@ def reduced(image: Float[Tensor, "c h w"], longest: int) -> Float[Tensor, "c h2 
     return interpolate(image[None], hw, mode="bicubic", align_corners=False, antialias=True)[0]
 
 
+def figure_file(path: Path) -> Path:
+    """The path. Raises ValueError unless its name ends in a format of figures."""
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    if path.suffix[1:].lower() not in FigureCanvasBase.get_supported_filetypes():
+        raise ValueError(f"{path}: no format of pictures: end its name in .png, .pdf or .svg")
+    return path
+
+
 def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
     """Write a figure atomically; returns the path."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
