@@ -1,6 +1,7 @@
 """Readers on hand-written files, and writers."""
 
 import json
+import math
 import re
 import struct
 import warnings
@@ -331,6 +332,13 @@ def test_what_cameras_record_comes_back(tmp_path):
     rig.save(tmp_path / "rig.yaml")
     again = Rig.load(tmp_path / "rig.yaml")
     assert [again[name].sensor for name in again.names] == [raw, slow]
+
+
+@pytest.mark.parametrize("offset", [math.inf, -math.inf, math.nan])
+def test_a_clock_starts_at_a_finite_time(offset):
+    with pytest.raises(ValueError, match="time_offset is"):
+        Sensor(time_offset=offset)
+    assert Sensor(time_offset=-0.5).time_offset == -0.5
 
 
 @pytest.mark.parametrize(
