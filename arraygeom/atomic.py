@@ -20,9 +20,11 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
     Missing folders are made. The content is on the disk before the name is, so that a file that is there
     after a crash is whole.
 
-    Raises OSError that names `path`, whatever file the system's own names.
+    Raises OSError that names `path`, whatever file the system's own names; IsADirectoryError for a folder.
     """
     path = Path(path)
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: name a file in it")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}-{uuid4().hex}{path.suffix}")
     try:

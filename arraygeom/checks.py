@@ -6,6 +6,7 @@ Numbers cannot be asked while torch compiles, traces or transforms: nothing is c
 
 from __future__ import annotations
 
+import math
 import operator
 import threading
 from collections.abc import Callable, Iterator
@@ -137,12 +138,12 @@ def check_batches(what: str, *shapes: tuple[int, ...]) -> None:
 
 
 def check_above(least: float, *, whole: bool = False, itself: bool = True, **values: Any) -> None:
-    """Raises unless each value that is not None is a number of at least `least`, or above it if not `itself`.
+    """Raises unless each value that is not None is a finite number from `least` up, or above if not `itself`.
 
     TypeError for what is no number.
     """
     bound = f"of {least:g} or more" if itself else f"above {least:g}"
-    wanted = f"wanted a {'whole number' if whole else 'number'} {bound}"
+    wanted = f"wanted a {'whole' if whole else 'finite'} number {bound}"
     for name, value in values.items():
         if value is None or isinstance(value, Tensor):
             continue
@@ -150,7 +151,7 @@ def check_above(least: float, *, whole: bool = False, itself: bool = True, **val
             number = operator.index(value) if whole else float(value)
         except (TypeError, ValueError):
             raise TypeError(f"{name} is a {type(value).__name__}: {wanted}") from None
-        if not (number > least or (itself and number == least)):
+        if not (number > least or (itself and number == least)) or number == math.inf:
             raise ValueError(f"{name} is {value}: {wanted}")
 
 

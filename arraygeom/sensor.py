@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -64,6 +65,7 @@ class Sensor:
     def __post_init__(self) -> None:
         gains = self.gain if isinstance(self.gain, tuple) else (self.gain,)
         check_above(0, itself=False, frame_rate=self.frame_rate, exposure=self.exposure)
+        check_above(-math.inf, itself=False, time_offset=self.time_offset)
         for gain in gains:
             check_above(0, itself=False, gain=gain)
         check_above(1, whole=True, bits=self.bits)

@@ -70,7 +70,8 @@ ALIKE = 8.0
 ALIKE_SLACK = 0.03
 """Poses whose points are farther from their lines than those of the best by no more than this, over the root
 of the points' number, as a share, and so many pixels more, are alike: points do not distinguish a rotation
-from a translation where they are few or far. The smallest rotation is taken."""
+from a translation where they are few or far, nor the side that beta is on. Of those with most points in
+front of the cameras, the smallest rotation is taken."""
 OUTLYING = 8.0
 """Inverse depths this many times their median deviation from the median are of wrong matches."""
 MARGIN, LEAST_MARGIN = 1.0, 0.12
@@ -136,6 +137,8 @@ def self_calibrated(
         return None
     least = min(trial.distance for trial in trials)
     fitting = [t for t in trials if t.distance <= (1 + ALIKE / math.sqrt(t.points)) * least + ALIKE_SLACK]
+    in_front = [len(depths_near_lines(_pair(t.rig), near, within=NEAR_LINE)) for t in fitting]
+    fitting = [t for t, count in zip(fitting, in_front) if 2 * count > max(in_front)]
     upright = _upright(link)
     found = min(fitting, key=lambda t: float(angle(_pair(t.rig).beta_from_alpha.R.T @ upright)))
     rig = found.rig

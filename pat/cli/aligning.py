@@ -28,7 +28,7 @@ class Align(Known):
 
     Values keep their recorded type and bits. Without a rig it is found from the tags of the images, or from
     the images, and written to rig.yaml beside the result. With folders, or quoted patterns, frames are
-    aligned one by one.
+    aligned one by one, matched by names or by the numbers or times in them.
     """
 
     spellings: ClassVar[Mapping[str, str]] = {"--rig": FIRST, "--to": "--alpha"}
@@ -60,11 +60,13 @@ class Align(Known):
                 self._align(frame)
 
     def _frames_with_rig(self, image: tuple[str, ...]) -> Iterator[_Frame]:
+        from ..fusion.frame_matching import matched_frames
         from ..fusion.healing import checked_rig
         from ..fusion.views import ViewFiles
 
         rig = options.load_rig_or_say_no_image(self.given[0], self.depth)
         alpha, files = files_by_camera(rig, self.alpha, self.given, image)
+        files = matched_frames(files)
         for i, one in enumerate(options.by_frame(files)):
             views = ViewFiles(rig, one, alpha=alpha)
             if i == 0:
@@ -73,12 +75,13 @@ class Align(Known):
 
     def _frames_without(self) -> Iterator[_Frame]:
         from ..fusion.batch import find_images
+        from ..fusion.frame_matching import matched_frames
         from ..fusion.from_images import array_from_images, camera_names
         from ..fusion.views import ViewFiles
 
         if self.depth:
             raise ValueError("--depth: needs a rig: give one with --rig RIG")
-        files = {name: find_images(path) for name, path in camera_names(self.given).items()}
+        files = matched_frames({name: find_images(path) for name, path in camera_names(self.given).items()})
         options.say_when_compiling()
         first = {name: paths[0] for name, paths in files.items()}
         with options.working("finding the rig"):

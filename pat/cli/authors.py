@@ -73,8 +73,8 @@ class Evaluate:
         from ..evaluation.tables import write_csv
 
         write_text(self.out / "scores.md", text)
-        all_rows = [row for found in rows.values() for row in found]
-        write_csv(self.out / "scores.csv", StereoRow._fields, all_rows)
+        all_rows = [(name, *row) for name, found in rows.items() for row in found]
+        write_csv(self.out / "scores.csv", ("set", *StereoRow._fields), all_rows)
         print(text, end="")
         say(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, images in {self.out}")
 
@@ -109,6 +109,11 @@ class Ablate:
 
         if self.scenes < 1:
             raise ValueError(f"--scenes: {self.scenes}: give at least 1")
+        layered = [
+            name for name in ("photos", "scenes", "hw") if getattr(self, name) != getattr(Ablate, name)
+        ]
+        if self.rendered is not None and layered:
+            raise ValueError(f"--{', --'.join(layered)}: of layered scenes: leave out with --rendered")
         writable(self.out, folder=True)
         network = load_weights(self.weights)
         if self.rendered is not None:

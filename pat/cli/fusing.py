@@ -206,9 +206,9 @@ class Fuse(Known):
             if name in rig.names:
                 rig = with_sensor(rig, name, frame_rate=rate)
         self.video = rates.get(array.alpha, self.video)
-        self._many(rig, {name: files[name] for name in rig.names}, array.alpha)
         rig.save(self.out / FOUND_RIG)
         say(f"the rig that was found: {self.out / FOUND_RIG}")
+        self._many(rig, {name: files[name] for name in rig.names}, array.alpha)
 
     def _choose_bits(self, files: Mapping[str, Sequence[Path]]) -> None:
         """As many bits as the images have, unless asked otherwise."""

@@ -66,8 +66,10 @@ class Known:
         """How frames are fused. Raises ValueError for options that are none."""
         from ..fusion.fuse import FuseSettings
 
-        if self.depth_scale is not None and self.depth_map is None:
-            raise ValueError("--depth-scale: needs --depth-map")
+        of_map = [n for n in ("depth_scale", "depth_tolerance") if getattr(self, n) != getattr(Known, n)]
+        if self.depth_map is None and of_map:
+            named = ", ".join(f"--{name.replace('_', '-')}" for name in of_map)
+            raise ValueError(f"{named}: needs --depth-map")
         return FuseSettings(
             field=options.field_named(self.field),
             max_memory=self.max_memory,

@@ -148,21 +148,21 @@ def _images_first(words: Sequence[str]) -> list[str]:
     return [*words[:leading], *(words[i] for i in sorted(files)), *others]
 
 
-def writable(out: Path, *, folder: bool = False) -> Path:
-    """The path of --out, before the work whose result is to be written there.
+def writable(out: Path, *, folder: bool = False, option: str = "--out") -> Path:
+    """The path of an option, before the work whose result is to be written there.
 
     Raises ValueError if it cannot be: a folder where a file is wanted, a file in its way, no permission.
     """
     if out.exists() and out.is_dir() != folder:
         raise ValueError(
-            f"--out: {out} is a {'folder: name a file in it' if out.is_dir() else 'file: name a folder'}"
+            f"{option}: {out} is a {'folder: name a file in it' if out.is_dir() else 'file: name a folder'}"
         )
     above = out if out.exists() else next(p for p in out.absolute().parents if p.exists())
     if above != out and not above.is_dir():
-        raise ValueError(f"--out: {above} is a file, so {out} cannot be made: give another path")
+        raise ValueError(f"{option}: {above} is a file, so {out} cannot be made: give another path")
     for place in {above, above if above.is_dir() else above.absolute().parent}:
         if not os.access(place, os.W_OK):
-            raise ValueError(f"--out: {place} cannot be written to: give another path, or permission")
+            raise ValueError(f"{option}: {place} cannot be written to: give another path, or permission")
     return out
 
 

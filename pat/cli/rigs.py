@@ -143,6 +143,8 @@ class Explore:
     def run(self) -> None:
         from ..explore import opened, serve
 
+        if self.save is not None:
+            options.writable(self.save, option="--save")
         rig = load_rig(self.rig)
         images = options.read_images(rig, self.image) if self.image else None
         if images:
@@ -435,10 +437,10 @@ class RigDiff:
         from calib.boards.rig_diff import draw_difference, rig_difference
         from calib.boards.uncertainty import RigCovariance
 
-        from ..media.figures import save_figure
+        from ..media.figures import figure_file, save_figure
 
         if self.out is not None:
-            options.writable(self.out)
+            figure_file(options.writable(self.out))
         a, b = load_rig(self.first), load_rig(self.second)
         depth = self.depth or (a.depth or b.depth)
         if depth is None:

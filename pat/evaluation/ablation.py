@@ -268,7 +268,7 @@ def ablate(
         panels |= _crops(case, images, found) if i < SHOWN else {}
     write_text(out / "ablation.md", markdown(rows))
     write_csv(out / "ablation.csv", AblationRow._fields, rows)
-    save_panels(panels, out / "ablation.png", columns=1 + len({row.family for row in rows}))
+    save_panels(panels, out / "ablation.png", columns=6)
     return rows
 
 

@@ -45,7 +45,9 @@ def matched_frames(files: Files) -> dict[str, list[Path]]:
     spans = ", ".join(f"'{name}' {paths[0].name} to {paths[-1].name}" for name, paths in given.items())
     if len({len(paths) for paths in given.values()}) > 1:
         counts = ", ".join(f"{len(paths)} of '{name}'" for name, paths in given.items())
-        raise ValueError(f"frames need as many images of each camera, got {counts}; or is it a --sequence?")
+        raise ValueError(
+            f"frames need as many images of each camera, got {counts}; or is it for `pat fuse --sequence`?"
+        )
     warn(f"no name or number relates the frames ({spans}): taken in order", MissingFramesWarning)
     return given
 
@@ -86,7 +88,7 @@ def _warn_of_missing(files: Files, frames: Sequence[Mapping[str, Path]], what: s
             missing.append(f"'{name}' has none of {', '.join(lacking[:LISTED])}{more}")
     if missing:
         whole = sum(len(frame) == len(files) for frame in frames)
-        text = f"frames are matched by their {what}: {'; '.join(missing)}: {whole} of {len(frames)} are fused"
+        text = f"frames are matched by their {what}: {'; '.join(missing)}: {whole} of {len(frames)} are taken"
         warn(text, MissingFramesWarning)
 
 

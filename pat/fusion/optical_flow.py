@@ -64,6 +64,11 @@ def warped(image: Float[Tensor, "c h w"], step: Float[Tensor, "2 h w"]) -> Float
 
 
 def _steps(a: Tensor, b: Tensor) -> Float[Tensor, "2 h w"]:
+    """The flow of frames extended to two of OpenCV's patches a side: it refuses smaller ones, or crashes."""
+    h, w = a.shape[-2:]
     engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    flow = engine.calc(to_bytes(a[0]), to_bytes(b[0]), np.empty(0, np.float32))
+    least = 2 * engine.getPatchSize()
+    margins = (0, max(least - h, 0)), (0, max(least - w, 0))
+    first, second = (np.pad(to_bytes(frame[0]), margins, "edge") for frame in (a, b))
+    flow = engine.calc(first, second, np.empty(0, np.float32))[:h, :w]
     return torch.from_numpy(np.ascontiguousarray(flow.transpose(2, 0, 1)))

@@ -48,6 +48,15 @@ def reduced(image: Float[Tensor, "c h w"], longest: int) -> Float[Tensor, "c h2 
     return interpolate(image[None], hw, mode="bicubic", align_corners=False, antialias=True)[0]
 
 
+def figure_file(path: Path) -> Path:
+    """The path. Raises ValueError unless its name ends in a format of figures."""
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    if path.suffix[1:].lower() not in FigureCanvasBase.get_supported_filetypes():
+        raise ValueError(f"{path}: no format of pictures: end its name in .png, .pdf or .svg")
+    return path
+
+
 def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
     """Write a figure atomically; returns the path."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -59,7 +68,7 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
 
 
 TITLE, GAP = 28, 10
-"""Pixels above and beside each panel."""
+"""Pixels of a title's line above each panel, and beside it."""
 
 
 def draw_panels(
@@ -67,22 +76,29 @@ def draw_panels(
 ) -> Image.Image:
     """One image, `width` times 110 pixels wide, of images by title, row by row, each scaled to its column.
 
+    Titles, of one line or several, are made small enough for the longest to fit.
+
     By Pillow: matplotlib takes a second and a half to import and draw as much.
     """
     wide = round(110 * width) // columns - GAP
     h, w = next(iter(panels.values())).shape[-2:]
     high = round(wide * h / w)
-    cell_wh = wide + GAP, high + TITLE
+    longest = max(
+        ImageFont.load_default(16).getlength(line) for title in panels for line in title.split("\n")
+    )
+    font = ImageFont.load_default(min(16, 16 * wide / max(longest, 1)))
+    above = TITLE * (1 + max(title.count("\n") for title in panels))
+    cell_wh = wide + GAP, high + above
     drawn = Image.new("RGB", (columns * cell_wh[0], -(-len(panels) // columns) * cell_wh[1] + GAP), "white")
-    text, font = ImageDraw.Draw(drawn), ImageFont.load_default(16)
+    text = ImageDraw.Draw(drawn)
     for i, (title, image) in enumerate(panels.items()):
         panel = Image.fromarray(np.ascontiguousarray(to_bytes(image.expand(3, -1, -1)).transpose(1, 2, 0)))
         factor = min(wide / panel.width, high / panel.height)
         wh = max(round(factor * panel.width), 1), max(round(factor * panel.height), 1)
         panel = panel.resize(wh, Image.Resampling.NEAREST if factor >= 3 else Image.Resampling.LANCZOS)
         left, top = i % columns * cell_wh[0] + GAP // 2, i // columns * cell_wh[1]
-        text.text((left + wide / 2, top + TITLE / 2 + 2), title, "black", font, anchor="mm")
-        drawn.paste(panel, (left + (wide - wh[0]) // 2, top + TITLE + (high - wh[1]) // 2))
+        text.text((left + wide / 2, top + above / 2 + 2), title, "black", font, anchor="mm", align="center")
+        drawn.paste(panel, (left + (wide - wh[0]) // 2, top + above + (high - wh[1]) // 2))
     return drawn
 
 

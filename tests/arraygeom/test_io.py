@@ -1,6 +1,7 @@
 """Readers on hand-written files, and writers."""
 
 import json
+import math
 import re
 import struct
 import warnings
@@ -343,6 +344,13 @@ def test_what_cameras_record_comes_back(tmp_path):
     assert [again[name].sensor for name in again.names] == [raw, slow]
 
 
+@pytest.mark.parametrize("offset", [math.inf, -math.inf, math.nan])
+def test_a_clock_starts_at_a_finite_time(offset):
+    with pytest.raises(ValueError, match="time_offset is"):
+        Sensor(time_offset=offset)
+    assert Sensor(time_offset=-0.5).time_offset == -0.5
+
+
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
@@ -351,9 +359,9 @@ def test_what_cameras_record_comes_back(tmp_path):
         ("bits: 12.5", "wanted a whole number from 1 to 16"),
         ("black_level: 64", "needs 'bits'"),
         ("bits: 6, black_level: 64", "not between 0 and white"),
-        ("exposure: 0", "wanted a number above 0"),
+        ("exposure: 0", "wanted a finite number above 0"),
         ("gain: [1, 2]", r"a\.gain: has 2 numbers, wanted 3"),
-        ("gain: [1, 2, -1]", "gain is -1.0: wanted a number above 0"),
+        ("gain: [1, 2, -1]", "gain is -1.0: wanted a finite number above 0"),
         ("frame_rate: fast", "other than numbers: 'fast'"),
     ],
 )

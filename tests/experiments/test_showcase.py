@@ -201,7 +201,10 @@ def test_evaluate_writes_and_prints_the_tables(data, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert printed == (tmp_path / "scores.md").read_text()
     assert printed.startswith("#### kitti\n\n| beta reduced 2x | alpha | beta | classical | fusion |\n")
-    assert len((tmp_path / "scores.csv").read_text().splitlines()) == 5
+    header, *rows = (tmp_path / "scores.csv").read_text().splitlines()
+    assert header.startswith("set,pair,rate,")
+    assert len(rows) == 4
+    assert all(row.startswith("kitti,") for row in rows)
     assert len(list((tmp_path / "kitti").glob("*_x2.png"))) == 1
 
 

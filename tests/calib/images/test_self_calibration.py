@@ -54,6 +54,19 @@ def test_pose_and_bounds_are_found_with_the_focal_lengths():
     assert far > 6.0 / 0.2
 
 
+@pytest.mark.parametrize("side", [1, -1], ids=["below", "above"])
+def test_most_points_are_in_front_where_some_are_behind(side):
+    """As in views shifted towards each other, whose far points have negative disparities: same lines."""
+    rig = rectified_pair()
+    a, b = rig.names
+    apart = Pose(torch.eye(3, dtype=torch.float64), torch.tensor([0, -0.2 * side, 0], dtype=torch.float64))
+    rig = rig.with_camera(b, rig[b].replace(cam_from_world=apart))
+    (matches,) = seen_points(rig, noise=0.1, near=2.0, far=6.0).values()
+    matches.beta[::6] = matches.alpha[::6] + torch.tensor([0, 8.0 * side])
+    found = calibrated_from(rig, matches, **dict.fromkeys(rig.names, 300.0))
+    assert found.rig.pair(a, b).beta_from_alpha.t.tolist() == pytest.approx([0, -side, 0], abs=0.1)
+
+
 def test_a_start_whose_baseline_vanishes_is_left_out(monkeypatch):
     """Matches do not determine the baseline's length: from a wrong start it shrank to 0 (Cloth3 of 2006)."""
     rig = rectified_pair()

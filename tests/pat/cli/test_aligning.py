@@ -1,5 +1,7 @@
 """`pat align`: its files and options on a wall with a post before it, and what is refused, one line each."""
 
+import shutil
+
 import cv2
 import numpy as np
 import pytest
@@ -183,3 +185,28 @@ def test_without_a_rig_the_files_rig_is_written(folder, counts):  # noqa: F811
     out = counts / "found"
     main(["align", str(counts / "mono.png"), str(counts / "colour.png"), "-o", str(out), "--no-report"])
     assert set(Rig.load(out / "rig.yaml").names) == {"mono", "colour"}
+
+
+def test_frames_are_matched_by_their_names(folder, counts):  # noqa: F811
+    """Of each camera another is missing: in order, the middle ones would be taken for one frame."""
+    for name, frames in {"mono": "012", "colour": "023"}.items():
+        (counts / name).mkdir()
+        for i in frames:
+            shutil.copy(counts / f"{name}.png", counts / name / f"{i}.png")
+    images = [word for name in ("mono", "colour") for word in ("--image", f"{name}={counts / name}")]
+    main(
+        [
+            "align",
+            str(folder / "rig.yaml"),
+            "--to",
+            "mono",
+            *images,
+            "-o",
+            str(counts / "out"),
+            "--no-correct",
+        ]
+    )
+    assert sorted(p.name for p in (counts / "out").glob("*_aligned.tif")) == [
+        "0_aligned.tif",
+        "2_aligned.tif",
+    ]

@@ -205,6 +205,9 @@ def test_rig_convert_and_back(small, capsys):
         assert torch.allclose(a.K, b.K)
         assert torch.allclose(a.cam_from_world.t, b.cam_from_world.t, atol=1e-9)
     assert "known" in fails(["rig", "convert", str(small / "rig.yaml"), "x", "--write-as", "word"], capsys)
+    rig = str(small / "rig.yaml")
+    for words in (["rig", "convert", rig, str(small)], ["explore", rig, "--save", str(small)]):
+        assert f"{small} is a folder: name a file in it" in fails(words, capsys)
 
 
 def test_the_size_of_files_that_state_none_or_several(small, tmp_path, capsys):
@@ -531,6 +534,8 @@ def test_a_bad_out_is_found_before_the_fusion(small, capsys, monkeypatch):
         (["demo"], "file", "is a file: name a folder"),
         (["ablate", "--scenes", "1"], "file", "is a file: name a folder"),
         (["board", "charuco:8x6:30mm"], "folder", "is a folder: name a file"),
+        (["rig", "diff", "rig.yaml", "rig.yaml"], "picture.foo", "end its name in .png, .pdf or .svg"),
+        (["ablate", "--rendered", "scenes", "--scenes", "1"], "new", "--scenes: of layered scenes"),
     ],
 )
 def test_a_bad_out_is_found_before_the_work(command, out, text, tmp_path, monkeypatch, capsys):

@@ -110,6 +110,7 @@ def test_rig_commands_take_matches(folder, capsys):
         (["--depth-map", "{}/mono.png"], "8 bits, too few"),
         (["--depth-map", "{}/none.png"], "no such depth map"),
         (["--depth-scale", "1"], "--depth-scale: needs --depth-map"),
+        (["--depth-tolerance", "0"], "--depth-tolerance: needs --depth-map"),
         (["--matches", "{}/mono.png"], "neither CSV nor a COLMAP database"),
         (["--depth-map", "{}/depth.tif", "--depth-tolerance", "-1"], "tolerance is -1.0"),
         (["--matches", "{}/exchanged.csv"], "behind the cameras by the rig: are its columns in the order"),

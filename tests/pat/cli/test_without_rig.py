@@ -216,6 +216,25 @@ def test_what_does_not_go_with_a_rig_or_with_many_frames_is_refused(folder, tmp_
     assert not (tmp_path / "out").exists()
 
 
+def test_a_found_rig_is_written_for_a_sequence_that_needs_more(folder, tmp_path, capsys):
+    for name in ("mono", "colour"):
+        (tmp_path / name).mkdir()
+        for i in range(2):
+            shutil.copy(folder / f"{name}.png", tmp_path / name / f"{i}.png")
+    given = [
+        "fuse",
+        str(tmp_path / "mono"),
+        str(tmp_path / "colour"),
+        "--sequence",
+        "-o",
+        str(tmp_path / "out"),
+    ]
+    with pytest.raises(SystemExit):
+        main(given)
+    assert "the frame rate of 'mono' is not known" in capsys.readouterr().err
+    assert set(Rig.load(tmp_path / "out" / "found_rig.yaml").names) == {"mono", "colour"}
+
+
 def test_names_of_cameras_are_those_of_files_or_folders(tmp_path):
     names = [tmp_path / "a" / "1.png", tmp_path / "b" / "1.png"]
     assert list(camera_names(names)) == ["a", "b"]

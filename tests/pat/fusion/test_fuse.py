@@ -43,7 +43,7 @@ from pat.networks.bandwise import BandwisePAT
 from pat.networks.configs import BandwisePATConfig, GuidedPATConfig, PATConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.paper import PAT
-from pat.networks.weights import load_weights
+from pat.networks.weights import load_weights, set_precision
 from tests.pat.layered_array import load_sample
 
 
@@ -307,7 +307,7 @@ def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
         fuse(network, rig, images | {"mono": images["mono"] * 0.9}, alpha="mono", store=tmp_path)
 
 
-def test_tiles_of_another_luminance_or_scale_are_not_taken(tmp_path, monkeypatch):
+def test_tiles_of_another_luminance_scale_or_precision_are_not_taken(tmp_path, monkeypatch):
     """A rig of other units has the same segments, and another depth."""
     hw, beta_hw = (34, 130), (30, 110)
     network, rig = network_of("GuidedPAT"), rig_of(hw, beta_hw)
@@ -327,6 +327,8 @@ def test_tiles_of_another_luminance_or_scale_are_not_taken(tmp_path, monkeypatch
     assert stored(rig) == count
     assert stored(rig, luminance="beta") == 2 * count
     assert stored(larger) == 3 * count
+    set_precision(network, "bfloat16")
+    assert stored(rig) == 4 * count
 
 
 def test_resolution_ratio_is_that_of_pixels_an_angle():

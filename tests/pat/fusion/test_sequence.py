@@ -100,6 +100,18 @@ def test_flow_finds_a_shift_and_its_weight_the_border():
     assert (warped(b, flow.step) - a)[:, 10:-10, 10:-10].abs().mean() < 0.01
 
 
+@pytest.mark.parametrize("hw", [(8, 8), (1, 40), (15, 40), (40, 5)])
+def test_frames_too_small_for_the_flow_have_one(hw):
+    h, w = hw
+    a, b = moving.WALL[1:2, :h, 20 : 20 + w], moving.WALL[1:2, :h, 21 : 21 + w]
+    flow = flow_between(a, b)
+    assert flow.step.shape == (2, h, w)
+    assert flow.weight.shape == hw
+    x, y = flow.step.flatten(1).median(dim=1).values
+    assert abs(x + 1) < 0.3
+    assert abs(y) < 0.3
+
+
 def test_colours_mix_by_confidence_which_disagreement_lowers():
     own = torch.full((1, 1, 2), 0.5)
     red, blue = (torch.tensor(c)[:, None, None].expand(3, 1, 2) for c in ((0.2, 0.0, 0.0), (0.0, 0.0, 0.2)))
@@ -118,7 +130,7 @@ def test_colours_mix_by_confidence_which_disagreement_lowers():
 
 def test_a_speed_that_is_none_is_refused_at_once():
     frames, _ = moving.recording(2)
-    for speed in (-3.0, float("nan")):
+    for speed in (-3.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match="speed is"):
             SequenceFusion(load_weights("mono-colour"), moving.rig(), frames, "fast", speed)
 

@@ -1,5 +1,6 @@
 """Panels of images side by side."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -24,3 +25,12 @@ def test_panels_keep_their_shape_and_stand_row_by_row(factor):
     assert drawn.getpixel((middles[1], rows[1])) == (255, 255, 255)
     title = drawn.crop((0, 0, wide, TITLE)).getextrema()
     assert title[0][0] < 100
+
+
+def test_long_titles_of_two_lines_stay_above_their_panels():
+    white = torch.ones(3, 50, 100)
+    drawn = draw_panels({"a title wider than a panel is\n21.3 dB": white, "": white}, columns=2, width=2.0)
+    dark = np.asarray(drawn.convert("L")) < 128
+    rows, columns = (np.flatnonzero(dark.any(axis)) for axis in (1, 0))
+    assert rows.max() < 2 * TITLE
+    assert columns.max() < drawn.width // 2
