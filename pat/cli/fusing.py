@@ -206,9 +206,12 @@ class Fuse(Known):
             if name in rig.names:
                 rig = with_sensor(rig, name, frame_rate=rate)
         self.video = rates.get(array.alpha, self.video)
-        rig.save(self.out / FOUND_RIG)
-        say(f"the rig that was found: {self.out / FOUND_RIG}")
+        path = self.out / FOUND_RIG
+        if not path.exists():  # frames that fail may want it; another job's is kept until this one is done
+            rig.save(path)
+        say(f"the rig that was found: {path}")
         self._many(rig, {name: files[name] for name in rig.names}, array.alpha)
+        rig.save(path)
 
     def _choose_bits(self, files: Mapping[str, Sequence[Path]]) -> None:
         """As many bits as the images have, unless asked otherwise."""

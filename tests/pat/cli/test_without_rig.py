@@ -233,6 +233,10 @@ def test_a_found_rig_is_written_for_a_sequence_that_needs_more(folder, tmp_path,
         main(given)
     assert "the frame rate of 'mono' is not known" in capsys.readouterr().err
     assert set(Rig.load(tmp_path / "out" / "found_rig.yaml").names) == {"mono", "colour"}
+    (tmp_path / "out" / "found_rig.yaml").write_text("another job's")
+    with pytest.raises(SystemExit):
+        main(given)
+    assert (tmp_path / "out" / "found_rig.yaml").read_text() == "another job's"
 
 
 def test_names_of_cameras_are_those_of_files_or_folders(tmp_path):
