@@ -265,7 +265,7 @@ def ablate(
     for i, case in enumerate(track(cases, "ablating", disable=not sys.stderr.isatty())):
         found, images = _case(network, case, chosen or families())
         rows += found
-        panels |= _crops(case, images, found) if i < SHOWN else {}
+        panels |= crops(case, images, found) if i < SHOWN else {}
     write_text(out / "ablation.md", markdown(rows))
     write_csv(out / "ablation.csv", AblationRow._fields, rows)
     save_panels(panels, out / "ablation.png", columns=6)
@@ -374,15 +374,13 @@ def _mean(values: Sequence[float]) -> float:
     return float(np.mean(known)) if known else math.nan
 
 
-def _crops(
-    case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[AblationRow]
-) -> dict[str, Tensor]:
-    """Crops by title, where calibrated and rectified differ most; the PSNR is that of the whole image."""
+def crops(case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[AblationRow]) -> dict[str, Tensor]:
+    """Crops by title of what was fused, where calibrated and rectified differ most; PSNR is the whole's."""
     window = (slice(None), *_most_different(images, case.ground_truth))
     panels = {f"{case.name}: ground truth\nfocal ratio {case.ratio:.1f}": case.ground_truth[window]}
     for row in rows:
-        image = images.get(row.family, torch.zeros_like(case.ground_truth))
-        panels[f"{case.name}: {row.family}\n{row.psnr:.1f} dB"] = image[window]
+        if row.family in images:
+            panels[f"{case.name}: {row.family}\n{row.psnr:.1f} dB"] = images[row.family][window]
     return panels
 
 

@@ -13,6 +13,7 @@ from pat.evaluation.ablation import (
     BETA,
     AblationRow,
     ablate,
+    crops,
     families,
     layered_cases,
     markdown,
@@ -130,6 +131,12 @@ def test_a_figure_that_is_missing_empties_no_column():
     assert "| -1.00 |" in line
     assert "| 1.50 | 40.0% |" in line
     assert "nan" not in markdown(rows[:2])
+
+
+def test_what_was_not_fused_is_not_in_the_picture(case):
+    rows = [AblationRow("a", 1.2, "calibrated", 30.0, 0.9), AblationRow("a", 1.2, "other", note="cannot")]
+    found = crops(case, {"calibrated": case.ground_truth}, rows)
+    assert [title.split(": ")[1].split("\n")[0] for title in found] == ["ground truth", "calibrated"]
 
 
 def test_the_true_depth_has_no_error(case):
