@@ -41,7 +41,7 @@ FITTED_ON = (
     "ideal", "x1", "x4", "x8", "alpha = .6/.3/.1", "alpha random", "beta x .6",
     "1000 electrons", "200 electrons", "50 electrons",
 )  # fmt: skip
-STEPS, BATCH, RATE, DECAY = 2000, 4096, 1e-2, 0.3
+STEPS, BATCH, RATE, DECAY = 2000, 4096, 1e-2, 5e-2
 
 
 class Judged(NamedTuple):
