@@ -64,7 +64,11 @@ class FoundDepth(NamedTuple):
 
 
 def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> FusionOutput:
-    """A network's result with the certainty of the matches it was given, where that is known, for its own."""
+    """A network's result with the certainty of the matches it was given, where that is known, for its own.
+
+    Where segments are around what is known of each pixel, the higher of the two: a match there is hardly
+    better than the few others, which certainty takes for doubt.
+    """
     if matches is None:
         return output
     confidence, deviation = list(output.confidence), list(output.deviation)
@@ -72,8 +76,10 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
         if found.certainty is not None:
             whole = interpolate(found.certainty.float(), scale_factor=FINE, mode="bilinear").to(confidence[i])
             seen = beta.field.straight.valid & (output.confidence[i] > 0)
-            confidence[i] = torch.where(seen, whole[:, 0], 0.0)
-            deviation[i] = whole[:, 1] / DEVIATIONS
+            stated, half_width = torch.where(seen, whole[:, 0], 0.0), whole[:, 1]
+            own = (confidence[i] > stated) & beta.around
+            confidence[i] = torch.where(own, confidence[i], stated)
+            deviation[i] = torch.where(own, deviation[i], half_width / DEVIATIONS)
     overall = output.overall if output.overall is None else torch.stack(confidence).amax(0)
     return output._replace(confidence=confidence, deviation=deviation, overall=overall)
 

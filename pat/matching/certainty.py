@@ -83,13 +83,12 @@ def fitted_network() -> CertaintyNetwork:
 
 @torch.no_grad()
 def with_certainty(matches: Matches) -> Matches:
-    """The matches, with the certainty of each of which the choice states something.
+    """The matches, with the certainty of each, once the choice has said what it thinks of them.
 
-    Of others, around what is known, it is not: the facts are those of whole segments. Of matches on which
-    several betas agree, whose certainty alone was known before: a beta sees a point only if both say so.
+    Of matches on which several betas agree, whose certainty alone was known before: a beta sees a point only
+    if both say so.
     """
-    known = [(found, found.stated is not None) for found in matches.betas]
-    return Matches(tuple(replace(m, certainty=_certainty(m)) if stated else m for m, stated in known))
+    return Matches(tuple(replace(found, certainty=_certainty(found)) for found in matches.betas))
 
 
 def _certainty(found: BetaMatches) -> Float[Tensor, "b 2 h2 w2"]:

@@ -95,12 +95,11 @@ def read_choice(path: Path) -> Choice:
 def chosen(inputs: Inputs, matches: Matches, network: Choice | None = None) -> Matches:
     """The matches in each beta, with the disparity of each pixel's candidate of the highest score.
 
-    Where each segment is around what is known of its own pixel, disparities of others say nothing, and the
-    matches stay as they are, with nothing stated.
+    Where each segment is around what is known of its own pixel, disparities of others say nothing: the choice
+    states how certain a match is, and changes none.
     """
     best = network or fitted_choice()
-    each = zip(inputs.by_beta, matches.betas)
-    return Matches(tuple(found if one.betas[0].around else _chosen(one, found, best) for one, found in each))
+    return Matches(tuple(_chosen(*one, best) for one in zip(inputs.by_beta, matches.betas)))
 
 
 def _chosen(inputs: Inputs, found: BetaMatches, network: Choice) -> BetaMatches:
@@ -119,7 +118,7 @@ def _chosen(inputs: Inputs, found: BetaMatches, network: Choice) -> BetaMatches:
         return candidates(part).gather(1, best), stated.mean(2)[..., : h // FINE, : w // FINE]
 
     disparity, stated = inputs.in_pieces(of, replace(found, bands=None, diffused=None, certainty=None))
-    return replace(found, chosen=disparity, stated=stated)
+    return replace(found, chosen=None if inputs.betas[0].around else disparity, stated=stated)
 
 
 def candidates(found: BetaMatches) -> Float[Tensor, "b n h w"]:
