@@ -281,7 +281,7 @@ def fused_apart(job: SystemRun, files: Mapping[str, Path]) -> tuple[Frame, list[
         if line.strip():
             job.say(line.rstrip())
     _, status, used = os.wait4(process.pid, 0)
-    if status:
+    if os.waitstatus_to_exitcode(status) not in (0, LowConfidenceWarning.exit_status):
         raise ValueError(f"fusing in a process of its own failed (wait status {status})")
     took = f"{time.monotonic() - begin:.0f} s, {used.ru_utime + used.ru_stime:.0f} s of a core"
     peak = f"allowed {job.max_memory}, at most {most() / 2**30:.2f} GiB resident"
