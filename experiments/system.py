@@ -30,6 +30,7 @@ from experiments.peaks import watch_peak
 from pat.evaluation.baseline import classical_baseline
 from pat.evaluation.metrics import score
 from pat.evaluation.tables import markdown_table
+from pat.fusion.checks import LowConfidenceWarning
 from pat.fusion.frames import ImageFiles
 from pat.fusion.fuse import FuseSettings, fuse
 from pat.fusion.results import Frame, save_frame, view_of
