@@ -1,1 +1,1 @@
-"""What completes colours (`pat.networks.completion`), trained on photographs cut into surfaces."""
+"""What completes colours (`pat.networks.completion`), and the pairs that it and the choice are trained on."""

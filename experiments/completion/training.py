@@ -1,7 +1,7 @@
 """Training of the completion: `python -m experiments.completion.training --photos DIR --stereo DIR`.
 
-First frames are fused and what the completion is given is kept, of photographs cut into surfaces and of
-rectified pairs; then it is trained on random windows of those. The weights are the fusion's with it.
+First frames are fused and what the completion is given is kept, of each kind of pairs (`samples.KINDS`);
+then it is trained on random windows of those. The weights are the fusion's with it.
 """
 
 from __future__ import annotations
