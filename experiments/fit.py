@@ -7,19 +7,21 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 import torch
 import tyro
+import yaml
 from torch import Tensor, nn
 from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from arraygeom.atomic import write_atomically
+from arraygeom.atomic import write_text
 from pat.support.locks import folder_lock
+from pat.support.schema import from_document, read_yaml, to_document
 from pat.training.checkpoints import collect, newest_checkpoint, restore, write_checkpoint
 
 Losses = Callable[[int], Iterator[Tensor]]
@@ -53,11 +55,10 @@ class Recipe:
     def folder(self) -> Iterator[None]:
         """The run's folder, with its recipe, for one process. Raises ValueError if it holds another run."""
         with folder_lock(self.out):
-            file, recipe = self.out / "recipe.json", recipe_text(self)
+            file, recipe = self.out / "recipe.yaml", recipe_of(self)
             if not file.exists():
-                with write_atomically(file) as temporary:
-                    temporary.write_text(recipe, encoding="utf-8")
-            elif (other := file.read_text(encoding="utf-8")) != recipe:
+                write_text(file, yaml.safe_dump(recipe, sort_keys=False))
+            elif (other := read_yaml(file)) != recipe:
                 raise ValueError(f"{self.out} holds a run of another recipe ({other}): give another --out")
             torch.manual_seed(self.seed)
             yield
@@ -70,12 +71,24 @@ class Recipe:
 
 
 def command(train: Callable[[Any], Path], recipe: type[Recipe], prog: str) -> None:
-    """Train by a command line, and print the file of the weights; what is wrong with it ends in one line."""
-    config = tyro.cli(recipe, prog=prog)
+    """Train by `[RECIPE.yaml] [--name value ...]`, and print the file of the weights; what is wrong with it
+    ends in one line."""
+    given = sys.argv[1:]
     try:
+        base = read_recipe(recipe, given.pop(0)) if given and given[0][:1] != "-" else None
+        config = tyro.cli(recipe, prog=prog + " [RECIPE.yaml]", default=base, args=given)
         print(train(config))
     except (ValueError, OSError) as error:
         sys.exit(f"{prog}: {error}")
+
+
+def read_recipe(kind: type[Recipe], path: str) -> Recipe:
+    """A recipe from a YAML file. Raises ValueError naming the file and the entry, OSError for no file."""
+    document = read_yaml(path)
+    try:
+        return from_document(kind, document)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def fit(network: nn.Module, losses: Losses, out: Path, steps: int, rate: float, save: int) -> nn.Module:
@@ -121,7 +134,12 @@ def _log(out: Path, step: int, steps: int, loss: float) -> None:
         file.write(json.dumps({"step": step, "mean loss": round(loss, 4)}) + "\n")
 
 
-def recipe_text(config: Any) -> str:
+def recipe_of(config: Any) -> dict[str, Any]:
     """A recipe without the entries that may differ between a run and its continuation."""
     left_out = {"out", "cache", "save", "device"}
-    return json.dumps({k: v for k, v in asdict(config).items() if k not in left_out}, default=str)
+    return {k: v for k, v in to_document(config, defaults=True).items() if k not in left_out}
+
+
+def recipe_text(config: Any) -> str:
+    """`recipe_of` for the facts of weights."""
+    return json.dumps(recipe_of(config))

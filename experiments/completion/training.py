@@ -75,7 +75,7 @@ def kept(config: CompletionTraining, network: GuidedPAT, kind: str) -> list[Tens
         file = folder / f"{i:05}.webp"
         if not file.exists():
             pair = make()
-            learned = config.choices and kind != "photos" and pair.disparity is not None
+            learned = config.choices and kind in ("pairs", "shapes") and pair.disparity is not None
             best = unseeing(config.choices, pair.name) if learned else None
             planes = captured(network, pair, i, matcher=partial(match, choice=best))
             write_planes(planes[:, :HIGHEST], file)

@@ -71,7 +71,7 @@ def _pattern(setting: Setting, depth: float, kinds: tuple[TextureKind, ...]) -> 
     feature = setting.metres(depth, math.exp(rng.uniform(math.log(10), math.log(50))))
     return Texture(
         kind=kinds[int(rng.integers(len(kinds)))],
-        paints=_paints(rng),
+        paints=paints(rng),
         scale=1 / feature,
         offset=vec(rng.uniform(-50, 50, 3)),
         distortion=float(rng.choice([0.0, rng.uniform(0.5, 4)])),
@@ -79,16 +79,16 @@ def _pattern(setting: Setting, depth: float, kinds: tuple[TextureKind, ...]) -> 
     )
 
 
-def _paints(rng: Generator) -> tuple[Paint, ...]:
+def paints(rng: Generator) -> tuple[Paint, ...]:
     """Two to four paints, alternately lighter and darker, of similar hues or not."""
     hue, width, dark_first = rng.uniform(), rng.choice([0.08, 0.5]), int(rng.integers(2))
-    paints = []
+    found = []
     for i in range(int(rng.integers(2, 5))):
         value = rng.uniform(0.25, 0.5) if (i + dark_first) % 2 else rng.uniform(0.6, 0.95)
         encoded = colorsys.hsv_to_rgb((hue + rng.uniform(-width, width)) % 1, rng.uniform(0.1, 0.9), value)
         r, g, b = linear_from_srgb(torch.tensor(encoded, dtype=torch.float64)).tolist()
-        paints.append(Paint((r, g, b), _near_infrared(rng, (r, g, b))))
-    return tuple(paints)
+        found.append(Paint((r, g, b), _near_infrared(rng, (r, g, b))))
+    return tuple(found)
 
 
 def _near_infrared(rng: Generator, rgb: Vec3) -> float:

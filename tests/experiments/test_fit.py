@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from experiments.fit import Recipe, fit
+from experiments.fit import Recipe, command, fit
 
 
 def test_the_mean_loss_since_the_last_checkpoint_is_said_and_logged(tmp_path, capsys):
@@ -53,3 +53,31 @@ def test_a_run_of_another_recipe_is_refused_before_anything_is_done(tmp_path):
         assert (recipe.out / "pairs").exists()
     with pytest.raises(ValueError, match="another recipe"), replace(recipe, seed=1).folder():
         pytest.fail("not refused")
+
+
+def test_a_recipe_is_a_file_that_the_command_line_changes(tmp_path, monkeypatch, capsys):
+    file = tmp_path / "recipe.yaml"
+    file.write_text(f"out: {tmp_path / 'run'}\nsteps: 7\nbatch: 2\nside: 8\n")
+    found = []
+
+    def train(config):
+        found.append(config)
+        with config.folder():
+            return config.out
+
+    monkeypatch.setattr("sys.argv", ["train", str(file), "--batch", "3"])
+    command(train, Recipe, "train")
+    assert found == [Recipe(out=tmp_path / "run", steps=7, batch=3, side=8)]
+    for text, said in (
+        ("step: 3", f"train: {file}: step: unknown key; did you mean 'steps'?"),
+        ("steps: 3", f"train: {file}: out: missing"),
+        ("steps: [", f"train: {file}: not valid YAML"),
+        ("", f"train: {file}: Recipe: "),
+    ):
+        file.write_text(text)
+        with pytest.raises(SystemExit) as stop:
+            command(train, Recipe, "train")
+        assert str(stop.value.code).startswith(said)
+    assert (
+        tmp_path / "run" / "recipe.yaml"
+    ).read_text() == "steps: 7\nbatch: 3\nside: 8\nrate: 0.001\nseed: 0\n"
