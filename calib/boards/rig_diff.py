@@ -21,6 +21,7 @@ from scipy.special import chdtrc
 
 from arraygeom import Camera, Pose, Rig, triangulate
 from arraygeom.pose import cross_matrix
+from arraygeom.text import length_unit
 
 from .bundle import camera_jacobian
 from .uncertainty import RigCovariance, beta_covariance, grid_points, worst_deviation
@@ -85,6 +86,8 @@ class RigDifference:
     alpha: str
     motion: Pose
     significance: Significance | None
+    unit: str = "m"
+    """Of depths; of rigs of unknown scale, "baselines"."""
 
     def as_text(self) -> str:
         """A line for each camera and each pair, and the verdict."""
@@ -95,7 +98,9 @@ class RigDifference:
         for name, found in self.depths.items():
             near, far = found.depth.min(), found.depth.max()
             sizes = _sizes(100 * found.change, 100 * found.sigma, " %")
-            lines.append(f"depth by {self.alpha} and {name}, {near:.3g} to {far:.3g} m: differs by {sizes}")
+            lines.append(
+                f"depth by {self.alpha} and {name}, {near:.3g} to {far:.3g} {self.unit}: differs by {sizes}"
+            )
         return "\n".join([*lines, self.verdict])
 
     @property
@@ -154,7 +159,7 @@ def rig_difference(
     alpha, *betas = names
     depths = {name: _depths(a, b, alpha, name, grids[alpha], known) for name in betas}
     depths = {name: found for name, found in depths.items() if len(found.x)}
-    return RigDifference(cameras, depths, alpha, motion, significance)
+    return RigDifference(cameras, depths, alpha, motion, significance, length_unit(a))
 
 
 def _same_cameras(a: Rig, b: Rig) -> tuple[str, ...]:
@@ -322,7 +327,7 @@ def draw_difference(found: RigDifference) -> Figure:
             cmap, least = ("viridis", 0.0) if at.change.ndim > 1 else ("RdBu", -most)
             drawn = axes.scatter(*x.T, c=shown, s=22, marker="s", cmap=cmap, vmin=least, vmax=most)
             figure.colorbar(drawn, ax=axes)
-            axes.set_title(f"{title}, {depth:.3g} m".replace("$", r"\$"), fontsize=9)
+            axes.set_title(f"{title}, {depth:.3g} {found.unit}".replace("$", r"\$"), fontsize=9)
             axes.set(aspect="equal", xticks=[], yticks=[])
             axes.invert_yaxis()
     return figure

@@ -356,7 +356,7 @@ class Fuse(Known):
 
     def _facts(self, rig: Rig, found: tuple[str, ...] | None, seconds: float) -> Facts:
         """What the page says."""
-        from calib.images.self_calibration import length_unit
+        from arraygeom.text import length_unit
 
         from ..fusion.report import Facts
         from ..support.memory import peak_memory

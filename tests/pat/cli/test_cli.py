@@ -12,7 +12,7 @@ import torch
 import yaml
 
 from arraygeom import Pose, Rig
-from calib.images.self_calibration import UNSCALED
+from arraygeom.text import UNSCALED
 from pat.cli.fusing import Fuse
 from pat.cli.main import Pat, command_paths, main
 from pat.cli.options import respelled
