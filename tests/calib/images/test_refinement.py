@@ -187,6 +187,18 @@ def test_translations_are_freed_where_points_demand_it():
     assert not any("translation" in change.name for change in only.changes)
 
 
+def test_a_refusal_says_what_else_to_free():
+    """A rotation that stands for no shift of the principal point was refused without a word of the latter."""
+    rig = unlike_pair()
+    bad, points = rig.perturbed({"second.centre": vector(0, 8, 0)[:2]}), seen_points(rig, count=200)
+    for free, advice in ((["rotation"], "leave out --free, or free "), (["rotation", "centre"], "")):
+        problem = RefinementProblem.of(bad, free, frames=[points])
+        solution = problem.solve()
+        refused = problem.report(solution._replace(z=torch.zeros_like(solution.z))).objections[0]
+        assert advice in refused
+        assert ("alone" in refused) == bool(advice)
+
+
 def test_a_rig_of_unknown_scale_is_not_refined_in_millimetres():
     rig = unlike_pair().replace(name=UNSCALED)
     moved = rig.perturbed({"second.translation": vector(0, 0.006, 0.012)})
