@@ -166,6 +166,11 @@ def _same_cameras(a: Rig, b: Rig) -> tuple[str, ...]:
     if set(a.names) != set(b.names):
         listed = f"{', '.join(a.names)}; and {', '.join(b.names)}"
         raise ValueError(f"the rigs are of other cameras ({listed}): give two calibrations of the same")
+    if (one := length_unit(a)) != (other := length_unit(b)):
+        raise ValueError(
+            f"lengths of one rig are in {one}, of the other in {other}, as if found from images: "
+            'bring them to one unit, as by `rig.scaled(0.12).replace(name="")`, 0.12 m being its baseline'
+        )
     for name in a.names:
         if not all(isinstance(rig[name], Camera) for rig in (a, b)):
             raise ValueError(f"'{name}' is not calibrated in both rigs: what it sees cannot be compared")
