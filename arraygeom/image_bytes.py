@@ -6,6 +6,8 @@ OpenCV 4.11 to 4.13 crash on damaged animated PNGs and take what is missing of a
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from typing import Any
 
@@ -13,6 +15,8 @@ PNG = b"\x89PNG\r\n\x1a\n"
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 ANIMATION = (b"acTL", b"fcTL", b"fdAT")
 """Chunks of a PNG file beside those of its first image."""
+REDUCED, MASK = 1, 4
+"""Of a TIFF directory's NewSubfileType."""
 DAMAGED = (OSError, SyntaxError, ValueError, struct.error, LookupError, TypeError, ArithmeticError)
 """What Pillow and tifffile raise where a file's head is damaged."""
 
@@ -45,13 +49,30 @@ def first_tiff_page(content: bytes) -> Any:
 
     Raises one of `DAMAGED` where there is none.
     """
+    with _quiet_tiff(content) as file:
+        return file.pages.first
+
+
+def has_further_images(content: bytes) -> bool:
+    """Whether a TIFF file holds more images of the first one's size, which are no copies or masks of it."""
+    try:
+        with _quiet_tiff(content) as file:
+            first, second = file.pages.first, file.pages[1]
+            own, other = ((page.imagelength, page.imagewidth) for page in (first, second))
+            return bool(own == other and not second.subfiletype & (REDUCED | MASK))
+    except DAMAGED:
+        return False
+
+
+@contextmanager
+def _quiet_tiff(content: bytes) -> Iterator[Any]:
     from tifffile import TiffFile, logger
 
     log = logger()
     log.disabled, before = True, log.disabled
     try:
         with TiffFile(BytesIO(content)) as file:
-            return file.pages.first
+            yield file
     finally:
         log.disabled = before
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from .camera import Camera, LensView, View
 from .checks import derived
 from .pixels import HW, coarse_grid
+from .text import length_unit
 
 if TYPE_CHECKING:
     from .rig import Pair, Rig
@@ -45,7 +46,7 @@ def oddities(rig: Rig) -> tuple[str, ...]:
 def unit_oddity(rig: Rig) -> str | None:
     """What to say of baselines that suggest another unit than metres."""
     centres = [camera.centre for camera in rig.cameras.values() if isinstance(camera, Camera)]
-    if len(centres) < 2:
+    if len(centres) < 2 or length_unit(rig) != "m":
         return None
     longest = float(torch.pdist(torch.stack(centres)).max())
     if longest > LARGEST_BASELINE:
@@ -81,7 +82,8 @@ def _all(rig: Rig) -> Iterator[str]:
     for one, other in [order for pair in pairs for order in (pair, pair[::-1])]:
         # a few pixels decide most pairs: through lenses all take seconds
         if not _overlap(small.pair(one, other)) and not _overlap(rig.pair(one, other)):
-            bounds = "" if rig.depth is None else " between {:g} and {:g} m".format(*map(float, rig.depth))
+            near, far = map(float, rig.depth or (0, 0))
+            bounds = f" between {near:g} and {far:g} {length_unit(rig)}" if rig.depth is not None else ""
             yield (
                 f"'{other}' sees nothing of what '{one}' sees{bounds}: check the poses, "
                 "which are X_cam = R X_world + t with z forward and y down (OpenGL's look along -z), "
@@ -156,20 +158,21 @@ def _of_positions(rig: Rig, pairs: Iterable[tuple[str, str]]) -> Iterator[str]:
 
 
 def _of_baseline(rig: Rig, a: str, b: str) -> Iterator[str]:
-    baseline = float((rig[a].centre - rig[b].centre).norm())
+    baseline, unit = float((rig[a].centre - rig[b].centre).norm()), length_unit(rig)
+    question = f"are depth and poses both in {'metres' if unit == 'm' else unit}?"
     if baseline > 0 and rig.depth is not None:
         near, far = map(float, rig.depth)
         focal = float(rig[b].K[:2, :2].det().abs().sqrt())
         moved = focal * baseline * (1 / near - 1 / far)
         if near < far and moved < LEAST_DISPARITY:
             yield (
-                f"'{a}' and '{b}' are {baseline:.3g} m apart: from {near:g} to {far:g} m a match moves by "
-                f"{moved:.2g} px; are depth and poses both in metres?"
+                f"'{a}' and '{b}' are {baseline:.3g} {unit} apart: from {near:g} to {far:g} {unit} a match "
+                f"moves by {moved:.2g} px; {question}"
             )
         if focal * baseline / far > 2 * max(rig[b].hw) * focal / float(rig[a].K[:2, :2].det().abs().sqrt()):
             yield (
-                f"'{a}' and '{b}' are {baseline:.3g} m apart, which is more than the depth of {far:g} m "
-                "allows: are depth and poses both in metres?"
+                f"'{a}' and '{b}' are {baseline:.3g} {unit} apart, which is more than the depth of "
+                f"{far:g} {unit} allows: {question}"
             )
 
 

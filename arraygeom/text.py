@@ -30,27 +30,39 @@ def response_text(sensor: Sensor) -> str:
     return response or ""
 
 
-def baseline_text(cameras: Mapping[str, Any]) -> str:
-    """Distances between the cameras whose poses are known, in a unit that suits them."""
+UNSCALED = "found from images: lengths are multiples of the baseline, not metres"
+"""The name of a rig of unknown scale."""
+
+
+def length_unit(rig: Any) -> str:
+    """What lengths of a rig are in: "m", or "baselines" of one of unknown scale."""
+    return "baselines" if rig.name == UNSCALED else "m"
+
+
+def baseline_text(cameras: Mapping[str, Any], unit: str = "m") -> str:
+    """Distances between the cameras whose poses are known; metres in a unit that suits them."""
     centres = [c.centre.detach() for c in cameras.values() if hasattr(c, "cam_from_world")]
     pairs = [(a - b).norm(dim=-1) for i, a in enumerate(centres) for b in centres[:i]]
     if not pairs:
         return ""
-    metres = torch.cat([d.reshape(-1) for d in torch.broadcast_tensors(*pairs)])
-    scale, unit = next((s, u) for limit, s, u in UNITS if float(metres.max()) < limit)
-    return f"baseline{'s' if len(pairs) > 1 else ''} {range_text(metres * scale, '.3g')} {unit}"
+    lengths = torch.cat([d.reshape(-1) for d in torch.broadcast_tensors(*pairs)])
+    named = "baselines" if len(pairs) > 1 else "baseline"
+    if unit != "m":
+        return f"{named} {range_text(lengths, '.3g')}"
+    scale, unit = next((s, u) for limit, s, u in UNITS if float(lengths.max()) < limit)
+    return f"{named} {range_text(lengths * scale, '.3g')} {unit}"
 
 
 UNITS = ((0.01, 1e3, "mm"), (1.0, 1e2, "cm"), (float("inf"), 1.0, "m"))
 """Below which length (metres) another unit reads better, its factor and name."""
 
 
-def depth_text(depth: tuple[Tensor, Tensor] | None) -> str:
+def depth_text(depth: tuple[Tensor, Tensor] | None, unit: str = "m") -> str:
     """The depth range: "2-5 m"."""
     if depth is None:
         return ""
     near, far = float(depth[0].detach().min()), float(depth[1].detach().max())
-    return f"{near:.3g} m to infinity" if far == float("inf") else f"{near:.3g}-{far:.3g} m"
+    return f"{near:.3g} {unit} to infinity" if far == float("inf") else f"{near:.3g}-{far:.3g} {unit}"
 
 
 def angle(R: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ from scipy.special import chdtrc
 
 from arraygeom import Camera, Pose, Rig, triangulate
 from arraygeom.pose import cross_matrix
+from arraygeom.text import length_unit
 
 from .bundle import camera_jacobian
 from .uncertainty import RigCovariance, beta_covariance, grid_points, worst_deviation
@@ -85,6 +86,8 @@ class RigDifference:
     alpha: str
     motion: Pose
     significance: Significance | None
+    unit: str = "m"
+    """Of depths; of rigs of unknown scale, "baselines"."""
 
     def as_text(self) -> str:
         """A line for each camera and each pair, and the verdict."""
@@ -95,7 +98,9 @@ class RigDifference:
         for name, found in self.depths.items():
             near, far = found.depth.min(), found.depth.max()
             sizes = _sizes(100 * found.change, 100 * found.sigma, " %")
-            lines.append(f"depth by {self.alpha} and {name}, {near:.3g} to {far:.3g} m: differs by {sizes}")
+            lines.append(
+                f"depth by {self.alpha} and {name}, {near:.3g} to {far:.3g} {self.unit}: differs by {sizes}"
+            )
         return "\n".join([*lines, self.verdict])
 
     @property
@@ -154,13 +159,18 @@ def rig_difference(
     alpha, *betas = names
     depths = {name: _depths(a, b, alpha, name, grids[alpha], known) for name in betas}
     depths = {name: found for name, found in depths.items() if len(found.x)}
-    return RigDifference(cameras, depths, alpha, motion, significance)
+    return RigDifference(cameras, depths, alpha, motion, significance, length_unit(a))
 
 
 def _same_cameras(a: Rig, b: Rig) -> tuple[str, ...]:
     if set(a.names) != set(b.names):
         listed = f"{', '.join(a.names)}; and {', '.join(b.names)}"
         raise ValueError(f"the rigs are of other cameras ({listed}): give two calibrations of the same")
+    if (one := length_unit(a)) != (other := length_unit(b)):
+        raise ValueError(
+            f"lengths of one rig are in {one}, of the other in {other}, as if found from images: "
+            'bring them to one unit, as by `rig.scaled(0.12).replace(name="")`, 0.12 m being its baseline'
+        )
     for name in a.names:
         if not all(isinstance(rig[name], Camera) for rig in (a, b)):
             raise ValueError(f"'{name}' is not calibrated in both rigs: what it sees cannot be compared")
@@ -322,7 +332,7 @@ def draw_difference(found: RigDifference) -> Figure:
             cmap, least = ("viridis", 0.0) if at.change.ndim > 1 else ("RdBu", -most)
             drawn = axes.scatter(*x.T, c=shown, s=22, marker="s", cmap=cmap, vmin=least, vmax=most)
             figure.colorbar(drawn, ax=axes)
-            axes.set_title(f"{title}, {depth:.3g} m".replace("$", r"\$"), fontsize=9)
+            axes.set_title(f"{title}, {depth:.3g} {found.unit}".replace("$", r"\$"), fontsize=9)
             axes.set(aspect="equal", xticks=[], yticks=[])
             axes.invert_yaxis()
     return figure

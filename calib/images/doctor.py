@@ -16,6 +16,7 @@ from torch.nn.functional import normalize
 from arraygeom import Camera, Rig
 from arraygeom.pixels import HW, coarse_grid
 from arraygeom.pose import rotation_vector
+from arraygeom.text import length_unit
 from arraygeom.threads import torch_in_one_thread
 
 from .depth_change import relative_change
@@ -32,7 +33,6 @@ from .hypotheses import (
 from .matches import Images, Pairs, PointMatches, agreeing_pairs, cameras_of, depth_seen, match_cameras
 from .parameters import SIGMA
 from .residuals import image_parts, line_distances, related
-from .self_calibration import length_unit
 
 LOG = logging.getLogger(__name__)
 

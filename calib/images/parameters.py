@@ -14,6 +14,7 @@ from torch import Tensor
 
 from arraygeom import Camera, LensView, Link, Rig, intrinsics, rotation_from_vector
 from arraygeom.distortion import typical_coefficients
+from arraygeom.text import length_unit
 
 SIGMA = {"rotation": math.radians(0.5), "translation": 0.01, "focal": 0.01, "centre": 5.0, "distortion": 0.02}
 """Default standard deviations: radians, a share of the longest baseline, a share of the focal length, pixels
@@ -146,6 +147,8 @@ def _free_parameter(rig: Rig, name: str, like: Tensor, sigma: Mapping[str, float
         centres = torch.stack([c.centre for c in rig.cameras.values() if isinstance(c, Camera)])
         size = size * (max(float(torch.pdist(centres).max()), 1e-6) if len(centres) > 1 else 1.0)
     unit, factor = UNITS.get(kind, ("", 1.0))
+    if kind == "translation" and (own := length_unit(rig)) != "m":
+        unit, factor = own, 1.0
     return FreeParameter(name, size, unit, factor, FOCAL_CORRELATION if kind == "focal" else 0.0)
 
 

@@ -328,9 +328,7 @@ class RefinementProblem:
         before, after = (line_distances(rig, self.held_out) for rig in (self.rig, refined))
         depth = self._depth_change(refined, solution)
         moved = bool(solution.z.any())
-        objections = (
-            [] if moved and nearer(before, after) else ["held-out points are no nearer to their lines"]
-        )
+        objections = [] if moved and nearer(before, after) else [self._no_nearer(before, solution)]
         objections += _contradictions(self.parameters, solution.z)
         off = float(after.abs().median())
         if moved and off > max(LARGEST_DISTANCE, OF_OWN * own_distance(refined, self.held_out)):
@@ -355,6 +353,17 @@ class RefinementProblem:
             objections=tuple(objections),
             kept=tuple(_kept(self.parameters, solution)),
         )
+
+    def _no_nearer(self, before: Tensor, solution: Solution) -> str:
+        """The objection that points are no nearer to their lines, and what else to free if that is why."""
+        text = "held-out points are no nearer to their lines"
+        kinds = dict.fromkeys(u.name.rpartition(".")[2] for u in self.considered)
+        if not kinds.keys() & set(FREE):  # else all that can be freed was tried
+            return text
+        with_considered = self.after(solution.full[: self.uncertain])
+        if not nearer(before, line_distances(with_considered, self.held_out)):
+            return text
+        return f"{text} by what is free alone: leave out --free, or free {', '.join(kinds)} too"
 
     def _explained_by_lenses(self, distances: Tensor) -> list[str]:
         """An objection if other lenses, with the same poses, put held-out points as near to their lines.

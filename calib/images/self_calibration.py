@@ -31,7 +31,7 @@ from arraygeom import (
 )
 from arraygeom.pixels import HW, map_homogeneous
 from arraygeom.robust import cauchy, least_squares, normal_deviation, robust_least_squares
-from arraygeom.text import angle
+from arraygeom.text import UNSCALED, angle
 from arraygeom.threads import torch_in_one_thread
 
 from .lenses import with_lens_of
@@ -181,15 +181,6 @@ def refined_by_depth(
         return pair
     LOG.info("refining %s and %s by %d points", *pair.rig.names, len(matches.alpha))
     return _refined_pair(pair.rig, matches, matches) or pair
-
-
-UNSCALED = "found from images: lengths are multiples of the baseline, not metres"
-"""The name of a rig of unknown scale."""
-
-
-def length_unit(rig: Rig) -> str:
-    """What lengths of a rig are in: "m", or "baselines" of one of unknown scale."""
-    return "baselines" if rig.name == UNSCALED else "m"
 
 
 def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig:

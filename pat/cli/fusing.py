@@ -237,7 +237,22 @@ class Fuse(Known):
             files = matched_frames(files)
         if self.sequence or max(map(len, files.values())) > 1:
             self.refuse_several()
+        self._warn_of_ignored(one=max(map(len, files.values())) == 1)
         return files
+
+    def _warn_of_ignored(self, *, one: bool) -> None:
+        """Say which options do nothing for `one` frame, and for frames that are no sequence."""
+        of_many = {
+            "--sequence": self.sequence,
+            "--workers": self.workers > 1,
+            "--scheduler": self.scheduler is not None,
+            "--on-error skip": self.on_error == "skip",
+        }
+        of_sequences = {"--video": self.video != Fuse.video, "--no-propagate": not self.propagate}
+        if one and (named := [option for option, given in of_many.items() if given]):
+            options.warn(f"{', '.join(named)}: for many frames, and each camera has one image")
+        if not self.sequence and (named := [option for option, given in of_sequences.items() if given]):
+            options.warn(f"{', '.join(named)}: for a --sequence only: of no effect")
 
     def refuse_several(self) -> None:
         """Raise ValueError for options of single frames."""
@@ -356,7 +371,7 @@ class Fuse(Known):
 
     def _facts(self, rig: Rig, found: tuple[str, ...] | None, seconds: float) -> Facts:
         """What the page says."""
-        from calib.images.self_calibration import length_unit
+        from arraygeom.text import length_unit
 
         from ..fusion.report import Facts
         from ..support.memory import peak_memory

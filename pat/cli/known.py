@@ -125,6 +125,7 @@ class Known:
 
         from arraygeom import Camera
         from arraygeom.fields import AroundDepth
+        from arraygeom.text import length_unit
 
         from ..media.depth_maps import read_depth
 
@@ -140,7 +141,8 @@ class Known:
             low, high = some.quantile(torch.tensor([0.05, 0.95])).tolist()
             raise ValueError(
                 f"{self.depth_map}: holds {low:.3g} to {high:.3g} m, the rig's depth range is {near:g} to "
-                f"{far:g} m: state its unit with --depth-scale, or another range with --depth"
+                f"{far:g} {length_unit(rig)}: state its unit with --depth-scale, or another range with "
+                "--depth"
             )
         return AroundDepth(depth, self.depth_tolerance, view)
 

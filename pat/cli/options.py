@@ -237,15 +237,15 @@ def numbers_by_name(texts: Iterable[str], option: str) -> dict[str, float]:
 
 
 def read_images(rig: Rig, texts: Iterable[str], *, sized: bool = True) -> dict[str, Tensor]:
-    """The images of `--image NAME=FILE` by camera.
+    """The images of `--image NAME=FILE` by camera, developed as the rig describes them.
 
     Raises ValueError for a camera given twice, or not of the rig, and, if `sized`, for an image of another
     size.
     """
-    from ..media.images import read_image
+    from ..fusion.views import read_view
 
     files = {rig.require(name): path for name, path in files_by_name(texts).items()}
-    return {n: read_image(path, name=n, hw=rig[n].hw if sized else None) for n, path in files.items()}
+    return {name: read_view(rig, name, path, sized=sized) for name, path in files.items()}
 
 
 def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
@@ -253,7 +253,7 @@ def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
 
     Raises ValueError for cameras with unequal numbers of images.
     """
-    from ..media.images import read_image
+    from ..fusion.views import read_view
 
     files: dict[str, list[Path]] = {}
     for name, path in (_named_file("--image", text) for text in texts):
@@ -262,7 +262,7 @@ def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
         frames = by_frame(files)
     except ValueError as error:
         raise ValueError(f"--image: {error}") from None
-    return [{n: read_image(path, name=n) for n, path in frame.items()} for frame in frames]
+    return [{n: read_view(rig, n, path, sized=False) for n, path in frame.items()} for frame in frames]
 
 
 def by_frame(files: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]]:

@@ -182,7 +182,7 @@ class Info:
 
         from arraygeom.rig_check import unit_oddity
         from arraygeom.summary import summarise_cameras, summarise_pairs
-        from calib.images.self_calibration import length_unit
+        from arraygeom.text import length_unit
 
         rig = load_rig(self.rig, self.depth)
         if rig.name:

@@ -147,6 +147,8 @@ class Batch:
         how: dict[str, Any] = {"workers": workers, "resume": resume, "on_error": on_error, "console": console}
         with folder_lock(self.out):
             self._begin(resume)
+            if self.sequence:
+                self.fusion.timeline.warn_of_ends()
             if self.sequence and not self.alone:
                 missing = [i for i in many if not (resume and self.fused_file(i).exists())]
                 alphas, keys = self.files[self.alpha], self.fusion.keys_of(missing)

@@ -18,12 +18,13 @@ from torch.nn.functional import interpolate
 from arraygeom import Link, Rig
 from arraygeom.io.xmp import named_by_band, rig_of_images, states_cameras
 from arraygeom.progress import log_step, part, stage
+from arraygeom.text import UNSCALED
 from arraygeom.undistortion import pixels_between
 from calib.images.focal_length import common_focal_length
 from calib.images.from_images import UncalibratedRig, rig_from_images
 from calib.images.known_intrinsics import centres_found
 from calib.images.lenses import describe_lenses
-from calib.images.self_calibration import UNSCALED, RefinedPair, joined, refined_by_depth, self_calibrated
+from calib.images.self_calibration import RefinedPair, joined, refined_by_depth, self_calibrated
 
 from ..media.headers import focal_length
 from ..media.images import read_image, write_image

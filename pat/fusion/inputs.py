@@ -16,6 +16,7 @@ from arraygeom.fields import AroundDepth, AroundMatches, default_field, pinhole_
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
 from arraygeom.fields.ray_depth import ray_depth
 from arraygeom.pixels import HW
+from arraygeom.text import length_unit
 
 from ..matching.inputs import Beta, Inputs
 from ..matching.normalisation import combined_bands
@@ -102,7 +103,8 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
         around = isinstance(innermost(field), AroundDepth | AroundMatches)
         betas.append(Beta(image, on_grid, track=place.track if place.has_track else None, around=around))
         if not on_grid.any_valid(pair.alpha.hw):
-            bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} m"
+            unit = length_unit(views.rig)
+            bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} {unit}"
             raise ValueError(
                 f"alpha's and '{name}'s views do not overlap{bounds}: check the poses and the depth range"
             )

@@ -330,6 +330,7 @@ def fuse_sequence(
     """
     job = SequenceFusion(network, rig, frames, alpha, speed, FuseSettings(**settings))
     keys = job.timeline.key_frames()
+    job.timeline.warn_of_ends()
 
     @lru_cache(maxsize=2 * int(SETTINGS.intervals) + 1)
     def colour(number: int) -> KeyColour:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from arraygeom import Rig
+from arraygeom.warned import warn
 
 
 class KeyFrame(NamedTuple):
@@ -84,6 +85,20 @@ class Timeline:
                     f"no frame of '{name}' is near one of alpha in time: check 'frame_rate' and 'time_offset'"
                 )
         return [KeyFrame(i, self.at(i)) for i in sorted(found)]
+
+    def warn_of_ends(self) -> None:
+        """Warn of betas without frames in a part of alpha's time: their first or last gives colour there."""
+        times = [self.time(self.alpha, i) for i in range(self.counts[self.alpha])]
+        for name in self.betas:
+            nearest = (self.time(name, self.nearest(name, t)) for t in times)
+            without = sum(abs(a - b) > 1 / self.rate(name) + 1e-9 for a, b in zip(nearest, times))
+            if without:
+                own = self.time(name, 0), self.time(name, self.counts[name] - 1)
+                warn(
+                    f"'{name}' recorded from {own[0]:.4g} to {own[1]:.4g} s and '{self.alpha}' from "
+                    f"{times[0]:.4g} to {times[-1]:.4g} s: {without} of {len(times)} frames get colour from "
+                    "its first or last one; check 'frame_rate' and 'time_offset', or give fewer frames"
+                )
 
     def at(self, index: int) -> dict[str, int]:
         """For each beta its frame nearest in time to alpha's frame `index`."""

@@ -199,16 +199,19 @@ class ViewFiles(Mapping[str, Tensor]):
         return developed_rig(self.rig, self.files)
 
 
-def read_view(rig: Rig, name: str, path: str | Path, *, like: Sensor) -> Float[Tensor, "c h w"]:
-    """Read and develop the image of one camera, on the scale of light of the sensor `like`.
+def read_view(
+    rig: Rig, name: str, path: str | Path, *, like: Sensor | None = None, sized: bool = True
+) -> Float[Tensor, "c h w"]:
+    """Read and develop the image of one camera, on the scale of light of the sensor `like`, or its own.
 
     Raises ValueError or FileNotFoundError naming the camera and the file for what cannot be read, has another
-    size than the rig says, or is in colour where the rig says raw.
+    size than the rig says (if `sized`), or is in colour where the rig says raw.
     """
     view = rig[name]
+    hw = view.hw if sized else None
     raw = view.sensor.bayer is not None
     turned: Literal["apply", "ignore"] = "ignore" if raw else "apply"
-    image = read_image(path, name=name, bits=view.sensor.bits, hw=view.hw, orientation=turned)
+    image = read_image(path, name=name, bits=view.sensor.bits, hw=hw, orientation=turned)
     if view.sensor.bayer and image.shape[0] != 1:
         raise ValueError(
             f"{name}: {path}: is in colour, and the rig says raw {view.sensor.bayer}: drop 'bayer'"

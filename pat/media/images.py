@@ -21,7 +21,7 @@ from torch import Tensor
 
 from arraygeom.atomic import write_atomically
 from arraygeom.chunks import ROWS, spans
-from arraygeom.image_bytes import decodable
+from arraygeom.image_bytes import TIFF, decodable, has_further_images
 from arraygeom.warned import warn
 
 from .headers import HW, ImageHeader, image_header
@@ -104,6 +104,8 @@ def _planes(
     header = image_header(content)
     if header is None:
         raise ValueError(f"{label}: not an image that can be read: give a whole PNG, TIFF, JPEG or PNM file")
+    if content[:4] in TIFF and has_further_images(content):
+        warn(f"{label}: holds several images: the first is taken; save the others as files of their own")
     applied = _applied(header, orientation, label)
     _check_header(header.upright if applied > 1 else header.hw, hw, label)
     values, packed = _decode(content, header, label)

@@ -24,6 +24,7 @@ from arraygeom import (
     stack,
 )
 from arraygeom.batching import tensors_of
+from arraygeom.text import UNSCALED
 from tests.arraygeom.rigs import random_rig, scene_points
 
 F64 = torch.float64
@@ -205,6 +206,7 @@ def test_a_rig_in_one_line():
     rig = Rig({"mono": camera, "colour": colour}, depth=(2, 5))
     assert repr(rig) == "Rig: mono 741x497 f=999, colour 741x497 f=999 rgb; baseline 19.3 cm; 2-5 m"
     assert repr(rig.replace(depth=(2, torch.inf))).endswith("2 m to infinity")
+    assert repr(rig.scaled(1 / 0.193).replace(name=UNSCALED)).endswith("; baseline 1; 10.4-25.9 baselines")
     nir = colour.replace(
         sensor=Sensor(response=Band(850.0, 40.0)), distortion=lens(0.1), K=intrinsics(2.0, (497, 741))
     )

@@ -1,3 +1,5 @@
+import re
+
 import pytest
 import torch
 
@@ -14,6 +16,7 @@ from arraygeom import (
     rotation_from_vector,
 )
 from arraygeom.pose import rotation_error
+from arraygeom.text import UNSCALED
 from tests.arraygeom.rigs import random_rig, scene_points, two_cameras
 
 EVERYTHING = ("rotation", "translation", "focal", "centre")
@@ -172,6 +175,18 @@ def test_overlap_of_large_images_through_lenses_is_checked_by_few_pixels(monkeyp
     odd = Rig({"a": cameras[0], "b": cameras[1]}).check()
     assert sum("sees nothing" in sentence for sentence in odd) == 2 * turned
     assert turned or sum(asked) < 10_000
+
+
+@pytest.mark.parametrize(("t", "depth"), [(1e-3, (50, 100)), (60, (1, 2)), (1e-6, (1, 2))])
+def test_what_is_odd_about_a_rig_of_unknown_scale_is_not_in_metres(t, depth):
+    poses = [Pose.identity(), Pose.from_centre(torch.eye(3), torch.tensor([t, 0.0, 0.0]))]
+    cameras = [Camera(K=intrinsics(90.0, (48, 64)), cam_from_world=pose, hw=(48, 64)) for pose in poses]
+    rig = Rig({"a": cameras[0], "b": cameras[1]}, depth=depth)
+    in_metres = [
+        re.findall(r"\bm?m\b|metres", " ".join(r.check())) for r in (rig, rig.replace(name=UNSCALED))
+    ]
+    assert in_metres[0]
+    assert not in_metres[1]
 
 
 def test_cameras_at_one_position_are_one_sentence():

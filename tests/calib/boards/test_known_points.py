@@ -115,6 +115,10 @@ def test_centres_and_corners_of_markers_are_found(tmp_path):
         ("id,corner,x,y,z\n1,4,0,0,0\n", "0 to 3"),
         ("id,x,y,z\n" + "3,0,0,0\n" * 6, "marker 3"),
         ("id,x,y,z\n" + "".join(f"{2000 + i},0,{i},0\n" for i in range(6)), "4x4"),
+        (
+            "id,x,y,z\n" + "".join(f"{i},{0.1 * i},{0.2 * i + 1},{i % 2 / 500}\n" for i in range(8)),
+            "on a line",
+        ),
     ],
 )
 def test_wrong_files_are_explained(text, message, tmp_path):

@@ -1,6 +1,7 @@
 """`pat rig diff`: simulated recalibrations of a rig that moved and one that did not; what is refused."""
 
 import math
+import re
 import shutil
 from itertools import pairwise
 
@@ -9,6 +10,7 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig, View, rotation_from_vector
+from arraygeom.text import UNSCALED
 from calib.boards.bundle import changed, parameter_names
 from calib.boards.rig_diff import _projections, draw_difference, rig_difference
 from calib.boards.solve import adjust
@@ -151,6 +153,15 @@ def test_without_deviations_there_is_no_verdict(files, capsys):
     said = capsys.readouterr()
     assert "verdict: the same" in said.out
     assert "bare.covariance.json: not there: that rig counts as calibrated as well" in said.err
+
+
+def test_depths_of_rigs_of_unknown_scale_are_not_in_metres(files, tmp_path, capsys):
+    for name in ("a", "turned"):
+        Rig.load(files / f"{name}.yaml").replace(name=UNSCALED).save(tmp_path / f"{name}.yaml")
+    diff(tmp_path, "a", "turned")
+    assert re.search(r"depth by \w+ and \w+, \S+ to \S+ baselines: differs", capsys.readouterr().out)
+    with pytest.raises(ValueError, match="of one rig are in m, of the other in baselines"):
+        rig_difference(Rig.load(files / "a.yaml"), Rig.load(tmp_path / "a.yaml"), depth=(1.0, 2.0))
 
 
 def test_a_covariance_is_of_the_rig_it_was_found_with(files, tmp_path, capsys):

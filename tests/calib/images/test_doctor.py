@@ -11,12 +11,12 @@ import torch
 
 from arraygeom import Link, Pose, Rig, View, rotation_from_vector, triangulate
 from arraygeom.pose import rotation_vector
+from arraygeom.text import UNSCALED
 from calib.images.doctor import diagnose, diagnose_matches
 from calib.images.hypotheses import TRANSPOSE, on_cameras, swap
 from calib.images.least_squares import most_probable
 from calib.images.parameters import UNCERTAIN, apply_change, free_parameters
 from calib.images.residuals import sampson_of_pairs
-from calib.images.self_calibration import UNSCALED
 from pat.cli.main import main
 from pat.media.images import write_image
 from tests.benchmarks.bench_drift import drifted

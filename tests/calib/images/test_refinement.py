@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from arraygeom import Camera, Distortion, Link, Rig, View
+from arraygeom.text import UNSCALED
 from calib.images.depth_change import DepthChange, relative_change
 from calib.images.hypotheses import swap
 from calib.images.matches import PointMatches, match_cameras
@@ -184,6 +185,27 @@ def test_translations_are_freed_where_points_demand_it():
     assert not any("translation" in change.name for change in rotated.changes)
     only = refine_matches(moved, [seen_points(rig, count=400)], free=["rotation"])
     assert not any("translation" in change.name for change in only.changes)
+
+
+def test_a_refusal_says_what_else_to_free():
+    """A rotation that stands for no shift of the principal point was refused without a word of the latter."""
+    rig = unlike_pair()
+    bad, points = rig.perturbed({"second.centre": vector(0, 8, 0)[:2]}), seen_points(rig, count=200)
+    for free, advice in ((["rotation"], "leave out --free, or free "), (["rotation", "centre"], "")):
+        problem = RefinementProblem.of(bad, free, frames=[points])
+        solution = problem.solve()
+        refused = problem.report(solution._replace(z=torch.zeros_like(solution.z))).objections[0]
+        assert advice in refused
+        assert ("alone" in refused) == bool(advice)
+
+
+def test_a_rig_of_unknown_scale_is_not_refined_in_millimetres():
+    rig = unlike_pair().replace(name=UNSCALED)
+    moved = rig.perturbed({"second.translation": vector(0, 0.006, 0.012)})
+    found = refine_matches(moved, [seen_points(rig, count=400)])
+    (change,) = (change for change in found.changes if change.name == "second.translation")
+    assert change.unit == "baselines"
+    assert max(map(abs, change.amount)) < 0.1
 
 
 def test_a_tight_prior_holds():

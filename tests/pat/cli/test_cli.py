@@ -1,6 +1,7 @@
 """The command line: it does the main job, and what is wrong is one line and exit status 2."""
 
 import contextlib
+import dataclasses
 import functools
 import json
 import re
@@ -12,12 +13,13 @@ import torch
 import yaml
 
 from arraygeom import Pose, Rig
-from calib.images.self_calibration import UNSCALED
+from arraygeom.text import UNSCALED
 from pat.cli.fusing import Fuse
 from pat.cli.main import Pat, command_paths, main
-from pat.cli.options import respelled
+from pat.cli.options import read_frames, read_images, respelled
 from pat.data.sample_array import SAMPLE, load_motorcycle, load_sample
 from pat.evaluation.metrics import score
+from pat.media.colour import linear_from_srgb
 from pat.media.images import read_image, write_image
 from tests.arraygeom.test_io import FIXTURES
 
@@ -241,6 +243,18 @@ def test_rig_info_says_no_metres_of_a_rig_of_unknown_scale(small, tmp_path, caps
     text = " ".join(capsys.readouterr().out.split())
     assert text.count("baselines") == 2
     assert not re.search(r"\bm?m\b", text)
+
+
+@pytest.mark.parametrize("read", [read_images, lambda *given: read_frames(*given)[0]])
+def test_images_are_read_as_the_rig_describes_them_outside_of_fuse_too(small, recwarn, read):
+    """Counts of 12 bits were nearly black to `pat show` and `pat rig`, which advised what the rig stated."""
+    rig, image = Rig.load(small / "rig.yaml"), read_image(small / "mono.png")
+    write_image(small / "raw.png", linear_from_srgb(image) * 4095 / 65535, bits=16)
+    sensor = dataclasses.replace(rig["mono"].sensor, bits=12, coding="linear")
+    rig = rig.with_camera("mono", rig["mono"].replace(sensor=sensor))
+    found = read(rig, [f"mono={small / 'raw.png'}"])["mono"]
+    assert float((found - image).abs().max()) < 0.01
+    assert not recwarn
 
 
 def test_rig_info_as_json(small, capsys):

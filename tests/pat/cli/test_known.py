@@ -10,6 +10,7 @@ import torch
 from torch.nn.functional import interpolate
 
 from arraygeom import Camera, Pose, Rig, intrinsics
+from pat.cli.fusing import Fuse
 from pat.cli.known import Known
 from pat.cli.main import main
 from pat.fusion.align import OCCLUDED
@@ -122,6 +123,19 @@ def test_bad_input_is_one_line(folder, options, expected, capsys):
         run(folder, "fuse", *(word.format(folder) for word in options))
     assert stop.value.code == 2
     assert expected in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_options_of_many_frames_are_said_to_do_nothing_for_one(folder, capsys):
+    """They were ignored without a word."""
+    images = {"mono": [folder / "mono.png"], "colour": [folder / "colour.png"]}
+    Fuse(workers=2, on_error="skip", propagate=False, video=10)._frames(images)
+    said = capsys.readouterr().err
+    assert "--workers, --on-error skip: for many frames, and each camera has one image" in said
+    assert "--video, --no-propagate: for a --sequence only: of no effect" in said
+    Fuse(sequence=True, video=10)._frames(images)
+    assert "--sequence: for many frames" in capsys.readouterr().err
+    Fuse(workers=2, on_error="skip")._frames({name: 2 * files for name, files in images.items()})
+    assert "for many frames" not in capsys.readouterr().err
 
 
 def test_a_large_depth_map_in_another_unit_is_told_what_it_holds(folder, monkeypatch):

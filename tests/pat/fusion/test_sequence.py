@@ -1,5 +1,6 @@
 """Sequences: clocks, motion, colour that stays on what moves and does not flicker, confidence that knows."""
 
+import warnings
 from functools import partial
 
 import pytest
@@ -63,6 +64,18 @@ def test_a_beta_that_recorded_at_another_time_is_named():
         else:
             with pytest.raises(ValueError, match="no frame of 'c' is near one of alpha in time"):
                 three.key_frames()
+
+
+def test_a_beta_that_recorded_a_part_of_the_time_is_said():
+    """Its first or last frame was used for the rest of the sequence without a word."""
+    with pytest.warns(
+        UserWarning, match=r"'b' recorded from 0\.2 to 0\.4 s and 'a' from 0 to 0\.9 s: 5 of 10"
+    ):
+        clocks(10.0, 10.0, 0.2, 10, 3).warn_of_ends()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        clocks(10.0, 10.0, 0.0, 10, 10).warn_of_ends()
+        clocks(60.0, 10.0, 0.05, 15, 2).warn_of_ends()
 
 
 def test_moved_samples_where_points_will_be():

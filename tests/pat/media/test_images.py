@@ -127,6 +127,23 @@ def test_half_a_planar_tiff_is_refused(tmp_path, options):
         read_image(tmp_path / "half.tif")
 
 
+def test_the_first_of_several_images_in_a_tiff_is_said_to_be_taken(tmp_path):
+    """A recording in one file was fused as its first frame without a word."""
+    image = np.full((30, 40), 200, np.uint8)
+    tifffile.imwrite(tmp_path / "stack.tif", np.stack([image, image, image]), photometric="minisblack")
+    with pytest.warns(UserWarning, match=r"stack\.tif: holds several images: the first is taken"):
+        assert read_image(tmp_path / "stack.tif").shape == (1, 30, 40)
+    with tifffile.TiffWriter(tmp_path / "pyramid.tif") as file:
+        file.write(image, photometric="minisblack")
+        file.write(image[::2, ::2], photometric="minisblack", subfiletype=1)
+        file.write(image > 0, photometric="mask", subfiletype=4)
+    tifffile.imwrite(tmp_path / "one.tif", image, photometric="minisblack")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_image(tmp_path / "pyramid.tif")
+        read_image(tmp_path / "one.tif")
+
+
 def png_chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
