@@ -54,6 +54,7 @@ from ..lenses.model import CAMERA_MODELS, CameraModel, LensModel
 from ..pixels import HW, shift_matrix
 from ..pose import Pose, rotation_from_vector
 from ..rig import Link, Rig
+from ..safe_yaml import SafeDumper
 from ..sensor import Band, Curve, Sensor
 from ..text import short
 from .source import Entry, RigSource
@@ -365,7 +366,7 @@ def _link_entry(alpha: str, beta: str, link: Link) -> dict[str, Any]:
     return {"alpha": alpha, "beta": beta, "F": link.F.tolist()} | H
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(SafeDumper):
     """Lists of numbers on one line."""
 
 

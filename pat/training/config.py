@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Union
 
 import tyro
-import yaml
 
 from pat.networks.configs import CONFIGS, BandwisePATConfig, GuidedPATConfig, PATConfig
 from pat.support.schema import from_document, near, parse_yaml, to_document
@@ -200,10 +199,12 @@ def parse_config(text: str, name: str = "config") -> TrainConfig:
 
 def config_text(config: TrainConfig) -> str:
     """The recipe as YAML, every value written out; `parse_config` reads it back."""
+    from arraygeom.safe_yaml import dump_yaml
+
     plain = to_document(config, defaults=True)
     kind = next(name for name, made_of in CONFIGS.items() if type(config.network) is made_of)
     values = plain | {"network": {"kind": kind} | plain["network"]}
-    return yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=118)
+    return dump_yaml(values, default_flow_style=None, width=118)
 
 
 def save_config(config: TrainConfig, path: Path) -> None:
