@@ -23,6 +23,7 @@ from uuid import uuid4
 from rich.console import Console
 
 from arraygeom.atomic import flush, sweep, write_text
+from arraygeom.io.native import write as rig_text
 from arraygeom.rig import Rig
 from arraygeom.safe_yaml import dump_yaml, load_yaml
 from pat.sensors import seed_for
@@ -123,13 +124,12 @@ class RenderConfig:
 
     def identity(self) -> dict[str, Any]:
         """All that the scenes depend on."""
-        rig = load_yaml(self.rig.read_text(encoding="utf-8")) if self.rig.is_file() else str(self.rig)
         return {
             "backend": self.backend,
             "seed": self.seed,
             "settings": to_document(self.settings),
             "check": to_document(self.check),
-            "rig": rig,
+            "rig": load_yaml(rig_text(Rig.load(self.rig))),
         }
 
 

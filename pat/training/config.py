@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,6 +47,13 @@ class RecordingConfig:
     """Probability of random bands, one to four if one beta has them all, instead of red, green and blue."""
     ideal: bool = False
     """The ground truth is the scene itself; else it has alpha's luminance as recorded, noise included."""
+
+    def __post_init__(self) -> None:
+        for name in ("gain", "blur", "noise", "paper", "lens", "spectral"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is a probability, 0 to 1, got {getattr(self, name):g}")
+        if not 0 <= self.miscalibrated < math.inf:
+            raise ValueError(f"miscalibrated must be 0 or more pixels, got {self.miscalibrated:g}")
 
 
 @dataclass(frozen=True)
@@ -134,8 +142,11 @@ class TrainConfig:
         for name in ("steps", "batch", "groups", "average", "validate", "save", "held_out"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not self.attention >= 0:
-            raise ValueError(f"attention must be 0 or more, got {self.attention:g}")
+        for name in ("attention", "warmup", "seed"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be 0 or more, got {getattr(self, name):g}")
+        if not all(0 <= momentum < 1 for momentum in self.momenta):
+            raise ValueError(f"momenta must be from 0 to below 1, got {self.momenta}")
         for name in ("minutes", "rate", "reuse", "clip"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be more than 0, got {getattr(self, name):g}")
@@ -144,10 +155,11 @@ class TrainConfig:
         self._check_sources()
 
     def _check_sources(self) -> None:
+        for name in ("filtered", "rectified", "rendered", "pairs", "measured"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is a share of the batches, 0 to 1, got {getattr(self, name):g}")
         for name in ("rendered", "pairs", "measured"):
             share, folders = getattr(self, name), getattr(self, f"{name}_from")
-            if not 0 <= share <= 1:
-                raise ValueError(f"{name} is a share of the batches, 0 to 1, got {share:g}")
             if bool(share) != bool(folders):
                 found = "there is no folder" if share else f"{folders[0]} is given"
                 raise ValueError(
