@@ -299,8 +299,9 @@ def _pair(entry: Entry) -> tuple[float, float]:
     """Two numbers; a single one counts for both."""
     if entry.value is None:
         raise entry.fail("is missing; wanted two numbers, in pixels")
-    value = entry.value if isinstance(entry.value, list) else [entry.value] * 2
-    a, b = Entry(entry.source, value, entry.name).numbers((2,)).tolist()
+    if not isinstance(entry.value, list):
+        return entry.number(), entry.number()
+    a, b = entry.numbers((2,)).tolist()
     return a, b
 
 

@@ -411,6 +411,12 @@ def test_rotation_vectors_are_in_degrees(tmp_path):
     torch.testing.assert_close(Rig.load(tmp_path / "rig.yaml")["a"].R, expected)
 
 
+def test_a_wrong_number_is_shown_as_it_was_written(tmp_path):
+    (tmp_path / "rig.yaml").write_text("cameras: {mono: {size: [4, 3], focal: long}}")
+    with pytest.raises(RigFileError, match="focal: holds something other than numbers: 'long'"):
+        Rig.load(tmp_path / "rig.yaml")
+
+
 def test_a_size_that_is_missing_is_called_missing(tmp_path):
     (tmp_path / "rig.yaml").write_text("format: arraygeom-rig 1\ncameras: {mono: {focal: 800}}\n")
     with pytest.raises(RigFileError, match=r"cameras\.mono\.size: is missing"):
