@@ -61,13 +61,13 @@ def warp(
     """Beta's image as alpha sees it, given the depth (metres) of alpha's pixels; through any lenses.
 
     Values (B, C, *d, Ha, Wa) and which are valid: depth is finite and positive, and the point is in front of
-    beta and on its image. Occlusion is not looked for. A batch of pairs (B) takes depths (B, *d, Ha, Wa), or
-    (1, ...) for the same in each. Differentiable in image, depth and cameras.
+    beta and on its image. Occlusion is not looked for. A batch of pairs (B) takes images and depths of B, or
+    of 1 for the same in each. Differentiable in image, depth and cameras.
     """
     for what, plane, view in (("image", image, pair.beta), ("depth", depth, pair.alpha)):
         _check_size(f"the {what} given", plane, view.hw)
     seen = _in_beta(pair, depth)
-    batch = max(len(image), len(depth))
+    batch = max(len(image), len(seen.x))
     values, inside = sample(image.expand(batch, *image.shape[1:]), seen.x, interpolation=interpolation)
     valid = inside & seen.valid
     return Sampled(torch.where(valid[:, None], values, 0.0), valid)

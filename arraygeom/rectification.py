@@ -20,7 +20,8 @@ class Rectification(NamedTuple):
     """The rectification of a pair.
 
     `R_alpha` and `R_beta` rotate the cameras' frames, `H_alpha` and `H_beta` take old pixels to new ones,
-    `pair` holds the rectified cameras: same K, same orientation, the baseline along x.
+    `pair` holds the rectified cameras: same K, same orientation, the baseline along x. Its depth range is
+    the pair's own in numbers, along the rotated axis now: widen it where that matters.
     """
 
     R_alpha: Float[Tensor, "3 3"]

@@ -133,8 +133,21 @@ class _SafeLoader(_Base):  # type: ignore[misc]
         return dict(super().construct_mapping(node, deep))
 
 
-_SafeLoader.add_implicit_resolver(  # YAML 1.2's numbers, as other libraries write them: PyYAML wants 1.0e-3
-    "tag:yaml.org,2002:float",
-    re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"),
-    list("-+.0123456789"),
-)
+class SafeDumper(yaml.SafeDumper):
+    """Writes what `load_yaml` reads back the same: a text such as 1e3, which is a number there, in quotes."""
+
+
+for _kind in (
+    _SafeLoader,
+    SafeDumper,
+):  # YAML 1.2's numbers, as other libraries write them: PyYAML wants 1.0e-3
+    _kind.add_implicit_resolver(
+        "tag:yaml.org,2002:float",
+        re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"),
+        list("-+.0123456789"),
+    )
+
+
+def dump_yaml(document: Any, **layout: Any) -> str:
+    """The text of a document of plain values, keys in their order; `layout` as of `yaml.dump`."""
+    return str(yaml.dump(document, Dumper=SafeDumper, sort_keys=False, **layout))

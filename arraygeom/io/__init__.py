@@ -23,7 +23,7 @@ from ..sensor import Sensor
 from ..warned import warn
 from . import kitti
 from .export import at_origin, calibrated
-from .source import RigFileError, RigFileWarning, RigSource, UnknownRigFormat
+from .source import RigFileError, RigFileWarning, RigSource, UnknownRigFormat, decoded
 
 FORMATS = (
     *("colmap", "opencv", "kalibr", "boofcv", "ros", "native", "bouguet", "matlab", "kitti-raw", "kitti"),
@@ -112,7 +112,7 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
 def recognise(path: str | Path) -> str:
     """The name of a file's or folder's format. Raises RigFileError if it is none that is known."""
     path = Path(path)
-    head = path.read_bytes()[:4096].decode("utf-8-sig", errors="replace") if path.is_file() else ""
+    head = decoded(path.read_bytes()[:4096]) if path.is_file() else ""
     if path.is_file() and not head.strip():
         raise RigFileError(path, None, "is empty")
     for name, reader in READERS.items():

@@ -98,6 +98,10 @@ def write(rig: Rig) -> dict[str, str]:
         ["# IMAGE_ID, QW..QZ, TX..TZ, CAMERA_ID, NAME"],
     )
     for i, (name, camera) in enumerate(calibrated(rig, "COLMAP"), 1):
+        if name != name.strip() or len(name.splitlines()) != 1:
+            raise ValueError(
+                f"camera {name!r} has a name that is no text of one line, as COLMAP's files need: rename it"
+            )
         h, w = camera.hw
         model, parameters = _parameters(name, camera)
         cameras.append(f"{i} {model} {w} {h} {_joined(parameters)}")

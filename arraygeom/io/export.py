@@ -35,9 +35,10 @@ def focal_and_centre(
 ) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy, the first pixel's centre at `first_pixel`. Raises ValueError if K has other entries."""
     (fx, skew, cx), (other, fy, cy) = camera.K[:2].tolist()
-    if skew != 0 or other != 0:
+    if skew != 0 or other != 0 or min(fx, fy) <= 0:
         raise ValueError(
-            f"camera '{name}' has a skewed or rotated K, which this format cannot hold: use the native format"
+            f"camera '{name}' has a skewed, rotated or mirrored K, "
+            "which this format cannot hold: use the native format"
         )
     return fx, fy, cx + first_pixel, cy + first_pixel
 

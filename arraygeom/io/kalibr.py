@@ -13,14 +13,13 @@ import re
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from ..camera import Camera
 from ..distortion import BROWN_CONRADY, KANNALA_BRANDT, Distortion
 from ..lenses.central import DOUBLE_SPHERE, EXTENDED_UNIFIED, FOV, UNIFIED
 from ..lenses.model import LensModel
 from ..pose import Pose
 from ..rig import Rig
+from ..safe_yaml import dump_yaml
 from ..sensor import Sensor
 from .export import at_origin, brown_conrady, calibrated, focal_and_centre, pose_rows
 from .source import Entry, RigSource
@@ -75,7 +74,7 @@ def write(rig: Rig) -> str:
         if camera.sensor.time_offset:
             entry["timeshift_cam_imu"] = camera.sensor.time_offset
         document[f"cam{i}"], before = entry, pose
-    return yaml.safe_dump(document, default_flow_style=None, sort_keys=False)
+    return dump_yaml(document, default_flow_style=None)
 
 
 def _poses(chain: list[Entry]) -> list[Pose]:

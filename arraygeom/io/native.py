@@ -54,6 +54,7 @@ from ..lenses.model import CAMERA_MODELS, CameraModel, LensModel
 from ..pixels import HW, shift_matrix
 from ..pose import Pose, rotation_from_vector
 from ..rig import Link, Rig
+from ..safe_yaml import SafeDumper
 from ..sensor import Band, Curve, Sensor
 from ..text import short
 from .source import Entry, RigSource
@@ -298,8 +299,9 @@ def _pair(entry: Entry) -> tuple[float, float]:
     """Two numbers; a single one counts for both."""
     if entry.value is None:
         raise entry.fail("is missing; wanted two numbers, in pixels")
-    value = entry.value if isinstance(entry.value, list) else [entry.value] * 2
-    a, b = Entry(entry.source, value, entry.name).numbers((2,)).tolist()
+    if not isinstance(entry.value, list):
+        return entry.number(), entry.number()
+    a, b = entry.numbers((2,)).tolist()
     return a, b
 
 
@@ -365,7 +367,7 @@ def _link_entry(alpha: str, beta: str, link: Link) -> dict[str, Any]:
     return {"alpha": alpha, "beta": beta, "F": link.F.tolist()} | H
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(SafeDumper):
     """Lists of numbers on one line."""
 
 

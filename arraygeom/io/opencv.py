@@ -8,6 +8,7 @@ image size.
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -68,14 +69,14 @@ def write(rig: Rig) -> str | dict[str, str]:
     """
     cameras = calibrated(rig, "OpenCV")
     if len(cameras) == 1:
-        return _HEADER + f'camera_name: "{cameras[0][0]}"\n' + _camera_text(*cameras[0], "")
+        return _HEADER + f"camera_name: {_quoted(cameras[0][0])}\n" + _camera_text(*cameras[0], "")
     if len(cameras) != 2:
         raise ValueError(
             f"OpenCV files hold one camera or two and the rig has {len(cameras)}: use the native format"
         )
     (_, one), (_, two) = cameras
     relative = two.cam_from_world @ one.cam_from_world.inverse()
-    names = "".join(f'name{i}: "{name}"\n' for i, (name, _) in enumerate(cameras, 1))
+    names = "".join(f"name{i}: {_quoted(name)}\n" for i, (name, _) in enumerate(cameras, 1))
     intrinsics = "".join(_camera_text(name, camera, str(i)) for i, (name, camera) in enumerate(cameras, 1))
     return {
         "intrinsics.yml": _HEADER + names + intrinsics,
@@ -165,6 +166,10 @@ def _value(node: Any) -> Any:
         count = node.getNode("rows").real() * node.getNode("cols").real()
         return node.mat() if 0 <= count <= MOST_NUMBERS else None
     return None
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)
 
 
 def _camera_text(name: str, camera: Camera, i: str) -> str:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..pixels import HW
+from .source import decoded
 
 MAX_IMAGES = 2**31 - 1
 """COLMAP numbers the pair of images a < b as a * MAX_IMAGES + b (its documentation of the database)."""
@@ -59,7 +60,7 @@ def _csv(path: Path, files: Mapping[str, Path]) -> PointPairs:
             f"{path}: x0 y0 x1 y1 relate two images, and {len(files)} are given: give two, or a database"
         )
     try:
-        lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
+        lines = [line for line in decoded(path.read_bytes(), "strict").splitlines() if line.strip()]
     except UnicodeDecodeError:
         raise ValueError(f"{path}: neither CSV nor a COLMAP database: give x0,y0,x1,y1 a line") from None
     lines = lines if lines and _numbers(lines[0]) else lines[1:]
@@ -86,9 +87,9 @@ def _numbers(line: str) -> list[float] | None:
 
 def _database(path: Path, files: Mapping[str, Path]) -> PointPairs:
     try:
-        with closing(sqlite3.connect(f"file:{path.resolve()}?mode=ro", uri=True)) as database:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
             return _colmap(database, path, files)
-    except sqlite3.Error as error:
+    except (sqlite3.Error, IndexError, TypeError) as error:
         raise ValueError(
             f"{path}: not a COLMAP database ({error}): give COLMAP's database.db, or CSV"
         ) from None

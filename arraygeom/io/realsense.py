@@ -15,7 +15,7 @@ from ..distortion import Distortion
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
-from .source import Entry, RigSource, pose_of
+from .source import Entry, RigSource, decoded, pose_of
 
 CONVENTION = (
     "first pixel's centre at 0 (shift 0); extrinsics from one stream to another, in metres; world = depth"
@@ -34,7 +34,7 @@ def recognises(path: Path, head: str) -> bool:
     """The lists of modes before the intrinsics may be longer than what was read of the file."""
     if not path.is_file() or head.lstrip().startswith(("{", "[")):
         return False
-    whole = path.read_bytes()[:LONGEST].decode(errors="replace") if "Intel RealSense" in head else head
+    whole = decoded(path.read_bytes()[:LONGEST]) if "Intel RealSense" in head else head
     return 'Intrinsic of "' in whole
 
 

@@ -16,21 +16,21 @@ from ..camera import Camera
 from ..distortion import Distortion
 from ..pose import Pose
 from ..rig import Rig
-from .source import Entry, RigSource
+from .source import Entry, RigSource, decoded
 
 CONVENTION = "first pixel's centre at 0 (shift 0); P on rectified points, world = the rectified frame; metres"
 
 
 def recognises(path: Path, head: str) -> bool:
     if path.is_dir():
-        return any(_is_camera_info(file.read_text(errors="replace")[:4096]) for file in _yaml_files(path))
+        return any(_is_camera_info(decoded(file.read_bytes()[:4096])) for file in _yaml_files(path))
     return _is_camera_info(head)
 
 
 def read(source: RigSource) -> Rig:
     """The cameras, under their `camera_name` (else the file's name)."""
     files = _yaml_files(source.path) if source.path.is_dir() else [source.path]
-    infos = [file for file in files if len(files) == 1 or _is_camera_info(file.read_text(errors="replace"))]
+    infos = [file for file in files if len(files) == 1 or _is_camera_info(decoded(file.read_bytes()))]
     return source.rig(_camera(RigSource(file, hw=source.hw)) for file in infos)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import re
 import tomllib
@@ -26,6 +27,12 @@ from ..warned import warn
 # Of a rotation vector, in radians; it may go round a few times.
 LARGEST_ANGLE = 1e3
 NO_MAPPING = "is not a mapping of names to values, or an empty one; is the file whole?"
+
+
+def decoded(content: bytes, errors: str = "replace") -> str:
+    """The text of a file in UTF-8, or in UTF-16 with a mark, as PowerShell's `>` writes what tools print."""
+    utf16 = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    return content.decode("utf-16" if utf16 else "utf-8-sig", errors)
 
 
 class RigFileError(ValueError):
@@ -74,7 +81,7 @@ class RigSource:
     def text(self, most: int | None = None) -> str:
         """The file's text, of at most so many characters."""
         try:
-            text = self.content().decode("utf-8-sig")
+            text = decoded(self.content(), "strict")
         except UnicodeDecodeError:
             raise self.fail(None, "is not a text file") from None
         if not text.strip():

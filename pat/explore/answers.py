@@ -195,6 +195,7 @@ def choices(scene: ExplorerScene, controls: Controls) -> list[list[Any]]:
     fields = [*FAMILIES, *scene.fields]
     own = [name for name in (controls["field"], controls["second"]) if name not in ("none", *fields)]
     weights = [WINDOWS, *(scene.networks or [SHIPPED])]
+    weights += [controls["weights"]] if controls["weights"] not in weights else []
     return [
         ["field", "field", [*fields, *own]],
         ["second", "compared with", ["none", *fields, *own]],
@@ -216,7 +217,8 @@ def data_url(image: Tensor) -> str:
     image = image if len(image) == 3 else image.mean(0, keepdim=True).expand(3, -1, -1)
     scale = min(1.0, WIDEST / max(image.shape[1:]))
     if scale < 1:
-        image = interpolate(image[None].float(), scale_factor=scale, mode="area")[0]
+        hw = [max(1, round(side * scale)) for side in image.shape[1:]]
+        image = interpolate(image[None].float(), size=hw, mode="area")[0]
     file = io.BytesIO()
     Image.fromarray(to_bytes(image.clamp(0, 1)).transpose(1, 2, 0)).save(file, "PNG")
     return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()

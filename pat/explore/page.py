@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +40,7 @@ class Explorer:
             return {"error": self.error}
         try:
             return answer(self.scene, self.alpha, controls)
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, LookupError, ArithmeticError) as error:
             return {"error": str(error)}
 
     def values(self) -> dict[str, Any]:
@@ -87,7 +88,7 @@ class Explorer:
         rows = max(1, round(columns * h / w))
         xs, ys = ([(i + 0.5) * side / n - 0.5 for i in range(n)] for side, n in ((w, columns), (h, rows)))
         answers = {
-            f"{i},{j}": self.answer({**self.controls, "x": [x, y]})
+            f"{i},{j}": self.answer({**self.controls, "x": [x, y], "clicked": None})
             for i, x in enumerate(xs)
             for j, y in enumerate(ys)
         }
@@ -115,8 +116,10 @@ def geometry(rig: Rig, alpha: str) -> dict[str, Any]:
 def page(values: Mapping[str, Any], asks: str) -> str:
     """The page of the widget, whose questions are answered by `asks`, an expression of pinhole.js."""
     scripts = MODULE.read_text().replace("export default { render };", "") + PINHOLE.read_text()
-    data = json.dumps(values).replace("</", "<\\/")
-    return PAGE.replace("MODULES", scripts).replace("ASKS", asks.replace("</", "<\\/")).replace("DATA", data)
+    # Nothing in a text may end the script, or be taken for a part of the page.
+    data, asks = (text.replace("<", "\\u003c") for text in (json.dumps(values), asks))
+    parts = {"MODULES": scripts, "DATA": data, "ASKS": asks}
+    return re.sub("|".join(parts), lambda part: parts[part[0]], PAGE)
 
 
 PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Receptive fields</title>
@@ -150,7 +153,7 @@ def opened(
             shipped_attention(network)  # refuses others
         images, alpha = checked(rig, images, alpha)
         scene = ExplorerScene(rig, images, fields or {}, networks)
-    except ValueError as error:
+    except (ValueError, TypeError, FileNotFoundError) as error:
         return Explorer(None, "", {**DEFAULTS, "x": [0, 0]}, str(error))
     h, w = rig[alpha].hw
     controls = {**DEFAULTS, "weights": weights, **controls, "x": list(x or (w // 2, h // 2))}
@@ -174,6 +177,8 @@ def checked(
 
 SQUARES = 2
 """Squares from the middle of the room to a wall."""
+NARROWEST = 1e-3
+"""Least tangent of half the room's angle of view: a row of pixels on the axis has none."""
 DEEPEST = 20.0
 """Depth of the back wall in nearest depths where the rig's farthest is beyond it."""
 
@@ -184,14 +189,14 @@ def checkered_room(rig: Rig, alpha: str) -> dict[str, Float[Tensor, "1 h w"]]:
     Squares differ in brightness, so that each has one match. Raises ValueError for a rig without poses or
     depth range.
     """
-    cameras = {name: view for name, view in rig.cameras.items() if isinstance(view, Camera)}
+    cameras = {name: view for name, view in rig.to(torch.float64).cameras.items() if isinstance(view, Camera)}
     if len(cameras) < len(rig.cameras) or rig.depth is None:
         raise ValueError("a synthetic room needs a calibrated rig with a depth range: give images")
     near, far = (float(d) for d in rig.depth)
     view = cameras[alpha]
     rays, valid = view.rays(pixel_grid(view.hw, dtype=torch.float64))
     rays = torch.where(valid[..., None], rays, 0.0)
-    side = near * rays[..., :2].abs().amax((0, 1))
+    side = near * rays[..., :2].abs().amax((0, 1)).clamp(min=NARROWEST)
     half = torch.cat([side, side.new_tensor([min(far, DEEPEST * near)])])
     return {name: room_image(camera, view, half) for name, camera in cameras.items()}
 

@@ -58,13 +58,13 @@ function asksPinholes(rig) {
     const { data } = context.getImageData(0, 0, width, height), luma = new Float32Array(width * height);
     for (let i = 0; i < luma.length; i++)
       luma[i] = (0.299 * data[4 * i] + 0.587 * data[4 * i + 1] + 0.114 * data[4 * i + 2]) / 255;
-    return (guides[name] = { luma, width, height, scale: width / hw[1] });
+    return (guides[name] = { luma, width, height, hw });
   }
-  function value({ luma, width, height, scale }, [x, y]) { // bilinear; beyond the border its nearest value
-    const u = Math.min(width - 1, Math.max(0, (x + 0.5) * scale - 0.5));
-    const v = Math.min(height - 1, Math.max(0, (y + 0.5) * scale - 0.5));
-    const i = Math.min(width - 2, Math.floor(u)), j = Math.min(height - 2, Math.floor(v)), a = u - i, b = v - j;
-    const at = (row, column) => luma[row * width + column];
+  function value({ luma, width, height, hw }, [x, y]) { // bilinear; beyond the border its nearest value
+    const u = Math.min(width - 1, Math.max(0, (x + 0.5) * width / hw[1] - 0.5));
+    const v = Math.min(height - 1, Math.max(0, (y + 0.5) * height / hw[0] - 0.5));
+    const i = Math.floor(u), j = Math.floor(v), a = u - i, b = v - j;
+    const at = (row, column) => luma[Math.min(height - 1, row) * width + Math.min(width - 1, column)];
     return (1 - b) * ((1 - a) * at(j, i) + a * at(j, i + 1)) + b * ((1 - a) * at(j + 1, i) + a * at(j + 1, i + 1));
   }
   function feature(image, [x, y], J) {
@@ -142,7 +142,7 @@ function asksPinholes(rig) {
   }
   return async (controls, { cameras: shown }) => {
     const cameras = moved(controls), own = cameras[rig.alpha], depths = [controls.near ?? rig.near, controls.far ?? rig.far];
-    if (!(depths[0] > 0 && depths[0] < depths[1])) return { error: `near must be less than far, got ${depths.join(" and ")}` };
+    if (!(depths[0] > 0 && depths[0] <= depths[1])) return { error: `near must be at most far, got ${depths.join(" and ")}` };
     const rounded = (v, size) => Math.min(size - 1, Math.max(0, Math.round(v)));
     const inside = ([x, y], [h, w]) => [rounded(x, w), rounded(y, h)];
     let x = inside(controls.x, own.hw), backwards = [];

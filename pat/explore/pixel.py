@@ -42,6 +42,7 @@ from arraygeom.fields.ray_depth import ray_depth, rough_transfer
 from arraygeom.pixels import HW
 
 from ..fusion.steps import at_alphas_resolution
+from ..fusion.views import checked_image
 from ..media.colour import luminance
 from ..networks.paper import PAT, QueryAndKey
 from ..networks.weights import load_weights
@@ -125,13 +126,8 @@ class ExplorerScene:
     features: dict[tuple[str, str, bool], QueryAndKey] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name, image in self.images.items():
-            if name in self.guides:
-                continue
-            hw = self.rig[name].hw
-            if tuple(image.shape[1:]) != hw:
-                got, wanted = f"{image.shape[2]}x{image.shape[1]}", f"{hw[1]}x{hw[0]}"
-                raise ValueError(f"the image of '{name}' is {got}, the rig says {wanted}: give the right one")
+        for name in [name for name in self.images if name not in self.guides]:
+            image = checked_image(self.rig, self.images, name)
             grey = luminance(image) if image.shape[0] == 3 else image.mean(0, keepdim=True)
             self.guides[name] = grey[None]
 

@@ -120,7 +120,7 @@ function svg(cameras, answer) {
       ? `<polyline points="${line.map((p) => p.join()).join(" ")}" fill="none" stroke="${colour}" stroke-width="${w / 300}"/>`
       : `<circle cx="${dot[0]}" cy="${dot[1]}" r="${radius}" fill="${colour}" fill-opacity=".7"/>`).join("");
     return `<svg x="${i * (wide + gap)}" y="24" width="${wide}" height="${wide * h / w}" viewBox="-.5 -.5 ${w} ${h}">` +
-      `<image x="-.5" y="-.5" width="${w}" height="${h}" href="${camera.src}"/>${drawn}</svg>` +
+      `<image x="-.5" y="-.5" width="${w}" height="${h}" preserveAspectRatio="none" href="${camera.src}"/>${drawn}</svg>` +
       `<text x="${i * (wide + gap)}" y="16" font-family="sans-serif" font-size="14">${escaped(camera.name)}</text>`;
   });
   const high = 24 + Math.max(...cameras.map(({ hw }) => wide * hw[0] / hw[1]));
@@ -249,7 +249,7 @@ function render({ model, el }) {
   for (const { input, name } of inputs) input.dataset.control = name;
   const acts = {
     c: ["copy code", async (button) => {
-      const text = code(cameras, model.get("controls"), model.get("defaults"), model.get("answer").x);
+      const text = code(cameras, model.get("controls"), model.get("defaults"), model.get("answer").x ?? first.x);
       try { await navigator.clipboard.writeText(text); button.textContent = "copied"; } catch { button.textContent = text; }
     }],
     s: ["save as SVG", () => download("fields.svg", svg(cameras, model.get("answer")), "image/svg+xml")],

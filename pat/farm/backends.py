@@ -53,6 +53,13 @@ class LayeredSettings:
     layers: tuple[int, int] = (5, 12)
     oversampling: int = 2
 
+    def __post_init__(self) -> None:
+        for name, least in (("edge", 32), ("oversampling", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        if not 1 <= self.layers[0] <= self.layers[1]:
+            raise ValueError(f"layers must be two numbers, at least 1 and in order, got {self.layers}")
+
     def images(self, rig: Rig) -> list[HW]:
         """The sizes of the images of a scene. Raises ValueError for a rig that cannot be rendered."""
         return [camera.hw for camera in rig_from_alpha(rig).cameras]

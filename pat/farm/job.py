@@ -20,12 +20,12 @@ from pathlib import Path
 from typing import Any, Literal
 from uuid import uuid4
 
-import yaml
 from rich.console import Console
 
 from arraygeom.atomic import flush, sweep, write_text
+from arraygeom.io.native import write as rig_text
 from arraygeom.rig import Rig
-from arraygeom.safe_yaml import load_yaml
+from arraygeom.safe_yaml import dump_yaml, load_yaml
 from pat.sensors import seed_for
 from pat.support.jobs import JobError, JobReport, Task, Workers, run_tasks
 from pat.support.locks import folder_lock
@@ -124,13 +124,12 @@ class RenderConfig:
 
     def identity(self) -> dict[str, Any]:
         """All that the scenes depend on."""
-        rig = load_yaml(self.rig.read_text(encoding="utf-8")) if self.rig.is_file() else str(self.rig)
         return {
             "backend": self.backend,
             "seed": self.seed,
             "settings": to_document(self.settings),
             "check": to_document(self.check),
-            "rig": rig,
+            "rig": load_yaml(rig_text(Rig.load(self.rig))),
         }
 
 
@@ -213,7 +212,7 @@ def write_manifest(config: RenderConfig, root: Path) -> None:
             raise ValueError(f"{text}: give another --out, or put {changed} back")
         return
     manifest = {"format": FORMAT, "made from": identity, "versions": versions()}
-    write_text(path, yaml.safe_dump(manifest, sort_keys=False, width=120, default_flow_style=None))
+    write_text(path, dump_yaml(manifest, width=120, default_flow_style=None))
 
 
 def versions() -> dict[str, str]:

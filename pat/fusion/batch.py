@@ -29,7 +29,7 @@ from arraygeom.atomic import sweep, write_text
 from arraygeom.fields import FIELDS
 from arraygeom.io.native import read_text as rig_of_text
 from arraygeom.io.native import write as rig_text
-from arraygeom.safe_yaml import load_yaml
+from arraygeom.safe_yaml import dump_yaml, load_yaml
 
 from ..media.images import read_image
 from ..media.raw import developed_rig
@@ -112,7 +112,7 @@ class Batch:
         entries["weights"] = f"{self.weights} (SHA-256 {digest[:16]})"
         if self.sequence:
             entries["frames"] = {name: len(paths) for name, paths in files.items()}
-        return yaml.safe_dump(entries, sort_keys=False)
+        return dump_yaml(entries)
 
     @property
     def inputs(self) -> dict[str, str]:

@@ -60,7 +60,7 @@ class Views:
             raise ValueError(
                 f"no image of any other camera than alpha, '{alpha}': fusion needs at least one beta"
             )
-        checked = {name: _checked(rig, images, name) for name in (alpha, *names)}
+        checked = {name: checked_image(rig, images, name) for name in (alpha, *names)}
         fields = field if isinstance(field, Mapping) else dict.fromkeys(names, field)
         rig = rig if depth is None else rig.replace(depth=depth)
         images = {**checked, alpha: grey_alpha(alpha, checked[alpha])}
@@ -138,7 +138,8 @@ def check_bands(views: Views, wanted: int | None) -> None:
             warn(f"the image of '{name}' has three equal bands: it is grey, and gives no colour")
 
 
-def _checked(rig: Rig, images: Images, name: str) -> Tensor:
+def checked_image(rig: Rig, images: Images, name: str) -> Tensor:
+    """A camera's image. Raises TypeError or ValueError unless it is (C, H, W), as large as the rig says."""
     image, (h, w) = images[name], rig[name].hw
     if not isinstance(image, Tensor):
         raise TypeError(

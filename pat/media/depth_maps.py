@@ -69,7 +69,7 @@ def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = 
 def _pfm(path: Path) -> NDArray[np.float32]:
     """A grey PFM file: "Pf", width and height, scale (negative: little-endian), rows from the bottom up."""
     content = path.read_bytes()
-    head = re.match(rb"Pf\s+(\d+)\s+(\d+)\s+(-?[0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)\s", content)
+    head = re.match(rb"Pf\s+(\d+)\s+(\d+)\s+([+-]?[0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)(?:\r\n|\s)", content)
     if head is None:
         raise ValueError(f"{path}: not a grey PFM file: give one that begins with 'Pf', or float TIFF")
     w, h, scale = int(head[1]), int(head[2]), float(head[3])

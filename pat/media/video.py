@@ -23,7 +23,7 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, r
     """Write images (grey or RGB, sRGB values, clipped to 0..1) as H.264 (.mp4, .mkv), atomically.
 
     An odd last row or column is left out: 4:2:0 has none. Raises ValueError for no frames, frames of
-    different sizes, and other suffixes, and as `check_video`.
+    different sizes or under 2 x 2, and other suffixes, and as `check_video`.
     """
     path = Path(path)
     if path.suffix.lower() not in (".mp4", ".mkv"):
@@ -35,6 +35,8 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, r
         stream = None
         for frame in frames:
             h, w = (n // 2 * 2 for n in frame.shape[-2:])
+            if not (h and w):
+                raise ValueError(f"{path}: the frames of a video have at least 2 x 2 pixels")
             pixels = np.ascontiguousarray(to_bytes(frame[..., :h, :w].expand(3, -1, -1)).transpose(1, 2, 0))
             if stream is None:
                 stream = file.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000))

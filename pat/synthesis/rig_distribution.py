@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -39,3 +40,13 @@ class RigDistribution:
     rotation: float = 4.0
     toe_in: Range = (0.0, 1.0)
     decentring: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("parallax", "near", "depth_ratio", "frame", "focal", "focal_ratio"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high < math.inf:
+                raise ValueError(f"{name} must be two positive numbers in order, got {low:g} and {high:g}")
+        if self.betas < 1 or not self.resolutions or not min(self.resolutions) > 0:
+            raise ValueError(
+                f"betas must be at least 1 and resolutions positive, got {self.betas}, {self.resolutions}"
+            )

@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-import yaml
 from jaxtyping import Float
 from numpy.typing import NDArray
 
 from arraygeom.atomic import write_text
-from arraygeom.safe_yaml import load_json
+from arraygeom.safe_yaml import dump_yaml, load_json
 
 from ..support.schema import from_document, parse_yaml, to_document
 
@@ -198,7 +197,7 @@ class Scene:
     def to_yaml(self) -> str:
         """The text of a scene file."""
         document = {"format": FORMAT, **to_document(self)}
-        return yaml.safe_dump(document, sort_keys=False, width=120, default_flow_style=None)
+        return dump_yaml(document, width=120, default_flow_style=None)
 
     @classmethod
     def from_yaml(cls, text: str, source: str = "scene") -> Scene:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Union
 
 import tyro
-import yaml
 
 from pat.networks.configs import CONFIGS, BandwisePATConfig, GuidedPATConfig, PATConfig
 from pat.support.schema import from_document, near, parse_yaml, to_document
@@ -47,6 +47,13 @@ class RecordingConfig:
     """Probability of random bands, one to four if one beta has them all, instead of red, green and blue."""
     ideal: bool = False
     """The ground truth is the scene itself; else it has alpha's luminance as recorded, noise included."""
+
+    def __post_init__(self) -> None:
+        for name in ("gain", "blur", "noise", "paper", "lens", "spectral"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is a probability, 0 to 1, got {getattr(self, name):g}")
+        if not 0 <= self.miscalibrated < math.inf:
+            raise ValueError(f"miscalibrated must be 0 or more pixels, got {self.miscalibrated:g}")
 
 
 @dataclass(frozen=True)
@@ -135,8 +142,11 @@ class TrainConfig:
         for name in ("steps", "batch", "groups", "average", "validate", "save", "held_out"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not self.attention >= 0:
-            raise ValueError(f"attention must be 0 or more, got {self.attention:g}")
+        for name in ("attention", "warmup", "seed"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be 0 or more, got {getattr(self, name):g}")
+        if not all(0 <= momentum < 1 for momentum in self.momenta):
+            raise ValueError(f"momenta must be from 0 to below 1, got {self.momenta}")
         for name in ("minutes", "rate", "reuse", "clip"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be more than 0, got {getattr(self, name):g}")
@@ -145,10 +155,11 @@ class TrainConfig:
         self._check_sources()
 
     def _check_sources(self) -> None:
+        for name in ("filtered", "rectified", "rendered", "pairs", "measured"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is a share of the batches, 0 to 1, got {getattr(self, name):g}")
         for name in ("rendered", "pairs", "measured"):
             share, folders = getattr(self, name), getattr(self, f"{name}_from")
-            if not 0 <= share <= 1:
-                raise ValueError(f"{name} is a share of the batches, 0 to 1, got {share:g}")
             if bool(share) != bool(folders):
                 found = "there is no folder" if share else f"{folders[0]} is given"
                 raise ValueError(
@@ -200,10 +211,12 @@ def parse_config(text: str, name: str = "config") -> TrainConfig:
 
 def config_text(config: TrainConfig) -> str:
     """The recipe as YAML, every value written out; `parse_config` reads it back."""
+    from arraygeom.safe_yaml import dump_yaml
+
     plain = to_document(config, defaults=True)
     kind = next(name for name, made_of in CONFIGS.items() if type(config.network) is made_of)
     values = plain | {"network": {"kind": kind} | plain["network"]}
-    return yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=118)
+    return dump_yaml(values, default_flow_style=None, width=118)
 
 
 def save_config(config: TrainConfig, path: Path) -> None:

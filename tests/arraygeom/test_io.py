@@ -13,7 +13,7 @@ import torch
 
 from arraygeom import Camera, LensView, Link, Pose, Rig, View, intrinsics
 from arraygeom.distortion import Distortion
-from arraygeom.io import READERS, RigFileError, read_rig, recognise, write_rig
+from arraygeom.io import READERS, WRITERS, RigFileError, read_rig, recognise, write_rig
 from arraygeom.pose import rotation_from_vector
 from arraygeom.sensor import Sensor
 from tests.oracles import Oracle
@@ -80,6 +80,19 @@ def test_a_mark_at_the_beginning_of_a_file_changes_nothing(file, tmp_path):
     assert recognise(tmp_path / file) == recognise(FIXTURES / file)
     marked, plain = (read_rig(folder / file, hw=(720, 1280)) for folder in (tmp_path, FIXTURES))
     assert marked.names == plain.names
+
+
+@pytest.mark.parametrize("file", sorted({path.name for path in FIXTURES.iterdir()} - {"README.md"}))
+@pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
+def test_files_in_utf_16_are_read(file, encoding, tmp_path):
+    """PowerShell writes what tools print so."""
+    for old in [p for p in FIXTURES.rglob("*") if p.is_file()]:
+        new = tmp_path / old.relative_to(FIXTURES)
+        new.parent.mkdir(exist_ok=True)
+        new.write_bytes(("\ufeff" + old.read_text(encoding="utf-8")).encode(encoding))
+    assert recognise(tmp_path / file) == recognise(FIXTURES / file)
+    found, wanted = (read_rig(folder / file, hw=(720, 1280)) for folder in (tmp_path, FIXTURES))
+    assert found.names == wanted.names
 
 
 @pytest.mark.parametrize("file", ["opencv_mono.xml", "opencv_mono.json", "ros/right.yaml"])
@@ -278,6 +291,20 @@ def test_write_then_read(format, tmp_path):
         assert_same(one, two)
 
 
+NAMES = ["a b", "1e3", 'q"', "q'", "back\\slash", "tab\tbed", "é漢", "sub/im.png", "x: #y", "%p", "true", "1"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("format", ["native", "opencv", "colmap", "nerfstudio"])
+def test_odd_names_come_back(format, name, tmp_path):
+    rig = Rig({name: camera(1), "other": camera(2)})
+    path = tmp_path / {"native": "rig.yaml", "nerfstudio": "t.json"}.get(format, "folder")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        write_rig(rig, path, format=format)
+    assert read_rig(path).names == rig.names
+
+
 @pytest.mark.parametrize("kind", LENSES, ids=["none", "4", "fisheye", "5", "8", "14"])
 def test_write_then_read_opencv(kind, tmp_path):
     one = camera(1, kind).replace(cam_from_world=Pose.identity())
@@ -320,6 +347,13 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path):
         write_rig(Rig({"t": tilted}), path, format="colmap")
     with pytest.raises(ValueError, match=r"'t'.* K"):
         write_rig(Rig({"t": camera(1).rot90(1)}), path, format="nerfstudio")
+    mirrored = camera(1).transformed(torch.diag(torch.tensor([-1.0, 1, 1])).double(), camera(1).hw)
+    for format in set(WRITERS) - {"native"}:
+        with pytest.raises(ValueError, match=r"'m'.* mirrored"):
+            write_rig(Rig({"m": mirrored}), path, format=format)
+    for name in ("two\nlines", "", " a", "a ", "sep\u2028arated"):
+        with pytest.raises(ValueError, match="one line"):
+            write_rig(Rig({name: camera(1)}), path, format="colmap")
     with pytest.raises(ValueError, match="'u'"):
         write_rig(Rig({"u": View(hw=(4, 5))}), path, format="kalibr")
     with pytest.raises(ValueError, match="'kitti'"):
@@ -375,6 +409,12 @@ def test_rotation_vectors_are_in_degrees(tmp_path):
     (tmp_path / "rig.yaml").write_text("cameras:\n  a: {size: [6, 4], focal: 5, rotation: [0, 0, 90]}\n")
     expected = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
     torch.testing.assert_close(Rig.load(tmp_path / "rig.yaml")["a"].R, expected)
+
+
+def test_a_wrong_number_is_shown_as_it_was_written(tmp_path):
+    (tmp_path / "rig.yaml").write_text("cameras: {mono: {size: [4, 3], focal: long}}")
+    with pytest.raises(RigFileError, match="focal: holds something other than numbers: 'long'"):
+        Rig.load(tmp_path / "rig.yaml")
 
 
 def test_a_size_that_is_missing_is_called_missing(tmp_path):

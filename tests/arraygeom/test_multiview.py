@@ -145,6 +145,12 @@ def test_batches_and_float32_of_warps():
         one = warp(rig.pair("alpha", "beta"), image[i : i + 1], depth[i : i + 1])
         torch.testing.assert_close(found.values[i], one.values[0])
         torch.testing.assert_close(swept.values[i, :, i], one.values[0])
+    same = warp(both, image[:1], depth[:1])
+    alike = plane_sweep(both, image[:1], torch.tensor([2.0, 4.0], dtype=F64))
+    for i, rig in enumerate(rigs):
+        one = warp(rig.pair("alpha", "beta"), image[:1], depth[:1])
+        torch.testing.assert_close(same.values[i], one.values[0])
+        torch.testing.assert_close(alike.values[i, :, 0], one.values[0])
     single = warp(rigs[0].to(torch.float32).pair("alpha", "beta"), image[:1].float(), depth[:1].float())
     valid = single.valid[0] & found.valid[0]
     assert float((single.values[0] - found.values[0]).abs()[:, valid].max()) < 1e-5

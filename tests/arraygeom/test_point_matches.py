@@ -44,6 +44,33 @@ def test_csv(tmp_path, text, between):
             assert np.array_equal(one.numpy(), points)
 
 
+def test_csv_in_utf_16(tmp_path):
+    """As PowerShell and spreadsheets write it."""
+    rows = "\n".join("\t".join(map(str, row)) for row in np.hstack(POINTS))
+    (tmp_path / "m.csv").write_text(rows, encoding="utf-16")
+    assert len(read_matches(tmp_path / "m.csv", FILES, SIZES)["mono", "colour"][0]) == 3
+
+
+@pytest.mark.parametrize("folder", ["run #1", "100%25", "what?", "50%", "é 1"])
+def test_colmap_in_folders_of_odd_names(tmp_path, folder):
+    (tmp_path / folder).mkdir()
+    database(tmp_path / folder / "database.db")
+    found = read_matches(tmp_path / folder / "database.db", FILES, SIZES)["mono", "colour"]
+    assert torch.allclose(found[0], torch.from_numpy(POINTS[0]))
+
+
+@pytest.mark.parametrize(
+    "change", ["UPDATE keypoints SET rows = 1, data = zeroblob(24)", "UPDATE keypoints SET data = NULL"]
+)
+def test_a_damaged_database_is_named(tmp_path, change):
+    path = tmp_path / "database.db"
+    database(path)
+    with sqlite3.connect(path) as file:
+        file.execute(change)
+    with pytest.raises(ValueError, match=r"database\.db: not a COLMAP database"):
+        read_matches(path, FILES, SIZES)
+
+
 @pytest.mark.parametrize("verified", [True, False])
 def test_colmap(tmp_path, verified):
     database(tmp_path / "database.db", verified=verified)

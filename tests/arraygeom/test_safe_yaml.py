@@ -9,7 +9,7 @@ import yaml
 
 from arraygeom import Rig
 from arraygeom.io import RigFileError
-from arraygeom.safe_yaml import load_yaml
+from arraygeom.safe_yaml import dump_yaml, load_yaml
 
 ROOT = Path(__file__).parents[2]
 
@@ -130,3 +130,11 @@ def test_there_is_one_loader_of_yaml():
     }
     users = [p.name for p, text in texts.items() if "safe_load(" in text or "yaml.load(" in text]
     assert users == ["safe_yaml.py"]
+
+
+@pytest.mark.parametrize(
+    "text", ["1e3", "12E5", "-4e-1", ".5e1", "1_000", "null", "yes", "12:30:45", "#", "a: b", ""]
+)
+def test_a_text_that_looks_like_something_else_stays_a_text(text):
+    document = {text: [text, 1e3, 1e-7, True, None]}
+    assert load_yaml(dump_yaml(document)) == document

@@ -20,7 +20,7 @@ from pat.matching.inputs import Inputs
 from pat.networks.weights import load_weights
 
 pytest.importorskip("anywidget", reason="the extra 'explore' is not installed")
-from pat.explore import explore
+from pat.explore import ExplorerScene, explore
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 Keys = webdriver.Keys
@@ -74,6 +74,39 @@ def test_what_is_wrong_is_said_in_the_picture():
     assert "problem" in explore(small_rig(baseline=50.0)).answer["betas"]["b"]
     assert "near" in change(explore(small_rig()), near=9.0)["error"]
     assert "nobody" in explore(small_rig(), alpha="nobody").answer["error"]
+    assert "nothing" in explore(small_rig(), network="nothing").answer["error"]
+    assert "infinity" in explore(small_rig(), x=(float("inf"), 0)).answer["error"]
+    for image in (torch.rand(80, 120), torch.ones(3, 80, 120, dtype=torch.uint8)):
+        with pytest.raises(ValueError, match=r"'a' is .*wanted float32"):
+            ExplorerScene(small_rig(), {"a": image, "b": image})
+
+
+def test_a_rig_in_float32_and_one_of_a_single_row_are_shown():
+    single = explore(small_rig().to(torch.float32), x=(70, 30)).answer
+    assert single["depth"] == pytest.approx(explore(small_rig(), x=(70, 30)).answer["depth"], rel=1e-3)
+    for h in (1, 3):
+        assert "betas" in explore(thin_rig(h)).answer
+
+
+def thin_rig(h):
+    """Images so wide that less than a row is left when they are shown small."""
+    rig = small_rig()
+    for name in rig.names:
+        rig = rig.with_camera(name, rig[name].resize((80, 4000)).crop((80 - h) // 2, 0, (h, 4000)))
+    return rig
+
+
+def test_a_grid_saved_after_a_click_on_a_beta_is_of_alphas_pixels():
+    view = explore(small_rig())
+    change(view, clicked=["b", 60.0, 40.0])
+    view.explorer.controls = view.controls
+    found = [answer["x"] for answer in view.explorer.grid(4)["answers"].values()]
+    assert len(set(map(tuple, found))) == len(found) == 12
+
+
+def test_weights_that_are_shown_can_be_chosen():
+    shown = explore(small_rig(), network="pat-supervised-4").choices
+    assert "pat-supervised-4" in {name: options for name, _, options in shown}["weights"]
 
 
 class Failing(ReceptiveField):
@@ -206,6 +239,51 @@ def test_a_saved_page_of_lenses_has_a_grid_of_answers(driver, tmp_path):
     until(driver, lambda told: told != before)
     assert captions(driver)[1].startswith("b: match (")
     assert resources(driver) == []
+
+
+@pytest.mark.parametrize(
+    "rig",
+    [
+        small_rig(names=("DATA", "ASKS")),
+        small_rig(names=("<!--<script>", "</script>&\"'")),
+        small_rig().replace(depth=(2.0, 2.0)),
+        thin_rig(1),
+    ],
+    ids=["words of the page", "marks of HTML", "one depth", "one row"],
+)
+def test_a_saved_page_answers_for_odd_names_depths_and_sizes(driver, tmp_path, rig):
+    explore(rig).save(tmp_path / "view.html")
+    driver.get((tmp_path / "view.html").as_uri())
+    until(driver, lambda told: len(told) == 2)
+    assert [told.partition(":")[0] for told in captions(driver)] == [f"{rig.names[0]} (alpha)", rig.names[1]]
+    before = captions(driver)
+    driver.find_element("css selector", ".pat").send_keys(Keys.ARROW_RIGHT)
+    until(driver, lambda told: told[0] != before[0])
+    assert "pixel (" in captions(driver)[0]
+    assert "match (" in captions(driver)[1]
+    assert "NaN" not in str(captions(driver))
+
+
+def test_an_image_saved_as_svg_fills_the_camera_and_code_is_copied_of_what_fails(driver, tmp_path):
+    rig = small_rig()
+    for name in rig.names:
+        rig = rig.resize(name, (333, 1001))
+    explore(rig).save(tmp_path / "view.html")
+    driver.get((tmp_path / "view.html").as_uri())
+    until(driver, lambda told: len(told) == 2)
+    driver.execute_script("URL.createObjectURL = (blob) => { window.saved = blob; return '#'; }")
+    driver.find_element("css selector", "[data-key=s]").click()
+    saved = driver.execute_async_script("window.saved.text().then(arguments[0])")
+    assert saved.count('preserveAspectRatio="none"') == saved.count("<image ") == 2
+    slide(driver, "near", 9.0)
+    slide(driver, "far", 1.0)
+    until(driver, lambda told: "near" in told[0])
+    driver.find_element("css selector", "[data-key=c]").click()
+    button = driver.find_element("css selector", "[data-key=c]")
+    end = time.monotonic() + 10
+    while button.text == "copy code":
+        assert time.monotonic() < end
+        time.sleep(0.05)
 
 
 def test_what_is_wrong_is_drawn_in_the_saved_page(driver, tmp_path):

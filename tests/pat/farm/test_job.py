@@ -4,6 +4,7 @@ import errno
 import importlib.util
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -154,6 +155,9 @@ def fails(arguments, capfd) -> str:
         ({"sed": 3}, "render.yaml: sed: unknown key; did you mean 'seed'?"),
         ({"backend": "blendr"}, "render.yaml: backend: is 'blendr'; did you mean 'blender'?"),
         ({"layered": {"layer": [1, 2]}}, "layered.layer: unknown key; did you mean 'layers'?"),
+        ({"layered": {"edge": -5}}, "layered: edge must be at least 32, got -5"),
+        ({"layered": {"oversampling": 0}}, "layered: oversampling must be at least 1, got 0"),
+        ({"layered": {"layers": [7, 4]}}, "layered: layers must be two numbers"),
         ({"limits": {"timeout": -1}}, "limits: timeout must be above 0"),
         ({"rig": "rg.yaml"}, "rg.yaml: no such file or folder"),
         ({"layered": {"photos": ["images"]}}, "images: no such file or folder"),
@@ -202,6 +206,21 @@ def test_a_folder_of_another_configuration_is_refused(config, tmp_path):
     (tmp_path / "rig.yaml").write_text(RIG.replace("120", "130"))
     with pytest.raises(ValueError, match=r"--out.*rig\.yaml"):
         write_manifest(RenderConfig.load(config), out)
+
+
+@pytest.mark.parametrize(
+    ("found", "given"),
+    [("opencv_stereo", "rig/intrinsics.yml"), ("aniposelib.toml", "rig.toml"), ("colmap", "rig")],
+)
+def test_rigs_of_all_formats_are_in_the_manifest(found, given, config, tmp_path):
+    """Not all are YAML, and a folder's name says nothing of what is in it."""
+    path = ROOT / "tests" / "arraygeom" / "fixtures" / found
+    (shutil.copytree if path.is_dir() else shutil.copy)(path, tmp_path / Path(given).parts[0])
+    write(config, rig=given)
+    for _ in range(2):
+        write_manifest(RenderConfig.load(config), tmp_path / "data")
+    said = yaml.safe_load((tmp_path / "data" / "manifest.yaml").read_text())
+    assert list(said["made from"]["rig"]["cameras"]) == list(Rig.load(tmp_path / given).names)
 
 
 def test_more_scenes_than_disk_are_refused_before_the_first(config, tmp_path, monkeypatch):

@@ -28,6 +28,16 @@ def test_pfm_of_either_order(tmp_path, order):
     assert torch.equal(found[5:], DEPTH[5:])
 
 
+@pytest.mark.parametrize(("end", "plus"), [("\r\n", ""), ("\n", "+"), (" ", "")])
+def test_pfm_heads_as_other_programs_write_them(tmp_path, end, plus):
+    """Lines may end as on Windows, a scale above 0 may have its sign; a value may begin with a line's end."""
+    values = np.frombuffer(b"\x0a\x0d\x0a\x40" * 600, "<f4").reshape(20, 30)
+    for order, scale in (("<", "-1.0"), (">", f"{plus}1.0")):
+        head = end.join(["Pf", "30 20", scale, ""]).encode()
+        (tmp_path / "depth.pfm").write_bytes(head + values.astype(f"{order}f4").tobytes())
+        assert np.array_equal(read_depth(tmp_path / "depth.pfm").numpy(), values)
+
+
 def test_tiff_and_png(tmp_path):
     tifffile.imwrite(tmp_path / "float.tif", DEPTH.numpy())
     assert torch.equal(read_depth(tmp_path / "float.tif"), DEPTH)
