@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 from jaxtyping import Float
@@ -20,7 +20,7 @@ from pat.sensors import Clip, Noise, Quantise, Step, seed_for
 from .grid import PatchGrid, PatchStack, cut, same_cameras
 
 LOADED = 64
-"""Scenes whose patches each process caches in memory."""
+"""Scenes whose patches are cached in memory."""
 
 
 @dataclass(frozen=True)
@@ -56,23 +56,35 @@ class ScenePatches:
         chains: Mapping[str, Sequence[Step]] | None = None,
         seed: int = 0,
     ):
-        self.scenes = SceneStacks(root, alpha=alpha, patches=patches)
-        self.chains = default_chains(self.scenes.rig) if chains is None else chains
+        self.folders = scene_folders(root)
+        self.rig = scene_rig(self.folders[0])
+        self.alpha = self.rig.require(alpha or self.rig.names[0])
+        self.patches = patches or PatchGrid.like_the_papers(self.rig[self.alpha].hw)
+        self.chains = default_chains(self.rig) if chains is None else chains
         for name in self.chains:
-            self.scenes.rig.require(name)
+            self.rig.require(name)
         self.seed = seed
+        self._stack = lru_cache(LOADED)(self._cut)
 
     def __len__(self) -> int:
-        return len(self.scenes) * self.scenes.patches.count
+        return len(self.folders) * self.patches.count
 
     def __getitem__(self, index: int) -> Patch:
         if not 0 <= index < len(self):
             raise IndexError(f"patch {index} of {len(self)}")
-        scene, number = divmod(index, self.scenes.patches.count)
-        return self._recorded(self.scenes[scene], number, seed_for(self.seed, 0, index))
+        scene, number = divmod(index, self.patches.count)
+        return self._recorded(self._stack(scene), number, seed_for(self.seed, 0, index))
+
+    def _cut(self, scene: int) -> PatchStack:
+        folder = self.folders[scene]
+        try:
+            same_cameras(self.rig, scene_rig(folder))
+        except ValueError as error:
+            raise ValueError(f"{folder}: {error}") from None
+        return cut(folder, self.patches, alpha=self.alpha)
 
     def _recorded(self, stack: PatchStack, number: int, seed: int) -> Patch:
-        alpha = self.scenes.alpha
+        alpha = self.alpha
         one = slice(number, number + 1)
         rig, rgb = stack.rig[number], {name: views[one] for name, views in stack.rgb.items()}
         depth = {name: views[one] for name, views in stack.depth.items()}
@@ -84,35 +96,6 @@ class ScenePatches:
             rig=recorded.rig,
             alpha=alpha,
         )
-
-
-class SceneStacks:
-    """The scenes of a folder, cut into patches on first use; the latest `LOADED` are cached."""
-
-    def __init__(self, root: str | Path, *, alpha: str | None = None, patches: PatchGrid | None = None):
-        self.folders = scene_folders(root)
-        self._cache: OrderedDict[int, PatchStack] = OrderedDict()
-        self.rig = scene_rig(self.folders[0])
-        self.alpha = self.rig.require(alpha or self.rig.names[0])
-        self.patches = patches or PatchGrid.like_the_papers(self.rig[self.alpha].hw)
-
-    def __len__(self) -> int:
-        return len(self.folders)
-
-    def __getitem__(self, index: int) -> PatchStack:
-        if index in self._cache:
-            self._cache.move_to_end(index)
-            return self._cache[index]
-        folder = self.folders[index]
-        try:
-            same_cameras(self.rig, scene_rig(folder))
-        except ValueError as error:
-            raise ValueError(f"{folder}: {error}") from None
-        stack = cut(folder, self.patches, alpha=self.alpha)
-        self._cache[index] = stack
-        if len(self._cache) > LOADED:
-            self._cache.popitem(last=False)
-        return stack
 
 
 def default_chains(rig: Rig) -> dict[str, tuple[Step, ...]]:
