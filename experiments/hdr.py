@@ -18,6 +18,8 @@ from pat.media.raw import light_of
 
 WHITE = 0.97
 """Values from here on count as saturated."""
+MEASURED = 0.25
+"""Largest relative error of light that counts as measured."""
 READ_NOISE = 1.5e-3
 """Variance of read noise over shot noise at white, for weighting exposures: typical of machine vision."""
 
@@ -105,10 +107,8 @@ class DynamicRange(NamedTuple):
         return float(torch.tensor(self.high / self.low).log2())
 
 
-def usable_range(
-    measured: Float[Tensor, "*n"], ground_truth: Float[Tensor, "*n"], *, within: float = 0.25
-) -> DynamicRange:
-    """Widest run of half-stops of true light in which an image's median relative error is at most `within`.
+def usable_range(measured: Float[Tensor, "*n"], ground_truth: Float[Tensor, "*n"]) -> DynamicRange:
+    """Widest run of half-stops of true light in which an image's median relative error is at most a quarter.
 
     Raises ValueError if there is none.
     """
@@ -119,7 +119,7 @@ def usable_range(
         here = bins == i
         if here.sum() < 50:
             continue
-        right = float(((found[here] - light[here]).abs() / light[here]).median()) <= within
+        right = float(((found[here] - light[here]).abs() / light[here]).median()) <= MEASURED
         runs = [*runs[:-1], [*runs[-1], i]] if right else [*runs, []]
     best = max(runs, key=len)
     if not best:
@@ -149,10 +149,10 @@ CLIPPED = 0.1
 """Light, 1 is alpha's white, above which an error is no noise."""
 
 
-def missed(image: Float[Tensor, "1 h w"], light: Float[Tensor, "1 h w"], *, within: float = 0.25) -> Tensor:
-    """A camera's image (3, H, W): red where it is clipped, and measures less of its light by more than that
-    part; blue where noise exceeds it."""
+def missed(image: Float[Tensor, "1 h w"], light: Float[Tensor, "1 h w"]) -> Tensor:
+    """A camera's image (3, H, W): red where it is clipped, and measures less of its light by more than
+    a quarter; blue where noise exceeds it."""
     value = linear_from_srgb(image)
-    wrong, clipped = (value - light).abs() > within * light, (value < light) & (value > CLIPPED)
+    wrong, clipped = (value - light).abs() > MEASURED * light, (value < light) & (value > CLIPPED)
     red, blue = (image.new_tensor(rgb)[:, None, None] for rgb in ([0.9, 0.1, 0.1], [0.15, 0.35, 0.95]))
     return torch.where(wrong & clipped, red, torch.where(wrong, blue, image.expand(3, -1, -1)))

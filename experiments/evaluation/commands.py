@@ -309,4 +309,4 @@ class Patches:
         data = ScenePatches(self.folder, alpha=self.alpha, chains=chains, seed=self.seed)
         chosen = torch.randperm(len(data), generator=generator_for(self.seed, "show"))[: self.samples]
         save_figure(draw_patches([data[i] for i in chosen.tolist()]), self.out)
-        say(f"written: {self.out} ({len(data)} patches of {len(data.scenes)} scenes in {self.folder})")
+        say(f"written: {self.out} ({len(data)} patches of {len(data.folders)} scenes in {self.folder})")

@@ -41,13 +41,11 @@ class OutsideRow(NamedTuple):
     seconds: float
 
 
-def evaluate_outside(
-    pairs: Iterable[StereoPair], network: FusionNetwork, *, rate: int = 2
-) -> list[OutsideRow]:
-    """Every source on every pair, all with true disparity, beta reduced `rate` times."""
+def evaluate_outside(pairs: Iterable[StereoPair], network: FusionNetwork) -> list[OutsideRow]:
+    """Every source on every pair, all with true disparity, beta reduced to half."""
     rows = []
     for pair in pairs:
-        task = mono_colour_task(pair, rate)
+        task = mono_colour_task(pair, 2)
         rows += [_row(pair, task, network, source, field_of) for source, field_of in SOURCES.items()]
     return rows
 

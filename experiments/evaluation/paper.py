@@ -130,12 +130,12 @@ def with_found_rig(network: Network) -> StereoMethod:
     return fused
 
 
-def falls(rows: Sequence[StereoRow], *, method: str = "fusion", names: Iterable[str]) -> str:
-    """A line for each of `names`: its mean PSNR against `method`'s, and the extremes over the images."""
+def falls(rows: Sequence[StereoRow], *, names: Iterable[str]) -> str:
+    """A line for each of `names`: its mean PSNR against the fusion's, and the extremes over the images."""
     psnr = {(row.pair, row.rate, row.method): row.psnr for row in rows}
     lines = []
     for name in names:
-        gains = [psnr[pair, rate, name] - value for (pair, rate, m), value in psnr.items() if m == method]
-        line = f"{np.mean(gains):+.2f} dB against {method}, {min(gains):+.2f} to {max(gains):+.2f}"
+        gains = [psnr[pair, rate, name] - value for (pair, rate, m), value in psnr.items() if m == "fusion"]
+        line = f"{np.mean(gains):+.2f} dB against fusion, {min(gains):+.2f} to {max(gains):+.2f}"
         lines.append(f"- {name}: {line}\n")
     return "".join(lines)

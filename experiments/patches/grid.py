@@ -148,14 +148,6 @@ def _beta_size(alpha: Camera, beta: Camera, patches: PatchGrid) -> HW:
     return h, w
 
 
-def stacked(rigs: list[Rig]) -> Rig:
-    """A batch of rigs of the same cameras. Raises ValueError where sizes or names differ."""
-    first = rigs[0]
-    for rig in rigs[1:]:
-        same_cameras(first, rig)
-    return stack(rigs)
-
-
 def same_cameras(one: Rig, other: Rig) -> None:
     """Raises ValueError unless two rigs have the same cameras with images of the same sizes."""
     sizes = [{name: f"{c.hw[1]}x{c.hw[0]}" for name, c in rig.cameras.items()} for rig in (one, other)]

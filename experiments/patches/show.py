@@ -9,7 +9,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from arraygeom.fields import ReceptiveField, recorded_field
+from arraygeom.fields import recorded_field
 from arraygeom.viz import COLOURS, draw_sampling_locations, numpy, show_image
 from pat.media.figures import colour_depth
 
@@ -19,7 +19,7 @@ SHOWN = 6
 """Pixels of alpha whose fields are drawn."""
 
 
-def draw_patches(patches: Sequence[Patch], *, field: ReceptiveField | None = None) -> Figure:
+def draw_patches(patches: Sequence[Patch]) -> Figure:
     """One line for each patch: alpha and betas as recorded with a few pixels' fields, ground truth, depth."""
     columns = len(patches[0].images) + 2
     h, w = patches[0].ground_truth.shape[-2:]
@@ -35,7 +35,7 @@ def draw_patches(patches: Sequence[Patch], *, field: ReceptiveField | None = Non
                 axes.scatter(*numpy(x).T, c=COLOURS[: len(x)], s=18, edgecolors="white", linewidths=0.6)
             elif column < len(patch.images):
                 pair = patch.rig.pair(patch.alpha, name)
-                draw_sampling_locations(axes, field or recorded_field(pair), pair, x)
+                draw_sampling_locations(axes, recorded_field(pair), pair, x)
     return figure
 
 
