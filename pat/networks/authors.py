@@ -40,7 +40,8 @@ def read_authors(path: str | Path) -> Authors:
     """
     content = _loaded(Path(path))
     given = content.get("state_dict", content) if isinstance(content, Mapping) else None
-    if not given or not all(isinstance(v, Tensor) and isinstance(k, str) for k, v in given.items()):
+    named = isinstance(given, Mapping) and len(given) > 0
+    if not named or not all(isinstance(v, Tensor) and isinstance(k, str) for k, v in given.items()):
         raise ValueError(f"{path}: holds no state_dict: give a best.pth.tar that the authors' train.py saved")
     given = {name.removeprefix(PREFIX): tensor for name, tensor in given.items()}
     try:
