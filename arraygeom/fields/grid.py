@@ -12,7 +12,7 @@ from ..chunks import Box, chunked
 from ..pixels import HW, pixel_coordinates, pixel_grid
 from ..rig import Pair
 from ..segments import Positions, Segments
-from .protocol import ReceptiveField, SamplingLocations, lazily
+from .protocol import ReceptiveField, SamplingLocations, device_of, lazily
 
 At = Callable[[Tensor], SamplingLocations]
 """A field as a function of alpha's pixels (n, 2)."""
@@ -55,10 +55,10 @@ class FieldOnGrid:
         right.
         """
         at, hw = lazily(field, pair), hw or pair.alpha.hw
-        device = pair.cameras[0].K.device if pair.calibrated else None
+        device = device_of(pair)
         # Explicit positions of a whole frame may not fit into memory: one point shows which kind the field
         # gives.
-        kind = at(torch.full((1, 2), 0.25, dtype=torch.float64, device=device))
+        kind = at(torch.full((1, 2), 0.25, dtype=torch.float64))
         if not isinstance(kind, Segments | Positions):
             name = getattr(field, "__name__", type(field).__name__)
             raise ValueError(
