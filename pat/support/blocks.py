@@ -81,7 +81,7 @@ def stacked(*parts: Float[Tensor, "b _ _ _"]) -> Float[Tensor, "b d h w"]:
         same = (part if part.shape[-1] == w else pixel_unshuffle(part, 2) for part in parts)
         return torch.cat([channels_last(part) for part in same], 1)
     counts = [part.shape[1] * (part.shape[-1] // w) ** 2 for part in parts]
-    out = torch.empty(len(parts[0]), h, w, sum(counts))
+    out = parts[0].new_empty(len(parts[0]), h, w, sum(counts))
     for part, target in zip(parts, out.split(counts, -1)):
         if part.shape[-1] == w:
             target.copy_(part.movedim(1, -1))
