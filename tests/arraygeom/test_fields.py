@@ -290,6 +290,19 @@ def test_fields_are_asked_where_the_numbers_of_a_link_are():
     assert set(asked) == {"meta"}
 
 
+def test_ends_that_are_not_finite_are_not_on_a_grid():
+    """Compiled loops would look at pixels that there are not, and crash the process."""
+
+    def field(pair, x):
+        end = torch.where(x[..., :1] < 4, x, torch.nan)
+        return Segments(end - 1, end, (x[..., 0] < 4) | (x[..., 1] < 2))
+
+    found = FieldOnGrid.of(field, Pair(View(hw=(8, 8)), View(hw=(8, 8)))).straight
+    assert found.start.isfinite().all()
+    assert found.end.isfinite().all()
+    assert torch.equal(found.valid[0], pixel_grid((8, 8))[..., 0] < 4)
+
+
 def test_lenses_and_missing_calibration_are_refused():
     pair = by_link(pair_of(random_rig(1)))
     with pytest.raises(ValueError, match="HomographyDisplacement or Rectified"):
