@@ -88,7 +88,6 @@ def _looked_up(
         return look_up(image, grid)
     out = image.new_empty(*image.shape[:2], 1, grid.shape[2])
 
-    @torch.no_grad()  # of the thread that looks up
     def piece(first: int) -> None:
         here = slice(first, first + PIECE)
         out[..., here] = look_up(image, grid[:, :, here])

@@ -97,7 +97,6 @@ def _convolved(
     out = torch.empty(shape, dtype=x.dtype, memory_format=order)
     rows = math.ceil(out.shape[2] / (STRIPS * threads()))
 
-    @torch.no_grad()  # of the thread that computes it
     def strip(top: int) -> None:
         bottom = min(top + rows, out.shape[2])
         first = max(top - above, 0)
@@ -109,26 +108,27 @@ def _convolved(
 
 
 def in_parallel(tasks: Sequence[Callable[[], object]], *, most: int | None = None) -> None:
-    """Run tasks on as many `threads` as there are, or `most` of them, this one included; torch in each alone.
+    """Run tasks on as many `threads` as there are, or `most` of them, this one included; torch in each alone,
+    with gradients and inference mode as here.
 
     After an error in one no other is begun; it is raised once those that were are at their end.
     """
     left = iter(tasks)
 
     def work() -> None:
-        with _torch_threads(1):
-            try:
-                for task in left:
-                    task()
-            except BaseException:
-                list(left)
-                raise
+        try:
+            for task in left:
+                task()
+        except BaseException:
+            list(left)
+            raise
 
     helpers = min(threads(), len(tasks), most or len(tasks)) - 1
     if helpers < 1:
         for task in left:
             task()
         return
+    work = _as_here(work)
     waiting = [_pool(os.getpid(), helpers).submit(work) for _ in range(helpers)]
     try:
         work()
@@ -153,13 +153,7 @@ def in_order(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[A
 
 def _ahead(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[Any]:
     """`in_order` on several threads: at most as many parts ahead as there are threads."""
-    count = threads()
-    graph, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
-
-    def work(part: Any) -> Any:
-        with _torch_threads(1), torch.inference_mode(inference), torch.set_grad_enabled(graph):
-            return function(part)
-
+    count, work = threads(), _as_here(function)
     ahead: deque[Future[Any]] = deque()
     try:
         for part in parts:
@@ -170,6 +164,17 @@ def _ahead(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[Any
             yield ahead.popleft().result()
     finally:
         wait([future for future in ahead if not future.cancel()])
+
+
+def _as_here(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function for other threads: torch in each alone, with gradients and inference mode as here."""
+    graph, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+
+    def called(*args: Any) -> Any:
+        with _torch_threads(1), torch.inference_mode(inference), torch.set_grad_enabled(graph):
+            return function(*args)
+
+    return called
 
 
 @contextmanager

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from itertools import product
 
 import torch
 from jaxtyping import Float, Real
@@ -81,7 +83,7 @@ class AroundMatches:
     def from_disparity(cls, disparity: Float[Tensor, "h w"], tolerance: float = 1.0) -> AroundMatches:
         """Of a rectified pair, alpha left: the point at x is at x - disparity in beta; NaN if unknown."""
         h, w = disparity.shape
-        grid = pixel_grid((h, w), dtype=disparity.dtype)
+        grid = pixel_grid((h, w), dtype=disparity.dtype, device=disparity.device)
         return cls(torch.stack([grid[..., 0] - disparity, grid[..., 1]], -1), tolerance)
 
     @classmethod
@@ -94,16 +96,17 @@ class AroundMatches:
         views: tuple[LensView, LensView] | None = None,
         field: ReceptiveField | None = None,
     ) -> AroundMatches:
-        """Of points (x, y) of an alpha of size `hw` and the same in beta; each is known in 3 x 3 pixels."""
-        positions = torch.full((*hw, 2), torch.nan, dtype=torch.float32)
+        """Of points (x, y) of an alpha of size `hw` and the same in beta; each is known in 3 x 3 pixels, as
+        far as no other is nearer."""
+        positions = torch.full((*hw, 2), torch.nan, dtype=torch.float32, device=alpha.device)
         column, row = alpha.round().long().unbind(-1)
         displacement = (beta - alpha).float()
-        for down in (-1, 0, 1):
-            for across in (-1, 0, 1):
-                x, y = column + across, row + down
-                inside = (x >= 0) & (y >= 0) & (x < hw[1]) & (y < hw[0])
-                here = torch.stack([x, y], -1)[inside]
-                positions[here[:, 1], here[:, 0]] = here + displacement[inside]
+        nearest_last = sorted(product((-1, 0, 1), repeat=2), key=lambda step: -math.hypot(*step))
+        for down, across in nearest_last:
+            x, y = column + across, row + down
+            inside = (x >= 0) & (y >= 0) & (x < hw[1]) & (y < hw[0])
+            here = torch.stack([x, y], -1)[inside]
+            positions[here[:, 1], here[:, 0]] = here + displacement[inside]
         return cls(positions, tolerance, views, field)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:

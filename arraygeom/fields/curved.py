@@ -123,11 +123,11 @@ class _Straight(NamedTuple):
     def undistort(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels (*n, 2) of the view in those of the pinhole, and which the lens model covers."""
         straight, valid = self.view.to(x.dtype).undistort(x)
-        return map_homogeneous(self.A[:2], straight), valid
+        return map_homogeneous(self.A[:2].to(x.device), straight), valid
 
     def distort(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels (*n, 2) of the pinhole in those of the view, and which the lens model covers."""
-        return self.view.to(x.dtype).distort(map_homogeneous(torch.linalg.inv(self.A)[:2], x))
+        return self.view.to(x.dtype).distort(map_homogeneous(torch.linalg.inv(self.A)[:2].to(x.device), x))
 
 
 EDGE, ROUNDED = 0.25, 1e-3

@@ -14,7 +14,7 @@ from ..checks import check_above
 from ..chunks import chunked, spans
 from ..epipolar import epipolar_lines
 from ..homography import apply_homography
-from ..pixels import HW, floating, pixel_grid
+from ..pixels import HW, floating, pixel_grid, within
 from ..rig import Pair
 from ..segments import Positions
 from ..threads import in_parallel
@@ -46,7 +46,7 @@ class NearestVoxels:
         with torch.no_grad():
             line = epipolar_lines(pair.fundamental, x)
             centre, placed = apply_homography(pair.homography, x)
-        usable = placed & (line != 0).any(-1)
+        usable = placed & (line != 0).any(-1) & within(centre, pair.beta.hw, self.window)
         axes = usable.shape
         line, centre = line.expand(*axes, 3), centre.round().expand(*axes, 2)
         line, centre = line.reshape(-1, 3), centre.reshape(-1, 2)

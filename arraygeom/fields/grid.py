@@ -12,7 +12,7 @@ from ..chunks import Box, chunked
 from ..pixels import HW, pixel_coordinates, pixel_grid
 from ..rig import Pair
 from ..segments import Positions, Segments
-from .protocol import ReceptiveField, SamplingLocations, lazily
+from .protocol import ReceptiveField, SamplingLocations, device_of, lazily
 
 At = Callable[[Tensor], SamplingLocations]
 """A field as a function of alpha's pixels (n, 2)."""
@@ -55,10 +55,10 @@ class FieldOnGrid:
         right.
         """
         at, hw = lazily(field, pair), hw or pair.alpha.hw
-        device = pair.cameras[0].K.device if pair.calibrated else None
+        device = device_of(pair)
         # Explicit positions of a whole frame may not fit into memory: one point shows which kind the field
         # gives.
-        kind = at(torch.full((1, 2), 0.25, dtype=torch.float64, device=device))
+        kind = at(torch.full((1, 2), 0.25, dtype=torch.float64))
         if not isinstance(kind, Segments | Positions):
             name = getattr(field, "__name__", type(field).__name__)
             raise ValueError(
@@ -170,10 +170,11 @@ def _on_grid(at: At, hw: HW, side: int = 1, device: torch.device | None = None) 
     def segments(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
         found = at((torch.stack([x, y], -1).reshape(-1, 2) + 0.5) * side - 0.5)
         assert isinstance(found, Segments)
-        ends = (end.reshape(-1, *y.shape[1:], 2) for end in (found.start, found.end))
-        return *(end.float() if h * w >= LARGE else end for end in ends), found.valid.reshape(
-            -1, *y.shape[1:]
-        )
+        # Own fields may divide by zero where nothing is valid; compiled loops look up whatever is there.
+        total, shape = found.start + found.end, (-1, *y.shape[1:])
+        valid = found.valid & (total[..., 0] + total[..., 1]).isfinite()
+        ends = (end.nan_to_num(0.0, 0.0, 0.0).reshape(*shape, 2) for end in (found.start, found.end))
+        return *(end.float() if h * w >= LARGE else end for end in ends), valid.reshape(shape)
 
     x, y = pixel_coordinates(hw, dtype=torch.float64, device=device)
     return Segments(*chunked(segments, x[None], y[None], rows=max(_CHUNK // max(w, 1), 1), axis=1))

@@ -47,18 +47,22 @@ def sampling_locations(
 def lazily(field: ReceptiveField, pair: Pair) -> Callable[[Tensor], SamplingLocations]:
     """The field as a function of alpha pixels (n, 2) alone, which attention calls chunk by chunk.
 
-    For a batch of rigs it answers for each of them, (*b, n).
+    For a batch of rigs it answers for each of them, (*b, n); on the device of the pair's numbers.
     """
     check_field(field)
-    axes = len(pair.batch_shape)
-    return lambda x: field(pair, floating(x).reshape(*[1] * axes, *x.shape))
+    axes, device = len(pair.batch_shape), device_of(pair)
+    return lambda x: field(pair, floating(x).to(device=device).reshape(*[1] * axes, *x.shape))
+
+
+def device_of(pair: Pair) -> torch.device | None:
+    """Where a pair's numbers are; None for one of which only the sizes are known."""
+    known = pair.alpha if isinstance(pair.alpha, Camera) else pair.link
+    return next((t.device for t, _ in tensors_of(known)), None)
 
 
 def all_pixels(pair: Pair) -> Float[Tensor, "*b h w 2"]:
     """Alpha's pixel centres, float32, with the axes of a batch of rigs (of length 1) in front."""
-    known = pair.alpha if isinstance(pair.alpha, Camera) else pair.link
-    device = next((t.device for t, _ in tensors_of(known)), None)
-    grid = pixel_grid(pair.alpha.hw, device=device)
+    grid = pixel_grid(pair.alpha.hw, device=device_of(pair))
     return grid.reshape(*[1] * len(pair.batch_shape), *grid.shape)
 
 

@@ -332,4 +332,4 @@ def _attend_by_rows(
     bias = _bias(bias, query, first.xy.shape[-2])
     biases = [] if bias is None else [bias.transpose(1, 2)]
     again = partial(checkpoint, attended, use_reentrant=False) if torch.is_grad_enabled() else attended
-    return chunked(again, query, x, y, *biases, rows=max(1, CHUNK_SAMPLES // (first.xy.numel() // 2)))
+    return chunked(again, query, x, y, *biases, rows=max(1, CHUNK_SAMPLES // max(first.xy.numel() // 2, 1)))

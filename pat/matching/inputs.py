@@ -163,9 +163,13 @@ def ends_of(found: Segments | Positions) -> Float[Tensor, "n 2"]:
 
 
 def box_around(points: Float[Tensor, "n 2"], hw: HW, halo: int, multiple: int) -> Box:
-    """The part of an image around points (x, y), with a halo, corners at whole multiples or the end."""
+    """The part of an image around points (x, y), or what is nearest to them, with a halo, corners at whole
+    multiples or the end."""
     if not len(points):
         return 0, multiple, 0, multiple
+    points = points.clamp(min=0).minimum(
+        points.new_tensor([hw[1] - 1, hw[0] - 1])
+    )  # own fields may be off it
     corners = torch.stack([points.amin(0) - halo, points.amax(0) + halo + multiple])
     (x0, y0), (x1, y1) = torch.div(corners, multiple, rounding_mode="floor").long() * multiple
     return max(int(y0), 0), min(int(y1), hw[0]), max(int(x0), 0), min(int(x1), hw[1])

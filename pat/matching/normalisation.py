@@ -179,10 +179,11 @@ def _equal_blur(image: Float[Tensor, "1 h w"], wanted: float) -> float:
 
 def _sharpness(image: Float[Tensor, "1 h w"]) -> float:
     """The mean second difference of the means of 2 x 2 pixels: of fine detail, which blur takes first, and
-    where noise counts less than from pixel to pixel. First differences are of coarser detail, too."""
+    where noise counts less than from pixel to pixel. First differences are of coarser detail, too. None along
+    a side of less than 6 pixels."""
     half = avg_pool2d(image, FINE)
-    across, down = (float(half.diff(n=2, dim=axis).abs().mean()) for axis in (-1, -2))
-    return across + down + 1e-9
+    differences = (half.diff(n=2, dim=axis).abs() for axis in (-1, -2))
+    return sum(float(part.mean()) for part in differences if part.numel()) + 1e-9
 
 
 class Comparison(NamedTuple):

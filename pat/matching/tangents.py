@@ -118,7 +118,8 @@ class _BlockCentres:
         """The positions of whole labels, and where there are some."""
         parts = []
         for rows in self.by_rows():
-            found, index = self.at(rows, slice(None)), labels[rows].long()[..., None]
+            found = self.at(rows, slice(None))
+            index = labels[rows].long().to(found.mask.device)[..., None]
             xy = found.xy.gather(-2, index[..., None].expand(*index.shape, 2))[..., 0, :]
             parts.append((xy, found.mask.gather(-1, index)[..., 0]))
         return Chosen(*(torch.cat(part) for part in zip(*parts)))
@@ -170,7 +171,7 @@ def _places(grid: _BlockCentres, box: tuple[slice, ...], hw: tuple[int, ...]) ->
         x, y = ((found.xy + 0.5) / FINE - 0.5).round().int().unbind(-1)
         inside = found.mask & (x >= 0) & (y >= 0) & (x < w) & (y < h)
         parts.append(torch.where(inside, y * w + x, -1).int())
-    return np.ascontiguousarray(torch.cat(parts).numpy())
+    return np.ascontiguousarray(torch.cat(parts).cpu().numpy())
 
 
 def _best(total: NDArray[np.int16]) -> tuple[NDArray, NDArray]:
@@ -184,7 +185,7 @@ def _best(total: NDArray[np.int16]) -> tuple[NDArray, NDArray]:
 def _tangents(found: Positions, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Start, end and validity of the lines of a part."""
     xy, mask = found.xy, found.mask
-    count = mask.shape[-1]
+    count, labels = mask.shape[-1], labels.to(mask.device)
     number = torch.arange(count, device=mask.device)
     nearest = torch.where(mask, (number - labels[..., None]).abs(), torch.inf).argmin(-1, keepdim=True)
 
@@ -210,7 +211,7 @@ def _tangents(found: Positions, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]
 
 def _around(found: Chosen) -> Segments:
     """Segments along x around positions chosen alone, which a median makes agree with their neighbours."""
-    xy = found.xy.detach().float().numpy()
+    xy = numpy_of(found.xy)
     smooth = np.stack([cv2.medianBlur(np.ascontiguousarray(xy[..., i]), 5) for i in range(2)], -1)
     middle = torch.from_numpy(smooth).to(found.xy)
     step = middle.new_tensor([HALF_WINDOW, 0.0])

@@ -40,9 +40,10 @@ def read_authors(path: str | Path) -> Authors:
     """
     content = _loaded(Path(path))
     given = content.get("state_dict", content) if isinstance(content, Mapping) else None
-    if not given or not all(isinstance(v, Tensor) and isinstance(k, str) for k, v in given.items()):
+    weights = given if isinstance(given, Mapping) else {}
+    if not weights or not all(isinstance(v, Tensor) and isinstance(k, str) for k, v in weights.items()):
         raise ValueError(f"{path}: holds no state_dict: give a best.pth.tar that the authors' train.py saved")
-    given = {name.removeprefix(PREFIX): tensor for name, tensor in given.items()}
+    given = {name.removeprefix(PREFIX): tensor for name, tensor in weights.items()}
     try:
         config = config_of(given)
         return Authors(config, renamed(given, config), _facts(content))

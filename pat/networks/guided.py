@@ -210,7 +210,7 @@ class GuidedPAT(nn.Module):
         """The estimate of one beta of any bands."""
         of, exactly = found.comparison.combined, alpha.dtype if self.training else torch.float64
         bands, diffused = found.colours
-        segments = beta.field.straight.to(exactly)
+        segments = beta.field.straight.to(alpha.device, exactly)
         extent = Extent.of(segments)
         position = matches(segments, found.surface, beyond_edge=True, extent=extent).movedim(-1, 1)
         window = window_around(found.disparity, segments, self.config.window, extent)

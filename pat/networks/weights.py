@@ -7,7 +7,7 @@ import json
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Union
+from typing import TYPE_CHECKING, Any, Literal, Union, get_args
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -64,8 +64,10 @@ def load_weights(name: str | Path, *, precision: Precision = "float32") -> Netwo
     by .003 dB. Then parts of a frame are equal to the whole to 1e-3 only.
 
     Raises FileNotFoundError for neither, ValueError for a file that is not of this format or does not fit,
-    and for a processor that has no bfloat16.
+    for another precision, and for a processor that has no bfloat16.
     """
+    if precision not in get_args(Precision):
+        raise ValueError(f"precision is {precision!r}; wanted one of {', '.join(get_args(Precision))}")
     network: Network = _load(find_weights(name), NETWORKS)
     if precision == "bfloat16":
         if not (torch.cpu._is_avx512_bf16_supported() or torch.cuda.is_available()):

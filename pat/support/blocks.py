@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -80,7 +81,7 @@ def stacked(*parts: Float[Tensor, "b _ _ _"]) -> Float[Tensor, "b d h w"]:
         same = (part if part.shape[-1] == w else pixel_unshuffle(part, 2) for part in parts)
         return torch.cat([channels_last(part) for part in same], 1)
     counts = [part.shape[1] * (part.shape[-1] // w) ** 2 for part in parts]
-    out = torch.empty(len(parts[0]), h, w, sum(counts))
+    out = parts[0].new_empty(len(parts[0]), h, w, sum(counts))
     for part, target in zip(parts, out.split(counts, -1)):
         if part.shape[-1] == w:
             target.copy_(part.movedim(1, -1))
@@ -137,11 +138,10 @@ def _in_turn(blocks: list[ResidualBlock]) -> nn.Module:
 
 def in_bfloat16(part: nn.Module) -> None:
     """Let a part compute in bfloat16 where autocast does, with float32 output."""
-    forward = part.forward
+    part.forward = partial(_rounded, part)  # copies of a part have their own
 
-    def cast(*images: Tensor) -> Any:
-        with torch.autocast(images[0].device.type, torch.bfloat16):
-            answer = forward(*images)
-        return tree_map(lambda t: t.float(), answer)
 
-    part.forward = cast
+def _rounded(part: nn.Module, *images: Any) -> Any:
+    with torch.autocast(images[0].device.type, torch.bfloat16):
+        answer = type(part).forward(part, *images)
+    return tree_map(lambda t: t.float(), answer)

@@ -103,6 +103,16 @@ def test_matches_off_their_lines_do_not_count():
     assert torch.equal(found.start[1], whole.start[1])
 
 
+def test_points_beside_each_other_keep_their_own_matches():
+    """A point is known in 3 x 3 pixels, but for those of other points."""
+    alpha = pixel_grid(HW)[10:13, 20:30].reshape(-1, 2)
+    beta = alpha - torch.rand(len(alpha), 2, generator=torch.Generator().manual_seed(0))
+    positions = AroundMatches.from_points(alpha, beta, HW).positions
+    assert torch.allclose(positions[10:13, 20:30].reshape(-1, 2), beta, atol=1e-5)
+    assert positions[9:14, 19:31].isfinite().all()
+    assert positions.isfinite().all(-1).sum() == 5 * 12
+
+
 def test_disparities_of_a_rectified_pair_without_calibration():
     pair = Pair(View(hw=HW), View(hw=HW))
     disparity = torch.full(HW, 6.0)

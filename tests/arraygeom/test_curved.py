@@ -24,6 +24,7 @@ from arraygeom import (
     rotation_from_vector,
     sampling_locations,
 )
+from arraygeom.fields.curved import _Straight
 from arraygeom.pixels import pixel_grid
 from tests.arraygeom import explicit
 from tests.arraygeom.rigs import half_rotation, random_rig, two_cameras, uniform
@@ -290,3 +291,11 @@ def test_everything_that_beta_sees_of_a_ray_is_near_a_sample(lens, focal):
         step = line.diff(dim=0).norm(dim=-1)
         off = torch.cdist(points, line).amin(-1).max()
         assert off < 0.6 * step.median() + 0.5
+
+
+def test_a_view_without_a_lens_beside_one_with_takes_pixels_of_any_device():
+    """As on a GPU, for which another device stands."""
+    x = pixel_grid((4, 6), device="meta").reshape(-1, 2)
+    straight = _Straight.of(View(hw=(4, 6)))
+    for found, valid in (straight.undistort(x), straight.distort(x)):
+        assert found.device.type == valid.device.type == "meta"

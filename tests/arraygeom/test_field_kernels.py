@@ -89,3 +89,10 @@ def test_nearest_pixels_are_those_of_the_readable_form(field, seed, monkeypatch)
     expected = field(pair, x)
     assert torch.equal(compiled.mask, expected.mask)
     assert torch.equal(compiled.xy, expected.xy)
+
+
+@pytest.mark.parametrize("far", [1e12, 1e20, 1e30])
+def test_pixels_whose_window_is_far_off_beta_have_none(far):
+    """The compiled loop read memory beside its own where their coordinates are no integers."""
+    x = torch.tensor([[far, 1.0], [1.0, far], [-far, far]])
+    assert not NearestVoxels(24, 12)(pair_with("none"), x).mask.any()

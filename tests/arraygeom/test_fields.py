@@ -27,6 +27,7 @@ from arraygeom import (
     sampling_locations,
 )
 from arraygeom.fields import covering_displacement
+from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.homography import apply_homography
 from arraygeom.pixels import pixel_grid
 from tests.arraygeom.rigs import half_rotation, random_rig, two_cameras, uniform
@@ -272,6 +273,34 @@ def test_whole_images_in_chunks_are_what_single_rows_are():
         torch.testing.assert_close(whole.start[123], row.start, atol=0, rtol=0)
         assert whole.start.shape == (300, 400, 2)
         assert torch.equal(lazily(field, pair)(pixel_grid((300, 400))[123]).end, row.end)
+
+
+def test_fields_are_asked_where_the_numbers_of_a_link_are():
+    """As on a GPU, for which another device stands."""
+    asked = []
+
+    def field(pair, x):
+        asked.append(x.device.type)
+        zero = torch.zeros(x.shape)
+        return Segments(zero, zero, zero[..., 0] == 0)
+
+    pair = Pair(View(hw=(8, 8)), View(hw=(8, 8)), link=Link(torch.eye(3), torch.eye(3)).to("meta"))
+    FieldOnGrid.of(field, pair)
+    lazily(field, pair)(pixel_grid((8, 8)).reshape(-1, 2))
+    assert set(asked) == {"meta"}
+
+
+def test_ends_that_are_not_finite_are_not_on_a_grid():
+    """Compiled loops would look at pixels that there are not, and crash the process."""
+
+    def field(pair, x):
+        end = torch.where(x[..., :1] < 4, x, torch.nan)
+        return Segments(end - 1, end, (x[..., 0] < 4) | (x[..., 1] < 2))
+
+    found = FieldOnGrid.of(field, Pair(View(hw=(8, 8)), View(hw=(8, 8)))).straight
+    assert found.start.isfinite().all()
+    assert found.end.isfinite().all()
+    assert torch.equal(found.valid[0], pixel_grid((8, 8))[..., 0] < 4)
 
 
 def test_lenses_and_missing_calibration_are_refused():

@@ -123,6 +123,16 @@ def test_convolutions_in_strips_are_the_same(two_threads, monkeypatch, of, chann
     assert len(strips) == (0 if "stride" in of else 4)
 
 
+def test_convolutions_in_inference_mode(two_threads, monkeypatch):
+    """Tensors made in it may be written in it alone, by whichever thread."""
+    monkeypatch.setattr(threads_module, "WORTH_STRIPS", 0)
+    conv, x = torch.nn.Conv2d(16, 16, 3, padding=1), torch.rand(1, 16, 301, 207)
+    with torch.inference_mode(), torch_in_one_thread():
+        whole = conv(x)
+        with convolutions_in_parallel():
+            torch.testing.assert_close(conv(x), whole, rtol=0, atol=2e-6)
+
+
 def test_convolutions_keep_gradients_and_precision(two_threads):
     conv, x = torch.nn.Conv2d(16, 16, 3, padding=1), torch.rand(1, 16, 301, 207)
     with torch_in_one_thread(), convolutions_in_parallel():

@@ -33,3 +33,9 @@ def test_a_number_of_samples_by_the_longest_segment_cannot_be_traced():
     with pytest.raises(NotImplementedError, match="`samples`"):
         torch.vmap(attended)(starts)
     torch.testing.assert_close(torch.vmap(lambda s: attended(s, 5))(starts)[0], attended(starts[0], 5))
+
+
+def test_a_field_without_positions_is_refused():
+    image = torch.ones(1, 2, 3, 4)
+    with pytest.raises(ValueError, match="samples must be at least 1"):
+        attend(image, image, image, lambda x: Positions(x[:, None][:, :0], x[:, :0] > 0))

@@ -13,7 +13,7 @@ from pat.matching.colour_transfer import transferred
 from pat.matching.match import located, match
 from pat.matching.matches import Matches
 from pat.media.colour import luminance
-from pat.networks.protocol import FusionOutput
+from pat.networks.protocol import FusionOutput, fused_at_once
 from pat.networks.weights import load_weights
 
 H, W = 64, 96
@@ -42,6 +42,17 @@ def flat():
 def inputs(network, flat):
     rig, images = flat
     return frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs
+
+
+@pytest.mark.parametrize("off", [-500.0, 500.0])
+def test_a_part_whose_segments_are_off_beta_has_some_of_beta(network, inputs, off):
+    """Fields of one's own need not clip them: what is off the image does not count."""
+    field = inputs.betas[0].field.displaced(lambda _, x: x.new_tensor([off, 0.0]).expand_as(x))
+    (beta,) = inputs.betas
+    part = replace(inputs, betas=(replace(beta, field=field),)).cut((0, 32, 32, 64))
+    assert min(part.betas[0].image.shape) > 0
+    assert part.betas[0].field.straight.valid.any()
+    assert fused_at_once(network, part).confidence[0].max() == 0
 
 
 def test_positions_are_where_the_wall_is(inputs):

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from pat.matching.filters import LocalMoments, box_mean
-from pat.matching.normalisation import Moments, mean_moments, moments, normalised
+from pat.matching.normalisation import Moments, equalising_blurs, mean_moments, moments, normalised
 
 
 def image(seed: int, bands: int = 1) -> torch.Tensor:
@@ -55,3 +55,12 @@ def test_local_moments_are_those_of_squares():
 def test_box_means_with_gradients_are_those_without():
     one = image(3)
     torch.testing.assert_close(box_mean(one.clone().requires_grad_(), 3).detach(), box_mean(one, 3))
+
+
+def test_images_of_few_rows_are_as_sharp_as_their_columns_are():
+    """Of less than three pairs of rows there is no second difference."""
+    one = torch.rand(1, 1, 4, 40, generator=torch.Generator().manual_seed(0))
+    assert equalising_blurs(one, one) == ([0.0], [0.0])
+    (own,), (other,) = equalising_blurs(one, 0.3 * one)
+    assert 0 < own < 3
+    assert other == 0

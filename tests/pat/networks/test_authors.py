@@ -224,7 +224,9 @@ def test_checkpoints_of_other_networks_name_what_does_not_fit_first(state, messa
         PAT.from_authors(save(tmp_path / "other", state))
 
 
-@pytest.mark.parametrize("content", [{"epoch": 3}, [1, 2], {}, {"state_dict": {"a": 1}}, torch.zeros(3)])
+@pytest.mark.parametrize(
+    "content", [{"epoch": 3}, [1, 2], {}, {"state_dict": {"a": 1}}, {"state_dict": [1]}, torch.zeros(3)]
+)
 def test_files_without_weights_are_refused(content, tmp_path):
     torch.save(content, tmp_path / "other")
     with pytest.raises(ValueError, match="state_dict"):

@@ -1,12 +1,16 @@
 """Convolutions in bfloat16."""
 
+import copy
+import pickle
+from inspect import unwrap
+
 import pytest
 import torch
 
 from pat import fuse
 from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
-from pat.networks.weights import load_weights
+from pat.networks.weights import load_weights, set_precision
 
 
 def test_bfloat16_changes_the_image_little_and_something(monkeypatch):
@@ -30,6 +34,24 @@ def test_bfloat16_changes_the_image_little_and_something(monkeypatch):
     scores = [score(frame.image.clamp(0, 1), sample.ground_truth).psnr for frame in (exact, rounded)]
     assert abs(scores[0] - scores[1]) < 0.02
     assert (exact.confidence - rounded.confidence).abs().max() < 0.02
+
+
+def test_a_copy_of_a_network_in_bfloat16_computes_with_its_own_weights():
+    network = load_weights("mono-colour-small")
+    set_precision(network, "bfloat16")
+    other = copy.deepcopy(network)
+    for parameter in other.encoder.parameters():
+        parameter.zero_()
+    image = torch.rand(1, 1, 32, 32)
+    assert network.encoder(image).half.any()
+    assert not other.encoder(image).half.any()
+    again = pickle.loads(pickle.dumps(network))
+    assert again.encoder(image).half.equal(network.encoder(image).half)
+
+
+def test_a_precision_that_there_is_not_is_refused():
+    with pytest.raises(ValueError, match=r"precision is 'float16'.*float32"):
+        unwrap(load_weights)("mono-colour-small", precision="float16")
 
 
 def test_a_processor_without_bfloat16_refuses_it(monkeypatch):
