@@ -42,8 +42,8 @@ class PairTraining(Recipe):
     """Real shapes in other textures."""
     varied: int = 520
     """And real pairs, in other colours and sizes."""
-    rendered: int = 800
-    """And rendered ones; they take Blender."""
+    rendered: int = 0
+    """And rendered rooms; they take Blender."""
     fusion: str = "mono-colour"
     """Weights of the fusion that what is learned is for."""
 
