@@ -30,7 +30,7 @@ KINDS = ("pairs", "shapes", "rooms", "photos")
 class PairTraining(Recipe):
     """What is learned from pairs."""
 
-    photos: tuple[Path, ...]
+    photos: tuple[Path, ...] = ()
     """Folders of photographs."""
     stereo: Path | None = None
     """Folder of Middlebury's pairs; those of the tune half are used."""
@@ -90,7 +90,8 @@ class PairTraining(Recipe):
         suffixes = {".jpg", ".jpeg", ".png"}
         files = [f for root in self.photos for f in files_below(root) if f.suffix.lower() in suffixes]
         if not files:
-            raise ValueError(f"no photograph in {', '.join(map(str, self.photos))}: check the folders")
+            given = ", ".join(map(str, self.photos)) or "no folder"
+            raise ValueError(f"no photograph in {given}: check --photos")
         return files
 
     def _middlebury(self) -> list[StereoPair]:

@@ -1,15 +1,18 @@
 """What the choice between disparities learns from: true positions, and a step of training."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import yaml
 from safetensors import safe_open
 from skimage.data import data_dir
 from torch.nn.functional import max_pool2d
 
 from experiments.choice import ChoiceTraining, Kept, losses, rows_of, train_choice, window
+from experiments.completion import samples
 from experiments.completion.pairs import HW, photo_pair, varied_pair
 from experiments.completion.shapes import seen_from_right, shape_pair
 from experiments.evaluation.certainty import unseeing
@@ -171,7 +174,17 @@ def test_a_wrong_folder_ends_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["choice", "--photos", str(tmp_path), "--out", str(tmp_path / "out")])
     with pytest.raises(SystemExit) as stop:
         command(train_choice, ChoiceTraining, "choice")
-    assert str(stop.value) == f"choice: no photograph in {tmp_path}: check the folders"
+    assert str(stop.value) == f"choice: no photograph in {tmp_path}: check --photos"
+
+
+def test_the_recipe_of_what_ships_wants_photographs(tmp_path, monkeypatch):
+    recipe = str(Path(samples.__file__).with_name("choice.yaml"))
+    monkeypatch.setattr("sys.argv", ["choice", recipe, "--out", str(tmp_path / "out")])
+    with pytest.raises(SystemExit) as stop:
+        command(train_choice, ChoiceTraining, "choice")
+    assert str(stop.value) == "choice: no photograph in no folder: check --photos"
+    kept = yaml.safe_load((tmp_path / "out" / "recipe.yaml").read_text())
+    assert (kept["captured"], kept["varied"], kept["rendered"]) == (250, 450, 0)
 
 
 @pytest.mark.slow
