@@ -40,6 +40,7 @@ from ..sensors import NoiseLevel
 from ..support.jobs import HERE, JobReport, OnError, Task, Workers, run_tasks
 from ..support.locks import folder_lock
 from ..support.memory import limited, parse_bytes
+from ..support.schema import entries_of
 from ..support.tensor_files import write_tensors
 from .checks import confidence_checked
 from .frames import ImageFiles
@@ -173,7 +174,7 @@ class Batch:
                 f"{file}: the frames there were made with other settings ({', '.join(changed)}): "
                 "give the same ones, or another --out"
             )
-        now, before = self.inputs, _read_inputs(self.out / INPUTS) if resume else {}
+        now, before = self.inputs, entries_of(self.out / INPUTS) if resume else {}
         other = [i for i, name in enumerate(self.names) if before.get(name) != now[name]]
         if not resume or (self.sequence and other):
             shutil.rmtree(self.out / KEYS, ignore_errors=True)
@@ -328,15 +329,6 @@ def _stamp(file: Path) -> str:
 
 def _digest(document: object) -> str:
     return hashlib.sha256(json.dumps(document).encode()).hexdigest()[:32]
-
-
-def _read_inputs(file: Path) -> dict[str, str]:
-    """What frames were made from; nothing where that is not known."""
-    try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return document if isinstance(document, dict) else {}
 
 
 @lru_cache(maxsize=2)
