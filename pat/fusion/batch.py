@@ -35,7 +35,7 @@ from ..media.images import read_image
 from ..media.raw import developed_rig
 from ..media.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from ..media.video import check_video, write_video
-from ..networks.weights import Network, Precision, find_weights, load_weights
+from ..networks.weights import Precision, find_weights, load_weights
 from ..sensors import NoiseLevel
 from ..support.jobs import HERE, JobReport, OnError, Task, Workers, run_tasks
 from ..support.locks import folder_lock
@@ -55,6 +55,7 @@ INPUTS = "inputs.json"
 SETTINGS, KEYS, PLAN = "settings.yaml", ".keys", "plan.json"
 
 PLAN_FORMAT = "pat-batch 1"
+_network = lru_cache(maxsize=2)(load_weights)
 FIELD_CLASSES = {kind.__name__: kind for kind in (*FIELDS.values(), ThroughLenses, Widened)}
 
 
@@ -222,7 +223,7 @@ class Batch:
     def fusion(self) -> SequenceFusion:
         """The sequence, with the images that its frames have in common."""
         frames = {n: ImageFiles(files, self.rig, n, alpha=self.alpha) for n, files in self.files.items()}
-        rig, network = developed_rig(self.rig, self.files), _network(self.weights, self.precision)
+        rig, network = developed_rig(self.rig, self.files), _network(self.weights, precision=self.precision)
         return SequenceFusion(network, rig, frames, self.alpha, self.speed, self.settings)
 
     def _key_file(self, key: KeyFrame) -> Path:
@@ -259,7 +260,7 @@ class Batch:
     def _frame(self, i: int) -> Frame:
         if not self.sequence:
             images = ViewFiles(self.rig, {n: files[i] for n, files in self.files.items()}, alpha=self.alpha)
-            network = _network(self.weights, self.precision)
+            network = _network(self.weights, precision=self.precision)
             return fuse(network, images.developed, images, alpha=self.alpha, settings=self.settings)
         fusion = self.fusion
         return fusion.alone(i) if self.alone else fusion.frame(i, fusion.timeline.key_frames(), self._fetch)
@@ -334,11 +335,6 @@ def _digest(document: object) -> str:
 @lru_cache(maxsize=2)
 def _planned(plan: Path, time: int) -> Batch:
     return Batch.from_json(plan.read_text(encoding="utf-8", errors="replace"), str(plan))
-
-
-@lru_cache(maxsize=2)
-def _network(weights: str, precision: Precision) -> Network:
-    return load_weights(weights, precision=precision)
 
 
 def find_images(text: str | Path, *, name: str = "") -> list[Path]:
