@@ -31,8 +31,8 @@ from ..matching.radiometry import Given
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
 from ..networks.weights import load_weights, weights_for
+from ..support.blocks import without_autocast
 from ..support.memory import limited, parse_bytes
-from ..support.precision import without_autocast
 from .checks import warn_of_confidence
 from .corrections import corrections_for, expected_work
 from .fuse import Progress
