@@ -249,7 +249,6 @@ def _located(
         return where[0, :h, :w], inside[0, :h, :w]
     pinhole = inputs.placements[i].pair.alpha
     assert isinstance(pinhole, LensView)
-    assert isinstance(recorded, LensView)
     x, seen = pixels_between(pinhole, recorded)
     disparity = _between_pixels(found.surface[0, :, :h, :w], x)
 
@@ -279,7 +278,6 @@ def _at_pixels(plane: Float[Tensor, "1 h w"], pinhole: View, recorded: View) -> 
     if not has_lens(recorded):
         return plane
     assert isinstance(pinhole, LensView)
-    assert isinstance(recorded, LensView)
     return resampled(plane, pinhole, recorded, interpolation="bilinear").values[0]
 
 
