@@ -122,7 +122,8 @@ def unseeing(choices: Sequence[Path], pair: str) -> Choice:
 def judged_pair(network: FusionNetwork, pair: StereoPair, condition: str, choice: Choice | None) -> Judged:
     """One of them. A match is right if beta sees the point and it is within a pixel."""
     assert pair.disparity is not None
-    (alpha, beta, _), noise = CONDITIONS[condition].recorded(pair)
+    alpha, beta, _ = CONDITIONS[condition].recorded(pair)
+    noise = CONDITIONS[condition].noise
     h, w = hw_of(alpha)
     rig = rectified_rig((h, w), {"beta": hw_of(beta)}, PAPER_DISPARITY)
     stated = None if noise is None else {"alpha": noise, "beta": noise}
