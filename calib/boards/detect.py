@@ -353,16 +353,13 @@ def collect_folder(
     none of them, or if they show a board of another size.
     """
     photos = find_photos(Path(folder), patterns=patterns)
-    jobs = [(name, key, photo) for name, moments in photos.items() for key, photo in moments.items()]
+    jobs = [job for moments in photos.values() for job in moments.items()]
     with ThreadPoolExecutor(2) as pool:
-        results = pool.map(lambda job: detected(job[2], job[1], board), jobs)
-        found = list(progress(results, len(jobs)) if progress else results)
-    by_camera: dict[str, dict[FrameKey, DetectedImage]] = {name: {} for name in photos}
-    for (name, key, _), image in zip(jobs, found):
-        by_camera[name][key] = image
+        results = pool.map(lambda job: detected(job[1], job[0], board), jobs)
+        found = iter(list(progress(results, len(jobs)) if progress else results))
     views, notes = {}, list[str]()
     for name, moments in photos.items():
-        images = by_camera[name]
+        images = {key: next(found) for key in moments}
         views[name] = board_views(name, moments, images)
         seen = {key: boards for key, (_, boards) in images.items() if boards}
         notes += _missing(name, moments, seen, board)

@@ -87,10 +87,8 @@ def report_html(
     if len(calibration.views) > 1:
         parts.append("<h2>Pairs</h2>" + pair_table(calibration))
     parts.append(_section("The rig and the boards", "", draw_scene(calibration)))
-    by_image = draw_by_image(calibration)
-    parts.append(_section("Residuals of each image", "Root mean square, pixels.", by_image))
-    worst = worst_images(calibration, detected) if detected and photos else []
-    if detected and photos and worst:
+    parts.append(_section("Residuals of each image", "Root mean square, pixels.", draw_by_image(calibration)))
+    if detected and photos and (worst := worst_images(calibration, detected)):
         text = "Points used (dots), left out (red circles), residuals (enlarged)."
         drawn = draw_images(calibration, worst, detected, photos)
         parts.append(_section("Images that fit worst", text, drawn))

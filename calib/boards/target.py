@@ -189,7 +189,7 @@ def _kalibr_target(path: Path) -> str:
     raise ValueError(f"{path}: not an aprilgrid of Kalibr's, nor a checkerboard of squares")
 
 
-def _counts(text: str, part: str, *, fewest: int = 3) -> tuple[int, int]:
+def _counts(text: str, part: str, *, fewest: int) -> tuple[int, int]:
     if not (match := re.fullmatch(r"(\d+)x(\d+)", part)):
         raise ValueError(f"board '{text}': '{part}' is not a count like 8x6; write it like {FORMS}")
     columns, rows = int(match[1]), int(match[2])

@@ -193,8 +193,7 @@ class FocalFit:
         """Relative, of the focal length: by the points' noise, or a jackknife over parts of the image."""
         residuals, z = self.views.residuals, self.z
         covariance = posterior_covariance(residuals, z)
-        groups = parts_of(self.views.hw, self.views.points.alpha)
-        shifts = shifts_left_out(residuals, z, groups, PARTS**2)[:, 0]
+        shifts = shifts_left_out(residuals, z, parts_of(self.views.hw, self.views.points.alpha))[:, 0]
         jackknife = (PARTS**2 - 1) / PARTS**2 * shifts.square().sum()
         return float(self.views.sigma[0] * torch.maximum(covariance[0, 0], jackknife).sqrt())
 

@@ -71,7 +71,7 @@ def centres_found(
     for name in rig.betas(alpha):
         own = {pair: matches for pair, matches in near.items() if name in pair}
         facts[name] = sum(len(matches.alpha) for matches in own.values()), median_off(rig, own)
-    return rig.replace(depth=_depths(rig, alpha, near)), facts
+    return rig.replace(depth=_depths(rig, near)), facts
 
 
 def _normals(rig: Rig, a: str, b: str, matches: PointMatches) -> Float[Tensor, "n 3"]:
@@ -161,7 +161,7 @@ def _points_ahead(
     return float((torch.linalg.cross(one, two) * torch.linalg.cross(baseline, two)).sum(-1).sign().sum())
 
 
-def _depths(rig: Rig, alpha: str, near: Mapping[tuple[str, str], PointMatches]) -> tuple[float, float]:
+def _depths(rig: Rig, near: Mapping[tuple[str, str], PointMatches]) -> tuple[float, float]:
     """The range of depths that all pairs' points have, extended. Raises ValueError without parallax."""
     every = [depth_bounds(Rig({name: rig[name] for name in pair}), m) for pair, m in near.items()]
     found = [bounds for bounds in every if bounds is not None]

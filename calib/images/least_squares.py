@@ -19,6 +19,8 @@ from torch import Tensor
 from arraygeom.progress import log_step
 from arraygeom.robust import LocalModel, cauchy, levenberg_marquardt, normal_deviation, normal_equations
 
+from .residuals import PARTS
+
 LOG = logging.getLogger(__name__)
 
 LARGEST_POSTERIOR = 0.9
@@ -98,21 +100,20 @@ def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
 def shifts_left_out(
     residuals: Residuals,
     z: Float[Tensor, " k"],
-    groups: Int[Tensor, " m"],
-    count: int,
+    parts: Int[Tensor, " m"],
     kept: Bool[Tensor, " k"] | None = None,
 ) -> Float[Tensor, "g n"]:
-    """Changes of those parameters `kept`, all unless stated, without the residuals of one of the groups.
+    """Changes of those parameters `kept`, all unless stated, without one of the `PARTS` x `PARTS` parts.
 
-    Groups are 0 to g - 1. To first order, from the most probable z on.
+    `parts` says in which of them each residual is. To first order, from the most probable z on.
     """
     r, J = jacobian(residuals, z)
     J = J if kept is None else J[:, kept]
     weight = _weight(r)
     information = normal_equations(J.T, r, weight)[0] + torch.eye(J.shape[1], dtype=J.dtype)
     changes = []
-    for group in range(count):
-        mine = groups == group
+    for number in range(PARTS**2):
+        mine = parts == number
         part, slope = normal_equations(J[mine].T, r[mine], weight[mine])
         changes.append(torch.linalg.solve(information - part, slope))
     return torch.stack(changes)

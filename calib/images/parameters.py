@@ -95,7 +95,7 @@ def free_parameters(
 
 
 def considered_parameters(
-    rig: Rig, names: Sequence[str], free: Sequence[FreeParameter], *, sigma: Mapping[str, float] | None = None
+    rig: Rig, names: Sequence[str], free: Sequence[FreeParameter], *, sigma: Mapping[str, float] | None
 ) -> list[FreeParameter]:
     """These cameras' poses, focal lengths and principal points that are not free but uncertain all the same.
 

@@ -64,7 +64,6 @@ from .parameters import LARGEST_CHANGE, FreeParameter, apply_change, considered_
 from .photometric import Attend, PhotometricImage, photometric_errors
 from .refined import LineStatistics, ParameterChange, PhotometricResult, Refinement
 from .residuals import (
-    PARTS,
     held_out_pixels,
     image_parts,
     line_distances,
@@ -283,7 +282,7 @@ class RefinementProblem:
             return solution
         active = torch.ones(len(solution.full), dtype=torch.bool)
         active[: self.count] = solution.active
-        shifts = shifts_left_out(residuals, solution.full, image_parts(self.rig, self.used), PARTS**2, active)
+        shifts = shifts_left_out(residuals, solution.full, image_parts(self.rig, self.used), active)
         found = solution._replace(z=torch.zeros_like(solution.z))
         for _ in range(2):
             values = log_depths(self.after, [self.rig, self.after(found.z)], self.used)

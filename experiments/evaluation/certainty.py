@@ -95,7 +95,7 @@ def judged(
     network: FusionNetwork,
     pairs: Iterable[StereoPair],
     conditions: Sequence[str],
-    choices: Sequence[Path] = (),
+    choices: Sequence[Path],
 ) -> Iterator[Judged]:
     """Every pair with true disparity under every condition, fused as `fuse` does.
 
@@ -119,12 +119,11 @@ def unseeing(choices: Sequence[Path], pair: str) -> Choice:
     raise ValueError(f"no choice was trained without {pair}: train one (--without) and give its file")
 
 
-def judged_pair(
-    network: FusionNetwork, pair: StereoPair, condition: str, choice: Choice | None = None
-) -> Judged:
+def judged_pair(network: FusionNetwork, pair: StereoPair, condition: str, choice: Choice | None) -> Judged:
     """One of them. A match is right if beta sees the point and it is within a pixel."""
     assert pair.disparity is not None
-    (alpha, beta, _), noise = CONDITIONS[condition].recorded(pair)
+    alpha, beta, _ = CONDITIONS[condition].recorded(pair)
+    noise = CONDITIONS[condition].noise
     h, w = hw_of(alpha)
     rig = rectified_rig((h, w), {"beta": hw_of(beta)}, PAPER_DISPARITY)
     stated = None if noise is None else {"alpha": noise, "beta": noise}

@@ -50,13 +50,6 @@ Region = Literal["whole", "seen", "occluded", "beyond", "cropped"]
 REGIONS: tuple[Region, ...] = ("whole", "seen", "occluded", "beyond", "cropped")
 
 
-class Recording(NamedTuple):
-    """What is fused, and the noise level of alpha and beta where there is noise."""
-
-    task: MonoColourTask
-    noise: NoiseLevel | None = None
-
-
 @dataclass(frozen=True)
 class Condition:
     """How a pair is recorded, with beta reduced `rate` times.
@@ -71,7 +64,7 @@ class Condition:
     beta: Callable[[Tensor], Tensor] = lambda image: image
     noise: NoiseLevel | None = None
 
-    def recorded(self, pair: StereoPair) -> Recording:
+    def recorded(self, pair: StereoPair) -> MonoColourTask:
         """The pair under this condition; what is drawn at random depends on the pair's name alone."""
         g = Generator().manual_seed(int(hashlib.sha256(pair.name.encode()).hexdigest()[:8], 16))
         moved = StereoPair(pair.name, pair.left, self.right(pair.right), pair.max_disparity, pair.disparity)
@@ -81,7 +74,7 @@ class Condition:
         beta = self.beta(beta)
         if self.noise is not None:
             alpha, beta = (self.noise.recorded(image[None], g)[0] for image in (alpha, beta))
-        return Recording(MonoColourTask(alpha, beta, truth), self.noise)
+        return MonoColourTask(alpha, beta, truth)
 
 
 def _weights(*weights: float) -> Callable[[Generator], Sequence[float]]:
@@ -162,10 +155,9 @@ class ConditionRow(NamedTuple):
     within_one: tuple[float, float] | None = None
 
 
-def methods_of(network: FusionNetwork, recording: Recording) -> dict[str, StereoMethod]:
+def methods_of(network: FusionNetwork, level: NoiseLevel | None) -> dict[str, StereoMethod]:
     """Those compared: classical, denoised first if there is noise, ours as it is and without corrections."""
     found: dict[str, StereoMethod] = {"classical": classical}
-    level = recording.noise
     if level is None:
         found["classical, corrected"] = lambda a, b, d: corrected_classical(network, a, b, d)
     else:
@@ -238,13 +230,13 @@ def evaluate_conditions(
     rows = []
     for pair in progress(pairs, len(pairs)):
         for name, condition in chosen.items():
-            recording = condition.recorded(pair)
-            truth, regions = recording.task.ground_truth, regions_of(pair, hw_of(recording.task.ground_truth))
+            task = condition.recorded(pair)
+            truth, regions = task.ground_truth, regions_of(pair, hw_of(task.ground_truth))
             if condition == CONDITIONS["ideal"]:
-                bound = StereoResult(chroma_bound(recording.task, condition.rate))
+                bound = StereoResult(chroma_bound(task, condition.rate))
                 rows.append(_row(pair, name, "bound of beta's resolution", bound, truth, regions))
-            for method, run in methods_of(network, recording).items():
-                found = run(recording.task.alpha, recording.task.beta, max_disparity)
+            for method, run in methods_of(network, condition.noise).items():
+                found = run(task.alpha, task.beta, max_disparity)
                 result = found if isinstance(found, StereoResult) else StereoResult(found)
                 rows.append(_row(pair, name, method, result, truth, regions))
     return rows

@@ -94,12 +94,12 @@ def fields_of(max_displacement: float) -> dict[str, ReceptiveField]:
     }
 
 
-def rectified_cases(pairs: Iterable[StereoPair], *, rate: int = 2, linked: bool = False) -> Iterator[Case]:
-    """Pairs with true disparity, the right reduced `rate` times and enlarged; F and H alone if `linked`."""
+def rectified_cases(pairs: Iterable[StereoPair], *, linked: bool = False) -> Iterator[Case]:
+    """Pairs with true disparity, the right halved and enlarged; F and H alone if `linked`."""
     for pair in pairs:
         if pair.disparity is None:
             continue
-        task = mono_colour_task(pair, rate)
+        task = mono_colour_task(pair, 2)
         h, w = hw_of(task.alpha)
         beta = interpolate(task.beta[None], (h, w), mode="bicubic", align_corners=False)[0].clamp(0, 1)
         scene = RecordedScene({ALPHA: task.alpha, BETA: beta}, task.ground_truth, *_truth(pair, (h, w)))

@@ -89,12 +89,11 @@ class ShuffledField:
     """A field in which each alpha pixel has another one's segment: the same segments, wrongly assigned."""
 
     field: ReceptiveField
-    seed: int = 0
 
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments | Positions:
         """The segments of the pixels to which a random permutation takes x."""
         h, w = pair.alpha.hw
-        order = torch.randperm(h * w, generator=torch.Generator().manual_seed(self.seed)).to(x.device)
+        order = torch.randperm(h * w, generator=torch.Generator().manual_seed(0)).to(x.device)
         column, row = x[..., 0].round().long().clamp(0, w - 1), x[..., 1].round().long().clamp(0, h - 1)
         drawn = order[row * w + column]
         return self.field(pair, torch.stack([drawn % w, drawn // w], -1).to(x))

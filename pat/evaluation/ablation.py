@@ -63,7 +63,7 @@ from ..synthesis.rig_distribution import RigDistribution
 from .baseline import classical
 from .metrics import bootstrap_interval, score
 from .rectified import rectified
-from .tables import markdown_table, write_csv
+from .tables import distinct, markdown_table, write_csv
 
 ALPHA, BETA = "alpha", "beta"
 RIGS = RigDistribution(
@@ -253,17 +253,13 @@ def sample_photographs(*, count: int = 12, seed: int = 0) -> PhotoBank:
 
 
 def ablate(
-    network: FusionNetwork,
-    cases: Iterable[AblationCase],
-    *,
-    out: Path,
-    chosen: Mapping[str, FieldFamily] | None = None,
+    network: FusionNetwork, cases: Iterable[AblationCase], chosen: Mapping[str, FieldFamily], *, out: Path
 ) -> list[AblationRow]:
-    """Every family on every case; ablation.md, .csv and .png (crops of some cases) go to `out`."""
+    """Every chosen family on every case; ablation.md, .csv and .png (crops of some cases) go to `out`."""
     rows: list[AblationRow] = []
     panels: dict[str, Tensor] = {}
     for i, case in enumerate(track(cases, "ablating", disable=not sys.stderr.isatty())):
-        found, images = _case(network, case, chosen or families())
+        found, images = _case(network, case, chosen)
         rows += found
         panels |= crops(case, images, found) if i < SHOWN else {}
     write_text(out / "ablation.md", markdown(rows))
@@ -336,7 +332,7 @@ def markdown(rows: Sequence[AblationRow]) -> str:
     between = [f"ratio {low:g} to {high:g}" for low, high in pairwise(RATIOS)]
     bins = [f"ratio below {RATIOS[0]:g}", *between, f"ratio from {RATIOS[-1]:g}"]
     columns = ["family", "PSNR", "SSIM", "against calibrated", *bins, "off, px", "within 1 px", ""]
-    names = list(dict.fromkeys(row.family for row in rows))
+    names = distinct(row.family for row in rows)
     lines = [[name, *_cells([row for row in rows if row.family == name], rows)] for name in names]
     scenes = len({row.scene for row in rows})
     note = (

@@ -1,4 +1,4 @@
-"""Errors of an image or a disparity: PSNR, SSIM, end-point error, and the confidence interval of a mean."""
+"""Errors of an image: PSNR, SSIM; and the confidence interval of a mean."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
@@ -20,13 +20,6 @@ class Score(NamedTuple):
 
     psnr: float
     ssim: float
-
-
-class DisparityScore(NamedTuple):
-    """Mean absolute error in pixels, and the share of pixels whose error is at most one pixel."""
-
-    end_point_error: float
-    within_one: float
 
 
 def score(image: Float[Tensor, "_ _ _"], ground_truth: Float[Tensor, "_ _ _"]) -> Score:
@@ -47,16 +40,6 @@ def score(image: Float[Tensor, "_ _ _"], ground_truth: Float[Tensor, "_ _ _"]) -
     how = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     ssim = structural_similarity(theirs, ours, data_range=1, channel_axis=0, **how)
     return Score(float(psnr), float(ssim))
-
-
-def disparity_score(
-    disparity: Float[Tensor, "h w"], ground_truth: Float[Tensor, "h w"], valid: Bool[Tensor, "h w"]
-) -> DisparityScore:
-    """Errors of a disparity, in pixels, where `valid`. Raises ValueError if no pixel is valid."""
-    if not valid.any():
-        raise ValueError("no pixel has a true disparity: nothing to compare with")
-    error = (disparity - ground_truth)[valid].abs().double()
-    return DisparityScore(float(error.mean()), float((error <= 1).double().mean()))
 
 
 def bootstrap_interval(values: Sequence[float]) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..data.pairs import PAPER_DISPARITY, Disparity, StereoPair, folder_pairs, middlebury_pairs
 from ..media.images import write_image
-from .metrics import bootstrap_interval, disparity_score, score
+from .metrics import bootstrap_interval, score
 from .protocols import MonoColourTask, StereoMethod, StereoResult, beta_alone, mono_colour_task
 from .tables import distinct, markdown_table
 
@@ -195,5 +195,5 @@ def disparity_errors(
     compared = valid & found.isfinite()
     if not compared.any():
         return None, None
-    errors = disparity_score(found.to(value), value, compared)
-    return errors.end_point_error, errors.within_one * float(compared.sum() / valid.sum())
+    error = (found.to(value) - value)[compared].abs().double()
+    return float(error.mean()), int((error <= 1).sum()) / int(valid.sum())

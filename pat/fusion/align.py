@@ -31,8 +31,8 @@ from ..matching.radiometry import Given
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
 from ..networks.weights import load_weights, weights_for
+from ..support.blocks import without_autocast
 from ..support.memory import limited, parse_bytes
-from ..support.precision import without_autocast
 from .checks import warn_of_confidence
 from .corrections import corrections_for, expected_work
 from .fuse import Progress
@@ -223,7 +223,7 @@ def align(
             LOG.info("aligning %s", name)
             place = inputs.placements[i]
             located = _located(inputs, i, matches.betas[i], rig[alpha])
-            confidence = _at_pixels(done.found[i, 2:], place.pair.alpha, rig[alpha], "bilinear")[0]
+            confidence = _at_pixels(done.found[i, 2:], place.pair.alpha, rig[alpha])[0]
             seen = confidence >= min_confidence
             aligned[name] = _aligned_view(
                 rig[name], name, place, located, confidence, seen, own[name], interpolation, fill
@@ -249,7 +249,6 @@ def _located(
         return where[0, :h, :w], inside[0, :h, :w]
     pinhole = inputs.placements[i].pair.alpha
     assert isinstance(pinhole, LensView)
-    assert isinstance(recorded, LensView)
     x, seen = pixels_between(pinhole, recorded)
     disparity = _between_pixels(found.surface[0, :, :h, :w], x)
 
@@ -274,15 +273,12 @@ def _between_pixels(disparity: Float[Tensor, "1 h w"], x: Float[Tensor, "h2 w2 2
     return torch.where((smooth - nearest).abs() < SMOOTH, smooth, nearest)
 
 
-def _at_pixels(
-    plane: Float[Tensor, "1 h w"], pinhole: View, recorded: View, interpolation: Interpolation
-) -> Float[Tensor, "1 h2 w2"]:
+def _at_pixels(plane: Float[Tensor, "1 h w"], pinhole: View, recorded: View) -> Float[Tensor, "1 h2 w2"]:
     """A plane at alpha's recorded pixels; 0 where its pinhole view has none."""
     if not has_lens(recorded):
         return plane
     assert isinstance(pinhole, LensView)
-    assert isinstance(recorded, LensView)
-    return resampled(plane, pinhole, recorded, interpolation=interpolation).values[0]
+    return resampled(plane, pinhole, recorded, interpolation="bilinear").values[0]
 
 
 def _aligned_view(

@@ -20,7 +20,7 @@ from ..media.raw import demosaiced
 from .align import Aligned, AlignedView
 
 PositionFormat = Literal["npy", "tif", "none"]
-GREY = {0: 0, 1: 128, 2: 255}
+GREY = np.array([0, 128, 255], np.float32) / 255
 """Of visibility in its image: beyond the edge, occluded, seen."""
 GDAL_METADATA, GDAL_NODATA = 42112, 42113
 """TIFF tags in which GDAL, QGIS and others read the bands' names and wavelengths, and the value of pixels
@@ -44,6 +44,9 @@ class RecordedFiles(Mapping[str, NDArray[Any]]):
 
     def __len__(self) -> int:
         return len(self.files)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.files
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         view = self.rig[name]
@@ -92,8 +95,7 @@ def save_aligned(
 
 
 def _write_view(folder: Path, stem: str, view: AlignedView, positions: PositionFormat) -> None:
-    grey = np.array([GREY[state] for state in sorted(GREY)], np.float32)[view.visibility] / 255
-    write_image(folder / f"{stem}_visibility.png", torch.from_numpy(grey)[None])
+    write_image(folder / f"{stem}_visibility.png", torch.from_numpy(GREY[view.visibility])[None])
     write_image(folder / f"{stem}_confidence.png", torch.from_numpy(view.confidence)[None])
     if positions == "npy":
         np.save(folder / f"{stem}_positions.npy", view.positions)

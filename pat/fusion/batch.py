@@ -35,11 +35,12 @@ from ..media.images import read_image
 from ..media.raw import developed_rig
 from ..media.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from ..media.video import check_video, write_video
-from ..networks.weights import Network, Precision, find_weights, load_weights
+from ..networks.weights import Precision, find_weights, load_weights
 from ..sensors import NoiseLevel
 from ..support.jobs import HERE, JobReport, OnError, Task, Workers, run_tasks
 from ..support.locks import folder_lock
 from ..support.memory import limited, parse_bytes
+from ..support.schema import entries_of
 from ..support.tensor_files import write_tensors
 from .checks import confidence_checked
 from .frames import ImageFiles
@@ -54,6 +55,7 @@ INPUTS = "inputs.json"
 SETTINGS, KEYS, PLAN = "settings.yaml", ".keys", "plan.json"
 
 PLAN_FORMAT = "pat-batch 1"
+_network = lru_cache(maxsize=2)(load_weights)
 FIELD_CLASSES = {kind.__name__: kind for kind in (*FIELDS.values(), ThroughLenses, Widened)}
 
 
@@ -175,7 +177,7 @@ class Batch:
                 f"{file}: the frames there were made with other settings ({', '.join(changed)}): "
                 "give the same ones, or another --out"
             )
-        now, before = self.inputs, _read_inputs(self.out / INPUTS) if resume else {}
+        now, before = self.inputs, entries_of(self.out / INPUTS) if resume else {}
         other = [i for i, name in enumerate(self.names) if before.get(name) != now[name]]
         if not resume or (self.sequence and other):
             shutil.rmtree(self.out / KEYS, ignore_errors=True)
@@ -223,7 +225,7 @@ class Batch:
     def fusion(self) -> SequenceFusion:
         """The sequence, with the images that its frames have in common."""
         frames = {n: ImageFiles(files, self.rig, n, alpha=self.alpha) for n, files in self.files.items()}
-        rig, network = developed_rig(self.rig, self.files), _network(self.weights, self.precision)
+        rig, network = developed_rig(self.rig, self.files), _network(self.weights, precision=self.precision)
         return SequenceFusion(network, rig, frames, self.alpha, self.speed, self.settings)
 
     def _key_file(self, key: KeyFrame) -> Path:
@@ -260,7 +262,7 @@ class Batch:
     def _frame(self, i: int) -> Frame:
         if not self.sequence:
             images = ViewFiles(self.rig, {n: files[i] for n, files in self.files.items()}, alpha=self.alpha)
-            network = _network(self.weights, self.precision)
+            network = _network(self.weights, precision=self.precision)
             return fuse(network, images.developed, images, alpha=self.alpha, settings=self.settings)
         fusion = self.fusion
         return fusion.alone(i) if self.alone else fusion.frame(i, fusion.timeline.key_frames(), self._fetch)
@@ -332,23 +334,9 @@ def _digest(document: object) -> str:
     return hashlib.sha256(json.dumps(document).encode()).hexdigest()[:32]
 
 
-def _read_inputs(file: Path) -> dict[str, str]:
-    """What frames were made from; nothing where that is not known."""
-    try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return document if isinstance(document, dict) else {}
-
-
 @lru_cache(maxsize=2)
 def _planned(plan: Path, time: int) -> Batch:
     return Batch.from_json(plan.read_text(encoding="utf-8", errors="replace"), str(plan))
-
-
-@lru_cache(maxsize=2)
-def _network(weights: str, precision: Precision) -> Network:
-    return load_weights(weights, precision=precision)
 
 
 def find_images(text: str | Path, *, name: str = "") -> list[Path]:

@@ -20,8 +20,8 @@ from ..matching.match import Matcher, match
 from ..matching.radiometry import Given, given_response
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
+from ..support.blocks import without_autocast
 from ..support.memory import limited, parse_bytes, planned
-from ..support.precision import without_autocast
 from .checks import warn_of_confidence
 from .corrections import Corrections, corrections_for, expected_work
 from .depth_edges import beside_edges

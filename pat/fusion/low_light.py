@@ -22,7 +22,6 @@ from arraygeom.warned import warn
 
 from ..matching.radiometry import Response
 from ..networks.collaborative import without_noise
-from ..networks.denoiser import LowLightNetwork
 from ..networks.weights import load_denoiser
 from ..sensors import NoiseLevel
 from ..support.settings import physics, size, tuned
@@ -66,12 +65,8 @@ SETTINGS = LowLightSettings()
 
 in_tiles = partial(chunked, rows=1024, halo=128, axis=(-2, -1))
 """Denoises images in tiles of this side, with so much seen around them, pixels."""
-
-
-@cache
-def shipped_denoiser() -> LowLightNetwork:
-    """The network that ships with the package."""
-    return load_denoiser()
+shipped_denoiser = cache(load_denoiser)
+"""The network that ships with the package, read once."""
 
 
 class NoisyView(NamedTuple):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 
 import torch
 from jaxtyping import Float
@@ -196,14 +196,14 @@ def without_lenses(rig: Rig, images: Images) -> tuple[Rig, dict[str, Tensor]]:
     straight = dict(images)
     for name, image in images.items():
         camera = rig[name]
-        if isinstance(camera, LensView) and camera.distortion is not None:
+        if has_lens(camera):
             view = pinhole_view(camera)
             rig = rig.transformed(name, view.K @ torch.linalg.inv(camera.K), view.hw).with_camera(name, view)
             straight[name] = resampled(image, camera, view, extended=True).values[0].clamp(min=0)
     return rig, straight
 
 
-def has_lens(view: View) -> bool:
+def has_lens(view: View) -> TypeGuard[LensView]:
     """Whether a camera's pixels are not those of a pinhole."""
     return isinstance(view, LensView) and view.distortion is not None
 
@@ -226,7 +226,6 @@ def _for_pinhole(field: ReceptiveField | None, lens: View, pinhole: View) -> Rec
     """The field for the pinhole view of alpha: displacements are between pixels of that, too."""
     if not (isinstance(field, Moved) and has_lens(lens)):
         return field
-    assert isinstance(lens, LensView)
     assert isinstance(pinhole, LensView)
     field.require(lens.hw)
     x, seen = pixels_between(lens, pinhole)
@@ -241,7 +240,6 @@ def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens:
     """The frame at the pixels of alpha's own image."""
     if not has_lens(lens):
         return frame
-    assert isinstance(lens, LensView)
     assert isinstance(pinhole, LensView)
     shown = torch.cat([frame.image - straight, frame.confidence[None]])
     inverse = torch.stack([(1 / frame.depth).nan_to_num(0.0), frame.half_width.nan_to_num(0.0)])

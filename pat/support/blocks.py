@@ -1,8 +1,9 @@
-"""The convolutional blocks that the networks are made of."""
+"""The convolutional blocks that the networks are made of, and the precision in which they compute."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -145,3 +146,10 @@ def _rounded(part: nn.Module, *images: Any) -> Any:
     with torch.autocast(images[0].device.type, torch.bfloat16):
         answer = type(part).forward(part, *images)
     return tree_map(lambda t: t.float(), answer)
+
+
+@contextmanager
+def without_autocast() -> Iterator[None]:
+    """Whatever autocast is in effect around: parts that may be less precise say so themselves."""
+    with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+        yield

@@ -12,6 +12,8 @@ from pathlib import Path
 
 from filelock import BaseFileLock, FileLock, Timeout
 
+from .schema import entries_of
+
 LOCK = ".lock"
 OWNER = ".lock.json"
 """Who holds it: a locked file cannot be read on every system."""
@@ -61,10 +63,10 @@ def _locked(folder: Path) -> BaseFileLock:
     except Timeout:
         if not (folder / LOCK).exists():
             raise _unusable(folder, FileNotFoundError(ENOENT, os.strerror(ENOENT), str(folder))) from None
-        raise _in_use(folder, _owner(owner_file), "wait for it") from None
+        raise _in_use(folder, entries_of(owner_file), "wait for it") from None
     except OSError as error:
         raise _unusable(folder, error) from None
-    owner = _owner(owner_file)
+    owner = entries_of(owner_file)
     if owner.get("host", socket.gethostname()) != socket.gethostname():
         lock.release()
         raise _in_use(folder, owner, f"wait for it, or remove {owner_file} if it has ended")
@@ -75,15 +77,6 @@ def _locked(folder: Path) -> BaseFileLock:
         lock.release()
         raise _unusable(folder, error) from None
     return lock
-
-
-def _owner(file: Path) -> dict[str, object]:
-    """What the file of the owner says; nothing where it is missing, empty or damaged."""
-    try:
-        owner = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return owner if isinstance(owner, dict) else {}
 
 
 def _in_use(folder: Path, owner: dict[str, object], advice: str) -> ValueError:

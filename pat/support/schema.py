@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 import math
 import types
 import typing
@@ -61,6 +62,15 @@ def parse_yaml(text: str | bytes, name: str) -> Any:
         line, problem = yaml_problem(error)
         at = f" at line {line}" if line else ""
         raise ValueError(f"{name}: not valid YAML{at}: {problem}") from None
+
+
+def entries_of(path: Path) -> dict[str, Any]:
+    """The entries of a JSON file; none where it is missing, empty or damaged."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return document if isinstance(document, dict) else {}
 
 
 def _default(field: dataclasses.Field[Any]) -> Any:

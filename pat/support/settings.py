@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import field, fields, is_dataclass
+from functools import partial
 from importlib import import_module
 from pkgutil import iter_modules
 from typing import Any, Literal, NamedTuple
@@ -15,23 +16,16 @@ from typing import Any, Literal, NamedTuple
 Kind = Literal["physics", "size", "tuned"]
 
 
-def physics(value: Any, why: str) -> Any:
-    """A field whose value follows from what is measured; `why` says from what."""
-    return _entry("physics", value, why)
-
-
-def size(value: Any, why: str) -> Any:
-    """A field that says how much is done at a time."""
-    return _entry("size", value, why)
-
-
-def tuned(value: Any, why: str) -> Any:
-    """A field whose value was chosen; `why` says on what, and what it does."""
-    return _entry("tuned", value, why)
-
-
 def _entry(kind: Kind, value: Any, why: str) -> Any:
     return field(default=value, metadata={"kind": kind, "why": why})
+
+
+physics = partial(_entry, "physics")
+"""A field whose value follows from what is measured; `why` says from what."""
+size = partial(_entry, "size")
+"""A field that says how much is done at a time."""
+tuned = partial(_entry, "tuned")
+"""A field whose value was chosen; `why` says on what, and what it does."""
 
 
 class SettingEntry(NamedTuple):

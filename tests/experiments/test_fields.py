@@ -43,7 +43,7 @@ def pair() -> StereoPair:
 
 
 def test_true_positions_of_a_pair(pair):
-    case = next(rectified_cases([pair], rate=2))
+    case = next(rectified_cases([pair]))
     seen = sample(case.scene.images[BETA][None], case.scene.position[None].float()).values[0]
     off = (seen - case.scene.ground_truth).abs().amax(0)
     assert off[case.scene.visible][20:].median() < 0.03  # reduced and enlarged

@@ -5,7 +5,9 @@ import pytest
 import torch
 from scipy import ndimage, stats
 
-from pat.evaluation.metrics import bootstrap_interval, disparity_score, score
+from pat.data.pairs import Disparity
+from pat.evaluation.metrics import bootstrap_interval, score
+from pat.evaluation.stereo import disparity_errors
 
 
 def ssim_of_wang(a, b):
@@ -51,11 +53,8 @@ def test_disparity_errors_count_only_where_valid():
     ground_truth = torch.zeros(2, 2)
     found = torch.tensor([[0.5, 1.0], [4.5, 100.0]])
     valid = torch.tensor([[True, True], [True, False]])
-    result = disparity_score(found, ground_truth, valid)
-    assert result.end_point_error == pytest.approx(2.0)
-    assert result.within_one == pytest.approx(2 / 3)
-    with pytest.raises(ValueError, match="no pixel"):
-        disparity_score(found, ground_truth, torch.zeros_like(valid))
+    assert disparity_errors(found, Disparity(ground_truth, valid)) == pytest.approx((2.0, 2 / 3))
+    assert disparity_errors(found, Disparity(ground_truth, torch.zeros_like(valid))) == (None, None)
 
 
 def test_the_interval_of_a_mean_is_scipys():
