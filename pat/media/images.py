@@ -135,7 +135,8 @@ def write_image(
     """
     path = Path(path)
     if not image.is_floating_point():
-        raise ValueError(f"{path}: the image to write is {image.dtype}: give floats in 0..1")
+        kind = str(image.dtype).removeprefix("torch.")
+        raise ValueError(f"{path}: the image to write is {kind}: give floats in 0..1")
     exact = torch.promote_types(image.dtype, torch.float32)  # NumPy has no bfloat16
     planes = image.detach().cpu().to(exact).numpy()
     if planes.shape[0] not in (1, 3):
