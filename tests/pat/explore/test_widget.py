@@ -310,9 +310,9 @@ def test_a_beta_at_alphas_centre_is_drawn_and_dragged_as_one_seen_from_above(dri
         top,
     )
     samples = captions(driver)[1]
-    webdriver.ActionChains(driver).move_to_element_with_offset(
-        top, 0, 45
-    ).click_and_hold().move_by_offset(30, 0).release().perform()
+    webdriver.ActionChains(driver).move_to_element_with_offset(top, 0, 45).click_and_hold().move_by_offset(
+        30, 0
+    ).release().perform()
     until(driver, lambda told: told[1] != samples)
     assert colours[:3] == FIRST
 
