@@ -245,7 +245,7 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
 
 
 def _fisheye(views: BoardViews, board: Board) -> OpenCVSolution:
-    """From the focal length of half a sphere, and of a narrow view; what fits better, if both lead anywhere."""
+    """From the focal length of half a sphere, and of a narrow view: what fits better, if both lead there."""
     if not board.flat:
         raise ValueError("fisheyes need a flat board to start from: points in space give pinhole cameras")
     points = [board.points[d.ids][:, None] for d in views.seen.values()]
