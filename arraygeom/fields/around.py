@@ -27,7 +27,8 @@ class AroundDepth:
     """The segment from depth / (1 + tolerance) to depth * (1 + tolerance) of a known map; needs calibration.
 
     `depth` (H, W) is z in metres at the pixels of `view`, alpha as it was recorded (None: the pair's alpha,
-    without a lens). Where it is not positive and finite, the segment is that between the pair's depth bounds.
+    without a lens). Where it is not positive and finite, the segment is that between the pair's depth bounds,
+    which it needs to have only if there is such a pixel.
     """
 
     depth: Float[Tensor, "h w"]
@@ -46,7 +47,9 @@ class AroundDepth:
         def around(x: Tensor) -> Segments:
             depth = _at_nearest(self.depth, x, pair.alpha, self.view).to(x)
             known = depth.isfinite() & (depth > 0)
-            near, far = (beside(bound.to(x), x.ndim - 1) for bound in pair.depth_range)
+            near = far = depth
+            if pair.depth is not None or not bool(known.all()):
+                near, far = (beside(bound.to(x), x.ndim - 1) for bound in pair.depth_range)
             near = torch.where(known, depth / (1 + self.tolerance), near)
             far = torch.where(known, depth * (1 + self.tolerance), far)
             return segments_between(pinhole_track(pair, x), near, far, pair.beta.hw)

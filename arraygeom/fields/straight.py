@@ -199,7 +199,8 @@ class Rectified:
 
     def _run(self, column: Tensor, width: int) -> tuple[Tensor, Tensor]:
         if self.max_disparity is None:
-            return torch.zeros_like(column), torch.full_like(column, width - 1)
+            first, last = torch.zeros_like(column), torch.full_like(column, width - 1)
+            return (last, first) if self.alpha_is == "right" else (first, last)
         left, right = column - self.max_disparity, column + self.max_disparity
         return {"left": (left, column), "right": (right, column), "either": (left, right)}[self.alpha_is]
 

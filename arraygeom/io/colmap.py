@@ -232,13 +232,13 @@ def _lines(source: RigSource, what: str, every: int = 1) -> list[Entry]:
     for line in source.text().splitlines()[:8]:
         head, _, rest = line.partition(f"Number of {what}:")
         stated = rest.split(",")[0].strip()
-        if head.startswith("#") and stated.isdigit() and int(stated) != len(found):
+        if head.startswith("#") and stated.isdecimal() and int(stated) != len(found):
             raise source.fail(None, f"announces {stated} {what} and holds {len(found)}; was it cut off?")
     return found
 
 
 def _id(entry: Entry, text: str) -> int:
-    if not text.isdigit():
+    if not text.isdecimal():
         raise entry.fail(f"wanted a number as id, got '{text[:40]}'")
     return int(text)
 

@@ -63,7 +63,7 @@ def _csv(path: Path, files: Mapping[str, Path]) -> PointPairs:
         lines = [line for line in decoded(path.read_bytes(), "strict").splitlines() if line.strip()]
     except UnicodeDecodeError:
         raise ValueError(f"{path}: neither CSV nor a COLMAP database: give x0,y0,x1,y1 a line") from None
-    lines = lines if lines and _numbers(lines[0]) else lines[1:]
+    lines = lines[1:] if lines and not any(map(_is_number, _words(lines[0]))) else lines
     parsed = [_numbers(line) for line in lines]
     wrong = next((line for line, row in zip(lines, parsed) if row is None), None)
     if wrong is not None or not parsed:
@@ -78,11 +78,20 @@ def _csv(path: Path, files: Mapping[str, Path]) -> PointPairs:
 
 def _numbers(line: str) -> list[float] | None:
     """The four numbers or more of a line; None if they are none."""
+    words = _words(line)
+    return [float(word) for word in words] if len(words) >= 4 and all(map(_is_number, words)) else None
+
+
+def _words(line: str) -> list[str]:
+    return re.split(r"[,;\s]+", line.strip())
+
+
+def _is_number(word: str) -> bool:
     try:
-        numbers = [float(word) for word in re.split(r"[,;\s]+", line.strip())]
+        float(word)
     except ValueError:
-        return None
-    return numbers if len(numbers) >= 4 else None
+        return False
+    return True
 
 
 def _database(path: Path, files: Mapping[str, Path]) -> PointPairs:

@@ -245,7 +245,7 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
 
 
 def _fisheye(views: BoardViews, board: Board) -> OpenCVSolution:
-    """From the focal length of half a sphere, or, if OpenCV then finds no poses, of a narrow view."""
+    """From the focal length of half a sphere, and of a narrow view: what fits better, if both lead there."""
     if not board.flat:
         raise ValueError("fisheyes need a flat board to start from: points in space give pinhole cameras")
     points = [board.points[d.ids][:, None] for d in views.seen.values()]
@@ -254,15 +254,18 @@ def _fisheye(views: BoardViews, board: Board) -> OpenCVSolution:
     flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
     flags |= cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
 
-    def calibrated(focal: float) -> OpenCVSolution:
+    found: list[tuple[float, OpenCVSolution]] = []
+    for focal in (w / np.pi, float(w)):
         K, none = np.array(intrinsics(focal, views.hw)), np.zeros((4, 1))
-        _, K, c, rotations, translations = cv2.fisheye.calibrate(points, pixels, (w, h), K, none, flags=flags)
-        return K, c.reshape(-1), list(rotations), list(translations)
-
-    try:
-        return calibrated(w / np.pi)
-    except cv2.error:
-        return calibrated(float(w))
+        try:
+            rms, K, c, *poses = cv2.fisheye.calibrate(points, pixels, (w, h), K, none, flags=flags)
+        except cv2.error as error:
+            failed = error
+        else:
+            found.append((rms, (K, c.reshape(-1), list(poses[0]), list(poses[1]))))
+    if not found:
+        raise failed
+    return min(found, key=lambda one: one[0])[1]
 
 
 def _pose(r: np.ndarray, t: np.ndarray) -> Pose:

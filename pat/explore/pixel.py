@@ -41,7 +41,7 @@ from arraygeom.fields.default import FIELDS, LINE_SHARE, named_field, recorded_f
 from arraygeom.fields.ray_depth import ray_depth, rough_transfer
 from arraygeom.pixels import HW
 
-from ..fusion.steps import at_alphas_resolution
+from ..fusion.steps import hw_at_alphas_resolution, of_size
 from ..fusion.views import checked_image
 from ..media.colour import luminance
 from ..networks.paper import PAT, QueryAndKey
@@ -123,7 +123,7 @@ class ExplorerScene:
     fields: Mapping[str, ReceptiveField] = field(default_factory=dict)
     networks: Mapping[str, PAT] = field(default_factory=dict)
     guides: dict[str, Tensor] = field(default_factory=dict)
-    features: dict[tuple[str, str, bool], QueryAndKey] = field(default_factory=dict)
+    features: dict[tuple[str, str, str | None], tuple[HW, QueryAndKey]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in [name for name in self.images if name not in self.guides]:
@@ -135,20 +135,28 @@ class ExplorerScene:
         """The same images with a rig that was moved."""
         return dataclasses.replace(self, rig=rig)
 
-    def query_and_key(self, network: str, camera: str, pair: Pair | None = None) -> QueryAndKey:
-        """What a network's attention compares of a camera's image; with a pair, of its beta.
+    def query(self, network: str, alpha: str) -> Tensor:
+        """What a network's attention compares of alpha."""
+        return self._features((network, alpha, None), self.images[alpha], self.rig[alpha].hw).query
 
-        That is at alpha's resolution if the network wants that.
-        """
-        which = network, camera, pair is not None
-        if which not in self.features:
-            asked = self.networks[network] if network in self.networks else shipped_attention(network)
-            image = self.images[camera]
-            if pair and asked.equal_resolution:
-                image = at_alphas_resolution(image, pair)
+    def key(self, network: str, alpha: str, beta: str, pair: Pair) -> Tensor:
+        """What it compares of a beta, at alpha's resolution if the network wants that."""
+        hw = hw_at_alphas_resolution(pair) if self._network(network).equal_resolution else pair.beta.hw
+        return self._features((network, alpha, beta), self.images[beta], hw).key
+
+    def _network(self, name: str) -> PAT:
+        return self.networks[name] if name in self.networks else shipped_attention(name)
+
+    def _features(self, which: tuple[str, str, str | None], image: Tensor, hw: HW) -> QueryAndKey:
+        """Features of an image at a size, of alpha or of a beta; computed again when another is asked for."""
+        if which not in self.features or self.features[which][0] != hw:
+            network, alpha, beta = which
+            asked = self._network(network)
+            betas = [name for name in self.rig.betas(alpha) if name in self.images]
+            number = min(betas.index(beta), asked.betas - 1) if beta else 0
             with torch.no_grad():
-                self.features[which] = asked.query_and_key(image[None])
-        return self.features[which]
+                self.features[which] = hw, asked.query_and_key(of_size(image, hw)[None], number)
+        return self.features[which][1]
 
 
 @cache
@@ -241,8 +249,8 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
     if state.weights == WINDOWS:
         scores = SHARPNESS * correlations(scene.guides[state.alpha], scene.guides[name], pair, x, xy)
     else:
-        query = sampled(scene.query_and_key(state.weights, state.alpha).query, x)
-        key = scene.query_and_key(state.weights, name, pair).key
+        query = sampled(scene.query(state.weights, state.alpha), x)
+        key = scene.key(state.weights, state.alpha, name, pair)
         larger = xy.new_tensor([key.shape[-1] / pair.beta.hw[1], key.shape[-2] / pair.beta.hw[0]])
         scores = (query.T @ sampled(key, (xy + 0.5) * larger - 0.5))[0]
     weight = softmax(scores, valid)

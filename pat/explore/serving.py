@@ -44,7 +44,7 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
 
         def do_POST(self) -> None:
             length = self.headers.get("Content-Length", "")
-            short = length.isdigit() and int(length) <= LARGEST
+            short = length.isdecimal() and int(length) <= LARGEST
             if not (self._is_own() and self.path == "/answer" and short):
                 self._refuse()
                 return

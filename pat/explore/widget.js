@@ -138,17 +138,18 @@ function topView(canvas, model, change) {
   canvas.width = 480;
   canvas.height = 360;
   let held = null, scale = 1;
+  const isAlpha = (camera) => model.get("cameras").some(({ name, alpha }) => alpha && name === camera.name);
   const place = ([x, z]) => [240 + scale * x, 270 - scale * z];
   const draw = () => {
     const shown = model.get("answer").top ?? [], context = canvas.getContext("2d");
     canvas.style.display = shown.length ? "" : "none";
-    if (!held) scale = 150 / Math.max(1e-9, ...shown.map(({ at }) => Math.hypot(...at)));
+    if (!held) scale = 150 / (Math.max(...shown.map(({ at }) => Math.hypot(...at))) || 1);
     context.clearRect(0, 0, 480, 360);
     context.font = "22px system-ui";
     context.lineWidth = 3;
-    for (const { name, at, ahead } of shown) {
-      const [x, y] = place(at), alpha = !Math.hypot(...at);
-      context.strokeStyle = context.fillStyle = alpha ? MATCH : FIRST;
+    for (const camera of shown) {
+      const { name, at, ahead } = camera, [x, y] = place(at);
+      context.strokeStyle = context.fillStyle = isAlpha(camera) ? MATCH : FIRST;
       const angle = Math.atan2(ahead[0], ahead[1]);
       context.beginPath();
       for (const side of [-0.35, 0.35]) {
@@ -166,7 +167,7 @@ function topView(canvas, model, change) {
   const at = (event) => [2 * event.offsetX, 2 * event.offsetY];
   canvas.addEventListener("pointerdown", (event) => {
     const [x, y] = at(event), near = ([a, b]) => Math.hypot(a - x, b - y) < 30;
-    const camera = (model.get("answer").top ?? []).find((one) => Math.hypot(...one.at) && near(place(one.at)));
+    const camera = (model.get("answer").top ?? []).find((one) => !isAlpha(one) && near(place(one.at)));
     held = camera && { name: camera.name, from: [x, y], before: model.get("controls").moved[camera.name] ?? [0, 0] };
     if (held) canvas.setPointerCapture(event.pointerId);
   });

@@ -177,8 +177,8 @@ def align(
         fill: "none" invents no values; "propagate" gives pixels that a camera does not see its nearest seen
             value.
 
-    Raises ValueError as `fuse`, and for recorded values that are missing, no numbers, or of another size than
-    the rig says.
+    Raises ValueError as `fuse`, for a network that uses no matches, and for recorded values that are missing,
+    no numbers, or of another size than the rig says.
     """
     if interpolation not in INTERPOLATIONS or fill not in ("none", "propagate"):
         raise ValueError(
@@ -199,6 +199,8 @@ def align(
         if isinstance(own, dict):  # others may be read from files, which takes time
             _as_array(own[name], name, rig[name].hw)
     network = network or load_weights(weights_for([len(views.images[name]) for name in betas]))
+    if not network.uses_matches:
+        raise ValueError("these weights use no matches to align by: take others, such as mono-spectral")
     check_bands(views, network.bands)
     inputs, undo = prepared(network, views, _steps(network, normalise=match_levels))
     del views
@@ -319,7 +321,10 @@ def _of_alpha(rig: Rig, name: str, recorded: Recorded) -> AlignedView:
 
 def _as_array(values: Any, name: str, hw: tuple[int, int]) -> NDArray[Any]:
     """Recorded values as NumPy's. Raises ValueError for another shape than (C, H, W), and without numbers."""
-    array = values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
+    if isinstance(values, Tensor):
+        values = values.detach().cpu()
+        values = values.float() if values.dtype == torch.bfloat16 else values  # which NumPy has not
+    array = np.asarray(values)
     if array.dtype.kind not in "biuf":
         raise ValueError(f"the recorded values of '{name}' are {array.dtype}: give integers or real numbers")
     if array.ndim != 3 or array.shape[1:] != tuple(hw):
@@ -357,6 +362,8 @@ def resampled_values(
         numbers = 1 + np.arange(values[0].size).reshape(values[0].shape)
         which = sampled(numbers).astype(np.int64)
         return np.where(which > 0, values.reshape(len(values), -1)[:, which - 1], np.zeros((), values.dtype))
+    if values.dtype.kind == "b":
+        return resampled_values(values.view(np.uint8), positions, interpolation) > 0
     if values.dtype.kind not in "iu":
         return np.stack([sampled(plane).astype(values.dtype) for plane in values])
     limits = np.iinfo(values.dtype)

@@ -134,6 +134,6 @@ def write_bands(
         planarconfig="separate" if len(values) > 1 else None,
         bigtiff=values.nbytes > LARGEST_TIFF,
         metadata=None,
-        description=", ".join(bands),
-        extratags=[(GDAL_METADATA, "s", 0, described, True), (GDAL_NODATA, "s", 0, nothing, True)],
+        description=", ".join(bands).encode(),
+        extratags=[(GDAL_METADATA, "s", 0, described.encode(), True), (GDAL_NODATA, "s", 0, nothing, True)],
     )

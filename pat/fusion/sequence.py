@@ -153,8 +153,12 @@ class SequenceFusion:
             return KeyContribution(nearness, *colour)
         LOG.info("motion of frame %d", i)
         flow = flow_between(own, self.grey(key.alpha))
-        moved = warped(torch.cat([colour.added, colour.confidence[None], colour.inverse_depth]), flow.step)
-        return KeyContribution(nearness, moved[:-3], moved[-3] * flow.weight, moved[-2:])
+        moved = warped(torch.cat([colour.added, colour.confidence[None]]), flow.step)
+        known = (colour.inverse_depth[:1] > 0).to(colour.inverse_depth)
+        share, *inverse = warped(torch.cat([known, colour.inverse_depth]), flow.step)
+        # An unknown neighbour is not infinitely far away.
+        inverse_depth = torch.where(share < 0.5, 0.0, torch.stack(inverse) / share.clamp(min=0.5))
+        return KeyContribution(nearness, moved[:-1], moved[-1] * flow.weight, inverse_depth)
 
     def _time(self, i: int) -> float:
         return self.timeline.time(self.alpha, i)

@@ -34,7 +34,7 @@ from arraygeom import (
 )
 from arraygeom.fields.default import default_field
 from arraygeom.fields.ray_depth import rough_transfer
-from arraygeom.pixels import coarse_grid, map_homogeneous, shift_matrix
+from arraygeom.pixels import HW, coarse_grid, map_homogeneous, shift_matrix
 from arraygeom.undistortion import pixels_between
 
 from ..matching.inputs import box_around, ends_of
@@ -258,12 +258,23 @@ def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens:
 
 def at_alphas_resolution(image: Float[Tensor, "c h w"], pair: Pair) -> Float[Tensor, "c h2 w2"]:
     """Beta's image with pixels of about alpha's size where the views meet; as it is if they nearly are."""
-    scale, (h, w) = resolution_ratio(pair), pair.beta.hw
-    if 0.8 < scale < 1.25:
+    return of_size(image, hw_at_alphas_resolution(pair))
+
+
+def of_size(image: Float[Tensor, "c h w"], hw: HW) -> Float[Tensor, "c h2 w2"]:
+    """An image made so large, by cubic interpolation; as it is if it is."""
+    if image.shape[-2:] == hw:
         return image
-    hw = (max(round(h / scale), 16), max(round(w / scale), 16))
     resized = interpolate(image[None], size=hw, mode="bicubic", align_corners=False, antialias=True)
     return resized[0].clamp(0, 1)
+
+
+def hw_at_alphas_resolution(pair: Pair) -> HW:
+    """The size of beta's image at alpha's resolution."""
+    scale, (h, w) = resolution_ratio(pair), pair.beta.hw
+    if 0.8 < scale < 1.25:
+        return pair.beta.hw
+    return max(round(h / scale), 16), max(round(w / scale), 16)
 
 
 def resolution_ratio(pair: Pair) -> float:

@@ -270,7 +270,7 @@ def _digest(network: FusionNetwork, frame: FrameInputs) -> str:
     rounded = [name for name, part in module.named_modules() if "forward" in vars(part)]  # by `in_bfloat16`
     digest = hashlib.sha256(f"{how} {rounded}".encode())
     parameters = module.state_dict().values()
-    fields = [tensor for beta in inputs.betas for tensor in _sparse(beta.field, inputs.hw)]
+    fields = [tensor for beta in inputs.betas for tensor in _tensors(beta.field, inputs.hw)]
     cameras = [camera for place in frame.placements if place.has_depth for camera in place.pair.cameras]
     poses = [tensor for camera in cameras for tensor in (camera.K, camera.R, camera.t)]
     for tensor in (*parameters, inputs.alpha, *(b.image for b in inputs.betas), *fields, *poses):
@@ -278,8 +278,8 @@ def _digest(network: FusionNetwork, frame: FrameInputs) -> str:
     return digest.hexdigest()[:16]
 
 
-def _sparse(field: Any, hw: HW) -> list[Tensor]:
-    """A few segments or positions of a field, which distinguish fields."""
+def _tensors(field: Any, hw: HW) -> list[Tensor]:
+    """The segments of a field, which may be known pixel by pixel; of one of positions a few."""
     if field.pixels is not None:
-        return [t[:, ::64, ::64] for t in vars(field.pixels).values()]
+        return list(vars(field.pixels).values())
     return list(vars(field.at(pixel_grid(hw, dtype=torch.float64)[::64, ::64].reshape(-1, 2))).values())

@@ -51,7 +51,7 @@ class Views:
         another size than the rig says, of another type, or with values that are not finite or far outside
         0..1. TypeError for what is no tensor.
         """
-        for name in (alpha, *images):
+        for name in (alpha, *images, *(field if isinstance(field, Mapping) else ())):
             rig.require(name)
         if alpha not in images:
             raise ValueError(f"no image of alpha, '{alpha}'")
@@ -95,7 +95,9 @@ def is_in_colour(image: Float[Tensor, "c h w"]) -> bool:
 
 
 def grey_alpha(name: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "1 h w"]:
-    """Alpha's image in grey. Warns if it was in colour."""
+    """Alpha's image in grey. Warns if it was in colour. Raises ValueError for other bands."""
+    if len(image) not in (1, 3):
+        raise ValueError(f"the image of alpha, '{name}', has {len(image)} bands: give one in grey or colour")
     if is_in_colour(image):
         text = "is in colour: colours come from the betas, its own only where they do not see"
         warn(f"the image of alpha, '{name}', {text}")
@@ -145,7 +147,7 @@ def checked_image(rig: Rig, images: Images, name: str) -> Tensor:
         raise TypeError(
             f"the image of '{name}' is a {type(image).__name__}: give a tensor, as `read_image` does"
         )
-    if image.ndim != 3 or image.dtype not in (torch.float32, torch.float64):
+    if image.ndim != 3 or not len(image) or image.dtype not in (torch.float32, torch.float64):
         got = f"{str(image.dtype).removeprefix('torch.')} of shape {tuple(image.shape)}"
         raise ValueError(f"the image of '{name}' is {got}: wanted float32 (C, H, W) in 0..1")
     if tuple(image.shape[1:]) != (h, w):

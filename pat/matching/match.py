@@ -49,8 +49,11 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
     """Match alpha with every beta, say how certain each match is, and transfer the betas' bands to alpha's
     view; with gradients as `transferred`, and of the positions. `choice` is another one than ships.
 
-    Raises ValueError for a beta whose field is not of straight segments.
+    Raises ValueError for a beta whose field is not of straight segments, and for an alpha of odd sides.
     """
+    if any(side % FINE for side in inputs.hw):
+        h, w = inputs.hw
+        raise ValueError(f"alpha has {w}x{h} pixels to match: pad both sides to whole multiples of {FINE}")
     found = in_each_beta(inputs)
     if inputs.can_agree:
         found = agreed(inputs, with_certainty(chosen(inputs, found, choice)))

@@ -134,9 +134,11 @@ def write_image(
     format that cannot hold it.
     """
     path = Path(path)
-    planes = image.detach().cpu().numpy()
-    if planes.dtype.kind != "f":
-        raise ValueError(f"{path}: the image to write is {planes.dtype}: give floats in 0..1")
+    if not image.is_floating_point():
+        kind = str(image.dtype).removeprefix("torch.")
+        raise ValueError(f"{path}: the image to write is {kind}: give floats in 0..1")
+    exact = torch.promote_types(image.dtype, torch.float32)  # NumPy has no bfloat16
+    planes = image.detach().cpu().to(exact).numpy()
     if planes.shape[0] not in (1, 3):
         raise ValueError(f"{path}: an image has 1 or 3 channels, got {len(planes)}: write them one by one")
     if not (unknown and bits == 32) and not np.isfinite(planes).all():

@@ -43,6 +43,17 @@ def sloping(hw=HW) -> torch.Tensor:
     return 2 + 0.05 * pixel_grid(hw)[..., 0] + 0.02 * pixel_grid(hw)[..., 1]
 
 
+def test_no_depth_range_is_needed_where_every_depth_is_known():
+    rig, depth, x = rig_of(), sloping(), pixel_grid(HW, dtype=torch.float64)
+    bare = Rig(rig.cameras).pair("a", "b")
+    found, bounded = (AroundDepth(depth)(pair, x) for pair in (bare, rig.pair("a", "b")))
+    assert torch.equal(found.start, bounded.start)
+    assert torch.equal(found.valid, bounded.valid)
+    depth[3, 5] = math.nan
+    with pytest.raises(ValueError, match="needs a depth range"):
+        AroundDepth(depth)(bare, x)
+
+
 def test_segments_are_between_the_bounds_of_each_pixels_depth():
     pair, depth = rig_of().pair("a", "b"), sloping()
     x = pixel_grid(HW, dtype=torch.float64)[5:50, 40:80]

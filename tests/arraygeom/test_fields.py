@@ -145,6 +145,13 @@ def test_rectified_runs(side):
     assert s.valid.all()
 
 
+def test_a_whole_row_begins_at_the_largest_disparity():
+    """Of an alpha on the right, too, whose points are farther right in beta the nearer they are."""
+    pair, x = Pair(View(hw=(4, 20)), View(hw=(4, 20))), torch.tensor([[10.0, 2.0]])
+    s = Rectified(alpha_is="right")(pair, x)
+    assert (s.start[0, 0], s.end[0, 0]) == (19, 0)
+
+
 def test_rectified_scales_to_another_size():
     pair = Pair(View(hw=(4, 20)), View(hw=(8, 10)))
     s = Rectified()(pair, torch.tensor([[10.0, 1.0]]))

@@ -44,6 +44,14 @@ def test_csv(tmp_path, text, between):
             assert np.array_equal(one.numpy(), points)
 
 
+@pytest.mark.parametrize("first", ["1.0,abc,3.0,4.0", "1.0,2.0,3.0", "1.0,2.0,3.0,"])
+def test_a_first_line_of_csv_with_numbers_is_no_header(tmp_path, first):
+    """One with a number missing or misspelt was dropped without a word."""
+    (tmp_path / "m.csv").write_text(f"{first}\n5,6,7,8\n")
+    with pytest.raises(ValueError, match=f"line '{first}' is not four numbers"):
+        read_matches(tmp_path / "m.csv", FILES, SIZES)
+
+
 def test_csv_in_utf_16(tmp_path):
     """As PowerShell and spreadsheets write it."""
     rows = "\n".join("\t".join(map(str, row)) for row in np.hstack(POINTS))

@@ -234,6 +234,17 @@ def test_fisheyes():
     assert abs(float(result.rig["a"].K[0, 0]) - 240) < 1
 
 
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_a_narrow_view_by_a_fisheyes_model(seed):
+    """OpenCV was started from half a sphere: good images were left out, or did not suffice."""
+    views = see(
+        Rig({"a": camera(300.0, (240, 320))}), board_poses(4, seed=seed, depth=(0.5, 1.5)), noise=0.02
+    )
+    found = calibrate(views, BOARD, lens="kannala-brandt")
+    assert len(found.views["a"].seen) == 4
+    assert float(found.rig["a"].K[0, 0]) == pytest.approx(300, abs=1)
+
+
 def test_coverage_names_what_is_missing():
     pose = Pose(torch.eye(3, dtype=torch.float64), tensor(-0.24, -0.18, 2.0))
     c = camera(600.0, (480, 640))

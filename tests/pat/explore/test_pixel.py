@@ -12,6 +12,7 @@ from pat.attention import attend_with_statistics
 from pat.data.sample_array import load_sample
 from pat.explore import FAMILIES, ExplorerScene, ExplorerState, inspect_pixel
 from pat.explore import pixel as core
+from pat.networks.paper import PAT, PATConfig
 
 
 @pytest.fixture(scope="module")
@@ -195,3 +196,27 @@ def test_a_moved_rig_puts_the_match_off_the_line_by_as_much_as_it_says():
         assert abs(off.distance - true) < 0.3
     # without texture
     assert inspect_pixel(scene, state.replace(x=(560.0, 60.0))).betas["colour"].offset is None
+
+
+def test_a_networks_features_are_those_of_the_pair():
+    """They were kept by camera alone, of another alpha's resolution, and all with the first beta's key."""
+    sample = load_sample()
+    rig = sample.rig.with_camera("third", sample.rig["colour"])
+    rig = rig.replace(cameras={name: rig[name] for name in ("mono", "colour", "third")})
+    images = {name: interpolate(image[None], scale_factor=0.25)[0] for name, image in sample.images.items()}
+    images["third"] = images["colour"]
+    for name, image in images.items():
+        rig = rig.resize(name, tuple(image.shape[1:]))
+    network = PAT(PATConfig(betas=2, dim=4, in_channels=3, equal_resolution=True))
+    network.engine.key[1].requires_grad_(False).weight.mul_(2)
+    scene = ExplorerScene(rig, images, networks={"own": network})
+
+    def key(alpha, beta, rig=rig):
+        return scene.with_rig(rig).key("own", alpha, beta, rig.pair(alpha, beta))
+
+    assert key("mono", "colour").shape[-2] > 1.5 * rig["colour"].hw[0]
+    assert key("third", "colour").shape[-2:] == rig["colour"].hw
+    assert not torch.allclose(key("mono", "colour"), key("mono", "third"))
+    colour = rig["colour"]
+    longer = rig.with_camera("colour", colour.replace(K=colour.K * colour.K.new_tensor([[2], [2], [1]])))
+    assert key("mono", "colour", longer).shape[-2] < 1.5 * rig["colour"].hw[0]

@@ -297,6 +297,30 @@ def test_what_is_wrong_is_drawn_in_the_saved_page(driver, tmp_path):
     assert driver.execute_script(yellow) > 50
 
 
+def test_a_beta_at_alphas_centre_is_drawn_and_dragged_as_one_seen_from_above(driver, tmp_path):
+    """It was taken for alpha, which does not move."""
+    page = tmp_path / "page.html"
+    explore(small_rig(baseline=0.0)).save(page)
+    driver.get(page.as_uri())
+    until(driver, lambda told: len(told) == 2 and "match" in told[1])
+    top = driver.find_element("css selector", "canvas.top")
+    colours = driver.execute_script(
+        """const { data } = arguments[0].getContext('2d').getImageData(240, 270, 1, 1);
+        return [...data];""",
+        top,
+    )
+    samples = captions(driver)[1]
+    webdriver.ActionChains(driver).move_to_element_with_offset(top, 0, 45).click_and_hold().move_by_offset(
+        30, 0
+    ).release().perform()
+    until(driver, lambda told: told[1] != samples)
+    assert colours[:3] == FIRST
+
+
+FIRST = [0xE6, 0x9F, 0x00]
+"""The colour of betas in the widget."""
+
+
 def test_the_served_page_in_a_browser(driver, tmp_path):
     """`pat explore`: points, slides, chooses, clicks a beta, drags a camera, keys; how long answers take."""
     small_rig(baseline=0.2).save(tmp_path / "rig.yaml")

@@ -15,9 +15,12 @@ from pat.fusion.aligned_files import RecordedFiles, save_aligned, write_bands
 from pat.fusion.aligned_page import aligned_page, ndvi
 from pat.fusion.report import Facts
 from pat.fusion.steps import without_lenses
+from pat.matching.inputs import Inputs
 from pat.matching.match import match
 from pat.matching.matches import Matches
 from pat.media.images import read_image, read_recorded
+from pat.networks.configs import PATConfig
+from pat.networks.paper import PAT
 
 HW = (96, 160)
 DEPTH = 4.4
@@ -121,6 +124,18 @@ def test_nearest_values_are_those_recorded_of_any_type(kind):
     assert not resampled_values(values, positions + 9, "nearest").any()
 
 
+@pytest.mark.parametrize("interpolation", ["bilinear", "cubic"])
+def test_truth_values_are_rounded_too(interpolation):
+    """Any share of a true neighbour, or overshoot, counted as true: masks grew."""
+    values = np.zeros((1, 6, 8), np.bool_)
+    values[:, :, 4:] = True
+    positions = np.stack(np.meshgrid(np.arange(8), np.arange(6)), -1).astype(np.float32)
+    for step, least in ((0.3, 4), (0.7, 3)):
+        taken = resampled_values(values, positions + np.float32([step, 0]), interpolation)[0, :, :7]
+        assert taken.dtype == np.bool_
+        assert np.array_equal(taken, np.broadcast_to(np.arange(7) >= least, taken.shape))
+
+
 def test_the_greatest_integers_stay_so():
     values = np.full((1, 4, 5), np.iinfo(np.int64).max)
     taken = resampled_values(values, np.full((1, 1, 2), 1.25, np.float32), "bilinear")
@@ -215,6 +230,31 @@ def test_mistakes_are_named(tmp_path):
             align(rig, images, alpha="mono", recorded=recorded, matcher=lambda inputs: pytest.fail("matched"))
     with pytest.raises(KeyError, match="there are: mono, nir"):
         align(rig, images, alpha="mono", correct=False).band("red")
+
+
+def test_weights_without_matches_are_refused():
+    """Of odd sizes the process crashed: those weights do not ask for padding."""
+    rig, images = array()
+    for name in rig.names:
+        rig, images[name] = rig.crop(name, 0, 0, (95, 159)), images[name][:, :95, :159]
+    with pytest.raises(ValueError, match="use no matches"):
+        align(rig, images, alpha="mono", network=PAT(PATConfig(betas=1, dim=4, in_channels=1)))
+    inputs = Inputs(images["mono"][None], betas=())
+    with pytest.raises(ValueError, match="159x95 pixels to match: pad"):
+        match(inputs)
+
+
+def test_values_in_bfloat16_and_names_beyond_ascii(tmp_path):
+    rig, images = array()
+    rig = Rig({"möno": rig["mono"], "nir": rig["nir"]}, depth=rig.depth)
+    images = {"möno": images["mono"], "nir": images["nir"]}
+    recorded = {name: image.bfloat16() for name, image in images.items()}
+    found = align(rig, images, alpha="möno", recorded=recorded, correct=False)
+    assert found["nir"].values.dtype == np.float32
+    save_aligned(found, tmp_path)
+    with tifffile.TiffFile(tmp_path / "aligned.tif") as file:
+        assert file.pages[0].tags["ImageDescription"].value == "möno, nir"
+        assert ">möno<" in file.pages[0].tags[42112].value
 
 
 def test_one_band_and_packed_values(tmp_path):

@@ -72,6 +72,13 @@ def test_images_are_found_in_the_order_of_their_numbers(material, tmp_path):
         find_images(tmp_path, name="mono")
 
 
+def test_digits_that_are_no_numbers_are_letters_in_names(tmp_path):
+    """A superscript between numbers ended in an error of int's."""
+    for name in ("1²10.png", "1²9.png"):
+        (tmp_path / name).touch()
+    assert [path.name for path in find_images(tmp_path)] == ["1²9.png", "1²10.png"]
+
+
 def test_a_stopped_sequence_is_resumed_to_the_same_bits(material, tmp_path, monkeypatch):
     whole = batch(material, tmp_path / "whole", sequence=True)
     assert len(whole.run(video=25.0).made) == 7

@@ -27,6 +27,7 @@ from arraygeom import (
     rotation_from_vector,
 )
 from arraygeom.chunks import Tile, tiles_of
+from arraygeom.fields import AroundDepth
 from calib.images.matches import match_points, seen_depths
 from pat.data.pairs import folder_pairs
 from pat.evaluation.metrics import score
@@ -305,6 +306,34 @@ def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
     made.clear()
     with pytest.raises(KeyboardInterrupt):
         fuse(network, rig, images | {"mono": images["mono"] * 0.9}, alpha="mono", store=tmp_path)
+
+
+def test_tiles_of_another_depth_map_are_not_taken(tmp_path, monkeypatch):
+    """Every 64th pixel was compared."""
+    hw = (34, 130)
+    network, rig = network_of("GuidedPAT"), rig_of(hw, (30, 110))
+    images = {"mono": texture(1, hw), "colour": texture(3, (30, 110))}
+    monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(hw, 64, 16)))
+    depth, counts = torch.full(hw, 2.0), []
+    for value in (2.0, 3.0):
+        depth[5:20, 10:50] = value
+        known = AroundDepth(depth.clone())
+        fuse(network, rig, images, alpha="mono", store=tmp_path, align=False, response="rec601", field=known)
+        counts.append(len(list(tmp_path.iterdir())))
+    assert counts[1] == 2 * counts[0]
+
+
+def test_fields_of_cameras_that_are_not_there_and_other_bands_of_alpha_are_refused():
+    """A misspelt name was ignored; two or four bands ended in an error of torch's."""
+    rig, images = rig_of((64, 96), (64, 96)), {"mono": texture(1, (64, 96)), "colour": texture(3, (64, 96))}
+    network = network_of("GuidedPAT")
+    with pytest.raises(ValueError, match="'color'"):
+        fuse(network, rig, images, alpha="mono", field={"color": Epipolar()})
+    for bands in (2, 4):
+        with pytest.raises(ValueError, match=f"alpha, 'mono', has {bands} bands"):
+            fuse(network, rig, {**images, "mono": texture(bands, (64, 96))}, alpha="mono")
+    with pytest.raises(ValueError, match=r"'colour' is float32 of shape \(0, 64, 96\)"):
+        fuse(network, rig, {**images, "colour": images["colour"][:0]}, alpha="mono")
 
 
 def test_tiles_of_another_luminance_scale_or_precision_are_not_taken(tmp_path, monkeypatch):

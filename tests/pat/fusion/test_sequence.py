@@ -9,9 +9,9 @@ import torch
 from arraygeom import Distortion, Epipolar, Moved, Rectified, Rig, Sensor, View, Widened, pixel_grid
 from experiments.flicker import flicker
 from pat.fusion.fuse import FuseSettings, fuse
-from pat.fusion.optical_flow import flow_between, warped
-from pat.fusion.sequence import KeyContribution, SequenceFusion, fuse_sequence, mixed
-from pat.fusion.timeline import Timeline
+from pat.fusion.optical_flow import Flow, flow_between, warped
+from pat.fusion.sequence import KeyColour, KeyContribution, SequenceFusion, fuse_sequence, mixed
+from pat.fusion.timeline import KeyFrame, Timeline
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
 from pat.sensors import NoiseLevel, generator_for
@@ -297,3 +297,19 @@ def test_of_several_betas_the_lowest_weight_of_motion_counts(fused, monkeypatch)
     sure = job.colour(key).confidence
     monkeypatch.setattr(SequenceFusion, "_field", doubtful)
     torch.testing.assert_close(job.colour(key).confidence, sure * 0.25)
+
+
+@pytest.mark.parametrize("step", [0.3, 0.7])
+def test_depth_beside_what_is_unknown_is_not_mixed_with_it(monkeypatch, step):
+    """It was blended with an inverse depth of 0: up to twice as far away."""
+    frames, _ = moving.recording(3)
+    job = SequenceFusion(load_weights("mono-colour"), moving.rig(), frames, "fast")
+    flow = Flow(torch.tensor([step, 0.0])[:, None, None].expand(2, *moving.HW), torch.ones(moving.HW))
+    monkeypatch.setattr("pat.fusion.sequence.flow_between", lambda a, b: flow)
+    inverse = torch.full((2, *moving.HW), 0.5)
+    inverse[:, 30:60, 40:80] = 0.0
+    colour = KeyColour(torch.zeros(3, *moving.HW), torch.ones(moving.HW), inverse)
+    depth = job.frame(1, [KeyFrame(0, {"slow": 0})], lambda key: colour).depth
+    known = depth.isfinite()
+    assert depth[known].allclose(torch.tensor(2.0))
+    assert abs(int((~known).sum()) - 30 * 40) == 0

@@ -42,6 +42,16 @@ def test_what_is_written_is_read_back(tmp_path, channels, suffix, bits):
     assert (again - image).abs().max() <= 0.5001 / (2 ** min(bits, 24) - 1)
 
 
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.float64])
+@pytest.mark.parametrize(("suffix", "bits"), [("png", 8), ("tif", 32)])
+def test_floats_of_any_precision_are_written(tmp_path, dtype, suffix, bits):
+    """bfloat16 ended in a TypeError of NumPy's, which has none."""
+    image = make_image(channels=3).to(dtype)
+    write_image(tmp_path / f"a.{suffix}", image, bits=bits)
+    again = read_image(tmp_path / f"a.{suffix}")
+    assert (again - image.double()).abs().max() <= 0.5001 / (2 ** min(bits, 24) - 1)
+
+
 def test_jpeg_is_read_back_nearly(tmp_path):
     image = RED.expand(3, 16, 16)
     write_image(tmp_path / "a.jpg", image)
