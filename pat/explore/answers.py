@@ -205,7 +205,7 @@ def choices(scene: ExplorerScene, controls: Controls) -> list[list[Any]]:
 
 
 def shown_cameras(scene: ExplorerScene, alpha: str) -> list[dict[str, Any]]:
-    """Name, width, height, image and unit of depth of alpha and of every beta with an image, in this order."""
+    """Name, width, height, image and unit of depth of alpha and of each beta with an image, in this order."""
     names = [alpha, *(n for n in scene.rig.betas(alpha) if n in scene.images)]
     unit = length_unit(scene.rig)
     return [

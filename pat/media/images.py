@@ -317,8 +317,8 @@ def _counts(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArr
         needed = next(n for n in FEW_BITS if largest < 2**n)
         warn(
             f"{label}: has 16 bits a value, and none above {largest}, so it is nearly black: "
-            f"if its camera counts to {2**needed - 1}, state `bits: {needed}` in the rig file, or save it with its "
-            f"values times {65535 // (2**needed - 1)}"
+            f"if its camera counts to {2**needed - 1}, state `bits: {needed}` in the rig file, "
+            f"or save it with its values times {65535 // (2**needed - 1)}"
         )
     if largest > white:
         raise ValueError(
