@@ -112,8 +112,8 @@ class Pair(Batched):
         """(near, far) in metres. Raises ValueError if the rig states none."""
         if self.depth is None:
             raise ValueError(
-                "this field needs a depth range: give the rig one, `depth: [near, far]` in its file "
-                "or `rig.replace(depth=(near, far))`"
+                "this field needs a depth range: give the rig one, `depth: [near, far]` in its file or "
+                "`rig.replace(depth=(near, far))`, or `--depth NEAR FAR` to `pat fuse` and `pat align`"
             )
         return self.depth
 

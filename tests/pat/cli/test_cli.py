@@ -150,6 +150,12 @@ def test_rig_mistakes_name_the_entry(edit, message, small, capsys):
     assert "rig.yaml" in error
 
 
+def test_a_rig_without_depth_range_is_answered_with_the_option_that_gives_one(small, capsys):
+    """As other tools' files are; only the native file's entry and Python were named."""
+    Rig.load(small / "rig.yaml").replace(depth=None).save(small / "rig.yaml")
+    assert "`--depth NEAR FAR`" in fails(arguments(small), capsys)
+
+
 def test_views_that_do_not_overlap(small, capsys):
     rig = yaml.safe_load((small / "rig.yaml").read_text())
     rig["cameras"]["colour"] |= {"rotation": [0, 180, 0]}
