@@ -20,6 +20,7 @@ from arraygeom import (
     Pose,
     Rectified,
     Rig,
+    Segments,
     Sensor,
     View,
     intrinsics,
@@ -202,6 +203,13 @@ def test_what_is_no_field_or_no_list_is_refused_in_a_line():
 
     with pytest.raises(ValueError, match="the field ends gave a tuple: fields give Segments or Positions"):
         fuse(network_of("GuidedPAT"), rig, images, alpha="mono", field=ends)
+
+    def fewer(pair, x):
+        found = Epipolar()(pair, x)
+        return Segments(found.start[:-1], found.end[:-1], found.valid[:-1])
+
+    with pytest.raises(ValueError, match=r"the field fewer gave 0 pixels for one: a field is asked for x"):
+        fuse(network_of("GuidedPAT"), rig, images, alpha="mono", field=fewer)
     with pytest.raises(ValueError, match=r"got mono\.png: give a list"):
         fuse("mono.png")
 
