@@ -24,6 +24,7 @@ from arraygeom import (
     stack,
 )
 from arraygeom.batching import tensors_of
+from arraygeom.checks import check_hw
 from arraygeom.rectification import rectify
 from arraygeom.text import UNSCALED
 from tests.arraygeom.rigs import random_rig, scene_points
@@ -259,3 +260,9 @@ def test_a_pair_of_unknown_scale_says_so():
     pair = Rig({"a": camera, "b": beta}, depth=(2, 5), name=UNSCALED).pair("a", "b")
     assert repr(pair).endswith("; baseline 1; 2-5 baselines")
     assert repr(rectify(pair).pair).endswith("; baseline 1; 2-5 baselines")
+
+
+def test_a_size_in_a_tensor_is_refused():
+    """It was taken, and the camera called itself a batch."""
+    with pytest.raises(ValueError, match=r"hw is tensor.*; wanted \(height, width\) in whole pixels"):
+        check_hw(torch.tensor([240, 320]))
