@@ -296,6 +296,16 @@ def test_an_interruption_is_one_line_and_status_130(monkeypatch, capsys):
     assert "interrupted" in capsys.readouterr().err
 
 
+def test_what_the_system_says_of_a_file_is_said_without_its_number(monkeypatch, capsys):
+    """As of a full disk: pat: [Errno 28] No space left on device: 'out/fused.png'."""
+
+    def full(*_):
+        raise OSError(28, "No space left on device", "out/fused.png")
+
+    monkeypatch.setattr("pat.cli.demo.Demo.run", full)
+    assert fails(["demo"], capsys) == "pat: out/fused.png: No space left on device"
+
+
 def test_explore_says_what_is_missing(small, capsys):
     told = fails(
         ["explore", str(small / "rig.yaml"), "--image", f"mono={small / 'mono.png'}", "--no-browser"], capsys
