@@ -116,7 +116,7 @@ def check_K(K: Any) -> None:
 def check_hw(hw: Any) -> None:
     """Raises ValueError unless hw is the (height, width) of an image."""
     try:
-        h, w = map(operator.index, hw)
+        h, w = map(operator.index, () if isinstance(hw, Tensor) else hw)  # a tensor would be one of a batch
     except (TypeError, ValueError):
         raise ValueError(f"hw is {hw!r}; wanted (height, width) in whole pixels") from None
     if min(h, w) < 1:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import torch
@@ -65,7 +66,8 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
         for c, R in ((alpha, R_alpha), (beta, R_beta))
     )
     H_alpha, H_beta = (infinite_homography(c.K, K, R) for c, R in ((alpha, R_alpha), (beta, R_beta)))
-    return Rectification(R_alpha, R_beta, H_alpha, H_beta, Pair(new_alpha, new_beta, pair.depth))
+    rectified = dataclasses.replace(pair, alpha=new_alpha, beta=new_beta, link=None)
+    return Rectification(R_alpha, R_beta, H_alpha, H_beta, rectified)
 
 
 def rectifying_rotations(beta_from_alpha: Pose) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"]]:

@@ -71,6 +71,8 @@ class Pair(Batched):
     beta: View
     depth: Depths | None = None
     link: Link | None = None
+    unit: str = "m"
+    """Of lengths: "baselines" where the rig's scale is unknown."""
     memo: dict[str, Any] = field(default_factory=dict, init=False, compare=False, repr=False)
     """Cache of what fields compute once a pair; never copied."""
 
@@ -110,8 +112,8 @@ class Pair(Batched):
         """(near, far) in metres. Raises ValueError if the rig states none."""
         if self.depth is None:
             raise ValueError(
-                "this field needs a depth range: give the rig one, `depth: [near, far]` in its file "
-                "or `rig.replace(depth=(near, far))`"
+                "this field needs a depth range: give the rig one, `depth: [near, far]` in its file or "
+                "`rig.replace(depth=(near, far))`, or `--depth NEAR FAR` to `pat fuse` and `pat align`"
             )
         return self.depth
 
@@ -180,7 +182,8 @@ class Pair(Batched):
         views = {"alpha": self.alpha, "beta": self.beta}
         named = ", ".join(f"{name} {view._text()}" for name, view in views.items())
         link = "" if self.link is None else f"link by {self.link._text()}"
-        return "; ".join(filter(None, (named, baseline_text(views), depth_text(self.depth), link)))
+        lengths = baseline_text(views, self.unit), depth_text(self.depth, self.unit)
+        return "; ".join(filter(None, (named, *lengths, link)))
 
 
 def middle_depth(near: Float[Tensor, "*b"], far: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
@@ -302,7 +305,7 @@ class Rig(Batched):
         link = self.links.get((alpha, beta))
         if link is None and (beta, alpha) in self.links:
             link = self.links[beta, alpha].reversed()
-        return Pair(self[alpha], self[beta], self.depth, link)
+        return Pair(self[alpha], self[beta], self.depth, link, length_unit(self))
 
     def with_camera(self, name: str, camera: View) -> Rig:
         """A copy with one camera set, replacing that of the same name if there is one."""

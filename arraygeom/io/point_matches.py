@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from .source import decoded
 
 MAX_IMAGES = 2**31 - 1
 """COLMAP numbers the pair of images a < b as a * MAX_IMAGES + b (its documentation of the database)."""
+COLUMNS = ("x0", "y0", "x1", "y1")
 SQLITE = b"SQLite format 3\0"
 
 PointPairs = dict[tuple[str, str], tuple[Tensor, Tensor]]
@@ -63,27 +64,30 @@ def _csv(path: Path, files: Mapping[str, Path]) -> PointPairs:
         lines = [line for line in decoded(path.read_bytes(), "strict").splitlines() if line.strip()]
     except UnicodeDecodeError:
         raise ValueError(f"{path}: neither CSV nor a COLMAP database: give x0,y0,x1,y1 a line") from None
-    lines = lines[1:] if lines and not any(map(_is_number, _words(lines[0]))) else lines
-    parsed = [_numbers(line) for line in lines]
+    named = _named_columns(lines[0]) if lines else None
+    lines = lines if named is None else lines[1:]
+    parsed = [_numbers(line, named or range(4)) for line in lines]
     wrong = next((line for line, row in zip(lines, parsed) if row is None), None)
     if wrong is not None or not parsed:
         what = "an empty file" if wrong is None else f"line '{wrong}'"
         raise ValueError(f"{path}: {what} is not four numbers: give x0,y0,x1,y1 a line")
-    points = torch.tensor([row[:4] for row in parsed if row], dtype=torch.float64)
+    points = torch.tensor([row for row in parsed if row], dtype=torch.float64)
     if not points.isfinite().all():
         raise ValueError(f"{path}: has points that are not finite: leave those lines out")
     a, b = files
     return {(a, b): (points[:, :2], points[:, 2:])}
 
 
-def _numbers(line: str) -> list[float] | None:
-    """The four numbers or more of a line; None if they are none."""
-    words = _words(line)
-    return [float(word) for word in words] if len(words) >= 4 and all(map(_is_number, words)) else None
-
-
 def _words(line: str) -> list[str]:
-    return re.split(r"[,;\s]+", line.strip())
+    return re.split(r"[,;\s]+", line.strip().lstrip("#").strip())
+
+
+def _named_columns(line: str) -> Sequence[int] | None:
+    """Where a header has x0, y0, x1, y1; the first four if it has none such; None for a line of numbers."""
+    words = [word.strip("\"'").lower() for word in _words(line)]
+    if any(map(_is_number, words)):
+        return None
+    return [words.index(name) for name in COLUMNS] if set(COLUMNS) <= set(words) else range(4)
 
 
 def _is_number(word: str) -> bool:
@@ -92,6 +96,15 @@ def _is_number(word: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _numbers(line: str, columns: Iterable[int]) -> list[float] | None:
+    """The numbers in four columns of a line; None if there is none in one."""
+    try:
+        words = _words(line)
+        return [float(words[i]) for i in columns]
+    except (ValueError, IndexError):
+        return None
 
 
 def _database(path: Path, files: Mapping[str, Path]) -> PointPairs:

@@ -25,6 +25,8 @@ MatchesFile = Annotated[Path | None, arg(metavar="FILE", help=MATCHES_HELP, help
 NOISE = "NAME=ELECTRONS[,READ]|estimate|none"
 OUT_OF_RANGE = 0.9
 """Share of a depth map outside the rig's depth range from which its unit must be wrong."""
+OFF = 5.0
+"""Pixels between matched points and the rig's lines in the median from which one of them must be wrong."""
 
 
 @dataclass
@@ -152,6 +154,7 @@ class Known:
         from arraygeom import LensView, depth_of
         from arraygeom.fields import AroundMatches
         from arraygeom.io.point_matches import read_matches
+        from arraygeom.warned import warn
 
         assert self.matches is not None
         fields = dict.fromkeys(rig.betas(alpha), field)
@@ -170,6 +173,15 @@ class Known:
                     raise ValueError(
                         f"{self.matches}: {behind:.0%} of the matches of '{a[0]}' and '{a[1]}' are behind "
                         "the cameras by the rig: are its columns in the order of the images?"
+                    )
+                view, other = rig.pair(a[0], a[1]).cameras
+                nearest = other.project(view.unproject(b[0], found_depth.depth)).x
+                off = float((nearest - b[1]).norm(dim=-1)[found_depth.valid].median())
+                if off > OFF:
+                    warn(
+                        f"{self.matches}: matches of '{a[0]}' and '{a[1]}' lie {off:.0f} px (median) off the "
+                        "lines that the rig allows: are they of these images, x before y? Else mend the rig: "
+                        "`pat rig doctor`"
                     )
             fields[a[1]] = AroundMatches.from_points(*b, own.hw, views=(own, beta), field=field)
         return fields

@@ -80,7 +80,9 @@ def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
         sys.exit(130)
     except BrokenPipeError:
         raise
-    except (ValueError, OSError, FloatingPointError) as error:
+    except OSError as error:
+        _fail(error, f"{error.filename}: {error.strerror}" if error.filename else f"{error}", debug)
+    except (ValueError, FloatingPointError) as error:
         _fail(error, f"{error}", debug)
     except ImportError as error:
         remedy = "" if "pip install" in f"{error}" else ": pip install 'arraygeom-pat[all]'"

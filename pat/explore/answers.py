@@ -14,6 +14,7 @@ from torch.nn.functional import interpolate
 
 from arraygeom import Camera, Distortion, Pose, Rig, rotation_from_vector
 from arraygeom.io.native import write as rig_text
+from arraygeom.text import length_unit
 
 from ..media.colour import to_bytes
 from .pixel import FAMILIES, WINDOWS, BetaReport, ExplorerScene, ExplorerState, image_pixel, inspect_pixel
@@ -177,9 +178,10 @@ def slider_ranges(rig: Rig) -> list[list[Any]]:
     """Name, label and (low, high, step, value) of each slider that the rig has a use for."""
     ranges: list[list[Any]] = []
     if rig.depth is not None:
+        unit = length_unit(rig)
         near, far = (min(float(d), FARTHEST) for d in rig.depth)
-        ranges.append(["near", "near (m)", [near / 4, far, (far - near / 4) / 500, near]])
-        ranges.append(["far", "far (m)", [near, 4 * far, (4 * far - near) / 500, far]])
+        ranges.append(["near", f"near ({unit})", [near / 4, far, (far - near / 4) / 500, near]])
+        ranges.append(["far", f"far ({unit})", [near, 4 * far, (4 * far - near) / 500, far]])
     cameras = [camera for camera in rig.cameras.values() if isinstance(camera, Camera)]
     if cameras:
         ranges.append(["baseline", "baseline (times)", [0.1, 4.0, 0.05, 1.0]])
@@ -204,10 +206,17 @@ def choices(scene: ExplorerScene, controls: Controls) -> list[list[Any]]:
 
 
 def shown_cameras(scene: ExplorerScene, alpha: str) -> list[dict[str, Any]]:
-    """Name, width, height and image of alpha and of every beta with an image, in this order."""
+    """Name, width, height, image and unit of depth of alpha and of each beta with an image, in this order."""
     names = [alpha, *(n for n in scene.rig.betas(alpha) if n in scene.images)]
+    unit = length_unit(scene.rig)
     return [
-        {"name": n, "hw": list(scene.rig[n].hw), "src": data_url(scene.images[n]), "alpha": n == alpha}
+        {
+            "name": n,
+            "hw": list(scene.rig[n].hw),
+            "src": data_url(scene.images[n]),
+            "alpha": n == alpha,
+            "unit": unit,
+        }
         for n in names
     ]
 

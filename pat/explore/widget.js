@@ -12,7 +12,7 @@ const STYLE = `
   border: 1px solid var(--line); border-radius: 5px; padding: 3px 8px } .pat button { cursor: pointer }
 .pat button:disabled { opacity: .4 } .pat :focus-visible { outline: 2px solid #0a84ff; outline-offset: 1px } .pat kbd { font: inherit; opacity: .6 }`;
 const FIRST = "#e69f00", SECOND = "#cc79a7", MATCH = "#00bfff", BACK = "#ff6d3a";
-const metres = (d) => (d == null ? "no depth" : `depth ${d} m`);
+const depthText = (d, unit) => (d == null ? "no depth" : `depth ${d} ${unit}`);
 const make = (tag, properties = {}, ...children) => {
   const made = Object.assign(document.createElement(tag), properties);
   made.append(...children);
@@ -73,7 +73,7 @@ function drawMarks(context, camera, answer) {
 }
 
 // Weights along the segment from one end to the other, the highest being 1.
-function drawProfile(canvas, beta) {
+function drawProfile(canvas, beta, unit) {
   const context = canvas.getContext("2d"), width = (canvas.width = 2 * canvas.clientWidth || 600);
   const height = (canvas.height = 112);
   [[beta?.second, SECOND], [beta, FIRST]].forEach(([report, colour]) => {
@@ -88,7 +88,7 @@ function drawProfile(canvas, beta) {
   if (!beta || beta.problem) return;
   context.font = "22px system-ui";
   context.fillStyle = getComputedStyle(canvas).color;
-  const ends = [beta.depths[0], beta.depths.at(-1)].map((d) => (d == null ? "" : `${d} m`));
+  const ends = [beta.depths[0], beta.depths.at(-1)].map((d) => (d == null ? "" : `${d} ${unit}`));
   context.fillText(ends[0], 0, 20);
   context.textAlign = "center";
   context.fillText("weight along the segment", width / 2, 20);
@@ -96,11 +96,11 @@ function drawProfile(canvas, beta) {
   context.fillText(ends[1], width, 20);
 }
 
-function betaText(beta) {
+function betaText(beta, unit) {
   if (beta.problem) return beta.problem;
   const off = beta.off == null ? "" : `, ${beta.off} px off the line`;
   const second = beta.second && (beta.second.problem ?? `${beta.second.samples.length} samples`);
-  return `match (${beta.match.map((v) => v.toFixed(1)).join(", ")}), ${metres(beta.depth)}, ` +
+  return `match (${beta.match.map((v) => v.toFixed(1)).join(", ")}), ${depthText(beta.depth, unit)}, ` +
     `${beta.samples.length} samples${off}` + (second ? `; compared: ${second}` : "");
 }
 
@@ -215,7 +215,7 @@ function render({ model, el }) {
   function draw() {
     const answer = model.get("answer");
     for (const { camera, canvas, caption, profile, image } of parts) {
-      const context = canvas.getContext("2d"), { name, alpha } = camera;
+      const context = canvas.getContext("2d"), { name, alpha, unit } = camera;
       context.setTransform(1, 0, 0, 1, 0, 0);
       context.clearRect(0, 0, canvas.width, canvas.height);
       if (image.complete && image.naturalWidth) context.drawImage(image, 0, 0, canvas.width, canvas.height);
@@ -223,8 +223,8 @@ function render({ model, el }) {
       if (problem) write(context, problem);
       context.translate(0.5, 0.5); // the centre of the first pixel is (0, 0)
       if (!answer.error) drawMarks(context, camera, answer);
-      if (!alpha) drawProfile(profile, beta);
-      const text = answer.error ?? (alpha ? `pixel (${answer.x}), ${metres(answer.depth)}` : betaText(beta));
+      if (!alpha) drawProfile(profile, beta, unit);
+      const text = answer.error ?? (alpha ? `pixel (${answer.x}), ${depthText(answer.depth, unit)}` : betaText(beta, unit));
       caption.textContent = `${name}${alpha ? " (alpha)" : ""}: ${text}`;
     }
     drawTop();

@@ -92,6 +92,12 @@ def array_from_images(
     if isinstance(sources, str | Path):
         raise ValueError(f"an array has two images or more, got {sources}: give a list of them")
     if not isinstance(sources, Mapping):
+        for source in sources:
+            if not isinstance(source, str | Path):
+                got = type(source).__name__
+                raise TypeError(
+                    f"an image is a {got} without a name: give files, or {{NAME: tensor}} by camera"
+                )
         sources = camera_names([Path(path) for path in sources])
     if len(sources) < 2:
         raise ValueError(f"an array has two images or more, got {len(sources)}")

@@ -214,7 +214,8 @@ def _with_rig(
         return network, rig, images, alpha, False
     if rig is not None or images is not None or not isinstance(network, Mapping | Sequence):
         raise TypeError(
-            "fuse takes a network, a rig, images and alpha=NAME; or images alone, to find the rig"
+            'fuse takes a network, a rig, images and alpha=NAME, such as `load_weights("mono-colour")`, '
+            "`Rig.load(FILE)` and {NAME: read_image(FILE)}; or images alone, to find the rig"
         )
     from ..networks.weights import load_weights
     from .from_images import array_from_images

@@ -195,9 +195,14 @@ def shown_noise(image: Float[Tensor, "c h w"]) -> float:
 
 
 def check_noise(noise: Noise | None) -> None:
-    """Raise ValueError for a word that is none."""
-    if isinstance(noise, str) and noise not in ("estimate", "auto"):
-        raise ValueError(f"noise is 'estimate', 'auto' or a NoiseLevel of each camera; got {noise!r}")
+    """Raise ValueError for what is no noise."""
+    if noise is None or noise in ("estimate", "auto"):
+        return
+    if not (isinstance(noise, Mapping) and all(isinstance(level, NoiseLevel) for level in noise.values())):
+        raise ValueError(
+            f"noise is 'estimate', 'auto' or a NoiseLevel of each camera; got {noise!r}: "
+            "give {NAME: NoiseLevel.of_electrons(200)}"
+        )
 
 
 def noise_levels(images: Mapping[str, Tensor], noise: Noise | None) -> Mapping[str, NoiseLevel]:

@@ -49,8 +49,10 @@ class Views:
 
         Raises ValueError for a camera that the rig lacks, no image of alpha or of any beta, an image of
         another size than the rig says, of another type, or with values that are not finite or far outside
-        0..1. TypeError for what is no tensor.
+        0..1. TypeError for what is no tensor, and for images without names.
         """
+        if not isinstance(images, Mapping):
+            raise TypeError(f"the images are a {type(images).__name__}: give {{NAME: image}}, by camera")
         for name in (alpha, *images, *(field if isinstance(field, Mapping) else ())):
             rig.require(name)
         if alpha not in images:
@@ -87,6 +89,9 @@ class Views:
 
 LARGEST_VALUE = 32.0
 """Of an image in 0..1: developed short exposures exceed 1, and those of 8 bits have values to 255."""
+
+SMALLEST_VALUE = -0.25
+"""Of an image in 0..1: noise goes below 0, and images as many networks take them, of mean 0, far below."""
 
 
 def is_in_colour(image: Float[Tensor, "c h w"]) -> bool:
@@ -155,9 +160,14 @@ def checked_image(rig: Rig, images: Images, name: str) -> Tensor:
         raise ValueError(
             f"the image of '{name}' is {got}, the rig says {w}x{h}: resize the rig, or give the right image"
         )
-    largest = max(abs(float(v)) for v in image.detach().aminmax())
-    if not math.isfinite(largest):
+    smallest, largest = (float(v) for v in image.detach().aminmax())
+    if not math.isfinite(largest - smallest):
         raise ValueError(f"the image of '{name}' has NaN or infinite values")
+    if smallest < SMALLEST_VALUE:
+        raise ValueError(
+            f"the image of '{name}' has values down to {smallest:g}: images are in 0..1, without a mean "
+            "subtracted"
+        )
     if largest > LARGEST_VALUE:
         raise ValueError(
             f"the image of '{name}' has values up to {largest:g}: divide them, images are in 0..1"

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from arraygeom.atomic import write_atomically
 from arraygeom.chunks import ROWS, spans
-from arraygeom.image_bytes import TIFF, decodable, has_further_images
+from arraygeom.image_bytes import TIFF, decodable, first_tiff_page, has_further_images
 from arraygeom.warned import warn
 
 from .headers import HW, ImageHeader, image_header
@@ -30,6 +30,10 @@ from .suffixes import RAW_SUFFIXES
 
 FEW_BITS = (8, 10, 12)
 """Bits of cameras that may be stored in 16 bits as they are."""
+CHANNELS = "give a grey (1) or RGB (3) image"
+KINDS = "save it with 8 or 16 bits without sign, or as float 0..1"
+DECODED = ("bool", "uint8", "uint16", "float32", "float64")
+"""Types of a TIFF file's values which OpenCV reads, and which are usable."""
 
 MOST_PIXELS = 2**28
 """Images with more are read only where their size is expected: some 3 GiB in colour."""
@@ -228,6 +232,12 @@ def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, i
     OpenCV shifts packed values up to 16 bits.
     """
     values = decoded(_without_orientation(content, header))
+    page = first_tiff_page(content) if content[:4] in TIFF else None
+    # Of two channels OpenCV leaves one out, more than four it does not read.
+    if page is not None and page.samplesperpixel not in (1, 3, 4):
+        raise ValueError(f"{label}: has {page.samplesperpixel} channels: {CHANNELS}")
+    if values is None and page is not None and page.dtype is not None and page.dtype not in DECODED:
+        raise ValueError(f"{label}: has {page.dtype} values: {KINDS}")
     if values is None:
         raise ValueError(f"{label}: not an image that can be read: give a whole PNG, TIFF or JPEG file")
     if values.shape[:2] != header.hw:
@@ -276,7 +286,7 @@ def _opaque(values: NDArray, label: str) -> NDArray:
     if values.ndim == 2 or values.shape[2] == 3:
         return values
     if values.shape[2] != 4:
-        raise ValueError(f"{label}: has {values.shape[2]} channels: give a grey (1) or RGB (3) image")
+        raise ValueError(f"{label}: has {values.shape[2]} channels: {CHANNELS}")
     full = np.iinfo(values.dtype).max if np.issubdtype(values.dtype, np.integer) else 1.0
     if (values[..., 3] != full).any():
         raise ValueError(f"{label}: has transparent pixels: flatten it and save it without alpha channel")
@@ -287,9 +297,7 @@ def _unit_range(planes: NDArray, label: str, bits: int | None, packed: int) -> N
     if planes.dtype in (np.uint8, np.uint16):
         return _counts(planes, label, bits, packed)
     if not np.issubdtype(planes.dtype, np.floating):
-        raise ValueError(
-            f"{label}: has {planes.dtype} values: save it with 8 or 16 bits without sign, or as float 0..1"
-        )
+        raise ValueError(f"{label}: has {planes.dtype} values: {KINDS}")
     if not np.isfinite(planes).all():
         raise ValueError(f"{label}: has NaN or infinite values: replace them before fusing")
     low, high = float(planes.min()), float(planes.max())
@@ -311,7 +319,8 @@ def _counts(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArr
         needed = next(n for n in FEW_BITS if largest < 2**n)
         warn(
             f"{label}: has 16 bits a value, and none above {largest}, so it is nearly black: "
-            f"if its camera counts to {2**needed - 1}, state `bits: {needed}` in the rig file"
+            f"if its camera counts to {2**needed - 1}, state `bits: {needed}` in the rig file, "
+            f"or save it with its values times {65535 // (2**needed - 1)}"
         )
     if largest > white:
         raise ValueError(

@@ -24,6 +24,8 @@ from arraygeom import (
     stack,
 )
 from arraygeom.batching import tensors_of
+from arraygeom.checks import check_hw
+from arraygeom.rectification import rectify
 from arraygeom.text import UNSCALED
 from tests.arraygeom.rigs import random_rig, scene_points
 
@@ -249,3 +251,18 @@ def test_a_pair_says_what_relates_it():
     assert repr(pair).startswith("Pair: alpha 64x48 f=")
     linked = Pair(View(hw=(2, 3)), View(hw=(4, 5)), None, Link(torch.eye(3)))
     assert repr(linked) == "Pair: alpha 3x2, beta 5x4; link by F"
+
+
+def test_a_pair_of_unknown_scale_says_so():
+    """Its lengths were said to be metres."""
+    camera = Camera(K=intrinsics(999.0, (497, 741)), cam_from_world=Pose.identity(), hw=(497, 741))
+    beta = camera.replace(cam_from_world=Pose(camera.R, torch.tensor([-1.0, 0, 0], dtype=F64)))
+    pair = Rig({"a": camera, "b": beta}, depth=(2, 5), name=UNSCALED).pair("a", "b")
+    assert repr(pair).endswith("; baseline 1; 2-5 baselines")
+    assert repr(rectify(pair).pair).endswith("; baseline 1; 2-5 baselines")
+
+
+def test_a_size_in_a_tensor_is_refused():
+    """It was taken, and the camera called itself a batch."""
+    with pytest.raises(ValueError, match=r"hw is tensor.*; wanted \(height, width\) in whole pixels"):
+        check_hw(torch.tensor([240, 320]))

@@ -79,6 +79,15 @@ def test_a_damaged_database_is_named(tmp_path, change):
         read_matches(path, FILES, SIZES)
 
 
+@pytest.mark.parametrize("header", ["id,x0,y0,x1,y1,score", 'score, "Y0", "X0", "Y1", "X1"'])
+def test_a_header_names_the_columns(tmp_path, header):
+    """It was left out, and the first four columns were taken."""
+    (tmp_path / "m.csv").write_text(f"{header}\n7,1,2,3,4,.5\n")
+    found = read_matches(tmp_path / "m.csv", FILES, SIZES)["mono", "colour"]
+    turned = "Y0" in header
+    assert [x.tolist() for x in found] == ([[[2, 1]], [[4, 3]]] if turned else [[[1, 2]], [[3, 4]]])
+
+
 @pytest.mark.parametrize("verified", [True, False])
 def test_colmap(tmp_path, verified):
     database(tmp_path / "database.db", verified=verified)
@@ -110,6 +119,9 @@ def test_what_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"1 of 2 .*'colour', 70x50"):
         read_matches(path, FILES, SIZES)
     path.write_text("1,2,3,4\n1,2,3\n")
+    with pytest.raises(ValueError, match="'1,2,3'"):
+        read_matches(path, FILES, SIZES)
+    path.write_text("1,2,3\n1,2,3,4\n")  # taken for a header
     with pytest.raises(ValueError, match="'1,2,3'"):
         read_matches(path, FILES, SIZES)
     path.write_text("1,2,nan,4\n")

@@ -150,6 +150,12 @@ def test_rig_mistakes_name_the_entry(edit, message, small, capsys):
     assert "rig.yaml" in error
 
 
+def test_a_rig_without_depth_range_is_answered_with_the_option_that_gives_one(small, capsys):
+    """As other tools' files are; only the native file's entry and Python were named."""
+    Rig.load(small / "rig.yaml").replace(depth=None).save(small / "rig.yaml")
+    assert "`--depth NEAR FAR`" in fails(arguments(small), capsys)
+
+
 def test_views_that_do_not_overlap(small, capsys):
     rig = yaml.safe_load((small / "rig.yaml").read_text())
     rig["cameras"]["colour"] |= {"rotation": [0, 180, 0]}
@@ -288,6 +294,16 @@ def test_an_interruption_is_one_line_and_status_130(monkeypatch, capsys):
         main(["demo"])
     assert stop.value.code == 130
     assert "interrupted" in capsys.readouterr().err
+
+
+def test_what_the_system_says_of_a_file_is_said_without_its_number(monkeypatch, capsys):
+    """As of a full disk: pat: [Errno 28] No space left on device: 'out/fused.png'."""
+
+    def full(*_):
+        raise OSError(28, "No space left on device", "out/fused.png")
+
+    monkeypatch.setattr("pat.cli.demo.Demo.run", full)
+    assert fails(["demo"], capsys) == "pat: out/fused.png: No space left on device"
 
 
 def test_explore_says_what_is_missing(small, capsys):

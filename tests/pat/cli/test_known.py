@@ -1,5 +1,6 @@
 """`--depth-map` and `--matches` of fuse, align and the rig commands, on a wall with a post before it."""
 
+import re
 from pathlib import Path
 
 import cv2
@@ -101,6 +102,19 @@ def test_rig_commands_take_matches(folder, capsys):
     assert Rig.load(folder / "started.yaml").links
     out = ["-o", str(folder / "refined.yaml"), "--no-photometric"]
     main(["rig", "refine", str(folder / "rig.yaml"), *images, *matches, *out])
+
+
+def test_matches_off_the_lines_of_the_rig_are_said(folder, capsys):
+    """Those of another image were taken without a word; here beta's rows are counted from below."""
+    rows = np.loadtxt(folder / "matches.csv", delimiter=",")
+    rows[:, 3] = H - 1 - rows[:, 3]
+    np.savetxt(folder / "rows.csv", rows, delimiter=",")
+    run(folder, "align", "--matches", str(folder / "rows.csv"))
+    assert re.search(
+        r"rows.csv: matches of 'mono' and 'colour' lie \d+ px .*x before y", capsys.readouterr().err
+    )
+    run(folder, "align", "--matches", str(folder / "matches.csv"))
+    assert "matches of" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom import Camera, Distortion, Epipolar, Pose, ReceptiveField, Rig
 from arraygeom.fields.grid import FieldOnGrid
+from arraygeom.text import UNSCALED
 from pat.data.sample_array import load_sample
 from pat.fusion.steps import at_alphas_resolution
 from pat.matching.inputs import Inputs
@@ -65,6 +66,14 @@ def test_controls_move_the_samples():
     assert abs(rotated[0] - first[0]) > 1
     moved = view.answer["rig"]
     assert "rotation" in moved
+
+
+def test_depths_of_unknown_scale_are_not_metres():
+    """Both the sliders and the captions said m."""
+    for name, unit in (("", "m"), (UNSCALED, "baselines")):
+        view = explore(small_rig().replace(name=name))
+        assert [text for _, text, _ in view.ranges][:2] == [f"near ({unit})", f"far ({unit})"]
+        assert {camera["unit"] for camera in view.cameras} == {unit}
 
 
 def test_what_is_wrong_is_said_in_the_picture():
@@ -225,6 +234,13 @@ def test_the_saved_page_gives_the_numbers_of_the_kernel(driver, tmp_path):
             assert int(count) == len(beta["samples"])
             assert [float(u), float(v)] == pytest.approx(beta["match"], abs=0.11)
     assert resources(driver) == []
+
+
+def test_the_saved_page_says_the_unit_of_depth(driver, tmp_path):
+    explore(small_rig().replace(name=UNSCALED)).save(tmp_path / "view.html")
+    driver.get((tmp_path / "view.html").as_uri())
+    until(driver, lambda told: len(told) == 2)
+    assert all(re.search(r"depth \S+ baselines", text) for text in captions(driver))
 
 
 def test_a_saved_page_of_lenses_has_a_grid_of_answers(driver, tmp_path):

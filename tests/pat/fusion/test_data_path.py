@@ -138,6 +138,7 @@ def test_views_name_what_is_wrong():
         (images | {"b": images["b"][:, :-1]}, "the image of 'b' is 96x63, the rig says 96x64"),
         (images | {"b": images["b"] * torch.nan}, "NaN or infinite"),
         (images | {"b": images["b"] * 255}, r"the image of 'b' has values up to 2\d\d.*: divide them"),
+        (images | {"b": 2 * images["b"] - 1}, r"the image of 'b' has values down to -.*: images are in 0"),
         (
             images | {"b": (images["b"] * 255).to(torch.uint8)},
             r"'b' is uint8 of shape \(3, 64, 96\): wanted float32",

@@ -20,6 +20,7 @@ from arraygeom import (
     Pose,
     Rectified,
     Rig,
+    Segments,
     Sensor,
     View,
     intrinsics,
@@ -161,6 +162,10 @@ for use in (
     lambda: fuse("mono-colour", rig, images, alpha="mono"),
     lambda: fuse(network, rig, images, alpha="mono", noise="much"),
     lambda: fuse(network, rig, images, alpha="mono", response="luma"),
+    lambda: fuse(network, rig, images, alpha="mono", noise=0.1),
+    lambda: fuse(network, rig, images, alpha="mono", noise={"mono": 200}),
+    lambda: fuse(network, rig, [*images.values()], alpha="mono"),
+    lambda: fuse([*images.values()]),
     lambda: write_image("x.png", torch.zeros(3, 8, 8, dtype=torch.uint8)),
 ):
     try:
@@ -180,6 +185,10 @@ def test_what_is_not_what_it_should_be_is_refused_in_a_line():
         "fuse takes a network, a rig, images and alpha=NAME",
         "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got 'much'",
         "response is 'fit', 'rec601' or three weights; got 'luma'",
+        "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got 0.1: give {NAME",
+        "noise is 'estimate', 'auto' or a NoiseLevel of each camera; got {'mono': 200}: give {NAME",
+        "the images are a list: give {NAME: image}, by camera",
+        "an image is a Tensor without a name: give files, or {NAME: tensor} by camera",
         "x.png: the image to write is uint8: give floats in 0..1",
     )
     lines = done.stdout.splitlines()
@@ -195,6 +204,13 @@ def test_what_is_no_field_or_no_list_is_refused_in_a_line():
 
     with pytest.raises(ValueError, match="the field ends gave a tuple: fields give Segments or Positions"):
         fuse(network_of("GuidedPAT"), rig, images, alpha="mono", field=ends)
+
+    def fewer(pair, x):
+        found = Epipolar()(pair, x)
+        return Segments(found.start[:-1], found.end[:-1], found.valid[:-1])
+
+    with pytest.raises(ValueError, match=r"the field fewer gave 0 pixels for one: a field is asked for x"):
+        fuse(network_of("GuidedPAT"), rig, images, alpha="mono", field=fewer)
     with pytest.raises(ValueError, match=r"got mono\.png: give a list"):
         fuse("mono.png")
 

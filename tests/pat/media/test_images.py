@@ -71,7 +71,7 @@ def test_sixteen_bits_are_scaled_by_65535(tmp_path):
 @pytest.mark.parametrize(("largest", "bits"), [(200, 8), (1000, 10), (4095, 12)])
 def test_few_bits_in_sixteen_are_said_unless_they_are_stated(tmp_path, largest, bits):
     cv2.imwrite(str(tmp_path / "a.png"), np.array([[0, largest]], np.uint16))
-    with pytest.warns(UserWarning, match=f"none above {largest}, .*state `bits: {bits}`"):
+    with pytest.warns(UserWarning, match=f"none above {largest}, .*state `bits: {bits}` .*or save it"):
         read_image(tmp_path / "a.png")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -179,6 +179,23 @@ def test_the_first_image_of_an_animated_png_is_read(tmp_path):
 def test_unusable_values_are_refused(tmp_path, values, complaint):
     cv2.imwrite(str(tmp_path / "a.tif"), values)
     with pytest.raises(ValueError, match=f"a.tif: .*{complaint}"):
+        read_image(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind", "complaint"),
+    [
+        ((6, 8), np.uint32, "uint32 values: save it with 8 or 16 bits"),
+        ((6, 8), np.float16, "float16 values: save it with 8 or 16 bits"),
+        ((6, 8, 2), np.uint16, "2 channels: give a grey"),
+        ((6, 8, 5), np.uint16, "5 channels: give a grey"),
+    ],
+)
+def test_what_opencv_does_not_read_of_a_tiff_is_named(tmp_path, shape, kind, complaint):
+    """Such files were no images at all; of two channels the second was left out without a word."""
+    values = np.ones(shape, kind)
+    tifffile.imwrite(tmp_path / "a.tif", values, photometric="minisblack", planarconfig="contig")
+    with pytest.raises(ValueError, match=f"a.tif: has {complaint}"):
         read_image(tmp_path / "a.tif")
 
 
