@@ -18,7 +18,11 @@ def execute(notebook: nbformat.NotebookNode, folder: Path) -> nbformat.NotebookN
     # seconds, for machines with other work
     patience = {"timeout": 1800, "startup_timeout": 600, "iopub_timeout": 120}
     client = NotebookClient(
-        notebook, kernel_name="python3", resources={"metadata": {"path": str(folder)}}, **patience
+        notebook,
+        kernel_name="python3",
+        resources={"metadata": {"path": str(folder)}},
+        coalesce_streams=True,
+        **patience,
     )
     client.execute(env={**os.environ, "PYTHONPATH": str(HERE.parent)})
     # the state of the explorer: images again, of no use without a kernel

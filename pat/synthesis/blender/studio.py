@@ -41,7 +41,8 @@ class Studio:
         self.blender.collection.objects.link(self.camera)
         self.blender.camera = self.camera
         self.stage: BuiltScene = build(self.bpy, scene, self.blender.world)
-        self._quality()
+        with quietly():  # naming a denoiser looks for GPUs, and complains of their absence
+            self._quality()
 
     def channels(self, camera: Camera, time: float, spectrum: Spectrum) -> dict[str, Tensor]:
         """Colours, depth and index by Blender's names (H, W)."""

@@ -1,6 +1,7 @@
 """Blender's images against arraygeom and against theory. Each scene is rendered in the worker's process."""
 
 import os
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -82,6 +83,28 @@ def test_a_tiny_scene_is_true_in_unlike_cameras(worker, tmp_path):
     with pytest.raises(ValueError, match=r"'oblong' .*0 s"):
         worker.render(away, rig, tmp_path / "nothing", settings=settings)
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
+
+
+def test_blender_prints_nothing(tmp_path, worker):
+    """It complained of the absence of a GPU's library before every scene, in notebooks too."""
+    (tmp_path / "s.yaml").write_text(
+        Scene(objects=(glowing("a", Motion((Key(position=(0, 0, 5)),))),)).to_yaml()
+    )
+    program = (
+        "from pathlib import Path; from pat.synthesis.blender import RenderSettings; "
+        "from pat.synthesis.blender.studio import Studio; from pat.synthesis.scene import Scene; "
+        "Studio(Scene.load('s.yaml'), RenderSettings(), Path()).close()"
+    )
+    path = os.pathsep.join([os.getcwd(), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == ""
 
 
 def idle_seconds(pid: int, *, over: float) -> float:
