@@ -73,11 +73,21 @@ def save_aligned(
     NAME_positions.npy (or .tif: x, y); depth.tif (metres) if any is known.
 
     One file a camera, NAME.tif, if `separate`, or if their types differ: values keep theirs. With a `name`
-    the files are name_aligned.tif and so on. All are written, or none. Returns what was written.
+    the files are name_aligned.tif and so on. All are written, or none. Of a former alignment bands, depth,
+    positions and the page index.html are gone; files of a camera that nothing replaces stay, as they may be
+    its images. Returns what was written.
+
+    Raises ValueError for a camera with a file of its own that is called "depth".
     """
     prefix = f"{name}_" if name else ""
     unlike = len({view.values.dtype for view in aligned.values()}) > 1
-    with write_together(out, last=f"{prefix}visibility.txt") as folder:
+    if (separate or unlike) and "depth" in aligned:
+        raise ValueError(
+            "the camera 'depth' would have its values in depth.tif, where the depth goes: rename the camera"
+        )
+    stale = {f"{prefix}aligned.tif", f"{prefix}depth.tif"} | (set() if name else {"index.html"})
+    stale |= {f"{prefix}{camera}_positions.{kind}" for camera in aligned for kind in ("npy", "tif")}
+    with write_together(out, last=f"{prefix}visibility.txt", stale=stale) as folder:
         if separate or unlike:
             for camera, view in aligned.items():
                 write_bands(folder / f"{prefix}{camera}.tif", view.values, view.bands, view.wavelengths)

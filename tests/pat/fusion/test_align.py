@@ -206,6 +206,26 @@ def test_types_that_differ_go_to_files_of_their_own(tmp_path):
     assert not (tmp_path / "aligned.tif").exists()
 
 
+def test_files_of_a_former_alignment_are_gone(tmp_path):
+    rig, images = array()
+    found = align(rig, images, alpha="mono", correct=False)
+    save_aligned(found, tmp_path)
+    (tmp_path / "index.html").write_text("its page")
+    unknown = replace(found, depth=np.full_like(found.depth, np.nan))
+    written = save_aligned(unknown, tmp_path, separate=True, positions="none")
+    assert {path.name for path in written} == {path.name for path in tmp_path.iterdir()}
+
+
+def test_a_camera_called_depth_has_no_file_of_its_own(tmp_path):
+    rig, images = array()
+    rig = Rig({"mono": rig["mono"], "depth": rig["nir"]}, depth=rig.depth)
+    images = {"mono": images["mono"], "depth": images["nir"]}
+    found = align(rig, images, alpha="mono", correct=False)
+    assert (tifffile.imread(save_aligned(found, tmp_path)[0]) == found.stack())[0].all()
+    with pytest.raises(ValueError, match=r"'depth' .*depth\.tif"):
+        save_aligned(found, tmp_path, separate=True)
+
+
 def test_ndvi_needs_both_bands_and_both_views():
     rig, images = array()
     found = align(rig, images, alpha="mono", correct=False)
