@@ -12,7 +12,7 @@ from arraygeom.undistortion import recorded_pixels, straight_pixels
 from pat import align
 from pat.fusion.align import OUTSIDE, SEEN, filled, resampled_values
 from pat.fusion.aligned_files import RecordedFiles, save_aligned, write_bands
-from pat.fusion.aligned_page import aligned_page, ndvi
+from pat.fusion.aligned_page import aligned_page, ndvi, shown_layers
 from pat.fusion.report import Facts
 from pat.fusion.steps import without_lenses
 from pat.matching.inputs import Inputs
@@ -222,6 +222,9 @@ def test_a_camera_called_depth_has_no_file_of_its_own(tmp_path):
     images = {"mono": images["mono"], "depth": images["nir"]}
     found = align(rig, images, alpha="mono", correct=False)
     assert (tifffile.imread(save_aligned(found, tmp_path)[0]) == found.stack())[0].all()
+    layers, usual = shown_layers(found), shown_layers(align(*array(), alpha="mono", correct=False))
+    assert torch.equal(layers["depth"], usual["nir"])
+    assert torch.equal(layers["derived depth"], usual["depth"])
     with pytest.raises(ValueError, match=r"'depth' .*depth\.tif"):
         save_aligned(found, tmp_path, separate=True)
 
