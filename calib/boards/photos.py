@@ -52,8 +52,12 @@ Photos = Mapping[str, Mapping[FrameKey, Photo]]
 
 
 def to_grey(image: np.ndarray) -> Grey:
-    """An image (H, W) or (H, W, 3) in grey, 8 bits; if dim or of 16 bits it is stretched to all of them."""
-    grey = image if image.ndim == 2 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
+    """An image (H, W) or (H, W, C) in grey, 8 bits; if dim or of 16 bits it is stretched to all of them.
+
+    Fewer than three channels are grey, and whatever else; of more, the first three are blue, green and red.
+    """
+    image = np.atleast_3d(image)
+    grey = image[..., 0] if image.shape[2] < 3 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
     low, high = np.percentile(grey[::4, ::4], (0.5, 99.5))
     if grey.dtype == np.uint8 and high - low > 100:
         return grey

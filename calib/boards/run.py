@@ -161,16 +161,21 @@ def watch(
     It shows what was detected, coverage, the current uncertainty, and which view would help most. Raises
     OSError.
     """
-    session = Session(board, lens)
+    session, problem = Session(board, lens), ""
     write_text(page, _page(session))
     while not finished():
+        before = problem
         try:
-            photos = find_photos(folder, patterns=patterns)
+            photos, problem = find_photos(folder, patterns=patterns), ""
         except ValueError as error:
-            photos, session.problem = {}, str(error)
-        if session.detect(photos):
+            photos, problem = {}, str(error)
+        if fresh := session.detect(photos):
             write_text(page, _page(session))  # at once, with the advice of before
-            session.calibrate()
+        if fresh or problem != before:
+            if problem:
+                session.problem = problem
+            else:
+                session.calibrate()
             write_text(page, _page(session))
         time.sleep(interval)
     return session

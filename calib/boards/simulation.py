@@ -33,14 +33,18 @@ WALL = 90
 """Grey value of the background."""
 
 
+@torch.no_grad()
 def simulate_photos(
     rig: Rig, board: Board, folder: Path, *, count: int = 12, noise: float = 1.5, seed: int = 0
 ) -> Pose:
     """Render a board in `count` random poses: `folder`/CAMERA/000.png and so on.
 
     `noise` is in grey values of 255. Returns the true `world_from_board`, a batch (count).
-    Raises ValueError for a rig without calibrated cameras, or whose cameras nowhere see a board together.
+    Raises ValueError for a rig without calibrated cameras, or whose cameras nowhere see a board together, a
+    `count` below 1, and a negative `noise`.
     """
+    if not 0 <= noise < math.inf:
+        raise ValueError(f"noise is a standard deviation in grey values, 0 or more; got {noise:g}")
     boards = board_poses(rig, board, count, seed=seed)
     random = np.random.default_rng(seed)
     for name, camera in calibrated(rig).items():
@@ -55,11 +59,14 @@ def simulate_photos(
     return boards
 
 
+@torch.no_grad()
 def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
     """Random `world_from_board` (a batch), boards' centres seen by every camera, at several depths and tilts.
 
-    Raises ValueError if there are too few such poses.
+    Raises ValueError if there are too few such poses, and for a `count` below 1.
     """
+    if count < 1:
+        raise ValueError(f"count is a number of images, 1 or more; got {count}")
     cameras, random = list(calibrated(rig).values()), np.random.default_rng(seed)
     narrow = max(float(c.K[0, :2].norm()) / c.hw[1] for c in cameras)
     middle = torch.from_numpy(board.middle)
@@ -81,6 +88,7 @@ def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
 Rays = tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]
 
 
+@torch.no_grad()
 def photograph(
     camera: Camera,
     cam_from_board: Pose,

@@ -30,7 +30,16 @@ from .hypotheses import (
     ignored_lens,
     in_degrees,
 )
-from .matches import Images, Pairs, PointMatches, agreeing_pairs, cameras_of, depth_seen, match_cameras
+from .matches import (
+    Images,
+    Pairs,
+    PointMatches,
+    agreeing_pairs,
+    cameras_of,
+    depth_seen,
+    image_sizes,
+    match_cameras,
+)
 from .parameters import SIGMA
 from .residuals import image_parts, line_distances, related
 
@@ -134,7 +143,7 @@ def diagnose(rig: Rig, images: Images, matches: Pairs | None = None) -> Diagnosi
     """
     for name in images:
         rig.require(name)
-    sizes = {name: (int(image.shape[1]), int(image.shape[2])) for name, image in images.items()}
+    sizes = image_sizes(images)
     return diagnose_matches(rig, sizes, match_cameras(images) if matches is None else agreeing_pairs(matches))
 
 

@@ -26,6 +26,7 @@ from .matches import (
     agreeing_pairs,
     fit_fundamental,
     fit_link,
+    image_sizes,
     line_distance,
     match_cameras,
     matching_time,
@@ -79,13 +80,13 @@ def rig_from_images(
     essential matrix is fitted too, with five degrees of freedom instead of seven: it is used where it fits
     held-out points better. All F are then fitted jointly, with lenses, and accepted on the same condition.
     `matches` of pairs of images are taken in place of those that would be found. Raises ValueError, one line:
-    fewer than two images, equal ones, too few points, a focal length of no camera.
+    as `match_cameras`, too few points, a focal length of no camera.
     """
     focal = dict(focal or {})
     for name, length in focal.items():
-        if name not in images or length <= 0:
+        if name not in images or not 0 < length < math.inf:
             raise ValueError(f"--focal: '{name}={length:g}' is no camera with an image, or not positive")
-    sizes = {name: (int(p.shape[1]), int(p.shape[2])) for name, p in images.items()}
+    sizes = image_sizes(images)
     K = {name: intrinsics(length, sizes[name]) for name, length in focal.items()}
     pairs = math.comb(len(images), 2) if alpha is None else len(images) - 1
     matched_at = (matching := matching_time(images, pairs)) / (matching + JOINED * pairs)

@@ -70,6 +70,18 @@ def cameras_of(rig: Rig, pairs: Iterable[tuple[str, str]]) -> list[str]:
     return [name for name in rig.names if name in among]
 
 
+def image_sizes(images: Mapping[str, Tensor]) -> dict[str, tuple[int, int]]:
+    """Height and width of each camera's image. Raises ValueError, one line, for fewer than two images, and
+    for what is no float image (C, H, W)."""
+    if len(images) < 2:
+        raise ValueError("matching needs the images of two cameras or more: give --image NAME=FILE for each")
+    for name, image in images.items():
+        if image.ndim != 3 or 0 in image.shape or not image.is_floating_point():
+            got = f"{str(image.dtype).removeprefix('torch.')} of shape {tuple(image.shape)}"
+            raise ValueError(f"the image of '{name}' is {got}: wanted float32 (C, H, W) in 0..1")
+    return {name: (image.shape[1], image.shape[2]) for name, image in images.items()}
+
+
 def match_points(alpha: Float[Tensor, "_ h w"], beta: Float[Tensor, "_ hb wb"]) -> PointMatches:
     """Mutually nearest SIFT features of both images' luminance that pass the ratio test.
 
@@ -105,7 +117,7 @@ def detect_features(image: Float[Tensor, "_ h w"]) -> SiftFeatures:
 
 def contrast_equalised(image: Float[Tensor, "_ h w"]) -> UInt8[NDArray, "h w"]:
     """An image's luminance, its contrast equalised (CLAHE)."""
-    values = image.movedim(0, -1).float().contiguous().numpy()
+    values = image.detach().cpu().movedim(0, -1).float().contiguous().numpy()
     grey = cv2.cvtColor(values, cv2.COLOR_RGB2GRAY) if image.shape[0] == 3 else values[..., 0]
     return cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clip(0, 1) * 255).astype(np.uint8))
 
@@ -138,11 +150,12 @@ def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str
 
     With `alpha`, only between that camera's image and each of the others, alpha first.
     Where there are few, the second image is tried mirrored, to which features are not invariant. Pairs with
-    fewer than 20 are left out. Raises ValueError, one line, if no pair is left, for fewer than two images,
-    and for equal ones.
+    fewer than 20 are left out. Raises ValueError, one line, if no pair is left, as `image_sizes`, for equal
+    images, and without one of `alpha`.
     """
-    if len(images) < 2:
-        raise ValueError("matching needs the images of two cameras or more: give --image NAME=FILE for each")
+    image_sizes(images)
+    if alpha is not None and alpha not in images:
+        raise ValueError(f"no image of alpha, '{alpha}', only of {', '.join(images)}")
     pairs = list(
         combinations(images, 2) if alpha is None else ((alpha, name) for name in images if name != alpha)
     )

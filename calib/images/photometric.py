@@ -107,7 +107,7 @@ def _local_mean(grey: Tensor) -> Tensor:
 def _reduced(image: Tensor) -> Tensor:
     from kornia.color import rgb_to_grayscale  # here, as it takes .3 s to import
 
-    grey = (rgb_to_grayscale(image) if image.shape[0] == 3 else image)[None].float()
+    grey = (rgb_to_grayscale(image) if image.shape[0] == 3 else image.mean(0, keepdim=True))[None].float()
     h, w = grey.shape[-2:]
     factor = LARGEST / max(h, w)
     if factor >= 1:

@@ -56,6 +56,7 @@ from .matches import (
     agreeing_pairs,
     cameras_of,
     depth_seen,
+    image_sizes,
     match_cameras,
     matching_time,
     with_map,
@@ -122,8 +123,10 @@ def refine(
     prior. `force` accepts a result in spite of objections. Raises ValueError, one line: a camera that the rig
     lacks, an image of another size than the rig states, equal images, too few points.
     """
-    for name, image in (item for frame in frames for item in frame.items()):
-        (h, w), (height, width) = rig[name].hw, image.shape[1:]
+    if not frames:
+        raise ValueError("no frame: give images of two cameras or more")
+    for name, (height, width) in (item for frame in frames for item in image_sizes(frame).items()):
+        h, w = rig[name].hw
         if (height, width) != (h, w):
             raise ValueError(
                 f"the image of '{name}' is {width}x{height}, the rig states {w}x{h}: "

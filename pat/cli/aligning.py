@@ -129,7 +129,12 @@ class Align(Known):
                     noise=settings.noise,
                 )
             written = save_aligned(
-                aligned, self.out, separate=self.separate, positions=self.positions, name=frame.name
+                aligned,
+                self.out,
+                separate=self.separate,
+                positions=self.positions,
+                name=frame.name,
+                keep=frame.files.values(),
             )
             if frame.found:
                 frame.recorded.save(self.out / "rig.yaml")

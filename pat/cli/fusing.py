@@ -84,8 +84,8 @@ class Fuse(Known):
     """Seconds of a camera's first frame on a common clock, instead of the rig's."""
     speed: Annotated[float | None, optional("PIXELS")] = None
     """Fastest motion, pixels of alpha a second; by default estimated from alpha's frames."""
-    video: float = 25.0
-    """Frames a second of the video of a sequence; 0 for none."""
+    video: Annotated[float | None, optional("FLOAT")] = None
+    """Frames a second of the video of a sequence; 0 for none. By default 25, and of videos as alpha has."""
     propagate: bool = True
     """Propagate colour along motion between frames of a sequence; else each is fused alone, and flickers."""
     resume: bool = False
@@ -205,7 +205,8 @@ class Fuse(Known):
         for name, rate in rates.items():
             if name in rig.names:
                 rig = with_sensor(rig, name, frame_rate=rate)
-        self.video = rates.get(array.alpha, self.video)
+        if self.video is None:
+            self.video = rates.get(array.alpha)
         path = self.out / FOUND_RIG
         if not path.exists():  # frames that fail may want it; another job's is kept until this one is done
             rig.save(path)
@@ -248,7 +249,7 @@ class Fuse(Known):
             "--scheduler": self.scheduler is not None,
             "--on-error skip": self.on_error == "skip",
         }
-        of_sequences = {"--video": self.video != Fuse.video, "--no-propagate": not self.propagate}
+        of_sequences = {"--video": self.video is not None, "--no-propagate": not self.propagate}
         if one and (named := [option for option, given in of_many.items() if given]):
             options.warn(f"{', '.join(named)}: for many frames, and each camera has one image")
         if not self.sequence and (named := [option for option, given in of_sequences.items() if given]):
@@ -427,17 +428,19 @@ class Fuse(Known):
             precision=self.precision,
             settings=self._settings(),
         )
+        rate = 25.0 if self.video is None else self.video
+        video = rate if self.sequence and rate and self.bits != 32 else None
         several = self.workers > 1 or self.scheduler is not None
         threads = self.threads if self.threads is not None else 1 if several else cores()
         report = batch.run(
             workers=Workers(self.workers, self.scheduler, threads),
             resume=self.resume,
             on_error=self.on_error,
-            video=self.video if self.sequence and self.video and self.bits != 32 else None,
+            video=video,
             console=options.console(),
         )
-        video = ", and fused.mp4" * (self.sequence and (self.out / "fused.mp4").is_file())
-        say(f"{self.out}: {report}{video}")
+        shown = video is not None and (self.out / "fused.mp4").is_file()
+        say(f"{self.out}: {report}{', and fused.mp4' * shown}")
         if report.failed:
             sys.exit(1)
 

@@ -251,13 +251,15 @@ def read_images(rig: Rig, texts: Iterable[str], *, sized: bool = True) -> dict[s
 def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
     """Images of `--image NAME=FILE`: the first of every camera make a frame, the second ones the next.
 
-    Raises ValueError for cameras with unequal numbers of images.
+    Raises ValueError for no images, and for cameras with unequal numbers of them.
     """
     from ..fusion.views import read_view
 
     files: dict[str, list[Path]] = {}
     for name, path in (_named_file("--image", text) for text in texts):
         files.setdefault(rig.require(name), []).append(path)
+    if not files:
+        raise ValueError("--image: give NAME=FILE for each of two cameras or more")
     try:
         frames = by_frame(files)
     except ValueError as error:

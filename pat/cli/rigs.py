@@ -441,6 +441,8 @@ class RigDiff:
 
         if self.out is not None:
             figure_file(options.writable(self.out))
+        if self.matches is not None and not self.image:
+            raise ValueError("--matches needs --image: give the images of the cameras, NAME=FILE for each")
         a, b = load_rig(self.first), load_rig(self.second)
         depth = self.depth or (a.depth or b.depth)
         if depth is None:

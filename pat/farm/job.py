@@ -200,11 +200,14 @@ def render(
 def write_manifest(config: RenderConfig, root: Path) -> None:
     """Write the manifest, or check that the existing one is the same.
 
-    Raises ValueError if the folder holds scenes of another configuration.
+    Raises ValueError if the folder holds scenes of another configuration, or of none that is stated.
     """
     path, identity = root / MANIFEST, json.loads(json.dumps(config.identity()))
     if path.is_file():
-        former = read_yaml(path).get("made from", {})
+        manifest = read_yaml(path)
+        former = manifest.get("made from") if isinstance(manifest, dict) else None
+        if not isinstance(former, dict):
+            raise ValueError(f"{path}: does not say what its scenes are made from: give another --out")
         other = [key for key in identity if former.get(key) != identity[key]]
         if other:
             changed = config.rig.name if other == ["rig"] else "the configuration"

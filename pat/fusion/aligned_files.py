@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 from xml.sax.saxutils import escape
@@ -67,17 +67,31 @@ def save_aligned(
     separate: bool = False,
     positions: PositionFormat = "npy",
     name: str = "",
+    keep: Iterable[Path] = (),
 ) -> list[Path]:
     """Write aligned.tif (all bands, alpha's first, with their names and wavelengths), and of each camera
     NAME_visibility.png (0 beyond its edge, 128 occluded, 255 seen), NAME_confidence.png and
     NAME_positions.npy (or .tif: x, y); depth.tif (metres) if any is known.
 
     One file a camera, NAME.tif, if `separate`, or if their types differ: values keep theirs. With a `name`
-    the files are name_aligned.tif and so on. All are written, or none. Returns what was written.
+    the files are name_aligned.tif and so on. All are written, or none. Of a former alignment bands, depth,
+    positions and the page index.html are gone; files of a camera that nothing replaces stay, as they may be
+    its images. Returns what was written.
+
+    Raises ValueError for a camera with a file of its own that is called "depth", and rather than write over a
+    file of `keep`, such as the images.
     """
     prefix = f"{name}_" if name else ""
     unlike = len({view.values.dtype for view in aligned.values()}) > 1
-    with write_together(out, last=f"{prefix}visibility.txt") as folder:
+    if (separate or unlike) and "depth" in aligned:
+        raise ValueError(
+            "the camera 'depth' would have its values in depth.tif, where the depth goes: rename the camera"
+        )
+    stale = {f"{prefix}aligned.tif", f"{prefix}depth.tif"} | (set() if name else {"index.html"})
+    stale |= {f"{prefix}{camera}_positions.{kind}" for camera in aligned for kind in ("npy", "tif")}
+    kept = {path.resolve() for path in keep}
+    stale = {file for file in stale if (out / file).resolve() not in kept}
+    with write_together(out, last=f"{prefix}visibility.txt", stale=stale) as folder:
         if separate or unlike:
             for camera, view in aligned.items():
                 write_bands(folder / f"{prefix}{camera}.tif", view.values, view.bands, view.wavelengths)
@@ -91,6 +105,8 @@ def save_aligned(
                 _write_view(folder, f"{prefix}{camera}", view, positions)
         (folder / f"{prefix}visibility.txt").write_text(_shares(aligned), encoding="utf-8")
         names = sorted(file.name for file in folder.iterdir())
+        if over := [out / file for file in names if (out / file).resolve() in kept]:
+            raise ValueError(f"{over[0]}: is one of the images: give another --out")
     return [out / file for file in names]
 
 

@@ -42,8 +42,11 @@ def aligned_page(aligned: Aligned, rig: Rig, facts: Facts) -> str:
 
 
 def shown_layers(aligned: Aligned, rig: Rig | None = None) -> dict[str, Float[Tensor, "_ h w"]]:
-    """Each camera's bands, stretched; composites and NDVI (see `ndvi`) if wavelengths allow; known depth."""
-    layers = {}
+    """Each camera's bands, stretched; composites and NDVI (see `ndvi`) if wavelengths allow; known depth.
+
+    One of the latter that is called as a camera is, such as "colour", is "derived colour".
+    """
+    layers, derived = {}, {}
     for name, view in aligned.items():
         bands = [_stretched(band, view.valid) for band in view.values]
         layers[name] = torch.stack(bands if len(bands) in (1, 3) else bands[:1])
@@ -52,12 +55,12 @@ def shown_layers(aligned: Aligned, rig: Rig | None = None) -> dict[str, Float[Te
     for name, waves in COLOURS.items():
         chosen = [_band_near(aligned, wave) for wave in waves]
         if all(chosen) and len({band.name for band in chosen if band}) == len(waves):
-            layers[name] = torch.stack([_stretched(band.values, band.valid) for band in chosen if band])
+            derived[name] = torch.stack([_stretched(band.values, band.valid) for band in chosen if band])
     if (index := ndvi(aligned, rig)) is not None:
-        layers["NDVI"] = _index_colours(index)
+        derived["NDVI"] = _index_colours(index)
     if np.isfinite(aligned.depth).any():
-        layers["depth"] = colour_depth(torch.from_numpy(aligned.depth))
-    return layers
+        derived["depth"] = colour_depth(torch.from_numpy(aligned.depth))
+    return layers | {f"derived {n}" if n in layers else n: layer for n, layer in derived.items()}
 
 
 def ndvi(aligned: Aligned, rig: Rig | None = None) -> NDArray[np.float32] | None:

@@ -71,7 +71,15 @@ class Corrections:
     misalignments: tuple[Misalignment, ...] = ()
 
     def applied(self, inputs: Inputs, hw: HW) -> Inputs:
-        """The inputs put right; `hw` is alpha's size without padding."""
+        """The inputs put right; `hw` is alpha's size without padding.
+
+        Raises ValueError for misalignments of another number of betas.
+        """
+        if self.misalignments and len(self.misalignments) != len(inputs.betas):
+            raise ValueError(
+                f"corrections are of {len(self.misalignments)} betas, this frame has {len(inputs.betas)}: "
+                "take those of a frame of the same cameras"
+            )
         if not self.response.is_rec601:
             of_beta = self.response.of_beta
             even = (replace(b, image=of_beta(b.image)) if _is_rgb(b) else b for b in inputs.betas)

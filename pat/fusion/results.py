@@ -72,6 +72,7 @@ def save_frame(
     former files are as they were.
     Returns what was written.
     """
+    frame = frame.mapped(lambda part: part.detach().cpu())
     prefix = f"{name}_" if name else ""
     last = f"{prefix}fused.{kind}"
     depths = {f"{prefix}depth{part}" for part in (".tif", ".png", "_16.png", "_nearest.tif", "_farthest.tif")}

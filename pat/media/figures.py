@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     """Inverse depth in colours, from its 1st to its 99th percentile; unknown depth is black."""
+    depth = depth.detach().cpu()
     known = depth.isfinite()
     inverse = torch.where(known, 1 / torch.where(known, depth, 1.0), 0.0)
     low, high = np.percentile(inverse[known].numpy(), (1, 99)) if known.any() else (0.0, 1.0)

@@ -270,6 +270,31 @@ def test_what_was_detected_is_shown_before_it_is_calibrated(tmp_path, monkeypatc
     assert "too few images" in page.read_text()
 
 
+def test_what_is_wrong_with_the_folder_is_on_the_page_until_it_is_mended(tmp_path, monkeypatch):
+    """The page said that it waits for images, for ever."""
+    rig = Rig({"a": camera(330.0, (240, 320))})
+    simulate_photos(rig, BOARD, tmp_path / "photos", count=2)
+    image = tmp_path / "photos/a/000.png"
+    page, pages = tmp_path / "page.html", []
+    wrong = image.rename(image.with_name("1.png"))
+    monkeypatch.setattr("calib.boards.run.calibrate", lambda *_, **__: pytest.fail("calibrated"))
+
+    def finished():
+        pages.append(page.read_text())
+        if len(pages) == 2:
+            wrong.rename(image)
+            monkeypatch.setattr("calib.boards.run.calibrate", too_few)
+        return len(pages) == 3
+
+    def too_few(*_, **__):
+        raise ValueError("too few images")
+
+    watch(tmp_path / "photos", BOARD, page, interval=0.0, finished=finished)
+    assert "two images have one number" in pages[1]
+    assert "two images have one number" not in pages[2]
+    assert "too few images" in pages[2]
+
+
 def test_notes_of_several_cameras_are_one():
     notes = ["a: no points: here", "b: no points: here", "held to the start", "b: bent", "a: no points: here"]
     assert by_cameras(notes) == ["a, b: no points: here", "held to the start", "b: bent"]

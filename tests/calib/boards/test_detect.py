@@ -65,6 +65,8 @@ CHANGES = {
     "inverted": lambda g: 255 - g,
     "dim and noisy": dim,
     "12 of 16 bits": lambda g: g.astype(np.uint16) * 16,
+    "one channel": lambda g: g[..., None],
+    "grey and alpha": lambda g: np.stack([g, np.full_like(g, 255)], -1),
     "colour": lambda g: np.stack([g, g // 2, g // 3], -1),
 }
 

@@ -75,3 +75,24 @@ def test_cameras_with_no_common_view_are_named(rig, monkeypatch):
 def test_what_is_behind_a_camera_is_not_seen(rig):
     behind = Pose(torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0, -1.0], dtype=torch.float64))
     assert np.ptp(photograph(rig["b"], behind, BOARD)) == 0
+
+
+def test_a_rig_of_an_optimiser_is_photographed(rig, tmp_path):
+    free = Rig({name: c.replace(K=c.K.clone().requires_grad_()) for name, c in rig.cameras.items()})
+    boards = simulate_photos(free, BOARD, tmp_path, count=1)
+    assert not boards.t.requires_grad
+    assert (tmp_path / "a/000.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"count": 0}, "count is a number of images, 1 or more; got 0"),
+        ({"noise": -1.0}, "noise is a standard deviation in grey values, 0 or more; got -1"),
+        ({"noise": float("nan")}, "noise is a standard deviation in grey values, 0 or more; got nan"),
+    ],
+)
+def test_bad_numbers_are_refused_before_anything_is_written(rig, tmp_path, options, message):
+    with pytest.raises(ValueError, match=message):
+        simulate_photos(rig, BOARD, tmp_path, **options)
+    assert not list(tmp_path.iterdir())

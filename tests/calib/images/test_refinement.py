@@ -10,7 +10,7 @@ from arraygeom import Camera, Distortion, Link, Rig, View
 from arraygeom.text import UNSCALED
 from calib.images.depth_change import DepthChange, relative_change
 from calib.images.hypotheses import swap
-from calib.images.matches import PointMatches, match_cameras
+from calib.images.matches import PointMatches, image_sizes, match_cameras
 from calib.images.parameters import apply_change, free_parameters
 from calib.images.photometric import PhotometricImage, photometric_errors
 from calib.images.refinement import RefinementProblem, jacobian, polish, refine, refine_matches, solve
@@ -328,6 +328,18 @@ def test_photometric_error_refines_a_rig():
     assert median_off(found.rig, seen_points(rig, noise=0.0)) < 0.1
 
 
+@pytest.mark.parametrize("bands", [2, 4])
+def test_photometric_error_refines_a_rig_of_many_bands(bands):
+    rig, images = rectified_pair(), {n: x.mean(0, keepdim=True) for n, x in rectified_images().items()}
+    bad = rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)})
+    one, many = (
+        refine(bad, [frame], free=["rotation"], attend=attend_with_statistics)
+        for frame in (images, {name: image.repeat(bands, 1, 1) for name, image in images.items()})
+    )
+    assert many.photometric is not None
+    assert torch.allclose(many.rig["right"].R, one.rig["right"].R, atol=1e-6)
+
+
 def test_photometric_error_alone_refines_a_rig():
     """No point is used: the gradient through attention's segments moves the rig."""
     rig, images = rectified_pair().replace(depth=(2.5, 6.5)), rectified_images()
@@ -361,6 +373,29 @@ def test_bad_input_is_one_clear_line():
         refine(unknown, [images])
     with pytest.raises(ValueError, match="--sigma"):
         refine(rig, [images], sigma={"center": 3})
+    with pytest.raises(ValueError, match="no frame"):
+        refine(rig, [])
+
+
+@pytest.mark.parametrize(
+    ("changed", "text"),
+    [
+        (lambda image: image[0], r"'left' is float32 of shape \(240, 320\)"),
+        (lambda image: image[None], r"'left' is float32 of shape \(1, .*240, 320\)"),
+        (lambda image: (image * 255).byte(), "'left' is uint8 of shape"),
+    ],
+)
+def test_images_of_another_kind_are_refused_by_name(changed, text):
+    with pytest.raises(ValueError, match=text):
+        image_sizes({name: changed(image) for name, image in rectified_images().items()})
+
+
+def test_images_that_want_gradients_are_matched():
+    images = rectified_images()
+    found = match_cameras({name: image.clone().requires_grad_() for name, image in images.items()})
+    assert torch.equal(found["left", "right"].beta, match_cameras(images)["left", "right"].beta)
+    with pytest.raises(ValueError, match="no image of alpha, 'top', only of left, right"):
+        match_cameras(images, alpha="top")
 
 
 def test_command_line(tmp_path, capsys):

@@ -91,6 +91,30 @@ def test_options(folder, counts):  # noqa: F811
     assert not (out / "index.html").exists()
 
 
+def test_images_are_not_overwritten_by_what_is_made_of_them(folder, tmp_path, capsys):  # noqa: F811
+    """The cameras' own files, as deep as they were recorded, may have the names of the images themselves."""
+    for name in ("mono", "colour"):
+        tifffile.imwrite(tmp_path / f"{name}.tif", cv2.imread(str(folder / f"{name}.png"))[..., ::-1])
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    images = [word for path in before for word in ("--image", f"{path.stem}={path}")]
+    command = [
+        "align",
+        str(folder / "rig.yaml"),
+        "--to",
+        "mono",
+        *images,
+        "-o",
+        str(tmp_path),
+        "--no-correct",
+    ]
+    with pytest.raises(SystemExit):
+        main([*command, "--separate", "--response", "rec601"])
+    assert ".tif: is one of the images: give another --out" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.glob("*.*")} == before
+    main([*command, "--response", "rec601"])
+    assert (tmp_path / "aligned.tif").is_file()
+
+
 def test_to_the_other_camera(folder, counts):  # noqa: F811
     out = align(folder, counts, "--no-correct", alpha="colour")
     bands = tifffile.imread(out / "aligned.tif")

@@ -578,3 +578,23 @@ def test_a_bad_out_is_found_before_the_work(command, out, text, tmp_path, monkey
         main([*command, "--out", out])
     assert ended.value.code == 2
     assert text in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    ("command", "text"),
+    [
+        (["refine", "rig.yaml", "-o", "new.yaml"], "--image"),
+        (["doctor", "rig.yaml"], "--image"),
+        (["start", "-o", "new.yaml"], "--image"),
+        (["diff", "rig.yaml", "rig.yaml", "--matches", "none.csv"], "--matches needs --image"),
+        (["start", "--image", "a=mono.png", "--image", "b=colour.png", "--focal", "a=nan"], "a=nan"),
+    ],
+)
+def test_images_that_are_missing_are_asked_for(small, command, text, monkeypatch, capsys):
+    """Without any, there were an IndexError and a division by zero; matches were ignored."""
+    monkeypatch.chdir(small)
+    out = ["-o", "new.yaml"] if "--focal" in command else []
+    said = fails(["rig", *command, *out], capsys)
+    assert text in said
+    assert "Error" not in said
+    assert not (small / "new.yaml").exists()

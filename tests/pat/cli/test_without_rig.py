@@ -16,6 +16,7 @@ from torch.nn.functional import avg_pool2d
 from arraygeom import Camera, Pose, Rig
 from experiments.evaluation.paper import with_found_rig
 from pat import fuse, load_weights
+from pat.cli.fusing import Fuse
 from pat.cli.main import main
 from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
@@ -23,6 +24,7 @@ from pat.fusion.from_images import array_from_images, camera_names, found_rig
 from pat.fusion.results import Frame, save_frame
 from pat.media.images import read_image, write_image
 from pat.media.video import read_video, write_video
+from pat.support.jobs import JobReport
 
 ALL = [
     *(f"{n}.png" for n in ("confidence", "depth")),
@@ -256,6 +258,24 @@ def test_videos_are_read_as_they_were_written(tmp_path):
     (tmp_path / "no.mp4").write_text("no video")
     with pytest.raises(ValueError, match="not a video that can be read"):
         read_video(tmp_path / "no.mp4")
+
+
+@pytest.mark.parametrize(("options", "rate"), [({}, 12.0), ({"video": 0.0}, None), ({"video": 30.0}, 30.0)])
+def test_the_rate_that_is_asked_for_is_that_of_the_video(
+    halved, tmp_path, monkeypatch, capsys, options, rate
+):
+    """Of videos, --video was replaced by alpha's rate, and a video written where none was wanted."""
+    array = SimpleNamespace(recorded=halved[0], alpha="mono", weights="mono-colour", match_levels=False)
+    array.rig, rates = array.recorded, []
+    monkeypatch.setattr("pat.fusion.from_images.array_from_images", lambda *_, **__: array)
+    monkeypatch.setattr(
+        "pat.fusion.batch.Batch.run", lambda *_, video, **__: rates.append(video) or JobReport()
+    )
+    files = {name: [tmp_path / f"{name}{i}.png" for i in range(2)] for name in ("mono", "colour")}
+    (tmp_path / "fused.mp4").write_bytes(b"of a former sequence")
+    Fuse(out=tmp_path, bits=8, **options)._without_rig_from(files, {"mono": 12.0, "colour": 24.0})
+    assert rates == [rate]
+    assert ("fused.mp4" in capsys.readouterr().err) == (rate is not None)
 
 
 def test_focal_lengths_come_from_exif(tmp_path):

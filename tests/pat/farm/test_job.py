@@ -195,6 +195,14 @@ def test_other_mistakes_are_one_line(config, tmp_path, capfd):
     assert "camera 'mono' is not calibrated: rendering needs its K, R and t" in said
 
 
+@pytest.mark.parametrize("text", ["", "[1]", "made from: 3", "made from: [rig]"])
+def test_a_file_that_is_no_manifest_is_named(config, tmp_path, text):
+    """It ended in an AttributeError."""
+    (tmp_path / "manifest.yaml").write_text(text)
+    with pytest.raises(ValueError, match=r"manifest\.yaml: does not say what its scenes are made from"):
+        write_manifest(RenderConfig.load(config), tmp_path)
+
+
 def test_a_folder_of_another_configuration_is_refused(config, tmp_path):
     out = tmp_path / "data"
     for _ in range(2):

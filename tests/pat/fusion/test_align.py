@@ -12,7 +12,7 @@ from arraygeom.undistortion import recorded_pixels, straight_pixels
 from pat import align
 from pat.fusion.align import OUTSIDE, SEEN, filled, resampled_values
 from pat.fusion.aligned_files import RecordedFiles, save_aligned, write_bands
-from pat.fusion.aligned_page import aligned_page, ndvi
+from pat.fusion.aligned_page import aligned_page, ndvi, shown_layers
 from pat.fusion.report import Facts
 from pat.fusion.steps import without_lenses
 from pat.matching.inputs import Inputs
@@ -204,6 +204,29 @@ def test_types_that_differ_go_to_files_of_their_own(tmp_path):
     assert tifffile.imread(tmp_path / "mono.tif").dtype == np.uint8
     assert tifffile.imread(tmp_path / "nir.tif").dtype == np.float32
     assert not (tmp_path / "aligned.tif").exists()
+
+
+def test_files_of_a_former_alignment_are_gone(tmp_path):
+    rig, images = array()
+    found = align(rig, images, alpha="mono", correct=False)
+    save_aligned(found, tmp_path)
+    (tmp_path / "index.html").write_text("its page")
+    unknown = replace(found, depth=np.full_like(found.depth, np.nan))
+    written = save_aligned(unknown, tmp_path, separate=True, positions="none")
+    assert {path.name for path in written} == {path.name for path in tmp_path.iterdir()}
+
+
+def test_a_camera_called_depth_has_no_file_of_its_own(tmp_path):
+    rig, images = array()
+    rig = Rig({"mono": rig["mono"], "depth": rig["nir"]}, depth=rig.depth)
+    images = {"mono": images["mono"], "depth": images["nir"]}
+    found = align(rig, images, alpha="mono", correct=False)
+    assert (tifffile.imread(save_aligned(found, tmp_path)[0]) == found.stack())[0].all()
+    layers, usual = shown_layers(found), shown_layers(align(*array(), alpha="mono", correct=False))
+    assert torch.equal(layers["depth"], usual["nir"])
+    assert torch.equal(layers["derived depth"], usual["depth"])
+    with pytest.raises(ValueError, match=r"'depth' .*depth\.tif"):
+        save_aligned(found, tmp_path, separate=True)
 
 
 def test_ndvi_needs_both_bands_and_both_views():

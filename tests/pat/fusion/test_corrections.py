@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from pat.evaluation.metrics import score
+from pat.fusion.corrections import Corrections
 from pat.fusion.fuse import corrections_of, fuse
 from pat.fusion.sequence import SequenceFusion
 from pat.matching.epipolar_offset import Misalignment, fit_misalignment
+from pat.matching.radiometry import Response
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
 from tests.pat.layered_array import ALPHA, BETA, load_sample, middle_of_sample
@@ -121,6 +123,13 @@ def test_found_corrections_serve_other_frames(sample, network, images):
     found = corrections_of(network, rig, images, alpha=ALPHA)
     one = fuse(network, rig, images, alpha=ALPHA)
     assert torch.equal(fuse(network, rig, images, alpha=ALPHA, corrections=found).image, one.image)
+
+
+def test_corrections_of_other_betas_are_refused(sample, network, images):
+    found = Corrections(Response.rec601(), (Misalignment(),) * 2)
+    message = "corrections are of 2 betas, this frame has 1: take those of a frame of the same cameras"
+    with pytest.raises(ValueError, match=message):
+        fuse(network, sample.rig, images, alpha=ALPHA, corrections=found)
 
 
 def test_a_sequence_finds_corrections_once(middle, network, monkeypatch):

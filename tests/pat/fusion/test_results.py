@@ -85,3 +85,15 @@ def test_unknown_depth_is_nan_in_the_file_as_in_memory(tmp_path):
     torch.testing.assert_close(
         torch.from_numpy(tifffile.imread(tmp_path / "depth.tif")), depth, equal_nan=True
     )
+
+
+def test_a_frame_that_wants_gradients_is_shown_and_saved(tmp_path):
+    """That of `fuse(..., differentiable=True)`: a notebook that showed it failed."""
+    hw = (4, 5)
+    parts = torch.rand(3, *hw), torch.full(hw, 2.0), torch.rand(hw), torch.full(hw, 0.1)
+    frame, wanting = Frame(*parts), Frame(*(part.clone().requires_grad_() for part in parts))
+    assert wanting._repr_png_() == frame._repr_png_()
+    for name, one in (("plain", frame), ("wanting", wanting)):
+        save_frame(one, tmp_path / name)
+    for path in (tmp_path / "plain").iterdir():
+        assert (tmp_path / "wanting" / path.name).read_bytes() == path.read_bytes(), path.name
