@@ -30,8 +30,8 @@ FEWEST_LEFT = 3
 """Frames that every camera must keep."""
 FAR_FROM_START = 4.0
 """Standard deviations from the start beyond which a camera is named."""
-COMPARED: tuple[Lens, ...] = ("none", "kannala-brandt", "brown-conrady", "rational", "thin-prism", "tilted")
-"""Models that are compared, by number of coefficients."""
+COMPARED: tuple[Lens, ...] = ("none", "brown-conrady", "kannala-brandt", "rational", "thin-prism", "tilted")
+"""Models that are compared, the most usual first; then by number of coefficients."""
 LENS_FOLDS = 4
 FEWEST_TO_COMPARE = 8
 EQUAL = 0.01
@@ -130,7 +130,7 @@ class LensComparison:
 
     @property
     def advised(self) -> Lens:
-        """The model with fewest coefficients that predicts like the best, to a standard error or 1 %."""
+        """The first model that predicts like the best, to a standard error or 1 %."""
         if not self.errors:
             return "brown-conrady"
         best = min(self.errors, key=self.rms)
