@@ -88,8 +88,8 @@ class FuseSettings:
         names = [entry.name for entry in fields(self)]
         if unknown := [name for name in changes if name not in names]:
             raise TypeError(
-                f"there is no argument or setting '{unknown[0]}': settings are {', '.join(names)}; on a GPU is "
-                "fused what is there, by `.to` of network, rig and images"
+                f"there is no argument or setting '{unknown[0]}': settings are {', '.join(names)}; "
+                "on a GPU is fused what is there, by `.to` of network, rig and images"
             )
         return replace(self, **changes)
 
