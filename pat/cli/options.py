@@ -143,7 +143,7 @@ def _images_first(words: Sequence[str]) -> list[str]:
         if Path(words[i]).suffix.lower() in IMAGE_SUFFIXES | VIDEO_SUFFIXES
         and not words[i].startswith("-")
         and "=" not in words[i]
-        and words[i - 1] not in ("-o", "--out", "--weights", "--image", "--depth-map", "--matches")
+        and words[i - 1] not in ("-o", "--out", "--alpha", "--weights", "--image", "--depth-map", "--matches")
     }
     others = [word for i, word in enumerate(words) if i >= leading and i not in files]
     return [*words[:leading], *(words[i] for i in sorted(files)), *others]

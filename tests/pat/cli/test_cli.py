@@ -444,6 +444,8 @@ def test_images_stand_anywhere_among_the_options_of_fuse():
     given += ["-o", "out.png"]
     others = ["--alpha", "mono", "--depth", "1", "9", "--image", "c=c.png", "-o", "out.png"]
     assert respelled(given, Fuse) == ["rig.yaml", "a.png", "b.tif", *others]
+    of_colmap = ["sparse", "--alpha", "DSC_0001.JPG", "--image", "DSC_0001.JPG=a.jpg"]
+    assert respelled(of_colmap, Fuse) == of_colmap  # whose cameras are called as their images are
     assert respelled(given[3:], Fuse) == ["a.png", "b.tif", *others[2:]]
 
 
