@@ -82,11 +82,11 @@ class View(Batched):
 
     def undistort(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Undistorted pixels, and which of them are within the lens model's range."""
-        return floating(x), torch.ones_like(x[..., 0], dtype=torch.bool)
+        return floating(x), torch.ones_like(floating(x)[..., 0], dtype=torch.bool)
 
     def distort(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Undistorted pixels to those of the image: the inverse of `undistort`."""
-        return floating(x), torch.ones_like(x[..., 0], dtype=torch.bool)
+        return floating(x), torch.ones_like(floating(x)[..., 0], dtype=torch.bool)
 
     @property
     def has_pinhole_view(self) -> bool:
@@ -95,7 +95,7 @@ class View(Batched):
 
     def contains(self, x: Real[Tensor, "*n 2"]) -> Bool[Tensor, "*n"]:
         """Whether points lie on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5]."""
-        return within(x, self.hw)
+        return within(floating(x), self.hw)
 
     def _text(self) -> str:
         return " ".join(filter(None, view_facts(self)))

@@ -66,7 +66,12 @@ def rot90_matrix(hw: HW, quarter_turns: int) -> Float[Tensor, "3 3"]:
 
 
 def floating(x: Real[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Pixels in float32 or float64: integers and half precision, which hold no position, become float32."""
+    """Pixels in float32 or float64: integers and half precision, which hold no position, become float32.
+
+    Raises TypeError for what is no tensor.
+    """
+    if not isinstance(x, Tensor):
+        raise TypeError(f"the points are a {type(x).__name__}: give a tensor, as by `torch.as_tensor`")
     return x.to(torch.promote_types(x.dtype, torch.float32))
 
 

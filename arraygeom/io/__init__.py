@@ -34,6 +34,8 @@ FORMATS = (
 READERS: dict[str, Any] = {
     name: kitti.Raw if name == "kitti-raw" else import_module(f"{__name__}.{name}") for name in FORMATS
 }
+ANY_SCALE = ("colmap", "nerfstudio", "pycalib", "strecha")
+"""Formats that state no unit: their lengths are metres only if whoever wrote the file scaled them so."""
 READERS["caliscope"] = READERS["aniposelib"]
 WRITERS = {name: READERS[name] for name in ("native", "opencv", "colmap", "kalibr", "nerfstudio")}
 

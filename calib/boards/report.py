@@ -138,8 +138,9 @@ def by_cameras(notes: Iterable[str]) -> list[str]:
 def summary(calibration: Calibration) -> str:
     """The calibration in a sentence or two."""
     points = sum(len(seen.x) for seen in calibration.fit.problem.seen.values())
+    cameras, frames = len(calibration.views), len(calibration.frames)
     text = (
-        f"{len(calibration.views)} cameras, {len(calibration.frames)} frames of {calibration.board}, "
+        f"{cameras} camera{'s' * (cameras > 1)}, {frames} frame{'s' * (frames > 1)} of {calibration.board}, "
         f"{points} points: reprojection error {calibration.rms:.3f} px (RMS)."
     )
     for where, errors in (("", calibration.epipolar), (" on held-out frames", calibration.held_out)):

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from functools import cache
 from itertools import takewhile
 from pathlib import Path
+from tempfile import TemporaryFile
 from threading import Lock
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -142,7 +143,7 @@ def _images_first(words: Sequence[str]) -> list[str]:
         if Path(words[i]).suffix.lower() in IMAGE_SUFFIXES | VIDEO_SUFFIXES
         and not words[i].startswith("-")
         and "=" not in words[i]
-        and words[i - 1] not in ("-o", "--out", "--weights", "--image", "--depth-map", "--matches")
+        and words[i - 1] not in ("-o", "--out", "--alpha", "--weights", "--image", "--depth-map", "--matches")
     }
     others = [word for i, word in enumerate(words) if i >= leading and i not in files]
     return [*words[:leading], *(words[i] for i in sorted(files)), *others]
@@ -160,10 +161,16 @@ def writable(out: Path, *, folder: bool = False, option: str = "--out") -> Path:
     above = out if out.exists() else next(p for p in out.absolute().parents if p.exists())
     if above != out and not above.is_dir():
         raise ValueError(f"{option}: {above} is a file, so {out} cannot be made: give another path")
-    for place in {above, above if above.is_dir() else above.absolute().parent}:
-        if not os.access(place, os.W_OK):
-            raise ValueError(f"{option}: {place} cannot be written to: give another path, or permission")
-    return out
+    if not os.access(above, os.W_OK):
+        raise ValueError(f"{option}: {above} cannot be written to: give another path, or permission")
+    place = above if above.is_dir() else above.absolute().parent
+    try:
+        with TemporaryFile(dir=place):  # of a drive that is read-only, or as root, permissions say little
+            return out
+    except OSError as error:
+        raise ValueError(
+            f"{option}: {place} cannot be written to ({error.strerror}): give another path, or permission"
+        ) from None
 
 
 def device_of(name: str) -> str:

@@ -180,6 +180,7 @@ class Info:
         from rich.console import Console
         from rich.table import Table
 
+        from arraygeom.io import ANY_SCALE, recognise
         from arraygeom.rig_check import unit_oddity
         from arraygeom.summary import summarise_cameras, summarise_pairs
         from arraygeom.text import length_unit
@@ -191,6 +192,10 @@ class Info:
         for oddity in rig.check():
             if warned is None or not oddity.endswith(warned):
                 say(f"pat: {oddity}", style="yellow")
+        unit = length_unit(rig)
+        if (kind := recognise(self.rig)) in ANY_SCALE:
+            unit = "units"
+            say(f"lengths are in units of the file: {kind} files state none, and seldom are in metres")
         alpha = None if self.alpha is None else rig.require(self.alpha)
         if alpha is None and len(rig.names) > MOST_CAMERAS:
             alpha, count = rig.names[0], len(rig.names)
@@ -199,7 +204,6 @@ class Info:
         if self.json:
             document = {"cameras": [c._asdict() for c in cameras], "pairs": [p._asdict() for p in pairs]}
             return options.print_json(document)
-        unit = length_unit(rig)
         fine, baseline = ("mm", "baseline m") if unit == "m" else (f"{unit}/1000", "baseline")
         footprint = f"{fine} a pixel, near - far"
         of_cameras = Table("camera", "pixels", "focal px", "view deg", footprint, box=None)

@@ -335,9 +335,10 @@ def markdown(rows: Sequence[AblationRow]) -> str:
     names = distinct(row.family for row in rows)
     lines = [[name, *_cells([row for row in rows if row.family == name], rows)] for name in names]
     scenes = len({row.scene for row in rows})
+    interval = ", behind it a 95% interval" if scenes > 1 else ""
     note = (
-        f"{scenes} scenes; the focal ratio is alpha's focal length over beta's. PSNR in dB, behind it a 95% "
-        "interval.\nRectified, warped: both images are rectified by the calibration, and the result is "
+        f"{_scenes(scenes)}; the focal ratio is alpha's focal length over beta's. PSNR in dB{interval}.\n"
+        "Rectified, warped: both images are rectified by the calibration, and the result is "
         "warped back. The\nrectified assumption takes lines of the images as they are for rows, and both "
         "images for the same field of\nview; 'rows around H x' is given position and scale, and takes only "
         "the lines for rows. Off: mean error in\nbeta of points at the depth found.\n\n"
@@ -357,11 +358,15 @@ def _cells(rows: Sequence[AblationRow], every: Sequence[AblationRow]) -> list[st
     interval = " ({:.2f} to {:.2f})".format(*bootstrap_interval(psnr)) if len(psnr) > 1 else ""
     groups = [[r.psnr for r in served if a <= r.ratio < b] for a, b in pairwise((0, *RATIOS, math.inf))]
     means = [f"{np.mean(g):.2f}" if g else "" for g in groups]
-    note = "" if len(served) == len(rows) else f"{len(rows) - len(served)} scenes omitted"
+    note = "" if len(served) == len(rows) else f"{_scenes(len(rows) - len(served))} omitted"
     depth = ["", ""] if math.isnan(error) else [f"{error:.2f}", f"{within:.1%}"]
     gained = "" if math.isnan(gain) else f"{gain:+.2f}"
     image = [f"{np.mean(psnr):.2f}{interval}", f"{np.mean(ssim):.4f}", gained]
     return [*image, *means, *depth, note]
+
+
+def _scenes(count: int) -> str:
+    return f"{count} scene{'s' * (count != 1)}"
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +83,16 @@ class FuseSettings:
         check_noise(self.noise)
         given_response(self.response)
 
+    def changed(self, changes: Mapping[str, Any]) -> FuseSettings:
+        """The settings with some of them changed. Raises TypeError for a name that is none of theirs."""
+        names = [entry.name for entry in fields(self)]
+        if unknown := [name for name in changes if name not in names]:
+            raise TypeError(
+                f"there is no argument or setting '{unknown[0]}': settings are {', '.join(names)}; "
+                "on a GPU is fused what is there, by `.to` of network, rig and images"
+            )
+        return replace(self, **changes)
+
 
 @torch_in_one_thread()
 @without_autocast()
@@ -143,7 +153,7 @@ def fuse(
         LowConfidenceWarning: the images hardly match: the rig is probably wrong. A filter makes it an error,
             as `warnings.simplefilter("error", LowConfidenceWarning)`.
     """
-    settings = replace(settings, **changes)
+    settings = settings.changed(changes)
     noise, luminance, response = settings.noise, settings.luminance, settings.response
     noise = "auto" if noise is None and rig is None and luminance == "alpha" else noise
     network, rig, images, alpha, grey_world = _with_rig(network, rig, images, alpha, explain)
@@ -239,7 +249,7 @@ def corrections_of(
 
     Arguments and errors are as of `fuse`.
     """
-    settings = replace(settings, **changes)
+    settings = settings.changed(changes)
     views, _ = _seen(network, rig, images, alpha, settings, settings.noise)
     inputs, _ = prepared(network, views, steps_for(network, normalise=settings.match_levels))
     return corrections_for(network, inputs, settings.response, align=settings.align is not False)

@@ -332,7 +332,7 @@ def fuse_sequence(
 
     Raises ValueError for frame rates that are not known and for recordings that do not overlap in time.
     """
-    job = SequenceFusion(network, rig, frames, alpha, speed, FuseSettings(**settings))
+    job = SequenceFusion(network, rig, frames, alpha, speed, FuseSettings().changed(settings))
     keys = job.timeline.key_frames()
     job.timeline.warn_of_ends()
 

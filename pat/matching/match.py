@@ -73,13 +73,16 @@ def located(inputs: Inputs) -> Matches:
 @torch.no_grad()
 def in_each_beta(inputs: Inputs) -> Matches:
     """The matches in each beta as if it were the only one."""
-    return Matches(tuple(map(located_in_one, inputs.by_beta)))
+    found = []
+    for number, one in enumerate(inputs.by_beta, 1):
+        LOG.info("matching beta %d of %d", number, len(inputs.betas))
+        found.append(located_in_one(one))
+    return Matches(tuple(found))
 
 
 def located_in_one(inputs: Inputs) -> BetaMatches:
     """Semi-global matches in the one beta: at half the size for the whole frame, then at full size around
     those."""
-    LOG.info("matching a beta")
     comparison = Comparison.of(inputs.alpha, inputs.betas[0].image, seen_mix(inputs))
     halves = comparison.half_views(inputs.alpha, inputs.betas[0].image)
     half = matched_at_half_size(halves, inputs.betas[0].field.of_blocks(FINE))

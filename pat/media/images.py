@@ -21,7 +21,7 @@ from torch import Tensor
 
 from arraygeom.atomic import write_atomically
 from arraygeom.chunks import ROWS, spans
-from arraygeom.image_bytes import TIFF, decodable, first_tiff_page, has_further_images
+from arraygeom.image_bytes import PNG, TIFF, decodable, first_tiff_page, has_further_images
 from arraygeom.warned import warn
 
 from .headers import HW, ImageHeader, image_header
@@ -35,6 +35,8 @@ KINDS = "save it with 8 or 16 bits without sign, or as float 0..1"
 DECODED = ("bool", "uint8", "uint16", "float32", "float64")
 """Types of a TIFF file's values which OpenCV reads, and which are usable."""
 
+GREY_WITH_ALPHA = 4
+"""The type of colour in a PNG file's header, its byte 25."""
 MOST_PIXELS = 2**28
 """Images with more are read only where their size is expected: some 3 GiB in colour."""
 
@@ -113,7 +115,7 @@ def _planes(
     applied = _applied(header, orientation, label)
     _check_header(header.upright if applied > 1 else header.hw, hw, label)
     values, packed = _decode(content, header, label)
-    values = _opaque(_upright(values, applied), label)
+    values = _opaque(_upright(values, applied), content, label)
     if orientation == "apply":
         values = in_srgb(values, content, label)
     return (values[None] if values.ndim == 2 else values[..., ::-1].transpose(2, 0, 1)), packed
@@ -282,7 +284,8 @@ def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | N
     return decoded(content, flags)
 
 
-def _opaque(values: NDArray, label: str) -> NDArray:
+def _opaque(values: NDArray, content: bytes, label: str) -> NDArray:
+    """Values without an alpha channel, which OpenCV gives to three equal bands where a PNG file is grey."""
     if values.ndim == 2 or values.shape[2] == 3:
         return values
     if values.shape[2] != 4:
@@ -290,7 +293,8 @@ def _opaque(values: NDArray, label: str) -> NDArray:
     full = np.iinfo(values.dtype).max if np.issubdtype(values.dtype, np.integer) else 1.0
     if (values[..., 3] != full).any():
         raise ValueError(f"{label}: has transparent pixels: flatten it and save it without alpha channel")
-    return values[..., :3]
+    grey = content.startswith(PNG) and content[25] == GREY_WITH_ALPHA
+    return values[..., 0] if grey else values[..., :3]
 
 
 def _unit_range(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArray[np.float32]:

@@ -58,6 +58,8 @@ class NoiseLevel:
                 "state how many a pixel counts at white, not a standard deviation, "
                 "or have the noise estimated"
             )
+        if read < 0:
+            raise ValueError(f"noise: read must be 0 or more, got {read:g}: state it in electrons")
         return cls(1 / electrons, read / electrons, added_to)
 
     @classmethod

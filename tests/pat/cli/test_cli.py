@@ -12,7 +12,8 @@ import pytest
 import torch
 import yaml
 
-from arraygeom import Pose, Rig
+from arraygeom import Pose, Rig, Sensor
+from arraygeom.io import write_rig
 from arraygeom.text import UNSCALED
 from pat.cli.fusing import Fuse
 from pat.cli.main import Pat, command_paths, main
@@ -251,6 +252,20 @@ def test_rig_info_says_no_metres_of_a_rig_of_unknown_scale(small, tmp_path, caps
     assert not re.search(r"\bm?m\b", text)
 
 
+@pytest.mark.parametrize("kind", ["colmap", "nerfstudio"])
+def test_rig_info_says_no_metres_of_a_file_that_states_no_unit(small, tmp_path, capsys, kind):
+    """Of COLMAP's arbitrary lengths it said metres and millimetres."""
+    path = tmp_path / ("transforms.json" if kind == "nerfstudio" else "sparse")
+    cameras = Rig.load(small / "rig.yaml").cameras.items()
+    write_rig(Rig({name: camera.replace(sensor=Sensor()) for name, camera in cameras}), path, format=kind)
+    main(["rig", "info", str(path), "--depth", "2", "8"])
+    printed = capsys.readouterr()
+    text = " ".join(printed.out.split())
+    assert text.count("units") == 2
+    assert not re.search(r"\bm?m\b", text)
+    assert f"{kind} files state none" in printed.err
+
+
 @pytest.mark.parametrize("read", [read_images, lambda *given: read_frames(*given)[0]])
 def test_images_are_read_as_the_rig_describes_them_outside_of_fuse_too(small, recwarn, read):
     """Counts of 12 bits were nearly black to `pat show` and `pat rig`, which advised what the rig stated."""
@@ -429,6 +444,8 @@ def test_images_stand_anywhere_among_the_options_of_fuse():
     given += ["-o", "out.png"]
     others = ["--alpha", "mono", "--depth", "1", "9", "--image", "c=c.png", "-o", "out.png"]
     assert respelled(given, Fuse) == ["rig.yaml", "a.png", "b.tif", *others]
+    of_colmap = ["sparse", "--alpha", "DSC_0001.JPG", "--image", "DSC_0001.JPG=a.jpg"]
+    assert respelled(of_colmap, Fuse) == of_colmap  # whose cameras are called as their images are
     assert respelled(given[3:], Fuse) == ["a.png", "b.tif", *others[2:]]
 
 
@@ -558,6 +575,7 @@ def test_a_bad_out_is_found_before_the_fusion(small, capsys, monkeypatch):
         (["rig", "refine", "rig.yaml", "--image", "mono=a.png"], "folder", "is a folder: name a file"),
         (["rig", "start", "--image", "mono=a.png"], "folder", "is a folder: name a file"),
         (["calibrate", "photos", "--board", "charuco:8x6:30mm"], "file/rig.yaml", "file is a file, so"),
+        (["calibrate", "photos", "--board", "charuco:8x6:30mm"], "/proc/rig.yaml", "/proc cannot be written"),
         (["evaluate", "--kitti", "kitti"], "file", "is a file: name a folder"),
         (["rig", "doctor", "rig.yaml", "--image", "mono=a.png"], "folder", "is a folder: name a file"),
         (["rig", "show", "rig.yaml"], "file", "is a file: name a folder"),

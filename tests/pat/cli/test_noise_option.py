@@ -24,7 +24,7 @@ def test_levels_by_camera_or_estimated():
         (["mono=200,2,1"], "has 3 numbers"),
         (["mono=-200"], "electrons at white must be 1 or more"),
         (["mono=0.02"], "not a standard deviation"),
-        (["mono=200,-2"], "read must be 0 or more"),
+        (["mono=200,-2"], "read must be 0 or more, got -2: "),
         (["mono=200", "mono=50"], "given twice"),
     ],
 )

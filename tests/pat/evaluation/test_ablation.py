@@ -112,11 +112,16 @@ def test_rows_are_grouped_by_focal_ratio():
     header = "| ratio below 1 | ratio 1 to 1.5 | ratio 1.5 to 2 | ratio from 2 |"
     assert any(header in line for line in lines)
     assert "| calibrated | 32.00 (30.00 to 34.00) | 0.9000 | +0.00 |  | 30.00 |  | 34.00 |  |  |  |" in lines
-    assert "| other | 29.00 | 0.8000 | -1.00 |  | 29.00 |  |  |  |  | 1 scenes omitted |" in lines
+    assert "| other | 29.00 | 0.8000 | -1.00 |  | 29.00 |  |  |  |  | 1 scene omitted |" in lines
     narrow = AblationRow("c", 0.5, "calibrated", 31.0, 0.9)
     assert (
         "| calibrated | 31.00 | 0.9000 | +0.00 | 31.00 |  |  |  |  |  |  |" in markdown([narrow]).splitlines()
     )
+    assert markdown([narrow]).startswith(
+        "1 scene; the focal ratio is alpha's focal length over beta's. PSNR in dB."
+    )
+    assert lines[0].startswith("2 scenes; ")
+    assert lines[0].endswith("PSNR in dB, behind it a 95% interval.")
     empty = markdown([AblationRow("d", 1.2, "other", note="cannot")]).splitlines()[-1]
     assert empty.count("|") == lines[-1].count("|")
 

@@ -32,7 +32,7 @@ from arraygeom.fields import AroundDepth
 from calib.images.matches import match_points, seen_depths
 from pat.data.pairs import folder_pairs
 from pat.evaluation.metrics import score
-from pat.fusion.fuse import fuse
+from pat.fusion.fuse import corrections_of, fuse
 from pat.fusion.inputs import FrameInputs, prepared
 from pat.fusion.steps import quarter_turns, resolution_ratio, steps_for, without_lenses
 from pat.fusion.tiles import MAX_HALO, SLACK, tiles_within, working_memory
@@ -603,3 +603,13 @@ def test_several_betas_of_float64_are_fused():
     both = Rig({**rig.cameras, "other": beside}, depth=rig.depth)
     images = {name: image.double() for name, image in {**images, "other": images["colour"]}.items()}
     assert fuse(network_of("GuidedPAT").double(), both, images, alpha="mono").image.dtype == torch.float64
+
+
+@pytest.mark.parametrize("of", [fuse, corrections_of])
+def test_an_argument_that_is_none_is_named_with_what_there_is(of):
+    """It was an argument of FuseSettings.__init__, which nobody had called."""
+    images = {name: torch.rand(1, 24, 32) for name in ("mono", "colour")}
+    with pytest.raises(
+        TypeError, match=r"^there is no argument or setting 'device': .*, luminance; on a GPU "
+    ):
+        of(PAT(PATConfig(dim=4)), rig_of((24, 32), (24, 32)), images, alpha="mono", device="cuda")

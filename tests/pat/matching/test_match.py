@@ -1,5 +1,6 @@
 """The door of the room: matches of several sources, and what is refused."""
 
+import logging
 from dataclasses import replace
 
 import pytest
@@ -71,6 +72,14 @@ def test_matches_are_located_first_and_coloured_then(inputs):
         bare.colours  # noqa: B018
     again = transferred(inputs, Matches((bare,)))
     assert torch.equal(again.betas[0].bands, whole.betas[0].bands)
+
+
+def test_which_beta_is_matched_is_said(inputs, caplog):
+    """Of the nine-band array it was the same line eight times, for minutes."""
+    with caplog.at_level(logging.INFO, "pat.matching.match"):
+        located(replace(inputs, betas=inputs.betas[:1] * 2))
+    said = [record.getMessage() for record in caplog.records if record.name == "pat.matching.match"]
+    assert said == ["matching beta 1 of 2", "matching beta 2 of 2"]
 
 
 def test_matches_from_a_file_take_the_place_of_those_found(network, flat, tmp_path):

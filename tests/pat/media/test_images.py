@@ -18,7 +18,7 @@ from PIL import Image, ImageOps
 from arraygeom.atomic import sweep, write_atomically
 from pat.media.colour import from_luma_chroma, luminance, to_luma_chroma
 from pat.media.headers import image_header
-from pat.media.images import read_image, write_image
+from pat.media.images import read_image, read_recorded, write_image
 
 RED = torch.tensor([1.0, 0.0, 0.0])[:, None, None]
 
@@ -94,6 +94,18 @@ def test_an_opaque_alpha_channel_is_dropped_and_any_other_refused(tmp_path, kind
     cv2.imwrite(str(tmp_path / "glass.png"), values)
     with pytest.raises(ValueError, match=r"glass.png: .*alpha"):
         read_image(tmp_path / "glass.png")
+
+
+@pytest.mark.parametrize("mode", ["LA", "L"])
+def test_a_grey_png_file_with_alpha_or_a_transparent_level_is_grey(tmp_path, mode):
+    """One of grey and alpha was three equal bands: a camera in colour, which is not taken for alpha."""
+    grey = np.arange(20, dtype=np.uint8).reshape(4, 5)
+    image = Image.fromarray(grey)
+    image.convert(mode).save(tmp_path / "a.png", **({"transparency": 255} if mode == "L" else {}))
+    read = read_image(tmp_path / "a.png")
+    assert read.shape == (1, 4, 5)
+    assert torch.equal(read[0] * 255, torch.from_numpy(grey).float())
+    assert read_recorded(tmp_path / "a.png").shape == (1, 4, 5)
 
 
 def test_a_missing_image_is_named_with_its_camera(tmp_path):
