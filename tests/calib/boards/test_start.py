@@ -159,7 +159,7 @@ def test_one_photograph_of_each_camera(photos, capsys):
     command = calibrating(photos)
     main([*command, "--start", str(photos / "start.yaml"), "--deviation", "position=0.001"])
     said = capsys.readouterr().out
-    assert "2 cameras, 1 frames" in said
+    assert "2 cameras, 1 frame of" in said
     assert "positions ±1 >" in said
     rig = Rig.load(photos / "rig.yaml")
     assert [float(bound) for bound in rig.depth] == [1.5, 20.0]  # the start's, which was lost
