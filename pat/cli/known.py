@@ -25,7 +25,7 @@ MatchesFile = Annotated[Path | None, arg(metavar="FILE", help=MATCHES_HELP, help
 NOISE = "NAME=ELECTRONS[,READ]|estimate|none"
 OUT_OF_RANGE = 0.9
 """Share of a depth map outside the rig's depth range from which its unit must be wrong."""
-OFF = 5.0
+OFF_LINES = 5.0
 """Pixels between matched points and the rig's lines in the median from which one of them must be wrong."""
 
 
@@ -177,7 +177,7 @@ class Known:
                 view, other = rig.pair(a[0], a[1]).cameras
                 nearest = other.project(view.unproject(b[0], found_depth.depth)).x
                 off = float((nearest - b[1]).norm(dim=-1)[found_depth.valid].median())
-                if off > OFF:
+                if off > OFF_LINES:
                     warn(
                         f"{self.matches}: matches of '{a[0]}' and '{a[1]}' lie {off:.0f} px (median) off the "
                         "lines that the rig allows: are they of these images, x before y? Else mend the rig: "
