@@ -104,7 +104,9 @@ def chosen(inputs: Inputs, matches: Matches, network: Choice | None = None) -> M
 
 def _chosen(inputs: Inputs, found: BetaMatches, network: Choice) -> BetaMatches:
     typical = typical_facts(found)
-    network = deepcopy(network).to(found.facts)  # another thread may need it in another precision
+    weight = network.unet.last.weight
+    if (weight.dtype, weight.device) != (found.facts.dtype, found.facts.device):
+        network = deepcopy(network).to(found.facts)  # another thread may need it as it is
 
     def of(piece: Inputs, part: BetaMatches) -> tuple[Tensor, Tensor]:
         (beta,), (h, w) = piece.betas, part.disparity.shape[-2:]

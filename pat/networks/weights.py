@@ -13,6 +13,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
+from ..support import eight_bits
 from ..support.blocks import in_bfloat16
 from ..support.schema import from_document
 from ..support.tensor_files import undamaged, write_tensors
@@ -145,8 +146,10 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
 
 
 def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
-    """The first tensor missing, too many, or of another shape than the network's; empty if all fit."""
+    """The first tensor missing, too many, or of another shape than the network's; empty if all fit. Ranges of
+    convolutions in 8 bits may be missing."""
     own, given = ({k: tuple(v.shape) for k, v in s.items()} for s in (network.state_dict(), state))
+    own |= {name: (2,) for name in eight_bits.names(network) if name in given}
     for name in [*own, *given]:
         if own.get(name) != given.get(name):
             return f"{name} is {given.get(name, 'missing')}, wanted {own.get(name, 'none')}"
