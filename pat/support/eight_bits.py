@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -23,8 +24,20 @@ from arraygeom.fields.protocol import compilable
 from arraygeom.threads import STRIPS, WORTH_STRIPS, in_parallel, threads
 
 from . import eight_bits_numba as kernels
+from .settings import size, tuned
 
 RANGE = "input_range"
+
+
+@dataclass(frozen=True)
+class EightBitSettings:
+    """Of ranges that are measured."""
+
+    beyond: float = tuned(1e-4, "Middlebury, tune half: the share of values beyond a range, at each end")
+    samples: int = size(10**6, "Values of an image by which its range is measured")
+
+
+SETTINGS = EightBitSettings()
 
 
 class Conv2d(nn.Conv2d):
@@ -46,8 +59,10 @@ class Conv2d(nn.Conv2d):
         if self.weight.requires_grad:
             self.input_range = None
         elif self.measuring:
-            given = [*x.detach().aminmax(), *([] if self.input_range is None else self.input_range)]
-            self.input_range = torch.stack(torch.stack(given).aminmax())
+            given = x.detach().flatten()[:: max(1, x.numel() // SETTINGS.samples)]
+            ends = given.quantile(given.new_tensor([SETTINGS.beyond, 1 - SETTINGS.beyond]))
+            known = ends if self.input_range is None else torch.cat([ends, self.input_range])
+            self.input_range = torch.stack(known.aminmax())
         elif self.input_range is not None and plain(x) and self.weight.dtype == x.dtype and available():
             return in_eight_bits(x, self, packed(self))
         return super().forward(x)
@@ -134,7 +149,9 @@ def in_eight_bits(x: Float[Tensor, "b i h w"], of: Conv2d, by: Packed) -> Float[
     height, width = (x.shape[2] + 2 * above - tall) // down + 1, (columns - wide) // across + 1
     large = of.weight.numel() * height * width >= WORTH_STRIPS
     rows = math.ceil(height / (STRIPS * threads())) if large and threads() > 1 else height
-    parts = [(image, *span) for image in x.movedim(1, -1).contiguous().numpy() for span in spans(height, rows)]
+    parts = [
+        (image, *span) for image in x.movedim(1, -1).contiguous().numpy() for span in spans(height, rows)
+    ]
 
     def strip(image: Any, first: int, last: int) -> Tensor:
         given = torch.empty(1, (last - first - 1) * down + tall, columns, x.shape[1], dtype=torch.uint8)
