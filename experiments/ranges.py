@@ -15,17 +15,18 @@ from statistics import fmean
 import torch
 import tyro
 from safetensors import safe_open
+from safetensors.torch import load_file
 from torch import nn
 
 from experiments.evaluation.conditions import CONDITIONS
 from experiments.evaluation.halves import of_half
 from pat.data.pairs import StereoPair, middlebury_pairs
 from pat.evaluation.metrics import score
-from pat.evaluation.protocols import rectified_fusion
+from pat.evaluation.protocols import StereoResult, rectified_fusion
 from pat.evaluation.stereo import disparity_errors
 from pat.fusion.low_light import shipped_denoiser
 from pat.matching.choice import FITTED, fitted_choice
-from pat.networks.weights import DENOISER, SHIPPED, load_weights
+from pat.networks.weights import DENOISER, SHIPPED, Network, load_weights
 from pat.support.eight_bits import RANGE, measured
 from pat.support.tensor_files import write_tensors
 
@@ -60,13 +61,16 @@ def main(middlebury: Path) -> None:
         write(path, some)
 
 
-def figures(network: nn.Module, pair: StereoPair, name: str) -> tuple[float, float]:
+def figures(network: Network, pair: StereoPair, name: str) -> tuple[float, float]:
     """PSNR of a pair fused under a condition, and the percentage of disparities within a pixel."""
     condition = CONDITIONS[name]
     task = condition.recorded(pair)
-    noise = {} if condition.noise is None else {"noise": dict.fromkeys(("alpha", "beta"), condition.noise)}
-    fused = rectified_fusion(network, **noise)(task.alpha, task.beta, pair.max_disparity)
-    assert pair.disparity is not None and fused.disparity is not None
+    noise = None if condition.noise is None else dict.fromkeys(("alpha", "beta"), condition.noise)
+    assert pair.max_disparity is not None
+    assert pair.disparity is not None
+    fused = rectified_fusion(network, noise=noise)(task.alpha, task.beta, pair.max_disparity)
+    assert isinstance(fused, StereoResult)
+    assert fused.disparity is not None
     _, within = disparity_errors(fused.disparity, pair.disparity)
     return score(fused.image, task.ground_truth).psnr, 100 * (within or 0.0)
 
@@ -88,8 +92,8 @@ def ranges(network: nn.Module) -> dict[str, torch.Tensor]:
 def write(path: Path, some: dict[str, torch.Tensor]) -> None:
     """A weights file with these ranges."""
     with safe_open(path, framework="pt") as file:
-        facts, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}
-    write_tensors(path, tensors | some, facts)
+        facts = file.metadata()
+    write_tensors(path, load_file(path) | some, facts)
 
 
 if __name__ == "__main__":

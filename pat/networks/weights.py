@@ -88,7 +88,8 @@ def new_network(config: Any, start: Path | None = None) -> Network:
                 f"the recipe is for a {type(network).__name__} of {config}: give its own recipe, "
                 "or leave `start` out"
             )
-        network.load_state_dict(weights.state_dict())
+        state = weights.state_dict()
+        network.load_state_dict({name: state[name] for name in network.state_dict()})  # without ranges
     return network
 
 

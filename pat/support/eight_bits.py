@@ -49,7 +49,7 @@ class Conv2d(nn.Conv2d):
 
     input_range: Tensor | None
 
-    def __init__(self, *shape: int, **how: Any) -> None:
+    def __init__(self, *shape: Any, **how: Any) -> None:
         super().__init__(*shape, **how)
         self.register_buffer(RANGE, None)
         self.measuring = False
@@ -97,7 +97,7 @@ def names(network: nn.Module) -> list[str]:
 
 
 class Packed(NamedTuple):
-    """A convolution's weights in the order that the processor wants, and the steps of them and of its input."""
+    """A convolution's weights as the processor wants them, and the steps of them and of its input."""
 
     weights: Tensor
     steps: Float[Tensor, " outputs"]
@@ -137,8 +137,8 @@ def multiplied(x: UInt8[Tensor, "1 i h w"], of: Conv2d, by: Packed) -> Float[Ten
     """The convolution of an image in 8 bits, without more around it."""
     shape = list(of.stride), [0, 0], list(of.dilation), of.groups
     inputs, weights = (x, by.step, by.zero), (by.weights, by.steps, by.zeros)
-    answer = 1.0, 0, torch.float32, "none", [], ""
-    return torch.ops.onednn.qconv2d_pointwise(*inputs, *weights, of.bias, *shape, *answer)
+    numbers, then = (1.0, 0, torch.float32), ("none", (), "")
+    return torch.ops.onednn.qconv2d_pointwise(*inputs, *weights, of.bias, *shape, *numbers, *then)
 
 
 def in_eight_bits(x: Float[Tensor, "b i h w"], of: Conv2d, by: Packed) -> Float[Tensor, "b o h2 w2"]:
