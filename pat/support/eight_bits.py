@@ -130,7 +130,7 @@ def _made(of: Conv2d) -> Packed:
     rounded = (weight / steps[:, None, None, None]).round().to(torch.int8)
     shape = list(of.stride), [0, 0], list(of.dilation), of.groups
     weights = torch.ops.onednn.qconv_prepack(rounded, steps, step, zero, *shape, None)
-    return Packed(weights, steps, torch.zeros(len(steps), dtype=torch.long), step, zero)
+    return Packed(weights, steps, torch.zeros_like(steps, dtype=torch.long), step, zero)
 
 
 def multiplied(x: UInt8[Tensor, "1 i h w"], of: Conv2d, by: Packed) -> Float[Tensor, "1 o h2 w2"]:
@@ -154,7 +154,8 @@ def in_eight_bits(x: Float[Tensor, "b i h w"], of: Conv2d, by: Packed) -> Float[
     ]
 
     def strip(image: Any, first: int, last: int) -> Tensor:
-        given = torch.empty(1, (last - first - 1) * down + tall, columns, x.shape[1], dtype=torch.uint8)
+        shape = 1, (last - first - 1) * down + tall, columns, x.shape[1]
+        given = torch.empty(shape, dtype=torch.uint8, device=x.device)
         kernels.rounded(image, first * down - above, left, 1 / by.step, by.zero, given.numpy()[0])
         return multiplied(given.movedim(-1, 1), of, by)
 
@@ -177,10 +178,11 @@ def _pair(x: Any) -> tuple[int, int]:
 @cache
 def available() -> bool:
     """Whether this processor and this torch multiply the largest numbers of 8 bits exactly."""
-    network = Conv2d(64, 8, kernel_size=3, bias=False).requires_grad_(False)
+    where: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
+    network = Conv2d(64, 8, 3, bias=False, **where).requires_grad_(False)
     network.weight.fill_(127.0)
-    network.input_range = torch.tensor([0.0, 255.0])
-    largest = torch.full((1, 64, 3, 3), 255.0)
+    network.input_range = torch.tensor([0.0, 255.0], **where)
+    largest = torch.full((1, 64, 3, 3), 255.0, **where)
     try:
         answer = in_eight_bits(largest, network, _made(network))
     except (AttributeError, RuntimeError):  # another torch, or one without oneDNN

@@ -82,6 +82,21 @@ def test_strips_parts_and_batches_are_equal_to_the_whole() -> None:
 
 
 @needs_processor
+def test_other_defaults_of_torch_change_nothing() -> None:
+    part, x = ranged(padding=1), rand(1, 16, 8, 8)
+    before = part(x)
+    available.cache_clear()
+    torch.set_default_dtype(torch.float64)
+    try:
+        with torch.device("meta"):
+            assert available()
+            again = deepcopy(part)(x)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(again, before)
+
+
+@needs_processor
 def test_a_change_of_weights_or_of_range_is_seen() -> None:
     part, x = ranged(padding=1), rand(1, 16, 8, 8)
     before = part(x)
