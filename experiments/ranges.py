@@ -2,7 +2,8 @@
 
 `python -m experiments.ranges --middlebury FOLDER` measures them, after a training, on every third pair of the
 tune half under some conditions, and writes them into the weights files. Of the other pairs it prints what the
-rounding changes.
+rounding changes. Not those of the
+denoiser, which loses by it where there is the least light.
 """
 
 from __future__ import annotations
@@ -24,9 +25,8 @@ from pat.data.pairs import StereoPair, middlebury_pairs
 from pat.evaluation.metrics import score
 from pat.evaluation.protocols import StereoResult, rectified_fusion
 from pat.evaluation.stereo import disparity_errors
-from pat.fusion.low_light import shipped_denoiser
 from pat.matching.choice import FITTED, fitted_choice
-from pat.networks.weights import DENOISER, SHIPPED, Network, load_weights
+from pat.networks.weights import SHIPPED, Network, load_weights
 from pat.support.eight_bits import RANGE, measured
 from pat.support.tensor_files import write_tensors
 
@@ -39,8 +39,8 @@ def main(middlebury: Path) -> None:
     Args:
         middlebury: Folder of Middlebury's pairs.
     """
-    network, choice, denoiser = load_weights("mono-colour"), fitted_choice(), shipped_denoiser()
-    parts = {SHIPPED / "mono-colour.safetensors": network, FITTED: choice, DENOISER: denoiser}
+    network, choice = load_weights("mono-colour"), fitted_choice()
+    parts = {SHIPPED / "mono-colour.safetensors": network, FITTED: choice}
     pairs = list(of_half(middlebury_pairs(middlebury), "tune"))
     with all_measured(list(parts.values())):
         for pair in pairs[::3]:
