@@ -215,10 +215,7 @@ def test_nothing_is_certain_where_repairs_of_equal_lines_give_other_depths():
     """The right camera sees 3 px to one side: an inverted pose is not quite the same as images swapped."""
     rig = rectified_pair().perturbed({"right.centre": vector(3, 0)})
     found = diagnose_matches(each(posed(Pose.inverse))(rig), sizes(rig), seen_points(rig))
-    assert {"pose inverted", "cameras swapped"} <= {
-        found.named.kind,
-        *(h.kind for h in found.equal),
-    }
+    assert {"pose inverted", "cameras swapped"} <= {found.named.kind, *(h.kind for h in found.equal)}
     assert not found.certain
 
 
