@@ -197,7 +197,7 @@ REFUSED = [
     ("mrcal/b.cameramodel", "'icam_intrinsics': 0", "'x': print('run')", "is not a dictionary of numbers"),
     ("mrcal/b.cameramodel", "    'icam_intrinsics': 0,\n}", "", "is the file whole"),
     ("kalibr.yaml", "radtan", "wide", "cam1.distortion_model: is 'wide'; supported for pinhole: radtan"),
-    ("kalibr.yaml", "camera_model: pinhole", "camera_model: tele", "model: is 'tele'; supported: pinhole"),
+    ("kalibr.yaml", "camera_model: pinhole", "camera_model: tele", "is 'tele'; supported: .*pinhole-radtan"),
     ("kalibr.yaml", "cam1:", "cam2:", "the chain has a gap"),
     ("colmap/cameras.txt", "PINHOLE", "WIDE", "line 4: has model WIDE, .* calibrate with one of"),
     ("colmap/cameras.txt", "\n7 OPENCV", "\n8 OPENCV", "camera 7: is used by .* and not defined"),
@@ -260,6 +260,36 @@ def test_what_is_wrong_is_named(name, old, new, message, tmp_path):
     text = file.read_text()
     assert old in text
     assert re.search(message, refusal(copied(file, tmp_path, text.replace(old, new)), formats(file)))
+
+
+BENT = "distortion: {model: brown-conrady, coefficients: [0.1, 0, 0, 0]"
+NATIVE = [
+    ("size: [6, 4], bayer: RGBG", r"cameras.a: bayer is 'RGBG': wanted 'RGGB' or"),
+    ("size: [6, 4], coding: gamma", "wanted 'srgb' or 'linear'"),
+    ("size: [6, 4], bits: 12.5", "wanted a whole number from 1 to 16"),
+    ("size: [6, 4], black_level: 64", "needs 'bits'"),
+    ("size: [6, 4], bits: 6, black_level: 64", "not between 0 and white"),
+    ("size: [6, 4], exposure: 0", "wanted a finite number above 0"),
+    ("size: [6, 4], gain: [1, 2]", r"a\.gain: has 2 numbers, wanted 3"),
+    ("size: [6, 4], gain: [1, 2, -1]", "gain is -1.0: wanted a finite number above 0"),
+    ("size: [6, 4], frame_rate: fast", "other than numbers: 'fast'"),
+    ("size: [6, 4], focal: long", "focal: holds something other than numbers: 'long'"),
+    ("focal: 800", r"cameras\.a\.size: is missing"),
+    ("size: [1000000, 4], focal: 80", r"cameras.a.size: is 1000000 x 4; images of up to 65535"),
+    ("size: [60000, 60000]", r"cameras.a.size: is 60000 x 60000"),
+    ("size: [true, 480]", "True"),
+    ("size: [640, 480], focal: true", "True"),
+    ("size: true", "True"),
+    (f"size: [6, 4], {BENT}}}", r"cameras\.a\.distortion: is of a camera without 'focal'.*`scale`"),
+    (f"size: [6, 4], {BENT}, scale: -3}}", r"distortion\.scale: is -3; a scale is positive"),
+    (f"size: [6, 4], focal: 500, {BENT}, scale: 3}}", r"distortion\.scale: unknown key"),
+]
+
+
+@pytest.mark.parametrize(("camera", "message"), NATIVE)
+def test_what_is_wrong_with_a_camera_of_our_own_format_is_named(camera, message, tmp_path):
+    (tmp_path / "rig.yaml").write_text(f"format: arraygeom-rig 1\ncameras:\n  a: {{{camera}}}\n")
+    assert re.search(message, refusal(tmp_path / "rig.yaml"))
 
 
 CUT = {
