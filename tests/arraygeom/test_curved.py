@@ -23,6 +23,7 @@ from arraygeom import (
     intrinsics,
     rotation_from_vector,
     sampling_locations,
+    stack,
 )
 from arraygeom.fields.curved import _Straight
 from arraygeom.pixels import pixel_grid
@@ -170,13 +171,7 @@ def test_batched_rigs_agree_with_single_ones():
     rigs = [with_lenses(random_rig(i), FISHEYE, None) for i in range(2)]
     g = torch.Generator().manual_seed(0)
     x = uniform(g, 5, 40, 2, 6, 2)
-
-    def stacked(name: str) -> Camera:
-        cameras = [r[name] for r in rigs]
-        pose = Pose(torch.stack([c.R for c in cameras]), torch.stack([c.t for c in cameras]))
-        return cameras[0].replace(K=torch.stack([c.K for c in cameras]), cam_from_world=pose)
-
-    batch = Rig({n: stacked(n) for n in ("alpha", "beta")}, depth=rigs[0].depth)
+    batch = stack(rigs)
     together = Curved(8)(batch.pair("alpha", "beta"), x)
     shared = Curved(8)(batch.pair("alpha", "beta"), x[:1])
     for i, rig in enumerate(rigs):

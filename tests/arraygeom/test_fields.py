@@ -7,7 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from arraygeom import (
-    Camera,
     Dense,
     Epipolar,
     EpipolarLine,
@@ -25,6 +24,7 @@ from arraygeom import (
     lazily,
     rotation_from_vector,
     sampling_locations,
+    stack,
 )
 from arraygeom.fields import covering_displacement
 from arraygeom.fields.grid import FieldOnGrid
@@ -241,24 +241,12 @@ def test_any_set_of_pixels(field, shape):
         torch.testing.assert_close(value.reshape(getattr(listed, f.name).shape), getattr(listed, f.name))
 
 
-def batch_of(rigs: list[Rig]) -> Rig:
-    """One rig with a leading axis."""
-
-    def stacked(name: str) -> Camera:
-        cameras = [r[name] for r in rigs]
-        pose = Pose(torch.stack([c.R for c in cameras]), torch.stack([c.t for c in cameras]))
-        return cameras[0].replace(K=torch.stack([c.K for c in cameras]), cam_from_world=pose)
-
-    depth = tuple(torch.stack([r.depth[i] for r in rigs]) for i in range(2))
-    return Rig({n: stacked(n) for n in rigs[0].names}, depth=depth)
-
-
 @pytest.mark.parametrize(
     "field", [Epipolar(), EpipolarLine(), HomographyDisplacement(8.0), Local(3)], ids=ids
 )
 def test_batched_rigs_agree_with_single_ones(field):
     rigs = [random_rig(i, near=1.0 + i) for i in range(3)]
-    together = sampling_locations(field, pair_of(batch_of(rigs)))
+    together = sampling_locations(field, pair_of(stack(rigs)))
     for i, rig in enumerate(rigs):
         alone = sampling_locations(field, pair_of(rig))
         for f in dataclasses.fields(alone):
@@ -268,7 +256,7 @@ def test_batched_rigs_agree_with_single_ones(field):
 @pytest.mark.parametrize("shape", [(), (5,), (4, 3)])
 def test_pixels_without_the_batch_axis_are_refused(shape):
     with pytest.raises(ValueError, match=r"batched over \(3,\) needs pixels"):
-        Epipolar()(pair_of(batch_of([random_rig(i) for i in range(3)])), torch.zeros(*shape, 2))
+        Epipolar()(pair_of(stack([random_rig(i) for i in range(3)])), torch.zeros(*shape, 2))
 
 
 def test_whole_images_in_chunks_are_what_single_rows_are():
@@ -497,7 +485,7 @@ def disturbed(rig: Rig, case: int, g: torch.Generator) -> Rig:
         lambda: rig.replace(depth=(near, INFINITE)),
         lambda: rig.replace(depth=(near, near)),
         lambda: rig.with_camera("beta", b.replace(cam_from_world=same_place)),
-        lambda: rig.with_camera("beta", a),
+        lambda: rig.with_camera("beta", a.replace(hw=b.hw)),
         lambda: rig.with_camera("beta", b.replace(cam_from_world=facing)),
         lambda: rig.with_camera("beta", b.replace(cam_from_world=ahead)),
     ][case % 7]()
@@ -525,7 +513,7 @@ def test_float32_agrees_with_float64_on_a_thousand_rigs(seed, turn):
     """10 times 100 rigs: no NaN, and no other `valid` than rounding at the image's edge explains."""
     g = torch.Generator().manual_seed(seed)
     kinds = [disturbed(random_rig(seed + i, near=0.5, turn=turn, baseline=1.0), i, g) for i in range(100)]
-    rig, x = batch_of(kinds), uniform(g, 0, 47, 100, 50, 2)
+    rig, x = stack(kinds), uniform(g, 0, 47, 100, 50, 2)
     exact, quick = Epipolar()(pair_of(rig), x), Epipolar()(pair_of(rig), x.float())
     roomy, tight = (Epipolar()(larger(rig, margin), x).valid for margin in (0.01, -0.01))
     assert quick.start.isfinite().all()
@@ -546,7 +534,7 @@ def test_the_epipole_itself_samples_one_point(dtype):
 
 
 def test_gradients_are_finite_where_only_some_rigs_of_a_batch_are_degenerate():
-    rig = batch_of([DEGENERATE["identical cameras"], DEGENERATE["near is far"], DEGENERATE["opposing"]])
+    rig = stack([DEGENERATE["identical cameras"], DEGENERATE["near is far"], DEGENERATE["opposing"]])
     changes = rig.parameters(free=["beta.*"])
     s = sampling_locations(
         Epipolar(), pair_of(rig.perturbed(changes)), pixel_grid((48, 64), dtype=torch.float64)[None, ::8, ::8]
