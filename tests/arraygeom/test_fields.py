@@ -30,7 +30,7 @@ from arraygeom.fields import covering_displacement
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.homography import apply_homography
 from arraygeom.pixels import pixel_grid
-from tests.arraygeom.rigs import half_rotation, random_rig, two_cameras, uniform
+from tests.arraygeom.rigs import half_rotation, known_by_f, random_rig, two_cameras, uniform
 
 STRAIGHT = [Epipolar(), EpipolarLine(), HomographyDisplacement(8.0), HomographyDisplacement()]
 ALL = [*STRAIGHT, Rectified(20.0), NearestVoxels(24, 12), Local(3), Dense(4)]
@@ -42,12 +42,6 @@ def ids(field) -> str:
 
 def pair_of(rig: Rig) -> Pair:
     return rig.pair("alpha", "beta")
-
-
-def by_link(pair: Pair) -> Pair:
-    """The same pair, known only by F and H."""
-    link = Link(pair.fundamental, pair.homography)
-    return Pair(View(hw=pair.alpha.hw), View(hw=pair.beta.hw), None, link)
 
 
 # ------------------------------------------------------------------ they hold what is seen, and are on the
@@ -96,12 +90,13 @@ def test_starts_are_near_and_ends_far_for_calibrated_pairs():
 
 
 def test_calibration_and_f_give_the_same_lines():
-    pair = pair_of(random_rig(1, baseline=0.1))
+    rig = random_rig(1, baseline=0.1)
+    pair, linked = pair_of(rig), pair_of(known_by_f(rig))
     x = pixel_grid(pair.alpha.hw, dtype=torch.float64)[::4, ::4]
-    a, b = (HomographyDisplacement(8.0)(p, x) for p in (pair, by_link(pair)))
+    a, b = (HomographyDisplacement(8.0)(p, x) for p in (pair, linked))
     torch.testing.assert_close(a.start, b.start)
     torch.testing.assert_close(a.end, b.end)
-    line, piece = EpipolarLine()(by_link(pair), x), EpipolarLine()(pair, x)
+    line, piece = EpipolarLine()(linked, x), EpipolarLine()(pair, x)
     assert line.valid[piece.valid].all()
     assert (line.length - piece.length)[piece.valid].min() > -1e-6
 
@@ -169,7 +164,7 @@ def test_epipolar_is_rectified_on_a_rectified_pair():
 
 
 def test_local_and_dense_sample_where_they_say():
-    pair = by_link(pair_of(random_rig(1)))
+    pair = pair_of(known_by_f(random_rig(1)))
     x = torch.tensor([[30.0, 20.0]], dtype=torch.float64)
     local = Local(3)(pair, x)
     centre = apply_homography(pair.link.H, x).x
@@ -241,18 +236,6 @@ def test_any_set_of_pixels(field, shape):
         torch.testing.assert_close(value.reshape(getattr(listed, f.name).shape), getattr(listed, f.name))
 
 
-@pytest.mark.parametrize(
-    "field", [Epipolar(), EpipolarLine(), HomographyDisplacement(8.0), Local(3)], ids=ids
-)
-def test_batched_rigs_agree_with_single_ones(field):
-    rigs = [random_rig(i, near=1.0 + i) for i in range(3)]
-    together = sampling_locations(field, pair_of(stack(rigs)))
-    for i, rig in enumerate(rigs):
-        alone = sampling_locations(field, pair_of(rig))
-        for f in dataclasses.fields(alone):
-            torch.testing.assert_close(getattr(together, f.name)[i], getattr(alone, f.name))
-
-
 @pytest.mark.parametrize("shape", [(), (5,), (4, 3)])
 def test_pixels_without_the_batch_axis_are_refused(shape):
     with pytest.raises(ValueError, match=r"batched over \(3,\) needs pixels"):
@@ -299,7 +282,7 @@ def test_ends_that_are_not_finite_are_not_on_a_grid():
 
 
 def test_lenses_and_missing_calibration_are_refused():
-    pair = by_link(pair_of(random_rig(1)))
+    pair = pair_of(known_by_f(random_rig(1)))
     with pytest.raises(ValueError, match="HomographyDisplacement or Rectified"):
         sampling_locations(Epipolar(), pair)
     with pytest.raises(ValueError, match="depth range"):
@@ -355,7 +338,7 @@ def test_second_derivatives_of_straight_fields(field):
 
 
 def test_gradients_of_an_uncalibrated_pair():
-    pair = by_link(pair_of(random_rig(3)))
+    pair = pair_of(known_by_f(random_rig(3)))
     x = torch.tensor([[30.0, 20.0], [5.0, 40.0]], dtype=torch.float64)
 
     def found(F, H):
