@@ -201,8 +201,7 @@ def test_a_lens_that_sees_the_board_behind_it_gives_no_pose():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("lens", "advised"),
-    [((-0.2, 0.05, 0.0, 0.0, 0.0), "brown-conrady"), (RATIONAL, "rational")],
+    ("lens", "advised"), [((-0.2, 0.05, 0.0, 0.0, 0.0), "brown-conrady"), (RATIONAL, "rational")]
 )
 def test_the_lens_that_the_images_support_is_advised(lens, advised):
     boards = board_poses(12, seed=3, spread=0.7, depth=(0.6, 1.6))

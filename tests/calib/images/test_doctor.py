@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Link, Pose, Rig, View, rotation_from_vector, triangulate
-from arraygeom.pose import rotation_vector
+from arraygeom import Link, Pose, Rig, View, triangulate
 from arraygeom.text import UNSCALED
 from calib.images.doctor import diagnose, diagnose_matches
 from calib.images.hypotheses import TRANSPOSE, on_cameras, swap
@@ -19,6 +18,7 @@ from calib.images.residuals import sampson_of_pairs
 from pat.cli.main import main
 from pat.media.images import write_image
 from tests.benchmarks.bench_drift import drifted
+from tests.benchmarks.bench_names import OPENGL, negated, reordered, shifted, turned
 from tests.calib.scenes import rectified_images, rectified_pair, seen_points, texture, unlike_pair, vector
 from tests.calib.simulated import simulated_matches, simulated_rig
 
@@ -39,28 +39,15 @@ def posed(change):
     return lambda c: c.replace(cam_from_world=change(c.cam_from_world))
 
 
-def moved(d):
-    return lambda c: c.replace(K=c.K + torch.nn.functional.pad(vector([d], [d]), (2, 0, 0, 1)))
-
-
-def opposite(lens):
-    return lens.with_coefficients(-lens.coefficients)
-
-
-def turned(R, factor):
-    return rotation_from_vector(factor * rotation_vector(R))
-
-
-OPENGL = torch.diag(vector(1, -1, -1))
 MISTAKES = {
     "sign of t": one(posed(lambda p: Pose(p.R, -p.t))),
-    "half-pixel shift": one(moved(0.5)),
-    "one-pixel shift": one(moved(-1.0)),
+    "half-pixel shift": one(shifted(0.5)),
+    "one-pixel shift": one(shifted(-1.0)),
     "R transposed": each(posed(lambda p: Pose(p.R.T, p.t))),
     "pose inverted": each(posed(Pose.inverse)),
     "centre as t": each(posed(lambda p: Pose(p.R, -p.R.T @ p.t))),
     "OpenGL axes": one(posed(lambda p: Pose(OPENGL @ p.R, OPENGL @ p.t))),
-    "order of quaternions": each(posed(lambda p: Pose.from_quaternion(p.quaternion[[3, 0, 1, 2]], p.t))),
+    "order of quaternions": each(posed(lambda p: reordered(p, (3, 0, 1, 2)))),
     "degrees and radians": each(posed(lambda p: Pose(turned(p.R, math.pi / 180), p.t))),
     "cameras swapped": lambda rig: swap(rig, *rig.names),
     "units": each(posed(lambda p: Pose(p.R, 1000 * p.t))),
@@ -162,11 +149,7 @@ def test_nothing_is_wrong(lens):
 
 
 @pytest.mark.parametrize(
-    ("words", "change"),
-    [
-        ("ignored", lambda c: c.replace(distortion=None)),
-        ("wrong sign", lambda c: c.replace(distortion=opposite(c.distortion))),
-    ],
+    ("words", "change"), [("ignored", lambda c: c.replace(distortion=None)), ("wrong sign", negated)]
 )
 def test_wrong_distortion_is_named(words, change):
     rig = unlike_pair(lens=True)
