@@ -236,6 +236,18 @@ def test_any_set_of_pixels(field, shape):
         torch.testing.assert_close(value.reshape(getattr(listed, f.name).shape), getattr(listed, f.name))
 
 
+@pytest.mark.parametrize(
+    "field", [Epipolar(), EpipolarLine(), HomographyDisplacement(8.0), Local(3)], ids=ids
+)
+def test_batched_rigs_agree_with_single_ones(field):
+    rigs = [random_rig(i, near=1.0 + i) for i in range(3)]
+    together = sampling_locations(field, pair_of(stack(rigs)))
+    for i, rig in enumerate(rigs):
+        alone = sampling_locations(field, pair_of(rig))
+        for f in dataclasses.fields(alone):
+            torch.testing.assert_close(getattr(together, f.name)[i], getattr(alone, f.name))
+
+
 @pytest.mark.parametrize("shape", [(), (5,), (4, 3)])
 def test_pixels_without_the_batch_axis_are_refused(shape):
     with pytest.raises(ValueError, match=r"batched over \(3,\) needs pixels"):
