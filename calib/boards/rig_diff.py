@@ -275,15 +275,9 @@ def _tested(
             best, motion, gain = part.name, found, explained
     pose = b[best].cam_from_world
     shift = pose.perturbed(*(torch.from_numpy(p) for p in np.split(motion, 2))).inverse().t - pose.inverse().t
-    return Significance(
-        total,
-        freedom,
-        float(chdtrc(freedom, total)),
-        best,
-        float(np.degrees(np.linalg.norm(motion[:3]))),
-        float(shift.norm()),
-        gain / max(total, 1e-300),
-    )
+    probability, degrees = float(chdtrc(freedom, total)), float(np.degrees(np.linalg.norm(motion[:3])))
+    share = gain / max(total, 1e-300)
+    return Significance(total, freedom, probability, best, degrees, float(shift.norm()), share)
 
 
 def _depths(

@@ -90,12 +90,7 @@ Rays = tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]
 
 @torch.no_grad()
 def photograph(
-    camera: Camera,
-    cam_from_board: Pose,
-    board: Board,
-    *,
-    dpi: float | None = None,
-    rays: Rays | None = None,
+    camera: Camera, cam_from_board: Pose, board: Board, *, dpi: float | None = None, rays: Rays | None = None
 ) -> UInt8[np.ndarray, "h w"]:
     """The image of a printed board by a camera, through its lens: the mean of four samples per pixel.
 

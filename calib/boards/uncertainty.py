@@ -156,7 +156,7 @@ class Intrinsics(NamedTuple):
 
     camera: Camera
     covariance: Float[np.ndarray, "f f"]
-    free: Float[np.ndarray, " p"]
+    free: Bool[np.ndarray, " p"]
     sigma: float
     seen: Float[np.ndarray, "m 3"]
 
@@ -164,14 +164,11 @@ class Intrinsics(NamedTuple):
 def intrinsics_of(fit: Solved, name: str) -> Intrinsics:
     """One camera of a fit; none of its intrinsics is free where the fit has no covariance."""
     camera, seen = in_own_frame(fit.problem, name)
-    entries, known = [f"{name}.{entry}" for entry in parameter_names(camera)], rig_covariance(fit)
-    free = np.array(
-        [i >= 6 and known is not None and entry in known.names for i, entry in enumerate(entries)]
-    )
-    covariance = np.zeros((0, 0))
-    if known is not None:
-        index = [known.names.index(entry) for entry, is_free in zip(entries, free) if is_free]
-        covariance = known.matrix[np.ix_(index, index)]
+    known = rig_covariance(fit) or RigCovariance((), np.zeros((0, 0)))
+    mine = known.of(name, camera)
+    mine[:6] = 0  # the pose
+    free = mine.any(1)
+    covariance = mine[free] @ known.matrix @ mine[free].T
     return Intrinsics(camera, covariance, free, fit.problem.sigma[name], seen)
 
 

@@ -21,15 +21,7 @@ from arraygeom.threads import torch_in_one_thread
 
 from .depth_change import relative_change
 from .evidence import SCALES, DriftEvidence, FitStatistics, fit_statistics, observations
-from .hypotheses import (
-    SHIFTS,
-    TURNS,
-    Hypothesis,
-    from_degrees,
-    hypotheses,
-    ignored_lens,
-    in_degrees,
-)
+from .hypotheses import SHIFTS, TURNS, Hypothesis, from_degrees, hypotheses, ignored_lens, in_degrees
 from .matches import (
     Images,
     Pairs,

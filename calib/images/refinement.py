@@ -30,14 +30,7 @@ from arraygeom import Camera, Rig
 from arraygeom.progress import log_step, part, stage
 from arraygeom.threads import torch_in_one_thread
 
-from .depth_change import (
-    NEGLIGIBLE,
-    DepthChange,
-    depth_modes,
-    log_depths,
-    relative_change,
-    share_outside,
-)
+from .depth_change import NEGLIGIBLE, DepthChange, depth_modes, log_depths, relative_change, share_outside
 from .least_squares import (
     Evaluated,
     Residuals,

@@ -18,17 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import (
-    Camera,
-    LensView,
-    Link,
-    Pair,
-    Pose,
-    Rig,
-    View,
-    intrinsics,
-    rotation_from_vector,
-)
+from arraygeom import Camera, LensView, Link, Pair, Pose, Rig, View, intrinsics, rotation_from_vector
 from arraygeom.pixels import HW, map_homogeneous
 from arraygeom.robust import cauchy, least_squares, normal_deviation, robust_least_squares
 from arraygeom.text import UNSCALED, angle
@@ -166,10 +156,7 @@ def has_parallax(matches: PointMatches, hw: HW) -> bool:
 
 @torch_in_one_thread()
 def refined_by_depth(
-    pair: RefinedPair,
-    images: Images,
-    depth: Float[Tensor, "h w"],
-    confidence: Float[Tensor, "h w"],
+    pair: RefinedPair, images: Images, depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"]
 ) -> RefinedPair:
     """The pair refined by dense matches: where a fusion found alpha's pixels, improved by least squares.
 
@@ -198,10 +185,7 @@ def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig
 
 
 def dense_matches(
-    rig: Rig,
-    images: Images,
-    depth: Float[Tensor, "h w"],
-    confidence: Float[Tensor, "h w"],
+    rig: Rig, images: Images, depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"]
 ) -> PointMatches:
     """Points of texture in alpha with their positions in beta, from a depth map, refined by least squares."""
     alpha, beta = (camera.to(torch.float64) for camera in _pair(rig).cameras)

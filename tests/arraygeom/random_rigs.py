@@ -36,27 +36,9 @@ class Drawn:
 
 
 KINDS = (
-    *(
-        "ordinary",
-        "ordinary",
-        "no baseline",
-        "identical",
-        "forward",
-        "backward",
-        "looking back",
-        "near is far",
-    ),
-    *(
-        "far is infinite",
-        "tiny baseline",
-        "long baseline",
-        "narrow",
-        "wide",
-        "tiny image",
-        "quarter turn",
-        "skewed",
-    ),
-    *("on the epipole", "sideways", "anywhere"),
+    *("ordinary", "ordinary", "no baseline", "identical", "forward", "backward", "looking back"),
+    *("near is far", "far is infinite", "tiny baseline", "long baseline", "narrow", "wide", "tiny image"),
+    *("quarter turn", "skewed", "on the epipole", "sideways", "anywhere"),
 )
 
 

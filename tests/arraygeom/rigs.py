@@ -5,14 +5,31 @@ import math
 import torch
 from torch import Tensor
 
-from arraygeom import Camera, Distortion, Pair, Pose, Rig, intrinsics, rotation_from_vector
+from arraygeom import (
+    Camera,
+    Distortion,
+    LensView,
+    Link,
+    Pair,
+    Pose,
+    Rig,
+    View,
+    intrinsics,
+    rotation_from_vector,
+)
 
 HW_ALPHA, HW_BETA = (48, 64), (40, 60)
 PAIRS_HW = (800, 1280)
+BARREL = Distortion("brown-conrady", torch.tensor([-0.1, 0.02, 1e-3, -5e-4], dtype=torch.float64))
 
 
 def uniform(g: torch.Generator, low: float, high: float, *shape: int) -> Tensor:
     return low + (high - low) * torch.rand(shape, generator=g, dtype=torch.float64)
+
+
+def directions(n: int, *, seed: int = 0) -> Tensor:
+    X = torch.randn(n, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    return X / X.norm(dim=-1, keepdim=True)
 
 
 def random_camera(
@@ -32,6 +49,20 @@ def random_rig(seed: int, *, near: float = 1.5, far: float = 10.0, **camera: flo
     g = torch.Generator().manual_seed(seed)
     cameras = {"alpha": random_camera(g, HW_ALPHA, **camera), "beta": random_camera(g, HW_BETA, **camera)}
     return Rig(cameras, depth=(near, far))
+
+
+def with_lenses(rig: Rig, alpha: Distortion | None, beta: Distortion | None) -> Rig:
+    rig = rig.with_camera("alpha", rig["alpha"].replace(distortion=alpha))
+    return rig.with_camera("beta", rig["beta"].replace(distortion=beta))
+
+
+def known_by_f(rig: Rig) -> Rig:
+    """The same pair known by F and H alone; lenses count in the unit of their camera's focal length."""
+    pair, views = rig.pair(*rig.names), {}
+    for name, c in rig.cameras.items():
+        lens = c.distortion
+        views[name] = View(hw=c.hw) if lens is None else LensView(hw=c.hw, K=c.K, distortion=lens)
+    return Rig(views, links={rig.names: Link(pair.fundamental, pair.homography)})
 
 
 def scene_points(rig: Rig, n: int = 200, *, seed: int = 0) -> Tensor:

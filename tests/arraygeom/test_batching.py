@@ -46,22 +46,18 @@ def each(seed: int) -> list:
     segments = sampling_locations(Epipolar(), straight, torch.rand(3, 2, dtype=F64) * 40)
     view = LensView(hw=(4, 6), K=intrinsics(3.0 + seed, (4, 6)), distortion=lens(0.1))
     return [
-        *(
-            View(hw=(4, 6)),
-            view,
-            rig["beta"],
-            lens(0.1 * seed),
-            rig["alpha"].cam_from_world,
-            link,
-            pair,
-            rig,
-            segments,
-        ),
-        *(
-            segments.positions(5),
-            dataclasses.replace(straight, link=link),
-            rig.replace(links={("alpha", "beta"): link}),
-        ),
+        View(hw=(4, 6)),
+        view,
+        rig["beta"],
+        lens(0.1 * seed),
+        rig["alpha"].cam_from_world,
+        link,
+        pair,
+        rig,
+        segments,
+        segments.positions(5),
+        dataclasses.replace(straight, link=link),
+        rig.replace(links={("alpha", "beta"): link}),
     ]
 
 

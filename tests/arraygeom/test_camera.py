@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from torch.nn.functional import interpolate, pad
 
 from arraygeom import Camera, Distortion, Pose, intrinsics, rotation_from_vector
 from tests.arraygeom.rigs import random_camera, random_rig, scene_points, uniform
@@ -10,14 +11,15 @@ from tests.oracles import Oracle
 cv2 = Oracle("cv2")
 
 CHANGES = {
-    "smaller": lambda c: c.resize((20, 31)),
-    "larger": lambda c: c.resize((100, 130)),
-    "cropped": lambda c: c.crop(6, 18, (32, 32)),
-    "padded": lambda c: c.crop(-4, -7, (60, 80)),
-    "turned": lambda c: c.rot90(1),
-    "turned back": lambda c: c.rot90(-1),
-    "upside down": lambda c: c.rot90(2),
+    "smaller": (lambda c: c.resize((20, 31)), lambda i: interpolate(i, (20, 31), mode="area")),
+    "larger": (lambda c: c.resize((100, 130)), lambda i: interpolate(i, (100, 130), mode="bilinear")),
+    "cropped": (lambda c: c.crop(6, 18, (32, 32)), lambda i: i[..., 6:38, 18:50]),
+    "padded": (lambda c: c.crop(-4, -7, (60, 80)), lambda i: pad(i, (7, 9, 4, 8))),
+    "turned": (lambda c: c.rot90(1), lambda i: torch.rot90(i, 1, (-2, -1))),
+    "turned back": (lambda c: c.rot90(-1), lambda i: torch.rot90(i, -1, (-2, -1))),
+    "upside down": (lambda c: c.rot90(2), lambda i: torch.rot90(i, 2, (-2, -1))),
 }
+"""What is done to a camera, and the same to its image."""
 
 
 def camera(seed: int = 0) -> Camera:
@@ -69,18 +71,7 @@ def test_projections_stay_the_same_point_of_the_actual_image(change):
     c = camera()
     X = c.unproject(torch.tensor([33.3, 21.7], dtype=torch.float64), torch.tensor(3.0, dtype=torch.float64))
     image = blob(c.hw, *c.project(X).x.tolist(), sigma=3.5)
-    changed = CHANGES[change](c)
-    changed_image = {
-        "smaller": lambda: torch.nn.functional.interpolate(image, (20, 31), mode="area"),
-        "larger": lambda: torch.nn.functional.interpolate(
-            image, (100, 130), mode="bilinear", align_corners=False
-        ),
-        "cropped": lambda: image[..., 6:38, 18:50],
-        "padded": lambda: torch.nn.functional.pad(image, (7, 9, 4, 8)),
-        "turned": lambda: torch.rot90(image, 1, (-2, -1)),
-        "turned back": lambda: torch.rot90(image, -1, (-2, -1)),
-        "upside down": lambda: torch.rot90(image, 2, (-2, -1)),
-    }[change]()
+    changed, changed_image = (f(v) for f, v in zip(CHANGES[change], (c, image)))
     assert changed.hw == tuple(changed_image.shape[-2:])
     # cropping cuts the blob's tails; resampling is uneven where pixels do not divide: hence a few hundredths
     tolerance = {"cropped": 0.01, "smaller": 0.05, "larger": 0.02}.get(change, 2e-3)
@@ -89,7 +80,7 @@ def test_projections_stay_the_same_point_of_the_actual_image(change):
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_changed_cameras_still_invert(change):
-    c = CHANGES[change](camera())
+    c = CHANGES[change][0](camera())
     X = points_ahead(c)
     x, depth, _ = c.project(X)
     torch.testing.assert_close(c.unproject(x, depth), X, atol=1e-12, rtol=0)

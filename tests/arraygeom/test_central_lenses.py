@@ -12,6 +12,8 @@ from arraygeom.distortion import COEFFICIENT_COUNTS, LENS_TERMS, Distortion
 from arraygeom.lenses import PolynomialFisheye
 from arraygeom.lenses.central import MODELS
 from arraygeom.lenses.model import LensModel
+from tests.arraygeom.rigs import directions
+from tests.arraygeom.test_distortion import BROWN, FISHEYES
 from tests.oracles import Oracle
 
 cv2 = Oracle("cv2")
@@ -114,11 +116,6 @@ def lens(model: str, c, dtype=torch.float64) -> LensModel:
     return Distortion(model, torch.as_tensor(c, dtype=dtype))
 
 
-def directions(n: int = 3000, seed: int = 0) -> torch.Tensor:
-    X = torch.randn(n, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    return X / X.norm(dim=-1, keepdim=True)
-
-
 def test_every_model_is_tested_and_has_names_and_sizes_for_refinement():
     assert {"brown-conrady", "kannala-brandt", *FORMULAS} == {"polynomial-fisheye", *COEFFICIENT_COUNTS}
     for name, counts in COEFFICIENT_COUNTS.items():
@@ -130,7 +127,7 @@ def test_every_model_is_tested_and_has_names_and_sizes_for_refinement():
 @pytest.mark.parametrize(("model", "c"), CASES)
 def test_the_tools_own_formula(model, c):
     """Where both are valid; directions where the formula is and we are not: few, at the very border."""
-    X = directions() * torch.linspace(0.1, 30, 3000)[:, None]
+    X = directions(3000) * torch.linspace(0.1, 30, 3000)[:, None]
     if model not in BEHIND:
         X = X[X[:, 2] > 0.02 * X.norm(dim=-1)]
     found, valid = lens(model, c).project(X)
@@ -163,7 +160,7 @@ def test_unified_is_opencvs_omnidir(c):
 @pytest.mark.parametrize(("model", "c"), CASES)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_round_trips(model, c, dtype):
-    d, X = lens(model, c, dtype), directions().to(dtype)
+    d, X = lens(model, c, dtype), directions(3000).to(dtype)
     xy_d, valid = d.project(X)
     ray, back = d.unproject(xy_d)
     assert xy_d.isfinite().all()
@@ -241,9 +238,12 @@ def test_the_axis_is_straight_in_float32():
         torch.testing.assert_close(found, torch.eye(2))
 
 
-@pytest.mark.parametrize("model", FORMULAS)
+OPENCVS = {"brown-conrady": BROWN, "kannala-brandt": FISHEYES[0]}
+
+
+@pytest.mark.parametrize("model", [*FORMULAS, *OPENCVS])
 def test_a_batch_of_lenses_is_each_lens(model):
-    sets = [c for m, c in CASES if m == model][:2]
+    sets = FORMULAS[model][1][:2] if model in FORMULAS else np.outer((0.5, 1.5), OPENCVS[model])
     batch, xy = lens(model, sets), directions(2 * 40)[:, :2].reshape(2, 4, 10, 2) * 0.4
     for method in ("distort", "undistort", "unproject"):
         values, valid = getattr(batch, method)(xy)

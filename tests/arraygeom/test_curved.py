@@ -11,8 +11,6 @@ from arraygeom import (
     Epipolar,
     EpipolarLine,
     HomographyDisplacement,
-    LensView,
-    Link,
     Local,
     NearestVoxels,
     Pair,
@@ -23,19 +21,15 @@ from arraygeom import (
     intrinsics,
     rotation_from_vector,
     sampling_locations,
+    stack,
 )
 from arraygeom.fields.curved import _Straight
 from arraygeom.pixels import pixel_grid
 from tests.arraygeom import explicit
-from tests.arraygeom.rigs import half_rotation, random_rig, two_cameras, uniform
+from tests.arraygeom.rigs import half_rotation, known_by_f, random_rig, two_cameras, uniform, with_lenses
 
 FISHEYE = Distortion("kannala-brandt", torch.tensor([0.1, -0.05, 0.02, -0.004], dtype=torch.float64))
 BARREL = Distortion("brown-conrady", torch.tensor([-0.28, 0.07, 1e-3, -5e-4], dtype=torch.float64))
-
-
-def with_lenses(rig: Rig, alpha: Distortion | None, beta: Distortion | None) -> Rig:
-    rig = rig.with_camera("alpha", rig["alpha"].replace(distortion=alpha))
-    return rig.with_camera("beta", rig["beta"].replace(distortion=beta))
 
 
 def fisheye_rig() -> Rig:
@@ -170,13 +164,7 @@ def test_batched_rigs_agree_with_single_ones():
     rigs = [with_lenses(random_rig(i), FISHEYE, None) for i in range(2)]
     g = torch.Generator().manual_seed(0)
     x = uniform(g, 5, 40, 2, 6, 2)
-
-    def stacked(name: str) -> Camera:
-        cameras = [r[name] for r in rigs]
-        pose = Pose(torch.stack([c.R for c in cameras]), torch.stack([c.t for c in cameras]))
-        return cameras[0].replace(K=torch.stack([c.K for c in cameras]), cam_from_world=pose)
-
-    batch = Rig({n: stacked(n) for n in ("alpha", "beta")}, depth=rigs[0].depth)
+    batch = stack(rigs)
     together = Curved(8)(batch.pair("alpha", "beta"), x)
     shared = Curved(8)(batch.pair("alpha", "beta"), x[:1])
     for i, rig in enumerate(rigs):
@@ -188,13 +176,6 @@ def test_batched_rigs_agree_with_single_ones():
 def test_straight_fields_refuse_lenses():
     with pytest.raises(ValueError, match="use Curved"):
         sampling_locations(Epipolar(), fisheye_rig().pair("alpha", "beta"))
-
-
-def known_by_F(rig: Rig) -> Rig:
-    """The rig's cameras without their poses and focal lengths: lenses that count in other units, F and H."""
-    pair = rig.pair("alpha", "beta")
-    views = {name: LensView(hw=c.hw, K=c.K, distortion=c.distortion) for name, c in rig.cameras.items()}
-    return Rig(views, links={("alpha", "beta"): Link(pair.fundamental, pair.homography)})
 
 
 @pytest.mark.parametrize("lenses", [(BARREL, BARREL), (BARREL, None), (None, BARREL)])
@@ -209,7 +190,7 @@ def test_a_straight_field_through_lenses_follows_the_same_curve(lenses):
     assert both.sum() > 15
     assert distance_to_polyline(exact.xy[both], found.xy[both]).max() < 0.05
     assert (found.xy[both][:, 0] - exact.xy[both][:, 0]).norm(dim=-1).max() < 0.5
-    by_F = ThroughLenses(HomographyDisplacement(100.0), 400)(known_by_F(rig).pair("alpha", "beta"), x)
+    by_F = ThroughLenses(HomographyDisplacement(100.0), 400)(known_by_f(rig).pair("alpha", "beta"), x)
     near = (exact.xy[both][:, :, None] - by_F.xy[both][:, None]).norm(dim=-1)
     assert near.masked_fill(~by_F.mask[both][:, None], torch.inf).amin(-1).max() < 0.5
 
@@ -224,7 +205,7 @@ def test_through_no_lenses_is_the_field_itself():
 
 def test_links_through_lenses_survive_what_is_done_to_images():
     """Resized, cropped and turned: the same points, in the new pixels."""
-    rig = known_by_F(with_lenses(random_rig(3), BARREL, BARREL))
+    rig = known_by_f(with_lenses(random_rig(3), BARREL, BARREL))
     x = torch.tensor([[30.0, 20.0]], dtype=torch.float64)
     before = ThroughLenses(HomographyDisplacement(20.0), 21)(rig.pair("alpha", "beta"), x)
     h, w = rig["beta"].hw
@@ -238,7 +219,7 @@ def test_links_through_lenses_survive_what_is_done_to_images():
 
 @pytest.mark.parametrize("field", [EpipolarLine(), HomographyDisplacement(20.0), NearestVoxels(), Local()])
 def test_fields_of_links_refuse_lenses(field):
-    rig = known_by_F(with_lenses(random_rig(3), None, BARREL))
+    rig = known_by_f(with_lenses(random_rig(3), None, BARREL))
     with pytest.raises(ValueError, match="ThroughLenses"):
         field(rig.pair("alpha", "beta"), torch.tensor([[30.0, 20.0]]))
     plain = rig.with_camera("beta", View(hw=rig["beta"].hw))

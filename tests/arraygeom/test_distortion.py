@@ -13,6 +13,7 @@ from arraygeom.checks import derived
 from arraygeom.distortion import Distortion
 from arraygeom.lenses import brown as brown_lens
 from arraygeom.lenses.fisheye import fisheye_limit
+from tests.arraygeom.rigs import directions
 from tests.oracles import Oracle
 
 cv2 = Oracle("cv2")
@@ -41,11 +42,6 @@ def plane_points(n: int = 2000, spread: float = 0.6, seed: int = 0) -> torch.Ten
     return spread * torch.randn(n, 2, dtype=torch.float64, generator=generator)
 
 
-def directions(n: int = 2000, seed: int = 0) -> torch.Tensor:
-    X = torch.randn(n, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    return X / X.norm(dim=-1, keepdim=True)
-
-
 def opencv(d: Distortion, X: torch.Tensor) -> np.ndarray:
     """OpenCV's pixels for focal length 1 and no principal point, in float64."""
     coefficients, zero = d.coefficients.numpy(), np.zeros(3)
@@ -65,7 +61,7 @@ def test_brown_conrady_is_opencvs(n):
 
 @pytest.mark.parametrize("k", FISHEYES)
 def test_fisheye_is_opencvs(k):
-    X = directions()
+    X = directions(2000)
     X = X[X[:, 2] > 0.01]
     xy_d, valid = fisheye(k).project(X)
     assert valid.float().mean() > 0.9
@@ -85,7 +81,7 @@ def test_brown_conrady_round_trip(n, dtype, pixels):
 @pytest.mark.parametrize("k", FISHEYES)
 @pytest.mark.parametrize(("dtype", "pixels"), [(torch.float64, 1e-6), (torch.float32, 0.05)])
 def test_fisheye_round_trip_all_round(k, dtype, pixels):
-    d, X = fisheye(k).to(dtype), directions().to(dtype)
+    d, X = fisheye(k).to(dtype), directions(2000).to(dtype)
     xy_d, valid = d.project(X)
     ray, valid_back = d.unproject(xy_d)
     assert bool((valid_back | ~valid).all())
@@ -307,19 +303,6 @@ def test_not_finite_points_are_invalid():
             value, valid = method(bad)
             assert valid.tolist() == [False, False, True]
             assert bool(value.isfinite().all())
-
-
-@pytest.mark.parametrize("d", [brown(), fisheye(FISHEYES[0])], ids=lambda d: d.model)
-def test_a_batch_of_lenses_is_each_lens(d):
-    factors = torch.tensor([0.5, 1.0, 1.5], dtype=torch.float64)
-    batch = Distortion(d.model, factors[:, None] * d.coefficients)
-    xy = plane_points(3 * 40).reshape(3, 4, 10, 2)
-    for method in ("distort", "undistort", "unproject"):
-        values, valid = getattr(batch, method)(xy)
-        for i in range(3):
-            one, one_valid = getattr(Distortion(d.model, factors[i] * d.coefficients), method)(xy[i])
-            torch.testing.assert_close(values[i], one, rtol=1e-9, atol=1e-9)
-            assert torch.equal(valid[i], one_valid)
 
 
 def test_no_points():

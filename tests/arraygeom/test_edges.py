@@ -33,13 +33,12 @@ from arraygeom import (
 )
 from arraygeom.distortion import COEFFICIENT_COUNTS
 from arraygeom.fields.straight import covering_displacement
-from tests.arraygeom.rigs import random_rig
+from tests.arraygeom.rigs import BARREL, random_rig, with_lenses
 from tests.arraygeom.test_camera_models import MODELS
 from tests.arraygeom.test_precision import FIELDS, WHOLE
 
 F64 = torch.float64
 EMPTY = torch.zeros(0, 2)
-LENS = Distortion("brown-conrady", torch.tensor([-0.1, 0.02, 1e-3, -5e-4], dtype=F64))
 
 
 def pinholes() -> Rig:
@@ -47,8 +46,7 @@ def pinholes() -> Rig:
 
 
 def bent() -> Rig:
-    rig = random_rig(1)
-    return Rig({name: rig[name].replace(distortion=LENS) for name in rig.names}, depth=rig.depth)
+    return with_lenses(random_rig(1), BARREL, BARREL)
 
 
 LENSES = {
@@ -153,7 +151,7 @@ def test_gradients_of_curves_by_betas_lens_are_those_of_differences(lens):
     """Of the function as it is computed: where its nodes lie depends on the lens too."""
     rig, c = (
         random_rig(2),
-        LENS.coefficients if lens == "brown-conrady" else torch.tensor([0.05, -0.01, 2e-3, -1e-3]),
+        BARREL.coefficients if lens == "brown-conrady" else torch.tensor([0.05, -0.01, 2e-3, -1e-3]),
     )
     x, c = WHOLE.double().reshape(-1, 2), c.double()
 

@@ -385,42 +385,10 @@ def test_a_clock_starts_at_a_finite_time(offset):
     assert Sensor(time_offset=-0.5).time_offset == -0.5
 
 
-@pytest.mark.parametrize(
-    ("entry", "message"),
-    [
-        ("bayer: RGBG", r"cameras.a: bayer is 'RGBG': wanted 'RGGB' or"),
-        ("coding: gamma", "wanted 'srgb' or 'linear'"),
-        ("bits: 12.5", "wanted a whole number from 1 to 16"),
-        ("black_level: 64", "needs 'bits'"),
-        ("bits: 6, black_level: 64", "not between 0 and white"),
-        ("exposure: 0", "wanted a finite number above 0"),
-        ("gain: [1, 2]", r"a\.gain: has 2 numbers, wanted 3"),
-        ("gain: [1, 2, -1]", "gain is -1.0: wanted a finite number above 0"),
-        ("frame_rate: fast", "other than numbers: 'fast'"),
-    ],
-)
-def test_wrong_facts_of_a_sensor_are_named(tmp_path, entry, message):
-    (tmp_path / "rig.yaml").write_text("cameras:\n  a: {size: [6, 4], " + entry + "}\n")
-    with pytest.raises(RigFileError, match=message):
-        Rig.load(tmp_path / "rig.yaml")
-
-
 def test_rotation_vectors_are_in_degrees(tmp_path):
     (tmp_path / "rig.yaml").write_text("cameras:\n  a: {size: [6, 4], focal: 5, rotation: [0, 0, 90]}\n")
     expected = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
     torch.testing.assert_close(Rig.load(tmp_path / "rig.yaml")["a"].R, expected)
-
-
-def test_a_wrong_number_is_shown_as_it_was_written(tmp_path):
-    (tmp_path / "rig.yaml").write_text("cameras: {mono: {size: [4, 3], focal: long}}")
-    with pytest.raises(RigFileError, match="focal: holds something other than numbers: 'long'"):
-        Rig.load(tmp_path / "rig.yaml")
-
-
-def test_a_size_that_is_missing_is_called_missing(tmp_path):
-    (tmp_path / "rig.yaml").write_text("format: arraygeom-rig 1\ncameras: {mono: {focal: 800}}\n")
-    with pytest.raises(RigFileError, match=r"cameras\.mono\.size: is missing"):
-        Rig.load(tmp_path / "rig.yaml")
 
 
 def test_an_image_upside_down_survives_the_native_file(tmp_path):
@@ -464,31 +432,15 @@ def test_lenses_of_uncalibrated_cameras_come_back(tmp_path):
 
 
 def test_a_lens_without_focal_length_states_its_scale(tmp_path):
-    path = tmp_path / "rig.yaml"
-    text = "first_pixel_centre: 1\ncameras:\n  a:\n    size: [640, 400]\n    distortion: "
-    path.write_text(
-        text + "{model: brown-conrady, coefficients: [0.1, 0, 0, 0], scale: 320, centre: [321, 201]}\n"
+    lens = "{model: brown-conrady, coefficients: [0.1, 0, 0, 0], scale: 320, centre: [321, 201]}"
+    (tmp_path / "rig.yaml").write_text(
+        f"first_pixel_centre: 1\ncameras:\n  a:\n    size: [640, 400]\n    distortion: {lens}\n"
     )
-    view = Rig.load(path)["a"]
+    view = Rig.load(tmp_path / "rig.yaml")["a"]
     assert isinstance(view, LensView)
     assert not isinstance(view, Camera)
-    assert view.distort(torch.tensor([640.0, 200.0], dtype=torch.float64))[0].tolist() == pytest.approx(
-        [672, 200]
-    )
-    path.write_text(text + "{model: brown-conrady, coefficients: [0.1, 0, 0, 0]}\n")
-    with pytest.raises(
-        RigFileError, match=r"cameras\.a\.distortion: is of a camera without 'focal'.*`scale`"
-    ):
-        Rig.load(path)
-    path.write_text(text + "{model: brown-conrady, coefficients: [0.1, 0, 0, 0], scale: -3}\n")
-    with pytest.raises(RigFileError, match=r"distortion\.scale: is -3; a scale is positive"):
-        Rig.load(path)
-    path.write_text(
-        text.replace("640, 400]", "640, 400]\n    focal: 500")
-        + "{model: brown-conrady, coefficients: [0, 0, 0, 0], scale: 3}\n"
-    )
-    with pytest.raises(RigFileError, match=r"distortion\.scale: unknown key"):
-        Rig.load(path)
+    x = view.distort(torch.tensor([640.0, 200.0], dtype=torch.float64))[0]
+    assert x.tolist() == pytest.approx([672, 200])
 
 
 def test_opencv_24s_samples_state_their_size(tmp_path):

@@ -7,6 +7,7 @@ import pytest
 import torch
 from kornia.geometry import calibration, epipolar
 from kornia.geometry.camera import PinholeCamera, project_points, unproject_points
+from kornia.geometry.grid import create_meshgrid
 from kornia.geometry.liegroup import Se3, So3
 from kornia.geometry.linalg import inverse_transformation, transform_points
 from kornia.geometry.transform import remap
@@ -131,7 +132,9 @@ def cases(points: int, dtype: torch.dtype = F64) -> dict[str, Parity]:
         ),
         "composed poses": Parity(
             lambda t: (beta.cam_from_world @ alpha.cam_from_world.replace(t=t).inverse()).t,
-            lambda t: (matrix4(beta.R, beta.t) @ inverse_transformation(matrix4(alpha.R, t)))[:3, 3],
+            lambda t: (
+                beta.cam_from_world.matrix @ inverse_transformation(alpha.cam_from_world.replace(t=t).matrix)
+            )[:3, 3],
             alpha.t,
         ),
         "triangulation": Parity(
@@ -158,7 +161,7 @@ def cases(points: int, dtype: torch.dtype = F64) -> dict[str, Parity]:
         ),
         "pixel grid": Parity(
             lambda s: s * pixel_grid((3, 5), dtype=dtype),
-            lambda s: s * created_grid(3, 5, dtype),
+            lambda s: s * create_meshgrid(3, 5, normalized_coordinates=False, dtype=dtype)[0],
             torch.ones((), dtype=dtype),
         ),
     }
@@ -167,17 +170,6 @@ def cases(points: int, dtype: torch.dtype = F64) -> dict[str, Parity]:
 X = scene_points(RIG, 40)
 X_ALPHA, X_BETA = ALPHA.project(X).x, BETA.project(X).x
 CASES = cases(40)
-
-
-def matrix4(R: Tensor, t: Tensor) -> Tensor:
-    last = R.new_tensor([[0.0, 0, 0, 1]])
-    return torch.cat([torch.cat([R, t[:, None]], -1), last])
-
-
-def created_grid(h: int, w: int, dtype: torch.dtype) -> Tensor:
-    from kornia.geometry.grid import create_meshgrid
-
-    return create_meshgrid(h, w, normalized_coordinates=False, dtype=dtype)[0]
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -6,7 +6,6 @@ import torch
 
 from arraygeom import (
     Camera,
-    Distortion,
     Pair,
     Pose,
     Rig,
@@ -18,17 +17,15 @@ from arraygeom import (
     warp,
     world_rays,
 )
-from tests.arraygeom.rigs import random_rig, scene_points, two_cameras
+from tests.arraygeom.rigs import BARREL, random_rig, scene_points, two_cameras, with_lenses
 from tests.oracles import Oracle
 
 cv2 = Oracle("cv2")
 F64 = torch.float64
-LENS = Distortion("brown-conrady", torch.tensor([-0.1, 0.02, 1e-3, -5e-4], dtype=F64))
 
 
 def bent_rig(seed: int = 1) -> Rig:
-    rig = random_rig(seed)
-    return rig.with_camera("alpha", rig["alpha"].replace(distortion=LENS))
+    return with_lenses(random_rig(seed), BARREL, None)
 
 
 def smooth(hw: tuple[int, int]) -> torch.Tensor:

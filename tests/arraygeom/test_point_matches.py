@@ -113,31 +113,28 @@ def test_images_of_colmap_called_alike_are_told_by_their_folders(tmp_path):
         read_matches(tmp_path / "database.db", {**files, "mono": Path("photos/1.png")}, SIZES)
 
 
-def test_what_is_refused(tmp_path):
-    path = tmp_path / "m.csv"
-    path.write_text("1,2,3,4\n1,2,300,4\n")
-    with pytest.raises(ValueError, match=r"1 of 2 .*'colour', 70x50"):
-        read_matches(path, FILES, SIZES)
-    path.write_text("1,2,3,4\n1,2,3\n")
-    with pytest.raises(ValueError, match="'1,2,3'"):
-        read_matches(path, FILES, SIZES)
-    path.write_text("1,2,3\n1,2,3,4\n")  # taken for a header
-    with pytest.raises(ValueError, match="'1,2,3'"):
-        read_matches(path, FILES, SIZES)
-    path.write_text("1,2,nan,4\n")
-    with pytest.raises(ValueError, match="not finite"):
-        read_matches(path, FILES, SIZES)
-    path.write_text("")
-    with pytest.raises(ValueError, match="an empty file is not four numbers"):
-        read_matches(path, FILES, SIZES)
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"1,2,3,4\n1,2,300,4\n", r"1 of 2 .*'colour', 70x50"),
+        (b"1,2,3,4\n1,2,3\n", "'1,2,3'"),
+        (b"1,2,3\n1,2,3,4\n", "'1,2,3'"),  # taken for a header
+        (b"1,2,nan,4\n", "not finite"),
+        (b"", "an empty file is not four numbers"),
+        (b"\xff\xfe\x00", "neither CSV nor"),
+        (b"SQLite format 3\0" + bytes(100), "not a COLMAP database"),
+    ],
+)
+def test_what_is_refused(tmp_path, content, message):
+    (tmp_path / "m.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=message):
+        read_matches(tmp_path / "m.csv", FILES, SIZES)
+
+
+def test_files_and_images_that_are_missing_are_named(tmp_path):
+    (tmp_path / "m.csv").write_text("1,2,3,4\n")
     with pytest.raises(ValueError, match="3 are given"):
-        read_matches(path, {**FILES, "nir": Path("c.png")}, SIZES)
-    path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ValueError, match="neither CSV nor"):
-        read_matches(path, FILES, SIZES)
-    path.write_bytes(b"SQLite format 3\0" + bytes(100))
-    with pytest.raises(ValueError, match="not a COLMAP database"):
-        read_matches(path, FILES, SIZES)
+        read_matches(tmp_path / "m.csv", {**FILES, "nir": Path("c.png")}, SIZES)
     with pytest.raises(FileNotFoundError, match=r"none\.csv"):
         read_matches(tmp_path / "none.csv", FILES, SIZES)
     database(tmp_path / "other.db", names=("set/c.png", "set/b.png"))

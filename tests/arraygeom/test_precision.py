@@ -43,22 +43,18 @@ from arraygeom.pixels import pixel_grid
 from tests.arraygeom.rigs import random_rig, scene_points, two_cameras
 
 FIELDS = [
-    *(
-        Epipolar(),
-        EpipolarLine(),
-        HomographyDisplacement(8.0),
-        HomographyDisplacement(),
-        Rectified(20.0),
-        Rectified(),
-    ),
-    *(
-        NearestVoxels(24, 12),
-        Local(3),
-        Dense(4),
-        Curved(16),
-        ThroughLenses(Epipolar(), 16),
-        Widened(Epipolar(), 2, 3),
-    ),
+    Epipolar(),
+    EpipolarLine(),
+    HomographyDisplacement(8.0),
+    HomographyDisplacement(),
+    Rectified(20.0),
+    Rectified(),
+    NearestVoxels(24, 12),
+    Local(3),
+    Dense(4),
+    Curved(16),
+    ThroughLenses(Epipolar(), 16),
+    Widened(Epipolar(), 2, 3),
     Widened(Epipolar(), along=3),
     Moved(Epipolar(), torch.full((2, 48, 64), 0.25)),
 ]

@@ -7,16 +7,15 @@ import torch
 from torch.utils import _pytree as pytree
 from torch.utils.data import DataLoader
 
-from arraygeom import Band, Camera, Distortion, Epipolar, LensView, Link, Pair, Pose, Rig, Sensor, View, stack
-from tests.arraygeom.rigs import random_rig
+from arraygeom import Band, Camera, Epipolar, LensView, Link, Pair, Pose, Rig, Sensor, View, stack
+from tests.arraygeom.rigs import BARREL, random_rig
 
-LENS = Distortion("brown-conrady", torch.tensor([-0.1, 0.02, 1e-3, -5e-4], dtype=torch.float64))
 PLAIN = random_rig(1)
-BENT = PLAIN.with_camera("alpha", PLAIN["alpha"].replace(distortion=LENS, sensor=Sensor("mono", bits=12)))
+BENT = PLAIN.with_camera("alpha", PLAIN["alpha"].replace(distortion=BARREL, sensor=Sensor("mono", bits=12)))
 LINKED = Rig(
     {
         "a": View(hw=(4, 6), sensor=Sensor(Band(550.0, 80.0))),
-        "b": LensView(hw=(4, 6), K=torch.eye(3), distortion=LENS),
+        "b": LensView(hw=(4, 6), K=torch.eye(3), distortion=BARREL),
     },
     links={("a", "b"): Link(torch.eye(3))},
     name="two",

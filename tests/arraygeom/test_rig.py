@@ -6,7 +6,6 @@ import torch
 from arraygeom import (
     Camera,
     Distortion,
-    Link,
     Pose,
     Rig,
     View,
@@ -17,21 +16,13 @@ from arraygeom import (
 )
 from arraygeom.pose import rotation_error
 from arraygeom.text import UNSCALED
-from tests.arraygeom.rigs import random_rig, scene_points, two_cameras
+from tests.arraygeom.rigs import known_by_f, random_rig, scene_points, two_cameras
 
 EVERYTHING = ("rotation", "translation", "focal", "centre")
 
 
-def uncalibrated() -> Rig:
-    """The same pair as `random_rig(0)`, known by F and H only."""
-    rig = random_rig(0)
-    pair = rig.pair("alpha", "beta")
-    views = {n: View(hw=rig[n].hw) for n in rig.names}
-    return Rig(views, links={("alpha", "beta"): Link(pair.fundamental, pair.homography)})
-
-
 def test_a_pair_follows_what_happens_to_betas_image_as_its_rig_does():
-    for rig in (random_rig(0), uncalibrated()):
+    for rig in (random_rig(0), known_by_f(random_rig(0))):
         one, other = rig.pair("alpha", "beta").resize_beta((30, 31)), rig.resize("beta", (30, 31))
         assert one.beta.hw == other["beta"].hw
         torch.testing.assert_close(one.fundamental, other.pair("alpha", "beta").fundamental)
@@ -49,7 +40,7 @@ def test_a_pair_follows_what_happens_to_betas_image_as_its_rig_does():
 @pytest.mark.parametrize("name", ["alpha", "beta"])
 def test_links_follow_what_happens_to_images(change, name):
     """The calibrated rig is the oracle of the uncalibrated one."""
-    known, unknown = change(random_rig(0), name), change(uncalibrated(), name)
+    known, unknown = change(random_rig(0), name), change(known_by_f(random_rig(0)), name)
     assert known[name].hw == unknown[name].hw
     X = scene_points(random_rig(0))
     x_alpha, x_beta = (known[n].project(X).x for n in ("alpha", "beta"))
@@ -61,7 +52,7 @@ def test_links_follow_what_happens_to_images(change, name):
 
 
 def test_a_link_serves_both_ways():
-    forth, back = (uncalibrated().pair(*names) for names in (("alpha", "beta"), ("beta", "alpha")))
+    forth, back = (known_by_f(random_rig(0)).pair(*names) for names in (("alpha", "beta"), ("beta", "alpha")))
     torch.testing.assert_close(back.fundamental, forth.fundamental.T)
     torch.testing.assert_close(back.homography @ forth.homography, torch.eye(3, dtype=torch.float64))
 
@@ -157,7 +148,7 @@ def test_a_scaled_rig_shows_the_scaled_scene_alike():
     for name in rig.names:
         torch.testing.assert_close(scaled[name].project(1e3 * X).x, rig[name].project(X).x)
     assert [float(bound) for bound in scaled.depth] == [1e3, 4e3]
-    assert uncalibrated().scaled(2.0).links == uncalibrated().links
+    assert known_by_f(random_rig(0)).scaled(2.0).links == known_by_f(random_rig(0)).links
 
 
 @pytest.mark.parametrize("turned", [False, True])

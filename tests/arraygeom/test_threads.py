@@ -8,13 +8,7 @@ import pytest
 import torch
 
 from arraygeom import threads as threads_module
-from arraygeom.threads import (
-    convolutions_in_parallel,
-    in_order,
-    in_parallel,
-    threads,
-    torch_in_one_thread,
-)
+from arraygeom.threads import convolutions_in_parallel, in_order, in_parallel, threads, torch_in_one_thread
 
 
 class Noted(list):

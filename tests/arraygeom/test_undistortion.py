@@ -22,10 +22,7 @@ from tests.oracles import Oracle
 cv2 = Oracle("cv2")
 
 HW = (120, 160)
-LENSES = {
-    "brown-conrady": [-0.36, 0.17, 0.001, -0.002],
-    "kannala-brandt": [-0.02, 0.01, -0.003, 0.001],
-}
+LENSES = {"brown-conrady": [-0.36, 0.17, 0.001, -0.002], "kannala-brandt": [-0.02, 0.01, -0.003, 0.001]}
 
 
 def camera(model, focal=110.0):

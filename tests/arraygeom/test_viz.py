@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Distortion, Epipolar, Link, Local, Rig, Segments, View, Widened, sampling_locations, viz
-from tests.arraygeom.rigs import random_rig, scene_points, two_cameras
+from arraygeom import Distortion, Epipolar, Local, Rig, Segments, Widened, sampling_locations, viz
+from tests.arraygeom.rigs import known_by_f, random_rig, scene_points, two_cameras
 
 pytest.importorskip("matplotlib", reason="drawings need matplotlib")
 
@@ -68,9 +68,7 @@ def test_any_field_can_be_drawn():
 
 
 def test_uncalibrated_pairs_are_drawn_about_their_homography():
-    pair = random_rig(1).pair("alpha", "beta")
-    views = {"alpha": View(hw=pair.alpha.hw), "beta": View(hw=pair.beta.hw)}
-    rig = Rig(views, links={("alpha", "beta"): Link(pair.fundamental, pair.homography)})
+    rig = known_by_f(random_rig(1))
     assert len(png(viz.draw_fields(rig, "alpha", X))) > 1000
     with pytest.raises(ValueError, match="nothing to draw"):
         viz.draw_rig(rig)

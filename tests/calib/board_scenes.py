@@ -3,8 +3,9 @@
 import numpy as np
 import torch
 
-from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_vector
-from calib.boards.bundle import BundleProblem, Observations, parameter_names
+from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_vector, stack
+from arraygeom.pose import rotation_vector
+from calib.boards.bundle import BundleProblem, Observations, intrinsic_values, parameter_names
 from calib.boards.detect import BoardViews, Detection
 from calib.boards.target import Board, parse_board
 
@@ -57,15 +58,14 @@ def board_poses(count, *, seed=0, depth=(0.9, 2.4), tilt=35.0, spread=0.4) -> Po
     """`world_from_board` in front of a camera at the origin: random positions, depths and tilts."""
     random = np.random.default_rng(seed)
     middle = BOARD.points.mean(0)
-    rotations, translations = [], []
+    poses = []
     for _ in range(count):
         vector = np.deg2rad(np.append(random.uniform(-tilt, tilt, 2), random.uniform(-20, 20)))
         R = rotation_from_vector(tensor(*vector))
         z = random.uniform(*depth)
         target = tensor(*(z * random.uniform(-spread, spread, 2)), z)
-        rotations.append(R)
-        translations.append(target - R @ tensor(*middle))
-    return Pose(torch.stack(rotations), torch.stack(translations))
+        poses.append(Pose(R, target - R @ tensor(*middle)))
+    return stack(poses)
 
 
 def see(rig, boards, board: Board = BOARD, *, noise=0.0, seed=1) -> dict[str, BoardViews]:
@@ -75,7 +75,7 @@ def see(rig, boards, board: Board = BOARD, *, noise=0.0, seed=1) -> dict[str, Bo
     for name, camera in rig.cameras.items():
         seen = {}
         for frame in range(len(boards.t)):
-            X = Pose(boards.R[frame], boards.t[frame]).apply(torch.from_numpy(board.points))
+            X = boards[frame].apply(torch.from_numpy(board.points))
             x, _, valid = camera.project(X)
             inside = (valid & camera.contains(x)).numpy()
             if inside.sum() >= 12:
@@ -108,21 +108,9 @@ def errors_of(fit, rig):
     """Estimate minus ground truth of every free parameter, in the order of `fit.names`."""
     found = []
     for name, camera_found in fit.problem.cameras.items():
-        ground_truth = rig[name]
-        R = (camera_found.R @ ground_truth.R.T).numpy()
-        turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-        K = (camera_found.K - ground_truth.K).numpy()
-        lenses = [c.distortion.coefficients for c in (camera_found, ground_truth) if c.distortion is not None]
-        lens = lenses[0] - lenses[1] if lenses else torch.zeros(0)
-        values = [
-            *turn,
-            *(camera_found.t - ground_truth.t).numpy(),
-            K[0, 0],
-            K[1, 1],
-            K[0, 2],
-            K[1, 2],
-            *lens.numpy(),
-        ]
+        turn = rotation_vector(camera_found.R @ rig[name].R.T)
+        values = intrinsic_values(camera_found) - intrinsic_values(rig[name])
+        values[:6] = *turn.tolist(), *(camera_found.t - rig[name].t).tolist()
         entries = [f"{name}.{entry}" for entry in parameter_names(camera_found)]
         found += [v for v, entry in zip(values, entries) if entry in fit.names]
     return np.array(found)
@@ -130,11 +118,6 @@ def errors_of(fit, rig):
 
 def pose_errors(fit, rig):
     """The largest error of orientations (degrees) and of optical centres (metres)."""
-    degrees = [
-        np.degrees(
-            np.linalg.norm(errors_of(fit, rig)[[fit.names.index(f"{n}.rotation.{i}") for i in range(3)]])
-        )
-        for n in list(fit.problem.cameras)[1:]
-    ]
-    metres = [float((c.centre - rig[n].centre).norm()) for n, c in fit.problem.cameras.items()]
-    return max(degrees), max(metres)
+    cameras = fit.problem.cameras.items()
+    radians = [float(rotation_vector(c.R @ rig[n].R.T).norm()) for n, c in cameras]
+    return np.degrees(max(radians)), max(float((c.centre - rig[n].centre).norm()) for n, c in cameras)

@@ -16,19 +16,9 @@ from arraygeom.io import read_rig
 from pat.media.images import read_image
 
 SYNTIM = (
-    "Color",
-    "Serfaty",
-    "Poly",
-    "BatInria",
-    "BatSynt",
-    "Billet",
-    "Cube",
-    "Jallut",
-    "LaMire",
-    "Money",
-    "Sigraph",
+    *("Color", "Serfaty", "Poly", "BatInria", "BatSynt", "Billet", "Cube", "Jallut", "LaMire", "Money"),
+    *("Sigraph", "TableSTV", "Tordu", "Aout", "BalMouss", "SmRub", "CubeR", "Lego"),
 )
-SYNTIM += ("TableSTV", "Tordu", "Aout", "BalMouss", "SmRub", "CubeR", "Lego")
 BUMBLEBEE = ("chair01", "chair02", "stones01", "thing01")
 MIDDLEBURY = {"2006_third/Cloth1": 3, "2006_third/Midd1": 3, "2006_half/Wood2": 2, "2005_half/Reindeer": 2}
 

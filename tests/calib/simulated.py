@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from itertools import combinations
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -51,43 +51,21 @@ def _towards(direction: np.ndarray) -> Tensor:
 
 
 def simulated_matches(
-    rig: Rig,
-    field: str,
-    g: np.random.Generator,
-    *,
-    count: int = 250,
-    noise: float = NOISE,
-    wrong: float = WRONG,
+    rig: Rig, field: str, g: np.random.Generator, *, count: int = 250, wrong: float = WRONG
 ) -> dict[tuple[str, str], PointMatches]:
     """Matched points of neighbouring cameras of a true rig; wrong ones lie some pixels across the lines."""
-    names = rig.names
-    found = {}
-    for a, b in combinations(names, 2):
-        if names.index(b) - names.index(a) == 1:
-            found[a, b] = _pair_matches(rig, (a, b), field, g, count=count, noise=noise, wrong=wrong)
-    return found
-
-
-def _pair_matches(
-    rig: Rig,
-    names: tuple[str, str],
-    field: str,
-    g: np.random.Generator,
-    *,
-    count: int,
-    noise: float,
-    wrong: float,
-) -> PointMatches:
-    alpha, beta = (rig[name] for name in names)
-    h, w = alpha.hw
     near, far = DISTANCE[field]
-    x = torch.from_numpy(g.uniform(0, 1, (6 * count, 2)) * [w - 1, h - 1])
-    depth = torch.from_numpy(1 / g.uniform(1 / far, 1 / near, len(x)))
-    y, _, valid = beta.project(alpha.unproject(x, depth))
-    seen = valid & beta.contains(y) & x.isfinite().all(-1)
-    x, y = x[seen][:count], y[seen][:count]
-    is_wrong = torch.from_numpy(g.uniform(size=len(x)) < wrong)
-    off = torch.from_numpy(
-        np.where(is_wrong[:, None], g.uniform(-5, 5, (len(x), 2)), g.normal(0, noise, (len(x), 2)))
-    )
-    return PointMatches(x + torch.from_numpy(g.normal(0, noise, (len(x), 2))), y + off)
+    found = {}
+    for names in pairwise(rig.names):
+        alpha, beta = (rig[name] for name in names)
+        h, w = alpha.hw
+        x = torch.from_numpy(g.uniform(0, 1, (6 * count, 2)) * [w - 1, h - 1])
+        depth = torch.from_numpy(1 / g.uniform(1 / far, 1 / near, len(x)))
+        y, _, valid = beta.project(alpha.unproject(x, depth))
+        seen = valid & beta.contains(y) & x.isfinite().all(-1)
+        x, y = x[seen][:count], y[seen][:count]
+        is_wrong = g.uniform(size=(len(x), 1)) < wrong
+        off = np.where(is_wrong, g.uniform(-5, 5, x.shape), g.normal(0, NOISE, x.shape))
+        here = g.normal(0, NOISE, x.shape)
+        found[names] = PointMatches(x + torch.from_numpy(here), y + torch.from_numpy(off))
+    return found

@@ -14,7 +14,6 @@ import torch
 import yaml
 from safetensors import safe_open
 
-from arraygeom import Pose
 from arraygeom.io import read_rig
 from calib.boards.simulation import photograph
 from calib.boards.target import parse_board
@@ -178,7 +177,7 @@ def calibration_job(folder: Path) -> Job:
         for name, c in cameras.items():
             (photos / name).mkdir(parents=True)
             for i in range(6):
-                pose = c.cam_from_world @ Pose(boards.R[i], boards.t[i])
+                pose = c.cam_from_world @ boards[i]
                 image = photograph(c, pose, parse_board(BOARD), dpi=60)
                 cv2.imwrite(str(photos / name / f"{i}.png"), image)
 

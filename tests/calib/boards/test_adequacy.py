@@ -15,12 +15,12 @@ from calib.boards.rig import calibrate
 from calib.boards.run import _advice, watch
 from calib.boards.simulation import simulate_photos
 from calib.boards.solve import misfit_notes
-from calib.boards.target import parse_board
 from calib.boards.uncertainty import intrinsics_of, uncertainty
 from calib.boards.validation import LensComparison, compare_lenses, half_difference
 from tests.calib.board_scenes import BOARD, board_poses, camera, errors_of, see
 
 TRUE = camera(700.0, (480, 640), lens=(-0.2, 0.05, 0.0, 0.0, 0.0))
+RATIONAL = (-2.0, 1.5, 0.001, -0.001, 0.05, -1.6, 1.2, 0.1)
 
 
 @pytest.fixture(scope="module")
@@ -201,11 +201,7 @@ def test_a_lens_that_sees_the_board_behind_it_gives_no_pose():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("lens", "advised"),
-    [
-        ((-0.2, 0.05, 0.0, 0.0, 0.0), "brown-conrady"),
-        ((-2.0, 1.5, 0.001, -0.001, 0.05, -1.6, 1.2, 0.1), "rational"),
-    ],
+    ("lens", "advised"), [((-0.2, 0.05, 0.0, 0.0, 0.0), "brown-conrady"), (RATIONAL, "rational")]
 )
 def test_the_lens_that_the_images_support_is_advised(lens, advised):
     boards = board_poses(12, seed=3, spread=0.7, depth=(0.6, 1.6))
@@ -214,7 +210,7 @@ def test_the_lens_that_the_images_support_is_advised(lens, advised):
 
 
 def test_rational_lenses_are_fitted():
-    true = camera(420.0, (480, 640), lens=(-2.0, 1.5, 0.001, -0.001, 0.05, -1.6, 1.2, 0.1))
+    true = camera(420.0, (480, 640), lens=RATIONAL)
     views = see(Rig({"c": true}), board_poses(12, seed=3, spread=0.7, depth=(0.6, 1.6)), noise=0.05)
     rational, brown = (calibrate(views, BOARD, lens=lens) for lens in ("rational", "brown-conrady"))
     assert len(parameter_names(rational.rig["c"])) == 18
@@ -224,15 +220,19 @@ def test_rational_lenses_are_fitted():
 
 def test_no_board_is_mistaken_for_its_mirror_image_by_a_poor_start():
     """With one radial term a board near the corner was seen from the other side for good: 5.7 px."""
-    true = camera(420.0, (480, 640), lens=(-2.0, 1.5, 0.001, -0.001, 0.05, -1.6, 1.2, 0.1))
+    true = camera(420.0, (480, 640), lens=RATIONAL)
     views = see(Rig({"c": true}), board_poses(12, seed=5, spread=0.7, depth=(0.6, 1.6)), noise=0.05)
     assert calibrate(views, BOARD).rms < 0.15
 
 
+SMALL = Rig({"a": camera(330.0, (240, 320))})
+"""Whose photographs arrive in the folders that are watched."""
+
+
 def test_a_folder_is_watched(tmp_path):
     """Images arrive by and by: the page says what is missing, then what would help most."""
-    board, source, folder = parse_board("charuco:9x7:60mm"), tmp_path / "all", tmp_path / "photos"
-    simulate_photos(Rig({"a": camera(330.0, (240, 320))}), board, source, count=5)
+    source, folder = tmp_path / "all", tmp_path / "photos"
+    simulate_photos(SMALL, BOARD, source, count=5)
     (folder / "a").mkdir(parents=True)
     pages, page = [], tmp_path / "page.html"
 
@@ -244,7 +244,7 @@ def test_a_folder_is_watched(tmp_path):
             (folder / "a" / image.name).write_bytes(image.read_bytes())
         return len(pages) == 4
 
-    session = watch(folder, board, page, interval=0.0, finished=finished)
+    session = watch(folder, BOARD, page, interval=0.0, finished=finished)
     assert len(session.seen) == 5
     assert "0 images" in pages[0]
     assert "the board is found in 2 of its images" in pages[1]
@@ -254,9 +254,7 @@ def test_a_folder_is_watched(tmp_path):
 
 
 def test_what_was_detected_is_shown_before_it_is_calibrated(tmp_path, monkeypatch):
-    simulate_photos(
-        Rig({"a": camera(330.0, (240, 320))}), parse_board("charuco:9x7:60mm"), tmp_path / "photos", count=1
-    )
+    simulate_photos(SMALL, BOARD, tmp_path / "photos", count=1)
     page, shown = tmp_path / "page.html", []
 
     def calibrate(*_, **__):
@@ -272,8 +270,7 @@ def test_what_was_detected_is_shown_before_it_is_calibrated(tmp_path, monkeypatc
 
 def test_what_is_wrong_with_the_folder_is_on_the_page_until_it_is_mended(tmp_path, monkeypatch):
     """The page said that it waits for images, for ever."""
-    rig = Rig({"a": camera(330.0, (240, 320))})
-    simulate_photos(rig, BOARD, tmp_path / "photos", count=2)
+    simulate_photos(SMALL, BOARD, tmp_path / "photos", count=2)
     image = tmp_path / "photos/a/000.png"
     page, pages = tmp_path / "page.html", []
     wrong = image.rename(image.with_name("1.png"))

@@ -97,11 +97,7 @@ def test_videos_are_read_frame_by_frame(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("files", "message"),
-    [
-        ([], "images or videos"),
-        (["a/x01.png", "a/x1.png", "a/y.txt"], "a: "),
-    ],
+    ("files", "message"), [([], "images or videos"), (["a/x01.png", "a/x1.png", "a/y.txt"], "a: ")]
 )
 def test_mistakes(files, message, tmp_path):
     for file in files:

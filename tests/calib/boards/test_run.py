@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from arraygeom import Pose, Rig
+from arraygeom import Rig
 from arraygeom.io import read_rig
 from calib.boards.detect import collect_folder
 from calib.boards.rig import calibrate
-from calib.boards.simulation import fine_rays, photograph
+from calib.boards.simulation import simulate_photos
 from calib.boards.solve import calibrate_single
 from calib.boards.target import parse_board
 from pat.cli.main import main
-from tests.calib.board_scenes import board_poses, camera, errors_of, four_cameras, pose_errors
+from tests.calib.board_scenes import camera, errors_of, four_cameras, pose_errors
 
 BOARD = "charuco:9x7:60mm"
 
@@ -27,14 +27,7 @@ def photos(tmp_path_factory):
         "a": camera(330.0, (240, 320), lens=(-0.2, 0.05, 0, 0, 0)),
         "b": camera(280.0, (220, 300), (0.15, 0, 0), (0, -6, 1)),
     }
-    boards = board_poses(6, depth=(0.8, 1.2), spread=0.1)
-    for name, c in cameras.items():
-        (folder / name).mkdir()
-        rays = fine_rays(c)
-        for i in range(6):
-            pose = c.cam_from_world @ Pose(boards.R[i], boards.t[i])
-            image = photograph(c, pose, parse_board(BOARD), dpi=60, rays=rays)
-            cv2.imwrite(str(folder / name / f"shot_{i:02d}.png"), image)
+    simulate_photos(Rig(cameras), parse_board(BOARD), folder, count=6, noise=0.0)
     return folder
 
 
@@ -87,7 +80,7 @@ def test_no_board(mine, capsys):
         cv2.imwrite(str(path), np.full((220, 300), 90, np.uint8))
     message = fails(mine, capsys)
     assert "b: the board charuco:9x7:60mm" in message
-    assert "none of 6 images (shot_00.png, shot_01.png" in message
+    assert "none of 6 images (000.png, 001.png" in message
     assert "hardly any contrast" in message
 
 
@@ -102,11 +95,11 @@ def test_mirrored(mine, capsys):
 
 
 def test_mixed_sizes(mine, capsys):
-    path = mine / "a" / "shot_03.png"
+    path = mine / "a" / "003.png"
     cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (640, 480)))
     message = fails(mine, capsys)
     assert "a: " in message
-    assert "640x480 (shot_03.png)" in message
+    assert "640x480 (003.png)" in message
 
 
 def test_one_image(mine, capsys):
@@ -116,9 +109,9 @@ def test_one_image(mine, capsys):
 
 
 def test_a_few_bad_images_are_named_and_left_out(mine, without_report, capsys):
-    cv2.imwrite(str(mine / "a" / "shot_02.png"), np.full((240, 320), 90, np.uint8))
+    cv2.imwrite(str(mine / "a" / "002.png"), np.full((240, 320), 90, np.uint8))
     run(mine)
-    assert "a: no board in 1 of 6 images (shot_02.png)" in capsys.readouterr().out
+    assert "a: no board in 1 of 6 images (002.png)" in capsys.readouterr().out
 
 
 def test_other_mistakes(mine, capsys):
@@ -149,14 +142,8 @@ def test_photographs_of_four_cameras(tmp_path):
 
     Sixteen boards and corners good to 0.1 px know the poses to about 0.1 degree and half a millimetre.
     """
-    rig, boards, random = four_cameras(), board_poses(16, spread=0.25), np.random.default_rng(0)
-    for name, c in rig.cameras.items():
-        (tmp_path / name).mkdir()
-        rays = fine_rays(c)
-        for i in range(16):
-            pose = c.cam_from_world @ Pose(boards.R[i], boards.t[i])
-            image = photograph(c, pose, parse_board(BOARD), dpi=100, rays=rays) + random.normal(0, 2, c.hw)
-            cv2.imwrite(str(tmp_path / name / f"{i}.png"), image.clip(0, 255).round().astype(np.uint8))
+    rig = four_cameras()
+    simulate_photos(rig, parse_board(BOARD), tmp_path, count=16, noise=2.0)
     found = collect_folder(tmp_path, parse_board(BOARD))
     result = calibrate({name: found.views[name] for name in rig.names}, parse_board(BOARD))
     error = errors_of(result.fit, rig) / np.sqrt(result.fit.covariance.diagonal())

@@ -35,7 +35,7 @@ def test_corners_are_where_the_cameras_put_them(rig, rehearsed):
     for name, seen in views.items():
         off = []
         for frame, found in seen.seen.items():
-            X = Pose(boards.R[frame], boards.t[frame]).apply(torch.from_numpy(BOARD.points))
+            X = boards[frame].apply(torch.from_numpy(BOARD.points))
             off.append(found.x - rig[name].project(X).x.numpy()[found.ids])
         off = np.concatenate(off)
         assert np.abs(off.mean(0)).max() < 0.03

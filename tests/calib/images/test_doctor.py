@@ -1,6 +1,5 @@
 """Every usual mistake made with rigs whose ground truth is known, and the name it is given."""
 
-import dataclasses
 import json
 import math
 import re
@@ -9,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Link, Pose, Rig, View, rotation_from_vector, triangulate
-from arraygeom.pose import rotation_vector
+from arraygeom import Link, Pose, Rig, View, triangulate
 from arraygeom.text import UNSCALED
 from calib.images.doctor import diagnose, diagnose_matches
 from calib.images.hypotheses import TRANSPOSE, on_cameras, swap
@@ -20,6 +18,7 @@ from calib.images.residuals import sampson_of_pairs
 from pat.cli.main import main
 from pat.media.images import write_image
 from tests.benchmarks.bench_drift import drifted
+from tests.benchmarks.bench_names import OPENGL, negated, reordered, shifted, turned
 from tests.calib.scenes import rectified_images, rectified_pair, seen_points, texture, unlike_pair, vector
 from tests.calib.simulated import simulated_matches, simulated_rig
 
@@ -40,23 +39,16 @@ def posed(change):
     return lambda c: c.replace(cam_from_world=change(c.cam_from_world))
 
 
-def moved(d):
-    return lambda c: c.replace(K=c.K + torch.nn.functional.pad(vector([d], [d]), (2, 0, 0, 1)))
-
-
-OPENGL = torch.diag(vector(1, -1, -1))
 MISTAKES = {
     "sign of t": one(posed(lambda p: Pose(p.R, -p.t))),
-    "half-pixel shift": one(moved(0.5)),
-    "one-pixel shift": one(moved(-1.0)),
+    "half-pixel shift": one(shifted(0.5)),
+    "one-pixel shift": one(shifted(-1.0)),
     "R transposed": each(posed(lambda p: Pose(p.R.T, p.t))),
     "pose inverted": each(posed(Pose.inverse)),
     "centre as t": each(posed(lambda p: Pose(p.R, -p.R.T @ p.t))),
     "OpenGL axes": one(posed(lambda p: Pose(OPENGL @ p.R, OPENGL @ p.t))),
-    "order of quaternions": each(posed(lambda p: Pose.from_quaternion(p.quaternion[[3, 0, 1, 2]], p.t))),
-    "degrees and radians": each(
-        posed(lambda p: Pose(rotation_from_vector(rotation_vector(p.R).deg2rad()), p.t))
-    ),
+    "order of quaternions": each(posed(lambda p: reordered(p, (3, 0, 1, 2)))),
+    "degrees and radians": each(posed(lambda p: Pose(turned(p.R, math.pi / 180), p.t))),
     "cameras swapped": lambda rig: swap(rig, *rig.names),
     "units": each(posed(lambda p: Pose(p.R, 1000 * p.t))),
     "x and y exchanged": each(lambda c: c.replace(K=TRANSPOSE @ c.K @ TRANSPOSE)),
@@ -131,15 +123,11 @@ def test_a_drift_that_a_mistake_would_explain_is_not_named(repair):
 def test_rotations_in_degrees_are_found_with_their_lost_turns(field, draw):
     g = np.random.default_rng([draw, 5])
     rig = simulated_rig(field, 2, g)
-    in_degrees = each(lambda c: c.replace(cam_from_world=Pose(turned(c.R, 180 / math.pi), c.t)))
+    in_degrees = each(posed(lambda p: Pose(turned(p.R, 180 / math.pi), p.t)))
     found = diagnose_matches(in_degrees(rig), sizes(rig), simulated_matches(rig, field, g))
     assert found.named.kind == "degrees and radians", found.verdict
     for name, camera in rig.cameras.items():
         assert torch.allclose(found.named.rig[name].R, camera.R, atol=1e-9)
-
-
-def turned(R, factor):
-    return rotation_from_vector(factor * rotation_vector(R))
 
 
 def test_a_repair_that_leaves_far_more_than_another_is_not_as_good():
@@ -161,16 +149,7 @@ def test_nothing_is_wrong(lens):
 
 
 @pytest.mark.parametrize(
-    ("words", "change"),
-    [
-        ("ignored", lambda c: c.replace(distortion=None)),
-        (
-            "wrong sign",
-            lambda c: c.replace(
-                distortion=dataclasses.replace(c.distortion, coefficients=-c.distortion.coefficients)
-            ),
-        ),
-    ],
+    ("words", "change"), [("ignored", lambda c: c.replace(distortion=None)), ("wrong sign", negated)]
 )
 def test_wrong_distortion_is_named(words, change):
     rig = unlike_pair(lens=True)
@@ -215,10 +194,7 @@ def test_nothing_is_certain_where_repairs_of_equal_lines_give_other_depths():
     """The right camera sees 3 px to one side: an inverted pose is not quite the same as images swapped."""
     rig = rectified_pair().perturbed({"right.centre": vector(3, 0)})
     found = diagnose_matches(each(posed(Pose.inverse))(rig), sizes(rig), seen_points(rig))
-    assert {"pose inverted", "cameras swapped"} <= {
-        found.named.kind,
-        *(h.kind for h in found.equal),
-    }
+    assert {"pose inverted", "cameras swapped"} <= {found.named.kind, *(h.kind for h in found.equal)}
     assert not found.certain
 
 
@@ -278,37 +254,31 @@ def test_command_line(tmp_path, capsys):
     for name, image in images.items():
         write_image(tmp_path / f"{name}.png", image)
     each(posed(Pose.inverse))(rig).save(tmp_path / "rig.yaml")
-    main(["rig", "doctor", str(tmp_path / "rig.yaml"), *files, "--fix", str(tmp_path / "fixed.yaml")])
+
+    def doctor(name, fixed, *more):
+        main(["rig", "doctor", str(tmp_path / name), *files, "--fix", str(tmp_path / fixed), *more])
+
+    doctor("rig.yaml", "fixed.yaml")
     said = capsys.readouterr().out
     assert "likely mistake" in said
     assert said.count("median depth") == 1
     given = (tmp_path / "rig.yaml").read_bytes() + b"# Gr\xf6\xdfe\r\n"  # not UTF-8: kept as it is
     (tmp_path / "other.yaml").write_bytes(given)
-    main(["rig", "doctor", str(tmp_path / "rig.yaml"), *files, "--fix", str(tmp_path / "other.yaml")])
+    doctor("rig.yaml", "other.yaml")
     assert (tmp_path / "other.yaml.old").read_bytes() == given
-    main(["rig", "doctor", str(tmp_path / "rig.yaml"), *files, "--fix", str(tmp_path / "rig.yaml")])
+    doctor("rig.yaml", "rig.yaml")
     assert "former file" in capsys.readouterr().err
     assert (tmp_path / "rig.yaml").read_text() == (tmp_path / "fixed.yaml").read_text()
     assert "likely mistake" not in (tmp_path / "rig.yaml.old").read_text()
     assert Rig.load(tmp_path / "rig.yaml.old")["right"].t[0] > 0
-    main(
-        [
-            "rig",
-            "doctor",
-            str(tmp_path / "fixed.yaml"),
-            *files,
-            "--json",
-            "--fix",
-            str(tmp_path / "none.yaml"),
-        ]
-    )
+    doctor("fixed.yaml", "none.yaml", "--json")
     captured = capsys.readouterr()
     assert json.loads(captured.out)["healthy"]
     assert "no rig written" in captured.err
     assert not (tmp_path / "none.yaml").exists()
     each(posed(Pose.inverse))(rig.perturbed({"right.centre": vector(3, 0)})).save(tmp_path / "other.yaml")
     with pytest.raises(SystemExit, match="4"):
-        main(["rig", "doctor", str(tmp_path / "other.yaml"), *files, "--fix", str(tmp_path / "none.yaml")])
+        doctor("other.yaml", "none.yaml")
     assert not (tmp_path / "none.yaml").exists()
 
 
@@ -317,10 +287,6 @@ def test_points_whose_equations_are_singular_are_invalid():
     g = np.random.default_rng([6, 5])
     rig = simulated_rig("wide", 2, g)
     (names, matches), *_ = simulated_matches(rig, "wide", g).items()
-    cameras = [
-        camera.replace(
-            cam_from_world=Pose(rotation_from_vector(torch.rad2deg(rotation_vector(camera.R))), camera.t)
-        )
-        for camera in rig.pair(*names).cameras
-    ]
+    in_degrees = posed(lambda p: Pose(turned(p.R, 180 / math.pi), p.t))
+    cameras = [in_degrees(camera) for camera in rig.pair(*names).cameras]
     assert not triangulate(cameras, torch.stack(list(matches))).valid.all()

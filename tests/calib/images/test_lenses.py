@@ -46,20 +46,16 @@ def pair(k1: float) -> Rig:
 
 
 def lenses(rig: Rig) -> set[str]:
-    return {
-        name
-        for name, view in rig.cameras.items()
-        if isinstance(view, LensView) and view.distortion is not None
-    }
+    views = {name: view for name, view in rig.cameras.items() if isinstance(view, LensView)}
+    return {name for name, view in views.items() if view.distortion is not None}
 
 
 def matches(rig, *, count=400, noise=0.05, wrong=True) -> dict[tuple[str, str], PointMatches]:
     """Points at 2 to 7 m, one in twenty wrong."""
     (names, (x, y)), *_ = seen_points(rig, count=count, near=2.0, far=7.0, noise=noise).items()
     if wrong:
-        y[::20] += (
-            4 * torch.randn(len(y), 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)[::20]
-        )
+        g = torch.Generator().manual_seed(1)
+        y[::20] += 4 * torch.randn(len(y), 2, generator=g, dtype=torch.float64)[::20]
     return {names: PointMatches(x, y)}
 
 
@@ -171,16 +167,8 @@ def test_the_papers_array_through_the_commands(shared_data, tmp_path, capsys):
         tmp_path / "published.yaml"
     )
     arguments = [f"--image={name}={file}" for name, file in files.items()]
-    main(
-        [
-            "rig",
-            "refine",
-            str(tmp_path / "published.yaml"),
-            *arguments,
-            "--out",
-            str(tmp_path / "better.yaml"),
-        ]
-    )
+    better = ["--out", str(tmp_path / "better.yaml")]
+    main(["rig", "refine", str(tmp_path / "published.yaml"), *arguments, *better])
     assert "F does not fit without lens distortion" in capsys.readouterr().out
     main(["rig", "start", *arguments, "--out", str(tmp_path / "started.yaml")])
     points = match_cameras(images)

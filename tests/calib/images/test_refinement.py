@@ -20,6 +20,7 @@ from pat.cli.main import main
 from pat.media.images import write_image
 from tests.benchmarks.bench_drift import DRIFTS, drifted, with_lens_mistake
 from tests.benchmarks.bench_drift import error as depth_error
+from tests.benchmarks.bench_refine import worse
 from tests.calib.real import bumblebee, syntim
 from tests.calib.scenes import (
     HW,
@@ -34,19 +35,15 @@ from tests.calib.scenes import (
 from tests.calib.simulated import simulated_matches, simulated_rig
 
 
-def worse(rig: Rig, *, seed=0) -> Rig:
-    """Each camera rotated by 0.3 degrees, each principal point moved by 5 pixels, in random directions."""
-    g = torch.Generator().manual_seed(seed)
-    changes = rig.parameters(free=["*.rotation", "*.centre"])
-    drawn = {k: torch.randn(v.shape, generator=g, dtype=torch.float64) for k, v in changes.items()}
-    size = {"rotation": math.radians(0.3), "centre": 5.0}
-    return rig.perturbed({k: v / v.norm() * size[k.rpartition(".")[2]] for k, v in drawn.items()})
+def drawn(rig: Rig) -> Rig:
+    """The rig with each camera turned and its principal point moved, in random directions."""
+    return worse(rig, torch.Generator().manual_seed(0))
 
 
 @pytest.mark.parametrize("lens", [False, True])
 def test_a_perturbed_rig_returns(lens):
     rig = unlike_pair(lens=lens)
-    bad, exact = worse(rig), seen_points(rig, noise=0.0, seed=1)
+    bad, exact = drawn(rig), seen_points(rig, noise=0.0, seed=1)
     assert median_off(bad, exact) > 1
     found = refine_matches(bad, [seen_points(rig)], force=True)
     assert found.accepted
@@ -147,14 +144,14 @@ def test_wrong_points_do_not_matter():
     (names, points), *_ = seen_points(rig).items()
     wrong = points.beta.clone()
     wrong[::8] += torch.from_numpy(np.random.default_rng(0).uniform(-20, 20, wrong[::8].shape))
-    found = refine_matches(worse(rig), [{names: PointMatches(points.alpha, wrong)}], force=True)
+    found = refine_matches(drawn(rig), [{names: PointMatches(points.alpha, wrong)}], force=True)
     assert median_off(found.rig, seen_points(rig, noise=0.0, seed=1)) < 0.25
 
 
 def test_several_frames_hold_a_whole_one_out():
     rig = unlike_pair()
     frames = [seen_points(rig, count=100, seed=seed) for seed in range(3)]
-    found = refine_matches(worse(rig), frames, force=True)
+    found = refine_matches(drawn(rig), frames, force=True)
     assert found.held_out[0].points == 100
     assert (
         sum(len(m.alpha) for m in RefinementProblem.of(rig, ["rotation"], frames=frames).used.values()) == 200
@@ -181,7 +178,7 @@ def test_translations_are_freed_where_points_demand_it():
     found = refine_matches(moved, [seen_points(rig, count=400)])
     assert any(change.name == "second.translation" for change in found.changes)
     assert median_off(found.rig, exact) < 0.1
-    rotated = refine_matches(worse(rig), [seen_points(rig)])
+    rotated = refine_matches(drawn(rig), [seen_points(rig)])
     assert not any("translation" in change.name for change in rotated.changes)
     only = refine_matches(moved, [seen_points(rig, count=400)], free=["rotation"])
     assert not any("translation" in change.name for change in only.changes)
@@ -211,7 +208,7 @@ def test_a_rig_of_unknown_scale_is_not_refined_in_millimetres():
 def test_a_tight_prior_holds():
     rig = unlike_pair()
     found = refine_matches(
-        worse(rig), [seen_points(rig)], sigma={"centre": 1e-4, "rotation": math.radians(1)}
+        drawn(rig), [seen_points(rig)], sigma={"centre": 1e-4, "rotation": math.radians(1)}
     )
     assert any("centre" in name for name in found.unobservable)
     assert not any("centre" in change.name for change in found.changes)
@@ -285,7 +282,7 @@ def test_solving_without_data_returns_the_prior():
 
 def test_a_fundamental_matrix_is_refined():
     rig = unlike_pair()
-    bad = worse(rig).pair("first", "second").fundamental
+    bad = drawn(rig).pair("first", "second").fundamental
     views = {name: View(hw=camera.hw) for name, camera in rig.cameras.items()}
     uncalibrated = Rig({**views, "third": View(hw=HW)}, links={("first", "second"): Link(bad)})
     points = seen_points(rig)

@@ -127,20 +127,12 @@ def test_a_killed_command_is_resumed_to_the_same_bits(material, tmp_path):  # no
         os.link(material / "fast" / f"fast_{8 + i % 7}.png", tmp_path / "fast" / f"f{i}.png")
         os.link(material / "slow" / f"slow_{8 + i % 2}.png", tmp_path / "slow" / f"s{i}.png")
     images = [a for name in ("fast", "slow") for a in ("--image", f"{name}={tmp_path / name}")]
-    given = [
-        "--rig",
-        material / "rig.yaml",
-        "--alpha",
-        "fast",
-        "--weights",
-        material / "tiny.safetensors",
-        *images,
-    ]
+    given = ["--rig", material / "rig.yaml", "--weights", material / "tiny.safetensors", "--alpha", "fast"]
     run = "import sys; from pat.cli.main import main\nif __name__ == '__main__': main(sys.argv[1:])"
     (tmp_path / "run.py").write_text(run)
 
     def command(out: str, *more: str) -> subprocess.Popen:
-        line = [sys.executable, tmp_path / "run.py", "fuse", *given, "--out", tmp_path / out, *more]
+        line = [sys.executable, tmp_path / "run.py", "fuse", *given, *images, "--out", tmp_path / out, *more]
         environment = {**os.environ, "PYTHONPATH": os.getcwd()}
         return subprocess.Popen([str(a) for a in line], env=environment, start_new_session=True)
 

@@ -6,15 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from pat.support.memory import (
-    ROOM,
-    give_back,
-    how_many_fit,
-    limited,
-    parse_bytes,
-    planned,
-    resident,
-)
+from pat.support.memory import ROOM, give_back, how_many_fit, limited, parse_bytes, planned, resident
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
