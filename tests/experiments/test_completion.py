@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from skimage.data import data_dir
 
 from experiments.completion.capture import PLANES, read_planes, values, write_planes
 from experiments.completion.pairs import HW, photo_pair
@@ -16,16 +15,8 @@ def planes_of(*shape):
     return torch.rand(*shape, generator=torch.Generator().manual_seed(0)) * 0.4
 
 
-def photographs(folder):
-    folder.mkdir()
-    for name in ("astronaut", "coffee"):
-        (folder / f"{name}.png").symlink_to(f"{data_dir}/{name}.png")
-    return folder
-
-
-def test_right_shows_what_left_does_farther_to_the_left(tmp_path):
+def test_right_shows_what_left_does_farther_to_the_left(photos):
     """Most of right's pixels are left's within the range of disparities; few are where they were."""
-    photos = photographs(tmp_path / "photos")
     pair = photo_pair(photos / "astronaut.png", photos / "coffee.png", 3)
     assert pair.left.shape == pair.right.shape == (3, *HW)
     apart = [
@@ -35,8 +26,7 @@ def test_right_shows_what_left_does_farther_to_the_left(tmp_path):
     assert float(apart[0].float().mean()) < 0.5
 
 
-def test_all_that_is_drawn_depends_on_the_seed(tmp_path):
-    photos = photographs(tmp_path / "photos")
+def test_all_that_is_drawn_depends_on_the_seed(photos):
     one, same, other = (photo_pair(photos / "coffee.png", photos / "astronaut.png", s) for s in (1, 1, 2))
     assert torch.equal(one.right, same.right)
     assert not torch.equal(one.right, other.right)
@@ -76,9 +66,9 @@ def test_a_photograph_must_be_one(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_completion_is_captured_and_trained(tmp_path):
+def test_a_completion_is_captured_and_trained(photos, tmp_path):
     config = CompletionTraining(
-        photos=(photographs(tmp_path / "photos"),),
+        photos=(photos,),
         out=tmp_path / "out",
         captured=2,
         widths=(4, 4, 4),

@@ -30,7 +30,7 @@ from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rendered import Rendered, save_frame
 from pat.synthesis.rig_distribution import RigDistribution
 from pat.synthesis.rigs import random_rigs
-from pat.training.config import RecordingConfig, TrainConfig, parse_config, save_config
+from pat.training.config import RecordingConfig, TrainConfig, save_config
 from pat.training.lenses import lens_over, through_lenses
 from pat.training.loop import train
 from pat.training.losses import explained, match_loss, validation
@@ -47,7 +47,7 @@ from pat.training.scenes import (
 from pat.training.stereo import PairCrops
 
 from .runs import losses, short_run
-from .test_loop import by_torchrun, one_thread, stopped  # noqa: F401
+from .test_loop import by_torchrun, ends_as, one_thread, stopped  # noqa: F401
 
 EXACT = RecordingConfig(gain=0, blur=0, noise=0, paper=0)
 
@@ -113,24 +113,6 @@ def test_shares_are_shares():
     assert kinds.count("rendered") / 2000 == pytest.approx(0.3, abs=0.03)
     assert kinds.count("pairs") / 2000 == pytest.approx(0.2, abs=0.03)
     assert kinds.count("rectified") == pytest.approx(kinds.count("general"), rel=0.2)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("rendered: 1.5", "rendered is a share of the batches, 0 to 1, got 1.5"),
-        ("rendered: 0.5", "rendered is 0.5 and there is no folder: give both `rendered` and `rendered_from`"),
-        ("pairs_from: a", "pairs is 0 and a is given: give both"),
-        (
-            "{rendered: 0.7, rendered_from: a, pairs: 0.7, pairs_from: [b]}",
-            "shares of the batches, 1.4 in all",
-        ),
-    ],
-)
-def test_what_is_wrong_with_shares(text, message):
-    with pytest.raises(ValueError) as caught:
-        parse_config(text)
-    assert message in str(caught.value)
 
 
 def test_all_items_are_drawn_equally_often():
@@ -472,11 +454,7 @@ def test_a_run_on_all_sources_goes_on_bit_for_bit(mixed, monkeypatch):
 def test_two_processes_on_all_sources_are_as_one(mixed):
     config = replace(mixed, out=mixed.out.with_name("two"))
     save_config(config, config.out.with_suffix(".yaml"))
-    running = by_torchrun(config, config.out.with_suffix(".yaml"), None)
-    said, _ = running.communicate()
-    assert running.returncode == 0, said
-    ours, theirs = ([[float(x) for x in row] for row in losses(c.out)[1:]] for c in (config, mixed))
-    torch.testing.assert_close(torch.tensor(ours), torch.tensor(theirs), rtol=0, atol=1e-4)
+    ends_as(by_torchrun(config, config.out.with_suffix(".yaml"), None), config, mixed)
 
 
 def test_photographs_are_not_needed_where_everything_comes_from_folders(mixed):
