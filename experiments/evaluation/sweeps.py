@@ -41,7 +41,7 @@ from arraygeom.fields.straight import covering_displacement
 from arraygeom.pixels import HW
 from experiments.names import refuse_unknown
 from pat.attention.scores import peak_position
-from pat.evaluation.ablation import sample_photographs
+from pat.evaluation.ablation import ALPHA, BETA, sample_photographs, turned
 from pat.evaluation.metrics import score
 from pat.evaluation.rectified import rectified
 from pat.fusion.steps import resolution_ratio
@@ -54,7 +54,6 @@ from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rig_distribution import RigDistribution
 from pat.synthesis.rigs import RigBatch
 
-ALPHA, BETA = "alpha", "beta"
 SIZE: HW = (96, 128)
 NEAR, FAR = 2.0, 16.0
 """Of the scenes, metres."""
@@ -321,16 +320,12 @@ def points(sweeps: Sequence[str] = tuple(SWEEPS), *, hw: HW = SIZE) -> Iterator[
 def point(sweep: str, value: float, *, hw: HW = SIZE) -> Point:
     """One rig of a sweep."""
     options = {"baseline": {"parallax": value}, "focal ratio": {"ratio": value}, "ahead": {"ahead": value}}
-    rig = rig_of(hw, **options.get(sweep, {}))
-    beta = rig[BETA]
+    assumed = rig = rig_of(hw, **options.get(sweep, {}))
     if sweep == "rotation":
-        turn = rotation_from_vector(math.radians(value) * _unit(1.0, 1.0, 1.0))
-        beta = beta.replace(cam_from_world=Pose(turn, torch.zeros(3).double()) @ beta.cam_from_world)
+        assumed = turned(rig, math.radians(value) * _unit(1.0, 1.0, 1.0))
     if sweep == "principal point":
-        shift = torch.zeros(3, 3).double()
-        shift[:2, 2] = value * _unit(1.0, 1.0)
-        beta = beta.replace(K=beta.K + shift)
-    return Point(sweep, float(value), rig, rig.with_camera(BETA, beta))
+        assumed = rig.perturbed({f"{BETA}.centre": value * _unit(1.0, 1.0)})
+    return Point(sweep, float(value), rig, assumed)
 
 
 def rig_of(hw: HW, *, parallax: float = PARALLAX, ratio: float = 1.0, ahead: float = 0.0) -> Rig:
