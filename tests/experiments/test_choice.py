@@ -31,9 +31,11 @@ def warped(pair):
 
 def test_photographs_pairs_have_the_disparity_they_were_made_with(photos):
     pair = photo_pair(photos / "astronaut.png", photos / "coffee.png", 3)
+    assert pair.left.shape == pair.right.shape == (3, *HW)
     seen, on = warped(pair)
-    apart = (seen - pair.left).abs().amax(0)
+    apart, unmoved = ((image - pair.left).abs().amax(0) for image in (seen, pair.right))
     assert float((apart < 0.1)[on].float().mean()) > 0.75
+    assert float((unmoved < 0.06).float().mean()) < 0.5
     assert pair.disparity.value.min() > 0
 
 
