@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 from dataclasses import replace
+from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
 
@@ -96,6 +97,20 @@ def stereo(folder, *, count: int = 4, hw: tuple[int, int] = (80, 120), disparity
     return folder
 
 
+def at(given, position):
+    """Beta's colours at positions (B, 32, 48, 2) of alpha's pixels in it."""
+    found = sample(given.betas[0], position.to(given.ground_truth).flatten(1, 2)).values
+    return found.unflatten(2, (32, 48))
+
+
+def refused(crops, root, hw=(32, 48), **how):
+    """What is said, in one line, of a folder that cannot be used."""
+    with pytest.raises(ValueError) as caught:
+        crops([root], hw=hw, **how).sample(8, generator(), number=0)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
 # What steps are made of ------------------------------------------------------------------------------------
 
 
@@ -158,9 +173,7 @@ def test_true_depth_says_where_alphas_pixels_are_in_beta(lenses, broken):
     for number in range(4):
         given = degraded(crops.sample(4, generator(number), number=number), generator(), recording=EXACT)
         assert given.position[0].isfinite().all()
-        found = sample(
-            given.betas[0], given.position[0].to(given.ground_truth).flatten(1, 2)
-        ).values.unflatten(2, (32, 48))
+        found = at(given, given.position[0])
         for image, collected in ((given.ground_truth, seen), (given.ground_truth.roll(3, -1), moved)):
             collected.append((found - image).abs().mean(1)[given.visible[0]].quantile(0.8))
         visible.append(given.visible[0].float().mean())
@@ -245,12 +258,7 @@ def test_the_sky_is_seen_by_both_at_infinity():
 
 
 def test_what_is_wrong_with_scenes(broken, tmp_path):
-    def said(root, hw=(32, 48), **how):
-        with pytest.raises(ValueError) as caught:
-            RenderedCrops([root], hw=hw, **how).sample(8, generator(), number=0)
-        assert "\n" not in str(caught.value)
-        return str(caught.value)
-
+    said = partial(refused, RenderedCrops)
     (tmp_path / "empty").mkdir()
     assert "holds no rendered scene" in said(tmp_path / "empty")
     assert "000000: no image is as large as the samples, 256x128 (mono 128x96, wide 112x80" in said(
@@ -265,9 +273,8 @@ def test_what_is_wrong_with_scenes(broken, tmp_path):
     rig.save(scene / "rig.yaml")
     assert "000002: the image of '" in (error := said(broken))
     assert "its rig says 120x90: remove it" in error
-    (scene / frames["wide"][0]["file"]).write_bytes(b"half")
-    (scene / frames["mono"][0]["file"]).write_bytes(b"half")
-    (scene / frames["tele"][0]["file"]).write_bytes(b"half")
+    for name in rig.names:
+        (scene / frames[name][0]["file"]).write_bytes(b"half")
     assert "000002: cannot be read (" in said(broken)
     (scene / "render.json").unlink()
     assert "000002: is not a whole scene (no render.json)" in said(broken)
@@ -291,10 +298,7 @@ def test_a_pairs_cameras_put_what_one_shows_where_the_other_shows_it(tmp_path):
         reductions |= set((120 / (48 / near)).round().int().tolist())
         depth = (near * 120 / 6)[:, None, None].expand(3, 32, 48)
         where, _ = transfer(pair_of(batch, 1, generator()), depth, depth)
-        found = sample(given.betas[0], where.to(given.ground_truth).flatten(1, 2)).values.unflatten(
-            2, (32, 48)
-        )
-        assert (found - given.ground_truth)[..., 8:-8].abs().max() < 0.03
+        assert (at(given, where) - given.ground_truth)[..., 8:-8].abs().max() < 0.03
         assert (given.betas[0] - given.ground_truth)[..., 8:-8].abs().max() > 0.1
         torch.testing.assert_close(given.alpha, luminance(given.ground_truth), atol=0.003, rtol=0)
         held = given.fields[0].at(torch.tensor([[24.0, 16.0]]).double())
@@ -331,12 +335,7 @@ def test_middleburys_collections_say_their_largest_disparity(shared_data):
 
 
 def test_what_is_wrong_with_pairs(tmp_path):
-    def said(root, hw=(32, 48)):
-        with pytest.raises(ValueError) as caught:
-            PairCrops([root], hw=hw).sample(8, generator(), number=0)
-        assert "\n" not in str(caught.value)
-        return str(caught.value)
-
+    said = partial(refused, PairCrops)
     (tmp_path / "empty").mkdir()
     assert "holds no stereo pair" in said(tmp_path / "empty")
     root = stereo(tmp_path / "pairs")
