@@ -41,14 +41,14 @@ from arraygeom.fields.straight import covering_displacement
 from arraygeom.pixels import HW
 from experiments.names import refuse_unknown
 from pat.attention.scores import peak_position
-from pat.evaluation.ablation import ALPHA, BETA, sample_photographs, turned
+from pat.evaluation.ablation import ALPHA, BETA, recorded, sample_photographs, turned
 from pat.evaluation.metrics import score
 from pat.evaluation.rectified import rectified
 from pat.fusion.steps import resolution_ratio
 from pat.matching.inputs import Inputs
 from pat.media.colour import luminance
 from pat.networks.protocol import Comparing
-from pat.sensors import Clip, Noise, Quantise, generator_for, record
+from pat.sensors import generator_for
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rig_distribution import RigDistribution
@@ -282,10 +282,9 @@ def made(rig: Rig, bank: PhotoBank, number: int, seed: int = 0) -> RecordedScene
         RigBatch(cameras, near, far), g
     )
     position, visible = seen_at(pair, *(depth[0].double() for depth in batch.depth))
-    steps = [Noise(8000, 3), Clip(), Quantise(8)]
-    images = {ALPHA: luminance(batch.images[0]), BETA: batch.images[1]}
-    recorded = {name: record(image, steps, g)[0] for name, image in images.items()}
-    return RecordedScene(recorded, batch.images[0][0], position, visible)
+    ground_truth, seen = (image[0] for image in batch.images)
+    images = recorded({ALPHA: luminance(ground_truth), BETA: seen}, g)
+    return RecordedScene(images, ground_truth, position, visible)
 
 
 def seen_at(

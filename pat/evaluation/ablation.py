@@ -230,11 +230,15 @@ def _recorded(
 ) -> AblationCase:
     """The case of two ideal images: some noise, a depth range a little wider than the scene's."""
     known = depth[depth.isfinite()]
-    steps = [Noise(8000, 3), Clip(), Quantise(8)]
-    ideal = {ALPHA: luminance(ground_truth), BETA: seen}
-    images = {name: record(scene[None], steps, g)[0] for name, scene in ideal.items()}
+    images = recorded({ALPHA: luminance(ground_truth), BETA: seen}, g)
     rig = rig.replace(depth=(float(known.min()) / 1.1, float(known.max()) * 1.1))
     return AblationCase(name, rig, images, ground_truth, depth)
+
+
+def recorded(ideal: Mapping[str, Tensor], g: Generator) -> dict[str, Tensor]:
+    """Ideal images (C, H, W) as good cameras record them: some noise, 8 bits."""
+    steps = [Noise(8000, 3), Clip(), Quantise(8)]
+    return {name: record(image[None], steps, g)[0] for name, image in ideal.items()}
 
 
 def sample_photographs(*, count: int = 12, seed: int = 0) -> PhotoBank:
