@@ -113,8 +113,8 @@ def test_a_mosaic_is_undone_by_its_pattern():
 
 
 def psnr(result) -> dict[str, float]:
-    """dB by method, of a result's table."""
-    rows = (line.split("|") for line in result.table.splitlines() if line.startswith("|"))
+    """dB by method, of a result's first table."""
+    rows = (line.split("|") for line in result.table.split("\n\n")[0].splitlines())
     return {cells[1].strip(): float(cells[2]) for cells in rows if cells[2].strip()[0].isdigit()}
 
 
