@@ -107,14 +107,7 @@ def room(rng: Generator, rig: Rig, photos: Sequence[Path], seed: int) -> Scene:
     scene = furnished("room", seed, rig, surface, 0.0)
     setting = Setting(rig, rng)
     things = [*_scattered(setting, surface), *_bunches(setting, surface)]
-    return Scene(
-        objects=(*things, *scene.objects),
-        lights=scene.lights,
-        world=scene.world,
-        depth=scene.depth,
-        generator="room",
-        seed=seed,
-    )
+    return replace(scene, objects=(*things, *scene.objects))
 
 
 def _plain(setting: Setting, depth: float) -> Texture:

@@ -10,7 +10,6 @@ from typing import Annotated, Literal, TypeVar
 import torch
 from tyro.conf import Positional, arg
 
-from arraygeom import ReceptiveField
 from arraygeom.atomic import write_text
 from experiments.names import refuse_unknown
 from experiments.patches.dataset import ScenePatches
@@ -219,6 +218,10 @@ class OnScenes:
             raise ValueError(f"--weights {self.weights}: they are for {network.betas} betas: {wanted}")
         return network
 
+    def chosen(self, fields: Mapping[str, T]) -> dict[str, T]:
+        """The fields that are not left out."""
+        return {name: field for name, field in fields.items() if name not in self.without}
+
     def bank(self) -> PhotoBank:
         """The photographs."""
         return PhotoBank.load(*self.photos) if self.photos else sample_photographs()
@@ -248,7 +251,7 @@ class Sweeps(OnScenes):
     def run(self) -> None:
         """Write ablation.md, .json, .svg, .png; print the table. Raises ValueError for an unknown sweep."""
         network = self.comparing(sweeps.FIELDS)
-        chosen = {name: field for name, field in sweeps.FIELDS.items() if name not in self.without}
+        chosen = self.chosen(sweeps.FIELDS)
         rigs = list(sweeps.points(self.sweeps or tuple(sweeps.SWEEPS), hw=self.hw))
         shown = progress("ablating")(rigs, len(rigs))
         rows = sweeps.ablate(network, shown, chosen, scenes=self.scenes, photos=self.bank(), seed=self.seed)
@@ -271,12 +274,8 @@ class Fields(OnScenes):
             for linked in (True, False):
                 pairs = of_half(middlebury_pairs(self.middlebury), "report")
                 cases += fields.rectified_cases(pairs, linked=linked)
-
-        def chosen(max_displacement: float) -> Mapping[str, ReceptiveField]:
-            every = fields.fields_of(max_displacement)
-            return {name: field for name, field in every.items() if name not in self.without}
-
-        rows = fields.evaluate_fields(network, progress("fusing")(cases, len(cases)), fields=chosen)
+        shown = progress("fusing")(cases, len(cases))
+        rows = fields.evaluate_fields(network, shown, fields=lambda most: self.chosen(fields.fields_of(most)))
         looked_at = [case for case in cases if case.kind != "F alone"]
         panels = fields.drawn_peaks(network, looked_at[:: -(-len(looked_at) // 3)])
         save_panels(panels, self.out / "peaks.png", columns=4)

@@ -41,20 +41,19 @@ from arraygeom.fields.straight import covering_displacement
 from arraygeom.pixels import HW
 from experiments.names import refuse_unknown
 from pat.attention.scores import peak_position
-from pat.evaluation.ablation import sample_photographs
+from pat.evaluation.ablation import ALPHA, BETA, recorded, sample_photographs, turned
 from pat.evaluation.metrics import score
 from pat.evaluation.rectified import rectified
 from pat.fusion.steps import resolution_ratio
 from pat.matching.inputs import Inputs
 from pat.media.colour import luminance
 from pat.networks.protocol import Comparing
-from pat.sensors import Clip, Noise, Quantise, generator_for, record
+from pat.sensors import generator_for
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rig_distribution import RigDistribution
 from pat.synthesis.rigs import RigBatch
 
-ALPHA, BETA = "alpha", "beta"
 SIZE: HW = (96, 128)
 NEAR, FAR = 2.0, 16.0
 """Of the scenes, metres."""
@@ -283,10 +282,9 @@ def made(rig: Rig, bank: PhotoBank, number: int, seed: int = 0) -> RecordedScene
         RigBatch(cameras, near, far), g
     )
     position, visible = seen_at(pair, *(depth[0].double() for depth in batch.depth))
-    steps = [Noise(8000, 3), Clip(), Quantise(8)]
-    images = {ALPHA: luminance(batch.images[0]), BETA: batch.images[1]}
-    recorded = {name: record(image, steps, g)[0] for name, image in images.items()}
-    return RecordedScene(recorded, batch.images[0][0], position, visible)
+    ground_truth, seen = (image[0] for image in batch.images)
+    images = recorded({ALPHA: luminance(ground_truth), BETA: seen}, g)
+    return RecordedScene(images, ground_truth, position, visible)
 
 
 def seen_at(
@@ -321,16 +319,12 @@ def points(sweeps: Sequence[str] = tuple(SWEEPS), *, hw: HW = SIZE) -> Iterator[
 def point(sweep: str, value: float, *, hw: HW = SIZE) -> Point:
     """One rig of a sweep."""
     options = {"baseline": {"parallax": value}, "focal ratio": {"ratio": value}, "ahead": {"ahead": value}}
-    rig = rig_of(hw, **options.get(sweep, {}))
-    beta = rig[BETA]
+    assumed = rig = rig_of(hw, **options.get(sweep, {}))
     if sweep == "rotation":
-        turn = rotation_from_vector(math.radians(value) * _unit(1.0, 1.0, 1.0))
-        beta = beta.replace(cam_from_world=Pose(turn, torch.zeros(3).double()) @ beta.cam_from_world)
+        assumed = turned(rig, math.radians(value) * _unit(1.0, 1.0, 1.0))
     if sweep == "principal point":
-        shift = torch.zeros(3, 3).double()
-        shift[:2, 2] = value * _unit(1.0, 1.0)
-        beta = beta.replace(K=beta.K + shift)
-    return Point(sweep, float(value), rig, rig.with_camera(BETA, beta))
+        assumed = rig.perturbed({f"{BETA}.centre": value * _unit(1.0, 1.0)})
+    return Point(sweep, float(value), rig, assumed)
 
 
 def rig_of(hw: HW, *, parallax: float = PARALLAX, ratio: float = 1.0, ahead: float = 0.0) -> Rig:

@@ -230,11 +230,15 @@ def _recorded(
 ) -> AblationCase:
     """The case of two ideal images: some noise, a depth range a little wider than the scene's."""
     known = depth[depth.isfinite()]
-    steps = [Noise(8000, 3), Clip(), Quantise(8)]
-    ideal = {ALPHA: luminance(ground_truth), BETA: seen}
-    images = {name: record(scene[None], steps, g)[0] for name, scene in ideal.items()}
+    images = recorded({ALPHA: luminance(ground_truth), BETA: seen}, g)
     rig = rig.replace(depth=(float(known.min()) / 1.1, float(known.max()) * 1.1))
     return AblationCase(name, rig, images, ground_truth, depth)
+
+
+def recorded(ideal: Mapping[str, Tensor], g: Generator) -> dict[str, Tensor]:
+    """Ideal images (C, H, W) as good cameras record them: some noise, 8 bits."""
+    steps = [Noise(8000, 3), Clip(), Quantise(8)]
+    return {name: record(image[None], steps, g)[0] for name, image in ideal.items()}
 
 
 def sample_photographs(*, count: int = 12, seed: int = 0) -> PhotoBank:
@@ -399,15 +403,19 @@ def _most_different(images: Mapping[str, Tensor], ground_truth: Tensor) -> tuple
 
 def _rotated(degrees: float, rig: Rig, g: Generator) -> Rig:
     """Beta rotated about a random axis."""
-    axis, beta = torch.randn(3, generator=g, dtype=torch.float64), rig.pair(ALPHA, BETA).cameras[1]
-    R = rotation_from_vector(axis / axis.norm() * math.radians(degrees))
-    moved = Pose(R, torch.zeros(3).double()) @ beta.cam_from_world
-    return rig.with_camera(BETA, beta.replace(cam_from_world=moved))
+    axis = torch.randn(3, generator=g, dtype=torch.float64)
+    return turned(rig, axis / axis.norm() * math.radians(degrees))
+
+
+def turned(rig: Rig, rotation: Float[Tensor, "3"]) -> Rig:
+    """Beta turned about its centre, by a rotation vector in its own axes."""
+    beta = rig.pair(ALPHA, BETA).cameras[1]
+    turn = Pose(rotation_from_vector(rotation), torch.zeros(3).double())
+    return rig.with_camera(BETA, beta.replace(cam_from_world=turn @ beta.cam_from_world))
 
 
 def _decentred(pixels: float, rig: Rig, g: Generator) -> Rig:
     """Beta's principal point shifted in a random direction."""
-    angle, beta = 2 * math.pi * float(torch.rand((), generator=g)), rig.pair(ALPHA, BETA).cameras[1]
-    K = beta.K.clone()
-    K[:2, 2] += K.new_tensor([pixels * math.cos(angle), pixels * math.sin(angle)])
-    return rig.with_camera(BETA, beta.replace(K=K))
+    angle = 2 * math.pi * float(torch.rand((), generator=g))
+    shift = torch.tensor([pixels * math.cos(angle), pixels * math.sin(angle)], dtype=torch.float64)
+    return rig.perturbed({f"{BETA}.centre": shift})

@@ -8,7 +8,6 @@ import time
 from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
 
 import torch
 from torch.optim import Adam
@@ -69,16 +68,11 @@ def train(config: TrainConfig) -> Path:
             step, best, minutes = (former.facts[k] for k in ("step", "best", "minutes"))
         if here.first:
             save_config(config, config.out / "config.yaml")
-        rates = config.rate, config.schedule, config.warmup
-        schedule = Schedule(config.steps, config.minutes, *rates, config.validate, config.save)
         batch = config.batch * config.groups
         watch = Watch(config.out, step, batch, tensorboard=config.tensorboard) if here.first else None
         began = time.monotonic() - 60 * minutes
         with closing(watch) if watch else nullcontext():
-            run = Run(
-                learner, learn, groups, examined, schedule, config.out, config, watch, step, best, began
-            )
-            run.work()
+            Run(learner, learn, groups, examined, config, watch, step, best, began).work()
         here.wait()
     return config.out / BEST
 
@@ -94,38 +88,22 @@ def former_run(config: TrainConfig) -> Checkpoint | None:
     return checkpoint
 
 
-@dataclass(frozen=True)
-class Schedule:
-    """How long a run is, its learning rate, and after how many steps it validates and saves."""
+def rate_at(config: TrainConfig, step: int, done: float) -> float:
+    """The learning rate of a step; `done` is how much of the run is, 1 at the end.
 
-    steps: int
-    minutes: float
-    rate: float
-    shape: Literal["cosine", "halving"]
-    warmup: int
-    validate: int
-    save: int
-
-    def done(self, step: int, minutes: float) -> float:
-        """How much of the run is done, 1 at the end."""
-        return max(step / self.steps, minutes / self.minutes)
-
-    def rate_at(self, step: int, done: float) -> float:
-        """The learning rate of a step.
-
-        >>> Schedule(100, math.inf, 1e-3, "halving", warmup=0, validate=10, save=10).rate_at(1, 0.5)
-        0.0005
-        """
-        if self.shape == "halving":
-            fall = 0.5 ** int(min(done, 1) * 80 / 30)
-        else:
-            fall = 0.5 + 0.5 * math.cos(math.pi * min(done, 1))
-        return self.rate * (min(step / self.warmup, fall) if self.warmup else fall)
+    >>> rate_at(TrainConfig(rate=1e-3, schedule="halving", warmup=0), 1, 0.5)
+    0.0005
+    """
+    if config.schedule == "halving":
+        fall = 0.5 ** int(min(done, 1) * 80 / 30)
+    else:
+        fall = 0.5 + 0.5 * math.cos(math.pi * min(done, 1))
+    return config.rate * (min(step / config.warmup, fall) if config.warmup else fall)
 
 
 @dataclass
 class Run:
-    """A run under way: what it learns with and from, and what it leaves in `out`.
+    """A run under way: what it learns with and from, by which recipe.
 
     `groups` of each step are this process's; `examined` is validated on. Of the first process only: `watch`.
     """
@@ -134,8 +112,6 @@ class Run:
     samples: SampleSource
     groups: list[int]
     examined: list[Sample]
-    schedule: Schedule
-    out: Path
     recipe: TrainConfig
     watch: Watch | None
     step: int
@@ -151,23 +127,24 @@ class Run:
     def work(self) -> None:
         """Step until done."""
         given = self.samples.steps(self.groups, start=self.step)
-        validate, save = self.schedule.validate, self.schedule.save
+        recipe = self.recipe
         for samples in made_ahead(given, self.learner.network):
             self.step += 1
-            done = self.learner.here.agreed(self.schedule.done(self.step, self.minutes))
+            done = max(self.step / recipe.steps, self.minutes / recipe.minutes)
+            done = self.learner.here.agreed(done)
             self._advance(samples, done)
-            if self.step % validate == 0 or done >= 1:
+            if self.step % recipe.validate == 0 or done >= 1:
                 self._validate()
-            elif self.watch and EARLY <= self.step < validate and self.step & (self.step - 1) == 0:
+            elif self.watch and EARLY <= self.step < recipe.validate and self.step & (self.step - 1) == 0:
                 self.watch.show(self.learner.averaged, self.examined, self.step)
-            if self.step % save == 0 or done >= 1:
+            if self.step % recipe.save == 0 or done >= 1:
                 self._save(done=done >= 1)
             if done >= 1:
                 return
 
     def _advance(self, given: list[Sample], done: float) -> None:
         """One step of the optimiser. Raises FloatingPointError if loss or gradients are not finite."""
-        rate = self.schedule.rate_at(self.step, done)
+        rate = rate_at(self.recipe, self.step, done)
         loss, norm = self.learner.gradients(given)
         if not (torch.isfinite(norm) and torch.isfinite(loss)):
             raise FloatingPointError(self._offence(given))
@@ -187,7 +164,7 @@ class Run:
         if facts["psnr"] > self.best:
             self.best = facts["psnr"]
             recipe = {"recipe": json.dumps(asdict(self.recipe), default=str), "validation": json.dumps(facts)}
-            save_weights(self.learner.averaged, self.out / BEST, facts=recipe)
+            save_weights(self.learner.averaged, self.recipe.out / BEST, facts=recipe)
 
     def _save(self, *, done: bool) -> None:
         if self.watch:
@@ -197,7 +174,7 @@ class Run:
             state = collect(
                 learner.network, learner.adam, learner.average, facts | {"recipe": config_text(self.recipe)}
             )
-            write_checkpoint(self.out / CHECKPOINTS, state)
+            write_checkpoint(self.recipe.out / CHECKPOINTS, state)
 
     def _offence(self, given: list[Sample]) -> str:
         """Save the groups of a failed step; the error message names the samples."""
@@ -206,13 +183,13 @@ class Run:
             bad = self.learner.offenders(part)
             found += [f"sample {i} of group {group}" for i in bad]
             if bad or len(given) == 1:
-                path = self.out / f"offending-step-{self.step}-group-{group}.safetensors"
+                path = self.recipe.out / f"offending-step-{self.step}-group-{group}.safetensors"
                 save_sample(part, path, facts={"step": str(self.step), "samples": str(bad)})
         who = ", ".join(found) or "no single sample of this process"
         return (
             f"step {self.step}: the loss or its gradient is not finite, by {who}; the batch is in "
-            f"{self.out}/offending-step-{self.step}-*.safetensors: inspect it, or lower `rate` "
-            f"(now {self.schedule.rate:g}); the last checkpoint and the best weights are as they were"
+            f"{self.recipe.out}/offending-step-{self.step}-*.safetensors: inspect it, or lower `rate` "
+            f"(now {self.recipe.rate:g}); the last checkpoint and the best weights are as they were"
         )
 
 

@@ -33,6 +33,7 @@ from arraygeom.atomic import write_text
 from arraygeom.segments import Segments
 from pat.attention import attend
 from pat.evaluation.tables import markdown_header, markdown_row
+from pat.support.memory import peak_memory
 
 RESULTS = Path(__file__).with_name("RESULTS.md")
 REPEATS, ENOUGH = 9, 6.0
@@ -168,8 +169,7 @@ def _peak(device: str, *, reset: bool = False) -> int:
         return torch.cuda.max_memory_allocated()
     if reset:
         Path("/proc/self/clear_refs").write_text("5")
-    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-    return int(status["VmHWM"].split()[0]) * 1024
+    return int(peak_memory() or 0)
 
 
 def in_own_process(job: Job) -> dict:

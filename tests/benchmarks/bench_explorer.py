@@ -30,6 +30,7 @@ from pat.data.sample_array import load_sample
 from pat.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.bench_job import PAT, ROOT
 from tests.benchmarks.printed import print_tables
+from tests.browser import browser
 
 SAMPLE = ROOT / "pat" / "data" / "sample"
 NETWORKS = "windows", "pat-supervised"
@@ -55,21 +56,6 @@ sample = load_sample()
 explore(sample.rig, sample.images, network=None if "{0}" == "windows" else "{0}")"""
 
 KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
-
-
-@contextmanager
-def browser() -> Iterator[Any]:
-    """A headless Chromium."""
-    options = webdriver.ChromeOptions()
-    options.binary_location = shutil.which("chromium") or shutil.which("google-chrome") or ""
-    for flag in ("--headless=new", "--no-sandbox", "--window-size=1200,900", "--disable-dev-shm-usage"):
-        options.add_argument(flag)
-    driver = webdriver.Chrome(options, webdriver.ChromeService(shutil.which("chromedriver")))
-    driver.set_script_timeout(300)
-    try:
-        yield driver
-    finally:
-        driver.quit()
 
 
 @contextmanager
@@ -153,6 +139,7 @@ def in_jupyter(driver: Any, folder: Path, network: str, points: int) -> list[flo
 def rows(points: int) -> Iterator[str]:
     yield from markdown_header(["in", "attention by", "points", "median, ms", "90 %, ms"]).splitlines()
     with browser() as driver:
+        driver.set_script_timeout(300)
         for where, network, found in measured(driver, points):
             figures = f"{median(found):.0f}", f"{quantiles(found, n=10)[-1]:.0f}"
             yield markdown_row([where, network, len(found), *figures])

@@ -19,6 +19,7 @@ import tyro
 from torch import Generator, Tensor
 
 from arraygeom import Rig
+from pat.evaluation.ablation import recorded
 from pat.evaluation.baseline import classical, classical_baseline
 from pat.evaluation.metrics import score
 from pat.evaluation.tables import markdown_header, markdown_row
@@ -26,7 +27,6 @@ from pat.fusion.fuse import fuse
 from pat.media.colour import luminance
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
-from pat.sensors import Clip, Noise, Quantise, record
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rig_distribution import RigDistribution
@@ -60,15 +60,14 @@ def cases(
         cameras = [camera[0].to(torch.float64) for camera in made.cameras]
         count = random or 3
         at = {f"band {i}": 1 + i % places for i in range(count)}
-        images = {"alpha": luminance(made.images[0])} | {
-            name: seen[place][:, i : i + 1] for i, (name, place) in enumerate(at.items())
+        ideal = {"alpha": luminance(made.images[0][0])} | {
+            name: seen[place][0, i : i + 1] for i, (name, place) in enumerate(at.items())
         }
         near, far = (float(d) for d in made.depth_range[0])
         rig = Rig(
             {"alpha": cameras[0]} | {name: cameras[place] for name, place in at.items()}, depth=(near, far)
         )
-        steps = [Noise(8000, 3), Clip(), Quantise(8)]
-        yield rig, {name: record(p, steps, g)[0] for name, p in images.items()}, seen[0][0]
+        yield rig, recorded(ideal, g), seen[0][0]
 
 
 def baseline(rig: Rig, images: dict[str, Tensor], places: int, random: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from skimage.data import data_dir
 
 from experiments.__main__ import Experiments
 from pat.cli.main import main
@@ -15,6 +16,16 @@ def network() -> PAT:
     torch.manual_seed(0)
     made = PAT(PATConfig(dim=8, residual=True, interpolation="bilinear", normalised=True)).eval()
     return made.requires_grad_(False)
+
+
+@pytest.fixture
+def photos(tmp_path):
+    """Two photographs in a folder: astronaut.png and coffee.png."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for name in ("astronaut.png", "coffee.png"):
+        (folder / name).symlink_to(f"{data_dir}/{name}")
+    return folder
 
 
 @pytest.fixture

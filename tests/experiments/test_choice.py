@@ -8,7 +8,6 @@ import pytest
 import torch
 import yaml
 from safetensors import safe_open
-from skimage.data import data_dir
 from torch.nn.functional import max_pool2d
 
 from experiments.choice import ChoiceTraining, Kept, losses, rows_of, train_choice, window
@@ -30,13 +29,13 @@ def warped(pair):
     return pair.right.gather(2, there), (x >= 0) & pair.disparity.valid
 
 
-def test_photographs_pairs_have_the_disparity_they_were_made_with(tmp_path):
-    for name in ("astronaut", "coffee"):
-        (tmp_path / f"{name}.png").symlink_to(f"{data_dir}/{name}.png")
-    pair = photo_pair(tmp_path / "astronaut.png", tmp_path / "coffee.png", 3)
+def test_photographs_pairs_have_the_disparity_they_were_made_with(photos):
+    pair = photo_pair(photos / "astronaut.png", photos / "coffee.png", 3)
+    assert pair.left.shape == pair.right.shape == (3, *HW)
     seen, on = warped(pair)
-    apart = (seen - pair.left).abs().amax(0)
+    apart, unmoved = ((image - pair.left).abs().amax(0) for image in (seen, pair.right))
     assert float((apart < 0.1)[on].float().mean()) > 0.75
+    assert float((unmoved < 0.06).float().mean()) < 0.5
     assert pair.disparity.value.min() > 0
 
 
@@ -50,12 +49,9 @@ def stepped(unknown=0):
     return StereoPair("a", grey, grey, 30.0, Disparity(value, valid))
 
 
-def test_shapes_in_other_textures_have_the_disparity_they_were_made_with(tmp_path):
+def test_shapes_in_other_textures_have_the_disparity_they_were_made_with(photos):
     """Surfaces are whole, with one step between them: right shows left's pixels moved by what is stated."""
-    files = []
-    for name in ("astronaut", "coffee"):
-        files.append(tmp_path / f"{name}.png")
-        files[-1].symlink_to(f"{data_dir}/{name}.png")
+    files = sorted(photos.iterdir())
     for seed in range(4):
         pair = shape_pair(stepped(unknown=9), files, seed)
         seen, on = warped(pair)
@@ -188,13 +184,8 @@ def test_the_recipe_of_what_ships_wants_photographs(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_choice_is_trained(tmp_path):
-    (tmp_path / "photos").mkdir()
-    for name in ("astronaut", "coffee"):
-        (tmp_path / "photos" / f"{name}.png").symlink_to(f"{data_dir}/{name}.png")
-    config = ChoiceTraining(
-        photos=(tmp_path / "photos",), out=tmp_path / "out", captured=2, steps=2, batch=2, side=64
-    )
+def test_a_choice_is_trained(photos, tmp_path):
+    config = ChoiceTraining(photos=(photos,), out=tmp_path / "out", captured=2, steps=2, batch=2, side=64)
     made = train_choice(config)
     assert bool(read_choice(made).unet.last.weight.isfinite().all())
     with safe_open(made, "pt") as file:

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from skimage.data import data_dir
 
 from experiments.completion.capture import PLANES, read_planes, values, write_planes
-from experiments.completion.pairs import HW, photo_pair
+from experiments.completion.pairs import photo_pair
 from experiments.completion.training import CompletionTraining, train_completion, varied
 from pat.media.colour import from_luma_chroma
 from pat.networks.weights import load_weights
@@ -16,27 +15,7 @@ def planes_of(*shape):
     return torch.rand(*shape, generator=torch.Generator().manual_seed(0)) * 0.4
 
 
-def photographs(folder):
-    folder.mkdir()
-    for name in ("astronaut", "coffee"):
-        (folder / f"{name}.png").symlink_to(f"{data_dir}/{name}.png")
-    return folder
-
-
-def test_right_shows_what_left_does_farther_to_the_left(tmp_path):
-    """Most of right's pixels are left's within the range of disparities; few are where they were."""
-    photos = photographs(tmp_path / "photos")
-    pair = photo_pair(photos / "astronaut.png", photos / "coffee.png", 3)
-    assert pair.left.shape == pair.right.shape == (3, *HW)
-    apart = [
-        (pair.right[..., :300] - pair.left[..., d : d + 300]).abs().amax(0) < 0.06 for d in range(0, 100, 1)
-    ]
-    assert float(torch.stack(apart[2:]).any(0).float().mean()) > 0.85
-    assert float(apart[0].float().mean()) < 0.5
-
-
-def test_all_that_is_drawn_depends_on_the_seed(tmp_path):
-    photos = photographs(tmp_path / "photos")
+def test_all_that_is_drawn_depends_on_the_seed(photos):
     one, same, other = (photo_pair(photos / "coffee.png", photos / "astronaut.png", s) for s in (1, 1, 2))
     assert torch.equal(one.right, same.right)
     assert not torch.equal(one.right, other.right)
@@ -76,9 +55,9 @@ def test_a_photograph_must_be_one(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_completion_is_captured_and_trained(tmp_path):
+def test_a_completion_is_captured_and_trained(photos, tmp_path):
     config = CompletionTraining(
-        photos=(photographs(tmp_path / "photos"),),
+        photos=(photos,),
         out=tmp_path / "out",
         captured=2,
         widths=(4, 4, 4),

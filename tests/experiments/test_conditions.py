@@ -1,7 +1,5 @@
 """Conditions: how pairs are recorded, regions, methods, tables; and which pairs may be tuned on."""
 
-import dataclasses
-
 import pytest
 import torch
 
@@ -12,7 +10,6 @@ from experiments.evaluation.conditions import (
     conditions_markdown,
     depth_errors,
     evaluate_conditions,
-    regions_of,
 )
 from experiments.evaluation.halves import of_half
 from pat.data.pairs import Disparity, StereoPair
@@ -74,17 +71,6 @@ def test_fewer_electrons_are_noisier():
         (CONDITIONS[f"{n} electrons"].recorded(p).alpha - luminance(p.left)).std() for n in (1000, 200, 50)
     ]
     assert errors[0] < errors[1] < errors[2]
-
-
-def test_regions_of_a_square_before_a_wall():
-    p = pair(disparity=0)
-    disparity = torch.full((64, 96), 2.0)
-    disparity[20:40, 50:70] = 12.0
-    found = regions_of(dataclasses.replace(p, disparity=Disparity(disparity, disparity > 0)), (64, 96))
-    assert found["beyond"][:, :2].all() and not found["beyond"][:, 2:].any()  # noqa: PT018
-    occluded = found["occluded"][30].nonzero().flatten().tolist()
-    assert occluded == list(range(40, 50))
-    assert not (found["seen"] & (found["occluded"] | found["beyond"])).any()
 
 
 def test_every_method_is_scored_under_every_condition(tmp_path):

@@ -6,7 +6,7 @@ import torch
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.pose import Pose
 from experiments.sensors import Defocus, DiscBlur, MotionBlur, Vignetting, circle_of_confusion, record
-from pat.sensors import GaussianBlur, Resample
+from pat.sensors import Resample
 
 HW = (61, 81)
 LENS, F_NUMBER = 50.0, 2.0
@@ -149,14 +149,6 @@ def test_vignetting_is_centred_on_the_principal_point():
     flat = torch.ones(1, 1, *HW, dtype=torch.float64)
     seen = record(flat, [Vignetting((-0.5,))], generator(), camera=off).image[0, 0]
     assert divmod(int(seen.argmax()), HW[1]) == (10, 20)
-
-
-@pytest.mark.parametrize(
-    "step", [MotionBlur(1.0, (2.3, -1.1)), Vignetting((-0.3, 0.1)), GaussianBlur(1.0)], ids=str
-)
-def test_gradients_in_the_image(step):
-    image = torch.rand(1, 2, 6, 8, generator=generator(), dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: record(x, [step], generator()).image, image)
 
 
 def test_what_a_step_misses_is_named():

@@ -102,17 +102,21 @@ def test_tables_hold_every_row(tmp_path):
     ]
 
 
-class Matcher:
-    """A network that finds each pixel `disparity` to the left; the mean of beta's bands is its confidence."""
+class Simple:
+    """A network that needs no matches and no margins."""
 
     halo, beta_halo, multiple, equal_resolution, joins_bands = 0, 2, 1, True, "no"
     bands, uses_matches, keeps_luminance = None, False, False
 
-    def __init__(self, disparity):
-        self.disparity, self.betas = disparity, []
-
     def working_bytes(self, alpha, betas):
         return 0.0
+
+
+class Matcher(Simple):
+    """A network that finds each pixel `disparity` to the left; the mean of beta's bands is its confidence."""
+
+    def __init__(self, disparity):
+        self.disparity, self.betas = disparity, []
 
     def __call__(self, inputs, matches=None):
         alpha, betas = inputs.alpha, inputs.betas
@@ -151,14 +155,8 @@ def test_three_bands_are_three_cameras():
     assert [mean for _, mean in given] == pytest.approx(pair.right.mean((1, 2)).tolist(), abs=0.01)
 
 
-class Onlooker:
+class Onlooker(Simple):
     """A network that notes where it is told to look, and gives alpha back."""
-
-    halo, beta_halo, multiple, equal_resolution, joins_bands = 0, 2, 1, True, "no"
-    bands, uses_matches, keeps_luminance = None, False, False
-
-    def working_bytes(self, alpha, betas):
-        return 0.0
 
     def __call__(self, inputs, matches=None):
         alpha, (beta,) = inputs.alpha, inputs.betas

@@ -1,7 +1,6 @@
 """The explorer's messages without a browser; its saved page and its served one in a real browser."""
 
 import re
-import shutil
 import subprocess
 import sys
 import time
@@ -19,6 +18,7 @@ from pat.data.sample_array import load_sample
 from pat.fusion.steps import at_alphas_resolution
 from pat.matching.inputs import Inputs
 from pat.networks.weights import load_weights
+from tests.browser import CHROMIUM, DRIVER, browser
 
 pytest.importorskip("anywidget", reason="the extra 'explore' is not installed")
 from pat.explore import ExplorerScene, explore
@@ -26,7 +26,6 @@ from pat.explore import ExplorerScene, explore
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 Keys = webdriver.Keys
 ROOT = Path(__file__).parents[3]
-CHROMIUM, DRIVER = shutil.which("chromium") or shutil.which("google-chrome"), shutil.which("chromedriver")
 
 
 def small_rig(baseline=0.1, names=("a", "b")):
@@ -171,13 +170,8 @@ def test_an_answer_takes_under_50_ms_of_processor_time():
 def driver():
     if not (CHROMIUM and DRIVER):
         pytest.skip("no browser is installed: apt-get install chromium")
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for flag in ("--headless=new", "--no-sandbox", "--window-size=1200,900", "--disable-dev-shm-usage"):
-        options.add_argument(flag)
-    made = webdriver.Chrome(options, webdriver.ChromeService(DRIVER))
-    yield made
-    made.quit()
+    with browser() as made:
+        yield made
 
 
 def captions(driver):

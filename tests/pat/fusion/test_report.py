@@ -1,7 +1,6 @@
 """The page of a fused frame: complete in itself, and in a real browser."""
 
 import re
-import shutil
 
 import pytest
 import torch
@@ -13,9 +12,7 @@ from pat.evaluation.metrics import score
 from pat.fusion.report import Facts, report_page, rig_drawing
 from pat.fusion.results import Frame
 from pat.media.figures import reduced
-
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
-DRIVER = shutil.which("chromedriver")
+from tests.browser import CHROMIUM, DRIVER, browser
 
 
 @pytest.fixture(scope="module")
@@ -62,15 +59,9 @@ def test_without_depth_poses_and_warnings_there_is_nothing_of_them(page):
 
 @pytest.mark.skipif(not (CHROMIUM and DRIVER), reason="no browser is installed: apt-get install chromium")
 def test_slider_and_overlays_work_in_a_browser(page):
-    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    for flag in ("--headless=new", "--no-sandbox", "--window-size=1280,1200", "--disable-dev-shm-usage"):
-        options.add_argument(flag)
-    driver = webdriver.Chrome(options, webdriver.ChromeService(DRIVER))
-    run = driver.execute_script
-    try:
+    pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    with browser("1280,1200") as driver:
+        run = driver.execute_script
         driver.get(page.as_uri())
         assert run("return [...document.images].every(i => i.complete && i.naturalWidth > 0)")
         shown = "return [...document.querySelectorAll('.layer.SIDE')].map(i => i.dataset.name)"
@@ -96,8 +87,6 @@ def test_slider_and_overlays_work_in_a_browser(page):
         )
         assert len(driver.get_screenshot_as_png()) > 20_000
         assert driver.get_log("browser") == []
-    finally:
-        driver.quit()
 
 
 @pytest.mark.parametrize("lens", [None, [-0.12, 0.03, 0.0, 0.0]])

@@ -8,7 +8,20 @@ import torch
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.pose import Pose
 from arraygeom.sensor import Band, Curve
-from experiments.sensors import DecodeSRGB, DiscBlur, EncodeSRGB, Exposure, Gamma, Spectral, record
+from experiments.sensors import (
+    Crop,
+    DecodeSRGB,
+    Demosaic,
+    DiscBlur,
+    EncodeSRGB,
+    Exposure,
+    Gamma,
+    Mosaic,
+    MotionBlur,
+    Spectral,
+    Vignetting,
+    record,
+)
 from pat.sensors import (
     BoxBlur,
     Clip,
@@ -184,24 +197,24 @@ def test_jitter_changes_each_image_by_about_what_is_asked():
 
 
 @pytest.mark.parametrize(
-    "step",
+    "steps",
     [
-        *(DecodeSRGB(), EncodeSRGB(), Exposure(1.7), Spectral("luminance"), Spectral(Band(560, 50))),
         *(
-            BoxBlur(3),
-            GaussianBlur(0.8),
-            DiscBlur(1.3),
-            Resample(0.5),
-            Resample((5, 9)),
-            Resample(2.0, "bicubic"),
+            [DecodeSRGB()],
+            [EncodeSRGB()],
+            [Exposure(1.7)],
+            [Spectral("luminance")],
+            [Spectral(Band(560, 50))],
         ),
-        *(Noise(500, 3), Jitter()),
+        *([BoxBlur(3)], [GaussianBlur(0.8)], [DiscBlur(1.3)], [MotionBlur(1.0, (2.3, -1.1))]),
+        *([Resample(0.5)], [Resample((5, 9))], [Resample(2.0, "bicubic")], [Crop(1, 2, (3, 4))]),
+        *([Vignetting((-0.3, 0.1))], [Mosaic("GRBG"), Demosaic("GRBG")], [Noise(500, 3)], [Jitter()]),
     ],
-    ids=lambda s: type(s).__name__,
+    ids=lambda steps: type(steps[0]).__name__,
 )
-def test_gradients_in_the_image(step):
+def test_gradients_in_the_image(steps):
     image = (0.1 + 0.8 * noise_image(1, 3, 6, 8)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: run(x, step), image)
+    assert torch.autograd.gradcheck(lambda x: run(x, *steps), image)
 
 
 @pytest.mark.parametrize("step", [GaussianBlur, DiscBlur, Exposure])

@@ -1,7 +1,6 @@
 """Runs: what they leave, going on after any stop, several processes, numbers that are not finite."""
 
 import json
-import math
 import os
 import resource
 import shutil
@@ -23,8 +22,8 @@ from pat.networks.weights import load_weights, new_network, save_weights
 from pat.support.locks import folder_lock
 from pat.training import loop
 from pat.training.checkpoints import newest_checkpoint
-from pat.training.config import save_config
-from pat.training.loop import Schedule, train
+from pat.training.config import TrainConfig, save_config
+from pat.training.loop import rate_at, train
 from pat.training.losses import Objective, validation
 from pat.training.processes import Process
 from pat.training.samples import made_ahead, scenes
@@ -98,6 +97,7 @@ def test_a_run_leaves_what_it_says(whole):
     assert load_weights(whole.out / "best.safetensors").config == SMALL
     lines = [json.loads(line) for line in (whole.out / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [4, 8]
+    assert all(line["psnr"] > 5 for line in lines)
     assert len(losses(whole.out)) == 1 + 8
     assert sorted(p.name for p in (whole.out / "images").iterdir()) == ["step-000004.png", "step-000008.png"]
     assert len(list((whole.out / "checkpoints").iterdir())) == 2
@@ -176,15 +176,19 @@ def by_torchrun(config, file, monkeypatch):
     return command(file, launcher=["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"])
 
 
-@pytest.mark.parametrize("run", [two_processes, pytest.param(by_torchrun, marks=pytest.mark.slow)])
-def test_two_processes_are_as_one(run, folder, whole, monkeypatch):
-    config = replace(whole, out=folder / run.__name__)
-    save_config(config, folder / "two.yaml")
-    running = run(config, folder / "two.yaml", monkeypatch)
+def ends_as(running, config, whole):
+    """The run ends well, with the losses of the whole one but for rounding."""
     said, _ = running.communicate()
     assert running.returncode == 0, said
     ours, theirs = ([[float(x) for x in row] for row in losses(c.out)[1:]] for c in (config, whole))
     torch.testing.assert_close(torch.tensor(ours), torch.tensor(theirs), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("run", [two_processes, pytest.param(by_torchrun, marks=pytest.mark.slow)])
+def test_two_processes_are_as_one(run, folder, whole, monkeypatch):
+    config = replace(whole, out=folder / run.__name__)
+    save_config(config, folder / "two.yaml")
+    ends_as(run(config, folder / "two.yaml", monkeypatch), config, whole)
 
 
 def test_forty_steps_learn(folder):
@@ -290,11 +294,11 @@ def test_half_precision_and_compiled_parts_train(folder, whole):
 
 
 def test_schedules():
-    warm = Schedule(8, math.inf, 1.0, "cosine", warmup=4, validate=4, save=4)
-    assert [warm.rate_at(s, s / 100) for s in (1, 2)] == [0.25, 0.5]
-    assert warm.rate_at(50, 0.5) == pytest.approx(0.5)
-    halving = Schedule(8, math.inf, 1.0, "halving", warmup=0, validate=4, save=4)
-    assert [halving.rate_at(1, done) for done in (0.3, 0.4, 0.8)] == [1, 0.5, 0.25]
+    warm = TrainConfig(rate=1.0, warmup=4)
+    assert [rate_at(warm, s, s / 100) for s in (1, 2)] == [0.25, 0.5]
+    assert rate_at(warm, 50, 0.5) == pytest.approx(0.5)
+    halving = TrainConfig(rate=1.0, schedule="halving", warmup=0)
+    assert [rate_at(halving, 1, done) for done in (0.3, 0.4, 0.8)] == [1, 0.5, 0.25]
 
 
 def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_again(folder, whole):

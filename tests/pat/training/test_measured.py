@@ -10,7 +10,7 @@ from PIL import Image
 from arraygeom import sample
 from pat.networks.configs import GuidedPATConfig
 from pat.networks.guided import GuidedPAT
-from pat.training.config import RecordingConfig, TrainConfig, parse_config
+from pat.training.config import RecordingConfig, TrainConfig
 from pat.training.losses import Objective
 from pat.training.samples import degraded, scenes
 from pat.training.stereo import MeasuredPairs
@@ -78,23 +78,6 @@ def test_a_recipe_takes_its_batches_from_them(pair):
     config = TrainConfig(measured=1.0, measured_from=(pair.parent,), hw=HW, batch=1, filtered=0, held_out=2)
     with pytest.raises(ValueError, match="too few"):  # one pair cannot be learned from and held out
         scenes(config)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("measured: 0.5", "give both `measured` and `measured_from`"),
-        ("measured_from: [a]", "give both `measured` and `measured_from`"),
-        ("attention: -1", "attention must be 0 or more"),
-        (
-            "{measured: 0.6, measured_from: [a], pairs: 0.6, pairs_from: [b]}",
-            "shares of the batches, 1.2 in all",
-        ),
-    ],
-)
-def test_recipes_that_cannot_be_are_refused(text, message):
-    with pytest.raises(ValueError, match=message):
-        parse_config(text)
 
 
 def test_a_network_without_attention_of_its_own_is_not_supervised_by_it():

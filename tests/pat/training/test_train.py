@@ -1,43 +1,20 @@
 """Training: samples that agree with their geometry, a loss that goes down, a file that loads."""
 
-import json
-
 import pytest
 import torch
 from torch import Generator
 
 from arraygeom import Epipolar, Segments, sample
 from pat.media.colour import luminance
-from pat.media.images import write_image
-from pat.networks.configs import GuidedPATConfig
-from pat.networks.weights import load_weights
-from pat.training.config import TrainConfig
-from pat.training.loop import train
 from pat.training.losses import image_loss
 from pat.training.samples import degraded, scenes
 
-SMALL = GuidedPATConfig(widths=(8, 8, 8, 8), taps=5)
+from .runs import short_run
 
 
 @pytest.fixture(scope="module")
 def config(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("photos")
-    g = Generator().manual_seed(0)
-    for i in range(4):
-        smooth = torch.nn.functional.interpolate(
-            torch.rand(1, 3, 12, 16, generator=g), (96, 128), mode="bilinear"
-        )
-        write_image(folder / f"{i}.png", smooth[0])
-    return TrainConfig(
-        photos=(folder,),
-        out=folder / "run",
-        network=SMALL,
-        steps=6,
-        batch=2,
-        hw=(32, 48),
-        validate=3,
-        held_out=4,
-    )
+    return short_run(tmp_path_factory.mktemp("photos"))
 
 
 def test_ground_truth_is_where_the_geometry_says(config):
@@ -93,14 +70,6 @@ def test_every_sample_pulls_alike():
     ground_truth = torch.zeros(1, 3, 4, 4)
     assert float(image_loss(ground_truth + 0.1, ground_truth)) == pytest.approx(-2, abs=1e-3)
     assert float(image_loss(ground_truth + 1.0, ground_truth)) == pytest.approx(0, abs=1e-3)
-
-
-def test_a_short_run_learns_and_leaves_weights(config):
-    best = train(config)
-    lines = [json.loads(line) for line in (config.out / "log.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines] == [3, 6]
-    assert load_weights(best).config == SMALL
-    assert all(line["psnr"] > 5 for line in lines)
 
 
 def test_degradation_keeps_the_ground_truth_in_colour(config):
