@@ -1,6 +1,5 @@
 """Real and rendered images of rigs: what the benchmarks measure at length."""
 
-import math
 from importlib.util import find_spec
 
 import numpy as np
@@ -8,55 +7,27 @@ import pytest
 import torch
 
 from arraygeom import Rig
-from arraygeom.undistortion import resampled
 from calib.boards.detect import collect_folder
 from calib.boards.rig import calibrate
 from calib.boards.target import parse_board
 from calib.images.doctor import diagnose, diagnose_matches
-from calib.images.hypotheses import on_cameras
 from calib.images.matches import match_cameras, seen_depths
 from calib.images.refinement import refine_matches
+from tests.benchmarks.bench_doctor import MISTAKES
+from tests.benchmarks.bench_refine import worse
 from tests.calib.board_scenes import errors_of, pose_errors
 from tests.calib.real import bumblebee, syntim
 from tests.calib.rendered import BOARD, photograph
 
 
-def on_rig(change):
-    return lambda rig, images: (on_cameras(rig, rig.names, change), images)
-
-
-def undistorted(rig, images):
-    return rig, {
-        name: resampled(image, rig[name], rig[name].replace(distortion=None)).values[0]
-        for name, image in images.items()
-    }
-
-
-MISTAKES = {
-    "resized": on_rig(lambda c: c.resize((c.hw[0] // 2, c.hw[1] // 2)).replace(hw=c.hw)),
-    "rotated or mirrored": lambda rig, images: (rig, {name: image.mT for name, image in images.items()}),
-    "cameras swapped": lambda rig, images: (rig, dict(zip(images, reversed(images.values())))),
-    "pose inverted": on_rig(lambda c: c.replace(cam_from_world=c.cam_from_world.inverse())),
-    "distortion": undistorted,
-}
-
-
-def worse(rig):
-    """Every camera rotated by 0.3 degrees, its principal point moved by 5 px, in random directions."""
-    g = torch.Generator().manual_seed(0)
-    drawn = {
-        name: torch.randn(v.shape, generator=g, dtype=torch.float64)
-        for name, v in rig.parameters(free=["*.rotation", "*.centre"]).items()
-    }
-    sizes = {"rotation": math.radians(0.3), "centre": 5.0}
-    return rig.perturbed({name: v / v.norm() * sizes[name.split(".")[-1]] for name, v in drawn.items()})
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", MISTAKES)
+@pytest.mark.parametrize(
+    "kind", ["resized", "rotated or mirrored", "cameras swapped", "pose inverted", "distortion"]
+)
 def test_mistakes_with_a_stereo_head_are_named(shared_data, kind):
     (pair, *_) = bumblebee(shared_data, ("chair01",))
-    found = diagnose(*MISTAKES[kind](pair.rig, pair.images))
+    rig, images = MISTAKES[kind](pair.rig, pair.images, np.random.default_rng(3))
+    found = diagnose(rig, images)
     assert kind in (found.named.kind, *(h.kind for h in found.equal)), found.verdict
 
 
@@ -89,7 +60,7 @@ def test_real_rigs_return(shared_data, source):
     (pair, *_) = source(shared_data)
     matches = match_cameras(pair.images)
     rig = Rig({name: pair.rig[name] for name in pair.images})
-    found = refine_matches(worse(rig), [matches], force=True)
+    found = refine_matches(worse(rig, torch.Generator().manual_seed(0)), [matches], force=True)
     assert found.accepted
     assert found.held_out[1].median < 0.3 < 1 < found.held_out[0].median
     assert diagnose_matches(found.rig, {n: c.hw for n, c in rig.cameras.items()}, matches).before.misfit < 0.2
