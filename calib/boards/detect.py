@@ -29,6 +29,8 @@ FEWEST_KNOWN = 6
 """Likewise of points of known position."""
 ENOUGH = 0.6
 """Share of a board's corners that must fit the corner model, else all are refined by gradients."""
+APRIL_SHIFT = 0.5
+"""Of the corners that OpenCV finds in the way of AprilTag's authors: the first pixel's centre is there (0.5, 0.5)."""
 LARGEST_MISFIT = 0.35
 """Largest median distance (spacings) of points from a smoothly distorted grid: beyond, a false detection."""
 SMALL = 640
@@ -115,11 +117,19 @@ def _chessboard(grey: Grey, board: Chessboard) -> Detection | None:
         done, corners = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
     if not done or len(corners) != len(board.points):
         return None
-    grid = corners.reshape(board.rows, board.columns, 2).astype(np.float64)
+    return _numbered(_right_handed(corners.reshape(board.rows, board.columns, 2)))
+
+
+def _right_handed(grid: np.ndarray) -> np.ndarray:
+    """A grid in which x, y and the direction into the board are a right-handed frame: the one given, or mirrored."""
     (ax, ay), (bx, by) = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-    if ax * by < ay * bx:  # x, y and the direction into the board have to be a right-handed frame
-        grid = grid[:, ::-1]
-    return Detection(np.arange(len(board.points)), grid.reshape(-1, 2))
+    return grid[:, ::-1] if ax * by < ay * bx else grid
+
+
+def _numbered(grid: np.ndarray) -> Detection:
+    """All points of a board, row by row."""
+    x = grid.reshape(-1, 2).astype(np.float64)
+    return Detection(np.arange(len(x)), x)
 
 
 def _charuco(grey: Grey, board: Charuco) -> Detection | None:
@@ -177,7 +187,8 @@ def _tags(grey: Grey, dictionary: str, border: int) -> dict[int, np.ndarray]:
         detector = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters)
         corners, ids, _ = detector.detectMarkers(grey)
         numbers = [] if ids is None else ids.reshape(-1).tolist()
-        found |= {number: x.reshape(4, 2) for number, x in zip(numbers, corners)}
+        shift = APRIL_SHIFT if method == cv2.aruco.CORNER_REFINE_APRILTAG else 0.0
+        found |= {number: x.reshape(4, 2) - shift for number, x in zip(numbers, corners)}
     return found
 
 
@@ -193,9 +204,15 @@ def _circles(grey: Grey, board: Circles) -> Detection | None:
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
     for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
         done, centres = cv2.findCirclesGrid(grey, (board.columns, board.rows), flags=flags)
-        if done and len(centres) == len(board.points):
-            x = centres.reshape(-1, 2).astype(np.float64)
-            return Detection(np.arange(len(x)), x)
+        if not done or len(centres) != len(board.points):
+            continue
+        grid = centres.reshape(board.rows, board.columns, 2)
+        if not board.asymmetric:
+            return _numbered(_right_handed(grid))
+        found = _numbered(grid)
+        if board.rows % 2 == 0 and not _plausible(found, board):  # OpenCV may swap the rows of each pair
+            return _numbered(grid.reshape(-1, 2, board.columns, 2)[:, ::-1])
+        return found
     return None
 
 
