@@ -30,7 +30,7 @@ FEWEST_KNOWN = 6
 ENOUGH = 0.6
 """Share of a board's corners that must fit the corner model, else all are refined by gradients."""
 APRIL_SHIFT = 0.5
-"""Of the corners that OpenCV finds in the way of AprilTag's authors: the first pixel's centre is there (0.5, 0.5)."""
+"""The first pixel's centre, x and y, where OpenCV finds corners in the way of AprilTag's authors."""
 LARGEST_MISFIT = 0.35
 """Largest median distance (spacings) of points from a smoothly distorted grid: beyond, a false detection."""
 SMALL = 640
@@ -121,7 +121,7 @@ def _chessboard(grey: Grey, board: Chessboard) -> Detection | None:
 
 
 def _right_handed(grid: np.ndarray) -> np.ndarray:
-    """A grid in which x, y and the direction into the board are a right-handed frame: the one given, or mirrored."""
+    """The grid, mirrored if x, y and the direction into the board are not a right-handed frame."""
     (ax, ay), (bx, by) = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     return grid[:, ::-1] if ax * by < ay * bx else grid
 

@@ -158,7 +158,7 @@ def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) ->
 
 
 def _aligned(seen: Sequence[CalibratedViews], board: Board) -> dict[str, Pose]:
-    """`cam_from_world` of all cameras, each with the orientation by the frames that it shares with one before.
+    """`cam_from_world` of all cameras, oriented by the frames that each shares with one before.
 
     The first is that with most images; then always those two that share most. Cameras that share none keep
     their own.

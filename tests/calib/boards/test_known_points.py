@@ -102,7 +102,7 @@ def crossing(square):
 
 @pytest.mark.parametrize("dictionary", ["5x5_50", "apriltag_36h11"])
 def test_centres_are_found_to_a_fraction_of_a_pixel(dictionary, tmp_path):
-    """OpenCV counts pixels of AprilTags from the first one's corner: they were half a pixel off, in x and y."""
+    """OpenCV counts AprilTags' pixels from the first one's corner: they were half a pixel off."""
     image, squares = six_markers(dictionary)
     found = detect(image, parse_board(f"{written(tmp_path, in_a_room(6))}:{dictionary}"))
     off = found.x - [crossing(squares[number]) for number in found.ids]

@@ -208,7 +208,7 @@ def test_the_nine_band_array(shared_data):
 
 
 def test_cameras_far_apart_are_rotated_by_way_of_those_between():
-    """Each sees boards with the next one alone: the last, off by 8 degrees against the second, was refused."""
+    """Each sees boards with the next alone: the last, off by 8 degrees against the second, was refused."""
     row = Rig({f"c{i}": camera(600.0, (480, 640), (0.5 * i, 0.0, 0.0)) for i in range(4)})
     views, middle = {name: {} for name in row.names}, torch.from_numpy(BOARD.middle)
     for frame, x in enumerate((0.25, 0.75, 1.25, 0.2, 0.8, 1.3)):
