@@ -19,7 +19,17 @@ from jaxtyping import Bool, Float, Int
 
 from arraygeom.pixels import HW
 
-from .board import AprilGrid, Board, Charuco, Chessboard, Circles, KnownPoints, MarkedBoard, marker_dictionary
+from .board import (
+    AprilGrid,
+    Board,
+    Charuco,
+    Chessboard,
+    Circles,
+    KnownPoints,
+    MarkedBoard,
+    marker_dictionary,
+    on_a_line,
+)
 from .corners import monomials, refine_corners
 from .photos import FrameKey, Grey, Photo, Photos, find_photos
 
@@ -270,7 +280,7 @@ def _plausible(found: Detection, board: Board) -> bool:
     A homography plus a polynomial of degree 3 has to map the points on the board to the pixels.
     """
     if isinstance(board, KnownPoints):
-        return True
+        return not on_a_line(board.points[found.ids])
     p = board.points[found.ids, :2]
     if len(p) < FEWEST or np.linalg.svd(p - p.mean(0), compute_uv=False)[1] <= 0.5 * board.spacing:
         return False
@@ -310,7 +320,7 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
         )
     if isinstance(board, KnownPoints):
         return (
-            f"{len(ids)} of its markers are visible, too few, "
+            f"{len(ids)} of its markers are visible, too few, all on a line, "
             f"or not of {board.dictionary}: name their dictionary"
         )
     if len(ids) >= 4 and max(ids) > last:

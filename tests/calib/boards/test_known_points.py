@@ -48,7 +48,7 @@ def test_a_room_has_no_print(room):
 def test_another_dictionary_is_asked_for(room):
     grey = np.random.default_rng(0).integers(0, 256, (240, 320)).astype(np.uint8)
     assert explain([grey], room) == (
-        "0 of its markers are visible, too few, or not of 4x4_50: name their dictionary"
+        "0 of its markers are visible, too few, all on a line, or not of 4x4_50: name their dictionary"
     )
 
 
@@ -107,6 +107,14 @@ def test_centres_are_found_to_a_fraction_of_a_pixel(dictionary, tmp_path):
     found = detect(image, parse_board(f"{written(tmp_path, in_a_room(6))}:{dictionary}"))
     off = found.x - [crossing(squares[number]) for number in found.ids]
     assert np.abs(off.mean(0)).max() < 0.25
+
+
+def test_an_image_with_markers_on_a_line_alone_is_not_used(tmp_path):
+    """About which the camera could turn: the calibration ended in a singular matrix."""
+    places = np.concatenate([np.arange(6)[:, None] * np.array([1.0, 2.0, 3.0]), in_a_room(2)])
+    image, board = six_markers()[0], parse_board(str(written(tmp_path, places)))
+    assert detect(image, board) is None
+    assert "all on a line" in explain([image], board)
 
 
 def test_centres_and_corners_of_markers_are_found(tmp_path):
