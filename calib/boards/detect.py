@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -105,12 +106,13 @@ def other_size(images: Iterable[Grey], board: Board, *, larger: bool = False) ->
     """
     if not isinstance(board, Chessboard):
         return None
-    sizes = Counter(size for grey in images if (size := _grid_size(grey)) is not None)
+    found = [_grid_size(grey) for grey in images]
+    sizes = Counter(size for size in found if size is not None)
     if not sizes:
         return None
     size, votes = sizes.most_common(1)[0]
     same = set(size) == {board.columns, board.rows} or (larger and size[0] * size[1] <= len(board.points))
-    return None if same or (votes < 2 and sizes.total() > 1) else f"{max(size)}x{min(size)}"
+    return None if same or (votes < 2 and len(found) > 1) else f"{size[0]}x{size[1]}"
 
 
 def _versions(grey: Grey) -> Iterator[Grey]:
@@ -301,7 +303,10 @@ def _reason(grey: Grey, board: Board) -> str:
     if isinstance(board, MarkedBoard) and (reason := _marker_reason(grey, board)):
         return reason
     if other := other_size([grey], board):
-        return f"a chessboard with {other} inner corners is visible: is the board's size right?"
+        return (
+            f"a chessboard with {other} inner corners is visible: is the board's size right, "
+            "and is all of it in the image?"
+        )
     if detect(np.ascontiguousarray(grey[:, ::-1]), board) is not None:
         return "it is found once the image is mirrored: save the images as captured, not mirrored"
     if cv2.Laplacian(grey, cv2.CV_64F).std() < 4:
@@ -344,12 +349,12 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
 
 
 def _grid_size(grey: Grey) -> tuple[int, int] | None:
-    """The (columns, rows) of inner corners of the largest chessboard in an image."""
+    """The inner corners of the largest chessboard in an image along its sides, the longer first."""
     scale = min(1.0, SMALL / grey.shape[1])
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
     done, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
-    return (meta.shape[1], meta.shape[0]) if done else None
+    return (max(meta.shape), min(meta.shape)) if done else None
 
 
 # All images -------------------------------------------------------------------------------------------------
@@ -384,12 +389,18 @@ def collect_folder(
     with ThreadPoolExecutor(2) as pool:
         results = pool.map(lambda job: detected(job[1], job[0], board), jobs)
         found = iter(list(progress(results, len(jobs)) if progress else results))
-    views, notes = {}, list[str]()
+    views, notes, shown = {}, list[str](), list[Iterable[Grey]]()
     for name, moments in photos.items():
         images = {key: next(found) for key in moments}
         views[name] = board_views(name, moments, images)
         seen = {key: boards for key, (_, boards) in images.items() if boards}
         notes += _missing(name, moments, seen, board)
+        shown.append(_greys([moments[key] for key in seen]))
+    if other := other_size(chain.from_iterable(shown), board, larger=True):
+        raise ValueError(
+            f"the images show a chessboard with {other} inner corners and the board given is {board}: "
+            "count the corners between squares, not the squares"
+        )
     return CollectedViews(views, photos, tuple(notes))
 
 
@@ -425,18 +436,13 @@ def board_views(
 def _missing(
     name: str, moments: Mapping[FrameKey, Photo], seen: Collection[FrameKey], board: Board
 ) -> Iterator[str]:
-    """A note on a camera's images without the board. Raises ValueError if all are, or show a larger one."""
+    """A note on a camera's images without the board. Raises ValueError if all are."""
     why, missing = "", [photo for key, photo in moments.items() if key not in seen]
     if missing:
         labels = named([photo.label for photo in missing], NAMED)
         why = f"images ({labels}): {explain(_greys(missing), board.members[0])}"
     if not seen:
         raise ValueError(f"{name}: the board {board} is in none of {len(moments)} {why}")
-    if other := other_size(_greys([moments[key] for key in seen]), board, larger=True):
-        raise ValueError(
-            f"{name}: the images show a chessboard with {other} inner corners and the board given is "
-            f"{board}: count the corners between squares, not the squares"
-        )
     if missing:
         yield f"{name}: no board in {len(missing)} of {len(moments)} {why}"
 

@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 
 import cv2
@@ -118,6 +119,9 @@ def _by_pattern(folder: Path, patterns: Mapping[str, str]) -> dict[str, list[Pat
     cameras = {name: _usable(folder.glob(pattern)) for name, pattern in patterns.items()}
     if empty := [name for name, files in cameras.items() if not files]:
         raise ValueError(f"{empty[0]}: no image or video in {folder} is called '{patterns[empty[0]]}'")
+    for (a, files), (b, others) in combinations(cameras.items(), 2):
+        if both := [file.name for file in files if file in others]:
+            raise ValueError(f"{both[0]} is an image of {a} and of {b}: give patterns of which one fits it")
     return cameras
 
 

@@ -138,3 +138,6 @@ def test_a_larger_chessboard_is_noticed_though_a_part_of_it_is_found():
     assert other_size([grey, grey], parse_board("chessboard:8x6:25mm"), larger=True) == "9x6"
     assert other_size([grey, grey], parse_board("chessboard:10x7:25mm")) == "9x6"
     assert other_size([grey, grey], parse_board("chessboard:10x7:25mm"), larger=True) is None, "a patch of it"
+    assert (
+        other_size([grey, *np.full((2, 48, 64), 90, np.uint8)], parse_board("chessboard:8x6:25mm")) is None
+    ), "the margin of a board passes for a row of it in one real image of 26"

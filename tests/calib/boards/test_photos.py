@@ -78,6 +78,8 @@ def test_patterns_say_it_outright(tmp_path):
     assert {n: list(m) for n, m in photos.items()} == {"l": [1, 2], "r": [1, 2]}
     with pytest.raises(ValueError, match=r"q: .*\*_Q\.png"):
         find_photos(tmp_path, patterns={"q": "*_Q.png"})
+    with pytest.raises(ValueError, match=r"1_R\.png is an image of l and of r"):
+        find_photos(tmp_path, patterns={"l": "*.png", "r": "*_R.png"})
     with pytest.raises(ValueError, match=r"1_L\.png' is a whole path: give a pattern of names in"):
         find_photos(tmp_path, patterns={"l": f"{tmp_path}/1_L.png"})
 
