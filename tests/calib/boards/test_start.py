@@ -229,3 +229,10 @@ def test_cameras_far_apart_are_rotated_by_way_of_those_between():
     found = calibrate(views, BOARD, lens="none", start=Rig(off))
     assert not found.fit.left_out
     assert found.rms < 0.2
+
+
+def test_cameras_of_the_start_without_images_are_named():
+    views = see(four(), one_board(0), noise=0.1)
+    found = calibrate({name: views[name] for name in ("c0", "c2")}, BOARD, lens="none", start=four())
+    assert found.rig.names == ("c0", "c2")
+    assert [note[:2] for note in found.notes if "has no images" in note] == ["c1", "c3"]
