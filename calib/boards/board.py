@@ -18,6 +18,8 @@ from matplotlib.patches import Circle, Rectangle
 
 FLAT = 0.03
 """Relief below which points of known position count as lying in a plane, as a share of their extent."""
+ON_A_LINE = 0.01
+"""Extent of known points across a line, as a share of that along it, below which they lie on one."""
 
 
 @dataclass(frozen=True)
@@ -311,6 +313,12 @@ def unit_grid(columns: int, rows: int) -> Float[np.ndarray, "n 3"]:
     grid = np.zeros((rows, columns, 3))
     grid[..., 0], grid[..., 1] = np.arange(columns), np.arange(rows)[:, None]
     return grid.reshape(-1, 3)
+
+
+def on_a_line(points: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether points lie on a line, about which a camera's pose is not determined."""
+    along, across, _ = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    return bool(across <= ON_A_LINE * along)
 
 
 def marker_dictionary(name: str) -> cv2.aruco.Dictionary:

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,17 @@ from jaxtyping import Bool, Float, Int
 
 from arraygeom.pixels import HW
 
-from .board import AprilGrid, Board, Charuco, Chessboard, Circles, KnownPoints, MarkedBoard, marker_dictionary
+from .board import (
+    AprilGrid,
+    Board,
+    Charuco,
+    Chessboard,
+    Circles,
+    KnownPoints,
+    MarkedBoard,
+    marker_dictionary,
+    on_a_line,
+)
 from .corners import monomials, refine_corners
 from .photos import FrameKey, Grey, Photo, Photos, find_photos
 
@@ -29,6 +40,8 @@ FEWEST_KNOWN = 6
 """Likewise of points of known position."""
 ENOUGH = 0.6
 """Share of a board's corners that must fit the corner model, else all are refined by gradients."""
+APRIL_SHIFT = 0.5
+"""The first pixel's centre, x and y, where OpenCV finds corners in the way of AprilTag's authors."""
 LARGEST_MISFIT = 0.35
 """Largest median distance (spacings) of points from a smoothly distorted grid: beyond, a false detection."""
 SMALL = 640
@@ -93,12 +106,13 @@ def other_size(images: Iterable[Grey], board: Board, *, larger: bool = False) ->
     """
     if not isinstance(board, Chessboard):
         return None
-    sizes = Counter(size for grey in images if (size := _grid_size(grey)) is not None)
+    found = [_grid_size(grey) for grey in images]
+    sizes = Counter(size for size in found if size is not None)
     if not sizes:
         return None
     size, votes = sizes.most_common(1)[0]
     same = set(size) == {board.columns, board.rows} or (larger and size[0] * size[1] <= len(board.points))
-    return None if same or (votes < 2 and sizes.total() > 1) else f"{max(size)}x{min(size)}"
+    return None if same or (votes < 2 and len(found) > 1) else f"{size[0]}x{size[1]}"
 
 
 def _versions(grey: Grey) -> Iterator[Grey]:
@@ -115,11 +129,19 @@ def _chessboard(grey: Grey, board: Chessboard) -> Detection | None:
         done, corners = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
     if not done or len(corners) != len(board.points):
         return None
-    grid = corners.reshape(board.rows, board.columns, 2).astype(np.float64)
+    return _numbered(_right_handed(corners.reshape(board.rows, board.columns, 2)))
+
+
+def _right_handed(grid: np.ndarray) -> np.ndarray:
+    """The grid, mirrored if x, y and the direction into the board are not a right-handed frame."""
     (ax, ay), (bx, by) = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-    if ax * by < ay * bx:  # x, y and the direction into the board have to be a right-handed frame
-        grid = grid[:, ::-1]
-    return Detection(np.arange(len(board.points)), grid.reshape(-1, 2))
+    return grid[:, ::-1] if ax * by < ay * bx else grid
+
+
+def _numbered(grid: np.ndarray) -> Detection:
+    """All points of a board, row by row."""
+    x = grid.reshape(-1, 2).astype(np.float64)
+    return Detection(np.arange(len(x)), x)
 
 
 def _charuco(grey: Grey, board: Charuco) -> Detection | None:
@@ -177,7 +199,8 @@ def _tags(grey: Grey, dictionary: str, border: int) -> dict[int, np.ndarray]:
         detector = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters)
         corners, ids, _ = detector.detectMarkers(grey)
         numbers = [] if ids is None else ids.reshape(-1).tolist()
-        found |= {number: x.reshape(4, 2) for number, x in zip(numbers, corners)}
+        shift = APRIL_SHIFT if method == cv2.aruco.CORNER_REFINE_APRILTAG else 0.0
+        found |= {number: x.reshape(4, 2) - shift for number, x in zip(numbers, corners)}
     return found
 
 
@@ -193,9 +216,15 @@ def _circles(grey: Grey, board: Circles) -> Detection | None:
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
     for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
         done, centres = cv2.findCirclesGrid(grey, (board.columns, board.rows), flags=flags)
-        if done and len(centres) == len(board.points):
-            x = centres.reshape(-1, 2).astype(np.float64)
-            return Detection(np.arange(len(x)), x)
+        if not done or len(centres) != len(board.points):
+            continue
+        grid = centres.reshape(board.rows, board.columns, 2)
+        if not board.asymmetric:
+            return _numbered(_right_handed(grid))
+        found = _numbered(grid)
+        if board.rows % 2 == 0 and not _plausible(found, board):  # OpenCV may swap the rows of each pair
+            return _numbered(grid.reshape(-1, 2, board.columns, 2)[:, ::-1])
+        return found
     return None
 
 
@@ -253,7 +282,7 @@ def _plausible(found: Detection, board: Board) -> bool:
     A homography plus a polynomial of degree 3 has to map the points on the board to the pixels.
     """
     if isinstance(board, KnownPoints):
-        return True
+        return not on_a_line(board.points[found.ids])
     p = board.points[found.ids, :2]
     if len(p) < FEWEST or np.linalg.svd(p - p.mean(0), compute_uv=False)[1] <= 0.5 * board.spacing:
         return False
@@ -274,7 +303,10 @@ def _reason(grey: Grey, board: Board) -> str:
     if isinstance(board, MarkedBoard) and (reason := _marker_reason(grey, board)):
         return reason
     if other := other_size([grey], board):
-        return f"a chessboard with {other} inner corners is visible: is the board's size right?"
+        return (
+            f"a chessboard with {other} inner corners is visible: is the board's size right, "
+            "and is all of it in the image?"
+        )
     if detect(np.ascontiguousarray(grey[:, ::-1]), board) is not None:
         return "it is found once the image is mirrored: save the images as captured, not mirrored"
     if cv2.Laplacian(grey, cv2.CV_64F).std() < 4:
@@ -293,7 +325,7 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
         )
     if isinstance(board, KnownPoints):
         return (
-            f"{len(ids)} of its markers are visible, too few, "
+            f"{len(ids)} of its markers are visible, too few, all on a line, "
             f"or not of {board.dictionary}: name their dictionary"
         )
     if len(ids) >= 4 and max(ids) > last:
@@ -317,12 +349,12 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
 
 
 def _grid_size(grey: Grey) -> tuple[int, int] | None:
-    """The (columns, rows) of inner corners of the largest chessboard in an image."""
+    """The inner corners of the largest chessboard in an image along its sides, the longer first."""
     scale = min(1.0, SMALL / grey.shape[1])
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
     done, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
-    return (meta.shape[1], meta.shape[0]) if done else None
+    return (max(meta.shape), min(meta.shape)) if done else None
 
 
 # All images -------------------------------------------------------------------------------------------------
@@ -357,12 +389,18 @@ def collect_folder(
     with ThreadPoolExecutor(2) as pool:
         results = pool.map(lambda job: detected(job[1], job[0], board), jobs)
         found = iter(list(progress(results, len(jobs)) if progress else results))
-    views, notes = {}, list[str]()
+    views, notes, shown = {}, list[str](), list[Iterable[Grey]]()
     for name, moments in photos.items():
         images = {key: next(found) for key in moments}
         views[name] = board_views(name, moments, images)
         seen = {key: boards for key, (_, boards) in images.items() if boards}
         notes += _missing(name, moments, seen, board)
+        shown.append(_greys([moments[key] for key in seen]))
+    if other := other_size(chain.from_iterable(shown), board, larger=True):
+        raise ValueError(
+            f"the images show a chessboard with {other} inner corners and the board given is {board}: "
+            "count the corners between squares, not the squares"
+        )
     return CollectedViews(views, photos, tuple(notes))
 
 
@@ -398,18 +436,13 @@ def board_views(
 def _missing(
     name: str, moments: Mapping[FrameKey, Photo], seen: Collection[FrameKey], board: Board
 ) -> Iterator[str]:
-    """A note on a camera's images without the board. Raises ValueError if all are, or show a larger one."""
+    """A note on a camera's images without the board. Raises ValueError if all are."""
     why, missing = "", [photo for key, photo in moments.items() if key not in seen]
     if missing:
         labels = named([photo.label for photo in missing], NAMED)
         why = f"images ({labels}): {explain(_greys(missing), board.members[0])}"
     if not seen:
         raise ValueError(f"{name}: the board {board} is in none of {len(moments)} {why}")
-    if other := other_size(_greys([moments[key] for key in seen]), board, larger=True):
-        raise ValueError(
-            f"{name}: the images show a chessboard with {other} inner corners and the board given is "
-            f"{board}: count the corners between squares, not the squares"
-        )
     if missing:
         yield f"{name}: no board in {len(missing)} of {len(moments)} {why}"
 

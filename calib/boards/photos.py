@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 
 import cv2
@@ -52,16 +53,21 @@ Photos = Mapping[str, Mapping[FrameKey, Photo]]
 
 
 def to_grey(image: np.ndarray) -> Grey:
-    """An image (H, W) or (H, W, C) in grey, 8 bits; if dim or of 16 bits it is stretched to all of them.
+    """An image (H, W) or (H, W, C) in grey, 8 bits; if dim or of other values it is stretched to all of them.
 
     Fewer than three channels are grey, and whatever else; of more, the first three are blue, green and red.
+    NaN and infinity are black.
     """
-    image = np.atleast_3d(image)
+    image = np.atleast_3d(image if image.dtype in (np.uint8, np.uint16) else image.astype(np.float32))
     grey = image[..., 0] if image.shape[2] < 3 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
-    low, high = np.percentile(grey[::4, ::4], (0.5, 99.5))
+    sample = grey[::4, ::4][np.isfinite(grey[::4, ::4])]
+    low, high = np.percentile(sample, (0.5, 99.5)) if len(sample) else (0.0, 0.0)
     if grey.dtype == np.uint8 and high - low > 100:
         return grey
-    scaled = (grey.astype(np.float32) - low) * (255 / max(high - low, 1.0))
+    least = 1e-6 if grey.dtype == np.float32 else 1.0
+    scaled = (np.where(np.isfinite(grey), grey, low).astype(np.float32) - low) * (
+        255 / max(high - low, least)
+    )
     return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
 
 
@@ -113,6 +119,9 @@ def _by_pattern(folder: Path, patterns: Mapping[str, str]) -> dict[str, list[Pat
     cameras = {name: _usable(folder.glob(pattern)) for name, pattern in patterns.items()}
     if empty := [name for name, files in cameras.items() if not files]:
         raise ValueError(f"{empty[0]}: no image or video in {folder} is called '{patterns[empty[0]]}'")
+    for (a, files), (b, others) in combinations(cameras.items(), 2):
+        if both := [file.name for file in files if file in others]:
+            raise ValueError(f"{both[0]} is an image of {a} and of {b}: give patterns of which one fits it")
     return cameras
 
 
@@ -170,9 +179,11 @@ def _orientation(file: Path) -> int:
 
 def _decode_file(path: Path) -> np.ndarray:
     tag, content = _orientation(path), decodable(path.read_bytes())
-    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR  # orientation tags are applied, as when images are fused
-    image = None if content is None else cv2.imdecode(np.frombuffer(content, np.uint8), flags)
-    if content is None or image is None:
+    flags = (
+        cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
+    )  # orientation tags are applied, as when images are fused
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
+    if not content or image is None:
         raise ValueError(f"{path}: not an image that can be read: give a complete PNG, TIFF or JPEG file")
     if tag > 1 and content[8:12] == b"WEBP":  # of which OpenCV applies none
         with Image.open(path) as stored:

@@ -123,8 +123,7 @@ def rig_near_start(
             raise ValueError(f"{name}: shares no frame with another camera: check the images' numbers")
         board_poses = {key: board_pose(camera, d, board) for key, d in v.seen.items()}
         seen.append(CalibratedViews(name, camera, v, board_poses))
-    anchor = max(seen, key=lambda v: len(v.poses))
-    poses = {v.name: _aligned(anchor, v, board) for v in seen}
+    poses = _aligned(seen, board)
     priors = {v.name: start_prior(v.camera, deviations) for v in seen}
     initial = consistent_boards(seen, poses, board)
     if lost := [name for name, v in initial.views.items() if not v.seen]:
@@ -158,14 +157,25 @@ def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) ->
     return camera.to(torch.float64)
 
 
-def _aligned(a: CalibratedViews, b: CalibratedViews, board: Board) -> Pose:
-    """`cam_from_world` of camera b with the orientation by the frames that it shares with a."""
-    shared = [key for key in b.poses if key in a.poses]
-    if not shared or a is b:
-        return b.camera.cam_from_world
-    nominal, symmetries = a.camera.cam_from_world @ b.camera.cam_from_world.inverse(), symmetry_poses(board)
-    a_from_b = average_pose([nearest_pose(nominal, a.poses[key], b.poses[key], symmetries) for key in shared])
-    return Pose.from_centre(a_from_b.R.T @ a.camera.R, b.camera.centre)
+def _aligned(seen: Sequence[CalibratedViews], board: Board) -> dict[str, Pose]:
+    """`cam_from_world` of all cameras, oriented by the frames that each shares with one before.
+
+    The first is that with most images; then always those two that share most. Cameras that share none keep
+    their own.
+    """
+    first, symmetries = max(seen, key=lambda v: len(v.poses)), symmetry_poses(board)
+    poses = {first.name: first.camera.cam_from_world}
+    for _ in seen[1:]:
+        pairs = ((a, b) for a in seen for b in seen if a.name in poses and b.name not in poses)
+        a, b = max(pairs, key=lambda pair: len(pair[0].poses.keys() & pair[1].poses.keys()))
+        pose, nominal = b.camera.cam_from_world, a.camera.cam_from_world @ b.camera.cam_from_world.inverse()
+        if shared := [key for key in b.poses if key in a.poses]:
+            a_from_b = average_pose(
+                [nearest_pose(nominal, a.poses[key], b.poses[key], symmetries) for key in shared]
+            )
+            pose = Pose.from_centre(a_from_b.R.T @ poses[a.name].R, b.camera.centre)
+        poses[b.name] = pose
+    return poses
 
 
 def pair_pose(a: CalibratedViews, b: CalibratedViews, board: Board) -> RelativePose | None:

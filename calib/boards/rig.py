@@ -100,6 +100,9 @@ def calibrate(
         notes[:0] = left_out_notes(views, singles, fitted)
     else:
         notes[:0] = start_notes(initial.views, fitted, stated, models)
+        notes += [
+            f"{n}: of the start, is not in the rig: it has no images" for n in start.names if n not in views
+        ]
     rig = Rig(solved.problem.cameras)
     single = {name: alone.problem.rms() for name, alone in singles.items()}
     return Calibration(rig, board, solved, single, epipolar_errors(rig, solved.views), tuple(notes))

@@ -46,6 +46,7 @@ from .board import (
     MarkedBoard,
     marker_dictionary,
     millimetres,
+    on_a_line,
 )
 
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
@@ -73,8 +74,6 @@ COLUMNS = ("id", "x", "y", "z"), ("id", "corner", "x", "y", "z")
 """Of a file of points."""
 FEWEST_POINTS = 6
 """Points that a target of known points needs."""
-ON_A_LINE = 0.01
-"""Extent of known points across a line, as a share of that along it, below which they lie on one."""
 PAPERS = {
     "A4": (210, 297),
     "letter": (216, 279),
@@ -242,8 +241,7 @@ def _known_points(text: str) -> KnownPoints:
     if twice := [marker for marker in ids if ids.count(marker) > 1]:
         raise ValueError(f"{path}: marker {twice[0][0]} is there twice")
     name = _smallest_dictionary(text, dictionary.removeprefix(":").lower() or "4x4", max(ids)[0] + 1)
-    along, across, _ = np.linalg.svd(np.array(positions) - np.mean(positions, 0), compute_uv=False)
-    if across <= ON_A_LINE * along:
+    if on_a_line(np.array(positions)):
         raise ValueError(
             f"{path}: all points lie on a line, about which a camera's pose is not determined: add others"
         )

@@ -55,6 +55,17 @@ def test_points_are_where_the_lens_puts_them(text, pixels):
     assert min(np.sqrt((e**2).mean()) for e in errors) < pixels
 
 
+@pytest.mark.parametrize("text", ["circles:7x5:25mm", "acircles:5x8:16mm"])
+@pytest.mark.parametrize("degrees", [0.0, 120.0])
+def test_circles_are_numbered_alike_however_their_board_is_turned(text, degrees):
+    """OpenCV mirrors the order of some circles, and swaps the rows of each pair of asymmetric ones."""
+    board = parse_board(text)
+    where = pose(board, (12.0, -12.0, degrees), 0.6)
+    found = detect(photograph(CAMERA, where, board, rays=rays()), board)
+    ground_truth = CAMERA.project(where.apply(torch.from_numpy(board.points))).x.numpy()
+    assert min(np.abs(found.x - ground_truth[order[found.ids]]).max() for order in board.symmetries) < 1
+
+
 def dim(grey):
     """A dim and noisy image."""
     noisy = grey * 0.06 + np.random.default_rng(0).normal(8, 0.7, grey.shape)
@@ -127,3 +138,6 @@ def test_a_larger_chessboard_is_noticed_though_a_part_of_it_is_found():
     assert other_size([grey, grey], parse_board("chessboard:8x6:25mm"), larger=True) == "9x6"
     assert other_size([grey, grey], parse_board("chessboard:10x7:25mm")) == "9x6"
     assert other_size([grey, grey], parse_board("chessboard:10x7:25mm"), larger=True) is None, "a patch of it"
+    assert (
+        other_size([grey, *np.full((2, 48, 64), 90, np.uint8)], parse_board("chessboard:8x6:25mm")) is None
+    ), "the margin of a board passes for a row of it in one real image of 26"

@@ -48,7 +48,7 @@ def test_a_room_has_no_print(room):
 def test_another_dictionary_is_asked_for(room):
     grey = np.random.default_rng(0).integers(0, 256, (240, 320)).astype(np.uint8)
     assert explain([grey], room) == (
-        "0 of its markers are visible, too few, or not of 4x4_50: name their dictionary"
+        "0 of its markers are visible, too few, all on a line, or not of 4x4_50: name their dictionary"
     )
 
 
@@ -80,24 +80,51 @@ def test_markers_on_a_wall_need_several_images(tmp_path):
     assert np.abs(errors_of(fit, rig) / np.sqrt(fit.covariance.diagonal())).max() < 4
 
 
-def test_centres_and_corners_of_markers_are_found(tmp_path):
-    """Markers seen at an angle: their centres are where the diagonals cross, not the mean of the corners."""
-    image, squares = np.full((480, 640), 200, np.uint8), {}
+def six_markers(dictionary="4x4_50"):
+    """An image of markers seen at an angle, and their corners."""
+    image, squares, known = np.full((480, 640), 200, np.uint8), {}, marker_dictionary(dictionary)
     for number in range(6):
         left, top = 40 + 200 * (number % 3), 60 + 220 * (number // 3)
         squares[number] = np.array([[0, 0], [90, 12], [80, 130], [-5, 150]]) + np.array([left, top])
-        marker = cv2.aruco.generateImageMarker(marker_dictionary("4x4_50"), number, 120)
+        marker = cv2.aruco.generateImageMarker(known, number, 120)
         marker = np.pad(marker, 20, constant_values=200)
         corners = np.array([[20, 20], [139, 20], [139, 139], [20, 139]], float)
         H, _ = cv2.findHomography(corners, squares[number].astype(float))
         cv2.warpPerspective(marker, H, (640, 480), image, cv2.INTER_LINEAR, cv2.BORDER_TRANSPARENT)
+    return image, squares
+
+
+def crossing(square):
+    a, b, c, d = square.astype(float)
+    s, _ = np.linalg.solve(np.stack([c - a, b - d], -1), b - a)
+    return a + s * (c - a)
+
+
+@pytest.mark.parametrize("dictionary", ["5x5_50", "apriltag_36h11"])
+def test_centres_are_found_to_a_fraction_of_a_pixel(dictionary, tmp_path):
+    """OpenCV counts AprilTags' pixels from the first one's corner: they were half a pixel off."""
+    image, squares = six_markers(dictionary)
+    found = detect(image, parse_board(f"{written(tmp_path, in_a_room(6))}:{dictionary}"))
+    off = found.x - [crossing(squares[number]) for number in found.ids]
+    assert np.abs(off.mean(0)).max() < 0.25
+
+
+def test_an_image_with_markers_on_a_line_alone_is_not_used(tmp_path):
+    """About which the camera could turn: the calibration ended in a singular matrix."""
+    places = np.concatenate([np.arange(6)[:, None] * np.array([1.0, 2.0, 3.0]), in_a_room(2)])
+    image, board = six_markers()[0], parse_board(str(written(tmp_path, places)))
+    assert detect(image, board) is None
+    assert "all on a line" in explain([image], board)
+
+
+def test_centres_and_corners_of_markers_are_found(tmp_path):
+    """Markers seen at an angle: their centres are where the diagonals cross, not the mean of the corners."""
+    image, squares = six_markers()
     board = parse_board(str(written(tmp_path, in_a_room(6))))
     found = detect(image, board)
     assert found.ids.tolist() == list(range(6))
     for number, x in zip(found.ids, found.x):
-        a, b, c, d = squares[number].astype(float)
-        s, _ = np.linalg.solve(np.stack([c - a, b - d], -1), b - a)
-        assert np.abs(x - (a + s * (c - a))).max() < 0.5
+        assert np.abs(x - crossing(squares[number])).max() < 0.5
         assert np.abs(x - squares[number].mean(0)).max() > 1
     path = tmp_path / "corners.csv"
     path.write_text("id,corner,x,y,z\n" + "".join(f"{n},{n % 4},{n},{n * n},{n % 3}\n" for n in range(6)))

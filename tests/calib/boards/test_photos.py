@@ -6,6 +6,7 @@ import zlib
 import cv2
 import numpy as np
 import pytest
+import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -77,6 +78,8 @@ def test_patterns_say_it_outright(tmp_path):
     assert {n: list(m) for n, m in photos.items()} == {"l": [1, 2], "r": [1, 2]}
     with pytest.raises(ValueError, match=r"q: .*\*_Q\.png"):
         find_photos(tmp_path, patterns={"q": "*_Q.png"})
+    with pytest.raises(ValueError, match=r"1_R\.png is an image of l and of r"):
+        find_photos(tmp_path, patterns={"l": "*.png", "r": "*_R.png"})
     with pytest.raises(ValueError, match=r"1_L\.png' is a whole path: give a pattern of names in"):
         find_photos(tmp_path, patterns={"l": f"{tmp_path}/1_L.png"})
 
@@ -109,10 +112,11 @@ def test_mistakes(files, message, tmp_path):
 def test_missing_folders_and_broken_images(tmp_path):
     with pytest.raises(FileNotFoundError, match="none"):
         find_photos(tmp_path / "none")
+    for i, content in ((1, b"not an image"), (2, b"")):  # as a camera's file is when it is made
+        (tmp_path / f"a{i}.png").write_bytes(content)
     for i in (1, 2):
-        (tmp_path / f"a{i}.png").write_bytes(b"not an image")
-    with pytest.raises(ValueError, match=r"a1\.png"):
-        find_photos(tmp_path)["a"][1].read()
+        with pytest.raises(ValueError, match=rf"a{i}\.png"):
+            find_photos(tmp_path)["a"][i].read()
     (tmp_path / "v").mkdir()
     (tmp_path / "v" / "x.mp4").write_bytes(b"not a video")
     with pytest.raises(ValueError, match=r"x\.mp4"):
@@ -130,7 +134,7 @@ def test_orientation_tags_are_applied_and_have_to_be_the_same(suffix, tmp_path):
         find_photos(tmp_path)
     (tmp_path / f"cam_2.{suffix}").unlink()
     photo = find_photos(tmp_path)["cam"][0]
-    assert (photo.decode()[..., 0] == np.rot90(pixels, -1)).all()
+    assert (np.atleast_3d(photo.decode())[..., 0] == np.rot90(pixels, -1)).all()
 
 
 def test_a_photograph_that_states_too_many_pixels_is_not_decoded(tmp_path):
@@ -146,3 +150,18 @@ def test_a_photograph_that_states_too_many_pixels_is_not_decoded(tmp_path):
         (tmp_path / f"a0{i}.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
     with pytest.raises(ValueError, match=r"a00\.png.*900000000"):
         find_photos(tmp_path)
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.int16, np.int32, np.float32, np.float64])
+@pytest.mark.parametrize("bands", [1, 3])
+def test_values_of_any_kind_are_stretched_to_grey(kind, bands, tmp_path):
+    """Temperatures in one band, as thermal cameras save them, were not read; others gave OpenCV's errors."""
+    values = np.add.outer(20 * np.arange(48), np.zeros((64, bands))).astype(kind)
+    if kind in (np.float32, np.float64):
+        values = 20 + values / 4000
+        values[0, :8] = np.nan
+    tifffile.imwrite(tmp_path / "1.tif", values.squeeze(), photometric="rgb" if bands == 3 else "minisblack")
+    (photo,) = find_photos(tmp_path)["camera"].values()
+    grey = photo.read()
+    assert (grey[0].max(), grey[-1].min()) == (0, 255)
+    assert (np.diff(grey[:, -1].astype(int)) >= 0).all()

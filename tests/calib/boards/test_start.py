@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Distortion, Pose, Rig
+from arraygeom import Distortion, Pose, Rig, rotation_from_vector
 from calib.boards.bundle import CameraPrior, changed, intrinsic_values
+from calib.boards.detect import BoardViews
 from calib.boards.poses import StartDeviations, start_prior
 from calib.boards.rig import calibrate
 from calib.boards.simulation import photograph
@@ -204,3 +205,34 @@ def test_the_nine_band_array(shared_data):
     folder = shared_data / "nine_band_array" / "scene"
     images = {name: read_image(folder / f"{name}.png") for name in ("Cam-3", "Cam-6")}
     assert float(line_distances(found.rig, match_cameras(images)).abs().median()) < 0.25
+
+
+def test_cameras_far_apart_are_rotated_by_way_of_those_between():
+    """Each sees boards with the next alone: the last, off by 8 degrees against the second, was refused."""
+    row = Rig({f"c{i}": camera(600.0, (480, 640), (0.5 * i, 0.0, 0.0)) for i in range(4)})
+    views, middle = {name: {} for name in row.names}, torch.from_numpy(BOARD.middle)
+    for frame, x in enumerate((0.25, 0.75, 1.25, 0.2, 0.8, 1.3)):
+        R = rotation_from_vector(torch.deg2rad(tensor(*((20, -25, 5) if frame < 3 else (-25, 15, -5)))))
+        pose = Pose(R[None], (tensor(x, 0, 1.6) - R @ middle)[None])
+        for name in row.names[int(2 * x) :][:2]:
+            views[name][frame] = see(Rig({name: row[name]}), pose, noise=0.1)[name].seen[0]
+    views = {name: BoardViews((480, 640), seen) for name, seen in views.items()}
+    turns = {"c0": 0.0, "c1": 4.0, "c2": 0.0, "c3": -4.0}
+    off = {
+        name: c.replace(
+            cam_from_world=Pose.from_centre(
+                rotation_from_vector(torch.deg2rad(tensor(0, turns[name], 0))) @ c.R, c.centre
+            )
+        )
+        for name, c in row.cameras.items()
+    }
+    found = calibrate(views, BOARD, lens="none", start=Rig(off))
+    assert not found.fit.left_out
+    assert found.rms < 0.2
+
+
+def test_cameras_of_the_start_without_images_are_named():
+    views = see(four(), one_board(0), noise=0.1)
+    found = calibrate({name: views[name] for name in ("c0", "c2")}, BOARD, lens="none", start=four())
+    assert found.rig.names == ("c0", "c2")
+    assert [note[:2] for note in found.notes if "has no images" in note] == ["c1", "c3"]
