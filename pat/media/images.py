@@ -21,7 +21,17 @@ from torch import Tensor
 
 from arraygeom.atomic import write_atomically
 from arraygeom.chunks import ROWS, spans
-from arraygeom.image_bytes import PNG, TIFF, decodable, first_tiff_page, has_further_images
+from arraygeom.image_bytes import (
+    MINISBLACK,
+    MINISWHITE,
+    PNG,
+    SEPARATE,
+    TIFF,
+    decodable,
+    first_tiff_page,
+    has_further_images,
+    tiff_colours,
+)
 from arraygeom.warned import warn
 
 from .headers import HW, ImageHeader, image_header
@@ -235,9 +245,8 @@ def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, i
     """
     values = decoded(_without_orientation(content, header))
     page = first_tiff_page(content) if content[:4] in TIFF else None
-    # Of two channels OpenCV leaves one out, more than four it does not read.
-    if page is not None and page.samplesperpixel not in (1, 3, 4):
-        raise ValueError(f"{label}: has {page.samplesperpixel} channels: {CHANNELS}")
+    if page is not None:
+        values = _as_tiff_states(values, page, content, label)
     if values is None and page is not None and page.dtype is not None and page.dtype not in DECODED:
         raise ValueError(f"{label}: has {page.dtype} values: {KINDS}")
     if values is None:
@@ -246,6 +255,24 @@ def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, i
         raise ValueError(f"{label}: its header says another size than its pixels have: save it again")
     packed = header.bits if values.dtype == np.uint16 and header.bits < 16 else 0
     return values, packed
+
+
+def _as_tiff_states(values: NDArray | None, page: Any, content: bytes, label: str) -> NDArray | None:
+    """Values as a TIFF file's tags state them, where OpenCV does not heed these.
+
+    It gives the first of several bands that are no colours, and mixes planes and takes white for black in
+    images of more than 8 bits.
+    """
+    bands, grey = page.samplesperpixel, page.photometric in (MINISWHITE, MINISBLACK)
+    if bands not in (1, 3, 4) or (bands == 4 and grey):
+        raise ValueError(f"{label}: has {bands} channels: {CHANNELS}")
+    if values is None:
+        return None
+    deep = values.dtype != np.uint8
+    if bands > 1 and (grey or (deep and page.planarconfig == SEPARATE)):
+        colours = tiff_colours(content)
+        return None if colours is None else colours[..., [2, 1, 0, 3][:bands]]
+    return 65535 - values if page.photometric == MINISWHITE and values.dtype == np.uint16 else values
 
 
 def _without_orientation(content: bytes, header: ImageHeader) -> bytes:
