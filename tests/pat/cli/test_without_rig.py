@@ -13,14 +13,14 @@ import torch
 from PIL import Image
 from torch.nn.functional import avg_pool2d
 
-from arraygeom import Camera, Pose, Rig
+from arraygeom import Camera, Pose, Rig, Sensor
 from experiments.evaluation.paper import with_found_rig
 from pat import fuse, load_weights
 from pat.cli.fusing import Fuse
 from pat.cli.main import main
 from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
-from pat.fusion.from_images import array_from_images, camera_names, found_rig
+from pat.fusion.from_images import ImageArray, array_from_images, camera_names, found_rig
 from pat.fusion.results import Frame, save_frame
 from pat.media.images import read_image, write_image
 from pat.media.video import read_video, write_video
@@ -124,6 +124,17 @@ def test_the_rig_that_was_found_serves_the_next_command(folder):
     assert float((again - first).abs().max()) <= 2 / 255
     assert all(" baselines" in (folder / out / "index.html").read_text() for out in ("next", "out"))
     assert not (folder / "next" / "found_rig.yaml").exists()
+
+
+def test_the_rig_that_is_written_is_of_the_files_as_they_were_recorded(folder, tmp_path, monkeypatch):
+    """Of tagged raw images it was that of the developed ones: they lost black level, bits and linear light."""
+    rig = Rig.load(folder / "out" / "found_rig.yaml")
+    raw = rig.with_camera("colour", rig["colour"].replace(sensor=Sensor(coding="linear", bits=16, black_level=64.0)))
+    images = {name: read_image(folder / f"{name}.png") for name in rig.names}
+    found = ImageArray(rig, raw, images, "mono", "mono-colour-small", False, ())
+    monkeypatch.setattr("pat.fusion.from_images.array_from_images", lambda *a, **k: found)
+    main(["fuse", *(str(folder / f"{n}.png") for n in rig.names), "--no-report", "-o", str(tmp_path)])
+    assert Rig.load(tmp_path / "found_rig.yaml")["colour"].sensor == raw["colour"].sensor
 
 
 def test_a_rig_of_ones_own_beside_the_result_is_kept(folder, tmp_path):
