@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from torch.nn.functional import avg_pool2d
 
-from arraygeom import Camera, Pose, Rig, Sensor
+from arraygeom import Camera, Pose, Rig, Sensor, View
 from experiments.evaluation.paper import with_found_rig
 from pat import fuse, load_weights
 from pat.cli.fusing import Fuse
@@ -129,12 +129,27 @@ def test_the_rig_that_was_found_serves_the_next_command(folder):
 def test_the_rig_that_is_written_is_of_the_files_as_they_were_recorded(folder, tmp_path, monkeypatch):
     """Of tagged raw images it was that of the developed ones: they lost black level, bits and linear light."""
     rig = Rig.load(folder / "out" / "found_rig.yaml")
-    raw = rig.with_camera("colour", rig["colour"].replace(sensor=Sensor(coding="linear", bits=16, black_level=64.0)))
+    raw = rig.with_camera(
+        "colour", rig["colour"].replace(sensor=Sensor(coding="linear", bits=16, black_level=64.0))
+    )
     images = {name: read_image(folder / f"{name}.png") for name in rig.names}
     found = ImageArray(rig, raw, images, "mono", "mono-colour-small", False, ())
     monkeypatch.setattr("pat.fusion.from_images.array_from_images", lambda *a, **k: found)
     main(["fuse", *(str(folder / f"{n}.png") for n in rig.names), "--no-report", "-o", str(tmp_path)])
     assert Rig.load(tmp_path / "found_rig.yaml")["colour"].sensor == raw["colour"].sensor
+
+
+def test_weights_are_for_the_cameras_that_are_fused(halved, monkeypatch):
+    """With one of red, green and blue left out, those for colours were taken, which two bands have not."""
+    _, images, _ = halved
+    names = ["mono", "cam_red", "cam_green", "cam_blue"]
+    bands = dict(zip(names, [images["mono"], *images["colour"].split(1)]))
+    cameras = {name: View(hw=image.shape[-2:]) for name, image in bands.items()}
+    monkeypatch.setattr("pat.fusion.from_images.found_rig", lambda *_: (Rig(cameras), names[:left]))
+    for left, weights in ((4, "mono-colour"), (3, "mono-spectral")):
+        array = array_from_images(bands, alpha="mono")
+        assert array.weights == weights
+        assert {array.rig[name].sensor.response for name in array.images} == {"mono"}
 
 
 def test_a_rig_of_ones_own_beside_the_result_is_kept(folder, tmp_path):
