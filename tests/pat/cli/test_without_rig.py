@@ -127,7 +127,7 @@ def test_the_rig_that_was_found_serves_the_next_command(folder):
 
 
 def test_the_rig_that_is_written_is_of_the_files_as_they_were_recorded(folder, tmp_path, monkeypatch):
-    """Of tagged raw images it was that of the developed ones: they lost black level, bits and linear light."""
+    """Of tagged raw images it was that of developed ones, without black level and linear light."""
     rig = Rig.load(folder / "out" / "found_rig.yaml")
     raw = rig.with_camera(
         "colour", rig["colour"].replace(sensor=Sensor(coding="linear", bits=16, black_level=64.0))
@@ -145,8 +145,9 @@ def test_weights_are_for_the_cameras_that_are_fused(halved, monkeypatch):
     names = ["mono", "cam_red", "cam_green", "cam_blue"]
     bands = dict(zip(names, [images["mono"], *images["colour"].split(1)]))
     cameras = {name: View(hw=image.shape[-2:]) for name, image in bands.items()}
-    monkeypatch.setattr("pat.fusion.from_images.found_rig", lambda *_: (Rig(cameras), names[:left]))
-    for left, weights in ((4, "mono-colour"), (3, "mono-spectral")):
+    for kept, weights in ((4, "mono-colour"), (3, "mono-spectral")):
+        found = Rig(cameras), names[:kept]
+        monkeypatch.setattr("pat.fusion.from_images.found_rig", lambda *_, found=found: found)
         array = array_from_images(bands, alpha="mono")
         assert array.weights == weights
         assert {array.rig[name].sensor.response for name in array.images} == {"mono"}
