@@ -226,10 +226,15 @@ class Fuse(Known):
     def _frames(self, files: dict[str, list[Path]]) -> dict[str, list[Path]]:
         """The files of the frames that every camera has; all of them, of a sequence.
 
-        Raises ValueError for options that are not of so many frames.
+        Raises ValueError for options that are not of so many frames, and for files where results would go.
         """
         from ..fusion.frame_matching import matched_frames, warn_of_gaps
+        from ..fusion.results import check_no_result
 
+        known = [path for path in (self.depth_map, self.matches) if path is not None]
+        check_no_result(
+            [*self.given, *known, *(path for paths in files.values() for path in paths)], self.out
+        )
         timed = {"--frame-rate": self.frame_rate, "--time-offset": self.time_offset, "--speed": self.speed}
         if self.sequence:
             warn_of_gaps(files)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from io import BytesIO
@@ -43,6 +44,20 @@ FOUND_RIG = "found_rig.yaml"
 
 HEALED_RIG = "healed_rig.yaml"
 """A given rig as its images have it."""
+
+
+RESULT = re.compile(
+    r"(.*_)?((fused|confidence)(_.*)?|depth(_16|_nearest|_farthest)?)\.(png|tif|exr|mp4)"
+    r"|(view|settings)\.yaml|inputs\.json"
+)
+"""What files are called that a fusion writes or takes away."""
+
+
+def check_no_result(inputs: Iterable[Path], out: Path) -> None:
+    """Raise ValueError for a file that is called as a result and lies where those go."""
+    for path in inputs:
+        if path.resolve().parent == out.resolve() and RESULT.fullmatch(path.name):
+            raise ValueError(f"{path}: is called as a result, which would go there: give another --out")
 
 
 def save_frame(

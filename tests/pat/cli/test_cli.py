@@ -569,6 +569,18 @@ def test_a_bad_out_is_found_before_the_fusion(small, capsys, monkeypatch):
     assert (small / "out").read_text() == "a file"
 
 
+@pytest.mark.parametrize("name", ["fused.png", "depth.png", "1_fused.png", "fused_red.png"])
+def test_images_that_results_would_replace_are_refused(small, name, capsys, monkeypatch):
+    """A colour image that was called fused.png was overwritten by the result."""
+    monkeypatch.setattr("pat.fusion.fuse.fuse", lambda *_, **__: pytest.fail("fused"))
+    (small / "out").mkdir()
+    given = (small / "colour.png").rename(small / "out" / name)
+    assert f"{name}: is called as a result" in fails(arguments(small, colour=given), capsys)
+    assert f"{name}: is called as a result" in fails(
+        ["fuse", str(small / "mono.png"), str(given), "-o", str(small / "out")], capsys
+    )
+
+
 @pytest.mark.parametrize(
     ("command", "out", "text"),
     [
