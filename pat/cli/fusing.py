@@ -260,6 +260,8 @@ class Fuse(Known):
             options.warn(f"{', '.join(named)}: for many frames, and each camera has one image")
         if not self.sequence and (named := [option for option, given in of_sequences.items() if given]):
             options.warn(f"{', '.join(named)}: for a --sequence only: of no effect")
+        if self.sequence and self.video and (self.bits == 32 or self.kind == "exr"):
+            options.warn("--video: of frames of 32 bits there is none: of no effect")
 
     def refuse_several(self) -> None:
         """Raise ValueError for options of single frames."""

@@ -153,7 +153,7 @@ def write_depth(path: Path, depth: Float[Tensor, "h w"], *, near: float | None =
     The scale is in the file's text chunk "Description". 0 is unknown, 65535 that far or farther.
     """
     known = depth.isfinite() & (depth > 0)
-    scale = depth_scale(near or float(depth[known].min()))
+    scale = depth_scale(near or float(depth[known].min() if known.any() else 1.0))
 
     def counted(depth: Tensor, known: Tensor) -> Tensor:
         return torch.where(known, (depth.double() * scale).round().clamp(1, MOST), 0.0).to(torch.uint16)

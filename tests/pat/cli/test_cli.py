@@ -394,6 +394,14 @@ def test_what_only_sequences_have_is_refused_of_frames(small, capsys):
     assert "--speed: for a --sequence only" in fails(["fuse", *images, "--speed", "3"], capsys)
 
 
+@pytest.mark.parametrize("options", [["--bits", "32", "--kind", "tif"], ["--kind", "exr"]])
+def test_a_video_of_frames_of_32_bits_is_said_to_be_none(small, capsys, monkeypatch, options):
+    monkeypatch.setattr("pat.media.images.exr_writer", lambda path: None)
+    monkeypatch.setattr(Fuse, "_many", lambda *_: None)
+    main([*arguments(small), "--sequence", "--video", "10", *options])
+    assert "--video: of frames of 32 bits there is none" in " ".join(capsys.readouterr().err.split())
+
+
 def test_what_several_frames_do_not_have_is_refused_before_a_rig_is_looked_for(small, capsys, monkeypatch):
     monkeypatch.setattr("pat.fusion.from_images.array_from_images", None)
     for name in ("mono", "colour"):
