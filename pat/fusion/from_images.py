@@ -126,8 +126,10 @@ def array_from_images(
     names = _ordered_betas(images, alpha, note)
     images = {name: images[name] for name in (alpha, *names)}
     if tagged is None:
-        by_tags = {n: by_exif for n in images if n in files and (by_exif := focal_length(files[n]))}
-        lengths = {n: length for n, length in (by_tags | dict(focal or {})).items() if n in images}
+        by_tags = {
+            n: focal_length(files[n], (x.shape[-2], x.shape[-1])) for n, x in images.items() if n in files
+        }
+        lengths = {n: length for n, length in {**by_tags, **(focal or {})}.items() if length and n in images}
         for name, length in lengths.items():
             by = "as given" if name in (focal or {}) else "by EXIF"
             note(f"{name}: focal length {length:.0f} pixels, {by}")

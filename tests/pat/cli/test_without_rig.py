@@ -22,6 +22,7 @@ from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
 from pat.fusion.from_images import ImageArray, array_from_images, camera_names, found_rig
 from pat.fusion.results import Frame, save_frame
+from pat.media.headers import focal_length
 from pat.media.images import read_image, write_image
 from pat.media.video import read_video, write_video
 from pat.support.jobs import JobReport
@@ -306,21 +307,28 @@ def test_the_rate_that_is_asked_for_is_that_of_the_video(
 
 
 def test_focal_lengths_come_from_exif(tmp_path):
-    from pat.media.headers import focal_length
-
     def saved(width=400, height=300, **tags):
         image, exif = Image.new("L", (width, height)), Image.Exif()
         exif.get_ifd(0x8769).update({int(tag[1:], 16): value for tag, value in tags.items()})
         image.save(tmp_path / "x.jpg", exif=exif)
-        return focal_length(tmp_path / "x.jpg")
+        return focal_length(tmp_path / "x.jpg", (300, 400))
 
     assert saved() is None
     assert saved(xA405=43) == pytest.approx(43 * 500 / 43.267)
     sensor = {"x920A": 4.0, "xA20E": 500.0, "xA210": 4}
     assert saved(**sensor) == pytest.approx(2000)
     assert saved(**sensor, xA002=800) == pytest.approx(1000)
+    assert saved(**sensor, xA002=600, xA003=800) == pytest.approx(1000)
     (tmp_path / "x.jpg").write_text("no image")
-    assert focal_length(tmp_path / "x.jpg") is None
+    assert focal_length(tmp_path / "x.jpg", (300, 400)) is None
+
+
+def test_the_focal_length_of_a_raw_file_is_not_of_its_thumbnail(tmp_path):
+    """Pillow opens a raw file as its first image, by whose size a focal length was 20 times too short."""
+    tags = Image.Exif()
+    tags.get_ifd(0x8769)[0xA405] = 43
+    Image.new("L", (40, 30)).save(tmp_path / "x.jpg", exif=tags)
+    assert focal_length(tmp_path / "x.jpg", (3000, 4000)) == pytest.approx(43 * 5000 / 43.267)
 
 
 def test_a_dark_image_is_brought_to_an_ordinary_brightness():
