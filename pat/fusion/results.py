@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from jaxtyping import Float
@@ -83,15 +83,16 @@ def save_frame(
     `bands`, the names of bands that cameras record one by one, each goes to fused_NAME.png and
     confidence_NAME.png too; bands without names that are not one or three go to fused_1.png and so on. Of
     other numbers than one and three fused.png is the mean. The image comes last: where it is, the others are
-    of the same frame, and points.ply and the page index.html of a former one are gone. After an error all
-    former files are as they were.
+    of the same frame, and points.ply, the page index.html and the image in another format of a former one are
+    gone. After an error all former files are as they were.
     Returns what was written.
     """
     frame = frame.mapped(lambda part: part.detach().cpu())
     prefix = f"{name}_" if name else ""
     last = f"{prefix}fused.{kind}"
     depths = {f"{prefix}depth{part}" for part in (".tif", ".png", "_16.png", "_nearest.tif", "_farthest.tif")}
-    stale = depths | (set() if name else {"points.ply", "index.html"})
+    stale = depths | {f"{prefix}fused.{other}" for other in get_args(ImageFormat)}
+    stale |= set() if name else {"points.ply", "index.html"}
     with write_together(out, last=last, stale=stale) as folder:
         confidence = partial(write_image, folder / f"{prefix}confidence.png", frame.confidence[None])
         tasks: list[Callable[[], object]] = [confidence]
