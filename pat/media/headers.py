@@ -77,7 +77,7 @@ def _pnm(content: bytes) -> ImageHeader | None:
     found = re.match(form, content[:4096])
     if found is None:
         return None
-    return ImageHeader((int(found[2]), int(found[1])), bits=16 if int(found[3] or 0) > 255 else 8)
+    return ImageHeader((int(found[2]), int(found[1])), bits=max(int(found[3] or 0).bit_length(), 8))
 
 
 def _tiff(content: bytes) -> ImageHeader | None:

@@ -76,8 +76,8 @@ def read_image(
     with another colour profile is converted to sRGB, with a warning; its profile is ignored with
     `orientation="ignore"`, and so are those of images of 16 bits.
     8-bit values are divided by 255 and 16-bit ones by 65535, or by 2^bits - 1: a 12-bit camera that stores
-    0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value need nothing. Float
-    files must hold 0..1. A wholly opaque alpha channel is dropped. `name` (such as a camera's) goes in front
+    0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value, and PNM files, which
+    state the largest, need nothing. Float files must hold 0..1. A wholly opaque alpha channel is dropped. `name` (such as a camera's) goes in front
     of messages.
 
     An orientation tag (EXIF, TIFF) is applied, with a warning, as viewers and OpenCV's `imread` do; with
@@ -101,7 +101,7 @@ def read_recorded(
 ) -> NDArray[Any]:
     """Values (C, H, W) of an image file in its own type and counts; else, and in errors, as `read_image`.
 
-    Those that a TIFF file packs into less than 16 bits are as its camera counted them.
+    Those of a TIFF or PNM file of less than 16 bits are as its camera counted them.
     """
     label = f"{name}: {path}" if name else f"{path}"
     planes, packed = _planes(Path(path), label, hw, orientation)
@@ -239,9 +239,9 @@ def _upright(values: NDArray, orientation: int) -> NDArray:
 
 
 def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, int]:
-    """Values as stored, and the bits of a value in a TIFF file that packs them into less than 16; else 0.
+    """Values as stored, and the bits of a value where a TIFF or PNM file states less than 16; else 0.
 
-    OpenCV shifts packed values up to 16 bits.
+    Those are shifted up to 16 bits, as OpenCV does in TIFF files alone.
     """
     values = decoded(_without_orientation(content, header))
     page = first_tiff_page(content) if content[:4] in TIFF else None
@@ -254,7 +254,7 @@ def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, i
     if values.shape[:2] != header.hw:
         raise ValueError(f"{label}: its header says another size than its pixels have: save it again")
     packed = header.bits if values.dtype == np.uint16 and header.bits < 16 else 0
-    return values, packed
+    return values << (16 - packed) if packed and page is None else values, packed
 
 
 def _as_tiff_states(values: NDArray | None, page: Any, content: bytes, label: str) -> NDArray | None:

@@ -80,6 +80,18 @@ def test_few_bits_in_sixteen_are_said_unless_they_are_stated(tmp_path, largest, 
         read_image(tmp_path / "a.png")
 
 
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_a_pnm_file_states_its_bits(tmp_path, bits):
+    """White of 14 bits was a quarter of white, without a word."""
+    white = 2**bits - 1
+    values = np.array([[0, 7, white // 2, white]], np.uint16)
+    (tmp_path / "a.pgm").write_bytes(b"P5 4 1 %d\n" % white + values.astype(">u2").tobytes())
+    assert np.array_equal(read_recorded(tmp_path / "a.pgm")[0], values)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert torch.allclose(read_image(tmp_path / "a.pgm")[0], torch.from_numpy(values / white).float())
+
+
 def test_values_outside_the_range_are_cut(tmp_path):
     write_image(tmp_path / "a.png", torch.tensor([[[-0.5, 1.5]]]))
     assert read_image(tmp_path / "a.png").tolist() == [[[0.0, 1.0]]]
