@@ -77,8 +77,8 @@ def read_image(
     `orientation="ignore"`, and so are those of images of 16 bits.
     8-bit values are divided by 255 and 16-bit ones by 65535, or by 2^bits - 1: a 12-bit camera that stores
     0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value, and PNM files, which
-    state the largest, need nothing. Float files must hold 0..1. A wholly opaque alpha channel is dropped. `name` (such as a camera's) goes in front
-    of messages.
+    state the largest, need nothing. Float files must hold 0..1. A wholly opaque alpha channel is dropped.
+    `name` (such as a camera's) goes in front of messages.
 
     An orientation tag (EXIF, TIFF) is applied, with a warning, as viewers and OpenCV's `imread` do; with
     `orientation="ignore"` the pixels are as stored, as raw images need it. `hw` is the expected (height,
