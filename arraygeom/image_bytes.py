@@ -6,6 +6,7 @@ OpenCV 4.11 to 4.13 crash on damaged animated PNGs and take what is missing of a
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
@@ -15,6 +16,10 @@ PNG = b"\x89PNG\r\n\x1a\n"
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 ANIMATION = (b"acTL", b"fcTL", b"fdAT")
 """Chunks of a PNG file beside those of its first image."""
+SEPARATE = 2
+"""A TIFF file's PlanarConfiguration: one plane after the other."""
+MINISWHITE, MINISBLACK = 0, 1
+"""Of its PhotometricInterpretation."""
 REDUCED, MASK = 1, 4
 """Of a TIFF directory's NewSubfileType."""
 DAMAGED = (OSError, SyntaxError, ValueError, struct.error, LookupError, TypeError, ArithmeticError)
@@ -51,6 +56,20 @@ def first_tiff_page(content: bytes) -> Any:
     """
     with _quiet_tiff(content) as file:
         return file.pages.first
+
+
+def tiff_colours(content: bytes) -> Any:
+    """Values (H, W, C) of a TIFF file's first image of several bands, by tifffile.
+
+    None for a damaged file, and for a compression that needs imagecodecs.
+    """
+    try:
+        with _quiet_tiff(content) as file:
+            page = file.pages.first
+            values = page.asarray()
+    except (*DAMAGED, zlib.error):
+        return None
+    return values.transpose(1, 2, 0) if page.planarconfig == SEPARATE else values
 
 
 def has_further_images(content: bytes) -> bool:

@@ -27,7 +27,7 @@ class Align(Known):
     With one: pat align rig.yaml --alpha mono --image mono=a.png --image nir=b.tif --depth 2 20 --out out/
 
     Values keep their recorded type and bits. Without a rig it is found from the tags of the images, or from
-    the images, and written to rig.yaml beside the result. With folders, or quoted patterns, frames are
+    the images, and written to found_rig.yaml beside the result. With folders, or quoted patterns, frames are
     aligned one by one, matched by names or by the numbers or times in them.
     """
 
@@ -101,6 +101,7 @@ class Align(Known):
         from ..fusion.aligned_files import RecordedFiles, save_aligned
         from ..fusion.aligned_page import aligned_page
         from ..fusion.report import Facts
+        from ..fusion.results import FOUND_RIG
         from ..networks.weights import load_weights
         from ..support.locks import folder_lock
 
@@ -137,8 +138,8 @@ class Align(Known):
                 keep=frame.files.values(),
             )
             if frame.found:
-                frame.recorded.save(self.out / "rig.yaml")
-                written.append(self.out / "rig.yaml")
+                frame.recorded.save(self.out / FOUND_RIG)
+                written.append(self.out / FOUND_RIG)
             if self.report and not frame.name:
                 texts = [str(message) for message in options.WARNED]
                 facts = Facts(frame.notes, texts, time.monotonic() - begin)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from arraygeom import Rig
     from arraygeom.chunks import Tile
 
+    from ..fusion.from_images import ImageArray
     from ..fusion.fuse import FuseSettings
     from ..fusion.healing import Healed
     from ..fusion.report import Facts
@@ -133,6 +134,7 @@ class Fuse(Known):
     def _with_rig(self) -> None:
         from ..fusion.healing import checked_rig
         from ..fusion.views import ViewFiles
+        from ..media.raw import developed_rig
 
         if self.focal:
             raise ValueError("--focal: the rig states the focal lengths: leave it out")
@@ -152,8 +154,7 @@ class Fuse(Known):
                 rig = self._healed(rig, healed)
             if several:
                 return self._many(rig, found, alpha)
-            fused = views.developed if rig is views.rig else rig
-            self._one(fused, views, alpha, views.files, healing=compared.result)
+            self._one(developed_rig(rig, found), views, alpha, views.files, healing=compared.result)
 
     def _without_rig(self) -> None:
         from ..fusion.batch import find_images
@@ -200,7 +201,7 @@ class Fuse(Known):
         if max(map(len, files.values())) == 1:
             measured = load_weights(array.weights).bands is None
             self.exposure = self.exposure or ("keep" if measured else "auto")
-            return self._one(array.rig, array.images, array.alpha, first, found=array.notes)
+            return self._one(array.rig, array.images, array.alpha, first, found=array)
         rig = array.recorded
         for name, rate in rates.items():
             if name in rig.names:
@@ -225,10 +226,15 @@ class Fuse(Known):
     def _frames(self, files: dict[str, list[Path]]) -> dict[str, list[Path]]:
         """The files of the frames that every camera has; all of them, of a sequence.
 
-        Raises ValueError for options that are not of so many frames.
+        Raises ValueError for options that are not of so many frames, and for files where results would go.
         """
         from ..fusion.frame_matching import matched_frames, warn_of_gaps
+        from ..fusion.results import check_no_result
 
+        known = [path for path in (self.depth_map, self.matches) if path is not None]
+        check_no_result(
+            [*self.given, *known, *(path for paths in files.values() for path in paths)], self.out
+        )
         timed = {"--frame-rate": self.frame_rate, "--time-offset": self.time_offset, "--speed": self.speed}
         if self.sequence:
             warn_of_gaps(files)
@@ -254,6 +260,8 @@ class Fuse(Known):
             options.warn(f"{', '.join(named)}: for many frames, and each camera has one image")
         if not self.sequence and (named := [option for option, given in of_sequences.items() if given]):
             options.warn(f"{', '.join(named)}: for a --sequence only: of no effect")
+        if self.sequence and self.video and (self.bits == 32 or self.kind == "exr"):
+            options.warn("--video: of frames of 32 bits there is none: of no effect")
 
     def refuse_several(self) -> None:
         """Raise ValueError for options of single frames."""
@@ -281,16 +289,17 @@ class Fuse(Known):
         alpha: str,
         files: Mapping[str, str | Path],
         *,
-        found: tuple[str, ...] | None = None,
+        found: ImageArray | None = None,
         healing: Callable[[], Healed | None] = lambda: None,
     ) -> None:
-        """Fuse one frame. `found` is what was found out about the rig, if it was found from the images;
-        `healing` gives the rig healed by them, with which a frame is fused again."""
+        """Fuse one frame. `rig` is of the files as they are developed; `found` is what they say of it, if it
+        was found from them; `healing` gives the rig healed by them, with which a frame is fused again."""
         from arraygeom import Camera
         from arraygeom.atomic import sweep, write_text
 
         from ..fusion.report import report_page
         from ..fusion.results import band_names, describe_bands, save_frame, view_of
+        from ..media.raw import developed_rig
         from ..support.locks import folder_lock
 
         if self.points and not isinstance(rig[alpha], Camera):
@@ -317,7 +326,7 @@ class Fuse(Known):
                 shutil.rmtree(store, ignore_errors=True)
             frame = fused(rig)
             if (healed := healing()) is not None and healed.text not in self._notes:
-                rig = self._healed(rig, healed)
+                rig = developed_rig(self._healed(rig, healed), files)
                 frame = fused(rig)
             frame, gain = self._exposed(frame)
             if found is None and not frame.depth.isfinite().any():
@@ -329,7 +338,7 @@ class Fuse(Known):
                 bits=self.bits or 8,
                 kind=self.kind,
                 view=view_of(rig, alpha, bits=self.bits or 8, bands=len(frame.image)),
-                rig=None if found is None else rig,
+                rig=None if found is None else found.recorded,
                 points=rig[alpha] if self.points else None,
                 bands=bands,
             )
@@ -339,7 +348,7 @@ class Fuse(Known):
             if self.points:
                 self._note("points.ply: the pixels of known depth, in alpha's frame")
             if self.report:
-                facts = self._facts(rig, found, time.monotonic() - begin)
+                facts = self._facts(rig, () if found is None else found.notes, time.monotonic() - begin)
                 if self.classical:
                     facts = facts._replace(classical=self._classical(rig, images, alpha, gain))
                 write_text(self.out / "index.html", report_page(frame, images, rig, alpha, facts))
@@ -370,14 +379,14 @@ class Fuse(Known):
         own = {"align": self.align, "keep_alpha": self.keep_alpha, "luminance": self.luminance}
         return self.settings(noise_by_default=quiet, **own)
 
-    def _facts(self, rig: Rig, found: tuple[str, ...] | None, seconds: float) -> Facts:
+    def _facts(self, rig: Rig, found: tuple[str, ...], seconds: float) -> Facts:
         """What the page says."""
         from arraygeom.text import length_unit
 
         from ..fusion.report import Facts
         from ..support.memory import peak_memory
 
-        notes = [f"weights: {self.weights or 'mono-colour'}", *self._notes, *(found or ())]
+        notes = [f"weights: {self.weights or 'mono-colour'}", *self._notes, *found]
         warned = [str(message) for message in options.WARNED]
         return Facts(notes, warned, seconds, peak_memory(), length_unit(rig))
 

@@ -16,7 +16,7 @@ from arraygeom import Rig
 from arraygeom.atomic import write_together
 
 from ..media.images import read_recorded, write_image
-from ..media.raw import demosaiced
+from ..media.raw import demosaiced, recorded_bands
 from .align import Aligned, AlignedView
 
 PositionFormat = Literal["npy", "tif", "none"]
@@ -53,11 +53,14 @@ class RecordedFiles(Mapping[str, NDArray[Any]]):
         pattern = view.sensor.bayer
         turned: Literal["apply", "ignore"] = "apply" if pattern is None else "ignore"
         values = read_recorded(self.files[name], name=name, hw=view.hw, orientation=turned)
-        if pattern is None or not np.issubdtype(values.dtype, np.integer):
+        values = recorded_bands(values, view.sensor)
+        if pattern is None:
             return values
-        white = 2 ** (view.sensor.bits or 8 * values.dtype.itemsize) - 1
+        counted = np.issubdtype(values.dtype, np.integer)
+        white = 2 ** (view.sensor.bits or 8 * values.dtype.itemsize) - 1 if counted else 1
         colours = demosaiced(torch.from_numpy(values.astype(np.float32) / white), pattern).numpy()
-        return np.rint(colours.astype(np.float64) * white).astype(values.dtype)
+        colours = colours.astype(np.float64) * white
+        return (np.rint(colours) if counted else colours).astype(values.dtype)
 
 
 def save_aligned(

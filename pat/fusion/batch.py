@@ -342,7 +342,7 @@ def _planned(plan: Path, time: int) -> Batch:
 def find_images(text: str | Path, *, name: str = "") -> list[Path]:
     """The images of a folder, a pattern such as "a/mono_*.png", or one file; numbers in names count as such.
 
-    Raises FileNotFoundError if there is none, ValueError for a video.
+    Raises FileNotFoundError if there is none, ValueError for a video, and for two of one name.
     """
     path = Path(text)
     label = f"{name}: " if name else ""
@@ -351,15 +351,22 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
             f"{label}{path}: is a video, which only `pat fuse` without a rig reads: save its frames"
         )
     if path.is_dir():
-        shown = (p for p in path.iterdir() if not p.name.startswith("."))
-        found = [p for p in shown if p.suffix.lower() in IMAGE_SUFFIXES]
+        found = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
     elif any(c in path.name for c in "*?["):
         found = list(path.parent.glob(path.name))
     else:
         found = [path] if path.exists() else []
+    found = sorted((p for p in found if p == path or not p.name.startswith(".")), key=_natural)
     if not found:
         raise FileNotFoundError(f"{label}{path}: no image there: check the path")
-    return sorted(found, key=_natural)
+    frames: dict[str, Path] = {}
+    for file in found:
+        if (other := frames.setdefault(file.stem, file)) != file:
+            pattern = file.with_name(f"*{file.suffix}")
+            raise ValueError(
+                f"{label}{other} and {file.name} are one frame: give a pattern, such as '{pattern}'"
+            )
+    return found
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from arraygeom import Link, Rig
+from arraygeom import Link, Rig, Sensor
 from arraygeom.io.xmp import named_by_band, rig_of_images, states_cameras
 from arraygeom.progress import log_step, part, stage
 from arraygeom.text import UNSCALED
@@ -124,19 +124,24 @@ def array_from_images(
     if tagged is not None:
         images = {name: read_view(tagged, name, files[name], like=tagged[alpha].sensor) for name in images}
     names = _ordered_betas(images, alpha, note)
-    bands = [len(images[name]) for name in names]
-    weights = weights or ("mono-colour" if 3 in bands or show_colour(names, bands) else "mono-spectral")
     images = {name: images[name] for name in (alpha, *names)}
     if tagged is None:
-        by_tags = {n: by_exif for n in images if n in files and (by_exif := focal_length(files[n]))}
-        lengths = {n: length for n, length in (by_tags | dict(focal or {})).items() if n in images}
+        by_tags = {
+            n: focal_length(files[n], (x.shape[-2], x.shape[-1])) for n, x in images.items() if n in files
+        }
+        lengths = {n: length for n, length in {**by_tags, **(focal or {})}.items() if length and n in images}
         for name, length in lengths.items():
             by = "as given" if name in (focal or {}) else "by EXIF"
             note(f"{name}: focal length {length:.0f} pixels, {by}")
-        rig, names = found_rig(images, alpha, lengths, load_weights(weights), note)
+        network = load_weights(weights or _weights_of(images, alpha))
+        rig, names = found_rig(images, alpha, lengths, network, note)
+        for name in names:
+            sensor = Sensor({1: "mono", 3: "rgb"}.get(len(images[name])))
+            rig = rig.with_camera(name, rig[name].replace(sensor=sensor))
     else:
         rig, names = _translated_rig(tagged, images, alpha, note)
     images = {name: images[name] for name in names}
+    weights = weights or _weights_of(images, alpha)
     several = len(names) > 2 and all(len(images[name]) == 1 for name in names[1:])
     if several:
         note("radiometry: each band is brought to alpha's mean and contrast, as for a grey world")
@@ -416,6 +421,13 @@ def _ordered_betas(images: Images, alpha: str, note: Say) -> list[str]:
     shown = ", shown as red, green, blue by their names" if show_colour(betas, [1] * len(betas)) else ""
     note(f"bands: {', '.join(betas)}, each at alpha's view{shown}")
     return betas
+
+
+def _weights_of(images: Images, alpha: str) -> str:
+    """The name of the shipped weights for alpha and the betas of these images."""
+    names = [name for name in images if name != alpha]
+    bands = [len(images[name]) for name in names]
+    return "mono-colour" if 3 in bands or show_colour(names, bands) else "mono-spectral"
 
 
 def show_colour(names: Sequence[str], bands: Sequence[int]) -> bool:

@@ -38,7 +38,7 @@ SETTINGS = HealingSettings()
 
 
 class Healed(NamedTuple):
-    """A rig as its images have it, and what was changed, in a line."""
+    """The rig of image files as these have it, and what was changed, in a line."""
 
     rig: Rig
     text: str
@@ -58,7 +58,7 @@ def checked_rig(views: ViewFiles, *, heal: bool) -> Healed | None:
     if misfit is None:
         return None
     wrong = misfit.mistaken or misfit.outside > OUTSIDE
-    if heal and not misfit.outside > OUTSIDE and (healed := healed_rig(views.developed, images, views.alpha)):
+    if heal and not misfit.outside > OUTSIDE and (healed := healed_rig(views.rig, images, views.alpha)):
         return healed._replace(text=f"{healed.text}; {misfit.text}") if misfit.mistaken else healed
     warn(misfit.text, LowConfidenceWarning if wrong else UserWarning)
     return None

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from jaxtyping import Float
@@ -45,6 +46,20 @@ HEALED_RIG = "healed_rig.yaml"
 """A given rig as its images have it."""
 
 
+RESULT = re.compile(
+    r"(.*_)?((fused|confidence)(_.*)?|depth(_16|_nearest|_farthest)?)\.(png|tif|exr|mp4)"
+    r"|(view|settings)\.yaml|inputs\.json"
+)
+"""What files are called that a fusion writes or takes away."""
+
+
+def check_no_result(inputs: Iterable[Path], out: Path) -> None:
+    """Raise ValueError for a file that is called as a result and lies where those go."""
+    for path in inputs:
+        if path.resolve().parent == out.resolve() and RESULT.fullmatch(path.name):
+            raise ValueError(f"{path}: is called as a result, which would go there: give another --out")
+
+
 def save_frame(
     frame: Frame,
     out: Path,
@@ -68,15 +83,16 @@ def save_frame(
     `bands`, the names of bands that cameras record one by one, each goes to fused_NAME.png and
     confidence_NAME.png too; bands without names that are not one or three go to fused_1.png and so on. Of
     other numbers than one and three fused.png is the mean. The image comes last: where it is, the others are
-    of the same frame, and points.ply and the page index.html of a former one are gone. After an error all
-    former files are as they were.
+    of the same frame, and points.ply, the page index.html and the image in another format of a former one are
+    gone. After an error all former files are as they were.
     Returns what was written.
     """
     frame = frame.mapped(lambda part: part.detach().cpu())
     prefix = f"{name}_" if name else ""
     last = f"{prefix}fused.{kind}"
     depths = {f"{prefix}depth{part}" for part in (".tif", ".png", "_16.png", "_nearest.tif", "_farthest.tif")}
-    stale = depths | (set() if name else {"points.ply", "index.html"})
+    stale = depths | {f"{prefix}fused.{other}" for other in get_args(ImageFormat)}
+    stale |= set() if name else {"points.ply", "index.html"}
     with write_together(out, last=last, stale=stale) as folder:
         confidence = partial(write_image, folder / f"{prefix}confidence.png", frame.confidence[None])
         tasks: list[Callable[[], object]] = [confidence]
@@ -138,7 +154,7 @@ def write_depth(path: Path, depth: Float[Tensor, "h w"], *, near: float | None =
     The scale is in the file's text chunk "Description". 0 is unknown, 65535 that far or farther.
     """
     known = depth.isfinite() & (depth > 0)
-    scale = depth_scale(near or float(depth[known].min()))
+    scale = depth_scale(near or float(depth[known].min() if known.any() else 1.0))
 
     def counted(depth: Tensor, known: Tensor) -> Tensor:
         return torch.where(known, (depth.double() * scale).round().clamp(1, MOST), 0.0).to(torch.uint16)

@@ -26,7 +26,7 @@ from arraygeom.checks import check_above
 from arraygeom.fields.default import straight_field
 
 from ..matching.likeness import UNLIKE
-from ..matching.normalisation import mean_moments
+from ..matching.normalisation import Moments, mean_moments
 from ..matching.radiometry import Response
 from ..networks.protocol import FusionNetwork
 from ..sensors import NoiseLevel
@@ -37,6 +37,7 @@ from .fuse import FuseSettings, corrections_of, fuse
 from .low_light import noise_levels
 from .optical_flow import flow_between, warped
 from .results import Frame
+from .steps import with_own_levels
 from .timeline import KeyFrame, Timeline
 from .views import grey_alpha
 
@@ -191,9 +192,11 @@ class SequenceFusion:
         images = {name: self.frames[name][j] for name, j in betas.items()}
         alone = alone or self.settings.noise is not None
         match_levels = self.settings.match_levels
-        if match_levels and not alone:
-            images = {name: self._normalised(name, image, i) for name, image in images.items()}
-        return fuse(
+        levels = self._levels(images, i) if match_levels and not alone else None
+        if levels is not None:
+            own, scales = levels
+            images = {name: scales[name].matched(image, own) for name, image in images.items()}
+        frame = fuse(
             self.network,
             self.rig,
             {self.alpha: self.recorded(i), **images},
@@ -204,6 +207,9 @@ class SequenceFusion:
             match_levels=match_levels and alone,
             noise=self._noise,
         )
+        if levels is None or self.network.keeps_luminance:
+            return frame
+        return with_own_levels(frame, [len(image) for image in images.values()], own, [*scales.values()])
 
     def _given_field(self, name: str) -> ReceptiveField | None:
         """A beta's field, where one is given."""
@@ -263,13 +269,16 @@ class SequenceFusion:
             noise=self._noise,
         )
 
-    def _normalised(self, name: str, image: Tensor, i: int) -> Tensor:
-        """Beta's image with alpha's mean and deviation over several key frames, so as not to flicker."""
+    def _levels(self, names: Iterable[str], i: int) -> tuple[Moments, dict[str, Moments]]:
+        """Moments of alpha's and of each beta's images over several key frames, so as not to flicker."""
         keys = self.timeline.key_frames()
         nearest = min(range(len(keys)), key=lambda k: abs(keys[k].alpha - i))
         around = keys[max(nearest - SETTINGS.neighbours, 0) : nearest + SETTINGS.neighbours + 1]
-        own = mean_moments(readable(self.frames[name].__getitem__, [k.betas[name] for k in around]))
-        return own.matched(image, mean_moments(readable(self.grey, [k.alpha for k in around])))
+        own = mean_moments(readable(self.grey, [k.alpha for k in around]))
+        return own, {
+            name: mean_moments(readable(self.frames[name].__getitem__, [k.betas[name] for k in around]))
+            for name in names
+        }
 
 
 def readable(read: Callable[[int], Tensor], numbers: Iterable[int]) -> Iterator[Tensor]:

@@ -38,7 +38,7 @@ from arraygeom.pixels import HW, coarse_grid, map_homogeneous, shift_matrix
 from arraygeom.undistortion import pixels_between
 
 from ..matching.inputs import box_around, ends_of
-from ..matching.normalisation import moments, normalised
+from ..matching.normalisation import Moments, moments, normalised
 from ..media.images import Images
 from ..media.raw import LIGHT, as_bright
 from ..networks.protocol import FusionNetwork, JoinsBands
@@ -142,12 +142,13 @@ def normalise_betas(views: Views, *, undone: bool = False) -> Done:
         return Done(done)
     own, scales = moments(views.own), [moments(views.images[name]) for name in views.betas]
     bands = [len(views.images[name]) for name in views.betas]
+    return Done(done, lambda frame: with_own_levels(frame, bands, own, scales))
 
-    def back(frame: Frame) -> Frame:
-        parts = zip(frame.image.split(bands), scales)
-        return frame._replace(image=torch.cat([own.matched(part, scale) for part, scale in parts]))
 
-    return Done(done, back)
+def with_own_levels(frame: Frame, bands: Sequence[int], own: Moments, scales: Sequence[Moments]) -> Frame:
+    """A frame whose bands, so many of each beta, have alpha's level, with each at its beta's own."""
+    parts = zip(frame.image.split(list(bands)), scales, strict=True)
+    return frame._replace(image=torch.cat([own.matched(part, scale) for part, scale in parts]))
 
 
 def join(which: JoinsBands, views: Views) -> Done:

@@ -18,7 +18,7 @@ from arraygeom.warned import warn
 
 from ..media.colour import luminance_of as grey
 from ..media.images import Images, read_image
-from ..media.raw import develop, developed_rig
+from ..media.raw import develop, developed_rig, recorded_bands
 
 Fields = Mapping[str, ReceptiveField | None]
 """The field of each beta; None, or a beta that is missing, stands for the default."""
@@ -225,6 +225,7 @@ def read_view(
     raw = view.sensor.bayer is not None
     turned: Literal["apply", "ignore"] = "ignore" if raw else "apply"
     image = read_image(path, name=name, bits=view.sensor.bits, hw=hw, orientation=turned)
+    image = recorded_bands(image, view.sensor)
     if view.sensor.bayer and image.shape[0] != 1:
         raise ValueError(
             f"{name}: {path}: is in colour, and the rig says raw {view.sensor.bayer}: drop 'bayer'"

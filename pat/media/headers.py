@@ -20,7 +20,7 @@ from arraygeom.image_bytes import DAMAGED, PNG, TIFF, first_tiff_page, png_chunk
 HW = tuple[int, int]
 
 _ORIENTATION = 274
-_EXIF, _FOCAL, _FOCAL_35MM, _WIDTH = 0x8769, 0x920A, 0xA405, 0xA002
+_EXIF, _FOCAL, _FOCAL_35MM, _WIDTH, _HEIGHT = 0x8769, 0x920A, 0xA405, 0xA002, 0xA003
 _PLANE_RESOLUTION, _PLANE_UNIT = 0xA20E, 0xA210
 _DIAGONAL_35MM = 43.267
 """Of 36 x 24 mm."""
@@ -77,7 +77,7 @@ def _pnm(content: bytes) -> ImageHeader | None:
     found = re.match(form, content[:4096])
     if found is None:
         return None
-    return ImageHeader((int(found[2]), int(found[1])), bits=16 if int(found[3] or 0) > 255 else 8)
+    return ImageHeader((int(found[2]), int(found[1])), bits=max(int(found[3] or 0).bit_length(), 8))
 
 
 def _tiff(content: bytes) -> ImageHeader | None:
@@ -102,21 +102,22 @@ def _known(orientation: object) -> int:
     return int(orientation) if isinstance(orientation, int) and 1 <= orientation <= 8 else 1
 
 
-def focal_length(path: str | Path) -> float | None:
-    """The focal length in pixels of an image file, by its EXIF tags; None if they do not say.
+def focal_length(path: str | Path, hw: HW) -> float | None:
+    """The focal length in pixels of an image of this size, by its file's EXIF tags; None if they do not say.
 
-    By the sensor's resolution or, without that, by the focal length's equivalent on 35 mm film.
+    By the sensor's resolution or, without that, by the focal length's equivalent on 35 mm film. The file's
+    first image may be a thumbnail, as raw files have one.
     """
     try:
         with Image.open(path) as image:
-            width, height = image.size
             tags = image.getexif().get_ifd(_EXIF)
         focal, resolution = (_number(tags.get(tag)) for tag in (_FOCAL, _PLANE_RESOLUTION))
         unit = _MM.get(int(_number(tags.get(_PLANE_UNIT)) or 2))
         if focal and resolution and unit:
-            return focal * resolution / unit * width / (_number(tags.get(_WIDTH)) or width)
+            longer = max(_number(tags.get(tag)) or 0.0 for tag in (_WIDTH, _HEIGHT)) or max(hw)
+            return focal * resolution / unit * max(hw) / longer
         film = _number(tags.get(_FOCAL_35MM))
-        return film * math.hypot(width, height) / _DIAGONAL_35MM if film else None
+        return film * math.hypot(*hw) / _DIAGONAL_35MM if film else None
     except (*DAMAGED, Image.DecompressionBombError):
         return None
 

@@ -21,7 +21,17 @@ from torch import Tensor
 
 from arraygeom.atomic import write_atomically
 from arraygeom.chunks import ROWS, spans
-from arraygeom.image_bytes import PNG, TIFF, decodable, first_tiff_page, has_further_images
+from arraygeom.image_bytes import (
+    MINISBLACK,
+    MINISWHITE,
+    PNG,
+    SEPARATE,
+    TIFF,
+    decodable,
+    first_tiff_page,
+    has_further_images,
+    tiff_colours,
+)
 from arraygeom.warned import warn
 
 from .headers import HW, ImageHeader, image_header
@@ -66,9 +76,9 @@ def read_image(
     with another colour profile is converted to sRGB, with a warning; its profile is ignored with
     `orientation="ignore"`, and so are those of images of 16 bits.
     8-bit values are divided by 255 and 16-bit ones by 65535, or by 2^bits - 1: a 12-bit camera that stores
-    0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value need nothing. Float
-    files must hold 0..1. A wholly opaque alpha channel is dropped. `name` (such as a camera's) goes in front
-    of messages.
+    0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value, and PNM files, which
+    state the largest, need nothing. Float files must hold 0..1. A wholly opaque alpha channel is dropped.
+    `name` (such as a camera's) goes in front of messages.
 
     An orientation tag (EXIF, TIFF) is applied, with a warning, as viewers and OpenCV's `imread` do; with
     `orientation="ignore"` the pixels are as stored, as raw images need it. `hw` is the expected (height,
@@ -91,7 +101,7 @@ def read_recorded(
 ) -> NDArray[Any]:
     """Values (C, H, W) of an image file in its own type and counts; else, and in errors, as `read_image`.
 
-    Those that a TIFF file packs into less than 16 bits are as its camera counted them.
+    Those of a TIFF or PNM file of less than 16 bits are as its camera counted them.
     """
     label = f"{name}: {path}" if name else f"{path}"
     planes, packed = _planes(Path(path), label, hw, orientation)
@@ -229,15 +239,14 @@ def _upright(values: NDArray, orientation: int) -> NDArray:
 
 
 def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, int]:
-    """Values as stored, and the bits of a value in a TIFF file that packs them into less than 16; else 0.
+    """Values as stored, and the bits of a value where a TIFF or PNM file states less than 16; else 0.
 
-    OpenCV shifts packed values up to 16 bits.
+    Those are shifted up to 16 bits, as OpenCV does in TIFF files alone.
     """
     values = decoded(_without_orientation(content, header))
     page = first_tiff_page(content) if content[:4] in TIFF else None
-    # Of two channels OpenCV leaves one out, more than four it does not read.
-    if page is not None and page.samplesperpixel not in (1, 3, 4):
-        raise ValueError(f"{label}: has {page.samplesperpixel} channels: {CHANNELS}")
+    if page is not None:
+        values = _as_tiff_states(values, page, content, label)
     if values is None and page is not None and page.dtype is not None and page.dtype not in DECODED:
         raise ValueError(f"{label}: has {page.dtype} values: {KINDS}")
     if values is None:
@@ -245,7 +254,25 @@ def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, i
     if values.shape[:2] != header.hw:
         raise ValueError(f"{label}: its header says another size than its pixels have: save it again")
     packed = header.bits if values.dtype == np.uint16 and header.bits < 16 else 0
-    return values, packed
+    return values << (16 - packed) if packed and page is None else values, packed
+
+
+def _as_tiff_states(values: NDArray | None, page: Any, content: bytes, label: str) -> NDArray | None:
+    """Values as a TIFF file's tags state them, where OpenCV does not heed these.
+
+    It gives the first of several bands that are no colours, and mixes planes and takes white for black in
+    images of more than 8 bits.
+    """
+    bands, grey = page.samplesperpixel, page.photometric in (MINISWHITE, MINISBLACK)
+    if bands not in (1, 3, 4) or (bands == 4 and grey):
+        raise ValueError(f"{label}: has {bands} channels: {CHANNELS}")
+    if values is None:
+        return None
+    deep = values.dtype != np.uint8
+    if bands > 1 and (grey or (deep and page.planarconfig == SEPARATE)):
+        colours = tiff_colours(content)
+        return None if colours is None else colours[..., [2, 1, 0, 3][:bands]]
+    return 65535 - values if page.photometric == MINISWHITE and values.dtype == np.uint16 else values
 
 
 def _without_orientation(content: bytes, header: ImageHeader) -> bytes:

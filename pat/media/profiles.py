@@ -36,7 +36,7 @@ def in_srgb(values: NDArray, content: bytes, label: str) -> NDArray:
     try:
         opened = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         name = ImageCms.getProfileDescription(opened).strip()
-        if "srgb" in name.lower():
+        if "srgb" in name.lower() and "linear" not in name.lower():
             return values
         if values.dtype != np.uint8:
             text = f"{label}: colour profile '{name}' is ignored, as values have 16 bits: save it in sRGB"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -40,6 +41,12 @@ def develop(
     linear = image if sensor.coding == "linear" else linear_from_srgb(image)
     scale = linear.new_tensor(factor if len(linear) == 3 else factor[1:2])
     return srgb_from_linear(linear * scale[:, None, None])
+
+
+def recorded_bands(values: Any, sensor: Sensor) -> Any:
+    """Values (C, H, W) of a file; one band of three equal ones of a camera that is in grey by the rig."""
+    grey = len(values) == 3 and sensor.response not in (None, "rgb")
+    return values[:1] if grey and all((values[0] == band).all() for band in values[1:]) else values
 
 
 LIGHT = "luminance of light"

@@ -93,7 +93,7 @@ def is_grey(image: Float[Tensor, "3 h w"]) -> bool:
     """Whether a decoded picture of any contrast has no colour but a codec's rounding."""
     differences = image.amax(0) - image.amin(0)
     low, high = image[1].aminmax()
-    return float(differences.max()) <= min(GREY_ROUNDED, float(high - low) / CONTRAST)
+    return float(differences.max()) < min(GREY_ROUNDED, float(high - low) / CONTRAST)
 
 
 def _frames(video: cv2.VideoCapture) -> Iterator[Float[Tensor, "c h w"]]:

@@ -208,7 +208,7 @@ def test_without_a_rig_the_files_rig_is_written(folder, counts):  # noqa: F811
     """Its sensors are those of the files: it serves for the next frame."""
     out = counts / "found"
     main(["align", str(counts / "mono.png"), str(counts / "colour.png"), "-o", str(out), "--no-report"])
-    assert set(Rig.load(out / "rig.yaml").names) == {"mono", "colour"}
+    assert set(Rig.load(out / "found_rig.yaml").names) == {"mono", "colour"}
 
 
 def test_frames_are_matched_by_their_names(folder, counts):  # noqa: F811

@@ -394,6 +394,14 @@ def test_what_only_sequences_have_is_refused_of_frames(small, capsys):
     assert "--speed: for a --sequence only" in fails(["fuse", *images, "--speed", "3"], capsys)
 
 
+@pytest.mark.parametrize("options", [["--bits", "32", "--kind", "tif"], ["--kind", "exr"]])
+def test_a_video_of_frames_of_32_bits_is_said_to_be_none(small, capsys, monkeypatch, options):
+    monkeypatch.setattr("pat.media.images.exr_writer", lambda path: None)
+    monkeypatch.setattr(Fuse, "_many", lambda *_: None)
+    main([*arguments(small), "--sequence", "--video", "10", *options])
+    assert "--video: of frames of 32 bits there is none" in " ".join(capsys.readouterr().err.split())
+
+
 def test_what_several_frames_do_not_have_is_refused_before_a_rig_is_looked_for(small, capsys, monkeypatch):
     monkeypatch.setattr("pat.fusion.from_images.array_from_images", None)
     for name in ("mono", "colour"):
@@ -567,6 +575,18 @@ def test_a_bad_out_is_found_before_the_fusion(small, capsys, monkeypatch):
     folders = arguments(small, mono=f"{small}/mon*.png", extra=["--out", "/proc/out"])
     assert "/proc/out: cannot write there (/proc/out: " in fails(folders, capsys)
     assert (small / "out").read_text() == "a file"
+
+
+@pytest.mark.parametrize("name", ["fused.png", "depth.png", "1_fused.png", "fused_red.png"])
+def test_images_that_results_would_replace_are_refused(small, name, capsys, monkeypatch):
+    """A colour image that was called fused.png was overwritten by the result."""
+    monkeypatch.setattr("pat.fusion.fuse.fuse", lambda *_, **__: pytest.fail("fused"))
+    (small / "out").mkdir()
+    given = (small / "colour.png").rename(small / "out" / name)
+    assert f"{name}: is called as a result" in fails(arguments(small, colour=given), capsys)
+    assert f"{name}: is called as a result" in fails(
+        ["fuse", str(small / "mono.png"), str(given), "-o", str(small / "out")], capsys
+    )
 
 
 @pytest.mark.parametrize(

@@ -13,15 +13,16 @@ import torch
 from PIL import Image
 from torch.nn.functional import avg_pool2d
 
-from arraygeom import Camera, Pose, Rig
+from arraygeom import Camera, Pose, Rig, Sensor, View
 from experiments.evaluation.paper import with_found_rig
 from pat import fuse, load_weights
 from pat.cli.fusing import Fuse
 from pat.cli.main import main
 from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
-from pat.fusion.from_images import array_from_images, camera_names, found_rig
+from pat.fusion.from_images import ImageArray, array_from_images, camera_names, found_rig
 from pat.fusion.results import Frame, save_frame
+from pat.media.headers import focal_length
 from pat.media.images import read_image, write_image
 from pat.media.video import read_video, write_video
 from pat.support.jobs import JobReport
@@ -124,6 +125,33 @@ def test_the_rig_that_was_found_serves_the_next_command(folder):
     assert float((again - first).abs().max()) <= 2 / 255
     assert all(" baselines" in (folder / out / "index.html").read_text() for out in ("next", "out"))
     assert not (folder / "next" / "found_rig.yaml").exists()
+
+
+def test_the_rig_that_is_written_is_of_the_files_as_they_were_recorded(folder, tmp_path, monkeypatch):
+    """Of tagged raw images it was that of developed ones, without black level and linear light."""
+    rig = Rig.load(folder / "out" / "found_rig.yaml")
+    raw = rig.with_camera(
+        "colour", rig["colour"].replace(sensor=Sensor(coding="linear", bits=16, black_level=64.0))
+    )
+    images = {name: read_image(folder / f"{name}.png") for name in rig.names}
+    found = ImageArray(rig, raw, images, "mono", "mono-colour-small", False, ())
+    monkeypatch.setattr("pat.fusion.from_images.array_from_images", lambda *a, **k: found)
+    main(["fuse", *(str(folder / f"{n}.png") for n in rig.names), "--no-report", "-o", str(tmp_path)])
+    assert Rig.load(tmp_path / "found_rig.yaml")["colour"].sensor == raw["colour"].sensor
+
+
+def test_weights_are_for_the_cameras_that_are_fused(halved, monkeypatch):
+    """With one of red, green and blue left out, those for colours were taken, which two bands have not."""
+    _, images, _ = halved
+    names = ["mono", "cam_red", "cam_green", "cam_blue"]
+    bands = dict(zip(names, [images["mono"], *images["colour"].split(1)]))
+    cameras = {name: View(hw=image.shape[-2:]) for name, image in bands.items()}
+    for kept, weights in ((4, "mono-colour"), (3, "mono-spectral")):
+        found = Rig(cameras), names[:kept]
+        monkeypatch.setattr("pat.fusion.from_images.found_rig", lambda *_, found=found: found)
+        array = array_from_images(bands, alpha="mono")
+        assert array.weights == weights
+        assert {array.rig[name].sensor.response for name in array.images} == {"mono"}
 
 
 def test_a_rig_of_ones_own_beside_the_result_is_kept(folder, tmp_path):
@@ -279,21 +307,28 @@ def test_the_rate_that_is_asked_for_is_that_of_the_video(
 
 
 def test_focal_lengths_come_from_exif(tmp_path):
-    from pat.media.headers import focal_length
-
     def saved(width=400, height=300, **tags):
         image, exif = Image.new("L", (width, height)), Image.Exif()
         exif.get_ifd(0x8769).update({int(tag[1:], 16): value for tag, value in tags.items()})
         image.save(tmp_path / "x.jpg", exif=exif)
-        return focal_length(tmp_path / "x.jpg")
+        return focal_length(tmp_path / "x.jpg", (300, 400))
 
     assert saved() is None
     assert saved(xA405=43) == pytest.approx(43 * 500 / 43.267)
     sensor = {"x920A": 4.0, "xA20E": 500.0, "xA210": 4}
     assert saved(**sensor) == pytest.approx(2000)
     assert saved(**sensor, xA002=800) == pytest.approx(1000)
+    assert saved(**sensor, xA002=600, xA003=800) == pytest.approx(1000)
     (tmp_path / "x.jpg").write_text("no image")
-    assert focal_length(tmp_path / "x.jpg") is None
+    assert focal_length(tmp_path / "x.jpg", (300, 400)) is None
+
+
+def test_the_focal_length_of_a_raw_file_is_not_of_its_thumbnail(tmp_path):
+    """Pillow opens a raw file as its first image, by whose size a focal length was 20 times too short."""
+    tags = Image.Exif()
+    tags.get_ifd(0x8769)[0xA405] = 43
+    Image.new("L", (40, 30)).save(tmp_path / "x.jpg", exif=tags)
+    assert focal_length(tmp_path / "x.jpg", (3000, 4000)) == pytest.approx(43 * 5000 / 43.267)
 
 
 def test_a_dark_image_is_brought_to_an_ordinary_brightness():

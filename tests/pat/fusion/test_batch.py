@@ -79,6 +79,18 @@ def test_digits_that_are_no_numbers_are_letters_in_names(tmp_path):
     assert [path.name for path in find_images(tmp_path)] == ["1²9.png", "1²10.png"]
 
 
+def test_files_of_the_system_are_no_frames_and_two_of_one_are_refused(tmp_path):
+    """A pattern took hidden files; of a raw file and its JPEG one was taken, in a sequence both."""
+    for name in ("1.png", "._1.png", "2.png"):
+        (tmp_path / name).touch()
+    for given in (tmp_path, tmp_path / "*.png"):
+        assert [path.name for path in find_images(given)] == ["1.png", "2.png"]
+    (tmp_path / "2.dng").touch()
+    with pytest.raises(ValueError, match=r"2\.dng and 2\.png are one frame: give a pattern"):
+        find_images(tmp_path, name="mono")
+    assert len(find_images(tmp_path / "*.png")) == 2
+
+
 def test_a_stopped_sequence_is_resumed_to_the_same_bits(material, tmp_path, monkeypatch):
     whole = batch(material, tmp_path / "whole", sequence=True)
     assert len(whole.run(video=25.0).made) == 7

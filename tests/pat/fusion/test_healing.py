@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from arraygeom import Pose, Rig, rotation_from_vector
+from arraygeom import Pose, Rig, Sensor, rotation_from_vector
 from pat.cli.main import main
 from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
@@ -73,6 +73,16 @@ def test_a_rig_of_the_same_name_as_the_healed_one_is_kept(material, capsys):
     fused(folder, "same/healed_rig.yaml", "same")
     assert given.read_text() == before
     assert "the healed rig is not written" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_healed_rig_is_of_the_files_as_they_were_recorded(material):
+    """It was of the developed images: of many frames and by the next command, raw ones were not developed."""
+    folder, _ = material
+    rig = Rig.load(folder / "rough.yaml")
+    rig = rig.with_camera("colour", rig["colour"].replace(sensor=Sensor("rgb", bits=8, black_level=2.0)))
+    files = {name: folder / f"{name}.png" for name in rig.names}
+    healed = checked_rig(ViewFiles(rig, files, alpha="mono"), heal=True)
+    assert {name: healed.rig[name].sensor for name in files} == {name: rig[name].sensor for name in files}
 
 
 def test_a_right_rig_is_left_as_it_is(material):

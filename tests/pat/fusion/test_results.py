@@ -57,6 +57,7 @@ def test_a_full_disk_leaves_the_former_files_all_of_one_frame(tmp_path):
 def test_depth_in_16_bits_says_its_scale(tmp_path):
     depth = torch.tensor([[1.2343, 7.0, torch.nan, 1e9]])
     assert write_depth(tmp_path / "d.png", depth, near=1.0) == 1000
+    assert write_depth(tmp_path / "none.png", torch.full((2, 2), -1.0)) == 1000
     with Image.open(tmp_path / "d.png") as image:
         assert image.text["Description"].startswith("depth: 1000 counts a metre; 0 is unknown")
         assert np.asarray(image).astype(int).tolist() == [[1234, 7000, 0, 65535]]
@@ -72,8 +73,9 @@ def test_fused_images_say_that_they_are_srgb(tmp_path):
     read_image(tmp_path / "fused.png")  # without a warning
 
 
-def test_depth_of_a_former_frame_does_not_stay_beside_one_without(tmp_path):
-    save_frame(Frame(torch.rand(3, 6, 8), torch.ones(6, 8), *torch.rand(2, 6, 8)), tmp_path)
+def test_depth_and_image_of_a_former_frame_do_not_stay_beside_one_without(tmp_path):
+    """An image in another format stayed, and looked like that of the new depth and confidence."""
+    save_frame(Frame(torch.rand(3, 6, 8), torch.ones(6, 8), *torch.rand(2, 6, 8)), tmp_path, kind="tif")
     save_frame(frame_of(3), tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["confidence.png", "fused.png"]
 

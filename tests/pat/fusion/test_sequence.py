@@ -167,6 +167,17 @@ def test_an_image_that_cannot_be_read_costs_its_own_key_frame_alone():
         job.colour(second)
 
 
+def test_bands_keep_their_own_level_where_levels_are_matched():
+    """As those of single frames do; in a sequence they had alpha's."""
+    frames, _ = moving.recording(2)
+    band = [0.3 * image[1:2] + 0.05 for image in frames["slow"]]
+    given = {"alpha": "fast", "align": False, "match_levels": True}
+    network, frames = load_weights("mono-spectral"), {"fast": frames["fast"], "slow": band}
+    first = next(fuse_sequence(network, moving.rig(), frames, **given))
+    alone = fuse(network, moving.rig(), {name: some[0] for name, some in frames.items()}, **given)
+    assert (first.image - alone.image).abs().mean() < 0.01
+
+
 def test_a_response_that_is_none_is_refused_of_sequences_too():
     """It was taken for an image that cannot be read, and left out."""
     frames, _ = moving.recording(2)

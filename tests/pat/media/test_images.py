@@ -80,6 +80,18 @@ def test_few_bits_in_sixteen_are_said_unless_they_are_stated(tmp_path, largest, 
         read_image(tmp_path / "a.png")
 
 
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_a_pnm_file_states_its_bits(tmp_path, bits):
+    """White of 14 bits was a quarter of white, without a word."""
+    white = 2**bits - 1
+    values = np.array([[0, 7, white // 2, white]], np.uint16)
+    (tmp_path / "a.pgm").write_bytes(b"P5 4 1 %d\n" % white + values.astype(">u2").tobytes())
+    assert np.array_equal(read_recorded(tmp_path / "a.pgm")[0], values)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert torch.allclose(read_image(tmp_path / "a.pgm")[0], torch.from_numpy(values / white).float())
+
+
 def test_values_outside_the_range_are_cut(tmp_path):
     write_image(tmp_path / "a.png", torch.tensor([[[-0.5, 1.5]]]))
     assert read_image(tmp_path / "a.png").tolist() == [[[0.0, 1.0]]]
@@ -194,12 +206,33 @@ def test_unusable_values_are_refused(tmp_path, values, complaint):
         read_image(tmp_path / "a.tif")
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize("layout", ["separate", "contig"])
+@pytest.mark.parametrize("photometric", ["rgb", "minisblack"])
+def test_three_bands_of_a_tiff_are_read_however_they_are_stored(tmp_path, kind, layout, photometric):
+    """OpenCV mixes planes of more than 8 bits, and gives the first of bands that are not called colours."""
+    values = np.random.default_rng(0).random((3, 9, 7))
+    values = values.astype(kind) if kind == np.float32 else (values * np.iinfo(kind).max).astype(kind)
+    stored = values if layout == "separate" else values.transpose(1, 2, 0)
+    tifffile.imwrite(tmp_path / "a.tif", stored, photometric=photometric, planarconfig=layout)
+    assert np.array_equal(read_recorded(tmp_path / "a.tif"), values)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_white_is_white_in_a_tiff_where_0_is(tmp_path, kind):
+    """Images of 16 bits were read as their negatives."""
+    values = np.arange(12, dtype=kind).reshape(3, 4)
+    tifffile.imwrite(tmp_path / "a.tif", values, photometric="miniswhite")
+    assert np.array_equal(read_recorded(tmp_path / "a.tif")[0], np.iinfo(kind).max - values)
+
+
 @pytest.mark.parametrize(
     ("shape", "kind", "complaint"),
     [
         ((6, 8), np.uint32, "uint32 values: save it with 8 or 16 bits"),
         ((6, 8), np.float16, "float16 values: save it with 8 or 16 bits"),
         ((6, 8, 2), np.uint16, "2 channels: give a grey"),
+        ((6, 8, 4), np.uint8, "4 channels: give a grey"),
         ((6, 8, 5), np.uint16, "5 channels: give a grey"),
     ],
 )

@@ -18,8 +18,8 @@ from pat.media.profiles import srgb_profile
 COLOURS = np.random.default_rng(0).integers(20, 236, (8, 9, 3), np.uint8)
 
 
-def profile_of(primaries: tuple[float, ...]) -> bytes:
-    """That of sRGB with the columns of another matrix of colorants."""
+def profile_of(primaries: tuple[float, ...], called: str = "wide built-in") -> bytes:
+    """That of sRGB with the columns of another matrix of colorants, and a name of as many letters."""
     content = bytearray(srgb_profile())
     for i, name in enumerate((b"rXYZ", b"gXYZ", b"bXYZ")):
         at = int.from_bytes(content[content.index(name) + 4 :][:4], "big")
@@ -28,8 +28,8 @@ def profile_of(primaries: tuple[float, ...]) -> bytes:
             content[at + 8 + 4 * k : at + 12 + 4 * k] = value.to_bytes(4, "big", signed=True)
     return (
         bytes(content)
-        .replace(b"sRGB", b"wide")
-        .replace("sRGB".encode("utf-16-be"), "wide".encode("utf-16-be"))
+        .replace(b"sRGB built-in", called.encode())
+        .replace("sRGB built-in".encode("utf-16-be"), called.encode("utf-16-be"))
     )
 
 
@@ -46,6 +46,14 @@ def test_another_profile_is_converted_and_said(suffix, tmp_path):
         red, green, _ = (255 * read_image(path)[:, 4, 4]).tolist()
     assert red > 205
     assert green < 55
+
+
+def test_linear_srgb_is_another_profile(tmp_path):
+    """Such images, as of GIMP, were taken for sRGB ones by its name, and are far darker."""
+    profile = profile_of(DISPLAY_P3, "Linear sRGB 1")
+    Image.fromarray(COLOURS).save(tmp_path / "a.png", icc_profile=profile)
+    with pytest.warns(UserWarning, match="'Linear sRGB"):
+        read_image(tmp_path / "a.png")
 
 
 def test_images_of_srgb_are_as_they_are(tmp_path):

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Rig, Sensor, View
+from arraygeom import Band, Rig, Sensor, View
 from experiments.sensors import Mosaic
+from pat.fusion.aligned_files import RecordedFiles
 from pat.fusion.views import ViewFiles
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.media.images import write_image
@@ -48,6 +49,28 @@ def test_counts_of_any_depth_become_the_light_they_stood_for(tmp_path, bits, suf
     read = ViewFiles(rig(a=sensor), {"a": tmp_path / f"a.{suffix}"}, alpha="a")
     assert (linear_from_srgb(read["a"]) - light()).abs().max() < 0.6 / (2**bits - 65)
     assert read.developed["a"].sensor == Sensor()
+
+
+@pytest.mark.parametrize(("response", "bands"), [("mono", 1), (Band(850, 40), 1), ("rgb", 3), (None, 3)])
+def test_three_equal_bands_of_a_camera_in_grey_are_one(tmp_path, response, bands):
+    """Of many frames and with a rig they were fused as three bands: of three such cameras nine, in grey."""
+    write_image(tmp_path / "a.png", light(channels=1).expand(3, -1, -1))
+    cameras, files = rig(a=Sensor(response)), {"a": tmp_path / "a.png"}
+    for images in (ViewFiles(cameras, files, alpha="a"), RecordedFiles(cameras, files)):
+        assert images["a"].shape == (bands, *HW)
+
+
+@pytest.mark.parametrize("bits", [12, 32])
+def test_recorded_values_behind_a_mosaic_are_colours_in_their_own_counts(tmp_path, bits):
+    """Those of floats were left as the mosaic, one band."""
+    raw = mosaic(light(), "RGGB")
+    values = counts(raw, bits=12, black=0) if bits == 12 else raw.numpy()
+    save(tmp_path / "a.tif", values)
+    found = RecordedFiles(
+        rig(a=Sensor(bits=12 if bits == 12 else None, bayer="RGGB")), {"a": tmp_path / "a.tif"}
+    )
+    assert found["a"].dtype == values.dtype
+    assert np.abs(found["a"] / (4095 if bits == 12 else 1) - demosaiced(raw, "RGGB").numpy()).mean() < 3e-4
 
 
 def test_packed_tiffs_need_no_bits_and_follow_them(tmp_path):

@@ -67,3 +67,9 @@ def test_what_goes_wrong_leaves_no_file(tmp_path):
         with pytest.raises(ValueError, match=r"frames a second: give .001 to 1000"):
             write_video(tmp_path / "a.mp4", frames(2), rate=rate)
     assert os.listdir(tmp_path) == []
+
+
+def test_a_video_that_begins_black_keeps_its_colours(tmp_path):
+    """Its first frame was taken for one of a grey video, and green for all of the others."""
+    write_video(tmp_path / "a.mp4", [torch.zeros(3, 48, 64), *frames(2, (48, 64))])
+    assert {frame.shape[0] for frame in read_video(tmp_path / "a.mp4").frames} == {3}
