@@ -139,8 +139,8 @@ def _of_lens(name: str, camera: LensView) -> Iterator[str]:
     off = torch.where(has_ray & has_image, off, 0.0)
     if not bool((off <= OFF_BACK).all()):
         yield (
-            f"the model of '{name}', {lens.model}, projects the rays of its pixels up to {float(off.max()):.3g} "
-            "px off them: project and unproject are to be the inverse of one another"
+            f"the model of '{name}', {lens.model}, projects the rays of its pixels up to "
+            f"{float(off.max()):.3g} px off them: project and unproject are to be the inverse of one another"
         )
 
 
