@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .camera import Camera, LensView, View
 from .checks import derived
-from .pixels import HW, coarse_grid
+from .pixels import HW, coarse_grid, map_homogeneous
 from .text import length_unit
 
 if TYPE_CHECKING:
@@ -29,6 +29,8 @@ LEAST_DISPARITY = 0.5
 """Pixels that matches move from near to far below which depth is not seen."""
 COVERED = 0.5
 """Share of an image below which its lens model hardly covers it."""
+OFF_BACK = 0.05
+"""Pixels by which projecting a pixel's ray may miss it: lenses in float32 do by thousandths."""
 MOST_CAMERAS = 16
 """Of rigs with more, each is compared with the next alone: pairs are many."""
 RANK = 1e-3
@@ -53,13 +55,13 @@ def unit_oddity(rig: Rig) -> str | None:
         return (
             f"has cameras {longest:.3g} m apart: is this file in millimetres? "
             "Then convert it (`pat rig convert`) and write units: millimetres, which its depth is in, too, "
-            "or read it with scale=0.001; "
+            "or read it by `arraygeom.io.read_rig(path, scale=0.001)`; "
             "if its scale is arbitrary, all is well"
         )
     if 0 < longest < SMALLEST_BASELINE:
         return (
             f"has cameras at most {1e3 * longest:.3g} mm apart: is this file in metres, "
-            "and read as millimetres? Then read it with scale=1000"
+            "and read as millimetres? Then read it by `arraygeom.io.read_rig(path, scale=1000)`"
         )
     return None
 
@@ -125,11 +127,21 @@ def _of_K(name: str, camera: Camera) -> Iterator[str]:
 
 
 def _of_lens(name: str, camera: LensView) -> Iterator[str]:
-    if camera.distortion is None:
+    if (lens := camera.distortion) is None:
         return
-    share = float(camera.rays(_grid(camera).to(camera.K))[1].double().mean())
+    points = map_homogeneous(torch.linalg.inv(camera.K)[..., :2, :], _grid(camera).to(camera.K))
+    directions, has_ray = lens.unproject(points)
+    share = float(has_ray.double().mean())
     if share < COVERED:
         yield f"the lens model of '{name}' covers {100 * share:.0f} % of its image: check the coefficients"
+    back, has_image = lens.project(lens.origins(points) + directions)
+    off = ((back - points) @ camera.K[:2, :2].mT).norm(dim=-1)
+    off = torch.where(has_ray & has_image, off, 0.0)
+    if not bool((off <= OFF_BACK).all()):
+        yield (
+            f"the model of '{name}', {lens.model}, projects the rays of its pixels up to "
+            f"{float(off.max()):.3g} px off them: project and unproject are to be the inverse of one another"
+        )
 
 
 def _reduced(hw: HW) -> HW:

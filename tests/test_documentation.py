@@ -11,7 +11,8 @@ from pkgutil import resolve_name
 import pytest
 import torch
 
-from arraygeom import Rig
+from arraygeom import Camera, Pose, Rig, intrinsics
+from arraygeom.io import opencv, write_rig
 from docs.hooks import on_page_markdown
 from experiments.__main__ import Experiments
 from pat.cli.main import command_paths
@@ -44,6 +45,18 @@ def test_rig_files_in_the_pages_are_read(page, tmp_path):
         assert Rig.load(tmp_path / "rig.yaml").names
 
 
+def write_an_array(folder: Path) -> None:
+    """Pairs in OpenCV's files, and a COLMAP model of images."""
+    camera = Camera(K=intrinsics(500.0, (480, 640)), cam_from_world=Pose.identity(), hw=(480, 640))
+    beta = camera.replace(cam_from_world=Pose(camera.R, camera.t + 0.1))
+    intrinsic, extrinsic = opencv.write(Rig({"left": camera, "right": beta})).values()
+    for name in ("red", "nir"):
+        (folder / f"green_{name}.yml").write_text(intrinsic + extrinsic.split("---\n")[1])
+    cameras = {"green": camera, "red": beta, "nir": beta}
+    model = Rig({f"{name}/0001.tif": camera for name, camera in cameras.items()})
+    write_rig(model, folder / "sparse" / "0", format="colmap")
+
+
 @those_with("python")
 def test_samples_in_the_pages_run(page, tmp_path, monkeypatch):
     if page.stem == "explorer":
@@ -51,6 +64,8 @@ def test_samples_in_the_pages_run(page, tmp_path, monkeypatch):
     (tmp_path / "rig.yaml").write_text(blocks(ROOT / "docs" / "index.md", "yaml")[0])
     for name, channels in (("a", 1), ("b", 3)):
         write_image(tmp_path / f"{name}.png", torch.rand(channels, 400, 640))
+    if page.stem == "rig_files":
+        write_an_array(tmp_path)
     monkeypatch.chdir(tmp_path)
     scope: dict = {}
     for text in blocks(page, "python"):

@@ -144,7 +144,7 @@ class RigSource:
         w, h = (max(1, round(2 * c + 1)) for c in K[:2, 2].tolist())
         self.warn(
             f"states no image size: took {w} x {h}, twice the principal point; give it by "
-            "`pat rig convert --size W H`, or hw=(height, width)"
+            "`pat rig convert --size W H`, or `arraygeom.io.read_rig(path, hw=(height, width))`"
         )
         return h, w
 

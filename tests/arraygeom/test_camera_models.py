@@ -245,6 +245,18 @@ def test_rig_files_hold_a_model_with_its_own_numbers(name, tmp_path):
     assert after.check() == ()
 
 
+def test_a_model_whose_unproject_is_not_the_inverse_is_odd():
+    """Its segments lay beside what they were of, and nothing said so."""
+
+    @dataclass(frozen=True, eq=False, repr=False)
+    class NotInverse(Stereographic):
+        def unproject(self, xy):
+            return Stereographic.unproject(self, xy / 1.01)
+
+    (odd,) = Rig({"own": camera("own").replace(distortion=NotInverse())}).check()
+    assert "projects the rays of its pixels up to 0.785 px off them" in odd
+
+
 def test_a_batch_of_rigs_has_the_fields_of_its_rigs():
     one, two = (
         rig("rolling shutter", "port"),

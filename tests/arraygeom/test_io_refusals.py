@@ -347,7 +347,8 @@ def test_wrong_units_warn(tmp_path):
 
 
 def test_unstated_sizes_warn():
-    with pytest.warns(RigFileWarning, match=r"states no image size: took 1201 x 341, .* --size W H`, or hw"):
+    advice = r"states no image size: took 1201 x 341, .* --size W H`, or `arraygeom.io.read_rig\(path, hw="
+    with pytest.warns(RigFileWarning, match=advice):
         assert read_rig(FIXTURES / "kitti_calib.txt")["cam1"].hw == (341, 1201)
 
 
