@@ -101,7 +101,7 @@ class AlignedView:
 class Aligned(Mapping[str, AlignedView]):
     """All cameras' own values at the pixels of one: a mapping of names to views, that of `alpha` first.
 
-    depth: (H, W), float32, metres along alpha's axis; NaN where no calibrated beta sees the point.
+    depth: (H, W), float32, as of `Frame`.
     """
 
     alpha: str

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Literal, NamedTuple
 
 from jaxtyping import Float
@@ -22,8 +23,8 @@ from ..matching.inputs import Beta, Inputs
 from ..matching.normalisation import combined_bands
 from ..matching.tangents import along_tangents
 from ..networks.protocol import FusionNetwork
-from .steps import FusionStep, Undo, innermost
-from .views import Views, check_precision
+from .steps import FusionStep, Undo, takes_pinhole_views
+from .views import Views, check_precision, innermost
 
 LOG = logging.getLogger(__name__)
 
@@ -55,10 +56,21 @@ class Placement(NamedTuple):
     def depth(
         self, x: Float[Tensor, "n 2"], x_beta: Float[Tensor, "n 2"], deviation: Float[Tensor, " n"]
     ) -> Depth:
-        """The depth of what alpha's pixels see at beta's pixels, or its distance if `bounds` are of that."""
-        if self.pair.alpha.has_pinhole_view and self.pair.beta.has_pinhole_view and self.bounds == "depth":
-            return depth_of(self.pair, self.points(x), x_beta, deviation)
-        return ray_depth(self.pair, self.points(x), x_beta, self.bounds, deviation=deviation)
+        """The depth of what alpha's pixels see at beta's pixels, or its distance if `bounds` are of that.
+
+        Through lenses within the pair's depth range.
+        """
+        pair, x = self.pair, self.points(x)
+        on_curve = partial(ray_depth, pair, bounds=self.bounds)
+        if not (pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view and self.bounds == "depth"):
+            return on_curve(x, x_beta, deviation=deviation)
+        found = depth_of(pair, x, x_beta, deviation)
+        if pair.depth is None or pair.link is not None or not pair.has_lens:
+            return found
+        near, far = (bound.to(found.depth) for bound in pair.depth)
+        beyond = ~(found.valid & (found.depth >= near) & (found.depth <= far))
+        there = on_curve(x[beyond], x_beta[beyond], deviation=deviation[beyond])
+        return Depth(*(t.masked_scatter(beyond, part) for t, part in zip(found, there)))
 
 
 class FrameInputs(NamedTuple):
@@ -124,6 +136,14 @@ def bounds_of(field: ReceptiveField) -> Literal["depth", "distance"]:
     """What a field's depth range is of."""
     inner = innermost(field)
     return inner.bounds if isinstance(inner, Curved) else "depth"
+
+
+def measured_along(views: Views) -> Literal["depth", "distance"]:
+    """What the depth of a frame of these views is: along alpha's axis, or the distance along its rays."""
+    if takes_pinhole_views(views):
+        return "depth"
+    fields = (views.fields.get(name) or default_field(views.pair(name)) for name in views.betas)
+    return "distance" if "distance" in map(bounds_of, fields) else "depth"
 
 
 def padded(image: Tensor, multiple: int) -> Tensor:

@@ -27,7 +27,6 @@ from arraygeom import (
     Rig,
     ThroughLenses,
     View,
-    Widened,
     pinhole_view,
     pixel_grid,
     resampled,
@@ -43,7 +42,7 @@ from ..media.images import Images
 from ..media.raw import LIGHT, as_bright
 from ..networks.protocol import FusionNetwork, JoinsBands
 from .results import Frame
-from .views import Fields, Views
+from .views import Fields, Views, innermost
 
 Undo = Callable[[Frame], Frame]
 
@@ -72,9 +71,7 @@ def undistort(views: Views) -> Done:
     Undone, the frame is at alpha's own pixels: the fusion's difference from alpha is resampled and added to
     alpha's own image, and what the pinhole view leaves out has confidence 0.
     """
-    cameras = [views.rig[name] for name in views.images]
-    through_lenses = any(isinstance(innermost(f), Curved | ThroughLenses) for f in views.fields.values())
-    if through_lenses or not all(c.has_pinhole_view for c in cameras) or not any(map(has_lens, cameras)):
+    if not takes_pinhole_views(views):
         return Done(views)
     rig, images = without_lenses(views.rig, views.images)
     lens, pinhole = views.rig[views.alpha], rig[views.alpha]
@@ -82,6 +79,13 @@ def undistort(views: Views) -> Done:
     straight, own = images[views.alpha], views.own
     done = Views(rig, images, views.alpha, fields)
     return Done(done, lambda frame: _distorted(frame, straight, own, pinhole, lens))
+
+
+def takes_pinhole_views(views: Views) -> bool:
+    """Whether `undistort` changes views."""
+    cameras = [views.rig[name] for name in views.images]
+    through_lenses = any(isinstance(innermost(f), Curved | ThroughLenses) for f in views.fields.values())
+    return any(map(has_lens, cameras)) and all(c.has_pinhole_view for c in cameras) and not through_lenses
 
 
 def linear_luminance(views: Views) -> Done:
@@ -206,13 +210,6 @@ def without_lenses(rig: Rig, images: Images) -> tuple[Rig, dict[str, Tensor]]:
 def has_lens(view: View) -> TypeGuard[LensView]:
     """Whether a camera's pixels are not those of a pinhole."""
     return isinstance(view, LensView) and view.distortion is not None
-
-
-def innermost(field: ReceptiveField | None) -> ReceptiveField | None:
-    """The field that is widened or moved, if it is."""
-    while isinstance(field, Widened | Moved):
-        field = field.field
-    return field
 
 
 def undone(frame: Frame, undo: Sequence[Undo]) -> Frame:
