@@ -7,7 +7,7 @@ import pytest
 import tifffile
 import torch
 
-from arraygeom import Band, Camera, Distortion, Pose, Rig, Sensor, View, intrinsics, sample
+from arraygeom import Band, Camera, Curved, Distortion, Epipolar, Pose, Rig, Sensor, View, intrinsics, sample
 from arraygeom.undistortion import recorded_pixels, straight_pixels
 from pat import align
 from pat.fusion.align import OUTSIDE, SEEN, filled, resampled_values
@@ -55,10 +55,18 @@ def array(lens: Distortion | None = None, turns: int = 0) -> tuple[Rig, dict[str
     return rig, images
 
 
-@pytest.mark.parametrize(("lens", "turns"), [(None, 0), (LENS, 0), (None, 1)])
-def test_positions_are_of_the_recorded_image(lens, turns):
+def in_order(pair, x):
+    return Epipolar()(pair, x).positions(64)
+
+
+@pytest.mark.parametrize(
+    ("lens", "turns", "field"),
+    [(None, 0, None), (LENS, 0, None), (None, 1, None), (LENS, 0, in_order), (LENS, 1, Curved())],
+)
+def test_positions_are_of_the_recorded_image(lens, turns, field):
+    """Also of images that are not undistorted: betas' were distorted twice, and alpha's lens was an error."""
     rig, images = array(lens, turns)
-    found = align(rig, images, alpha="mono", correct=False)
+    found = align(rig, images, alpha="mono", correct=False, field=field)
     view = found["nir"]
     y, x = np.mgrid[: HW[0], : HW[1]]
     X = rig["mono"].unproject(
@@ -156,9 +164,10 @@ def test_without_a_view_there_are_no_values_unless_filled():
     assert (everything.visibility[~beyond] == SEEN).all()
 
 
-def test_recorded_pixels_undo_all_that_was_done_to_a_view():
+@pytest.mark.parametrize("undistorted", [True, False])
+def test_recorded_pixels_undo_all_that_was_done_to_a_view(undistorted):
     rig, images = array(LENS)
-    straight, _ = without_lenses(rig, images)
+    straight = without_lenses(rig, images)[0] if undistorted else rig
     now = straight.rot90("nir", 1).resize("nir", (77, 50)).crop("nir", 5, 7, (40, 30))["nir"]
     X = torch.tensor([[0.2, 0.1, 4.0], [-0.3, 0.2, 5.0]], dtype=torch.float64)
     found, valid = recorded_pixels(now.project(X).x, now, rig["nir"])
