@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from arraygeom import Curved, Moved, Pair, ReceptiveField, depth_of
+from arraygeom import Curved, Moved, Pair, ReceptiveField, Widened, depth_of
 from arraygeom.epipolar import Depth, Track
 from arraygeom.fields import AroundDepth, AroundMatches, default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
@@ -111,7 +111,7 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
         on_grid = FieldOnGrid.of(field, pair, hw=(alpha.shape[-2], alpha.shape[-1]), blocks=m % BLOCK == 0)
         if network.uses_matches and on_grid.pixels is None:
             on_grid = along_tangents(alpha, combined_bands(image), on_grid, name)
-        place = Placement(pair, field.points if isinstance(field, Moved) else lambda x: x, bounds_of(field))
+        place = Placement(pair, points_of(field), bounds_of(field))
         around = isinstance(innermost(field), AroundDepth | AroundMatches)
         betas.append(Beta(image, on_grid, track=place.track if place.has_track else None, around=around))
         if not on_grid.any_valid(pair.alpha.hw):
@@ -130,6 +130,16 @@ def bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:
     own = {image.untyped_storage().data_ptr() for image in held}
     parts = {image.untyped_storage().data_ptr(): image.nbytes for image in images}
     return float(sum(nbytes for place, nbytes in parts.items() if place not in own))
+
+
+def points_of(field: ReceptiveField) -> Callable[[Tensor], Tensor]:
+    """Where a field looks for alpha's pixels, in alpha's own: elsewhere if they move, within a band too."""
+    if isinstance(field, Widened):
+        return points_of(field.field)
+    if not isinstance(field, Moved):
+        return lambda x: x
+    moved, then = field.points, points_of(field.field)
+    return lambda x: then(moved(x))
 
 
 def bounds_of(field: ReceptiveField) -> Literal["depth", "distance"]:

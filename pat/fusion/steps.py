@@ -5,6 +5,7 @@ A step takes views and returns them changed, with a function that takes the fuse
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -27,6 +28,7 @@ from arraygeom import (
     Rig,
     ThroughLenses,
     View,
+    Widened,
     pinhole_view,
     pixel_grid,
     resampled,
@@ -221,8 +223,12 @@ def undone(frame: Frame, undo: Sequence[Undo]) -> Frame:
 
 def _for_pinhole(field: ReceptiveField | None, lens: View, pinhole: View) -> ReceptiveField | None:
     """The field for the pinhole view of alpha: displacements are between pixels of that, too."""
-    if not (isinstance(field, Moved) and has_lens(lens)):
+    if not (isinstance(field, Moved | Widened) and has_lens(lens)):
         return field
+    within = _for_pinhole(field.field, lens, pinhole)
+    assert within is not None
+    if isinstance(field, Widened):
+        return dataclasses.replace(field, field=within)
     assert isinstance(pinhole, LensView)
     field.require(lens.hw)
     x, seen = pixels_between(lens, pinhole)
@@ -230,7 +236,7 @@ def _for_pinhole(field: ReceptiveField | None, lens: View, pinhole: View) -> Rec
     there = map_homogeneous(pinhole.K.double()[:2], rays[..., :2] / rays[..., 2:])
     known = seen & valid & (rays[..., 2] > 0)
     step = torch.where(known[..., None], there - pixel_grid(pinhole.hw, dtype=torch.float64), 0.0)
-    return Moved(field.field, step.movedim(-1, 0).to(field.displacement))
+    return Moved(within, step.movedim(-1, 0).to(field.displacement))
 
 
 def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens: View) -> Frame:

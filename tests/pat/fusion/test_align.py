@@ -7,7 +7,21 @@ import pytest
 import tifffile
 import torch
 
-from arraygeom import Band, Camera, Curved, Distortion, Epipolar, Pose, Rig, Sensor, View, intrinsics, sample
+from arraygeom import (
+    Band,
+    Camera,
+    Curved,
+    Distortion,
+    Epipolar,
+    Moved,
+    Pose,
+    Rig,
+    Sensor,
+    View,
+    Widened,
+    intrinsics,
+    sample,
+)
 from arraygeom.undistortion import recorded_pixels, straight_pixels
 from pat import align
 from pat.fusion.align import OUTSIDE, SEEN, filled, resampled_values
@@ -79,6 +93,17 @@ def test_positions_are_of_the_recorded_image(lens, turns, field):
     assert view.valid[inner].mean() > 0.8
     assert np.abs(view.values[0] - images["mono"][0].numpy())[inner][view.valid[inner]].mean() < 0.02
     assert np.nanmedian(np.abs(found.depth[inner] - DEPTH)) < 0.1
+
+
+@pytest.mark.parametrize("lens", [None, LENS])
+def test_points_that_move_may_do_so_within_a_band(lens):
+    """Depth was of where they are when alpha records, and lenses were an error."""
+    rig, images = array(lens)
+    step = torch.stack([torch.full(HW, 4.0), torch.full(HW, 1.0)])
+    within, around = Widened(Moved(Epipolar(), step), along=2.0), Moved(Widened(Epipolar(), along=2.0), step)
+    one, other = (align(rig, images, alpha="mono", correct=False, field=field) for field in (within, around))
+    assert np.array_equal(one.depth, other.depth, equal_nan=True)
+    assert np.array_equal(one["nir"].positions, other["nir"].positions, equal_nan=True)
 
 
 @pytest.mark.parametrize("lens", [None, LENS])
