@@ -10,7 +10,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeGuard
 
 import cv2
 import numpy as np
@@ -246,7 +246,7 @@ def _located(
     h, w = inputs.hw
     beta, pinhole = inputs.inputs.betas[i], inputs.placements[i].pair.alpha
     hw = (beta.image.shape[-2], beta.image.shape[-1])
-    if not _is_undistorted(pinhole, recorded):
+    if not _is_undistorted(recorded, pinhole):
         where, inside = found.positions(beta.field.straight, hw)
         return where[0, :h, :w], inside[0, :h, :w]
     assert isinstance(pinhole, LensView)
@@ -265,7 +265,7 @@ def _located(
     return where, inside & seen
 
 
-def _is_undistorted(now: View, recorded: View) -> bool:
+def _is_undistorted(recorded: View, now: View) -> TypeGuard[LensView]:
     """Whether a camera's lens was taken out of its image: some are fused as they recorded."""
     return has_lens(recorded) and not has_lens(now)
 
@@ -281,7 +281,7 @@ def _between_pixels(disparity: Float[Tensor, "1 h w"], x: Float[Tensor, "h2 w2 2
 
 def _at_pixels(plane: Float[Tensor, "1 h w"], pinhole: View, recorded: View) -> Float[Tensor, "1 h2 w2"]:
     """A plane at alpha's recorded pixels; 0 where its pinhole view has none."""
-    if not _is_undistorted(pinhole, recorded):
+    if not _is_undistorted(recorded, pinhole):
         return plane
     assert isinstance(pinhole, LensView)
     return resampled(plane, pinhole, recorded, interpolation="bilinear").values[0]
