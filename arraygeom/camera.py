@@ -260,13 +260,14 @@ class Camera(LensView):
         return self.project_local(self.cam_from_world.apply(X))
 
     def unproject(self, x: Real[Tensor, "*n 2"], depth: Real[Tensor, "*n"]) -> Float[Tensor, "*n 3"]:
-        """Pixels at depth z (metres) to world points. Pixels outside the lens's range give NaN.
+        """Pixels at depth z (metres) to world points. NaN for pixels outside the lens's range, and for depths
+        that their rays do not reach: below 0 of those ahead, above 0 of those 90 degrees and more off axis.
 
         Raises nothing: `rays` gives the validity.
         """
         rays, valid = self.rays(x)
         z = rays[..., 2]
-        valid = valid & (z != 0)
+        valid = valid & (z != 0) & (z * depth >= 0)
         X = rays * (depth / torch.where(valid, z, 1.0))[..., None]
         if not self.central:
             start = self.ray_origins(x)

@@ -28,10 +28,14 @@ def essential_matrix(beta_from_alpha: Pose) -> Float[Tensor, "*b 3 3"]:
 def fundamental_matrix(
     K_alpha: Float[Tensor, "*b 3 3"], K_beta: Float[Tensor, "*b 3 3"], beta_from_alpha: Pose
 ) -> Float[Tensor, "*b 3 3"]:
-    """F = K_beta^-T E K_alpha^-1, so that x_beta^T F x_alpha = 0: kornia's, in float64."""
+    """F = K_beta^-T E K_alpha^-1, so that x_beta^T F x_alpha = 0: kornia's, in float64.
+
+    Along (l1, -l0) of a line l points are farther away: the sign is kornia's unless K_beta mirrors.
+    """
     from kornia.geometry.epipolar import fundamental_from_essential
 
-    return in_float64(fundamental_from_essential, essential_matrix(beta_from_alpha), K_alpha, K_beta)
+    F = in_float64(fundamental_from_essential, essential_matrix(beta_from_alpha), K_alpha, K_beta)
+    return F * torch.linalg.det(K_beta).sign()[..., None, None]
 
 
 def shift_origin(F: Float[Tensor, "*b 3 3"], first_pixel: float) -> Float[Tensor, "*b 3 3"]:

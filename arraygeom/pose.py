@@ -212,7 +212,7 @@ def in_float64(function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
 
 
 def nearest_rotation(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
-    """A matrix that is a rotation but for rounding, made one to rounding squared: R (3 I - R^T R) / 2."""
+    """A matrix that is nearly a rotation, its error squared by a step (Newton's): R (3 I - R^T R) / 2."""
     return 1.5 * R - product(0.5 * R, product(R.mT, R))
 
 

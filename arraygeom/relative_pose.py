@@ -9,22 +9,29 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .epipolar import depth_from_track, track
-from .pose import Pose, in_float64
+from .pose import Pose, in_float64, nearest_rotation
 
 
 def poses_from_essential(E: Float[Tensor, "*b 3 3"]) -> Pose:
     """The four poses (*b, 4) that E allows (H&Z 9.14), |t| = 1: both rotations with t, then with -t.
 
     Kornia's decomposition without a singular value decomposition (Horn 1990): differentiable, where E's two
-    equal singular values give SVD no gradient.
+    equal singular values give SVD no gradient. Where noise makes them differ, the rotations are those nearest
+    to Horn's matrices, which are those of the SVD.
     """
     from kornia.geometry.epipolar import decompose_essential_matrix_no_svd
 
     R1, R2, t = (
         part.reshape(*E.shape[:-2], *part.shape[1:]) for part in decompose_essential_matrix_no_svd(E)
     )
-    t = t[..., 0]
-    return Pose(torch.stack([R1, R2, R1, R2], -3), torch.stack([t, t, -t, -t], -2))
+    R, t = torch.stack([R1, R2, R1, R2], -3), t[..., 0]
+    for _ in range(STEPS):
+        R = nearest_rotation(R)
+    return Pose(R, torch.stack([t, t, -t, -t], -2))
+
+
+STEPS = 16
+"""To the nearest rotation, enough where E's singular values differ a hundredfold."""
 
 
 class TwoViewPose(NamedTuple):

@@ -73,20 +73,26 @@ def _by_rows(function: Callable[[Tensor], Any], hw: HW, *, axis: int) -> Any:
 def recorded_pixels(
     x: Float[Tensor, "*n 2"], now: View, recorded: LensView
 ) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-    """Pixels of a view without its lens, cropped, resized or rotated, in the recorded image; which it shows.
+    """Pixels of a view cropped, resized, rotated, or without its lens, in the recorded image; which it shows.
 
     K of both views says how pixels were changed: x ~ K_now K_recorded^-1 x_recorded but for the lens.
     """
     x = map_homogeneous(_between(recorded, now)[:2], x)
-    return recorded.to(torch.float64).distort(x)
+    return _lens_taken(recorded, now).distort(x)
 
 
 def straight_pixels(
     x: Float[Tensor, "*n 2"], now: View, recorded: LensView
 ) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
     """The inverse of `recorded_pixels`: pixels of the image as recorded in the view as it is now."""
-    x, valid = recorded.to(torch.float64).undistort(x)
+    x, valid = _lens_taken(recorded, now).undistort(x)
     return map_homogeneous(torch.linalg.inv(_between(recorded, now))[:2], x), valid
+
+
+def _lens_taken(recorded: LensView, now: View) -> LensView:
+    """The recorded view, float64, with the lens that it has no longer; without one if it still has it."""
+    kept = isinstance(now, LensView) and now.distortion is not None
+    return (recorded.replace(distortion=None) if kept else recorded).to(torch.float64)
 
 
 def _between(recorded: LensView, now: View) -> Float[Tensor, "3 3"]:

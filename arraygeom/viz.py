@@ -24,6 +24,7 @@ from .fields.widened import direction
 from .pixels import HW
 from .rig import Pair, Rig
 from .segments import Segments
+from .text import length_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,7 +56,8 @@ def draw_rig(rig: Rig, *, alpha: str | None = None) -> Figure:
     for line in depth_outline(rig, cameras, alpha):
         axes.plot(*_upright(line), color="0.6", lw=0.8, ls="--")
     _equal_axes(axes)
-    axes.set(xlabel="x (m)", ylabel="z (m)", zlabel="-y (m)")
+    unit = length_unit(rig)
+    axes.set(xlabel=f"x ({unit})", ylabel=f"z ({unit})", zlabel=f"-y ({unit})")
     axes.tick_params(labelsize=7, pad=-1)
     axes.locator_params(nbins=5)
     axes.view_init(elev=24, azim=-62)

@@ -297,17 +297,20 @@ class Fuse(Known):
         from arraygeom import Camera
         from arraygeom.atomic import sweep, write_text
 
+        from ..fusion.inputs import measured_along
         from ..fusion.report import report_page
         from ..fusion.results import band_names, describe_bands, save_frame, view_of
+        from ..fusion.views import Views
         from ..media.raw import developed_rig
         from ..support.locks import folder_lock
 
         if self.points and not isinstance(rig[alpha], Camera):
             raise ValueError("--points needs a calibrated alpha, and the rig has only F for it: leave it out")
-        begin, store = time.monotonic(), self.out / ".tiles"
+        begin, store, field = time.monotonic(), self.out / ".tiles", options.field_named(self.field)
+        views = Views(rig, images, alpha, dict.fromkeys(images, field))
 
         def fused(rig: Rig) -> Frame:
-            known, field = self.with_known(rig, alpha, files, options.field_named(self.field))
+            known, field_given = self.with_known(rig, alpha, files, field)
             return fuse_with_progress(
                 self.weights or "mono-colour",
                 known,
@@ -315,7 +318,7 @@ class Fuse(Known):
                 alpha=alpha,
                 device=self.device,
                 precision=self.precision,
-                settings=replace(self._settings(), field=field),
+                settings=replace(self._settings(), field=field_given),
                 explain=self._note,
                 store=store,
             )
@@ -340,6 +343,7 @@ class Fuse(Known):
                 view=view_of(rig, alpha, bits=self.bits or 8, bands=len(frame.image)),
                 rig=None if found is None else found.recorded,
                 points=rig[alpha] if self.points else None,
+                along=measured_along(views),
                 bands=bands,
             )
             shutil.rmtree(store, ignore_errors=True)

@@ -41,7 +41,6 @@ from arraygeom import (
     apply_homography,
     pixel_grid,
     rotation_from_vector,
-    world_rays,
 )
 from arraygeom.atomic import write_text
 from arraygeom.fields.default import natural_bounds
@@ -52,6 +51,7 @@ from arraygeom.segments import clip_to_image
 from ..fusion.fuse import fuse
 from ..fusion.steps import resolution_ratio
 from ..media.colour import luminance, srgb_image
+from ..media.depth_maps import at_distance
 from ..media.figures import save_panels
 from ..networks.protocol import FusionNetwork
 from ..sensors import Clip, Noise, Quantise, record
@@ -306,7 +306,7 @@ def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float
     """
     alpha, beta = case.rig.pair(ALPHA, BETA).cameras
     x = pixel_grid(alpha.hw, dtype=torch.float64).reshape(-1, 2)
-    unproject = _at_distance if natural_bounds(case.rig.pair(ALPHA, BETA)) == "distance" else Camera.unproject
+    unproject = at_distance if natural_bounds(case.rig.pair(ALPHA, BETA)) == "distance" else Camera.unproject
     ours, theirs = (beta.project(unproject(alpha, x, d.reshape(-1).double())) for d in (depth, case.depth))
     known = theirs.valid & theirs.x.isfinite().all(-1)
     compared = known & ours.valid & ours.x.isfinite().all(-1)
@@ -314,11 +314,6 @@ def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float
         return math.nan, math.nan
     error = (ours.x - theirs.x).norm(dim=-1)[compared]
     return float(error.mean()), float((error <= 1).sum() / known.sum())
-
-
-def _at_distance(camera: Camera, x: Tensor, distance: Tensor) -> Tensor:
-    rays = world_rays(camera, x)
-    return torch.where(rays.valid[..., None], rays.origin + distance[..., None] * rays.direction, torch.nan)
 
 
 def unsupported(field: ReceptiveField | None, rig: Rig) -> str:

@@ -10,7 +10,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeGuard
 
 import cv2
 import numpy as np
@@ -101,7 +101,7 @@ class AlignedView:
 class Aligned(Mapping[str, AlignedView]):
     """All cameras' own values at the pixels of one: a mapping of names to views, that of `alpha` first.
 
-    depth: (H, W), float32, metres along alpha's axis; NaN where no calibrated beta sees the point.
+    depth: (H, W), float32, as of `Frame`.
     """
 
     alpha: str
@@ -244,12 +244,11 @@ def _located(
 ) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
     """Where alpha's recorded pixels are in the i-th beta as prepared, by its matches; which are on it."""
     h, w = inputs.hw
-    beta = inputs.inputs.betas[i]
+    beta, pinhole = inputs.inputs.betas[i], inputs.placements[i].pair.alpha
     hw = (beta.image.shape[-2], beta.image.shape[-1])
-    if not has_lens(recorded):
+    if not _is_undistorted(recorded, pinhole):
         where, inside = found.positions(beta.field.straight, hw)
         return where[0, :h, :w], inside[0, :h, :w]
-    pinhole = inputs.placements[i].pair.alpha
     assert isinstance(pinhole, LensView)
     x, seen = pixels_between(pinhole, recorded)
     disparity = _between_pixels(found.surface[0, :, :h, :w], x)
@@ -257,13 +256,18 @@ def _located(
     def at_points(x: Float[Tensor, "h w 2"], disparity: Float[Tensor, "h w"]) -> tuple[Tensor, Tensor]:
         segments, rows = beta.field.at(x.reshape(-1, 2)), (1, *x.shape[:2])
         assert isinstance(segments, Segments)
-        parts = (part.unflatten(0, rows) for part in (segments.start, segments.end, segments.valid))
+        parts = segments.start.reshape(*rows, 2), segments.end.reshape(*rows, 2), segments.valid.reshape(rows)
         bare = replace(found, disparity=disparity[None, None], chosen=None)
         where, inside = bare.positions(Segments(*parts), hw)
         return where[0], inside[0]
 
     where, inside = chunked(at_points, x, disparity, axis=0)
     return where, inside & seen
+
+
+def _is_undistorted(recorded: View, now: View) -> TypeGuard[LensView]:
+    """Whether a camera's lens was taken out of its image: some are fused as they recorded."""
+    return has_lens(recorded) and not has_lens(now)
 
 
 def _between_pixels(disparity: Float[Tensor, "1 h w"], x: Float[Tensor, "h2 w2 2"]) -> Float[Tensor, "h2 w2"]:
@@ -277,7 +281,7 @@ def _between_pixels(disparity: Float[Tensor, "1 h w"], x: Float[Tensor, "h2 w2 2
 
 def _at_pixels(plane: Float[Tensor, "1 h w"], pinhole: View, recorded: View) -> Float[Tensor, "1 h2 w2"]:
     """A plane at alpha's recorded pixels; 0 where its pinhole view has none."""
-    if not has_lens(recorded):
+    if not _is_undistorted(recorded, pinhole):
         return plane
     assert isinstance(pinhole, LensView)
     return resampled(plane, pinhole, recorded, interpolation="bilinear").values[0]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Literal, NamedTuple
 
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from arraygeom import Curved, Moved, Pair, ReceptiveField, depth_of
+from arraygeom import Curved, Moved, Pair, ReceptiveField, Widened, depth_of
 from arraygeom.epipolar import Depth, Track
 from arraygeom.fields import AroundDepth, AroundMatches, default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
@@ -22,8 +23,8 @@ from ..matching.inputs import Beta, Inputs
 from ..matching.normalisation import combined_bands
 from ..matching.tangents import along_tangents
 from ..networks.protocol import FusionNetwork
-from .steps import FusionStep, Undo, innermost
-from .views import Views, check_precision
+from .steps import FusionStep, Undo, takes_pinhole_views
+from .views import Views, check_precision, innermost
 
 LOG = logging.getLogger(__name__)
 
@@ -55,10 +56,21 @@ class Placement(NamedTuple):
     def depth(
         self, x: Float[Tensor, "n 2"], x_beta: Float[Tensor, "n 2"], deviation: Float[Tensor, " n"]
     ) -> Depth:
-        """The depth of what alpha's pixels see at beta's pixels, or its distance if `bounds` are of that."""
-        if self.pair.alpha.has_pinhole_view and self.pair.beta.has_pinhole_view and self.bounds == "depth":
-            return depth_of(self.pair, self.points(x), x_beta, deviation)
-        return ray_depth(self.pair, self.points(x), x_beta, self.bounds, deviation=deviation)
+        """The depth of what alpha's pixels see at beta's pixels, or its distance if `bounds` are of that.
+
+        Through lenses within the pair's depth range.
+        """
+        pair, x = self.pair, self.points(x)
+        on_curve = partial(ray_depth, pair, bounds=self.bounds)
+        if not (pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view and self.bounds == "depth"):
+            return on_curve(x, x_beta, deviation=deviation)
+        found = depth_of(pair, x, x_beta, deviation)
+        if pair.depth is None or pair.link is not None or not pair.has_lens:
+            return found
+        near, far = (bound.to(found.depth) for bound in pair.depth)
+        beyond = ~(found.valid & (found.depth >= near) & (found.depth <= far))
+        there = on_curve(x[beyond], x_beta[beyond], deviation=deviation[beyond])
+        return Depth(*(t.masked_scatter(beyond, part) for t, part in zip(found, there)))
 
 
 class FrameInputs(NamedTuple):
@@ -99,7 +111,7 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
         on_grid = FieldOnGrid.of(field, pair, hw=(alpha.shape[-2], alpha.shape[-1]), blocks=m % BLOCK == 0)
         if network.uses_matches and on_grid.pixels is None:
             on_grid = along_tangents(alpha, combined_bands(image), on_grid, name)
-        place = Placement(pair, field.points if isinstance(field, Moved) else lambda x: x, bounds_of(field))
+        place = Placement(pair, points_of(field), bounds_of(field))
         around = isinstance(innermost(field), AroundDepth | AroundMatches)
         betas.append(Beta(image, on_grid, track=place.track if place.has_track else None, around=around))
         if not on_grid.any_valid(pair.alpha.hw):
@@ -120,10 +132,28 @@ def bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:
     return float(sum(nbytes for place, nbytes in parts.items() if place not in own))
 
 
+def points_of(field: ReceptiveField) -> Callable[[Tensor], Tensor]:
+    """Where a field looks for alpha's pixels, in alpha's own: elsewhere if they move, within a band too."""
+    if isinstance(field, Widened):
+        return points_of(field.field)
+    if not isinstance(field, Moved):
+        return lambda x: x
+    moved, then = field.points, points_of(field.field)
+    return lambda x: then(moved(x))
+
+
 def bounds_of(field: ReceptiveField) -> Literal["depth", "distance"]:
     """What a field's depth range is of."""
     inner = innermost(field)
     return inner.bounds if isinstance(inner, Curved) else "depth"
+
+
+def measured_along(views: Views) -> Literal["depth", "distance"]:
+    """What the depth of a frame of these views is: along alpha's axis, or the distance along its rays."""
+    if takes_pinhole_views(views):
+        return "depth"
+    fields = (views.fields.get(name) or default_field(views.pair(name)) for name in views.betas)
+    return "distance" if "distance" in map(bounds_of, fields) else "depth"
 
 
 def padded(image: Tensor, multiple: int) -> Tensor:

@@ -69,6 +69,7 @@ def save_frame(
     view: Rig | None = None,
     rig: Rig | None = None,
     points: Camera | None = None,
+    along: Literal["depth", "distance"] = "depth",
     name: str = "",
     bands: Sequence[str] = (),
 ) -> list[Path]:
@@ -78,13 +79,13 @@ def save_frame(
 
     8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With
     `view`, the rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to
-    found_rig.yaml; with `points`, the camera of alpha, the pixels of known depth go to points.ply. With a
-    `name` the files are name_fused.png and so on. Without any known depth there are no depth files. With
-    `bands`, the names of bands that cameras record one by one, each goes to fused_NAME.png and
-    confidence_NAME.png too; bands without names that are not one or three go to fused_1.png and so on. Of
-    other numbers than one and three fused.png is the mean. The image comes last: where it is, the others are
-    of the same frame, and points.ply, the page index.html and the image in another format of a former one are
-    gone. After an error all former files are as they were.
+    found_rig.yaml; with `points`, the camera of alpha, the pixels of known depth, which is `along` its axis
+    or rays (`measured_along`), go to points.ply. With a `name` the files are name_fused.png and so on.
+    Without any known depth there are no depth files. With `bands`, the names of bands that cameras record one
+    by one, each goes to fused_NAME.png and confidence_NAME.png too; bands without names that are not one or
+    three go to fused_1.png and so on. Of other numbers than one and three fused.png is the mean. The image
+    comes last: where it is, the others are of the same frame, and points.ply, the page index.html and the
+    image in another format of a former one are gone. After an error all former files are as they were.
     Returns what was written.
     """
     frame = frame.mapped(lambda part: part.detach().cpu())
@@ -108,7 +109,7 @@ def save_frame(
         if rig is not None:
             rig.save(folder / FOUND_RIG)
         if points is not None:
-            write_points(folder / "points.ply", points, frame.depth, frame.image)
+            write_points(folder / "points.ply", points, frame.depth, frame.image, along=along)
         image = linear_from_srgb(frame.image) if bits == 32 else frame.image
         bands = bands or ([] if len(image) in (1, 3) else [str(i + 1) for i in range(len(image))])
         for band, values in zip(bands, image):
@@ -178,7 +179,8 @@ class Frame(NamedTuple):
     """A fused frame at alpha's view.
 
     image: (C, H, W), in alpha's coding, not cut to 0..1.
-    depth: (H, W), metres along alpha's axis; NaN where no calibrated beta sees the point.
+    depth: (H, W), metres along alpha's axis, or its rays (`measured_along`); NaN where no calibrated beta
+        sees the point.
     confidence: (H, W), the probability that every band's beta sees the point and its position is right to a
         pixel.
     half_width: (H, W), 1/metres: in 9 of 10 pixels the true inverse depth is within it of 1 / depth; NaN

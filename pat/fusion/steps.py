@@ -5,6 +5,7 @@ A step takes views and returns them changed, with a function that takes the fuse
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -43,7 +44,7 @@ from ..media.images import Images
 from ..media.raw import LIGHT, as_bright
 from ..networks.protocol import FusionNetwork, JoinsBands
 from .results import Frame
-from .views import Fields, Views
+from .views import Fields, Views, innermost
 
 Undo = Callable[[Frame], Frame]
 
@@ -72,9 +73,7 @@ def undistort(views: Views) -> Done:
     Undone, the frame is at alpha's own pixels: the fusion's difference from alpha is resampled and added to
     alpha's own image, and what the pinhole view leaves out has confidence 0.
     """
-    cameras = [views.rig[name] for name in views.images]
-    through_lenses = any(isinstance(innermost(f), Curved | ThroughLenses) for f in views.fields.values())
-    if through_lenses or not all(c.has_pinhole_view for c in cameras) or not any(map(has_lens, cameras)):
+    if not takes_pinhole_views(views):
         return Done(views)
     rig, images = without_lenses(views.rig, views.images)
     lens, pinhole = views.rig[views.alpha], rig[views.alpha]
@@ -82,6 +81,13 @@ def undistort(views: Views) -> Done:
     straight, own = images[views.alpha], views.own
     done = Views(rig, images, views.alpha, fields)
     return Done(done, lambda frame: _distorted(frame, straight, own, pinhole, lens))
+
+
+def takes_pinhole_views(views: Views) -> bool:
+    """Whether `undistort` changes views."""
+    cameras = [views.rig[name] for name in views.images]
+    through_lenses = any(isinstance(innermost(f), Curved | ThroughLenses) for f in views.fields.values())
+    return any(map(has_lens, cameras)) and all(c.has_pinhole_view for c in cameras) and not through_lenses
 
 
 def linear_luminance(views: Views) -> Done:
@@ -209,13 +215,6 @@ def has_lens(view: View) -> TypeGuard[LensView]:
     return isinstance(view, LensView) and view.distortion is not None
 
 
-def innermost(field: ReceptiveField | None) -> ReceptiveField | None:
-    """The field that is widened or moved, if it is."""
-    while isinstance(field, Widened | Moved):
-        field = field.field
-    return field
-
-
 def undone(frame: Frame, undo: Sequence[Undo]) -> Frame:
     """A frame taken back to what it was before the steps."""
     for back in undo:
@@ -225,8 +224,12 @@ def undone(frame: Frame, undo: Sequence[Undo]) -> Frame:
 
 def _for_pinhole(field: ReceptiveField | None, lens: View, pinhole: View) -> ReceptiveField | None:
     """The field for the pinhole view of alpha: displacements are between pixels of that, too."""
-    if not (isinstance(field, Moved) and has_lens(lens)):
+    if not (isinstance(field, Moved | Widened) and has_lens(lens)):
         return field
+    within = _for_pinhole(field.field, lens, pinhole)
+    assert within is not None
+    if isinstance(field, Widened):
+        return dataclasses.replace(field, field=within)
     assert isinstance(pinhole, LensView)
     field.require(lens.hw)
     x, seen = pixels_between(lens, pinhole)
@@ -234,7 +237,7 @@ def _for_pinhole(field: ReceptiveField | None, lens: View, pinhole: View) -> Rec
     there = map_homogeneous(pinhole.K.double()[:2], rays[..., :2] / rays[..., 2:])
     known = seen & valid & (rays[..., 2] > 0)
     step = torch.where(known[..., None], there - pixel_grid(pinhole.hw, dtype=torch.float64), 0.0)
-    return Moved(field.field, step.movedim(-1, 0).to(field.displacement))
+    return Moved(within, step.movedim(-1, 0).to(field.displacement))
 
 
 def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens: View) -> Frame:

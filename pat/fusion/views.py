@@ -13,7 +13,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from arraygeom import Pair, ReceptiveField, Rig, Sensor
+from arraygeom import (
+    Curved,
+    Epipolar,
+    Moved,
+    Pair,
+    ReceptiveField,
+    Rig,
+    Sensor,
+    ThroughLenses,
+    Widened,
+)
 from arraygeom.warned import warn
 
 from ..media.colour import luminance_of as grey
@@ -79,12 +89,23 @@ class Views:
         return [name for name in self.rig.betas(self.alpha) if name in self.images]
 
     def pair(self, beta: str) -> Pair:
-        """Alpha and a beta."""
-        return self.rig.pair(self.alpha, beta)
+        """Alpha and a beta, with the depth range that is searched: fields may have bounds of their own."""
+        pair, field = self.rig.pair(self.alpha, beta), innermost(self.fields.get(beta))
+        field = innermost(field.field) if isinstance(field, ThroughLenses) else field
+        if not (pair.calibrated and isinstance(field, Curved | Epipolar)):
+            return pair
+        return dataclasses.replace(pair, depth=Epipolar(field.near, field.far).bounds(pair))
 
     def replace(self, images: Mapping[str, Tensor], *, rig: Rig | None = None) -> Views:
         """The same with other images of some cameras, and another rig."""
         return dataclasses.replace(self, rig=rig or self.rig, images={**self.images, **images})
+
+
+def innermost(field: ReceptiveField | None) -> ReceptiveField | None:
+    """The field that is widened or moved, if it is."""
+    while isinstance(field, Widened | Moved):
+        field = field.field
+    return field
 
 
 LARGEST_VALUE = 32.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from arraygeom import Camera, pixel_grid
+from arraygeom import Camera, pixel_grid, world_rays
 from arraygeom.atomic import write_atomically
 
 from .colour import to_bytes
@@ -89,18 +90,23 @@ def _stated_scale(path: Path) -> float | None:
 
 
 def write_points(
-    path: Path, camera: Camera, depth: Float[Tensor, "h w"], image: Float[Tensor, "c h w"]
+    path: Path,
+    camera: Camera,
+    depth: Float[Tensor, "h w"],
+    image: Float[Tensor, "c h w"],
+    *,
+    along: Literal["depth", "distance"] = "depth",
 ) -> int:
     """Write the pixels of known depth as a coloured point cloud (binary PLY), atomically; returns how many.
 
-    Coordinates are the camera's: x right, y down, z ahead, in the unit of the depth. An image of one band is
-    grey.
+    Coordinates are the camera's: x right, y down, z ahead, in the unit of the depth, which is `along` the
+    axis, or the distance along the ray. An image of one band is grey.
     """
     known = depth.isfinite()
     x = pixel_grid(camera.hw, dtype=torch.float64)[known]
     colours = image.expand(3, -1, -1) if len(image) == 1 else image[:3]
-    own = camera.to(torch.float64)
-    X = own.cam_from_world.apply(own.unproject(x, depth[known].double()))
+    own, to_point = camera.to(torch.float64), depth[known].double()
+    X = own.cam_from_world.apply((at_distance if along == "distance" else Camera.unproject)(own, x, to_point))
     seen = X.isfinite().all(-1)
     vertices = np.empty(int(seen.sum()), VERTEX)
     vertices["X"] = X[seen].numpy()
@@ -108,3 +114,11 @@ def write_points(
     with write_atomically(path) as temporary:
         temporary.write_bytes(PLY_HEADER.format(count=len(vertices)).encode() + vertices.tobytes())
     return len(vertices)
+
+
+def at_distance(
+    camera: Camera, x: Float[Tensor, "*n 2"], distance: Float[Tensor, "*n"]
+) -> Float[Tensor, "*n 3"]:
+    """World points of pixels at a distance along their rays, metres; NaN for those without a ray."""
+    rays = world_rays(camera, x)
+    return torch.where(rays.valid[..., None], rays.origin + distance[..., None] * rays.direction, torch.nan)

@@ -52,6 +52,18 @@ def test_unprojection_inverts_projection(seed):
     torch.testing.assert_close(c.unproject(x, depth), X, atol=1e-12, rtol=0)
 
 
+def test_depths_that_a_ray_does_not_reach_have_no_point():
+    """They gave the point opposite, which the camera sees at another pixel or not at all."""
+    fisheye = Distortion("kannala-brandt", torch.zeros(4, dtype=torch.float64))
+    c = Camera(K=intrinsics(20.0, (48, 96)), cam_from_world=Pose.identity(), hw=(48, 96), distortion=fisheye)
+    x = torch.tensor([[50.0, 20.0], [95.0, 24.0]], dtype=torch.float64)  # ahead, and 136 degrees off axis
+    for depth in ([2.0, -2.0], [-2.0, 2.0]):
+        z = torch.tensor(depth, dtype=torch.float64)
+        X, reached = c.unproject(x, z), torch.tensor([depth[0] > 0] * 2)
+        assert torch.equal(X.isfinite().all(-1), reached)
+        torch.testing.assert_close(c.project(X[reached]).x, x[reached])
+
+
 def test_points_behind_are_invalid_and_finite_with_their_gradients():
     c = camera()
     X = c.cam_from_world.inverse().apply(

@@ -78,8 +78,15 @@ def test_segments_lie_on_the_lines_and_inside_the_image(field):
         assert off[segments.valid].abs().max() < 1e-6
 
 
-def test_starts_are_near_and_ends_far_for_calibrated_pairs():
-    pair = pair_of(random_rig(1))
+@pytest.mark.parametrize("mirrored", ["neither", "alpha", "beta"])
+def test_starts_are_near_and_ends_far_for_calibrated_pairs(mirrored):
+    """Also behind a mirror, where F by K has the other sign."""
+    rig = random_rig(1)
+    if mirrored != "neither":
+        h, w = rig[mirrored].hw
+        flip = torch.tensor([[-1.0, 0, w - 1], [0, 1, 0], [0, 0, 1]], dtype=torch.float64)
+        rig = rig.transformed(mirrored, flip, (h, w))
+    pair = pair_of(rig)
     x = pixel_grid(pair.alpha.hw, dtype=torch.float64)
     reference = Epipolar()(pair, x)
     direction = reference.end - reference.start

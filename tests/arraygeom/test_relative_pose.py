@@ -55,6 +55,23 @@ def test_the_chosen_pose_is_opencvs():
     np.testing.assert_allclose(found.t.numpy(), t[:, 0], atol=1e-9)
 
 
+@pytest.mark.parametrize("noise", [0.5, 2.0])
+@pytest.mark.parametrize("seed", range(5))
+def test_the_pose_of_noisy_matches_is_opencvs(seed, noise):
+    """E from F of noisy matches has singular values that differ: no pose was found, or R was no rotation."""
+    pair, x, y = seen(seed, 200)
+    rng = np.random.default_rng(seed)
+    x, y = (p + noise * torch.from_numpy(rng.standard_normal(p.shape)) for p in (x, y))
+    F, _ = cv2.findFundamentalMat(x.numpy(), y.numpy(), cv2.FM_8POINT)
+    K, L = pair.alpha.K, pair.beta.K
+    E = L.T @ torch.from_numpy(F) @ K
+    normalised = [((p - M[:2, 2]) @ torch.linalg.inv(M[:2, :2]).T).numpy() for p, M in ((x, K), (y, L))]
+    _, R, t, _ = cv2.recoverPose(E.numpy(), *normalised, np.eye(3))
+    found = relative_pose(torch.from_numpy(F), K, L, x, y).beta_from_alpha
+    np.testing.assert_allclose(found.R.numpy(), R, atol=1e-9)
+    np.testing.assert_allclose(found.t.numpy(), t[:, 0], atol=1e-9)
+
+
 def test_gradients_batches_and_float32():
     pairs = [seen(seed) for seed in (1, 2)]
     n = min(len(x) for _, x, _ in pairs)

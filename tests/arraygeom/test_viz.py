@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Distortion, Epipolar, Local, Rig, Segments, Widened, sampling_locations, viz
+from arraygeom import Distortion, Epipolar, Link, Local, Rig, Segments, View, Widened, sampling_locations, viz
+from arraygeom.text import UNSCALED
 from tests.arraygeom.rigs import known_by_f, random_rig, scene_points, two_cameras
 
 pytest.importorskip("matplotlib", reason="drawings need matplotlib")
@@ -30,6 +31,14 @@ def test_rigs_are_drawn(rig):
     figure = viz.draw_rig(rig)
     assert len(png(figure)) > 1000
     assert {t.get_text().strip() for t in figure.axes[0].texts} == {"alpha", "beta"}
+
+
+@pytest.mark.parametrize(("name", "unit"), [("", "m"), (UNSCALED, "baselines")])
+def test_axes_are_in_the_rigs_unit(name, unit):
+    axes = viz.draw_rig(random_rig(0).replace(name=name)).axes[0]
+    assert [axes.get_xlabel(), axes.get_ylabel(), axes.get_zlabel()] == [
+        f"{c} ({unit})" for c in ("x", "z", "-y")
+    ]
 
 
 def test_frusta_are_in_front_of_their_cameras_and_project_to_the_corners():

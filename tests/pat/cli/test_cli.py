@@ -8,12 +8,14 @@ import re
 import shutil
 import typing
 
+import numpy as np
 import pytest
 import torch
 import yaml
 
-from arraygeom import Pose, Rig, Sensor
+from arraygeom import Camera, Pose, Rig, Sensor, intrinsics
 from arraygeom.io import write_rig
+from arraygeom.lenses import Equirectangular
 from arraygeom.text import UNSCALED
 from pat.cli.fusing import Fuse
 from pat.cli.main import Pat, command_paths, main
@@ -21,8 +23,10 @@ from pat.cli.options import read_frames, read_images, respelled
 from pat.data.sample_array import SAMPLE, load_motorcycle, load_sample
 from pat.evaluation.metrics import score
 from pat.media.colour import linear_from_srgb
+from pat.media.depth_maps import VERTEX, read_depth
 from pat.media.images import read_image, write_image
 from tests.arraygeom.test_io import FIXTURES
+from tests.pat.any_camera import recorded
 
 
 @pytest.fixture
@@ -83,6 +87,26 @@ def test_fuse_writes_everything(small):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+def test_points_of_a_whole_sphere_are_on_its_rays(tmp_path):
+    """Its depth is the distance along them, which points took for z."""
+    hw = (64, 128)
+    poses = Pose.identity(), Pose(torch.eye(3).double(), torch.tensor([-0.25, 0.01, 0.0]).double())
+    here = {"K": intrinsics(hw[1] / (2 * torch.pi), hw), "hw": hw, "distortion": Equirectangular()}
+    cameras = {n: Camera(**here, cam_from_world=p) for n, p in zip(("mono", "colour"), poses)}
+    rig = Rig(cameras, depth=(1.3, 5.3))
+    rig.save(tmp_path / "rig.yaml")
+    images, _ = recorded(rig)
+    for name, image in images.items():
+        write_image(tmp_path / f"{name}.png", image)
+    main(arguments(tmp_path, extra=["--points"]))
+    depth = read_depth(tmp_path / "out" / "depth.tif")
+    cloud = (tmp_path / "out" / "points.ply").read_bytes().partition(b"end_header\n")[2]
+    X = torch.from_numpy(np.frombuffer(cloud, VERTEX)["X"].copy())
+    torch.testing.assert_close(X.norm(dim=-1), depth[depth.isfinite()])
+    assert (X[:, 2] < -1).sum() > 1000
+
+
 def test_demo_beats_alpha_and_every_classical_fusion_of_the_photograph(tmp_path, capsys):
     main(["demo", "--out", str(tmp_path)])
     truth = load_motorcycle().ground_truth

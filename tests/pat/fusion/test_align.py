@@ -7,7 +7,21 @@ import pytest
 import tifffile
 import torch
 
-from arraygeom import Band, Camera, Distortion, Pose, Rig, Sensor, View, intrinsics, sample
+from arraygeom import (
+    Band,
+    Camera,
+    Curved,
+    Distortion,
+    Epipolar,
+    Moved,
+    Pose,
+    Rig,
+    Sensor,
+    View,
+    Widened,
+    intrinsics,
+    sample,
+)
 from arraygeom.undistortion import recorded_pixels, straight_pixels
 from pat import align
 from pat.fusion.align import OUTSIDE, SEEN, filled, resampled_values
@@ -68,10 +82,18 @@ def test_fine_texture_and_short_segments_are_no_reason_for_doubt(count):
         assert view.confidence[inside].mean() > 0.8
 
 
-@pytest.mark.parametrize(("lens", "turns"), [(None, 0), (LENS, 0), (None, 1)])
-def test_positions_are_of_the_recorded_image(lens, turns):
+def in_order(pair, x):
+    return Epipolar()(pair, x).positions(64)
+
+
+@pytest.mark.parametrize(
+    ("lens", "turns", "field"),
+    [(None, 0, None), (LENS, 0, None), (None, 1, None), (LENS, 0, in_order), (LENS, 1, Curved())],
+)
+def test_positions_are_of_the_recorded_image(lens, turns, field):
+    """Also of images that are not undistorted: betas' were distorted twice, and alpha's lens was an error."""
     rig, images = array(lens, turns)
-    found = align(rig, images, alpha="mono", correct=False)
+    found = align(rig, images, alpha="mono", correct=False, field=field)
     view = found["nir"]
     y, x = np.mgrid[: HW[0], : HW[1]]
     X = rig["mono"].unproject(
@@ -84,6 +106,17 @@ def test_positions_are_of_the_recorded_image(lens, turns):
     assert view.valid[inner].mean() > 0.8
     assert np.abs(view.values[0] - images["mono"][0].numpy())[inner][view.valid[inner]].mean() < 0.02
     assert np.nanmedian(np.abs(found.depth[inner] - DEPTH)) < 0.1
+
+
+@pytest.mark.parametrize("lens", [None, LENS])
+def test_points_that_move_may_do_so_within_a_band(lens):
+    """Depth was of where they are when alpha records, and lenses were an error."""
+    rig, images = array(lens)
+    step = torch.stack([torch.full(HW, 4.0), torch.full(HW, 1.0)])
+    within, around = Widened(Moved(Epipolar(), step), along=2.0), Moved(Widened(Epipolar(), along=2.0), step)
+    one, other = (align(rig, images, alpha="mono", correct=False, field=field) for field in (within, around))
+    assert np.array_equal(one.depth, other.depth, equal_nan=True)
+    assert np.array_equal(one["nir"].positions, other["nir"].positions, equal_nan=True)
 
 
 @pytest.mark.parametrize("lens", [None, LENS])
@@ -169,9 +202,10 @@ def test_without_a_view_there_are_no_values_unless_filled():
     assert (everything.visibility[~beyond] == SEEN).all()
 
 
-def test_recorded_pixels_undo_all_that_was_done_to_a_view():
+@pytest.mark.parametrize("undistorted", [True, False])
+def test_recorded_pixels_undo_all_that_was_done_to_a_view(undistorted):
     rig, images = array(LENS)
-    straight, _ = without_lenses(rig, images)
+    straight = without_lenses(rig, images)[0] if undistorted else rig
     now = straight.rot90("nir", 1).resize("nir", (77, 50)).crop("nir", 5, 7, (40, 30))["nir"]
     X = torch.tensor([[0.2, 0.1, 4.0], [-0.3, 0.2, 5.0]], dtype=torch.float64)
     found, valid = recorded_pixels(now.project(X).x, now, rig["nir"])

@@ -3,13 +3,18 @@
 import pytest
 import torch
 
-from arraygeom import Camera, Epipolar, Pose, Rig, Segments, intrinsics
+from arraygeom import Camera, Curved, Distortion, Epipolar, Pose, Rig, Segments, intrinsics, pixel_grid
 from arraygeom.fields.grid import FieldOnGrid
+from arraygeom.lenses import Equirectangular
 from pat.fusion.depth import measured_depth
 from pat.fusion.depth_filling import background_filled
-from pat.fusion.inputs import FrameInputs, Placement
+from pat.fusion.inputs import FrameInputs, Placement, frame_inputs, measured_along
 from pat.fusion.results import Frame
+from pat.fusion.steps import quarter_turns
+from pat.fusion.views import Views
 from pat.matching.inputs import Beta, Inputs
+from pat.networks.configs import PATConfig
+from pat.networks.paper import PAT
 from pat.networks.protocol import FusionOutput
 
 NEAR, FAR, HW = 1.4, 20.0, (12, 40)
@@ -41,6 +46,69 @@ def test_positions_beyond_a_segment_are_its_ends(share):
         assert depth[seen].isfinite().all()
         assert (depth[seen] > NEAR * 0.999).all()
         assert (depth[seen] < FAR * 1.001).all()
+
+
+LENSES = {
+    "none": None,
+    "brown-conrady": Distortion("brown-conrady", torch.tensor([-0.05, 0.0, 0.0, 0.0], dtype=torch.float64)),
+    "fisheye": Distortion("kannala-brandt", torch.zeros(4, dtype=torch.float64)),
+}
+
+
+@pytest.mark.parametrize("depth", [(NEAR, FAR), None])
+@pytest.mark.parametrize("true", [0.2, 1.0, 60.0, -60.0])
+@pytest.mark.parametrize("lens", LENSES)
+def test_bounds_are_those_of_the_field_where_it_has_some(lens, true, depth):
+    """Depth through lenses was any, distances of a wide fisheye were within the rig's range or an error."""
+    wide = lens == "fisheye"
+    K, hw = intrinsics(20.0 if wide else 60.0, (24, 64)), (24, 64)
+    near, far = 0.5, 30.0
+    t = torch.tensor([-0.02, 0.01, 0.005], dtype=torch.float64)
+    poses = {"a": Pose.identity(), "b": Pose(torch.eye(3, dtype=torch.float64), t)}
+    cameras = {n: Camera(K=K, hw=hw, cam_from_world=p, distortion=LENSES[lens]) for n, p in poses.items()}
+    field = Epipolar(near, far) if lens == "none" else Curved(near=near, far=far, bounds=BOUNDS[wide])
+    images = {"a": torch.zeros(1, *hw), "b": torch.zeros(3, *hw)}
+    views = Views.of(Rig(cameras, depth=depth), images, alpha="a", field=field)
+    found = frame_inputs(PAT(PATConfig(dim=4)), views)
+    rays, _ = cameras["a"].rays(pixel_grid(hw, dtype=torch.float64))
+    rays = rays / (rays.norm(dim=-1, keepdim=True) if wide else rays[..., 2:])
+    x_beta = cameras["b"].project_local(rays + t / true).x
+    position, ones = x_beta.movedim(-1, 0)[None], torch.ones(1, *hw, dtype=torch.float64)
+    output = FusionOutput(torch.zeros(1, 3, *hw).double(), [position], [ones], [ones])
+    inner = (slice(4, 20), slice(16, 48))  # whose segments are not cut by the edge of the image
+    depth = measured_depth(output, found.inputs, found.placements, hw, (0, 0)).depth[inner]
+    wanted = min(max(true, near), far) if true > 0 else far
+    torch.testing.assert_close(depth, torch.full_like(depth, wanted), rtol=1e-3, atol=0)
+
+
+BOUNDS = {False: "depth", True: "distance"}
+
+
+def test_a_field_with_bounds_needs_none_of_the_rig_in_cameras_of_any_model():
+    """Whether beta was upright was asked of the middle of the rig's depth range."""
+    whole = Camera(
+        K=intrinsics(10.0, HW), cam_from_world=Pose.identity(), hw=HW, distortion=Equirectangular()
+    )
+    images = {"a": torch.zeros(1, *HW), "b": torch.zeros(3, *HW)}
+    views = Views.of(Rig({"a": whole, "b": whole}), images, alpha="a", field=Curved(near=1.0, far=3.0))
+    assert quarter_turns(views.pair("b")) == 0
+
+
+@pytest.mark.parametrize(
+    ("lens", "field", "along"),
+    [
+        (None, None, "depth"),
+        (LENSES["fisheye"], None, "depth"),  # undistorted
+        (LENSES["fisheye"], Curved(bounds="distance"), "distance"),
+        (Equirectangular(), None, "distance"),
+        (Equirectangular(), Curved(), "depth"),
+    ],
+)
+def test_what_depth_is_measured_along(lens, field, along):
+    here = {"K": intrinsics(10.0, HW), "hw": HW, "cam_from_world": Pose.identity()}
+    rig = Rig({name: Camera(**here, distortion=lens) for name in "ab"}, depth=(NEAR, FAR))
+    images = {"a": torch.zeros(1, *HW), "b": torch.zeros(3, *HW)}
+    assert measured_along(Views.of(rig, images, alpha="a", field=field)) == along
 
 
 def fields_along(*steps, alpha=None, pairs=()):

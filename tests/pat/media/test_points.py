@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from arraygeom import Camera, Pose, intrinsics
+from arraygeom.lenses import Equirectangular
 from pat.media.depth_maps import VERTEX, write_points
 
 
@@ -20,3 +21,16 @@ def test_points_are_the_pixels_of_known_depth_in_the_camera_frame(tmp_path):
     found = np.frombuffer(body, VERTEX)
     assert np.allclose(found["X"], [[0, 0, 5], [0.04, 0.02, 2]])
     assert found["colour"].tolist() == [[0, 0, 0], [255, 128, 0]]
+
+
+def test_points_at_distances_are_on_their_rays_also_behind(tmp_path):
+    """A depth of a whole sphere is a distance: taken for z, points beside were far, those behind in front."""
+    pose = Pose(torch.eye(3).double(), torch.tensor([1.0, 2.0, 3.0]).double())
+    K = intrinsics(4 / torch.pi, (4, 8), (4.0, 2.0))
+    camera = Camera(K=K, cam_from_world=pose, hw=(4, 8), distortion=Equirectangular())
+    depth = torch.full((4, 8), torch.nan)
+    depth[2, 4], depth[2, 5], depth[2, 6], depth[2, 0], depth[0, 4] = 2.0, 3.0, 4.0, 5.0, 6.0
+    assert write_points(tmp_path / "p.ply", camera, depth, torch.zeros(1, 4, 8), along="distance") == 5
+    found = np.frombuffer((tmp_path / "p.ply").read_bytes().partition(b"end_header\n")[2], VERTEX)["X"]
+    beside = 3 / 2**0.5
+    assert np.allclose(found, [[0, -6, 0], [0, 0, -5], [0, 0, 2], [beside, 0, beside], [4, 0, 0]], atol=1e-6)
