@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Distortion, Epipolar, Link, Local, Rig, Segments, View, Widened, sampling_locations, viz
+from arraygeom import Distortion, Epipolar, Local, Rig, Segments, Widened, sampling_locations, viz
 from arraygeom.text import UNSCALED
 from tests.arraygeom.rigs import known_by_f, random_rig, scene_points, two_cameras
 
