@@ -1,35 +1,35 @@
-"""Ranges of what the convolutions of the shipped weights are given, so that they compute in 8 bits.
+"""Ranges of what the convolutions of `mono-colour` are given, so that they can compute in 8 bits.
 
 `python -m experiments.ranges --middlebury FOLDER` measures them, after a training, on every third pair of the
-tune half under some conditions, and writes them into the weights files. Of the other pairs it prints what the
-rounding changes. Not those of the
-denoiser, which loses by it where there is the least light.
+tune half under some conditions, and writes them into the weights file. What the rounding changes of the other
+pairs goes to tests/benchmarks/RESULTS_int8.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+import time
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from functools import partial
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, median
 
-import torch
 import tyro
 from safetensors import safe_open
 from safetensors.torch import load_file
-from torch import nn
 
+from experiments.evaluation.commands import finished
 from experiments.evaluation.conditions import CONDITIONS
 from experiments.evaluation.halves import of_half
 from pat.data.pairs import StereoPair, middlebury_pairs
 from pat.evaluation.metrics import score
 from pat.evaluation.protocols import StereoResult, rectified_fusion
-from pat.evaluation.stereo import disparity_errors
-from pat.matching.choice import FITTED, fitted_choice
+from pat.evaluation.tables import markdown_table
 from pat.networks.weights import SHIPPED, Network, load_weights
-from pat.support.eight_bits import RANGE, measured
+from pat.support.eight_bits import measured, names, round_to_eight_bits
 from pat.support.tensor_files import write_tensors
 
+RESULTS = Path("tests/benchmarks/RESULTS_int8.md")
 UNDER = ("ideal", "x1", "x4", "x8", "alpha random", "beta x .6", "200 electrons", "50 electrons")
 
 
@@ -39,61 +39,52 @@ def main(middlebury: Path) -> None:
     Args:
         middlebury: Folder of Middlebury's pairs.
     """
-    network, choice = load_weights("mono-colour"), fitted_choice()
-    parts = {SHIPPED / "mono-colour.safetensors": network, FITTED: choice}
-    pairs = list(of_half(middlebury_pairs(middlebury), "tune"))
-    with all_measured(list(parts.values())):
+    path = SHIPPED / "mono-colour.safetensors"
+    network, pairs = load_weights(path), list(of_half(middlebury_pairs(middlebury), "tune"))
+    with measured(network):
         for pair in pairs[::3]:
             for name in UNDER:
-                figures(network, pair, name)
-    found = {path: ranges(part) for path, part in parts.items()}
-    for name in UNDER:
-        others = [pair for i, pair in enumerate(pairs) if i % 3]
-        rounded = [figures(network, pair, name) for pair in others]
-        with all_measured(list(parts.values())):
-            exact = [figures(network, pair, name) for pair in others]
-        for path, part in parts.items():
-            part.load_state_dict(part.state_dict() | found[path])
-        for what, now, before in zip(("PSNR, dB", "depth, points"), zip(*rounded), zip(*exact)):
-            by = [a - b for a, b in zip(now, before)]
-            print(f"{name}: {what}: {fmean(by):+.3f}, {min(by):+.3f} to {max(by):+.3f}", flush=True)
-    for path, some in found.items():
-        write(path, some)
+                psnr(network, pair, name)
+    rounded = deepcopy(network)
+    round_to_eight_bits(rounded)
+    rows = [compared(network, rounded, [p for i, p in enumerate(pairs) if i % 3], name) for name in UNDER]
+    heads = "condition", "PSNR, dB", "of single pairs", "time of a frame"
+    finished(RESULTS, markdown_table(heads, rows))
+    with safe_open(path, framework="pt") as file:
+        facts = file.metadata()
+    state = network.state_dict()
+    write_tensors(path, load_file(path) | {name: state[name] for name in names(network)}, facts)
 
 
-def figures(network: Network, pair: StereoPair, name: str) -> tuple[float, float]:
-    """PSNR of a pair fused under a condition, and the percentage of disparities within a pixel."""
+def compared(
+    network: Network, rounded: Network, pairs: Sequence[StereoPair], name: str
+) -> tuple[str, str, str, str]:
+    """What rounding changes under a condition: PSNR in the mean, least and most; time as a share."""
+    changes, times = [], []
+    for pair in pairs:
+        psnr(network, pair, name)
+        (before, slow), (now, fast) = (timed(partial(psnr, one, pair, name)) for one in (network, rounded))
+        changes.append(now - before)
+        times.append(fast / slow)
+    spread = f"{min(changes):+.3f} to {max(changes):+.3f}"
+    return name, f"{fmean(changes):+.3f}", spread, f"{median(times):.2f}"
+
+
+def timed(work: Callable[[], float]) -> tuple[float, float]:
+    """What it gives, and seconds of the processor."""
+    begin = time.process_time()
+    return work(), time.process_time() - begin
+
+
+def psnr(network: Network, pair: StereoPair, name: str) -> float:
+    """Of a pair fused under a condition."""
     condition = CONDITIONS[name]
     task = condition.recorded(pair)
     noise = None if condition.noise is None else dict.fromkeys(("alpha", "beta"), condition.noise)
     assert pair.max_disparity is not None
-    assert pair.disparity is not None
     fused = rectified_fusion(network, noise=noise)(task.alpha, task.beta, pair.max_disparity)
     assert isinstance(fused, StereoResult)
-    assert fused.disparity is not None
-    _, within = disparity_errors(fused.disparity, pair.disparity)
-    return score(fused.image, task.ground_truth).psnr, 100 * (within or 0.0)
-
-
-@contextmanager
-def all_measured(networks: Sequence[nn.Module]) -> Iterator[None]:
-    """`measured` of several networks."""
-    with ExitStack() as stack:
-        for network in networks:
-            stack.enter_context(measured(network))
-        yield
-
-
-def ranges(network: nn.Module) -> dict[str, torch.Tensor]:
-    """By name in the network's state."""
-    return {name: value for name, value in network.state_dict().items() if name.endswith(RANGE)}
-
-
-def write(path: Path, some: dict[str, torch.Tensor]) -> None:
-    """A weights file with these ranges."""
-    with safe_open(path, framework="pt") as file:
-        facts = file.metadata()
-    write_tensors(path, load_file(path) | some, facts)
+    return score(fused.image, task.ground_truth).psnr
 
 
 if __name__ == "__main__":

@@ -103,8 +103,9 @@ class Fuse(Known):
     """Address of a Dask scheduler whose workers fuse the frames, such as tcp://host:8786."""
     threads: Annotated[int | None, optional("INT")] = None
     """Threads in each process: by default 1 with several, else all cores."""
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Of the network's convolutions: bfloat16 is faster if the processor has it, PSNR changes by .003 dB."""
+    precision: Literal["float32", "bfloat16", "int8"] = "float32"
+    """Of the network's convolutions: the others are faster where the processor has them, see
+    docs/performance.md."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Where a single frame is fused: auto takes CUDA where there is such a GPU."""
 
@@ -464,7 +465,7 @@ def fuse_with_progress(
     images: Mapping[str, Tensor],
     *,
     device: str = "cpu",
-    precision: Literal["float32", "bfloat16"] = "float32",
+    precision: Literal["float32", "bfloat16", "int8"] = "float32",
     **further: Any,
 ) -> Frame:
     """`fuse` with weights by name, the plan and a bar on the terminal. The frame is on the CPU."""

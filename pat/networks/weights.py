@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     Network = PAT | GuidedPAT | BandwisePAT
 else:
     Network = Union[tuple(network for network, _ in NETWORKS.values())]  # noqa: UP007
-Precision = Literal["float32", "bfloat16"]
+Precision = Literal["float32", "bfloat16", "int8"]
 
 
 def save_weights(
@@ -62,18 +62,20 @@ def load_weights(name: str | Path, *, precision: Precision = "float32") -> Netwo
 
     With `precision` "bfloat16" its convolutions are in that (attention and matching never are): they take
     less than half the time on processors that multiply it (AVX-512 BF16, AMX), and the image's PSNR changes
-    by .003 dB. Then parts of a frame are equal to the whole to 1e-3 only.
+    by .003 dB. Then parts of a frame are equal to the whole to 1e-3 only. With "int8" those of a network
+    whose weights state ranges for it are in that, on the CPU and without gradients, four times as fast: see
+    docs/performance.md.
 
     Raises FileNotFoundError for neither, ValueError for a file that is not of this format or does not fit,
-    for another precision, and for a processor that has no bfloat16.
+    for another precision, and for a processor that has not this one.
     """
     if precision not in get_args(Precision):
         raise ValueError(f"precision is {precision!r}; wanted one of {', '.join(get_args(Precision))}")
     network: Network = _load(find_weights(name), NETWORKS)
-    if precision == "bfloat16":
-        if not (torch.cpu._is_avx512_bf16_supported() or torch.cuda.is_available()):
-            raise ValueError("this processor does not multiply bfloat16: leave the precision at float32")
-        set_precision(network, precision)
+    multiplied = torch.cpu._is_avx512_bf16_supported() or torch.cuda.is_available()
+    if precision == "bfloat16" and not multiplied:
+        raise ValueError("this processor does not multiply bfloat16: leave the precision at float32")
+    set_precision(network, precision)
     return network
 
 
@@ -102,7 +104,10 @@ def set_precision(network: nn.Module, precision: Precision, *, compiled: bool = 
     """Let convolutions compute in this precision, and compile them by torch.compile.
 
     Not attention, whose search segments are functions that torch.compile would break at.
+    Raises ValueError for "int8" if the processor cannot, or the weights have no ranges.
     """
+    if precision == "int8":
+        eight_bits.round_to_eight_bits(network)
     inner = network.single if isinstance(network, BandwisePAT) else network
     for part in inner.children():
         if isinstance(part, (AttentionEngine, nn.ModuleList)):

@@ -1,4 +1,4 @@
-"""Convolutions in 8 bits, where the range of what they are given is known.
+"""Convolutions in 8 bits, where that is wanted and the range of what they are given is known.
 
 A processor that multiplies 8-bit integers (AVX-512 VNNI) takes a quarter of the time for them. The weights of
 each output channel are rounded to 255 steps, and so is the input, within a range that was measured once: were
@@ -41,18 +41,18 @@ SETTINGS = EightBitSettings()
 
 
 class Conv2d(nn.Conv2d):
-    """A convolution that computes in 8 bits once the range of its input is known.
+    """A convolution that computes in 8 bits if it is to be `rounded`.
 
-    Not for gradients, on a GPU, in another precision than float32, or on a processor that cannot: then it is
-    torch's. Weights that are trained lose the range, which was another network's.
+    Not for gradients, on a GPU, or of other numbers than float32: then it is torch's. Weights that are
+    trained lose the range, which was another network's.
     """
 
     input_range: Tensor | None
+    rounded = measuring = False
 
     def __init__(self, *shape: Any, **how: Any) -> None:
         super().__init__(*shape, **how)
         self.register_buffer(RANGE, None)
-        self.measuring = False
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h2 w2"]:
         """As of `torch.nn.Conv2d`."""
@@ -63,7 +63,7 @@ class Conv2d(nn.Conv2d):
             ends = given.quantile(given.new_tensor([SETTINGS.beyond, 1 - SETTINGS.beyond]))
             known = ends if self.input_range is None else torch.cat([ends, self.input_range])
             self.input_range = torch.stack(known.aminmax())
-        elif self.input_range is not None and plain(x) and self.weight.dtype == x.dtype and available():
+        elif self.rounded and self.input_range is not None and plain(x) and self.weight.dtype == x.dtype:
             return in_eight_bits(x, self, packed(self))
         return super().forward(x)
 
@@ -94,6 +94,17 @@ def measured(network: nn.Module) -> Iterator[None]:
 def names(network: nn.Module) -> list[str]:
     """Of the ranges that its convolutions may have."""
     return [f"{name}.{RANGE}" for name, part in network.named_modules() if isinstance(part, Conv2d)]
+
+
+def round_to_eight_bits(network: nn.Module) -> None:
+    """Let convolutions compute in 8 bits. Raises ValueError if the processor cannot or a range is missing."""
+    if not available():
+        raise ValueError("this processor does not multiply 8-bit integers: leave the precision at float32")
+    convolutions = [part for part in network.modules() if isinstance(part, Conv2d)]
+    if not convolutions or any(part.input_range is None for part in convolutions):
+        raise ValueError("these weights state no ranges for 8 bits, as mono-colour's do: leave the precision")
+    for part in convolutions:
+        part.rounded = True
 
 
 class Packed(NamedTuple):

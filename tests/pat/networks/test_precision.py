@@ -1,4 +1,4 @@
-"""Convolutions in bfloat16."""
+"""Convolutions in bfloat16, and in 8 bits."""
 
 import copy
 import pickle
@@ -11,11 +11,14 @@ from pat import fuse
 from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
 from pat.networks.weights import load_weights, set_precision
+from pat.support import eight_bits
+from pat.support.eight_bits import available
 
 
-def test_bfloat16_changes_the_image_little_and_something(monkeypatch):
-    if not torch.cpu._is_avx512_bf16_supported():
-        pytest.skip("this processor has no bfloat16")
+@pytest.mark.parametrize("precision", ["bfloat16", "int8"])
+def test_a_precision_changes_the_image_little_and_something(precision):
+    if not (torch.cpu._is_avx512_bf16_supported() if precision == "bfloat16" else available()):
+        pytest.skip(f"this processor has no {precision}")
     sample = load_sample()
     images = {name: sample.images[name] for name in sample.rig.names}
     exact, rounded = (
@@ -27,10 +30,10 @@ def test_bfloat16_changes_the_image_little_and_something(monkeypatch):
             align=False,
             response="rec601",
         )
-        for p in ("float32", "bfloat16")
+        for p in ("float32", precision)
     )
     apart = (exact.image - rounded.image).abs()
-    assert 0 < apart.max() < 0.02
+    assert 0 < apart.max() < 0.05
     scores = [score(frame.image.clamp(0, 1), sample.ground_truth).psnr for frame in (exact, rounded)]
     assert abs(scores[0] - scores[1]) < 0.02
     assert (exact.confidence - rounded.confidence).abs().max() < 0.02
@@ -52,6 +55,14 @@ def test_a_copy_of_a_network_in_bfloat16_computes_with_its_own_weights():
 def test_a_precision_that_there_is_not_is_refused():
     with pytest.raises(ValueError, match=r"precision is 'float16'.*float32"):
         unwrap(load_weights)("mono-colour-small", precision="float16")
+
+
+def test_weights_without_ranges_and_processors_without_8_bits_refuse_them(monkeypatch):
+    with pytest.raises(ValueError, match="state no ranges" if available() else "float32"):
+        load_weights("mono-colour-small", precision="int8")
+    monkeypatch.setattr(eight_bits, "available", lambda: False)
+    with pytest.raises(ValueError, match=r"8-bit integers.*float32"):
+        load_weights("mono-colour", precision="int8")
 
 
 def test_a_processor_without_bfloat16_refuses_it(monkeypatch):

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from arraygeom.threads import limited_to, torch_in_one_thread
 from pat.networks.weights import misfit
-from pat.support.eight_bits import Conv2d, available, measured, packed
+from pat.support.eight_bits import Conv2d, available, measured, packed, round_to_eight_bits
 
 needs_processor = pytest.mark.skipif(not available(), reason="this processor does not multiply 8 bits")
 
@@ -29,6 +29,7 @@ def convolution(kernel: int = 3, **how: int) -> Conv2d:
 def ranged(kernel: int = 3, *, least: float = -1.0, most: float = 2.0, **how: int) -> Conv2d:
     made = convolution(kernel, **how)
     made.input_range = torch.tensor([least, most])
+    made.rounded = True
     return made
 
 
@@ -109,6 +110,8 @@ def test_a_change_of_weights_or_of_range_is_seen() -> None:
     assert torch.equal(deepcopy(part)(x), part(x))
     other = convolution(padding=1)
     other.load_state_dict(part.state_dict())
+    assert not torch.equal(other(x), part(x)), "not unless it is to be"
+    round_to_eight_bits(other)
     assert torch.equal(other(x), part(x))
 
 
