@@ -25,7 +25,7 @@ from torch.nn.functional import max_pool2d
 
 from arraygeom.chunks import ROWS, Tile, assembled, tiles_of
 
-from ..support.settings import size, tuned
+from ..support.settings import size
 from .filters import box_mean, numpy_of
 from .matches import BetaMatches, Matches
 from .positions import FINE
@@ -43,11 +43,6 @@ class CertaintySettings:
     )
     apart: tuple[int, int] = size((1, 4), "Radii, at full size, in which disparities are compared")
     width: int = size(16, "Numbers in each of the two hidden layers")
-    typical_margin: float = tuned(
-        0.3,
-        "Middlebury, tune half: by how much a pair's consistent matches are better than others, in the mean, "
-        "at most; it is fitted to such, and of more, as of fine texture and short segments, it knows nothing",
-    )
     least: float = size(
         1e-3, "The least probability, where a segment is: a disparity is chosen there, and gives depth"
     )
@@ -127,9 +122,7 @@ def measured(found: BetaMatches, typical: Float[Tensor, "b 2"]) -> Float[Tensor,
     ranges = (max_pool2d(_range(found.surface, radius), FINE) for radius in SETTINGS.apart)
     apart = [(part.clamp(min=0) + 0.1).log() for part in ranges]
     blurs = torch.tensor(found.comparison.whole.blurs).T  # of alpha and of beta, of each of the batch
-    margin, cost = typical.split(1, 1)
-    known = margin.clamp(max=SETTINGS.typical_margin)
-    same = torch.cat([blurs.to(typical), known, cost], 1)[..., None, None]
+    same = torch.cat([blurs.to(typical), typical], 1)[..., None, None]
     same = same.expand(*same.shape[:2], *found.facts.shape[-2:])
     return torch.cat([*facts, *apart, same, found.stated], 1)
 

@@ -34,6 +34,8 @@ ONE = np.float32(1.0)
 HALF = np.float32(0.5)
 PARTS = 16
 """Sums of costs are whole 16ths in 16 bits: twice as many as floats go through memory in the same time."""
+UNRELATED = np.float32(0.3)
+"""What a match of points that are not the same costs, about, in the unit of the facts (Middlebury)."""
 WALL = np.int16(30000)
 """More than a sum of costs along a path can be, in parts."""
 
@@ -299,9 +301,9 @@ def _keep(paths, start, stride, runs, penalty, path):
 @compiled(nogil=True, cache=True)
 def winners(total, first, count, segments, hw, corner, large, claims, found):
     """Of each pixel of a part that begins at a corner: the best label, to a fraction (disparity); facts
-    (h, w, 1 or 3): the whole label, its margin to the second best, and its cost; where it is in beta, pixels
-    counted row by row (positions; rows * columns: not on it). `total` is in parts, the larger penalty `large`
-    the unit of the facts.
+    (h, w, 1 or 3): the whole label, its margin to the second best (`UNRELATED` if there is none), and its
+    cost; where it is in beta, pixels counted row by row (positions; rows * columns: not on it). `total` is in
+    parts, the larger penalty `large` the unit of the facts.
 
     `claims`, of each pixel of beta and one more, keeps the least cost with which a pixel of alpha matches it,
     and that pixel's label: 16 bits of either. `segments` are end, along, length and cut, as of `costs`;
@@ -348,6 +350,8 @@ def winners(total, first, count, segments, hw, corner, large, claims, found):
                     last = count if cut[here] else _count_within(far, start, count)
                     second = min(second, _lowest(sums, 0, min(label - 1 - start, last)))
                     second = min(second, _lowest(sums, max(label + 2 - start, 0), last))
+                if second == WALL:  # there is no other label: what a point that is not the same would cost
+                    second = max(np.int32(UNRELATED * most), least)
                 facts[y, x, 1] = min(np.float32(second - least) / most, ONE)
                 facts[y, x, 2] = np.float32(least) / most
 

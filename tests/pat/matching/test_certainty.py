@@ -37,8 +37,7 @@ def test_what_certainty_is_read_off():
     near, far = numbers[9, 0], numbers[10, 0]
     torch.testing.assert_close(near.exp() - 0.1, torch.tensor([0.0, 0.0, 4.0, 4.0]))
     torch.testing.assert_close(far.exp() - 0.1, torch.tensor([0.0, 4.0, 4.0, 4.0]))
-    same = [0.6, 0.0, certainty.SETTINGS.typical_margin, 0.25, 2.0, -1.0]  # .5 is more than it was fitted to
-    assert numbers[11:, 0, 0].tolist() == pytest.approx(same)
+    assert numbers[11:, 0, 0].tolist() == pytest.approx([0.6, 0.0, 0.5, 0.25, 2.0, -1.0])
 
 
 def test_other_threads_find_the_networks_as_they_were():
