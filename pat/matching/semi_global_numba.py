@@ -35,8 +35,8 @@ HALF = np.float32(0.5)
 PARTS = 16
 """Sums of costs are whole 16ths in 16 bits: twice as many as floats go through memory in the same time."""
 UNRELATED = np.float32(0.2)
-"""Where a segment has no other label, the second best costs so much, in the unit of the facts: margins are then
-what those of right matches are on Middlebury, .16 to .29, and none of wrong ones, which cost .26 to .29."""
+"""What the second best costs, in the unit of the facts, where a segment has no other label: margins are those
+of right matches then, .16 to .29 on Middlebury, and none of wrong ones, which cost .26 to .29."""
 WALL = np.int16(30000)
 """More than a sum of costs along a path can be, in parts."""
 
