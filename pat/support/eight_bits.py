@@ -102,7 +102,7 @@ def round_to_eight_bits(network: nn.Module) -> None:
         raise ValueError("this processor does not multiply 8-bit integers: leave the precision at float32")
     convolutions = [part for part in network.modules() if isinstance(part, Conv2d)]
     if not convolutions or any(part.input_range is None for part in convolutions):
-        raise ValueError("these weights state no ranges for 8 bits, as mono-colour's do: leave the precision")
+        raise ValueError("these weights state no ranges for 8 bits: leave the precision at float32")
     for part in convolutions:
         part.rounded = True
 
