@@ -63,8 +63,7 @@ def load_weights(name: str | Path, *, precision: Precision = "float32") -> Netwo
     With `precision` "bfloat16" its convolutions are in that (attention and matching never are): they take
     less than half the time on processors that multiply it (AVX-512 BF16, AMX), and the image's PSNR changes
     by .003 dB. Then parts of a frame are equal to the whole to 1e-3 only. With "int8" those of a network
-    whose weights state ranges for it are in that, on the CPU and without gradients, four times as fast: see
-    docs/performance.md.
+    whose weights state ranges for it are in that, on the CPU and without gradients: see docs/performance.md.
 
     Raises FileNotFoundError for neither, ValueError for a file that is not of this format or does not fit,
     for another precision, and for a processor that has not this one.

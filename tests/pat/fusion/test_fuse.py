@@ -46,7 +46,6 @@ from pat.networks.configs import BandwisePATConfig, GuidedPATConfig, PATConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.paper import PAT
 from pat.networks.weights import load_weights, set_precision
-from pat.support.eight_bits import available
 from tests.pat.layered_array import load_sample
 
 
@@ -132,7 +131,7 @@ def test_matching_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
 @pytest.mark.parametrize("folder", ["kitti", "flickr1024/train"])
 def test_halos_are_wide_enough_for_the_weights(folder, precision, most, rms, shared_data):
     """Tiles of real images equal the whole with the shipped weights, but for rounding of positions."""
-    if precision == "int8" and not available():
+    if precision == "int8" and not torch.cpu._is_vnni_supported():
         pytest.skip("this processor does not multiply 8-bit integers")
     pair, network = next(folder_pairs(shared_data / folder)), load_weights("mono-colour", precision=precision)
     images = {"left": luminance(pair.left), "right": pair.right}

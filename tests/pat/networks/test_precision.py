@@ -12,12 +12,13 @@ from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
 from pat.networks.weights import load_weights, set_precision
 from pat.support import eight_bits
-from pat.support.eight_bits import available
 
 
 @pytest.mark.parametrize("precision", ["bfloat16", "int8"])
 def test_a_precision_changes_the_image_little_and_something(precision):
-    if not (torch.cpu._is_avx512_bf16_supported() if precision == "bfloat16" else available()):
+    if not (
+        torch.cpu._is_avx512_bf16_supported() if precision == "bfloat16" else torch.cpu._is_vnni_supported()
+    ):
         pytest.skip(f"this processor has no {precision}")
     sample = load_sample()
     images = {name: sample.images[name] for name in sample.rig.names}
@@ -58,7 +59,7 @@ def test_a_precision_that_there_is_not_is_refused():
 
 
 def test_weights_without_ranges_and_processors_without_8_bits_refuse_them(monkeypatch):
-    with pytest.raises(ValueError, match="state no ranges" if available() else "float32"):
+    with pytest.raises(ValueError, match="state no ranges" if torch.cpu._is_vnni_supported() else "float32"):
         load_weights("mono-colour-small", precision="int8")
     monkeypatch.setattr(eight_bits, "available", lambda: False)
     with pytest.raises(ValueError, match=r"8-bit integers.*float32"):
