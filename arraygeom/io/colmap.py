@@ -15,8 +15,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torch import Tensor
-
 from ..camera import Camera, LensView
 from ..distortion import BROWN_CONRADY, KANNALA_BRANDT
 from ..lenses.central import FOV, THIN_PRISM_FISHEYE
@@ -105,7 +103,9 @@ def write(rig: Rig) -> dict[str, str]:
         h, w = camera.hw
         model, parameters = _parameters(name, camera)
         cameras.append(f"{i} {model} {w} {h} {_joined(parameters)}")
-        images += [f"{i} {_joined(_wxyz(camera.R))} {_joined(camera.t.tolist())} {i} {name}", ""]
+        q, t = camera.cam_from_world.quaternion, camera.t
+        pose = [*(q if q[0] >= 0 else -q).tolist(), *t.tolist()]
+        images += [f"{i} {_joined(pose)} {i} {name}", ""]
     points = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR"]
     texts = {"cameras.txt": cameras, "points3D.txt": points, "images.txt": images}
     return {name: "\n".join(lines) + "\n" for name, lines in texts.items()}
@@ -333,14 +333,6 @@ def _parameters(name: str, camera: Camera) -> tuple[str, list[float]]:
         return ("FOV" if lens.model == FOV else "THIN_PRISM_FISHEYE"), pinhole + lens.coefficients.tolist()
     c = brown_conrady(name, lens, at_most=8)
     return ("OPENCV", pinhole + c) if len(c) == 4 else ("FULL_OPENCV", pinhole + c + [0.0] * (8 - len(c)))
-
-
-def _wxyz(R: Tensor) -> list[float]:
-    """The quaternion of a rotation, scalar first and not negative."""
-    from kornia.geometry.conversions import rotation_matrix_to_quaternion
-
-    q = rotation_matrix_to_quaternion(R)
-    return (q if q[0] >= 0 else -q).tolist()
 
 
 def _joined(numbers: list[float]) -> str:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import struct
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..extras import needs
 from ..pixels import HW
 
 PIX4D, DJI, MICASENSE = "pix4d.com", "drone-dji", "micasense.com/MicaSense"
 """Parts of the names of XMP's namespaces; those of Pix4D's `Camera:` differ between makers."""
-EXIF, GPS, WIDTH, HEIGHT = 0x8769, 0x8825, 256, 257
-"""Tags of TIFF (6.0) and EXIF (2.32)."""
+EXIF, GPS = 0x8769, 0x8825
+"""Tags of TIFF's directories with EXIF's fields (2.32)."""
 LARGEST_XMP = 1 << 20
 """Bytes of an XMP packet, at most: those of cameras have some tens of thousands."""
-_TYPES = {1: "B", 2: "c", 3: "H", 4: "I", 5: "II", 9: "i", 10: "ii", 11: "f", 12: "d", 13: "I"}
-"""Of TIFF's fields, as `struct` codes."""
 
 
 class ImageTags(NamedTuple):
@@ -33,61 +31,19 @@ class ImageTags(NamedTuple):
 
 def image_tags(path: Path) -> ImageTags | None:
     """The tags of a TIFF or JPEG file; None for other files, damaged ones, and those without XMP."""
-    content = path.read_bytes()
-    xmp = _xmp(content)
+    xmp = _xmp(path.read_bytes())
     if not xmp:
         return None
+    with needs("calibration", "reading images' tags"):
+        from PIL import Image
     try:
-        if content[:4] in (b"II*\0", b"MM\0*"):
-            fields = _fields(content)
-            return ImageTags((int(fields[HEIGHT][0]), int(fields[WIDTH][0])), fields, xmp)
-        if content[:2] == b"\xff\xd8":
-            return _jpeg(content, xmp)
-    except (struct.error, IndexError, KeyError, ValueError):
-        pass
-    return None
-
-
-def _jpeg(content: bytes, xmp: dict[tuple[str, str], str]) -> ImageTags | None:
-    at, fields = 2, {}
-    while at + 9 <= len(content):
-        marker, length = struct.unpack_from(">HH", content, at)
-        if marker == 0xFFE1 and content[at + 4 : at + 10] == b"Exif\0\0":
-            fields = _fields(content[at + 10 : at + 2 + length])
-        tables = (0xFFC4, 0xFFC8, 0xFFCC)
-        if 0xFFC0 <= marker <= 0xFFCF and marker not in tables:  # the start of a frame
-            height, width = struct.unpack_from(">HH", content, at + 5)
-            return ImageTags((height, width), fields, xmp)
-        at += 2 + length
-    return None
-
-
-def _fields(content: bytes) -> dict[int, tuple[Any, ...]]:
-    """Numbers and texts of the first directory of a TIFF file, and of its EXIF and GPS directories."""
-    order = "<" if content.startswith(b"II") else ">"
-    fields = _directory(content, order, struct.unpack_from(order + "I", content, 4)[0])
-    for inner in (EXIF, GPS):
-        if inner in fields:
-            fields |= _directory(content, order, int(fields[inner][0]))
-    return fields
-
-
-def _directory(content: bytes, order: str, start: int) -> dict[int, tuple[Any, ...]]:
-    fields: dict[int, tuple[Any, ...]] = {}
-    for i in range(min(struct.unpack_from(order + "H", content, start)[0], 1000)):
-        at = start + 2 + 12 * i
-        tag, kind, count = struct.unpack_from(order + "HHI", content, at)
-        if kind not in _TYPES or count > 4096:
-            continue
-        form = order + count * _TYPES[kind]
-        place = at + 8 if struct.calcsize(form) <= 4 else struct.unpack_from(order + "I", content, at + 8)[0]
-        values = struct.unpack_from(form, content, place)
-        if kind == 2:
-            values = (b"".join(values).split(b"\0")[0].decode("latin-1").strip(),)
-        elif kind in (5, 10):
-            values = tuple(a / b if b else 0.0 for a, b in zip(values[::2], values[1::2]))
-        fields[tag] = values
-    return fields
+        with Image.open(path, formats=("TIFF", "JPEG")) as image:
+            exif = image.getexif()
+            stated = dict(exif) | exif.get_ifd(EXIF) | exif.get_ifd(GPS)
+            fields = {tag: v if isinstance(v, tuple) else (v,) for tag, v in stated.items()}
+            return ImageTags((image.height, image.width), fields, xmp)
+    except (Image.DecompressionBombError, OSError, SyntaxError, TypeError, ValueError):
+        return None
 
 
 def _xmp(content: bytes) -> dict[tuple[str, str], str]:

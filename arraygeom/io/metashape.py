@@ -10,7 +10,6 @@ and b2 is the skew. Frame and fisheye sensors.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
 from pathlib import Path
 
 from ..camera import Camera, LensView
@@ -18,7 +17,7 @@ from ..distortion import Distortion
 from ..lenses.central import THIN_PRISM_FISHEYE
 from ..pose import Pose
 from ..rig import Rig
-from ..safe_yaml import DEEPEST, LARGEST_TEXT
+from ..safe_yaml import LARGEST_TEXT
 from .source import RigSource
 
 CONVENTION = (
@@ -66,29 +65,14 @@ def read(source: RigSource) -> Rig:
 
 
 def _document(source: RigSource) -> ET.Element:
-    """The parsed text, once it is neither too large nor nested too deeply, and defines no entities."""
+    """The parsed text, once it is not too large and defines no entities."""
     text = source.text(LARGEST_TEXT)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise source.fail(None, "defines entities, which Metashape does not write")
-    parser: ET.XMLPullParser = ET.XMLPullParser(["start", "end"])
-    depth, root = 0, None
     try:
-        for event, element in _events(parser, text):
-            root = element if root is None else root
-            depth += 1 if event == "start" else -1
-            if depth > DEEPEST:
-                raise source.fail(None, f"is nested more than {DEEPEST} deep")
-        parser.close()
+        return ET.fromstring(text)
     except ET.ParseError as error:
         raise source.fail(f"line {error.position[0]}", "is not XML; is the file whole?") from None
-    assert root is not None
-    return root
-
-
-def _events(parser: ET.XMLPullParser, text: str) -> Iterator[tuple[str, ET.Element]]:
-    for at in range(0, len(text), 4096):
-        parser.feed(text[at : at + 4096])
-        yield from parser.read_events()  # type: ignore[misc]
 
 
 def _sensor(source: RigSource, sensor: ET.Element, entry: str) -> LensView:

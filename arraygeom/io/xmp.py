@@ -28,7 +28,7 @@ from ..camera import Camera
 from ..distortion import Distortion
 from ..lenses import PolynomialFisheye
 from ..lenses.model import LensModel
-from ..pose import Pose
+from ..pose import Pose, rotation_from_vector
 from ..rig import Rig
 from ..sensor import Band, Sensor
 from .image_tags import DJI, MICASENSE, PIX4D, ImageTags, image_tags
@@ -319,10 +319,5 @@ def _place(tags: ImageTags) -> tuple[float, float] | None:
 
 def _rotation(degrees: Tensor) -> Tensor:
     """Rx Ry Rz of angles in degrees."""
-    (cx, sx), (cy, sy), (cz, sz) = zip(
-        torch.deg2rad(degrees).cos().tolist(), torch.deg2rad(degrees).sin().tolist()
-    )
-    about_x = torch.tensor([[1, 0, 0], [0, cx, -sx], [0, sx, cx]], dtype=torch.float64)
-    about_y = torch.tensor([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]], dtype=torch.float64)
-    about_z = torch.tensor([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]], dtype=torch.float64)
+    about_x, about_y, about_z = rotation_from_vector(torch.deg2rad(degrees).diag())
     return about_x @ about_y @ about_z
