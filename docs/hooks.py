@@ -8,6 +8,7 @@ link.
 from __future__ import annotations
 
 import contextlib
+import inspect
 import io
 import json
 import os
@@ -93,10 +94,16 @@ def formats() -> str:
     from arraygeom.io import READERS, WRITERS
 
     rows = [
-        f"| `{n}` | {r.CONVENTION} | {'yes' if n in WRITERS else ''} |"
+        f"| `{n}` | {convention(r)} | {'yes' if n in WRITERS else ''} |"
         for n, r in READERS.items()
         if n != "native"
     ]
     return "\n".join(
         ["| name | its convention, and what is done about it | written |", "|---|---|---|", *rows]
     )
+
+
+def convention(reader: Any) -> str:
+    """What a reader's module states, as a table's cell."""
+    stated = re.search(r"^Source convention: (.+?)(\n\n|\Z)", inspect.getmodule(reader).__doc__, re.M | re.S)
+    return " ".join(stated[1].split()).replace("|", r"\|")

@@ -38,6 +38,11 @@ def those_with(language: str):
     return pytest.mark.parametrize("page", pages, ids=lambda p: p.stem)
 
 
+def test_rows_of_the_table_of_formats_have_its_three_cells():
+    rows = on_page_markdown("<!-- formats -->").splitlines()
+    assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {4}
+
+
 @those_with("yaml")
 def test_rig_files_in_the_pages_are_read(page, tmp_path):
     for text in blocks(page, "yaml"):

@@ -1,7 +1,7 @@
 """Rig files: one module a format, one registry.
 
-Each reader's module states the convention of its format and the shift that it applies, in its docstring and
-in one line as `CONVENTION`.
+Each reader's module states the convention of its format and the shift that it applies in its docstring, in a
+paragraph that begins "Source convention:".
 """
 
 from __future__ import annotations

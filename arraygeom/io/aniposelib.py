@@ -14,8 +14,6 @@ from ..camera import Camera
 from ..rig import Rig
 from .source import Entry, RigSource, pose_of
 
-CONVENTION = "first pixel's centre at 0 (shift 0); world->camera, Rodrigues vectors; metres"
-
 
 def recognises(path: Path, head: str) -> bool:
     return path.suffix == ".toml" or ("[cam" in head and "matrix =" in head)

@@ -16,9 +16,6 @@ from ..pose import Pose
 from ..rig import Rig
 from .source import Entry, RigSource, pose_of
 
-CONVENTION = (
-    "first pixel's centre at 0 (shift 0); rightToLeft inverted, world = left camera; the board's unit"
-)
 MODELS = ("pinhole_radial_tangential", "pinhole")
 
 

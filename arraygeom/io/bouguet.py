@@ -15,7 +15,6 @@ from ..rig import Rig
 from .matfile import load_variables, readable_variables
 from .source import Entry, RigSource, pose_of
 
-CONVENTION = "first pixel's centre at 0 (shift 0); X_right = R X_left + T, world = left camera; mm"
 SIDES = ("left", "right")
 
 

@@ -23,10 +23,6 @@ from ..rig import Rig
 from .export import brown_conrady, calibrated, focal_and_centre
 from .source import Entry, RigFileError, RigSource
 
-CONVENTION = (
-    "first pixel's centre at 0.5 (shift -0.5); world->camera, quaternions w x y z; scale as in the model"
-)
-
 
 class _Model(NamedTuple):
     """How a camera model's parameters are laid out: how many focal lengths, then cx cy, then the lens."""

@@ -24,8 +24,6 @@ from ..sensor import Sensor
 from .export import at_origin, brown_conrady, calibrated, focal_and_centre, pose_rows
 from .source import Entry, RigSource
 
-CONVENTION = "first pixel's centre at 0 (shift 0); T_cn_cnm1 chained, world = cam0 (or the IMU); metres"
-
 MODELS: dict[str, tuple[str | None, int, tuple[str, ...]]] = {
     "pinhole": (None, 0, ("radtan", "equidistant", "fov", "none")),
     "omni": (UNIFIED, 1, ("radtan", "none")),

@@ -17,9 +17,6 @@ from ..pose import Pose
 from ..rig import Rig
 from .source import Entry, RigSource, pose_of
 
-CONVENTION = (
-    "first pixel's centre at 0 (shift 0); P = K [I | t] on rectified camera 0, raw X_i = R X_0 + T; metres"
-)
 ENTRIES = r"(P|S|K|D|R|T)\d?(_rect)?(_\d\d)?"
 """Names of the lines that are read; others (dates, say) are passed over."""
 
@@ -48,8 +45,6 @@ def _rectified(entries: Entry, name: str) -> Camera:
 
 class Raw:
     """Reader of the cameras as they are, before rectification, in `calib_cam_to_cam.txt`."""
-
-    CONVENTION = CONVENTION
 
     @staticmethod
     def recognises(path: Path, head: str) -> bool:

@@ -20,7 +20,6 @@ from ..pose import Pose
 from ..rig import Rig
 from .source import Entry, RigSource
 
-CONVENTION = "first pixel's centre at 0 (shift 0); no pose: the camera is the world"
 OLDEST = 3
 """The first version whose splines are these."""
 

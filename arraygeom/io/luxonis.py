@@ -14,10 +14,6 @@ from ..pose import Pose
 from ..rig import Rig
 from .source import Entry, RigSource, pose_of
 
-CONVENTION = (
-    "first pixel's centre at 0 (shift 0); "
-    "extrinsics to another camera of the box, in centimetres; world = first"
-)
 PERSPECTIVE, FISHEYE = 0, 1
 CENTIMETRES = 1
 """What a `lengthUnit`, if there is one, may be."""

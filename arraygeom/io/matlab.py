@@ -30,9 +30,6 @@ from ..rig import Rig
 from .matfile import load_variables
 from .source import Entry, RigSource, pose_of
 
-CONVENTION = (
-    "first pixel's centre at 1 (shift -1); row vectors transposed, world = camera 1; WorldUnits, else mm"
-)
 FISHEYE = "MappingCoefficients"
 METRES = {
     1e-3: ("mm", "millimeters", "millimetres"),

@@ -20,10 +20,6 @@ from ..rig import Rig
 from ..safe_yaml import LARGEST_TEXT
 from .source import RigSource
 
-CONVENTION = (
-    "first pixel's centre at 0.5 (shift -0.5); "
-    "camera->chunk, inverted; the chunk's scale, else as in the file"
-)
 LENS_NUMBERS = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 
 

@@ -17,8 +17,6 @@ from ..pose import Pose
 from ..rig import Rig
 from .source import RigSource
 
-CONVENTION = "first pixel's centre at 0 (shift 0); rectified, cam1 at +baseline along x; millimetres"
-
 
 def recognises(path: Path, head: str) -> bool:
     return re.search(r"^cam0\s*=\s*\[", head, re.MULTILINE) is not None

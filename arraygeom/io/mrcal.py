@@ -19,9 +19,6 @@ from ..lenses.model import LensModel
 from ..rig import Rig
 from .source import Entry, RigSource, pose_of
 
-CONVENTION = (
-    "first pixel's centre at 0 (shift 0); rt_cam_ref (extrinsics) = X_camera from X_reference, in metres"
-)
 SUFFIX = ".cameramodel"
 LENSES = {"LENSMODEL_PINHOLE": 0, **{f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)}}
 """How many coefficients follow fx, fy, cx, cy."""

@@ -14,8 +14,6 @@ from ..pose import Pose
 from ..rig import Rig
 from .source import Entry, RigSource, pose_of
 
-CONVENTION = "first pixel's centre at 0 (shift 0); camera<-rig, 'B_to_A' takes A into B; metres"
-
 
 def recognises(path: Path, head: str) -> bool:
     return '"cameras"' in head and '"image_size"' in head

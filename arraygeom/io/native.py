@@ -61,7 +61,6 @@ from .source import Entry, RigSource
 
 T = TypeVar("T")
 
-CONVENTION = "stated in the file: units and first_pixel_centre"
 FORMAT = "arraygeom-rig 1"
 UNITS = {"metres": 1.0, "millimetres": 1e-3}
 TOP = ("format", "name", "units", "first_pixel_centre", "depth", "cameras", "links")

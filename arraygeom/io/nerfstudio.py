@@ -21,10 +21,6 @@ from ..rig import Rig
 from .export import brown_conrady, calibrated, focal_and_centre, pose_rows
 from .source import Entry, RigSource
 
-CONVENTION = (
-    "first pixel's centre at 0.5 (shift -0.5); "
-    "OpenGL camera->world, rotated and inverted; scale as in the file"
-)
 FISHEYES = ("OPENCV_FISHEYE", "FISHEYE")
 PERSPECTIVES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 # Ours (y down, z forward) from OpenGL's (y up, z back).

@@ -12,8 +12,6 @@ from ..camera import Camera
 from ..rig import Rig
 from .source import Entry, RigSource
 
-CONVENTION = "first pixel's centre at 0 (shift 0); world->camera, matrices column by column; metres"
-
 
 def recognises(path: Path, head: str) -> bool:
     return head.lstrip().startswith("{") and '"PinholeCamera' in head

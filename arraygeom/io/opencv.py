@@ -25,7 +25,6 @@ from ..safe_yaml import DEEPEST, LARGEST_TEXT
 from .export import brown_conrady, calibrated, focal_and_centre
 from .source import Entry, RigSource, pose_of
 
-CONVENTION = "first pixel's centre at 0 (shift 0); X_2 = R X_1 + T, world = camera 1; metres"
 K_NAMES = ("M{}", "cameraMatrix{}", "camera_matrix{}", "Camera_Matrix{}", "K{}", "CM{}", "intrinsicMatrix{}")
 D_NAMES = (
     *("D{}", "distCoeffs{}", "distortion_coefficients{}", "Distortion_Coefficients{}"),

@@ -12,8 +12,6 @@ from ..camera import Camera
 from ..rig import Rig
 from .source import Entry, RigSource, pose_of
 
-CONVENTION = "first pixel's centre at 0 (shift 0); world->camera; scale as in the file"
-
 
 def recognises(path: Path, head: str) -> bool:
     return head.lstrip().startswith("{") and '"K"' in head

@@ -17,9 +17,6 @@ from ..pose import Pose
 from ..rig import Rig
 from .source import Entry, RigSource, decoded, pose_of
 
-CONVENTION = (
-    "first pixel's centre at 0 (shift 0); extrinsics from one stream to another, in metres; world = depth"
-)
 LONGEST = 1_000_000
 INTRINSIC = re.compile(r'^\s*Intrinsic of "([^"]+)"[^\n]*\n((?:\s+[^:\n]+:[^\n]*\n?)+)', re.M)
 EXTRINSIC = re.compile(

@@ -18,8 +18,6 @@ from ..pose import Pose
 from ..rig import Rig
 from .source import Entry, RigSource, decoded
 
-CONVENTION = "first pixel's centre at 0 (shift 0); P on rectified points, world = the rectified frame; metres"
-
 
 def recognises(path: Path, head: str) -> bool:
     if path.is_dir():

@@ -15,8 +15,6 @@ from ..rig import Rig
 from ..text import short
 from .source import RigSource
 
-CONVENTION = "first pixel's centre at 0 (shift 0); world_from_camera R and the centre; scale as in the file"
-
 
 def recognises(path: Path, head: str) -> bool:
     return bool(_files(path)) if path.is_dir() else path.suffix == ".camera"

@@ -13,7 +13,6 @@ from ..camera import Camera
 from ..rig import Rig
 from .source import RigSource, pose_of
 
-CONVENTION = "first pixel's centre at 0 (shift 0); X_cam = R^T (X - t); millimetres"
 SIDES = {"_g": "left", "_d": "right"}
 NUMBER = r"([-+]?(?:nan|inf|[\d.]+(?:[eE][-+]?\d+)?))"
 

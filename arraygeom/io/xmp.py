@@ -4,7 +4,7 @@ A file is one image; the others of its capture are those beside it whose names d
 "_".
 
 Source convention: principal points in millimetres (pixels where the units say so) from the image's first
-pixel, whose centre is 0, as in MicaSense's own code; focal lengths in millimetres or, above 100 or where the
+pixel, whose centre is 0 (shift 0), as in MicaSense's own code; focal lengths in millimetres or, above 100 or where the
 units say so, in pixels; radial R1 R2 R3 and tangential T1 T2 as OpenCV's k1 k2 k3 p1 p2. Fisheye: theta = 2 /
 pi times the angle off axis goes to p0 + p1 theta + p2 theta^2 + ..., which the matrix C D E F takes to
 pixels. `RigRelatives` are degrees about x, y and z, R = Rx Ry Rz: camera->rig, inverted; `RigTranslations`
@@ -33,10 +33,6 @@ from ..rig import Rig
 from ..sensor import Band, Sensor
 from .image_tags import DJI, MICASENSE, PIX4D, ImageTags, image_tags
 from .source import RigSource
-
-CONVENTION = (
-    "first pixel's centre at 0 (no shift); millimetres by the sensor's resolution; RigRelatives camera->rig"
-)
 
 SUFFIXES = (".tif", ".tiff", ".jpg", ".jpeg")
 VIGNETTING = "VignettingPolynomial", "VignettingPolynomial2D"

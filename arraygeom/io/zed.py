@@ -1,6 +1,6 @@
 """A ZED camera's factory calibration, `SN12345.conf`: an INI file with the pair at each resolution.
 
-Source convention, as the maker's own rectification reads it (zed-open-capture, `calibration.hpp`): pixels
+Source convention: as the maker's own rectification reads it (zed-open-capture, `calibration.hpp`), pixels
 with the first centre at 0 (shift 0); OpenCV axes; lenses of OpenCV, fisheye ones where there is a k4 and no
 p1; RX, CV, RZ are the rotation vector that takes points of the left camera into the right one, with T along
 (Baseline, TY, TZ), in millimetres. There the sign of T is lost, as rectification does not need it; the right
@@ -18,9 +18,6 @@ from ..pose import Pose
 from ..rig import Rig
 from .source import Entry, RigSource, pose_of
 
-CONVENTION = (
-    "first pixel's centre at 0 (shift 0); rotation vector left to right, baseline in mm; world = left"
-)
 LONGEST = 100_000
 SIZES: dict[str, HW] = {
     "2k": (1242, 2208),
