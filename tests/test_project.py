@@ -187,6 +187,7 @@ GEOMETRY_MAY_USE = {
     "compiled.py": {"numba"},
     "opencv.py": {"cv2"},
     "image_bytes.py": {"tifffile"},
+    "image_tags.py": {"PIL"},
     "matfile.py": {"scipy"},
     "viz.py": {"matplotlib"},
 }

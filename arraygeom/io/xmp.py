@@ -4,13 +4,13 @@ A file is one image; the others of its capture are those beside it whose names d
 "_".
 
 Source convention: principal points in millimetres (pixels where the units say so) from the image's first
-pixel, whose centre is 0 (shift 0), as in MicaSense's own code; focal lengths in millimetres or, above 100 or where the
-units say so, in pixels; radial R1 R2 R3 and tangential T1 T2 as OpenCV's k1 k2 k3 p1 p2. Fisheye: theta = 2 /
-pi times the angle off axis goes to p0 + p1 theta + p2 theta^2 + ..., which the matrix C D E F takes to
-pixels. `RigRelatives` are degrees about x, y and z, R = Rx Ry Rz: camera->rig, inverted; `RigTranslations`
-are the cameras' centres, metres. DJI's `DewarpData` is fx fy cx cy k1 k2 p1 p2 k3, with cx and cy counted
-from `CalibratedOpticalCenter`. All are of the pixels as stored: the rig is of the images as their orientation
-tags say.
+pixel, whose centre is 0 (shift 0), as in MicaSense's own code; focal lengths in millimetres or, above 100 or
+where the units say so, in pixels; radial R1 R2 R3 and tangential T1 T2 as OpenCV's k1 k2 k3 p1 p2. Fisheye:
+theta = 2 / pi times the angle off axis goes to p0 + p1 theta + p2 theta^2 + ..., which the matrix C D E F
+takes to pixels. `RigRelatives` are degrees about x, y and z, R = Rx Ry Rz: camera->rig, inverted;
+`RigTranslations` are the cameras' centres, metres. DJI's `DewarpData` is fx fy cx cy k1 k2 p1 p2 k3, with cx
+and cy counted from `CalibratedOpticalCenter`. All are of the pixels as stored: the rig is of the images as
+their orientation tags say.
 """
 
 from __future__ import annotations
