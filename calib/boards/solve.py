@@ -104,28 +104,18 @@ def _check_tilts(name: str, poses: Mapping[FrameKey, Pose], board: Board) -> Non
 
 
 def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
-    """Fit all observable parameters; those that turn out to be unobservable are fixed, until none is.
+    """Fit all parameters; those that turn out to be unobservable are fixed, until none is.
 
-    Parameters fixed before the fit, when the noise was overestimated, may return after it; and boards that
-    are clearly neither flat nor printed true are deformed. Raises ValueError where a `final` fit has no focal
-    length.
+    Boards that are clearly neither flat nor printed true are deformed. Raises ValueError where a `final` fit
+    has no focal length.
     """
-    problem, flat = initial.problem(board), initial.flat(board)
-    full = problem.free
-    problem, notes = observable(replace(problem, sigma=noise(problem, 0)), final=False)
-    solved = _with_deformation(adjust(problem), flat)
-    for _ in range(ROUNDS):
-        returned, changed = observable(replace(solved.problem, free=full), final=False)
-        if all(np.array_equal(mask, solved.problem.free[name]) for name, mask in returned.free.items()):
-            break
-        notes = changed
-        solved = _with_deformation(adjust(returned), flat)
+    problem, flat, notes = initial.problem(board), initial.flat(board), list[str]()
     while True:
-        fewer, dropped = observable(solved.problem, final=final)
+        solved = _with_deformation(adjust(problem), flat)
+        problem, dropped = observable(solved.problem, final=final)
         if not dropped:
             return replace(solved, notes=tuple(notes), views=initial.views, left_out=initial.left_out)
-        notes = notes + dropped
-        solved = adjust(fewer)
+        notes += dropped
 
 
 def solve_inliers(
