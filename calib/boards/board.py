@@ -56,7 +56,7 @@ class Board:
         """
         if self.identified:
             return (np.arange(len(self.points)),)
-        points = self.points[:, :2] - (self.points[:, :2].max(0) + self.points[:, :2].min(0)) / 2
+        points = (self.points - self.middle)[:, :2]
         found = []
         for quarter_turns in range(4):
             rotated = points @ np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), quarter_turns)

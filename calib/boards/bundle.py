@@ -191,9 +191,8 @@ class InitialRig(NamedTuple):
         if isinstance(board, KnownPoints):
             return None
         first = {key: d.ids[0] for v in self.views.values() for key, d in v.seen.items()}
-        return BoardDeformation.flat(
-            board.points, board.part, board.part[[first[key] for key in self.boards]]
-        )
+        middle = np.stack([member.middle[:2] for member in board.members])
+        return BoardDeformation.flat(middle, board.part[[first[key] for key in self.boards]])
 
 
 @dataclass(frozen=True)
@@ -256,20 +255,12 @@ def linearised(problem: BundleProblem) -> dict[str, Linearised]:
         x, by_camera = linear_projection(camera, problem.world(name))
         r = seen.x - x
         by_point = by_camera[..., 3:6] @ camera.R.numpy()
-        by_board = by_point @ _by_pose(problem, name)
+        by_board = np.concatenate([np.cross(problem.rotated(name)[:, None], by_point), by_point], -1)
         by_shared = np.concatenate([by_camera[..., free], by_point @ _by_deformation(problem, name)], -1)
         weight = np.sqrt(robust_weights(np.linalg.norm(r, axis=-1) / sigma)) / sigma
         wide = weight[:, None, None]
         found[name] = Linearised(weight[:, None] * r, wide * by_shared, wide * by_board, seen.block, columns)
     return found
-
-
-def _by_pose(problem: BundleProblem, name: str) -> Float[np.ndarray, "n 3 6"]:
-    """Derivatives of a camera's points in the world by their boards' poses, exp(w) R and the translation."""
-    x, y, z = problem.rotated(name).T
-    o, one = np.zeros_like(x), np.ones_like(x)
-    rows = [[o, z, -y, one, o, o], [-z, o, x, o, one, o], [y, -x, o, o, o, one]]
-    return np.moveaxis(np.array(rows), -1, 0)
 
 
 def _by_deformation(problem: BundleProblem, name: str) -> Float[np.ndarray, "n 3 s"]:

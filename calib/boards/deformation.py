@@ -39,12 +39,8 @@ class BoardDeformation:
     part: Int[np.ndarray, " b"]
 
     @classmethod
-    def flat(
-        cls, points: Float[np.ndarray, "n 3"], of_point: Int[np.ndarray, " n"], part: np.ndarray
-    ) -> BoardDeformation:
-        """Flat boards of given points and the board of each; `part` is the board of each block."""
-        ends = [points[of_point == k, :2] for k in range(int(of_point.max()) + 1)]
-        middle = np.stack([(p.min(0) + p.max(0)) / 2 for p in ends])
+    def flat(cls, middle: Float[np.ndarray, "k 2"], part: Int[np.ndarray, " b"]) -> BoardDeformation:
+        """Flat boards."""
         return cls(np.zeros((len(middle), PARAMETERS)), middle, part)
 
     def __len__(self) -> int:

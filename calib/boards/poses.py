@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 from torch.nn.functional import pad
 
 from arraygeom import Camera, Distortion, Pose, Rig
@@ -214,22 +215,16 @@ def nearest_pose(a_from_b: Pose, a_from_board: Pose, b_from_board: Pose, symmetr
 
 def average_pose(poses: Sequence[Pose]) -> Pose:
     """The rotation nearest to the mean of all, and the median translation."""
-    U, _, Vh = torch.linalg.svd(torch.stack([pose.R for pose in poses]).mean(0))
-    flip = torch.diag(torch.tensor([1.0, 1.0, float(torch.linalg.det(U @ Vh).sign())], dtype=U.dtype))
-    return Pose(U @ flip @ Vh, torch.stack([pose.t for pose in poses]).median(0).values)
+    R = Rotation.from_matrix(np.stack([pose.R for pose in poses])).mean().as_matrix()
+    return Pose(torch.from_numpy(R), torch.stack([pose.t for pose in poses]).median(0).values)
 
 
 def symmetry_poses(board: Board) -> list[Pose]:
     """The rotations of the board that belong to its renumberings: point i moves to point `image[i]`."""
-    found = []
+    found, mean = [], board.points.mean(0)
     for image in board.symmetries:
-        before, after = board.points - board.points.mean(0), board.points[image] - board.points.mean(0)
-        sine = (before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]).sum()
-        angle = np.arctan2(sine, (before[:, :2] * after[:, :2]).sum())
-        R = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-        found.append(
-            Pose(torch.from_numpy(R), torch.from_numpy(board.points.mean(0) - R @ board.points.mean(0)))
-        )
+        R = Rotation.align_vectors(board.points[image] - mean, board.points - mean)[0].as_matrix()
+        found.append(Pose(torch.from_numpy(R), torch.from_numpy(mean - R @ mean)))
     return found
 
 

@@ -92,7 +92,7 @@ def calibrate(
     else:
         singles, stated = {}, deviations or StartDeviations()
         initial = rig_near_start(start, views, board, models, stated)
-        fitted = solve_inliers(initial, initial.views, board, rounds=2)
+        fitted = solve_inliers(initial, initial.views, board)
     extents = [each.extent for each in board.members]
     solved = with_disagreement(fitted, extents, unchecked=bool(singles) and board.flat)
     notes = [*solved.notes, *misfit_notes(solved)]

@@ -54,7 +54,7 @@ POOLED = 50
 UNOBSERVABLE = 0.5
 """A parameter is unobservable if its posterior deviation stays above this share of its typical size."""
 ROUNDS = 3
-"""Times that parameters may return, and that outliers may change."""
+"""Times that all are fitted, each without the outliers of the one before."""
 MISFIT = 1.8
 """A frame does not fit if its residuals exceed those of the camera's median frame by this factor,"""
 CONSPICUOUS = 1.8
@@ -81,9 +81,8 @@ def calibrate_single(
     kept = without_bad_images(views, first, board)
     if len(kept.seen) < len(views.seen):
         first = initial_camera(name, kept, board, lens)
-    used = without_outliers(kept, first.camera, first.poses, board.points)
     _check_tilts(name, first.poses, board)
-    initial = InitialRig({name: first.camera}, first.poses, {name: used})
+    initial = InitialRig({name: first.camera}, first.poses, {name: first.views})
     solved = solve_inliers(initial, {name: kept}, board, final=final)
     _check_tilts(name, solved.problem.board_poses, board)
     return solved
@@ -123,12 +122,11 @@ def solve_inliers(
     detected: Mapping[str, BoardViews],
     board: Board,
     *,
-    rounds: int = ROUNDS,
     final: bool = True,
 ) -> Solved:
     """`solve` in some rounds, each without the `detected` points that the one before shows to be outliers."""
     solved = solve(initial, board, final=final)
-    for _ in range(rounds - 1):
+    for _ in range(ROUNDS - 1):
         problem, boards, deformation = solved.problem, solved.problem.board_poses, solved.problem.deformation
         points = board.points if deformation is None else deformation.deformed(board.points, board.part)
         views = {}

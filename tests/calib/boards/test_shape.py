@@ -23,7 +23,7 @@ CYLINDER = (0.0, 0.5, 0.0, 0.0)
 
 
 def shaped(values, board=BOARD):
-    flat = BoardDeformation.flat(board.points, board.part, np.zeros(1, dtype=int))
+    flat = BoardDeformation.flat(board.middle[None, :2], np.zeros(1, dtype=int))
     return replace(flat, values=np.array([values]))
 
 
