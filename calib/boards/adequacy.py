@@ -166,9 +166,9 @@ def coverages(calibration: Calibration) -> dict[str, Coverage]:
     return found
 
 
-def coverage_advice(calibration: Calibration, covers: Mapping[str, Coverage]) -> Iterator[str]:
+def coverage_advice(calibration: Calibration) -> Iterator[str]:
     """What each camera's images lack, and, where that is something, which views would help most."""
-    for name, covered in covers.items():
+    for name, covered in coverages(calibration).items():
         yield from (f"{name}: {text}" for text in covered.missing)
         known = intrinsics_of(calibration.fit, name)
         depth, lacking = float(np.mean(covered.depths)), covered.missing and len(known.covariance)

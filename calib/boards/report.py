@@ -23,7 +23,7 @@ from arraygeom.distortion import term
 from arraygeom.text import angle
 from arraygeom.viz import COLOURS, draw_rig, show_image
 
-from .adequacy import CELLS, Coverage, coverage_advice, coverages
+from .adequacy import CELLS, Coverage, coverages
 from .bundle import intrinsic_values, parameter_names
 from .detect import BoardViews
 from .photos import FrameKey, Photos
@@ -71,16 +71,15 @@ def report_html(
     detected: Mapping[str, BoardViews] | None = None,
     photos: Photos | None = None,
 ) -> str:
-    """The report: accuracy by camera, pair and image, coverage, residual fields, uncertainties, the rig.
+    """The report: notes, accuracy by camera, pair, image, coverage, residual fields, uncertainties, the rig.
 
     With the points `detected` in `photos`, the images that fit worst are drawn.
     """
     covers, known = coverages(calibration), calibration.fit.covariance is not None
-    advice = by_cameras([*notes, *calibration.notes, *coverage_advice(calibration, covers)])
     near, far = _depths(covers.values())
     parts = [
         f"<h1>{escape(title)}</h1><p>{escape(summary(calibration))}</p><ul>",
-        *(f'<li class="note">{escape(a)}</li>' for a in advice or ["No advice."]),
+        *(f'<li class="note">{escape(a)}</li>' for a in notes or ["No advice."]),
         "</ul><h2>Cameras</h2>",
         camera_table(calibration, covers),
     ]

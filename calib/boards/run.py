@@ -82,13 +82,9 @@ def calibrate_photos(
     stated = depth if depth is not None or nominal is None else nominal.depth
     rig = calibration.rig.replace(depth=stated, name=out.stem)
     written = [out.with_suffix(".html"), out.with_suffix(".covariance.json"), out]
-    report = report_html(
-        calibration,
-        title=f"Calibration of {out.name}",
-        notes=[*lenses, *found.notes],
-        detected=found.views,
-        photos=found.photos,
-    )
+    notes = by_cameras([*lenses, *found.notes, *calibration.notes, *coverage_advice(calibration)])
+    title = f"Calibration of {out.name}"
+    report = report_html(calibration, title=title, notes=notes, detected=found.views, photos=found.photos)
     covariance = rig_covariance(calibration.fit)
     sweep(out.parent, out.stem)
     with write_together(out.parent, last=out.name, stale=[path.name for path in written[:2]]) as folder:
@@ -96,9 +92,7 @@ def calibrate_photos(
         if covariance is not None:
             covariance.save(folder / written[1].name, rig)
         rig.save(folder / out.name)
-    advice = coverage_advice(calibration, coverages(calibration))
-    messages = [summary(calibration), *by_cameras([*lenses, *found.notes, *calibration.notes, *advice])]
-    return CalibrationOutput(messages, [path for path in written if path.exists()])
+    return CalibrationOutput([summary(calibration), *notes], [path for path in written if path.exists()])
 
 
 # While images are taken -------------------------------------------------------------------------------------

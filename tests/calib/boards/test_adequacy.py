@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig
-from calib.boards.adequacy import coverage_advice, coverages, next_views, proposed_views
+from calib.boards.adequacy import coverage_advice, next_views, proposed_views
 from calib.boards.bundle import camera_jacobian, parameter_names
 from calib.boards.intrinsics import board_pose
 from calib.boards.report import by_cameras, draw_adequacy, report_html
@@ -308,7 +308,7 @@ def test_images_that_show_no_view_of_the_board_have_none_proposed():
     """A strip shows less than the board's height: its report ended in "min() arg is an empty sequence"."""
     views = see(Rig({"cam": camera(1150.0, (160, 1600))}), board_poses(12, spread=0.1, depth=(6, 14)))
     strip = calibrate(views, BOARD)
-    said = " ".join(coverage_advice(strip, coverages(strip)))
+    said = " ".join(coverage_advice(strip))
     assert "no points at the" in said
     assert "views would help" not in said
     assert "Next: " not in _advice(strip, "cam")
