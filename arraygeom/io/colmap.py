@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..camera import Camera, LensView
+from ..checks import ROUNDED
 from ..distortion import BROWN_CONRADY, KANNALA_BRANDT
 from ..lenses.central import FOV, THIN_PRISM_FISHEYE
 from ..pose import Pose
@@ -139,7 +140,12 @@ def _camera(source: RigSource, cameras: dict[int, LensView], i: int, pose: Pose)
 def _pose(entry: Entry) -> Pose:
     """From QW QX QY QZ TX TY TZ."""
     numbers = entry.numbers((7,))
-    return Pose(entry.at(numbers[:4], "QW QX QY QZ").quaternion(), numbers[4:])
+    q, t = numbers.split([4, 3])
+    if not (q.norm() - 1).abs() < ROUNDED:
+        raise entry.at(q, "QW QX QY QZ").fail(
+            f"is a quaternion of length {q.norm():.4g}, not 1; is the order w x y z?"
+        )
+    return Pose.from_quaternion(q / q.norm(), t)
 
 
 def _sensor(entry: Entry, camera: int, numbers: list[float] | None) -> Posed:
@@ -323,10 +329,9 @@ def _parameters(name: str, camera: Camera) -> tuple[str, list[float]]:
     lens, pinhole = camera.distortion, list(focal_and_centre(name, camera, first_pixel=0.5))
     if lens is None:
         return "PINHOLE", pinhole
-    if lens.model == KANNALA_BRANDT:
-        return "OPENCV_FISHEYE", pinhole + lens.coefficients.tolist()
-    if lens.model in (FOV, THIN_PRISM_FISHEYE):
-        return ("FOV" if lens.model == FOV else "THIN_PRISM_FISHEYE"), pinhole + lens.coefficients.tolist()
+    whole = {KANNALA_BRANDT: "OPENCV_FISHEYE", FOV: "FOV", THIN_PRISM_FISHEYE: "THIN_PRISM_FISHEYE"}
+    if lens.model in whole:
+        return whole[lens.model], pinhole + lens.coefficients.tolist()
     c = brown_conrady(name, lens, at_most=8)
     return ("OPENCV", pinhole + c) if len(c) == 4 else ("FULL_OPENCV", pinhole + c + [0.0] * (8 - len(c)))
 

@@ -39,7 +39,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING
 from pathlib import Path
 from typing import Any, TypeVar
@@ -352,12 +352,8 @@ def _K_entry(K: Tensor, scale: str) -> dict[str, Any]:
 def _sensor_entry(sensor: Sensor) -> dict[str, Any]:
     default = Sensor()
     entry = {k: v for k, v in vars(sensor).items() if v != getattr(default, k)}
-    if isinstance(sensor.gain, tuple):
-        entry["gain"] = list(sensor.gain)
     if isinstance(sensor.response, Band | Curve):
-        entry["response"] = {
-            k: list(v) if isinstance(v, tuple) else v for k, v in vars(sensor.response).items()
-        }
+        entry["response"] = vars(sensor.response)
     return entry
 
 
@@ -367,13 +363,14 @@ def _link_entry(alpha: str, beta: str, link: Link) -> dict[str, Any]:
 
 
 class _Dumper(SafeDumper):
-    """Lists of numbers on one line."""
+    """Lists and tuples of numbers on one line."""
 
 
-def _represent_list(dumper: yaml.SafeDumper, items: list[Any]) -> yaml.Node:
+def _represent_list(dumper: yaml.SafeDumper, items: Sequence[Any]) -> yaml.Node:
     flow = all(isinstance(i, int | float | list) for i in items)
     return dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=flow)
 
 
 _represent: Callable[..., None] = _Dumper.add_representer
 _represent(list, _represent_list)
+_represent(tuple, _represent_list)

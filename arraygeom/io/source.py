@@ -304,15 +304,6 @@ class Entry:
             raise self.fail(f"has last row {short(M[3].tolist())}, wanted [0, 0, 0, 1]; is it transposed?")
         return Pose(Entry(self.source, M[:3, :3], self.name).rotation(), M[:3, 3] * metres)
 
-    def quaternion(self) -> Tensor:
-        """A rotation from a quaternion, scalar first, of length 1 to 1e-3."""
-        q = self.numbers((4,))
-        if not (q.norm() - 1).abs() < ROUNDED:
-            raise self.fail(f"is a quaternion of length {q.norm():.4g}, not 1; is the order w x y z?")
-        from kornia.geometry.conversions import quaternion_to_rotation_matrix
-
-        return quaternion_to_rotation_matrix(q / q.norm())
-
     def brown_conrady(self) -> Distortion | None:
         """A lens from OpenCV's coefficients, zero-padded to a number the model has; none if all are 0."""
         c = torch.zeros(0) if self.value is None else self.numbers()

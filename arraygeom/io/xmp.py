@@ -132,17 +132,18 @@ class _Image(NamedTuple):
     def text(self, name: str) -> str | None:
         return self.tags.text(PIX4D, name)
 
-    def numbers(self, name: str, namespace: str = PIX4D) -> Tensor | None:
-        """The numbers of a tag, None if it is not stated."""
+    def numbers(self, name: str, *count: int, namespace: str = PIX4D) -> Tensor | None:
+        """The numbers of a tag, as many as are wanted; None if it is not stated."""
         text = self.tags.text(namespace, name)
-        return None if text is None else self.source.at(re.sub("[,;]", " ", text), name).words().numbers()
+        words = None if text is None else self.source.at(re.sub("[,;]", " ", text), name).words()
+        return None if words is None else words.numbers(count or None)
 
     def needed(self, name: str, count: int) -> Tensor:
         """So many numbers of a tag of Pix4D's."""
-        found = self.numbers(name)
+        found = self.numbers(name, count)
         if found is None:
             raise self.source.fail(name, "is not stated: give a rig file instead")
-        return self.source.at(found, name).numbers((count,))
+        return found
 
     @property
     def per_mm(self) -> Tensor:
@@ -160,14 +161,16 @@ class _Image(NamedTuple):
     @property
     def rotation(self) -> Tensor | None:
         """Rotation from the camera to the rig; None if it is not stated."""
-        return None if self.numbers("RigRelatives") is None else _rotation(self.needed("RigRelatives", 3))
+        if (degrees := self.numbers("RigRelatives", 3)) is None:
+            return None
+        about_x, about_y, about_z = rotation_from_vector(torch.deg2rad(degrees).diag())
+        return about_x @ about_y @ about_z
 
     @property
     def centre(self) -> Tensor:
         """The camera's centre in the rig, metres; zero if it is not stated."""
-        if self.numbers("RigTranslations") is None:
+        if (found := self.numbers("RigTranslations", 3)) is None:
             return torch.zeros(3, dtype=torch.float64)
-        found = self.needed("RigTranslations", 3)
         if float(found.abs().max()) > LONGEST_TRANSLATION:
             raise self.source.fail(
                 "RigTranslations", f"is {found.tolist()}, and metres are wanted: give a rig file in metres"
@@ -202,9 +205,9 @@ class _Image(NamedTuple):
             (focal,) = self.needed("PerspectiveFocalLength", 1)
             units = self.text("PerspectiveFocalLengthUnits") or ("pixel" if focal > IN_PIXELS else "mm")
             K[:2, :2] = torch.diag(focal.expand(2) if "pixel" in units else focal * self.per_mm)
-            if self.numbers("PerspectiveDistortion") is None:
+            if (c := self.numbers("PerspectiveDistortion", 5)) is None:
                 return K, None
-            r1, r2, r3, t1, t2 = self.needed("PerspectiveDistortion", 5)
+            r1, r2, r3, t1, t2 = c
             lens = self.source.at([r1, r2, t1, t2, r3], "PerspectiveDistortion").brown_conrady()
             return K, lens
         if kind != "fisheye":
@@ -227,7 +230,8 @@ class _Image(NamedTuple):
         listed = self.source.at(numbers.replace(",", " "), "DewarpData").words()
         fx, fy, cx, cy, *c = listed.numbers((9,)).tolist()
         middle = [
-            (self.numbers(f"CalibratedOpticalCenter{axis}", DJI), n / 2) for axis, n in (("X", w), ("Y", h))
+            (self.numbers(f"CalibratedOpticalCenter{axis}", namespace=DJI), n / 2)
+            for axis, n in (("X", w), ("Y", h))
         ]
         x, y = (half if stated is None else float(stated[0]) for stated, half in middle)
         K = torch.tensor([[fx, 0, x + cx], [0, fy, y + cy], [0, 0, 1]], dtype=torch.float64)
@@ -311,9 +315,3 @@ def _place(tags: ImageTags) -> tuple[float, float] | None:
         value = sum(float(part) / 60**i for i, part in enumerate(parts))
         degrees.append(-value if tags.fields.get(letter, ("",))[0] in ("S", "W") else value)
     return degrees[0], degrees[1]
-
-
-def _rotation(degrees: Tensor) -> Tensor:
-    """Rx Ry Rz of angles in degrees."""
-    about_x, about_y, about_z = rotation_from_vector(torch.deg2rad(degrees).diag())
-    return about_x @ about_y @ about_z

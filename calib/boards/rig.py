@@ -93,8 +93,7 @@ def calibrate(
         singles, stated = {}, deviations or StartDeviations()
         initial = rig_near_start(start, views, board, models, stated)
         fitted = solve_inliers(initial, initial.views, board)
-    extents = [each.extent for each in board.members]
-    solved = with_disagreement(fitted, extents, unchecked=bool(singles) and board.flat)
+    solved = with_disagreement(fitted, board, unchecked=bool(singles) and board.flat)
     notes = [*solved.notes, *misfit_notes(solved)]
     if start is None:
         notes[:0] = left_out_notes(views, singles, fitted)

@@ -25,6 +25,7 @@ from arraygeom.pixels import HW
 from arraygeom.safe_yaml import load_json
 from arraygeom.sensor import Sensor
 
+from .board import Board
 from .bundle import (
     Array,
     BundleProblem,
@@ -284,14 +285,12 @@ def _clustered(total: Array, H: Array, g: Array) -> Array:
     return np.asarray(changes.T @ changes)
 
 
-def with_disagreement(
-    solved: Solved, extents: list[tuple[float, float]], *, unchecked: bool = False
-) -> Solved:
+def with_disagreement(solved: Solved, board: Board, *, unchecked: bool = False) -> Solved:
     """The solution, its covariance raised if frames disagree considerably; notes on that and on the boards.
 
     Where frames are too few to tell, it is raised by `UNCHECKED` if it is of such frames alone (`unchecked`).
 
-    `extents` are the boards' sizes, metres. The raised covariance is the mean of the jackknife's, which few
+    The raised covariance is the mean of the jackknife's, which few
     frames make noisy, and of that of the points' noise, scaled to the jackknife's level: the median over the
     parameters, as frames that disagree about a focal length say nothing of the lens.
     """
@@ -307,7 +306,7 @@ def with_disagreement(
     found = jackknife(problem) if checked or problem.deformation is not None else None
     if found is not None and problem.deformation is not None:
         deviations = np.sqrt(found.deformations.diagonal()).reshape(problem.deformation.values.shape)
-        notes += described(problem.deformation, deviations, extents)
+        notes += described(problem.deformation, deviations, [each.extent for each in board.members])
     if found is not None and checked and covariance is not None:
         excess = np.trace(np.linalg.solve(covariance, found.covariance)) / len(covariance)
         if excess**0.5 > CONSIDERABLE:

@@ -62,7 +62,7 @@ def fit_focal_length(views: Mapping[str, View], link: Link, matches: PointMatche
 
     None for views of unlike sizes, a mirrored one, or points that no pose has in front of both cameras.
     """
-    (alpha, beta), (hw, hw_beta) = views, (view.hw for view in views.values())
+    hw, hw_beta = (view.hw for view in views.values())
     if hw != hw_beta or _is_mirrored(matches):
         return None
     kept = torch.randperm(len(matches.alpha), generator=torch.Generator().manual_seed(0))[:POINTS]
@@ -73,10 +73,10 @@ def fit_focal_length(views: Mapping[str, View], link: Link, matches: PointMatche
         starts = [TwoViews(hw, pose, points) for pose in initial_poses(points, link, K, K)]
         z = torch.zeros(len(starts[0].sigma), dtype=torch.float64)
         z[0] = math.log(factor) / SIGMA["focal"]
-        ahead = [start for start in starts if start.is_ahead((alpha, beta), z)]
+        ahead = [start for start in starts if start.is_ahead(z)]
         best = sorted(ahead, key=lambda start: cost(start.distances(z), z, 1.0))[:2]
         fits += [FocalFit(start, start.fitted(z)) for start in best]
-    fits = [fit for fit in fits if fit.views.is_ahead((alpha, beta), fit.z)]
+    fits = [fit for fit in fits if fit.views.is_ahead(fit.z)]
     if not fits:
         return None
     left = [fit.views.distances(fit.z) for fit in fits]
@@ -163,12 +163,13 @@ class TwoViews:
         """The most probable change, from z on; the first `fixed` components stay."""
         return most_probable(self.residuals, z, torch.eye(len(z), dtype=z.dtype)[:, fixed:], steps=STEPS)
 
-    def is_ahead(self, names: tuple[str, str], z: Tensor) -> bool:
+    def is_ahead(self, z: Tensor) -> bool:
         """Whether no more of the points are behind a camera than `BEHIND`."""
-        K = intrinsics(float(self.length(z)), self.hw).double()
-        poses = Pose.identity(), self.moved(z)
-        rig = Rig({n: Camera(hw=self.hw, K=K, cam_from_world=pose) for n, pose in zip(names, poses)})
-        return not share_outside(rig, {names: self.points}) > BEHIND
+        alpha = Camera(
+            hw=self.hw, K=intrinsics(float(self.length(z)), self.hw), cam_from_world=Pose.identity()
+        )
+        rig = Rig({"alpha": alpha, "beta": alpha.replace(cam_from_world=self.moved(z))})
+        return not share_outside(rig, {("alpha", "beta"): self.points}) > BEHIND
 
 
 @dataclass(frozen=True)

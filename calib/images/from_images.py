@@ -20,6 +20,7 @@ from arraygeom.threads import torch_in_one_thread
 from .lenses import describe_lenses
 from .matches import (
     AGREE,
+    MATCHED,
     FittedLink,
     Pairs,
     PointMatches,
@@ -29,14 +30,10 @@ from .matches import (
     image_sizes,
     line_distance,
     match_cameras,
-    matching_time,
     with_map,
 )
 from .refinement import refine_matches
 from .residuals import median_off, split
-
-JOINED = 1.0
-"""Seconds that one core takes for each pair to fit all lines jointly, roughly."""
 
 
 class UncalibratedRig(NamedTuple):
@@ -88,16 +85,14 @@ def rig_from_images(
             raise ValueError(f"--focal: '{name}={length:g}' is no camera with an image, or not positive")
     sizes = image_sizes(images)
     K = {name: intrinsics(length, sizes[name]) for name, length in focal.items()}
-    pairs = math.comb(len(images), 2) if alpha is None else len(images) - 1
-    matched_at = (matching := matching_time(images, pairs)) / (matching + JOINED * pairs)
-    with part(0, matched_at):
+    with part(0, MATCHED):
         matched = match_cameras(images, alpha=alpha) if matches is None else agreeing_pairs(matches)
     distance, by_focal, links = {}, {}, {}
     for names, points in matched.items():
         F, distance[names], by_focal[names] = _fundamental(points, *(K.get(name) for name in names))
         links[names] = fit_link(points, F, within=AGREE).link
     rig = Rig({name: View(hw=hw) for name, hw in sizes.items()}, links=links)
-    with part(matched_at, 1):
+    with part(MATCHED, 1):
         refined = refine_matches(rig, [matched])
     if refined.accepted:
         rig = refined.rig

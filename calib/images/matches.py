@@ -41,8 +41,8 @@ MANY = 60
 """With fewer consistent matches, mirrored images are tried."""
 AGREE = 5.0
 """Largest distance, in pixels, of a consistent match from its line: lenses distort lines."""
-MEGAPIXEL, PAIR = 0.35, 0.65
-"""Seconds that one core takes for the features of a megapixel, and to match a pair, roughly."""
+MATCHED = 0.8
+"""The share of the time, roughly, that images take to be matched before something is fitted to the points."""
 STILL = 0.05
 """Images in which nine points in ten move less than this, in pixels, are the same image."""
 
@@ -159,21 +159,18 @@ def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str
     pairs = list(
         combinations(images, 2) if alpha is None else ((alpha, name) for name in images if name != alpha)
     )
-    total, done = matching_time(images, len(pairs)), 0.0
-    features = {}
-    for name, image in images.items():
-        log_step(LOG, done / total, "features of %s", name)
+    total, features = len(images) + len(pairs), {}
+    for i, (name, image) in enumerate(images.items()):
+        log_step(LOG, i / total, "features of %s", name)
         features[name] = detect_features(image)
-        done += matching_time({name: image}, 0)
         if len(features[name].points) < ENOUGH:
             raise ValueError(
                 f"the image of '{name}' has hardly any texture to match: take one in focus, with detail"
             )
     found = {}
-    for a, b in pairs:
-        log_step(LOG, done / total, "matching %s and %s", a, b)
+    for i, (a, b) in enumerate(pairs, len(images)):
+        log_step(LOG, i / total, "matching %s and %s", a, b)
         found[a, b] = _agreeing(features[a], features[b], images[b])
-        done += PAIR
     kept = {names: matches for names, matches in found.items() if len(matches.alpha) >= ENOUGH}
     for (a, b), matches in kept.items():
         displacement = float((matches.alpha - matches.beta).norm(dim=-1).quantile(0.9))
@@ -186,11 +183,6 @@ def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str
             "do the cameras see the same things, at the same time and in focus?"
         )
     return kept
-
-
-def matching_time(images: Images, pairs: int) -> float:
-    """Roughly how long one core takes to match that many pairs of the images, seconds."""
-    return sum(MEGAPIXEL * image[0].numel() / 1e6 for image in images.values()) + PAIR * pairs
 
 
 def _agreeing(a: SiftFeatures, b: SiftFeatures, image: Tensor) -> PointMatches:

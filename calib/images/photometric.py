@@ -8,7 +8,7 @@ depends on the rig alone. Bilinear sampling propagates the gradient to the segme
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,22 +18,9 @@ from torch.nn.functional import avg_pool2d, interpolate, pad, unfold
 from arraygeom import Positions, Rig, Segments, pixel_grid
 from arraygeom.fields import recorded_field
 
-
-@runtime_checkable
-class PhotometricMatch(Protocol):
-    """The result of attention: values (1, D, h, w) and the largest weight (1, h, w) as a confidence."""
-
-    @property
-    def value(self) -> Tensor:
-        """The weighted value."""
-
-    @property
-    def peak(self) -> Tensor:
-        """The largest weight."""
-
-
-Attend = Callable[[Tensor, Tensor, Tensor, Segments | Positions], PhotometricMatch]
-"""Attention from queries to keys and values along a field: `pat.attention.attend_with_statistics`."""
+Attend = Callable[[Tensor, Tensor, Tensor, Segments | Positions], Any]
+"""Attention from queries to keys and values along a field, `pat.attention.attend_with_statistics`: of what it
+returns, `value` (1, D, h, w) is the weighted one, and `peak` (1, h, w) the largest weight."""
 LARGEST = 480
 """Images are reduced to this many pixels along their longer side."""
 PIXELS = 6000

@@ -5,9 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from jaxtyping import Float
-from torch import Tensor
-
 from arraygeom import Rig
 
 from .depth_change import DepthChange
@@ -35,11 +32,6 @@ class LineStatistics(NamedTuple):
 
     points: int
     median: float
-
-    @classmethod
-    def of(cls, distance: Float[Tensor, " n"]) -> LineStatistics:
-        """Of the signed distances of some points."""
-        return cls(len(distance), float(distance.abs().median()))
 
     def __str__(self) -> str:
         return f"{self.median:.2f} px"

@@ -16,10 +16,9 @@ the prior of a second fit, to the photometric error of the fusion: see `photomet
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, product
+from itertools import accumulate, count, product
 
 import torch
 from jaxtyping import Bool, Float
@@ -44,6 +43,7 @@ from .least_squares import (
 from .lenses import with_distortion, with_lenses
 from .matches import (
     ENOUGH,
+    MATCHED,
     Images,
     Pairs,
     agreeing_pairs,
@@ -51,7 +51,6 @@ from .matches import (
     depth_seen,
     image_sizes,
     match_cameras,
-    matching_time,
     with_map,
 )
 from .parameters import LARGEST_CHANGE, FreeParameter, apply_change, considered_parameters, free_parameters
@@ -92,8 +91,6 @@ ROUNDS, EVALUATIONS = 8, 13
 """Iterations of the photometric minimisation, and how often it evaluates the error of all pairs, roughly."""
 LEFT_OUT_SIGMA = 1.0
 """Prior deviation of lens terms that may have been left out, as a share of typical ones."""
-FITTED = 1.4
-"""Seconds that one core takes to fit a rig to the points of a pair, roughly."""
 
 
 @torch_in_one_thread()
@@ -126,13 +123,11 @@ def refine(
                 "`pat rig doctor` finds the reason"
             )
     with stage("points" + ", stage 1 of 2" * (attend is not None), new=True):
-        seconds = sum(matching_time(frame, math.comb(len(frame), 2)) for frame in frames)
-        matched_at = seconds / (seconds + FITTED * math.comb(len(frames[0]), 2))
         pairs = []
         for i, frame in enumerate(frames):
-            with part(matched_at * i / len(frames), matched_at * (i + 1) / len(frames)):
+            with part(MATCHED * i / len(frames), MATCHED * (i + 1) / len(frames)):
                 pairs.append(match_cameras(frame) if matches is None else agreeing_pairs(matches[i]))
-        with part(matched_at, 1):
+        with part(MATCHED, 1):
             fit, solution = fitted(rig, pairs, free=free, sigma=sigma)
     refined = fit.report(solution, force=force)
     if attend is None or not refined.accepted or not solution.directions.shape[1]:
@@ -178,13 +173,12 @@ def fitted(
     if (with_lens := with_lenses(rig)) is not rig:
         candidates.append((with_lens, free))
     problems = [RefinementProblem.of(*candidate, frames=frames, sigma=sigma) for candidate in candidates]
-    ends = [sum(problem.count**2 for problem in problems[:i]) for i in range(len(problems) + 1)]
-    with part(0, ends[1] / ends[-1]):
+    with part(0, 1 / len(problems)):
         best = problems[0], problems[0].solve()
-    for problem, begin, end in zip(problems[1:], ends[1:], ends[2:]):
+    for i, problem in enumerate(problems[1:], 1):
         if _at_its_best(*best):
             break
-        with part(begin / ends[-1], end / ends[-1]):
+        with part(i / len(problems), (i + 1) / len(problems)):
             other = problem, problem.solve()
         distances = [line_distances(fit.after(solution.z), fit.held_out) for fit, solution in (best, other)]
         best = other if nearer(*distances) else best
@@ -343,7 +337,10 @@ class RefinementProblem:
             accepted=accepted,
             changes=tuple(_changes(self.parameters, solution)) if accepted else (),
             unobservable=tuple(_unobservable(self.parameters, solution.active)),
-            held_out=(LineStatistics.of(before), LineStatistics.of(after)),
+            held_out=(
+                LineStatistics(len(before), float(before.abs().median())),
+                LineStatistics(len(after), off),
+            ),
             depth=depth,
             objections=tuple(objections),
             kept=tuple(_kept(self.parameters, solution)),
@@ -436,17 +433,13 @@ def polish(
     base = replace(fit, rig=fit.rig.replace(depth=depth))
     views = [{name: PhotometricImage.of(image) for name, image in frame.items()} for frame in frames]
     root = solution.directions
-
-    done = 0
-    total = EVALUATIONS * len(views) * len(fit.used)
+    done, total = count(), EVALUATIONS * len(views) * len(fit.used)
 
     def errors(z: Tensor, *, held_out: bool) -> Tensor:
-        nonlocal done
         parts = []
         for view, names in product(views, fit.used):
-            log_step(LOG, min(done / total, 0.95), "photometric error of %s and %s", *names)
+            log_step(LOG, min(next(done) / total, 0.95), "photometric error of %s and %s", *names)
             parts.append(photometric_errors(base.after(z), view, names, attend))
-            done += 1
         return torch.cat([error[valid & (held_out_pixels(error) == held_out)] for error, valid in parts])
 
     noise = noise_scale(errors(solution.z, held_out=False).detach())

@@ -308,7 +308,7 @@ def test_frames_that_disagree_about_the_focal_lengths_raise_those_alone(found, m
     given = jackknife(found.fit.problem)._replace(covariance=disagreeing, left_out=disagreeing)
     assert found.fit.raised == 1.0
     monkeypatch.setattr("calib.boards.uncertainty.jackknife", lambda _: given)
-    raised = with_disagreement(found.fit, [BOARD.extent])
+    raised = with_disagreement(found.fit, BOARD)
     ratio = np.sqrt(raised.covariance.diagonal() / found.fit.covariance.diagonal())
     assert ratio == pytest.approx(np.where(factor > 1, np.sqrt((1 + 25) / 2), 1.0))
     assert raised.raised == pytest.approx(np.sqrt(13))
