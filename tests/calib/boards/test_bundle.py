@@ -124,7 +124,7 @@ def test_views_of_the_same_points_are_solved_once(small, monkeypatch):
     rig, boards, _ = small
     views = see(rig, boards, noise=0.1)["mono"]
     (key, first), *_ = views.seen.items()
-    wrong = first._replace(x=first.x + 50 * (first.ids == first.ids[0])[:, None])
+    wrong = first._replace(x=first.x + 5 * (first.ids == first.ids[0])[:, None])
     for seen, times in ((views.seen, 1), ({**views.seen, key: wrong}, 2)):
         counts.clear()
         found = intrinsics.initial_camera("mono", replace(views, seen=seen), BOARD, "brown-conrady")
