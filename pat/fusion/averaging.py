@@ -15,9 +15,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom.chunks import spans
+from arraygeom.compiled import compiled
 from arraygeom.threads import in_parallel
 
-from ..attention.kernels import compiled, separate_cache
 from ..media.colour import from_luma_chroma, luminance
 from ..support.settings import size, tuned
 
@@ -121,6 +121,3 @@ def add_alike(guide, values, radius, sharpness, top, out):
                     seen = values[k, around + top + y - 1 + dy, around + dx : around + dx + width]
                     for x in range(width):
                         out[k, y - 1, x] += weight[x] * seen[x]
-
-
-separate_cache(add_alike)

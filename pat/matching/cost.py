@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arraygeom.compiled import compiled, separate_cache
+from arraygeom.compiled import compiled
 
 from ..support.settings import physics, tuned
 
@@ -84,6 +84,3 @@ def census(image, out):
                 if dx != 3 or dy != 0:
                     for x in range(width):
                         bits[x] = (bits[x] << np.uint64(1)) | np.uint64(row[x + dx] < centre[x])
-
-
-separate_cache(census)

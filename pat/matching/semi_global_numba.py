@@ -14,9 +14,9 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from arraygeom.compiled import renew_with
+from arraygeom.compiled import compiled, renew_with
 from pat.attention.kernels import SOURCES
-from pat.attention.kernels.emit import LANES, NARROW, Vector, compiled, instruction, separate_cache
+from pat.attention.kernels.emit import LANES, NARROW, Vector, instruction
 from pat.attention.kernels.layout import pointers
 from pat.attention.kernels.vectors import from_index
 
@@ -416,4 +416,3 @@ def costs_at(own, other, places, out):
 
 for _entry in (costs, aggregate, winners, regression, costs_at):
     renew_with(_entry, [Path(__file__), Path(__file__).with_name("cost.py"), *SOURCES])
-    separate_cache(_entry)

@@ -16,9 +16,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom.chunks import spans
+from arraygeom.compiled import compiled
 from arraygeom.threads import in_parallel
 
-from ..attention.kernels import compiled, separate_cache
 from ..support.settings import size, tuned
 from .denoiser import opponent, opponent_deviation, rgb_of_opponent
 
@@ -245,7 +245,3 @@ def filter_groups(image, expected, variance, top, found, cosines, window, out):
                             weight = counts * window[i, j]
                             out[0, c, y + i, x + j] += weight * seen[SIDE * i + j, n]
                             out[1, c, y + i, x + j] += weight
-
-
-separate_cache(find_alike)
-separate_cache(filter_groups)

@@ -18,7 +18,7 @@ from arraygeom.compiled import renew_with
 
 from .backward import backward
 from .channels import scatter
-from .emit import LANES, compiled, separate_cache
+from .emit import LANES
 from .forward import forward
 from .layout import Call, Geometry, Gradients, Outputs, Saved, Share, TapList, block_scratch
 from .local import ROWS, attend_rows
@@ -37,10 +37,8 @@ __all__ = [
     "attend_rows",
     "backward",
     "block_scratch",
-    "compiled",
     "forward",
     "scatter",
-    "separate_cache",
 ]
 
 
@@ -48,4 +46,3 @@ SOURCES = [*Path(__file__).parent.glob("*.py")]
 
 for _entry in (forward, backward, scatter, attend_rows):
     renew_with(_entry, SOURCES)
-    separate_cache(_entry)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from arraygeom.compiled import compiled
+
 from .channels import block_products, block_sums, fill, pack, unpack
-from .emit import LANES, compiled
+from .emit import LANES
 from .layout import BLOCK, Taps, from_pixel, of, pixel_of, pointers, replaced
 from .sampling import HALF, course_of, distribute, find_samples, interpolate, interpolation_slopes
 from .softmax import exponentiate, find_scores

@@ -10,7 +10,9 @@ from llvmlite.binding import get_host_cpu_features
 from numba import types
 from numba.extending import overload
 
-from .emit import LANES, NARROW, compiled
+from arraygeom.compiled import compiled
+
+from .emit import LANES, NARROW
 from .layout import BLOCK, from_pixel, of, pointers
 from .vectors import (
     TAP_BLOCK,

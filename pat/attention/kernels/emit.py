@@ -13,20 +13,6 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
-from arraygeom.compiled import compiled, separate_cache
-
-__all__ = [
-    "LANES",
-    "NARROW",
-    "Code",
-    "Vector",
-    "accumulated",
-    "compiled",
-    "instruction",
-    "row_of",
-    "separate_cache",
-]
-
 LANES = 16
 NARROW = 8
 """Lanes where there may be few channels."""

@@ -6,8 +6,10 @@ import math
 
 import numpy as np
 
+from arraygeom.compiled import compiled
+
 from .channels import block_products, block_sums, fill, pack, unpack
-from .emit import LANES, compiled
+from .emit import LANES
 from .layout import BLOCK, of, pixel_of, pointers
 from .sampling import distribute, find_samples
 from .softmax import find_scores, softmax
