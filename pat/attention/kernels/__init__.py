@@ -7,9 +7,7 @@ weights, and in backward the addition of the query to the taps' gradients. Neigh
 in turn, a few taps at a time, since they share most of them. Everything else is work on samples, sixteen at
 a time.
 
-Images come channels-last and flat. The numbers in them are float64, float32, or 16-bit ones seen as
-integers: uint16 is bfloat16, int16 is float16. Arithmetic is in float64 for the first and in float32 for the
-others.
+Images come channels-last and flat, in float64 or float32.
 """
 
 from pathlib import Path
