@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, depth_from_track, pixel_grid
-from arraygeom.chunks import Tile, assembled, spans
+from arraygeom.chunks import Tile, assembled, slices, spans
 from arraygeom.epipolar import FRONT, Track
 
 from ..media.colour import to_bytes
@@ -306,8 +306,7 @@ def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
     plane, known = numpy_of(agreement.inverse_depth), agreement.known.cpu().numpy()
 
     def of(tile: Tile) -> Tensor:
-        top, bottom, left, right = tile.outer
-        part = (..., slice(top, bottom), slice(left, right))
+        part = (..., *slices(tile.outer))
         weight = known[0][part].astype(np.float32) + 1e-5
         smooth = filled(plane[part], weight, guide[part], DISPARITY_FILL)
         median = cv2.medianBlur(np.where(known[part], plane[part], smooth)[0], 5)
