@@ -103,26 +103,19 @@ class Corrections:
         return frame if self.response.is_rec601 else frame._replace(image=self.response.undone(frame.image))
 
 
-def corrections_for(
+@torch.no_grad()
+def find_corrections(
     network: FusionNetwork, frame: FrameInputs, response: Given, *, align: bool
 ) -> Corrections:
-    """What to correct for a network: for one without matches nothing. Raises as `find_corrections`."""
-    if network.uses_matches:
-        return find_corrections(frame, response, align=align)
-    return Corrections(_given(response, frame.inputs))
-
-
-@torch.no_grad()
-def find_corrections(frame: FrameInputs, response: Given, *, align: bool) -> Corrections:
     """Alpha's response if it is to be fitted, and the betas' misalignments if these are asked for.
 
-    A response is fitted for RGB betas. Raises ValueError for a stated response that is not three weights,
-    none negative, or where there is no RGB beta.
+    A response is fitted for RGB betas. Nothing is found for a network without matches. Raises ValueError for
+    a stated response that is not three weights, none negative, or where there is no RGB beta.
     """
     found = Corrections(_given(response, frame.inputs))
     fits = response == "fit" and any(map(_is_rgb, frame.inputs.betas))
     align = align and all(beta.field.pixels is not None for beta in frame.inputs.betas)
-    if not fits and not align:
+    if not network.uses_matches or not (fits or align):
         return found
     small = _reduced_frame(frame)
     found = replace(found, misalignments=(Misalignment(),) * len(frame.inputs.betas))

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from arraygeom.chunks import chunked
 
-from ..matching.filters import numpy_of
+from ..matching.filters import nearest_known, numpy_of
 from ..matching.positions import FINE
 from ..matching.surfaces import Plane, Planes, repeated
 from ..support.settings import physics, tuned
@@ -140,13 +140,6 @@ def _far_by_slope(inverse: Plane) -> list[Plane]:
 
 def _background(inverse: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """The farther of the nearest known ones to either side; as it is where a row has none."""
-    before = _nearest_known(inverse, known)
-    beside = torch.fmin(before, _nearest_known(inverse.flip(-1), known.flip(-1)).flip(-1))
+    alone = torch.where(known, inverse, torch.nan)
+    beside = torch.fmin(*(nearest_known(alone, known, -1, back) for back in (False, True)))
     return torch.where(beside.isnan(), inverse, beside)
-
-
-def _nearest_known(values: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Each pixel's nearest known value to the left, itself included; NaN if there is none."""
-    columns = torch.arange(values.shape[1], device=values.device).expand_as(values)
-    last = torch.where(known, columns, -1).cummax(1).values
-    return torch.where(last >= 0, values.gather(1, last.clamp(min=0)), torch.nan)

@@ -59,8 +59,7 @@ def warped(image: Float[Tensor, "c h w"], step: Float[Tensor, "2 h w"]) -> Float
     """The image sampled where each pixel goes, bilinearly; outside the frame its nearest pixel."""
     h, w = image.shape[-2:]
     x = pixel_grid((h, w)) + step.movedim(0, -1)
-    x = torch.minimum(x.clamp(min=0), x.new_tensor([w - 1, h - 1]))
-    return sample(image[None], x[None]).values[0]
+    return sample(image[None], x[None], extended=True).values[0]
 
 
 def _steps(a: Tensor, b: Tensor) -> Float[Tensor, "2 h w"]:

@@ -15,7 +15,7 @@ from functools import cache, partial
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
@@ -29,7 +29,7 @@ from ..support.blocks import UNet
 from ..support.settings import size
 from . import choice_numba as kernels
 from .certainty import typical_facts
-from .filters import numpy_of
+from .filters import nearest_known, numpy_of
 from .inputs import Inputs
 from .matches import BetaMatches, Matches
 from .normalisation import ComparedViews
@@ -127,24 +127,11 @@ def candidates(found: BetaMatches) -> Float[Tensor, "b n h w"]:
     """Disparities of each pixel to choose from; the first is its own."""
     own = found.disparity
     consistent = enlarged(found.facts[:, :1] < CONSISTENT)
-    along = [_nearest(own, consistent, axis, back) for axis in (-2, -1) for back in (False, True)]
+    along = [nearest_known(own, consistent, axis, back) for axis in (-2, -1) for back in (False, True)]
     (h, w), most = own.shape[-2:], max(SETTINGS.around)
     wide = pad(own, (most,) * 4, mode="replicate")
     beside = [wide[..., most + y : most + y + h, most + x : most + x + w] for y, x in AROUND]
     return torch.cat([own, *along, *beside], 1)
-
-
-def _nearest(
-    x: Float[Tensor, "b 1 h w"], known: Bool[Tensor, "b 1 h w"], axis: int, back: bool
-) -> Float[Tensor, "b 1 h w"]:
-    """The value of the nearest known pixel before (or after) along an axis; the pixel's own if none is."""
-    if back:
-        return _nearest(x.flip(axis), known.flip(axis), axis, False).flip(axis)
-    shape = [1] * x.ndim
-    shape[axis] = -1
-    index = torch.arange(x.shape[axis], device=x.device).view(shape)
-    last = torch.where(known, index, -1).cummax(axis).values
-    return torch.where(last >= 0, x.gather(axis, last.clamp(min=0)), x)
 
 
 def features(

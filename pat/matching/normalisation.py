@@ -127,30 +127,21 @@ class Normalisation(NamedTuple):
         """What makes the means and standard deviations the same, and then the sharpness."""
         own, wanted = moments(beta), moments(alpha)
         level = torch.stack([own.mean, own.gain(wanted, SETTINGS.largest_gain), wanted.mean])
-        return cls(level, equalising_blurs(alpha, _levelled(beta, level)))
+        return cls(level, equalising_blurs(alpha, own.matched(beta, wanted, SETTINGS.largest_gain)))
 
     def normalised(self, beta: Tensor) -> Tensor:
         """Beta's brightness (or that of a part of it) with alpha's mean and standard deviation."""
-        return _levelled(beta, self.level)
+        mean, factor, middle = self.level.to(beta)
+        return (beta - mean) * factor + middle
 
     def softened(self, alpha: Tensor) -> Tensor:
         """Alpha (or a part of it), no sharper than beta."""
         return blurred(alpha, self.blurs[0])
 
-    def equally_sharp(self, alpha: Tensor, normalised: Tensor) -> tuple[Tensor, Tensor]:
-        """Both (or parts of them), the sharper one blurred."""
-        return blurred(alpha, self.blurs[0]), blurred(normalised, self.blurs[1])
-
     def views(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> ComparedViews:
         """Alpha and beta's brightness, or parts of them, as they are compared."""
-        return ComparedViews(
-            *self.equally_sharp(alpha, self.normalised(beta)), to_bytes(alpha[:, 0]), self.blurs[0]
-        )
-
-
-def _levelled(image: Tensor, level: Tensor) -> Tensor:
-    mean, factor, middle = level.to(image)
-    return (image - mean) * factor + middle
+        other = blurred(self.normalised(beta), self.blurs[1])
+        return ComparedViews(self.softened(alpha), other, to_bytes(alpha[:, 0]), self.blurs[0])
 
 
 def equalising_blurs(

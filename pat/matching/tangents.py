@@ -26,7 +26,6 @@ from arraygeom.fields.widened import direction
 from arraygeom.pixels import HW, pixel_grid
 from arraygeom.warned import warn
 
-from ..media.colour import to_bytes
 from . import semi_global_numba as kernels
 from .cost import planes_of
 from .filters import filled, numpy_of
@@ -136,8 +135,8 @@ class _BlockCentres:
 def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool) -> NDArray:
     """The label of each block of alpha."""
     own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
-    level = Normalisation.of(own, other)
-    a, b = (numpy_of(p[0, 0]) for p in level.equally_sharp(own, level.normalised(other)))
+    views = Normalisation.of(own, other).views(own, other)
+    a, b = (numpy_of(p[0, 0]) for p in views[:2])
     planes, other_planes = planes_of(a), flat(planes_of(b))
     label, margin = np.zeros((2, *a.shape), np.float32)
     side, halo = (HALF_SIZE.block, HALF_SIZE.margin) if ordered else ((grid.rows, a.shape[1]), 0)
@@ -159,7 +158,7 @@ def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool)
         return label
     scale = np.float32(8 * kernels.PARTS * HALF_SIZE.jump)
     weight = np.minimum(margin / scale, 1)
-    dense = filled(label[None], weight + np.float32(1e-5), to_bytes(own[:, 0])[0], DISPARITY_FILL)[0]
+    dense = filled(label[None], weight + np.float32(1e-5), views.guides[0], DISPARITY_FILL)[0]
     return cv2.medianBlur(np.where(weight > LEAST_MARGIN, label, dense).astype(np.float32), 5)
 
 
