@@ -186,12 +186,7 @@ def _matched_blocks(
     (_, *hw), (_, rows, columns) = own.shape, other.shape
     disparity, place = np.empty(own.shape, np.float32), np.empty(own.shape, np.int32)
     measured = np.empty((*own.shape, facts), np.float32)
-    planes: list[tuple[NDArray, ...]] = [()] * (2 * len(own))
-
-    def prepare(i: int, image: NDArray) -> None:
-        planes[i] = planes_of(image)
-
-    in_parallel([partial(prepare, *one) for one in enumerate((*own, *other))])
+    planes = in_parallel([partial(planes_of, image) for image in (*own, *other)])
     images, tasks, nbytes = [], [], 1.0
     for i, (mine, its) in enumerate(zip(planes[: len(own)], planes[len(own) :])):
         views = own[i], windows.first[i], *(g[i] for g in geometry), *mine

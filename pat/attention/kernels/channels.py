@@ -48,10 +48,7 @@ def fill(numbers, first, last, filler):
 @compiled
 def copy(array, at, n, out):
     """out[c] = array[at + c]."""
-    whole = n // NARROW * NARROW
-    for c in range(0, whole, NARROW):
-        store(out, c, load_narrow(array, at + c))
-    for c in range(whole, n):
+    for c in range(n):
         out[c] = array[at + c]
 
 
