@@ -35,7 +35,6 @@ from .matches import BetaMatches, Matches
 from .normalisation import ComparedViews
 from .positions import FINE, Extent, enlarged
 from .semi_global import CONSISTENT
-from .surfaces import Plane
 
 FITTED = Path(__file__).with_name("choice.safetensors")
 
@@ -151,18 +150,14 @@ def features(
     for i, image in enumerate(given):
         one = min(i, len(segments.end) - 1)
         parts = views.alpha[i, 0], views.beta[i, 0], segments.end[one], extent.towards[one], options[i]
-        planes = tuple(map(numpy_of, parts))
-        compared = partial(_compared_rows, planes, image[..., FACTS:].numpy())
-        in_parallel([partial(compared, *span) for span in spans(sides[0], STRIP)])
+        own, other, end, towards, each = map(numpy_of, parts)
+        tasks = []
+        for top, bottom in spans(sides[0], STRIP):
+            rows, out = slice(FINE * top, FINE * bottom), image[top:bottom, :, FACTS:].numpy()
+            planes = own[rows], other, end[rows], towards[rows], each[:, rows]
+            tasks.append(partial(kernels.compared, *planes, SETTINGS.scales, out))
+        in_parallel(tasks)
     return given.movedim(-1, 1).to(views.alpha)
-
-
-def _compared_rows(planes: tuple[Plane, ...], out: Plane, top: int, bottom: int) -> None:
-    """`kernels.compared` of some rows of half the size."""
-    (own, other, end, towards, options), rows = planes, slice(FINE * top, FINE * bottom)
-    kernels.compared(
-        own[rows], other, end[rows], towards[rows], options[:, rows], SETTINGS.scales, out[top:bottom]
-    )
 
 
 def _at_half(found: BetaMatches, typical: Tensor) -> Float[Tensor, "b 7 h2 w2"]:

@@ -196,7 +196,8 @@ class Agreement(NamedTuple):
         """The inverse depth that is supported best, in the type of another tensor."""
         proposals = [view.inverse_depth for view in views]
         weights = torch.stack([known * (0.1 + view.facts[1]) for view, (_, known) in zip(views, proposals)])
-        support = torch.stack([_supported(views, weights, w) for w, _ in proposals])  # proposal, beta, h, w
+        near = [[(v.disparity_of(w) - v.disparity).abs() < NEAR for v in views] for w, _ in proposals]
+        support = torch.stack([weights * torch.stack(one) for one in near])  # proposal, beta, h, w
         total = torch.where(torch.stack([known for _, known in proposals]), support.sum(1), -1.0)
         best = total.argmax(0)[None, None].expand(1, *support.shape[1:])
         counts = support.gather(0, best)[0]
@@ -337,11 +338,3 @@ def _of_beta(
         facts[0, :1, half] = avg_pool2d(unlike[None], FINE)
         facts[0, 1:, half] = agreement.facts[:, half]
     return replace(own, disparity=disparity, facts=facts, chosen=None)
-
-
-def _supported(
-    views: Sequence[MatchedBeta], weights: Tensor, inverse_depth: Tensor
-) -> Float[Tensor, "betas h w"]:
-    """The weights of the betas whose matches are near a proposed inverse depth."""
-    apart = [(view.disparity_of(inverse_depth) - view.disparity).abs() for view in views]
-    return torch.stack([w * (pixels < NEAR) for pixels, w in zip(apart, weights)])

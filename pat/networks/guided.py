@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, conv2d, pad, pixel_unshuffle
+from torch.nn.functional import avg_pool2d, pad, pixel_shuffle, pixel_unshuffle
 
 from arraygeom import Local, Segments
 
@@ -239,14 +239,8 @@ class GuidedPAT(nn.Module):
         return self.confidence(stacked(enlarge(context), own.half, matched, facts))
 
     def _key(self, features: Encoded) -> Tensor:
-        """What queries and keys are at full size; channels beside each other, as attention wants them."""
-        weight, bias = (
-            p.unflatten(0, (-1, 2, 2)).movedim(0, 2).flatten(0, 2) for p in self.fine_key.parameters()
-        )
-        x = conv2d(features.half, weight, bias).movedim(1, -1)
-        b, h, w, c = x.shape
-        pixels = x.unflatten(-1, (2, c // 2)).movedim(3, 2)
-        return pixels.reshape(b, 2 * h, 2 * w, c // 4).movedim(-1, 1)
+        """What queries and keys are at full size."""
+        return pixel_shuffle(self.fine_key(features.half), 2)
 
 
 def _joined(bands: Sequence[Tensor]) -> Tensor:
