@@ -27,8 +27,7 @@ class AveragingSettings:
     """Of means over pixels that are alike."""
 
     scale: float = tuned(
-        0.18,
-        "Middlebury, tune half: the scale of unlikeness, over the root of the noise's standard deviation",
+        0.18, "Middlebury, tune half: scale of unlikeness over the root of the noise's deviation"
     )
     radius: int = size(8, "How far away pixels are, rows and columns")
     rows: int = size(16, "Rows that a thread works on at once: what it sums stays in its cache")

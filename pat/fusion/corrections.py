@@ -49,15 +49,10 @@ class PrePassSettings:
     pixels: int = size(400_000, "Alpha's pixels in the pre-pass, at most")
     small: int = size(50_000, "Alpha's pixels below which the pre-pass is at full size")
     margin: float = tuned(
-        0.1,
-        "The first value tried, which held: by how much a match must be better than others to "
-        "count, as of `BetaMatches.facts`",
+        0.1, "First value tried: by how much a match must be better than others, as of `BetaMatches.facts`"
     )
     passes: int = size(3, "Pre-passes at most: matches are better where what was found is put right")
-    settled: float = size(
-        0.25,
-        "Change of the largest displacement, pixels of the pre-pass, up to which no other pass is made",
-    )
+    settled: float = size(0.25, "Pixels by which the largest displacement changes, up to which passes end")
 
 
 SETTINGS = PrePassSettings()

@@ -29,9 +29,7 @@ from .inputs import Placement
 class DepthSettings:
     """Of the depth of fused pixels."""
 
-    unseen: float = size(
-        1e-4, "At confidences up to this beta does not see the point: then its position gives no depth"
-    )
+    unseen: float = size(1e-4, "Confidence up to which beta does not see the point, and gives no depth")
 
 
 SETTINGS = DepthSettings()

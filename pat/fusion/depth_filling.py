@@ -28,8 +28,7 @@ class FillSettings:
 
     share: float = tuned(
         0.4,
-        "Middlebury, tune half, of .2 to .7: share of the confidence around it below which a match is "
-        "left for a plane",
+        "Middlebury, tune half, of .2 to .7: share of the confidence around, below which a plane is taken",
     )
     reach: float = tuned(
         80.0,
@@ -42,9 +41,7 @@ class FillSettings:
         "are first fitted, in half-widths of its interval: its width",
     )
     one_side: float = physics(
-        0.9,
-        "Length of the sum of all betas' segments, "
-        "over the sum of their lengths, from which all count as on one side",
+        0.9, "Length of the segments' sum over the sum of their lengths, from which betas are on one side"
     )
 
 

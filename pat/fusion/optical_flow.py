@@ -23,9 +23,7 @@ class FlowSettings:
     """Of optical flow between frames."""
 
     astray: float = tuned(
-        1.0,
-        "Source not recorded: "
-        "flow that does not lead back to within this many pixels has a weight below 1 / e",
+        1.0, "Source not recorded: flow that does not lead back to so many pixels has a weight below 1 / e"
     )
 
 

@@ -45,7 +45,7 @@ class ChoiceSettings:
 
     around: tuple[int, ...] = size((2, 5, 10), "Distances, in pixels, of those around a pixel")
     scales: tuple[float, float] = size(
-        (6.0, 1 / 6), "Differences of disparity, in pixels, and of brightness that count as half of the most"
+        (6.0, 1 / 6), "Differences of disparity, pixels, and of brightness that count as a half"
     )
     widths: tuple[int, int, int] = size((32, 48, 64), "Channels at 1/2, 1/4 and 1/8 of the size")
     multiple: int = size(8, "Images are padded to multiples of this")

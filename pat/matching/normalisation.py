@@ -28,13 +28,10 @@ LEAST_WEIGHT = 1e-6
 class NormalisationSettings:
     """How far one image is brought to another's brightness and sharpness."""
 
-    largest_gain: float = size(
-        4.0, "The largest factor of brightness; images that differ by more show different things"
-    )
+    largest_gain: float = size(4.0, "Of brightness; images that differ by more show different things")
     blurs: tuple[float, ...] = size(
         (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0),
-        "Standard deviations, in pixels, "
-        "with which the sharper image is tried until it is no sharper than the other",
+        "Standard deviations, pixels, tried on the sharper image until it is no sharper than the other",
     )
 
 

@@ -46,13 +46,11 @@ class ResponseSettings:
     rare: float = tuned(0.05, "Middlebury: the probability of anything that is not as usual")
     light: float = tuned(0.03, "Middlebury: standard deviation of light between the views, a share of it")
     near: float = tuned(
-        0.2, "Middlebury: by how much colour, or place in widths of beta, differs where light is another"
+        0.2, "Middlebury: difference in colour, or in place in widths of beta, where light differs"
     )
     least: float = tuned(0.005, "Middlebury: standard deviation of a point, at least")
     independent: float = tuned(3.0, "Middlebury: a group counts as so many independent points")
-    groups: int = size(
-        256, "Groups, at most, of points that are alike in colour and place; half or twice as many do as well"
-    )
+    groups: int = size(256, "Groups of alike points, at most; half or twice as many do as well")
     points_of_group: int = size(8, "Points of a group, at least")
     points: tuple[int, int] = size((6000, 300), "Pixels used at most, and the fewest that are enough")
     outlier: float = physics(2.385, "Deviations that count half: 95 % efficient if errors are normal")

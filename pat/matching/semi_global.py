@@ -40,12 +40,8 @@ from .positions import FINE, Extent
 class SemiGlobalSettings:
     """The numbers of a run of semi-global matching."""
 
-    step: float = tuned(
-        12.0, "Source not recorded: penalty of neighbours whose labels differ by one, in the unit of `cost`"
-    )
-    jump: float = tuned(
-        100.0, "Source not recorded: penalty of those that differ by more, where alpha shows no edge"
-    )
+    step: float = tuned(12.0, "Source not recorded: penalty of neighbours' labels that differ by one")
+    jump: float = tuned(100.0, "Source not recorded: of those that differ by more, where alpha has no edge")
     margin: int = size(64, "What is matched around a block, pixels")
     block: int = size(320, "Sides of a block, pixels")
     long_block: int = size(640, "The longer side of the blocks of large images, along the segments")
@@ -54,13 +50,11 @@ class SemiGlobalSettings:
     label_bytes: int = size(3, "What it takes for each label of each pixel: cost, and sum of costs")
     consistent: float = tuned(
         0.2,
-        "Source not recorded: "
-        "a match is consistent if matching back from beta ends less than this (times 8 pixels) from it",
+        "Source not recorded: matching back from beta ends less than this (times 8 pixels) from the match",
     )
     fill: tuple[float, float] = tuned(
         (50.0, 4.0),
-        "Source not recorded: "
-        "strength, and 8-bit difference that is an edge, of the smoothing that fills (Min et al. 2014)",
+        "Source not recorded: strength, and 8-bit difference of an edge, of smoothing (Min et al. 2014)",
     )
 
 

@@ -25,23 +25,20 @@ class MixSettings:
     """Brightness is 0 to 1."""
 
     equal: float = size(
-        1e-4, "How strongly the combination is drawn to one of equal parts: share of the bands' mean variance"
+        1e-4, "Share of the bands' mean variance by which the combination is drawn to equal parts"
     )
     misfit: float = tuned(
         0.016,
-        "Source not recorded: difference from alpha, averaged over `smooth` pixels to either side, at which "
-        "the combination counts half",
+        "Source not recorded: difference from alpha, averaged around, at which the combination counts half",
     )
-    smooth: int = size(4, "See `misfit`")
+    smooth: int = size(4, "Pixels to either side over which `misfit` is averaged")
     diluted: float = tuned(
         0.8,
         "Source not recorded: wrong matches make least squares' weights too small; they are enlarged until "
         "the combination varies as much as alpha, "
         "as if no less than this share of alpha's variance were explained",
     )
-    wide: int = size(
-        4, "Bands are compared with alpha within squares whose radius is the image's longer side over this"
-    )
+    wide: int = size(4, "The image's longer side over the radius in which bands are compared")
 
 
 SETTINGS = MixSettings()

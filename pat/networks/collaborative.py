@@ -37,9 +37,7 @@ class CollaborativeSettings:
         "Middlebury, tune half: alike blocks are looked for in an estimate with so much of the noise left: "
         "where an image is flat the noise makes blocks alike that lie apart, as is needed",
     )
-    kept: float = tuned(
-        0.5, "Middlebury, tune half: share of the network's brightness that is kept: its errors are others"
-    )
+    kept: float = tuned(0.5, "Middlebury, tune half: share of the network's brightness that is kept")
 
 
 SETTINGS = CollaborativeSettings()
