@@ -117,7 +117,7 @@ def _measured(
     total, widths, weights = like.new_zeros(3, h, w)
     found_in_betas = zip(output.position, output.deviation, output.confidence)
     for beta, place, (position, deviation, confidence) in zip(betas, placements, found_in_betas):
-        if not place.has_depth:
+        if not place.pair.calibrated:
             continue
         pair, offset = place.pair, like.new_tensor(beta.offset)
         where = position[0, :, :h, :w].movedim(0, -1)

@@ -87,7 +87,7 @@ def background_filled(frame: Frame, given: FrameInputs) -> Float[Tensor, "h w"]:
 
 def _searched(placements: Sequence[Placement]) -> tuple[float, float]:
     """The least and the greatest inverse depth that was looked for; any, where nothing says."""
-    stated = [place.pair.depth for place in placements if place.has_depth]
+    stated = [place.pair.depth for place in placements if place.pair.calibrated]
     known = [(float(far), float(near)) for near, far in filter(None, stated)]
     if not known or len(known) < len(stated):
         return 0.0, math.inf

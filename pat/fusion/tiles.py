@@ -266,7 +266,7 @@ def _digest(network: FusionNetwork, frame: FrameInputs) -> str:
     digest = hashlib.sha256(f"{how} {rounded}".encode())
     parameters = module.state_dict().values()
     fields = [tensor for beta in inputs.betas for tensor in _tensors(beta.field, inputs.hw)]
-    cameras = [camera for place in frame.placements if place.has_depth for camera in place.pair.cameras]
+    cameras = [camera for place in frame.placements if place.pair.calibrated for camera in place.pair.cameras]
     poses = [tensor for camera in cameras for tensor in (camera.K, camera.R, camera.t)]
     for tensor in (*parameters, inputs.alpha, *(b.image for b in inputs.betas), *fields, *poses):
         digest.update(tensor.detach().cpu().contiguous().numpy())

@@ -38,7 +38,7 @@ from .positions import FINE, Extent
 
 @dataclass(frozen=True)
 class SemiGlobalSettings:
-    """The numbers of a run of semi-global matching."""
+    """The numbers of a run of semi-global matching; penalties are in the unit of `cost`."""
 
     step: float = tuned(12.0, "Source not recorded: penalty of neighbours' labels that differ by one")
     jump: float = tuned(100.0, "Source not recorded: of those that differ by more, where alpha has no edge")

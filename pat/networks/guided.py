@@ -137,7 +137,10 @@ class GuidedPAT(nn.Module):
         self.encoder = Encoder(c.widths)
         self.fine_key = nn.Conv2d(w2, 4 * c.fine_dim, 1)
         self.judge = UNet(w4 + 9, c.widths[1:], c.judge_dim)
-        self.confidence = ConfidenceHead(c.judge_dim + w2 + 4 + 12, c.confidence_dim)
+        # The logits of confidence, choices and the better match at full size, computed at half of it.
+        width = c.confidence_dim
+        logits = nn.Conv2d(width, 4 * (3 + FILLS), 3, padding=1), nn.PixelShuffle(2)
+        self.confidence = nn.Sequential(conv(c.judge_dim + w2 + 4 + 12, width), ResidualBlock(width), *logits)
         rounds = (Propagation(w4, c.propagation_dim, spacing) for spacing in c.propagation_steps)
         self.propagation = nn.ModuleList(rounds)
         self.completion = Completion(c.completion) if c.completion else None
@@ -281,18 +284,6 @@ def combined(estimates: Sequence[BetaEstimate]) -> BetaEstimate:
         first.position,
         mean([e.likeness for e in estimates]),
     )
-
-
-class ConfidenceHead(nn.Sequential):
-    """The logits of confidence, choices and the better match at full size, computed at half of it."""
-
-    def __init__(self, inputs: int, width: int) -> None:
-        super().__init__(
-            conv(inputs, width),
-            ResidualBlock(width),
-            nn.Conv2d(width, 4 * (3 + FILLS), 3, padding=1),
-            nn.PixelShuffle(2),
-        )
 
 
 class Propagation(nn.Module):
