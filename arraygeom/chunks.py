@@ -32,6 +32,11 @@ def area(box: Box) -> int:
     return math.prod(last - first for first, last in zip(box[::2], box[1::2]))
 
 
+def slices(box: Sequence[int]) -> tuple[Any, ...]:
+    """What is indexed to get a box, along its axes."""
+    return tuple(slice(*span) for span in zip(box[::2], box[1::2]))
+
+
 def whole(lengths: Sequence[int]) -> Tile:
     """All of a frame (h, w) as one tile."""
     box = tuple(chain(*((0, n) for n in lengths)))

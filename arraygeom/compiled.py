@@ -39,6 +39,7 @@ def compiled(function=None, **options):
         _warn_of_no_folder()
         return njit(inspect.unwrap(function), **options)
     if options.get("cache"):
+        separate_cache(entry)
         _one_process_at_a_time(entry)
     return entry
 

@@ -107,27 +107,25 @@ def _convolved(
     return out
 
 
-def in_parallel(tasks: Sequence[Callable[[], object]], *, most: int | None = None) -> None:
-    """Run tasks on as many `threads` as there are, or `most` of them, this one included; torch in each alone,
-    with gradients and inference mode as here.
+def in_parallel(tasks: Sequence[Callable[[], Any]], *, most: int | None = None) -> list[Any]:
+    """What tasks give, on as many `threads` as there are, or `most` of them, this one included; torch in each
+    alone, with gradients and inference mode as here.
 
     After an error in one no other is begun; it is raised once those that were are at their end.
     """
-    left = iter(tasks)
+    left, made = enumerate(tasks), [None] * len(tasks)
 
     def work() -> None:
         try:
-            for task in left:
-                task()
+            for i, task in left:
+                made[i] = task()
         except BaseException:
             list(left)
             raise
 
     helpers = min(threads(), len(tasks), most or len(tasks)) - 1
     if helpers < 1:
-        for task in left:
-            task()
-        return
+        return [task() for task in tasks]
     work = _as_here(work)
     waiting = [_pool(os.getpid(), helpers).submit(work) for _ in range(helpers)]
     try:
@@ -136,6 +134,7 @@ def in_parallel(tasks: Sequence[Callable[[], object]], *, most: int | None = Non
         wait(waiting)
     for future in waiting:
         future.result()
+    return made
 
 
 def in_order(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[Any]:

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from ..compiled import compiled, separate_cache
+from ..compiled import compiled
 from ..epipolar import FRONT
 from ..segments import FLAT
 
@@ -192,6 +192,3 @@ def _along(pieces, total, fractions, out):
         length = pieces[2, i]
         within = min(max(1 - (pieces[3, i] - wanted) / length, 0.0), 1.0) if length > 0 else 0.0
         out[k] = (i + pieces[0, i] + within * (pieces[1, i] - pieces[0, i])) / count
-
-
-separate_cache(curved_positions)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled import compiled, separate_cache
+from ..compiled import compiled
 
 BUCKETS = 128
 """Buckets into which distances are sorted first."""
@@ -95,6 +95,3 @@ def _sort(keys, n, limit, order, begins, buckets, found):
             order[at], found[at] = order[at - 1], found[at - 1]
             at -= 1
         order[at], found[at] = one, key
-
-
-separate_cache(nearest_pixels)

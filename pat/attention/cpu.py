@@ -35,13 +35,13 @@ def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Te
     query = inputs.query
     b, _, ha, wa = query.shape
     counted = accumulated(query)
-    out = _new(b, ha, wa, inputs.value.shape[1], dtype=query.dtype)
+    out = _new(b, ha, wa, inputs.value.shape[1], dtype=counted)
     statistics = _new(*((b, ha, wa, 4) if measured else (0,)), dtype=counted)
     logsum = _new(b, ha, wa, dtype=counted)
     call = _call(inputs)
     outputs = kernels.Outputs(_flat(out), _flat(statistics), _flat(logsum), measured)
     in_parallel([partial(kernels.forward, call, share, outputs) for share in _shares(0, b * ha * wa, call)])
-    return out.permute(0, 3, 1, 2), statistics, logsum, torch.empty(0, dtype=torch.int32)
+    return out.to(query.dtype).permute(0, 3, 1, 2), statistics, logsum, torch.empty(0, dtype=torch.int32)
 
 
 def forward_local(query: Tensor, key: Tensor, value: Tensor, field: Local, bias: Tensor | None) -> Tensor:
@@ -75,7 +75,7 @@ def backward(
     b, d, ha, wa = query.shape
     counted = accumulated(query)
     call = _call(inputs)
-    upstream = _flat(channels_last(cotangents[0]))
+    upstream = _flat(channels_last(cotangents[0].to(counted)))
     measured = saved[0], cotangents[1].to(counted).contiguous()
     statistics, statistics_upstream = (t if t.numel() else t.new_zeros(4) for t in measured)
     found = kernels.Saved(
@@ -85,10 +85,9 @@ def backward(
         statistics_upstream=_flat(statistics_upstream),
         step=4 if saved[0].numel() else 0,
     )
-    query_out = _new(*((b, ha, wa, d) if wanted[0] else (0,)), dtype=query.dtype)
-    key_out, value_out = (
+    query_out, key_out, value_out = (
         _new(*((b, *t.shape[2:], t.shape[1]) if want else (0,)), dtype=counted).zero_()
-        for t, want in ((key, wanted[1]), (value, wanted[2]))
+        for t, want in zip((query, key, value), wanted)
     )
     points_out = query.new_zeros((b, *positions.points.shape[1:]) if wanted[3] else 0, dtype=counted)
     bias_out = query.new_zeros((b, ha, wa, positions.samples) if wanted[4] else 0, dtype=counted)
@@ -118,9 +117,8 @@ def backward(
 
 
 def _flat(tensor: Tensor) -> np.ndarray:
-    """The numbers as the kernels know them: bfloat16 as uint16, float16 as int16."""
-    seen = {torch.bfloat16: torch.uint16, torch.float16: torch.int16}.get(tensor.dtype, tensor.dtype)
-    return tensor.detach().reshape(-1).view(seen).numpy()
+    """The numbers as the kernels know them."""
+    return tensor.detach().reshape(-1).numpy()
 
 
 def _new(*shape: int, dtype: torch.dtype) -> Tensor:
@@ -154,12 +152,11 @@ def _geometry(inputs: AttentionInputs) -> kernels.Geometry:
 
 
 def _call(inputs: AttentionInputs) -> kernels.Call:
-    query, key, value, _, bias, _ = inputs
+    query, _, value, _, bias, _ = inputs
     counted = accumulated(query)
+    images = [_flat(channels_last(image.to(counted))) for image in inputs[:3]]
     return kernels.Call(
-        _flat(channels_last(query)),
-        _flat(channels_last(key)),
-        _flat(channels_last(value)),
+        *images,  # type: ignore[arg-type]
         geometry=_geometry(inputs),
         bias=_flat(query.new_empty(0, dtype=counted) if bias is None else bias.to(counted).contiguous()),
         biased=bias is not None,

@@ -66,27 +66,14 @@ def compiled(backend: str) -> ModuleType:
 @torch.library.custom_op(
     "pat::attend", mutates_args=(), schema=f"({INPUTS}, {OPTIONS}) -> (Tensor, Tensor, Tensor, Tensor)"
 )
-def _attend(
-    query: Tensor,
-    key: Tensor,
-    value: Tensor,
-    points: Tensor,
-    mask: Tensor,
-    bias: Tensor | None,
-    samples: int,
-    straight: bool,
-    nearest: bool,
-    measured: bool,
-    backend: str,
-    strict: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    inputs = _inputs((query, key, value, points, mask, bias), (samples, straight, nearest))
-    return compiled(backend).forward(inputs, measured)
+def _attend(*given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    tensors, (*form, measured, backend, _) = given[:6], given[6:]
+    return compiled(backend).forward(_inputs(tensors, form), measured)
 
 
-def _inputs(tensors: Any, options: Any) -> AttentionInputs:
+def _inputs(tensors: Any, form: Any) -> AttentionInputs:
     """The inputs of `INPUTS`, and the first three of `OPTIONS`."""
-    (query, key, value, points, mask, bias), (samples, straight, nearest) = tensors, options
+    (query, key, value, points, mask, bias), (samples, straight, nearest) = tensors, form
     positions = SamplePositions(points, mask, samples, straight)
     return AttentionInputs(query, key, value, positions, bias, nearest)
 
@@ -113,30 +100,14 @@ def _(info, in_dims, *inputs):
     mutates_args=(),
     schema=f"({INPUTS}, {SAVED}, {OPTIONS}, bool[] wanted) -> (Tensor, Tensor, Tensor, Tensor, Tensor)",
 )
-def _attend_backward(
-    query: Tensor,
-    key: Tensor,
-    value: Tensor,
-    points: Tensor,
-    mask: Tensor,
-    bias: Tensor | None,
-    statistics: Tensor,
-    logsum: Tensor,
-    best: Tensor,
-    out: Tensor | None,
-    value_cotangent: Tensor,
-    statistics_cotangent: Tensor,
-    samples: int,
-    straight: bool,
-    nearest: bool,
-    measured: bool,
-    backend: str,
-    strict: bool,
-    wanted: list[bool],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    inputs = _inputs((query, key, value, points, mask, bias), (samples, straight, nearest))
-    saved, cotangents = (statistics, logsum, best, out), (value_cotangent, statistics_cotangent)
-    return compiled(backend).backward(inputs, saved, cotangents, wanted)
+def _attend_backward(*given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    tensors, saved, cotangents, (*form, _, backend, _, wanted) = (
+        given[:6],
+        given[6:10],
+        given[10:12],
+        given[12:],
+    )
+    return compiled(backend).backward(_inputs(tensors, form), saved, cotangents, wanted)
 
 
 @_attend_backward.register_fake

@@ -34,7 +34,7 @@ from ..networks.weights import load_weights, weights_for
 from ..support.blocks import without_autocast
 from ..support.memory import limited, parse_bytes
 from .checks import warn_of_confidence
-from .corrections import corrections_for, expected_work
+from .corrections import expected_work, find_corrections
 from .fuse import Progress
 from .inputs import FrameInputs, Placement, prepared
 from .low_light import Noise, denoised_views
@@ -213,7 +213,7 @@ def align(
         before=expected_work(inputs, response, align=correct),
         kept=low_light.kept(inputs.hw, len(betas)),
     )
-    found = corrections_for(network, inputs, response, align=correct)
+    found = find_corrections(network, inputs, response, align=correct)
     inputs = inputs._replace(inputs=found.applied(inputs.inputs, inputs.hw))
     with limited(limit), torch.no_grad():
         matches = matcher(inputs.inputs)

@@ -15,9 +15,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom.chunks import spans
+from arraygeom.compiled import compiled
 from arraygeom.threads import in_parallel
 
-from ..attention.kernels import compiled, separate_cache
 from ..media.colour import from_luma_chroma, luminance
 from ..support.settings import size, tuned
 
@@ -27,8 +27,7 @@ class AveragingSettings:
     """Of means over pixels that are alike."""
 
     scale: float = tuned(
-        0.18,
-        "Middlebury, tune half: the scale of unlikeness, over the root of the noise's standard deviation",
+        0.18, "Middlebury, tune half: scale of unlikeness over the root of the noise's deviation"
     )
     radius: int = size(8, "How far away pixels are, rows and columns")
     rows: int = size(16, "Rows that a thread works on at once: what it sums stays in its cache")
@@ -121,6 +120,3 @@ def add_alike(guide, values, radius, sharpness, top, out):
                     seen = values[k, around + top + y - 1 + dy, around + dx : around + dx + width]
                     for x in range(width):
                         out[k, y - 1, x] += weight[x] * seen[x]
-
-
-separate_cache(add_alike)

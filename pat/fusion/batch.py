@@ -23,8 +23,9 @@ import yaml
 from rich.console import Console
 from safetensors import SafetensorError
 from safetensors.torch import load_file
+from torch import Tensor
 
-from arraygeom import ReceptiveField, Rig, ThroughLenses, Widened
+from arraygeom import Rig, ThroughLenses, Widened
 from arraygeom.atomic import sweep, write_text
 from arraygeom.fields import FIELDS
 from arraygeom.io.native import read_text as rig_of_text
@@ -45,7 +46,6 @@ from ..support.tensor_files import write_tensors
 from .checks import confidence_checked
 from .frames import ImageFiles
 from .fuse import FuseSettings, fuse
-from .low_light import Noise
 from .results import Frame, ImageFormat, band_names, save_frame, view_of
 from .sequence import KeyColour, SequenceFusion
 from .timeline import KeyFrame
@@ -192,31 +192,20 @@ class Batch:
     def to_json(self) -> str:
         """The batch as text for processes that fuse its frames. Raises ValueError for one's own field."""
         entries = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
-        entries["rig"] = rig_text(self.rig)
-        entries["files"] = {name: [str(file) for file in files] for name, files in self.files.items()}
-        entries["out"] = str(self.out)
-        settings = vars(self.settings)
-        written = {"field": field_document(settings["field"]), "noise": noise_document(settings["noise"])}
-        entries["settings"] = {**settings, **written}
-        return json.dumps({"format": PLAN_FORMAT, **entries})
+        return json.dumps({"format": PLAN_FORMAT, **entries}, default=_plain)
 
     @classmethod
     def from_json(cls, text: str, source: str = PLAN) -> Batch:
         """The batch of `to_json`'s text. Raises ValueError naming `source`."""
         try:
-            entries = json.loads(text)
+            entries = json.loads(text, object_hook=_made)
             if entries.pop("format") != PLAN_FORMAT:
                 raise ValueError("another version's")
             entries["rig"] = rig_of_text(entries["rig"], source)
             entries["files"] = {n: [Path(file) for file in files] for n, files in entries["files"].items()}
             entries["out"] = Path(entries["out"])
             settings = entries["settings"]
-            settings["field"] = field_of(settings["field"])
-            if isinstance(settings["noise"], dict):
-                settings["noise"] = {name: NoiseLevel(**level) for name, level in settings["noise"].items()}
-            for name in ("response", "depth"):
-                if isinstance(settings[name], list):
-                    settings[name] = tuple(settings[name])
+            settings |= {n: tuple(v) for n, v in settings.items() if isinstance(v, list)}
             return cls(**{**entries, "settings": FuseSettings(**settings)})
         except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
             raise ValueError(f"{source}: not a plan of this program ({error}): start the job again") from None
@@ -268,34 +257,33 @@ class Batch:
         return fusion.alone(i) if self.alone else fusion.frame(i, fusion.timeline.key_frames(), self._fetch)
 
 
-def noise_document(noise: Noise | None) -> str | dict[str, Any] | None:
-    """Noise levels as their entries by camera; "estimate" and None as they are."""
-    if noise is None or isinstance(noise, str):
-        return noise
-    names = ("shot", "read", "added_to")
-    return {name: dict(zip(names, (float(n.shot), float(n.read), n.added_to))) for name, n in noise.items()}
-
-
-def field_document(field: ReceptiveField | None) -> dict[str, Any] | None:
-    """A field as class name and entries. Raises ValueError for fields of other families than arraygeom's."""
-    if field is None:
-        return None
-    if FIELD_CLASSES.get(type(field).__name__) is not type(field):
+def _plain(value: object) -> object:
+    """What is in a plan as JSON has it. Raises ValueError for fields of other families than arraygeom's."""
+    if isinstance(value, Rig):
+        return rig_text(value)
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Tensor):
+        return float(value)
+    if isinstance(value, FuseSettings | NoiseLevel):
+        return vars(value)
+    kind = type(value).__name__
+    if FIELD_CLASSES.get(kind) is not type(value):
         known = ", ".join(FIELD_CLASSES)
         raise ValueError(
-            f"a batch's field is written to a file, which {field!r} cannot be: give one of {known}"
+            f"a batch's field is written to a file, which {value!r} cannot be: give one of {known}"
         )
-    entries = vars(field)
-    inner = {"field": field_document(entries["field"])} if "field" in entries else {}
-    return {"kind": type(field).__name__, **entries, **inner}
+    return {"kind": kind, **vars(value)}
 
 
-def field_of(document: Mapping[str, Any] | None) -> ReceptiveField | None:
-    """The field of a `field_document`. Raises KeyError, TypeError or ValueError for anything else."""
-    if document is None:
-        return None
-    entries: dict[str, Any] = {n: field_of(value) if n == "field" else value for n, value in document.items()}
-    return FIELD_CLASSES[entries.pop("kind")](**entries)
+def _made(entries: dict[str, Any]) -> Any:
+    """The field or noise level that a part of a plan is of; other entries as they are."""
+    if entries.keys() == vars(NoiseLevel()).keys():
+        return NoiseLevel(**entries)
+    kind = entries.get("kind")
+    if isinstance(kind, str) and kind in FIELD_CLASSES:
+        return FIELD_CLASSES[kind](**{name: value for name, value in entries.items() if name != "kind"})
+    return entries
 
 
 def fuse_key(plan: Path, key: KeyFrame) -> None:

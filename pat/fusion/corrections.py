@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
@@ -49,15 +49,10 @@ class PrePassSettings:
     pixels: int = size(400_000, "Alpha's pixels in the pre-pass, at most")
     small: int = size(50_000, "Alpha's pixels below which the pre-pass is at full size")
     margin: float = tuned(
-        0.1,
-        "The first value tried, which held: by how much a match must be better than others to "
-        "count, as of `BetaMatches.facts`",
+        0.1, "First value tried: by how much a match must be better than others, as of `BetaMatches.facts`"
     )
     passes: int = size(3, "Pre-passes at most: matches are better where what was found is put right")
-    settled: float = size(
-        0.25,
-        "Change of the largest displacement, pixels of the pre-pass, up to which no other pass is made",
-    )
+    settled: float = size(0.25, "Pixels by which the largest displacement changes, up to which passes end")
 
 
 SETTINGS = PrePassSettings()
@@ -103,34 +98,31 @@ class Corrections:
         return frame if self.response.is_rec601 else frame._replace(image=self.response.undone(frame.image))
 
 
-def corrections_for(
+@torch.no_grad()
+def find_corrections(
     network: FusionNetwork, frame: FrameInputs, response: Given, *, align: bool
 ) -> Corrections:
-    """What to correct for a network: for one without matches nothing. Raises as `find_corrections`."""
-    if network.uses_matches:
-        return find_corrections(frame, response, align=align)
-    return Corrections(_given(response, frame.inputs))
-
-
-@torch.no_grad()
-def find_corrections(frame: FrameInputs, response: Given, *, align: bool) -> Corrections:
     """Alpha's response if it is to be fitted, and the betas' misalignments if these are asked for.
 
-    A response is fitted for RGB betas. Raises ValueError for a stated response that is not three weights,
-    none negative, or where there is no RGB beta.
+    A response is fitted for RGB betas. Nothing is found for a network without matches. Raises ValueError for
+    a stated response that is not three weights, none negative, or where there is no RGB beta.
     """
-    found = Corrections(_given(response, frame.inputs))
-    fits = response == "fit" and any(map(_is_rgb, frame.inputs.betas))
+    rgb = any(map(_is_rgb, frame.inputs.betas))
+    if not isinstance(response, str | Response) and not rgb:
+        raise ValueError("a response needs betas in red, green and blue: leave it out for other bands")
+    found, fits = Corrections(given_response(response)), response == "fit" and rgb
     align = align and all(beta.field.pixels is not None for beta in frame.inputs.betas)
-    if not fits and not align:
+    if not network.uses_matches or not (fits or align):
         return found
     small = _reduced_frame(frame)
     found = replace(found, misalignments=(Misalignment(),) * len(frame.inputs.betas))
     for i in range(SETTINGS.passes):
         LOG.info("pre-pass %d of at most %d", i + 1, SETTINGS.passes)
-        matches = _matches(small, found)
+        inputs = found.applied(small.inputs, small.hw)
+        parts = zip(small.inputs.betas, inputs.betas, located(inputs).betas)
+        matches = [_of_beta(inputs.alpha, *part, small.hw) for part in parts]
         response_now = _fitted(small, matches) if fits else found.response
-        steps = [m.misalignment if align else Misalignment() for m in matches]
+        steps = [fit_misalignment(*m[1:]) if align else Misalignment() for m in matches]
         moves = tuple(before + step for before, step in zip(found.misalignments, steps))
         found = Corrections(response_now, moves)
         if all(step.largest(small.hw) <= SETTINGS.settled for step in steps):
@@ -141,12 +133,6 @@ def find_corrections(frame: FrameInputs, response: Given, *, align: bool) -> Cor
 def expected_work(frame: FrameInputs, response: Given, *, align: bool) -> float:
     """About how much work `find_corrections` is, as a share of fusing the frame: mostly two passes."""
     return 2 * min(SETTINGS.pixels / math.prod(frame.hw), 1.0) if align or response == "fit" else 0.0
-
-
-def _given(response: Given, inputs: Inputs) -> Response:
-    if not isinstance(response, str | Response) and not any(map(_is_rgb, inputs.betas)):
-        raise ValueError("a response needs betas in red, green and blue: leave it out for other bands")
-    return given_response(response)
 
 
 def _is_rgb(beta: Beta) -> bool:
@@ -188,7 +174,8 @@ def _reduced_field(
 
 
 class _Matches(NamedTuple):
-    """What one beta shows at its matches: all (h, w) or (c, h, w), at the size of the pre-pass.
+    """What one beta shows at its matches: all (h, w) or (c, h, w), at the size of the pre-pass; after
+    `before` what `fit_misalignment` takes.
 
     `before` are beta's own bands, blurred; `luma` is that of the corrected beta, as bright and sharp as
     `alpha`.
@@ -207,18 +194,6 @@ class _Matches(NamedTuple):
         h, w = self.luma.shape
         return (self.position + 0.5) / self.position.new_tensor([w, h]) - 0.5
 
-    @property
-    def misalignment(self) -> Misalignment:
-        """How far beta is across its segments."""
-        return fit_misalignment(self.alpha, self.luma, self.position, self.normal, self.weight)
-
-
-def _matches(frame: FrameInputs, found: Corrections) -> list[_Matches]:
-    """Matches of each beta with what has been found put right."""
-    inputs = found.applied(frame.inputs, frame.hw)
-    parts = zip(frame.inputs.betas, inputs.betas, located(inputs).betas)
-    return [_of_beta(inputs.alpha, *part, frame.hw) for part in parts]
-
 
 def _of_beta(alpha: Tensor, before: Beta, beta: Beta, found: BetaMatches, hw: HW) -> _Matches:
     h, w = hw
@@ -227,7 +202,9 @@ def _of_beta(alpha: Tensor, before: Beta, beta: Beta, found: BetaMatches, hw: HW
     luma = combined_bands(beta.image)
     seen = sample(torch.cat([before.image, luma], 1), where.reshape(1, -1, 2).to(luma)).values
     values = seen.reshape(seen.shape[1], h, w)
-    weight = (_reliable(found)[0, 0, :h, :w] & valid[0, :h, :w]).to(alpha)
+    unlike, margin, _ = found.facts[0]
+    reliable = (unlike < CONSISTENT) & (margin > SETTINGS.margin)
+    weight = (enlarged(reliable)[:h, :w] & valid[0, :h, :w]).to(alpha)
     whole = Normalisation.of(alpha, luma)
     own = whole.softened(alpha)[:, :, :h, :w]
     seen_there, wanted = (moments(image, weight[None, None]) for image in (values[-1:][None], own))
@@ -235,12 +212,6 @@ def _of_beta(alpha: Tensor, before: Beta, beta: Beta, found: BetaMatches, hw: HW
     soft = blurred(values[:-1][:, None], [ALIGNMENT.blur] * (len(values) - 1))[:, 0]
     normal = normals(beta.field.straight)[0, :h, :w]
     return _Matches(soft, own[0, 0], bright[0, 0], where, normal.to(where), weight)
-
-
-def _reliable(found: BetaMatches) -> Bool[Tensor, "b 1 h w"]:
-    """Where a match is consistent and clearly better than others."""
-    unlike, margin, _ = found.facts.split(1, 1)
-    return enlarged(((unlike < CONSISTENT) & (margin > SETTINGS.margin)).to(margin)) > 0
 
 
 def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:

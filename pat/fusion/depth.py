@@ -29,9 +29,7 @@ from .inputs import Placement
 class DepthSettings:
     """Of the depth of fused pixels."""
 
-    unseen: float = size(
-        1e-4, "At confidences up to this beta does not see the point: then its position gives no depth"
-    )
+    unseen: float = size(1e-4, "Confidence up to which beta does not see the point, and gives no depth")
 
 
 SETTINGS = DepthSettings()
@@ -119,7 +117,7 @@ def _measured(
     total, widths, weights = like.new_zeros(3, h, w)
     found_in_betas = zip(output.position, output.deviation, output.confidence)
     for beta, place, (position, deviation, confidence) in zip(betas, placements, found_in_betas):
-        if not place.has_depth:
+        if not place.pair.calibrated:
             continue
         pair, offset = place.pair, like.new_tensor(beta.offset)
         where = position[0, :, :h, :w].movedim(0, -1)

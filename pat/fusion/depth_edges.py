@@ -33,7 +33,7 @@ class EdgeSettings:
     radius: int = size(5, "Pixels to each side of what counts around a pixel")
     near: int = size(2, "Pixels to an edge of depth up to which depth is chosen anew")
     alike: float = tuned(
-        0.1, "Middlebury, tune half, of .02 to .2: difference of alpha that counts as one standard deviation"
+        0.1, "Middlebury, tune half, of .02 to .2: the standard deviation of what is alike in alpha"
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from arraygeom.compiled import compiled, separate_cache
+from arraygeom.compiled import compiled
 
 
 @compiled(inline="always")
@@ -55,6 +55,3 @@ def weighted_medians(values, alpha, where, weights, radius, top, bottom, out):
             for i in range(n):
                 if (some[i] > low or low == least) and some[i] < best:
                     best, out[r, c] = some[i], place[i]
-
-
-separate_cache(weighted_medians)

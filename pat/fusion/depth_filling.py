@@ -14,7 +14,7 @@ from torch import Tensor
 
 from arraygeom.chunks import chunked
 
-from ..matching.filters import numpy_of
+from ..matching.filters import nearest_known, numpy_of
 from ..matching.positions import FINE
 from ..matching.surfaces import Plane, Planes, repeated
 from ..support.settings import physics, tuned
@@ -28,8 +28,7 @@ class FillSettings:
 
     share: float = tuned(
         0.4,
-        "Middlebury, tune half, of .2 to .7: share of the confidence around it below which a match is "
-        "left for a plane",
+        "Middlebury, tune half, of .2 to .7: share of the confidence around, below which a plane is taken",
     )
     reach: float = tuned(
         80.0,
@@ -42,9 +41,7 @@ class FillSettings:
         "are first fitted, in half-widths of its interval: its width",
     )
     one_side: float = physics(
-        0.9,
-        "Length of the sum of all betas' segments, "
-        "over the sum of their lengths, from which all count as on one side",
+        0.9, "Length of the segments' sum over the sum of their lengths, from which betas are on one side"
     )
 
 
@@ -90,7 +87,7 @@ def background_filled(frame: Frame, given: FrameInputs) -> Float[Tensor, "h w"]:
 
 def _searched(placements: Sequence[Placement]) -> tuple[float, float]:
     """The least and the greatest inverse depth that was looked for; any, where nothing says."""
-    stated = [place.pair.depth for place in placements if place.has_depth]
+    stated = [place.pair.depth for place in placements if place.pair.calibrated]
     known = [(float(far), float(near)) for near, far in filter(None, stated)]
     if not known or len(known) < len(stated):
         return 0.0, math.inf
@@ -140,13 +137,6 @@ def _far_by_slope(inverse: Plane) -> list[Plane]:
 
 def _background(inverse: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """The farther of the nearest known ones to either side; as it is where a row has none."""
-    before = _nearest_known(inverse, known)
-    beside = torch.fmin(before, _nearest_known(inverse.flip(-1), known.flip(-1)).flip(-1))
+    alone = torch.where(known, inverse, torch.nan)
+    beside = torch.fmin(*(nearest_known(alone, known, -1, back) for back in (False, True)))
     return torch.where(beside.isnan(), inverse, beside)
-
-
-def _nearest_known(values: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Each pixel's nearest known value to the left, itself included; NaN if there is none."""
-    columns = torch.arange(values.shape[1], device=values.device).expand_as(values)
-    last = torch.where(known, columns, -1).cummax(1).values
-    return torch.where(last >= 0, values.gather(1, last.clamp(min=0)), torch.nan)

@@ -23,7 +23,7 @@ from ..networks.protocol import FusionNetwork
 from ..support.blocks import without_autocast
 from ..support.memory import limited, parse_bytes, planned
 from .checks import warn_of_confidence
-from .corrections import Corrections, corrections_for, expected_work
+from .corrections import Corrections, expected_work, find_corrections
 from .depth_edges import beside_edges
 from .depth_filling import background_filled
 from .inputs import bytes_beside, prepared
@@ -183,7 +183,7 @@ def fuse(
     )
     if announce:
         announce(plan)
-    found = corrections or corrections_for(network, inputs, response, align=align)
+    found = corrections or find_corrections(network, inputs, response, align=align)
     for line in found.described(betas, inputs.hw) if explain else ():
         explain(line)
     right = replace(found.applied(inputs.inputs, inputs.hw), luminance=SHARES[luminance])
@@ -252,7 +252,7 @@ def corrections_of(
     settings = settings.changed(changes)
     views, _ = _seen(network, rig, images, alpha, settings, settings.noise)
     inputs, _ = prepared(network, views, steps_for(network, normalise=settings.match_levels))
-    return corrections_for(network, inputs, settings.response, align=settings.align is not False)
+    return find_corrections(network, inputs, settings.response, align=settings.align is not False)
 
 
 def _seen(

@@ -40,14 +40,9 @@ class Placement(NamedTuple):
     bounds: Literal["depth", "distance"] = "depth"
 
     @property
-    def has_depth(self) -> bool:
-        """Whether positions in beta give depth: also along the lines of a link, if roughly."""
-        return self.pair.calibrated
-
-    @property
     def has_track(self) -> bool:
-        """Whether they do by a straight track that is the search segment's line."""
-        return self.has_depth and self.pair.link is None and not self.pair.has_lens
+        """Whether positions in beta give depth by a straight track that is the search segment's line."""
+        return self.pair.calibrated and self.pair.link is None and not self.pair.has_lens
 
     def track(self, x: Float[Tensor, "*n 2"]) -> Track:
         """The tracks in beta of alpha's pixels, of pinholes."""

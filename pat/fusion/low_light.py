@@ -56,9 +56,7 @@ class LowLightSettings:
         "noise that a demosaicing has smoothed shows as half or less",
     )
     found_bytes: float = size(12.0, "Of a position in a beta and its confidence")
-    averaging: float = size(
-        0.25, "The time of averaging colours over that of denoising the views before, about"
-    )
+    averaging: float = size(0.25, "The time of averaging over that of denoising the views, about")
 
 
 SETTINGS = LowLightSettings()
@@ -81,19 +79,14 @@ class NoisyView(NamedTuple):
 class LowLight:
     """Views as given, without noise, and those that had some: (1, C, H, W) by camera, recorded but unbiased.
 
-    If no view had noise, nothing is asked of them, and they are without images. `seconds` is what denoising
-    took.
+    If no view had noise, nothing is asked of them, and they are without images. `seconds_left` is about how
+    long the correction will take.
     """
 
     given: Views
     views: Views
     noisy: Mapping[str, NoisyView]
-    seconds: float = 0.0
-
-    @property
-    def seconds_left(self) -> float:
-        """About how long the correction will take."""
-        return SETTINGS.averaging * self.seconds if self.noisy else 0.0
+    seconds_left: float = 0.0
 
     def described(self) -> str:
         """Which views are denoised, and by how much they deviate."""
@@ -170,7 +163,7 @@ def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:
         without = replace(views, images={})
         return views, LowLight(without, without, {})
     denoised = views.replace({name: view.denoised[0] for name, view in noisy.items()})
-    return denoised, LowLight(views, denoised, noisy, time.perf_counter() - begin)
+    return denoised, LowLight(views, denoised, noisy, SETTINGS.averaging * (time.perf_counter() - begin))
 
 
 def warn_of_noise(name: str, image: Float[Tensor, "c h w"], view: NoisyView) -> None:

@@ -23,9 +23,7 @@ class FlowSettings:
     """Of optical flow between frames."""
 
     astray: float = tuned(
-        1.0,
-        "Source not recorded: "
-        "flow that does not lead back to within this many pixels has a weight below 1 / e",
+        1.0, "Source not recorded: flow that does not lead back to so many pixels has a weight below 1 / e"
     )
 
 
@@ -59,8 +57,7 @@ def warped(image: Float[Tensor, "c h w"], step: Float[Tensor, "2 h w"]) -> Float
     """The image sampled where each pixel goes, bilinearly; outside the frame its nearest pixel."""
     h, w = image.shape[-2:]
     x = pixel_grid((h, w)) + step.movedim(0, -1)
-    x = torch.minimum(x.clamp(min=0), x.new_tensor([w - 1, h - 1]))
-    return sample(image[None], x[None]).values[0]
+    return sample(image[None], x[None], extended=True).values[0]
 
 
 def _steps(a: Tensor, b: Tensor) -> Float[Tensor, "2 h w"]:

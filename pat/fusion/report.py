@@ -62,25 +62,27 @@ def report_page(
         layers["classical"] = facts.classical
     layers["fused"] = frame.image
     overlays: dict[str, Callable[[], str]] = {"confidence": lambda: shares_layer(frame.confidence)}
-    known = frame.depth[frame.depth.isfinite()]
+    known, extent, legend = frame.depth[frame.depth.isfinite()], "", ""
     if len(known):
         overlays["depth"] = lambda: data_url(colour_depth(frame.depth))
-    urls: dict[str, str] = {}
-
-    def make(name: str) -> None:
-        urls[name] = overlays[name]() if name in overlays else data_url(picture_of(layers[name]))
-
-    most = how_many_fit(100 * LONGEST**2)
-    in_parallel([partial(make, name) for name in (*layers, *overlays)], most=most)
+        (near, far), unit = (f"{d:.3g}" for d in np.percentile(known.cpu().numpy(), (1, 99))), facts.unit
+        extent = f"{near} to {far} {unit}, for 98% of the pixels"
+        legend = f"depth: near, {near} {unit} <i></i> far, {far} {unit}; unknown is black"
+        legend = f'<p class="legend" hidden>{legend}</p>'
+    tasks: list[Callable[[], str]] = [
+        *(partial(data_url, picture_of(layer)) for layer in layers.values()),
+        *overlays.values(),
+    ]
+    urls = dict(zip((*layers, *overlays), in_parallel(tasks, most=how_many_fit(100 * LONGEST**2))))
     return filled_page(
         f"{' + '.join(name for name in rig.names if name in images)}, fused",
         frame.depth.shape,
         {name: urls[name] for name in layers},
         {name: urls[name] for name in overlays},
-        _figures(frame, known, facts),
+        _figures(frame, extent, facts),
         facts,
         RIG=rig_drawing(rig, alpha),
-        LEGEND=_depth_legend(known, facts.unit),
+        LEGEND=legend,
     )
 
 
@@ -152,33 +154,17 @@ def rig_drawing(rig: Rig, alpha: str) -> str:
     )
 
 
-def _figures(frame: Frame, known: Tensor, facts: Facts) -> dict[str, str]:
+def _figures(frame: Frame, extent: str, facts: Facts) -> dict[str, str]:
     h, w = frame.depth.shape
     figures = {"size": f"{w} x {h} pixels", "mean confidence": f"{float(frame.confidence.mean()):.2f}"}
     figures["confidence above 0.5"] = f"{float((frame.confidence > 0.5).float().mean()):.0%} of the pixels"
-    if len(known):
-        near, far = _range(known)
-        figures["depth"] = f"{near:.3g} to {far:.3g} {facts.unit}, for 98% of the pixels"
+    if extent:
+        figures["depth"] = extent
     if facts.seconds is not None:
         figures["time"] = f"{facts.seconds:.0f} s"
     if facts.memory is not None:
         figures["memory"] = f"{facts.memory / 2**30:.1f} GiB at most"
     return figures
-
-
-def _range(known: Float[Tensor, " n"]) -> tuple[float, float]:
-    near, far = np.percentile(known.cpu().numpy(), (1, 99))
-    return float(near), float(far)
-
-
-def _depth_legend(known: Float[Tensor, " n"], unit: str) -> str:
-    if not len(known):
-        return ""
-    near, far = _range(known)
-    return (
-        f'<p class="legend" hidden>depth: near, {near:.3g} {unit} <i></i> far, {far:.3g} {unit}; unknown '
-        "is black</p>"
-    )
 
 
 def data_url(image: Float[Tensor, "c h w"]) -> str:

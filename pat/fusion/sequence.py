@@ -147,11 +147,12 @@ class SequenceFusion:
         longest = max(SETTINGS.intervals * self.timeline.interval * (1 - 1e-9), min(gaps.values()))
         return [k for k in keys if gaps[k.alpha] <= longest]
 
-    def _warped(self, i: int, own: Tensor, key: KeyFrame, colour: KeyColour) -> KeyContribution:
+    def _warped(self, i: int, own: Tensor, key: KeyFrame, colour: KeyColour) -> tuple[float, KeyColour]:
+        """How near a key frame is in time, 0 to 1, and its colour, warped to a frame."""
         gap = abs(self._time(key.alpha) - self._time(i))
         nearness = max(1 - gap / (SETTINGS.intervals * self.timeline.interval), 1e-3)
         if key.alpha == i:
-            return KeyContribution(nearness, *colour)
+            return nearness, colour
         LOG.info("motion of frame %d", i)
         flow = flow_between(own, self.grey(key.alpha))
         moved = warped(torch.cat([colour.added, colour.confidence[None]]), flow.step)
@@ -159,7 +160,7 @@ class SequenceFusion:
         share, *inverse = warped(torch.cat([known, colour.inverse_depth]), flow.step)
         # An unknown neighbour is not infinitely far away.
         inverse_depth = torch.where(share < 0.5, 0.0, torch.stack(inverse) / share.clamp(min=0.5))
-        return KeyContribution(nearness, moved[:-1], moved[-1] * flow.weight, inverse_depth)
+        return nearness, KeyColour(moved[:-1], moved[-1] * flow.weight, inverse_depth)
 
     def _time(self, i: int) -> float:
         return self.timeline.time(self.alpha, i)
@@ -288,28 +289,18 @@ def readable(read: Callable[[int], Tensor], numbers: Iterable[int]) -> Iterator[
             yield read(i)
 
 
-class KeyContribution(NamedTuple):
-    """A key frame's contribution to a frame: how near it is in time (0 to 1), its colour warped there."""
-
-    nearness: float
-    added: Tensor
-    confidence: Tensor
-    inverse_depth: Tensor
-
-
-def mixed(own: Float[Tensor, "1 h w"], sources: Sequence[KeyContribution]) -> Frame:
+def mixed(own: Float[Tensor, "1 h w"], sources: Sequence[tuple[float, KeyColour]]) -> Frame:
     """Alpha's frame with the sources' colours, weighted by nearness in time and confidence.
 
     Confidence is the sources' own weighted mean, lowered where sources that are weighed about the same
     disagree.
     """
-    weights = torch.stack([s.nearness * (s.confidence + SETTINGS.floor) for s in sources])
+    weights = torch.stack([nearness * (s.confidence + SETTINGS.floor) for nearness, s in sources])
     share = (weights / weights.sum(0))[:, None]
-    added = torch.stack([s.added for s in sources])
+    added, confidences, found = map(torch.stack, zip(*(colour for _, colour in sources)))
     colour = (share * added).sum(0)
     apart = (share * (added - colour).square()).sum((0, 1))
-    confidence = (share[:, 0] * torch.stack([s.confidence for s in sources])).sum(0)
-    found = torch.stack([s.inverse_depth for s in sources])
+    confidence = (share[:, 0] * confidences).sum(0)
     weights = torch.where(found[:, 0] > 0, weights, 0.0)
     known = weights.sum(0) > 0
     inverse, half_width = (weights[:, None] * found).sum(0) / weights.sum(0).clamp(min=1e-12)

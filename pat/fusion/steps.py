@@ -112,7 +112,7 @@ def equal_resolution(network: FusionNetwork, views: Views) -> Done:
     """Betas at about alpha's angular resolution where views meet, less large parts alpha cannot see."""
     for name in views.betas:
         views = _cropped(network, views, name)
-        image = at_alphas_resolution(views.images[name], views.pair(name))
+        image = of_size(views.images[name], hw_at_alphas_resolution(views.pair(name)))
         if image is not views.images[name]:
             rig = views.rig.resize(name, (image.shape[-2], image.shape[-1]))
             views = views.replace({name: image}, rig=rig)
@@ -183,19 +183,14 @@ def co_located(rig: Rig, names: Sequence[str], fields: Fields, which: JoinsBands
     """
     groups: list[list[str]] = []
     for name in names:
-        near = [] if which == "no" else groups[-1:] if which == "neighbours" else groups
-        alike = [g for g in near if fields.get(g[0]) is fields.get(name)]
-        home = [g for g in alike if _same_view(rig[g[0]], rig[name])]
-        if home:
-            home[0].append(name)
+        for group in [] if which == "no" else groups[-1:] if which == "neighbours" else groups:
+            same_field, view = fields.get(group[0]) is fields.get(name), rig[group[0]]
+            if same_field and isinstance(view, Camera) and view.replace(sensor=rig[name].sensor) == rig[name]:
+                group.append(name)
+                break
         else:
             groups.append([name])
     return groups
-
-
-def _same_view(one: View, other: View) -> bool:
-    """Whether two calibrated cameras differ at most in their sensors."""
-    return isinstance(one, Camera) and one.replace(sensor=other.sensor) == other
 
 
 def without_lenses(rig: Rig, images: Images) -> tuple[Rig, dict[str, Tensor]]:
@@ -260,11 +255,6 @@ def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens:
     return Frame(own + back[:-1], depth, back[-1], half_width, by_band)
 
 
-def at_alphas_resolution(image: Float[Tensor, "c h w"], pair: Pair) -> Float[Tensor, "c h2 w2"]:
-    """Beta's image with pixels of about alpha's size where the views meet; as it is if they nearly are."""
-    return of_size(image, hw_at_alphas_resolution(pair))
-
-
 def of_size(image: Float[Tensor, "c h w"], hw: HW) -> Float[Tensor, "c h2 w2"]:
     """An image made so large, by cubic interpolation; as it is if it is."""
     if image.shape[-2:] == hw:
@@ -274,7 +264,8 @@ def of_size(image: Float[Tensor, "c h w"], hw: HW) -> Float[Tensor, "c h2 w2"]:
 
 
 def hw_at_alphas_resolution(pair: Pair) -> HW:
-    """The size of beta's image at alpha's resolution."""
+    """The size of beta's image with pixels of about alpha's size where the views meet; its own if they
+    nearly are."""
     scale, (h, w) = resolution_ratio(pair), pair.beta.hw
     if 0.8 < scale < 1.25:
         return pair.beta.hw

@@ -92,7 +92,9 @@ def plan_frame(
     `kept` are bytes that the caller holds beside the frame.
     Raises ValueError as `tiles_within`.
     """
-    pieces, pixels, of_frame = frame.inputs.pieces, math.prod(frame.hw), frame_bytes(frame.inputs)
+    pieces, pixels = frame.inputs.pieces, math.prod(frame.hw)
+    bands = frame.inputs.bands or sum(beta.image.shape[1] for beta in frame.inputs.betas)
+    of_frame = FRAME_BYTES + bands * sum(BAND_BYTES[: len(frame.inputs.betas)])
     wanted = (pixels > LARGE and limit) or (pixels > ESTIMATED and estimate)
     probe = Probe.of(network, frame) if wanted else None
     for_each = (probe.matches if probe else 0.0) + (0.0 if stored else of_frame)
@@ -139,13 +141,6 @@ def working_memory(network: FusionNetwork, inputs: Inputs, tile: Tile) -> float:
     """Bytes of a tile: those for its part of alpha and the part of each beta that its segments touch."""
     betas = [area(inputs.touched(beta, tile.outer, 16)) for beta in inputs.betas]
     return network.working_bytes(area(tile.outer), betas)
-
-
-def frame_bytes(inputs: Inputs) -> float:
-    """Bytes of a fused frame for each pixel."""
-    bands = inputs.bands or sum(beta.image.shape[1] for beta in inputs.betas)
-    values, confidence = BAND_BYTES
-    return FRAME_BYTES + bands * (values + (confidence if len(inputs.betas) > 1 else 0.0))
 
 
 class Probe(NamedTuple):
@@ -271,7 +266,7 @@ def _digest(network: FusionNetwork, frame: FrameInputs) -> str:
     digest = hashlib.sha256(f"{how} {rounded}".encode())
     parameters = module.state_dict().values()
     fields = [tensor for beta in inputs.betas for tensor in _tensors(beta.field, inputs.hw)]
-    cameras = [camera for place in frame.placements if place.has_depth for camera in place.pair.cameras]
+    cameras = [camera for place in frame.placements if place.pair.calibrated for camera in place.pair.cameras]
     poses = [tensor for camera in cameras for tensor in (camera.K, camera.R, camera.t)]
     for tensor in (*parameters, inputs.alpha, *(b.image for b in inputs.betas), *fields, *poses):
         digest.update(tensor.detach().cpu().contiguous().numpy())

@@ -38,14 +38,10 @@ FITTED = Path(__file__).with_name("certainty.safetensors")
 class CertaintySettings:
     """What certainty is read off."""
 
-    around: tuple[int, int] = size(
-        (2, 6), "Radii, at half the size, around a pixel in which facts are averaged"
-    )
+    around: tuple[int, int] = size((2, 6), "Radii, at half the size, in which facts are averaged")
     apart: tuple[int, int] = size((1, 4), "Radii, at full size, in which disparities are compared")
     width: int = size(16, "Numbers in each of the two hidden layers")
-    least: float = size(
-        1e-3, "The least probability, where a segment is: a disparity is chosen there, and gives depth"
-    )
+    least: float = size(1e-3, "The least probability where a segment is: what is chosen there gives depth")
     covered: float = size(0.9, "The share of true positions that an interval is to cover")
 
 

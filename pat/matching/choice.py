@@ -15,7 +15,7 @@ from functools import cache, partial
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
@@ -29,13 +29,12 @@ from ..support.blocks import UNet
 from ..support.settings import size
 from . import choice_numba as kernels
 from .certainty import typical_facts
-from .filters import numpy_of
+from .filters import nearest_known, numpy_of
 from .inputs import Inputs
 from .matches import BetaMatches, Matches
 from .normalisation import ComparedViews
 from .positions import FINE, Extent, enlarged
 from .semi_global import CONSISTENT
-from .surfaces import Plane
 
 FITTED = Path(__file__).with_name("choice.safetensors")
 
@@ -46,7 +45,7 @@ class ChoiceSettings:
 
     around: tuple[int, ...] = size((2, 5, 10), "Distances, in pixels, of those around a pixel")
     scales: tuple[float, float] = size(
-        (6.0, 1 / 6), "Differences of disparity, in pixels, and of brightness that count as half of the most"
+        (6.0, 1 / 6), "Differences of disparity, pixels, and of brightness that count as a half"
     )
     widths: tuple[int, int, int] = size((32, 48, 64), "Channels at 1/2, 1/4 and 1/8 of the size")
     multiple: int = size(8, "Images are padded to multiples of this")
@@ -127,24 +126,11 @@ def candidates(found: BetaMatches) -> Float[Tensor, "b n h w"]:
     """Disparities of each pixel to choose from; the first is its own."""
     own = found.disparity
     consistent = enlarged(found.facts[:, :1] < CONSISTENT)
-    along = [_nearest(own, consistent, axis, back) for axis in (-2, -1) for back in (False, True)]
+    along = [nearest_known(own, consistent, axis, back) for axis in (-2, -1) for back in (False, True)]
     (h, w), most = own.shape[-2:], max(SETTINGS.around)
     wide = pad(own, (most,) * 4, mode="replicate")
     beside = [wide[..., most + y : most + y + h, most + x : most + x + w] for y, x in AROUND]
     return torch.cat([own, *along, *beside], 1)
-
-
-def _nearest(
-    x: Float[Tensor, "b 1 h w"], known: Bool[Tensor, "b 1 h w"], axis: int, back: bool
-) -> Float[Tensor, "b 1 h w"]:
-    """The value of the nearest known pixel before (or after) along an axis; the pixel's own if none is."""
-    if back:
-        return _nearest(x.flip(axis), known.flip(axis), axis, False).flip(axis)
-    shape = [1] * x.ndim
-    shape[axis] = -1
-    index = torch.arange(x.shape[axis], device=x.device).view(shape)
-    last = torch.where(known, index, -1).cummax(axis).values
-    return torch.where(last >= 0, x.gather(axis, last.clamp(min=0)), x)
 
 
 def features(
@@ -164,18 +150,14 @@ def features(
     for i, image in enumerate(given):
         one = min(i, len(segments.end) - 1)
         parts = views.alpha[i, 0], views.beta[i, 0], segments.end[one], extent.towards[one], options[i]
-        planes = tuple(map(numpy_of, parts))
-        compared = partial(_compared_rows, planes, image[..., FACTS:].numpy())
-        in_parallel([partial(compared, *span) for span in spans(sides[0], STRIP)])
+        own, other, end, towards, each = map(numpy_of, parts)
+        tasks = []
+        for top, bottom in spans(sides[0], STRIP):
+            rows, out = slice(FINE * top, FINE * bottom), image[top:bottom, :, FACTS:].numpy()
+            planes = own[rows], other, end[rows], towards[rows], each[:, rows]
+            tasks.append(partial(kernels.compared, *planes, SETTINGS.scales, out))
+        in_parallel(tasks)
     return given.movedim(-1, 1).to(views.alpha)
-
-
-def _compared_rows(planes: tuple[Plane, ...], out: Plane, top: int, bottom: int) -> None:
-    """`kernels.compared` of some rows of half the size."""
-    (own, other, end, towards, options), rows = planes, slice(FINE * top, FINE * bottom)
-    kernels.compared(
-        own[rows], other, end[rows], towards[rows], options[:, rows], SETTINGS.scales, out[top:bottom]
-    )
 
 
 def _at_half(found: BetaMatches, typical: Tensor) -> Float[Tensor, "b 7 h2 w2"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from arraygeom.compiled import compiled, separate_cache
+from arraygeom.compiled import compiled
 
 COLUMNS = 32
 """Columns whose numbers are written at a time: they stay in a core's first cache."""
@@ -53,6 +53,3 @@ def compared(own, other, end, towards, candidates, scales, out):
                     above = other[top, left] + u * (other[top, beside] - other[top, left])
                     under = other[below, left] + u * (other[below, beside] - other[below, left])
                     target[4 * (n + k) + at] = soft((own[r, c] - above - v * (under - above)) * level)
-
-
-separate_cache(compared)

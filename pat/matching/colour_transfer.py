@@ -38,43 +38,28 @@ FILLS = 2
 class ColourTransferSettings:
     """Brightness is 0 to 1. Middlebury and SYNTIM are the pairs of their tune halves."""
 
-    inconsistent: float = tuned(
-        0.25, "Middlebury: weight of a match that is not consistent, before the likeness"
-    )
+    inconsistent: float = tuned(0.25, "Middlebury: weight of an inconsistent match, before the likeness")
     fill: float = tuned(
-        100.0,
-        "Middlebury, tune half: strength of the smoothing that diffuses colour; edges are those at which "
-        "disparity's stops",
+        100.0, "Middlebury, tune half: strength of colour's diffusion, which stops where disparity's does"
     )
-    surroundings: int = tuned(
-        48, "Middlebury: within how many pixels the brightness of both views is compared"
-    )
+    surroundings: int = tuned(48, "Middlebury: pixels within which both views' brightness is compared")
     saturation: float = tuned(0.6, "Middlebury: the power of its ratio by which colour grows")
-    most_brighter: float = size(
-        2.0, "Matched surroundings whose brightness differs by a larger factor are of different things"
-    )
+    most_brighter: float = size(2.0, "Surroundings that differ by a larger factor are of different things")
     detail_radius: int = tuned(
         2,
         "Middlebury, reduced 4 and 8 times: window of the regression that gives matched colour the detail "
         "that beta lost; in standard deviations of the blur by which beta is less sharp than alpha, where "
         "that is more: within a smaller window beta shows one value",
     )
-    floor: float = tuned(
-        1e-4, "Middlebury: regulariser of colour's regressions on brightness, a variance of that"
-    )
+    floor: float = tuned(1e-4, "Middlebury: regulariser of regressions on brightness, a variance of that")
     noise_share: float = tuned(
         20.0,
-        "SYNTIM and Middlebury: "
-        "variance of colour's noise, of all bands, over that of what the views' brightness differs by",
+        "SYNTIM and Middlebury: variance of noise in all bands over that of the difference in brightness",
     )
     texture_share: float = tuned(0.6, "SYNTIM and Middlebury: texture's share that is taken off that")
-    lowest: float = tuned(
-        0.1, "SYNTIM and Middlebury: the quantile of either that is taken for where there is least"
-    )
+    lowest: float = tuned(0.1, "SYNTIM and Middlebury: the quantile that stands for the least of either")
     least_noise: float = size(
-        2e-5,
-        "Less variance than this, two thirds of a level of 8 bits in each band, "
-        "is left; taking it out takes time",
+        2e-5, "Variance not worth the time to take it out: two thirds of a level of 8 bits in each band"
     )
     most_detail: float = size(0.2, "Differences of brightness beyond this are no detail that beta lost")
 

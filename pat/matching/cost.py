@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arraygeom.compiled import compiled, separate_cache
+from arraygeom.compiled import compiled
 
 from ..support.settings import physics, tuned
 
@@ -21,13 +21,9 @@ from ..support.settings import physics, tuned
 class CensusSettings:
     """The numbers of this cost, whose unit is a bit of the census."""
 
-    brightness: float = tuned(
-        30.0, "Source not recorded: what a difference of 1 in (normalised) brightness costs"
-    )
+    brightness: float = tuned(30.0, "Source not recorded: what a difference of 1 in brightness costs")
     truncated: float = tuned(20.0, "Source not recorded: what brightness costs at most")
-    unseen: int = physics(
-        24, "About a mismatch, half of the bits: of a label beyond beta's edge, where the point may well be"
-    )
+    unseen: int = physics(24, "About half of the bits: a label beyond beta's edge, where the point may be")
     nowhere: int = physics(80, "More than any other cost, 48 + `truncated`: of a label that is not on beta")
 
 
@@ -84,6 +80,3 @@ def census(image, out):
                 if dx != 3 or dy != 0:
                     for x in range(width):
                         bits[x] = (bits[x] << np.uint64(1)) | np.uint64(row[x + dx] < centre[x])
-
-
-separate_cache(census)

@@ -33,23 +33,15 @@ class AlignmentSettings:
     """Lengths are pixels of the images given, brightness is 0 to 1. Middlebury is its tune half."""
 
     blur: float = tuned(
-        1.0,
-        "Middlebury, tune half: standard deviation of the blur before gradients, and before colours are "
-        "compared that a response is found from",
+        1.0, "Middlebury, tune half: deviation of the blur before gradients, and before a response is fitted"
     )
     radius: int = tuned(7, "Middlebury: of the windows, to either side")
     steps: int = size(6, "Gauss-Newton steps at most")
     finest: float = size(5e-3, "A step below this ends them")
     farthest: float = size(2.0, "A window's displacement in one step is at most this")
-    deviation: float = size(
-        0.05, "The standard deviation of windows' displacements about the plane, at least"
-    )
-    least: float = tuned(
-        0.2, "Middlebury: largest displacement of a pixel below which the rig is taken to be right"
-    )
-    better: float = tuned(
-        0.98, "Middlebury: residual with the displacement over that without, up to which it is accepted"
-    )
+    deviation: float = size(0.05, "Standard deviation of displacements about the plane, at least")
+    least: float = tuned(0.2, "Middlebury: pixels of the largest displacement below which a rig is right")
+    better: float = tuned(0.98, "Middlebury: the residual over that without, up to which it is accepted")
     windows: int = size(50, "Fewest windows with texture")
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
@@ -95,6 +95,17 @@ def smoothed(planes: Sequence[NDArray], guide: NDArray[np.uint8], how: tuple[flo
     threads, but has its own."""
     smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, *how)
     return [smoother.filter(np.ascontiguousarray(plane, np.float32)) for plane in planes]
+
+
+def nearest_known(
+    x: Float[Tensor, "*b h w"], known: Bool[Tensor, "*b h w"], axis: int, back: bool
+) -> Float[Tensor, "*b h w"]:
+    """The value of the nearest known pixel before (or after) along an axis; the pixel's own if none is."""
+    if back:
+        return nearest_known(x.flip(axis), known.flip(axis), axis, False).flip(axis)
+    index = torch.arange(x.shape[axis], device=x.device).view(-1, *[1] * (-1 - axis))
+    last = torch.where(known, index, -1).cummax(axis).values
+    return torch.where(last >= 0, x.gather(axis, last.clamp(min=0)), x)
 
 
 def numpy_of(x: Tensor) -> NDArray[np.float32]:

@@ -16,9 +16,7 @@ from .filters import box_mean
 class LikenessSettings:
     """Brightness is 0 to 1."""
 
-    unlike: float = tuned(
-        0.07, "Middlebury: difference of brightness at which likeness, and the weight by it, is 1 / e"
-    )
+    unlike: float = tuned(0.07, "Middlebury: difference of brightness at which likeness is 1 / e")
 
 
 SETTINGS = LikenessSettings()

@@ -34,9 +34,7 @@ LOG = logging.getLogger(__name__)
 class MatchSettings:
     """Of matching as a whole."""
 
-    coarsely: int = size(
-        400_000, "Pixels of alpha at most on which the combination of bands that it sees is found"
-    )
+    coarsely: int = size(400_000, "Alpha's pixels at most on which the bands' combination is found")
 
 
 SETTINGS = MatchSettings()

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from arraygeom import Segments
-from arraygeom.chunks import Box
+from arraygeom.chunks import Box, slices
 from arraygeom.pixels import HW
 from arraygeom.sampling import on_image
 
@@ -56,6 +56,11 @@ class BetaMatches:
     certainty: Tensor | None = None
 
     @property
+    def hw(self) -> HW:
+        """Size of the alpha that they are of."""
+        return self.disparity.shape[-2], self.disparity.shape[-1]
+
+    @property
     def surface(self) -> Float[Tensor, "b 1 h w"]:
         """The disparity of what alpha sees, as far as it is known: the one that was chosen."""
         return self.disparity if self.chosen is None else self.chosen
@@ -76,20 +81,10 @@ class BetaMatches:
 
     def cut(self, box: Box) -> BetaMatches:
         """The part at alpha's (top, bottom, left, right), all even."""
-        top, bottom, left, right = box
-        half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
-        whole = (..., slice(top, bottom), slice(left, right))
-        names = {
-            "disparity": whole,
-            "chosen": whole,
-            "bands": whole,
-            "diffused": whole,
-            "facts": half,
-            "stated": half,
-            "certainty": half,
-        }
-        parts = {name: getattr(self, name) for name in names}
-        cut: dict[str, Any] = {n: part if part is None else part[names[n]] for n, part in parts.items()}
+        whole, half = slices(box), slices([n // FINE for n in box])
+        planes = {name: plane for name, plane in vars(self).items() if isinstance(plane, Tensor)}
+        sizes = {name: whole if plane.shape[-1] == self.hw[1] else half for name, plane in planes.items()}
+        cut: dict[str, Any] = {name: plane[(..., *sizes[name])] for name, plane in planes.items()}
         return replace(self, **cut)
 
 
@@ -102,7 +97,7 @@ class Matches:
     @property
     def hw(self) -> HW:
         """Size of the alpha that they are of."""
-        return self.betas[0].disparity.shape[-2], self.betas[0].disparity.shape[-1]
+        return self.betas[0].hw
 
     @property
     def nbytes(self) -> int:

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, depth_from_track, pixel_grid
-from arraygeom.chunks import Tile, assembled, spans
+from arraygeom.chunks import Tile, assembled, slices, spans
 from arraygeom.epipolar import FRONT, Track
 
 from ..media.colour import to_bytes
@@ -38,16 +38,12 @@ class MultiviewSettings:
     """Of the agreement of several betas."""
 
     farthest: float = size(
-        8.0,
-        "A difference of disparities of this many half-size pixels is 1 in the facts, "
-        "as in semi-global matching",
+        8.0, "Half-size pixels between disparities that are 1 in the facts, as in semi-global matching"
     )
     sampled_rows: int = size(64, "In how many pairs of alpha's rows the depths of betas are compared")
     sampled_columns: int = size(4, "Every how many columns the depths of betas are compared")
     trials: int = size(
-        400,
-        "Fits to four pixels each, "
-        "of which that is taken with which most others agree (Fischler, Bolles 1981)",
+        400, "Fits to four pixels each; that with which most agree is taken (Fischler, Bolles 1981)"
     )
     more: float = tuned(
         0.1,
@@ -196,7 +192,8 @@ class Agreement(NamedTuple):
         """The inverse depth that is supported best, in the type of another tensor."""
         proposals = [view.inverse_depth for view in views]
         weights = torch.stack([known * (0.1 + view.facts[1]) for view, (_, known) in zip(views, proposals)])
-        support = torch.stack([_supported(views, weights, w) for w, _ in proposals])  # proposal, beta, h, w
+        near = [[(v.disparity_of(w) - v.disparity).abs() < NEAR for v in views] for w, _ in proposals]
+        support = torch.stack([weights * torch.stack(one) for one in near])  # proposal, beta, h, w
         total = torch.where(torch.stack([known for _, known in proposals]), support.sum(1), -1.0)
         best = total.argmax(0)[None, None].expand(1, *support.shape[1:])
         counts = support.gather(0, best)[0]
@@ -306,8 +303,7 @@ def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
     plane, known = numpy_of(agreement.inverse_depth), agreement.known.cpu().numpy()
 
     def of(tile: Tile) -> Tensor:
-        top, bottom, left, right = tile.outer
-        part = (..., slice(top, bottom), slice(left, right))
+        part = (..., *slices(tile.outer))
         weight = known[0][part].astype(np.float32) + 1e-5
         smooth = filled(plane[part], weight, guide[part], DISPARITY_FILL)
         median = cv2.medianBlur(np.where(known[part], plane[part], smooth)[0], 5)
@@ -338,11 +334,3 @@ def _of_beta(
         facts[0, :1, half] = avg_pool2d(unlike[None], FINE)
         facts[0, 1:, half] = agreement.facts[:, half]
     return replace(own, disparity=disparity, facts=facts, chosen=None)
-
-
-def _supported(
-    views: Sequence[MatchedBeta], weights: Tensor, inverse_depth: Tensor
-) -> Float[Tensor, "betas h w"]:
-    """The weights of the betas whose matches are near a proposed inverse depth."""
-    apart = [(view.disparity_of(inverse_depth) - view.disparity).abs() for view in views]
-    return torch.stack([w * (pixels < NEAR) for pixels, w in zip(apart, weights)])

@@ -28,13 +28,10 @@ LEAST_WEIGHT = 1e-6
 class NormalisationSettings:
     """How far one image is brought to another's brightness and sharpness."""
 
-    largest_gain: float = size(
-        4.0, "The largest factor of brightness; images that differ by more show different things"
-    )
+    largest_gain: float = size(4.0, "Of brightness; images that differ by more show different things")
     blurs: tuple[float, ...] = size(
         (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0),
-        "Standard deviations, in pixels, "
-        "with which the sharper image is tried until it is no sharper than the other",
+        "Standard deviations, pixels, tried on the sharper image until it is no sharper than the other",
     )
 
 
@@ -127,30 +124,21 @@ class Normalisation(NamedTuple):
         """What makes the means and standard deviations the same, and then the sharpness."""
         own, wanted = moments(beta), moments(alpha)
         level = torch.stack([own.mean, own.gain(wanted, SETTINGS.largest_gain), wanted.mean])
-        return cls(level, equalising_blurs(alpha, _levelled(beta, level)))
+        return cls(level, equalising_blurs(alpha, own.matched(beta, wanted, SETTINGS.largest_gain)))
 
     def normalised(self, beta: Tensor) -> Tensor:
         """Beta's brightness (or that of a part of it) with alpha's mean and standard deviation."""
-        return _levelled(beta, self.level)
+        mean, factor, middle = self.level.to(beta)
+        return (beta - mean) * factor + middle
 
     def softened(self, alpha: Tensor) -> Tensor:
         """Alpha (or a part of it), no sharper than beta."""
         return blurred(alpha, self.blurs[0])
 
-    def equally_sharp(self, alpha: Tensor, normalised: Tensor) -> tuple[Tensor, Tensor]:
-        """Both (or parts of them), the sharper one blurred."""
-        return blurred(alpha, self.blurs[0]), blurred(normalised, self.blurs[1])
-
     def views(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> ComparedViews:
         """Alpha and beta's brightness, or parts of them, as they are compared."""
-        return ComparedViews(
-            *self.equally_sharp(alpha, self.normalised(beta)), to_bytes(alpha[:, 0]), self.blurs[0]
-        )
-
-
-def _levelled(image: Tensor, level: Tensor) -> Tensor:
-    mean, factor, middle = level.to(image)
-    return (image - mean) * factor + middle
+        other = blurred(self.normalised(beta), self.blurs[1])
+        return ComparedViews(self.softened(alpha), other, to_bytes(alpha[:, 0]), self.blurs[0])
 
 
 def equalising_blurs(

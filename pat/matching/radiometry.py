@@ -10,7 +10,6 @@ fused image is sheared back.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import attrgetter, itemgetter
 from typing import Literal, NamedTuple
@@ -46,13 +45,11 @@ class ResponseSettings:
     rare: float = tuned(0.05, "Middlebury: the probability of anything that is not as usual")
     light: float = tuned(0.03, "Middlebury: standard deviation of light between the views, a share of it")
     near: float = tuned(
-        0.2, "Middlebury: by how much colour, or place in widths of beta, differs where light is another"
+        0.2, "Middlebury: difference in colour, or in place in widths of beta, where light differs"
     )
     least: float = tuned(0.005, "Middlebury: standard deviation of a point, at least")
     independent: float = tuned(3.0, "Middlebury: a group counts as so many independent points")
-    groups: int = size(
-        256, "Groups, at most, of points that are alike in colour and place; half or twice as many do as well"
-    )
+    groups: int = size(256, "Groups of alike points, at most; half or twice as many do as well")
     points_of_group: int = size(8, "Points of a group, at least")
     points: tuple[int, int] = size((6000, 300), "Pixels used at most, and the fewest that are enough")
     outlier: float = physics(2.385, "Deviations that count half: 95 % efficient if errors are normal")
@@ -147,21 +144,18 @@ Given = Literal["fit", "rec601"] | tuple[float, float, float] | Response
 """What is known of alpha's response: its weights of red, green and blue, or that it is to be fitted."""
 
 
-def stated_response(weights: Sequence[float]) -> Response:
-    """The response of an alpha that is weights . beta. Raises ValueError unless three, none negative."""
-    values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
-    if values.shape != (3,) or not bool((values >= 0).all() & (values.sum() > 0) & values.isfinite().all()):
-        given = tuple(weights)
-        raise ValueError(f"a response is three weights, of red, green and blue, none negative; got {given}")
-    return Response(values / values.sum(), gain=float(values.sum()))
-
-
 def given_response(given: Given) -> Response:
     """The response that is given, Rec. 601's if it is to be fitted. Raises ValueError for what is none."""
     if isinstance(given, Response):
         return given
     if not isinstance(given, str):
-        return stated_response(given)
+        weights = torch.tensor([float(w) for w in given], dtype=torch.float64)
+        total = weights.sum()
+        if weights.shape != (3,) or not bool((weights >= 0).all() & (total > 0) & total.isfinite()):
+            raise ValueError(
+                f"a response is three weights, of red, green and blue, none negative; got {tuple(given)}"
+            )
+        return Response(weights / total, gain=float(total))
     if given not in ("fit", "rec601"):
         raise ValueError(f"response is 'fit', 'rec601' or three weights; got {given!r}")
     return Response.rec601()

@@ -10,7 +10,7 @@ Without gradients.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
 from typing import NamedTuple
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arraygeom import Segments
-from arraygeom.chunks import Box
+from arraygeom.chunks import Box, Tile, area, slices, tiles_of
 from arraygeom.sampling import SLACK
 from arraygeom.threads import in_parallel
 
@@ -38,14 +38,10 @@ from .positions import FINE, Extent
 
 @dataclass(frozen=True)
 class SemiGlobalSettings:
-    """The numbers of a run of semi-global matching."""
+    """The numbers of a run of semi-global matching; penalties are in the unit of `cost`."""
 
-    step: float = tuned(
-        12.0, "Source not recorded: penalty of neighbours whose labels differ by one, in the unit of `cost`"
-    )
-    jump: float = tuned(
-        100.0, "Source not recorded: penalty of those that differ by more, where alpha shows no edge"
-    )
+    step: float = tuned(12.0, "Source not recorded: penalty of neighbours' labels that differ by one")
+    jump: float = tuned(100.0, "Source not recorded: of those that differ by more, where alpha has no edge")
     margin: int = size(64, "What is matched around a block, pixels")
     block: int = size(320, "Sides of a block, pixels")
     long_block: int = size(640, "The longer side of the blocks of large images, along the segments")
@@ -54,13 +50,11 @@ class SemiGlobalSettings:
     label_bytes: int = size(3, "What it takes for each label of each pixel: cost, and sum of costs")
     consistent: float = tuned(
         0.2,
-        "Source not recorded: "
-        "a match is consistent if matching back from beta ends less than this (times 8 pixels) from it",
+        "Source not recorded: matching back from beta ends less than this (times 8 pixels) from the match",
     )
     fill: tuple[float, float] = tuned(
         (50.0, 4.0),
-        "Source not recorded: "
-        "strength, and 8-bit difference that is an edge, of the smoothing that fills (Min et al. 2014)",
+        "Source not recorded: strength, and 8-bit difference of an edge, of smoothing (Min et al. 2014)",
     )
 
 
@@ -76,8 +70,8 @@ class HalfSizeMatches(NamedTuple):
 
     def cut(self, box: Box) -> HalfSizeMatches:
         """The part at alpha's (top, bottom, left, right), all even."""
-        top, bottom, left, right = (n // FINE for n in box)
-        return HalfSizeMatches(*(part[..., top:bottom, left:right] for part in self))
+        half = (..., *slices([n // FINE for n in box]))
+        return HalfSizeMatches(*(part[half] for part in self))
 
 
 class Windows(NamedTuple):
@@ -186,21 +180,15 @@ def _matched_blocks(
     (_, *hw), (_, rows, columns) = own.shape, other.shape
     disparity, place = np.empty(own.shape, np.float32), np.empty(own.shape, np.int32)
     measured = np.empty((*own.shape, facts), np.float32)
-    planes: list[tuple[NDArray, ...]] = [()] * (2 * len(own))
-
-    def prepare(i: int, image: NDArray) -> None:
-        planes[i] = planes_of(image)
-
-    in_parallel([partial(prepare, *one) for one in enumerate((*own, *other))])
+    planes = in_parallel([partial(planes_of, image) for image in (*own, *other)])
     images, tasks, nbytes = [], [], 1.0
     for i, (mine, its) in enumerate(zip(planes[: len(own)], planes[len(own) :])):
         views = own[i], windows.first[i], *(g[i] for g in geometry), *mine
         images.append(_Image(views, flat(its), (rows, columns), (disparity[i], measured[i], place[i]), []))
         boxes = _boxes(hw, geometry.along[i], windows.first.shape[-1] * windows.labels, settings)
         tasks += [partial(_block, images[-1], box, windows, settings) for box in boxes]
-        largest = max(math.prod(min(s.stop, n) - s.start for s, n in zip(outer, hw)) for _, outer in boxes)
         for_each = settings.pixel_bytes + settings.label_bytes * math.prod(windows.lanes)
-        nbytes = max(nbytes, largest * for_each)
+        nbytes = max(nbytes, for_each * max(area(box.outer) for box in boxes))
     in_parallel(tasks, most=how_many_fit(nbytes))
     for image, fact, its in zip(images, measured[..., 0], place):
         label = (reduce(np.minimum, image.claims)[its] & 0xFFFF).astype(np.float32)
@@ -214,30 +202,20 @@ def flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
     return tuple(plane.reshape(-1, *plane.shape[2:]) for plane in planes)
 
 
-def _boxes(hw: Sequence[int], along: NDArray, labels: int, settings: SemiGlobalSettings) -> list[tuple]:
+def _boxes(hw: Sequence[int], along: NDArray, labels: int, settings: SemiGlobalSettings) -> list[Tile]:
     """Blocks and margins: as high as an image with few costs, else longer along the segments than across."""
     side, margin = settings.block, settings.margin
     if hw[0] * (side + 2 * margin) * labels <= settings.most_costs:
-        return list(inner_and_outer(hw, margin, hw[0], side))
+        return list(tiles_of(hw, (hw[0], side), margin))
     across, down = np.abs(along).max((0, 1))
     sides = (side, settings.long_block) if across > down else (settings.long_block, side)
-    return list(inner_and_outer(hw, margin, *sides))
+    return list(tiles_of(hw, sides, margin))
 
 
-def inner_and_outer(
-    hw: Sequence[int], margin: int, rows: int, columns: int
-) -> Iterator[tuple[tuple[slice, slice], tuple[slice, slice]]]:
-    """Inner and outer blocks of so many rows and columns: the result, and what is computed for it."""
-    for top in range(0, hw[0], rows):
-        for left in range(0, hw[1], columns):
-            inner = slice(top, min(top + rows, hw[0])), slice(left, min(left + columns, hw[1]))
-            yield inner, tuple(slice(max(s.start - margin, 0), s.stop + margin) for s in inner)
-
-
-def _block(image: _Image, box: tuple, windows: Windows, settings: SemiGlobalSettings) -> None:
+def _block(image: _Image, box: Tile, windows: Windows, settings: SemiGlobalSettings) -> None:
     """What is found of a block. What its pixels claim of beta goes into one of the tables, of which each is
     of one thread at a time; what all claim is the least of them."""
-    inner, outer = box
+    inner, outer = map(slices, box)
     guide, first, end, along, length, cut, *own = (np.ascontiguousarray(x[outer]) for x in image.views)
     labels, segments = (first, windows.labels), (end, along, length, cut)
     cost = np.empty((*length.shape, *windows.lanes), np.uint8)

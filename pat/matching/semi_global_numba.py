@@ -14,11 +14,11 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from arraygeom.compiled import renew_with
+from arraygeom.compiled import compiled, renew_with
 from pat.attention.kernels import SOURCES
-from pat.attention.kernels.emit import LANES, NARROW, Vector, compiled, instruction, separate_cache
+from pat.attention.kernels.emit import LANES, NARROW, Vector, instruction
 from pat.attention.kernels.layout import pointers
-from pat.attention.kernels.vectors import from_index
+from pat.attention.kernels.vectors import add_int, from_index, load, splat, store
 
 from .cost import NOWHERE, UNSEEN, dissimilarity, pixel_of
 
@@ -100,23 +100,11 @@ def _costs_at(code, cost, i: index):
     return code.mul(wide, wide.type([PARTS] * LANES))
 
 
-@instruction(lambda path, i: Vector(types.int16))
-def _load(code, path, i: index):
-    """The vector at an index."""
-    return code.get(code.kinds[0], path, i)
-
-
 @instruction(lambda path, i, j: Vector(types.int16))
 def _load_halves(code, path, i: index, j: index):
     """Half a vector from either index."""
     low, high = (code.get(code.kinds[0], path, at, NARROW) for at in (i, j))
     return code.shuffle(low, high, [*range(LANES)])
-
-
-@instruction(lambda *_: types.void)
-def _store(code, path, i: index, vector):
-    """Stores a vector at an index."""
-    code.put(code.kinds[0], path, i, vector)
 
 
 @instruction(lambda *_: types.void)
@@ -126,32 +114,13 @@ def _store_halves(code, path, i: index, j: index, vector):
         code.put(code.kinds[0], path, at, code.shuffle(vector, None, [*lanes]))
 
 
-@instruction(lambda number: Vector(number))
-def _repeat(code, number):
-    """A vector of one number repeated."""
-    return code.repeat(number)
-
-
 def _lesser(code, a, b):
     return code.select(code.icmp_unsigned("<", a, b), a, b)
 
 
-@instruction(lambda a, b: a)
-def _less(code, a, b):
-    """The lesser of two, lane by lane; of what is not negative."""
-    return _lesser(code, a, b)
-
-
-@instruction(lambda a, b: a)
-def _add(code, a, b):
-    """The sum, lane by lane."""
-    return code.add(a, b)
-
-
-@instruction(lambda a, b: a)
-def _subtract(code, a, b):
-    """The difference, lane by lane."""
-    return code.sub(a, b)
+_less = instruction(lambda a, b: a)(_lesser)
+"""The lesser of two, lane by lane; of what is not negative."""
+_subtract = instruction(lambda a, b: a)(lambda code, a, b: code.sub(a, b))
 
 
 @instruction(lambda path, small: path)
@@ -227,7 +196,7 @@ def _sweep(way, shape, planes, guide, reach, pad, small, large, paths, fewest, j
     paths, fewest, ahead, above, behind, beside = pointers(
         (paths, fewest, jumps[0], jumps[1], jumps[2], jumps[3])
     )
-    known = cost, first, total, paths, fewest, runs, lanes, pad, reach, _repeat(np.int16(small * PARTS))
+    known = cost, first, total, paths, fewest, runs, lanes, pad, reach, splat(np.int16(small * PARTS))
     side, none = 3 * width + 4 * height + 4, 3 * width + 4 * height + 6
     step = 1 - 2 * way
     for row in range(height):
@@ -258,17 +227,17 @@ def _sweep(way, shape, planes, guide, reach, pad, small, large, paths, fewest, j
 def _advance(known, p, q, before, now, jump, is_first):
     """A path from pixel q, in slot `before`, to pixel p, in slot `now`, and its costs to the sums."""
     cost, first, total, paths, fewest, runs, lanes, pad, reach, penalty = known
-    base, leap, lowest = _repeat(fewest[before]), _repeat(np.int16(fewest[before] + jump)), _repeat(WALL)
+    base, leap, lowest = splat(fewest[before]), splat(np.int16(fewest[before] + jump)), splat(WALL)
     stride = lanes + pad
     start, end = pad + before * runs * stride, pad + now * runs * stride
     ours, theirs = from_index(first, runs * p), from_index(first, runs * q)
     for lane in range(0, runs * lanes, LANES):
         at = p * runs * lanes + lane
         stay = _reached(paths, start + lane, ours, theirs, reach, stride, runs, penalty)
-        path = _add(_costs_at(cost, at), _subtract(_less(stay, leap), base))
+        path = add_int(_costs_at(cost, at), _subtract(_less(stay, leap), base))
         _keep(paths, end + lane, stride, runs, penalty, path)
         lowest = _less(lowest, path)
-        _store(total, at, path if is_first else _add(path, _load(total, at)))
+        store(total, at, path if is_first else add_int(path, load(total, at)))
     fewest[now] = _least(lowest)
 
 
@@ -281,8 +250,8 @@ def _reached(paths, start, ours, theirs, reach, stride, runs, penalty):
     """
     if runs == 1:
         here = start + min(max(ours[0] - theirs[0], -reach), reach)
-        beside = _less(_load(paths, here - 1), _load(paths, here + 1))
-        return _less(_load(paths, here), _add(beside, penalty))
+        beside = _less(load(paths, here - 1), load(paths, here + 1))
+        return _less(load(paths, here), add_int(beside, penalty))
     shifts, low = _shifts(ours, theirs, reach), start + 1
     high = low + stride
     same = _load_halves(paths, low + shifts[0], high + shifts[1])
@@ -294,7 +263,7 @@ def _keep(paths, start, stride, runs, penalty, path):
     """Keep a vector of a path for `_reached`. Of two runs, what labels beside cost is known here already:
     then a pixel after it reads 4 half vectors instead of 12, which takes half the time."""
     if runs == 1:
-        _store(paths, start, path)
+        store(paths, start, path)
     else:
         _store_halves(paths, start, start + stride, _spread(path, penalty))
 
@@ -416,4 +385,3 @@ def costs_at(own, other, places, out):
 
 for _entry in (costs, aggregate, winners, regression, costs_at):
     renew_with(_entry, [Path(__file__), Path(__file__).with_name("cost.py"), *SOURCES])
-    separate_cache(_entry)

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from arraygeom.robust import RobustFit, gaussian, least_squares, robust_least_squares
 
@@ -26,23 +25,20 @@ class MixSettings:
     """Brightness is 0 to 1."""
 
     equal: float = size(
-        1e-4, "How strongly the combination is drawn to one of equal parts: share of the bands' mean variance"
+        1e-4, "Share of the bands' mean variance by which the combination is drawn to equal parts"
     )
     misfit: float = tuned(
         0.016,
-        "Source not recorded: difference from alpha, averaged over `smooth` pixels to either side, at which "
-        "the combination counts half",
+        "Source not recorded: difference from alpha, averaged around, at which the combination counts half",
     )
-    smooth: int = size(4, "See `misfit`")
+    smooth: int = size(4, "Pixels to either side over which `misfit` is averaged")
     diluted: float = tuned(
         0.8,
         "Source not recorded: wrong matches make least squares' weights too small; they are enlarged until "
         "the combination varies as much as alpha, "
         "as if no less than this share of alpha's variance were explained",
     )
-    wide: int = size(
-        4, "Bands are compared with alpha within squares whose radius is the image's longer side over this"
-    )
+    wide: int = size(4, "The image's longer side over the radius in which bands are compared")
 
 
 SETTINGS = MixSettings()
@@ -108,7 +104,7 @@ def _mix(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, 
     explained = (1 - unexplained).clamp(min=0)
     weights = weights / explained.clamp(min=SETTINGS.diluted).sqrt()
     # What pixels have beyond the mean of those around: how materials differ does not count.
-    detail = (bands[order] - _mean_around(bands[order], 1)).flatten(1)
+    detail = (bands[order] - box_mean(bands[order], 1)).flatten(1)
     combined = weights @ detail
     slopes = explained * (detail @ (share * combined)) / (share @ combined.square()).clamp(min=1e-12)
     misfit = _smooth_misfit(rest.view_as(alpha), share.view_as(alpha))
@@ -141,16 +137,11 @@ def _combination(x: Tensor, y: Tensor, weight: Tensor) -> RobustFit:
 def _beyond_local_mean(planes: Tensor, weight: Tensor) -> Tensor:
     """Planes (c, h, w) less their weighted mean in wide squares: light and lenses of views differ, slowly."""
     radius = max(planes.shape[-2:]) // SETTINGS.wide
-    return planes - (box_mean((planes * weight)[None], radius) / box_mean(weight[None], radius))[0]
-
-
-def _mean_around(planes: Tensor, radius: int) -> Tensor:
-    """Of planes (c, h, w), within squares around each pixel."""
-    return avg_pool2d(planes[None], 2 * radius + 1, 1, radius, count_include_pad=False)[0]
+    return planes - box_mean(planes * weight, radius) / box_mean(weight, radius)
 
 
 def _smooth_misfit(rest: Tensor, share: Tensor) -> Tensor:
     """Root mean square of the rest (1, h, w) around each pixel: matches' errors, at edges, average out."""
-    total = _mean_around(share, SETTINGS.smooth).clamp(min=1e-12)
-    smooth = _mean_around(share * rest, SETTINGS.smooth) / total
+    total = box_mean(share, SETTINGS.smooth).clamp(min=1e-12)
+    smooth = box_mean(share * rest, SETTINGS.smooth) / total
     return (share * smooth.square()).sum().sqrt()

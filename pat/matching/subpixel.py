@@ -48,12 +48,10 @@ class SubpixelSettings:
         "and a match weighs half in its surface; and across it, at which a displacement of beta counts half",
     )
     reach: float = tuned(
-        24.0, "Middlebury, tune half, of 16 to 32: pixels to which matches of a surface count"
+        24.0, "Middlebury, tune half, of 16 to 32: pixels to which a surface's matches count"
     )
     edge: float = tuned(
-        0.5,
-        "Middlebury, tune half, of .5 to 1: change of disparity, pixels, that is as far as `reach`, where "
-        "both views are sharp",
+        0.5, "Middlebury, tune half, of .5 to 1: change of disparity as far as `reach`, where views are sharp"
     )
     surfaces: int = size(2, "How often surfaces are fitted, the second time within the first ones")
 

@@ -28,8 +28,7 @@ class SurfaceSettings:
     """Of planes."""
 
     level: float = tuned(
-        0.005,
-        "Middlebury, tune half: variance of position, in squares of the reach, below which planes are level",
+        0.005, "Middlebury, tune half: variance of position, over reach^2, below which planes are level"
     )
 
 

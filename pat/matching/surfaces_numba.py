@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from arraygeom.compiled import compiled, separate_cache
+from arraygeom.compiled import compiled
 
 from .positions import FINE
 
@@ -60,7 +60,3 @@ def at_pixels(value, right, down, out):
         for c in range(width):
             y, x = r // FINE, c // FINE
             out[r, c] = value[y, x] + np.float32(c % FINE) * right[y, x] + np.float32(r % FINE) * down[y, x]
-
-
-for _entry in (weighted_terms, planes_through, at_pixels):
-    separate_cache(_entry)

@@ -10,7 +10,6 @@ and what follows is as for any segment.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,19 +20,18 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Positions, Segments, sample
-from arraygeom.chunks import spans
+from arraygeom.chunks import slices, spans, tiles_of
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.fields.widened import direction
 from arraygeom.pixels import HW, pixel_grid
 from arraygeom.warned import warn
 
-from ..media.colour import to_bytes
 from . import semi_global_numba as kernels
 from .cost import planes_of
 from .filters import filled, numpy_of
 from .normalisation import Normalisation
 from .positions import FINE
-from .semi_global import DISPARITY_FILL, HALF_SIZE, flat, inner_and_outer
+from .semi_global import DISPARITY_FILL, HALF_SIZE, flat
 
 ORDERED = 0.95
 """Share of pixels whose steps from one position to the next hardly ever go back, from which positions are a
@@ -63,7 +61,7 @@ def along_tangents(
         warn(f"the field in '{name}' is a set of positions without an order: each pixel is matched alone")
     with torch.no_grad():
         labels = torch.from_numpy(_labels(alpha, guide, grid, ordered=ordered))
-    lines = grid.tangents(labels) if ordered else _around(grid.chosen(labels))
+    lines = grid.tangents(labels) if ordered else grid.chosen(labels)
     longest = float(torch.where(lines.valid, lines.length.detach(), 0.0).max())
     planes = torch.cat([lines.start, lines.end], -1).movedim(-1, 0)[None]
 
@@ -93,10 +91,14 @@ class _BlockCentres:
         parts = (found.xy, 2), (found.mask, 1)
         return Positions(*(t.reshape(*grid.shape[:2], *t.shape[t.ndim - n :]) for t, n in parts))
 
+    @property
+    def rows(self) -> int:
+        """How many are asked for at once."""
+        return max(1, AT_ONCE // (self.hw[1] * self.field.samples))
+
     def by_rows(self) -> list[slice]:
         """Rows that are asked for at once."""
-        rows = max(1, AT_ONCE // (self.hw[1] * self.field.samples))
-        return [slice(*span) for span in spans(self.hw[0], rows)]
+        return [slice(*span) for span in spans(self.hw[0], self.rows)]
 
     def ordered(self) -> bool:
         """Whether a pixel's positions follow each other along a curve."""
@@ -114,34 +116,32 @@ class _BlockCentres:
         parts = [_tangents(self.at(rows, slice(None)), labels[rows]) for rows in self.by_rows()]
         return Segments(*(torch.cat(part) for part in zip(*parts)))
 
-    def chosen(self, labels: Tensor) -> Chosen:
-        """The positions of whole labels, and where there are some."""
+    def chosen(self, labels: Tensor) -> Segments:
+        """Segments along x around the positions of whole labels, which a median makes agree with their
+        neighbours."""
         parts = []
         for rows in self.by_rows():
             found = self.at(rows, slice(None))
             index = labels[rows].long().to(found.mask.device)[..., None]
             xy = found.xy.gather(-2, index[..., None].expand(*index.shape, 2))[..., 0, :]
             parts.append((xy, found.mask.gather(-1, index)[..., 0]))
-        return Chosen(*(torch.cat(part) for part in zip(*parts)))
-
-
-class Chosen(NamedTuple):
-    """One position of each pixel (h, w, 2), and where there is one."""
-
-    xy: Tensor
-    valid: Tensor
+        xy, valid = (torch.cat(part) for part in zip(*parts))
+        smooth = [cv2.medianBlur(numpy_of(plane), 5) for plane in xy.unbind(-1)]
+        middle = torch.from_numpy(np.stack(smooth, -1)).to(xy)
+        step = middle.new_tensor([HALF_WINDOW, 0.0])
+        return Segments(middle - step, middle + step, valid)
 
 
 def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool) -> NDArray:
     """The label of each block of alpha."""
     own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
-    level = Normalisation.of(own, other)
-    a, b = (numpy_of(p[0, 0]) for p in level.equally_sharp(own, level.normalised(other)))
+    views = Normalisation.of(own, other).views(own, other)
+    a, b = (numpy_of(p[0, 0]) for p in views[:2])
     planes, other_planes = planes_of(a), flat(planes_of(b))
     label, margin = np.zeros((2, *a.shape), np.float32)
-    rows = [(rows, slice(0, a.shape[1])) for rows in grid.by_rows()]
-    sides = (HALF_SIZE.margin, HALF_SIZE.block, HALF_SIZE.block)
-    for inner, outer in inner_and_outer(a.shape, *sides) if ordered else zip(rows, rows):
+    side, halo = (HALF_SIZE.block, HALF_SIZE.margin) if ordered else ((grid.rows, a.shape[1]), 0)
+    for tile in tiles_of(a.shape, side, halo):
+        inner, outer = map(slices, tile)
         places = _places(grid, outer, b.shape)
         lanes = -(-places.shape[-1] // kernels.LANES) * kernels.LANES
         cost = np.empty((*places.shape[:2], 1, lanes), np.uint8)
@@ -158,7 +158,7 @@ def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool)
         return label
     scale = np.float32(8 * kernels.PARTS * HALF_SIZE.jump)
     weight = np.minimum(margin / scale, 1)
-    dense = filled(label[None], weight + np.float32(1e-5), to_bytes(own[:, 0])[0], DISPARITY_FILL)[0]
+    dense = filled(label[None], weight + np.float32(1e-5), views.guides[0], DISPARITY_FILL)[0]
     return cv2.medianBlur(np.where(weight > LEAST_MARGIN, label, dense).astype(np.float32), 5)
 
 
@@ -166,7 +166,7 @@ def _places(grid: _BlockCentres, box: tuple[slice, ...], hw: tuple[int, ...]) ->
     """Where positions are in the reduced beta, pixels counted row by row; -1 for those that do not count."""
     (h, w), (rows, columns) = hw, box
     parts, at_once = [], max(1, AT_ONCE // (w * grid.field.samples))
-    for top, bottom in spans(min(rows.stop, grid.hw[0]) - rows.start, at_once):
+    for top, bottom in spans(rows.stop - rows.start, at_once):
         found = grid.at(slice(rows.start + top, rows.start + bottom), columns)
         x, y = ((found.xy + 0.5) / FINE - 0.5).round().int().unbind(-1)
         inside = found.mask & (x >= 0) & (y >= 0) & (x < w) & (y < h)
@@ -207,12 +207,3 @@ def _tangents(found: Positions, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]
     end = here - arc[..., None] * towards
     start = end + lengths.sum(-1, keepdim=True) * towards
     return start, end, mask.any(-1)
-
-
-def _around(found: Chosen) -> Segments:
-    """Segments along x around positions chosen alone, which a median makes agree with their neighbours."""
-    xy = numpy_of(found.xy)
-    smooth = np.stack([cv2.medianBlur(np.ascontiguousarray(xy[..., i]), 5) for i in range(2)], -1)
-    middle = torch.from_numpy(smooth).to(found.xy)
-    step = middle.new_tensor([HALF_WINDOW, 0.0])
-    return Segments(middle - step, middle + step, found.valid)

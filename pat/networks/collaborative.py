@@ -16,9 +16,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom.chunks import spans
+from arraygeom.compiled import compiled
 from arraygeom.threads import in_parallel
 
-from ..attention.kernels import compiled, separate_cache
 from ..support.settings import size, tuned
 from .denoiser import opponent, opponent_deviation, rgb_of_opponent
 
@@ -37,9 +37,7 @@ class CollaborativeSettings:
         "Middlebury, tune half: alike blocks are looked for in an estimate with so much of the noise left: "
         "where an image is flat the noise makes blocks alike that lie apart, as is needed",
     )
-    kept: float = tuned(
-        0.5, "Middlebury, tune half: share of the network's brightness that is kept: its errors are others"
-    )
+    kept: float = tuned(0.5, "Middlebury, tune half: share of the network's brightness that is kept")
 
 
 SETTINGS = CollaborativeSettings()
@@ -245,7 +243,3 @@ def filter_groups(image, expected, variance, top, found, cosines, window, out):
                             weight = counts * window[i, j]
                             out[0, c, y + i, x + j] += weight * seen[SIDE * i + j, n]
                             out[1, c, y + i, x + j] += weight
-
-
-separate_cache(find_alike)
-separate_cache(filter_groups)

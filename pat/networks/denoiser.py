@@ -19,10 +19,7 @@ class DenoiserSettings:
     """Of what the denoisers are given."""
 
     multiple: int = size(8, "Images are padded to multiples of this")
-    scale: float = size(
-        4.0,
-        "Deviations are given to networks this many times larger: then they are about as large as values",
-    )
+    scale: float = size(4.0, "So many times larger deviations are given to networks: about as values")
 
 
 SETTINGS = DenoiserSettings()

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, conv2d, pad, pixel_unshuffle
+from torch.nn.functional import avg_pool2d, pad, pixel_shuffle, pixel_unshuffle
 
 from arraygeom import Local, Segments
 
@@ -137,7 +137,10 @@ class GuidedPAT(nn.Module):
         self.encoder = Encoder(c.widths)
         self.fine_key = nn.Conv2d(w2, 4 * c.fine_dim, 1)
         self.judge = UNet(w4 + 9, c.widths[1:], c.judge_dim)
-        self.confidence = ConfidenceHead(c.judge_dim + w2 + 4 + 12, c.confidence_dim)
+        # The logits of confidence, choices and the better match at full size, computed at half of it.
+        width = c.confidence_dim
+        logits = nn.Conv2d(width, 4 * (3 + FILLS), 3, padding=1), nn.PixelShuffle(2)
+        self.confidence = nn.Sequential(conv(c.judge_dim + w2 + 4 + 12, width), ResidualBlock(width), *logits)
         rounds = (Propagation(w4, c.propagation_dim, spacing) for spacing in c.propagation_steps)
         self.propagation = nn.ModuleList(rounds)
         self.completion = Completion(c.completion) if c.completion else None
@@ -239,14 +242,8 @@ class GuidedPAT(nn.Module):
         return self.confidence(stacked(enlarge(context), own.half, matched, facts))
 
     def _key(self, features: Encoded) -> Tensor:
-        """What queries and keys are at full size; channels beside each other, as attention wants them."""
-        weight, bias = (
-            p.unflatten(0, (-1, 2, 2)).movedim(0, 2).flatten(0, 2) for p in self.fine_key.parameters()
-        )
-        x = conv2d(features.half, weight, bias).movedim(1, -1)
-        b, h, w, c = x.shape
-        pixels = x.unflatten(-1, (2, c // 2)).movedim(3, 2)
-        return pixels.reshape(b, 2 * h, 2 * w, c // 4).movedim(-1, 1)
+        """What queries and keys are at full size."""
+        return pixel_shuffle(self.fine_key(features.half), 2)
 
 
 def _joined(bands: Sequence[Tensor]) -> Tensor:
@@ -287,18 +284,6 @@ def combined(estimates: Sequence[BetaEstimate]) -> BetaEstimate:
         first.position,
         mean([e.likeness for e in estimates]),
     )
-
-
-class ConfidenceHead(nn.Sequential):
-    """The logits of confidence, choices and the better match at full size, computed at half of it."""
-
-    def __init__(self, inputs: int, width: int) -> None:
-        super().__init__(
-            conv(inputs, width),
-            ResidualBlock(width),
-            nn.Conv2d(width, 4 * (3 + FILLS), 3, padding=1),
-            nn.PixelShuffle(2),
-        )
 
 
 class Propagation(nn.Module):

@@ -13,11 +13,12 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, interpolate
+from torch.nn.functional import interpolate
 
 from arraygeom.fields.grid import FieldOnGrid
 
 from ..attention.scores import Compared
+from ..matching.filters import box_mean
 from ..matching.inputs import Inputs
 from ..matching.matches import Matches
 from ..support.blocks import ResidualASPP, ResidualBlock
@@ -115,10 +116,7 @@ class PAT(nn.Module):
 
 def normalised(image: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
     """The image less its mean in 9x9 pixels, over its standard deviation there, with a floor of .01."""
-    mean, squares = (
-        avg_pool2d(x, SURROUNDINGS, 1, SURROUNDINGS // 2, count_include_pad=False)
-        for x in (image, image * image)
-    )
+    mean, squares = (box_mean(x, SURROUNDINGS // 2) for x in (image, image * image))
     return (image - mean) / ((squares - mean * mean).clamp(min=0) + FLOOR**2).sqrt()
 
 

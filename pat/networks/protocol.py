@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from arraygeom.chunks import Box
+from arraygeom.chunks import Box, slices
 
 from ..attention.scores import Compared
 from ..matching.inputs import Inputs
@@ -34,8 +34,7 @@ class FusionOutput(NamedTuple):
 
     def cut(self, box: Box) -> FusionOutput:
         """The part at (top, bottom, left, right); of an image that is not enlarged."""
-        top, bottom, left, right = box
-        part = (..., slice(top, bottom), slice(left, right))
+        part = (..., *slices(box))
         position, deviation, confidence = ([t[part] for t in tensors] for tensors in self[1:4])
         overall = None if self.overall is None else self.overall[part]
         return FusionOutput(self.image[part], position, deviation, confidence, overall)

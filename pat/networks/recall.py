@@ -31,19 +31,13 @@ class RecallSettings:
     """Pixels are those of half the size, but for `last`."""
 
     scales: int = tuned(3, "Middlebury, tune half: sizes of what is around a pixel, radii 2, 4, 8")
-    pixel: float = tuned(
-        0.02, "Middlebury, tune half: difference of alpha that counts as one standard deviation"
-    )
+    pixel: float = tuned(0.02, "Middlebury, tune half: standard deviation of what is alike in alpha")
     alike: float = tuned(
-        0.04,
-        "Middlebury, tune half: the same of means around, at each radius; and the difference at which "
-        "smoothing's weight falls to 1 / e",
+        0.04, "Middlebury, tune half: the same of means around; and where smoothing's weight is 1 / e"
     )
     slope: float = tuned(0.1, "Middlebury, tune half: the same of slopes there")
     distance: float = tuned(10.0, "Middlebury, tune half: pixels at which the weight falls to 1 / e")
-    certainty: int = tuned(
-        3, "Middlebury, tune half: the power of confidence, squared, that a pixel counts by"
-    )
+    certainty: int = tuned(3, "Middlebury, tune half: power of confidence, squared, that pixels count by")
     share: float = tuned(
         0.5,
         "Middlebury, tune half: of what no beta sees, so much is by example; of what is doubtful, so much "

@@ -7,7 +7,7 @@ import json
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Union, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -26,18 +26,15 @@ from .paper import PAT, AttentionEngine
 SHIPPED = Path(__file__).parent / "shipped"
 DENOISER = Path(__file__).parent / "denoisers" / "low-light.safetensors"
 FORMAT = "pat-weights 1"
+Network = PAT | GuidedPAT | BandwisePAT
 NETWORKS: Mapping[str, tuple[Any, Any]] = {
-    network.__name__: (network, CONFIGS[network.__name__]) for network in (PAT, GuidedPAT, BandwisePAT)
+    network.__name__: (network, CONFIGS[network.__name__]) for network in get_args(Network)
 }
 DENOISERS = {"LowLightNetwork": (LowLightNetwork, DenoiserConfig)}
 
 LARGEST, MOST_ENTRIES = 1024, 16
 """Of the numbers in a configuration, and of a list of them. The largest shipped are 48 and 4."""
 
-if TYPE_CHECKING:
-    Network = PAT | GuidedPAT | BandwisePAT
-else:
-    Network = Union[tuple(network for network, _ in NETWORKS.values())]  # noqa: UP007
 Precision = Literal["float32", "bfloat16", "int8"]
 
 

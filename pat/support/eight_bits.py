@@ -173,12 +173,7 @@ def in_eight_bits(x: Float[Tensor, "b i h w"], of: Conv2d, by: Packed) -> Float[
 
     if len(parts) == 1:
         return strip(*parts[0])
-    found: list[Tensor] = [x] * len(parts)
-
-    def put(index: int) -> None:
-        found[index] = strip(*parts[index])
-
-    in_parallel([partial(put, index) for index in range(len(parts))])
+    found = in_parallel([partial(strip, *part) for part in parts])
     each = len(parts) // len(x)
     return torch.cat([torch.cat(found[i : i + each], 2) for i in range(0, len(parts), each)])
 

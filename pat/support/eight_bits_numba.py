@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from arraygeom.compiled import compiled, separate_cache
+from arraygeom.compiled import compiled
 
 
 @compiled(nogil=True, cache=True)
@@ -25,6 +25,3 @@ def rounded(image, top, left, scale, zero, out):
             out[i, :left] = out[i, left + width :] = beyond
         else:
             out[i] = beyond
-
-
-separate_cache(rounded)

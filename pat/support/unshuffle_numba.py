@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from arraygeom.compiled import compiled, separate_cache
+from arraygeom.compiled import compiled
 
 COLUMNS = 32
 """Columns whose channels are interleaved at a time: they stay in a core's first cache."""
@@ -20,6 +20,3 @@ def unshuffle(upper, lower, out):
                 for x in range(left, min(left + COLUMNS, width)):
                     out[y, x, k], out[y, x, k + 1] = above[2 * x], above[2 * x + 1]
                     out[y, x, k + 2], out[y, x, k + 3] = below[2 * x], below[2 * x + 1]
-
-
-separate_cache(unshuffle)

@@ -21,7 +21,7 @@ STAGES = {
     "views": ["pat.fusion.fuse.prepared"],
     "field": ["arraygeom.fields.grid.FieldOnGrid.of"],
     "plan": ["pat.fusion.fuse.plan_frame"],
-    "pre-pass": ["pat.fusion.corrections.find_corrections"],
+    "pre-pass": ["pat.fusion.fuse.find_corrections"],
     "matching": ["pat.matching.match.located", "pat.matching.colour_transfer.transferred"],
     "attention": ["pat.attention.attend._attend"],
     "network": ["pat.networks.guided.GuidedPAT.forward"],

@@ -7,9 +7,7 @@ weights, and in backward the addition of the query to the taps' gradients. Neigh
 in turn, a few taps at a time, since they share most of them. Everything else is work on samples, sixteen at
 a time.
 
-Images come channels-last and flat. The numbers in them are float64, float32, or 16-bit ones seen as
-integers: uint16 is bfloat16, int16 is float16. Arithmetic is in float64 for the first and in float32 for the
-others.
+Images come channels-last and flat, in float64 or float32.
 """
 
 from pathlib import Path
@@ -18,7 +16,7 @@ from arraygeom.compiled import renew_with
 
 from .backward import backward
 from .channels import scatter
-from .emit import LANES, compiled, separate_cache
+from .emit import LANES
 from .forward import forward
 from .layout import Call, Geometry, Gradients, Outputs, Saved, Share, TapList, block_scratch
 from .local import ROWS, attend_rows
@@ -37,10 +35,8 @@ __all__ = [
     "attend_rows",
     "backward",
     "block_scratch",
-    "compiled",
     "forward",
     "scatter",
-    "separate_cache",
 ]
 
 
@@ -48,4 +44,3 @@ SOURCES = [*Path(__file__).parent.glob("*.py")]
 
 for _entry in (forward, backward, scatter, attend_rows):
     renew_with(_entry, SOURCES)
-    separate_cache(_entry)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from .channels import block_products, block_sums, fill, pack, unpack
-from .emit import LANES, compiled
+from arraygeom.compiled import compiled
+
+from .channels import block_products, block_sums, copy, fill
+from .emit import LANES
 from .layout import BLOCK, Taps, from_pixel, of, pixel_of, pointers, replaced
 from .sampling import HALF, course_of, distribute, find_samples, interpolate, interpolation_slopes
 from .softmax import exponentiate, find_scores
@@ -39,8 +41,8 @@ def _backward_block(first, pixels, call, saved, block, taps, gradients):
     key_weight, value_weight = from_pixel(taps.key_weight, slot), from_pixel(taps.value_weight, slot)
     for i in range(pixels):
         p, here = first + i, pixel_of(block, i)
-        unpack(call.query, p * d, d, here.query)
-        unpack(saved.value_upstream, p * dv, dv, here.upstream)
+        copy(call.query, p * d, d, here.query)
+        copy(saved.value_upstream, p * dv, dv, here.upstream)
         here.tap_count[0] = 0
         if saved.logsum[p] > -np.inf:
             find_samples(p, call.geometry, here)
@@ -55,7 +57,7 @@ def _backward_block(first, pixels, call, saved, block, taps, gradients):
     if gradients.wants_query:
         block_sums(pixels, block.tap_count, key_weight, block.rows, call.key, d, block.query)
         for i in range(pixels):
-            pack(of(block.query, i), d, gradients.query, (first + i) * d)
+            copy(of(block.query, i), 0, d, from_index(gradients.query, (first + i) * d))
 
 
 @compiled

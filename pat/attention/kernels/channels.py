@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from inspect import unwrap
-
-import numpy as np
 from llvmlite.binding import get_host_cpu_features
-from numba import types
-from numba.extending import overload
 
-from .emit import LANES, NARROW, compiled
+from arraygeom.compiled import compiled
+
+from .emit import LANES, NARROW
 from .layout import BLOCK, from_pixel, of, pointers
 from .vectors import (
     TAP_BLOCK,
@@ -22,9 +18,7 @@ from .vectors import (
     fold_row,
     from_index,
     gather_row,
-    half_bits,
     load_narrow,
-    load_one,
     load_row,
     nothing_narrow,
     splat,
@@ -52,54 +46,10 @@ def fill(numbers, first, last, filler):
 
 
 @compiled
-def unpack(array, at, n, out):
-    """out[c] = array[at + c], widened."""
-    whole = n // NARROW * NARROW
-    for c in range(0, whole, NARROW):
-        store(out, c, load_narrow(array, at + c))
-    for c in range(whole, n):
-        out[c] = load_one(array, at + c)
-
-
-def pack(numbers, n, array, at):
-    """array[at + c] = numbers[c], narrowed."""
-
-
-@overload(pack)
-def _pack(numbers, n, array, at):
-    return _pack_same if array.dtype == numbers.dtype else _pack_narrower
-
-
-@unwrap
-def _pack_same(numbers, n, array, at):
-    unpack(numbers, 0, n, from_index(array, at))
-
-
-@unwrap
-def _pack_narrower(numbers, n, array, at):
+def copy(array, at, n, out):
+    """out[c] = array[at + c]."""
     for c in range(n):
-        array[at + c] = narrow(array, numbers[c])
-
-
-def narrow(array, number):
-    """A number as the array stores it."""
-
-
-@overload(narrow)
-def _narrow(array, number):
-    if array.dtype == types.uint16:
-        return _bfloat16_bits
-    if array.dtype == types.int16:
-        return lambda array, number: half_bits(number)
-    return lambda array, number: number
-
-
-@unwrap
-def _bfloat16_bits(array, number):
-    bits = np.float32(number).view(np.uint32)
-    if math.isnan(number):
-        return np.uint16(0x7FC0)
-    return np.uint16((bits + np.uint32(0x7FFF) + ((bits >> np.uint32(16)) & np.uint32(1))) >> np.uint32(16))
+        out[c] = array[at + c]
 
 
 @compiled
@@ -140,7 +90,7 @@ def _inner_products_of_rest(x, rows, first, last, image, channels, first_channel
         add_totals(out, t, *totals)
         for c in range(whole, channels):
             for k in range(TAP_BLOCK):
-                out[t + k] += x[c] * load_one(image, starts[k] + c)
+                out[t + k] += x[c] * image[starts[k] + c]
 
 
 @compiled
@@ -161,7 +111,7 @@ def weighted_sum(weights, rows, first, last, image, channels, begin, end, out):
         c += NARROW
     for tail in range(c, end):
         for t in range(first, last):
-            out[tail] += weights[t] * load_one(image, rows[t] * channels + tail)
+            out[tail] += weights[t] * image[rows[t] * channels + tail]
 
 
 def _weighted_sum(n, taps, lanes):
@@ -249,7 +199,7 @@ def _scatter(rows, weights, first, last, x, channels, first_channel, last_channe
         _scatter_1(rows, weights, first, last, x, channels, c, out)
         c += NARROW
     for tail in range(c, last_channel):
-        one = load_one(x, tail)
+        one = x[tail]
         for t in range(first, last):
             out[rows[t] * channels + tail] += weights[t] * one
 

@@ -13,27 +13,13 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
-from arraygeom.compiled import compiled, separate_cache
-
-__all__ = [
-    "LANES",
-    "NARROW",
-    "Code",
-    "Vector",
-    "accumulated",
-    "compiled",
-    "instruction",
-    "row_of",
-    "separate_cache",
-]
-
 LANES = 16
 NARROW = 8
 """Lanes where there may be few channels."""
 
 
 class Vector(types.Type):
-    """`LANES` numbers (or as many as said) of the accumulation type, or of int32, in one register or two."""
+    """`LANES` numbers, or as many as said, in one register or two."""
 
     def __init__(self, scalar, lanes=LANES):
         self.scalar, self.lanes = scalar, lanes
@@ -44,16 +30,6 @@ class Vector(types.Type):
 class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager, kind):
         super().__init__(manager, kind, ir.VectorType(manager[kind.scalar].get_value_type(), kind.lanes))
-
-
-def accumulated(array):
-    """The type in which the numbers at a pointer are accumulated."""
-    return types.float64 if array.dtype == types.float64 else types.float32
-
-
-def vector_of(array, *_):
-    """The type of a vector of the numbers at a pointer."""
-    return Vector(accumulated(array))
 
 
 def row_of(vector, n):
@@ -85,28 +61,10 @@ class Code:
         place = self.builder.bitcast(self.builder.gep(address, [index]), lane.as_pointer())
         return self.builder.load(place, align=array.dtype.bitwidth // 8)
 
-    def get_wide(self, array, address, index, lanes=LANES):
-        """The same in the accumulation type."""
-        return self.widen(self.get(array, address, index, lanes), array.dtype, lanes)
-
     def put(self, array, address, index, vector):
         """Stores a vector at an index."""
         place = self.builder.bitcast(self.builder.gep(address, [index]), vector.type.as_pointer())
         self.builder.store(vector, place, align=array.dtype.bitwidth // 8)
-
-    def widen(self, stored, dtype, lanes: int):
-        """A stored number, or a vector of them, in the accumulation type."""
-
-        def shape(lane):
-            return ir.VectorType(lane, lanes) if lanes > 1 else lane
-
-        if dtype == types.uint16:
-            whole = shape(ir.IntType(32))
-            sixteen = whole([16] * lanes if lanes > 1 else 16)
-            return self.bitcast(self.shl(self.zext(stored, whole), sixteen), shape(ir.FloatType()))
-        if dtype == types.int16:
-            return self.fpext(self.bitcast(stored, shape(ir.HalfType())), shape(ir.FloatType()))
-        return stored
 
     def repeat(self, number, lanes=LANES):
         """A vector of one number repeated."""

@@ -6,8 +6,10 @@ import math
 
 import numpy as np
 
-from .channels import block_products, block_sums, fill, pack, unpack
-from .emit import LANES, compiled
+from arraygeom.compiled import compiled
+
+from .channels import block_products, block_sums, copy, fill
+from .emit import LANES
 from .layout import BLOCK, of, pixel_of, pointers
 from .sampling import distribute, find_samples
 from .softmax import find_scores, softmax
@@ -34,7 +36,7 @@ def _forward_block(first, pixels, call, block, outputs):
     d, dv = call.channels, call.value_channels
     for i in range(pixels):
         here = pixel_of(block, i)
-        unpack(call.query, (first + i) * d, d, here.query)
+        copy(call.query, (first + i) * d, d, here.query)
         find_samples(first + i, call.geometry, here)
     block_products(pixels, block.tap_count, block.query, block.rows, call.key, d, block.by_key)
     for i in range(pixels):
@@ -44,7 +46,7 @@ def _forward_block(first, pixels, call, block, outputs):
             _find_statistics(here, from_index(outputs.statistics, 4 * p))
     block_sums(pixels, block.tap_count, block.by_key, block.rows, call.value, dv, block.query)
     for i in range(pixels):
-        pack(of(block.query, i), dv, outputs.value, (first + i) * dv)
+        copy(of(block.query, i), 0, dv, from_index(outputs.value, (first + i) * dv))
 
 
 @compiled
@@ -77,7 +79,7 @@ def _find_tap_weights(p, n, call, measured, here):
     if logsum == -np.inf:
         here.tap_count[0] = 0
     elif measured:
-        unpack(by_tap, 0, n + LANES, here.weight)
+        copy(by_tap, 0, n + LANES, here.weight)
     return logsum
 
 

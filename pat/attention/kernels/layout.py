@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from .emit import LANES, compiled, instruction
+from arraygeom.compiled import compiled
+
+from .emit import LANES, instruction
 from .vectors import from_index
 
 BLOCK = 16

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from .emit import LANES, compiled
+from arraygeom.compiled import compiled
+
+from .emit import LANES
 from .layout import of, pointers
 from .softmax import exponentials
 from .vectors import add, load, maximum, splat, store, sub

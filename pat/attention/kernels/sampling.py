@@ -6,8 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from arraygeom.compiled import compiled
+
 from .channels import fill
-from .emit import LANES, compiled
+from .emit import LANES
 from .vectors import (
     TAP_BLOCK,
     add,

@@ -9,8 +9,10 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
+from arraygeom.compiled import compiled
+
 from .channels import fill
-from .emit import LANES, compiled
+from .emit import LANES
 from .sampling import ONE, interpolate
 from .vectors import (
     add,

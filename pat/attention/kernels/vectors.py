@@ -8,7 +8,7 @@ from __future__ import annotations
 from llvmlite import ir
 from numba import types
 
-from .emit import LANES, NARROW, Vector, accumulated, instruction, row_of, vector_of
+from .emit import LANES, NARROW, Vector, instruction, row_of
 
 TAP_BLOCK = 4
 
@@ -36,22 +36,22 @@ def from_index(code, array, i: index):
     return code.gep(array, [i])
 
 
-@instruction(accumulated)
+@instruction(lambda array: array.dtype)
 def zero(code, array):
-    """0 in the accumulation type of the numbers at a pointer."""
+    """0 in the type of the numbers at a pointer."""
     return code.context.get_constant(code.result, 0)
 
 
-@instruction(vector_of)
+@instruction(lambda array, i: Vector(array.dtype))
 def load(code, array, i: index):
-    """The vector at an index, in the accumulation type."""
-    return code.get_wide(code.kinds[0], array, i)
+    """The vector at an index."""
+    return code.get(code.kinds[0], array, i)
 
 
-@instruction(lambda array, i: Vector(accumulated(array), NARROW))
+@instruction(lambda array, i: Vector(array.dtype, NARROW))
 def load_narrow(code, array, i: index):
-    """The narrow vector at an index, in the accumulation type."""
-    return code.get_wide(code.kinds[0], array, i, NARROW)
+    """The narrow vector at an index."""
+    return code.get(code.kinds[0], array, i, NARROW)
 
 
 @instruction(_nothing)
@@ -60,28 +60,20 @@ def store(code, array, i: index, vector):
     code.put(code.kinds[0], array, i, vector)
 
 
-@instruction(lambda array, i: accumulated(array))
-def load_one(code, array, i: index):
-    """The number at an index, in the accumulation type."""
-    return code.widen(code.at(array, i), code.kinds[0].dtype, 1)
-
-
 # ---- rows ----------------------------------------------------------------------------------------
 
 
-@instruction(lambda array, i, n, lanes: row_of(Vector(accumulated(array), lanes.literal_value), n))
+@instruction(lambda array, i, n, lanes: row_of(Vector(array.dtype, lanes.literal_value), n))
 def load_row(code, array, i: index, n: literal, lanes: literal):
     """n vectors of so many lanes from an index on."""
-    return code.pack(
-        [code.get_wide(code.kinds[0], array, code.offset(i, k * lanes), lanes) for k in range(n)]
-    )
+    return code.pack([code.get(code.kinds[0], array, code.offset(i, k * lanes), lanes) for k in range(n)])
 
 
-@instruction(lambda array, starts, i: row_of(Vector(accumulated(array), NARROW), starts.count))
+@instruction(lambda array, starts, i: row_of(Vector(array.dtype, NARROW), starts.count))
 def gather_row(code, array, starts, i: index):
     """The narrow vector at an index from each of some starts on."""
     return code.pack(
-        [code.get_wide(code.kinds[0], array, code.add(start, i), NARROW) for start in code.parts(starts)]
+        [code.get(code.kinds[0], array, code.add(start, i), NARROW) for start in code.parts(starts)]
     )
 
 
@@ -99,9 +91,9 @@ def extend_row(code, row, n: literal):
     return code.pack(vectors + [ir.Constant(vectors[0].type, None)] * (n - len(vectors)))
 
 
-@instruction(lambda array: Vector(accumulated(array), NARROW))
+@instruction(lambda array: Vector(array.dtype, NARROW))
 def nothing_narrow(code, array):
-    """A narrow vector of 0 in the accumulation type."""
+    """A narrow vector of 0."""
     return ir.Constant(code.context.get_value_type(code.result), None)
 
 
@@ -119,7 +111,7 @@ def dot_row(code, row, array, i: index):
     """The products of a row with the one at an index, summed lane by lane."""
     total = None
     for k, a in enumerate(code.parts(row)):
-        b = code.get_wide(code.kinds[1], array, code.offset(i, k * a.type.count), a.type.count)
+        b = code.get(code.kinds[1], array, code.offset(i, k * a.type.count), a.type.count)
         total = code.fmul(a, b) if total is None else code.fused(a, b, total)
     return total
 
@@ -134,7 +126,7 @@ def fma_taps(code, weights, rows, t: index, image, channels: index, c: index, to
         weight = code.repeat(code.at(weights, tap), lanes)
         start = code.add(code.mul(code.sext(code.at(rows, tap), channels.type), channels), c)
         for i in range(n):
-            vector = code.get_wide(code.kinds[3], image, code.offset(start, i * lanes), lanes)
+            vector = code.get(code.kinds[3], image, code.offset(start, i * lanes), lanes)
             vectors[k + i] = code.fused(weight, vector, vectors[k + i])
     return code.pack(vectors)
 
@@ -303,9 +295,3 @@ def store_four(code, array, i: index, number, offsets):
         numbers = code.insert_element(numbers, number, ir.IntType(32)(k))
         shifts = code.insert_element(shifts, shift, ir.IntType(32)(k))
     code.put(code.kinds[0], array, i, code.builder.add(numbers, shifts))
-
-
-@instruction(lambda number: types.int16)
-def half_bits(code, number):
-    """float32 to the bits of float16, to nearest even."""
-    return code.bitcast(code.fptrunc(number, ir.HalfType()), ir.IntType(16))

@@ -224,7 +224,7 @@ def test_processes_that_compile_at_once_do_not_take_each_others_code(tmp_path):
     """Two processes read the same empty index, then each saves code of its own types."""
     from numba.core.caching import IndexDataCacheFile
 
-    from pat.attention.kernels import separate_cache
+    from arraygeom.compiled import separate_cache
 
     class Entry:
         def __init__(self):

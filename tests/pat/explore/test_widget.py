@@ -15,7 +15,7 @@ from arraygeom import Camera, Distortion, Epipolar, Pose, ReceptiveField, Rig
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.text import UNSCALED
 from pat.data.sample_array import load_sample
-from pat.fusion.steps import at_alphas_resolution
+from pat.fusion.steps import hw_at_alphas_resolution, of_size
 from pat.matching.inputs import Inputs
 from pat.networks.weights import load_weights
 from tests.browser import CHROMIUM, DRIVER, browser
@@ -141,7 +141,7 @@ def test_a_networks_weights_are_its_attention():
         rig = rig.resize(name, tuple(images[name].shape[1:]))
     x, h = (80, 50), rig["colour"].hw[0]
     ours = explore(rig, images, x=x, network=network)
-    colour = at_alphas_resolution(images["colour"], rig.pair("mono", "colour"))
+    colour = of_size(images["colour"], hw_at_alphas_resolution(rig.pair("mono", "colour")))
     assert colour.shape[1] > h * 1.5
     larger = rig.resize("colour", tuple(colour.shape[1:]))
     field = FieldOnGrid.of(Epipolar(), larger.pair("mono", "colour"))

@@ -10,7 +10,7 @@ from arraygeom import Distortion, Epipolar, Moved, Rectified, Rig, Sensor, View,
 from experiments.flicker import flicker
 from pat.fusion.fuse import FuseSettings, fuse
 from pat.fusion.optical_flow import Flow, flow_between, warped
-from pat.fusion.sequence import KeyColour, KeyContribution, SequenceFusion, fuse_sequence, mixed
+from pat.fusion.sequence import KeyColour, SequenceFusion, fuse_sequence, mixed
 from pat.fusion.timeline import KeyFrame, Timeline
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
@@ -130,8 +130,8 @@ def test_colours_mix_by_confidence_which_disagreement_lowers():
     red, blue = (torch.tensor(c)[:, None, None].expand(3, 1, 2) for c in ((0.2, 0.0, 0.0), (0.0, 0.0, 0.2)))
     sure = torch.tensor([[0.9, 0.9]])
     sources = [
-        KeyContribution(1.0, red, sure, torch.stack([sure, 0.1 * sure])),
-        KeyContribution(1.0, blue, torch.tensor([[0.9, 0.0]]), torch.zeros(2, 1, 2)),
+        (1.0, KeyColour(red, sure, torch.stack([sure, 0.1 * sure]))),
+        (1.0, KeyColour(blue, torch.tensor([[0.9, 0.0]]), torch.zeros(2, 1, 2))),
     ]
     frame = mixed(own, sources)
     torch.testing.assert_close(frame.image[:, 0, 1], torch.tensor([0.7, 0.5, 0.5]), atol=1e-3, rtol=0)
