@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -67,14 +67,14 @@ class Condition:
     def recorded(self, pair: StereoPair) -> MonoColourTask:
         """The pair under this condition; what is drawn at random depends on the pair's name alone."""
         g = Generator().manual_seed(int(hashlib.sha256(pair.name.encode()).hexdigest()[:8], 16))
-        moved = StereoPair(pair.name, pair.left, self.right(pair.right), pair.max_disparity, pair.disparity)
-        alpha, beta, truth = mono_colour_task(moved, self.rate)
+        moved = replace(pair, right=self.right(pair.right))
+        task = mono_colour_task(moved, self.rate)
+        alpha, beta = task.alpha, self.beta(task.beta)
         if self.alpha is not None:
-            alpha = luminance(truth, tuple(self.alpha(g)))  # type: ignore[arg-type]
-        beta = self.beta(beta)
+            alpha = luminance(task.ground_truth, tuple(self.alpha(g)))  # type: ignore[arg-type]
         if self.noise is not None:
             alpha, beta = (self.noise.recorded(image[None], g)[0] for image in (alpha, beta))
-        return MonoColourTask(alpha, beta, truth)
+        return task._replace(alpha=alpha, beta=beta)
 
 
 def _weights(*weights: float) -> Callable[[Generator], Sequence[float]]:
@@ -199,15 +199,12 @@ def sgbm_disparity(
     return torch.where(found >= 0, found, torch.nan)
 
 
-def regions_of(pair: StereoPair, hw: tuple[int, int]) -> dict[str, Bool[Tensor, "h w"]]:
+def regions_of(task: MonoColourTask) -> dict[str, Bool[Tensor, "h w"]]:
     """Where left's pixels are seen in right, occluded, beyond its left edge; and all but left columns."""
-    h, w = hw
+    h, w = hw_of(task.ground_truth)
     found = {"whole": torch.ones(h, w, dtype=torch.bool)}
     found["cropped"] = torch.arange(w).expand(h, w) >= LEFT_CROP
-    if pair.disparity is None:
-        return found
-    cut = Disparity(*(plane[:h, :w] for plane in pair.disparity))
-    return found | cut.regions()._asdict()
+    return found if task.disparity is None else found | task.disparity.regions()._asdict()
 
 
 def chroma_bound(task: MonoColourTask, rate: int) -> Float[Tensor, "3 h w"]:
@@ -231,33 +228,33 @@ def evaluate_conditions(
     for pair in progress(pairs, len(pairs)):
         for name, condition in chosen.items():
             task = condition.recorded(pair)
-            truth, regions = task.ground_truth, regions_of(pair, hw_of(task.ground_truth))
+            regions = regions_of(task)
             if condition == CONDITIONS["ideal"]:
                 bound = StereoResult(chroma_bound(task, condition.rate))
-                rows.append(_row(pair, name, "bound of beta's resolution", bound, truth, regions))
+                rows.append(_row(pair.name, name, "bound of beta's resolution", bound, task, regions))
             for method, run in methods_of(network, condition.noise).items():
                 found = run(task.alpha, task.beta, max_disparity)
                 result = found if isinstance(found, StereoResult) else StereoResult(found)
-                rows.append(_row(pair, name, method, result, truth, regions))
+                rows.append(_row(pair.name, name, method, result, task, regions))
     return rows
 
 
 def _row(
-    pair: StereoPair,
+    pair: str,
     condition: str,
     method: str,
     result: StereoResult,
-    truth: Tensor,
+    task: MonoColourTask,
     regions: Mapping[str, Tensor],
 ) -> ConditionRow:
-    image = result.image.clamp(0, 1)
+    image, truth = result.image.clamp(0, 1), task.ground_truth
     error = (image - truth).square().mean(0)
     psnr = {
         n: -10 * math.log10(max(float(error[at].mean()), 1e-12)) if at.any() else None
         for n, at in regions.items()
     }
-    depth = depth_errors(result.disparity, pair.disparity, regions)
-    return ConditionRow(pair.name, condition, method, score(image, truth).ssim, psnr, *depth)
+    depth = depth_errors(result.disparity, task.disparity, regions)
+    return ConditionRow(pair, condition, method, score(image, truth).ssim, psnr, *depth)
 
 
 def depth_errors(

@@ -75,7 +75,7 @@ def evaluate_pairs(
         for rate in rates:
             task = mono_colour_task(pair, rate)
             results = {n: _result(n, method, pair, task, max_disparity) for n, method in methods.items()}
-            rows += [_row(pair, rate, name, result, task.ground_truth) for name, result in results.items()]
+            rows += [_row(pair.name, rate, name, result, task) for name, result in results.items()]
             if images:
                 beta, shown = beta_alone(task.alpha, task.beta, 0.0), [r.image for r in results.values()]
                 strip = torch.cat([beta, *shown, task.ground_truth], -1)
@@ -176,22 +176,18 @@ def _result(
     return StereoResult(image.float().clamp(0, 1), result.disparity)
 
 
-def _row(pair: StereoPair, rate: int, method: str, result: StereoResult, ground_truth: Tensor) -> StereoRow:
+def _row(pair: str, rate: int, method: str, result: StereoResult, task: MonoColourTask) -> StereoRow:
     errors: tuple[float | None, float | None] = (None, None)
-    if result.disparity is not None and pair.disparity is not None:
-        errors = disparity_errors(result.disparity.detach().cpu(), pair.disparity)
-    return StereoRow(pair.name, rate, method, *score(result.image, ground_truth), *errors)
+    if result.disparity is not None and task.disparity is not None:
+        errors = disparity_errors(result.disparity.detach().cpu(), task.disparity)
+    return StereoRow(pair, rate, method, *score(result.image, task.ground_truth), *errors)
 
 
 def disparity_errors(
     found: Float[Tensor, "h w"], ground_truth: Disparity
 ) -> tuple[float | None, float | None]:
-    """Mean error of `found` where both are known, and the share of known ground truth that is within a pixel.
-
-    The ground truth may be larger by what was cut off at the bottom and the right.
-    """
-    h, w = found.shape
-    value, valid = ground_truth.value[:h, :w], ground_truth.valid[:h, :w]
+    """Mean error where both are known, and the share of the known ground truth within a pixel of it."""
+    value, valid = ground_truth
     compared = valid & found.isfinite()
     if not compared.any():
         return None, None
