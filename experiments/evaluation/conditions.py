@@ -22,7 +22,7 @@ from torch.nn.functional import interpolate
 from arraygeom.sampling import sample
 from arraygeom.viz import new_figure
 from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
-from pat.evaluation.baseline import classical_fusion, non_local_means, raw_disparity
+from pat.evaluation.baseline import classical_fusion, denoised_knowing, raw_disparity
 from pat.evaluation.metrics import bootstrap_interval, score
 from pat.evaluation.protocols import (
     MonoColourTask,
@@ -162,17 +162,12 @@ def methods_of(network: FusionNetwork, level: NoiseLevel | None) -> dict[str, St
         found["classical, corrected"] = lambda a, b, d: corrected_classical(network, a, b, d)
     else:
         found["denoised, classical"] = lambda a, b, d: classical(
-            _non_local(a, level), _non_local(b, level), d
+            denoised_knowing(a, level), denoised_knowing(b, level), d
         )
     found["uncorrected"] = rectified_fusion(network, response="rec601", align=False)
     noisy: dict[str, Any] = {} if level is None else {"noise": {"alpha": level, "beta": level}}
     found["fusion"] = rectified_fusion(network, **noisy)
     return found
-
-
-def _non_local(image: Tensor, level: NoiseLevel) -> Tensor:
-    """Non-local means with the true noise level, in the mean."""
-    return non_local_means(image, float(level.deviation(image[None]).mean())).clamp(0, 1)
 
 
 def corrected_classical(network: FusionNetwork, alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
