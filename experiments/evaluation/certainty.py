@@ -20,7 +20,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from pat.data.pairs import PAPER_DISPARITY, StereoPair
-from pat.evaluation.protocols import StereoResult, hw_of, rectified_fusion
+from pat.evaluation.protocols import hw_of, rectified_fusion
 from pat.evaluation.tables import distinct, markdown_table
 from pat.matching.certainty import SETTINGS, CertaintyNetwork, measured, typical_facts
 from pat.matching.choice import Choice, read_choice
@@ -131,7 +131,6 @@ def judged_pair(network: FusionNetwork, pair: StereoPair, condition: str, choice
         return found
 
     fused = rectified_fusion(network, noise=stated, matcher=matcher)(task.alpha, task.beta, PAPER_DISPARITY)
-    assert isinstance(fused, StereoResult)
     assert fused.disparity is not None
     (value, known), (h, w) = task.disparity, hw_of(task.alpha)
     places = known.nonzero()

@@ -28,6 +28,7 @@ from pat.evaluation.protocols import (
     MonoColourTask,
     StereoMethod,
     StereoResult,
+    enlarged,
     hw_of,
     mono_colour_task,
     rectified_field,
@@ -170,28 +171,23 @@ def methods_of(network: FusionNetwork, level: NoiseLevel | None) -> dict[str, St
     return found
 
 
-def corrected_classical(network: FusionNetwork, alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
+def corrected_classical(
+    network: FusionNetwork, alpha: Tensor, beta: Tensor, max_disparity: float
+) -> StereoResult:
     """The classical baseline with alpha's response as the fusion finds it."""
     rig = rectified_rig(hw_of(alpha), {"beta": hw_of(beta)}, max_disparity)
     images, field = {"alpha": alpha, "beta": beta}, rectified_field(max_disparity)
     response = corrections_of(network, rig, images, alpha="alpha", field=field, align=False).response
     image = classical_fusion(response.of_alpha(alpha), response.of_beta(beta), max_disparity)
-    return response.undone(image)
+    return StereoResult(response.undone(image))
 
 
 def classical(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
-    """The classical baseline, disparity by OpenCV's semi-global matching where that is consistent."""
+    """The classical baseline, disparity by OpenCV's semi-global matching; NaN where that gives nothing."""
+    right = luminance(enlarged(beta, hw_of(alpha)))[0]
+    found = torch.from_numpy(raw_disparity(to_bytes(alpha[0]), to_bytes(right), max_disparity))
     image = classical_fusion(alpha, beta, max_disparity)
-    enlarged = interpolate(beta[None], alpha.shape[1:], mode="bicubic", align_corners=False)[0].clamp(0, 1)
-    return StereoResult(image, sgbm_disparity(alpha, luminance(enlarged), max_disparity))
-
-
-def sgbm_disparity(
-    alpha: Float[Tensor, "1 h w"], beta: Float[Tensor, "1 h w"], max_disparity: float
-) -> Float[Tensor, "h w"]:
-    """OpenCV's semi-global matching of a rectified pair, alpha on the left; NaN where it gives nothing."""
-    found = torch.from_numpy(raw_disparity(to_bytes(alpha[0]), to_bytes(beta[0]), max_disparity))
-    return torch.where(found >= 0, found, torch.nan)
+    return StereoResult(image, torch.where(found >= 0, found, torch.nan))
 
 
 def regions_of(task: MonoColourTask) -> dict[str, Bool[Tensor, "h w"]]:
@@ -228,8 +224,7 @@ def evaluate_conditions(
                 bound = StereoResult(chroma_bound(task, condition.rate))
                 rows.append(_row(pair.name, name, "bound of beta's resolution", bound, task, regions))
             for method, run in methods_of(network, condition.noise).items():
-                found = run(task.alpha, task.beta, max_disparity)
-                result = found if isinstance(found, StereoResult) else StereoResult(found)
+                result = run(task.alpha, task.beta, max_disparity)
                 rows.append(_row(pair.name, name, method, result, task, regions))
     return rows
 

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from arraygeom import (
     Curved,
@@ -38,7 +37,7 @@ from arraygeom.fields.straight import covering_displacement
 from experiments.peaks import with_peak
 from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
 from pat.evaluation.metrics import score
-from pat.evaluation.protocols import hw_of, mono_colour_task, rectified_rig
+from pat.evaluation.protocols import enlarged, hw_of, mono_colour_task, rectified_rig
 from pat.evaluation.tables import distinct, markdown_table
 from pat.media.figures import colour_depth
 from pat.networks.protocol import Comparing
@@ -102,7 +101,7 @@ def rectified_cases(pairs: Iterable[StereoPair], *, linked: bool = False) -> Ite
         task = mono_colour_task(pair, 2)
         assert task.disparity is not None
         h, w = hw_of(task.alpha)
-        beta = interpolate(task.beta[None], (h, w), mode="bicubic", align_corners=False)[0].clamp(0, 1)
+        beta = enlarged(task.beta, (h, w))
         scene = RecordedScene({ALPHA: task.alpha, BETA: beta}, task.ground_truth, *_truth(task.disparity))
         rig = rectified_rig((h, w), {BETA: (h, w)}, PAPER_DISPARITY)
         known = row_link((h, w)) if linked else rig.pair(ALPHA, BETA)

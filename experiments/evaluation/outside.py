@@ -17,7 +17,7 @@ from arraygeom.fields import AroundDepth
 from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
 from pat.evaluation.baseline import checked_disparity
 from pat.evaluation.metrics import score
-from pat.evaluation.protocols import MonoColourTask, hw_of, mono_colour_task, rectified_rig
+from pat.evaluation.protocols import MonoColourTask, enlarged, hw_of, mono_colour_task, rectified_rig
 from pat.evaluation.stereo import disparity_errors
 from pat.evaluation.tables import distinct, markdown_table
 from pat.fusion.fuse import fuse
@@ -88,8 +88,7 @@ def _around(disparity: Float[Tensor, "h w"], known: Tensor, tolerance: float) ->
 
 
 def _sgbm(task: MonoColourTask) -> ReceptiveField:
-    hw = hw_of(task.alpha)
-    beta = interpolate(luminance(task.beta)[None], hw, mode="bicubic", align_corners=False)[0].clamp(0, 1)
+    beta = enlarged(luminance(task.beta), hw_of(task.alpha))
     disparity, consistent = checked_disparity(
         to_bytes(task.alpha[0]), to_bytes(beta[0]), round(PAPER_DISPARITY)
     )

@@ -73,28 +73,27 @@ def hw_of(image: Float[Tensor, "*c h w"]) -> HW:
 
 
 class StereoResult(NamedTuple):
-    """A colour image (3, H, W), 0..1, and the disparity (H, W) of its match, pixels of alpha; NaN unknown."""
+    """An image (3, H, W), 0..1 or more, and the disparity (H, W) of its match in alpha's pixels, or NaN."""
 
     image: Tensor
     disparity: Tensor | None = None
 
 
-StereoMethod = Callable[[Tensor, Tensor, float], Tensor | StereoResult]
-"""(alpha (1, H, W), beta (3, Hb, Wb), max_disparity in alpha pixels) -> colours (3, H, W), 0..1 or more."""
+StereoMethod = Callable[[Tensor, Tensor, float], StereoResult]
+"""Of alpha (1, H, W), beta (3, Hb, Wb), and the largest disparity in alpha's pixels."""
 
 
-def alpha_alone(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
-    """The grey image in all three channels: the score without any colour."""
-    return alpha.expand(3, -1, -1)
+def enlarged(beta: Float[Tensor, "c hb wb"], hw: HW) -> Float[Tensor, "c h w"]:
+    """Beta as large as alpha (bicubic, 0..1), and not warped."""
+    return interpolate(beta[None], hw, mode="bicubic", align_corners=False)[0].clamp(0, 1)
 
 
-def beta_alone(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
-    """The colour image enlarged (bicubic) and not warped: the score without any matching."""
-    return interpolate(beta[None], alpha.shape[1:], mode="bicubic", align_corners=False)[0]
-
-
-BASELINES: dict[str, StereoMethod] = {"alpha": alpha_alone, "beta": beta_alone, "classical": classical_fusion}
-"""Methods without learning, by name."""
+BASELINES: dict[str, StereoMethod] = {
+    "alpha": lambda alpha, beta, most: StereoResult(alpha.expand(3, -1, -1)),
+    "beta": lambda alpha, beta, most: StereoResult(enlarged(beta, hw_of(alpha))),
+    "classical": lambda alpha, beta, most: StereoResult(classical_fusion(alpha, beta, most)),
+}
+"""Methods without learning, by name: without any colour, without any matching."""
 
 
 def rectified_fusion(

@@ -16,7 +16,7 @@ from torch import Tensor
 from ..data.pairs import PAPER_DISPARITY, Disparity, StereoPair, folder_pairs, middlebury_pairs
 from ..media.images import write_image
 from .metrics import bootstrap_interval, score
-from .protocols import MonoColourTask, StereoMethod, StereoResult, beta_alone, mono_colour_task
+from .protocols import MonoColourTask, StereoMethod, StereoResult, enlarged, hw_of, mono_colour_task
 from .tables import distinct, markdown_table
 
 DATA_SETS: dict[str, Callable[[Path], Iterable[StereoPair]]] = {
@@ -77,8 +77,8 @@ def evaluate_pairs(
             results = {n: _result(n, method, pair, task, max_disparity) for n, method in methods.items()}
             rows += [_row(pair.name, rate, name, result, task) for name, result in results.items()]
             if images:
-                beta, shown = beta_alone(task.alpha, task.beta, 0.0), [r.image for r in results.values()]
-                strip = torch.cat([beta, *shown, task.ground_truth], -1)
+                shown = [enlarged(task.beta, hw_of(task.alpha)), *(r.image for r in results.values())]
+                strip = torch.cat([*shown, task.ground_truth], -1)
                 write_image(images / f"{pair.name.replace('/', '-')}_x{rate}.png", strip)
     return rows
 
@@ -165,8 +165,7 @@ def structure_kept(rows: Sequence[StereoRow]) -> str:
 def _result(
     name: str, method: StereoMethod, pair: StereoPair, task: MonoColourTask, max_disparity: float
 ) -> StereoResult:
-    given = method(task.alpha, task.beta, max_disparity)
-    result = given if isinstance(given, StereoResult) else StereoResult(given)
+    result = method(task.alpha, task.beta, max_disparity)
     image = result.image.detach().cpu()
     if image.shape != task.ground_truth.shape:
         wanted = tuple(task.ground_truth.shape)
