@@ -61,7 +61,7 @@ class Condition:
 
     rate: int = 2
     right: Callable[[Tensor], Tensor] = lambda image: image
-    alpha: Callable[[Generator], Sequence[float]] | None = None
+    alpha: tuple[float, float, float] | Literal["luma", "random"] = "luma"
     beta: Callable[[Tensor], Tensor] = lambda image: image
     noise: NoiseLevel | None = None
 
@@ -71,20 +71,17 @@ class Condition:
         moved = replace(pair, right=self.right(pair.right))
         task = mono_colour_task(moved, self.rate)
         alpha, beta = task.alpha, self.beta(task.beta)
-        if self.alpha is not None:
-            alpha = luminance(task.ground_truth, tuple(self.alpha(g)))  # type: ignore[arg-type]
+        if self.alpha != "luma":
+            alpha = luminance(task.ground_truth, _random_weights(g) if self.alpha == "random" else self.alpha)
         if self.noise is not None:
             alpha, beta = (self.noise.recorded(image[None], g)[0] for image in (alpha, beta))
         return task._replace(alpha=alpha, beta=beta)
 
 
-def _weights(*weights: float) -> Callable[[Generator], Sequence[float]]:
-    return lambda g: weights
-
-
-def _random_weights(g: Generator) -> Sequence[float]:
+def _random_weights(g: Generator) -> tuple[float, float, float]:
     drawn = torch.rand(3, generator=g) + 0.1
-    return (drawn / drawn.sum()).tolist()
+    red, green, blue = (drawn / drawn.sum()).tolist()
+    return red, green, blue
 
 
 def _moved(rows: float = 0.0, degrees: float = 0.0) -> Callable[[Tensor], Tensor]:
@@ -122,13 +119,13 @@ CONDITIONS: dict[str, Condition] = {
     "x1": Condition(rate=1),
     "x4": Condition(rate=4),
     "x8": Condition(rate=8),
-    "alpha = mean": Condition(alpha=_weights(1 / 3, 1 / 3, 1 / 3)),
-    "alpha = .2/.4/.4": Condition(alpha=_weights(0.2, 0.4, 0.4)),
-    "alpha = .6/.3/.1": Condition(alpha=_weights(0.6, 0.3, 0.1)),
-    "alpha random": Condition(alpha=_random_weights),
+    "alpha = mean": Condition(alpha=(1 / 3, 1 / 3, 1 / 3)),
+    "alpha = .2/.4/.4": Condition(alpha=(0.2, 0.4, 0.4)),
+    "alpha = .6/.3/.1": Condition(alpha=(0.6, 0.3, 0.1)),
+    "alpha random": Condition(alpha="random"),
     "beta x .6": Condition(beta=lambda beta: 0.6 * beta),
     "beta x .6, gamma 1.3": Condition(beta=lambda beta: 0.6 * beta**1.3),
-    "alpha random, beta x .6": Condition(alpha=_random_weights, beta=lambda beta: 0.6 * beta),
+    "alpha random, beta x .6": Condition(alpha="random", beta=lambda beta: 0.6 * beta),
     "beta vignetted": Condition(beta=_vignetted),
     "rows off 1 px": Condition(right=_moved(rows=1)),
     "rows off 3 px": Condition(right=_moved(rows=3)),
