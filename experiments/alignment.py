@@ -165,7 +165,8 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
         expected[..., 0] -= truth.value.numpy()
         regions = truth.regions()
         occluded, visible = regions.occluded.numpy(), regions.seen.numpy() & (expected[..., 0] >= 0)
-    candidates = corners[patch_mean(visible.astype(float), corners) > 1 - 1e-6]
+    whole = cv2.blur(visible.astype(float), (2 * PATCH + 1, 2 * PATCH + 1)) > 1 - 1e-6
+    candidates = corners[whole[corners[:, 1], corners[:, 0]]]
     rows = []
     for name in scene.rig.betas(scene.alpha):
         view, values = aligned[name], np.asarray(scene.recorded[name])
@@ -310,11 +311,6 @@ def _correlation(a: NDArray[Any], b: NDArray[Any], H: NDArray[Any]) -> float:
 def _gradients(image: NDArray[np.uint8], factor: float) -> NDArray[np.float32]:
     small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA).astype(np.float32)
     return np.asarray(np.hypot(cv2.Sobel(small, -1, 1, 0), cv2.Sobel(small, -1, 0, 1)), np.float32)
-
-
-def patch_mean(plane: NDArray[Any], x: NDArray[Any]) -> Float[np.ndarray, " n"]:
-    """The mean over the patch around each pixel."""
-    return np.asarray(cv2.blur(plane, (2 * PATCH + 1, 2 * PATCH + 1))[x[:, 1], x[:, 0]])
 
 
 def sampling_error(view: Any, values: NDArray[Any]) -> float:

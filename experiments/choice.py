@@ -24,9 +24,8 @@ from torch.nn.functional import binary_cross_entropy_with_logits, pixel_shuffle
 from arraygeom import Segments, pixel_grid
 from experiments.completion.capture import fused_at_random
 from experiments.completion.samples import KINDS, Made, PairTraining
-from experiments.evaluation.conditions import regions_of
 from experiments.fit import command, recipe_text
-from pat.data.pairs import StereoPair
+from pat.data.pairs import Disparity, StereoPair
 from pat.matching.certainty import SETTINGS, typical_facts
 from pat.matching.choice import CANDIDATES, Choice, candidates, features
 from pat.matching.inputs import Inputs
@@ -132,11 +131,11 @@ def matched(network: GuidedPAT, pair: StereoPair, seed: int) -> Kept:
     h, w = (n // FINE * FINE for n in truth.shape[1:])
     whole = (views.alpha, views.beta, found.disparity)
     alpha, beta, disparity = (part[0, :, :h, :w].half() for part in whole)
-    value, valid = (part[None, :h, :w] for part in pair.disparity)
+    known = Disparity(*(part[:h, :w] for part in pair.disparity))
     facts = found.facts[0, :, : h // FINE, : w // FINE].half()
     blurs = torch.tensor(found.comparison.whole.blurs)[:, 0]
-    seen = regions_of(pair, (h, w))["seen"][None]
-    planes = alpha, beta, disparity, facts, (value * valid).half(), seen, blurs
+    truth, seen = (known.value * known.valid)[None].half(), known.regions().seen[None]
+    planes = alpha, beta, disparity, facts, truth, seen, blurs
     return Kept(*(part.contiguous() for part in planes))
 
 

@@ -23,7 +23,7 @@ from experiments.evaluation.conditions import CONDITIONS
 from experiments.evaluation.halves import of_half
 from pat.data.pairs import StereoPair, middlebury_pairs
 from pat.evaluation.metrics import score
-from pat.evaluation.protocols import StereoResult, rectified_fusion
+from pat.evaluation.protocols import rectified_fusion
 from pat.evaluation.tables import markdown_table
 from pat.networks.weights import SHIPPED, Network, load_weights
 from pat.support.eight_bits import measured, names, round_to_eight_bits
@@ -83,7 +83,6 @@ def psnr(network: Network, pair: StereoPair, name: str) -> float:
     noise = None if condition.noise is None else dict.fromkeys(("alpha", "beta"), condition.noise)
     assert pair.max_disparity is not None
     fused = rectified_fusion(network, noise=noise)(task.alpha, task.beta, pair.max_disparity)
-    assert isinstance(fused, StereoResult)
     return score(fused.image, task.ground_truth).psnr
 
 

@@ -56,7 +56,7 @@ def fused_at_random(network: GuidedPAT, pair: StereoPair, seed: int, **options: 
     """Fuse a pair recorded at random, left as alpha, its largest disparity known; returns left as it is."""
     assert pair.max_disparity is not None
     rng, g = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
-    alpha, beta, truth = mono_colour_task(pair, int(rng.choice(RATES)))
+    alpha, beta, truth, _ = mono_colour_task(pair, int(rng.choice(RATES)))
     if rng.random() < NOISY:
         level = NoiseLevel.of_electrons(float(np.exp(rng.uniform(np.log(50), np.log(2000)))), READ_NOISE)
         alpha, beta = (level.recorded(image[None], g)[0] for image in (alpha, beta))

@@ -17,13 +17,12 @@ from pat.networks.weights import load_weights
 from pat.support.folders import files_below
 
 from .pairs import mirrored, photo_pair, varied_pair
-from .rooms import room_pair
 from .shapes import shape_pair
 
 Made = partial[StereoPair]
 """A pair that is made when it is called."""
-KINDS = ("pairs", "shapes", "rooms", "photos")
-"""Real pairs, real shapes in other textures, rendered rooms, photographs cut into surfaces."""
+KINDS = ("pairs", "shapes", "photos")
+"""Real pairs, real shapes in other textures, photographs cut into surfaces."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +41,6 @@ class PairTraining(Recipe):
     """Real shapes in other textures."""
     varied: int = 520
     """And real pairs, in other colours and sizes."""
-    rendered: int = 0
-    """And rendered rooms; they take Blender."""
     fusion: str = "mono-colour"
     """Weights of the fusion that what is learned is for."""
 
@@ -55,12 +52,7 @@ class PairTraining(Recipe):
 
     def pairs(self, kind: str) -> Iterator[Made]:
         """Those of one of the `KINDS`. Raises ValueError where there are no photographs."""
-        made = {
-            "pairs": self._real_pairs,
-            "shapes": self._shape_pairs,
-            "rooms": self._rooms,
-            "photos": self._photo_pairs,
-        }
+        made = {"pairs": self._real_pairs, "shapes": self._shape_pairs, "photos": self._photo_pairs}
         return made[kind]()
 
     def _photo_pairs(self) -> Iterator[Made]:
@@ -73,10 +65,6 @@ class PairTraining(Recipe):
         files, known = self._photographs(), self._middlebury()
         for i in range(self.shaped if known else 0):
             yield partial(shape_pair, known[i % len(known)], files, i)
-
-    def _rooms(self) -> Iterator[Made]:
-        files = self._photographs()
-        return (partial(room_pair, files, i) for i in range(self.rendered))
 
     def _real_pairs(self) -> Iterator[Made]:
         """Each side as alpha, in turns."""

@@ -20,9 +20,8 @@ from torch import Generator, Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from pat.data.pairs import PAPER_DISPARITY, StereoPair
-from pat.evaluation.protocols import hw_of, rectified_field, rectified_rig
+from pat.evaluation.protocols import hw_of, rectified_fusion
 from pat.evaluation.tables import distinct, markdown_table
-from pat.fusion.fuse import fuse
 from pat.matching.certainty import SETTINGS, CertaintyNetwork, measured, typical_facts
 from pat.matching.choice import Choice, read_choice
 from pat.matching.inputs import Inputs
@@ -31,7 +30,7 @@ from pat.matching.matches import BetaMatches, Matches
 from pat.matching.positions import FINE
 from pat.networks.protocol import FusionNetwork
 
-from .conditions import CONDITIONS, regions_of, save_curves
+from .conditions import CONDITIONS, save_curves
 
 PIXELS = 6000
 """Of a pair under a condition that take part, drawn evenly: every pair counts the same."""
@@ -121,11 +120,8 @@ def unseeing(choices: Sequence[Path], pair: str) -> Choice:
 
 def judged_pair(network: FusionNetwork, pair: StereoPair, condition: str, choice: Choice | None) -> Judged:
     """One of them. A match is right if beta sees the point and it is within a pixel."""
-    assert pair.disparity is not None
-    alpha, beta, _ = CONDITIONS[condition].recorded(pair)
-    noise = CONDITIONS[condition].noise
-    h, w = hw_of(alpha)
-    rig = rectified_rig((h, w), {"beta": hw_of(beta)}, PAPER_DISPARITY)
+    task, noise = CONDITIONS[condition].recorded(pair), CONDITIONS[condition].noise
+    assert task.disparity is not None
     stated = None if noise is None else {"alpha": noise, "beta": noise}
     kept: list[BetaMatches] = []
 
@@ -134,15 +130,15 @@ def judged_pair(network: FusionNetwork, pair: StereoPair, condition: str, choice
         kept.extend(found.betas)
         return found
 
-    images, field = {"alpha": alpha, "beta": beta}, rectified_field(PAPER_DISPARITY)
-    frame = fuse(network, rig, images, alpha="alpha", field=field, noise=stated, matcher=matcher)
-    value, known = (x[:h, :w] for x in pair.disparity)
+    fused = rectified_fusion(network, noise=stated, matcher=matcher)(task.alpha, task.beta, PAPER_DISPARITY)
+    assert fused.disparity is not None
+    (value, known), (h, w) = task.disparity, hw_of(task.alpha)
     places = known.nonzero()
     y, x = places[torch.randperm(len(places), generator=Generator().manual_seed(0))[:PIXELS]].unbind(-1)
     (found,) = kept
     numbers = measured(found, typical_facts(found))[0, :, y // FINE, x // FINE].T
-    right = regions_of(pair, (h, w))["seen"] & ((found.surface[0, 0, :h, :w] - value).abs() <= 1)
-    error = (w / frame.depth - value).abs().nan_to_num(float(w))
+    right = task.disparity.regions().seen & ((found.surface[0, 0, :h, :w] - value).abs() <= 1)
+    error = (fused.disparity - value).abs().nan_to_num(float(w))
     return Judged(pair.name, condition, numbers, right[y, x], error[y, x])
 
 

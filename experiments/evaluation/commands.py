@@ -12,8 +12,7 @@ from tyro.conf import Positional, arg
 
 from arraygeom.atomic import write_text
 from experiments.names import refuse_unknown
-from experiments.patches.dataset import ScenePatches
-from experiments.patches.show import draw_patches
+from experiments.patches import ScenePatches, draw_patches
 from experiments.sensors import read_chains
 from pat.cli import authors
 from pat.cli.options import MaybePath, Out, Weights, optional, progress, say, writable

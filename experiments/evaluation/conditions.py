@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -22,12 +22,13 @@ from torch.nn.functional import interpolate
 from arraygeom.sampling import sample
 from arraygeom.viz import new_figure
 from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
-from pat.evaluation.baseline import classical_fusion, non_local_means, raw_disparity
+from pat.evaluation.baseline import classical_fusion, denoised_knowing, raw_disparity
 from pat.evaluation.metrics import bootstrap_interval, score
 from pat.evaluation.protocols import (
     MonoColourTask,
     StereoMethod,
     StereoResult,
+    enlarged,
     hw_of,
     mono_colour_task,
     rectified_field,
@@ -60,30 +61,27 @@ class Condition:
 
     rate: int = 2
     right: Callable[[Tensor], Tensor] = lambda image: image
-    alpha: Callable[[Generator], Sequence[float]] | None = None
+    alpha: tuple[float, float, float] | Literal["luma", "random"] = "luma"
     beta: Callable[[Tensor], Tensor] = lambda image: image
     noise: NoiseLevel | None = None
 
     def recorded(self, pair: StereoPair) -> MonoColourTask:
         """The pair under this condition; what is drawn at random depends on the pair's name alone."""
         g = Generator().manual_seed(int(hashlib.sha256(pair.name.encode()).hexdigest()[:8], 16))
-        moved = StereoPair(pair.name, pair.left, self.right(pair.right), pair.max_disparity, pair.disparity)
-        alpha, beta, truth = mono_colour_task(moved, self.rate)
-        if self.alpha is not None:
-            alpha = luminance(truth, tuple(self.alpha(g)))  # type: ignore[arg-type]
-        beta = self.beta(beta)
+        moved = replace(pair, right=self.right(pair.right))
+        task = mono_colour_task(moved, self.rate)
+        alpha, beta = task.alpha, self.beta(task.beta)
+        if self.alpha != "luma":
+            alpha = luminance(task.ground_truth, _random_weights(g) if self.alpha == "random" else self.alpha)
         if self.noise is not None:
             alpha, beta = (self.noise.recorded(image[None], g)[0] for image in (alpha, beta))
-        return MonoColourTask(alpha, beta, truth)
+        return task._replace(alpha=alpha, beta=beta)
 
 
-def _weights(*weights: float) -> Callable[[Generator], Sequence[float]]:
-    return lambda g: weights
-
-
-def _random_weights(g: Generator) -> Sequence[float]:
+def _random_weights(g: Generator) -> tuple[float, float, float]:
     drawn = torch.rand(3, generator=g) + 0.1
-    return (drawn / drawn.sum()).tolist()
+    red, green, blue = (drawn / drawn.sum()).tolist()
+    return red, green, blue
 
 
 def _moved(rows: float = 0.0, degrees: float = 0.0) -> Callable[[Tensor], Tensor]:
@@ -121,13 +119,13 @@ CONDITIONS: dict[str, Condition] = {
     "x1": Condition(rate=1),
     "x4": Condition(rate=4),
     "x8": Condition(rate=8),
-    "alpha = mean": Condition(alpha=_weights(1 / 3, 1 / 3, 1 / 3)),
-    "alpha = .2/.4/.4": Condition(alpha=_weights(0.2, 0.4, 0.4)),
-    "alpha = .6/.3/.1": Condition(alpha=_weights(0.6, 0.3, 0.1)),
-    "alpha random": Condition(alpha=_random_weights),
+    "alpha = mean": Condition(alpha=(1 / 3, 1 / 3, 1 / 3)),
+    "alpha = .2/.4/.4": Condition(alpha=(0.2, 0.4, 0.4)),
+    "alpha = .6/.3/.1": Condition(alpha=(0.6, 0.3, 0.1)),
+    "alpha random": Condition(alpha="random"),
     "beta x .6": Condition(beta=lambda beta: 0.6 * beta),
     "beta x .6, gamma 1.3": Condition(beta=lambda beta: 0.6 * beta**1.3),
-    "alpha random, beta x .6": Condition(alpha=_random_weights, beta=lambda beta: 0.6 * beta),
+    "alpha random, beta x .6": Condition(alpha="random", beta=lambda beta: 0.6 * beta),
     "beta vignetted": Condition(beta=_vignetted),
     "rows off 1 px": Condition(right=_moved(rows=1)),
     "rows off 3 px": Condition(right=_moved(rows=3)),
@@ -162,7 +160,7 @@ def methods_of(network: FusionNetwork, level: NoiseLevel | None) -> dict[str, St
         found["classical, corrected"] = lambda a, b, d: corrected_classical(network, a, b, d)
     else:
         found["denoised, classical"] = lambda a, b, d: classical(
-            _non_local(a, level), _non_local(b, level), d
+            denoised_knowing(a, level), denoised_knowing(b, level), d
         )
     found["uncorrected"] = rectified_fusion(network, response="rec601", align=False)
     noisy: dict[str, Any] = {} if level is None else {"noise": {"alpha": level, "beta": level}}
@@ -170,44 +168,31 @@ def methods_of(network: FusionNetwork, level: NoiseLevel | None) -> dict[str, St
     return found
 
 
-def _non_local(image: Tensor, level: NoiseLevel) -> Tensor:
-    """Non-local means with the true noise level, in the mean."""
-    return non_local_means(image, float(level.deviation(image[None]).mean())).clamp(0, 1)
-
-
-def corrected_classical(network: FusionNetwork, alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
+def corrected_classical(
+    network: FusionNetwork, alpha: Tensor, beta: Tensor, max_disparity: float
+) -> StereoResult:
     """The classical baseline with alpha's response as the fusion finds it."""
     rig = rectified_rig(hw_of(alpha), {"beta": hw_of(beta)}, max_disparity)
     images, field = {"alpha": alpha, "beta": beta}, rectified_field(max_disparity)
     response = corrections_of(network, rig, images, alpha="alpha", field=field, align=False).response
     image = classical_fusion(response.of_alpha(alpha), response.of_beta(beta), max_disparity)
-    return response.undone(image)
+    return StereoResult(response.undone(image))
 
 
 def classical(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
-    """The classical baseline, disparity by OpenCV's semi-global matching where that is consistent."""
+    """The classical baseline, disparity by OpenCV's semi-global matching; NaN where that gives nothing."""
+    right = luminance(enlarged(beta, hw_of(alpha)))[0]
+    found = torch.from_numpy(raw_disparity(to_bytes(alpha[0]), to_bytes(right), max_disparity))
     image = classical_fusion(alpha, beta, max_disparity)
-    enlarged = interpolate(beta[None], alpha.shape[1:], mode="bicubic", align_corners=False)[0].clamp(0, 1)
-    return StereoResult(image, sgbm_disparity(alpha, luminance(enlarged), max_disparity))
+    return StereoResult(image, torch.where(found >= 0, found, torch.nan))
 
 
-def sgbm_disparity(
-    alpha: Float[Tensor, "1 h w"], beta: Float[Tensor, "1 h w"], max_disparity: float
-) -> Float[Tensor, "h w"]:
-    """OpenCV's semi-global matching of a rectified pair, alpha on the left; NaN where it gives nothing."""
-    found = torch.from_numpy(raw_disparity(to_bytes(alpha[0]), to_bytes(beta[0]), max_disparity))
-    return torch.where(found >= 0, found, torch.nan)
-
-
-def regions_of(pair: StereoPair, hw: tuple[int, int]) -> dict[str, Bool[Tensor, "h w"]]:
+def regions_of(task: MonoColourTask) -> dict[str, Bool[Tensor, "h w"]]:
     """Where left's pixels are seen in right, occluded, beyond its left edge; and all but left columns."""
-    h, w = hw
+    h, w = hw_of(task.ground_truth)
     found = {"whole": torch.ones(h, w, dtype=torch.bool)}
     found["cropped"] = torch.arange(w).expand(h, w) >= LEFT_CROP
-    if pair.disparity is None:
-        return found
-    cut = Disparity(*(plane[:h, :w] for plane in pair.disparity))
-    return found | cut.regions()._asdict()
+    return found if task.disparity is None else found | task.disparity.regions()._asdict()
 
 
 def chroma_bound(task: MonoColourTask, rate: int) -> Float[Tensor, "3 h w"]:
@@ -231,33 +216,32 @@ def evaluate_conditions(
     for pair in progress(pairs, len(pairs)):
         for name, condition in chosen.items():
             task = condition.recorded(pair)
-            truth, regions = task.ground_truth, regions_of(pair, hw_of(task.ground_truth))
+            regions = regions_of(task)
             if condition == CONDITIONS["ideal"]:
                 bound = StereoResult(chroma_bound(task, condition.rate))
-                rows.append(_row(pair, name, "bound of beta's resolution", bound, truth, regions))
+                rows.append(_row(pair.name, name, "bound of beta's resolution", bound, task, regions))
             for method, run in methods_of(network, condition.noise).items():
-                found = run(task.alpha, task.beta, max_disparity)
-                result = found if isinstance(found, StereoResult) else StereoResult(found)
-                rows.append(_row(pair, name, method, result, truth, regions))
+                result = run(task.alpha, task.beta, max_disparity)
+                rows.append(_row(pair.name, name, method, result, task, regions))
     return rows
 
 
 def _row(
-    pair: StereoPair,
+    pair: str,
     condition: str,
     method: str,
     result: StereoResult,
-    truth: Tensor,
+    task: MonoColourTask,
     regions: Mapping[str, Tensor],
 ) -> ConditionRow:
-    image = result.image.clamp(0, 1)
+    image, truth = result.image.clamp(0, 1), task.ground_truth
     error = (image - truth).square().mean(0)
     psnr = {
         n: -10 * math.log10(max(float(error[at].mean()), 1e-12)) if at.any() else None
         for n, at in regions.items()
     }
-    depth = depth_errors(result.disparity, pair.disparity, regions)
-    return ConditionRow(pair.name, condition, method, score(image, truth).ssim, psnr, *depth)
+    depth = depth_errors(result.disparity, task.disparity, regions)
+    return ConditionRow(pair, condition, method, score(image, truth).ssim, psnr, *depth)
 
 
 def depth_errors(

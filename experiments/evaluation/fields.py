@@ -15,7 +15,6 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from arraygeom import (
     Curved,
@@ -36,9 +35,9 @@ from arraygeom import (
 )
 from arraygeom.fields.straight import covering_displacement
 from experiments.peaks import with_peak
-from pat.data.pairs import PAPER_DISPARITY, StereoPair
+from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
 from pat.evaluation.metrics import score
-from pat.evaluation.protocols import hw_of, mono_colour_task, rectified_rig
+from pat.evaluation.protocols import enlarged, hw_of, mono_colour_task, rectified_rig
 from pat.evaluation.tables import distinct, markdown_table
 from pat.media.figures import colour_depth
 from pat.networks.protocol import Comparing
@@ -100,9 +99,10 @@ def rectified_cases(pairs: Iterable[StereoPair], *, linked: bool = False) -> Ite
         if pair.disparity is None:
             continue
         task = mono_colour_task(pair, 2)
+        assert task.disparity is not None
         h, w = hw_of(task.alpha)
-        beta = interpolate(task.beta[None], (h, w), mode="bicubic", align_corners=False)[0].clamp(0, 1)
-        scene = RecordedScene({ALPHA: task.alpha, BETA: beta}, task.ground_truth, *_truth(pair, (h, w)))
+        beta = enlarged(task.beta, (h, w))
+        scene = RecordedScene({ALPHA: task.alpha, BETA: beta}, task.ground_truth, *_truth(task.disparity))
         rig = rectified_rig((h, w), {BETA: (h, w)}, PAPER_DISPARITY)
         known = row_link((h, w)) if linked else rig.pair(ALPHA, BETA)
         yield Case("F alone" if linked else "rectified pairs", pair.name, known, scene, PAPER_DISPARITY)
@@ -114,13 +114,11 @@ def row_link(hw: tuple[int, int]) -> Pair:
     return Pair(View(hw=hw), View(hw=hw), link=Link(F, torch.eye(3, dtype=torch.float64)))
 
 
-def _truth(pair: StereoPair, hw: tuple[int, int]) -> tuple[Float[Tensor, "h w 2"], Tensor]:
+def _truth(disparity: Disparity) -> tuple[Float[Tensor, "h w 2"], Tensor]:
     """Where left's pixels are in right, and where that is known and in the image."""
-    assert pair.disparity is not None
-    value, valid = (t[: hw[0], : hw[1]] for t in pair.disparity)
-    y, x = torch.meshgrid(torch.arange(hw[0]).double(), torch.arange(hw[1]).double(), indexing="ij")
-    found = x - value.double()
-    return torch.stack([found, y], -1), valid & (found >= -0.5)
+    found = pixel_grid(hw_of(disparity.value), dtype=torch.float64).clone()
+    found[..., 0] -= disparity.value
+    return found, disparity.valid & (found[..., 0] >= -0.5)
 
 
 def layered_cases(bank: PhotoBank, count: int, *, hw: tuple[int, int] = (96, 128)) -> Iterator[Case]:

@@ -14,10 +14,10 @@ from torch.nn.functional import interpolate
 
 from arraygeom import ReceptiveField
 from arraygeom.fields import AroundDepth
-from pat.data.pairs import PAPER_DISPARITY, StereoPair
+from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair
 from pat.evaluation.baseline import checked_disparity
 from pat.evaluation.metrics import score
-from pat.evaluation.protocols import MonoColourTask, hw_of, mono_colour_task, rectified_rig
+from pat.evaluation.protocols import MonoColourTask, enlarged, hw_of, mono_colour_task, rectified_rig
 from pat.evaluation.stereo import disparity_errors
 from pat.evaluation.tables import distinct, markdown_table
 from pat.fusion.fuse import fuse
@@ -46,7 +46,7 @@ def evaluate_outside(pairs: Iterable[StereoPair], network: FusionNetwork) -> lis
     rows = []
     for pair in pairs:
         task = mono_colour_task(pair, 2)
-        rows += [_row(pair, task, network, source, field_of) for source, field_of in SOURCES.items()]
+        rows += [_row(pair.name, task, network, source, field_of) for source, field_of in SOURCES.items()]
     return rows
 
 
@@ -62,24 +62,23 @@ def outside_markdown(rows: Sequence[OutsideRow]) -> str:
     return markdown_table(columns, lines)
 
 
-FieldOf = Callable[[StereoPair, MonoColourTask], ReceptiveField | None]
+FieldOf = Callable[[MonoColourTask], ReceptiveField | None]
 
 
 def _row(
-    pair: StereoPair, task: MonoColourTask, network: FusionNetwork, source: str, field_of: FieldOf
+    pair: str, task: MonoColourTask, network: FusionNetwork, source: str, field_of: FieldOf
 ) -> OutsideRow:
     hw = hw_of(task.alpha)
     rig = rectified_rig(hw, {"beta": hw_of(task.beta)}, PAPER_DISPARITY)
     began = time.perf_counter()
-    field = field_of(pair, task)
+    field = field_of(task)
     frame = fuse(network, rig, {"alpha": task.alpha, "beta": task.beta}, alpha="alpha", field=field)
     seconds = time.perf_counter() - began
-    assert pair.disparity is not None
-    error, within = disparity_errors(hw[1] / frame.depth, pair.disparity)
+    error, within = disparity_errors(hw[1] / frame.depth, _truth(task))
     assert error is not None
     assert within is not None
     psnr = score(frame.image.clamp(0, 1), task.ground_truth).psnr
-    return OutsideRow(pair.name, source, psnr, error, within, seconds)
+    return OutsideRow(pair, source, psnr, error, within, seconds)
 
 
 def _around(disparity: Float[Tensor, "h w"], known: Tensor, tolerance: float) -> AroundDepth:
@@ -88,35 +87,33 @@ def _around(disparity: Float[Tensor, "h w"], known: Tensor, tolerance: float) ->
     return AroundDepth(depth, tolerance)
 
 
-def _sgbm(pair: StereoPair, task: MonoColourTask) -> ReceptiveField:
-    hw = hw_of(task.alpha)
-    beta = interpolate(luminance(task.beta)[None], hw, mode="bicubic", align_corners=False)[0].clamp(0, 1)
+def _sgbm(task: MonoColourTask) -> ReceptiveField:
+    beta = enlarged(luminance(task.beta), hw_of(task.alpha))
     disparity, consistent = checked_disparity(
         to_bytes(task.alpha[0]), to_bytes(beta[0]), round(PAPER_DISPARITY)
     )
     return _around(torch.from_numpy(disparity), torch.from_numpy(consistent), 0.0)
 
 
-def _true(pair: StereoPair, task: MonoColourTask) -> ReceptiveField:
-    return _around(*_truth(pair, task), 0.0)
+def _true(task: MonoColourTask) -> ReceptiveField:
+    return _around(*_truth(task), 0.0)
 
 
-def _prior(pair: StereoPair, task: MonoColourTask) -> ReceptiveField:
-    disparity, known = _truth(pair, task)
+def _prior(task: MonoColourTask) -> ReceptiveField:
+    disparity, known = _truth(task)
     h, w = disparity.shape
     coarse = torch.rand(1, 1, h // BUMP + 2, w // BUMP + 2, generator=torch.Generator().manual_seed(0))
     error = interpolate(coarse, (h, w), mode="bilinear", align_corners=True)[0, 0]
     return _around(disparity * (1 + PRIOR * (2 * error - 1)), known, PRIOR)
 
 
-def _truth(pair: StereoPair, task: MonoColourTask) -> tuple[Tensor, Tensor]:
-    assert pair.disparity is not None
-    h, w = hw_of(task.alpha)
-    return pair.disparity.value[:h, :w].float(), pair.disparity.valid[:h, :w]
+def _truth(task: MonoColourTask) -> Disparity:
+    assert task.disparity is not None
+    return task.disparity
 
 
 SOURCES: dict[str, FieldOf] = {
-    "own matches": lambda pair, task: None,
+    "own matches": lambda task: None,
     "OpenCV's SGBM, own where it has none": _sgbm,
     "true disparities": _true,
     "true depth to 5 %, as a prior": _prior,

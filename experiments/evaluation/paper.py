@@ -7,13 +7,12 @@ three cameras, each of one channel.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from arraygeom import Pair, Positions, ReceptiveField, Segments
 from pat.data.pairs import Disparity, StereoPair
@@ -29,6 +28,7 @@ from pat.evaluation.protocols import (
 from pat.evaluation.stereo import StereoRow
 from pat.fusion.from_images import found_rig
 from pat.fusion.fuse import fuse
+from pat.fusion.steps import of_size
 from pat.media.images import read_image
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import Network
@@ -56,11 +56,8 @@ def halved(pair: StereoPair) -> StereoPair:
         value, valid = (t[: 2 * hw[0] : 2, : 2 * hw[1] : 2] for t in pair.disparity)
         disparity = Disparity(value / 2, valid)
 
-    def smaller(image: Tensor) -> Tensor:
-        cut = cut_to_multiple(image, 2)[None]
-        return interpolate(cut, hw, mode="bicubic", antialias=True, align_corners=False)[0].clamp(0, 1)
-
-    return StereoPair(pair.name, smaller(pair.left), smaller(pair.right), pair.max_disparity, disparity)
+    left, right = (of_size(cut_to_multiple(image, 2), hw) for image in (pair.left, pair.right))
+    return replace(pair, left=left, right=right, disparity=disparity)
 
 
 @dataclass(frozen=True)
@@ -101,30 +98,27 @@ class ShuffledField:
 
 def controls(network: FusionNetwork, *, bands: bool = False) -> dict[str, StereoMethod]:
     """What fusion that uses beta must lose by: no beta (zeros), beta of another scene, shuffled fields."""
-    other = read_image(SAMPLE / f"{BETA}.png")[None]
+    other = read_image(SAMPLE / f"{BETA}.png")
     fusion = rectified_fusion(network, bands=bands)
 
-    def without_beta(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor | StereoResult:
-        return fusion(alpha, torch.zeros_like(beta), max_disparity)
-
-    def with_foreign_beta(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor | StereoResult:
-        foreign = interpolate(other, hw_of(beta), mode="bicubic", align_corners=False, antialias=True)
-        return fusion(alpha, foreign[0].clamp(0, 1), max_disparity)
-
-    def shuffled(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor | StereoResult:
+    def shuffled(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
         field = ShuffledField(rectified_field(max_disparity))
         return rectified_fusion(network, bands=bands, field=field)(alpha, beta, max_disparity)
 
-    return {"no beta": without_beta, "another scene's beta": with_foreign_beta, "shuffled fields": shuffled}
+    return {
+        "no beta": lambda alpha, beta, most: fusion(alpha, torch.zeros_like(beta), most),
+        "another scene's beta": lambda alpha, beta, most: fusion(alpha, of_size(other, hw_of(beta)), most),
+        "shuffled fields": shuffled,
+    }
 
 
 def with_found_rig(network: Network) -> StereoMethod:
     """The fusion of two images with the rig found from them."""
 
-    def fused(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
+    def fused(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
         images = {"alpha": alpha, "beta": beta}
         rig, _ = found_rig(images, "alpha", {}, network, lambda line: None)
-        return fuse(network, rig, images, alpha="alpha").image
+        return StereoResult(fuse(network, rig, images, alpha="alpha").image)
 
     return fused
 

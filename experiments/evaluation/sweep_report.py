@@ -66,14 +66,13 @@ def _tables(rows: Sequence[Row], sweep: str) -> str:
     values, fields = distinct(row.value for row in some), distinct(row.field for row in some)
     parts = []
     for measure, (label, form) in MEASURES.items():
-        lines = [[field, *(_cell(_drawn(some, field, v, measure), form) for v in values)] for field in fields]
+        found = {field: [_drawn(some, field, value, measure) for value in values] for field in fields}
+        lines = [
+            [field, *(form.format(np.mean(v)) if v else "" for v in cells)] for field, cells in found.items()
+        ]
         parts.append(markdown_table([label, *(f"{v:g}" for v in values)], lines))
     notes = distinct(f"{row.field} at {row.value:g}: {row.note}" for row in some if row.note)
     return "\n".join(parts) + "".join(f"\n{note}." for note in notes) + "\n" * bool(notes)
-
-
-def _cell(values: Sequence[float], form: str) -> str:
-    return form.format(np.mean(values)) if values else ""
 
 
 def curves(rows: Sequence[Row]) -> Figure:

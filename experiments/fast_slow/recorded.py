@@ -7,11 +7,12 @@ from pathlib import Path
 
 from torch import Tensor
 
-from arraygeom import HomographyDisplacement, Rig, Sensor
+from arraygeom import HomographyDisplacement
 from arraygeom.atomic import write_text
 from experiments.flicker import flicker
 from experiments.showcase import FAST, SCENE, SLOW, FastSlowArray, bright_gain, fast_and_slow_array
 from experiments.system import SystemResult, fused_frames
+from pat.cli.fusing import with_sensor
 from pat.evaluation.tables import markdown_table
 from pat.fusion.fuse import FuseSettings
 from pat.fusion.results import Frame, save_frame
@@ -36,7 +37,9 @@ def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], 
     """
     say("fitting the lines of each pair to points seen in both images")
     array = fast_and_slow_array(folder)
-    rig, frames = clocked(array.rig), recorded_frames(folder)
+    rig, frames = array.rig, recorded_frames(folder)
+    for name, rate in RATES.items():
+        rig = with_sensor(rig, name, frame_rate=rate)
     field = HomographyDisplacement(array.displacement)
     settings = FuseSettings(field=field, match_levels=True)
     job = SequenceFusion(load_weights(weights), rig, frames, FAST, settings=settings)
@@ -49,13 +52,6 @@ def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], 
     written = _write(out, array, frames, fused, alone)
     write_text(out / "scores.md", table)
     return SystemResult(table, [*written, out / "scores.md"])
-
-
-def clocked(rig: Rig) -> Rig:
-    """The rig with the paper's frame rates."""
-    for name in rig.names:
-        rig = rig.with_camera(name, rig[name].replace(sensor=Sensor(frame_rate=RATES[name])))
-    return rig
 
 
 def recorded_frames(folder: Path) -> dict[str, list[Tensor]]:

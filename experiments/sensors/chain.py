@@ -41,14 +41,13 @@ class OpticalImage:
         hw = image.shape[-2], image.shape[-1]
         if hw == self.hw and torch.equal(A, torch.eye(3, dtype=A.dtype)):
             return replace(self, image=image)
-        depth = None if self.depth is None else _nearest_values(self.depth[:, None], A, hw)[:, 0]
+        depth = self.depth
+        if depth is not None:
+            grid = pixel_grid(hw, dtype=depth.dtype, device=depth.device)
+            old = map_homogeneous(torch.linalg.inv(A)[:2], grid)[None]
+            depth = sample(depth[:, None], old, interpolation="nearest", extended=True).values[:, 0]
         camera = None if self.camera is None else self.camera.transformed(A, hw)
         return OpticalImage(image, A @ self.pixels, depth, camera)
-
-
-def _nearest_values(values: Tensor, A: Tensor, hw: HW) -> Tensor:
-    old = map_homogeneous(torch.linalg.inv(A)[:2], pixel_grid(hw, dtype=values.dtype, device=values.device))
-    return sample(values, old[None], interpolation="nearest", extended=True).values
 
 
 class LitStep(Step):

@@ -163,7 +163,7 @@ def _cos4(grid: Tensor, camera: Camera | None) -> Tensor:
 
 def disc_kernel(radius: float | Tensor, like: Tensor, aspect: float = 1.0) -> Tensor:
     """A disc with a rim one pixel soft, `aspect` times as high as wide; its sum is 1."""
-    x, y = _kernel_grid(_value(radius) + 0.5, aspect, like)
+    x, y = _kernel_grid(float(torch.as_tensor(radius).detach()) + 0.5, aspect, like)
     kernel = (radius + 0.5 - torch.hypot(x, y)).clamp(0, 1)
     return kernel / kernel.sum()
 
@@ -180,7 +180,3 @@ def _kernel_grid(disparity: float, aspect: float, like: Tensor) -> tuple[Tensor,
     x = torch.arange(-nx, nx + 1, dtype=like.dtype, device=like.device)
     y = torch.arange(-ny, ny + 1, dtype=like.dtype, device=like.device)
     return x[None], y[:, None] / aspect
-
-
-def _value(x: float | Tensor) -> float:
-    return float(x.detach()) if isinstance(x, Tensor) else float(x)

@@ -76,18 +76,13 @@ class Align(Known):
     def _frames_without(self) -> Iterator[_Frame]:
         from ..fusion.batch import find_images
         from ..fusion.frame_matching import matched_frames
-        from ..fusion.from_images import array_from_images, camera_names
+        from ..fusion.from_images import camera_names
         from ..fusion.views import ViewFiles
 
         if self.depth:
             raise ValueError("--depth: needs a rig: give one with --rig RIG")
         files = matched_frames({name: find_images(path) for name, path in camera_names(self.given).items()})
-        options.say_when_compiling()
-        first = {name: paths[0] for name, paths in files.items()}
-        with options.working("finding the rig"):
-            array = array_from_images(first, alpha=self.alpha, weights=self.weights, say=say)
-        self.weights = array.weights
-        self.normalise_radiometry |= array.match_levels
+        array = self.found_array(files)
         files = {name: files[name] for name in array.rig.names}
         for i, one in enumerate(options.by_frame(files)):
             images = ViewFiles(array.recorded, one, alpha=array.alpha) if i else array.images

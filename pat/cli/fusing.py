@@ -185,23 +185,17 @@ class Fuse(Known):
 
     def _without_rig_from(self, files: dict[str, list[Path]], rates: Mapping[str, float]) -> None:
         """Find the rig from each camera's first image and fuse; `rates` are frames a second, of videos."""
-        from ..fusion.from_images import array_from_images
         from ..fusion.results import FOUND_RIG
         from ..networks.weights import load_weights
 
         self.sequence |= bool(rates)
         files = self._frames(files)
         self._choose_bits(files)
-        first = {name: paths[0] for name, paths in files.items()}
-        focal = options.numbers_by_name(self.focal, "--focal")
-        options.say_when_compiling()
-        with options.working("finding the rig"):
-            array = array_from_images(first, alpha=self.alpha, weights=self.weights, focal=focal, say=say)
-        self.weights = array.weights
-        self.normalise_radiometry |= array.match_levels
+        array = self.found_array(files, options.numbers_by_name(self.focal, "--focal"))
         if max(map(len, files.values())) == 1:
             measured = load_weights(array.weights).bands is None
             self.exposure = self.exposure or ("keep" if measured else "auto")
+            first = {name: paths[0] for name, paths in files.items()}
             return self._one(array.rig, array.images, array.alpha, first, found=array)
         rig = array.recorded
         for name, rate in rates.items():

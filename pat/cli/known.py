@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +17,7 @@ from .options import WEIGHTS_HELP, Depth, FieldName, Images, Memory, optional, s
 if TYPE_CHECKING:
     from arraygeom import ReceptiveField, Rig
 
+    from ..fusion.from_images import ImageArray
     from ..fusion.fuse import FuseSettings
 
 MATCHES_HELP = "Matched points to use: CSV (x0,y0,x1,y1 a line, of two images in order) or a COLMAP database."
@@ -116,6 +117,18 @@ class Known:
         if self.matches is not None or field is not None:
             raise ValueError("--depth-map, --matches, --field: each excludes the others: give one of them")
         return rig, self._around_depth(rig, alpha)
+
+    def found_array(self, files: Mapping[str, Sequence[Path]], focal: Mapping[str, float] = {}) -> ImageArray:
+        """The array that each camera's first image says, whose weights and levels are then taken."""
+        from ..fusion.from_images import array_from_images
+
+        first = {name: paths[0] for name, paths in files.items()}
+        options.say_when_compiling()
+        with options.working("finding the rig"):
+            array = array_from_images(first, alpha=self.alpha, weights=self.weights, focal=focal, say=say)
+        self.weights = array.weights
+        self.normalise_radiometry |= array.match_levels
+        return array
 
     def refuse_several(self) -> None:
         """Raise ValueError if something is known, which is of a single frame."""

@@ -29,6 +29,7 @@ from ..fusion.steps import undistort
 from ..fusion.views import Views
 from ..media.colour import from_luma_chroma, luminance, luminance_of, to_bytes
 from ..media.figures import reduced
+from ..sensors import NoiseLevel
 
 Image = NDArray[Any]
 
@@ -153,6 +154,11 @@ def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Te
         channel_axis=-1,
     )
     return torch.from_numpy(np.ascontiguousarray(found.reshape(given.shape))).movedim(-1, 0).to(image)
+
+
+def denoised_knowing(image: Float[Tensor, "c h w"], level: NoiseLevel) -> Float[Tensor, "c h w"]:
+    """`non_local_means` for the mean deviation of a noise level; 0..1."""
+    return non_local_means(image, float(level.deviation(image[None]).mean())).clamp(0, 1)
 
 
 class _Plane(NamedTuple):

@@ -6,18 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from PIL import Image
 from torch import Generator, Tensor
-
-from arraygeom.atomic import write_atomically
 
 from ..data.sample_array import ALPHA, BETA, SampleArray
 from ..fusion.fuse import corrections_of
 from ..media.colour import luminance
-from ..media.figures import draw_panels
+from ..media.figures import save_panels
 from ..networks.protocol import FusionNetwork
 from ..sensors.noise_level import NoiseLevel
-from .baseline import classical, non_local_means
+from .baseline import classical, denoised_knowing
 
 RESPONSE = (0.2, 0.4, 0.4)
 """Weights of red, green and blue in the real mono camera, whose luminance is not Rec. 601's."""
@@ -56,10 +53,7 @@ def classical_methods(network: FusionNetwork, recording: DemoRecording) -> dict[
     methods = {"classical": classical(rig, images, ALPHA, BETA)}
     if recording.noise is None:
         return methods
-    denoised = {
-        name: non_local_means(image, float(recording.noise[name].deviation(image[None]).mean())).clamp(0, 1)
-        for name, image in images.items()
-    }
+    denoised = {name: denoised_knowing(image, recording.noise[name]) for name, image in images.items()}
     response = corrections_of(network, rig, denoised, alpha=ALPHA, align=False).response
 
     def corrected(given: Mapping[str, Tensor]) -> Tensor:
@@ -78,9 +72,4 @@ def save_demo_figure(panels: Mapping[str, Tensor], corner: tuple[int, int], path
     top, left = corner
     window = (..., slice(top, top + h // CROP), slice(left, left + w // CROP))
     enlarged = {f"{name}, {CROP} x": image[window] for name, image in panels.items()}
-    drawn, crops = (draw_panels(images, columns=3, width=16) for images in (panels, enlarged))
-    both = Image.new("RGB", (drawn.width, drawn.height + crops.height), "white")
-    both.paste(drawn, (0, 0))
-    both.paste(crops, (0, drawn.height))
-    with write_atomically(path) as temporary:
-        both.save(temporary, compress_level=3)
+    save_panels({**panels, **enlarged}, path, columns=3)

@@ -9,14 +9,14 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Camera, Pose, ReceptiveField, Rectified, Rig, intrinsics
 from arraygeom.pixels import HW
 
-from ..data.pairs import StereoPair
+from ..data.pairs import Disparity, StereoPair
 from ..fusion.fuse import fuse
 from ..media.colour import luminance
 from ..networks.protocol import FusionNetwork
@@ -27,12 +27,13 @@ class MonoColourTask(NamedTuple):
     """What a fusion gets (`alpha`, `beta`) and what it should return (`ground_truth`).
 
     alpha is grey and sharp. beta is in colour and `rate` times smaller: the pixel at x in the whole right
-    image is at (x + 0.5) / rate - 0.5 in it.
+    image is at (x + 0.5) / rate - 0.5 in it. `disparity` is of the ground truth's pixels, where it is known.
     """
 
     alpha: Float[Tensor, "1 h w"]
     beta: Float[Tensor, "3 hb wb"]
     ground_truth: Float[Tensor, "3 h w"]
+    disparity: Disparity | None = None
 
 
 def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
@@ -48,9 +49,9 @@ def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
             f"{pair.name}: left is {tuple(pair.left.shape[1:])} and right {tuple(pair.right.shape[1:])}: "
             "the mono + colour protocol needs equal sizes"
         )
-    ground_truth = cut_to_multiple(pair.left, rate)
-    beta = reduce_by(cut_to_multiple(pair.right, rate), rate)
-    return MonoColourTask(luminance(ground_truth), beta, ground_truth)
+    ground_truth, right = (cut_to_multiple(image, rate) for image in (pair.left, pair.right))
+    known = pair.disparity and Disparity(*(cut_to_multiple(plane, rate) for plane in pair.disparity))
+    return MonoColourTask(luminance(ground_truth), reduce_by(right, rate), ground_truth, known)
 
 
 def reduce_by(image: Float[Tensor, "c h w"], rate: int) -> Float[Tensor, "c hr wr"]:
@@ -60,40 +61,39 @@ def reduce_by(image: Float[Tensor, "c h w"], rate: int) -> Float[Tensor, "c hr w
     return avg_pool2d(image, rate)
 
 
-def cut_to_multiple(image: Float[Tensor, "c h w"], rate: int) -> Float[Tensor, "c hc wc"]:
+def cut_to_multiple(image: Shaped[Tensor, "*c h w"], rate: int) -> Shaped[Tensor, "*c hc wc"]:
     """The image without the rows and columns beyond the last multiple of `rate`."""
-    height, width = (side - side % rate for side in image.shape[1:])
-    return image[:, :height, :width]
+    height, width = (side - side % rate for side in image.shape[-2:])
+    return image[..., :height, :width]
 
 
-def hw_of(image: Float[Tensor, "c h w"]) -> HW:
+def hw_of(image: Float[Tensor, "*c h w"]) -> HW:
     """Height and width."""
     return image.shape[-2], image.shape[-1]
 
 
 class StereoResult(NamedTuple):
-    """A colour image (3, H, W), 0..1, and the disparity (H, W) of its match, pixels of alpha; NaN unknown."""
+    """An image (3, H, W), 0..1 or more, and the disparity (H, W) of its match in alpha's pixels, or NaN."""
 
     image: Tensor
     disparity: Tensor | None = None
 
 
-StereoMethod = Callable[[Tensor, Tensor, float], Tensor | StereoResult]
-"""(alpha (1, H, W), beta (3, Hb, Wb), max_disparity in alpha pixels) -> colours (3, H, W), 0..1 or more."""
+StereoMethod = Callable[[Tensor, Tensor, float], StereoResult]
+"""Of alpha (1, H, W), beta (3, Hb, Wb), and the largest disparity in alpha's pixels."""
 
 
-def alpha_alone(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
-    """The grey image in all three channels: the score without any colour."""
-    return alpha.expand(3, -1, -1)
+def enlarged(beta: Float[Tensor, "c hb wb"], hw: HW) -> Float[Tensor, "c h w"]:
+    """Beta as large as alpha (bicubic, 0..1), and not warped."""
+    return interpolate(beta[None], hw, mode="bicubic", align_corners=False)[0].clamp(0, 1)
 
 
-def beta_alone(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
-    """The colour image enlarged (bicubic) and not warped: the score without any matching."""
-    return interpolate(beta[None], alpha.shape[1:], mode="bicubic", align_corners=False)[0]
-
-
-BASELINES: dict[str, StereoMethod] = {"alpha": alpha_alone, "beta": beta_alone, "classical": classical_fusion}
-"""Methods without learning, by name."""
+BASELINES: dict[str, StereoMethod] = {
+    "alpha": lambda alpha, beta, most: StereoResult(alpha.expand(3, -1, -1)),
+    "beta": lambda alpha, beta, most: StereoResult(enlarged(beta, hw_of(alpha))),
+    "classical": lambda alpha, beta, most: StereoResult(classical_fusion(alpha, beta, most)),
+}
+"""Methods without learning, by name: without any colour, without any matching."""
 
 
 def rectified_fusion(

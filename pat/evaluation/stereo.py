@@ -16,7 +16,7 @@ from torch import Tensor
 from ..data.pairs import PAPER_DISPARITY, Disparity, StereoPair, folder_pairs, middlebury_pairs
 from ..media.images import write_image
 from .metrics import bootstrap_interval, score
-from .protocols import MonoColourTask, StereoMethod, StereoResult, beta_alone, mono_colour_task
+from .protocols import MonoColourTask, StereoMethod, StereoResult, enlarged, hw_of, mono_colour_task
 from .tables import distinct, markdown_table
 
 DATA_SETS: dict[str, Callable[[Path], Iterable[StereoPair]]] = {
@@ -75,10 +75,10 @@ def evaluate_pairs(
         for rate in rates:
             task = mono_colour_task(pair, rate)
             results = {n: _result(n, method, pair, task, max_disparity) for n, method in methods.items()}
-            rows += [_row(pair, rate, name, result, task.ground_truth) for name, result in results.items()]
+            rows += [_row(pair.name, rate, name, result, task) for name, result in results.items()]
             if images:
-                beta, shown = beta_alone(task.alpha, task.beta, 0.0), [r.image for r in results.values()]
-                strip = torch.cat([beta, *shown, task.ground_truth], -1)
+                shown = [enlarged(task.beta, hw_of(task.alpha)), *(r.image for r in results.values())]
+                strip = torch.cat([*shown, task.ground_truth], -1)
                 write_image(images / f"{pair.name.replace('/', '-')}_x{rate}.png", strip)
     return rows
 
@@ -165,8 +165,7 @@ def structure_kept(rows: Sequence[StereoRow]) -> str:
 def _result(
     name: str, method: StereoMethod, pair: StereoPair, task: MonoColourTask, max_disparity: float
 ) -> StereoResult:
-    given = method(task.alpha, task.beta, max_disparity)
-    result = given if isinstance(given, StereoResult) else StereoResult(given)
+    result = method(task.alpha, task.beta, max_disparity)
     image = result.image.detach().cpu()
     if image.shape != task.ground_truth.shape:
         wanted = tuple(task.ground_truth.shape)
@@ -176,22 +175,18 @@ def _result(
     return StereoResult(image.float().clamp(0, 1), result.disparity)
 
 
-def _row(pair: StereoPair, rate: int, method: str, result: StereoResult, ground_truth: Tensor) -> StereoRow:
+def _row(pair: str, rate: int, method: str, result: StereoResult, task: MonoColourTask) -> StereoRow:
     errors: tuple[float | None, float | None] = (None, None)
-    if result.disparity is not None and pair.disparity is not None:
-        errors = disparity_errors(result.disparity.detach().cpu(), pair.disparity)
-    return StereoRow(pair.name, rate, method, *score(result.image, ground_truth), *errors)
+    if result.disparity is not None and task.disparity is not None:
+        errors = disparity_errors(result.disparity.detach().cpu(), task.disparity)
+    return StereoRow(pair, rate, method, *score(result.image, task.ground_truth), *errors)
 
 
 def disparity_errors(
     found: Float[Tensor, "h w"], ground_truth: Disparity
 ) -> tuple[float | None, float | None]:
-    """Mean error of `found` where both are known, and the share of known ground truth that is within a pixel.
-
-    The ground truth may be larger by what was cut off at the bottom and the right.
-    """
-    h, w = found.shape
-    value, valid = ground_truth.value[:h, :w], ground_truth.valid[:h, :w]
+    """Mean error where both are known, and the share of the known ground truth within a pixel of it."""
+    value, valid = ground_truth
     compared = valid & found.isfinite()
     if not compared.any():
         return None, None

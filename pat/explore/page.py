@@ -55,10 +55,6 @@ class Explorer:
             "answer": self.answer(self.controls),
         }
 
-    def served_page(self) -> str:
-        """A page that asks the server it came from."""
-        return page(self.values(), "asksServer()")
-
     def save(self, path: str | Path, columns: int = GRID) -> None:
         """Write a page of one file that needs neither a kernel nor a network.
 

@@ -9,7 +9,7 @@ import webbrowser
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from .page import Explorer
+from .page import Explorer, page
 
 LARGEST = 1 << 16
 """Bytes of a question."""
@@ -38,7 +38,7 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             if self._is_own() and self.path == "/":
-                self._send(200, "text/html; charset=utf-8", page)
+                self._send(200, "text/html; charset=utf-8", served)
             else:
                 self._refuse()
 
@@ -81,7 +81,7 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
         server = _Server(("127.0.0.1", port), Handler)
     except OSError as error:
         raise ValueError(f"--port {port}: {error.strerror}: give another, or 0 for a free one") from None
-    page = explorer.served_page().encode()  # computes once what the first answer would wait for
+    served = page(explorer.values(), "asksServer()").encode()  # computes what the first answer would wait for
     address = f"http://localhost:{server.server_port}"
     print(f"the explorer is at {address} (Ctrl+C ends it)", flush=True)
     if browser:

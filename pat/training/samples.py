@@ -68,21 +68,6 @@ class Sample(NamedTuple):
         return Inputs.of(self.alpha, self.betas, self.fields)
 
 
-class Mixture(NamedTuple):
-    """What steps record: entries as of `TrainConfig`, and the shares of `sources` other than photographs."""
-
-    reuse: float
-    filtered: float
-    rectified: float
-    sources: Mapping[str, float]
-
-    @classmethod
-    def of(cls, config: TrainConfig) -> Mixture:
-        """That of a recipe."""
-        sources = {"rendered": config.rendered, "pairs": config.pairs, "measured": config.measured}
-        return cls(config.reuse, config.filtered, config.rectified, sources)
-
-
 class Planned(NamedTuple):
     """The scenes that a step records: their number, and the kind of their rigs."""
 
@@ -93,17 +78,18 @@ class Planned(NamedTuple):
     """The number of the scenes to drop from the cache."""
 
 
-def plan(mixture: Mixture, seed: int) -> Iterator[Planned]:
-    """What each step records, from step 0: new scenes, or some of the last `CACHED` again."""
+def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
+    """What each step of a recipe records, from step 0: new scenes, or some of the last `CACHED` again."""
     draw = random.Random(seed)
+    shares = {name: getattr(config, name) for name in ("rendered", "pairs", "measured")}
     cached: list[Planned] = []
     for number in range(2**62):
-        new = len(cached) < FEW or draw.random() < 1 / mixture.reuse
+        new = len(cached) < FEW or draw.random() < 1 / config.reuse
         if new:
-            kind = _source(mixture.sources, draw) or (
-                "rectified" if draw.random() < mixture.rectified else "general"
-            )
-            betas = 3 if draw.random() < mixture.filtered else 1
+            kind = _source(shares, draw)
+            if kind is None:
+                kind = "rectified" if draw.random() < config.rectified else "general"
+            betas = 3 if draw.random() < config.filtered else 1
             dropped = cached.pop() if len(cached) > CACHED else None
             cached.insert(0, Planned(number, kind, betas, None))
             yield cached[0]._replace(dropped=dropped.scenes if dropped else None)
@@ -128,16 +114,14 @@ class SampleSource:
     """Samples by the number of the step: called with a count it gives the first group of that many steps.
 
     Scenes are of `layered`, by the kind of their rigs and the number of betas, or of `folders`, by their
-    kind; `batch` of them are a group's.
+    kind.
     """
 
+    config: TrainConfig
     layered: Mapping[tuple[str, int], LayeredScenes]
     folders: Mapping[str, Crops]
-    mixture: Mixture
-    batch: int
     seed: int
     field: ReceptiveField
-    recording: RecordingConfig
     cache: dict[tuple[int, int], ArrayBatch] = dataclasses.field(default_factory=dict)
 
     def __call__(self, count: int) -> Iterator[Sample]:
@@ -146,7 +130,7 @@ class SampleSource:
 
     def steps(self, groups: list[int], *, start: int = 0) -> Iterator[list[Sample]]:
         """The samples of these groups, step by step, from step `start` on."""
-        for step, planned in enumerate(plan(self.mixture, self.seed)):
+        for step, planned in enumerate(plan(self.config, self.seed)):
             for key in [key for key in self.cache if key[0] == planned.dropped]:
                 del self.cache[key]
             if step >= start:
@@ -158,13 +142,14 @@ class SampleSource:
             g = _generator(self.seed, SCENE, planned.scenes, group)
             self.cache[planned.scenes, group] = self._made(planned, g)
         g = _generator(self.seed, RECORDING, step, group)
-        return degraded(self.cache[planned.scenes, group], g, field=self.field, recording=self.recording)
+        scenes = self.cache[planned.scenes, group]
+        return degraded(scenes, g, field=self.field, recording=self.config.recording)
 
     def _made(self, planned: Planned, g: Generator) -> ArrayBatch:
         if planned.kind in self.folders:
             crops = self.folders[planned.kind]
-            return crops.sample(self.batch, g, number=planned.scenes, betas=planned.betas)
-        return self.layered[planned.kind, planned.betas].sample(self.batch, g)
+            return crops.sample(self.config.batch, g, number=planned.scenes, betas=planned.betas)
+        return self.layered[planned.kind, planned.betas].sample(self.config.batch, g)
 
 
 def made_ahead(samples: Iterator[list[Sample]], network: FusionNetwork) -> Iterator[list[Sample]]:
@@ -217,7 +202,7 @@ def source_of(
         for betas in (1, 3)
         if photos is not None
     }
-    return SampleSource(layered, folders, Mixture.of(config), config.batch, seed, field, config.recording)
+    return SampleSource(config, layered, folders, seed, field)
 
 
 def crops(config: TrainConfig, seed: int, device: str, choose: Callable[[int], bool]) -> dict[str, Crops]:

@@ -33,7 +33,7 @@ from experiments.evaluation.halves import of_half
 from pat import load_weights
 from pat.data.pairs import PAPER_DISPARITY, StereoPair, middlebury_pairs
 from pat.evaluation.baseline import classical_fusion
-from pat.evaluation.protocols import mono_colour_task, rectified_fusion
+from pat.evaluation.protocols import MonoColourTask, mono_colour_task, rectified_fusion
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.matching.colour_transfer import FILLS
 from pat.media.colour import to_luma_chroma
@@ -68,16 +68,15 @@ def filled_by(network: GuidedPAT, fill: int | None) -> None:
     vars(network)["blended"] = lambda *given, complete: GuidedPAT.blended(network, *given)
 
 
-def images_of(network: GuidedPAT, pair: StereoPair) -> tuple[dict[str, Tensor], Tensor]:
-    """Fused images by the way of filling, with the classical one, and ground truth; (3, H, W) each."""
-    task = mono_colour_task(pair, 2)
+def images_of(network: GuidedPAT, task: MonoColourTask) -> dict[str, Tensor]:
+    """Fused images (3, H, W) by the way of filling, with the classical one."""
     given = task.alpha, task.beta, PAPER_DISPARITY
     found = {"classical": classical_fusion(*given)}
     for name, fill in (*((name, i) for i, name in enumerate(FILL_NAMES)), ("chosen", None)):
         filled_by(network, fill)
         found[name] = rectified_fusion(network)(*given).image
     found["best choice"] = best([found[name] for name in FILL_NAMES], task.ground_truth)
-    return {name: image.clamp(0, 1) for name, image in found.items()}, task.ground_truth
+    return {name: image.clamp(0, 1) for name, image in found.items()}
 
 
 def best(images: list[Tensor], truth: Tensor) -> Tensor:
@@ -124,8 +123,8 @@ def tables(pairs: list[StereoPair]) -> tuple[list[str], list[str]]:
     found: dict[str, list[dict[str, float]]] = {}
     distances: dict[int, list[Unseen]] = {low: [] for low in DISTANCES}
     for pair in pairs:
-        images, truth = images_of(network, pair)
-        regions = regions_of(pair, (truth.shape[-2], truth.shape[-1]))
+        task = mono_colour_task(pair, 2)
+        images, truth, regions = images_of(network, task), task.ground_truth, regions_of(task)
         for name, image in images.items():
             error = (image - truth).square().mean(0)
             found.setdefault(name, []).append(

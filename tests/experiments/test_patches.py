@@ -17,8 +17,7 @@ from arraygeom import (
 )
 from arraygeom.fields.grid import FieldOnGrid
 from experiments.__main__ import Experiments
-from experiments.patches.dataset import ScenePatches
-from experiments.patches.grid import PatchGrid, cut
+from experiments.patches import PatchGrid, ScenePatches
 from pat.cli.main import main
 from pat.data import scene_folders
 from pat.data.windows import reduced_depth
@@ -75,14 +74,13 @@ def test_the_papers_windows_reach_from_edge_to_edge():
 
 
 def test_points_of_the_whole_image_are_where_the_patches_cameras_project_them(rendered):
-    stack = cut(rendered / "scenes" / "000000", SMALL, alpha="mono")
+    data = ScenePatches(rendered, patches=SMALL, chains={})
     X = torch.tensor([[0.1, -0.2, 5.0], [-0.4, 0.3, 8.0]]).double()
     whole = make_rig()["mono"].project(X).x
     for i, (top, left) in enumerate(SMALL.corners((96, 128))):
         wanted = (whole - torch.tensor([left, top]).double() + 0.5) / 2 - 0.5
-        torch.testing.assert_close(stack.rig[i]["mono"].project(X).x, wanted)
-    assert stack.rgb["mono"].shape == (6, 3, 16, 24)
-    assert stack.rgb["colour"].shape[0] == 6
+        torch.testing.assert_close(data[i].rig["mono"].project(X).x, wanted)
+        assert data[i].images["mono"].shape == (3, 16, 24)
 
 
 def test_reduced_depth_is_exact_on_planes_and_takes_sides_at_edges():

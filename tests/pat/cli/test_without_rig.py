@@ -100,7 +100,7 @@ def test_fuse_of_images_alone_is_that_of_the_command(folder, monkeypatch):
 def test_the_evaluation_without_a_rig_is_that_of_the_command(halved, folder, monkeypatch):
     _, images, ground_truth = halved
     monkeypatch.setattr("pat.fusion.from_images.MATCHED", 300)
-    found = with_found_rig(load_weights("mono-colour"))(images["mono"], images["colour"], 0.0)
+    found = with_found_rig(load_weights("mono-colour"))(images["mono"], images["colour"], 0.0).image
     written = score(read_image(folder / "out" / "fused.png"), ground_truth).psnr
     assert score(found.clamp(0, 1), ground_truth).psnr == pytest.approx(written, abs=0.3)
 

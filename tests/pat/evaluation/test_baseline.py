@@ -29,7 +29,7 @@ def shifted_pair(disparity):
 
 @pytest.mark.parametrize(("rate", "least"), [(1, 45), (2, 38), (4, 30)])
 def test_a_shifted_image_gives_its_colours_back(rate, least):
-    alpha, beta, ground_truth = mono_colour_task(shifted_pair(9), rate)
+    alpha, beta, ground_truth, _ = mono_colour_task(shifted_pair(9), rate)
     result = classical_fusion(alpha, beta, max_disparity=20.0)
     away = (slice(None), slice(None), slice(12, None))
     assert score(result[away], ground_truth[away]).psnr > least
@@ -37,7 +37,7 @@ def test_a_shifted_image_gives_its_colours_back(rate, least):
 
 
 def test_the_result_has_alphas_luminance():
-    alpha, beta, _ = mono_colour_task(StereoPair("a", 0.2 + 0.6 * patches(), 0.2 + 0.6 * patches(seed=1)), 2)
+    alpha, beta, *_ = mono_colour_task(StereoPair("a", 0.2 + 0.6 * patches(), 0.2 + 0.6 * patches(seed=1)), 2)
     result = classical_fusion(alpha, beta, max_disparity=30.0)
     inside = ((result > 0) & (result < 1)).all(0)
     assert inside.float().mean() > 0.9
@@ -45,7 +45,7 @@ def test_the_result_has_alphas_luminance():
 
 
 def test_a_darker_colour_camera_is_matched_too():
-    alpha, beta, ground_truth = mono_colour_task(shifted_pair(9), 2)
+    alpha, beta, ground_truth, _ = mono_colour_task(shifted_pair(9), 2)
     darker = classical_fusion(alpha, 0.2 * beta, max_disparity=20.0)
     expected = 0.2 * to_luma_chroma(ground_truth)[1][:, :, 12:]
     assert (to_luma_chroma(darker)[1][:, :, 12:] - expected).abs().mean() < 0.004
@@ -171,7 +171,7 @@ def test_rigs_that_cannot_be_rectified_are_refused(t, depth, complaint):
 
 def test_teddy_keeps_its_colours(shared_data):
     pair = next(pair for pair in middlebury_pairs(shared_data / "middlebury") if "teddy" in pair.name)
-    alpha, beta, ground_truth = mono_colour_task(pair, 2)
+    alpha, beta, ground_truth, _ = mono_colour_task(pair, 2)
     result, grey = (
         score(classical_fusion(alpha, beta, max_disparity=64.0), ground_truth),
         score(alpha.expand(3, -1, -1), ground_truth),

@@ -26,7 +26,7 @@ def test_reducing_keeps_the_centre_convention(rate, x):
 
 def test_a_task_is_grey_alpha_small_colour_beta_and_colour_ground_truth():
     pair = StereoPair("a", torch.rand(3, 13, 22), torch.rand(3, 13, 22))
-    alpha, beta, ground_truth = mono_colour_task(pair, 4)
+    alpha, beta, ground_truth, _ = mono_colour_task(pair, 4)
     torch.testing.assert_close(ground_truth, pair.left[:, :12, :20])
     torch.testing.assert_close(alpha, luminance(ground_truth))
     assert beta.shape == (3, 3, 5)

@@ -8,7 +8,7 @@ import torch
 from arraygeom import pixel_grid
 from pat.data import Disparity, StereoPair
 from pat.evaluation.metrics import score
-from pat.evaluation.protocols import BASELINES, rectified_fusion
+from pat.evaluation.protocols import BASELINES, StereoResult, rectified_fusion
 from pat.evaluation.stereo import (
     DATA_SETS,
     StereoRow,
@@ -31,7 +31,9 @@ def pairs(count=2):
 
 def test_rows_are_the_scores_of_what_the_method_returns():
     first, second = pairs()
-    rows = evaluate_pairs([first, second], {"grey": lambda alpha, beta, d: alpha.expand(3, -1, -1) + 2}, [2])
+    rows = evaluate_pairs(
+        [first, second], {"grey": lambda alpha, beta, d: StereoResult(alpha.expand(3, -1, -1) + 2)}, [2]
+    )
     assert [(row.pair, row.rate, row.method) for row in rows] == [("set/0", 2, "grey"), ("set/1", 2, "grey")]
     white = torch.ones(3, 16, 24)
     assert rows[0][3:5] == score(white, first.left)
@@ -41,7 +43,7 @@ def test_rows_are_the_scores_of_what_the_method_returns():
 def test_a_method_gets_the_protocols_inputs():
     def noted(alpha, beta, max_disparity):
         seen.append((tuple(alpha.shape), tuple(beta.shape), max_disparity))
-        return alpha.expand(3, -1, -1)
+        return StereoResult(alpha.expand(3, -1, -1))
 
     seen = []
     evaluate_pairs(pairs(1), {"noted": noted}, [2, 4])
@@ -64,7 +66,7 @@ def test_baselines_run_and_images_lie_side_by_side(tmp_path):
 )
 def test_a_result_that_cannot_be_scored_names_method_and_pair(result, complaint):
     with pytest.raises(ValueError, match=f"ours on set/0: .*{complaint}"):
-        evaluate_pairs(pairs(1), {"ours": lambda *_: result}, [2])
+        evaluate_pairs(pairs(1), {"ours": lambda *_: StereoResult(result)}, [2])
 
 
 ROWS = [

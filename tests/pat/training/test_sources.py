@@ -35,7 +35,7 @@ from pat.training.config import RecordingConfig, TrainConfig, save_config
 from pat.training.lenses import lens_over, through_lenses
 from pat.training.loop import train
 from pat.training.losses import explained, match_loss, validation
-from pat.training.samples import Mixture, degraded, pair_of, plan, scenes, transfer
+from pat.training.samples import degraded, pair_of, plan, scenes, transfer
 from pat.training.scenes import (
     ACTIVE,
     GROUPS_PER_EXCHANGE,
@@ -116,7 +116,7 @@ def refused(crops, root, hw=(32, 48), **how):
 
 def test_without_these_sources_steps_are_what_they_were():
     """The weights of the package were trained on this sequence."""
-    kinds = "".join(f"{p.kind[0]}{p.betas}" for p in islice(plan(Mixture.of(TrainConfig()), 1), 20))
+    kinds = "".join(f"{p.kind[0]}{p.betas}" for p in islice(plan(TrainConfig(), 1), 20))
     assert kinds == "r1g1r1g1r3g1g3r1g1r1g3r3r1r1r3g3r1g1r1r1"
 
 
@@ -124,7 +124,7 @@ def test_shares_are_shares():
     config = TrainConfig(
         rendered=0.3, rendered_from=(Path("a"),), pairs=0.2, pairs_from=(Path("b"),), reuse=1.0
     )
-    kinds = [p.kind for p in islice(plan(Mixture.of(config), 0), 2000)]
+    kinds = [p.kind for p in islice(plan(config, 0), 2000)]
     assert kinds.count("rendered") / 2000 == pytest.approx(0.3, abs=0.03)
     assert kinds.count("pairs") / 2000 == pytest.approx(0.2, abs=0.03)
     assert kinds.count("rectified") == pytest.approx(kinds.count("general"), rel=0.2)
@@ -439,7 +439,7 @@ def mixed(rendered, tmp_path_factory):
 
 
 def test_a_run_on_all_sources_goes_on_bit_for_bit(mixed, monkeypatch):
-    kinds = {p.kind for p in islice(plan(Mixture.of(mixed), mixed.seed + 1), mixed.steps)}
+    kinds = {p.kind for p in islice(plan(mixed, mixed.seed + 1), mixed.steps)}
     assert {"rendered", "pairs"} == kinds
     config = replace(mixed, out=mixed.out.with_name("stopped"))
     stopped(config, 5, monkeypatch)

@@ -1,1 +1,0 @@
-"""The paper's patches of rendered scenes as a data set of torch."""
