@@ -14,7 +14,7 @@ from .batching import Batched
 from .checks import check_batches, check_hw, check_K, check_origin, checking
 from .distortion import Distortion
 from .lenses.common import on_plane
-from .lenses.model import LensModel
+from .lenses.model import LensModel, check_model
 from .pixels import (
     HW,
     coarse_grid,
@@ -144,6 +144,12 @@ class LensView(View):
                 raise TypeError(
                     f"{kind} is no dataclass: put @dataclass(frozen=True, eq=False, repr=False) before it"
                 )
+            check_model(self.distortion)
+            check_batches("K and lens", self.K.shape[:-2], self._lens_batch)
+
+    @property
+    def _lens_batch(self) -> torch.Size:
+        return self.distortion.batch_shape if self.distortion is not None else torch.Size()
 
     def project_local(self, X: Real[Tensor, "*n 3"]) -> Projected:
         """Points in the camera's own frame to pixels."""
@@ -229,7 +235,8 @@ class Camera(LensView):
                 raise TypeError(
                     f"cam_from_world is a {type(self.cam_from_world).__name__}: give a Pose(R, t)"
                 )
-            check_batches("K and cam_from_world", self.K.shape[:-2], self.cam_from_world.batch_shape)
+            shapes = self.K.shape[:-2], self._lens_batch, self.cam_from_world.batch_shape
+            check_batches("K, lens and cam_from_world", *shapes)
             check_origin(self.cam_from_world.t)
 
     def scaled(self, factor: float) -> Camera:

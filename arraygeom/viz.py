@@ -20,6 +20,7 @@ from .camera import Camera
 from .epipolar import epipolar_distance, epipolar_lines
 from .extras import needs
 from .fields import ReceptiveField, recorded_field
+from .fields.protocol import sampling_locations
 from .fields.widened import direction
 from .pixels import HW
 from .rig import Pair, Rig
@@ -165,7 +166,7 @@ def draw_fields(
 
 def draw_sampling_locations(axes: Axes, field: ReceptiveField, pair: Pair, x: Float[Tensor, "n 2"]) -> None:
     """The sampling locations in beta of a few alpha pixels, each in its own colour."""
-    found = field(pair, x)
+    found = sampling_locations(field, pair, x)
     for i, colour in enumerate(_colours(len(x))):
         if isinstance(found, Segments):
             if found.valid[i]:

@@ -25,7 +25,7 @@ from ..segments import Positions, Segments, fractions_on_image, sample_fractions
 from ..threads import in_parallel
 from ..tracing import traced
 from ..undistortion import pinhole_view
-from .protocol import PIECE, ReceptiveField, compilable
+from .protocol import PIECE, ReceptiveField, answered, compilable
 from .straight import Epipolar
 
 
@@ -97,7 +97,7 @@ class ThroughLenses:
         link = None if pair.link is None else pair.link.transformed(alpha.A, beta.A)
         straight = dataclasses.replace(pair, alpha=alpha.pinhole, beta=beta.pinhole, link=link)
         there, seen = alpha.undistort(floating(x))
-        found = self.field(straight, there)
+        found = answered(self.field, straight, there)
         found = found.positions(self.samples) if isinstance(found, Segments) else found
         xy, shown = beta.distort(found.xy)
         xy, inside = _onto_edge(xy, pair.beta.hw, ROUNDED)

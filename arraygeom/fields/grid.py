@@ -59,17 +59,6 @@ class FieldOnGrid:
         # Explicit positions of a whole frame may not fit into memory: one point shows which kind the field
         # gives.
         kind = at(torch.full((1, 2), 0.25, dtype=torch.float64))
-        name = getattr(field, "__name__", type(field).__name__)
-        if not isinstance(kind, Segments | Positions):
-            raise ValueError(
-                f"the field {name} gave a {type(kind).__name__}: fields give Segments or Positions"
-            )
-        points = kind.valid.shape[-1:] if isinstance(kind, Segments) else kind.mask.shape[-2:-1]
-        if points != (1,):
-            raise ValueError(
-                f"the field {name} gave {points[0] if points else 'no axis of'} pixels for one: a field is "
-                "asked for x (n, 2), and answers with Segments of n, or Positions (n, L)"
-            )
         if isinstance(kind, Positions):
             return cls(at, kind.xy.shape[-2], None)
         pixels = _on_grid(at, hw, device=device)

@@ -12,7 +12,7 @@ from ..checks import check_field
 from ..pixels import HW, floating
 from ..rig import Pair
 from ..sampling import sample
-from .protocol import ReceptiveField, SamplingLocations
+from .protocol import ReceptiveField, SamplingLocations, answered
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Moved:
         Raises ValueError if alpha has another size than the displacement.
         """
         self.require(pair.alpha.hw)
-        return self.field(pair, self.points(x))
+        return answered(self.field, pair, self.points(x))
 
     def require(self, hw: HW) -> None:
         """Raise ValueError unless the displacement is of an alpha of this size."""

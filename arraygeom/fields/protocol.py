@@ -41,7 +41,26 @@ def sampling_locations(
     check_field(field)
     if x is not None:
         check_pixels(x)
-    return field(pair, all_pixels(pair) if x is None else floating(x))
+    return answered(field, pair, all_pixels(pair) if x is None else floating(x))
+
+
+def answered(field: ReceptiveField, pair: Pair, x: Float[Tensor, "*n 2"]) -> SamplingLocations:
+    """What a field gives for pixels. Raises ValueError for what is not Segments or Positions of each."""
+    found, name = field(pair, x), getattr(field, "__name__", type(field).__name__)
+    if not isinstance(found, Segments | Positions):
+        raise ValueError(f"the field {name} gave a {type(found).__name__}: fields give Segments or Positions")
+    for part, value in vars(found).items():
+        if not isinstance(value, Tensor):
+            kind, held = type(found).__name__, type(value).__name__
+            raise ValueError(f"the field {name} gave {kind} whose {part} is a {held}: give a tensor")
+    shape = found.valid.shape if isinstance(found, Segments) else found.mask.shape[:-1]
+    batch = len(pair.batch_shape)
+    if len(shape) != x.ndim - 1 or shape[batch:] != x.shape[batch:-1]:
+        raise ValueError(
+            f"the field {name} gave {tuple(shape)} pixels for {tuple(x.shape[:-1])}: a field is asked for x "
+            "(*n, 2), and answers with Segments (*n), or Positions (*n, L)"
+        )
+    return found
 
 
 def lazily(field: ReceptiveField, pair: Pair) -> Callable[[Tensor], SamplingLocations]:
@@ -51,7 +70,7 @@ def lazily(field: ReceptiveField, pair: Pair) -> Callable[[Tensor], SamplingLoca
     """
     check_field(field)
     axes, device = len(pair.batch_shape), device_of(pair)
-    return lambda x: field(pair, floating(x).to(device=device).reshape(*[1] * axes, *x.shape))
+    return lambda x: answered(field, pair, floating(x).to(device=device).reshape(*[1] * axes, *x.shape))
 
 
 def device_of(pair: Pair) -> torch.device | None:

@@ -15,7 +15,7 @@ from ..rig import Pair
 from ..segments import Positions, Segments, clip_to_image
 from .curved import Curved, ThroughLenses
 from .moved import Moved
-from .protocol import ReceptiveField, SamplingLocations
+from .protocol import ReceptiveField, SamplingLocations, answered
 from .straight import Epipolar, EpipolarLine, HomographyDisplacement
 
 
@@ -62,11 +62,10 @@ class Widened:
         """The field about beta's image too, as far as it may be brought in; of sizes alone on the image."""
         margin = math.ceil(self.across + self.along)
         if margin == 0 or not _follows_beta(self.field, pair):
-            return self.field(pair, x)
+            return answered(self.field, pair, x)
         h, w = pair.beta.hw
-        found = self.field(
-            pair.transform_beta(shift_matrix(-margin, -margin), (h + 2 * margin, w + 2 * margin)), x
-        )
+        padded = pair.transform_beta(shift_matrix(-margin, -margin), (h + 2 * margin, w + 2 * margin))
+        found = answered(self.field, padded, x)
         if isinstance(found, Segments):
             return Segments(found.start - margin, found.end - margin, found.valid)
         return Positions(found.xy - margin, found.mask)

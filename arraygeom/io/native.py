@@ -50,7 +50,7 @@ from torch import Tensor
 
 from ..camera import Camera, LensView, View, intrinsics
 from ..distortion import COEFFICIENT_COUNTS, Distortion
-from ..lenses.model import CAMERA_MODELS, CameraModel, LensModel
+from ..lenses.model import CAMERA_MODELS, CameraModel, LensModel, check_model
 from ..pixels import HW, shift_matrix
 from ..pose import Pose, rotation_from_vector
 from ..rig import Link, Rig
@@ -153,14 +153,16 @@ def _camera(fields: Entry, origin: float) -> View:
 
 def _lens_view(fields: Entry, view: View, origin: float) -> View:
     """An uncalibrated view whose lens states its own scale and centre."""
-    _check_keys(fields, ("model", "coefficients", "scale", "centre", "K"))
+    kind = CAMERA_MODELS.get(str(fields.get("model").value))
+    own = ("coefficients",) if kind is None else tuple(f.name for f in dataclasses.fields(kind))  # type: ignore[arg-type]
+    _check_keys(fields, ("model", *own, "scale", "centre", "K"))
     if not ("scale" in fields or "K" in fields):
         raise fields.fail(
             "is of a camera without 'focal': "
             "add that, or `scale` (the pixels that count as 1 in the lens model)"
         )
     K = _intrinsics(fields, view.hw, origin, scale="scale")
-    stated = {key: fields.get(key).value for key in ("model", "coefficients")}
+    stated = {key: value for key, value in fields.value.items() if key in ("model", *own)}
     return LensView(
         hw=view.hw, sensor=view.sensor, K=K, distortion=_lens(Entry(fields.source, stated, fields.name))
     )
@@ -227,7 +229,9 @@ def _model(entry: Entry, kind: type[CameraModel]) -> CameraModel:
     missing = [n for n, f in known.items() if n not in numbers and f.default is f.default_factory is MISSING]
     if missing:
         raise entry.fail(f"has no {' or '.join(missing)}, which a {entry['model'].value} camera has")
-    return _made(entry, kind, **numbers)
+    model = _made(entry, kind, **numbers)
+    _made(entry, check_model, model)
+    return model
 
 
 def _sensor(fields: Entry) -> Sensor:
@@ -308,7 +312,7 @@ def _made(entry: Entry, kind: Callable[..., T], *numbers: Any, **named: Any) -> 
     """What a constructor makes, its refusals with the entry's name."""
     try:
         return kind(*numbers, **named)
-    except ValueError as error:
+    except (TypeError, ValueError) as error:
         raise entry.fail(str(error)) from None
 
 
@@ -334,13 +338,22 @@ def _model_entry(lens: LensModel) -> dict[str, Any]:
         raise ValueError(
             f"the camera model {kind} has no name for rig files: class {kind}(CameraModel, name=...)"
         )
-    held = {f.name: getattr(lens, f.name) for f in dataclasses.fields(lens)}  # type: ignore[arg-type]
     entry: dict[str, Any] = {"model": lens.model}
-    for name, value in held.items():
+    for f in dataclasses.fields(lens):  # type: ignore[arg-type]
+        value = getattr(lens, f.name)
         if isinstance(value, LensModel):
-            entry[name] = _model_entry(value)
+            entry[f.name] = _model_entry(value)
+        elif isinstance(value, Tensor):
+            if "Tensor" not in str(f.type):
+                raise ValueError(f"{f.name} of {lens.model} is a tensor: state it, {f.name}: torch.Tensor")
+            entry[f.name] = value.tolist()
+        elif isinstance(value, str | bool | int | float | list | tuple):
+            entry[f.name] = value
         elif value is not None:
-            entry[name] = value.tolist() if isinstance(value, Tensor) else value
+            kind = type(value).__name__
+            raise ValueError(
+                f"{f.name} of {lens.model} is a {kind}, which no rig file holds: make it a tensor"
+            )
     return entry
 
 

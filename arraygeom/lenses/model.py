@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
-from ..batching import Batched
+from ..batching import Batched, tensors_of
+from ..checks import check_numbers
 from ..pixels import broadcast_shapes, floating, to_homogeneous
 from .common import on_plane
 
@@ -88,6 +89,8 @@ class CameraModel(LensModel):
     """
 
     registered: ClassVar[str] = ""
+    asked: ClassVar[bool] = False
+    """Whether `check_model` asked its methods."""
     lengths: ClassVar[tuple[str, ...] | None] = None
     """Which of its numbers are metres, or metres a second; to be stated where rays do not meet."""
 
@@ -135,6 +138,64 @@ class CameraModel(LensModel):
         """The model's tensors and the number of their item axes, by field."""
         held = ((f.name, getattr(self, f.name)) for f in dataclasses.fields(self))  # type: ignore[arg-type]
         return {name: (t, self.item_axes.get(name, 0)) for name, t in held if isinstance(t, Tensor)}
+
+
+def check_model(model: LensModel | None) -> None:
+    """Raises unless a camera model's numbers are finite, and its methods return what `LensModel`'s do.
+
+    They are asked once a class, in float32 and float64. TypeError or ValueError.
+    """
+    if not isinstance(model, CameraModel):
+        return
+    kind = type(model)
+    for f in dataclasses.fields(model):  # type: ignore[arg-type]
+        value = getattr(model, f.name)
+        if isinstance(value, Tensor):
+            check_numbers(value, (), f"{f.name} of {kind.__name__}")
+        elif type(value).__module__ == "numpy":
+            raise TypeError(
+                f"{f.name} of {kind.__name__} is of numpy: give a tensor, as torch.as_tensor makes"
+            )
+    if "asked" in vars(kind) or any(t.is_meta for t, _ in tensors_of(model)):
+        return
+    one = model[(0,) * len(model.batch_shape)] if model.batch_shape else model
+    device = next((t.device for t, _ in tensors_of(one)), None)
+    for dtype in (torch.float32, torch.float64):
+        xy = torch.tensor([[0, 0], [0.1, 0.05], [-0.1, 0.2]], dtype=dtype, device=device).expand(2, 3, 2)
+        value, valid = xy.new_zeros(2, 3, 3), xy.new_zeros(2, 3).bool()
+        _check_method(one, "project", 2 * to_homogeneous(xy), (value[..., :2], valid))
+        _check_method(one, "unproject", xy, (value, valid))
+        if not one.central:
+            _check_method(one, "origins", xy, (value,))
+    kind.asked = True
+
+
+def _check_method(model: CameraModel, method: str, points: Tensor, like: tuple[Tensor, ...]) -> None:
+    """Raises TypeError unless a method gives tensors like those, and leaves the points as they are."""
+    name, given = f"{type(model).__name__}.{method}", points.clone()
+    try:
+        with torch.no_grad():
+            found = getattr(model, method)(given)
+    except NotImplementedError:
+        raise
+    except Exception as error:
+        raise TypeError(
+            f"{name} raised {type(error).__name__} for points {_kind(points)}: {error}; points have any "
+            "number of axes before their last, and numbers of the model those that `item_axes` states"
+        ) from error
+    kinds, wanted = [_kind(v) for v in (found if isinstance(found, tuple) else (found,))], [*map(_kind, like)]
+    if kinds != wanted:
+        raise TypeError(
+            f"{name} gives {' and '.join(kinds)} for points {_kind(points)}; "
+            f"wanted {' and, of which are valid, '.join(wanted)}"
+        )
+    if not torch.equal(given, points):
+        raise TypeError(f"{name} changes the points that it is given: make new ones, `a / b` for `a /= b`")
+
+
+def _kind(value: Any) -> str:
+    """A tensor's dtype and shape, or what else it is."""
+    return f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
 
 
 def beside_points(number: Tensor, points: Tensor, axes: int = 0) -> Tensor:

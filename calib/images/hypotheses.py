@@ -188,9 +188,8 @@ def _same_size(A: Tensor) -> Change:
 
 def _opposite_lens(camera: Camera) -> Camera:
     lens = camera.distortion
-    return (
-        camera if lens is None else camera.replace(distortion=lens.replace(coefficients=-lens.coefficients))
-    )
+    assert lens is not None
+    return camera.replace(distortion=lens.with_coefficients(-lens.coefficients))
 
 
 POSES: dict[tuple[str, str], Callable[[Pose], Pose]] = {
@@ -220,8 +219,11 @@ CURVED = {
     "images of {} are undistorted already: distortion applied twice": partial(
         on_cameras, change=lambda camera: camera.replace(distortion=None)
     ),
-    "distortion of {} with the wrong sign (the inverse map)": partial(on_cameras, change=_opposite_lens),
 }
+OPPOSITE = {
+    "distortion of {} with the wrong sign (the inverse map)": partial(on_cameras, change=_opposite_lens)
+}
+"""Of a `Distortion`: of another camera model's numbers a sign may be part of what they are."""
 FITS: dict[str, Callable[[HW, HW], Tensor]] = {
     "resized": resize_matrix,
     "cropped about its middle": lambda old, new: shift_matrix((old[1] - new[1]) / 2, (old[0] - new[0]) / 2),
@@ -251,6 +253,8 @@ def _of_numbers(rig: Rig, names: Sequence[str]) -> Iterator[Hypothesis]:
         yield from _of_groups(rig, every, "resized", {words: _same_size(A)})
     curved = [name for name in calibrated if rig[name].distortion is not None]
     yield from _of_groups(rig, _groups(curved), "distortion", CURVED)
+    lenses = [name for name in curved if isinstance(rig[name].distortion, Distortion)]
+    yield from _of_groups(rig, _groups(lenses), "distortion", OPPOSITE)
     for kind, pixels in SHIFTS.items():
         shifts = {
             f"pixels of {{}} are {shift:+g} from where the rig counts them": _same_size(

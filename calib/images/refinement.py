@@ -398,7 +398,7 @@ def _contradictions(parameters: Sequence[FreeParameter], z: Tensor) -> list[str]
         if ratio > LARGEST_CHANGE and u.unit != "F":
             size, sigma = (float(v[worst]) * u.factor for v in (change, u.sigma))
             found.append(
-                f"{u.label(worst)} would change by {size:+.3g} {u.unit}, "
+                f"{u.label(worst)} would change by {f'{size:+.3g} {u.unit}'.rstrip()}, "
                 f"{ratio:.0f} standard deviations of {sigma:.3g}: is something else wrong (`pat rig "
                 "doctor`)? If so large a change is plausible, say so with --sigma"
             )

@@ -38,6 +38,7 @@ from arraygeom import (
 )
 from arraygeom.fields import covering_displacement
 from arraygeom.fields.default import FIELDS, LINE_SHARE, named_field, recorded_field
+from arraygeom.fields.protocol import sampling_locations
 from arraygeom.fields.ray_depth import ray_depth, rough_transfer
 from arraygeom.pixels import HW
 
@@ -239,7 +240,7 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
     """A pixel's samples in one beta, their weights, depths. Raises ValueError if the field does not fit."""
     x = pixel_of(state)
     field = scene.fields.get(state.family) or chosen_field(pair, state.family, x)
-    found = field(pair, x)
+    found = sampling_locations(field, pair, x)
     if isinstance(found, Segments):  # about one sample a pixel of beta
         longest = float(torch.where(found.valid, found.length, 0.0).max())
         samples = found.positions(math.ceil(longest) + 1)

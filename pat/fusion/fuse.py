@@ -15,6 +15,7 @@ from torch import Tensor
 from arraygeom import ReceptiveField, Rig
 from arraygeom.chunks import Tile
 from arraygeom.threads import torch_in_one_thread
+from arraygeom.warned import warn
 
 from ..matching.match import Matcher, match
 from ..matching.radiometry import Given, given_response
@@ -260,6 +261,9 @@ def _seen(
 ) -> tuple[Views, LowLight]:
     """The views to fuse, denoised, and what is known of their noise."""
     views = Views.of(rig, images, alpha=alpha, depth=settings.depth, field=settings.field)
+    if views.alpha_in_colour:
+        text = "is in colour: colours come from the betas, its own only where they do not see"
+        warn(f"the image of alpha, '{alpha}', {text}")
     views, low_light = denoised_views(views, noise)
     check_bands(views, network.bands)
     return views, low_light

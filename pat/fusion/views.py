@@ -121,12 +121,9 @@ def is_in_colour(image: Float[Tensor, "c h w"]) -> bool:
 
 
 def grey_alpha(name: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "1 h w"]:
-    """Alpha's image in grey. Warns if it was in colour. Raises ValueError for other bands."""
+    """Alpha's image in grey. Raises ValueError for other bands."""
     if len(image) not in (1, 3):
         raise ValueError(f"the image of alpha, '{name}', has {len(image)} bands: give one in grey or colour")
-    if is_in_colour(image):
-        text = "is in colour: colours come from the betas, its own only where they do not see"
-        warn(f"the image of alpha, '{name}', {text}")
     return grey(image)
 
 

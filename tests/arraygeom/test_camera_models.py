@@ -11,6 +11,7 @@ import torch
 from arraygeom import (
     Camera,
     Curved,
+    LensView,
     Pose,
     Rig,
     default_field,
@@ -29,6 +30,7 @@ from arraygeom.lenses import (
     PolynomialFisheye,
     RollingShutter,
     Splined,
+    beside_points,
 )
 
 HW = (96, 128)
@@ -320,3 +322,101 @@ def test_a_model_that_does_not_state_its_lengths_cannot_be_in_another_unit():
         ValueError, match="Mine does not say which of its numbers are lengths: state `lengths`"
     ):
         Mine().scaled(10.0)
+
+
+def project(X):
+    return Stereographic().project(X)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (
+            lambda X: project(X)[0],
+            r"Sloppy.project gives torch.float32 \(2, 3, 2\) for .* are valid, torch.bool",
+        ),
+        (lambda X: (project(X)[0], True), "and a bool for points"),
+        (lambda X: (project(X)[0], None), "and a NoneType for points"),
+        (lambda X: (project(X)[0], project(X)[1].float()), r"and torch.float32 \(2, 3\) for points"),
+        (lambda X: (project(X)[0], project(X)[1][..., None]), r"and torch.bool \(2, 3, 1\) for points"),
+        (lambda X: tuple(v.numpy() for v in project(X)), "gives a ndarray and a ndarray"),
+        (lambda X: project(X.double()), "gives torch.float64 .* for points torch.float32"),
+        (lambda X: project(X.float()), "gives torch.float32 .* for points torch.float64"),
+        (lambda X: project(X.reshape(-1, 3)), r"gives torch.float32 \(6, 2\)"),
+        (lambda X: (X, project(X)[1]), r"gives torch.float32 \(2, 3, 3\)"),
+        (lambda X: project(X.div_(X[..., 2:])), "changes the points that it is given"),
+        (lambda X: X.x, "Sloppy.project raised AttributeError"),
+    ],
+)
+def test_a_model_that_returns_something_else_is_refused_with_what_is_wanted(wrong, said):
+    """Each was a traceback from within a field, or a depth of another point."""
+
+    @dataclass(frozen=True, eq=False, repr=False)
+    class Sloppy(Stereographic):
+        def project(self, X):
+            return wrong(X)
+
+    with pytest.raises(TypeError, match=said):
+        camera("own").replace(distortion=Sloppy())
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Division(CameraModel, name="tests-division"):
+    k: torch.Tensor
+
+    def project(self, X):
+        z = X[..., 2]
+        root = z.square() - 4 * beside_points(self.k, z[..., None]) * X[..., :2].square().sum(-1)
+        ahead = (z > 0) & (root > 0)
+        return 2 * X[..., :2] / (z + root.clamp(min=1e-12).sqrt()).clamp(min=1e-12)[..., None], ahead
+
+    def unproject(self, xy):
+        z = 1 + beside_points(self.k, xy) * xy.square().sum(-1)
+        return torch.cat([xy, z[..., None]], -1), z > 0
+
+
+@pytest.mark.parametrize(
+    ("k", "said"),
+    [
+        (np.array(-0.1), "k of Division is of numpy: give a tensor"),
+        (torch.tensor(1), "k of Division holds torch.int64"),
+        (number(math.nan), "k of Division holds NaN"),
+    ],
+)
+def test_numbers_of_a_model_are_finite_tensors(k, said):
+    with pytest.raises((TypeError, ValueError), match=said):
+        camera("own").replace(distortion=Division(k))
+
+
+def test_batches_of_lenses_are_as_large_as_those_of_cameras():
+    one = camera("own")
+    with pytest.raises(ValueError, match=r"K and lens are \(3,\) and \(2,\)"):
+        one.replace(K=one.K.expand(3, 3, 3), distortion=Division(number(0.0, 0.1)))
+
+
+def test_a_model_with_rays_that_it_does_not_see_covers_nothing():
+    @dataclass(frozen=True, eq=False, repr=False)
+    class Nothing(Stereographic):
+        def unproject(self, xy):
+            return Stereographic.unproject(self, xy)[0] * torch.nan, torch.ones_like(xy[..., 0]).bool()
+
+    (odd,) = Rig({"own": camera("own").replace(distortion=Nothing())}).check()
+    assert "covers 0 % of its image" in odd
+
+
+def test_an_uncalibrated_view_keeps_its_model_in_a_file(tmp_path):
+    """It was written, and refused when read."""
+    view = LensView(hw=HW, K=intrinsics(100.0, HW), distortion=Division(number(-0.1)))
+    rig = Rig({"a": view, "b": view})
+    rig.save(tmp_path / "rig.yaml")
+    assert Rig.load(tmp_path / "rig.yaml") == rig
+
+
+def test_what_no_file_gives_back_is_not_written(tmp_path):
+    @dataclass(frozen=True, eq=False, repr=False)
+    class Untyped(Stereographic, name="tests-untyped"):
+        k: object
+
+    for k, said in ((number(0.1), "state it, k: torch.Tensor"), ({0.1}, "is a set, which no rig file holds")):
+        with pytest.raises(ValueError, match=said):
+            Rig({"own": camera("own").replace(distortion=Untyped(k))}).save(tmp_path / "rig.yaml")

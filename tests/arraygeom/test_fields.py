@@ -13,6 +13,7 @@ from arraygeom import (
     HomographyDisplacement,
     Link,
     Local,
+    Moved,
     NearestVoxels,
     Pair,
     Pose,
@@ -20,6 +21,7 @@ from arraygeom import (
     Rig,
     Segments,
     View,
+    Widened,
     epipolar_lines,
     lazily,
     rotation_from_vector,
@@ -543,3 +545,32 @@ def test_gradients_are_finite_where_only_some_rigs_of_a_batch_are_degenerate():
     )
     slopes = torch.autograd.grad(s.start.sum() + s.end.sum(), list(changes.values()), allow_unused=True)
     assert all(v is None or v.isfinite().all() for v in slopes)
+
+
+def test_what_a_field_gives_is_asked_wherever_it_is_called():
+    """Widened, sampling locations and drawings were an AttributeError; `fuse` alone said what is wanted."""
+    pair = pair_of(two_cameras())
+    x = torch.tensor([[20.0, 20.0], [30.0, 10.0]])
+
+    def ends(pair, x):
+        found = Epipolar()(pair, x)
+        return found.start, found.end
+
+    def fewer(pair, x):
+        found = Epipolar()(pair, x)
+        return Segments(found.start[:1], found.end[:1], found.valid[:1])
+
+    def without_mask(pair, x):
+        found = Epipolar()(pair, x).positions(8)
+        object.__setattr__(found, "mask", None)
+        return found
+
+    wrong = {
+        ends: "the field ends gave a tuple: fields give Segments or Positions",
+        fewer: r"the field fewer gave \(1,\) pixels for \(2,\)",
+        without_mask: "the field without_mask gave Positions whose mask is a NoneType",
+    }
+    for field, said in wrong.items():
+        for asked in (field, Widened(field, across=1), Moved(field, torch.zeros(2, *pair.alpha.hw))):
+            with pytest.raises(ValueError, match=said):
+                sampling_locations(asked, pair, x)

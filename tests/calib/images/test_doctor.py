@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Link, Pose, Rig, View, triangulate
+from arraygeom import Distortion, Link, Pose, Rig, View, triangulate
+from arraygeom.lenses import PolynomialFisheye
 from arraygeom.text import UNSCALED
 from calib.images.doctor import diagnose, diagnose_matches
-from calib.images.hypotheses import TRANSPOSE, on_cameras, swap
+from calib.images.hypotheses import TRANSPOSE, hypotheses, on_cameras, swap
 from calib.images.least_squares import most_probable
 from calib.images.parameters import UNCERTAIN, apply_change, free_parameters
 from calib.images.residuals import sampson_of_pairs
@@ -290,3 +291,19 @@ def test_points_whose_equations_are_singular_are_invalid():
     in_degrees = posed(lambda p: Pose(turned(p.R, 180 / math.pi), p.t))
     cameras = [in_degrees(camera) for camera in rig.pair(*names).cameras]
     assert not triangulate(cameras, torch.stack(list(matches))).valid.all()
+
+
+def test_only_a_distortion_may_have_the_wrong_sign():
+    """The numbers of a camera model were negated too, as if they were called coefficients: a TypeError."""
+    cameras = dict(simulated_rig("wide", 2, np.random.default_rng(0)).cameras)
+    lenses = (PolynomialFisheye(vector(0.01, -0.02)), Distortion("kannala-brandt", vector(0.1, 0, 0, 0)))
+    for name, lens in zip(cameras, lenses):
+        cameras[name] = cameras[name].replace(distortion=lens)
+    rig = Rig(cameras, depth=(1, 10))
+    named = [
+        h.words for h in hypotheses(rig, {n: c.hw for n, c in cameras.items()}) if "sign (the" in h.words
+    ]
+    second = list(cameras)[1]
+    assert named == [
+        f"distortion of {who} with the wrong sign (the inverse map)" for who in ("all cameras", f"'{second}'")
+    ]

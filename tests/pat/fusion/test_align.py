@@ -351,3 +351,11 @@ def test_ndvi_is_of_light_where_the_sensors_are_stated():
     light = images["nir"][0].numpy()[where[..., 1], where[..., 0]], images["mono"][0].numpy()
     expected = (light[0] - light[1]) / (light[0] + light[1])
     assert np.nanmedian(np.abs(index - expected)[seen]) < 1e-3
+
+
+def test_of_an_alpha_in_colour_nothing_is_said(recwarn):
+    """It said where colours come from, though nothing is fused."""
+    rig, images = array()
+    images["mono"] = torch.cat([images["mono"], *(0.9 * images["mono"] for _ in range(2))])
+    align(rig, images, alpha="mono", correct=False)
+    assert not [w for w in recwarn if "in colour" in str(w.message)]
