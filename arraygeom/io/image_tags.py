@@ -40,9 +40,11 @@ def image_tags(path: Path) -> ImageTags | None:
         with Image.open(path, formats=("TIFF", "JPEG")) as image:
             exif = image.getexif()
             stated = dict(exif) | exif.get_ifd(EXIF) | exif.get_ifd(GPS)
-            fields = {tag: v if isinstance(v, tuple) else (v,) for tag, v in stated.items()}
+            values = {tag: v if isinstance(v, tuple) else (v,) for tag, v in stated.items()}
+            # 0 / 0 is NaN, by which cameras say that they do not know
+            fields = {tag: tuple(0.0 if v != v else v for v in each) for tag, each in values.items()}
             return ImageTags((image.height, image.width), fields, xmp)
-    except (Image.DecompressionBombError, OSError, SyntaxError, TypeError, ValueError):
+    except Exception:  # whatever Pillow trips over in a damaged file
         return None
 
 

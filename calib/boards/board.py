@@ -321,6 +321,11 @@ def on_a_line(points: Float[np.ndarray, "n 3"]) -> bool:
     return bool(across <= ON_A_LINE * along)
 
 
+def apart(points: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
+    """The distance of each point from the next one."""
+    return np.asarray(np.sort(np.linalg.norm(points[:, None] - points, axis=-1), axis=1)[:, 1])
+
+
 def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
     """OpenCV's dictionary of a name such as "4x4_50"."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name.upper()}"))

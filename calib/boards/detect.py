@@ -28,6 +28,7 @@ from .board import (
     Circles,
     KnownPoints,
     MarkedBoard,
+    apart,
     marker_dictionary,
     on_a_line,
 )
@@ -265,15 +266,10 @@ def _clear(board: Board) -> float:
 
 def _by_gradients(grey: Grey, x: np.ndarray, share: float) -> np.ndarray:
     """Corners by OpenCV's gradient criterion, in windows of `share` times the distance to the next corner."""
-    half = int(np.clip(share * np.quantile(_apart(x), 0.1), 2, 11))
+    half = int(np.clip(share * np.quantile(apart(x), 0.1), 2, 11))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
     refined = cv2.cornerSubPix(grey, x.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
     return refined.reshape(-1, 2).astype(np.float64)
-
-
-def _apart(x: np.ndarray) -> np.ndarray:
-    """The distance of each point from the next one."""
-    return np.asarray(np.sort(np.linalg.norm(x[:, None] - x[None], axis=-1), axis=1)[:, 1])
 
 
 def _plausible(found: Detection, board: Board) -> bool:
@@ -293,7 +289,7 @@ def _plausible(found: Detection, board: Board) -> bool:
     basis = monomials((p - p.mean(0)) / np.abs(p - p.mean(0)).max(0), 3 if len(p) >= 30 else 1)
     distort = np.linalg.lstsq(basis, found.x - flat, rcond=None)[0]
     left = np.linalg.norm(found.x - flat - basis @ distort, axis=-1)
-    return bool(np.median(left) < LARGEST_MISFIT * np.median(_apart(flat)) and np.isfinite(left).all())
+    return bool(np.median(left) < LARGEST_MISFIT * np.median(apart(flat)) and np.isfinite(left).all())
 
 
 def _reason(grey: Grey, board: Board) -> str:

@@ -17,7 +17,7 @@ from arraygeom.pixels import HW
 
 from . import Lens
 from .board import Board
-from .detect import BoardViews, Detection
+from .detect import BoardViews, Detection, homography_errors
 from .photos import FrameKey
 
 LENSES: dict[Lens, tuple[str, int]] = {
@@ -71,14 +71,14 @@ def initial_camera(name: str, views: BoardViews, board: Board, lens: Lens) -> Ca
             f"{name}: the board is found in {len(views.seen)} of its images and {fewest} is the least: "
             "take ten or more, at several distances and tilts"
         )
-    kept = views
-    camera, poses = _solved(name, kept, board, lens)
+    plausible = BoardViews(views.hw, {key: near_homography(d, board) for key, d in views.seen.items()})
+    camera, poses = _solved(name, plausible, board, lens)
     for _ in range(2):
-        before, kept = kept, without_outliers(views, camera, poses, board.points)
-        if all(np.array_equal(before.seen[key].ids, d.ids) for key, d in kept.seen.items()):
+        before, plausible = plausible, without_outliers(views, camera, poses, board.points)
+        if all(np.array_equal(before.seen[key].ids, d.ids) for key, d in plausible.seen.items()):
             break
-        camera, poses = _solved(name, kept, board, lens)
-    return CalibratedViews(name, camera, kept, poses)
+        camera, poses = _solved(name, plausible, board, lens)
+    return CalibratedViews(name, camera, plausible, poses)
 
 
 def without_bad_images(views: BoardViews, initial: CalibratedViews, board: Board) -> BoardViews:
@@ -127,6 +127,14 @@ def _projection_errors(
     """How far the points of an image are from a camera's projections of the board's, pixels."""
     projected = camera.project_local(pose.apply(torch.from_numpy(points[found.ids]))).x.numpy()
     return np.linalg.norm(projected - found.x, axis=-1)
+
+
+def near_homography(found: Detection, board: Board) -> Detection:
+    """Points that a homography of the board fits (least median of squares), but for the lens's distortion."""
+    if len(found.ids) < FEWEST_POINTS or not board.flat:
+        return found
+    off = homography_errors(board.points[found.ids, :2], found.x)
+    return found.where(off <= max(1.0, 4 * float(np.median(off)) / RAYLEIGH_MEDIAN))
 
 
 def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Camera, dict[FrameKey, Pose]]:

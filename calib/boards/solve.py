@@ -54,7 +54,7 @@ POOLED = 50
 UNOBSERVABLE = 0.5
 """A parameter is unobservable if its posterior deviation stays above this share of its typical size."""
 ROUNDS = 3
-"""Times that all are fitted, each without the outliers of the one before."""
+"""Times that parameters may return, and that outliers may change."""
 MISFIT = 1.8
 """A frame does not fit if its residuals exceed those of the camera's median frame by this factor,"""
 CONSPICUOUS = 1.8
@@ -103,18 +103,28 @@ def _check_tilts(name: str, poses: Mapping[FrameKey, Pose], board: Board) -> Non
 
 
 def solve(initial: InitialRig, board: Board, *, final: bool = True) -> Solved:
-    """Fit all parameters; those that turn out to be unobservable are fixed, until none is.
+    """Fit all observable parameters; those that turn out to be unobservable are fixed, until none is.
 
-    Boards that are clearly neither flat nor printed true are deformed. Raises ValueError where a `final` fit
-    has no focal length.
+    Parameters fixed before the fit, when the noise was overestimated, may return after it; and boards that
+    are clearly neither flat nor printed true are deformed. Raises ValueError where a `final` fit has no focal
+    length.
     """
-    problem, flat, notes = initial.problem(board), initial.flat(board), list[str]()
+    problem, flat = initial.problem(board), initial.flat(board)
+    full = problem.free
+    problem, notes = observable(replace(problem, sigma=noise(problem, 0)), final=False)
+    solved = _with_deformation(adjust(problem), flat)
+    for _ in range(ROUNDS):
+        returned, changed = observable(replace(solved.problem, free=full), final=False)
+        if all(np.array_equal(mask, solved.problem.free[name]) for name, mask in returned.free.items()):
+            break
+        notes = changed
+        solved = _with_deformation(adjust(returned), flat)
     while True:
-        solved = _with_deformation(adjust(problem), flat)
-        problem, dropped = observable(solved.problem, final=final)
+        fewer, dropped = observable(solved.problem, final=final)
         if not dropped:
             return replace(solved, notes=tuple(notes), views=initial.views, left_out=initial.left_out)
-        notes += dropped
+        notes = notes + dropped
+        solved = adjust(fewer)
 
 
 def solve_inliers(

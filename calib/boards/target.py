@@ -44,6 +44,7 @@ from .board import (
     Circles,
     KnownPoints,
     MarkedBoard,
+    apart,
     marker_dictionary,
     millimetres,
     on_a_line,
@@ -245,8 +246,7 @@ def _known_points(text: str) -> KnownPoints:
         raise ValueError(
             f"{path}: all points lie on a line, about which a camera's pose is not determined: add others"
         )
-    apart = np.linalg.norm(np.array(positions)[:, None] - np.array(positions), axis=-1)
-    spacing = float(np.median(np.sort(apart, axis=1)[:, 1]))
+    spacing = float(np.median(apart(np.array(positions))))
     markers = tuple(sorted({marker for marker, _ in ids}))
     return KnownPoints(len(ids), 1, spacing, name, markers, file=str(path), ids=ids, positions=positions)
 

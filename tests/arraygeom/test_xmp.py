@@ -34,7 +34,15 @@ PER_MM = 266.666667
 
 
 def image_of(
-    path: Path, tags, *, dji=None, orientation=1, serial="A1", hw=(960, 1280), taken="2018:04:13 08:06:58"
+    path: Path,
+    tags,
+    *,
+    dji=None,
+    orientation=1,
+    serial="A1",
+    hw=(960, 1280),
+    taken="2018:04:13 08:06:58",
+    exposure=(3, 1000),
 ) -> Path:
     """A TIFF file of zeros with these Camera: tags, half of them as elements."""
     parts = [f'Camera:{k}="{v}"' for k, v in list(tags.items())[::2]]
@@ -58,7 +66,7 @@ def image_of(
         (0xA210, "H", 1, 4, True),
         (0xA431, "s", 0, serial, True),
         (0x9003, "s", 0, taken, True),
-        (0x829A, "2I", 1, (3, 1000), True),
+        (0x829A, "2I", 1, exposure, True),
         (50714, "H", 4, (4000, 4002, 4000, 4002), True),
     ]
     tifffile.imwrite(path, np.zeros(hw, np.uint16), extratags=fields, metadata=None)
@@ -102,6 +110,21 @@ def test_rig_relatives_are_from_the_camera_to_the_rig_and_translations_its_centr
     X = rig["nir"].cam_from_world.inverse().apply(torch.tensor([1.0, 0, 0], dtype=torch.float64))
     assert torch.allclose(X, torch.tensor([0.01, 0.98, 0], dtype=torch.float64))
     assert torch.equal(rig["green"].R, torch.eye(3, dtype=torch.float64))
+
+
+def test_an_exposure_of_nothing_by_nothing_is_not_stated(tmp_path):
+    camera = Rig.load(image_of(tmp_path / "IMG_1.tif", FISHEYE, exposure=(0, 0)))["red"]
+    assert camera.sensor.exposure is None
+
+
+def test_damaged_images_have_tags_or_none(tmp_path):
+    path = image_of(tmp_path / "IMG_1.tif", FISHEYE, hw=(4, 6))
+    content, random = path.read_bytes(), np.random.default_rng(0)
+    for _ in range(300):
+        damaged = np.frombuffer(content, np.uint8).copy()
+        damaged[random.integers(0, 400, 3)] = random.integers(0, 256, 3)
+        path.write_bytes(damaged.tobytes())
+        image_tags(path)
 
 
 def test_tags_are_of_the_stored_pixels_and_the_rig_of_upright_ones(tmp_path):
