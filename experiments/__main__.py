@@ -104,9 +104,8 @@ class SystemsRun:
         else:
             raise ValueError(f"--recording is of fast-slow, not of '{self.name}'")
         print(result.table, end="")
-        expected = load_system(self.name).expected
-        if expected and self.recording is None and self.scene == "layered" and not self.full:
-            say(f"\nexpected:\n{expected}")
+        if self.recording is None and self.scene == "layered" and not self.full:
+            say(f"\nexpected:\n{load_system(self.name).expected}")
         say(f"written: {', '.join(map(str, result.written))}")
 
 

@@ -64,9 +64,37 @@ class Recipe:
             yield
 
     def train(self, network: nn.Module, losses: Losses) -> None:
-        """Train a network, or the rest of a run, and leave the averaged weights in it, on the CPU."""
-        averaged = fit(network, losses, self.out / "training", self.steps, self.rate, self.save)
-        network.load_state_dict(averaged.state_dict())
+        """Train a network, or the rest of a run, and leave the averaged weights in it, on the CPU.
+
+        The rate falls along half a cosine. The mean loss is logged with each checkpoint, every `save` steps.
+        Raises RuntimeError if a gradient is not finite.
+        """
+        out, steps, step = self.out / "training", self.steps, 0
+        averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / AVERAGE))
+        adam = Adam(network.parameters(), lr=self.rate, betas=(0.9, 0.99))
+        if former := newest_checkpoint(out / "checkpoints"):
+            restore(former, network, adam, averaged)
+            step = former.facts["step"]
+        given = losses(step)
+        since_save: list[float] = []
+        while step < steps:
+            for group in adam.param_groups:
+                group["lr"] = self.rate * min(0.5 + 0.5 * math.cos(math.pi * step / steps), (step + 1) / 100)
+            loss = next(given)
+            adam.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(network.parameters(), 1.0, error_if_nonfinite=True)
+            adam.step()
+            averaged.update_parameters(network)
+            since_save.append(float(loss.detach()))
+            step += 1
+            done = step == steps
+            if step % self.save == 0 or done:
+                _log(out, step, steps, fmean(since_save))
+                since_save = []
+                state = {"step": step, "best": 0.0, "minutes": 0.0, "done": done, "recipe": ""}
+                write_checkpoint(out / "checkpoints", collect(network, adam, averaged, state))
+        network.load_state_dict(averaged.module.state_dict())
         network.cpu()
 
 
@@ -89,41 +117,6 @@ def read_recipe(kind: type[Recipe], path: str) -> Recipe:
         return from_document(kind, document)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-
-
-def fit(network: nn.Module, losses: Losses, out: Path, steps: int, rate: float, save: int) -> nn.Module:
-    """Train a network for so many steps, or the rest of the run in `out`; returns it with averaged weights.
-
-    The rate falls along half a cosine. The mean loss is logged with each checkpoint, every `save` steps.
-    Raises RuntimeError if a gradient is not finite.
-    """
-    averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / AVERAGE))
-    adam = Adam(network.parameters(), lr=rate, betas=(0.9, 0.99))
-    step = 0
-    former = newest_checkpoint(out / "checkpoints")
-    if former:
-        restore(former, network, adam, averaged)
-        step = former.facts["step"]
-    given = losses(step)
-    since_save: list[float] = []
-    while step < steps:
-        for group in adam.param_groups:
-            group["lr"] = rate * min(0.5 + 0.5 * math.cos(math.pi * step / steps), (step + 1) / 100)
-        loss = next(given)
-        adam.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(network.parameters(), 1.0, error_if_nonfinite=True)
-        adam.step()
-        averaged.update_parameters(network)
-        since_save.append(float(loss.detach()))
-        step += 1
-        done = step == steps
-        if step % save == 0 or done:
-            _log(out, step, steps, fmean(since_save))
-            since_save = []
-            state = {"step": step, "best": 0.0, "minutes": 0.0, "done": done, "recipe": ""}
-            write_checkpoint(out / "checkpoints", collect(network, adam, averaged, state))
-    return averaged.module
 
 
 def _log(out: Path, step: int, steps: int, loss: float) -> None:

@@ -98,8 +98,7 @@ class ArraySystem:
     @property
     def expected(self) -> str:
         """The table that `run_system` gave at reduced size when it was last recorded."""
-        file = Path(self.module.__file__ or "").with_name("expected.md")
-        return file.read_text(encoding="utf-8") if file.is_file() else ""
+        return Path(self.module.__file__ or "").with_name("expected.md").read_text(encoding="utf-8")
 
     def sized(self, full: bool, *, scale: float = 1.0) -> Rig:
         """The rig at full size, or at `scale` times the reduced one; raw images keep even sides."""

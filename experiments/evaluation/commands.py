@@ -94,7 +94,7 @@ class Evaluate(Pairs):
         """Write and print the scores. Raises ValueError for no images, and for rates below 1."""
         if self.without_rig and self.protocol != "table1":
             raise ValueError("--without-rig needs --protocol table1")
-        sets, network, bands = self.sets(), load_weights(self.weights), paper.PROTOCOLS[self.protocol]
+        sets, network, bands = self.sets(), load_weights(self.weights), self.protocol == "table2"
         compared = paper.controls(network, bands=bands) if self.controls else {}
         if self.without_rig:
             compared["fusion, rig found"] = paper.with_found_rig(network)

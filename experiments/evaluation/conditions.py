@@ -47,8 +47,7 @@ LEFT_CROP = 64
 """Columns at the left that stereo super-resolution leaves out of its scores."""
 READ_NOISE = 2.0
 """Electrons, in the low-light conditions."""
-Region = Literal["whole", "seen", "occluded", "beyond", "cropped"]
-REGIONS: tuple[Region, ...] = ("whole", "seen", "occluded", "beyond", "cropped")
+REGIONS = ("whole", "seen", "occluded", "beyond", "cropped")
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ CONDITIONS: dict[str, Condition] = {
 
 
 class ConditionRow(NamedTuple):
-    """One method on one pair under one condition: PSNR by region (None: no such pixels), SSIM, and depth.
+    """One method on one pair under one condition: PSNR by region that has pixels, SSIM, depth.
 
     `end_point_error` (pixels) and `within_one` (shares of pixels whose truth is known: of all, of seen ones)
     are None without a true disparity, or where the method gives none.
@@ -148,7 +147,7 @@ class ConditionRow(NamedTuple):
     condition: str
     method: str
     ssim: float
-    psnr: Mapping[str, float | None]
+    psnr: Mapping[str, float]
     end_point_error: float | None = None
     within_one: tuple[float, float] | None = None
 
@@ -236,10 +235,7 @@ def _row(
 ) -> ConditionRow:
     image, truth = result.image.clamp(0, 1), task.ground_truth
     error = (image - truth).square().mean(0)
-    psnr = {
-        n: -10 * math.log10(max(float(error[at].mean()), 1e-12)) if at.any() else None
-        for n, at in regions.items()
-    }
+    psnr = {n: -10 * math.log10(max(float(error[at].mean()), 1e-12)) for n, at in regions.items() if at.any()}
     depth = depth_errors(result.disparity, task.disparity, regions)
     return ConditionRow(pair, condition, method, score(image, truth).ssim, psnr, *depth)
 
@@ -277,14 +273,14 @@ def _by_condition(rows: Sequence[ConditionRow]) -> str:
 
 
 def _gains(rows: Sequence[ConditionRow], condition: str) -> list[float]:
-    psnr = {(r.method, r.pair): r.psnr["whole"] or 0.0 for r in rows if r.condition == condition}
+    psnr = {(r.method, r.pair): r.psnr["whole"] for r in rows if r.condition == condition}
     return [value - psnr["classical", pair] for (method, pair), value in psnr.items() if method == "fusion"]
 
 
 def _mean_cell(rows: Sequence[ConditionRow]) -> str:
     if not rows:
         return ""
-    return f"{np.mean([r.psnr['whole'] or 0.0 for r in rows]):.2f} / {np.mean([r.ssim for r in rows]):.4f}"
+    return f"{np.mean([r.psnr['whole'] for r in rows]):.2f} / {np.mean([r.ssim for r in rows]):.4f}"
 
 
 def _by_region(rows: Sequence[ConditionRow]) -> str:
@@ -292,7 +288,7 @@ def _by_region(rows: Sequence[ConditionRow]) -> str:
     lines = []
     for method in distinct(r.method for r in ideal):
         found = [r for r in ideal if r.method == method]
-        values = [[v for r in found if (v := r.psnr.get(region)) is not None] for region in REGIONS]
+        values = [[r.psnr[region] for r in found if region in r.psnr] for region in REGIONS]
         lines.append([method, *(f"{np.mean(v):.2f}" if v else "" for v in values)])
     names = ["whole", "seen by beta", "occluded", "beyond beta's edge"]
     return markdown_table(["PSNR", *names, f"without the left {LEFT_CROP} columns"], lines)
@@ -349,6 +345,6 @@ def _curve(rows: Sequence[ConditionRow], points: Mapping[int, str]) -> dict[str,
     for x, name in points.items():
         for method in distinct(r.method for r in rows if r.condition == name):
             if method != "bound of beta's resolution":
-                values = [r.psnr["whole"] or 0.0 for r in rows if (r.condition, r.method) == (name, method)]
+                values = [r.psnr["whole"] for r in rows if (r.condition, r.method) == (name, method)]
                 found.setdefault(method, []).append((x, float(np.mean(values))))
     return found

@@ -33,8 +33,6 @@ from pat.media.images import read_image
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import Network
 
-PROTOCOLS = {"table1": False, "table2": True}
-"""Whether each channel of beta is a camera of its own."""
 PRINTED = {
     "table1": {
         "flickr1024": {2: (27.26, 0.8992), 4: (25.85, 0.8840)},

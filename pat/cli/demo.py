@@ -29,31 +29,28 @@ class Demo:
         from arraygeom.atomic import write_text
 
         from ..data.sample_array import ALPHA, load_motorcycle, load_sample
-        from ..evaluation.demo import DemoRecording, classical_methods, save_demo_figure
+        from ..evaluation.demo import as_real_cameras, classical_methods, save_demo_figure
         from ..evaluation.metrics import score
         from ..fusion.results import save_frame
         from ..networks.weights import load_weights
 
         options.writable(self.out, folder=True)
         network = load_weights(self.weights)
-        photograph, sample = DemoRecording(load_motorcycle()), DemoRecording(load_sample())
-        recordings = {
-            "photograph": photograph.as_real_cameras(),
-            "rendered": sample.as_real_cameras(),
+        sample = load_sample()
+        arrays = {
+            "photograph": as_real_cameras(load_motorcycle()),
+            "rendered": as_real_cameras(sample),
             "rendered, ideal": sample,
         }
         columns: dict[str, dict[str, str]] = {}
-        for name, recording in recordings.items():
-            array = recording.array
+        for name, array in arrays.items():
             say(f"{name}: classical fusion")
             methods = {
                 "alpha alone": array.images[ALPHA].expand(3, -1, -1),
-                **classical_methods(network, recording),
+                **classical_methods(network, array),
             }
             say(f"{name}: fusion with the weights '{self.weights}'")
-            frame = fuse_with_progress(
-                self.weights, array.rig, array.images, alpha=ALPHA, noise=recording.noise
-            )
+            frame = fuse_with_progress(self.weights, array.rig, array.images, alpha=ALPHA, noise=array.noise)
             methods["fusion"] = frame.image.clamp(0, 1)
             scores = {method: score(image, array.ground_truth) for method, image in methods.items()}
             columns[name] = {method: f"{psnr:.2f} / {ssim:.3f}" for method, (psnr, ssim) in scores.items()}

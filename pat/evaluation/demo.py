@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 from torch import Generator, Tensor
 
@@ -26,34 +25,25 @@ CROP = 4
 """Enlargement of the figure's lower row."""
 
 
-class DemoRecording(NamedTuple):
-    """An array with its images as recorded, and their noise levels by camera if there is noise."""
-
-    array: SampleArray
-    noise: Mapping[str, NoiseLevel] | None = None
-
-    def as_real_cameras(self) -> DemoRecording:
-        """The same array with cameras of another response and exposure, in low light."""
-        generator = Generator().manual_seed(0)
-        ideal = {
-            ALPHA: luminance(self.array.ground_truth, RESPONSE),
-            BETA: EXPOSURE * self.array.images[BETA],
-        }
-        images = {name: NOISE.recorded(image[None], generator)[0] for name, image in ideal.items()}
-        return DemoRecording(self.array._replace(images=images), dict.fromkeys(images, NOISE))
+def as_real_cameras(array: SampleArray) -> SampleArray:
+    """The same array with cameras of another response and exposure, in low light."""
+    generator = Generator().manual_seed(0)
+    ideal = {ALPHA: luminance(array.ground_truth, RESPONSE), BETA: EXPOSURE * array.images[BETA]}
+    images = {name: NOISE.recorded(image[None], generator)[0] for name, image in ideal.items()}
+    return array._replace(images=images, noise=dict.fromkeys(images, NOISE))
 
 
-def classical_methods(network: FusionNetwork, recording: DemoRecording) -> dict[str, Tensor]:
+def classical_methods(network: FusionNetwork, array: SampleArray) -> dict[str, Tensor]:
     """The classical fusion: plain; with alpha's response corrected; denoised first; and both.
 
     The response is what our fusion finds in the denoised images; these are by non-local means that know the
     noise. Plain alone where the cameras are ideal.
     """
-    rig, images = recording.array.rig, recording.array.images
+    rig, images, noise = array.rig, array.images, array.noise
     methods = {"classical": classical(rig, images, ALPHA, BETA)}
-    if recording.noise is None:
+    if noise is None:
         return methods
-    denoised = {name: denoised_knowing(image, recording.noise[name]) for name, image in images.items()}
+    denoised = {name: denoised_knowing(image, noise[name]) for name, image in images.items()}
     response = corrections_of(network, rig, denoised, alpha=ALPHA, align=False).response
 
     def corrected(given: Mapping[str, Tensor]) -> Tensor:

@@ -48,7 +48,7 @@ SHIPPED = "pat-supervised"
 def answer(scene: ExplorerScene, alpha: str, controls: Controls) -> dict[str, Any]:
     """The pixel, its depth, each beta's samples, weights and match, or `problem` where none.
 
-    Raises ValueError, TypeError or KeyError for controls that cannot be.
+    Raises ValueError, TypeError, AttributeError or KeyError for controls that cannot be.
     """
     rig = scene.rig
     scene = scene.with_rig(moved_rig(rig, alpha, controls))

@@ -40,7 +40,7 @@ class Explorer:
             return {"error": self.error}
         try:
             return answer(self.scene, self.alpha, controls)
-        except (ValueError, TypeError, LookupError, ArithmeticError) as error:
+        except (ValueError, TypeError, AttributeError, LookupError, ArithmeticError) as error:
             return {"error": str(error)}
 
     def values(self) -> dict[str, Any]:

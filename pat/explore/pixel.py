@@ -224,7 +224,7 @@ def inspect_pixel(scene: ExplorerScene, state: ExplorerState) -> PixelReport:
             continue
         try:
             betas[name] = beta_report(scene, rig.pair(state.alpha, name), name, state)
-        except ValueError as error:
+        except (ValueError, FileNotFoundError) as error:
             problems[name] = str(error)
         except Exception as error:  # of a field of one's own
             problems[name] = f"the field '{state.family}' failed: {type(error).__name__}: {error}"

@@ -21,7 +21,7 @@ from pat.media.colour import linear_from_srgb
 from pat.support.schema import from_document
 from pat.synthesis.blender import compat
 from pat.synthesis.blender.lens import lens_for
-from pat.synthesis.blender.settings import RenderSettings
+from pat.synthesis.blender.settings import PRESETS, RenderSettings
 from pat.synthesis.blender.task import fitted, render_here, shots
 from pat.synthesis.check import CheckLimits, check_views
 from pat.synthesis.generators import generator_named
@@ -119,9 +119,8 @@ class BlenderSettings:
 
     def render_settings(self) -> RenderSettings:
         """All settings; one thread by default, because a farm has a worker a core."""
-        given = from_document(RenderSettings, dict(self.settings), "settings")
-        changes = {name: getattr(given, name) for name in self.settings}
-        return RenderSettings.preset(self.preset, **{"threads": 1, **changes})
+        settings = {**PRESETS[self.preset], "threads": 1, **self.settings}
+        return from_document(RenderSettings, settings, "settings")
 
     def images(self, rig: Rig) -> list[HW]:
         """The sizes of the images of a scene, one for each exposure.

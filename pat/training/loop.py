@@ -6,24 +6,27 @@ import json
 import math
 import time
 from contextlib import closing, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any, cast
 
 import torch
+from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
+from torch.nn.utils import clip_grad_norm_
 from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from arraygeom.atomic import sweep
-from pat.networks.weights import new_network, save_weights, set_precision
+from pat.networks.weights import Network, new_network, save_weights, set_precision
 from pat.support.locks import folder_lock
 from pat.support.tensor_files import write_tensors
 
 from .checkpoints import Checkpoint, collect, newest_checkpoint, restore, write_checkpoint
 from .config import TrainConfig, config_text, difference, parse_config, save_config
-from .learner import Learner
 from .losses import Objective, validation
-from .processes import process
-from .samples import Sample, SampleSource, made_ahead, scenes
+from .processes import Process, process
+from .samples import Sample, alone, made_ahead, scenes
 from .watch import Watch
 
 BEST, CHECKPOINTS = "best.safetensors", "checkpoints"
@@ -50,29 +53,9 @@ def train(config: TrainConfig) -> Path:
         if here.first:
             for folder in (config.out, config.out / CHECKPOINTS, config.out / "images"):
                 sweep(folder)
-        groups = here.share(config.groups)
-        torch.manual_seed(config.seed)
-        network = new_network(config.network, config.start).to(here.device)
-        average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / config.average))
-        set_precision(network, config.precision, compiled=config.compile)  # not the average's
-        objective = Objective(network, config.loss, attention=config.attention)
-        together = here.together(objective)
-        adam = Adam(network.parameters(), betas=config.momenta)
-        learner = Learner(network, average, objective, together, adam, config.clip, here)
-        with here.before_others():  # a cache of photographs is there for the others
-            learn, examine = scenes(config, device=str(here.device))
-        examined = list(examine(8)) if here.first else []
-        step, best, minutes = 0, -math.inf, 0.0
-        if former:
-            restore(former, network, adam, average)
-            step, best, minutes = (former.facts[k] for k in ("step", "best", "minutes"))
-        if here.first:
-            save_config(config, config.out / "config.yaml")
-        batch = config.batch * config.groups
-        watch = Watch(config.out, step, batch, tensorboard=config.tensorboard) if here.first else None
-        began = time.monotonic() - 60 * minutes
-        with closing(watch) if watch else nullcontext():
-            Run(learner, learn, groups, examined, config, watch, step, best, began).work()
+        run = Run(config, here, former)
+        with closing(run.watch) if run.watch else nullcontext():
+            run.work()
         here.wait()
     return config.out / BEST
 
@@ -101,23 +84,40 @@ def rate_at(config: TrainConfig, step: int, done: float) -> float:
     return config.rate * (min(step / config.warmup, fall) if config.warmup else fall)
 
 
-@dataclass
 class Run:
-    """A run under way: what it learns with and from, by which recipe.
+    """A run under way: the network and its objective, the average of its weights, and what it learns from.
 
-    `groups` of each step are this process's; `examined` is validated on. Of the first process only: `watch`.
+    `together` is the objective whose gradients all processes share, `groups` of each step are this process's.
+    Of the first process only: `examined`, which is validated on, and `watch`.
     """
 
-    learner: Learner
-    samples: SampleSource
-    groups: list[int]
-    examined: list[Sample]
-    recipe: TrainConfig
-    watch: Watch | None
-    step: int
-    best: float
-    began: float
-    loss: float = math.nan
+    def __init__(self, config: TrainConfig, here: Process, former: Checkpoint | None) -> None:
+        self.config, self.here, self.groups = config, here, here.share(config.groups)
+        torch.manual_seed(config.seed)
+        self.network = new_network(config.network, config.start).to(here.device)
+        self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / config.average))
+        set_precision(self.network, config.precision, compiled=config.compile)  # not the average's
+        self.objective = Objective(self.network, config.loss, attention=config.attention)
+        self.together = here.together(self.objective)
+        self.adam = Adam(self.network.parameters(), betas=config.momenta)
+        with here.before_others():  # a cache of photographs is there for the others
+            self.samples, examine = scenes(config, device=str(here.device))
+        self.examined = list(examine(8)) if here.first else []
+        self.step, self.best, self.loss, minutes = 0, -math.inf, math.nan, 0.0
+        if former:
+            restore(former, self.network, self.adam, self.average)
+            self.step, self.best, minutes = (former.facts[k] for k in ("step", "best", "minutes"))
+        self.watch = None
+        if here.first:
+            save_config(config, config.out / "config.yaml")
+            batch = config.batch * config.groups
+            self.watch = Watch(config.out, self.step, batch, tensorboard=config.tensorboard)
+        self.began = time.monotonic() - 60 * minutes
+
+    @property
+    def averaged(self) -> Network:
+        """The network with averaged weights."""
+        return cast(Network, self.average.module)
 
     @property
     def minutes(self) -> float:
@@ -127,16 +127,15 @@ class Run:
     def work(self) -> None:
         """Step until done."""
         given = self.samples.steps(self.groups, start=self.step)
-        recipe = self.recipe
-        for samples in made_ahead(given, self.learner.network):
+        recipe = self.config
+        for samples in made_ahead(given, self.network):
             self.step += 1
-            done = max(self.step / recipe.steps, self.minutes / recipe.minutes)
-            done = self.learner.here.agreed(done)
+            done = self.here.agreed(max(self.step / recipe.steps, self.minutes / recipe.minutes))
             self._advance(samples, done)
             if self.step % recipe.validate == 0 or done >= 1:
                 self._validate()
             elif self.watch and EARLY <= self.step < recipe.validate and self.step & (self.step - 1) == 0:
-                self.watch.show(self.learner.averaged, self.examined, self.step)
+                self.watch.show(self.averaged, self.examined, self.step)
             if self.step % recipe.save == 0 or done >= 1:
                 self._save(done=done >= 1)
             if done >= 1:
@@ -144,53 +143,78 @@ class Run:
 
     def _advance(self, given: list[Sample], done: float) -> None:
         """One step of the optimiser. Raises FloatingPointError if loss or gradients are not finite."""
-        rate = rate_at(self.recipe, self.step, done)
-        loss, norm = self.learner.gradients(given)
+        self.adam.zero_grad()
+        losses = [self._backward(part, len(given), last=part is given[-1]) for part in given]
+        norm = clip_grad_norm_(self.network.parameters(), self.config.clip)
+        loss = self.here.mean(torch.stack(losses).mean())
         if not (torch.isfinite(norm) and torch.isfinite(loss)):
             raise FloatingPointError(self._offence(given))
-        self.learner.update(rate)
+        rate = rate_at(self.config, self.step, done)
+        for parameters in self.adam.param_groups:
+            parameters["lr"] = rate
+        self.adam.step()
+        self.average.update_parameters(self.network)
         self.loss = float(loss)
         if self.watch:
             self.watch.step(self.step, self.loss, float(norm), rate, done=done)
+
+    def _backward(self, given: Sample, groups: int, *, last: bool) -> Tensor:
+        """Add the gradients of one group to the others'; processes exchange them with the last."""
+        wait = isinstance(self.together, DistributedDataParallel) and not last
+        with self.together.no_sync() if wait else nullcontext():  # type: ignore[operator]
+            loss = self.together(given)
+            (loss / groups).backward()
+        return loss.detach()
 
     def _validate(self) -> None:
         """Measure, show, and keep the weights if they are the best so far."""
         if self.watch is None:
             return
-        facts = validation(self.learner.averaged, self.examined)
+        facts = validation(self.averaged, self.examined)
         facts |= {"step": self.step, "loss": self.loss, "minutes": self.minutes}
         self.watch.validated(facts)
-        self.watch.show(self.learner.averaged, self.examined, self.step)
+        self.watch.show(self.averaged, self.examined, self.step)
         if facts["psnr"] > self.best:
             self.best = facts["psnr"]
-            recipe = {"recipe": json.dumps(asdict(self.recipe), default=str), "validation": json.dumps(facts)}
-            save_weights(self.learner.averaged, self.recipe.out / BEST, facts=recipe)
+            recipe = {"recipe": json.dumps(asdict(self.config), default=str), "validation": json.dumps(facts)}
+            save_weights(self.averaged, self.config.out / BEST, facts=recipe)
 
     def _save(self, *, done: bool) -> None:
         if self.watch:
             self.watch.steps.flush()
-            facts = {"step": self.step, "best": self.best, "minutes": self.minutes, "done": done}
-            learner = self.learner
-            state = collect(
-                learner.network, learner.adam, learner.average, facts | {"recipe": config_text(self.recipe)}
-            )
-            write_checkpoint(self.recipe.out / CHECKPOINTS, state)
+            facts: dict[str, Any] = {
+                "step": self.step,
+                "best": self.best,
+                "minutes": self.minutes,
+                "done": done,
+            }
+            facts["recipe"] = config_text(self.config)
+            state = collect(self.network, self.adam, self.average, facts)
+            write_checkpoint(self.config.out / CHECKPOINTS, state)
 
     def _offence(self, given: list[Sample]) -> str:
         """Save the groups of a failed step; the error message names the samples."""
         found = []
         for group, part in zip(self.groups, given):
-            bad = self.learner.offenders(part)
+            bad = [i for i in range(len(part.alpha)) if not self._is_finite(alone(part, i))]
             found += [f"sample {i} of group {group}" for i in bad]
             if bad or len(given) == 1:
-                path = self.recipe.out / f"offending-step-{self.step}-group-{group}.safetensors"
+                path = self.config.out / f"offending-step-{self.step}-group-{group}.safetensors"
                 save_sample(part, path, facts={"step": str(self.step), "samples": str(bad)})
         who = ", ".join(found) or "no single sample of this process"
         return (
             f"step {self.step}: the loss or its gradient is not finite, by {who}; the batch is in "
-            f"{self.recipe.out}/offending-step-{self.step}-*.safetensors: inspect it, or lower `rate` "
-            f"(now {self.recipe.rate:g}); the last checkpoint and the best weights are as they were"
+            f"{self.config.out}/offending-step-{self.step}-*.safetensors: inspect it, or lower `rate` "
+            f"(now {self.config.rate:g}); the last checkpoint and the best weights are as they were"
         )
+
+    def _is_finite(self, given: Sample) -> bool:
+        """Whether the loss of a sample and its gradients are finite."""
+        self.objective.zero_grad()
+        loss = self.objective(given)
+        loss.backward()
+        gradients = [p.grad for p in self.objective.parameters() if p.grad is not None]
+        return bool(loss.isfinite()) and all(bool(g.isfinite().all()) for g in gradients)
 
 
 def save_sample(given: Sample, path: Path, *, facts: dict[str, str]) -> None:

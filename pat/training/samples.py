@@ -82,12 +82,15 @@ def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
     """What each step of a recipe records, from step 0: new scenes, or some of the last `CACHED` again."""
     draw = random.Random(seed)
     shares = {name: getattr(config, name) for name in ("rendered", "pairs", "measured")}
+    layered = max(1 - sum(shares.values()), 0.0)
     cached: list[Planned] = []
     for number in range(2**62):
         new = len(cached) < FEW or draw.random() < 1 / config.reuse
         if new:
-            kind = _source(shares, draw)
-            if kind is None:
+            kind = "layered"
+            if layered < 1:  # drawn only where there is a choice: what ships was trained on these sequences
+                kind = draw.choices([*shares, kind], [*shares.values(), layered])[0]
+            if kind == "layered":
                 kind = "rectified" if draw.random() < config.rectified else "general"
             betas = 3 if draw.random() < config.filtered else 1
             dropped = cached.pop() if len(cached) > CACHED else None
@@ -95,18 +98,6 @@ def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
             yield cached[0]._replace(dropped=dropped.scenes if dropped else None)
         else:
             yield cached[int(draw.random() * len(cached))]
-
-
-def _source(shares: Mapping[str, float], draw: random.Random) -> str | None:
-    """The source of scenes, if not photographs. Draws only where there is a choice."""
-    if not any(shares.values()):
-        return None
-    drawn = draw.random()
-    for kind, share in shares.items():
-        drawn -= share
-        if drawn < 0:
-            return kind
-    return None
 
 
 @dataclass

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from experiments.fit import Recipe, command, fit
+from experiments.fit import Recipe, command
 
 
 def test_the_mean_loss_since_the_last_checkpoint_is_said_and_logged(tmp_path, capsys):
@@ -18,10 +18,10 @@ def test_the_mean_loss_since_the_last_checkpoint_is_said_and_logged(tmp_path, ca
         for step in range(start, 5):
             yield 0 * network.weight.sum() + step
 
-    fit(network, losses, tmp_path / "views", steps=5, rate=1e-3, save=2)
-    log = [json.loads(line) for line in (tmp_path / "views" / "log.jsonl").read_text().splitlines()]
+    Recipe(out=tmp_path, steps=5, batch=1, side=8, save=2).train(network, losses)
+    log = [json.loads(line) for line in (tmp_path / "training" / "log.jsonl").read_text().splitlines()]
     assert log == [{"step": step, "mean loss": mean} for step, mean in ((2, 0.5), (4, 2.5), (5, 4.0))]
-    assert "views: step 4 of 5, mean loss 2.5000\n" in capsys.readouterr().out
+    assert "training: step 4 of 5, mean loss 2.5000\n" in capsys.readouterr().out
 
 
 def test_a_run_that_stopped_goes_on_exactly(tmp_path):
@@ -34,13 +34,14 @@ def test_a_run_that_stopped_goes_on_exactly(tmp_path):
                 yield (network(torch.full((1, 3), step + 1.0)) - step).square().sum()
             raise KeyboardInterrupt
 
-        return fit(network, losses, out, steps=6, rate=1e-2, save=2).weight
+        Recipe(out=out, steps=6, batch=1, side=8, rate=1e-2, save=2).train(network, losses)
+        return network.weight
 
     whole = run(tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "parts", until=5)
     assert torch.equal(run(tmp_path / "parts"), whole)
-    log = (tmp_path / "parts" / "log.jsonl").read_text().splitlines()
+    log = (tmp_path / "parts" / "training" / "log.jsonl").read_text().splitlines()
     assert [json.loads(line)["step"] for line in log] == [2, 4, 6]
 
 

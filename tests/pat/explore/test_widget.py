@@ -84,6 +84,9 @@ def test_what_is_wrong_is_said_in_the_picture():
     assert "nobody" in explore(small_rig(), alpha="nobody").answer["error"]
     assert "nothing" in explore(small_rig(), network="nothing").answer["error"]
     assert "infinity" in explore(small_rig(), x=(float("inf"), 0)).answer["error"]
+    assert "error" in explore(small_rig(), moved=0.1).answer
+    problem = explore(small_rig(), weights="nothing").answer["betas"]["b"]["problem"]
+    assert problem.startswith("no weights 'nothing'")
     for image in (torch.rand(80, 120), torch.ones(3, 80, 120, dtype=torch.uint8)):
         with pytest.raises(ValueError, match=r"'a' is .*wanted float32"):
             ExplorerScene(small_rig(), {"a": image, "b": image})

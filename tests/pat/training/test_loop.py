@@ -26,7 +26,7 @@ from pat.training.config import TrainConfig, save_config
 from pat.training.loop import rate_at, train
 from pat.training.losses import Objective, validation
 from pat.training.processes import Process
-from pat.training.samples import made_ahead, scenes
+from pat.training.samples import SampleSource, made_ahead, scenes
 
 from .runs import SMALL, losses, short_run
 
@@ -213,7 +213,7 @@ def test_groups_must_be_shared_evenly():
 
 def test_a_sample_that_is_not_finite_is_named_and_saved(folder, whole, monkeypatch):
     config = replace(whole, out=folder / "nan")
-    ordinary = loop.SampleSource.sample
+    ordinary = SampleSource.sample
 
     def poisoned(self, planned, step, group):
         given = ordinary(self, planned, step, group)
@@ -221,7 +221,7 @@ def test_a_sample_that_is_not_finite_is_named_and_saved(folder, whole, monkeypat
             given.ground_truth[1, :, 5, 5] = torch.nan
         return given
 
-    monkeypatch.setattr(loop.SampleSource, "sample", poisoned)
+    monkeypatch.setattr(SampleSource, "sample", poisoned)
     with pytest.raises(FloatingPointError, match=r"step 5: .*, by sample 1 of group 1; "):
         train(config)
     (file,) = config.out.glob("offending-*")
