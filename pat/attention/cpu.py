@@ -129,18 +129,18 @@ def _new(*shape: int, dtype: torch.dtype) -> Tensor:
     return torch.from_numpy(np.empty(math.prod(shape) * dtype.itemsize, np.uint8)).view(dtype).view(shape)
 
 
-def _geometry(inputs: AttentionInputs) -> kernels.Geometry:
-    query, positions = inputs.query, inputs.positions
-    h, w = inputs.key.shape[2:]
-    number = np.float64 if accumulated(query) == torch.float64 else np.float32
+def _call(inputs: AttentionInputs) -> kernels.Call:
+    query, key, value, positions, bias, nearest = inputs
+    counted, (h, w) = accumulated(query), key.shape[2:]
+    number = np.float64 if counted == torch.float64 else np.float32
     fractions = pad(sample_fractions(positions.samples, like=positions.points), (0, kernels.LANES))
-    return kernels.Geometry(
+    geometry = kernels.Geometry(
         points=_flat(positions.points.contiguous()),
         mask=_flat(positions.mask.contiguous().view(torch.uint8)),
         fractions=_flat(fractions),
         samples=positions.samples,
         straight=positions.straight,
-        nearest=inputs.nearest,
+        nearest=nearest,
         alpha_pixels=query.shape[2] * query.shape[3],
         shared=positions.points.shape[0] == 1,
         height=h,
@@ -149,15 +149,10 @@ def _geometry(inputs: AttentionInputs) -> kernels.Geometry:
         last_y=number(h - 1),
         slack=number(EDGE_SLACK),
     )
-
-
-def _call(inputs: AttentionInputs) -> kernels.Call:
-    query, _, value, _, bias, _ = inputs
-    counted = accumulated(query)
-    images = [_flat(channels_last(image.to(counted))) for image in inputs[:3]]
+    images = [_flat(channels_last(image.to(counted))) for image in (query, key, value)]
     return kernels.Call(
         *images,  # type: ignore[arg-type]
-        geometry=_geometry(inputs),
+        geometry=geometry,
         bias=_flat(query.new_empty(0, dtype=counted) if bias is None else bias.to(counted).contiguous()),
         biased=bias is not None,
         channels=query.shape[1],

@@ -91,18 +91,13 @@ def attend(inputs: AttentionInputs) -> Attended:
     with torch.autocast(query.device.type, enabled=False):
         key, value = (channels_last(plane.to(counted)) for plane in (inputs.key, inputs.value))
         biases = [] if bias is None else [bias]
-        rows = _rows_at_once(query, key, value, positions.samples)
+        channels = key.shape[-1] + value.shape[-1]
+        row_bytes = 2 * query[:, 0, 0].numel() * positions.samples * channels * key.element_size()
+        rows = max(1, BAND_BYTES // max(1, row_bytes))
         tensors = query.permute(0, 2, 3, 1), positions.points, positions.mask, *biases
         out = Attended(*chunked(band, *tensors, rows=rows, axis=1))
     value = out.value.to(query.dtype).permute(0, 3, 1, 2)
     return Attended(value, out.position.permute(0, 3, 1, 2), out.deviation, out.peak)
-
-
-def _rows_at_once(query: Tensor, key: Tensor, value: Tensor, samples: int) -> int:
-    """How many rows of alpha gather no more than `BAND_BYTES`."""
-    channels = key.shape[-1] + value.shape[-1]
-    row_bytes = 2 * query.shape[0] * query.shape[3] * samples * channels * key.element_size()
-    return max(1, BAND_BYTES // max(1, row_bytes))
 
 
 def accumulated(tensor: Tensor) -> torch.dtype:
