@@ -17,10 +17,11 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from arraygeom.fields import Local
+from arraygeom.sampling import SLACK
 from arraygeom.segments import sample_fractions
 from arraygeom.threads import in_parallel, threads
 from pat.attention import kernels
-from pat.attention.reference import EDGE_SLACK, AttentionInputs, accumulated, channels_last
+from pat.attention.reference import AttentionInputs, accumulated, channels_last
 
 PIECE_SAMPLES = 2**15
 """Samples that a thread takes at a time: a fraction of a millisecond."""
@@ -147,7 +148,7 @@ def _call(inputs: AttentionInputs) -> kernels.Call:
         width=w,
         last_x=number(w - 1),
         last_y=number(h - 1),
-        slack=number(EDGE_SLACK),
+        slack=number(SLACK),
     )
     images = [_flat(channels_last(image.to(counted))) for image in (query, key, value)]
     return kernels.Call(
