@@ -164,10 +164,10 @@ def fitted(found: Sequence[Judged], *, steps: int = STEPS) -> CertaintyNetwork:
             loss.backward()
             optimizer.step()
             schedule.step()
-    first = network.first
+    weight, bias = network[0].parameters()
     with torch.no_grad():  # of numbers as they are
-        first.weight /= spread
-        first.bias -= first.weight @ middle
+        weight /= spread
+        bias -= weight @ middle
     return network.eval().requires_grad_(False)
 
 
@@ -184,7 +184,8 @@ def widened(found: Sequence[Judged], *, steps: int = STEPS) -> CertaintyNetwork:
     were fitted to."""
     stating, network = by_thirds(found, steps=steps), fitted(found, steps=steps)
     share = torch.cat([one.error / stating(one).half_width for one in found]).quantile(SETTINGS.covered)
-    network.last.bias[1] += share.log()
+    _, bias = network[-1].parameters()
+    bias[1] += share.log()
     return network
 
 

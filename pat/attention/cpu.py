@@ -17,10 +17,11 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from arraygeom.fields import Local
+from arraygeom.sampling import SLACK
 from arraygeom.segments import sample_fractions
 from arraygeom.threads import in_parallel, threads
 from pat.attention import kernels
-from pat.attention.reference import EDGE_SLACK, AttentionInputs, accumulated, channels_last
+from pat.attention.reference import AttentionInputs, accumulated, channels_last
 
 PIECE_SAMPLES = 2**15
 """Samples that a thread takes at a time: a fraction of a millisecond."""
@@ -129,35 +130,30 @@ def _new(*shape: int, dtype: torch.dtype) -> Tensor:
     return torch.from_numpy(np.empty(math.prod(shape) * dtype.itemsize, np.uint8)).view(dtype).view(shape)
 
 
-def _geometry(inputs: AttentionInputs) -> kernels.Geometry:
-    query, positions = inputs.query, inputs.positions
-    h, w = inputs.key.shape[2:]
-    number = np.float64 if accumulated(query) == torch.float64 else np.float32
+def _call(inputs: AttentionInputs) -> kernels.Call:
+    query, key, value, positions, bias, nearest = inputs
+    counted, (h, w) = accumulated(query), key.shape[2:]
+    number = np.float64 if counted == torch.float64 else np.float32
     fractions = pad(sample_fractions(positions.samples, like=positions.points), (0, kernels.LANES))
-    return kernels.Geometry(
+    geometry = kernels.Geometry(
         points=_flat(positions.points.contiguous()),
         mask=_flat(positions.mask.contiguous().view(torch.uint8)),
         fractions=_flat(fractions),
         samples=positions.samples,
         straight=positions.straight,
-        nearest=inputs.nearest,
+        nearest=nearest,
         alpha_pixels=query.shape[2] * query.shape[3],
         shared=positions.points.shape[0] == 1,
         height=h,
         width=w,
         last_x=number(w - 1),
         last_y=number(h - 1),
-        slack=number(EDGE_SLACK),
+        slack=number(SLACK),
     )
-
-
-def _call(inputs: AttentionInputs) -> kernels.Call:
-    query, _, value, _, bias, _ = inputs
-    counted = accumulated(query)
-    images = [_flat(channels_last(image.to(counted))) for image in inputs[:3]]
+    images = [_flat(channels_last(image.to(counted))) for image in (query, key, value)]
     return kernels.Call(
         *images,  # type: ignore[arg-type]
-        geometry=_geometry(inputs),
+        geometry=geometry,
         bias=_flat(query.new_empty(0, dtype=counted) if bias is None else bias.to(counted).contiguous()),
         biased=bias is not None,
         channels=query.shape[1],

@@ -21,8 +21,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from arraygeom.sampling import SLACK as EDGE_SLACK
 from arraygeom.segments import sample_fractions
-from pat.attention.reference import EDGE_SLACK, LEAST_DEVIATION, AttentionInputs, accumulated, channels_last
+from pat.attention.reference import LEAST_DEVIATION, AttentionInputs, accumulated, channels_last
 
 PIXELS = 8
 """Alpha pixels of one program."""

@@ -20,11 +20,10 @@ import torch
 from torch import Tensor
 
 from arraygeom.chunks import chunked
+from arraygeom.sampling import on_image
 from arraygeom.segments import sample_fractions
 
 BAND_BYTES = 2**27
-EDGE_SLACK = 1e-3
-"""Samples this far (pixels) off the image's area still count: rounding puts clipped ends there."""
 LEAST_DEVIATION = 1e-4
 """A deviation (pixels) below this reads 0: it is rounding, and its derivative noise."""
 
@@ -91,18 +90,13 @@ def attend(inputs: AttentionInputs) -> Attended:
     with torch.autocast(query.device.type, enabled=False):
         key, value = (channels_last(plane.to(counted)) for plane in (inputs.key, inputs.value))
         biases = [] if bias is None else [bias]
-        rows = _rows_at_once(query, key, value, positions.samples)
+        channels = key.shape[-1] + value.shape[-1]
+        row_bytes = 2 * query[:, 0, 0].numel() * positions.samples * channels * key.element_size()
+        rows = max(1, BAND_BYTES // max(1, row_bytes))
         tensors = query.permute(0, 2, 3, 1), positions.points, positions.mask, *biases
         out = Attended(*chunked(band, *tensors, rows=rows, axis=1))
     value = out.value.to(query.dtype).permute(0, 3, 1, 2)
     return Attended(value, out.position.permute(0, 3, 1, 2), out.deviation, out.peak)
-
-
-def _rows_at_once(query: Tensor, key: Tensor, value: Tensor, samples: int) -> int:
-    """How many rows of alpha gather no more than `BAND_BYTES`."""
-    channels = key.shape[-1] + value.shape[-1]
-    row_bytes = 2 * query.shape[0] * query.shape[3] * samples * channels * key.element_size()
-    return max(1, BAND_BYTES // max(1, row_bytes))
 
 
 def accumulated(tensor: Tensor) -> torch.dtype:
@@ -120,7 +114,7 @@ def _band(inputs: AttentionInputs) -> Attended:
     q, key, value, positions, bias, nearest = inputs
     b, r, w, _ = q.shape
     xy = positions.positions().to(q.dtype)  # p r w l 2
-    counts = positions.mask & on_image(xy, hw=key.shape[1:3])  # p r w l
+    counts = positions.mask & on_image(xy, (key.shape[1], key.shape[2]))  # p r w l
     xy = torch.where(counts[..., None], xy, 0).expand(b, r, w, positions.samples, 2)
     at = _nearest if nearest else _bilinear
 
@@ -130,12 +124,6 @@ def _band(inputs: AttentionInputs) -> Attended:
     weight = _softmax(score, counts)
     out = torch.einsum("brwl,brwld->brwd", weight, at(value, xy))
     return Attended(out, *_statistics(weight, xy))
-
-
-def on_image(xy: Tensor, *, hw: tuple[int, int] | torch.Size) -> Tensor:
-    """Whether (..., 2) points lie on the image's area, half a pixel beyond the border's centres."""
-    last = xy.new_tensor([hw[1] - 0.5, hw[0] - 0.5]) + EDGE_SLACK
-    return ((xy >= -0.5 - EDGE_SLACK) & (xy <= last)).all(-1)
 
 
 def _nearest(image: Tensor, xy: Tensor) -> Tensor:

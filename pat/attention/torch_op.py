@@ -114,7 +114,8 @@ def _attend_backward(*given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tenso
 def _(query, key, value, points, mask, bias, statistics, logsum, *rest):
     wanted = rest[-1]
     images = (
-        _channels_last_like(t) if want else t.new_empty(0) for t, want in zip((query, key, value), wanted)
+        t.new_empty(len(t), *t.shape[2:], t.shape[1]).permute(0, 3, 1, 2) if want else t.new_empty(0)
+        for t, want in zip((query, key, value), wanted)
     )
     weights = (*logsum.shape, rest[2])
     return (
@@ -122,11 +123,6 @@ def _(query, key, value, points, mask, bias, statistics, logsum, *rest):
         torch.empty_like(points, memory_format=torch.contiguous_format) if wanted[3] else points.new_empty(0),
         points.new_empty(weights if wanted[4] else 0),
     )
-
-
-def _channels_last_like(image: Tensor) -> Tensor:
-    b, d, h, w = image.shape
-    return image.new_empty(b, h, w, d).permute(0, 3, 1, 2)
 
 
 def _keep(ctx, inputs, output) -> None:

@@ -220,16 +220,21 @@ def align(
         done = fused_in_tiles(network, inputs, matches, plan.tiles, progress=progress)
         warn_of_confidence(network, done.frame, inputs)
         depths = undone(done.frame, undo).depth
-        aligned = {alpha: _of_alpha(rig, alpha, own)}
+        values, hw = _as_array(own[alpha], alpha, rig[alpha].hw), rig[alpha].hw
+        planes = pixel_grid(hw).numpy(), np.full(hw, SEEN, np.uint8), np.ones(hw, np.float32)
+        names, response_of = _band_names(alpha, len(values)), rig[alpha].sensor.response
+        aligned = {alpha: AlignedView(values, *planes, names, response_of)}
         for i, name in enumerate(betas):
             LOG.info("aligning %s", name)
             place = inputs.placements[i]
             located = _located(inputs, i, matches.betas[i], rig[alpha])
-            confidence = _at_pixels(done.found[i, 2:], place.pair.alpha, rig[alpha])[0]
-            seen = confidence >= min_confidence
-            aligned[name] = _aligned_view(
-                rig[name], name, place, located, confidence, seen, own[name], interpolation, fill
-            )
+            confidence, pinhole = done.found[i, 2:], place.pair.alpha
+            if _is_undistorted(rig[alpha], pinhole):  # 0 where the pinhole view has none
+                assert isinstance(pinhole, LensView)
+                confidence = resampled(confidence, pinhole, rig[alpha], interpolation="bilinear").values[0]
+            values = _as_array(own[name], name, rig[name].hw)
+            how = min_confidence, interpolation, fill
+            aligned[name] = _aligned_view(rig[name], name, place, located, confidence[0], values, *how)
     return Aligned(alpha, aligned, depths.cpu().numpy())
 
 
@@ -279,29 +284,21 @@ def _between_pixels(disparity: Float[Tensor, "1 h w"], x: Float[Tensor, "h2 w2 2
     return torch.where((smooth - nearest).abs() < SMOOTH, smooth, nearest)
 
 
-def _at_pixels(plane: Float[Tensor, "1 h w"], pinhole: View, recorded: View) -> Float[Tensor, "1 h2 w2"]:
-    """A plane at alpha's recorded pixels; 0 where its pinhole view has none."""
-    if not _is_undistorted(recorded, pinhole):
-        return plane
-    assert isinstance(pinhole, LensView)
-    return resampled(plane, pinhole, recorded, interpolation="bilinear").values[0]
-
-
 def _aligned_view(
     camera: LensView,
     name: str,
     place: Placement,
     located: tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]],
     confidence: Float[Tensor, "h w"],
-    seen: Bool[Tensor, "h w"],
-    values: Any,
+    values: NDArray[Any],
+    min_confidence: float,
     interpolation: Resampling,
     fill: Fill,
 ) -> AlignedView:
-    values, now = _as_array(values, name, camera.hw), place.pair.beta
+    now = place.pair.beta
     assert isinstance(now, LensView)
     where, valid = chunked(lambda x: recorded_pixels(x, now, camera), located[0].double(), axis=0)
-    where, confidence = where.float().cpu(), confidence.float().cpu()
+    where, confidence, seen = where.float().cpu(), confidence.float().cpu(), confidence >= min_confidence
     inside, seen = (located[1] & valid).cpu() & on_image(where, camera.hw), seen.cpu()
     visibility = torch.where(inside, torch.where(seen, SEEN, OCCLUDED), OUTSIDE).to(torch.uint8).numpy()
     taken = filled(resampled_values(values, where.numpy(), interpolation), visibility == SEEN, fill)
@@ -313,14 +310,6 @@ def _aligned_view(
         _band_names(name, len(values)),
         camera.sensor.response,
     )
-
-
-def _of_alpha(rig: Rig, name: str, recorded: Recorded) -> AlignedView:
-    """Alpha's own values, each at its own pixel."""
-    hw = rig[name].hw
-    values = _as_array(recorded[name], name, hw)
-    planes = pixel_grid(hw).numpy(), np.full(hw, SEEN, np.uint8), np.ones(hw, np.float32)
-    return AlignedView(values, *planes, _band_names(name, len(values)), rig[name].sensor.response)
 
 
 def _as_array(values: Any, name: str, hw: tuple[int, int]) -> NDArray[Any]:

@@ -25,8 +25,6 @@ Measured on Middlebury's tune half: with the sign of the baseline changed, or be
 pairs had .05 to .24, 32 of them below .16; the same with the right rig .61 to .88, with beta reduced eight
 times .27 to .55, and with 50 electrons from .23.
 """
-
-
 PLAIN_NOISE = 4 / 255
 """The standard deviation from which noise is named as a reason."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -52,15 +51,6 @@ def _within(
     return torch.where(beyond[..., None], moved, where)
 
 
-class FoundDepth(NamedTuple):
-    """Depth (h, w), NaN where unknown, the half-width of the interval of inverse depth as of `Frame`, and the
-    image's confidence."""
-
-    depth: Tensor
-    half_width: Tensor
-    confidence: Tensor
-
-
 def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> FusionOutput:
     """A network's result with the certainty of the matches it was given, where that is known, for its own.
 
@@ -84,15 +74,16 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
 
 def measured_depth(
     output: FusionOutput, part: Inputs, placements: list[Placement], hw: HW, corner: tuple[int, int]
-) -> FoundDepth:
-    """Depth from the calibrated betas, weighted by confidence in inverse depth, with its interval.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Depth (h, w) from the calibrated betas, weighted by confidence in inverse depth, NaN where unknown; the
+    half-width of its interval, as of `Frame`; and the image's confidence.
 
     A position whose depth is beyond the bounds that were searched counts as the end of its segment: a pixel
     beyond the far end may otherwise stand for any distance. `corner` is the (x, y) of the part's first pixel
     in alpha; `hw` the size of the part without padding.
     """
 
-    def of_rows(tile: Tile) -> FoundDepth:
+    def of_rows(tile: Tile) -> tuple[Tensor, ...]:
         (top, bottom), (left, above) = tile.inner, corner
         box = top, bottom, 0, hw[1]
         betas = tuple(replace(beta, field=beta.field.cut(box)) for beta in part.betas)
@@ -100,7 +91,7 @@ def measured_depth(
 
     tiles = list(tiles_of(hw[:1], ROWS, 0))
     made = in_order(of_rows, tiles) if output.image.device.type == "cpu" else map(of_rows, tiles)
-    return FoundDepth(*assembled(hw[:1], zip(tiles, made), axes=[-2]))
+    return assembled(hw[:1], zip(tiles, made), axes=[-2])
 
 
 def _measured(
@@ -109,7 +100,7 @@ def _measured(
     placements: list[Placement],
     hw: HW,
     corner: tuple[int, int],
-) -> FoundDepth:
+) -> tuple[Tensor, ...]:
     """`measured_depth` of some rows."""
     h, w = hw
     like = output.position[0]
@@ -145,4 +136,4 @@ def _measured(
     depth = torch.where(known, weights / torch.where(known, total, 1.0), torch.nan)
     overall = torch.stack(output.confidence).amin(0) if output.overall is None else output.overall
     half_width = torch.where(known, widths / torch.where(known, weights, 1.0), torch.nan)
-    return FoundDepth(depth.to(output.image), half_width.to(output.image), overall[0, :h, :w])
+    return depth.to(output.image), half_width.to(output.image), overall[0, :h, :w]

@@ -188,8 +188,7 @@ def _tagged_rig(files: Mapping[str, Path], note: Say) -> Rig | None:
     """The rig that the images' tags state, but for translations; None if not every image has such tags."""
     if not states_cameras(list(files.values())):
         return None
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as caught:
         rig = rig_of_images(files)
     note(f"lenses and orientations of {', '.join(files)}: by the images' tags")
     for warning in caught:
@@ -336,8 +335,7 @@ def _refined(
     bands = len(small[beta])
     link = links.get((alpha, beta))
     rig = resized_rig(pair.rig if link is None else pair.rig.replace(links={(alpha, beta): link}), small)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         network = network if network.bands in (None, bands) else load_weights(weights_for([bands]))
         LOG.info("coarse fusion of %s and %s", alpha, beta)
         frame = fuse(network, rig, small, alpha=alpha, align=False, response="rec601")
@@ -373,8 +371,7 @@ def scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 
 
 
 def _read(name: str, path: Path, note: Say) -> Float[Tensor, "c h w"]:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as caught:
         image = read_image(path, name=name)
     for warning in caught:
         rotated = "orientation tag" in str(warning.message)

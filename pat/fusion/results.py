@@ -37,15 +37,10 @@ MOST = 65535
 
 ImageFormat = Literal["png", "tif", "exr"]
 
-
 FOUND_RIG = "found_rig.yaml"
 """The rig that was found from images. Not rig.yaml, which may be one that somebody wrote."""
-
-
 HEALED_RIG = "healed_rig.yaml"
 """A given rig as its images have it."""
-
-
 RESULT = re.compile(
     r"(.*_)?((fused|confidence)(_.*)?|depth(_16|_nearest|_farthest)?)\.(png|tif|exr|mp4)"
     r"|(view|settings)\.yaml|inputs\.json"

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from safetensors.torch import load_file
@@ -16,7 +16,6 @@ from torch import Tensor, nn
 
 from arraygeom import pixel_grid
 from arraygeom.chunks import Box, Tile, area, assembled, sides_by_work, tiles_of, whole
-from arraygeom.pixels import HW
 from arraygeom.threads import convolutions_in_parallel
 
 from ..matching.inputs import Inputs
@@ -258,23 +257,18 @@ def fused_in_tiles(
 
 
 def _digest(network: FusionNetwork, frame: FrameInputs) -> str:
-    """Of all that a frame's tiles depend on."""
+    """Of all that a frame's tiles depend on; of fields of positions, those of some pixels."""
     inputs = frame.inputs
     how = type(network).__name__, FusedTile._fields, inputs.luminance, inputs.bands, inputs.sees_luma
     module = network if isinstance(network, nn.Module) else nn.Module()
     rounded = [name for name, part in module.named_modules() if "forward" in vars(part)]  # by `in_bfloat16`
     digest = hashlib.sha256(f"{how} {rounded}".encode())
     parameters = module.state_dict().values()
-    fields = [tensor for beta in inputs.betas for tensor in _tensors(beta.field, inputs.hw)]
+    some = pixel_grid(inputs.hw, dtype=torch.float64)[::64, ::64].reshape(-1, 2)
+    found = [b.field.at(some) if b.field.pixels is None else b.field.pixels for b in inputs.betas]
+    fields = [tensor for one in found for tensor in vars(one).values()]
     cameras = [camera for place in frame.placements if place.pair.calibrated for camera in place.pair.cameras]
     poses = [tensor for camera in cameras for tensor in (camera.K, camera.R, camera.t)]
     for tensor in (*parameters, inputs.alpha, *(b.image for b in inputs.betas), *fields, *poses):
         digest.update(tensor.detach().cpu().contiguous().numpy())
     return digest.hexdigest()[:16]
-
-
-def _tensors(field: Any, hw: HW) -> list[Tensor]:
-    """The segments of a field, which may be known pixel by pixel; of one of positions a few."""
-    if field.pixels is not None:
-        return list(vars(field.pixels).values())
-    return list(vars(field.at(pixel_grid(hw, dtype=torch.float64)[::64, ::64].reshape(-1, 2))).values())

@@ -110,7 +110,6 @@ def innermost(field: ReceptiveField | None) -> ReceptiveField | None:
 
 LARGEST_VALUE = 32.0
 """Of an image in 0..1: developed short exposures exceed 1, and those of 8 bits have values to 255."""
-
 SMALLEST_VALUE = -0.25
 """Of an image in 0..1: noise goes below 0, and images as many networks take them, of mean 0, far below."""
 

@@ -13,7 +13,6 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import cast
 
 import cv2
 import numpy as np
@@ -57,16 +56,6 @@ class CertaintyNetwork(nn.Sequential):
         width = SETTINGS.width
         first, middle, last = nn.Linear(MEASURED, width), nn.Linear(width, width), nn.Linear(width, 2)
         super().__init__(first, nn.SiLU(), middle, nn.SiLU(), last)
-
-    @property
-    def first(self) -> nn.Linear:
-        """The layer that takes the numbers."""
-        return cast(nn.Linear, self[0])
-
-    @property
-    def last(self) -> nn.Linear:
-        """The layer that gives logit and logarithm."""
-        return cast(nn.Linear, self[-1])
 
 
 @cache

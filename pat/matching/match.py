@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -14,7 +13,6 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments
 
-from ..support.settings import size
 from .certainty import with_certainty
 from .choice import Choice, chosen
 from .colour_transfer import transferred
@@ -24,20 +22,12 @@ from .multiview import agreed
 from .normalisation import Comparison
 from .positions import FINE, at_matches, reduced
 from .semi_global import HalfSizeMatches, matched_at_half_size
+from .spectral_mix import SETTINGS as MIX
 from .spectral_mix import SpectralMix
 from .subpixel import following, matched_at_full_size
 
 LOG = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True)
-class MatchSettings:
-    """Of matching as a whole."""
-
-    coarsely: int = size(400_000, "Alpha's pixels at most on which the bands' combination is found")
-
-
-SETTINGS = MatchSettings()
 
 Matcher = Callable[[Inputs], Matches]
 """What `fuse` asks for matches of inputs, sides whole multiples of `inputs.multiple`: `match` or yours."""
@@ -101,7 +91,7 @@ def seen_mix(inputs: Inputs) -> SpectralMix | None:
     if inputs.bands is not None or beta.image.shape[1] == 1:
         return None
     factor = FINE
-    while factor < inputs.multiple // FINE and math.prod(inputs.hw) > SETTINGS.coarsely * factor**2:
+    while factor < inputs.multiple // FINE and math.prod(inputs.hw) > MIX.coarsely * factor**2:
         factor *= 2
     segments, blocks = (beta.field.of_blocks(side) for side in (factor, FINE * factor))
     return coarse_mix(alpha, beta.image, segments, blocks, factor)

@@ -10,6 +10,7 @@ fused image is sheared back.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import attrgetter, itemgetter
 from typing import Literal, NamedTuple
@@ -144,18 +145,21 @@ Given = Literal["fit", "rec601"] | tuple[float, float, float] | Response
 """What is known of alpha's response: its weights of red, green and blue, or that it is to be fitted."""
 
 
+def stated_response(weights: Sequence[float]) -> Response:
+    """The response of an alpha that is weights . beta. Raises ValueError unless three, none negative."""
+    values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
+    if values.shape != (3,) or not bool((values >= 0).all() & (values.sum() > 0) & values.isfinite().all()):
+        given = tuple(weights)
+        raise ValueError(f"a response is three weights, of red, green and blue, none negative; got {given}")
+    return Response(values / values.sum(), gain=float(values.sum()))
+
+
 def given_response(given: Given) -> Response:
     """The response that is given, Rec. 601's if it is to be fitted. Raises ValueError for what is none."""
     if isinstance(given, Response):
         return given
     if not isinstance(given, str):
-        weights = torch.tensor([float(w) for w in given], dtype=torch.float64)
-        total = weights.sum()
-        if weights.shape != (3,) or not bool((weights >= 0).all() & (total > 0) & total.isfinite()):
-            raise ValueError(
-                f"a response is three weights, of red, green and blue, none negative; got {tuple(given)}"
-            )
-        return Response(weights / total, gain=float(total))
+        return stated_response(given)
     if given not in ("fit", "rec601"):
         raise ValueError(f"response is 'fit', 'rec601' or three weights; got {given!r}")
     return Response.rec601()

@@ -38,6 +38,7 @@ class MixSettings:
         "the combination varies as much as alpha, "
         "as if no less than this share of alpha's variance were explained",
     )
+    coarsely: int = size(400_000, "Alpha's pixels at most on which the combination is found")
     wide: int = size(4, "The image's longer side over the radius in which bands are compared")
 
 

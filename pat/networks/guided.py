@@ -44,8 +44,7 @@ class GuidedSettings:
     least_weight: float = size(1e-3, "The least weight of a pixel in propagation")
     alike: float = tuned(
         2.0,
-        "Middlebury, tune half: added to the logit of the confidence where beta is as bright as alpha, when "
-        "colour is blended",
+        "Middlebury, tune half: added to confidence's logit where beta is as bright, when colour is blended",
     )
     nowhere: float = size(-10.0, "The logit of the confidence where there is no valid segment")
 

@@ -39,9 +39,7 @@ class RecallSettings:
     distance: float = tuned(10.0, "Middlebury, tune half: pixels at which the weight falls to 1 / e")
     certainty: int = tuned(3, "Middlebury, tune half: power of confidence, squared, that pixels count by")
     share: float = tuned(
-        0.5,
-        "Middlebury, tune half: of what no beta sees, so much is by example; of what is doubtful, so much "
-        "is smoothed in the end",
+        0.5, "Middlebury, tune half: of what no beta sees, by example; of what is doubtful, smoothed"
     )
     least_weight: float = size(1e-3, "The least weight of a pixel")
     side: int = size(17, "A pixel looks at so many in each row and column")

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from arraygeom.chunks import spans
@@ -144,14 +144,6 @@ def _made(of: Conv2d) -> Packed:
     return Packed(weights, steps, torch.zeros_like(steps, dtype=torch.long), step, zero)
 
 
-def multiplied(x: UInt8[Tensor, "1 i h w"], of: Conv2d, by: Packed) -> Float[Tensor, "1 o h2 w2"]:
-    """The convolution of an image in 8 bits, without more around it."""
-    shape = list(of.stride), [0, 0], list(of.dilation), of.groups
-    inputs, weights = (x, by.step, by.zero), (by.weights, by.steps, by.zeros)
-    numbers, then = (1.0, 0, torch.float32), ("none", (), "")
-    return torch.ops.onednn.qconv2d_pointwise(*inputs, *weights, of.bias, *shape, *numbers, *then)
-
-
 def in_eight_bits(x: Float[Tensor, "b i h w"], of: Conv2d, by: Packed) -> Float[Tensor, "b o h2 w2"]:
     """The convolution of images, of a large one in strips of rows on all threads."""
     assert isinstance(of.padding, tuple)
@@ -161,6 +153,7 @@ def in_eight_bits(x: Float[Tensor, "b i h w"], of: Conv2d, by: Packed) -> Float[
     height, width = (x.shape[2] + 2 * above - tall) // down + 1, (columns - wide) // across + 1
     large = of.weight.numel() * height * width >= WORTH_STRIPS
     rows = math.ceil(height / (STRIPS * threads())) if large and threads() > 1 else height
+    how = list(of.stride), [0, 0], list(of.dilation), of.groups, 1.0, 0, torch.float32, "none", (), ""
     parts = [
         (image, *span) for image in x.movedim(1, -1).contiguous().numpy() for span in spans(height, rows)
     ]
@@ -169,7 +162,8 @@ def in_eight_bits(x: Float[Tensor, "b i h w"], of: Conv2d, by: Packed) -> Float[
         shape = 1, (last - first - 1) * down + tall, columns, x.shape[1]
         given = torch.empty(shape, dtype=torch.uint8, device=x.device)
         kernels.rounded(image, first * down - above, left, 1 / by.step, by.zero, given.numpy()[0])
-        return multiplied(given.movedim(-1, 1), of, by)
+        inputs, weights = (given.movedim(-1, 1), by.step, by.zero), (by.weights, by.steps, by.zeros, of.bias)
+        return torch.ops.onednn.qconv2d_pointwise(*inputs, *weights, *how)
 
     if len(parts) == 1:
         return strip(*parts[0])

@@ -202,3 +202,9 @@ def test_parts_stay_in_the_thread_that_torch_has_to_see(two_threads):
     with torch_in_one_thread():  # else what it computes would have one thread
         assert set(in_order(lambda _: threading.get_ident(), range(1))) == {here}
     assert set(in_order(lambda _: threading.get_ident(), range(4))) == {here}
+
+
+@pytest.mark.parametrize("most", [None, 1])
+def test_what_tasks_give_comes_back_in_their_order(monkeypatch, most):
+    monkeypatch.setattr("arraygeom.threads.threads", lambda: 3)
+    assert in_parallel([lambda i=i: i * i for i in range(20)], most=most) == [i * i for i in range(20)]

@@ -18,7 +18,6 @@ from .vectors import (
     fold_row,
     from_index,
     gather_row,
-    load_narrow,
     load_row,
     nothing_narrow,
     splat,
@@ -86,7 +85,7 @@ def _inner_products_of_rest(x, rows, first, last, image, channels, first_channel
         starts = rows[t] * channels, rows[t + 1] * channels, rows[t + 2] * channels, rows[t + 3] * channels
         totals = extend_row((nothing_narrow(x),), TAP_BLOCK)
         for c in range(first_channel, whole, NARROW):
-            totals = fma_row(load_narrow(x, c), gather_row(image, starts, c), totals)
+            totals = fma_row(load_row(x, c, 1, NARROW)[0], gather_row(image, starts, c), totals)
         add_totals(out, t, *totals)
         for c in range(whole, channels):
             for k in range(TAP_BLOCK):

@@ -48,12 +48,6 @@ def load(code, array, i: index):
     return code.get(code.kinds[0], array, i)
 
 
-@instruction(lambda array, i: Vector(array.dtype, NARROW))
-def load_narrow(code, array, i: index):
-    """The narrow vector at an index."""
-    return code.get(code.kinds[0], array, i, NARROW)
-
-
 @instruction(_nothing)
 def store(code, array, i: index, vector):
     """Stores a vector at an index."""

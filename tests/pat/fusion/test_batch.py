@@ -330,6 +330,7 @@ def test_a_plan_in_the_output_folder_cannot_run_code(material, tmp_path, monkeyp
         HomographyDisplacement(12.5),
         Rectified(7.0, alpha_is="either"),
         Widened(ThroughLenses(EpipolarLine(), 64), across=1.5),
+        {"slow": Widened(Epipolar(), along=2.0)},
     ],
 )
 def test_a_plan_comes_back_exactly(material, tmp_path, field):

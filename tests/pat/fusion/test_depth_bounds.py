@@ -76,7 +76,7 @@ def test_bounds_are_those_of_the_field_where_it_has_some(lens, true, depth):
     position, ones = x_beta.movedim(-1, 0)[None], torch.ones(1, *hw, dtype=torch.float64)
     output = FusionOutput(torch.zeros(1, 3, *hw).double(), [position], [ones], [ones])
     inner = (slice(4, 20), slice(16, 48))  # whose segments are not cut by the edge of the image
-    depth = measured_depth(output, found.inputs, found.placements, hw, (0, 0)).depth[inner]
+    depth = measured_depth(output, found.inputs, found.placements, hw, (0, 0))[0][inner]
     wanted = min(max(true, near), far) if true > 0 else far
     torch.testing.assert_close(depth, torch.full_like(depth, wanted), rtol=1e-3, atol=0)
 

@@ -8,7 +8,7 @@ import torch
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
 from pat.matching import radiometry
-from pat.matching.radiometry import KINDS, SETTINGS, Response, fit, given_response
+from pat.matching.radiometry import KINDS, SETTINGS, Response, fit, stated_response
 from pat.media.colour import REC601, luminance
 from pat.networks.weights import load_weights
 from tests.pat.layered_array import ALPHA, BETA, load_sample
@@ -21,7 +21,7 @@ def combined(image, weights=WEIGHTS):
 
 
 @pytest.mark.parametrize(
-    "response", [Response(torch.tensor(WEIGHTS).double()), given_response((0.1, 0.5, 0.6))]
+    "response", [Response(torch.tensor(WEIGHTS).double()), stated_response((0.1, 0.5, 0.6))]
 )
 def test_neutral_stays_neutral_and_luma_becomes_what_alpha_sees(response):
     image = torch.rand(2, 3, 8, 9, dtype=torch.float64)
@@ -206,4 +206,4 @@ def test_fusion_of_another_response():
 @pytest.mark.parametrize("wrong", [(0.5, 0.5), (0.5, -0.1, 0.6), (0.0, 0.0, 0.0), (float("nan"), 1.0, 1.0)])
 def test_wrong_responses_are_refused(wrong):
     with pytest.raises(ValueError, match="three weights, of red, green and blue"):
-        given_response(wrong)
+        stated_response(wrong)
