@@ -321,9 +321,9 @@ class Camera(LensView):
             {(int(h), int(w)) for h, w in zip(camera.height.reshape(-1), camera.width.reshape(-1))}
         )
         if len(sizes) > 1:
-            found = " and ".join(f"{w}x{h}" for h, w in sizes)
+            listed = " and ".join(f"{w}x{h}" for h, w in sizes)
             raise ValueError(
-                f"the cameras of a kornia batch have images of {found}: convert those of each size apart"
+                f"the cameras of a kornia batch have images of {listed}: convert those of each size apart"
             )
         pose = Pose(camera.extrinsics[..., :3, :3], camera.extrinsics[..., :3, 3])
         made = cls(K=camera.intrinsics[..., :3, :3], cam_from_world=pose, hw=sizes[0])

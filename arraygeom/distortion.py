@@ -91,8 +91,8 @@ class Distortion(LensModel):
             raise ValueError(f"unknown lens model {self.model!r}: use one of {', '.join(COEFFICIENT_COUNTS)}")
         counts = COEFFICIENT_COUNTS[self.model]
         if self.coefficients.shape[-1] not in counts:
-            given, wanted = self.coefficients.shape[-1], " or ".join(map(str, counts))
-            raise ValueError(f"{self.model} takes {wanted} coefficients, got {given}: pad with zeros")
+            count, wanted = self.coefficients.shape[-1], " or ".join(map(str, counts))
+            raise ValueError(f"{self.model} takes {wanted} coefficients, got {count}: pad with zeros")
         if checking():
             check_numbers(self.coefficients, self.coefficients.shape[-1:], f"a lens ({self.model})")
 

@@ -136,8 +136,8 @@ def consistent_depth(
     """
     if rig.require(alpha) not in depths:
         raise ValueError(f"there is no depth map of '{alpha}', only of {', '.join(depths)}")
-    for name, given in depths.items():
-        _check_size(f"the depth map of '{name}'", given, rig[name].hw)
+    for name, depth in depths.items():
+        _check_size(f"the depth map of '{name}'", depth, rig[name].hw)
     own = floating(depths[alpha])
     x = pixel_grid(rig[alpha].hw, dtype=own.dtype, device=own.device)
     total, count = own, torch.ones_like(own)
@@ -146,8 +146,8 @@ def consistent_depth(
             continue
         there = _in_beta(rig.pair(alpha, name), own)
         known = torch.where(other.isfinite(), other, 0.0)
-        found, inside = sample(known[None, None].to(own), there.x[None])
-        back = _in_beta(rig.pair(name, alpha), found[0, 0], there.x)
+        sampled, inside = sample(known[None, None].to(own), there.x[None])
+        back = _in_beta(rig.pair(name, alpha), sampled[0, 0], there.x)
         agrees = there.valid & inside[0] & back.valid
         agrees = (
             agrees & ((back.x - x).square().sum(-1) < pixels**2) & ((back.depth - own).abs() < relative * own)

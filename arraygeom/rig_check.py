@@ -155,8 +155,8 @@ def _overlap(pair: Pair) -> bool:
     """Whether the segment of any pixel of a grid reaches beta's image."""
     from .fields.default import recorded_field
 
-    found = recorded_field(pair)(pair, _grid(pair.alpha).to(pair.cameras[0].K))
-    return bool((found.valid if hasattr(found, "valid") else found.mask).any())
+    locations = recorded_field(pair)(pair, _grid(pair.alpha).to(pair.cameras[0].K))
+    return bool((locations.valid if hasattr(locations, "valid") else locations.mask).any())
 
 
 def _of_positions(rig: Rig, pairs: Iterable[tuple[str, str]]) -> Iterator[str]:

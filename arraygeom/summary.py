@@ -111,13 +111,13 @@ def _segments(pair: Pair) -> tuple[float, tuple[float, float] | None]:
     field, most = (Curved(64), MOST_PIXELS // 16) if pair.has_lens else (Epipolar(), MOST_PIXELS)
     step = max(4, math.ceil(math.sqrt(h * w / most)))
     x = pixel_grid((-(-h // step), -(-w // step))) * step
-    found = sampling_locations(field, pair, x)
-    if isinstance(found, Segments):
-        valid, length = found.valid, found.length
+    locations = sampling_locations(field, pair, x)
+    if isinstance(locations, Segments):
+        valid, length = locations.valid, locations.length
     else:
-        counts = found.mask[..., 1:] & found.mask[..., :-1]
-        valid = found.mask.any(-1)
-        length = (found.xy.diff(dim=-2).norm(dim=-1) * counts).sum(-1)
+        counts = locations.mask[..., 1:] & locations.mask[..., :-1]
+        valid = locations.mask.any(-1)
+        length = (locations.xy.diff(dim=-2).norm(dim=-1) * counts).sum(-1)
     if not valid.any():
         return 0.0, None
     return float(valid.float().mean()), (float(length[valid].median()), float(length[valid].max()))

@@ -100,8 +100,8 @@ def _convolved(
     def strip(top: int) -> None:
         bottom = min(top + rows, out.shape[2])
         first = max(top - above, 0)
-        found = torch.conv2d(x[:, :, first : max(bottom - above + seen, first + 1)], weight, *further)
-        out[:, :, top:bottom] = found[:, :, top - first : bottom - first]
+        convolved = torch.conv2d(x[:, :, first : max(bottom - above + seen, first + 1)], weight, *further)
+        out[:, :, top:bottom] = convolved[:, :, top - first : bottom - first]
 
     in_parallel([partial(strip, top) for top in range(0, out.shape[2], rows)])
     return out

@@ -17,14 +17,14 @@ def followed() -> bool:
     return bool(compiled_or_traced or torch._C._len_torch_dispatch_stack() or transformations())
 
 
-def needs_numbers(what: str, *given: Tensor) -> None:
+def needs_numbers(what: str, *tensors: Tensor) -> None:
     """Say why a call cannot be traced: it breaks `torch.compile`'s graph, an error with `fullgraph`.
 
     Raises NotImplementedError for tensors that `torch.func.vmap` has batched.
     """
     if torch.compiler.is_compiling():
         torch._dynamo.graph_break(msg=f"{what} depends on numbers: compute it before compiling")
-    elif any(_is_batched(t) for t in given):
+    elif any(_is_batched(t) for t in tensors):
         raise NotImplementedError(f"{what} depends on numbers, which vmap does not know: use a loop")
 
 

@@ -107,9 +107,9 @@ def depth_of(
     rays, seen = zip(*(c.to(x.dtype).rays(p) for c, p in ((alpha, x), (beta, x_beta))))
     (normalised, ahead), (normalised_beta, ahead_beta) = map(on_plane, rays)
     eye = torch.eye(3).to(pose.R).expand_as(pose.R)
-    found = depth_from_track(track(eye, eye, pose, normalised), normalised_beta)
-    valid = found.valid & seen[0] & seen[1] & ahead & ahead_beta
-    depth = torch.where(valid, found.depth, 0.0)
+    of_track = depth_from_track(track(eye, eye, pose, normalised), normalised_beta)
+    valid = of_track.valid & seen[0] & seen[1] & ahead & ahead_beta
+    depth = torch.where(valid, of_track.depth, 0.0)
     sigma = torch.zeros_like(depth) if deviation is None else deviation
     return Depth(depth, torch.where(valid, sigma * _metres_per_pixel(pair, x, depth, valid), 0.0), valid)
 

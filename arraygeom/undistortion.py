@@ -59,8 +59,8 @@ def pixels_between(
     rays, valid = target.rays(x)
     if isinstance(source, Camera) and isinstance(target, Camera):
         rays = rays @ (source.R @ target.R.mT).mT
-    found = source.project_local(rays)
-    return found.x, valid & found.valid & source.contains(found.x)
+    projected = source.project_local(rays)
+    return projected.x, valid & projected.valid & source.contains(projected.x)
 
 
 def _by_rows(function: Callable[[Tensor], Any], hw: HW, *, axis: int) -> Any:
@@ -138,13 +138,13 @@ def resampled(
 def sampled_between(
     image: Float[Tensor, "c h w"],
     source: LensView,
-    found: tuple[Float[Tensor, "ht wt 2"], Tensor],
+    pixels: tuple[Float[Tensor, "ht wt 2"], Tensor],
     interpolation: Interpolation,
     *,
     extended: bool = False,
 ) -> Sampled:
     """`resampled` with what `pixels_between` found, which several images of one camera share."""
-    x, seen = found
+    x, seen = pixels
     h, w = source.hw
     nearest = torch.minimum(x.clamp(min=0), x.new_tensor([w - 1, h - 1]))
     inside = torch.where(seen[..., None], x, nearest if extended else 0.0)

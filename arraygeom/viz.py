@@ -166,16 +166,16 @@ def draw_fields(
 
 def draw_sampling_locations(axes: Axes, field: ReceptiveField, pair: Pair, x: Float[Tensor, "n 2"]) -> None:
     """The sampling locations in beta of a few alpha pixels, each in its own colour."""
-    found = sampling_locations(field, pair, x)
+    locations = sampling_locations(field, pair, x)
     for i, colour in enumerate(_colours(len(x))):
-        if isinstance(found, Segments):
-            if found.valid[i]:
-                (x0, y0), (x1, y1) = numpy(found.start[i]), numpy(found.end[i])
+        if isinstance(locations, Segments):
+            if locations.valid[i]:
+                (x0, y0), (x1, y1) = numpy(locations.start[i]), numpy(locations.end[i])
                 axes.plot([x0, x1], [y0, y1], color="white", lw=3.0, alpha=0.6, solid_capstyle="round")
                 axes.plot([x0, x1], [y0, y1], color=colour, lw=1.6, solid_capstyle="round")
                 axes.plot(x0, y0, "o", color=colour, ms=4, mec="white", mew=0.6)
         else:
-            axes.scatter(*numpy(found.xy[i][found.mask[i]]).T, color=colour, s=1.5, linewidths=0)
+            axes.scatter(*numpy(locations.xy[i][locations.mask[i]]).T, color=colour, s=1.5, linewidths=0)
 
 
 # How well it fits -------------------------------------------------------------------------------------------

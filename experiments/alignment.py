@@ -207,7 +207,7 @@ def composites(scene: AlignmentScene, aligned: Aligned) -> dict[str, Float[Tenso
     """The first two betas as red and blue and alpha as green: by the homography, and aligned."""
     straight, pinhole = without_lenses(scene.rig, scene.images)
     names = scene.rig.betas(scene.alpha)[:2]
-    found: list[list[NDArray[Any]]] = [[], []]
+    images: list[list[NDArray[Any]]] = [[], []]
     for name in names:
         values, view = np.asarray(scene.recorded[name]), aligned[name]
         rigid = by_homography(scene, name, straight, pinhole)
@@ -215,14 +215,14 @@ def composites(scene: AlignmentScene, aligned: Aligned) -> dict[str, Float[Tenso
             resampled_values(values, plane, "bilinear")[0] * (0.95 / np.percentile(values[0], 99))
             for plane in (rigid, np.nan_to_num(view.positions))
         )
-        found[0].append(by_plane)
-        found[1].append(np.where(view.valid, by_scene, 1.0))
+        images[0].append(by_plane)
+        images[1].append(np.where(view.valid, by_scene, 1.0))
     own = aligned[scene.alpha].values[0]
     green = own * (0.95 / np.percentile(own, 99))
     unseen = np.any([~aligned[name].valid for name in names], 0)
     titles = "by a homography", "by pat align, white where not seen"
     panels = {}
-    for title, (red, *further), middle in zip(titles, found, (green, np.where(unseen, 1.0, green))):
+    for title, (red, *further), middle in zip(titles, images, (green, np.where(unseen, 1.0, green))):
         bands = np.stack([red, middle, (further or [red])[0]])
         panels[title] = torch.from_numpy(bands.clip(0, 1).astype(np.float32))
     return panels
@@ -235,8 +235,8 @@ def local_offsets(
     whether it can be located: it is like it, and its halves agree. Alike is by correlation squared, which
     does not depend on the sign of a band's contrast. The peak is found by a parabola.
     """
-    found, like = zip(*(_best_match(own, other, pixel) for pixel in x)) if len(x) else ([], [])
-    best = np.reshape(found, (len(x), len(PARTS), 2))
+    offsets, like = zip(*(_best_match(own, other, pixel) for pixel in x)) if len(x) else ([], [])
+    best = np.reshape(offsets, (len(x), len(PARTS), 2))
     agree = np.linalg.norm(best[:, 1:] - best[:, :1], axis=-1).max(1) <= HALF_PIXEL
     return np.linalg.norm(best[:, 0], axis=-1), agree & (np.array(like) >= ALIKE)
 
@@ -257,12 +257,12 @@ def _best_match(
     return offsets, like[0]
 
 
-def _peak(found: NDArray[Any], best: Sequence[Any], axis: int) -> float:
+def _peak(scores: NDArray[Any], best: Sequence[Any], axis: int) -> float:
     """The position along an axis of the parabola's peak through the largest value and its neighbours."""
     at = int(best[axis])
-    if not 0 < at < found.shape[axis] - 1:
+    if not 0 < at < scores.shape[axis] - 1:
         return float(at)
-    before, middle, after = np.take(found, best[1 - axis], 1 - axis)[at - 1 : at + 2]
+    before, middle, after = np.take(scores, best[1 - axis], 1 - axis)[at - 1 : at + 2]
     bend = before - 2 * middle + after
     return at + (0.0 if bend >= 0 else float(0.5 * (before - after) / bend))
 
@@ -295,10 +295,10 @@ def ecc_homography(own: NDArray[np.uint8], other: NDArray[np.uint8]) -> Float[np
         if level < LEVELS:
             H = SCALE @ H @ np.linalg.inv(SCALE)
         try:
-            _, found = ecc(a, b, H.astype(np.float32), cv2.MOTION_HOMOGRAPHY, criteria, None, 5)
+            _, refined = ecc(a, b, H.astype(np.float32), cv2.MOTION_HOMOGRAPHY, criteria, None, 5)
         except cv2.error:  # it does not converge on this level
             continue
-        H = max([H, found], key=lambda H: _correlation(a, b, H))
+        H = max([H, refined], key=lambda H: _correlation(a, b, H))
     return np.asarray(H, np.float64)
 
 
@@ -350,8 +350,8 @@ def alignment_markdown(rows: Sequence[AlignmentRow]) -> str:
 
 
 def _line(row: AlignmentRow) -> list[str]:
-    found = [getattr(row, share) for share in SHARES]
-    shares = ["" if share is None else f"{share:.1%}" for share in found]
+    values = [getattr(row, share) for share in SHARES]
+    shares = ["" if share is None else f"{share:.1%}" for share in values]
     medians = f"{row.median:.2f} / {row.median_homography:.2f}"
     return [f"{row.scene}, {row.beta}", *shares, medians, f"{row.off:.1g} ({row.dtype})"]
 

@@ -93,9 +93,9 @@ def train_choice(config: ChoiceTraining) -> Path:
     """
     with config.folder():
         network = config.network()
-        found = [kept(config.out / kind, network, config.pairs(kind), config.without) for kind in KINDS]
+        samples = [kept(config.out / kind, network, config.pairs(kind), config.without) for kind in KINDS]
         choice = Choice().to(config.device)
-        config.train(choice, partial(losses, config, found, choice))
+        config.train(choice, partial(losses, config, samples, choice))
         state = choice.half().state_dict()
         write_tensors(config.out / "best.safetensors", state, {"recipe": recipe_text(config)})
     return config.out / "best.safetensors"
@@ -104,7 +104,7 @@ def train_choice(config: ChoiceTraining) -> Path:
 def kept(folder: Path, network: GuidedPAT, pairs: Iterator[Made], without: Sequence[str] = ()) -> list[Kept]:
     """Of pairs with true disparity, matched where they are not yet."""
     folder.mkdir(parents=True, exist_ok=True)
-    found = []
+    samples = []
     for i, make in enumerate(pairs):
         file = folder / f"{i:05}.safetensors"
         if not file.exists():
@@ -112,8 +112,8 @@ def kept(folder: Path, network: GuidedPAT, pairs: Iterator[Made], without: Seque
             if pair.disparity is None or any(part in pair.name for part in without):
                 continue
             write_tensors(file, matched(network, pair, i)._asdict())
-        found.append(Kept(**load_file(file)))
-    return found
+        samples.append(Kept(**load_file(file)))
+    return samples
 
 
 def matched(network: GuidedPAT, pair: StereoPair, seed: int) -> Kept:
@@ -122,36 +122,36 @@ def matched(network: GuidedPAT, pair: StereoPair, seed: int) -> Kept:
     given: list[tuple[ComparedViews, BetaMatches]] = []
 
     def matcher(inputs: Inputs) -> Matches:
-        found = located_in_one(inputs)
-        given.append((found.comparison.views(inputs.alpha, inputs.betas[0].image), found))
+        matches = located_in_one(inputs)
+        given.append((matches.comparison.views(inputs.alpha, inputs.betas[0].image), matches))
         return match(inputs)
 
     truth = fused_at_random(network, pair, seed, matcher=matcher)
-    ((views, found),) = given
+    ((views, matches),) = given
     h, w = (n // FINE * FINE for n in truth.shape[1:])
-    whole = (views.alpha, views.beta, found.disparity)
+    whole = (views.alpha, views.beta, matches.disparity)
     alpha, beta, disparity = (part[0, :, :h, :w].half() for part in whole)
     known = Disparity(*(part[:h, :w] for part in pair.disparity))
-    facts = found.facts[0, :, : h // FINE, : w // FINE].half()
-    blurs = torch.tensor(found.comparison.whole.blurs)[:, 0]
+    facts = matches.facts[0, :, : h // FINE, : w // FINE].half()
+    blurs = torch.tensor(matches.comparison.whole.blurs)[:, 0]
     truth, seen = (known.value * known.valid)[None].half(), known.regions().seen[None]
     planes = alpha, beta, disparity, facts, truth, seen, blurs
     return Kept(*(part.contiguous() for part in planes))
 
 
 def losses(
-    config: ChoiceTraining, found: Sequence[Sequence[Kept]], network: Choice, start: int
+    config: ChoiceTraining, samples: Sequence[Sequence[Kept]], network: Choice, start: int
 ) -> Iterator[Tensor]:
     """Of each step from one on: the cross-entropy of how near candidates are to the true disparity, of the
     statement that the best one is right, and how far it is off beyond or within what is stated."""
-    kinds = [some for some in found if some]
+    kinds = [some for some in samples if some]
     for step in itertools.count(start):
         g = generator_for(config.seed, "choice", step)
         of = [kinds[i % len(kinds)] for i in range(config.batch)]
         windows = [window(some[below(len(some), g)], config.side, g) for some in of]
-        given, options, truth, seen = (torch.cat(parts).to(config.device) for parts in zip(*windows))
+        inputs, options, truth, seen = (torch.cat(parts).to(config.device) for parts in zip(*windows))
         with torch.autocast(config.device, torch.bfloat16, enabled=config.device != "cpu"):
-            answer = pixel_shuffle(network(given).float().flatten(1, 2), FINE)
+            answer = pixel_shuffle(network(inputs).float().flatten(1, 2), FINE)
             scores, logit, width = answer.split([CANDIDATES, 1, 1], 1)
         apart = (options - truth).abs()
         near = (1 - FAR) / (1 + (apart / NEAR) ** 4) + FAR / (1 + apart)
@@ -173,12 +173,12 @@ def window(one: Kept, side: int, g: Generator) -> tuple[Tensor, Tensor, Tensor, 
     alpha, beta, disparity, facts, truth = (part.float()[None] for part in one[:-2])
     seen = one.seen[None]
     level = Normalisation(torch.zeros(3, 1, 1, 1, 1), ([float(one.blurs[0])], [float(one.blurs[1])]))
-    found = BetaMatches(disparity, facts, Comparison(None, level, level))
+    matches = BetaMatches(disparity, facts, Comparison(None, level, level))
     views = ComparedViews(another_response(alpha, g), beta, to_bytes(alpha[:, 0]), level.blurs[0])
-    options = candidates(found)
-    given = features(views, rows_of((side, w)), found, options, typical_facts(found))
+    options = candidates(matches)
+    inputs = features(views, rows_of((side, w)), matches, options, typical_facts(matches))
     x = 0 if below(10, g) < 3 else FINE * below((w - side) // FINE + 1, g)
-    half = given[..., x // FINE : (x + side) // FINE]
+    half = inputs[..., x // FINE : (x + side) // FINE]
     columns = slice(x, x + side)
     return half, options[..., columns], truth[..., columns], seen[..., columns]
 

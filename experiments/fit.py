@@ -101,10 +101,10 @@ class Recipe:
 def command(train: Callable[[Any], Path], recipe: type[Recipe], prog: str) -> None:
     """Train by `[RECIPE.yaml] [--name value ...]`, and print the file of the weights; what is wrong with it
     ends in one line."""
-    given = sys.argv[1:]
+    arguments = sys.argv[1:]
     try:
-        base = read_recipe(recipe, given.pop(0)) if given and given[0][:1] != "-" else None
-        config = tyro.cli(recipe, prog=prog + " [RECIPE.yaml]", default=base, args=given)
+        base = read_recipe(recipe, arguments.pop(0)) if arguments and arguments[0][:1] != "-" else None
+        config = tyro.cli(recipe, prog=prog + " [RECIPE.yaml]", default=base, args=arguments)
         print(train(config))
     except (ValueError, OSError) as error:
         sys.exit(f"{prog}: {error}")

@@ -53,8 +53,8 @@ def _at_alpha(frame: Frame, rig: Rig, image: Tensor, alpha: str, name: str) -> F
         raise ValueError("merging exposures needs calibrated cameras: betas are sampled by depth")
     X = a.to(torch.float32).unproject(pixel_grid(a.hw), frame.depth)
     x, _, valid = b.to(torch.float32).project(X)
-    found = sample(linear_from_srgb(image)[None], torch.where(valid[..., None], x, -1e3)[None])
-    return torch.where(valid & found.valid[0], found.values[0, 0], torch.nan)
+    sampled = sample(linear_from_srgb(image)[None], torch.where(valid[..., None], x, -1e3)[None])
+    return torch.where(valid & sampled.valid[0], sampled.values[0, 0], torch.nan)
 
 
 MISPLACED = 0.1
@@ -112,14 +112,14 @@ def usable_range(measured: Float[Tensor, "*n"], ground_truth: Float[Tensor, "*n"
 
     Raises ValueError if there is none.
     """
-    found, light = measured.flatten(), ground_truth.flatten()
+    values, light = measured.flatten(), ground_truth.flatten()
     bins = (2 * light.clamp(min=1e-7).log2()).floor().long()
     runs: list[list[int]] = [[]]
     for i in range(int(bins.min()), int(bins.max()) + 1):
         here = bins == i
         if here.sum() < 50:
             continue
-        right = float(((found[here] - light[here]).abs() / light[here]).median()) <= MEASURED
+        right = float(((values[here] - light[here]).abs() / light[here]).median()) <= MEASURED
         runs = [*runs[:-1], [*runs[-1], i]] if right else [*runs, []]
     best = max(runs, key=len)
     if not best:

@@ -180,7 +180,7 @@ def windows(
     """
     own, (h, w), r = views[alpha].camera, patches.hw, patches.reduce
     top, left = patches.corners(own.hw)[number]
-    found = {alpha: window(views[alpha], top, left, patches.hw, (h // r, w // r))}
+    made = {alpha: window(views[alpha], top, left, patches.hw, (h // r, w // r))}
     middle = torch.tensor([left + (w - 1) / 2, top + (h - 1) / 2], dtype=torch.float64)
     X = own.unproject(middle, middle_depth(*rig.pair(alpha, alpha).depth_range).double())
     for name in rig.betas(alpha):
@@ -191,8 +191,8 @@ def windows(
         top, left = (
             min(max(round(c - (n - 1) / 2), 0), whole - n) for c, n, whole in zip(centre[::-1], hw, beta.hw)
         )
-        found[name] = window(views[name], top, left, hw, (hw[0] // r, hw[1] // r))
-    return found
+        made[name] = window(views[name], top, left, hw, (hw[0] // r, hw[1] // r))
+    return made
 
 
 def _beta_size(alpha: Camera, beta: Camera, patches: PatchGrid) -> HW:

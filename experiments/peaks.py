@@ -18,11 +18,11 @@ def watch_peak(pid: int, *, every: float = 0.2) -> Callable[[], float]:
 
     `wait4` would count what the parent had resident when it started the process.
     """
-    found = [0.0]
+    largest = [0.0]
 
     def watch() -> None:
         while (resident := peak_memory(pid)) is not None:
-            found[0] = resident
+            largest[0] = resident
             time.sleep(every)
 
     watching = Thread(target=watch, daemon=True)
@@ -30,7 +30,7 @@ def watch_peak(pid: int, *, every: float = 0.2) -> Callable[[], float]:
 
     def peak() -> float:
         watching.join()
-        return found[0]
+        return largest[0]
 
     return peak
 

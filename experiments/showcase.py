@@ -134,10 +134,10 @@ def _fused_scene(network: FusionNetwork, scene: SyntimScene, out: Path) -> list[
 
 
 def _syntim_image(folder: Path, scene: str, side: int) -> Tensor:
-    found = sorted(folder.glob(f"{scene}{side}_OG*.png"))
-    if not found:
+    files = sorted(folder.glob(f"{scene}{side}_OG*.png"))
+    if not files:
         raise FileNotFoundError(f"{folder / scene}{side}_OG*.png: no such image")
-    return read_image(found[0])
+    return read_image(files[0])
 
 
 class FastSlowArray(NamedTuple):

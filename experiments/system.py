@@ -298,7 +298,7 @@ def _sequence(job: SystemRun) -> tuple[list[str], Panels]:
     settings = FuseSettings(max_memory=job.max_memory)
     fusion = SequenceFusion(load_weights(job.weights), rig, frames, alpha, settings=settings)
     colours, fused = fused_frames(fusion, len(ground_truth))
-    alone = [fusion.alone(i) for i in range(len(fused))]
+    by_themselves = [fusion.alone(i) for i in range(len(fused))]
     for i, frame in enumerate(fused):
         save_frame(frame, out / "frames", name=f"{i:03d}", view=view_of(rig, alpha, bits=8))
     write_video(out / "fused.mp4", [f.image for f in fused], rate=10)
@@ -307,7 +307,7 @@ def _sequence(job: SystemRun) -> tuple[list[str], Panels]:
     methods = {
         "alpha alone": [g.expand(3, -1, -1) for g in greys],
         "classical": base,
-        "fusion, each frame alone": [f.image for f in alone],
+        "fusion, each frame alone": [f.image for f in by_themselves],
         "fusion": [f.image for f in fused],
     }
     lines = [*_sequence_table(methods, ground_truth, greys), *_confidence_line(fused[2], ground_truth[2])]
@@ -316,7 +316,10 @@ def _sequence(job: SystemRun) -> tuple[list[str], Panels]:
     panels = {f"alpha, frame {i}": greys[i], f"beta {first}": frames[first][0]}
     panels["ground truth"] = ground_truth[i]
     panels |= {n: p[i] for n, p in methods.items() if n != "alpha alone"}
-    panels |= {"confidence": fused[i].confidence[None], "confidence, frame alone": alone[i].confidence[None]}
+    panels |= {
+        "confidence": fused[i].confidence[None],
+        "confidence, frame alone": by_themselves[i].confidence[None],
+    }
     return lines, panels
 
 
@@ -334,7 +337,7 @@ def _images(fusion: SequenceFusion, i: int) -> dict[str, Tensor]:
 
 def _table(rows: Mapping[str, Tensor], ground_truth: Tensor, white: float) -> list[str]:
     scores = {name: score((image / white).clamp(0, 1), ground_truth / white) for name, image in rows.items()}
-    cells = [(name, f"{found.psnr:.2f}", f"{found.ssim:.4f}") for name, found in scores.items()]
+    cells = [(name, f"{of_method.psnr:.2f}", f"{of_method.ssim:.4f}") for name, of_method in scores.items()]
     return markdown_table(["", "PSNR, dB", "SSIM"], cells).splitlines()
 
 

@@ -97,11 +97,11 @@ class ThroughLenses:
         link = None if pair.link is None else pair.link.transformed(alpha.A, beta.A)
         straight = dataclasses.replace(pair, alpha=alpha.pinhole, beta=beta.pinhole, link=link)
         there, seen = alpha.undistort(floating(x))
-        found = answered(self.field, straight, there)
-        found = found.positions(self.samples) if isinstance(found, Segments) else found
-        xy, shown = beta.distort(found.xy)
+        locations = answered(self.field, straight, there)
+        locations = locations.positions(self.samples) if isinstance(locations, Segments) else locations
+        xy, shown = beta.distort(locations.xy)
         xy, inside = _onto_edge(xy, pair.beta.hw, ROUNDED)
-        mask = found.mask & seen[..., None] & shown & inside
+        mask = locations.mask & seen[..., None] & shown & inside
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
 
 

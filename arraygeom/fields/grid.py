@@ -65,14 +65,14 @@ class FieldOnGrid:
         h, w = pair.alpha.hw
         sparse = (..., slice(0, h, 4), slice(0, w, 4))
         longest = torch.where(pixels.valid[sparse], pixels.length[sparse].detach().float(), 0.0).max()
-        found = cls(at, int(torch.ceil(longest)) + 1, pixels)
-        return replace(found, blocks=found.of_blocks(BLOCK)) if blocks and not found.large else found
+        on_grid = cls(at, int(torch.ceil(longest)) + 1, pixels)
+        return replace(on_grid, blocks=on_grid.of_blocks(BLOCK)) if blocks and not on_grid.large else on_grid
 
     @classmethod
     def evaluated(cls, at: Callable[[Tensor], Segments], hw: HW, samples: int) -> FieldOnGrid:
         """A straight field, given as a function of alpha's pixels, on a grid of even sides."""
-        found = cls(at, samples, _on_grid(at, hw))
-        return replace(found, blocks=found.of_blocks(BLOCK))
+        on_grid = cls(at, samples, _on_grid(at, hw))
+        return replace(on_grid, blocks=on_grid.of_blocks(BLOCK))
 
     def of_blocks(self, side: int) -> Segments:
         """Segments of centres of blocks of `side` x `side` pixels of the grid, (B or 1, H / side, W / side).
@@ -87,9 +87,9 @@ class FieldOnGrid:
     def displaced(self, step: Callable[[Segments, Tensor], Tensor]) -> FieldOnGrid:
         """A straight field, segments moved by a step that depends on them and on alpha's pixels (*n, 2)."""
 
-        def moved(found: SamplingLocations, x: Tensor) -> Segments:
-            assert isinstance(found, Segments)
-            return _shifted(found, -step(found, x))
+        def moved(locations: SamplingLocations, x: Tensor) -> Segments:
+            assert isinstance(locations, Segments)
+            return _shifted(locations, -step(locations, x))
 
         def grid(stored: Segments, side: int) -> Segments:
             def at(x: Tensor) -> Segments:
@@ -108,9 +108,9 @@ class FieldOnGrid:
         h, w = hw
         if self.pixels is not None:
             return bool(self.pixels.valid[..., :h:8, :w:8].any())
-        found = self.at(pixel_grid(hw)[::8, ::8].reshape(-1, 2))
-        assert isinstance(found, Positions)
-        return bool(found.mask.any())
+        locations = self.at(pixel_grid(hw)[::8, ::8].reshape(-1, 2))
+        assert isinstance(locations, Positions)
+        return bool(locations.mask.any())
 
     @property
     def large(self) -> bool:
@@ -137,10 +137,10 @@ class FieldOnGrid:
         top, _, left, _ = box
 
         def at(x: Tensor) -> SamplingLocations:
-            found = self.at(x + x.new_tensor([left, top]))
-            if isinstance(found, Positions):
-                return Positions(found.xy - found.xy.new_tensor(shift), found.mask)
-            return _shifted(found, shift)
+            locations = self.at(x + x.new_tensor([left, top]))
+            if isinstance(locations, Positions):
+                return Positions(locations.xy - locations.xy.new_tensor(shift), locations.mask)
+            return _shifted(locations, shift)
 
         pixels = self.pixels and _window(self.pixels, box)
         pixels = pixels and _shifted(_exact(pixels) if self.large else pixels, shift)
@@ -150,9 +150,9 @@ class FieldOnGrid:
     def of_one(self, i: int) -> FieldOnGrid:
         """The field of the i-th rig of a batch, still with a batch axis, of length 1."""
 
-        def one(found: SamplingLocations) -> SamplingLocations:
-            parts = [t if len(t) == 1 else t[i : i + 1] for t in vars(found).values()]
-            return type(found)(*parts)
+        def one(locations: SamplingLocations) -> SamplingLocations:
+            parts = [t if len(t) == 1 else t[i : i + 1] for t in vars(locations).values()]
+            return type(locations)(*parts)
 
         pixels, blocks = (part and one(part) for part in (self.pixels, self.blocks))
         return FieldOnGrid(lambda x: one(self.at(x)), self.samples, pixels, blocks)  # type: ignore[arg-type]
@@ -163,33 +163,33 @@ def _on_grid(at: At, hw: HW, side: int = 1, device: torch.device | None = None) 
     h, w = hw
 
     def segments(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
-        found = at((torch.stack([x, y], -1).reshape(-1, 2) + 0.5) * side - 0.5)
-        assert isinstance(found, Segments)
+        locations = at((torch.stack([x, y], -1).reshape(-1, 2) + 0.5) * side - 0.5)
+        assert isinstance(locations, Segments)
         # Own fields may divide by zero where nothing is valid; compiled loops look up whatever is there.
-        total, shape = found.start + found.end, (-1, *y.shape[1:])
-        valid = found.valid & (total[..., 0] + total[..., 1]).isfinite()
-        ends = (end.nan_to_num(0.0, 0.0, 0.0).reshape(*shape, 2) for end in (found.start, found.end))
+        total, shape = locations.start + locations.end, (-1, *y.shape[1:])
+        valid = locations.valid & (total[..., 0] + total[..., 1]).isfinite()
+        ends = (end.nan_to_num(0.0, 0.0, 0.0).reshape(*shape, 2) for end in (locations.start, locations.end))
         return *(end.float() if h * w >= LARGE else end for end in ends), valid.reshape(shape)
 
     x, y = pixel_coordinates(hw, dtype=torch.float64, device=device)
     return Segments(*chunked(segments, x[None], y[None], rows=max(_CHUNK // max(w, 1), 1), axis=1))
 
 
-def _exact(found: Segments) -> Segments:
-    return Segments(found.start.double(), found.end.double(), found.valid)
+def _exact(segments: Segments) -> Segments:
+    return Segments(segments.start.double(), segments.end.double(), segments.valid)
 
 
-def _parts(found: Segments) -> tuple[Tensor, Tensor, Tensor]:
-    return found.start, found.end, found.valid
+def _parts(segments: Segments) -> tuple[Tensor, Tensor, Tensor]:
+    return segments.start, segments.end, segments.valid
 
 
-def _window(found: Segments, box: Box) -> Segments:
+def _window(segments: Segments, box: Box) -> Segments:
     rows, columns = slice(box[0], box[1]), slice(box[2], box[3])
-    return Segments(*(t[:, rows, columns] for t in _parts(found)))
+    return Segments(*(t[:, rows, columns] for t in _parts(segments)))
 
 
-def _shifted(found: Segments, shift: tuple[int, int] | Tensor) -> Segments:
+def _shifted(segments: Segments, shift: tuple[int, int] | Tensor) -> Segments:
     if shift == (0, 0):
-        return found
-    step = shift if isinstance(shift, Tensor) else found.start.new_tensor(shift)
-    return Segments(found.start - step, found.end - step, found.valid)
+        return segments
+    step = shift if isinstance(shift, Tensor) else segments.start.new_tensor(shift)
+    return Segments(segments.start - step, segments.end - step, segments.valid)

@@ -25,14 +25,14 @@ def nearest_pixels(first, last, line, centre, usable, window, tie, hw, xy, mask)
     order, begins = np.empty(most, np.int32), np.empty(BUCKETS + 1, np.int32)
     sorted_keys, buckets = np.empty(most, line.dtype), np.empty(most, np.int32)
     for p in range(first, last):
-        found = 0
+        count_near = 0
         if usable[p]:
-            found, limit = _within(line[p], centre[p], window, tie, hw, count, keys, pixels)
-            _sort(keys, found, limit, order, begins, buckets, sorted_keys)
+            count_near, limit = _within(line[p], centre[p], window, tie, hw, count, keys, pixels)
+            _sort(keys, count_near, limit, order, begins, buckets, sorted_keys)
         for i in range(count):
-            mask[p, i] = i < found
-            xy[p, i, 0] = pixels[order[i], 0] if i < found else 0
-            xy[p, i, 1] = pixels[order[i], 1] if i < found else 0
+            mask[p, i] = i < count_near
+            xy[p, i, 0] = pixels[order[i], 0] if i < count_near else 0
+            xy[p, i, 1] = pixels[order[i], 1] if i < count_near else 0
 
 
 @compiled(inline="always")
@@ -44,11 +44,11 @@ def _within(line, centre, window, tie, hw, count, keys, pixels):
     nearest, farthest = max(abs(at_centre) - spans, 0), abs(at_centre) + spans + tie * hw[0] * hw[1]
     columns = 2 * window + 1
     step = nearest + max(MORE * count / columns, 0.5) * max(abs(a), abs(b)) / 2 + tie * hw[0] * hw[1]
-    found = _collect(line, at_centre, x, y, window, tie, hw, step, keys, pixels)
-    while found < count and step < farthest:
+    collected = _collect(line, at_centre, x, y, window, tie, hw, step, keys, pixels)
+    while collected < count and step < farthest:
         step = nearest + 2 * (step - nearest)
-        found = _collect(line, at_centre, x, y, window, tie, hw, step, keys, pixels)
-    return found, step
+        collected = _collect(line, at_centre, x, y, window, tie, hw, step, keys, pixels)
+    return collected, step
 
 
 @compiled(inline="always")
@@ -59,7 +59,7 @@ def _collect(line, at_centre, x, y, window, tie, hw, limit, keys, pixels):
     slope, other = (b, a) if steep else (a, b)
     along, across = (y, x) if steep else (x, y)
     length, width = (hw[0], hw[1]) if steep else (hw[1], hw[0])
-    found, reach, inverse = 0, limit / abs(other) + 0.01, 1 / other
+    collected, reach, inverse = 0, limit / abs(other) + 0.01, 1 / other
     for u in range(max(along - window, 0), min(along + window, length - 1) + 1):
         middle = across - (at_centre + slope * (u - along)) * inverse
         begin = max(across - window, 0, int(np.ceil(middle - reach)))
@@ -69,14 +69,14 @@ def _collect(line, at_centre, x, y, window, tie, hw, limit, keys, pixels):
             distance = np.float32(column - x) * a + np.float32(row - y) * b + at_centre
             key = abs(distance) + keys.dtype.type(row * hw[1] + column) * tie
             if key <= limit:
-                keys[found], pixels[found, 0], pixels[found, 1] = key, column, row
-                found += 1
-    return found
+                keys[collected], pixels[collected, 0], pixels[collected, 1] = key, column, row
+                collected += 1
+    return collected
 
 
 @compiled(inline="always")
-def _sort(keys, n, limit, order, begins, buckets, found):
-    """The order of keys in 0 .. limit, and `found`, keys in that order: into buckets, then by insertion."""
+def _sort(keys, n, limit, order, begins, buckets, ordered):
+    """The order of keys in 0 .. limit, and `ordered`, keys in that order: into buckets, then by insertion."""
     scale = keys.dtype.type(BUCKETS / limit)
     begins[:] = 0
     for i in range(n):
@@ -87,11 +87,11 @@ def _sort(keys, n, limit, order, begins, buckets, found):
         begins[k + 1] += begins[k]
     for i in range(n):
         at = begins[buckets[i]]
-        order[at], found[at] = i, keys[i]
+        order[at], ordered[at] = i, keys[i]
         begins[buckets[i]] = at + 1
     for i in range(1, n):
-        one, key, at = order[i], found[i], i
-        while at > 0 and found[at - 1] > key:
-            order[at], found[at] = order[at - 1], found[at - 1]
+        one, key, at = order[i], ordered[i], i
+        while at > 0 and ordered[at - 1] > key:
+            order[at], ordered[at] = order[at - 1], ordered[at - 1]
             at -= 1
-        order[at], found[at] = one, key
+        order[at], ordered[at] = one, key

@@ -46,21 +46,23 @@ def sampling_locations(
 
 def answered(field: ReceptiveField, pair: Pair, x: Float[Tensor, "*n 2"]) -> SamplingLocations:
     """What a field gives for pixels. Raises ValueError for what is not Segments or Positions of each."""
-    found, name = field(pair, x), getattr(field, "__name__", type(field).__name__)
-    if not isinstance(found, Segments | Positions):
-        raise ValueError(f"the field {name} gave a {type(found).__name__}: fields give Segments or Positions")
-    for part, value in vars(found).items():
+    answer, name = field(pair, x), getattr(field, "__name__", type(field).__name__)
+    if not isinstance(answer, Segments | Positions):
+        raise ValueError(
+            f"the field {name} gave a {type(answer).__name__}: fields give Segments or Positions"
+        )
+    for part, value in vars(answer).items():
         if not isinstance(value, Tensor):
-            kind, held = type(found).__name__, type(value).__name__
+            kind, held = type(answer).__name__, type(value).__name__
             raise ValueError(f"the field {name} gave {kind} whose {part} is a {held}: give a tensor")
-    shape = found.valid.shape if isinstance(found, Segments) else found.mask.shape[:-1]
+    shape = answer.valid.shape if isinstance(answer, Segments) else answer.mask.shape[:-1]
     batch = len(pair.batch_shape)
     if len(shape) != x.ndim - 1 or shape[batch:] != x.shape[batch:-1]:
         raise ValueError(
             f"the field {name} gave {tuple(shape)} pixels for {tuple(x.shape[:-1])}: a field is asked for x "
             "(*n, 2), and answers with Segments (*n), or Positions (*n, L)"
         )
-    return found
+    return answer
 
 
 def lazily(field: ReceptiveField, pair: Pair) -> Callable[[Tensor], SamplingLocations]:

@@ -93,8 +93,8 @@ def rough_transfer(pair: Pair, x: Real[Tensor, "n 2"]) -> TransformedPoints:
     if pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view:
         return apply_homography(pair.homography.detach().to(x), x)
     with torch.no_grad():
-        found = Curved(3, bounds=natural_bounds(pair))(pair, x)
-    return TransformedPoints(found.xy[:, 1], found.mask[:, 1])
+        locations = Curved(3, bounds=natural_bounds(pair))(pair, x)
+    return TransformedPoints(locations.xy[:, 1], locations.mask[:, 1])
 
 
 def _apart(

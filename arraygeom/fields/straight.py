@@ -107,8 +107,8 @@ class HomographyDisplacement:
         """
         require_straight(pair)
         F, H, hw = pair.fundamental, pair.homography, pair.beta.hw
-        x, given = floating(x), self.displacement
-        reach = (covering_displacement(pair) if given is None else torch.as_tensor(given)).to(x)
+        x, displacement = floating(x), self.displacement
+        reach = (covering_displacement(pair) if displacement is None else torch.as_tensor(displacement)).to(x)
         reach = reach[(..., *[None] * (x.ndim - 1 - reach.ndim))] if reach.ndim else reach
 
         def around(x: Tensor) -> Segments:

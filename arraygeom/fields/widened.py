@@ -44,19 +44,19 @@ class Widened:
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
         """Segments if `across` is 0 and the field gives segments, else positions (*n, rows * samples, 2)."""
-        found = self._evaluated(pair, x)
-        if isinstance(found, Segments):
-            more = self.along * direction(found.end - found.start)
-            longer = Segments(found.start - more, found.end + more, found.valid)
+        locations = self._evaluated(pair, x)
+        if isinstance(locations, Segments):
+            more = self.along * direction(locations.end - locations.start)
+            longer = Segments(locations.start - more, locations.end + more, locations.valid)
             if self.across == 0:
                 clipped = clip_to_image(longer.start, longer.end, pair.beta.hw)
-                return Segments(clipped.start, clipped.end, clipped.valid & found.valid)
-            found = longer.positions(self.samples)
+                return Segments(clipped.start, clipped.end, clipped.valid & locations.valid)
+            locations = longer.positions(self.samples)
         else:
-            xy, along = found.xy, self.along
+            xy, along = locations.xy, self.along
             steps = torch.linspace(-along, along, xy.shape[-2], dtype=xy.dtype, device=xy.device)
-            found = Positions(xy + steps[:, None] * tangents(found), found.mask)
-        return self._band(found, pair.beta.hw)
+            locations = Positions(xy + steps[:, None] * tangents(locations), locations.mask)
+        return self._band(locations, pair.beta.hw)
 
     def _evaluated(self, pair: Pair, x: Tensor) -> SamplingLocations:
         """The field about beta's image too, as far as it may be brought in; of sizes alone on the image."""
@@ -65,10 +65,10 @@ class Widened:
             return answered(self.field, pair, x)
         h, w = pair.beta.hw
         padded = pair.transform_beta(shift_matrix(-margin, -margin), (h + 2 * margin, w + 2 * margin))
-        found = answered(self.field, padded, x)
-        if isinstance(found, Segments):
-            return Segments(found.start - margin, found.end - margin, found.valid)
-        return Positions(found.xy - margin, found.mask)
+        locations = answered(self.field, padded, x)
+        if isinstance(locations, Segments):
+            return Segments(locations.start - margin, locations.end - margin, locations.valid)
+        return Positions(locations.xy - margin, locations.mask)
 
     @classmethod
     def for_motion(cls, field: ReceptiveField, pixels: float, **options: int) -> Widened:

@@ -200,10 +200,10 @@ def _images_text(source: RigSource) -> Iterator[Posed]:
 
 
 def _rigs_text(source: RigSource) -> list[list[Posed]]:
-    found = [list(_sensors(entry)) for entry in _lines(source, "rigs")]
-    if not found:
+    rigs = [list(_sensors(entry)) for entry in _lines(source, "rigs")]
+    if not rigs:
         raise source.fail(None, "holds no rig; was it cut off?")
-    return found
+    return rigs
 
 
 def _sensors(entry: Entry) -> Iterator[Posed]:
@@ -227,16 +227,16 @@ def _lines(source: RigSource, what: str, every: int = 1) -> list[Entry]:
     """The lines that are no comments, nor blank (of an image's two the second may be); as many as stated."""
     lines = [(n, line) for n, line in enumerate(source.text().splitlines(), 1) if not line.startswith("#")]
     first = next((i for i, (_, line) in enumerate(lines) if line.strip()), 0)
-    found = [source.at(line, f"line {n}") for n, line in lines[first::every] if line.strip()]
+    content = [source.at(line, f"line {n}") for n, line in lines[first::every] if line.strip()]
     for n, line in lines[first + 1 :: 2] if every == 2 else ():
         if len(line.split(maxsplit=10)) == 10:  # those of points have a multiple of three
             raise source.fail(f"line {n}", "wanted the points of the image above: add a line, blank if none")
     for line in source.text().splitlines()[:8]:
         head, _, rest = line.partition(f"Number of {what}:")
         stated = rest.split(",")[0].strip()
-        if head.startswith("#") and stated.isdecimal() and int(stated) != len(found):
-            raise source.fail(None, f"announces {stated} {what} and holds {len(found)}; was it cut off?")
-    return found
+        if head.startswith("#") and stated.isdecimal() and int(stated) != len(content):
+            raise source.fail(None, f"announces {stated} {what} and holds {len(content)}; was it cut off?")
+    return content
 
 
 def _id(entry: Entry, text: str) -> int:

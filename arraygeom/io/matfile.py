@@ -153,10 +153,10 @@ def _fields(parts: Iterator[_Element], order: str) -> int:
     each = struct.unpack_from(order + "i", length.data)[0]
     if not 1 <= each <= 64 or len(names.data) % each:
         raise ValueError("the field names of a struct are damaged")
-    found = [bytes(names.data[i : i + each]) for i in range(0, len(names.data), each)]
-    if len(set(found)) < len(found) or not all(0 in name for name in found):
+    encoded = [bytes(names.data[i : i + each]) for i in range(0, len(names.data), each)]
+    if len(set(encoded)) < len(encoded) or not all(0 in name for name in encoded):
         raise ValueError("the field names of a struct are damaged")
-    return len(found)
+    return len(encoded)
 
 
 def _matrices(parts: Iterator[_Element]) -> Iterator[_Element]:

@@ -73,10 +73,10 @@ def _document(source: RigSource) -> ET.Element:
 
 def _sensor(source: RigSource, sensor: ET.Element, entry: str) -> LensView:
     """A sensor's last calibration (the adjusted one, where there are two)."""
-    found = sensor.findall("calibration")
-    if not found:
+    calibrations = sensor.findall("calibration")
+    if not calibrations:
         raise source.fail(entry, "has no calibration: optimise the cameras, and export again")
-    calibration = next((c for c in found if c.get("class") == "adjusted"), found[-1])
+    calibration = next((c for c in calibrations if c.get("class") == "adjusted"), calibrations[-1])
     resolution = calibration.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
     if resolution is None:

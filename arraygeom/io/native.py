@@ -221,11 +221,11 @@ def _model(entry: Entry, kind: type[CameraModel]) -> CameraModel:
     known = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
     _check_keys(entry, ("model", *known))
     numbers: dict[str, Any] = {}
-    for name, given in entry.items():
-        if isinstance(given.value, dict):
-            numbers[name] = _lens(given)
+    for name, value in entry.items():
+        if isinstance(value.value, dict):
+            numbers[name] = _lens(value)
         elif name != "model":
-            numbers[name] = given.tensor() if "Tensor" in str(known[name].type) else given.value
+            numbers[name] = value.tensor() if "Tensor" in str(known[name].type) else value.value
     missing = [n for n, f in known.items() if n not in numbers and f.default is f.default_factory is MISSING]
     if missing:
         raise entry.fail(f"has no {' or '.join(missing)}, which a {entry['model'].value} camera has")

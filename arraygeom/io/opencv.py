@@ -43,10 +43,10 @@ def recognises(path: Path, head: str) -> bool:
 
 def read(source: RigSource) -> Rig:
     """One camera at the origin, named "camera"; or a pair, named "left" and "right" unless the file says."""
-    found: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     for path in _files(source.path):
-        found |= _nodes(RigSource(path))
-    nodes = source.at(found).mapping()
+        entries |= _nodes(RigSource(path))
+    nodes = source.at(entries).mapping()
     if not any(name.format(1) in nodes for name in K_NAMES):
         if "R" in nodes and "T" in nodes:
             raise source.fail(
@@ -117,8 +117,8 @@ def _files(path: Path) -> list[Path]:
 
 
 def _named(folder: Path, part: str) -> Path | None:
-    found = [folder / f"{part}s{suffix}" for suffix in (".yml", ".yaml", ".xml", ".json")]
-    return next((path for path in found if path.exists()), None)
+    candidates = [folder / f"{part}s{suffix}" for suffix in (".yml", ".yaml", ".xml", ".json")]
+    return next((path for path in candidates if path.exists()), None)
 
 
 def _nodes(source: RigSource) -> dict[str, Any]:

@@ -42,8 +42,8 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
     with path.open("rb") as file:
         database = file.read(len(SQLITE)) == SQLITE
     named = {name: Path(file) for name, file in files.items()}
-    found = _database(path, named) if database else _csv(path, named)
-    for names, points in found.items():
+    matches = _database(path, named) if database else _csv(path, named)
+    for names, points in matches.items():
         for name, x in zip(names, points):
             h, w = sizes[name]
             outside = ((x < -0.5) | (x > x.new_tensor([w, h]) - 0.5)).any(-1)
@@ -52,7 +52,7 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
                     f"{path}: {int(outside.sum())} of {len(x)} points are outside the image of '{name}', "
                     f"{w}x{h}: are they of this image, at this size?"
                 )
-    return found
+    return matches
 
 
 def _csv(path: Path, files: Mapping[str, Path]) -> PointPairs:
@@ -120,14 +120,14 @@ def _database(path: Path, files: Mapping[str, Path]) -> PointPairs:
 def _colmap(database: sqlite3.Connection, path: Path, files: Mapping[str, Path]) -> PointPairs:
     images = [(Path(name), number) for name, number in database.execute("SELECT name, image_id FROM images")]
     names = {_image(path, file, images): name for name, file in files.items()}
-    found: PointPairs = {}
+    matches: PointPairs = {}
     for table in ("two_view_geometries", "matches"):
         for (a, b), pairs in _matches(database, table, names):
             points = (_keypoints(database, number)[pairs[:, side]] for side, number in enumerate((a, b)))
-            found.setdefault((names[a], names[b]), tuple(points))  # type: ignore[arg-type]
-    if not found:
+            matches.setdefault((names[a], names[b]), tuple(points))  # type: ignore[arg-type]
+    if not matches:
         raise ValueError(f"{path}: has no matches between {', '.join(files)}: match these images first")
-    return found
+    return matches
 
 
 def _image(path: Path, file: Path, images: Sequence[tuple[Path, int]]) -> int:

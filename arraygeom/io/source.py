@@ -125,8 +125,8 @@ class RigSource:
         """Numbers by name, one a line, of the names that a pattern matches."""
         entries: dict[str, Tensor] = {}
         for line in self.text().splitlines():
-            name, found, value = (part.strip() for part in line.partition(separator))
-            if not found or not re.fullmatch(pattern, name):
+            name, separated, value = (part.strip() for part in line.partition(separator))
+            if not separated or not re.fullmatch(pattern, name):
                 continue
             if name in entries:
                 raise self.fail(name, "occurs twice; keep one")

@@ -140,10 +140,10 @@ class _Image(NamedTuple):
 
     def needed(self, name: str, count: int) -> Tensor:
         """So many numbers of a tag of Pix4D's."""
-        found = self.numbers(name, count)
-        if found is None:
+        numbers = self.numbers(name, count)
+        if numbers is None:
             raise self.source.fail(name, "is not stated: give a rig file instead")
-        return found
+        return numbers
 
     @property
     def per_mm(self) -> Tensor:
@@ -169,13 +169,14 @@ class _Image(NamedTuple):
     @property
     def centre(self) -> Tensor:
         """The camera's centre in the rig, metres; zero if it is not stated."""
-        if (found := self.numbers("RigTranslations", 3)) is None:
+        if (translation := self.numbers("RigTranslations", 3)) is None:
             return torch.zeros(3, dtype=torch.float64)
-        if float(found.abs().max()) > LONGEST_TRANSLATION:
+        if float(translation.abs().max()) > LONGEST_TRANSLATION:
             raise self.source.fail(
-                "RigTranslations", f"is {found.tolist()}, and metres are wanted: give a rig file in metres"
+                "RigTranslations",
+                f"is {translation.tolist()}, and metres are wanted: give a rig file in metres",
             )
-        return found
+        return translation
 
     def camera(self) -> Camera:
         """The camera with its pose in the rig."""
@@ -268,8 +269,8 @@ class _Image(NamedTuple):
         )
 
     def _one(self, name: str) -> float | None:
-        found = self.numbers(name)
-        return None if found is None else float(found[0])
+        numbers = self.numbers(name)
+        return None if numbers is None else float(numbers[0])
 
 
 def _states_camera(tags: ImageTags | None) -> bool:

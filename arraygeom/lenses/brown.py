@@ -226,8 +226,8 @@ def _brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     def of_rest(v: Tensor) -> Tensor:
         return v.expand(rest.shape)[rest]
 
-    found, valid_there = _attempts(_each(lens, of_rest), of_rest(limit), start[rest], target[rest])
-    return solved.masked_scatter(rest[..., None], found), valid.masked_scatter(rest, valid_there)
+    rest_solved, valid_there = _attempts(_each(lens, of_rest), of_rest(limit), start[rest], target[rest])
+    return solved.masked_scatter(rest[..., None], rest_solved), valid.masked_scatter(rest, valid_there)
 
 
 def _reach(lens: Brown, limit: Tensor) -> Tensor:

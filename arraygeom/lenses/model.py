@@ -175,7 +175,7 @@ def _check_method(model: CameraModel, method: str, points: Tensor, like: tuple[T
     name, given = f"{type(model).__name__}.{method}", points.clone()
     try:
         with torch.no_grad():
-            found = getattr(model, method)(given)
+            answer = getattr(model, method)(given)
     except NotImplementedError:
         raise
     except Exception as error:
@@ -183,7 +183,10 @@ def _check_method(model: CameraModel, method: str, points: Tensor, like: tuple[T
             f"{name} raised {type(error).__name__} for points {_kind(points)}: {error}; points have any "
             "number of axes before their last, and numbers of the model those that `item_axes` states"
         ) from error
-    kinds, wanted = [_kind(v) for v in (found if isinstance(found, tuple) else (found,))], [*map(_kind, like)]
+    kinds, wanted = (
+        [_kind(v) for v in (answer if isinstance(answer, tuple) else (answer,))],
+        [*map(_kind, like)],
+    )
     if kinds != wanted:
         raise TypeError(
             f"{name} gives {' and '.join(kinds)} for points {_kind(points)}; "

@@ -64,8 +64,8 @@ def coverage(views: BoardViews, cam_from_board: Mapping[FrameKey, Pose], board: 
     ]
     tilts = np.degrees([np.arccos(min(1.0, abs(float(pose.R[2, 2])))) for pose in poses.values()])
     (near, far), (least, most) = ((float(v.min()), float(v.max())) for v in (np.concatenate(depths), tilts))
-    found = Coverage(cells, (near, far), (least, most), ())
-    return found._replace(missing=tuple(_missing(found, board)))
+    covered = Coverage(cells, (near, far), (least, most), ())
+    return covered._replace(missing=tuple(_missing(covered, board)))
 
 
 def point_counts(parts: Iterable[Float[np.ndarray, "_ 2"]], hw: HW) -> Int[np.ndarray, "r c"]:
@@ -77,8 +77,8 @@ def point_counts(parts: Iterable[Float[np.ndarray, "_ 2"]], hw: HW) -> Int[np.nd
     return counts.astype(np.int64)
 
 
-def _missing(found: Coverage, board: Board) -> Iterator[str]:
-    thirds = found.cells.reshape(3, CELLS[0] // 3, CELLS[1])
+def _missing(coverage: Coverage, board: Board) -> Iterator[str]:
+    thirds = coverage.cells.reshape(3, CELLS[0] // 3, CELLS[1])
     empty = [
         POSITIONS[i][j]
         for i, band in enumerate(thirds)
@@ -87,13 +87,13 @@ def _missing(found: Coverage, board: Board) -> Iterator[str]:
     ]
     if empty:
         yield f"no points at the {', '.join(empty)} of the image: the lens model is extrapolated there"
-    elif found.share < WIDE_ENOUGH:
-        yield f"points in only {found.share:.0%} of the image: fill it, corners too"
-    near, far = found.depths
+    elif coverage.share < WIDE_ENOUGH:
+        yield f"points in only {coverage.share:.0%} of the image: fill it, corners too"
+    near, far = coverage.depths
     if far < DEEP_ENOUGH * near:
         yield f"boards at one depth only ({near:.3g} to {far:.3g} m): take some closer, some further"
-    if board.flat and found.tilts[1] < TILTED_ENOUGH:
-        yield f"boards tilted by {found.tilts[1]:.0f} degrees at most: tilt it by 20 to 40"
+    if board.flat and coverage.tilts[1] < TILTED_ENOUGH:
+        yield f"boards tilted by {coverage.tilts[1]:.0f} degrees at most: tilt it by 20 to 40"
 
 
 class NextView(NamedTuple):
@@ -117,18 +117,18 @@ def next_views(known: Intrinsics, board: Board, depth: float, *, count: int = 2)
 
     gains = {text: _gain(known, X) for text, X in proposed_views(known.camera, board.members[0]).items()}
     candidates = {text: gain for text, gain in gains.items() if gain is not None and board.flat}
-    information, found = np.linalg.inv(known.covariance), list[NextView]()
+    information, proposals = np.linalg.inv(known.covariance), list[NextView]()
     for _ in range(count if candidates else 0):
         after = {text: median(information + gain) for text, gain in candidates.items()}
         best = min(after, key=lambda text: after[text])
-        found.append(NextView(best, median(information), after[best]))
+        proposals.append(NextView(best, median(information), after[best]))
         information = information + candidates[best]
-    return found
+    return proposals
 
 
 def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarray, "n 3"]]:
     """Views of a board in words, and its points in the camera's frame."""
-    found, (h, w) = {}, camera.hw
+    proposals, (h, w) = {}, camera.hw
     middle = torch.from_numpy(board.middle)
     for fill in FILLS:
         depth = float(camera.K[0, :2].norm()) * max(board.extent) / (fill * w)
@@ -140,8 +140,8 @@ def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarra
             for (a, b), edge in TILTS.items():
                 R = rotation_from_vector(torch.deg2rad(TILT * torch.tensor([a, b, 0.0], dtype=torch.float64)))
                 X = Pose(R, centre - R @ middle).apply(torch.from_numpy(board.points)).numpy()
-                found[f"{where}, tilted, {edge} edge nearer"] = X
-    return found
+                proposals[f"{where}, tilted, {edge} edge nearer"] = X
+    return proposals
 
 
 def _gain(known: Intrinsics, X: np.ndarray) -> np.ndarray | None:
@@ -158,12 +158,12 @@ def _gain(known: Intrinsics, X: np.ndarray) -> np.ndarray | None:
 
 def coverages(calibration: Calibration) -> dict[str, Coverage]:
     """Coverage of every camera."""
-    boards, found = calibration.fit.problem.board_poses, {}
+    boards, by_camera = calibration.fit.problem.board_poses, {}
     for name, views in calibration.views.items():
         camera = calibration.fit.problem.cameras[name]
         poses = {key: camera.cam_from_world @ boards[key] for key in views.seen}
-        found[name] = coverage(views, poses, calibration.board)
-    return found
+        by_camera[name] = coverage(views, poses, calibration.board)
+    return by_camera
 
 
 def coverage_advice(calibration: Calibration) -> Iterator[str]:

@@ -57,13 +57,13 @@ class Board:
         if self.identified:
             return (np.arange(len(self.points)),)
         points = (self.points - self.middle)[:, :2]
-        found = []
+        symmetries = []
         for quarter_turns in range(4):
             rotated = points @ np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), quarter_turns)
             distance = np.linalg.norm(rotated[:, None] - points[None], axis=-1)
             if distance.min(1).max() < 0.01 * self.spacing:
-                found.append(distance.argmin(1))
-        return tuple(found)
+                symmetries.append(distance.argmin(1))
+        return tuple(symmetries)
 
     @cached_property
     def part(self) -> Int[np.ndarray, " n"]:

@@ -102,11 +102,11 @@ class BundleProblem:
     @cached_property
     def residuals(self) -> dict[str, Float[np.ndarray, "_ 2"]]:
         """By camera: measured minus projected, pixels."""
-        found = {}
+        residuals = {}
         for name, seen in self.seen.items():
             X = torch.from_numpy(self.world(name))
-            found[name] = seen.x - self.cameras[name].project(X).x.detach().numpy()
-        return found
+            residuals[name] = seen.x - self.cameras[name].project(X).x.detach().numpy()
+        return residuals
 
     def rms(self) -> float:
         """Root mean square length of all residuals, pixels: OpenCV's reprojection error."""
@@ -175,8 +175,10 @@ class InitialRig(NamedTuple):
         """What is to be adjusted."""
         index, seen, free = {key: i for i, key in enumerate(self.boards)}, {}, {}
         for number, (name, camera) in enumerate(self.cameras.items()):
-            found = self.views[name].seen
-            parts = [(np.full(len(d.ids), index[key]), board.points[d.ids], d.x) for key, d in found.items()]
+            detections = self.views[name].seen
+            parts = [
+                (np.full(len(d.ids), index[key]), board.points[d.ids], d.x) for key, d in detections.items()
+            ]
             seen[name] = Observations(*(np.concatenate(part) for part in zip(*parts)))
             free[name] = np.ones(len(parameter_names(camera)), dtype=bool)
             free[name][:6] = number > 0 or self.priors is not None
@@ -245,7 +247,7 @@ class Linearised(NamedTuple):
 def linearised(problem: BundleProblem) -> dict[str, Linearised]:
     """The residuals and derivatives of each camera."""
     shapes = 0 if problem.deformation is None else len(problem.deformation)
-    first, found = 0, {}
+    first, rows = 0, {}
     total = len(problem.names) + shapes
     for name, camera in problem.cameras.items():
         seen, free, sigma = problem.seen[name], problem.free[name], problem.sigma[name]
@@ -259,8 +261,8 @@ def linearised(problem: BundleProblem) -> dict[str, Linearised]:
         by_shared = np.concatenate([by_camera[..., free], by_point @ _by_deformation(problem, name)], -1)
         weight = np.sqrt(robust_weights(np.linalg.norm(r, axis=-1) / sigma)) / sigma
         wide = weight[:, None, None]
-        found[name] = Linearised(weight[:, None] * r, wide * by_shared, wide * by_board, seen.block, columns)
-    return found
+        rows[name] = Linearised(weight[:, None] * r, wide * by_shared, wide * by_board, seen.block, columns)
+    return rows
 
 
 def _by_deformation(problem: BundleProblem, name: str) -> Float[np.ndarray, "n 3 s"]:

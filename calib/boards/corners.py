@@ -74,14 +74,14 @@ def refine_corners(
     `p` are their positions on the board, in squares; nothing but the corner's own squares is within `clear`
     squares of its edges.
     """
-    found, good = x, np.ones(len(x), dtype=bool)
+    refined, good = x, np.ones(len(x), dtype=bool)
     for _ in range(PASSES):
         if good.sum() < FEWEST:
             break
-        board = smooth_map(p, found, good)
+        board = smooth_map(p, refined, good)
         shape = _shape(board, p)
-        found, good = _fitted(grey.astype(np.float32), board(p), shape, clear)
-    return np.where(good[:, None], found, x), good
+        refined, good = _fitted(grey.astype(np.float32), board(p), shape, clear)
+    return np.where(good[:, None], refined, x), good
 
 
 def smooth_map(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"], good: Bool[np.ndarray, " n"]) -> Map:
@@ -134,13 +134,13 @@ def _fitted(grey: Array, start: Array, shape: EdgeGeometry, clear: float) -> tup
     sine = np.abs(np.linalg.det(shape.normal))
     width = np.minimum(clear * length * sine - BLEED, WIDEST_BAND)
     usable = (extent >= SHORTEST_EDGE) & (width >= NARROWEST_BAND) & (sine > 0.2)
-    found, good = start.copy(), np.zeros(len(start), dtype=bool)
+    fitted, good = start.copy(), np.zeros(len(start), dtype=bool)
     if usable.any():
         part = EdgeGeometry(*(v[usable] for v in shape))
         at, misfit = _least_squares(grey, start[usable], part, extent[usable], width[usable])
         near = np.linalg.norm(at - start[usable], axis=-1) < LARGEST_SHIFT * extent[usable]
-        found[usable], good[usable] = at, near & (misfit < MISFIT)
-    return found, good
+        fitted[usable], good[usable] = at, near & (misfit < MISFIT)
+    return fitted, good
 
 
 class CornerModel(NamedTuple):

@@ -54,12 +54,12 @@ class BoardDeformation:
         self, p: Float[np.ndarray, "n 3"], part: Int[np.ndarray, " n"]
     ) -> Float[np.ndarray, "n 3 s"]:
         """Derivatives of the deformed points with respect to all values, by central differences."""
-        found = np.zeros((len(p), 3, *self.values.shape))
+        jacobian = np.zeros((len(p), 3, *self.values.shape))
         rows, middle, values = np.arange(len(p)), self.middle[part], self.values[part]
         for i, step in enumerate(STEP * np.eye(PARAMETERS)):
             ahead, behind = (_deformed(p, middle, values + sign * step) for sign in (1, -1))
-            found[rows, :, part, i] = (ahead - behind) / (2 * STEP)
-        return found.reshape(len(p), 3, -1)
+            jacobian[rows, :, part, i] = (ahead - behind) / (2 * STEP)
+        return jacobian.reshape(len(p), 3, -1)
 
     def stepped(self, change: Float[np.ndarray, " s"]) -> BoardDeformation:
         """The shapes after a change of all values."""

@@ -87,10 +87,10 @@ class BoardViews:
 def detect(grey: Grey, board: Board) -> Detection | None:
     """The board's points in a grey image (uint8), or None if it is not found."""
     for candidate in _versions(grey):
-        found = _FINDERS[type(board)](candidate, board)
-        if found is not None and _plausible(found, board):
-            refined = _refined(grey, found, board)
-            return refined if _plausible(refined, board) else found
+        detection = _FINDERS[type(board)](candidate, board)
+        if detection is not None and _plausible(detection, board):
+            refined = _refined(grey, detection, board)
+            return refined if _plausible(refined, board) else detection
     return None
 
 
@@ -107,13 +107,13 @@ def other_size(images: Iterable[Grey], board: Board, *, larger: bool = False) ->
     """
     if not isinstance(board, Chessboard):
         return None
-    found = [_grid_size(grey) for grey in images]
-    sizes = Counter(size for size in found if size is not None)
+    size_of_each = [_grid_size(grey) for grey in images]
+    sizes = Counter(size for size in size_of_each if size is not None)
     if not sizes:
         return None
     size, votes = sizes.most_common(1)[0]
     same = set(size) == {board.columns, board.rows} or (larger and size[0] * size[1] <= len(board.points))
-    return None if same or (votes < 2 and len(found) > 1) else f"{size[0]}x{size[1]}"
+    return None if same or (votes < 2 and len(size_of_each) > 1) else f"{size[0]}x{size[1]}"
 
 
 def _versions(grey: Grey) -> Iterator[Grey]:
@@ -125,10 +125,10 @@ def _versions(grey: Grey) -> Iterator[Grey]:
 def _chessboard(grey: Grey, board: Chessboard) -> Detection | None:
     size = board.columns, board.rows
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-    done, corners = cv2.findChessboardCorners(grey, size, flags=flags)
-    if not done:
-        done, corners = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
-    if not done or len(corners) != len(board.points):
+    succeeded, corners = cv2.findChessboardCorners(grey, size, flags=flags)
+    if not succeeded:
+        succeeded, corners = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    if not succeeded or len(corners) != len(board.points):
         return None
     return _numbered(_right_handed(corners.reshape(board.rows, board.columns, 2)))
 
@@ -192,7 +192,7 @@ def _tags(grey: Grey, dictionary: str, border: int) -> dict[int, np.ndarray]:
     AprilTags touch other squares at their corners: OpenCV's way of finding them and that of their authors
     miss others.
     """
-    found: dict[int, np.ndarray] = {}
+    tags: dict[int, np.ndarray] = {}
     april = [cv2.aruco.CORNER_REFINE_APRILTAG] if dictionary.startswith("april") else []
     for method in (cv2.aruco.CORNER_REFINE_SUBPIX, *april):
         parameters = cv2.aruco.DetectorParameters()
@@ -201,8 +201,8 @@ def _tags(grey: Grey, dictionary: str, border: int) -> dict[int, np.ndarray]:
         corners, ids, _ = detector.detectMarkers(grey)
         numbers = [] if ids is None else ids.reshape(-1).tolist()
         shift = APRIL_SHIFT if method == cv2.aruco.CORNER_REFINE_APRILTAG else 0.0
-        found |= {number: x.reshape(4, 2) - shift for number, x in zip(numbers, corners)}
-    return found
+        tags |= {number: x.reshape(4, 2) - shift for number, x in zip(numbers, corners)}
+    return tags
 
 
 def homography_errors(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
@@ -216,16 +216,16 @@ def homography_errors(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"]) 
 def _circles(grey: Grey, board: Circles) -> Detection | None:
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
     for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
-        done, centres = cv2.findCirclesGrid(grey, (board.columns, board.rows), flags=flags)
-        if not done or len(centres) != len(board.points):
+        succeeded, centres = cv2.findCirclesGrid(grey, (board.columns, board.rows), flags=flags)
+        if not succeeded or len(centres) != len(board.points):
             continue
         grid = centres.reshape(board.rows, board.columns, 2)
         if not board.asymmetric:
             return _numbered(_right_handed(grid))
-        found = _numbered(grid)
-        if board.rows % 2 == 0 and not _plausible(found, board):  # OpenCV may swap the rows of each pair
+        numbered = _numbered(grid)
+        if board.rows % 2 == 0 and not _plausible(numbered, board):  # OpenCV may swap the rows of each pair
             return _numbered(grid.reshape(-1, 2, board.columns, 2)[:, ::-1])
-        return found
+        return numbered
     return None
 
 
@@ -238,20 +238,20 @@ _FINDERS: dict[type[Board], Callable[[Grey, Any], Detection | None]] = {
 }
 
 
-def _refined(grey: Grey, found: Detection, board: Board) -> Detection:
+def _refined(grey: Grey, detection: Detection, board: Board) -> Detection:
     """Corners refined to a hundredth of a pixel; of boards that may be seen in part, without occluded ones.
 
     Where few fit the corner model, as in images that are too small for it, all are refined by gradients.
     """
     if isinstance(board, Circles | KnownPoints):
-        return found
+        return detection
     clear = _clear(board)
-    x, good = refine_corners(grey, found.x, board.points[found.ids, :2] / board.spacing, clear=clear)
+    x, good = refine_corners(grey, detection.x, board.points[detection.ids, :2] / board.spacing, clear=clear)
     if good.mean() < ENOUGH:
-        return Detection(found.ids, _by_gradients(grey, found.x, 0.9 * clear))
+        return Detection(detection.ids, _by_gradients(grey, detection.x, 0.9 * clear))
     if isinstance(board, MarkedBoard):
-        return Detection(found.ids[good], x[good])
-    return Detection(found.ids, np.where(good[:, None], x, _by_gradients(grey, x, 0.3)))
+        return Detection(detection.ids[good], x[good])
+    return Detection(detection.ids, np.where(good[:, None], x, _by_gradients(grey, x, 0.3)))
 
 
 def _clear(board: Board) -> float:
@@ -272,23 +272,23 @@ def _by_gradients(grey: Grey, x: np.ndarray, share: float) -> np.ndarray:
     return refined.reshape(-1, 2).astype(np.float64)
 
 
-def _plausible(found: Detection, board: Board) -> bool:
+def _plausible(detection: Detection, board: Board) -> bool:
     """Whether there are enough points, not collinear, and on a smoothly distorted grid.
 
     A homography plus a polynomial of degree 3 has to map the points on the board to the pixels.
     """
     if isinstance(board, KnownPoints):
-        return not on_a_line(board.points[found.ids])
-    p = board.points[found.ids, :2]
+        return not on_a_line(board.points[detection.ids])
+    p = board.points[detection.ids, :2]
     if len(p) < FEWEST or np.linalg.svd(p - p.mean(0), compute_uv=False)[1] <= 0.5 * board.spacing:
         return False
-    H, _ = cv2.findHomography(p, found.x)
+    H, _ = cv2.findHomography(p, detection.x)
     if H is None:
         return False
     flat = cv2.perspectiveTransform(p[:, None], H)[:, 0]
     basis = monomials((p - p.mean(0)) / np.abs(p - p.mean(0)).max(0), 3 if len(p) >= 30 else 1)
-    distort = np.linalg.lstsq(basis, found.x - flat, rcond=None)[0]
-    left = np.linalg.norm(found.x - flat - basis @ distort, axis=-1)
+    distort = np.linalg.lstsq(basis, detection.x - flat, rcond=None)[0]
+    left = np.linalg.norm(detection.x - flat - basis @ distort, axis=-1)
     return bool(np.median(left) < LARGEST_MISFIT * np.median(apart(flat)) and np.isfinite(left).all())
 
 
@@ -349,8 +349,8 @@ def _grid_size(grey: Grey) -> tuple[int, int] | None:
     scale = min(1.0, SMALL / grey.shape[1])
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
-    done, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
-    return (max(meta.shape), min(meta.shape)) if done else None
+    succeeded, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
+    return (max(meta.shape), min(meta.shape)) if succeeded else None
 
 
 # All images -------------------------------------------------------------------------------------------------
@@ -384,10 +384,10 @@ def collect_folder(
     jobs = [job for moments in photos.values() for job in moments.items()]
     with ThreadPoolExecutor(2) as pool:
         results = pool.map(lambda job: detected(job[1], job[0], board), jobs)
-        found = iter(list(progress(results, len(jobs)) if progress else results))
+        detections = iter(list(progress(results, len(jobs)) if progress else results))
     views, notes, shown = {}, list[str](), list[Iterable[Grey]]()
     for name, moments in photos.items():
-        images = {key: next(found) for key in moments}
+        images = {key: next(detections) for key in moments}
         views[name] = board_views(name, moments, images)
         seen = {key: boards for key, (_, boards) in images.items() if boards}
         notes += _missing(name, moments, seen, board)
@@ -406,12 +406,12 @@ def detected(photo: Photo, key: FrameKey, board: Board) -> DetectedImage:
     Each board has poses of its own, hence a key of its own; that of the first one is the image's. Raises
     ValueError if the image cannot be read.
     """
-    grey, found, before = photo.read(), dict[FrameKey, Detection](), 0
+    grey, detections, before = photo.read(), dict[FrameKey, Detection](), 0
     for index, member in enumerate(board.members):
         if (seen := detect(grey, member)) is not None:
-            found[f"{key} board {index + 1}" if index else key] = Detection(seen.ids + before, seen.x)
+            detections[f"{key} board {index + 1}" if index else key] = Detection(seen.ids + before, seen.x)
         before += len(member.points)
-    return (grey.shape[0], grey.shape[1]), found
+    return (grey.shape[0], grey.shape[1]), detections
 
 
 def board_views(

@@ -122,19 +122,19 @@ def _spans(points: Float[np.ndarray, "n 3"]) -> bool:
 
 
 def _projection_errors(
-    camera: Camera, pose: Pose, found: Detection, points: Float[np.ndarray, "n 3"]
+    camera: Camera, pose: Pose, detection: Detection, points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " m"]:
     """How far the points of an image are from a camera's projections of the board's, pixels."""
-    projected = camera.project_local(pose.apply(torch.from_numpy(points[found.ids]))).x.numpy()
-    return np.linalg.norm(projected - found.x, axis=-1)
+    projected = camera.project_local(pose.apply(torch.from_numpy(points[detection.ids]))).x.numpy()
+    return np.linalg.norm(projected - detection.x, axis=-1)
 
 
-def near_homography(found: Detection, board: Board) -> Detection:
+def near_homography(detection: Detection, board: Board) -> Detection:
     """Points that a homography of the board fits (least median of squares), but for the lens's distortion."""
-    if len(found.ids) < FEWEST_POINTS or not board.flat:
-        return found
-    off = homography_errors(board.points[found.ids, :2], found.x)
-    return found.where(off <= max(1.0, 4 * float(np.median(off)) / RAYLEIGH_MEDIAN))
+    if len(detection.ids) < FEWEST_POINTS or not board.flat:
+        return detection
+    off = homography_errors(board.points[detection.ids, :2], detection.x)
+    return detection.where(off <= max(1.0, 4 * float(np.median(off)) / RAYLEIGH_MEDIAN))
 
 
 def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Camera, dict[FrameKey, Pose]]:
@@ -170,19 +170,19 @@ def _with_model(camera: Camera, model: str) -> Camera:
         return camera.replace(K=K, distortion=Distortion(model, coefficients))
 
     first = np.array([0.0, *plain[:2]])
-    found = least_squares(
+    solution = least_squares(
         lambda v: (changed(v).project_local(rays).x - x).numpy().ravel(), first, loss="soft_l1"
     )
-    return changed(found.x)
+    return changed(solution.x)
 
 
-def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:
+def board_pose(camera: Camera, detection: Detection, board: Board) -> Pose:
     """`cam_from_board` of one image, for a camera whose intrinsics are known.
 
     Raises ValueError for fewer than four points in front of the camera, as a lens far from the true one may
     see them.
     """
-    directions, valid = camera.rays(torch.from_numpy(found.x))
+    directions, valid = camera.rays(torch.from_numpy(detection.x))
     rays = directions.numpy()
     usable = valid.numpy() & (rays[:, 2] > 0.05 * np.linalg.norm(rays, axis=1))
     if usable.sum() < 4:
@@ -191,7 +191,7 @@ def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:
             "a pose needs four; check its lens and focal length"
         )
     flat = rays[usable, :2] / rays[usable, 2:]
-    points = board.points[found.ids[usable]]
+    points = board.points[detection.ids[usable]]
     method = cv2.SOLVEPNP_IPPE if board.flat else cv2.SOLVEPNP_SQPNP
     first = points * (1, 1, 0) if board.flat else points
     _, r, t = cv2.solvePnP(first, flat, np.eye(3), np.zeros(4), flags=method)
@@ -213,14 +213,14 @@ def _pinhole(views: BoardViews, board: Board, count: int) -> OpenCVSolution:
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     if not count:
         flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
-    given: np.ndarray = np.eye(3)
+    start: np.ndarray = np.eye(3)
     if not board.flat:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
-        given = _linear_intrinsics(max(zip(points, pixels), key=lambda view: len(view[0])), views.hw)
+        start = _linear_intrinsics(max(zip(points, pixels), key=lambda view: len(view[0])), views.hw)
     K: np.ndarray
     for further in (0, cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_K2):
         _, K, c, rotations, translations = cv2.calibrateCamera(
-            points, pixels, (w, h), given.copy(), np.zeros(5), flags=flags | further
+            points, pixels, (w, h), start.copy(), np.zeros(5), flags=flags | further
         )
         if abs(np.log(K[0, 0] / K[1, 1])) < OBLONG:
             break
@@ -254,7 +254,7 @@ def _fisheye(views: BoardViews, board: Board) -> OpenCVSolution:
     flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
     flags |= cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
 
-    found: list[tuple[float, OpenCVSolution]] = []
+    solutions: list[tuple[float, OpenCVSolution]] = []
     for focal in (w / np.pi, float(w)):
         K, none = np.array(intrinsics(focal, views.hw)), np.zeros((4, 1))
         try:
@@ -262,10 +262,10 @@ def _fisheye(views: BoardViews, board: Board) -> OpenCVSolution:
         except cv2.error as error:
             failed = error
         else:
-            found.append((rms, (K, c.reshape(-1), list(poses[0]), list(poses[1]))))
-    if not found:
+            solutions.append((rms, (K, c.reshape(-1), list(poses[0]), list(poses[1]))))
+    if not solutions:
         raise failed
-    return min(found, key=lambda one: one[0])[1]
+    return min(solutions, key=lambda one: one[0])[1]
 
 
 def _pose(r: np.ndarray, t: np.ndarray) -> Pose:

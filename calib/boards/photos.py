@@ -205,8 +205,8 @@ def _video_frames(path: Path) -> Iterator[tuple[int, Photo]]:
 def _decode_frame(path: Path, index: int) -> np.ndarray:
     video = cv2.VideoCapture(str(path))
     video.set(cv2.CAP_PROP_POS_FRAMES, index)
-    done, image = video.read()
+    succeeded, image = video.read()
     video.release()
-    if not done:
+    if not succeeded:
         raise ValueError(f"{path}: frame {index} cannot be read: is the video complete?")
     return image

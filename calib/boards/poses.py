@@ -70,11 +70,11 @@ class StartDeviations:
                 raise ValueError(f"the start's deviation {name}={value:g} is not a positive number")
 
     @classmethod
-    def of(cls, given: Mapping[str, float]) -> StartDeviations:
+    def of(cls, deviations: Mapping[str, float]) -> StartDeviations:
         """By name. Raises ValueError for another name."""
-        if unknown := given.keys() - vars(cls()).keys():
+        if unknown := deviations.keys() - vars(cls()).keys():
             raise ValueError(f"a start has no deviation '{min(unknown)}': it has {', '.join(vars(cls()))}")
-        return cls(**given)
+        return cls(**deviations)
 
 
 def start_prior(camera: Camera, deviations: StartDeviations) -> CameraPrior:
@@ -95,12 +95,10 @@ def initial_rig(singles: Mapping[str, Solved], board: Board) -> InitialRig:
     each other: images that are mirrored, or not of the same moments.
     """
     cameras = [
-        CalibratedViews(name, alone.problem.cameras[name], alone.views[name], alone.problem.board_poses)
-        for name, alone in singles.items()
+        CalibratedViews(name, single.problem.cameras[name], single.views[name], single.problem.board_poses)
+        for name, single in singles.items()
     ]
-    pairs = {
-        (a.name, b.name): found for a, b in combinations(cameras, 2) if (found := pair_pose(a, b, board))
-    }
+    pairs = {(a.name, b.name): pair for a, b in combinations(cameras, 2) if (pair := pair_pose(a, b, board))}
     return consistent_boards(cameras, _along_tree(cameras, pairs, board), board)
 
 
@@ -221,24 +219,24 @@ def average_pose(poses: Sequence[Pose]) -> Pose:
 
 def symmetry_poses(board: Board) -> list[Pose]:
     """The rotations of the board that belong to its renumberings: point i moves to point `image[i]`."""
-    found, mean = [], board.points.mean(0)
+    poses, mean = [], board.points.mean(0)
     for image in board.symmetries:
         R = Rotation.align_vectors(board.points[image] - mean, board.points - mean)[0].as_matrix()
-        found.append(Pose(torch.from_numpy(R), torch.from_numpy(mean - R @ mean)))
-    return found
+        poses.append(Pose(torch.from_numpy(R), torch.from_numpy(mean - R @ mean)))
+    return poses
 
 
 def _prediction_errors(
     camera: CalibratedViews, cam_from_board: Mapping[FrameKey, Pose], board: Board
 ) -> Float[np.ndarray, "s k"]:
     """By numbering and frame: the median distance of a camera's points from those of board poses, pixels."""
-    found = [camera.views.seen[key] for key in cam_from_board]
-    ends, points = np.cumsum([len(d.ids) for d in found])[:-1], torch.from_numpy(board.points)
+    detections = [camera.views.seen[key] for key in cam_from_board]
+    ends, points = np.cumsum([len(d.ids) for d in detections])[:-1], torch.from_numpy(board.points)
     errors = []
     for image in board.symmetries:
-        X = torch.cat([p.apply(points[image[d.ids]]) for d, p in zip(found, cam_from_board.values())])
+        X = torch.cat([p.apply(points[image[d.ids]]) for d, p in zip(detections, cam_from_board.values())])
         x, _, valid = camera.camera.project_local(X)
-        distance = np.linalg.norm(x.numpy() - np.concatenate([d.x for d in found]), axis=-1)
+        distance = np.linalg.norm(x.numpy() - np.concatenate([d.x for d in detections]), axis=-1)
         distance = np.where(valid.numpy(), distance, np.inf)
         errors.append([np.median(part) for part in np.split(distance, ends)])
     return np.array(errors)
@@ -295,9 +293,9 @@ def consistent_boards(cameras: Sequence[CalibratedViews], poses: dict[str, Pose]
         boards[key] = proposed[anchor]
         for i, (camera, error) in enumerate(zip(views, errors[anchor])):
             if i == anchor or error.min() < 3 * _tolerance(camera):
-                found = camera.views.seen[key]
+                detection = camera.views.seen[key]
                 numbers = board.symmetries[int(error.argmin())]
-                seen[camera.name][key] = Detection(numbers[found.ids], found.x)
+                seen[camera.name][key] = Detection(numbers[detection.ids], detection.x)
             else:
                 left_out.append((camera.name, key))
     placed = {c.name: c.camera.replace(cam_from_world=poses[c.name]) for c in cameras}
@@ -329,11 +327,11 @@ def _connection_error(
 def _explain_contradiction(a: CalibratedViews, b: CalibratedViews, board: Board) -> str:
     """What would make two cameras' frames agree: mirroring one, or shifting it by a few frames."""
     for mirrored, other in () if board.identified else ((b, a), (a, b)):
-        if (found := pair_pose(other, _mirrored(mirrored, board), board)) and found.consistent:
+        if (pair := pair_pose(other, _mirrored(mirrored, board), board)) and pair.consistent:
             return f"they agree once {mirrored.name} is mirrored: save its images as captured, not mirrored"
     for shift in (1, -1, 2, -2, 3, -3):
-        found = pair_pose(a, _shifted(a, b, shift), board)
-        if found and found.consistent and len(found.shared) >= FEWEST_TO_JUDGE:
+        pair = pair_pose(a, _shifted(a, b, shift), board)
+        if pair and pair.consistent and len(pair.shared) >= FEWEST_TO_JUDGE:
             frames, late = ("frame", "frames")[abs(shift) > 1], "late" if shift > 0 else "early"
             return f"they agree if {b.name} is {abs(shift)} {frames} {late}: renumber its images"
     return "were the images taken at the same moments, with matching numbers, and without moving the cameras?"

@@ -396,13 +396,13 @@ def draw_images(
 
 def worst_images(calibration: Calibration, detected: Mapping[str, BoardViews]) -> list[tuple[str, FrameKey]]:
     """Images (camera, moment) that do not fit, then those with most points left out."""
-    found = [(m.camera, m.frame) for m in misfits(calibration.fit)]
+    worst = [(m.camera, m.frame) for m in misfits(calibration.fit)]
     left_out: dict[tuple[str, FrameKey], int] = {}
     for name, v in detected.items():
         used = {key: len(d.ids) for key, d in calibration.views[name].seen.items()}
         left_out |= {(name, key): len(d.ids) - used.get(key, 0) for key, d in v.seen.items()}
-    found += sorted((image for image, count in left_out.items() if count), key=lambda image: -left_out[image])
-    return list(dict.fromkeys(found))[:DRAWN]
+    worst += sorted((image for image, count in left_out.items() if count), key=lambda image: -left_out[image])
+    return list(dict.fromkeys(worst))[:DRAWN]
 
 
 def _draw_image(

@@ -103,5 +103,5 @@ def calibrate(
             f"{n}: of the start, is not in the rig: it has no images" for n in start.names if n not in views
         ]
     rig = Rig(solved.problem.cameras)
-    single = {name: alone.problem.rms() for name, alone in singles.items()}
+    single = {name: camera.problem.rms() for name, camera in singles.items()}
     return Calibration(rig, board, solved, single, epipolar_errors(rig, solved.views), tuple(notes))

@@ -92,12 +92,12 @@ class RigDifference:
     def as_text(self) -> str:
         """A line for each camera and each pair, and the verdict."""
         lines = ["after the rigid motion of the whole rig that brings all pixels together best:"]
-        for name, found in self.cameras.items():
-            off = np.linalg.norm(found.change, axis=1)
-            lines.append(f"{name}: pixels differ by {_sizes(off, found.sigma)}")
-        for name, found in self.depths.items():
-            near, far = found.depth.min(), found.depth.max()
-            sizes = _sizes(100 * found.change, 100 * found.sigma, " %")
+        for name, difference in self.cameras.items():
+            off = np.linalg.norm(difference.change, axis=1)
+            lines.append(f"{name}: pixels differ by {_sizes(off, difference.sigma)}")
+        for name, difference in self.depths.items():
+            near, far = difference.depth.min(), difference.depth.max()
+            sizes = _sizes(100 * difference.change, 100 * difference.sigma, " %")
             lines.append(
                 f"depth by {self.alpha} and {name}, {near:.3g} to {far:.3g} {self.unit}: differs by {sizes}"
             )
@@ -106,16 +106,18 @@ class RigDifference:
     @property
     def verdict(self) -> str:
         """One line: whether the rig has moved."""
-        found = self.significance
-        if found is None:
+        motion = self.significance
+        if motion is None:
             return "verdict: none: no deviations are known; one rig calibrated twice may differ so"
-        test = f"chi-square {found.chi_square:.1f} of {found.freedom} parameters, p = {found.probability:.2g}"
-        if not found.moved:
+        test = (
+            f"chi-square {motion.chi_square:.1f} of {motion.freedom} parameters, p = {motion.probability:.2g}"
+        )
+        if not motion.moved:
             return f"verdict: the same: the rigs differ no more than their calibrations' errors ({test})"
         return (
             f"verdict: moved: the rigs differ by more than their calibrations' errors ({test}); "
-            f"a rotation of {found.camera} by {found.degrees:.3f} degrees and a shift of "
-            f"{1e3 * found.metres:.2f} mm explain {found.share:.0%} of it"
+            f"a rotation of {motion.camera} by {motion.degrees:.3f} degrees and a shift of "
+            f"{1e3 * motion.metres:.2f} mm explain {motion.share:.0%} of it"
         )
 
 
@@ -158,7 +160,7 @@ def rig_difference(
         cameras[name] = Difference(x, z, part.change, sigma)
     alpha, *betas = names
     depths = {name: _depths(a, b, alpha, name, grids[alpha], known) for name in betas}
-    depths = {name: found for name, found in depths.items() if len(found.x)}
+    depths = {name: points for name, points in depths.items() if len(points.x)}
     return RigDifference(cameras, depths, alpha, motion, significance, length_unit(a))
 
 
@@ -269,10 +271,10 @@ def _tested(
         own[rows] = part.jacobians[1][..., :6].reshape(-1, 6)
         own -= by_motion @ (by_motion.T @ own)
         by_own = U.T @ own / s[:, None]
-        found = np.linalg.lstsq(by_own, z, rcond=None)[0]
-        explained = total - float(np.square(z - by_own @ found).sum())
+        solution = np.linalg.lstsq(by_own, z, rcond=None)[0]
+        explained = total - float(np.square(z - by_own @ solution).sum())
         if explained > gain:
-            best, motion, gain = part.name, found, explained
+            best, motion, gain = part.name, solution, explained
     pose = b[best].cam_from_world
     shift = pose.perturbed(*(torch.from_numpy(p) for p in np.split(motion, 2))).inverse().t - pose.inverse().t
     probability, degrees = float(chdtrc(freedom, total)), float(np.degrees(np.linalg.norm(motion[:3])))
@@ -288,9 +290,9 @@ def _depths(
     there = a[beta].project(torch.from_numpy(X))
     kept = (there.valid & a[beta].contains(there.x)).numpy()
     x, z, y = x[kept], z[kept], there.x[torch.from_numpy(kept)]
-    found = triangulate([b[alpha], b[beta]], torch.stack([torch.from_numpy(x), y]), residual=np.inf)
-    valid = found.valid.numpy()
-    change = b[alpha].cam_from_world.apply(found.X)[:, 2].numpy() / z - 1
+    triangulated = triangulate([b[alpha], b[beta]], torch.stack([torch.from_numpy(x), y]), residual=np.inf)
+    valid = triangulated.valid.numpy()
+    change = b[alpha].cam_from_world.apply(triangulated.X)[:, 2].numpy() / z - 1
     farther = a[alpha].unproject(torch.from_numpy(x), torch.from_numpy(z * (1 + STEP)))
     slope = (a[beta].project(farther).x - y).numpy() / STEP  # pixels of beta by relative depth
     along = slope / np.square(slope).sum(1, keepdims=True)
@@ -314,10 +316,12 @@ def _sizes(values: np.ndarray, sigma: np.ndarray, unit: str = "") -> str:
     return f"{rms:.3f}{unit} (RMS), {most:.3f}{unit} at most{stated}"
 
 
-def draw_difference(found: RigDifference) -> Figure:
+def draw_difference(difference: RigDifference) -> Figure:
     """How far two rigs' pixels differ, at nearest and farthest depth, and depths by each pair, in percent."""
-    maps = [(f"{n}: pixels", c, np.linalg.norm(c.change, axis=1)) for n, c in found.cameras.items()]
-    maps += [(f"depth by {found.alpha} and {n}: %", d, 100 * d.change) for n, d in found.depths.items()]
+    maps = [(f"{n}: pixels", c, np.linalg.norm(c.change, axis=1)) for n, c in difference.cameras.items()]
+    maps += [
+        (f"depth by {difference.alpha} and {n}: %", d, 100 * d.change) for n, d in difference.depths.items()
+    ]
     figure = Figure(figsize=(9, 2.7 * len(maps)), layout="constrained")
     for row, (title, at, values) in zip(figure.subplots(len(maps), 2, squeeze=False), maps):
         for axes, depth in zip(row, (at.depth.min(), at.depth.max())):
@@ -326,7 +330,7 @@ def draw_difference(found: RigDifference) -> Figure:
             cmap, least = ("viridis", 0.0) if at.change.ndim > 1 else ("RdBu", -most)
             drawn = axes.scatter(*x.T, c=shown, s=22, marker="s", cmap=cmap, vmin=least, vmax=most)
             figure.colorbar(drawn, ax=axes)
-            axes.set_title(f"{title}, {depth:.3g} {found.unit}".replace("$", r"\$"), fontsize=9)
+            axes.set_title(f"{title}, {depth:.3g} {difference.unit}".replace("$", r"\$"), fontsize=9)
             axes.set(aspect="equal", xticks=[], yticks=[])
             axes.invert_yaxis()
     return figure

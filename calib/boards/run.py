@@ -74,17 +74,19 @@ def calibrate_photos(
         named = {name: f"{glob.escape(name)}.*" for name in nominal.names}
         if not patterns and all(any(photos.glob(pattern)) for pattern in named.values()):
             patterns = named  # a file called like each camera
-    found = collect_folder(photos, target, patterns=patterns, progress=progress)
-    comparisons = compare_lenses(found.views, target) if lens == "auto" else {}
-    chosen = {name: comparisons[name].advised if lens == "auto" else lens for name in found.views}
-    calibration = calibrate(found.views, target, lens=chosen, start=nominal, deviations=deviations)
+    collected = collect_folder(photos, target, patterns=patterns, progress=progress)
+    comparisons = compare_lenses(collected.views, target) if lens == "auto" else {}
+    chosen = {name: comparisons[name].advised if lens == "auto" else lens for name in collected.views}
+    calibration = calibrate(collected.views, target, lens=chosen, start=nominal, deviations=deviations)
     lenses = [f"{name}: {c.advice}" for name, c in comparisons.items()]
     stated = depth if depth is not None or nominal is None else nominal.depth
     rig = calibration.rig.replace(depth=stated, name=out.stem)
     written = [out.with_suffix(".html"), out.with_suffix(".covariance.json"), out]
-    notes = by_cameras([*lenses, *found.notes, *calibration.notes, *coverage_advice(calibration)])
+    notes = by_cameras([*lenses, *collected.notes, *calibration.notes, *coverage_advice(calibration)])
     title = f"Calibration of {out.name}"
-    report = report_html(calibration, title=title, notes=notes, detected=found.views, photos=found.photos)
+    report = report_html(
+        calibration, title=title, notes=notes, detected=collected.views, photos=collected.photos
+    )
     covariance = rig_covariance(calibration.fit)
     sweep(out.parent, out.stem)
     with write_together(out.parent, last=out.name, stale=[path.name for path in written[:2]]) as folder:
@@ -125,12 +127,16 @@ class Session:
     def views(self) -> dict[str, BoardViews]:
         """The board points of all cameras."""
         images = {name: self.images(name) for name in self.photos}
-        return {name: board_views(name, self.photos[name], found) for name, found in images.items() if found}
+        return {
+            name: board_views(name, self.photos[name], detections)
+            for name, detections in images.items()
+            if detections
+        }
 
     def images(self, name: str) -> dict[FrameKey, DetectedImage]:
         """What was detected in the images of a camera, the last to arrive last."""
         moments = self.photos[name]
-        return {key: found for (n, key), found in self.seen.items() if n == name and key in moments}
+        return {key: detection for (n, key), detection in self.seen.items() if n == name and key in moments}
 
     def calibrate(self) -> None:
         """Calibrate with all that was detected."""
@@ -176,11 +182,11 @@ def watch(
 
 
 def _page(session: Session) -> str:
-    found, notes = session.calibration, [session.problem]
+    calibration, notes = session.calibration, [session.problem]
     parts = [f"<h1>{len(session.seen)} images</h1>"]
-    if found is not None and not session.problem:
-        parts.append(f"<p>Reprojection error {found.rms:.3f} px, {len(found.frames)} frames.</p>")
-        notes = list(found.notes)
+    if calibration is not None and not session.problem:
+        parts.append(f"<p>Reprojection error {calibration.rms:.3f} px, {len(calibration.frames)} frames.</p>")
+        notes = list(calibration.notes)
     parts += [_note(note) for note in notes]
     parts += [_camera(session, name) for name in session.photos]
     return html_page(parts, "Calibration", '<meta http-equiv="refresh" content="2">')
@@ -225,8 +231,8 @@ def _drawn(grey: Grey, boards: Mapping[FrameKey, Detection]) -> np.ndarray:
     scale = WIDTH / grey.shape[1]
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     small = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
-    for found in boards.values():
-        for x, y in (found.x + 0.5) * scale - 0.5:
+    for detection in boards.values():
+        for x, y in (detection.x + 0.5) * scale - 0.5:
             cv2.circle(small, (round(float(x)), round(float(y))), 2, COLOURS[1], -1)
     return small
 

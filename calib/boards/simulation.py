@@ -70,7 +70,7 @@ def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
     cameras, random = list(calibrated(rig).values()), np.random.default_rng(seed)
     narrow = max(float(c.K[0, :2].norm()) / c.hw[1] for c in cameras)
     middle = torch.from_numpy(board.middle)
-    found: list[Pose] = []
+    poses: list[Pose] = []
     for _ in range(TRIES):
         camera = cameras[random.integers(len(cameras))]
         depth = max(board.extent) * narrow / random.uniform(*FILLS)
@@ -79,9 +79,9 @@ def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
         if all(bool(p.valid) and bool(c.contains(p.x)) for c in cameras for p in [c.project(centre)]):
             rotation = np.radians([*random.uniform(-TILT, TILT, 2), random.uniform(-20, 20)])
             R = camera.R.T.double() @ rotation_from_vector(torch.from_numpy(rotation))
-            found.append(Pose(R, centre - R @ middle))
-        if len(found) == count:
-            return stack(found)
+            poses.append(Pose(R, centre - R @ middle))
+        if len(poses) == count:
+            return stack(poses)
     raise ValueError(f"the cameras hardly see the board {board} together: take a larger or a smaller one")
 
 

@@ -307,24 +307,24 @@ class FrameMisfit(NamedTuple):
 
 def frame_rms(problem: BundleProblem) -> dict[str, dict[FrameKey, float]]:
     """By camera and frame: root mean square residual, pixels."""
-    found = {}
+    by_camera = {}
     for name, r in problem.residuals.items():
         block = problem.seen[name].block
         squared, count = np.bincount(block, (r**2).sum(-1)), np.bincount(block)
-        found[name] = {
+        by_camera[name] = {
             problem.frames[b]: float(np.sqrt(squared[b] / count[b])) for b in np.flatnonzero(count)
         }
-    return found
+    return by_camera
 
 
 def misfits(fit: Solved) -> list[FrameMisfit]:
     """Frames whose residuals stand out, worst first."""
-    found = []
+    misfits = []
     for name, by_frame in frame_rms(fit.problem).items():
         typical = float(np.median(list(by_frame.values())))
         limit = max(MISFIT * typical, CONSPICUOUS * 2**0.5 * max(fit.problem.sigma[name], LEAST_SIGMA))
-        found += [FrameMisfit(name, frame, rms, typical) for frame, rms in by_frame.items() if rms > limit]
-    return sorted(found, key=lambda m: -m.rms / m.typical)
+        misfits += [FrameMisfit(name, frame, rms, typical) for frame, rms in by_frame.items() if rms > limit]
+    return sorted(misfits, key=lambda m: -m.rms / m.typical)
 
 
 def misfit_notes(fit: Solved) -> Iterator[str]:
@@ -352,33 +352,33 @@ def solve_together(initial: InitialRig, board: Board, singles: Mapping[str, Solv
     """
     if len(singles) == 1:
         return next(iter(singles.values()))
-    rms = {name: alone.problem.rms() for name, alone in singles.items()}
+    rms = {name: single.problem.rms() for name, single in singles.items()}
     solved = solve(initial, board)
     while wrong := _wrong_images(solved, rms):
         initial = _without(initial, wrong)
         solved = solve(initial, board)
     if not (doubts := _inconsistent_cameras(solved, rms)):
         return solved
-    priors = {name: _as_prior(name, alone) for name, alone in singles.items()}
+    priors = {name: _as_prior(name, single) for name, single in singles.items()}
     free = {name: prior.information.diagonal() > 0 for name, prior in priors.items()}
     for name, mask in free.items():
         mask[:6] = name != next(iter(free))
     held = replace(initial.problem(board), priors=priors, deformation=solved.problem.deformation, free=free)
-    notes = [note for alone in singles.values() for note in alone.notes]
+    notes = [note for single in singles.values() for note in single.notes]
     notes.append(f"{doubts}; so each camera's intrinsics keep close to its own calibration")
-    found = adjust(held, equal_noise=True)
-    return replace(found, notes=tuple(notes), views=initial.views, left_out=initial.left_out)
+    adjusted = adjust(held, equal_noise=True)
+    return replace(adjusted, notes=tuple(notes), views=initial.views, left_out=initial.left_out)
 
 
-def _wrong_images(solved: Solved, alone: Mapping[str, float]) -> list[tuple[str, FrameKey]]:
+def _wrong_images(solved: Solved, single_rms: Mapping[str, float]) -> list[tuple[str, FrameKey]]:
     """Images so far off that their camera would be refused, one of a moment, unless many are one camera's."""
-    found = dict[FrameKey, str]()
+    reasons = dict[FrameKey, str]()
     for misfit in misfits(solved):
-        if misfit.rms > _refused_from(alone[misfit.camera]):
-            found.setdefault(misfit.frame, misfit.camera)
+        if misfit.rms > _refused_from(single_rms[misfit.camera]):
+            reasons.setdefault(misfit.frame, misfit.camera)
     seen = {name: len(v.seen) for name, v in solved.views.items()}
-    many = many_wrong(list(found.values()), [name for name, _ in solved.left_out], seen)
-    return [] if many else [(camera, frame) for frame, camera in found.items()]
+    many = many_wrong(list(reasons.values()), [name for name, _ in solved.left_out], seen)
+    return [] if many else [(camera, frame) for frame, camera in reasons.items()]
 
 
 def _without(initial: InitialRig, images: Sequence[tuple[str, FrameKey]]) -> InitialRig:
@@ -390,38 +390,38 @@ def _without(initial: InitialRig, images: Sequence[tuple[str, FrameKey]]) -> Ini
     return initial._replace(boards=boards, views=views, left_out=[*initial.left_out, *images])
 
 
-def many_wrong(found: Sequence[str], before: Sequence[str], seen: Mapping[str, int]) -> bool:
+def many_wrong(wrong: Sequence[str], before: Sequence[str], seen: Mapping[str, int]) -> bool:
     """Whether images found wrong, and those left out before (the camera of each), are more than `MANY_WRONG`
     of all of a camera's; `seen` are those that are left of it."""
     return any(
-        found.count(n) + before.count(n) > MANY_WRONG * (seen[n] + before.count(n)) for n in set(found)
+        wrong.count(n) + before.count(n) > MANY_WRONG * (seen[n] + before.count(n)) for n in set(wrong)
     )
 
 
-def _refused_from(alone: float) -> float:
+def _refused_from(single_rms: float) -> float:
     """The reprojection error (RMS, px) with the other cameras from which a camera contradicts them."""
-    return REJECTED * max(alone, 0.3)
+    return REJECTED * max(single_rms, 0.3)
 
 
-def _inconsistent_cameras(solved: Solved, alone: Mapping[str, float]) -> str:
+def _inconsistent_cameras(solved: Solved, single_rms: Mapping[str, float]) -> str:
     """Text on cameras that fit much worse together than alone, or "". Raises ValueError if far worse."""
     doubts = []
     for name, r in solved.problem.residuals.items():
         together = float(np.sqrt((r**2).sum(-1).mean()))
-        fits = f"{name} fits to {alone[name]:.2f} px alone but to {together:.2f} px with the others"
-        if together > _refused_from(alone[name]):
+        fits = f"{name} fits to {single_rms[name]:.2f} px alone but to {together:.2f} px with the others"
+        if together > _refused_from(single_rms[name]):
             raise ValueError(f"{fits}: were the images {SYNCHRONISED}?")
-        if together > 0.5 and together > INCONSISTENT * alone[name]:
+        if together > 0.5 and together > INCONSISTENT * single_rms[name]:
             doubts.append(fits)
     return f"{', '.join(doubts)} (were the images {SYNCHRONISED}?)" if doubts else ""
 
 
-def _as_prior(name: str, alone: Solved) -> CameraPrior:
+def _as_prior(name: str, single: Solved) -> CameraPrior:
     """A camera's single calibration as a prior of its intrinsics; none for parameters that were fixed."""
-    camera = alone.problem.cameras[name]
+    camera = single.problem.cameras[name]
     entries = parameter_names(camera)
-    free = [entries.index(entry.removeprefix(f"{name}.")) for entry in alone.names]
+    free = [entries.index(entry.removeprefix(f"{name}.")) for entry in single.names]
     information = np.zeros((len(entries), len(entries)))
-    if alone.covariance is not None:
-        information[np.ix_(free, free)] = np.linalg.inv(alone.covariance)
+    if single.covariance is not None:
+        information[np.ix_(free, free)] = np.linalg.inv(single.covariance)
     return CameraPrior(intrinsic_values(camera), information)

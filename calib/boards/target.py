@@ -114,17 +114,17 @@ def parse_board(text: str) -> Board:
     return Circles(columns, rows, length, asymmetric=kind == "acircles")
 
 
-def _options(text: str, given: Sequence[str], patterns: Mapping[str, str]) -> dict[str, str]:
+def _options(text: str, options_text: Sequence[str], patterns: Mapping[str, str]) -> dict[str, str]:
     """Each option by the name of the pattern that it matches. Raises ValueError for others, and for two."""
-    found: dict[str, str] = {}
-    for option in given:
+    options: dict[str, str] = {}
+    for option in options_text:
         name = next((n for n, p in patterns.items() if re.fullmatch(p, option)), None)
         if name is None:
             raise ValueError(f"board '{text}': '{option}' is not recognised; write it like {FORMS}")
-        if name in found:
-            raise ValueError(f"board '{text}': '{found[name]}' and '{option}' say the same: give one")
-        found[name] = option
-    return found
+        if name in options:
+            raise ValueError(f"board '{text}': '{options[name]}' and '{option}' say the same: give one")
+        options[name] = option
+    return options
 
 
 def parse_boards(texts: Sequence[str]) -> Board:

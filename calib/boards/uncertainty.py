@@ -124,15 +124,15 @@ def beta_covariance(
     a, b = rig.pair(alpha, beta).cameras
     X = a.unproject(torch.from_numpy(x), torch.full((len(x),), depth, dtype=torch.float64))
     usable = (X.isfinite().all(-1) & b.project(X.nan_to_num(1.0)).valid).numpy()
-    found = np.full((len(x), 2, 2), np.nan)
+    at_points = np.full((len(x), 2, 2), np.nan)
     if usable.any():
         J_a, J_b = (camera_jacobian(camera, X.numpy()[usable]) for camera in (a, b))
         across = J_b[..., 3:6] @ (b.R @ a.R.T).numpy()[:, :2]
         change = J_b @ covariance.of(beta, b) - across @ np.linalg.solve(
             J_a[..., 3:5], J_a @ covariance.of(alpha, a)
         )
-        found[usable] = change @ covariance.matrix @ change.swapaxes(-1, -2)
-    return found
+        at_points[usable] = change @ covariance.matrix @ change.swapaxes(-1, -2)
+    return at_points
 
 
 def baseline_deviation(rig: Mapping[str, Camera], a: str, b: str, covariance: RigCovariance) -> float:
@@ -303,15 +303,15 @@ def with_disagreement(solved: Solved, board: Board, *, unchecked: bool = False) 
             f"{UNCHECKED:.0f}, as more frames do of real boards; take {FEWEST_TO_JACKKNIFE} or more"
         )
     checked = covariance is not None and len(covariance) > 0 and frames >= FEWEST_TO_JACKKNIFE
-    found = jackknife(problem) if checked or problem.deformation is not None else None
-    if found is not None and problem.deformation is not None:
-        deviations = np.sqrt(found.deformations.diagonal()).reshape(problem.deformation.values.shape)
+    jackknifed = jackknife(problem) if checked or problem.deformation is not None else None
+    if jackknifed is not None and problem.deformation is not None:
+        deviations = np.sqrt(jackknifed.deformations.diagonal()).reshape(problem.deformation.values.shape)
         notes += described(problem.deformation, deviations, [each.extent for each in board.members])
-    if found is not None and checked and covariance is not None:
-        excess = np.trace(np.linalg.solve(covariance, found.covariance)) / len(covariance)
+    if jackknifed is not None and checked and covariance is not None:
+        excess = np.trace(np.linalg.solve(covariance, jackknifed.covariance)) / len(covariance)
         if excess**0.5 > CONSIDERABLE:
-            level = max(1.0, float(np.median(_ratio(found.left_out, covariance))))
-            before, covariance = covariance, (level**2 * covariance + found.left_out) / 2
+            level = max(1.0, float(np.median(_ratio(jackknifed.left_out, covariance))))
+            before, covariance = covariance, (level**2 * covariance + jackknifed.left_out) / 2
             raised = float(_ratio(covariance, before).max())
             notes.append(
                 "frames disagree more than the points' noise explains: standard deviations are raised, "

@@ -42,7 +42,7 @@ def epipolar_errors(
     rig: Rig, views: Mapping[str, BoardViews]
 ) -> dict[tuple[str, str], Float[np.ndarray, " _"]]:
     """By pair: distances in undistorted pixels from beta's points to alpha's lines, and the reverse."""
-    found = {}
+    errors = {}
     for a, b in combinations(views, 2):
         parts = []
         for key in views[a].seen:
@@ -57,8 +57,8 @@ def epipolar_errors(
         (pa, va), (pb, vb) = pair.alpha.undistort(xa), pair.beta.undistort(xb)
         forward = epipolar_distance(pair.fundamental, pa, pb).abs()
         backward = epipolar_distance(reverse.fundamental, pb, pa).abs()
-        found[a, b] = ((forward + backward) / 2)[va & vb].numpy()
-    return found
+        errors[a, b] = ((forward + backward) / 2)[va & vb].numpy()
+    return errors
 
 
 # Frames held out --------------------------------------------------------------------------------------------
@@ -75,7 +75,7 @@ def held_out_errors(
     shared = [key for key in frames if sum(key in v.seen for v in views.values()) > 1]
     if len(shared) < FEWEST_TO_HOLD_OUT:
         return {}
-    found = dict[tuple[str, str], list[np.ndarray]]()
+    by_pair = dict[tuple[str, str], list[np.ndarray]]()
     for fold in range(FOLDS):
         out = set(shared[fold::FOLDS])
         if any(len(v.seen.keys() - out) < FEWEST_LEFT for v in views.values()):
@@ -83,8 +83,8 @@ def held_out_errors(
         used = readjusted(fit.problem.of_boards(np.array([key not in out for key in frames])))
         judged = {name: v.only(out) for name, v in views.items()}
         for names, errors in epipolar_errors(Rig(used.cameras), judged).items():
-            found.setdefault(names, []).append(errors)
-    return {names: np.concatenate(errors) for names, errors in found.items()}
+            by_pair.setdefault(names, []).append(errors)
+    return {names: np.concatenate(errors) for names, errors in by_pair.items()}
 
 
 def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -102,15 +102,15 @@ def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np
         halves = [readjusted(half) for half in parts]
     except np.linalg.LinAlgError:
         return {}
-    found = {}
+    differences = {}
     for name in fit.problem.cameras:
         (a, seen), (b, _) = (in_own_frame(half, name) for half in halves)
         motion = compensation(camera_jacobian(a, seen)[..., :6], _difference(a, b, seen))
         x, X = grid_points(a, depth)
         near = np.logical_and(*(covered(x, half.seen[name].x, a.hw) for half in halves))
         x, X = x[near], X[near]
-        found[name] = x, _difference(a, b, X) - (camera_jacobian(a, X)[..., :6] @ motion)[..., 0]
-    return found
+        differences[name] = x, _difference(a, b, X) - (camera_jacobian(a, X)[..., :6] @ motion)[..., 0]
+    return differences
 
 
 def _difference(a: Camera, b: Camera, X: np.ndarray) -> Float[np.ndarray, "n 2"]:
@@ -248,8 +248,8 @@ def _gains(fit: Solved, deviations: StartDeviations) -> str:
     )
     texts = []
     for kind, label, before in stated:
-        found = [d for name, d in fit.deviations.items() if f".{kind}." in name]
-        texts += [f"{label} ±{before:.3g} > ±{np.median(found):.3g} px"] if found else []
+        after = [d for name, d in fit.deviations.items() if f".{kind}." in name]
+        texts += [f"{label} ±{before:.3g} > ±{np.median(after):.3g} px"] if after else []
     positions = np.median(_position_deviations(fit))
     texts.append(f"positions ±{1e3 * deviations.position:.3g} > ±{1e3 * positions:.3g} mm")
     return f"held to the start; standard deviations stated > with the images: {', '.join(texts)}"
@@ -258,14 +258,14 @@ def _gains(fit: Solved, deviations: StartDeviations) -> str:
 def _position_deviations(fit: Solved) -> list[float]:
     """Of each camera's optical centre, root mean square of the axes, metres."""
     assert fit.covariance is not None
-    found = []
+    deviations = []
     for name, camera in fit.problem.cameras.items():
         derivatives = camera.cam_from_world.centre_jacobian.numpy()
         first = fit.names.index(f"{name}.rotation.0")
         pose = slice(first, first + 6)
         covariance = derivatives @ fit.covariance[pose, pose] @ derivatives.T
-        found.append(float(np.sqrt(np.trace(covariance) / 3)))
-    return found
+        deviations.append(float(np.sqrt(np.trace(covariance) / 3)))
+    return deviations
 
 
 def _far(fit: Solved) -> Iterator[str]:

@@ -83,12 +83,12 @@ class DepthChange(NamedTuple):
         )
 
 
-def relative_change(given: Rig, refined: Rig, pairs: Pairs) -> float:
+def relative_change(original: Rig, refined: Rig, pairs: Pairs) -> float:
     """The median of |depth after / depth before - 1| over points observable before; NaN for too few.
 
     Points that have no depth afterwards (behind a camera, too far) count as 1.
     """
-    before, after = (observed_depths(rig, pairs) for rig in (given, refined))
+    before, after = (observed_depths(rig, pairs) for rig in (original, refined))
     usable = (after / before - 1).abs()[~before.isnan()].nan_to_num(1.0)
     return float(usable.median()) if len(usable) >= FEW else torch.nan
 

@@ -195,27 +195,27 @@ def _by_evidence(
     if not some:
         return given, []
     limit = misfit[some[0]] / LARGEST_REMAINDER[1] + EQUAL[1]
-    found = {
+    evidence_for = {
         h: DriftEvidence.of(h.rig, pairs, inliers, noise)
         for h in (given, *some)
         if misfit[h] <= limit or h is given
     }
-    drift = found.pop(given)
-    least = min(evidence.cost for evidence in found.values())
-    best = next(h for h in misfit if h in found and found[h].cost <= least + TIE)
+    drift = evidence_for.pop(given)
+    least = min(evidence.cost for evidence in evidence_for.values())
+    best = next(h for h in misfit if h in evidence_for and evidence_for[h].cost <= least + TIE)
     allowed = max(ROUGHLY if best.approximate else EXPLAINED[0], EXPLAINED[1] * misfit[given])
     parts = image_parts(given.rig, pairs)
     rest = (inliers & (parts != part) for part in parts.unique().tolist())
     clear = (
         misfit[best] <= allowed
-        and found[best].cost + MARGIN < drift.cost
-        and all(found[best].by(used) + MARGIN < drift.by(used) for used in rest)
+        and evidence_for[best].cost + MARGIN < drift.cost
+        and all(evidence_for[best].by(used) + MARGIN < drift.by(used) for used in rest)
     )
     is_named = mirrored or (clear and (bool(given.rig.links) or best.kind not in SHIFTS))
     bound = MARGIN + (least if is_named else min(least, drift.cost))
     near = EQUAL[0] * misfit[best] + EQUAL[1] if is_named else 0.0
-    ranked = sorted(found, key=lambda h: found[h].cost)
-    as_good = [h for h in ranked if found[h].cost <= bound or misfit[h] <= near]
+    ranked = sorted(evidence_for, key=lambda h: evidence_for[h].cost)
+    as_good = [h for h in ranked if evidence_for[h].cost <= bound or misfit[h] <= near]
     return best if is_named else given, as_good
 
 
@@ -268,10 +268,10 @@ def _degrees(rig: Rig, pairs: Pairs) -> list[Hypothesis]:
         turns[other] = off.argmin(1)
     best = int(cost.argmin())
     missing = {first: TURNS[best]} | {other: TURNS[int(i[best])] for other, i in turns.items()}
-    found = in_degrees(rig, missing)
-    before, after = ([r.pair(first, other).beta_from_alpha.R for other in others] for r in (rig, found.rig))
+    degrees = in_degrees(rig, missing)
+    before, after = ([r.pair(first, other).beta_from_alpha.R for other in others] for r in (rig, degrees.rig))
     angles = [float(rotation_vector(R.mT @ Q).norm()) for R, Q in zip(before, after)]
-    return [found] if max(angles) > 3 * SCALES[-1] * SIGMA["rotation"] else []
+    return [degrees] if max(angles) > 3 * SCALES[-1] * SIGMA["rotation"] else []
 
 
 def _off_planes(rig: Rig, names: tuple[str, str], matches: PointMatches) -> Float[Tensor, "k k"]:

@@ -107,7 +107,7 @@ def fit_statistics(
     observed = observations([hypothesis.rig for hypothesis in tried], pairs)
     inliers, floor = _inliers(tried, observed.off, pairs)
     preserved = [_handedness(matches) for matches in pairs.values()]
-    found = {}
+    statistics = {}
     for hypothesis, off, depth, front in zip(tried, *observed):
         rig, observable = hypothesis.rig, ~depth.isnan()
         ahead = depth[observable & front]
@@ -115,7 +115,7 @@ def fit_statistics(
         if rig.depth is not None:
             near, far = (float(bound) for bound in rig.depth)
             inside = share((ahead > 0.5 * near) & (ahead < 2 * far))
-        found[hypothesis] = FitStatistics(
+        statistics[hypothesis] = FitStatistics(
             off=float(off[inliers].abs().median()),
             misfit=math.sqrt(max(trimmed_square(off[inliers]) - floor, 0.0)),
             front=share(front[observable]),
@@ -123,7 +123,7 @@ def fit_statistics(
             handed=fmean(abs(kept - _mirrors(rig, names)) for kept, names in zip(preserved, pairs)),
             depth=float(ahead.median()) if len(ahead) >= FEW else math.nan,
         )
-    return found, inliers, max(math.sqrt(floor / OF_TRIMMED), LEAST_NOISE)
+    return statistics, inliers, max(math.sqrt(floor / OF_TRIMMED), LEAST_NOISE)
 
 
 class PointObservations(NamedTuple):
@@ -242,15 +242,15 @@ class DriftEvidence:
             return explained + volume + fixed[scale]
 
         best = min(SCALES, key=cost_of)
-        found = cls(math.inf, distances, z, r, J, B, best, fixed[best], CLIPPED / noise)
+        evidence = cls(math.inf, distances, z, r, J, B, best, fixed[best], CLIPPED / noise)
         for _ in range(STEPS):
-            cost = found._at(found.z, used)
-            if not cost < found.cost - NO_BETTER:
-                return replace(found, cost=min(cost, found.cost))
-            z = found._refitted(used)
+            cost = evidence._at(evidence.z, used)
+            if not cost < evidence.cost - NO_BETTER:
+                return replace(evidence, cost=min(cost, evidence.cost))
+            z = evidence._refitted(used)
             r, J = jacobian(distances, z)
-            found = replace(found, cost=cost, z=z, r=r - J @ z, J=J)
-        return found
+            evidence = replace(evidence, cost=cost, z=z, r=r - J @ z, J=J)
+        return evidence
 
     def by(self, used: Bool[Tensor, " n"]) -> float:
         """The cost by other points, of this drift or of the best by them to first order: the better."""
@@ -283,11 +283,11 @@ def _drift(r: Tensor, J: Tensor, B: Tensor, scale: float) -> tuple[float, float,
 def _rotation_to_plausible_depth(rig: Rig, pairs: Pairs) -> float:
     """The rotation, in prior deviations, that brings half the points in front and into the depth range."""
     near, far = (0.0, math.inf) if rig.depth is None else (float(bound) for bound in rig.depth)
-    found = []
+    rotations = []
     for names, matches in pairs.items():
         if (pair := rig.pair(*names)).calibrated and pair.link is None:
             baseline = float(pair.beta_from_alpha.t.norm())
             parallax = (baseline / match_depths(rig, {names: matches}).depth).nan_to_num()
             low, high = baseline / (2 * far), baseline / max(near / 2, 1e-12)
-            found.append((low - parallax).clamp(min=0) + (parallax - high).clamp(min=0))
-    return float(torch.cat(found).median()) / SIGMA["rotation"] if found else 0.0
+            rotations.append((low - parallax).clamp(min=0) + (parallax - high).clamp(min=0))
+    return float(torch.cat(rotations).median()) / SIGMA["rotation"] if rotations else 0.0

@@ -55,9 +55,9 @@ def guided_matches(
     corners = cv2.goodFeaturesToTrack(own, POINTS, 1e-3, SPACING, mask=mask)
     x = np.zeros((0, 2)) if corners is None else corners[:, 0].astype(np.float64)
     there = cv2.perspectiveTransform(x[:, None], beta_from_alpha.double().numpy())[:, 0] if len(x) else x
-    found = [_most_alike(own, other, valid, *points, window) for points in zip(x, there)]
-    kept = [i for i, y in enumerate(found) if y is not None]
-    y = np.array([found[i] for i in kept], np.float64).reshape(-1, 2)
+    positions = [_most_alike(own, other, valid, *points, window) for points in zip(x, there)]
+    kept = [i for i, y in enumerate(positions) if y is not None]
+    y = np.array([positions[i] for i in kept], np.float64).reshape(-1, 2)
     return PointMatches(torch.from_numpy(x[kept].round()), torch.from_numpy(y))
 
 

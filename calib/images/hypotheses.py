@@ -66,19 +66,19 @@ def hypotheses(rig: Rig, sizes: Mapping[str, HW]) -> list[Hypothesis]:
     """
     names = [name for name in rig.names if name in sizes]
     wrong = [name for name in names if rig[name].hw != sizes[name]]
-    found = [
+    candidates = [
         Hypothesis("cameras swapped", f"images of '{a}' and '{b}' swapped", swap(rig, a, b))
         for a, b in combinations(names, 2)
     ]
     if wrong:
-        found = [*_of_sizes(rig, wrong, sizes), *found]
+        candidates = [*_of_sizes(rig, wrong, sizes), *candidates]
     else:
-        found = [h for h in [*found, *_of_numbers(rig, names)] if _is_plausible(rig, h)]
-    fitting = [h for h in found if all(h.rig[name].hw == sizes[name] for name in names)]
+        candidates = [h for h in [*candidates, *_of_numbers(rig, names)] if _is_plausible(rig, h)]
+    fitting = [h for h in candidates if all(h.rig[name].hw == sizes[name] for name in names)]
     return [Hypothesis("nothing", "as given", rig), *fitting]
 
 
-def _is_plausible(given: Rig, hypothesis: Hypothesis) -> bool:
+def _is_plausible(rig: Rig, hypothesis: Hypothesis) -> bool:
     """Whether a rig may hold this mistake, by its numbers alone.
 
     Another size and exchanged axes change K by more than a drift does, and take principal points away from
@@ -87,16 +87,16 @@ def _is_plausible(given: Rig, hypothesis: Hypothesis) -> bool:
     """
     if hypothesis.kind not in ("resized", "x and y exchanged"):
         return True
-    views = zip(given.cameras.values(), hypothesis.rig.cameras.values())
+    views = zip(rig.cameras.values(), hypothesis.rig.cameras.values())
     changed = [(a, b) for a, b in views if a is not b and isinstance(a, LensView) and isinstance(b, LensView)]
     nearer = all(_centre_offset(b) <= max(_centre_offset(a), OFF_CENTRE) for a, b in changed)
     return nearer and (not changed or any(_beyond_drift(a.K, b.K) for a, b in changed))
 
 
-def _beyond_drift(given: Tensor, other: Tensor) -> bool:
+def _beyond_drift(own: Tensor, other: Tensor) -> bool:
     """Whether a focal length or a principal point differs by more than `LARGEST_CHANGE` prior deviations."""
-    focal = (other / given - 1).diagonal()[:2].abs().max() / SIGMA["focal"]
-    centre = (other - given)[:2, 2].norm() / SIGMA["centre"]
+    focal = (other / own - 1).diagonal()[:2].abs().max() / SIGMA["focal"]
+    centre = (other - own)[:2, 2].norm() / SIGMA["centre"]
     return bool(torch.maximum(focal, centre) > LARGEST_CHANGE)
 
 

@@ -54,8 +54,8 @@ def centres_found(
         infinite = rig[b].K @ rig[b].R @ rig[a].R.mT @ torch.linalg.inv(rig[a].K)
         window = round(WINDOW * max(images[b].shape[-2:]))
         matches = guided_matches(images[a], images[b], infinite, window=window, shown=(shown[a], shown[b]))
-        if (found := _consistent(rig, a, b, matches)) is not None:
-            pairs[a, b] = found
+        if (consistent := _consistent(rig, a, b, matches)) is not None:
+            pairs[a, b] = consistent
     rig, pairs = _matched(rig, alpha, pairs)
     rig = _with_centres(rig, alpha, pairs)
     for within in ROUNDS:
@@ -164,7 +164,7 @@ def _points_ahead(
 def _depths(rig: Rig, near: Mapping[tuple[str, str], PointMatches]) -> tuple[float, float]:
     """The range of depths that all pairs' points have, extended. Raises ValueError without parallax."""
     every = [depth_bounds(Rig({name: rig[name] for name in pair}), m) for pair, m in near.items()]
-    found = [bounds for bounds in every if bounds is not None]
-    if not found:
+    bounded = [bounds for bounds in every if bounds is not None]
+    if not bounded:
         raise ValueError("the images have no parallax, so depths stay unknown: give a rig file")
-    return min(n for n, _ in found), max(f for _, f in found)
+    return min(n for n, _ in bounded), max(f for _, f in bounded)

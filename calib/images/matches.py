@@ -108,10 +108,12 @@ def detect_features(image: Float[Tensor, "_ h w"]) -> SiftFeatures:
     """SIFT features of an image's luminance, its contrast equalised."""
     even = contrast_equalised(image)
     sift = cv2.SIFT.create(FEATURES, enable_precise_upscale=True)
-    found, descriptors = sift.detectAndCompute(even, np.empty(0, np.uint8))
-    points = np.array([p.pt for p in found], np.float64).reshape(-1, 2)
-    sizes, angles = (np.array([getattr(p, name) for p in found], np.float64) for name in ("size", "angle"))
-    described = np.asarray(descriptors, np.float32) if len(found) else np.zeros((0, 128), np.float32)
+    keypoints, descriptors = sift.detectAndCompute(even, np.empty(0, np.uint8))
+    points = np.array([p.pt for p in keypoints], np.float64).reshape(-1, 2)
+    sizes, angles = (
+        np.array([getattr(p, name) for p in keypoints], np.float64) for name in ("size", "angle")
+    )
+    described = np.asarray(descriptors, np.float32) if len(keypoints) else np.zeros((0, 128), np.float32)
     return SiftFeatures(points, sizes, np.radians(angles), described, even)
 
 
@@ -167,17 +169,17 @@ def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str
             raise ValueError(
                 f"the image of '{name}' has hardly any texture to match: take one in focus, with detail"
             )
-    found = {}
+    by_pair = {}
     for i, (a, b) in enumerate(pairs, len(images)):
         log_step(LOG, i / total, "matching %s and %s", a, b)
-        found[a, b] = _agreeing(features[a], features[b], images[b])
-    kept = {names: matches for names, matches in found.items() if len(matches.alpha) >= ENOUGH}
+        by_pair[a, b] = _agreeing(features[a], features[b], images[b])
+    kept = {names: matches for names, matches in by_pair.items() if len(matches.alpha) >= ENOUGH}
     for (a, b), matches in kept.items():
         displacement = float((matches.alpha - matches.beta).norm(dim=-1).quantile(0.9))
         if images[a].shape[1:] == images[b].shape[1:] and displacement < STILL:
             raise ValueError(f"the images of '{a}' and '{b}' are the same image: give each camera its own")
     if not kept:
-        (a, b), most = max(found.items(), key=lambda item: len(item[1].alpha))
+        (a, b), most = max(by_pair.items(), key=lambda item: len(item[1].alpha))
         raise ValueError(
             f"only {len(most.alpha)} points seen in both '{a}' and '{b}' agree, {ENOUGH} are needed: "
             "do the cameras see the same things, at the same time and in focus?"
@@ -203,12 +205,12 @@ def agreeing(matches: PointMatches) -> PointMatches:
     return matches.only(torch.zeros(len(matches.alpha), dtype=torch.bool))
 
 
-def agreeing_pairs(given: Pairs) -> dict[tuple[str, str], PointMatches]:
+def agreeing_pairs(pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
     """Consistent matches of pairs that have enough, from elsewhere. Raises ValueError if none has."""
-    found = {names: agreeing(matches) for names, matches in given.items()}
-    kept = {names: matches for names, matches in found.items() if len(matches.alpha) >= ENOUGH}
+    agreed = {names: agreeing(matches) for names, matches in pairs.items()}
+    kept = {names: matches for names, matches in agreed.items() if len(matches.alpha) >= ENOUGH}
     if not kept:
-        most = max((len(matches.alpha) for matches in found.values()), default=0)
+        most = max((len(matches.alpha) for matches in agreed.values()), default=0)
         raise ValueError(
             f"only {most} of the given matches agree with any rig, "
             f"{ENOUGH} are needed: are they of these images?"
@@ -262,10 +264,10 @@ def _with_rough_map(matches: PointMatches, F: Tensor) -> FittedLink:
             f"only {len(matches.alpha)} points seen in both images agree with F: does it belong to them?"
         )
     x, y = (points.numpy() for points in matches)
-    found, _ = cv2.estimateAffinePartial2D(x, y, ransacReprojThreshold=30)
-    if found is None:
+    affine, _ = cv2.estimateAffinePartial2D(x, y, ransacReprojThreshold=30)
+    if affine is None:
         raise ValueError("no similarity fits the points seen in both images")
-    H = torch.from_numpy(np.vstack([found, [0, 0, 1]]))
+    H = torch.from_numpy(np.vstack([affine, [0, 0, 1]]))
     line = epipolar_lines(F, matches.alpha)
     along = torch.stack([-line[:, 1], line[:, 0]], -1)
 
@@ -289,8 +291,8 @@ def depths_near_lines(pair: Pair, matches: PointMatches, *, within: float) -> Fl
     undistorted = PointMatches(pair.alpha.undistort(matches.alpha)[0], pair.beta.undistort(matches.beta)[0])
     near = matches.only(line_distance(undistorted, pair.fundamental) <= within)
     cameras = [camera.to(torch.float64) for camera in pair.cameras]
-    found = triangulate(cameras, torch.stack(near), deviation=LOCALISED, residual=within)
-    return cameras[0].cam_from_world.apply(found.X)[found.valid, 2]
+    triangulated = triangulate(cameras, torch.stack(near), deviation=LOCALISED, residual=within)
+    return cameras[0].cam_from_world.apply(triangulated.X)[triangulated.valid, 2]
 
 
 def seen_depths(pair: Pair, matches: PointMatches) -> tuple[float, float]:
@@ -310,23 +312,23 @@ def seen_depths(pair: Pair, matches: PointMatches) -> tuple[float, float]:
 
 def depth_seen(rig: Rig, pairs: Pairs) -> tuple[float, float] | None:
     """`seen_depths` of all pairs related by their poses, together; None if none has enough points."""
-    found = []
+    depths = []
     for names, matches in pairs.items():
         if (pair := rig.pair(*names)).calibrated and pair.link is None:
             with suppress(ValueError):
-                found.append(seen_depths(pair, matches))
-    return (min(near for near, _ in found), max(far for _, far in found)) if found else None
+                depths.append(seen_depths(pair, matches))
+    return (min(near for near, _ in depths), max(far for _, far in depths)) if depths else None
 
 
 def fit_fundamental(matches: PointMatches) -> Float[Tensor, "3 3"]:
     """F by MAGSAC++ (Barath et al. 2020) to 1 px, or else by RANSAC. Raises ValueError if none fits."""
     x, y = (points.numpy() for points in matches)
-    found = None
+    F = None
     for method in (cv2.USAC_MAGSAC, cv2.FM_RANSAC):
         with suppress(cv2.error):
-            found, _ = cv2.findFundamentalMat(x, y, method, 1.0, 0.999, 10_000)
-        if found is not None and found.shape == (3, 3):
-            return torch.from_numpy(found)
+            F, _ = cv2.findFundamentalMat(x, y, method, 1.0, 0.999, 10_000)
+        if F is not None and F.shape == (3, 3):
+            return torch.from_numpy(F)
     raise ValueError("no fundamental matrix fits the points seen in both images")
 
 

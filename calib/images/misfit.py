@@ -42,8 +42,8 @@ class Misfit(NamedTuple):
 
 def misfit_warning(rig: Rig, images: Images) -> str | None:
     """The sentence of `find_misfit`, if any."""
-    found = find_misfit(rig, images)
-    return None if found is None else found.text
+    misfit = find_misfit(rig, images)
+    return None if misfit is None else misfit.text
 
 
 def find_misfit(rig: Rig, images: Images) -> Misfit | None:
@@ -62,9 +62,9 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
     rough = _matched(rig, some, ROUGH_SIDE)
     if rough is not None and median_off(*rough) <= limit and share_outside(*rough) <= OUTSIDE:
         return None
-    if (found := _matched(rig, some, LARGEST_SIDE)) is None:
+    if (matched := _matched(rig, some, LARGEST_SIDE)) is None:
         return None
-    rig, pairs = found
+    rig, pairs = matched
     off, outside = median_off(rig, pairs), share_outside(rig, pairs)
     if off <= max(BADLY, OF_OWN * own_distance(rig, pairs)) and not outside > OUTSIDE:
         return None

@@ -85,13 +85,15 @@ def free_parameters(
     calibrated = [name for name in parameters if isinstance(rig[_camera_of(name)], Camera)]
     wanted = [*_matching(calibrated, free), *(name for name in parameters if name not in calibrated)]
     fixed = {f"{names[0]}.rotation", f"{names[0]}.translation"}
-    found = [
+    of_cameras = [
         _free_parameter(rig, name, parameters[name], sigma)
         for name in wanted
         if _camera_of(name) in names and name not in fixed
     ]
     links = [f"{a} > {b}" for a, b in rig.links if a in names and b in names]
-    return found + [FreeParameter(name, torch.full((7,), LINK_SIGMA).double(), "F", 1.0) for name in links]
+    return of_cameras + [
+        FreeParameter(name, torch.full((7,), LINK_SIGMA).double(), "F", 1.0) for name in links
+    ]
 
 
 def considered_parameters(
@@ -102,14 +104,16 @@ def considered_parameters(
     Their uncertainty counts, but they are not changed.
     """
     fixed = {f.name for f in free}
-    found = free_parameters(rig, names, free=UNCERTAIN, sigma=sigma)
-    return [f for f in found if f.name not in fixed and f.unit != "F" and not f.name.endswith(".distortion")]
+    parameters = free_parameters(rig, names, free=UNCERTAIN, sigma=sigma)
+    return [
+        f for f in parameters if f.name not in fixed and f.unit != "F" and not f.name.endswith(".distortion")
+    ]
 
 
-def apply_change(rig: Rig, given: Sequence[FreeParameter], z: Float[Tensor, " n"]) -> Rig:
+def apply_change(rig: Rig, parameters: Sequence[FreeParameter], z: Float[Tensor, " n"]) -> Rig:
     """The rig after a change of each component by z standard deviations; differentiable in z."""
-    parts = z.split([len(u.sigma) for u in given])
-    values = {u.name: u.root.to(part) @ part for u, part in zip(given, parts)}
+    parts = z.split([len(u.sigma) for u in parameters])
+    values = {u.name: u.root.to(part) @ part for u, part in zip(parameters, parts)}
     links = {
         names: _perturbed_link(link, values.get(" > ".join(names)), rig, names)
         for names, link in rig.links.items()

@@ -56,15 +56,15 @@ def refine_points(
     weight = np.exp(-(around**2).sum(1) / (2 * (HALF_PATCH / 1.6) ** 2))
     image = beta.astype(np.float32)
     slopes = [cv2.Sobel(image, cv2.CV_32F, 1 - k, k, ksize=3) / 8 for k in (0, 1)]
-    found = PatchWarps(
+    warps = PatchWarps(
         _sampled(alpha.astype(np.float32), x[:, None] + step * around), y, step * beta_from_alpha
     )
     for _ in range(STEPS):
-        found, correlation, moved, deviation = _step(found, [image, *slopes], around, weight)
+        warps, correlation, moved, deviation = _step(warps, [image, *slopes], around, weight)
         if np.quantile(moved, 0.9) < CONVERGED:
             break
-    good = (correlation > LEAST_CORRELATION) & (np.linalg.norm(found.y - y, axis=1) < LARGEST_SHIFT)
-    return RefinedPoints(np.where(good[:, None], found.y, y), np.where(good, deviation, np.inf))
+    good = (correlation > LEAST_CORRELATION) & (np.linalg.norm(warps.y - y, axis=1) < LARGEST_SHIFT)
+    return RefinedPoints(np.where(good[:, None], warps.y, y), np.where(good, deviation, np.inf))
 
 
 def _sampled(image: Array, x: Array) -> Array:
@@ -75,14 +75,14 @@ def _sampled(image: Array, x: Array) -> Array:
 
 
 def _step(
-    found: PatchWarps, images: list[Array], around: Array, weights: Array
+    warps: PatchWarps, images: list[Array], around: Array, weights: Array
 ) -> tuple[PatchWarps, Array, Array, Array]:
     """The patches after a step, their correlation before it, how far they moved, and the standard deviation
     of their positions by the residuals (worse axis, pixels)."""
     weight = weights / weights.sum()
-    at = found.y[:, None] + around @ found.A.swapaxes(1, 2)
+    at = warps.y[:, None] + around @ warps.A.swapaxes(1, 2)
     seen, across, down = (_sampled(p, at) for p in images)
-    seen, wanted = (v - (v @ weight)[:, None] for v in (seen, found.values))
+    seen, wanted = (v - (v @ weight)[:, None] for v in (seen, warps.values))
     both, power, own = ((a * b) @ weight for a, b in ((seen, wanted), (seen, seen), (wanted, wanted)))
     gain = (both / (power + 1e-6))[:, None]
     J = np.stack([across, down, *(slope * part for slope in (across, down) for part in around.T)], -1)
@@ -96,5 +96,5 @@ def _step(
     left = ((wanted - gain * seen) ** 2) @ weight
     covariance = np.linalg.inv(H)[:, :2, :2] * (left / weights.sum())[:, None, None]
     deviation = np.sqrt(np.linalg.eigvalsh(covariance)[:, 1])
-    moved = found._replace(y=found.y + shift, A=found.A + affine)
+    moved = warps._replace(y=warps.y + shift, A=warps.A + affine)
     return moved, correlation, np.linalg.norm(shift, axis=1), deviation

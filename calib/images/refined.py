@@ -68,10 +68,10 @@ class Refinement:
 
     def as_text(self) -> str:
         """The changes, the distances of held-out points and what happens to depth, as text."""
-        given, refined = self.held_out
+        original, refined = self.held_out
         verdict = "accepted all the same" if self.accepted else "not accepted"
         lines = [
-            f"held-out points ({given.points}) lie {given} from their lines before, {refined} after",
+            f"held-out points ({original.points}) lie {original} from their lines before, {refined} after",
             "" if self.depth is None else str(self.depth),
             *(f"{verdict}: {objection}" for objection in self.objections),
             *(f"changed: {change}" for change in self.changes),

@@ -225,8 +225,10 @@ class RefinementProblem:
 
     def after(self, z: Float[Tensor, " n"]) -> Rig:
         """The rig after a change of z, in standard deviations; of considered parameters too if z has them."""
-        given = (*self.parameters, *self.considered)[: len(self.parameters) if len(z) == self.count else None]
-        return apply_change(self.rig, given, z)
+        parameters = (*self.parameters, *self.considered)[
+            : len(self.parameters) if len(z) == self.count else None
+        ]
+        return apply_change(self.rig, parameters, z)
 
     @property
     def count(self) -> int:
@@ -249,15 +251,15 @@ class RefinementProblem:
         columns = systematic.split([len(matches.alpha) for matches in self.used.values()])
 
         def residuals(z: Tensor) -> list[Tensor]:
-            found = sampson_of_pairs(self.after(z[: self.uncertain]), self.used)
-            return [part + own @ z[self.uncertain :] for part, own in zip(found, columns)]
+            distances = sampson_of_pairs(self.after(z[: self.uncertain]), self.used)
+            return [part + own @ z[self.uncertain :] for part, own in zip(distances, columns)]
 
         considered = self.uncertain - self.count + systematic.shape[1]
         unrestricted = solve(residuals, self.count, considered)
-        found = self._determined(unrestricted, residuals)
-        if (depth := self._depth_change(self.after(found.z), found)) is not None and depth.doubtful:
-            found = self._determined(unrestricted, residuals, keep_depth=True)
-        return found
+        determined = self._determined(unrestricted, residuals)
+        if (depth := self._depth_change(self.after(determined.z), determined)) is not None and depth.doubtful:
+            determined = self._determined(unrestricted, residuals, keep_depth=True)
+        return determined
 
     def solve_freely(self) -> Solution:
         """The posterior given the used points, whatever happens to depth."""
@@ -273,21 +275,23 @@ class RefinementProblem:
         active = torch.ones(len(solution.full), dtype=torch.bool)
         active[: self.count] = solution.active
         shifts = shifts_left_out(residuals, solution.full, image_parts(self.rig, self.used), active)
-        found = solution._replace(z=torch.zeros_like(solution.z))
+        determined = solution._replace(z=torch.zeros_like(solution.z))
         for _ in range(2):
-            values = log_depths(self.after, [self.rig, self.after(found.z)], self.used)
+            values = log_depths(self.after, [self.rig, self.after(determined.z)], self.used)
             if values is None:
                 return solution
-            G = jacobian(values, found.z)[1][:, solution.active]
+            G = jacobian(values, determined.z)[1][:, solution.active]
             covariance = solution.covariance[solution.active][:, solution.active]
             modes = depth_modes(G, solution.z[solution.active], covariance, shifts[:, : G.shape[1]])
             kept = modes.deviation < NEGLIGIBLE if keep_depth else modes.kept
             patterns = torch.nn.functional.normalize(G @ modes.root[:, ~kept], dim=0)
-            found = self._without_patterns(solution, active, patterns, residuals, values)
+            determined = self._without_patterns(solution, active, patterns, residuals, values)
             directions = torch.zeros(self.count, int(kept.sum()), dtype=torch.float64)
             directions[solution.active] = modes.root[:, kept]
-            found = found._replace(directions=directions, gained=modes.gained(kept), known=modes.total)
-        return found
+            determined = determined._replace(
+                directions=directions, gained=modes.gained(kept), known=modes.total
+            )
+        return determined
 
     def _without_patterns(
         self,
@@ -390,19 +394,19 @@ class RefinementProblem:
 
 def _contradictions(parameters: Sequence[FreeParameter], z: Tensor) -> list[str]:
     """An objection for each parameter vector that changes by more than its prior allows."""
-    found = []
+    contradictions = []
     for u, change_of in zip(parameters, z.split([len(u.sigma) for u in parameters])):
         change = u.root @ change_of
         worst = int((change / u.sigma).abs().argmax())
         ratio = float((change / u.sigma)[worst].abs())
         if ratio > LARGEST_CHANGE and u.unit != "F":
             size, sigma = (float(v[worst]) * u.factor for v in (change, u.sigma))
-            found.append(
+            contradictions.append(
                 f"{u.label(worst)} would change by {f'{size:+.3g} {u.unit}'.rstrip()}, "
                 f"{ratio:.0f} standard deviations of {sigma:.3g}: is something else wrong (`pat rig "
                 "doctor`)? If so large a change is plausible, say so with --sigma"
             )
-    return found
+    return contradictions
 
 
 def systematic_columns(rig: Rig, pairs: Pairs) -> Float[Tensor, "m s"]:

@@ -95,12 +95,12 @@ def sampson_of_pairs(rig: Rig, pairs: Pairs) -> list[Float[Tensor, " n"]]:
 
 def match_depths(rig: Rig, pairs: Pairs) -> MatchDepths:
     """Of all points of all pairs: depths where rays are closest to each other, differentiable in the rig."""
-    found = []
+    depths = []
     for names, matches in pairs.items():
         pair = rig.pair(*names)
         (a, b), _, valid = _rays(pair, *_for_each(pair, matches))
-        found.append(_depths(pair, a, b, valid))
-    return MatchDepths(*(torch.cat(part) for part in zip(*found)))
+        depths.append(_depths(pair, a, b, valid))
+    return MatchDepths(*(torch.cat(part) for part in zip(*depths)))
 
 
 def _depths(pair: Pair, a: Tensor, b: Tensor, valid: Tensor) -> MatchDepths:
@@ -134,11 +134,11 @@ def systematic_modes(pair: Pair, matches: PointMatches) -> tuple[Float[Tensor, "
         (a, b), F, _ = _rays(pair, alpha, beta)
         slopes = torch.autograd.grad(((b @ F) * a).sum(), (alpha, beta))
     norm = torch.cat(slopes, -1).norm(dim=-1).clamp(min=1e-150)
-    found = [
+    modes = [
         torch.einsum("ni,nim->nm", slope / norm[:, None], displacements(view.hw, x)).nan_to_num()
         for slope, view, x in zip(slopes, (pair.alpha, pair.beta), matches)
     ]
-    return found[0], found[1]
+    return modes[0], modes[1]
 
 
 def displacements(hw: HW, points: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2 4"]:
@@ -168,16 +168,16 @@ def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
 
 def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
     """Those of the pairs the rig relates: calibrated ones and those with an F. Raises ValueError if none."""
-    found = {
+    relations = {
         names: m
         for names, m in pairs.items()
         if (pair := rig.pair(*names)).calibrated or pair.link is not None
     }
-    if not found:
+    if not relations:
         raise ValueError(
             "the rig does not relate these cameras: calibrate them, or make a rig with `pat rig start`"
         )
-    return found
+    return relations
 
 
 def stack_key(pair: Pair) -> tuple[object, ...]:
@@ -225,14 +225,14 @@ def _rays(pair: Pair, x: Tensor, y: Tensor) -> tuple[tuple[Tensor, Tensor], Tens
 
 def own_distance(rig: Rig, pairs: Pairs) -> float:
     """How near points can be to any lines: median distance, undistorted pixels, from those of their own F."""
-    found = []
+    distances = []
     for names, matches in pairs.items():
         undistorted = undistort_matches(rig.pair(*names), matches)
         try:
-            found.append(line_distance(undistorted, fit_fundamental(undistorted)))
+            distances.append(line_distance(undistorted, fit_fundamental(undistorted)))
         except ValueError:
             continue
-    return float(torch.cat(found).median()) if found else 0.0
+    return float(torch.cat(distances).median()) if distances else 0.0
 
 
 def trimmed_square(distance: Float[Tensor, " n"]) -> float:
@@ -290,7 +290,9 @@ def held_out_parts(matches: PointMatches) -> Int[Tensor, " n"]:
 def _joined(frames: Sequence[Pairs]) -> dict[tuple[str, str], PointMatches]:
     names = dict.fromkeys(name for frame in frames for name in frame)
     parts = {name: [frame[name] for frame in frames if name in frame] for name in names}
-    return {name: PointMatches(*(torch.cat(side) for side in zip(*found))) for name, found in parts.items()}
+    return {
+        name: PointMatches(*(torch.cat(side) for side in zip(*matches))) for name, matches in parts.items()
+    }
 
 
 def held_out_pixels(error: Tensor) -> Tensor:

@@ -130,11 +130,11 @@ def self_calibrated(
     in_front = [len(depths_near_lines(_pair(t.rig), near, within=NEAR_LINE)) for t in fitting]
     fitting = [t for t, count in zip(fitting, in_front) if 2 * count > max(in_front)]
     upright = _upright(link)
-    found = min(fitting, key=lambda t: float(angle(_pair(t.rig).beta_from_alpha.R.T @ upright)))
-    rig = found.rig
+    upright_trial = min(fitting, key=lambda t: float(angle(_pair(t.rig).beta_from_alpha.R.T @ upright)))
+    rig = upright_trial.rig
     for name, view in lenses.items():
         rig = rig.with_camera(name, with_lens_of(rig[name], view))
-    return found._replace(rig=rig, exact=found.distance <= best and not lenses)
+    return upright_trial._replace(rig=rig, exact=upright_trial.distance <= best and not lenses)
 
 
 def has_parallax(matches: PointMatches, hw: HW) -> bool:
@@ -247,14 +247,14 @@ def initial_poses(
     flow = y - map_homogeneous(R @ rays[0], matches.alpha)[..., :2]
     _, _, axes = torch.linalg.svd(flow - flow.median(0).values)
     t = torch.cat([axes[0], axes.new_zeros(1)])
-    found = [Pose(R, t), Pose(R, -t)]
+    poses = [Pose(R, t), Pose(R, -t)]
     a, b, threshold = x.numpy(), y.numpy(), 1 / float(K_beta[0, 0])
     fitted, _ = cv2.findEssentialMat(a, b, np.eye(3), method=cv2.RANSAC, threshold=threshold)
     for E in ((K_beta.T @ link.F @ K).numpy(), fitted):
         if E is not None and E.shape == (3, 3):
             _, R_of_E, t_of_E, _ = cv2.recoverPose(E, a, b, np.eye(3))
-            found.append(Pose(torch.from_numpy(R_of_E), torch.from_numpy(t_of_E[:, 0])))
-    return found
+            poses.append(Pose(torch.from_numpy(R_of_E), torch.from_numpy(t_of_E[:, 0])))
+    return poses
 
 
 def _upright(link: Link) -> Float[Tensor, "3 3"]:

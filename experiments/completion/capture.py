@@ -73,8 +73,8 @@ def captured(network: GuidedPAT, pair: StereoPair, seed: int, **options: Any) ->
     own, confidence, mixed, candidates = recorder.given
     colours = [to_luma_chroma(c)[1] for c in (mixed, *differences(confidence, mixed, candidates))]
     h, w = truth.shape[1:]
-    given = torch.cat([own, confidence, *colours], 1)[0, :, :h, :w]
-    return torch.cat([given[:2], to_luma_chroma(truth)[1], given[2:]])
+    planes = torch.cat([own, confidence, *colours], 1)[0, :, :h, :w]
+    return torch.cat([planes[:2], to_luma_chroma(truth)[1], planes[2:]])
 
 
 def write_planes(planes: Float[Tensor, "p h w"], path: Path) -> None:

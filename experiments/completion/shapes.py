@@ -80,8 +80,8 @@ def _last_known(x: NDArray) -> NDArray:
 def _nearest(x: NDArray, kept: NDArray) -> NDArray:
     """Each pixel's value, or that of the nearest one that is kept."""
     there = ndimage.distance_transform_edt(~kept, return_distances=False, return_indices=True)
-    found: NDArray = x[tuple(there)]
-    return found
+    nearest: NDArray = x[tuple(there)]
+    return nearest
 
 
 def _window(labels: NDArray, value: NDArray, rng: np.random.Generator) -> tuple[NDArray, NDArray]:

@@ -70,7 +70,7 @@ def kept(config: CompletionTraining, network: GuidedPAT, kind: str) -> list[Tens
     """Planes of pairs of a kind, captured where they are not yet."""
     folder = config.out / kind
     folder.mkdir(parents=True, exist_ok=True)
-    found = []
+    samples = []
     for i, make in enumerate(config.pairs(kind)):
         file = folder / f"{i:05}.webp"
         if not file.exists():
@@ -79,8 +79,8 @@ def kept(config: CompletionTraining, network: GuidedPAT, kind: str) -> list[Tens
             best = unseeing(config.choices, pair.name) if learned else None
             planes = captured(network, pair, i, matcher=partial(match, choice=best))
             write_planes(planes[:, :HIGHEST], file)
-        found.append(read_planes(file))
-    return found
+        samples.append(read_planes(file))
+    return samples
 
 
 def losses(
@@ -96,9 +96,9 @@ def losses(
         parts = [window(kinds[i % len(kinds)], config.side, g) for i in range(config.batch)]
         planes = varied(torch.stack(parts), g).to(config.device)
         facts, truth = torch.cat([planes[:, :2], planes[:, 4:]], 1), planes[:, 2:4]
-        given = features(facts[:, :1], facts[:, 1:2], [facts[:, 2:]])
+        inputs = features(facts[:, :1], facts[:, 1:2], [facts[:, 2:]])
         with torch.autocast(config.device, torch.bfloat16, enabled=config.device != "cpu"):
-            answer = network.answer(given).float()
+            answer = network.answer(inputs).float()
         own, shares = answer.split([2, CANDIDATES], 1)
         _, confidence, mixed, apart = facts.split([1, 1, 2, 2 * CANDIDATES], 1)
         change = (shares[:, :, None] * apart.unflatten(1, (-1, 2))).sum(1) + (1 - confidence) * own
@@ -125,8 +125,8 @@ def varied(planes: Float[Tensor, "b p n n"], g: Generator) -> Float[Tensor, "b p
     c, s = size * angle.cos(), size * angle.sin()
     root = hue_axes()
     turned = root.T @ torch.stack([torch.stack([c, -s], -1), torch.stack([s, c], -1)], -2) @ root.T.inverse()
-    found = torch.einsum("bij,bkjyx->bkiyx", turned, chroma.unflatten(1, (-1, 2))).flatten(1, 2)
-    return torch.cat([light, found], 1)
+    turned_chroma = torch.einsum("bij,bkjyx->bkiyx", turned, chroma.unflatten(1, (-1, 2))).flatten(1, 2)
+    return torch.cat([light, turned_chroma], 1)
 
 
 def hue_axes() -> Float[Tensor, "2 2"]:

@@ -126,26 +126,26 @@ def judged_pair(network: FusionNetwork, pair: StereoPair, condition: str, choice
     kept: list[BetaMatches] = []
 
     def matcher(inputs: Inputs) -> Matches:
-        found = match(inputs, choice)
-        kept.extend(found.betas)
-        return found
+        matches = match(inputs, choice)
+        kept.extend(matches.betas)
+        return matches
 
     fused = rectified_fusion(network, noise=stated, matcher=matcher)(task.alpha, task.beta, PAPER_DISPARITY)
     assert fused.disparity is not None
     (value, known), (h, w) = task.disparity, hw_of(task.alpha)
     places = known.nonzero()
     y, x = places[torch.randperm(len(places), generator=Generator().manual_seed(0))[:PIXELS]].unbind(-1)
-    (found,) = kept
-    numbers = measured(found, typical_facts(found))[0, :, y // FINE, x // FINE].T
-    right = task.disparity.regions().seen & ((found.surface[0, 0, :h, :w] - value).abs() <= 1)
+    (matches,) = kept
+    numbers = measured(matches, typical_facts(matches))[0, :, y // FINE, x // FINE].T
+    right = task.disparity.regions().seen & ((matches.surface[0, 0, :h, :w] - value).abs() <= 1)
     error = (fused.disparity - value).abs().nan_to_num(float(w))
     return Judged(pair.name, condition, numbers, right[y, x], error[y, x])
 
 
-def fitted(found: Sequence[Judged], *, steps: int = STEPS) -> CertaintyNetwork:
+def fitted(pixels: Sequence[Judged], *, steps: int = STEPS) -> CertaintyNetwork:
     """The network that states of all of these together what they ask for."""
     numbers, right, error = (
-        torch.cat([getattr(j, name) for j in found]) for name in ("numbers", "right", "error")
+        torch.cat([getattr(j, name) for j in pixels]) for name in ("numbers", "right", "error")
     )
     middle, spread = numbers.mean(0), numbers.std(0) + 1e-6
     farness = error.clamp(min=0.02).log()
@@ -171,19 +171,19 @@ def fitted(found: Sequence[Judged], *, steps: int = STEPS) -> CertaintyNetwork:
     return network.eval().requires_grad_(False)
 
 
-def by_thirds(found: Sequence[Judged], *, steps: int = STEPS) -> Callable[[Judged], Stated]:
+def by_thirds(pixels: Sequence[Judged], *, steps: int = STEPS) -> Callable[[Judged], Stated]:
     """What fits to two thirds of the pairs state of the others."""
-    pairs = distinct(j.pair for j in found)
-    networks = [fitted([j for j in found if j.pair not in pairs[k::3]], steps=steps) for k in range(3)]
+    pairs = distinct(j.pair for j in pixels)
+    networks = [fitted([j for j in pixels if j.pair not in pairs[k::3]], steps=steps) for k in range(3)]
     return lambda one: Stated.by(networks[pairs.index(one.pair) % 3], one.numbers)
 
 
-def widened(found: Sequence[Judged], *, steps: int = STEPS) -> CertaintyNetwork:
+def widened(pixels: Sequence[Judged], *, steps: int = STEPS) -> CertaintyNetwork:
     """The fit to all, its intervals as much wider as makes those of `by_thirds` cover what they are to
     (conformal prediction, Romano et al. 2019): other pairs are always a little farther off than those that
     were fitted to."""
-    stating, network = by_thirds(found, steps=steps), fitted(found, steps=steps)
-    share = torch.cat([one.error / stating(one).half_width for one in found]).quantile(SETTINGS.covered)
+    stating, network = by_thirds(pixels, steps=steps), fitted(pixels, steps=steps)
+    share = torch.cat([one.error / stating(one).half_width for one in pixels]).quantile(SETTINGS.covered)
     _, bias = network[-1].parameters()
     bias[1] += share.log()
     return network
@@ -196,18 +196,18 @@ class Held(NamedTuple):
     covered: float
 
 
-def held(found: Sequence[Judged], stating: Callable[[Judged], Stated]) -> dict[str, Held]:
+def held(pixels: Sequence[Judged], stating: Callable[[Judged], Stated]) -> dict[str, Held]:
     """By condition, and over "all"."""
-    stated = [stating(j) for j in found]
+    stated = [stating(j) for j in pixels]
 
     def of(some: Sequence[int]) -> Held:
-        right, error = (torch.cat([getattr(found[i], name) for i in some]) for name in ("right", "error"))
+        right, error = (torch.cat([getattr(pixels[i], name) for i in some]) for name in ("right", "error"))
         probability, width = (torch.cat(planes) for planes in zip(*(stated[i] for i in some)))
         covered = float((error <= width).float().mean())
         return Held(Reliability.of(probability, right), covered)
 
-    names = distinct(j.condition for j in found)
-    return {n: of([i for i, j in enumerate(found) if n in (j.condition, "all")]) for n in [*names, "all"]}
+    names = distinct(j.condition for j in pixels)
+    return {n: of([i for i, j in enumerate(pixels) if n in (j.condition, "all")]) for n in [*names, "all"]}
 
 
 def held_markdown(held: dict[str, Held]) -> str:

@@ -45,11 +45,11 @@ def finished(path: Path, text: str, more: str = "") -> None:
     say(f"written: {path}{more}")
 
 
-def with_truth(found: Sequence[T], half: str) -> Sequence[T]:
+def with_truth(items: Sequence[T], half: str) -> Sequence[T]:
     """Raises ValueError where no pair of a half has a true disparity."""
-    if not found:
+    if not items:
         raise ValueError(f"--half {half}: none of its pairs has a true disparity: give the other half")
-    return found
+    return items
 
 
 @dataclass
@@ -65,12 +65,12 @@ class Pairs(authors.Evaluate):
 
     def pairs(self) -> list[StereoPair]:
         """All of them. Raises ValueError if there is none."""
-        found = [pair for pairs in self.sets().values() for pair in pairs]
-        if not found:
+        every = [pair for pairs in self.sets().values() for pair in pairs]
+        if not every:
             raise ValueError(
                 f"--half {self.half}: no pair belongs to that half: give more pairs, or the other half"
             )
-        return found
+        return every
 
 
 @dataclass
@@ -106,7 +106,7 @@ class Evaluate(Pairs):
         rows = stereo.evaluate_sets(sets, methods, self.rates, out=self.out)
         text = stereo.sets_markdown(rows, printed=paper.PRINTED[self.protocol])
         if compared:
-            text += "\n" + paper.falls([row for found in rows.values() for row in found], names=compared)
+            text += "\n" + paper.falls([row for of_pair in rows.values() for row in of_pair], names=compared)
         self.write(rows, text)
 
 
@@ -173,14 +173,16 @@ class Certainty:
         writable(self.out, folder=True)
         pairs = list(of_half(middlebury_pairs(self.middlebury), self.half))
         shown = progress("fusing")(pairs, len(pairs))
-        found = with_truth(
+        judged_pixels = with_truth(
             list(certainty.judged(load_weights(self.weights), shown, names, self.choices)), self.half
         )
         if self.fit:
-            write_tensors(self.fit, certainty.widened(found).state_dict())
-            held = certainty.held(found, certainty.by_thirds(found))
+            write_tensors(self.fit, certainty.widened(judged_pixels).state_dict())
+            held = certainty.held(judged_pixels, certainty.by_thirds(judged_pixels))
         else:
-            held = certainty.held(found, lambda one: certainty.Stated.by(fitted_network(), one.numbers))
+            held = certainty.held(
+                judged_pixels, lambda one: certainty.Stated.by(fitted_network(), one.numbers)
+            )
         certainty.save_reliability(held, self.out / "reliability.png")
         text = certainty.held_markdown(held)
         finished(self.out / "certainty.md", text, ", and reliability.png beside it")

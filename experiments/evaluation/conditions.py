@@ -95,8 +95,8 @@ def _moved(rows: float = 0.0, degrees: float = 0.0) -> Callable[[Tensor], Tensor
         columns = (c * x + s * y + (w - 1) / 2).clamp(0, w - 1)
         lines = (c * y - s * x + (h - 1) / 2).clamp(0, h - 1)
         where = torch.stack([columns, lines], -1).reshape(1, -1, 2)
-        found = sample(image[None], where, interpolation="bicubic").values
-        return found.reshape(image.shape).clamp(0, 1)
+        sampled = sample(image[None], where, interpolation="bicubic").values
+        return sampled.reshape(image.shape).clamp(0, 1)
 
     return moved
 
@@ -154,17 +154,17 @@ class ConditionRow(NamedTuple):
 
 def methods_of(network: FusionNetwork, level: NoiseLevel | None) -> dict[str, StereoMethod]:
     """Those compared: classical, denoised first if there is noise, ours as it is and without corrections."""
-    found: dict[str, StereoMethod] = {"classical": classical}
+    methods: dict[str, StereoMethod] = {"classical": classical}
     if level is None:
-        found["classical, corrected"] = lambda a, b, d: corrected_classical(network, a, b, d)
+        methods["classical, corrected"] = lambda a, b, d: corrected_classical(network, a, b, d)
     else:
-        found["denoised, classical"] = lambda a, b, d: classical(
+        methods["denoised, classical"] = lambda a, b, d: classical(
             denoised_knowing(a, level), denoised_knowing(b, level), d
         )
-    found["uncorrected"] = rectified_fusion(network, response="rec601", align=False)
+    methods["uncorrected"] = rectified_fusion(network, response="rec601", align=False)
     noisy: dict[str, Any] = {} if level is None else {"noise": {"alpha": level, "beta": level}}
-    found["fusion"] = rectified_fusion(network, **noisy)
-    return found
+    methods["fusion"] = rectified_fusion(network, **noisy)
+    return methods
 
 
 def corrected_classical(
@@ -181,17 +181,17 @@ def corrected_classical(
 def classical(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
     """The classical baseline, disparity by OpenCV's semi-global matching; NaN where that gives nothing."""
     right = luminance(enlarged(beta, hw_of(alpha)))[0]
-    found = torch.from_numpy(raw_disparity(to_bytes(alpha[0]), to_bytes(right), max_disparity))
+    disparity = torch.from_numpy(raw_disparity(to_bytes(alpha[0]), to_bytes(right), max_disparity))
     image = classical_fusion(alpha, beta, max_disparity)
-    return StereoResult(image, torch.where(found >= 0, found, torch.nan))
+    return StereoResult(image, torch.where(disparity >= 0, disparity, torch.nan))
 
 
 def regions_of(task: MonoColourTask) -> dict[str, Bool[Tensor, "h w"]]:
     """Where left's pixels are seen in right, occluded, beyond its left edge; and all but left columns."""
     h, w = hw_of(task.ground_truth)
-    found = {"whole": torch.ones(h, w, dtype=torch.bool)}
-    found["cropped"] = torch.arange(w).expand(h, w) >= LEFT_CROP
-    return found if task.disparity is None else found | task.disparity.regions()._asdict()
+    regions = {"whole": torch.ones(h, w, dtype=torch.bool)}
+    regions["cropped"] = torch.arange(w).expand(h, w) >= LEFT_CROP
+    return regions if task.disparity is None else regions | task.disparity.regions()._asdict()
 
 
 def chroma_bound(task: MonoColourTask, rate: int) -> Float[Tensor, "3 h w"]:
@@ -241,16 +241,16 @@ def _row(
 
 
 def depth_errors(
-    found: Tensor | None, ground_truth: Disparity | None, regions: Mapping[str, Tensor]
+    estimate: Tensor | None, ground_truth: Disparity | None, regions: Mapping[str, Tensor]
 ) -> tuple[float | None, tuple[float, float] | None]:
     """The end-point error, and shares within a pixel: of all with known ground truth, and of those seen.
 
     A pixel of unknown disparity is not within one pixel, and is left out of the end-point error.
     """
-    if found is None or ground_truth is None:
+    if estimate is None or ground_truth is None:
         return None, None
-    error, of_all = disparity_errors(found, ground_truth)
-    _, of_seen = disparity_errors(found, Disparity(ground_truth.value, regions["seen"]))
+    error, of_all = disparity_errors(estimate, ground_truth)
+    _, of_seen = disparity_errors(estimate, Disparity(ground_truth.value, regions["seen"]))
     return error, None if of_all is None or of_seen is None else (of_all, of_seen)
 
 
@@ -287,8 +287,8 @@ def _by_region(rows: Sequence[ConditionRow]) -> str:
     ideal = [r for r in rows if r.condition == "ideal"]
     lines = []
     for method in distinct(r.method for r in ideal):
-        found = [r for r in ideal if r.method == method]
-        values = [[r.psnr[region] for r in found if region in r.psnr] for region in REGIONS]
+        ours = [r for r in ideal if r.method == method]
+        values = [[r.psnr[region] for r in ours if region in r.psnr] for region in REGIONS]
         lines.append([method, *(f"{np.mean(v):.2f}" if v else "" for v in values)])
     names = ["whole", "seen by beta", "occluded", "beyond beta's edge"]
     return markdown_table(["PSNR", *names, f"without the left {LEFT_CROP} columns"], lines)
@@ -298,9 +298,9 @@ def _depth(rows: Sequence[ConditionRow]) -> str:
     lines = []
     known = [r for r in rows if r.condition in ("ideal", "x1") and r.within_one is not None]
     for condition, method in distinct((r.condition, r.method) for r in known):
-        found = [r for r in known if (r.condition, r.method) == (condition, method)]
-        shares = [100 * float(np.mean([r.within_one[i] for r in found if r.within_one])) for i in range(2)]
-        errors = [r.end_point_error for r in found if r.end_point_error is not None]
+        matching = [r for r in known if (r.condition, r.method) == (condition, method)]
+        shares = [100 * float(np.mean([r.within_one[i] for r in matching if r.within_one])) for i in range(2)]
+        errors = [r.end_point_error for r in matching if r.end_point_error is not None]
         name = "OpenCV's SGBM" if method == "classical" else method
         rate = f"x{CONDITIONS[condition].rate}"
         lines.append([rate, name, f"{np.mean(errors):.2f} px", *(f"{share:.1f} %" for share in shares)])
@@ -341,10 +341,10 @@ def save_condition_curves(rows: Sequence[ConditionRow], path: Path) -> None:
 
 
 def _curve(rows: Sequence[ConditionRow], points: Mapping[int, str]) -> dict[str, list[tuple[float, float]]]:
-    found: dict[str, list[tuple[float, float]]] = {}
+    curves: dict[str, list[tuple[float, float]]] = {}
     for x, name in points.items():
         for method in distinct(r.method for r in rows if r.condition == name):
             if method != "bound of beta's resolution":
                 values = [r.psnr["whole"] for r in rows if (r.condition, r.method) == (name, method)]
-                found.setdefault(method, []).append((x, float(np.mean(values))))
-    return found
+                curves.setdefault(method, []).append((x, float(np.mean(values))))
+    return curves

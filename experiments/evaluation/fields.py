@@ -116,9 +116,9 @@ def row_link(hw: tuple[int, int]) -> Pair:
 
 def _truth(disparity: Disparity) -> tuple[Float[Tensor, "h w 2"], Tensor]:
     """Where left's pixels are in right, and where that is known and in the image."""
-    found = pixel_grid(hw_of(disparity.value), dtype=torch.float64).clone()
-    found[..., 0] -= disparity.value
-    return found, disparity.valid & (found[..., 0] >= -0.5)
+    difference = pixel_grid(hw_of(disparity.value), dtype=torch.float64).clone()
+    difference[..., 0] -= disparity.value
+    return difference, disparity.valid & (difference[..., 0] >= -0.5)
 
 
 def layered_cases(bank: PhotoBank, count: int, *, hw: tuple[int, int] = (96, 128)) -> Iterator[Case]:
@@ -176,9 +176,9 @@ def drawn_peaks(network: Comparing, cases: Iterable[Case]) -> dict[str, Tensor]:
         H = case.pair.homography_at(torch.tensor(torch.inf, dtype=torch.float64))
         at_infinity = apply_homography(H, pixel_grid(hw, dtype=torch.float64)).x
         known = case.scene.visible
-        true, found = ((x - at_infinity).norm(dim=-1) for x in (case.scene.position, result.peak[0]))
+        true, peak = ((x - at_infinity).norm(dim=-1) for x in (case.scene.position, result.peak[0]))
         largest = true[known].quantile(0.99)
-        moved = torch.cat([torch.where(known, true, torch.nan), found.clamp(max=largest)], 1)
+        moved = torch.cat([torch.where(known, true, torch.nan), peak.clamp(max=largest)], 1)
         true_drawn, found_drawn = colour_depth(1 / moved.clamp(min=0.1)).split(hw[1], dim=2)
         wrong = known & ((result.peak[0] - case.scene.position).norm(dim=-1) > 1)
         red = torch.where(wrong, alpha.new_tensor([1.0, 0.0, 0.0])[:, None, None], alpha.expand(3, -1, -1))

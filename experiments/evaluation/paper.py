@@ -75,8 +75,8 @@ class AuthorsRows:
         column = x[..., :1].round()
         first = (column - self.length).clamp(min=0)
         columns = first + torch.arange(self.length, dtype=x.dtype, device=x.device)
-        found = torch.stack([columns, x[..., 1:].round().expand_as(columns)], -1)
-        return Positions(found, columns < pair.beta.hw[1])
+        xy = torch.stack([columns, x[..., 1:].round().expand_as(columns)], -1)
+        return Positions(xy, columns < pair.beta.hw[1])
 
 
 @dataclass(frozen=True)

@@ -37,10 +37,10 @@ def write_report(rows: Sequence[Row], out: Path) -> None:
 def read_rows(path: str | Path) -> list[Row]:
     """The rows of an ablation.json. Raises ValueError for another file."""
     try:
-        found = json.loads(Path(path).read_text(encoding="utf-8"))
-        if not isinstance(found, list):
+        rows = json.loads(Path(path).read_text(encoding="utf-8"))
+        if not isinstance(rows, list):
             raise TypeError("wanted a list")
-        return [Row(**{k: math.nan if v is None else v for k, v in row.items()}) for row in found]  # type: ignore[arg-type]
+        return [Row(**{k: math.nan if v is None else v for k, v in row.items()}) for row in rows]  # type: ignore[arg-type]
     except (TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{path}: not the rows of an ablation ({error})") from None
 
@@ -66,9 +66,9 @@ def _tables(rows: Sequence[Row], sweep: str) -> str:
     values, fields = distinct(row.value for row in some), distinct(row.field for row in some)
     parts = []
     for measure, (label, form) in MEASURES.items():
-        found = {field: [_drawn(some, field, value, measure) for value in values] for field in fields}
+        drawn = {field: [_drawn(some, field, value, measure) for value in values] for field in fields}
         lines = [
-            [field, *(form.format(np.mean(v)) if v else "" for v in cells)] for field, cells in found.items()
+            [field, *(form.format(np.mean(v)) if v else "" for v in cells)] for field, cells in drawn.items()
         ]
         parts.append(markdown_table([label, *(f"{v:g}" for v in values)], lines))
     notes = distinct(f"{row.field} at {row.value:g}: {row.note}" for row in some if row.note)
@@ -97,10 +97,10 @@ def _draw(axis: Axes, rows: Sequence[Row], measure: str) -> None:
     """The curves of one sweep."""
     values = distinct(row.value for row in rows)
     for field in distinct(row.field for row in rows):
-        found = {value: _drawn(rows, field, value, measure) for value in values}
-        known = [value for value in values if found[value]]
-        means = np.array([np.mean(found[value]) for value in known])
-        bounds = np.array([bootstrap_interval(found[value]) for value in known]).reshape(-1, 2)
+        drawn = {value: _drawn(rows, field, value, measure) for value in values}
+        known = [value for value in values if drawn[value]]
+        means = np.array([np.mean(drawn[value]) for value in known])
+        bounds = np.array([bootstrap_interval(drawn[value]) for value in known]).reshape(-1, 2)
         spread = np.abs(np.nan_to_num(bounds.T - means)) if len(known) else None
         axis.errorbar(
             known, means, yerr=spread, label=field, marker="o", markersize=3, capsize=2, linewidth=1

@@ -149,9 +149,9 @@ class Directly:
                 0, 1
             )
             camera = camera.resize(larger)
-        found = fused(network, Pair(pair.alpha, camera, pair.depth), images[ALPHA], beta[0], self.field)
-        step = found.peak.new_tensor([hw[1] / camera.hw[1], hw[0] / camera.hw[0]])
-        return found._replace(peak=(found.peak + 0.5) * step - 0.5 - border)
+        result = fused(network, Pair(pair.alpha, camera, pair.depth), images[ALPHA], beta[0], self.field)
+        step = result.peak.new_tensor([hw[1] / camera.hw[1], hw[0] / camera.hw[0]])
+        return result._replace(peak=(result.peak + 0.5) * step - 0.5 - border)
 
 
 @dataclass(frozen=True)
@@ -205,11 +205,11 @@ def ablate(
     A rig has two calibrated pinhole cameras, alpha first, and a depth range: its scenes lie in it. `fields`
     are fields, one's own included, or ways. Raises ValueError for another kind of rig.
     """
-    given = [Point(name, 0.0, rig, rig) for name, rig in rigs.items()] if isinstance(rigs, Mapping) else rigs
+    points = [Point(name, 0.0, rig, rig) for name, rig in rigs.items()] if isinstance(rigs, Mapping) else rigs
     bank = photos or sample_photographs()
     rows: list[Row] = []
     everywhere: dict[tuple[str, int, bytes], Row] = {}
-    for point in given:
+    for point in points:
         for number in range(scenes):
             scene = made(two(point.rig), bank, number, seed)
             for name, field in fields.items():
@@ -292,10 +292,10 @@ def seen_at(
 ) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
     """Where alpha's pixels are in beta, and whether beta sees the same surface there, to 2 % of its depth."""
     alpha, beta = pair.cameras
-    found = beta.project(alpha.unproject(pixel_grid(alpha.hw, dtype=torch.float64), depth))
-    there = sample(beta_depth[None, None], found.x[None], interpolation="nearest")
-    same = (there.values[0, 0] / found.depth - 1).abs() < 0.02
-    return found.x, found.valid & there.valid[0] & same
+    projected = beta.project(alpha.unproject(pixel_grid(alpha.hw, dtype=torch.float64), depth))
+    there = sample(beta_depth[None, None], projected.x[None], interpolation="nearest")
+    same = (there.values[0, 0] / projected.depth - 1).abs() < 0.02
+    return projected.x, projected.valid & there.valid[0] & same
 
 
 SWEEPS: dict[str, tuple[str, tuple[float, ...]]] = {

@@ -47,9 +47,9 @@ def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], 
     say(f"fusing key frames {', '.join(keys)}, then all")
     _, fused = fused_frames(job, len(FAST_FRAMES))
     say("fusing each frame alone, to compare")
-    alone = [job.alone(i) for i in range(len(FAST_FRAMES))]
-    table = _table(fused, alone, frames[FAST])
-    written = _write(out, array, frames, fused, alone)
+    by_themselves = [job.alone(i) for i in range(len(FAST_FRAMES))]
+    table = _table(fused, by_themselves, frames[FAST])
+    written = _write(out, array, frames, fused, by_themselves)
     write_text(out / "scores.md", table)
     return SystemResult(table, [*written, out / "scores.md"])
 
@@ -62,9 +62,11 @@ def recorded_frames(folder: Path) -> dict[str, list[Tensor]]:
     return {n: [srgb_image(luminance_of(p) * gains.get(n, 1.0)) for p in images] for n, images in raw.items()}
 
 
-def _table(fused: list[Frame], alone: list[Frame], greys: list[Tensor]) -> str:
-    frames = {"each frame alone": alone, "colour propagated": fused}
-    rows = [(n, f"{1000 * flicker([f.image for f in found], greys):.2f}") for n, found in frames.items()]
+def _table(fused: list[Frame], by_themselves: list[Frame], greys: list[Tensor]) -> str:
+    frames = {"each frame alone": by_themselves, "colour propagated": fused}
+    rows = [
+        (n, f"{1000 * flicker([f.image for f in of_method], greys):.2f}") for n, of_method in frames.items()
+    ]
     return (
         f"{markdown_table(['', 'flicker x 1000'], rows)}\n"
         "Flicker is the mean change of chroma from frame to frame where nothing moves.\n"
@@ -72,7 +74,11 @@ def _table(fused: list[Frame], alone: list[Frame], greys: list[Tensor]) -> str:
 
 
 def _write(
-    out: Path, array: FastSlowArray, frames: dict[str, list[Tensor]], fused: list[Frame], alone: list[Frame]
+    out: Path,
+    array: FastSlowArray,
+    frames: dict[str, list[Tensor]],
+    fused: list[Frame],
+    by_themselves: list[Frame],
 ) -> list[Path]:
     for number, frame in zip(FAST_FRAMES, fused):
         save_frame(frame, out / "frames", name=str(number))
@@ -81,8 +87,8 @@ def _write(
     rows, columns = DETAIL
     detail = {f"frame {n}": f.image[:, rows, columns] for n, f in zip(FAST_FRAMES, fused)}
     detail |= {"confidence, 144": fused[3].confidence[None, rows, columns]}
-    detail |= {f"frame {n} alone": f.image[:, rows, columns] for n, f in zip(FAST_FRAMES, alone)}
-    detail |= {"confidence, 144 alone": alone[3].confidence[None, rows, columns]}
+    detail |= {f"frame {n} alone": f.image[:, rows, columns] for n, f in zip(FAST_FRAMES, by_themselves)}
+    detail |= {"confidence, 144 alone": by_themselves[3].confidence[None, rows, columns]}
     save_panels(detail, out / "details.png", columns=4)
     whole = {"alpha, 144": frames[FAST][3], "fused, 144": fused[3].image}
     save_panels(whole, out / "figure.png", columns=2)

@@ -63,26 +63,26 @@ def losses(
     for step in itertools.count(start):
         g = generator_for(config.seed, "views", step)
         colours = windows(bank, config.batch, config.side, g)
-        found = []
+        losses = []
         for denoiser, ideal in ((network.band, luminance(colours)), (network.colour, colours)):
             recorded, deviation = noisy(ideal, noise_levels(len(ideal), g), g)
             with torch.autocast(config.device, torch.bfloat16, enabled=config.device != "cpu"):
                 image = denoiser(recorded.to(config.device), deviation.to(config.device))
-            found.append(image_loss(image, ideal.to(config.device)))
-        yield torch.stack(found).mean()
+            losses.append(image_loss(image, ideal.to(config.device)))
+        yield torch.stack(losses).mean()
 
 
 def windows(bank: PhotoBank, count: int, side: int, g: Generator) -> Tensor:
     """Square parts of photographs (count, 3, side, side), some reduced, darkened, flipped and transposed."""
-    found = []
+    windows = []
     for _ in range(count):
         texture, level = (below(n, g) for n in (len(bank), 2))
         w, h = bank.wh[texture, level].tolist()
         x, y = (below(max(n - side, 0) + 1, g) for n in (w, h))
         flips, gain = torch.randint(2, (3,), generator=g).tolist(), float(torch.rand((), generator=g))
         image = flipped(bank.window(texture, level, (x, y), side), flips)
-        found.append(image * min(0.4 + 1.2 * gain, 1.0))
-    return torch.stack(found)
+        windows.append(image * min(0.4 + 1.2 * gain, 1.0))
+    return torch.stack(windows)
 
 
 def noise_levels(count: int, g: Generator) -> NoiseLevel:

@@ -145,10 +145,12 @@ def _attend(
     if backend == "local":
         raise RuntimeError(f"backend 'local' serves {LOCAL_SERVES} only: ask for 'auto'")
 
-    def run(q: Tensor, k: Tensor, v: Tensor, given: Locations, part: Tensor | None) -> tuple[Tensor, ...]:
-        form = sample_positions(given, q, samples)
-        found = _run(AttentionInputs(q, k, v, form, _bias(part, q, form.samples), nearest), backend, measured)
-        return found if measured else found[:1]
+    def run(q: Tensor, k: Tensor, v: Tensor, locations: Locations, part: Tensor | None) -> tuple[Tensor, ...]:
+        form = sample_positions(locations, q, samples)
+        attended = _run(
+            AttentionInputs(q, k, v, form, _bias(part, q, form.samples), nearest), backend, measured
+        )
+        return attended if measured else attended[:1]
 
     if not callable(locations):
         return run(query, key, value, locations, bias)
@@ -183,8 +185,8 @@ def _check(query: Tensor, key: Tensor, value: Tensor, interpolation: str, backen
 def _local_serves(query: Tensor, key: Tensor, value: Tensor, field: Local, bias: Tensor | None) -> bool:
     whole = field.size > 0 and field.size % 2 == 1 and float(field.spacing).is_integer()
     taken = query.dtype == torch.float32 and query.device.type == "cpu" and query.shape[2:] == key.shape[2:]
-    given = query, key, value, bias
-    plain = torch_op.is_plain(*given) and not _missing(*given)
+    tensors = query, key, value, bias
+    plain = torch_op.is_plain(*tensors) and not _missing(*tensors)
     of_samples = bias is None or (bias.shape == (field.size**2,) and bias.dtype == torch.float32)
     return whole and taken and plain and of_samples
 
@@ -308,27 +310,27 @@ def _attend_by_rows(
     x, y = pixel_coordinates((query.shape[2], query.shape[3]), dtype=accumulated(query), device=query.device)
 
     def at(x: Tensor, y: Tensor, kind: Any = None) -> Any:
-        found = locations(torch.stack([x, y], -1).reshape(-1, 2))
-        if not isinstance(found, kind or Locations):
+        here = locations(torch.stack([x, y], -1).reshape(-1, 2))
+        if not isinstance(here, kind or Locations):
             wanted = "Segments or Positions, of one kind for all pixels"
-            raise TypeError(f"locations must return {wanted}, got {type(found)}")
-        return found
+            raise TypeError(f"locations must return {wanted}, got {type(here)}")
+        return here
 
     def segments(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
-        found, rows = at(x, y, Segments), x.shape[-2:]
-        return found.start.unflatten(-2, rows), found.end.unflatten(-2, rows), found.valid.unflatten(-1, rows)
+        here, rows = at(x, y, Segments), x.shape[-2:]
+        return here.start.unflatten(-2, rows), here.end.unflatten(-2, rows), here.valid.unflatten(-1, rows)
 
     def attended(q: Tensor, x: Tensor, y: Tensor, *part: Tensor) -> tuple[Tensor, ...]:
-        given = at(x, y, Positions)
-        given = Positions(given.xy.unflatten(-3, x.shape), given.mask.unflatten(-2, x.shape))
-        return run(q, key, value, given, part[0].transpose(1, 2) if part else None)
+        positions = at(x, y, Positions)
+        positions = Positions(positions.xy.unflatten(-3, x.shape), positions.mask.unflatten(-2, x.shape))
+        return run(q, key, value, positions, part[0].transpose(1, 2) if part else None)
 
     first = at(x[:1], y[:1])
     if isinstance(first, Segments):
         batch = (None,) * (first.valid.dim() - 1)
         rows = max(1, CHUNK_PIXELS // x.shape[1])
-        found = chunked(segments, x[batch], y[batch], rows=rows, axis=len(batch))
-        return run(query, key, value, Segments(*found), bias)
+        ends = chunked(segments, x[batch], y[batch], rows=rows, axis=len(batch))
+        return run(query, key, value, Segments(*ends), bias)
     bias = _bias(bias, query, first.xy.shape[-2])
     biases = [] if bias is None else [bias.transpose(1, 2)]
     again = partial(checkpoint, attended, use_reentrant=False) if torch.is_grad_enabled() else attended

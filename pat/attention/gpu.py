@@ -85,14 +85,14 @@ def backward(
     if fixed:
         images = [(t.double() / s.double()).to(counted) for t, s in zip(images, scales)]
     key_out, value_out = (t.to(query.dtype).permute(0, 3, 1, 2) for t in images)
-    found = (
+    gradients = (
         query_out.permute(0, 3, 1, 2),
         key_out,
         value_out,
         points_out.sum_to_size(positions.points.shape),
         bias_out,
     )
-    return tuple(t if want else t.new_empty(0) for t, want in zip(found, wanted))
+    return tuple(t if want else t.new_empty(0) for t, want in zip(gradients, wanted))
 
 
 def _scales(

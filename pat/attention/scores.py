@@ -81,8 +81,8 @@ def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
     """Where the largest weight is, (x, y) in beta's pixels; 0 if no sample counts. Equal ones: their mean."""
     query, key, _, locations, samples, interpolation = compared
     sharp = query.float() * SHARPENED
-    given = sharp, key.float(), key[:, :1].float(), locations
-    return attend_with_statistics(*given, samples=samples, interpolation=interpolation).position
+    arguments = sharp, key.float(), key[:, :1].float(), locations
+    return attend_with_statistics(*arguments, samples=samples, interpolation=interpolation).position
 
 
 class _LogSum(Function):

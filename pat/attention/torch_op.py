@@ -42,12 +42,12 @@ def attend(inputs: AttentionInputs, *, measured: bool, backend: str, strict: boo
     return Attended(out, statistics[..., :2].permute(0, 3, 1, 2), statistics[..., 2], statistics[..., 3])
 
 
-def is_plain(*given: Tensor | None) -> bool:
+def is_plain(*operands: Tensor | None) -> bool:
     """Whether nothing but numbers is asked for, so that the kernels can be called without torch's dispatcher.
 
     An operator's first call imports torch's compiler, which takes a second.
     """
-    tensors = [t for t in given if t is not None]
+    tensors = [t for t in operands if t is not None]
     gradient = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     return not (gradient or followed()) and all(type(t) in (Tensor, Parameter) for t in tensors)
 

@@ -87,7 +87,9 @@ class Align(Known):
         for i, one in enumerate(options.by_frame(files)):
             images = ViewFiles(array.recorded, one, alpha=array.alpha) if i else array.images
             name = _name_of(files, array.alpha, one)
-            yield _Frame(array.rig, array.recorded, images, one, array.alpha, array.notes, name, found=True)
+            yield _Frame(
+                array.rig, array.recorded, images, one, array.alpha, array.notes, name, rig_found=True
+            )
 
     def _align(self, frame: _Frame) -> None:
         from arraygeom.atomic import write_text
@@ -132,7 +134,7 @@ class Align(Known):
                 name=frame.name,
                 keep=frame.files.values(),
             )
-            if frame.found:
+            if frame.rig_found:
                 frame.recorded.save(self.out / FOUND_RIG)
                 written.append(self.out / FOUND_RIG)
             if self.report and not frame.name:
@@ -147,8 +149,8 @@ class Align(Known):
 
 @dataclass(frozen=True)
 class _Frame:
-    """One frame to align: the rig of its developed images, that of its files, and those; `found` says that
-    the rig was found from the images. The name goes in front of the files'; empty for a single frame."""
+    """One frame to align: the rig of its developed images, that of its files, and those; `rig_found` says
+    that the rig was found from the images. The name goes in front of the files'; empty for a single frame."""
 
     rig: Rig
     recorded: Rig
@@ -157,7 +159,7 @@ class _Frame:
     alpha: str
     notes: tuple[str, ...] = ()
     name: str = ""
-    found: bool = False
+    rig_found: bool = False
 
 
 def _name_of(files: Mapping[str, Sequence[Path]], alpha: str, one: Mapping[str, Path]) -> str:

@@ -73,7 +73,7 @@ class Evaluate:
         from ..evaluation.tables import write_csv
 
         write_text(self.out / "scores.md", text)
-        all_rows = [(name, *row) for name, found in rows.items() for row in found]
+        all_rows = [(name, *row) for name, of_method in rows.items() for row in of_method]
         write_csv(self.out / "scores.csv", ("set", *StereoRow._fields), all_rows)
         print(text, end="")
         say(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, images in {self.out}")
@@ -228,11 +228,11 @@ class Settings:
         """Print a line for each."""
         from ..support.settings import all_settings
 
-        found = [s for s in all_settings(*self.rooms) if self.kind in ("all", s.kind)]
-        for entry in found:
+        entries = [s for s in all_settings(*self.rooms) if self.kind in ("all", s.kind)]
+        for entry in entries:
             name = f"{entry.algorithm.removesuffix('Settings')}.{entry.name}"
             print(f"{entry.kind:8}{name} = {entry.value}  {entry.why}")
-        print(f"{sum(s.numbers for s in found)} numbers under {len(found)} names")
+        print(f"{sum(s.numbers for s in entries)} numbers under {len(entries)} names")
 
 
 @dataclass

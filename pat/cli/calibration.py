@@ -65,7 +65,7 @@ class Calibrate:
         patterns = {name: str(pattern) for name, pattern in given.items()}
         if self.watch:
             self._watch(patterns)
-        found = calibrate_photos(
+        session = calibrate_photos(
             self.photos,
             self.board,
             self.out,
@@ -76,8 +76,8 @@ class Calibrate:
             deviations=self._deviations(),
             progress=options.progress("detecting the board"),
         )
-        print("\n".join(found.messages))
-        say(f"written: {', '.join(map(str, found.written))}")
+        print("\n".join(session.messages))
+        say(f"written: {', '.join(map(str, session.written))}")
 
     def _deviations(self) -> StartDeviations:
         from calib.boards.poses import StartDeviations

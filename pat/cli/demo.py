@@ -78,7 +78,7 @@ def table_of(columns: dict[str, dict[str, str]]) -> str:
     wide = max(map(len, methods)) + 2
     lines = [" " * wide + "".join(f"{name:>18s}" for name in columns)]
     for method in methods:
-        scores = "".join(f"{found.get(method, '-'):>18s}" for found in columns.values())
+        scores = "".join(f"{scores_of.get(method, '-'):>18s}" for scores_of in columns.values())
         lines.append(f"{method:{wide}s}{scores}")
     return "\n".join([*lines, ""])
 

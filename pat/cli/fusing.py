@@ -140,22 +140,22 @@ class Fuse(Known):
         if self.focal:
             raise ValueError("--focal: the rig states the focal lengths: leave it out")
         rig = self._rig()
-        alpha, found = files_by_camera(rig, self.alpha, self.given, self.image)
-        found = self._frames(found)
-        self._choose_bits(found)
-        views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=alpha)
+        alpha, files = files_by_camera(rig, self.alpha, self.given, self.image)
+        files = self._frames(files)
+        self._choose_bits(files)
+        views = ViewFiles(rig, {name: paths[0] for name, paths in files.items()}, alpha=alpha)
         if self.sequence:
-            return self._many(rig, found, alpha)
+            return self._many(rig, files, alpha)
         with ThreadPoolExecutor(1) as beside:
             compared = beside.submit(checked_rig, views, heal=self.align)
-            several = max(map(len, found.values())) > 1
+            several = max(map(len, files.values())) > 1
             if several or self.strict or self.max_memory is not None:
                 with options.working("comparing the rig with the images"):
                     healed = compared.result()
                 rig = self._healed(rig, healed)
             if several:
-                return self._many(rig, found, alpha)
-            self._one(developed_rig(rig, found), views, alpha, views.files, healing=compared.result)
+                return self._many(rig, files, alpha)
+            self._one(developed_rig(rig, files), views, alpha, views.files, healing=compared.result)
 
     def _without_rig(self) -> None:
         from ..fusion.batch import find_images
@@ -196,7 +196,7 @@ class Fuse(Known):
             measured = load_weights(array.weights).bands is None
             self.exposure = self.exposure or ("keep" if measured else "auto")
             first = {name: paths[0] for name, paths in files.items()}
-            return self._one(array.rig, array.images, array.alpha, first, found=array)
+            return self._one(array.rig, array.images, array.alpha, first, image_array=array)
         rig = array.recorded
         for name, rate in rates.items():
             if name in rig.names:
@@ -284,11 +284,11 @@ class Fuse(Known):
         alpha: str,
         files: Mapping[str, str | Path],
         *,
-        found: ImageArray | None = None,
+        image_array: ImageArray | None = None,
         healing: Callable[[], Healed | None] = lambda: None,
     ) -> None:
-        """Fuse one frame. `rig` is of the files as they are developed; `found` is what they say of it, if it
-        was found from them; `healing` gives the rig healed by them, with which a frame is fused again."""
+        """Fuse one frame. `rig` is of the files as they are developed; `image_array` is what they say of
+        it, if it was found from them; `healing` gives the rig healed by them, with which a frame is fused again."""
         from arraygeom import Camera
         from arraygeom.atomic import sweep, write_text
 
@@ -327,7 +327,7 @@ class Fuse(Known):
                 rig = developed_rig(self._healed(rig, healed), files)
                 frame = fused(rig)
             frame, gain = self._exposed(frame)
-            if found is None and not frame.depth.isfinite().any():
+            if image_array is None and not frame.depth.isfinite().any():
                 self._note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
             bands = band_names(frame, (name for name in rig.betas(alpha) if name in files))
             written = save_frame(
@@ -336,7 +336,7 @@ class Fuse(Known):
                 bits=self.bits or 8,
                 kind=self.kind,
                 view=view_of(rig, alpha, bits=self.bits or 8, bands=len(frame.image)),
-                rig=None if found is None else found.recorded,
+                rig=None if image_array is None else image_array.recorded,
                 points=rig[alpha] if self.points else None,
                 along=measured_along(views),
                 bands=bands,
@@ -347,7 +347,9 @@ class Fuse(Known):
             if self.points:
                 self._note("points.ply: the pixels of known depth, in alpha's frame")
             if self.report:
-                facts = self._facts(rig, () if found is None else found.notes, time.monotonic() - begin)
+                facts = self._facts(
+                    rig, () if image_array is None else image_array.notes, time.monotonic() - begin
+                )
                 if self.classical:
                     facts = facts._replace(classical=self._classical(rig, images, alpha, gain))
                 write_text(self.out / "index.html", report_page(frame, images, rig, alpha, facts))
@@ -378,14 +380,14 @@ class Fuse(Known):
         own = {"align": self.align, "keep_alpha": self.keep_alpha, "luminance": self.luminance}
         return self.settings(noise_by_default=quiet, **own)
 
-    def _facts(self, rig: Rig, found: tuple[str, ...], seconds: float) -> Facts:
+    def _facts(self, rig: Rig, adopted: tuple[str, ...], seconds: float) -> Facts:
         """What the page says."""
         from arraygeom.text import length_unit
 
         from ..fusion.report import Facts
         from ..support.memory import peak_memory
 
-        notes = [f"weights: {self.weights or 'mono-colour'}", *self._notes, *found]
+        notes = [f"weights: {self.weights or 'mono-colour'}", *self._notes, *adopted]
         warned = [str(message) for message in options.WARNED]
         return Facts(notes, warned, seconds, peak_memory(), length_unit(rig))
 
@@ -494,36 +496,36 @@ def with_sensor(rig: Rig, name: str, **changes: float) -> Rig:
     return rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, **changes)))
 
 
-def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> tuple[tuple[str, ...], bool]:
+def named_images(paths: Sequence[Path], image: Sequence[str], command: str) -> tuple[tuple[str, ...], bool]:
     """The images NAME=FILE of a rig's cameras, and whether the first argument is a rig. Imports no torch.
 
     Images that follow a rig are of the cameras that their names say. Raises ValueError for arguments that do
     not go together, FileNotFoundError for files that do not exist.
     """
-    if given and (image or is_rig_file(given[0])):
-        named = (*image, *(f"{path.stem}={path}" for path in given[1:]))
+    if paths and (image or is_rig_file(paths[0])):
+        named = (*image, *(f"{path.stem}={path}" for path in paths[1:]))
         if not named:
             raise ValueError(
-                f"{given[0]}: {options.NO_IMAGE}; if it is a rig, give --image NAME=FILE for each camera"
+                f"{paths[0]}: {options.NO_IMAGE}; if it is a rig, give --image NAME=FILE for each camera"
             )
         options.files_by_name(named)
-        options.refuse_missing(given[0], rig=True)
+        options.refuse_missing(paths[0], rig=True)
         return named, True
     if image:
         files = " ".join(text.partition("=")[2] or text for text in image)
         raise ValueError(f"--image needs a rig: give --rig RIG, or the images alone: `pat {command} {files}`")
-    if len(given) < 2:
+    if len(paths) < 2:
         raise ValueError(
             f"give two images or more, as `pat {command} mono.png colour.png`; "
             "or a rig, --alpha and each --image"
         )
-    for path in given:
+    for path in paths:
         options.refuse_missing(path, rig=False)
     return (), False
 
 
 def files_by_camera(
-    rig: Rig, alpha: str | None, given: Sequence[Path], image: Sequence[str]
+    rig: Rig, alpha: str | None, paths: Sequence[Path], image: Sequence[str]
 ) -> tuple[str, dict[str, list[Path]]]:
     """Alpha's name, and the image files of each camera of a rig. Raises ValueError without alpha, for names
     that the rig lacks, and for one image given twice."""
@@ -532,15 +534,15 @@ def files_by_camera(
     if alpha is None:
         raise ValueError(f"--alpha: give the camera whose view is wanted, one of {', '.join(rig.names)}")
     files = options.files_by_name(image)
-    if unknown := [path for path in given[1:] if path.stem not in rig.names]:
+    if unknown := [path for path in paths[1:] if path.stem not in rig.names]:
         raise ValueError(f"{unknown[0]}: no camera of the rig has its name: give --image NAME={unknown[0]}")
-    found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
-    for (a, (first, *_)), (b, (second, *_)) in combinations(found.items(), 2):
+    files_of = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
+    for (a, (first, *_)), (b, (second, *_)) in combinations(files_of.items(), 2):
         if first.is_file() and second.is_file() and filecmp.cmp(first, second, shallow=False):
             raise ValueError(
                 f"the images of '{a}' and '{b}' are the same image, {second}: give each camera its own"
             )
-    return rig.require(alpha), found
+    return rig.require(alpha), files_of
 
 
 def is_rig_file(path: Path) -> bool:

@@ -171,8 +171,8 @@ class Known:
 
         assert self.matches is not None
         fields = dict.fromkeys(rig.betas(alpha), field)
-        found = read_matches(self.matches, files, {name: rig[name].hw for name in files})
-        for names, points in found.items():
+        matches = read_matches(self.matches, files, {name: rig[name].hw for name in files})
+        for names, points in matches.items():
             if alpha not in names:
                 continue
             (a, b) = (names, points) if names[0] == alpha else (names[::-1], points[::-1])

@@ -155,12 +155,12 @@ def _union(group: Any) -> Any:
     return Union[tuple(made)]  # noqa: UP007
 
 
-def _choices(given: str, option: str, choices: str) -> str:
+def _choices(value: str, option: str, choices: str) -> str:
     """What an option can be, without the None of one that may be left out, numbers in order."""
     named = [choice for choice in choices.split(", ") if choice != "'None'"]
     if all(choice.strip("'").isdecimal() for choice in named):
         named.sort(key=lambda choice: int(choice.strip("'")))
-    return f"{option}: {given} is not one of {', '.join(named)}"
+    return f"{option}: {value} is not one of {', '.join(named)}"
 
 
 REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
@@ -175,7 +175,7 @@ REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"could not convert string to float: (.+)", r"\1 is not a number"),
     (
         r"^invalid choice (.+) for argument '(\S+)'\. Expected one of \((.*?),?\)\.",
-        lambda found: _choices(*found.groups()),
+        lambda match: _choices(*match.groups()),
     ),
     (r"^Missing value for argument '(\S+)'.*", r"\1: give a value"),
     (r"^Missing from .+?: (\S+) (.+?) \(required\)", r"\1 is missing: \2"),

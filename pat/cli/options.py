@@ -228,8 +228,8 @@ def refuse_missing(path: Path, *, rig: bool) -> None:
     _, _, file = str(path).partition("=")
     advice = "check the path"
     if file and Path(file).exists():
-        alone = f"give {file} alone, cameras are called as their files are"
-        advice = "if it is an image, write --image before each NAME=FILE" if rig else alone
+        rigless = f"give {file} alone, cameras are called as their files are"
+        advice = "if it is an image, write --image before each NAME=FILE" if rig else rigless
     raise FileNotFoundError(f"{path}: no such {'rig file' if rig else 'image'}: {advice}")
 
 

@@ -70,9 +70,9 @@ class Show:
             fields = draw_fields(rig, alpha, _twelve_pixels(rig[alpha].hw), images=images)
             written.append(save_figure(fields, self.out / "fields.png"))
         with options.working("matching points of the images"):
-            found = matched_points(rig, alpha, images)
-        if found:
-            written.append(save_figure(draw_matches(rig, alpha, found, images), self.out / "matches.png"))
+            points = matched_points(rig, alpha, images)
+        if points:
+            written.append(save_figure(draw_matches(rig, alpha, points, images), self.out / "matches.png"))
         say(f"written: {', '.join(map(str, written))}")
 
 
@@ -89,13 +89,13 @@ def matched_points(rig: Rig, alpha: str, images: Mapping[str, Tensor]) -> dict[s
     from calib.images.matches import match_cameras
     from calib.images.residuals import related
 
-    found: dict[str, tuple[Tensor, Tensor]] = {}
+    points: dict[str, tuple[Tensor, Tensor]] = {}
     for name in rig.betas(alpha) if alpha in images else ():
         if name in images:
             with suppress(ValueError):
                 pair = related(rig, match_cameras({alpha: images[alpha], name: images[name]}))
-                found[name] = pair[alpha, name].alpha, pair[alpha, name].beta
-    return found
+                points[name] = pair[alpha, name].alpha, pair[alpha, name].beta
+    return points
 
 
 def given_matches(path: Path | None, texts: Sequence[str], images: Mapping[str, Tensor]) -> Pairs | None:
@@ -288,16 +288,16 @@ class Doctor:
         rig = load_rig(self.rig)
         with options.working("matching features and trying mistakes"):
             images = options.read_images(rig, self.image, sized=False)
-            found = diagnose(rig, images, given_matches(self.matches, self.image, images))
+            diagnosis = diagnose(rig, images, given_matches(self.matches, self.image, images))
         if self.json:
-            options.print_json(json.loads(found.as_json()))
+            options.print_json(json.loads(diagnosis.as_json()))
         else:
-            print(found.as_text())
+            print(diagnosis.as_text())
         if self.out is None:
             return
-        if found.named.kind == "nothing":
+        if diagnosis.named.kind == "nothing":
             return say("no rig written: no mistake was found")
-        if not found.certain:
+        if not diagnosis.certain:
             say("no rig written: several mistakes explain these images as well: correct the rig file by hand")
             raise SystemExit(REFUSED)
         kept = ""
@@ -306,8 +306,8 @@ class Doctor:
             with write_atomically(former) as temporary:
                 temporary.write_bytes(self.out.read_bytes())
             kept = f"; the former file: {former}"
-        found.named.rig.save(self.out)
-        say(f"written: {self.out} ({found.named.words}: undone{kept})")
+        diagnosis.named.rig.save(self.out)
+        say(f"written: {self.out} ({diagnosis.named.words}: undone{kept})")
 
 
 REFUSED = 4
@@ -359,7 +359,7 @@ class Refine:
             )
         matches = given_matches(self.matches, self.image, frames[0])
         with options.working("matching features and refining"):
-            found = refine(
+            refined = refine(
                 rig,
                 frames,
                 matches=None if matches is None else [matches],
@@ -368,10 +368,10 @@ class Refine:
                 attend=attend_with_statistics if self.photometric else None,
                 force=self.force,
             )
-        print(found.as_text())
-        if not found.accepted:
-            force = ": --force writes it all the same" if found.objections else ""
-            if not found.held_out[1].median < found.held_out[0].median / NEARER:
+        print(refined.as_text())
+        if not refined.accepted:
+            force = ": --force writes it all the same" if refined.objections else ""
+            if not refined.held_out[1].median < refined.held_out[0].median / NEARER:
                 return say(f"no rig written{force}")
             first = {text.partition("=")[0]: text.partition("=")[2] for text in self.image[::-1]}
             say(
@@ -380,8 +380,8 @@ class Refine:
                 style="yellow",
             )
             sys.exit(REFUSED)
-        notes = "".join(f"# {line}\n" for line in ["pat rig refine:", *found.as_text().splitlines()])
-        write_text(self.out, write(found.rig) + notes)
+        notes = "".join(f"# {line}\n" for line in ["pat rig refine:", *refined.as_text().splitlines()])
+        write_text(self.out, write(refined.rig) + notes)
         say(f"written: {self.out}")
 
 
@@ -410,9 +410,9 @@ class RigFromImages:
         focal = options.numbers_by_name(self.focal, "--focal")
         with options.working("matching features and fitting lines"):
             matches = given_matches(self.matches, self.image, images)
-            found = rig_from_images(images, focal=focal, matches=matches)
-        print(found.as_text())
-        found.rig.save(self.out)
+            result = rig_from_images(images, focal=focal, matches=matches)
+        print(result.as_text())
+        result.rig.save(self.out)
         say(f"written: {self.out}")
 
 
@@ -458,17 +458,17 @@ class RigDiff:
         covariances = [
             RigCovariance.load(path, rig) if path.is_file() else None for path, rig in zip(beside, (a, b))
         ]
-        found = rig_difference(a, b, covariances=(covariances[0], covariances[1]), depth=(near, far))
+        difference = rig_difference(a, b, covariances=(covariances[0], covariances[1]), depth=(near, far))
         for path, covariance in zip(beside, covariances):
             if covariance is None and any(covariances):
                 options.warn(f"{path}: not there: that rig counts as calibrated as well as the other")
         if not any(covariances):
             options.warn("no covariance file beside the rigs: calibrate with `pat calibrate`")
-        print(found.as_text())
+        print(difference.as_text())
         if self.image:
             print(self._on_images(a, b))
         if self.out is not None:
-            save_figure(draw_difference(found), self.out)
+            save_figure(draw_difference(difference), self.out)
             say(f"written: {self.out}")
 
     def _on_images(self, a: Rig, b: Rig) -> str:

@@ -134,10 +134,10 @@ def pair_files(root: str | Path) -> list[PairFiles]:
     Raises FileNotFoundError for no such folder, ValueError where there is no pair.
     """
     root = _folder(root)
-    found = {left: PairFiles(left, right, PAPER_DISPARITY) for left, right in _named(root)}
+    files = {left: PairFiles(left, right, PAPER_DISPARITY) for left, right in _named(root)}
     for left, layout in _middlebury_scenes(root):
-        found[left] = PairFiles(left, left.with_name(layout.right), 255 / layout.scale)
-    return [found[left] for left in _some(sorted(found), root)]
+        files[left] = PairFiles(left, left.with_name(layout.right), 255 / layout.scale)
+    return [files[left] for left in _some(sorted(files), root)]
 
 
 def _folder(root: str | Path) -> Path:
@@ -147,10 +147,10 @@ def _folder(root: str | Path) -> Path:
     return root
 
 
-def _some(found: list[T], root: Path) -> list[T]:
-    if not found:
+def _some(items: list[T], root: Path) -> list[T]:
+    if not items:
         raise ValueError(f"{root}: holds no stereo pair: check the folder and how its images are named")
-    return found
+    return items
 
 
 def _middlebury_scenes(root: Path) -> list[tuple[Path, _Middlebury]]:
@@ -177,13 +177,13 @@ def _middlebury_pair(root: Path, left: Path, layout: _Middlebury) -> StereoPair:
 def _named(root: Path) -> list[tuple[Path, Path]]:
     """Left and right by their names: the first of `LEFT_AND_RIGHT` whose right image is there."""
     before = root.as_posix()
-    found: list[tuple[Path, Path]] = []
+    files: list[tuple[Path, Path]] = []
     for left in (file for file in files_below(root) if file.suffix.lower() in IMAGE_SUFFIXES):
         inside = left.as_posix()[len(before) :]
         marks = [(ours, theirs) for ours, theirs in LEFT_AND_RIGHT if ours in inside]
         rights = (Path(before + theirs.join(inside.rsplit(ours, 1))) for ours, theirs in marks)
-        found += [(left, right) for right in rights if right.is_file()][:1]
-    return found
+        files += [(left, right) for right in rights if right.is_file()][:1]
+    return files
 
 
 def _pair_name(root: Path, left: Path) -> str:

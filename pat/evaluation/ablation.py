@@ -152,8 +152,8 @@ class HorizontalDisplacement:
         """Horizontal segments of beta around H x."""
         centre, finite = apply_homography(pair.homography, x)
         step = centre.new_tensor([self.disparity, 0.0])
-        found = clip_to_image(centre + step, centre - step, pair.beta.hw)
-        return Segments(found.start, found.end, found.valid & finite)
+        segments = clip_to_image(centre + step, centre - step, pair.beta.hw)
+        return Segments(segments.start, segments.end, segments.valid & finite)
 
 
 def families() -> dict[str, FieldFamily]:
@@ -176,8 +176,10 @@ def families() -> dict[str, FieldFamily]:
 def disparity(network: FusionNetwork, pair: Pair) -> float:
     """The largest displacement of a point from H x, pixels of beta as the network gets it."""
     if pair.has_lens:
-        found = Curved(bounds=natural_bounds(pair))(pair, coarse_grid(pair.alpha.hw).reshape(-1, 2).double())
-        reached = (found.xy - found.xy[:, :1]).norm(dim=-1)[found.mask & found.mask[:, :1]]
+        segments = Curved(bounds=natural_bounds(pair))(
+            pair, coarse_grid(pair.alpha.hw).reshape(-1, 2).double()
+        )
+        reached = (segments.xy - segments.xy[:, :1]).norm(dim=-1)[segments.mask & segments.mask[:, :1]]
         return float(reached.amax()) if len(reached) else 1.0
     scale = resolution_ratio(pair)
     resized = network.equal_resolution and not 0.8 < scale < 1.25
@@ -207,9 +209,11 @@ def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
 
     Raises ValueError for a folder without rendered scenes, or with incomplete ones.
     """
-    found = sorted({path.parent for path in files_below(folder) if path.name in ("scene.yaml", RENDER_FILE)})
-    broken = [path for path in found if not is_rendered(path)]
-    if not found or broken:
+    folders = sorted(
+        {path.parent for path in files_below(folder) if path.name in ("scene.yaml", RENDER_FILE)}
+    )
+    broken = [path for path in folders if not is_rendered(path)]
+    if not folders or broken:
         incomplete = f"{broken[0]} is incomplete ({RENDER_FILE} is missing)" if broken else ""
         what = incomplete or f"{folder} holds no rendered scene"
         raise ValueError(f"{what}: render it with `pat render`")
@@ -222,7 +226,7 @@ def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
         rig = Rig(dict(zip((ALPHA, BETA), (scene.rig[name] for name in names))))
         return _recorded(str(path.relative_to(folder)), rig, ground_truth, seen, frames[0].depth, g)
 
-    return map(case, found)
+    return map(case, folders)
 
 
 def _recorded(
@@ -263,9 +267,9 @@ def ablate(
     rows: list[AblationRow] = []
     panels: dict[str, Tensor] = {}
     for i, case in enumerate(track(cases, "ablating", disable=not sys.stderr.isatty())):
-        found, images = _case(network, case, chosen)
-        rows += found
-        panels |= crops(case, images, found) if i < SHOWN else {}
+        result, images = _case(network, case, chosen)
+        rows += result
+        panels |= crops(case, images, result) if i < SHOWN else {}
     write_text(out / "ablation.md", markdown(rows))
     write_csv(out / "ablation.csv", AblationRow._fields, rows)
     save_panels(panels, out / "ablation.png", columns=6)

@@ -143,9 +143,9 @@ def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Te
     """
     from skimage.restoration import denoise_nl_means
 
-    given = image.movedim(0, -1).numpy()
-    found = denoise_nl_means(
-        given,
+    pixels = image.movedim(0, -1).numpy()
+    denoised = denoise_nl_means(
+        pixels,
         patch_size=5,
         patch_distance=6,
         h=0.8 * deviation,
@@ -153,7 +153,7 @@ def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Te
         fast_mode=True,
         channel_axis=-1,
     )
-    return torch.from_numpy(np.ascontiguousarray(found.reshape(given.shape))).movedim(-1, 0).to(image)
+    return torch.from_numpy(np.ascontiguousarray(denoised.reshape(pixels.shape))).movedim(-1, 0).to(image)
 
 
 def denoised_knowing(image: Float[Tensor, "c h w"], level: NoiseLevel) -> Float[Tensor, "c h w"]:
@@ -178,8 +178,8 @@ def _rectified_plane(pair: Pair, depth: tuple[float, float]) -> _Plane:
     beta's principal point is shifted so that disparities start at 0 whichever camera is on the left.
     """
     pose = pair.beta_from_alpha
-    given = (*(c.K for c in pair.cameras), pose.R, pose.t)
-    K_alpha, K_beta, R, t = (x.detach().cpu().double().numpy() for x in given)
+    tensors = (*(c.K for c in pair.cameras), pose.R, pose.t)
+    K_alpha, K_beta, R, t = (x.detach().cpu().double().numpy() for x in tensors)
     hw = pair.alpha.hw
     rotation = _rectifying_rotation(R, t)
     focal = (K_alpha[0, 0] + K_alpha[1, 1]) / 2

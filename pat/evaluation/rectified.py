@@ -35,8 +35,8 @@ class Warped(NamedTuple):
         """Depth of the canvas as alpha's at its pixels, by the nearest pixel."""
         level, (alpha, _) = self.rectification.pair.cameras[0], self.original.cameras
         x = apply_homography(self.rectification.H_alpha, pixel_grid(alpha.hw, dtype=torch.float64)).x
-        found = self.back(depth[None], interpolation="nearest")[0].double()
-        return alpha.project(level.unproject(x, found)).depth.to(depth)
+        warped = self.back(depth[None], interpolation="nearest")[0].double()
+        return alpha.project(level.unproject(x, warped)).depth.to(depth)
 
 
 def rectified(rig: Rig, images: Mapping[str, Tensor]) -> Warped:
@@ -47,13 +47,13 @@ def rectified(rig: Rig, images: Mapping[str, Tensor]) -> Warped:
     """
     first, second = rig.names[:2]
     pair = rig.pair(first, second)
-    found = whole_alpha(pair)
-    views = (first, found.H_alpha), (second, found.H_beta)
-    canvas = found.pair.alpha.hw
+    plane = whole_alpha(pair)
+    views = (first, plane.H_alpha), (second, plane.H_beta)
+    canvas = plane.pair.alpha.hw
     made = {name: warped(images[name], torch.linalg.inv(H), canvas).clamp(0, 1) for name, H in views}
     near, far = (float(d) for d in pair.depth_range)
-    level = Rig(dict(zip((first, second), found.pair.cameras)), depth=(near, far))
-    return Warped(level, made, found, pair)
+    level = Rig(dict(zip((first, second), plane.pair.cameras)), depth=(near, far))
+    return Warped(level, made, plane, pair)
 
 
 def whole_alpha(pair: Pair) -> Rectification:

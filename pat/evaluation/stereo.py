@@ -92,10 +92,10 @@ def sets_markdown(
 ) -> str:
     """`markdown` of each data set under its name, then `structure_kept` and, with `depth`, its errors."""
     parts = []
-    for name, found in rows.items():
-        scores = markdown(found, printed=printed.get(name, {}))
-        parts.append(f"#### {name}\n\n{scores}\n{structure_kept(found)}\n")
-        parts += [errors] if depth and (errors := depth_markdown(found)) else []
+    for name, of_set in rows.items():
+        scores = markdown(of_set, printed=printed.get(name, {}))
+        parts.append(f"#### {name}\n\n{scores}\n{structure_kept(of_set)}\n")
+        parts += [errors] if depth and (errors := depth_markdown(of_set)) else []
     return "\n".join(parts)
 
 
@@ -183,12 +183,12 @@ def _row(pair: str, rate: int, method: str, result: StereoResult, task: MonoColo
 
 
 def disparity_errors(
-    found: Float[Tensor, "h w"], ground_truth: Disparity
+    disparity: Float[Tensor, "h w"], ground_truth: Disparity
 ) -> tuple[float | None, float | None]:
     """Mean error where both are known, and the share of the known ground truth within a pixel of it."""
     value, valid = ground_truth
-    compared = valid & found.isfinite()
+    compared = valid & disparity.isfinite()
     if not compared.any():
         return None, None
-    error = (found.to(value) - value)[compared].abs().double()
+    error = (disparity.to(value) - value)[compared].abs().double()
     return float(error.mean()), int((error <= 1).sum()) / int(valid.sum())

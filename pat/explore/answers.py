@@ -78,10 +78,10 @@ def clicked(scene: ExplorerScene, alpha: str, controls: Controls) -> tuple[Contr
     """The controls with alpha's pixel that matches a beta's clicked one, and that one's samples in alpha."""
     name, column, row = controls["clicked"]
     x = image_pixel(column, row, scene.rig[name].hw)
-    found = inspect_pixel(scene, explorer_state(scene.rig, alpha, controls).replace(alpha=name, x=x))
-    if alpha in found.problems:
-        raise ValueError(found.problems[alpha])
-    report = drawn(found.betas[alpha])
+    inspected = inspect_pixel(scene, explorer_state(scene.rig, alpha, controls).replace(alpha=name, x=x))
+    if alpha in inspected.problems:
+        raise ValueError(inspected.problems[alpha])
+    report = drawn(inspected.betas[alpha])
     if "problem" in report:
         raise ValueError(f"no pixel of {alpha} can match ({x[0]:.0f}, {x[1]:.0f}) of {name}")
     return {**controls, "x": report["match"]}, report["samples"]

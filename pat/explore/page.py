@@ -64,7 +64,7 @@ class Explorer:
         """
         values = {**self.values(), "choices": []}
         if self.scene is not None and is_pinhole(self.scene.rig) and self.usual:
-            values["ranges"] = [found for found in values["ranges"] if found[0] != "lens"]
+            values["ranges"] = [entry for entry in values["ranges"] if entry[0] != "lens"]
             asks = f"asksPinholes({json.dumps(geometry(self.scene.rig, self.alpha))})"
         else:
             values["ranges"] = []

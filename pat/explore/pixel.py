@@ -163,10 +163,10 @@ class ExplorerScene:
 @cache
 def shipped_attention(name: str) -> PAT:
     """Weights of the paper's network. Raises ValueError for others."""
-    found = load_weights(name)
-    if not isinstance(found, PAT):
+    network = load_weights(name)
+    if not isinstance(network, PAT):
         raise ValueError(f"weights '{name}' are not of the paper's network: its attention alone can be shown")
-    return found
+    return network
 
 
 DENSE = 2048
@@ -240,12 +240,12 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
     """A pixel's samples in one beta, their weights, depths. Raises ValueError if the field does not fit."""
     x = pixel_of(state)
     field = scene.fields.get(state.family) or chosen_field(pair, state.family, x)
-    found = sampling_locations(field, pair, x)
-    if isinstance(found, Segments):  # about one sample a pixel of beta
-        longest = float(torch.where(found.valid, found.length, 0.0).max())
-        samples = found.positions(math.ceil(longest) + 1)
+    locations = sampling_locations(field, pair, x)
+    if isinstance(locations, Segments):  # about one sample a pixel of beta
+        longest = float(torch.where(locations.valid, locations.length, 0.0).max())
+        samples = locations.positions(math.ceil(longest) + 1)
     else:
-        samples = found
+        samples = locations
     xy, valid = samples.xy[0], samples.mask[0]
     if state.weights == WINDOWS:
         scores = SHARPNESS * correlations(scene.guides[state.alpha], scene.guides[name], pair, x, xy)
@@ -256,7 +256,7 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
         scores = (query.T @ sampled(key, (xy + 0.5) * larger - 0.5))[0]
     weight = softmax(scores, valid)
     value = sampled(scene.images[name][None], xy) @ weight
-    depth, ends = depths(pair, x, xy, valid), ends_of(found)
+    depth, ends = depths(pair, x, xy, valid), ends_of(locations)
     offset = match_offset((scene.guides[state.alpha], scene.guides[name]), pair, x, (xy, weight), ends)
     return BetaReport(xy, valid, ends, weight, depth, value, float(weight.max()), offset)
 
@@ -309,11 +309,11 @@ def match_offset(
     return MatchOffset(beside, distance, other) if distance < ACROSS else None
 
 
-def ends_of(found: Segments | Positions) -> Float[Tensor, "2 2"] | None:
+def ends_of(locations: Segments | Positions) -> Float[Tensor, "2 2"] | None:
     """Start and end of the first pixel's segment, if it is one."""
-    if not isinstance(found, Segments) or not bool(found.valid[0]):
+    if not isinstance(locations, Segments) or not bool(locations.valid[0]):
         return None
-    return torch.stack([found.start[0], found.end[0]])
+    return torch.stack([locations.start[0], locations.end[0]])
 
 
 SHARPNESS = 30.0
@@ -372,8 +372,8 @@ def depths(
     if pair.link is not None or not pair.calibrated:
         return torch.full_like(xy[:, 0], torch.nan)
     pinholes = pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view
-    found = (depth_of if pinholes else ray_depth)(pair, x.expand(len(xy), 2), xy)
-    return torch.where(found.valid & valid, found.depth, torch.nan)
+    depth = (depth_of if pinholes else ray_depth)(pair, x.expand(len(xy), 2), xy)
+    return torch.where(depth.valid & valid, depth.depth, torch.nan)
 
 
 def joint_depth(betas: Mapping[str, BetaReport]) -> float:

@@ -184,11 +184,14 @@ def render(
         if shard.count == 1:  # no other run writes to this folder
             sweep(root)
         write_manifest(config, root)
-        given = json.dumps(to_document(config)), work
+        arguments = json.dumps(to_document(config)), work
         folders = {i: root / "scenes" / f"{i:06d}" for i in shard.of(scenes)}
         check_space(root, sum(not folder.exists() for folder in folders.values()), scene_bytes)
         return run_tasks(
-            [Task(folder, make_scene, (*given, folder, i), f"scene {i}") for i, folder in folders.items()],
+            [
+                Task(folder, make_scene, (*arguments, folder, i), f"scene {i}")
+                for i, folder in folders.items()
+            ],
             workers=Workers(workers, scheduler, apart=True, timeout=config.limits.timeout),
             resume=True,
             on_error="skip",
@@ -220,13 +223,13 @@ def write_manifest(config: RenderConfig, root: Path) -> None:
 
 def versions() -> dict[str, str]:
     """Versions of the packages that rendering uses."""
-    found = {"python": platform.python_version()}
+    versions = {"python": platform.python_version()}
     for package in ("arraygeom-pat", "torch", "numpy", "bpy", "OpenEXR"):
         try:
-            found[package] = version(package)
+            versions[package] = version(package)
         except PackageNotFoundError:
             continue
-    return found
+    return versions
 
 
 def check_space(root: Path, scenes: int, scene_bytes: float) -> None:

@@ -213,13 +213,13 @@ def align(
         before=expected_work(inputs, response, align=correct),
         kept=low_light.kept(inputs.hw, len(betas)),
     )
-    found = find_corrections(network, inputs, response, align=correct)
-    inputs = inputs._replace(inputs=found.applied(inputs.inputs, inputs.hw))
+    corrections = find_corrections(network, inputs, response, align=correct)
+    inputs = inputs._replace(inputs=corrections.applied(inputs.inputs, inputs.hw))
     with limited(limit), torch.no_grad():
         matches = matcher(inputs.inputs)
-        done = fused_in_tiles(network, inputs, matches, plan.tiles, progress=progress)
-        warn_of_confidence(network, done.frame, inputs)
-        depths = undone(done.frame, undo).depth
+        fused = fused_in_tiles(network, inputs, matches, plan.tiles, progress=progress)
+        warn_of_confidence(network, fused.frame, inputs)
+        depths = undone(fused.frame, undo).depth
         values, hw = _as_array(own[alpha], alpha, rig[alpha].hw), rig[alpha].hw
         planes = pixel_grid(hw).numpy(), np.full(hw, SEEN, np.uint8), np.ones(hw, np.float32)
         names, response_of = _band_names(alpha, len(values)), rig[alpha].sensor.response
@@ -228,7 +228,7 @@ def align(
             LOG.info("aligning %s", name)
             place = inputs.placements[i]
             located = _located(inputs, i, matches.betas[i], rig[alpha])
-            confidence, pinhole = done.found[i, 2:], place.pair.alpha
+            confidence, pinhole = fused.matched[i, 2:], place.pair.alpha
             if _is_undistorted(rig[alpha], pinhole):  # 0 where the pinhole view has none
                 assert isinstance(pinhole, LensView)
                 confidence = resampled(confidence, pinhole, rig[alpha], interpolation="bilinear").values[0]
@@ -245,24 +245,24 @@ def _steps(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:
 
 
 def _located(
-    inputs: FrameInputs, i: int, found: BetaMatches, recorded: View
+    inputs: FrameInputs, i: int, matches: BetaMatches, recorded: View
 ) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
     """Where alpha's recorded pixels are in the i-th beta as prepared, by its matches; which are on it."""
     h, w = inputs.hw
     beta, pinhole = inputs.inputs.betas[i], inputs.placements[i].pair.alpha
     hw = (beta.image.shape[-2], beta.image.shape[-1])
     if not _is_undistorted(recorded, pinhole):
-        where, inside = found.positions(beta.field.straight, hw)
+        where, inside = matches.positions(beta.field.straight, hw)
         return where[0, :h, :w], inside[0, :h, :w]
     assert isinstance(pinhole, LensView)
     x, seen = pixels_between(pinhole, recorded)
-    disparity = _between_pixels(found.surface[0, :, :h, :w], x)
+    disparity = _between_pixels(matches.surface[0, :, :h, :w], x)
 
     def at_points(x: Float[Tensor, "h w 2"], disparity: Float[Tensor, "h w"]) -> tuple[Tensor, Tensor]:
         segments, rows = beta.field.at(x.reshape(-1, 2)), (1, *x.shape[:2])
         assert isinstance(segments, Segments)
         parts = segments.start.reshape(*rows, 2), segments.end.reshape(*rows, 2), segments.valid.reshape(rows)
-        bare = replace(found, disparity=disparity[None, None], chosen=None)
+        bare = replace(matches, disparity=disparity[None, None], chosen=None)
         where, inside = bare.positions(Segments(*parts), hw)
         return where[0], inside[0]
 

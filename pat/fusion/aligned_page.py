@@ -100,13 +100,13 @@ class _ShownBand(NamedTuple):
 
 def _band_near(aligned: Aligned, wave: float) -> _ShownBand | None:
     """The band whose centre is nearest to a wavelength; None if none is near."""
-    found = {
+    near = {
         abs(centre - wave): _ShownBand(camera, name, values, view.valid)
         for camera, view in aligned.items()
         for name, centre, values in zip(view.bands, view.wavelengths, view.values)
         if centre is not None and abs(centre - wave) <= NEAREST
     }
-    return found[min(found)] if found else None
+    return near[min(near)] if near else None
 
 
 def _stretched(values: NDArray[Any], valid: NDArray[np.bool_]) -> Float[Tensor, "h w"]:

@@ -122,7 +122,7 @@ class Batch:
         stamps = {name: [_stamp(file) for file in files] for name, files in self.files.items()}
         if self.sequence:
             return dict.fromkeys(self.names, _digest(stamps))
-        frames = ({n: found[i] for n, found in stamps.items()} for i in range(len(self.names)))
+        frames = ({n: indices[i] for n, indices in stamps.items()} for i in range(len(self.names)))
         return dict(zip(self.names, map(_digest, frames)))
 
     def fused_file(self, i: int) -> Path:
@@ -339,22 +339,22 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
             f"{label}{path}: is a video, which only `pat fuse` without a rig reads: save its frames"
         )
     if path.is_dir():
-        found = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
+        files = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
     elif any(c in path.name for c in "*?["):
-        found = list(path.parent.glob(path.name))
+        files = list(path.parent.glob(path.name))
     else:
-        found = [path] if path.exists() else []
-    found = sorted((p for p in found if p == path or not p.name.startswith(".")), key=_natural)
-    if not found:
+        files = [path] if path.exists() else []
+    files = sorted((p for p in files if p == path or not p.name.startswith(".")), key=_natural)
+    if not files:
         raise FileNotFoundError(f"{label}{path}: no image there: check the path")
     frames: dict[str, Path] = {}
-    for file in found:
+    for file in files:
         if (other := frames.setdefault(file.stem, file)) != file:
             pattern = file.with_name(f"*{file.suffix}")
             raise ValueError(
                 f"{label}{other} and {file.name} are one frame: give a pattern, such as '{pattern}'"
             )
-    return found
+    return files
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

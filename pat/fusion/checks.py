@@ -58,9 +58,9 @@ def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs
 
 def noise_advice(inputs: Inputs) -> str:
     """What to do about noise that the middle of an image shows plainly; empty if there is hardly any."""
-    found = max(shown_noise(image[0]) for image in (inputs.alpha, *(beta.image for beta in inputs.betas)))
-    advice = f"; noise of {255 * found:.0f}/255 shows: try `--noise estimate` first"
-    return "" if found < PLAIN_NOISE else advice
+    shown = max(shown_noise(image[0]) for image in (inputs.alpha, *(beta.image for beta in inputs.betas)))
+    advice = f"; noise of {255 * shown:.0f}/255 shows: try `--noise estimate` first"
+    return "" if shown < PLAIN_NOISE else advice
 
 
 @contextmanager

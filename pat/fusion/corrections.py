@@ -110,24 +110,24 @@ def find_corrections(
     rgb = any(map(_is_rgb, frame.inputs.betas))
     if not isinstance(response, str | Response) and not rgb:
         raise ValueError("a response needs betas in red, green and blue: leave it out for other bands")
-    found, fits = Corrections(given_response(response)), response == "fit" and rgb
+    corrections, fits = Corrections(given_response(response)), response == "fit" and rgb
     align = align and all(beta.field.pixels is not None for beta in frame.inputs.betas)
     if not network.uses_matches or not (fits or align):
-        return found
+        return corrections
     small = _reduced_frame(frame)
-    found = replace(found, misalignments=(Misalignment(),) * len(frame.inputs.betas))
+    corrections = replace(corrections, misalignments=(Misalignment(),) * len(frame.inputs.betas))
     for i in range(SETTINGS.passes):
         LOG.info("pre-pass %d of at most %d", i + 1, SETTINGS.passes)
-        inputs = found.applied(small.inputs, small.hw)
+        inputs = corrections.applied(small.inputs, small.hw)
         parts = zip(small.inputs.betas, inputs.betas, located(inputs).betas)
         matches = [_of_beta(inputs.alpha, *part, small.hw) for part in parts]
-        response_now = _fitted(small, matches) if fits else found.response
+        response_now = _fitted(small, matches) if fits else corrections.response
         steps = [fit_misalignment(*m[1:]) if align else Misalignment() for m in matches]
-        moves = tuple(before + step for before, step in zip(found.misalignments, steps))
-        found = Corrections(response_now, moves)
+        moves = tuple(before + step for before, step in zip(corrections.misalignments, steps))
+        corrections = Corrections(response_now, moves)
         if all(step.largest(small.hw) <= SETTINGS.settled for step in steps):
             break
-    return found
+    return corrections
 
 
 def expected_work(frame: FrameInputs, response: Given, *, align: bool) -> float:
@@ -166,9 +166,9 @@ def _reduced_field(
     field: FieldOnGrid, alpha: Tensor, whole: Callable[[Tensor], Tensor], factor: int
 ) -> FieldOnGrid:
     def at(x: Tensor) -> Segments:
-        found = field.at(whole(x))
-        assert isinstance(found, Segments)
-        return reduced(found, factor)
+        locations = field.at(whole(x))
+        assert isinstance(locations, Segments)
+        return reduced(locations, factor)
 
     return FieldOnGrid.evaluated(at, (alpha.shape[-2], alpha.shape[-1]), field.samples // factor + 2)
 
@@ -195,14 +195,14 @@ class _Matches(NamedTuple):
         return (self.position + 0.5) / self.position.new_tensor([w, h]) - 0.5
 
 
-def _of_beta(alpha: Tensor, before: Beta, beta: Beta, found: BetaMatches, hw: HW) -> _Matches:
+def _of_beta(alpha: Tensor, before: Beta, beta: Beta, matches: BetaMatches, hw: HW) -> _Matches:
     h, w = hw
-    positions, valid = found.positions(beta.field.straight, (beta.image.shape[-2], beta.image.shape[-1]))
+    positions, valid = matches.positions(beta.field.straight, (beta.image.shape[-2], beta.image.shape[-1]))
     where = positions[0, :h, :w]
     luma = combined_bands(beta.image)
     seen = sample(torch.cat([before.image, luma], 1), where.reshape(1, -1, 2).to(luma)).values
     values = seen.reshape(seen.shape[1], h, w)
-    unlike, margin, _ = found.facts[0]
+    unlike, margin, _ = matches.facts[0]
     reliable = (unlike < CONSISTENT) & (margin > SETTINGS.margin)
     weight = (enlarged(reliable)[:h, :w] & valid[0, :h, :w]).to(alpha)
     whole = Normalisation.of(alpha, luma)
@@ -218,6 +218,6 @@ def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
     h, w = frame.hw
     own = blurred(frame.inputs.alpha[:, :, :h, :w], [ALIGNMENT.blur])[0, 0]
     colour = [(m, m.weight > 0) for m in matches if len(m.before) == 3]
-    points = [found.before[:, counts] for found, counts in colour]
-    places = [found.place[counts] for found, counts in colour]
+    points = [of_beta.before[:, counts] for of_beta, counts in colour]
+    places = [of_beta.place[counts] for of_beta, counts in colour]
     return fit(torch.cat(points, 1), torch.cat([own[counts] for _, counts in colour]), torch.cat(places))

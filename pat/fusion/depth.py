@@ -60,9 +60,11 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
     if matches is None:
         return output
     confidence, deviation = list(output.confidence), list(output.deviation)
-    for i, (found, beta) in enumerate(zip(matches.betas, inputs.betas)):
-        if found.certainty is not None:
-            whole = interpolate(found.certainty.float(), scale_factor=FINE, mode="bilinear").to(confidence[i])
+    for i, (of_beta, beta) in enumerate(zip(matches.betas, inputs.betas)):
+        if of_beta.certainty is not None:
+            whole = interpolate(of_beta.certainty.float(), scale_factor=FINE, mode="bilinear").to(
+                confidence[i]
+            )
             seen = beta.field.straight.valid & (output.confidence[i] > 0)
             stated, half_width = torch.where(seen, whole[:, 0], 0.0), whole[:, 1]
             own = (confidence[i] > stated) & beta.around
@@ -113,24 +115,26 @@ def _measured(
         pair, offset = place.pair, like.new_tensor(beta.offset)
         where = position[0, :, :h, :w].movedim(0, -1)
         half_width = DEVIATIONS * deviation[0, :h, :w].reshape(-1)
-        found = place.depth(x, (where + offset).reshape(-1, 2), half_width)
+        triangulated = place.depth(x, (where + offset).reshape(-1, 2), half_width)
         if beta.field.pixels is not None and pair.depth is not None and place.has_track:
             track = place.track(x)
-            near, far = (bound.to(found.depth) for bound in pair.depth)
-            beyond = ~(found.valid & (found.depth >= near) & (found.depth <= far))
+            near, far = (bound.to(triangulated.depth) for bound in pair.depth)
+            beyond = ~(triangulated.valid & (triangulated.depth >= near) & (triangulated.depth <= far))
             if bool(beyond.any()):
                 moved = _within(where.reshape(-1, 2)[beyond], beta.field.pixels, beyond.view(h, w))
                 some = Track(*(v.expand_as(track.a)[beyond] for v in track))
                 there = depth_from_track(some, moved + offset, half_width[beyond])
-                found = Depth(*(t.masked_scatter(beyond, part) for t, part in zip(found, there)))
+                triangulated = Depth(
+                    *(t.masked_scatter(beyond, part) for t, part in zip(triangulated, there))
+                )
         elif pair.link is not None and pair.depth is not None:
-            near, far = (bound.to(found.depth) for bound in pair.depth)
-            found = found._replace(depth=found.depth.clamp(near, far))
-        valid = found.valid.reshape(h, w)
+            near, far = (bound.to(triangulated.depth) for bound in pair.depth)
+            triangulated = triangulated._replace(depth=triangulated.depth.clamp(near, far))
+        valid = triangulated.valid.reshape(h, w)
         weight = torch.where(valid & (confidence[0, :h, :w] > SETTINGS.unseen), confidence[0, :h, :w], 0.0)
-        inverse = (1 / torch.where(found.valid, found.depth, 1.0)).reshape(h, w)
+        inverse = (1 / torch.where(triangulated.valid, triangulated.depth, 1.0)).reshape(h, w)
         total = total + weight * inverse
-        widths = widths + weight * found.deviation.reshape(h, w) * inverse.square()
+        widths = widths + weight * triangulated.deviation.reshape(h, w) * inverse.square()
         weights = weights + weight
     known = weights > 0
     depth = torch.where(known, weights / torch.where(known, total, 1.0), torch.nan)

@@ -42,20 +42,22 @@ ROWS, STRIP = 512, 16
 """Size: rows of a part, and of what a thread takes of it at a time."""
 
 
-def beside_edges(depth: Float[Tensor, "h w"], frame: Frame, given: FrameInputs) -> Float[Tensor, "h w"]:
+def beside_edges(
+    depth: Float[Tensor, "h w"], frame: Frame, frame_inputs: FrameInputs
+) -> Float[Tensor, "h w"]:
     """A frame's depth, near its edges that of a pixel beside that looks alike in alpha.
 
     An edge is where inverse depth changes by more than the width of its interval. Not where the search was
     around what is known of each pixel. Gradients are those of the pixel whose depth is taken.
     """
     known = depth.isfinite() & (frame.confidence > 0)
-    if any(beta.around for beta in given.inputs.betas) or not bool(known.any()):
+    if any(beta.around for beta in frame_inputs.inputs.betas) or not bool(known.any()):
         return depth
     likely = known & (frame.confidence >= frame.confidence[known].mean())
     step = 2 * float(frame.half_width[likely].detach().nanmedian())
     if not step > 0:
         return depth
-    alpha = given.inputs.alpha[0, 0, : depth.shape[0], : depth.shape[1]]
+    alpha = frame_inputs.inputs.alpha[0, 0, : depth.shape[0], : depth.shape[1]]
     halo = SETTINGS.near + SETTINGS.radius
     return chunked(partial(_taken, step=step), depth, alpha, rows=ROWS, halo=halo)
 

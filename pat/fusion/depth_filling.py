@@ -50,7 +50,7 @@ ROWS, HALO = 512, 128
 """Size: rows of a part, and beside it that its planes see: matches there count a sixth of those at hand."""
 
 
-def background_filled(frame: Frame, given: FrameInputs) -> Float[Tensor, "h w"]:
+def background_filled(frame: Frame, frame_inputs: FrameInputs) -> Float[Tensor, "h w"]:
     """Depth that is far less certain than around it replaced by that of the plane through the background.
 
     What a beta does not see is occluded: farther away than what is beside it, along the segments' rows or
@@ -59,7 +59,7 @@ def background_filled(frame: Frame, given: FrameInputs) -> Float[Tensor, "h w"]:
     NaN. Betas on several sides see what is occluded in one of them: depth is then as it is; so it is where it
     is known from elsewhere. Planes end at the bounds that were searched. No gradient passes through planes.
     """
-    depth, confidence, inputs = frame.depth, frame.confidence, given.inputs
+    depth, confidence, inputs = frame.depth, frame.confidence, frame_inputs.inputs
     if any(beta.around for beta in inputs.betas):
         return depth
     steps = [beta.field.pixels for beta in inputs.betas if beta.field.pixels is not None]
@@ -77,7 +77,7 @@ def background_filled(frame: Frame, given: FrameInputs) -> Float[Tensor, "h w"]:
     unit = float(half_width[known & (confidence >= least)].nanmedian())
     if not unit > 0:
         return depth
-    farthest, nearest = (inverse / unit for inverse in _searched(given.placements))
+    farthest, nearest = (inverse / unit for inverse in _searched(frame_inputs.placements))
     fill = partial(_filled_rows, least=least, unit=unit, bounds=(farthest, nearest))
     planes = depth, confidence, inputs.alpha[0, 0, : depth.shape[0], : depth.shape[1]]
     if apart.sum(0).abs().argmax() == 1:

@@ -33,23 +33,23 @@ def matched_frames(files: Files) -> dict[str, list[Path]]:
     Warns of frames that some camera lacks, and where nothing but their order relates files. Raises ValueError
     if nothing relates them and their numbers differ. A camera of one file is left as it is.
     """
-    given = {name: list(paths) for name, paths in files.items()}
-    if min(map(len, given.values())) < 2:
-        return given
+    files_of = {name: list(paths) for name, paths in files.items()}
+    if min(map(len, files_of.values())) < 2:
+        return files_of
     for what, keys in (("names", _names(files)), ("numbers", _numbers(files)), ("names", _endings(files))):
-        frames = _frames(given, keys) if keys else []
-        whole = [frame for frame in frames if len(frame) == len(given)]
+        frames = _frames(files_of, keys) if keys else []
+        whole = [frame for frame in frames if len(frame) == len(files_of)]
         if len(whole) >= LEAST_WHOLE * len(frames) > 0:
-            _warn_of_missing(given, frames, what)
-            return {name: [frame[name] for frame in whole] for name in given}
-    spans = ", ".join(f"'{name}' {paths[0].name} to {paths[-1].name}" for name, paths in given.items())
-    if len({len(paths) for paths in given.values()}) > 1:
-        counts = ", ".join(f"{len(paths)} of '{name}'" for name, paths in given.items())
+            _warn_of_missing(files_of, frames, what)
+            return {name: [frame[name] for frame in whole] for name in files_of}
+    spans = ", ".join(f"'{name}' {paths[0].name} to {paths[-1].name}" for name, paths in files_of.items())
+    if len({len(paths) for paths in files_of.values()}) > 1:
+        counts = ", ".join(f"{len(paths)} of '{name}'" for name, paths in files_of.items())
         raise ValueError(
             f"frames need as many images of each camera, got {counts}; or is it for `pat fuse --sequence`?"
         )
     warn(f"no name or number relates the frames ({spans}): taken in order", MissingFramesWarning)
-    return given
+    return files_of
 
 
 def warn_of_gaps(files: Files) -> None:

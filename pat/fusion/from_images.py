@@ -206,15 +206,15 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
     factors = {name: min(finest / length, 1.0) for name, length in lengths.items()}
     reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
     masks = {name: scaled(mask, factors[name])[0] > 0.99 for name, mask in shown.items()}
-    found, facts = centres_found(resized_rig(straight, reduced), reduced, masks, alpha=alpha)
+    translated, facts = centres_found(resized_rig(straight, reduced), reduced, masks, alpha=alpha)
     for name, (points, distance) in facts.items():
         note(f"{name}: {points} points, {distance:.2f} px from their lines, intrinsics kept")
-    for name in images.keys() - {*found.names}:
+    for name in images.keys() - {*translated.names}:
         note(f"{name}: left out, too little in common with the others")
-    note(f"depths are multiples of the baseline {alpha} to {found.betas(alpha)[0]}")
-    rig, names = developed_rig(tagged, images), [alpha, *found.betas(alpha)]
-    cameras = {name: rig[name].replace(cam_from_world=found[name].cam_from_world) for name in names}
-    return Rig(cameras, depth=found.depth, name=UNSCALED), names
+    note(f"depths are multiples of the baseline {alpha} to {translated.betas(alpha)[0]}")
+    rig, names = developed_rig(tagged, images), [alpha, *translated.betas(alpha)]
+    cameras = {name: rig[name].replace(cam_from_world=translated[name].cam_from_world) for name in names}
+    return Rig(cameras, depth=translated.depth, name=UNSCALED), names
 
 
 @stage()
@@ -230,43 +230,45 @@ def found_rig(
     reduced = {name: scaled(image, factors[name]) for name, image in images.items()}
     lengths = {name: length * factors[name] for name, length in focal.items()}
     with part(0, LINES):
-        found = rig_from_images(reduced, focal=lengths, alpha=alpha)
-    betas = [name for name in images if (alpha, name) in found.rig.links]
+        uncalibrated = rig_from_images(reduced, focal=lengths, alpha=alpha)
+    betas = [name for name in images if (alpha, name) in uncalibrated.rig.links]
     if not betas:
         raise ValueError(
             f"no image shows enough of what '{alpha}' shows: choose another alpha with --alpha NAME"
         )
     for name in images.keys() - {alpha, *betas}:
         note(f"{name}: left out, too little in common with {alpha}")
-    observed = {} if lengths.keys() & {alpha, *betas} else _observed_focal_lengths(found, alpha, betas)
+    observed = {} if lengths.keys() & {alpha, *betas} else _observed_focal_lengths(uncalibrated, alpha, betas)
     for name, (length, deviation) in observed.items():
         note(
             f"{name}: focal length {length / factors[name]:.0f} pixels +- {deviation:.0%}, by matched points"
         )
     lengths |= {name: length for name, (length, _) in observed.items()}
-    rig = _calibrated(found, reduced, alpha, betas, lengths, network, note)
+    rig = _calibrated(uncalibrated, reduced, alpha, betas, lengths, network, note)
     return resized_rig(rig, images), [alpha, *betas]
 
 
 def _observed_focal_lengths(
-    found: UncalibratedRig, alpha: str, betas: Sequence[str]
+    uncalibrated: UncalibratedRig, alpha: str, betas: Sequence[str]
 ) -> dict[str, tuple[float, float]]:
     """Of alpha and the betas of its size, pixels, and its relative deviation: that which the points of a pair
     determine best; of none where no pair does."""
     fits = []
     for name in betas:
         LOG.info("looking for the focal length of %s and %s", alpha, name)
-        views = {n: found.rig[n] for n in (alpha, name)}
-        fits.append(common_focal_length(views, found.rig.links[alpha, name], found.matches[alpha, name]))
+        views = {n: uncalibrated.rig[n] for n in (alpha, name)}
+        fits.append(
+            common_focal_length(views, uncalibrated.rig.links[alpha, name], uncalibrated.matches[alpha, name])
+        )
     best = min((fit for fit in fits if fit is not None), key=lambda fit: fit.deviation, default=None)
     if best is None:
         return {}
-    alike = [name for name in (alpha, *betas) if found.rig[name].hw == found.rig[alpha].hw]
+    alike = [name for name in (alpha, *betas) if uncalibrated.rig[name].hw == uncalibrated.rig[alpha].hw]
     return dict.fromkeys(alike, (best.length, best.deviation))
 
 
 def _calibrated(
-    found: UncalibratedRig,
+    uncalibrated: UncalibratedRig,
     images: Images,
     alpha: str,
     betas: Sequence[str],
@@ -284,12 +286,18 @@ def _calibrated(
     links: dict[tuple[str, str], Link] = {}
     for i, name in enumerate(betas):
         log_step(LOG, LINES + (1 - LINES) * i / len(betas), "calibrating %s and %s", alpha, name)
-        link = found.rig.links[alpha, name]
-        views = {n: found.rig[n] for n in (alpha, name)}
-        pair = self_calibrated(views, link, found.matches[alpha, name], focal=focal)
+        link = uncalibrated.rig.links[alpha, name]
+        views = {n: uncalibrated.rig[n] for n in (alpha, name)}
+        pair = self_calibrated(views, link, uncalibrated.matches[alpha, name], focal=focal)
         if pair is None or not pair.exact:
             links[alpha, name] = link
-            note(next(line for line in found.as_text().splitlines() if line.startswith(f"{alpha} > {name}")))
+            note(
+                next(
+                    line
+                    for line in uncalibrated.as_text().splitlines()
+                    if line.startswith(f"{alpha} > {name}")
+                )
+            )
         if pair is None:
             note(
                 f"no depth by {name}: "
@@ -305,13 +313,13 @@ def _calibrated(
         if pairs[name] is not pair:
             points, distance = pairs[name].points, pairs[name].distance
             note(f"{alpha} > {name}: {points} points, {distance:.2f} px from their lines")
-    if any(getattr(view, "distortion", None) is not None for view in found.rig.cameras.values()):
-        note(describe_lenses(found.rig))
+    if any(getattr(view, "distortion", None) is not None for view in uncalibrated.rig.cameras.values()):
+        note(describe_lenses(uncalibrated.rig))
     known = {alpha, *betas}
     if not pairs:
-        cameras = {name: view for name, view in found.rig.cameras.items() if name in known}
-        links = {pair: link for pair, link in found.rig.links.items() if known >= {*pair}}
-        return found.rig.replace(cameras=cameras, links=links)
+        cameras = {name: view for name, view in uncalibrated.rig.cameras.items() if name in known}
+        links = {pair: link for pair, link in uncalibrated.rig.links.items() if known >= {*pair}}
+        return uncalibrated.rig.replace(cameras=cameras, links=links)
     first = next(iter(pairs))
     assumed = [name for name in (alpha, *pairs) if name not in focal]
     of = f" {alpha} to {first}" if len(betas) > 1 else ""
@@ -321,7 +329,7 @@ def _calibrated(
     rig = joined(pairs, scales)
     for name in betas:
         if name not in pairs:
-            rig = rig.with_camera(name, found.rig[name])
+            rig = rig.with_camera(name, uncalibrated.rig[name])
     return rig.replace(cameras={name: rig[name] for name in (alpha, *betas)}, links=links)
 
 
@@ -435,7 +443,7 @@ def show_colour(names: Sequence[str], bands: Sequence[int]) -> bool:
 
 def _wavelength(name: str) -> float:
     """Nanometres by a camera's name, such as cam_550nm or green; 0 if it does not say."""
-    if found := re.search(r"(?<!\d)([3-9]\d\d)(?:\s*nm)?(?!\d)", name):
-        return float(found[1]) if float(found[1]) <= LONGEST_VISIBLE else 0.0
+    if number := re.search(r"(?<!\d)([3-9]\d\d)(?:\s*nm)?(?!\d)", name):
+        return float(number[1]) if float(number[1]) <= LONGEST_VISIBLE else 0.0
     words = re.split(r"[^a-z]+", name.lower())
     return next((float(w) for colour, w in WAVELENGTHS.items() if colour in words), 0.0)

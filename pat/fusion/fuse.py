@@ -184,28 +184,28 @@ def fuse(
     )
     if announce:
         announce(plan)
-    found = corrections or find_corrections(network, inputs, response, align=align)
-    for line in found.described(betas, inputs.hw) if explain else ():
+    fitted = corrections or find_corrections(network, inputs, response, align=align)
+    for line in fitted.described(betas, inputs.hw) if explain else ():
         explain(line)
-    right = replace(found.applied(inputs.inputs, inputs.hw), luminance=SHARES[luminance])
+    right = replace(fitted.applied(inputs.inputs, inputs.hw), luminance=SHARES[luminance])
     inputs = inputs._replace(inputs=right)
     with limited(planned(limit, plan.memory, large=math.prod(inputs.hw) > LARGE)):
         with torch.set_grad_enabled(differentiable):
             matches = matcher(inputs.inputs) if network.uses_matches else None
             LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
-            done = fused_in_tiles(
-                network, inputs, matches, plan.tiles, found=noisy, progress=progress, store=store
+            fused = fused_in_tiles(
+                network, inputs, matches, plan.tiles, keep_matched=noisy, progress=progress, store=store
             )
             del matches
-        warn_of_confidence(network, done.frame, inputs)
-        depth = beside_edges(background_filled(done.frame, inputs), done.frame, inputs)
-        frame = done.frame._replace(depth=depth)
+        warn_of_confidence(network, fused.frame, inputs)
+        depth = beside_edges(background_filled(fused.frame, inputs), fused.frame, inputs)
+        frame = fused.frame._replace(depth=depth)
         if luminance != "alpha":
             frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
         del inputs, right  # the segments of a large frame: what follows needs memory, too
-        taken = steps_for(network, normalise=False), found.response
-        frame = found.undone(frame)
-        frame = low_light.corrected(frame, done.found, *taken, keep_alpha=settings.keep_alpha)
+        taken = steps_for(network, normalise=False), fitted.response
+        frame = fitted.undone(frame)
+        frame = low_light.corrected(frame, fused.matched, *taken, keep_alpha=settings.keep_alpha)
         LOG.info("back to the pixels of %s", alpha)
         frame = undone(frame, undo)
         if in_colour and len(frame.image) == 3 and frame.by_band is None and not noisy:

@@ -72,32 +72,32 @@ def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | N
     reduced = resized_rig(rig.replace(cameras={name: rig[name] for name in (alpha, *small)}), small)
     try:
         pairs = related(reduced, match_cameras(small, alpha=alpha))
-        found = refine_matches(reduced, [pairs], force=True)
+        refined = refine_matches(reduced, [pairs], force=True)
     except ValueError:  # too few points, nothing to refine
         return None
-    before, after = (statistics.median for statistics in found.held_out)
+    before, after = (statistics.median for statistics in refined.held_out)
     best = SETTINGS.of_own * own_distance(reduced, pairs) + SETTINGS.slack
     far = after > best or after * SETTINGS.nearer > before
-    if not found.accepted or far or share_outside(found.rig, pairs) > OUTSIDE:
+    if not refined.accepted or far or share_outside(refined.rig, pairs) > OUTSIDE:
         return None
     cameras = dict(rig.cameras)
     for name in small:
-        cameras[name] = found.rig.resize(name, rig[name].hw)[name].replace(sensor=rig[name].sensor)
+        cameras[name] = refined.rig.resize(name, rig[name].hw)[name].replace(sensor=rig[name].sensor)
     text = (
         f"the rig is healed by these images: points lay {before:.1f} px from their lines, {after:.2f} px now"
     )
-    if found.depth is not None:
-        text += f"; depth changes by {found.depth.change:.0%} (median), and is rough"
-    healed = rig.replace(cameras=cameras, depth=_depth_range(found.rig, pairs))
+    if refined.depth is not None:
+        text += f"; depth changes by {refined.depth.change:.0%} (median), and is rough"
+    healed = rig.replace(cameras=cameras, depth=_depth_range(refined.rig, pairs))
     return Healed(healed, f"{text} (--no-align leaves the rig as it is)")
 
 
 def _depth_range(rig: Rig, pairs: Pairs) -> tuple[float, float] | None:
     """The rig's depth range, extended to that of the matched points: a rotation that images correct moves all
     depths along the segments."""
-    found = [depth_bounds(Rig({n: rig[n] for n in names}), matches) for names, matches in pairs.items()]
-    ranges = [bounds for bounds in found if bounds is not None]
+    every = [depth_bounds(Rig({n: rig[n] for n in names}), matches) for names, matches in pairs.items()]
+    ranges = [bounds for bounds in every if bounds is not None]
     if rig.depth is None or not ranges:
         return rig.depth
-    given = [float(bound) for bound in rig.depth]
-    return min(given[0], *(near for near, _ in ranges)), max(given[1], *(far for _, far in ranges))
+    recorded = [float(bound) for bound in rig.depth]
+    return min(recorded[0], *(near for near, _ in ranges)), max(recorded[1], *(far for _, far in ranges))

@@ -59,13 +59,13 @@ class Placement(NamedTuple):
         on_curve = partial(ray_depth, pair, bounds=self.bounds)
         if not (pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view and self.bounds == "depth"):
             return on_curve(x, x_beta, deviation=deviation)
-        found = depth_of(pair, x, x_beta, deviation)
+        triangulated = depth_of(pair, x, x_beta, deviation)
         if pair.depth is None or pair.link is not None or not pair.has_lens:
-            return found
-        near, far = (bound.to(found.depth) for bound in pair.depth)
-        beyond = ~(found.valid & (found.depth >= near) & (found.depth <= far))
+            return triangulated
+        near, far = (bound.to(triangulated.depth) for bound in pair.depth)
+        beyond = ~(triangulated.valid & (triangulated.depth >= near) & (triangulated.depth <= far))
         there = on_curve(x[beyond], x_beta[beyond], deviation=deviation[beyond])
-        return Depth(*(t.masked_scatter(beyond, part) for t, part in zip(found, there)))
+        return Depth(*(t.masked_scatter(beyond, part) for t, part in zip(triangulated, there)))
 
 
 class FrameInputs(NamedTuple):

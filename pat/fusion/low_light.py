@@ -90,8 +90,8 @@ class LowLight:
 
     def described(self) -> str:
         """Which views are denoised, and by how much they deviate."""
-        found = (f"{name} {255 * float(view.deviation.mean()):.0f}/255" for name, view in self.noisy.items())
-        return f"noise shows plainly and is removed: {', '.join(found)}; --noise none leaves it"
+        texts = (f"{name} {255 * float(view.deviation.mean()):.0f}/255" for name, view in self.noisy.items())
+        return f"noise shows plainly and is removed: {', '.join(texts)}; --noise none leaves it"
 
     def kept(self, hw: HW, betas: int) -> float:
         """Bytes held until the frame of this size is corrected: views, its pixels' places in each beta."""
@@ -99,13 +99,13 @@ class LowLight:
             return 0.0
         images = [*self.given.images.values(), *self.views.images.values()]
         parts = [part for view in self.noisy.values() for part in view]
-        found = math.prod(hw) * betas * SETTINGS.found_bytes
-        return found + sum({part.data_ptr(): part.nbytes for part in (*images, *parts)}.values())
+        kept_bytes = math.prod(hw) * betas * SETTINGS.found_bytes
+        return kept_bytes + sum({part.data_ptr(): part.nbytes for part in (*images, *parts)}.values())
 
     def corrected(
         self,
         frame: Frame,
-        found: Float[Tensor, "n 3 h w"],
+        matched: Float[Tensor, "n 3 h w"],
         steps: Sequence[FusionStep],
         response: Response,
         *,
@@ -113,9 +113,9 @@ class LowLight:
     ) -> Frame:
         """A frame fused from the denoised views, its colours averaged with those that betas recorded.
 
-        `found` is where its pixels are in each beta, x and y, and the confidence of that. `steps` were taken
-        before it was fused, but for radiometry: values keep their scale; they are not undone yet. `response`
-        says what brings betas to alpha's exposure.
+        `matched` is where its pixels are in each beta, x and y, and the confidence of that. `steps` were
+        taken before it was fused, but for radiometry: values keep their scale; they are not undone yet.
+        `response` says what brings betas to alpha's exposure.
         With `keep_alpha` the luma is alpha's as recorded. Betas that are not all RGB are denoised one by one
         alone.
         """
@@ -125,7 +125,7 @@ class LowLight:
         alpha, image, views = self.views.alpha, frame.image, self.prepared(steps)
         own = views.pop(alpha)
         if all(view.recorded.shape[1] == 3 for view in views.values()):
-            image = colours_averaged(image, [exposed(view, response) for view in views.values()], found)
+            image = colours_averaged(image, [exposed(view, response) for view in views.values()], matched)
         if keep_alpha:
             image = image + self._stepped(self.given.images, steps)[alpha] - own.denoised[0]
         return frame._replace(image=image)
@@ -170,11 +170,11 @@ def warn_of_noise(name: str, image: Float[Tensor, "c h w"], view: NoisyView) -> 
     """Warn if the noise that is stated of an image is far more than it shows."""
     shown = NoiseLevel.estimated(image[None])
     deviations = view.deviation, shown.deviation(image[None])
-    stated, found = (255 * float(deviation.mean()) for deviation in deviations)
-    if shown != NoiseLevel() and stated > SETTINGS.far_more * max(found, 255 * SETTINGS.least_deviation):
+    stated, measured = (255 * float(deviation.mean()) for deviation in deviations)
+    if shown != NoiseLevel() and stated > SETTINGS.far_more * max(measured, 255 * SETTINGS.least_deviation):
         warn(
             f"noise of '{name}': a standard deviation of {stated:.0f}/255 is stated, "
-            f"its image shows {found:.1f}/255: detail will be lost; state electrons at white, "
+            f"its image shows {measured:.1f}/255: detail will be lost; state electrons at white, "
             "or have the noise estimated"
         )
 
@@ -231,20 +231,20 @@ def denoised(
     image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b c h w"]:
     """An image without noise of this standard deviation; bands other than three are denoised one by one."""
-    network, given = shipped_denoiser(), image.dtype
+    network, dtype = shipped_denoiser(), image.dtype
     image, deviation = image.float(), deviation.float()
     if image.shape[1] == 3:
-        return in_tiles(partial(without_noise, network.colour), image, deviation).to(given)
+        return in_tiles(partial(without_noise, network.colour), image, deviation).to(dtype)
     bands = zip(image.split(1, 1), deviation.split(1, 1))
-    return torch.cat([in_tiles(partial(without_noise, network.band), *band) for band in bands], 1).to(given)
+    return torch.cat([in_tiles(partial(without_noise, network.band), *band) for band in bands], 1).to(dtype)
 
 
 @torch.no_grad()
 def colours_averaged(
-    image: Float[Tensor, "3 h w"], betas: Sequence[NoisyView], found: Float[Tensor, "n 3 h w"]
+    image: Float[Tensor, "3 h w"], betas: Sequence[NoisyView], matched: Float[Tensor, "n 3 h w"]
 ) -> Float[Tensor, "3 h w"]:
     """The image fused from denoised views with means of its colours and of those that RGB betas recorded."""
-    beta, confidence = warped(betas, found)
+    beta, confidence = warped(betas, matched)
     deviation = float(beta.deviation.mean())
     if not deviation:
         return image
@@ -256,10 +256,10 @@ def colours_averaged(
 
 
 def warped(
-    betas: Sequence[NoisyView], found: Float[Tensor, "n 3 h w"]
+    betas: Sequence[NoisyView], matched: Float[Tensor, "n 3 h w"]
 ) -> tuple[NoisyView, Float[Tensor, "1 1 h w"]]:
     """All betas at alpha's pixels, mixed by their confidences; and the confidence of the mixture."""
-    positions, confidence = found[:, :2].movedim(1, -1), found[:, 2]
+    positions, confidence = matched[:, :2].movedim(1, -1), matched[:, 2]
     images = [torch.cat([sample(part, x[None]).values for part in beta]) for beta, x in zip(betas, positions)]
     weight = (confidence + 1e-6) / (confidence + 1e-6).sum(0)
     mixed = torch.stack([w * image for w, image in zip(weight, images)]).sum(0)

@@ -297,13 +297,13 @@ def mixed(own: Float[Tensor, "1 h w"], sources: Sequence[tuple[float, KeyColour]
     """
     weights = torch.stack([nearness * (s.confidence + SETTINGS.floor) for nearness, s in sources])
     share = (weights / weights.sum(0))[:, None]
-    added, confidences, found = map(torch.stack, zip(*(colour for _, colour in sources)))
+    added, confidences, of_sources = map(torch.stack, zip(*(colour for _, colour in sources)))
     colour = (share * added).sum(0)
     apart = (share * (added - colour).square()).sum((0, 1))
     confidence = (share[:, 0] * confidences).sum(0)
-    weights = torch.where(found[:, 0] > 0, weights, 0.0)
+    weights = torch.where(of_sources[:, 0] > 0, weights, 0.0)
     known = weights.sum(0) > 0
-    inverse, half_width = (weights[:, None] * found).sum(0) / weights.sum(0).clamp(min=1e-12)
+    inverse, half_width = (weights[:, None] * of_sources).sum(0) / weights.sum(0).clamp(min=1e-12)
     depth = torch.where(known, 1 / torch.where(known, inverse, 1.0), torch.nan)
     agreeing = torch.exp(-apart / UNLIKE**2)
     return Frame(own + colour, depth, confidence * agreeing, torch.where(known, half_width, torch.nan))

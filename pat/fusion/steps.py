@@ -79,8 +79,8 @@ def undistort(views: Views) -> Done:
     lens, pinhole = views.rig[views.alpha], rig[views.alpha]
     fields = {name: _for_pinhole(field, lens, pinhole) for name, field in views.fields.items()}
     straight, own = images[views.alpha], views.own
-    done = Views(rig, images, views.alpha, fields)
-    return Done(done, lambda frame: _distorted(frame, straight, own, pinhole, lens))
+    undistorted = Views(rig, images, views.alpha, fields)
+    return Done(undistorted, lambda frame: _distorted(frame, straight, own, pinhole, lens))
 
 
 def takes_pinhole_views(views: Views) -> bool:
@@ -129,8 +129,8 @@ def _cropped(network: FusionNetwork, views: Views, name: str) -> Views:
     follows = field is None or isinstance(field, (Epipolar, EpipolarLine))
     if not follows or pair.link is not None or not pair.calibrated or resolution_ratio(pair) > 0.8:
         return views
-    found = (field or default_field(pair))(pair, coarse_grid(pair.alpha.hw).reshape(-1, 2))
-    top, bottom, left, right = box_around(ends_of(found), (h, w), network.beta_halo, network.multiple)
+    locations = (field or default_field(pair))(pair, coarse_grid(pair.alpha.hw).reshape(-1, 2))
+    top, bottom, left, right = box_around(ends_of(locations), (h, w), network.beta_halo, network.multiple)
     if (bottom - top) * (right - left) > 0.75 * h * w:
         return views
     rig = views.rig.transformed(name, shift_matrix(left, top), (bottom - top, right - left))
@@ -143,12 +143,12 @@ def normalise_betas(views: Views, *, undone: bool = False) -> Done:
     `undone`: bands have their own scale in the result, as measurements need it; else that is as bright as
     alpha.
     """
-    done = views.replace({n: normalised(views.images[n], views.own) for n in views.betas})
+    in_one_exposure = views.replace({n: normalised(views.images[n], views.own) for n in views.betas})
     if not undone:
-        return Done(done)
+        return Done(in_one_exposure)
     own, scales = moments(views.own), [moments(views.images[name]) for name in views.betas]
     bands = [len(views.images[name]) for name in views.betas]
-    return Done(done, lambda frame: with_own_levels(frame, bands, own, scales))
+    return Done(in_one_exposure, lambda frame: with_own_levels(frame, bands, own, scales))
 
 
 def with_own_levels(frame: Frame, bands: Sequence[int], own: Moments, scales: Sequence[Moments]) -> Frame:
@@ -172,8 +172,8 @@ def join(which: JoinsBands, views: Views) -> Done:
         by_band = frame.confidence.expand(len(order), -1, -1) if frame.by_band is None else frame.by_band
         return frame._replace(image=frame.image[order], by_band=by_band[order])
 
-    done = Views(views.rig, {views.alpha: views.own, **joined}, views.alpha, views.fields)
-    return Done(done, back)
+    joined_views = Views(views.rig, {views.alpha: views.own, **joined}, views.alpha, views.fields)
+    return Done(joined_views, back)
 
 
 def co_located(rig: Rig, names: Sequence[str], fields: Fields, which: JoinsBands) -> list[list[str]]:

@@ -182,14 +182,14 @@ def _to_multiple(box: Box, multiple: int) -> Box:
 
 class FusedTile(NamedTuple):
     """The inner part of a tile: image (C, h, w), depth, confidence and half-width (h, w) as of `Frame`, and
-    where its pixels were found in each whole beta, (betas, 3, h, w): x, y and the confidence of that;
+    where its pixels are in each whole beta, (betas, 3, h, w): x, y and the confidence of that;
     `by_band` as of `Frame`, or empty."""
 
     image: Tensor
     depth: Tensor
     confidence: Tensor
     half_width: Tensor
-    found: Tensor
+    matched: Tensor
     by_band: Tensor
 
     @property
@@ -217,12 +217,12 @@ def _fused(
     depth, half_width, confidence = measured_depth(output, part, frame.placements, hw, (left, top))
     corners = [p.new_tensor(beta.offset)[:, None, None] for beta, p in zip(part.betas, output.position)]
     seen = zip(output.position, corners, output.confidence)
-    found = torch.stack([torch.cat([p[0] + corner, c]) for p, corner, c in seen]).to(output.image)
+    matched = torch.stack([torch.cat([p[0] + corner, c]) for p, corner, c in seen]).to(output.image)
     bands = [beta.image.shape[1] for beta in part.betas]
     by_band = output.image[0, :0]
     if len(bands) > 1 and sum(bands) == output.image.shape[1]:
         by_band = torch.cat([c.expand(n, -1, -1) for c, n in zip(output.confidence, bands)])
-    return FusedTile(output.image[0], depth, confidence, half_width, found, by_band.half())
+    return FusedTile(output.image[0], depth, confidence, half_width, matched, by_band.half())
 
 
 def fused_in_tiles(
@@ -231,16 +231,16 @@ def fused_in_tiles(
     matches: Matches | None,
     tiles: list[Tile],
     *,
-    found: bool = True,
+    keep_matched: bool = True,
     progress: Callable[[Iterable[Tile], int], Iterable[Tile]] | None = None,
     store: Path | None = None,
 ) -> FusedTile:
     """The frame put together from its tiles, or from a folder where finished tiles are; without what was
-    `found` in the betas (it takes 12 bytes a pixel and beta) if that is not asked for."""
+    `matched` in the betas (it takes 12 bytes a pixel and beta) if that is not asked for."""
 
     def make(tile: Tile) -> FusedTile:
         made = fuse_tile(network, frame, matches, tile)
-        return made if found else made._replace(found=made.found[:0])
+        return made if keep_matched else made._replace(matched=made.matched[:0])
 
     shown = progress(tiles, len(tiles)) if progress else tiles
     if store and len(tiles) > 1:
@@ -265,8 +265,8 @@ def _digest(network: FusionNetwork, frame: FrameInputs) -> str:
     digest = hashlib.sha256(f"{how} {rounded}".encode())
     parameters = module.state_dict().values()
     some = pixel_grid(inputs.hw, dtype=torch.float64)[::64, ::64].reshape(-1, 2)
-    found = [b.field.at(some) if b.field.pixels is None else b.field.pixels for b in inputs.betas]
-    fields = [tensor for one in found for tensor in vars(one).values()]
+    samples = [b.field.at(some) if b.field.pixels is None else b.field.pixels for b in inputs.betas]
+    fields = [tensor for one in samples for tensor in vars(one).values()]
     cameras = [camera for place in frame.placements if place.pair.calibrated for camera in place.pair.cameras]
     poses = [tensor for camera in cameras for tensor in (camera.K, camera.R, camera.t)]
     for tensor in (*parameters, inputs.alpha, *(b.image for b in inputs.betas), *fields, *poses):

@@ -70,21 +70,21 @@ class Timeline:
         Raises ValueError for a beta without a frame near any of them: then the recordings do not overlap.
         """
         fastest = max(self.betas, key=self.rate)
-        found: dict[int, float] = {}
+        gains: dict[int, float] = {}
         for i in range(self.counts[fastest]):
             time = self.time(fastest, i)
             index = self.nearest(self.alpha, time)
             gap = abs(self.time(self.alpha, index) - time)
             if gap <= 0.5 * self.interval + 1e-9:
-                found[index] = min(gap, found.get(index, gap))
+                gains[index] = min(gap, gains.get(index, gap))
         for name in self.betas:
             within = 0.5 * max(1 / self.rate(name), self.interval) + 1e-9
-            times = (self.time(self.alpha, i) for i in found)
+            times = (self.time(self.alpha, i) for i in gains)
             if not any(abs(self.time(name, self.nearest(name, t)) - t) <= within for t in times):
                 raise ValueError(
                     f"no frame of '{name}' is near one of alpha in time: check 'frame_rate' and 'time_offset'"
                 )
-        return [KeyFrame(i, self.at(i)) for i in sorted(found)]
+        return [KeyFrame(i, self.at(i)) for i in sorted(gains)]
 
     def warn_of_ends(self) -> None:
         """Warn of betas without frames in a part of alpha's time: their first or last gives colour there."""

@@ -73,13 +73,13 @@ def with_certainty(matches: Matches) -> Matches:
     Of matches on which several betas agree, whose certainty alone was known before: a beta sees a point only
     if both say so.
     """
-    return Matches(tuple(replace(found, certainty=_certainty(found)) for found in matches.betas))
+    return Matches(tuple(replace(beta, certainty=_certainty(beta)) for beta in matches.betas))
 
 
-def _certainty(found: BetaMatches) -> Float[Tensor, "b 2 h2 w2"]:
-    typical, (h, w) = typical_facts(found), found.disparity.shape[-2:]
-    bare = replace(found, bands=None, diffused=None, certainty=None)
-    network = deepcopy(fitted_network()).to(found.facts)  # another thread may need it in another precision
+def _certainty(matches: BetaMatches) -> Float[Tensor, "b 2 h2 w2"]:
+    typical, (h, w) = typical_facts(matches), matches.disparity.shape[-2:]
+    bare = replace(matches, bands=None, diffused=None, certainty=None)
+    network = deepcopy(fitted_network()).to(matches.facts)  # another thread may need it in another precision
 
     def of(tile: Tile) -> Tensor:
         numbers = measured(bare.cut(tile.outer), typical).movedim(1, -1)
@@ -88,28 +88,28 @@ def _certainty(found: BetaMatches) -> Float[Tensor, "b 2 h2 w2"]:
 
     halo = FINE * max(SETTINGS.around + SETTINGS.apart)
     certainty = assembled((h, w), ((tile, of(tile)) for tile in tiles_of((h, w), (FINE * ROWS, w), halo)))
-    if found.certainty is not None:
-        certainty[:, :1] = certainty[:, :1].minimum(found.certainty[:, :1])
+    if matches.certainty is not None:
+        certainty[:, :1] = certainty[:, :1].minimum(matches.certainty[:, :1])
     return certainty
 
 
-def typical_facts(found: BetaMatches) -> Float[Tensor, "b 2"]:
+def typical_facts(matches: BetaMatches) -> Float[Tensor, "b 2"]:
     """By how much the pair's consistent matches are better than others, and their cost, in the mean."""
-    consistent = (found.facts[:, :1] < CONSISTENT).to(found.facts)
+    consistent = (matches.facts[:, :1] < CONSISTENT).to(matches.facts)
     some = consistent.mean((-2, -1)).clamp(min=1e-3)
-    return (found.facts[:, 1:] * consistent).mean((-2, -1)) / some
+    return (matches.facts[:, 1:] * consistent).mean((-2, -1)) / some
 
 
-def measured(found: BetaMatches, typical: Float[Tensor, "b 2"]) -> Float[Tensor, "b n h2 w2"]:
+def measured(matches: BetaMatches, typical: Float[Tensor, "b 2"]) -> Float[Tensor, "b n h2 w2"]:
     """The `MEASURED` numbers of each pixel, at half the size; `typical` is of the whole frame."""
-    assert found.stated is not None
-    facts = [found.facts, *(box_mean(found.facts, radius) for radius in SETTINGS.around)]
-    ranges = (max_pool2d(_range(found.surface, radius), FINE) for radius in SETTINGS.apart)
+    assert matches.stated is not None
+    facts = [matches.facts, *(box_mean(matches.facts, radius) for radius in SETTINGS.around)]
+    ranges = (max_pool2d(_range(matches.surface, radius), FINE) for radius in SETTINGS.apart)
     apart = [(part.clamp(min=0) + 0.1).log() for part in ranges]
-    blurs = torch.tensor(found.comparison.whole.blurs).T  # of alpha and of beta, of each of the batch
+    blurs = torch.tensor(matches.comparison.whole.blurs).T  # of alpha and of beta, of each of the batch
     same = torch.cat([blurs.to(typical), typical], 1)[..., None, None]
-    same = same.expand(*same.shape[:2], *found.facts.shape[-2:])
-    return torch.cat([*facts, *apart, same, found.stated], 1)
+    same = same.expand(*same.shape[:2], *matches.facts.shape[-2:])
+    return torch.cat([*facts, *apart, same, matches.stated], 1)
 
 
 def _range(x: Float[Tensor, "b 1 h w"], radius: int) -> Float[Tensor, "b 1 h w"]:

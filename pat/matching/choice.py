@@ -70,9 +70,9 @@ class Choice(nn.Module):
         self.unet = UNet(FACTS + 4 * (1 + 2 * CANDIDATES), widths, 4 * (CANDIDATES + 2))
         nn.init.zeros_(self.unet.last.weight)
 
-    def forward(self, given: Float[Tensor, "b i h2 w2"]) -> Float[Tensor, "b n 4 h2 w2"]:
+    def forward(self, inputs: Float[Tensor, "b i h2 w2"]) -> Float[Tensor, "b n 4 h2 w2"]:
         """By `features`, of 2 x 2 pixels."""
-        return self.unet(given).unflatten(1, (CANDIDATES + 2, FINE * FINE))
+        return self.unet(inputs).unflatten(1, (CANDIDATES + 2, FINE * FINE))
 
 
 @cache
@@ -101,31 +101,31 @@ def chosen(inputs: Inputs, matches: Matches, network: Choice | None = None) -> M
     return Matches(tuple(_chosen(*one, best) for one in zip(inputs.by_beta, matches.betas)))
 
 
-def _chosen(inputs: Inputs, found: BetaMatches, network: Choice) -> BetaMatches:
-    typical = typical_facts(found)
+def _chosen(inputs: Inputs, matches: BetaMatches, network: Choice) -> BetaMatches:
+    typical = typical_facts(matches)
     weight = network.unet.last.weight
-    if (weight.dtype, weight.device) != (found.facts.dtype, found.facts.device):
-        network = deepcopy(network).to(found.facts)  # another thread may need it as it is
+    if (weight.dtype, weight.device) != (matches.facts.dtype, matches.facts.device):
+        network = deepcopy(network).to(matches.facts)  # another thread may need it as it is
 
     def of(piece: Inputs, part: BetaMatches) -> tuple[Tensor, Tensor]:
         (beta,), (h, w) = piece.betas, part.disparity.shape[-2:]
-        views = found.comparison.views(piece.alpha, beta.image)
+        views = matches.comparison.views(piece.alpha, beta.image)
         with torch.no_grad(), convolutions_in_parallel():
-            given = features(views, beta.field.straight, part, candidates(part), typical)
-            answer = network(given)
-            del given  # most of the memory; candidates are made twice for the same reason
+            planes = features(views, beta.field.straight, part, candidates(part), typical)
+            answer = network(planes)
+            del planes  # most of the memory; candidates are made twice for the same reason
             scores, stated = answer.split([CANDIDATES, 2], 1)
             best = pixel_shuffle(scores.max(1).indices.float(), FINE)[..., :h, :w].long()
         return candidates(part).gather(1, best), stated.mean(2)[..., : h // FINE, : w // FINE]
 
-    disparity, stated = inputs.in_pieces(of, replace(found, bands=None, diffused=None, certainty=None))
-    return replace(found, chosen=None if inputs.betas[0].around else disparity, stated=stated)
+    disparity, stated = inputs.in_pieces(of, replace(matches, bands=None, diffused=None, certainty=None))
+    return replace(matches, chosen=None if inputs.betas[0].around else disparity, stated=stated)
 
 
-def candidates(found: BetaMatches) -> Float[Tensor, "b n h w"]:
+def candidates(matches: BetaMatches) -> Float[Tensor, "b n h w"]:
     """Disparities of each pixel to choose from; the first is its own."""
-    own = found.disparity
-    consistent = enlarged(found.facts[:, :1] < CONSISTENT)
+    own = matches.disparity
+    consistent = enlarged(matches.facts[:, :1] < CONSISTENT)
     along = [nearest_known(own, consistent, axis, back) for axis in (-2, -1) for back in (False, True)]
     (h, w), most = own.shape[-2:], max(SETTINGS.around)
     wide = pad(own, (most,) * 4, mode="replicate")
@@ -136,18 +136,18 @@ def candidates(found: BetaMatches) -> Float[Tensor, "b n h w"]:
 def features(
     views: ComparedViews,
     segments: Segments,
-    found: BetaMatches,
+    matches: BetaMatches,
     options: Float[Tensor, "b n h w"],
     typical: Float[Tensor, "b 2"],
 ) -> Float[Tensor, "b i h2 w2"]:
     """What the scores are by, padded to whole multiples; `typical` facts are of the whole frame."""
     extent, (h, w) = Extent.of(segments), options.shape[-2:]
-    half = _at_half(found, typical)
+    half = _at_half(matches, typical)
     sides = [-(-n // SETTINGS.multiple) * SETTINGS.multiple // FINE for n in (h, w)]
-    given = torch.empty(len(options), *sides, FACTS + 4 * (1 + 2 * CANDIDATES))
+    stacked_planes = torch.empty(len(options), *sides, FACTS + 4 * (1 + 2 * CANDIDATES))
     padded = pad(half, (0, sides[1] - half.shape[-1], 0, sides[0] - half.shape[-2]), mode="replicate")
-    given[..., :FACTS] = padded.movedim(1, -1)
-    for i, image in enumerate(given):
+    stacked_planes[..., :FACTS] = padded.movedim(1, -1)
+    for i, image in enumerate(stacked_planes):
         one = min(i, len(segments.end) - 1)
         parts = views.alpha[i, 0], views.beta[i, 0], segments.end[one], extent.towards[one], options[i]
         own, other, end, towards, each = map(numpy_of, parts)
@@ -157,11 +157,11 @@ def features(
             planes = own[rows], other, end[rows], towards[rows], each[:, rows]
             tasks.append(partial(kernels.compared, *planes, SETTINGS.scales, out))
         in_parallel(tasks)
-    return given.movedim(-1, 1).to(views.alpha)
+    return stacked_planes.movedim(-1, 1).to(views.alpha)
 
 
-def _at_half(found: BetaMatches, typical: Tensor) -> Float[Tensor, "b 7 h2 w2"]:
+def _at_half(matches: BetaMatches, typical: Tensor) -> Float[Tensor, "b 7 h2 w2"]:
     """The `FACTS` of each pixel, about -.4 to .6."""
-    blurs = torch.tensor(found.comparison.whole.blurs).T.to(typical) / SETTINGS.blur
-    same = torch.cat([typical, blurs], 1)[..., None, None].expand(-1, -1, *found.facts.shape[-2:])
-    return torch.cat([found.facts, same], 1) - 0.4
+    blurs = torch.tensor(matches.comparison.whole.blurs).T.to(typical) / SETTINGS.blur
+    same = torch.cat([typical, blurs], 1)[..., None, None].expand(-1, -1, *matches.facts.shape[-2:])
+    return torch.cat([matches.facts, same], 1) - 0.4

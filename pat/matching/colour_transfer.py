@@ -71,14 +71,14 @@ class ColourTransferSettings:
 SETTINGS = ColourTransferSettings()
 
 
-def transferred(inputs: Inputs, found: Matches) -> Matches:
+def transferred(inputs: Inputs, matches: Matches) -> Matches:
     """The matches with beta's bands at them; those of matches from elsewhere, too.
 
     Of betas that agree on depth, those that have all of the result's bands share the colour that is diffused;
     any other has its own. With gradients if images or fields have some and gradients are recorded. Raises
     ValueError for matches of another size or number of betas.
     """
-    found.check(inputs.hw, len(inputs.betas))
+    matches.check(inputs.hw, len(inputs.betas))
     agree, large = inputs.can_agree, len(inputs.pieces) > 1
     sharing = [agree and inputs.shows_all_bands(beta) for beta in inputs.betas]
 
@@ -86,33 +86,33 @@ def transferred(inputs: Inputs, found: Matches) -> Matches:
         parts = _transferred_piece(piece, there, sharing)
         return [part if part.requires_grad or not large else part.half() for part in parts]
 
-    parts = inputs.in_pieces(of, found)
+    parts = inputs.in_pieces(of, matches)
     bands, diffused = parts[-len(sharing) :], iter(parts[: -len(sharing)])
     shared = next(diffused) if any(sharing) else None
-    made = zip(found.betas, bands, sharing)
+    made = zip(matches.betas, bands, sharing)
     return Matches(tuple(replace(m, bands=b, diffused=shared if s else next(diffused)) for m, b, s in made))
 
 
-def _transferred_piece(piece: Inputs, found: Matches, sharing: Sequence[bool]) -> list[Tensor]:
+def _transferred_piece(piece: Inputs, matches: Matches, sharing: Sequence[bool]) -> list[Tensor]:
     """The diffused colour betas share, if any do, each other beta's, and each beta's bands minus alpha."""
     alpha = piece.alpha
-    alone = [transferred_bands(alpha, *one) for one in zip(piece.betas, found.betas)]
+    of_each = [transferred_bands(alpha, *one) for one in zip(piece.betas, matches.betas)]
     shared = []
     if any(sharing):
-        counting = [(c, w, m.prior) for (c, w), m, counts in zip(alone, found.betas, sharing) if counts]
+        counting = [(c, w, m.prior) for (c, w), m, counts in zip(of_each, matches.betas, sharing) if counts]
         weights = [weight * math.exp(prior) for _, weight, prior in counting]
         mixed = sum(w * colour for w, (colour, _, _) in zip(weights, counting)) / torch.stack(weights).sum(0)
         shared = [diffused_from(mixed, alpha, torch.stack([weight for _, weight, _ in counting]).amax(0))]
-    others = [one for one, counts in zip(alone, sharing) if not counts]
+    others = [one for one, counts in zip(of_each, sharing) if not counts]
     own = [diffused_from(colour, alpha, weight) for colour, weight in others]
-    return [*shared, *own, *(colour for colour, _ in alone)]
+    return [*shared, *own, *(colour for colour, _ in of_each)]
 
 
-def transferred_bands(alpha: Tensor, beta: Beta, found: BetaMatches) -> tuple[Tensor, Tensor]:
+def transferred_bands(alpha: Tensor, beta: Beta, matches: BetaMatches) -> tuple[Tensor, Tensor]:
     """A beta's bands minus alpha at its matches (B, C, H, W), and their weight (B, 1, H, W), 0 to 1."""
-    if found.comparison.mix is not None:
-        return _colours_of_bands(alpha, beta, found, found.comparison.mix)
-    where = beta.field.straight, found.disparity, found.facts, found.comparison.whole
+    if matches.comparison.mix is not None:
+        return _colours_of_bands(alpha, beta, matches, matches.comparison.mix)
+    where = beta.field.straight, matches.disparity, matches.facts, matches.comparison.whole
     return matched_colours(alpha, combined_bands(beta.image), beta.image, *where)
 
 
@@ -149,18 +149,18 @@ def matched_colours(
 
 @torch.no_grad()
 def _colours_of_bands(
-    alpha: Tensor, beta: Beta, found: BetaMatches, mix: SpectralMix
+    alpha: Tensor, beta: Beta, matches: BetaMatches, mix: SpectralMix
 ) -> tuple[Tensor, Tensor]:
     """The bands minus alpha at matches that the mix has found, with the detail that alpha has and they have
     not; their weight, 0 to 1."""
-    values, valid = at_matches(beta.image, beta.field.straight, found.disparity)
-    brightness, soft = mix.of(values), found.comparison.whole.softened(alpha)
+    values, valid = at_matches(beta.image, beta.field.straight, matches.disparity)
+    brightness, soft = mix.of(values), matches.comparison.whole.softened(alpha)
     gain = mix.gain[:, None, None, None].to(alpha)
     beyond = (alpha - soft) + gain * (soft - brightness)
     rises = mix.rises(values)
     slope = rises + local_slope(values - rises * brightness, brightness)
     colours = values + slope * SETTINGS.detail(beyond) - alpha
-    return colours, match_weight(brightness - soft, is_consistent(found.facts), valid)
+    return colours, match_weight(brightness - soft, is_consistent(matches.facts), valid)
 
 
 def _scaled_to_alpha(

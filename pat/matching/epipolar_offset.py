@@ -79,7 +79,7 @@ class Misalignment:
         """The field with its segments displaced; `hw` is alpha's size without padding."""
         if self == Misalignment() or field.pixels is None:
             return field
-        return field.displaced(lambda found, x: self.at(x, hw)[..., None] * normals(found))
+        return field.displaced(lambda locations, x: self.at(x, hw)[..., None] * normals(locations))
 
 
 @torch.no_grad()
@@ -95,8 +95,8 @@ def fit_misalignment(
     `alpha` and `beta` are of equal brightness and sharpness; `position` are the matches in beta, `weight` is
     0 to 1.
     """
-    given = (t.detach().cpu().float().numpy() for t in (alpha, beta, position, normal, weight))
-    views = _Windows.of(*given)
+    arrays = (t.detach().cpu().float().numpy() for t in (alpha, beta, position, normal, weight))
+    views = _Windows.of(*arrays)
     height, width = alpha.shape
     coefficients = np.zeros(3)
     for _ in range(SETTINGS.steps):
@@ -106,11 +106,11 @@ def fit_misalignment(
         coefficients = coefficients + step
         if np.abs(step).max() < SETTINGS.finest:
             break
-    found = Misalignment(*(float(c) / width for c in coefficients))
-    if found.largest((height, width)) < SETTINGS.least:
+    misalignment = Misalignment(*(float(c) / width for c in coefficients))
+    if misalignment.largest((height, width)) < SETTINGS.least:
         return Misalignment()
     accepted = views.residual(coefficients) < SETTINGS.better * views.residual(np.zeros(3))
-    return found if accepted else Misalignment()
+    return misalignment if accepted else Misalignment()
 
 
 class _Windows(NamedTuple):
@@ -171,10 +171,10 @@ class _Windows(NamedTuple):
         useful = (strength[some] > SUBPIXEL.flat / 10) & (weight[some] > 0.3)
         if useful.sum() < SETTINGS.windows:
             return None
-        found = towards[some][useful] / (strength[some][useful] + SUBPIXEL.flat / 10)
+        steps = towards[some][useful] / (strength[some][useful] + SUBPIXEL.flat / 10)
         counts = strength[some][useful] / (strength[some][useful] + SUBPIXEL.flat)
         limit = SETTINGS.farthest
-        return _robust_plane(self.design[:, ::4, ::4][:, useful], np.clip(found, -limit, limit), counts)
+        return _robust_plane(self.design[:, ::4, ::4][:, useful], np.clip(steps, -limit, limit), counts)
 
 
 def _robust_plane(design: NDArray, values: NDArray, weight: NDArray) -> NDArray[np.float64]:

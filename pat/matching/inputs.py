@@ -155,11 +155,11 @@ def track_in(
     return lambda x: Track(*map(changed, track(whole(x))))
 
 
-def ends_of(found: Segments | Positions) -> Float[Tensor, "n 2"]:
+def ends_of(locations: Segments | Positions) -> Float[Tensor, "n 2"]:
     """The ends of valid segments, or the positions that count."""
-    if isinstance(found, Positions):
-        return found.xy[found.mask]
-    return torch.cat([found.start[found.valid], found.end[found.valid]])
+    if isinstance(locations, Positions):
+        return locations.xy[locations.mask]
+    return torch.cat([locations.start[locations.valid], locations.end[locations.valid]])
 
 
 def box_around(points: Float[Tensor, "n 2"], hw: HW, halo: int, multiple: int) -> Box:

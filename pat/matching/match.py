@@ -42,30 +42,30 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
     if any(side % FINE for side in inputs.hw):
         h, w = inputs.hw
         raise ValueError(f"alpha has {w}x{h} pixels to match: pad both sides to whole multiples of {FINE}")
-    found = in_each_beta(inputs)
+    matches = in_each_beta(inputs)
     if inputs.can_agree:
-        found = agreed(inputs, with_certainty(chosen(inputs, found, choice)))
+        matches = agreed(inputs, with_certainty(chosen(inputs, matches, choice)))
     if torch.is_grad_enabled():
-        found = following(inputs, found)
+        matches = following(inputs, matches)
     if not inputs.can_agree:
-        found = chosen(inputs, found, choice)
-    return transferred(inputs, with_certainty(found))
+        matches = chosen(inputs, matches, choice)
+    return transferred(inputs, with_certainty(matches))
 
 
 def located(inputs: Inputs) -> Matches:
     """Where alpha's pixels are in each beta, no colours; of several calibrated betas, where all agree."""
-    alone = in_each_beta(inputs)
-    return agreed(inputs, alone) if inputs.can_agree else alone
+    of_each = in_each_beta(inputs)
+    return agreed(inputs, of_each) if inputs.can_agree else of_each
 
 
 @torch.no_grad()
 def in_each_beta(inputs: Inputs) -> Matches:
     """The matches in each beta as if it were the only one."""
-    found = []
+    of_betas = []
     for number, one in enumerate(inputs.by_beta, 1):
         LOG.info("matching beta %d of %d", number, len(inputs.betas))
-        found.append(located_in_one(one))
-    return Matches(tuple(found))
+        of_betas.append(located_in_one(one))
+    return Matches(tuple(of_betas))
 
 
 def located_in_one(inputs: Inputs) -> BetaMatches:

@@ -102,14 +102,14 @@ class Matches:
     @property
     def nbytes(self) -> int:
         """Memory held, of a large frame: colours as float16, those that betas share counted once."""
-        colours = {id(part): part.numel() for found in self.betas for part in found.colours}
-        planes = [2 * found.disparity.nbytes + found.facts.nbytes * 7 // 3 for found in self.betas]
+        colours = {id(part): part.numel() for beta in self.betas for part in beta.colours}
+        planes = [2 * beta.disparity.nbytes + beta.facts.nbytes * 7 // 3 for beta in self.betas]
         return 2 * sum(colours.values()) + sum(planes)
 
     def cut(self, box: Box) -> Matches:
         """Of a part of alpha. Colour that several betas share, they share there too."""
         shared: dict[int, Tensor | None] = {}
-        parts = [(id(found.diffused), found.cut(box)) for found in self.betas]
+        parts = [(id(beta.diffused), beta.cut(box)) for beta in self.betas]
         for key, part in parts:
             shared.setdefault(key, part.diffused)
         return Matches(tuple(replace(part, diffused=shared[key]) for key, part in parts))

@@ -98,17 +98,17 @@ class MatchedBeta:
 
     @classmethod
     def of(
-        cls, beta: Beta, found: BetaMatches, rows: tuple[int, int], ambiguity: Ambiguity = NO_AMBIGUITY
+        cls, beta: Beta, matches: BetaMatches, rows: tuple[int, int], ambiguity: Ambiguity = NO_AMBIGUITY
     ) -> MatchedBeta:
         """Of a beta with a track and its own matches, at some rows of alpha: from an even to an even one."""
         top, bottom = rows
-        pixels, disparity = beta.field.straight, found.disparity[0, 0, top:bottom]
+        pixels, disparity = beta.field.straight, matches.disparity[0, 0, top:bottom]
         start, end = (x[0, top:bottom].double() for x in (pixels.start, pixels.end))
         assert beta.track is not None
         x = pixel_grid((bottom - top, disparity.shape[1]), dtype=torch.float64, device=end.device)
         x = x + end.new_tensor([0.0, top])
         size = (beta.image.shape[-2], beta.image.shape[-1])
-        facts = enlarged(found.facts[0, :, top // FINE : bottom // FINE])
+        facts = enlarged(matches.facts[0, :, top // FINE : bottom // FINE])
         segments = Segments(start, end, pixels.valid[0, top:bottom])
         track = beta.track(x) if ambiguity == NO_AMBIGUITY else ambiguity.of(beta.track(x), x)
         return cls(segments, track, disparity.to(end), facts.to(end), size)
@@ -128,9 +128,9 @@ class MatchedBeta:
     def inverse_depth(self) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
         """Of the matches, and where these are consistent and have one."""
         x = self.segments.end + self.disparity[..., None] * self.extent.towards
-        found = depth_from_track(self.track, x)
-        known = found.valid & self.segments.valid & (self.facts[0] < CONSISTENT)
-        return torch.where(known, 1 / torch.where(known, found.depth, 1.0), 0.0), known
+        depth = depth_from_track(self.track, x)
+        known = depth.valid & self.segments.valid & (self.facts[0] < CONSISTENT)
+        return torch.where(known, 1 / torch.where(known, depth.depth, 1.0), 0.0), known
 
     def _seen(self, inverse_depth: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
         """Beta's pixels as by `Track.at`, x and y apart, which takes a fraction of the time."""
@@ -212,26 +212,26 @@ def agreed(inputs: Inputs, matches: Matches) -> Matches:
 
     Those are better than what was chosen for each beta alone.
     """
-    found = matches.betas
-    between = ambiguities(inputs, found)
+    of_betas = matches.betas
+    between = ambiguities(inputs, of_betas)
 
     def at(i: int, rows: tuple[int, int]) -> MatchedBeta:
-        return MatchedBeta.of(inputs.betas[i], found[i], rows, between[i])
+        return MatchedBeta.of(inputs.betas[i], of_betas[i], rows, between[i])
 
-    (height, width), betas = matches.hw, range(len(found))
+    (height, width), betas = matches.hw, range(len(of_betas))
     strips = spans(height, max(STRIP // width // FINE, 1) * FINE)
     parts = [Agreement.of([at(i, rows) for i in betas], inputs.alpha) for rows in strips]
     agreement = _dense(Agreement(*(torch.cat(planes, 1) for planes in zip(*parts))), inputs)
     del parts
-    agreeing = (_of_beta(partial(at, i), agreement, strips, found[i]) for i in betas)
+    agreeing = (_of_beta(partial(at, i), agreement, strips, of_betas[i]) for i in betas)
     return Matches(tuple(replace(one, prior=prior) for one, prior in zip(agreeing, _priors(inputs))))
 
 
-def ambiguities(inputs: Inputs, found: Sequence[BetaMatches]) -> list[Ambiguity]:
+def ambiguities(inputs: Inputs, of_betas: Sequence[BetaMatches]) -> list[Ambiguity]:
     """Of each beta against that whose matches tell most: none unless clearly more pixels agree with one."""
     step = max(inputs.hw[0] // SETTINGS.sampled_rows // FINE, 1) * FINE
     rows = [(top, top + FINE) for top in range(0, inputs.hw[0], step)]
-    sampled = [_Sampled.of(inputs.betas[i], found[i], rows) for i in range(len(found))]
+    sampled = [_Sampled.of(inputs.betas[i], of_betas[i], rows) for i in range(len(of_betas))]
     reference = max(sampled, key=lambda one: float((one.known * one.pixels_per_w).sum()))
     columns = torch.arange(0, inputs.hw[1], SETTINGS.sampled_columns).to(reference.w)
     sampled_rows = reference.w.new_tensor([row for pair in rows for row in range(*pair)])
@@ -248,10 +248,10 @@ class _Sampled(NamedTuple):
     pixels_per_w: Tensor
 
     @classmethod
-    def of(cls, beta: Beta, found: BetaMatches, rows: Sequence[tuple[int, int]]) -> _Sampled:
+    def of(cls, beta: Beta, matches: BetaMatches, rows: Sequence[tuple[int, int]]) -> _Sampled:
         parts = []
         for pair in rows:
-            view = MatchedBeta.of(beta, found, pair)
+            view = MatchedBeta.of(beta, matches, pair)
             w, known = view.inverse_depth
             little = 1e-3 * w + 1e-9
             rise = (view.disparity_of(w + little) - view.disparity_of(w)).abs() / little

@@ -149,19 +149,19 @@ def stated_response(weights: Sequence[float]) -> Response:
     """The response of an alpha that is weights . beta. Raises ValueError unless three, none negative."""
     values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
     if values.shape != (3,) or not bool((values >= 0).all() & (values.sum() > 0) & values.isfinite().all()):
-        given = tuple(weights)
-        raise ValueError(f"a response is three weights, of red, green and blue, none negative; got {given}")
+        shares = tuple(weights)
+        raise ValueError(f"a response is three weights, of red, green and blue, none negative; got {shares}")
     return Response(values / values.sum(), gain=float(values.sum()))
 
 
-def given_response(given: Given) -> Response:
+def given_response(response: Given) -> Response:
     """The response that is given, Rec. 601's if it is to be fitted. Raises ValueError for what is none."""
-    if isinstance(given, Response):
-        return given
-    if not isinstance(given, str):
-        return stated_response(given)
-    if given not in ("fit", "rec601"):
-        raise ValueError(f"response is 'fit', 'rec601' or three weights; got {given!r}")
+    if isinstance(response, Response):
+        return response
+    if not isinstance(response, str):
+        return stated_response(response)
+    if response not in ("fit", "rec601"):
+        raise ValueError(f"response is 'fit', 'rec601' or three weights; got {response!r}")
     return Response.rec601()
 
 
@@ -189,12 +189,12 @@ def fit(
         return Response.rec601()
     groups = _Groups.of(x[:, unclipped], y[unclipped], place[unclipped])
     shading = y.new_zeros(len(groups.terms))
-    found = [groups.explained_by(shading, vignetted=False)]
+    fits = [groups.explained_by(shading, vignetted=False)]
     if where is not None:
         for _ in range(SETTINGS.steps):
             shading = shading + groups.explained_by(shading, vignetted=True).further
-        found.append(groups.explained_by(shading, vignetted=True))
-    response = max(found, key=attrgetter("evidence")).response
+        fits.append(groups.explained_by(shading, vignetted=True))
+    response = max(fits, key=attrgetter("evidence")).response
     return response if response.explains else Response.rec601()._replace(explained=response.explained)
 
 
@@ -326,13 +326,13 @@ class _Groups(NamedTuple):
         _, gram = self._modelled(gammas, shading, vignetted)
         drawn = -shading if vignetted else shading[:0]
         rare = math.log(SETTINGS.rare if vignetted else 1 - SETTINGS.rare)
-        found = []
+        fits = []
         for kind in KINDS:
             evidence = kind.evidence(gram, drawn)[0] + kind.prior(gammas) + rare
             for some in (gammas == 1, gammas != 1)[: 1 + kind.gain]:
                 best = gammas[some][evidence[some].argmax()]
-                found.append((float(evidence[some].logsumexp(0)), kind, best, int(some.sum()) > 1))
-        most, kind, gamma, bent = max(found, key=itemgetter(0))
+                fits.append((float(evidence[some].logsumexp(0)), kind, best, int(some.sum()) > 1))
+        most, kind, gamma, bent = max(fits, key=itemgetter(0))
         if bent:
             gamma = self._most_probable(gamma, kind, shading, vignetted)
         (model,), there = self._modelled(gamma[None], shading, vignetted)

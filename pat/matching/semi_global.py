@@ -144,10 +144,10 @@ def matched_by_labels(
     connected in alpha.
     """
     own, other = (numpy_of(image[:, 0]) for image in (views.alpha, views.beta))
-    found, measured = _matched_blocks(own, other, geometry, windows, settings, facts)
+    disparity, measured = _matched_blocks(own, other, geometry, windows, settings, facts)
     consistent = (measured[..., 0] < settings.consistent).astype(np.float32)
     smooth = []
-    for d, c, guide in zip(found, consistent, views.guides):
+    for d, c, guide in zip(disparity, consistent, views.guides):
         dense = filled(d[None], c + 1e-5, guide, settings.fill)[0]
         smooth.append(cv2.medianBlur(np.where(c > 0, d, dense), 5))
     return torch.from_numpy(np.stack(smooth)), torch.from_numpy(measured)
@@ -157,14 +157,14 @@ class _Image(NamedTuple):
     """What the blocks of one image are matched by, and where what they find goes.
 
     `views` are planes of alpha's size: brightness, first labels, geometry, and what `cost` compares; `other`
-    are the flat planes that it compares them with, of a beta of `hw`. `found`: disparity, facts, and pixels
+    are the flat planes that it compares them with, of a beta of `hw`. `results`: disparity, facts, and pixels
     of beta. `claims` are tables of `winners`.
     """
 
     views: tuple[NDArray, ...]
     other: tuple[NDArray, ...]
     hw: tuple[int, int]
-    found: tuple[NDArray, ...]
+    results: tuple[NDArray, ...]
     claims: list[NDArray[np.int32]]
 
 
@@ -227,9 +227,9 @@ def _block(image: _Image, box: Tile, windows: Windows, settings: SemiGlobalSetti
         claims = image.claims.pop()
     except IndexError:
         claims = np.full(math.prod(image.hw) + 1, 2**31 - 1, np.int32)
-    parts = tuple(np.ascontiguousarray(plane[inner]) for plane in image.found)
+    parts = tuple(np.ascontiguousarray(plane[inner]) for plane in image.results)
     corner = inner[0].start - outer[0].start, inner[1].start - outer[1].start
     kernels.winners(total, *labels, segments, image.hw, corner, jump, claims, parts)
     image.claims.append(claims)
-    for plane, part in zip(image.found, parts):
+    for plane, part in zip(image.results, parts):
         plane[inner] = part

@@ -73,7 +73,7 @@ def costs(own, other, first, count, end, along, length, cut, rows, columns, out)
     or, where it is beta's edge that cuts the segment, not seen.
     """
     height, width, runs, lanes = out.shape
-    size, places, found = runs * lanes, np.empty(runs * lanes, np.int32), np.empty(lanes, np.uint8)
+    size, places, best_label = runs * lanes, np.empty(runs * lanes, np.int32), np.empty(lanes, np.uint8)
     for y in range(height):
         for x in range(width):
             last, pixel = length[y, x] + HALF, pixel_of(own, y * width + x)
@@ -85,9 +85,9 @@ def costs(own, other, first, count, end, along, length, cut, rows, columns, out)
                 within = _count_within(length[y, x], first[y, x, run], count)
                 at, costs = places[run * lanes :], out[y, x, run]
                 for k in range(within):
-                    found[k] = dissimilarity(pixel, pixel_of(other, max(at[k], 0)))
+                    best_label[k] = dissimilarity(pixel, pixel_of(other, max(at[k], 0)))
                 for k in range(lanes):
-                    cost = found[k] if at[k] >= 0 else NOWHERE
+                    cost = best_label[k] if at[k] >= 0 else NOWHERE
                     cost = cost if k < within else beyond
                     costs[k] = cost if k < count else NO_LABEL
 
@@ -269,7 +269,7 @@ def _keep(paths, start, stride, runs, penalty, path):
 
 
 @compiled(nogil=True, cache=True)
-def winners(total, first, count, segments, hw, corner, large, claims, found):
+def winners(total, first, count, segments, hw, corner, large, claims, labels):
     """Of each pixel of a part that begins at a corner: the best label, to a fraction (disparity); facts
     (h, w, 1 or 3): the whole label, its margin to the second best (`UNRELATED` if there is none), and its
     cost; where it is in beta, pixels counted row by row (positions; rows * columns: not on it). `total` is in
@@ -277,10 +277,10 @@ def winners(total, first, count, segments, hw, corner, large, claims, found):
 
     `claims`, of each pixel of beta and one more, keeps the least cost with which a pixel of alpha matches it,
     and that pixel's label: 16 bits of either. `segments` are end, along, length and cut, as of `costs`;
-    `found` are disparity, facts and positions.
+    `labels` are disparity, facts and positions.
     """
     (end, along, length, cut), (rows, columns), (top, left) = segments, hw, corner
-    disparity, facts, positions = found
+    disparity, facts, positions = labels
     height, width, measured = facts.shape[0], facts.shape[1], facts.shape[2] > 1
     _, _, runs, lanes = total.shape
     nowhere, most = rows * columns, np.float32(8 * PARTS) * large

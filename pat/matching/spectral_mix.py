@@ -131,8 +131,8 @@ def _combination(x: Tensor, y: Tensor, weight: Tensor) -> RobustFit:
         return robust / robust.sum()
 
     start = least_squares(x, beyond, share, precision)
-    found = robust_least_squares(x, beyond, start, weigh, precision=precision, steps=1)
-    return found._replace(coefficients=equal + found.coefficients)
+    weights = robust_least_squares(x, beyond, start, weigh, precision=precision, steps=1)
+    return weights._replace(coefficients=equal + weights.coefficients)
 
 
 def _beyond_local_mean(planes: Tensor, weight: Tensor) -> Tensor:

@@ -67,8 +67,8 @@ def matched_at_full_size(
     own, other = views.alpha, views.beta
     geometry = geometry_of(segments, len(own), (other.shape[-2], other.shape[-1]), factor=1)
     windows = Windows(np.stack([_runs(plane) for plane in numpy_of(half[:, 0])]), SETTINGS.run)
-    found, measured = matched_by_labels(views, geometry, windows, FULL_SIZE, facts=1)
-    disparity, unlike = found[:, None].to(own), measured.movedim(-1, 1).to(own)
+    labelled, measured = matched_by_labels(views, geometry, windows, FULL_SIZE, facts=1)
+    disparity, unlike = labelled[:, None].to(own), measured.movedim(-1, 1).to(own)
     near = interpolate(half, scale_factor=FINE, mode="bilinear")
     return _precise(views, segments, disparity, unlike < CONSISTENT, near), avg_pool2d(unlike, FINE)
 
@@ -84,7 +84,7 @@ def _precise(
     near = consistent & ((disparity - rough).abs() < SETTINGS.same)
     start = torch.where(near, (disparity + rough) / 2, disparity)
     rise, rest = _compared(own, other, segments, start)
-    found = []
+    positions = []
     for i, blur in enumerate(blurs):
         one = slice(i, i + 1)
         common, slope = _agreement(rise[one], rest[one], round(SETTINGS.step_radius * (1 + blur)))
@@ -92,8 +92,8 @@ def _precise(
         moved = start[one] + near[one] * (1 + blur) * step
         weight = torch.where(consistent[one], slope / (slope + SETTINGS.flat), 0.0) + 1e-5
         planes = numpy_of(moved[0, 0]), numpy_of(weight[0, 0]), guides[i]
-        found.append(_surfaces(*planes, SETTINGS.edge * (1 + blur)))
-    return torch.from_numpy(np.stack(found))[:, None].to(disparity)
+        positions.append(_surfaces(*planes, SETTINGS.edge * (1 + blur)))
+    return torch.from_numpy(np.stack(positions))[:, None].to(disparity)
 
 
 def _surfaces(disparity: Plane, weight: Plane, brightness: NDArray[np.uint8], edge: float) -> Plane:
@@ -105,10 +105,10 @@ def _surfaces(disparity: Plane, weight: Plane, brightness: NDArray[np.uint8], ed
     return whole
 
 
-def following(inputs: Inputs, found: Matches) -> Matches:
+def following(inputs: Inputs, matches: Matches) -> Matches:
     """The matches, which follow images and segments that have gradients."""
     betas, alpha = [], inputs.alpha
-    for beta, one in zip(inputs.betas, found.betas):
+    for beta, one in zip(inputs.betas, matches.betas):
         segments = beta.field.straight
         if any(x.requires_grad for x in (alpha, beta.image, segments.start, segments.end)):
             views = one.comparison.views(alpha, beta.image)

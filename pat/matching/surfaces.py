@@ -57,9 +57,9 @@ class Planes(NamedTuple):
         kernels.weighted_terms(values, weight, centre, reach, terms)
         over = cv2.ximgproc.createDTFilter(guide, reach, 1.0, cv2.ximgproc.DTF_RF)
         sums = (over.filter(part) for part in terms)
-        found = np.empty((4, *values.shape), np.float32)
-        kernels.planes_through(*sums, centre, reach, SETTINGS.level, found)
-        return cls(*found)
+        planes = np.empty((4, *values.shape), np.float32)
+        kernels.planes_through(*sums, centre, reach, SETTINGS.level, planes)
+        return cls(*planes)
 
     def at_pixels(self, hw: HW) -> Plane:
         """The values at all pixels."""

@@ -85,10 +85,10 @@ class _BlockCentres:
         """The positions (h, w, L) of a part."""
         h, w = self.hw
         grid = (pixel_grid((h, w), dtype=torch.float64)[rows, columns] + 0.5) * FINE - 0.5
-        found = self.field.at(grid.reshape(-1, 2))
-        if not isinstance(found, Positions):
+        locations = self.field.at(grid.reshape(-1, 2))
+        if not isinstance(locations, Positions):
             raise TypeError("this field gives segments for some pixels, positions for others: give one kind")
-        parts = (found.xy, 2), (found.mask, 1)
+        parts = (locations.xy, 2), (locations.mask, 1)
         return Positions(*(t.reshape(*grid.shape[:2], *t.shape[t.ndim - n :]) for t, n in parts))
 
     @property
@@ -102,12 +102,12 @@ class _BlockCentres:
 
     def ordered(self) -> bool:
         """Whether a pixel's positions follow each other along a curve."""
-        found = self.at(slice(None, None, 8), slice(None, None, 8))
-        if found.xy.shape[-2] < 3:
+        locations = self.at(slice(None, None, 8), slice(None, None, 8))
+        if locations.xy.shape[-2] < 3:
             return False
-        steps = found.xy.detach().diff(dim=-2)
+        steps = locations.xy.detach().diff(dim=-2)
         back = (steps[..., 1:, :] * steps[..., :-1, :]).sum(-1) < 0
-        counts = found.mask[..., 2:] & found.mask[..., 1:-1] & found.mask[..., :-2]
+        counts = locations.mask[..., 2:] & locations.mask[..., 1:-1] & locations.mask[..., :-2]
         some = counts.any(-1)
         return bool(some.any()) and float(((back & counts).sum(-1) <= SEAM)[some].double().mean()) >= ORDERED
 
@@ -121,10 +121,10 @@ class _BlockCentres:
         neighbours."""
         parts = []
         for rows in self.by_rows():
-            found = self.at(rows, slice(None))
-            index = labels[rows].long().to(found.mask.device)[..., None]
-            xy = found.xy.gather(-2, index[..., None].expand(*index.shape, 2))[..., 0, :]
-            parts.append((xy, found.mask.gather(-1, index)[..., 0]))
+            locations = self.at(rows, slice(None))
+            index = labels[rows].long().to(locations.mask.device)[..., None]
+            xy = locations.xy.gather(-2, index[..., None].expand(*index.shape, 2))[..., 0, :]
+            parts.append((xy, locations.mask.gather(-1, index)[..., 0]))
         xy, valid = (torch.cat(part) for part in zip(*parts))
         smooth = [cv2.medianBlur(numpy_of(plane), 5) for plane in xy.unbind(-1)]
         middle = torch.from_numpy(np.stack(smooth, -1)).to(xy)
@@ -167,9 +167,9 @@ def _places(grid: _BlockCentres, box: tuple[slice, ...], hw: tuple[int, ...]) ->
     (h, w), (rows, columns) = hw, box
     parts, at_once = [], max(1, AT_ONCE // (w * grid.field.samples))
     for top, bottom in spans(rows.stop - rows.start, at_once):
-        found = grid.at(slice(rows.start + top, rows.start + bottom), columns)
-        x, y = ((found.xy + 0.5) / FINE - 0.5).round().int().unbind(-1)
-        inside = found.mask & (x >= 0) & (y >= 0) & (x < w) & (y < h)
+        locations = grid.at(slice(rows.start + top, rows.start + bottom), columns)
+        x, y = ((locations.xy + 0.5) / FINE - 0.5).round().int().unbind(-1)
+        inside = locations.mask & (x >= 0) & (y >= 0) & (x < w) & (y < h)
         parts.append(torch.where(inside, y * w + x, -1).int())
     return np.ascontiguousarray(torch.cat(parts).cpu().numpy())
 
@@ -182,9 +182,9 @@ def _best(total: NDArray[np.int16]) -> tuple[NDArray, NDArray]:
     return best.astype(np.float32), second - total.min(-1)
 
 
-def _tangents(found: Positions, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _tangents(positions: Positions, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Start, end and validity of the lines of a part."""
-    xy, mask = found.xy, found.mask
+    xy, mask = positions.xy, positions.mask
     count, labels = mask.shape[-1], labels.to(mask.device)
     number = torch.arange(count, device=mask.device)
     nearest = torch.where(mask, (number - labels[..., None]).abs(), torch.inf).argmin(-1, keepdim=True)

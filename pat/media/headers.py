@@ -74,10 +74,10 @@ def _pnm(content: bytes) -> ImageHeader | None:
     """By hand: Pillow does not state the bits."""
     gap = rb"(?:\s|#[^\n]*\n)+"
     form = rb"P[1-6]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})\s(?:\s*(\d{1,5})\s)?"
-    found = re.match(form, content[:4096])
-    if found is None:
+    header = re.match(form, content[:4096])
+    if header is None:
         return None
-    return ImageHeader((int(found[2]), int(found[1])), bits=max(int(found[3] or 0).bit_length(), 8))
+    return ImageHeader((int(header[2]), int(header[1])), bits=max(int(header[3] or 0).bit_length(), 8))
 
 
 def _tiff(content: bytes) -> ImageHeader | None:

@@ -395,10 +395,10 @@ def _encode(path: Path, colours: NDArray, bits: int) -> bytes:
         raise ValueError(f"{path}: 32-bit floats need a name that ends in .tif")
     try:
         # Without the option OpenCV writes float colours as LogLuv, which has 3 digits.
-        done, content = cv2.imencode(suffix, _quantised(colours, bits), _LZW if bits == 32 else [])
+        succeeded, content = cv2.imencode(suffix, _quantised(colours, bits), _LZW if bits == 32 else [])
     except cv2.error:
-        done = False
-    if not done:
+        succeeded = False
+    if not succeeded:
         raise ValueError(f"{path}: cannot write an image named so: end the name in .png, .tif or .jpg")
     return content.tobytes()
 

@@ -68,8 +68,8 @@ def _converted(values: NDArray, profile: ImageCms.ImageCmsProfile) -> NDArray:
     image = Image.fromarray(values if grey else np.ascontiguousarray(values[..., ::-1]))
     srgb = ImageCms.createProfile("sRGB")
     intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
-    done = ImageCms.profileToProfile(image, profile, srgb, intent, outputMode="RGB")
-    colours = np.asarray(done)
+    converted = ImageCms.profileToProfile(image, profile, srgb, intent, outputMode="RGB")
+    colours = np.asarray(converted)
     return colours[..., 1].copy() if grey else colours[..., ::-1]
 
 

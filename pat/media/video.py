@@ -98,10 +98,10 @@ def is_grey(image: Float[Tensor, "3 h w"]) -> bool:
 
 def _frames(video: cv2.VideoCapture) -> Iterator[Float[Tensor, "c h w"]]:
     grey = None
-    done, frame = video.read()
-    while done:
+    succeeded, frame = video.read()
+    while succeeded:
         image = torch.from_numpy(np.ascontiguousarray(frame[..., ::-1].transpose(2, 0, 1))).float() / 255
         grey = is_grey(image) if grey is None else grey
         yield image[1:2] if grey else image
-        done, frame = video.read()
+        succeeded, frame = video.read()
     video.release()

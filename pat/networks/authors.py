@@ -39,30 +39,30 @@ def read_authors(path: str | Path) -> Authors:
     another network, naming the first weight that does not fit.
     """
     content = _loaded(Path(path))
-    given = content.get("state_dict", content) if isinstance(content, Mapping) else None
-    weights = given if isinstance(given, Mapping) else {}
+    state = content.get("state_dict", content) if isinstance(content, Mapping) else None
+    weights = state if isinstance(state, Mapping) else {}
     if not weights or not all(isinstance(v, Tensor) and isinstance(k, str) for k, v in weights.items()):
         raise ValueError(f"{path}: holds no state_dict: give a best.pth.tar that the authors' train.py saved")
-    given = {name.removeprefix(PREFIX): tensor for name, tensor in weights.items()}
+    state = {name.removeprefix(PREFIX): tensor for name, tensor in weights.items()}
     try:
-        config = config_of(given)
-        return Authors(config, renamed(given, config), _facts(content))
+        config = config_of(state)
+        return Authors(config, renamed(state, config), _facts(content))
     except ValueError as error:
         raise ValueError(f"{path}: not a checkpoint of the authors' PAT: {error}") from None
 
 
-def config_of(given: Mapping[str, Tensor]) -> PATConfig:
+def config_of(state: Mapping[str, Tensor]) -> PATConfig:
     """The configuration that weights with their names are of. Raises ValueError naming what is missing."""
-    betas = sum(re.fullmatch(r"pam\.b2s\.\d+\.weight", name) is not None for name in given)
+    betas = sum(re.fullmatch(r"pam\.b2s\.\d+\.weight", name) is not None for name in state)
     for name in ("init_feature.0.weight", "upscale.4.weight", "upscale.7.weight"):
-        if name not in given or given[name].dim() != 4:
+        if name not in state or state[name].dim() != 4:
             raise ValueError(f"{name} is missing")
-    dim, in_channels = given["init_feature.0.weight"].shape[:2]
-    scale = round((len(given["upscale.4.weight"]) / max(dim, 1)) ** 0.5)
+    dim, in_channels = state["init_feature.0.weight"].shape[:2]
+    scale = round((len(state["upscale.4.weight"]) / max(dim, 1)) ** 0.5)
     sizes = {
         "betas": betas,
         "in_channels": in_channels,
-        "out_channels": len(given["upscale.7.weight"]),
+        "out_channels": len(state["upscale.7.weight"]),
         "dim": dim,
         "scale": scale,
     }
@@ -73,7 +73,7 @@ def config_of(given: Mapping[str, Tensor]) -> PATConfig:
     return PATConfig(**sizes, **layout, equal_resolution=True)
 
 
-def renamed(given: Mapping[str, Tensor], config: PATConfig) -> dict[str, Tensor]:
+def renamed(weights: Mapping[str, Tensor], config: PATConfig) -> dict[str, Tensor]:
     """Weights with their names as those of a PAT of this configuration.
 
     Raises ValueError naming the first that is missing, too many, or of another shape.
@@ -84,13 +84,13 @@ def renamed(given: Mapping[str, Tensor], config: PATConfig) -> dict[str, Tensor]
         wanted = {name: tuple(t.shape) for name, t in PAT(config).state_dict().items()}
     names = dict(_names(config.betas))
     for theirs, ours in names.items():
-        shape = tuple(given[theirs].shape) if theirs in given else "missing"
+        shape = tuple(weights[theirs].shape) if theirs in weights else "missing"
         if shape != wanted[ours]:
             raise ValueError(f"{theirs} is {shape}, wanted {wanted[ours]}")
-    more = [name for name in given if name not in names]
+    more = [name for name in weights if name not in names]
     if more:
         raise ValueError(f"{more[0]} is one weight too many")
-    state = {ours: given[theirs].float() for theirs, ours in names.items()}
+    state = {ours: weights[theirs].float() for theirs, ours in names.items()}
     # Their fusion takes the attended betas first and alpha last; here alpha's columns are first.
     state["post.0.weight"] = state["post.0.weight"].roll(config.dim, 1)
     for name, tensor in state.items():
@@ -153,5 +153,5 @@ def _loaded(path: Path) -> Any:
 
 
 def _facts(content: Mapping[str, Any]) -> dict[str, str]:
-    found = {name: content[name] for name in ("epoch", "psnr") if isinstance(content.get(name), int | float)}
-    return {"recipe": "the authors' checkpoint"} | {name: f"{value:g}" for name, value in found.items()}
+    facts = {name: content[name] for name in ("epoch", "psnr") if isinstance(content.get(name), int | float)}
+    return {"recipe": "the authors' checkpoint"} | {name: f"{value:g}" for name, value in facts.items()}

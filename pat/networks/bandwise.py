@@ -55,13 +55,13 @@ class BandwisePAT(nn.Module):
         parts = [self._of_beta(own, alpha, *one) for one in zip(estimates, matches.betas)]
         return output_of(torch.cat(parts, 1), estimates), estimates
 
-    def _of_beta(self, own: Encoded, alpha: Tensor, estimate: BetaEstimate, found: BetaMatches) -> Tensor:
+    def _of_beta(self, own: Encoded, alpha: Tensor, estimate: BetaEstimate, matches: BetaMatches) -> Tensor:
         """One beta's bands at alpha's view.
 
         The network's result for each is counted from its local regression on alpha: where a band is unlike
         alpha, its difference from alpha differs even between similar pixels.
         """
-        base, mix = found.colours[1][:, 0].to(alpha), found.comparison.mix
+        base, mix = matches.colours[1][:, 0].to(alpha), matches.comparison.mix
         bands = [
             regressed + self.single.blended(own, regressed, [estimate.beyond(base, i)])
             for i, regressed in enumerate((alpha + base).split(1, 1))

@@ -71,9 +71,9 @@ def _refined(estimate: Tensor, recorded: Tensor, deviation: Tensor) -> Float[Ten
     if len(estimate) == 1:
         return torch.lerp(_filtered(recorded, estimate, deviation), estimate, KEPT)
     bands, noise = opponent(recorded[None])[0], opponent_deviation(deviation[None])[0]
-    found = opponent(estimate[None])[0]
-    result = _filtered(bands, _filtered(bands, found, noise), noise)
-    result = torch.cat([torch.lerp(result[:1], found[:1], KEPT), result[1:]])
+    transformed = opponent(estimate[None])[0]
+    result = _filtered(bands, _filtered(bands, transformed, noise), noise)
+    result = torch.cat([torch.lerp(result[:1], transformed[:1], KEPT), result[1:]])
     return rgb_of_opponent(result[None])[0]
 
 
@@ -106,10 +106,10 @@ def wiener_filtered(
     high = STEP * (ROWS - 1) + SIDE + 2 * RADIUS
 
     def filtered(top: int, bottom: int) -> np.ndarray:
-        found = np.zeros((bottom - top, across, ALIKE, 2), np.int16)
-        find_alike(planes[3], top, found)
+        alike = np.zeros((bottom - top, across, ALIKE, 2), np.int16)
+        find_alike(planes[3], top, alike)
         sums = np.zeros((2, len(image), high, planes[0].shape[2]), np.float32)
-        filter_groups(*planes[:3], top, found, COSINES, WINDOW, sums)
+        filter_groups(*planes[:3], top, alike, COSINES, WINDOW, sums)
         return sums
 
     total = np.zeros((2, *planes[0].shape), np.float32)
@@ -131,12 +131,12 @@ WINDOW = np.outer(np.kaiser(SIDE, 2.0), np.kaiser(SIDE, 2.0)).astype(np.float32)
 
 
 @compiled(nogil=True, cache=True, fastmath=True)
-def find_alike(guide, top, found):
-    """Fill `found` (rows, columns, ALIKE, 2) with displacements (y, x) of the blocks most alike each one.
+def find_alike(guide, top, alike):
+    """Fill `alike` (rows, columns, ALIKE, 2) with displacements (y, x) of the blocks most alike each one.
 
     Block (r, k) begins at pixel (STEP (top + r), STEP k), RADIUS pixels inside; the first found is itself.
     """
-    rows, columns = found.shape[:2]
+    rows, columns = alike.shape[:2]
     cells = np.zeros((rows + CELLS - 1, columns + CELLS - 1), np.float32)
     line = np.zeros(STEP * cells.shape[1], np.float32)
     nearest = np.full((rows, columns, ALIKE), np.inf, np.float32)
@@ -161,11 +161,11 @@ def find_alike(guide, top, found):
                         i = ALIKE - 1
                         while i > 0 and nearest[r, k, i - 1] > d:
                             nearest[r, k, i] = nearest[r, k, i - 1]
-                            found[r, k, i] = found[r, k, i - 1]
+                            alike[r, k, i] = alike[r, k, i - 1]
                             i -= 1
                         nearest[r, k, i] = d
-                        found[r, k, i, 0] = dy
-                        found[r, k, i, 1] = dx
+                        alike[r, k, i, 0] = dy
+                        alike[r, k, i, 1] = dx
 
 
 @compiled(inline="always")
@@ -203,9 +203,9 @@ def group_transform(blocks):
 
 
 @compiled(nogil=True, cache=True, fastmath=True)
-def filter_groups(image, expected, variance, top, found, cosines, window, out):
+def filter_groups(image, expected, variance, top, alike, cosines, window, out):
     """Add to `out` (2, c, rows, w), from its first row of blocks: filtered blocks, weighted, and weights."""
-    rows, columns = found.shape[:2]
+    rows, columns = alike.shape[:2]
     seen = np.empty((SIDE * SIDE, ALIKE), np.float32)
     known = np.empty((SIDE * SIDE, ALIKE), np.float32)
     spare = np.empty((SIDE * SIDE, ALIKE), np.float32)
@@ -216,7 +216,7 @@ def filter_groups(image, expected, variance, top, found, cosines, window, out):
             for c in range(len(image)):
                 noise = np.float32(1e-12)
                 for n in range(ALIKE):
-                    y, x = y0 + found[r, k, n, 0], x0 + found[r, k, n, 1]
+                    y, x = y0 + alike[r, k, n, 0], x0 + alike[r, k, n, 1]
                     noise += variance[c, y + SIDE // 2, x + SIDE // 2] / ALIKE
                     for i in range(SIDE):
                         for j in range(SIDE):
@@ -237,7 +237,7 @@ def filter_groups(image, expected, variance, top, found, cosines, window, out):
                 block_transform(seen, spare, back)
                 counts = 1 / ((noise + np.float32(1e-8)) * total)
                 for n in range(ALIKE):
-                    y, x = y0 + found[r, k, n, 0] - STEP * top, x0 + found[r, k, n, 1]
+                    y, x = y0 + alike[r, k, n, 0] - STEP * top, x0 + alike[r, k, n, 1]
                     for i in range(SIDE):
                         for j in range(SIDE):
                             weight = counts * window[i, j]

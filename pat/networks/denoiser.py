@@ -46,9 +46,9 @@ class Denoising(nn.Module):
     ) -> Float[Tensor, "b c h w"]:
         """Of any size."""
         h, w = image.shape[-2:]
-        given = torch.cat([image - 0.5, SETTINGS.scale * deviation], 1)
-        given = pad(given, (0, -w % SETTINGS.multiple, 0, -h % SETTINGS.multiple), mode="replicate")
-        noise = pixel_shuffle(self.network(channels_last(pixel_unshuffle(given, 2))).float(), 2)[..., :h, :w]
+        inputs = torch.cat([image - 0.5, SETTINGS.scale * deviation], 1)
+        inputs = pad(inputs, (0, -w % SETTINGS.multiple, 0, -h % SETTINGS.multiple), mode="replicate")
+        noise = pixel_shuffle(self.network(channels_last(pixel_unshuffle(inputs, 2))).float(), 2)[..., :h, :w]
         return image - deviation * noise
 
 

@@ -82,8 +82,8 @@ class BetaEstimate(NamedTuple):
     def confidence(self) -> Float[Tensor, "b h w"]:
         """That `colour` is of the point that alpha sees, 0 to 1. Over [1 2 1] pixels: the four pixels that
         are made of one at half the size differ by some .02."""
-        found = pad(self.logit.sigmoid(), (1, 1, 1, 1), mode="replicate")
-        return avg_pool2d(avg_pool2d(found, 2, 1), 2, 1)[:, 0] * (self.peak > 0)
+        confidence = pad(self.logit.sigmoid(), (1, 1, 1, 1), mode="replicate")
+        return avg_pool2d(avg_pool2d(confidence, 2, 1), 2, 1)[:, 0] * (self.peak > 0)
 
     @property
     def odds(self) -> Float[Tensor, "b 1 h w"]:
@@ -188,12 +188,12 @@ class GuidedPAT(nn.Module):
         confidence = _joined([s.blending.expand_as(s.colour) for s in estimates])
         colour = _joined([s.colour for s in estimates])
         unseen, *fills = map(_joined, zip(*(self._fills(own, alpha, s) for s in estimates)))
-        found = by_example(alpha, colour, confidence)
-        unseen = with_examples(unseen, found, confidence)
+        recalled = by_example(alpha, colour, confidence)
+        unseen = with_examples(unseen, recalled, confidence)
         mixed = with_less_noise(alpha, torch.lerp(unseen, colour, confidence), confidence)
         if self.completion is None or len(estimates) > 1 or not complete:
             return mixed
-        return self.completion(alpha, confidence[:, :1], mixed, (colour, *fills, found))
+        return self.completion(alpha, confidence[:, :1], mixed, (colour, *fills, recalled))
 
     def _fills(self, own: Encoded, alpha: Tensor, estimate: BetaEstimate) -> tuple[Tensor, ...]:
         """Colour for where beta does not see the point: the choice; and what it is of, propagated at 1/4 of
@@ -208,14 +208,14 @@ class GuidedPAT(nn.Module):
         weights = estimate.choice.softmax(1).split(1, 1)
         return reduce(torch.add, (w * c for w, c in zip(weights, choices))), *choices
 
-    def estimate(self, own: Encoded, alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaEstimate:
+    def estimate(self, own: Encoded, alpha: Tensor, beta: Beta, matched: BetaMatches) -> BetaEstimate:
         """The estimate of one beta of any bands."""
-        of, exactly = found.comparison.combined, alpha.dtype if self.training else torch.float64
-        bands, diffused = found.colours
+        of, exactly = matched.comparison.combined, alpha.dtype if self.training else torch.float64
+        bands, diffused = matched.colours
         segments = beta.field.straight.to(alpha.device, exactly)
         extent = Extent.of(segments)
-        position = matches(segments, found.surface, beyond_edge=True, extent=extent).movedim(-1, 1)
-        window = window_around(found.disparity, segments, self.config.window, extent)
+        position = matches(segments, matched.surface, beyond_edge=True, extent=extent).movedim(-1, 1)
+        window = window_around(matched.disparity, segments, self.config.window, extent)
         del extent
         other = self.encoder(of(beta.image))
         value, attended, deviation, peak = attend_with_statistics(
@@ -223,18 +223,18 @@ class GuidedPAT(nn.Module):
         )
         del other, window
         facts = [of(value) - alpha, peak[:, None], deviation[:, None]]
-        judged = self._judged(own, found, torch.cat(facts, 1), segments.valid[:, None])
+        judged = self._judged(own, matched, torch.cat(facts, 1), segments.valid[:, None])
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
         logit = torch.where(peak[:, None] > 0, logit, SETTINGS.nowhere)
         colour = torch.lerp(value - alpha, bands.to(value), exact.sigmoid())
         alike = likeness(facts[0])
         return BetaEstimate(
-            attended, deviation, peak, colour, diffused, logit, choice, position, alike, found.prior
+            attended, deviation, peak, colour, diffused, logit, choice, position, alike, matched.prior
         )
 
-    def _judged(self, own: Encoded, found: BetaMatches, facts: Tensor, valid: Tensor) -> Tensor:
+    def _judged(self, own: Encoded, of_beta: BetaMatches, facts: Tensor, valid: Tensor) -> Tensor:
         """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the semi-global match."""
-        matched = torch.cat([avg_pool2d(found.disparity, FINE) / 64, found.facts], 1)
+        matched = torch.cat([avg_pool2d(of_beta.disparity, FINE) / 64, of_beta.facts], 1)
         samples = torch.cat([facts, facts[:, :1].abs(), valid.expand(len(facts), -1, -1, -1).to(facts)], 1)
         rough = torch.cat([avg_pool2d(matched, 2), avg_pool2d(samples, SETTINGS.coarse)], 1)
         context = self.judge(stacked(own.quarter, rough))
@@ -251,8 +251,8 @@ def _joined(bands: Sequence[Tensor]) -> Tensor:
 
 def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]) -> FusionOutput:
     """The image with the position in each beta, its deviation, and its confidence."""
-    found = zip(*((s.position, s.deviation, s.confidence) for s in estimates))
-    position, deviation, confidence = map(list, found)
+    matched = zip(*((s.position, s.deviation, s.confidence) for s in estimates))
+    position, deviation, confidence = map(list, matched)
     return FusionOutput(image, position, deviation, confidence)
 
 
@@ -308,8 +308,8 @@ class Propagation(nn.Module):
         query = torch.cat([self.query(features), torch.ones_like(weight)], 1)
         key = torch.cat([self.key(features), (weight + SETTINGS.least_weight).log()], 1)
         value = torch.cat([colour, weight], 1)
-        found = attend(query, key, value, self.field, interpolation="nearest")
-        return found[:, :-1], found[:, -1:]
+        attended = attend(query, key, value, self.field, interpolation="nearest")
+        return attended[:, :-1], attended[:, -1:]
 
 
 def window_around(

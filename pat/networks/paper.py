@@ -155,13 +155,13 @@ class AttentionEngine(nn.Module):
     def compare(self, own: Tensor, others: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> list[Compared]:
         """The query, each beta's key and value, and where they are compared."""
         query, how = self.query(self.before(own)), self.interpolation
-        found = []
+        scores = []
         for f, to_key, to_value, field in zip(others, self.key, self.value, fields):
             after = self.before(f)
             value = to_value(after if self.values_after_block else f)
             locations = field.at if field.pixels is None else field.pixels.to(query)
-            found.append(Compared(query, to_key(after), value, locations, field.samples, how))
-        return found
+            scores.append(Compared(query, to_key(after), value, locations, field.samples, how))
+        return scores
 
 
 class PostFusion(nn.Sequential):

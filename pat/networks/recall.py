@@ -60,10 +60,10 @@ def by_example(
 
 
 def with_examples(
-    unseen: Float[Tensor, "b c h w"], found: Float[Tensor, "b c h w"], confidence: Float[Tensor, "b c h w"]
+    unseen: Float[Tensor, "b c h w"], recalled: Float[Tensor, "b c h w"], confidence: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b c h w"]:
     """Colour for where no beta sees the point, in part by example, the less certain a pixel is the more."""
-    return torch.lerp(unseen, found, SETTINGS.share * (1 - confidence))
+    return torch.lerp(unseen, recalled, SETTINGS.share * (1 - confidence))
 
 
 def with_less_noise(

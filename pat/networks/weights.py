@@ -150,11 +150,11 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
 def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
     """The first tensor missing, too many, or of another shape than the network's; empty if all fit. Ranges of
     convolutions in 8 bits may be missing."""
-    own, given = ({k: tuple(v.shape) for k, v in s.items()} for s in (network.state_dict(), state))
-    own |= {name: (2,) for name in eight_bits.names(network) if name in given}
-    for name in [*own, *given]:
-        if own.get(name) != given.get(name):
-            return f"{name} is {given.get(name, 'missing')}, wanted {own.get(name, 'none')}"
+    own, theirs = ({k: tuple(v.shape) for k, v in s.items()} for s in (network.state_dict(), state))
+    own |= {name: (2,) for name in eight_bits.names(network) if name in theirs}
+    for name in [*own, *theirs]:
+        if own.get(name) != theirs.get(name):
+            return f"{name} is {theirs.get(name, 'missing')}, wanted {own.get(name, 'none')}"
     return ""
 
 
@@ -181,8 +181,8 @@ def _described(
         )
     if metadata.get("format") != FORMAT or metadata.get("network") not in networks:
         said = f"it is '{metadata.get('format')}' of a {metadata.get('network')}"
-        found = f"'{FORMAT}' is wanted in the file's metadata, {said if metadata else 'it says nothing'}"
-        raise ValueError(f"{path}: not weights of this package ({found})")
+        saying = f"'{FORMAT}' is wanted in the file's metadata, {said if metadata else 'it says nothing'}"
+        raise ValueError(f"{path}: not weights of this package ({saying})")
     network, kind = networks[metadata["network"]]
     try:
         config: Any = from_document(kind, json.loads(metadata["config"]))  # type: ignore[arg-type]

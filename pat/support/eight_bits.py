@@ -59,8 +59,8 @@ class Conv2d(nn.Conv2d):
         if self.weight.requires_grad:
             self.input_range = None
         elif self.measuring:
-            given = x.detach().flatten()[:: max(1, x.numel() // SETTINGS.samples)]
-            ends = given.quantile(given.new_tensor([SETTINGS.beyond, 1 - SETTINGS.beyond]))
+            values = x.detach().flatten()[:: max(1, x.numel() // SETTINGS.samples)]
+            ends = values.quantile(values.new_tensor([SETTINGS.beyond, 1 - SETTINGS.beyond]))
             known = ends if self.input_range is None else torch.cat([ends, self.input_range])
             self.input_range = torch.stack(known.aminmax())
         elif self.rounded and self.input_range is not None and plain(x) and self.weight.dtype == x.dtype:
@@ -160,16 +160,19 @@ def in_eight_bits(x: Float[Tensor, "b i h w"], of: Conv2d, by: Packed) -> Float[
 
     def strip(image: Any, first: int, last: int) -> Tensor:
         shape = 1, (last - first - 1) * down + tall, columns, x.shape[1]
-        given = torch.empty(shape, dtype=torch.uint8, device=x.device)
-        kernels.rounded(image, first * down - above, left, 1 / by.step, by.zero, given.numpy()[0])
-        inputs, weights = (given.movedim(-1, 1), by.step, by.zero), (by.weights, by.steps, by.zeros, of.bias)
+        rounded = torch.empty(shape, dtype=torch.uint8, device=x.device)
+        kernels.rounded(image, first * down - above, left, 1 / by.step, by.zero, rounded.numpy()[0])
+        inputs, weights = (
+            (rounded.movedim(-1, 1), by.step, by.zero),
+            (by.weights, by.steps, by.zeros, of.bias),
+        )
         return torch.ops.onednn.qconv2d_pointwise(*inputs, *weights, *how)
 
     if len(parts) == 1:
         return strip(*parts[0])
-    found = in_parallel([partial(strip, *part) for part in parts])
+    outputs = in_parallel([partial(strip, *part) for part in parts])
     each = len(parts) // len(x)
-    return torch.cat([torch.cat(found[i : i + each], 2) for i in range(0, len(parts), each)])
+    return torch.cat([torch.cat(outputs[i : i + each], 2) for i in range(0, len(parts), each)])
 
 
 @cache

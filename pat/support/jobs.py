@@ -263,8 +263,8 @@ class _Process:
         if self.process is None:
             spawn = get_context("spawn")
             self.pipe, theirs = spawn.Pipe()
-            given = theirs, self.workers.threads, os.getpid()
-            self.process = spawn.Process(target=_serve, args=given, daemon=True)
+            arguments = theirs, self.workers.threads, os.getpid()
+            self.process = spawn.Process(target=_serve, args=arguments, daemon=True)
             self.process.start()
             theirs.close()
         self.pipe.send(task)
@@ -328,13 +328,13 @@ def _on_dask(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
             return future
 
         ahead = max(AHEAD * len(client.scheduler_info()["workers"]), 8)
-        done = as_completed([submit(task) for _, task in zip(range(ahead), queue)], with_results=False)
+        completed = as_completed([submit(task) for _, task in zip(range(ahead), queue)], with_results=False)
         try:
-            for future in done:
+            for future in completed:
                 _, task = running.pop(future.key)
                 following = next(queue, None)
                 if following is not None:
-                    done.add(submit(following))
+                    completed.add(submit(following))
                 yield future.result() if future.status == "finished" else _failed(task, future)
         finally:
             client.cancel([future for future, _ in running.values()])
@@ -370,8 +370,8 @@ def attempt(task: Task, threads: int) -> TaskOutcome:
             error = " ".join(str(failure).split())
         except Warning as failure:
             error, raised = f"{failure}", [failure]
-    given = [entry.message for entry in caught if isinstance(entry.message, Warning)]
-    return TaskOutcome(task.makes, error, (*given, *raised))
+    caught_warnings = [entry.message for entry in caught if isinstance(entry.message, Warning)]
+    return TaskOutcome(task.makes, error, (*caught_warnings, *raised))
 
 
 def attempt_on_worker(task: Task, threads: int) -> TaskOutcome:

@@ -55,10 +55,10 @@ def listed(settings: Any) -> Iterator[SettingEntry]:
 def all_settings(*rooms: str) -> list[SettingEntry]:
     """The entries of all settings of these packages, such as "pat.matching", in their modules' order; of
     settings that a room has more than once, what differs from the first."""
-    found: dict[SettingEntry, None] = {}
+    entries: dict[SettingEntry, None] = {}
     for room in rooms:
         for module in iter_modules(import_module(room).__path__, f"{room}."):
             for value in vars(import_module(module.name)).values():
                 if is_dataclass(value) and type(value).__name__.endswith("Settings"):
-                    found |= dict.fromkeys(listed(value))
-    return list(found)
+                    entries |= dict.fromkeys(listed(value))
+    return list(entries)

@@ -82,13 +82,13 @@ def _pattern(setting: Setting, depth: float, kinds: tuple[TextureKind, ...]) -> 
 def paints(rng: Generator) -> tuple[Paint, ...]:
     """Two to four paints, alternately lighter and darker, of similar hues or not."""
     hue, width, dark_first = rng.uniform(), rng.choice([0.08, 0.5]), int(rng.integers(2))
-    found = []
+    paints = []
     for i in range(int(rng.integers(2, 5))):
         value = rng.uniform(0.25, 0.5) if (i + dark_first) % 2 else rng.uniform(0.6, 0.95)
         encoded = colorsys.hsv_to_rgb((hue + rng.uniform(-width, width)) % 1, rng.uniform(0.1, 0.9), value)
         r, g, b = linear_from_srgb(torch.tensor(encoded, dtype=torch.float64)).tolist()
-        found.append(Paint((r, g, b), _near_infrared(rng, (r, g, b))))
-    return tuple(found)
+        paints.append(Paint((r, g, b), _near_infrared(rng, (r, g, b))))
+    return tuple(paints)
 
 
 def _near_infrared(rng: Generator, rgb: Vec3) -> float:
@@ -106,10 +106,10 @@ def _near_infrared(rng: Generator, rgb: Vec3) -> float:
 
 @lru_cache(maxsize=8)
 def _images(folder: Path) -> tuple[str, ...]:
-    found = sorted(str(p.resolve()) for p in files_below(folder) if p.suffix.lower() in PHOTO_SUFFIXES)
-    if not found:
+    files = sorted(str(p.resolve()) for p in files_below(folder) if p.suffix.lower() in PHOTO_SUFFIXES)
+    if not files:
         raise ValueError(f"{folder}: no images ({', '.join(sorted(PHOTO_SUFFIXES))}) under this folder")
-    return tuple(found)
+    return tuple(files)
 
 
 def _bright_one(rng: Generator, files: tuple[str, ...]) -> str:

@@ -103,15 +103,15 @@ def newest_checkpoint(folder: Path) -> Checkpoint | None:
     Raises ValueError if it has some and none of them can be read: a run is not to begin again unasked.
     """
     files = _files(folder)
-    found = next((checkpoint for path in files if (checkpoint := read_checkpoint(path))), None)
-    if files and found is None:
+    newest = next((checkpoint for path in files if (checkpoint := read_checkpoint(path))), None)
+    if files and newest is None:
         names = ", ".join(path.name for path in files)
         raise ValueError(
             f"{folder}: no checkpoint there can be read ({names}), so this run cannot continue: "
             "restore one of them from a copy, or remove these files to begin again at step 0, "
             "or give another --out"
         )
-    return found
+    return newest
 
 
 def read_checkpoint(path: Path) -> Checkpoint | None:

@@ -161,9 +161,9 @@ class TrainConfig:
         for name in ("rendered", "pairs", "measured"):
             share, folders = getattr(self, name), getattr(self, f"{name}_from")
             if bool(share) != bool(folders):
-                found = "there is no folder" if share else f"{folders[0]} is given"
+                given = "there is no folder" if share else f"{folders[0]} is given"
                 raise ValueError(
-                    f"{name} is {share:g} and {found}: give both `{name}` and `{name}_from`, or neither"
+                    f"{name} is {share:g} and {given}: give both `{name}` and `{name}_from`, or neither"
                 )
         total = self.rendered + self.pairs + self.measured
         if total > 1:

@@ -71,16 +71,16 @@ def former_run(config: TrainConfig) -> Checkpoint | None:
     return checkpoint
 
 
-def rate_at(config: TrainConfig, step: int, done: float) -> float:
-    """The learning rate of a step; `done` is how much of the run is, 1 at the end.
+def rate_at(config: TrainConfig, step: int, share: float) -> float:
+    """The learning rate of a step; `share` is how much of the run is, 1 at the end.
 
     >>> rate_at(TrainConfig(rate=1e-3, schedule="halving", warmup=0), 1, 0.5)
     0.0005
     """
     if config.schedule == "halving":
-        fall = 0.5 ** int(min(done, 1) * 80 / 30)
+        fall = 0.5 ** int(min(share, 1) * 80 / 30)
     else:
-        fall = 0.5 + 0.5 * math.cos(math.pi * min(done, 1))
+        fall = 0.5 + 0.5 * math.cos(math.pi * min(share, 1))
     return config.rate * (min(step / config.warmup, fall) if config.warmup else fall)
 
 
@@ -130,33 +130,33 @@ class Run:
         recipe = self.config
         for samples in made_ahead(given, self.network):
             self.step += 1
-            done = self.here.agreed(max(self.step / recipe.steps, self.minutes / recipe.minutes))
-            self._advance(samples, done)
-            if self.step % recipe.validate == 0 or done >= 1:
+            share = self.here.agreed(max(self.step / recipe.steps, self.minutes / recipe.minutes))
+            self._advance(samples, share)
+            if self.step % recipe.validate == 0 or share >= 1:
                 self._validate()
             elif self.watch and EARLY <= self.step < recipe.validate and self.step & (self.step - 1) == 0:
                 self.watch.show(self.averaged, self.examined, self.step)
-            if self.step % recipe.save == 0 or done >= 1:
-                self._save(done=done >= 1)
-            if done >= 1:
+            if self.step % recipe.save == 0 or share >= 1:
+                self._save(done=share >= 1)
+            if share >= 1:
                 return
 
-    def _advance(self, given: list[Sample], done: float) -> None:
+    def _advance(self, samples: list[Sample], share: float) -> None:
         """One step of the optimiser. Raises FloatingPointError if loss or gradients are not finite."""
         self.adam.zero_grad()
-        losses = [self._backward(part, len(given), last=part is given[-1]) for part in given]
+        losses = [self._backward(part, len(samples), last=part is samples[-1]) for part in samples]
         norm = clip_grad_norm_(self.network.parameters(), self.config.clip)
         loss = self.here.mean(torch.stack(losses).mean())
         if not (torch.isfinite(norm) and torch.isfinite(loss)):
-            raise FloatingPointError(self._offence(given))
-        rate = rate_at(self.config, self.step, done)
+            raise FloatingPointError(self._offence(samples))
+        rate = rate_at(self.config, self.step, share)
         for parameters in self.adam.param_groups:
             parameters["lr"] = rate
         self.adam.step()
         self.average.update_parameters(self.network)
         self.loss = float(loss)
         if self.watch:
-            self.watch.step(self.step, self.loss, float(norm), rate, done=done)
+            self.watch.step(self.step, self.loss, float(norm), rate, done=share)
 
     def _backward(self, given: Sample, groups: int, *, last: bool) -> Tensor:
         """Add the gradients of one group to the others'; processes exchange them with the last."""
@@ -192,16 +192,16 @@ class Run:
             state = collect(self.network, self.adam, self.average, facts)
             write_checkpoint(self.config.out / CHECKPOINTS, state)
 
-    def _offence(self, given: list[Sample]) -> str:
+    def _offence(self, samples: list[Sample]) -> str:
         """Save the groups of a failed step; the error message names the samples."""
-        found = []
-        for group, part in zip(self.groups, given):
+        offences = []
+        for group, part in zip(self.groups, samples):
             bad = [i for i in range(len(part.alpha)) if not self._is_finite(alone(part, i))]
-            found += [f"sample {i} of group {group}" for i in bad]
-            if bad or len(given) == 1:
+            offences += [f"sample {i} of group {group}" for i in bad]
+            if bad or len(samples) == 1:
                 path = self.config.out / f"offending-step-{self.step}-group-{group}.safetensors"
                 save_sample(part, path, facts={"step": str(self.step), "samples": str(bad)})
-        who = ", ".join(found) or "no single sample of this process"
+        who = ", ".join(offences) or "no single sample of this process"
         return (
             f"step {self.step}: the loss or its gradient is not finite, by {who}; the batch is in "
             f"{self.config.out}/offending-step-{self.step}-*.safetensors: inspect it, or lower `rate` "
@@ -217,9 +217,9 @@ class Run:
         return bool(loss.isfinite()) and all(bool(g.isfinite().all()) for g in gradients)
 
 
-def save_sample(given: Sample, path: Path, *, facts: dict[str, str]) -> None:
+def save_sample(sample: Sample, path: Path, *, facts: dict[str, str]) -> None:
     """A group's sample tensors: alpha, ground truth, and beta, position, visible of each beta by number."""
-    tensors = {"alpha": given.alpha, "ground_truth": given.ground_truth}
+    tensors = {"alpha": sample.alpha, "ground_truth": sample.ground_truth}
     for name in ("betas", "position", "visible"):
-        tensors |= {f"{name}/{i}": t for i, t in enumerate(getattr(given, name))}
+        tensors |= {f"{name}/{i}": t for i, t in enumerate(getattr(sample, name))}
     write_tensors(path, tensors, facts)

@@ -65,28 +65,28 @@ class Objective(nn.Module):
         self.image_loss = IMAGE_LOSSES[loss]
         self.attention = attention
 
-    def forward(self, given: Sample) -> Tensor:
+    def forward(self, sample: Sample) -> Tensor:
         """The loss of a group of samples."""
         if self.attention and isinstance(self.network, Comparing):
-            fused, compared = self.network.compare(given.inputs)
-            where = attention_loss(compared, given.position, given.visible)
-            return self.image_loss(fused.image, given.ground_truth) + self.attention * where
-        fused, seen = explained(self.network, given)
-        loss = self.image_loss(fused.image, given.ground_truth)
-        return loss + match_loss(seen, given) if seen else loss
+            fused, compared = self.network.compare(sample.inputs)
+            where = attention_loss(compared, sample.position, sample.visible)
+            return self.image_loss(fused.image, sample.ground_truth) + self.attention * where
+        fused, seen = explained(self.network, sample)
+        loss = self.image_loss(fused.image, sample.ground_truth)
+        return loss + match_loss(seen, sample) if seen else loss
 
 
-def explained(network: FusionNetwork, given: Sample) -> tuple[FusionOutput, list[BetaEstimate]]:
+def explained(network: FusionNetwork, sample: Sample) -> tuple[FusionOutput, list[BetaEstimate]]:
     """The network's output, and its match in each beta if it reports it."""
     if not isinstance(network, Explaining):
-        return network(given.inputs), []
-    return network.explain(given.inputs, given.matches or matched_for(network, given.inputs))
+        return network(sample.inputs), []
+    return network.explain(sample.inputs, sample.matches or matched_for(network, sample.inputs))
 
 
-def match_loss(seen: list[BetaEstimate], given: Sample) -> Tensor:
+def match_loss(seen: list[BetaEstimate], sample: Sample) -> Tensor:
     """Error of position where beta sees the point, pixels, and of confidence; 0 without ground truth."""
-    total = given.ground_truth.new_zeros(())
-    for match, ground_truth, visible in zip(seen, given.position, given.visible):
+    total = sample.ground_truth.new_zeros(())
+    for match, ground_truth, visible in zip(seen, sample.position, sample.visible):
         off = (match.attended - ground_truth.movedim(-1, 1)).abs().sum(1)
         total = total + 0.02 * (off.clamp(max=6.0) * visible).sum() / visible.sum().clamp(min=1)
         good = (visible & (off.detach() < 1.5)).to(off)
@@ -102,22 +102,22 @@ def validation(network: FusionNetwork, samples: list[Sample]) -> dict[str, float
     pixel of the true position.
     """
     psnr, near, peaks = [], [], []
-    for given in samples:
-        fused, compared = _compared(network, given)
-        error = (fused.image.clamp(0, 1) - given.ground_truth).square().flatten(1).mean(1)
+    for sample in samples:
+        fused, compared = _compared(network, sample)
+        error = (fused.image.clamp(0, 1) - sample.ground_truth).square().flatten(1).mean(1)
         psnr.append(-10 * error.clamp(min=1e-8).log10().mean())
-        for where, visible in list(zip(given.position, given.visible))[:1]:
+        for where, visible in list(zip(sample.position, sample.visible))[:1]:
             off = (fused.position[0] - where.movedim(-1, 1)).norm(dim=1)
             near.append((off[visible] < 1.5).float().mean())
             for one in compared[:1]:
                 off = (peak_position(one) - where.movedim(-1, 1)).norm(dim=1)
                 peaks.append((off[visible] <= 1).float().mean())
     matched = float(torch.stack(near).nanmean()) if near else math.nan
-    found = {"peaks": float(torch.stack(peaks).nanmean())} if peaks else {}
-    return {"psnr": float(torch.stack(psnr).mean()), "matched": matched} | found
+    metrics = {"peaks": float(torch.stack(peaks).nanmean())} if peaks else {}
+    return {"psnr": float(torch.stack(psnr).mean()), "matched": matched} | metrics
 
 
-def _compared(network: FusionNetwork, given: Sample) -> tuple[FusionOutput, list[Compared]]:
-    if isinstance(network, Comparing) and given.fields[0].pixels is not None:
-        return network.compare(given.inputs)
-    return fused_at_once(network, given.inputs), []
+def _compared(network: FusionNetwork, sample: Sample) -> tuple[FusionOutput, list[Compared]]:
+    if isinstance(network, Comparing) and sample.fields[0].pixels is not None:
+        return network.compare(sample.inputs)
+    return fused_at_once(network, sample.inputs), []

@@ -234,22 +234,22 @@ def degraded(
     recording: RecordingConfig = RecordingConfig(),  # noqa: B008
 ) -> Sample:
     """Recorded images of a scene: alpha grey, betas in colour (or one band), at alpha's resolution."""
-    images, alone = _banded(scene, g, recording.spectral), len(scene.images) == 2
+    images, two_views = _banded(scene, g, recording.spectral), len(scene.images) == 2
     ideal, grey, cameras = images[0], luminance(scene.images[0]), scene.cameras
     alpha = recorded(grey, cameras[0], g, recording).values
     betas, on_grid, position, visible = [], [], [], []
     for i, image in enumerate(images[1:], 1):
-        band = image if alone else image[:, i - 1 : i]
+        band = image if two_views else image[:, i - 1 : i]
         seen = recorded(band, cameras[i], g, recording, lost=LOST)
         betas.append(enlarged(seen.values, scene.cameras[0].hw))
-        if alone and _chance(recording.paper, g):
+        if two_views and _chance(recording.paper, g):
             alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
         pair = pair_of(scene, i, g)
         on_grid.append(FieldOnGrid.of(field, perturbed(pair, recording.miscalibrated, g)))
         if scene.depth:
-            found = transfer(pair, scene.depth[0], scene.depth[i].masked_fill(~seen.valid, torch.nan))
-            position.append(found[0])
-            visible.append(found[1])
+            transferred = transfer(pair, scene.depth[0], scene.depth[i].masked_fill(~seen.valid, torch.nan))
+            position.append(transferred[0])
+            visible.append(transferred[1])
     ground_truth = ideal if recording.ideal else ideal + (alpha - grey)
     return Sample(alpha, betas, on_grid, ground_truth, position, visible)
 
@@ -323,20 +323,20 @@ def transfer(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Ten
     expected = (track.a[..., 2] + track.b[..., 2] / z) * z
     native = beta_depth[:, None].reciprocal()
     scale = x.new_tensor([beta_depth.shape[-1] / pair.beta.hw[1], beta_depth.shape[-2] / pair.beta.hw[0]])
-    found = sample(native, (x + 0.5) * scale - 0.5, interpolation="nearest")
-    visible = found.valid & ((found.values[:, 0] * expected - 1).abs() < 0.02)
+    sampled = sample(native, (x + 0.5) * scale - 0.5, interpolation="nearest")
+    visible = sampled.valid & ((sampled.values[:, 0] * expected - 1).abs() < 0.02)
     return x.nan_to_num(0.0).reshape(-1, *hw, 2), visible.reshape(-1, *hw)
 
 
-def alone(given: Sample, i: int) -> Sample:
+def alone(sample: Sample, i: int) -> Sample:
     """The i-th of a group of samples."""
 
     def one(parts: Sequence[Tensor]) -> list[Tensor]:
         return [part if len(part) == 1 else part[i : i + 1] for part in parts]
 
-    alpha, ground_truth = one([given.alpha, given.ground_truth])
-    on_grid = [f.of_one(i) for f in given.fields]
-    return Sample(alpha, one(given.betas), on_grid, ground_truth, one(given.position), one(given.visible))
+    alpha, ground_truth = one([sample.alpha, sample.ground_truth])
+    on_grid = [f.of_one(i) for f in sample.fields]
+    return Sample(alpha, one(sample.betas), on_grid, ground_truth, one(sample.position), one(sample.visible))
 
 
 def enlarged(image: Float[Tensor, "b c hb wb"], hw: HW) -> Float[Tensor, "b c h w"]:

@@ -86,8 +86,8 @@ class RenderedCrops(Crops):
     """
 
     def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
-        found = [folder for root in roots for folder in scene_folders(root)]
-        self.folders = chosen(found, choose, f"rendered scenes of {', '.join(map(str, roots))}")
+        folders = [folder for root in roots for folder in scene_folders(root)]
+        self.folders = chosen(folders, choose, f"rendered scenes of {', '.join(map(str, roots))}")
         rigs = [scene_rig(folder) for folder in self.folders]
         self.names = [rig.names for rig in rigs]
         self.alphas = [large_enough(folder, rig, self.hw) for folder, rig in zip(self.folders, rigs)]
@@ -137,12 +137,12 @@ def _order(count: int, seed: int, epoch: int) -> list[int]:
     return torch.randperm(count, generator=generator_for(seed, "order", epoch)).tolist()
 
 
-def chosen(found: list[T], choose: Callable[[int], bool], what: str) -> list[T]:
+def chosen(every: list[T], choose: Callable[[int], bool], what: str) -> list[T]:
     """Those chosen by their number. Raises ValueError if none is."""
-    items = [item for i, item in enumerate(found) if choose(i)]
+    items = [item for i, item in enumerate(every) if choose(i)]
     if not items:
         raise ValueError(
-            f"{what}: {len(found)} are too few to learn from some and to hold others out: give more"
+            f"{what}: {len(every)} are too few to learn from some and to hold others out: give more"
         )
     return items
 

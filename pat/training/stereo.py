@@ -51,8 +51,8 @@ class PairCrops(Crops):
     """
 
     def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
-        found = [pair for root in roots for pair in pair_files(root)]
-        self.pairs = chosen(found, choose, f"stereo pairs of {', '.join(map(str, roots))}")
+        pairs = [pair for root in roots for pair in pair_files(root)]
+        self.pairs = chosen(pairs, choose, f"stereo pairs of {', '.join(map(str, roots))}")
         for pair in self.pairs:
             self.check(pair)
         self._pictures = lru_cache(ACTIVE)(lambda i: self.read(self.pairs[i]))

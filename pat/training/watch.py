@@ -100,15 +100,15 @@ class Watch:
 @torch.no_grad()
 def contact_sheet(network: FusionNetwork, samples: list[Sample]) -> Float[Tensor, "3 _ _"]:
     """A row for the first scene of each group: beta (three bands or one), alpha, fused, truth, confidence."""
-    return torch.cat([_row(network, given) for given in samples], -2).cpu()
+    return torch.cat([_row(network, sample) for sample in samples], -2).cpu()
 
 
-def _row(network: FusionNetwork, given: Sample) -> Tensor:
-    fused, _ = explained(network, given)
-    beta = torch.cat([b[:1] for b in given.betas], 1)
+def _row(network: FusionNetwork, sample: Sample) -> Tensor:
+    fused, _ = explained(network, sample)
+    beta = torch.cat([b[:1] for b in sample.betas], 1)
     confidence = torch.stack([c[:1] for c in fused.confidence], 1).amin(1, keepdim=True)
-    hw = (given.ground_truth.shape[-2], given.ground_truth.shape[-1])
-    columns = [beta, given.alpha[:1], fused.image[:1], given.ground_truth[:1], confidence]
+    hw = (sample.ground_truth.shape[-2], sample.ground_truth.shape[-1])
+    columns = [beta, sample.alpha[:1], fused.image[:1], sample.ground_truth[:1], confidence]
     three = [c[:, :3] if c.shape[1] > 2 else c[:, :1].expand(-1, 3, -1, -1) for c in columns]
     row = [interpolate(c.float(), hw, mode="bilinear", align_corners=False) for c in three]
     return torch.cat(row, -1)[0].clamp(0, 1)

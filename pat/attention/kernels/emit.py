@@ -110,7 +110,7 @@ def instruction(result):
         notes = [str(parameter.annotation) for parameter in parameters]
 
         def typed(typing, *kinds):
-            given = result(*kinds)
+            numba_type = result(*kinds)
             taken = [types.intp if note == "index" else kind for note, kind in zip(notes, kinds)]
 
             def code(context, builder, signature, args):
@@ -118,10 +118,10 @@ def instruction(result):
                     kind.literal_value if note == "literal" else a
                     for note, kind, a in zip(notes, kinds, args)
                 ]
-                out = inspect.unwrap(emit)(Code(context, builder, kinds, given), *values)
+                out = inspect.unwrap(emit)(Code(context, builder, kinds, numba_type), *values)
                 return context.get_dummy_value() if out is None else out
 
-            return given(*taken), code
+            return numba_type(*taken), code
 
         first = inspect.Parameter("typing", inspect.Parameter.POSITIONAL_OR_KEYWORD)
         typed.__signature__ = inspect.Signature([first, *parameters])  # type: ignore[attr-defined]

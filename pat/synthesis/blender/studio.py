@@ -99,10 +99,10 @@ class Studio:
         self.blender.world.light_settings.distance = 0.15 * self.scene.depth[1]
 
     def _gpu(self) -> bool:
-        found = compat.use_gpu(self.bpy)
-        if not found and self.settings.device == "gpu":
+        gpu = compat.use_gpu(self.bpy)
+        if not gpu and self.settings.device == "gpu":
             raise ValueError("no GPU that Cycles can use was found: take device 'cpu' or 'auto'")
-        return found
+        return gpu
 
     # One image -----------------------------------------------------------------------------------------
 
@@ -127,13 +127,13 @@ def read_layers(path: Path) -> dict[str, Tensor]:
         import OpenEXR
     except ImportError:
         raise ValueError(f"rendering needs OpenEXR to read what Blender writes: {compat.INSTALL}") from None
-    found: dict[str, Tensor] = {}
+    layers: dict[str, Tensor] = {}
     with OpenEXR.File(str(path), separate_channels=True) as file:
         for part in file.parts:
             for name, channel in part.channels.items():
                 short = name.split(".", 1)[1] if name.count(".") > 1 else name
-                found[short] = torch.from_numpy(np.array(channel.pixels, dtype=np.float32))
-    return found
+                layers[short] = torch.from_numpy(np.array(channel.pixels, dtype=np.float32))
+    return layers
 
 
 @contextmanager

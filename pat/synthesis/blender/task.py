@@ -118,9 +118,9 @@ def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
 
 def take(studio: Studio, lens: Lens, shot: Shot) -> RenderedFrame:
     """One frame. Raises ValueError if the camera sees nothing."""
-    found = studio.channels(lens.pinhole, shot.time, "rgb")
-    index = found[compat.index_name(found)].round().int()
-    depth = torch.where(found["Depth.Z"] < NOTHING, found["Depth.Z"], torch.inf)
+    rendered = studio.channels(lens.pinhole, shot.time, "rgb")
+    index = rendered[compat.index_name(rendered)].round().int()
+    depth = torch.where(rendered["Depth.Z"] < NOTHING, rendered["Depth.Z"], torch.inf)
     if not (index > 0).any():
         raise ValueError(f"camera '{shot.camera}' sees nothing at {shot.time:g} s: rotate it or move it")
     nir = None
@@ -128,7 +128,7 @@ def take(studio: Studio, lens: Lens, shot: Shot) -> RenderedFrame:
         nir = lens.resampled(studio.channels(lens.pinhole, shot.time, "nir")["Combined.R"][None])
     return RenderedFrame(
         time=shot.time,
-        rgb=lens.resampled(torch.stack([found[f"Combined.{letter}"] for letter in "RGB"])),
+        rgb=lens.resampled(torch.stack([rendered[f"Combined.{letter}"] for letter in "RGB"])),
         depth=lens.depth(depth, index),
         index=lens.nearest(index[None].float())[0].int(),
         nir=nir,

@@ -230,7 +230,7 @@ def test_positions_of_parts_are_in_the_whole_betas(network, monkeypatch):
     )
     whole = (0, 4, 0, 5)
     monkeypatch.setattr(Inputs, "cut", lambda self, box: self)
-    found = fuse_tile(network, frame, None, Tile(whole, whole)).found
+    found = fuse_tile(network, frame, None, Tile(whole, whole)).matched
     assert found[0, :, 1, 1].tolist() == [8.0, 3.0, 0.5]
 
 

@@ -140,7 +140,7 @@ def test_no_more_blocks_at_once_than_memory_holds(monkeypatch, limit, at_once):
             running.append(box)
             most.append(len(running))
         image.claims.append(np.zeros(1, np.int32))
-        image.found[2][:] = 0
+        image.results[2][:] = 0
         time.sleep(0.05)
         running.remove(box)
 
