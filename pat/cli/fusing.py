@@ -287,8 +287,8 @@ class Fuse(Known):
         image_array: ImageArray | None = None,
         healing: Callable[[], Healed | None] = lambda: None,
     ) -> None:
-        """Fuse one frame. `rig` is of the files as they are developed; `image_array` is what they say of
-        it, if it was found from them; `healing` gives the rig healed by them, with which a frame is fused again."""
+        """Fuse one frame. `rig` is of the files as they are developed; `image_array` is what they say of it,
+        where it was found from them; `healing` gives the rig healed by them, and the frame is fused again."""
         from arraygeom import Camera
         from arraygeom.atomic import sweep, write_text
 
