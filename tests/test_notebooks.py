@@ -4,6 +4,9 @@ import importlib.util
 from pathlib import Path
 
 import pytest
+import torch
+
+from pat.data.sample_array import load_sample
 
 nbformat = pytest.importorskip("nbformat")
 ROOT = Path(__file__).parents[1]
@@ -80,3 +83,21 @@ def test_the_explorer_is_shown_by_a_cell(tmp_path):
     shown = [kind for output in fresh.cells[0].outputs for kind in output.get("data", {})]
     assert "application/vnd.jupyter.widget-view+json" in shown
     assert not [o for o in fresh.cells[0].outputs if o.output_type == "error"]
+
+
+def test_the_field_of_notebook_4_has_gradients_all_over():
+    """Beyond alpha's image, where fusion pads, its depth was 0: a differentiable fusion had NaN gradients."""
+    cells = [c.source for c in read(ROOT / "notebooks" / "4_your_own_field.ipynb").cells]
+    scope = {}
+    source = next(c for c in cells if "class AroundDepth" in c).replace("field = AroundDepth(depth)", "")
+    imports = (
+        "import torch\nfrom dataclasses import dataclass\nfrom arraygeom import ReceptiveField, sample\n"
+    )
+    imports += "from arraygeom.fields import pinhole_track\nfrom arraygeom.segments import clip_to_image\n"
+    exec(imports + source.replace("isinstance(field, ReceptiveField)", ""), scope)
+    rig = load_sample().rig
+    step = rig.parameters(free=["colour.rotation"])
+    x = torch.tensor([[40.0, 30.0], [40.0, 402.0], [645.0, 30.0]])
+    found = scope["AroundDepth"](torch.full((400, 640), 3.0))(rig.perturbed(step).pair("mono", "colour"), x)
+    (found.start.sum() + found.end.sum()).backward()
+    assert step["colour.rotation"].grad.isfinite().all()

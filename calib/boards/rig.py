@@ -79,6 +79,8 @@ def calibrate(
     contradict each other. With `start`, a rig known to within `deviations`, one image of each camera is
     enough, and the world is the start's; so are its lenses.
     """
+    if not views:
+        raise ValueError("there are no views: give those of one camera or more, by name")
     models = dict.fromkeys(views, lens) if isinstance(lens, str) else lens
     for name in views:
         if models.get(name) not in LENSES:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import re
 import sys
@@ -22,15 +23,17 @@ EVERY = 0.005
 
 def parse_bytes(amount: float | str) -> float:
     """Bytes of a number, or of text such as "4GiB" or "500 MB". Raises ValueError for other text."""
-    if not isinstance(amount, str):
-        return float(amount)
     units = {"B": 1, "KB": 1e3, "MB": 1e6, "GB": 1e9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
-    number = amount.rstrip("BbKkMmGgIi ")
-    unit = amount[len(number) :].strip().upper() or "B"
+    text = str(amount)
+    number = text.rstrip("BbKkMmGgIi ")
+    unit = text[len(number) :].strip().upper() or "B"
     try:
-        return float(number) * units[unit]
+        size = float(number) * units[unit]
     except (KeyError, ValueError):
-        raise ValueError(f"max_memory is '{amount}'; wanted bytes, or like 4GiB or 500MB") from None
+        size = math.nan
+    if math.isnan(size):
+        raise ValueError(f"max_memory is '{amount}'; wanted bytes, or like 4GiB or 500MB")
+    return size
 
 
 _keeps = False

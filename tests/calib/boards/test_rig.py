@@ -328,3 +328,8 @@ def test_small_boards_around_the_centre_do_not_lead_the_start_astray(shared_data
     fx, fy = camera.K[:2, :2].diagonal().tolist()
     assert fx == pytest.approx(800, rel=0.1)
     assert fx == pytest.approx(fy, rel=0.01)
+
+
+def test_without_views_there_is_nothing_to_calibrate():
+    with pytest.raises(ValueError, match="there are no views"):
+        calibrate({}, parse_board("chessboard:9x6:25mm"))

@@ -75,3 +75,9 @@ def test_a_large_task_takes_what_is_planned_whatever_more_is_allowed(limit, want
     monkeypatch.setattr("pat.support.memory._keeps", True)
     assert planned(limit, 2.0, large=True) == wanted
     assert planned(limit, 2.0, large=False) == limit
+
+
+@pytest.mark.parametrize("amount", ["nan", "nanGiB", float("nan")])
+def test_a_limit_that_is_no_number_is_refused(amount):
+    with pytest.raises(ValueError, match="max_memory is"):
+        parse_bytes(amount)
