@@ -44,7 +44,7 @@ def sampling_locations(
     return answered(field, pair, all_pixels(pair) if x is None else floating(x))
 
 
-def answered(field: ReceptiveField, pair: Pair, x: Float[Tensor, "*n 2"]) -> SamplingLocations:
+def answered(field: ReceptiveField, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
     """What a field gives for pixels. Raises ValueError for what is not Segments or Positions of each."""
     answer, name = field(pair, x), getattr(field, "__name__", type(field).__name__)
     if not isinstance(answer, Segments | Positions):

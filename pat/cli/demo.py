@@ -40,17 +40,17 @@ class Demo:
         arrays = {
             "photograph": as_real_cameras(load_motorcycle()),
             "rendered": as_real_cameras(sample),
-            "rendered, ideal": sample,
+            "rendered, ideal": (sample, None),
         }
         columns: dict[str, dict[str, str]] = {}
-        for name, array in arrays.items():
+        for name, (array, noise) in arrays.items():
             say(f"{name}: classical fusion")
             methods = {
                 "alpha alone": array.images[ALPHA].expand(3, -1, -1),
-                **classical_methods(network, array),
+                **classical_methods(network, array, noise),
             }
             say(f"{name}: fusion with the weights '{self.weights}'")
-            frame = fuse_with_progress(self.weights, array.rig, array.images, alpha=ALPHA, noise=array.noise)
+            frame = fuse_with_progress(self.weights, array.rig, array.images, alpha=ALPHA, noise=noise)
             methods["fusion"] = frame.image.clamp(0, 1)
             scores = {method: score(image, array.ground_truth) for method, image in methods.items()}
             columns[name] = {method: f"{psnr:.2f} / {ssim:.3f}" for method, (psnr, ssim) in scores.items()}

@@ -13,22 +13,17 @@ from torch.nn.functional import avg_pool2d
 from arraygeom import Camera, Pose, Rig
 from pat.media.colour import luminance, luminance_of
 from pat.media.images import read_image
-from pat.sensors import NoiseLevel
 
 SAMPLE = Path(__file__).parent / "sample"
 ALPHA, BETA = "mono", "colour"
 
 
 class SampleArray(NamedTuple):
-    """A mono alpha and a colour beta of different focal length and pose, and alpha's view in true colour.
-
-    `noise` is that of each camera, if there is noise.
-    """
+    """A mono alpha and a colour beta of different focal length and pose, and alpha's view in true colour."""
 
     rig: Rig
     images: dict[str, Tensor]
     ground_truth: Float[Tensor, "3 h w"]
-    noise: dict[str, NoiseLevel] | None = None
 
 
 def load_sample(folder: Path = SAMPLE) -> SampleArray:

@@ -25,21 +25,23 @@ CROP = 4
 """Enlargement of the figure's lower row."""
 
 
-def as_real_cameras(array: SampleArray) -> SampleArray:
-    """The same array with cameras of another response and exposure, in low light."""
+def as_real_cameras(array: SampleArray) -> tuple[SampleArray, dict[str, NoiseLevel]]:
+    """The same array with cameras of another response and exposure, in low light, and the noise of each."""
     generator = Generator().manual_seed(0)
     ideal = {ALPHA: luminance(array.ground_truth, RESPONSE), BETA: EXPOSURE * array.images[BETA]}
     images = {name: NOISE.recorded(image[None], generator)[0] for name, image in ideal.items()}
-    return array._replace(images=images, noise=dict.fromkeys(images, NOISE))
+    return array._replace(images=images), dict.fromkeys(images, NOISE)
 
 
-def classical_methods(network: FusionNetwork, array: SampleArray) -> dict[str, Tensor]:
+def classical_methods(
+    network: FusionNetwork, array: SampleArray, noise: Mapping[str, NoiseLevel] | None
+) -> dict[str, Tensor]:
     """The classical fusion: plain; with alpha's response corrected; denoised first; and both.
 
     The response is what our fusion finds in the denoised images; these are by non-local means that know the
     noise. Plain alone where the cameras are ideal.
     """
-    rig, images, noise = array.rig, array.images, array.noise
+    rig, images, _ = array
     methods = {"classical": classical(rig, images, ALPHA, BETA)}
     if noise is None:
         return methods
