@@ -20,7 +20,7 @@ from arraygeom.threads import torch_in_one_thread
 from .lenses import describe_lenses
 from .matches import (
     AGREE,
-    MATCHED,
+    MATCHING_SHARE,
     FittedLink,
     Pairs,
     PointMatches,
@@ -85,14 +85,14 @@ def rig_from_images(
             raise ValueError(f"--focal: '{name}={length:g}' is no camera with an image, or not positive")
     sizes = image_sizes(images)
     K = {name: intrinsics(length, sizes[name]) for name, length in focal.items()}
-    with part(0, MATCHED):
+    with part(0, MATCHING_SHARE):
         matched = match_cameras(images, alpha=alpha) if matches is None else agreeing_pairs(matches)
     distance, by_focal, links = {}, {}, {}
     for names, points in matched.items():
         F, distance[names], by_focal[names] = _fundamental(points, *(K.get(name) for name in names))
         links[names] = fit_link(points, F, within=AGREE).link
     rig = Rig({name: View(hw=hw) for name, hw in sizes.items()}, links=links)
-    with part(MATCHED, 1):
+    with part(MATCHING_SHARE, 1):
         refined = refine_matches(rig, [matched])
     if refined.accepted:
         rig = refined.rig

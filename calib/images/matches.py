@@ -41,7 +41,7 @@ MANY = 60
 """With fewer consistent matches, mirrored images are tried."""
 AGREE = 5.0
 """Largest distance, in pixels, of a consistent match from its line: lenses distort lines."""
-MATCHED = 0.8
+MATCHING_SHARE = 0.8
 """The share of the time, roughly, that images take to be matched before something is fitted to the points."""
 STILL = 0.05
 """Images in which nine points in ten move less than this, in pixels, are the same image."""

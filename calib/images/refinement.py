@@ -43,7 +43,7 @@ from .least_squares import (
 from .lenses import with_distortion, with_lenses
 from .matches import (
     ENOUGH,
-    MATCHED,
+    MATCHING_SHARE,
     Images,
     Pairs,
     agreeing_pairs,
@@ -125,9 +125,9 @@ def refine(
     with stage("points" + ", stage 1 of 2" * (attend is not None), new=True):
         pairs = []
         for i, frame in enumerate(frames):
-            with part(MATCHED * i / len(frames), MATCHED * (i + 1) / len(frames)):
+            with part(MATCHING_SHARE * i / len(frames), MATCHING_SHARE * (i + 1) / len(frames)):
                 pairs.append(match_cameras(frame) if matches is None else agreeing_pairs(matches[i]))
-        with part(MATCHED, 1):
+        with part(MATCHING_SHARE, 1):
             fit, solution = fitted(rig, pairs, free=free, sigma=sigma)
     refined = fit.report(solution, force=force)
     if attend is None or not refined.accepted or not solution.directions.shape[1]:

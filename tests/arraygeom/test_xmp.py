@@ -9,7 +9,7 @@ import torch
 
 from arraygeom import Band, Rig
 from arraygeom.io import RigFileError, RigFileWarning, recognise
-from arraygeom.io.image_tags import image_tags
+from arraygeom.io.image_tags import ImageTags, image_tags
 from arraygeom.io.xmp import named_by_band
 
 tifffile = pytest.importorskip("tifffile")
@@ -124,7 +124,8 @@ def test_damaged_images_have_tags_or_none(tmp_path):
         damaged = np.frombuffer(content, np.uint8).copy()
         damaged[random.integers(0, 400, 3)] = random.integers(0, 256, 3)
         path.write_bytes(damaged.tobytes())
-        image_tags(path)
+        tags = image_tags(path)
+        assert tags is None or isinstance(tags, ImageTags)
 
 
 def test_tags_are_of_the_stored_pixels_and_the_rig_of_upright_ones(tmp_path):
