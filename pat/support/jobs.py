@@ -204,12 +204,19 @@ TRIES = 3
 def _in_processes(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
     """Outcomes as they come. Each process has a thread that waits for it, and with which it would die."""
     own, processes, before = threading.local(), [], dict(os.environ)
+    fatal: list[JobError] = []
 
     def made(task: Task) -> TaskOutcome:
+        if fatal:  # threads may come to many tasks before the job's own thread hears of it
+            raise fatal[0]
         if not hasattr(own, "process"):
             own.process = _Process(workers)
             processes.append(own.process)
-        return own.process.made(task)
+        try:
+            return own.process.made(task)
+        except JobError as error:
+            fatal.append(error)
+            raise
 
     os.environ.update(ENVIRONMENT)
     threads = ThreadPoolExecutor(workers.count)
