@@ -187,7 +187,8 @@ def fuse(
     fitted = corrections or find_corrections(network, inputs, response, align=align)
     for line in fitted.described(betas, inputs.hw) if explain else ():
         explain(line)
-    right = replace(fitted.applied(inputs.inputs, inputs.hw), luminance=SHARES[luminance])
+    right = fitted.applied(inputs.inputs, inputs.hw)
+    right = replace(right, luminance=SHARES[luminance], denoised=noisy)
     inputs = inputs._replace(inputs=right)
     with limited(planned(limit, plan.memory, large=math.prod(inputs.hw) > LARGE)):
         with torch.set_grad_enabled(differentiable):

@@ -115,7 +115,9 @@ def equal_resolution(network: FusionNetwork, views: Views) -> StepResult:
         image = of_size(views.images[name], hw_at_alphas_resolution(views.pair(name)))
         if image is not views.images[name]:
             rig = views.rig.resize(name, (image.shape[-2], image.shape[-1]))
-            views = views.replace({name: image}, rig=rig)
+            h, w = views.images[name].shape[-2:]
+            enlargement = {**views.enlargement, name: (image.shape[-2] / h, image.shape[-1] / w)}
+            views = dataclasses.replace(views.replace({name: image}, rig=rig), enlargement=enlargement)
     return StepResult(views)
 
 
@@ -172,7 +174,7 @@ def join(which: JoinsBands, views: Views) -> StepResult:
         by_band = frame.confidence.expand(len(order), -1, -1) if frame.by_band is None else frame.by_band
         return frame._replace(image=frame.image[order], by_band=by_band[order])
 
-    joined_views = Views(views.rig, {views.alpha: views.own, **joined}, views.alpha, views.fields)
+    joined_views = dataclasses.replace(views, images={views.alpha: views.own, **joined})
     return StepResult(joined_views, back)
 
 

@@ -22,6 +22,7 @@ from ..matching.inputs import Inputs
 from ..matching.matches import Matches
 from ..networks.protocol import FusionNetwork, matched_for
 from ..support.tensor_files import write_tensors
+from .back_projection import back_projected
 from .depth import certain, measured_depth
 from .inputs import FrameInputs
 from .results import Frame
@@ -211,7 +212,10 @@ def _fused(
     top, bottom, left, right = tile.inner
     box = (top - tile.outer[0], bottom - tile.outer[0], left - tile.outer[2], right - tile.outer[2])
     with convolutions_in_parallel():
-        output = certain(network(inputs, matches), matches, inputs).cut(box)
+        output = certain(network(inputs, matches), matches, inputs)
+    if network.keeps_luminance and not inputs.denoised:
+        output = back_projected(output, inputs)
+    output = output.cut(box)
     part = replace(inputs, betas=tuple(replace(beta, field=beta.field.cut(box)) for beta in inputs.betas))
     hw = bottom - top, right - left
     depth, half_width, confidence = measured_depth(output, part, frame.placements, hw, (left, top))

@@ -44,6 +44,8 @@ class Views:
     fields: Fields = dataclasses.field(default_factory=dict)
     alpha_in_colour: bool = False
     """Whether alpha's image was, before it was made grey."""
+    enlargement: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    """How many times as high and wide a beta's image is as it was, if it was resized."""
 
     @classmethod
     def of(

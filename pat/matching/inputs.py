@@ -36,6 +36,7 @@ class Beta:
     """One beta's image (B, C, H, W) and the field of alpha's pixels in it.
 
     `offset` is the (x, y) of its first pixel in the whole image, other than (0, 0) for a part of an image.
+    `enlargement` says how many times as high and wide it is as what the camera recorded.
     `track` gives the tracks of alpha's pixels (*n, 2) in the image of a calibrated beta. With `around` each
     segment is around what is known of its own pixel: positions along the segments of two pixels are not to be
     compared.
@@ -46,6 +47,7 @@ class Beta:
     offset: tuple[int, int] = (0, 0)
     track: Callable[[Tensor], Track] | None = None
     around: bool = False
+    enlargement: tuple[float, float] = (1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,8 @@ class Inputs:
     `luminance` is alpha's share of the result's, for networks that keep it; the rest is beta's. `bands` are
     those of the result: so many, whose luminance (the mean, if they are not three) is what alpha sees, or
     None: those of all betas, of which alpha may see any combination. `sees_luma` is whether RGB betas' luma
-    is about what alpha sees, as far as is known: not in the near infrared.
+    is about what alpha sees, as far as is known: not in the near infrared. `denoised`: the betas' images are
+    not what was recorded.
     """
 
     alpha: Float[Tensor, "b c h w"]
@@ -66,6 +69,7 @@ class Inputs:
     luminance: float = 1.0
     bands: int | None = None
     sees_luma: bool = True
+    denoised: bool = False
 
     @classmethod
     def of(cls, alpha: Tensor, images: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> Inputs:
@@ -138,7 +142,7 @@ class Inputs:
         top, _, left, _ = box
         track = beta.track and track_in(beta.track, lambda x: x + x.new_tensor((left, top)), 1.0, (-x0, -y0))
         image = beta.image[..., y0:y1, x0:x1]
-        return Beta(image, beta.field.cut(box, (x0, y0)), offset, track, beta.around)
+        return replace(beta, image=image, field=beta.field.cut(box, (x0, y0)), offset=offset, track=track)
 
 
 def track_in(

@@ -1,0 +1,123 @@
+"""Colour put right by what betas recorded: iterative back-projection (Irani and Peleg 1991), one step.
+
+A beta of fewer pixels records means over several of alpha's. Of the fused image it would have recorded,
+too: what its image has more, within small neighbourhoods, is detail that the image lacks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, grid_sample
+
+from ..matching.inputs import Beta, Inputs
+from ..media.colour import luminance
+from ..networks.protocol import FusionOutput
+from ..support.settings import size, tuned
+
+
+@dataclass(frozen=True)
+class BackProjectionSettings:
+    """Of the step."""
+
+    strength: float = tuned(0.75, "Middlebury, tune half: share of what is missing that is added")
+    radius: int = size(1, "Beta's own pixels around each whose mean is left as it is: views differ in colour")
+
+
+SETTINGS = BackProjectionSettings()
+
+
+def back_projected(output: FusionOutput, inputs: Inputs) -> FusionOutput:
+    """The output with the colour that betas of fewer pixels recorded; its luminance is as it was.
+
+    Of betas with all bands of the image, or each the next ones of it.
+    """
+    bands, image = [beta.image.shape[1] for beta in inputs.betas], output.image
+    each = sum(bands) == image.shape[1]
+    change, of = torch.zeros_like(image), 0
+    for beta, count, position, confidence in zip(inputs.betas, bands, output.position, output.confidence):
+        shown = slice(of, of + count) if each else slice(None)
+        of += count if each else 0
+        if min(beta.enlargement) > 1 and (each or count == image.shape[1]):
+            lacks = missing(image[:, shown], position.to(image), confidence[:, None], beta)
+            change[:, shown] = change[:, shown] + lacks
+    change = SETTINGS.strength * change
+    return output._replace(image=image + change - luminance(change))
+
+
+def missing(
+    image: Float[Tensor, "b c h w"],
+    position: Float[Tensor, "b 2 h w"],
+    confidence: Float[Tensor, "b 1 h w"],
+    beta: Beta,
+) -> Float[Tensor, "b c h w"]:
+    """What `beta` shows more than it would record of an image, where its pixels are matched, by confidence.
+
+    `position` is in pixels of the beta's image, which is enlarged from fewer.
+    """
+    scale = position.new_tensor(beta.enlargement[::-1])
+    hw = tuple(beta.image.shape[-2:])
+    # The first pixel of the image within the first of those that it is enlarged from, all counted from there.
+    first = (position.new_tensor(beta.offset) / scale).floor()
+    begin = position.new_tensor(beta.offset) - first * scale
+    own_hw = tuple(int(n) for n in ((begin + position.new_tensor(hw[::-1])) / scale).ceil().flip(0))
+    corner = (position + begin[:, None, None]).movedim(1, -1)
+    recorded, share = _recorded(image, corner, confidence, scale, own_hw)
+    shown = _before_enlargement(beta.image, begin, scale, own_hw)
+    seen = (share / scale.prod()).clamp(max=1)
+    rest = (shown - recorded) * (share > 0)
+    side = 2 * SETTINGS.radius + 1
+    mean = avg_pool2d(torch.cat([rest * seen, seen], 1), side, 1, SETTINGS.radius)
+    rest = (rest - mean[:, :-1] / mean[:, -1:].clamp(min=1e-6)) * seen
+    return _at(rest, (corner + 0.5) / scale - 0.5) * confidence
+
+
+def _recorded(
+    image: Float[Tensor, "b c h w"],
+    corner: Float[Tensor, "b h w 2"],
+    weight: Float[Tensor, "b 1 h w"],
+    scale: Float[Tensor, "2"],
+    hw: tuple[int, int],
+) -> tuple[Float[Tensor, "b c hb wb"], Float[Tensor, "b 1 hb wb"]]:
+    """Means of the image over pixels of `scale` by `scale`, of its own ones with corners there; weights."""
+    planes = torch.cat([image * weight, weight], 1).flatten(2)
+    cell = (corner / scale).floor()
+    beyond = (corner + 1 - (cell + 1) * scale).clamp(min=0)
+    total = planes.new_zeros(len(planes), planes.shape[1], (hw[0] + 2) * (hw[1] + 2))
+    limits = cell.new_tensor([hw[1], hw[0]])
+    for right in (0, 1):
+        for below in (0, 1):
+            step = cell.new_tensor([right, below])
+            share = (beyond if right else 1 - beyond)[..., 0] * (beyond if below else 1 - beyond)[..., 1]
+            x, y = ((cell + step).clamp(min=-1).minimum(limits) + 1).long().unbind(-1)
+            index = (y * (hw[1] + 2) + x).flatten(1)[:, None].expand_as(planes)
+            total = total.scatter_add(2, index, planes * share.flatten(1)[:, None])
+    total = total.unflatten(2, (hw[0] + 2, hw[1] + 2))[..., 1:-1, 1:-1]
+    return total[:, :-1] / total[:, -1:].clamp(min=1e-6), total[:, -1:]
+
+
+def _before_enlargement(
+    image: Float[Tensor, "b c h w"], begin: Float[Tensor, "2"], scale: Float[Tensor, "2"], hw: tuple[int, int]
+) -> Float[Tensor, "b c hb wb"]:
+    """The pixels from which an image was enlarged by cubic interpolation, to second order."""
+    h, w = image.shape[-2:]
+    pixels = _grid(hw, image)
+    centres = (pixels + 0.5) * scale - 0.5 - begin
+    rough = _at(image, centres)
+    again = _at(_at(rough, (_grid((h, w), image) + begin + 0.5) / scale - 0.5), centres)
+    return 2 * rough - again
+
+
+def _grid(hw: tuple[int, int], like: Tensor) -> Float[Tensor, "1 h w 2"]:
+    y, x = (torch.arange(n, dtype=like.dtype, device=like.device) for n in hw)
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)[None]
+
+
+def _at(image: Float[Tensor, "b c h w"], x: Float[Tensor, "_ m n 2"]) -> Float[Tensor, "b c m n"]:
+    """The image at positions (x, y), by cubic interpolation, the nearest values outside it."""
+    size = x.new_tensor([image.shape[-1], image.shape[-2]])
+    grid = ((2 * x + 1) / size - 1).expand(len(image), -1, -1, -1)
+    return grid_sample(image, grid, mode="bicubic", padding_mode="border", align_corners=False)
