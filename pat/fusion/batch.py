@@ -339,14 +339,16 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
             f"{label}{path}: is a video, which only `pat fuse` without a rig reads: save its frames"
         )
     if path.is_dir():
-        files = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
+        files = _images_in(path)
     elif any(c in path.name for c in "*?["):
-        files = list(path.parent.glob(path.name))
+        files = [p for p in path.parent.glob(path.name) if p.is_file()]
     else:
         files = [path] if path.exists() else []
     files = sorted((p for p in files if p == path or not p.name.startswith(".")), key=_natural)
     if not files:
-        raise FileNotFoundError(f"{label}{path}: no image there: check the path")
+        below = [str(p) for p in sorted(path.iterdir()) if _images_in(p)] if path.is_dir() else []
+        advice = f"give a folder of images, such as {below[0]}" if below else "check the path"
+        raise FileNotFoundError(f"{label}{path}: no image there: {advice}")
     frames: dict[str, Path] = {}
     for file in files:
         if (other := frames.setdefault(file.stem, file)) != file:
@@ -355,6 +357,11 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
                 f"{label}{other} and {file.name} are one frame: give a pattern, such as '{pattern}'"
             )
     return files
+
+
+def _images_in(folder: Path) -> list[Path]:
+    files = folder.iterdir() if folder.is_dir() else ()
+    return [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

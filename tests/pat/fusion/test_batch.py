@@ -91,6 +91,16 @@ def test_files_of_the_system_are_no_frames_and_two_of_one_are_refused(tmp_path):
     assert len(find_images(tmp_path / "*.png")) == 2
 
 
+def test_folders_are_no_frames_and_those_that_hold_images_are_named(tmp_path):
+    for name in ("day/thumbnails/1.png", "day/2.png/x", "day/3.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    for given in (tmp_path / "day", tmp_path / "day" / "*"):
+        assert [path.name for path in find_images(given)] == ["3.png"]
+    with pytest.raises(FileNotFoundError, match="no image there: give a folder of images, such as .*day"):
+        find_images(tmp_path)
+
+
 def test_a_stopped_sequence_is_resumed_to_the_same_bits(material, tmp_path, monkeypatch):
     whole = batch(material, tmp_path / "whole", sequence=True)
     assert len(whole.run(video=25.0).made) == 7
