@@ -47,7 +47,7 @@ from .checks import confidence_checked
 from .frames import ImageFiles
 from .fuse import FuseSettings, fuse
 from .results import Frame, ImageFormat, band_names, save_frame, view_of
-from .sequence import KeyColour, SequenceFusion
+from .sequence import KeyColour, SequenceFusion, readable
 from .timeline import KeyFrame
 from .views import ViewFiles
 
@@ -243,10 +243,22 @@ class Batch:
             with confidence_checked(strict=self.strict):
                 frame = self._frame(i)
             view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
-            bands = band_names(frame, (name for name in self.rig.betas(self.alpha) if name in self.files))
+            bands = band_names(frame, self._betas) or self._propagated_bands(frame)
             save_frame(
                 frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i], bands=bands
             )
+
+    @property
+    def _betas(self) -> list[str]:
+        return [name for name in self.rig.betas(self.alpha) if name in self.files]
+
+    def _propagated_bands(self, frame: Frame) -> list[str]:
+        """As `band_names`, of a frame of several bands that does not say whose confidence is whose."""
+        if not self.sequence or not 1 < len(frame.image) == len(self._betas):
+            return []
+        frames = [self.fusion.frames[name] for name in self._betas]
+        images = [next(readable(of_one.__getitem__, range(len(of_one))), frame.image) for of_one in frames]
+        return self._betas if all(len(image) == 1 for image in images) else []
 
     def _frame(self, i: int) -> Frame:
         if not self.sequence:
