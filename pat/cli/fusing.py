@@ -120,7 +120,8 @@ class Fuse(Known):
             exr_writer(self.out)
         self.image, with_rig = named_images(self.given, self.image, "fuse")
         self._settings()
-        options.device_of(self.device)
+        if options.device_of(self.device) != "cpu" and self.precision == "int8":
+            raise ValueError("--precision int8 is for the CPU: leave it out, or --device")
         if self.classical and not self.report:
             raise ValueError("--classical needs the page: leave out --no-report")
         if self.workers < 1 or (self.threads is not None and self.threads < 1):
