@@ -190,8 +190,12 @@ def load_config(name: str | Path) -> TrainConfig:
 
 def parse_config(text: str, name: str = "config") -> TrainConfig:
     """A recipe from YAML text. Raises ValueError naming the entry."""
-    values = parse_yaml(text, name) or {}
+    values = parse_yaml(text, name)
     try:
+        if not values:
+            raise ValueError(
+                f"the recipe is empty: write entries (name: value), or take {', '.join(recipes())}"
+            )
         if not isinstance(values, Mapping):
             raise ValueError(f"wanted entries (name: value), got {values!r}")
         config = from_document(TrainConfig, {k: v for k, v in values.items() if k != "network"})
