@@ -97,7 +97,7 @@ def test_folders_are_no_frames_and_those_that_hold_images_are_named(tmp_path):
         (tmp_path / name).touch()
     for given in (tmp_path / "day", tmp_path / "day" / "*"):
         assert [path.name for path in find_images(given)] == ["3.png"]
-    with pytest.raises(FileNotFoundError, match="no image there: give a folder of images, such as .*day"):
+    with pytest.raises(FileNotFoundError, match=r"no image there: give a folder of images, such as .*day"):
         find_images(tmp_path)
 
 
