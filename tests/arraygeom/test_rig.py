@@ -1,3 +1,4 @@
+import math
 import re
 
 import pytest
@@ -11,10 +12,12 @@ from arraygeom import (
     View,
     epipolar_distance,
     intrinsics,
+    pixel_grid,
     resize_matrix,
     rotation_from_vector,
 )
 from arraygeom.pose import rotation_error
+from arraygeom.summary import summarise_pairs
 from arraygeom.text import UNSCALED
 from tests.arraygeom.rigs import known_by_f, random_rig, scene_points, two_cameras
 
@@ -186,3 +189,31 @@ def test_cameras_at_one_position_are_one_sentence():
     bands = dict.fromkeys(("blue", "green", "red"), rig["alpha"])
     odd = [s for s in Rig({**bands, "beta": rig["beta"]}).check() if "same position" in s]
     assert odd == ["'blue', 'green' and 'red' are at the same position: between them depth has no effect"]
+
+
+@pytest.mark.parametrize(
+    ("centre", "turn", "steps"),
+    [
+        ((0.5, 0, 0), 0.0, (2 * 2 / 50, 10 * 10 / 50)),  # beside: depth^2 / (focal length x baseline)
+        ((0, 0, 12.0), math.pi, (None, None)),  # facing
+        ((0, 0, 1.0), 0.0, (None, None)),  # ahead
+        ((6.0, 0, 6.0), -math.pi / 2, (None, None)),  # from the side
+    ],
+)
+def test_a_pixel_of_depth_is_what_moves_the_point_by_a_pixel(centre, turn, steps):
+    K = intrinsics(100.0, (60, 100))
+    alpha = Camera(K=K, cam_from_world=Pose.identity(), hw=(60, 100))
+    R = rotation_from_vector(torch.tensor([0, turn, 0], dtype=torch.float64))
+    pose = Pose.from_centre(R, torch.tensor(centre, dtype=torch.float64))
+    beta = alpha.replace(cam_from_world=pose)
+    (summary,) = summarise_pairs(Rig({"alpha": alpha, "beta": beta}, depth=(2.0, 10.0)), "alpha")
+    x = pixel_grid((60, 100), dtype=torch.float64).reshape(-1, 2)
+    for depth, step, expected in zip((2.0, 10.0), summary.depth_step, steps):
+        here = beta.project(alpha.unproject(x, torch.full_like(x[:, 0], depth)))
+        there = beta.project(alpha.unproject(x, torch.full_like(x[:, 0], depth + step)))
+        seen = here.valid & there.valid & beta.contains(here.x)
+        if not seen.any():
+            assert math.isnan(step)
+            continue
+        assert float((there.x - here.x).norm(dim=-1)[seen].median()) == pytest.approx(1, rel=0.2)
+        assert expected is None or step == pytest.approx(expected, rel=1e-4)
