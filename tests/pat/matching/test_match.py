@@ -59,7 +59,7 @@ def test_a_part_whose_segments_are_off_beta_has_some_of_beta(network, inputs, of
 
 
 def test_explicit_positions_of_a_part_are_never_all_held(flat):
-    """Each pixel has its own positions, of a window: a part of alpha is given those of beta that it may need."""
+    """A part of alpha comes with what its positions, here a window a pixel, touch of beta."""
     rig, images = flat
     window, asked = Local(11), []
 
