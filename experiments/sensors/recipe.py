@@ -3,7 +3,7 @@
     mono:
       - decode-srgb
       - spectral: luminance
-      - defocus: {focus: 3, f_number: 2, lens: 25}
+      - gaussian-blur: 0.8
       - resample: 0.5
       - noise: {full_well: 8000, read: 3}
       - clip
@@ -24,14 +24,11 @@ from typing import Any
 from pat.sensors import BoxBlur, Clip, GaussianBlur, Jitter, Noise, Quantise, Resample, Step
 from pat.support.schema import from_document, near
 
-from .grids import Crop, Demosaic, Mosaic
-from .optics import Defocus, DiscBlur, MotionBlur, Vignetting
-from .spectral import DecodeSRGB, EncodeSRGB, Exposure, Gamma, Spectral
+from .steps import DecodeSRGB, EncodeSRGB, Exposure, Mosaic, MotionBlur, Spectral
 
 _CLASSES: tuple[type[Step], ...] = (
-    *(DecodeSRGB, EncodeSRGB, Gamma, Spectral, Exposure, Vignetting),
-    *(BoxBlur, GaussianBlur, DiscBlur, Defocus, MotionBlur),
-    *(Resample, Crop, Mosaic, Demosaic, Noise, Clip, Quantise, Jitter),
+    *(DecodeSRGB, EncodeSRGB, Spectral, Exposure, BoxBlur, GaussianBlur, MotionBlur),
+    *(Resample, Mosaic, Noise, Clip, Quantise, Jitter),
 )
 STEPS: dict[str, type[Step]] = {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", c.__name__).lower(): c for c in _CLASSES}
 """Every step by its name in files."""

@@ -1,4 +1,4 @@
-"""Spectral responses, the encoding of light, and exposure."""
+"""Steps of a recording: motion, exposure, spectral responses, colour filters, the encoding of light."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
+from arraygeom.pixels import pixel_grid
+from arraygeom.sampling import sample
 from arraygeom.sensor import Band, Curve
 from pat.media.colour import REC601, linear_from_srgb, srgb_from_linear
 from pat.sensors import Step
@@ -18,6 +20,8 @@ CHANNELS = ((600.0, 35.0), (540.0, 35.0), (460.0, 35.0), (850.0, 60.0))
 """Assumed responses of the channels R, G, B and NIR of an ideal image: Gaussians, centre and sigma in nm."""
 
 NAMES = ("rgb", "luminance", "nir")
+_KORNIA = {"RGGB": "BG", "GRBG": "GB", "BGGR": "RG", "GBRG": "GR"}
+"""kornia's names of the patterns. It is imported where it is used: that takes a quarter of a second."""
 _VISIBLE, _NEAR_INFRARED = (400.0, 700.0), (400.0, 1000.0)
 
 
@@ -39,16 +43,6 @@ class EncodeSRGB(Step):
 
 
 @dataclass(frozen=True)
-class Gamma(Step):
-    """Values to the power 1 / `gamma`: a plain gamma curve. Negative values become 0."""
-
-    gamma: float | Tensor = 2.2
-
-    def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        return image.clamp(min=1e-8) ** (1 / self.gamma)
-
-
-@dataclass(frozen=True)
 class Exposure(Step):
     """Linear light times a gain: exposure time, aperture and amplification together."""
 
@@ -56,6 +50,29 @@ class Exposure(Step):
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         return image * self.gain
+
+
+@dataclass(frozen=True)
+class MotionBlur(Step):
+    """The mean over the time the shutter is open, `shutter` seconds, about the moment of the sharp image.
+
+    Everything moves with `velocity` (x, y) in pixels a second. The border is replicated.
+    """
+
+    shutter: float
+    velocity: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        if self.shutter < 0:
+            raise ValueError(f"motion blur: shutter is a time in seconds, got {self.shutter:g}")
+
+    def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
+        path = self.shutter * image.new_tensor(self.velocity)
+        steps = max(math.ceil(2 * float(path.norm())), 1)
+        times = (torch.arange(steps, dtype=path.dtype) + 0.5) / steps - 0.5
+        grid = pixel_grid((image.shape[-2], image.shape[-1]), dtype=path.dtype, device=path.device)
+        frames = [sample(image, (grid - t * path)[None], extended=True).values for t in times.tolist()]
+        return torch.stack(frames).mean(0)
 
 
 @dataclass(frozen=True)
@@ -102,6 +119,26 @@ class Spectral(Step):
             return band_weights(self.response, channels)
         assert isinstance(self.response, Curve)
         return curve_weights(self.response, channels)
+
+
+@dataclass(frozen=True)
+class Mosaic(Step):
+    """A Bayer filter: each pixel keeps one of R, G and B. `pattern` is read from the top left, row by row."""
+
+    pattern: Literal["RGGB", "GRBG", "BGGR", "GBRG"] = "RGGB"
+
+    def __post_init__(self) -> None:
+        if self.pattern not in _KORNIA:
+            raise ValueError(f"a colour filter pattern is one of {', '.join(_KORNIA)}, got '{self.pattern}'")
+
+    def apply(self, image: Float[Tensor, "b 3 h w"], generator: Generator) -> Float[Tensor, "b 1 h w"]:
+        """The raw images. Raises ValueError for odd sizes."""
+        h, w = image.shape[-2:]
+        if h % 2 or w % 2:
+            raise ValueError(f"a colour filter needs even sizes, got {w}x{h}: crop first")
+        from kornia.color import CFA, rgb_to_raw
+
+        return rgb_to_raw(image, CFA[_KORNIA[self.pattern]])
 
 
 def band_weights(band: Band, channels: int = 3) -> tuple[float, ...]:
