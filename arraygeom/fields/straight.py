@@ -65,8 +65,8 @@ class EpipolarLine:
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Segments across beta's image. Raises ValueError for lenses."""
         if pair.link is None and pair.calibrated:
-            zero, infinite = (torch.tensor(d, dtype=torch.float64) for d in (NEAREST, torch.inf))
-            return _between(pair, zero, infinite, x)
+            nearest = NEAREST * pair.beta_from_alpha.t.detach().norm(dim=-1)
+            return _between(pair, nearest, torch.full_like(nearest, torch.inf), x)
         require_straight(pair)
         F, (h, w) = pair.fundamental, pair.beta.hw
 
@@ -79,8 +79,8 @@ class EpipolarLine:
         return segments_by_rows(across, pair, floating(x))
 
 
-NEAREST = 1e-4
-"""Where a line that has no near bound begins, metres from alpha."""
+NEAREST = 1e-3
+"""Where a line that has no near bound begins: its depth as a share of the baseline."""
 
 
 @dataclass(frozen=True)

@@ -1,3 +1,5 @@
+import dataclasses
+import math
 import re
 
 import pytest
@@ -5,15 +7,21 @@ import torch
 
 from arraygeom import (
     Camera,
+    Curved,
     Distortion,
+    Epipolar,
+    EpipolarLine,
     Pose,
     Rig,
     View,
+    depth_of,
     epipolar_distance,
     intrinsics,
     resize_matrix,
     rotation_from_vector,
 )
+from arraygeom.lenses import RollingShutter
+from arraygeom.pixels import pixel_grid
 from arraygeom.pose import rotation_error
 from arraygeom.text import UNSCALED
 from tests.arraygeom.rigs import known_by_f, random_rig, scene_points, two_cameras
@@ -186,3 +194,32 @@ def test_cameras_at_one_position_are_one_sentence():
     bands = dict.fromkeys(("blue", "green", "red"), rig["alpha"])
     odd = [s for s in Rig({**bands, "beta": rig["beta"]}).check() if "same position" in s]
     assert odd == ["'blue', 'green' and 'red' are at the same position: between them depth has no effect"]
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-6])
+@pytest.mark.parametrize(
+    ("field", "moves"), [(Epipolar(), False), (EpipolarLine(), False), (Curved(9), False), (Curved(9), True)]
+)
+def test_fields_in_another_unit_are_the_same(field, moves, factor):
+    """A line began 0.1 mm from alpha, and infinity was at 100 km, whatever the rig's unit."""
+    rig = random_rig(0).replace(depth=(1.0, math.inf))
+    if moves:
+        velocity, rotation, readout = (
+            torch.tensor(v).double() for v in ([1.0, 0.2, 0.1], [0.1, 0.2, 0.3], 0.02)
+        )
+        shutter = RollingShutter(velocity=velocity, rotation=rotation, readout=readout)
+        rig = rig.with_camera("beta", dataclasses.replace(rig["beta"], distortion=shutter))
+    x = pixel_grid(rig["alpha"].hw).double()
+    found, wanted = (field(r.pair("alpha", "beta"), x) for r in (rig.scaled(factor), rig))
+    for part, value in vars(wanted).items():
+        torch.testing.assert_close(vars(found)[part], value, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-6])
+def test_depth_in_another_unit_is_the_same(factor):
+    """A baseline of less than a few nanometres gave no depth, whatever the unit."""
+    rig = random_rig(0)
+    seen = [rig[name].project(scene_points(rig)).x for name in ("alpha", "beta")]
+    found, wanted = (depth_of(r.pair("alpha", "beta"), *seen) for r in (rig.scaled(factor), rig))
+    assert torch.equal(found.valid, wanted.valid)
+    torch.testing.assert_close(found.depth, factor * wanted.depth)
