@@ -268,8 +268,8 @@ class RayCurve(NamedTuple):
 
 
 REMOTE = 1e-5
-"""The inverse depth of infinity to a beta whose rays do not meet, where a point is not only a direction, times
-baseline plus near bound."""
+"""Inverse depth of infinity, in units of baseline plus near bound, to a beta whose rays do not meet: there a
+point is not only a direction."""
 
 
 def _lines(alpha: Camera, x: Tensor, bounds: str) -> tuple[Tensor | None, Tensor, Tensor]:
