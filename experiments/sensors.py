@@ -1,20 +1,41 @@
-"""Steps of a recording: motion, exposure, spectral responses, colour filters, the encoding of light."""
+"""What cameras record of ideal images: responses, filters, motion; chains of steps, from files too.
+
+A chain is a list of steps, applied in order to images (B, C, H, W) with values 0..1. Light adds up in linear
+values only, so a chain for ordinary images begins with `DecodeSRGB()` and ends with `EncodeSRGB()`:
+
+    mono:
+      - decode-srgb
+      - spectral: luminance
+      - gaussian-blur: 0.8
+      - resample: 0.5
+      - noise: {full_well: 8000, read: 3}
+      - clip
+      - encode-srgb
+      - quantise: 8
+
+A step is its name, or its name with its options; a single value is its first option. Steps are named as their
+classes are, in small letters with hyphens.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
 from arraygeom.pixels import pixel_grid
+from arraygeom.rig import Rig
 from arraygeom.sampling import sample
 from arraygeom.sensor import Band, Curve
 from pat.media.colour import REC601, linear_from_srgb, srgb_from_linear
-from pat.sensors import Step
+from pat.sensors import BoxBlur, Clip, GaussianBlur, Jitter, Noise, Quantise, Resample, Step, generator_for
+from pat.support.schema import from_document, near
 
 CHANNELS = ((600.0, 35.0), (540.0, 35.0), (460.0, 35.0), (850.0, 60.0))
 """Assumed responses of the channels R, G, B and NIR of an ideal image: Gaussians, centre and sigma in nm."""
@@ -177,3 +198,83 @@ def curve_weights(curve: Curve, channels: int = 3) -> tuple[float, ...]:
 
 def _shares(overlaps: list[float]) -> tuple[float, ...]:
     return tuple(o / sum(overlaps) for o in overlaps)
+
+
+class RecordedArray(NamedTuple):
+    """Images of every camera after its chain, and the rig of those images."""
+
+    images: dict[str, Float[Tensor, "b _ _ _"]]
+    rig: Rig
+
+
+def record_array(
+    images: Mapping[str, Float[Tensor, "b _ _ _"]],
+    rig: Rig,
+    chains: Mapping[str, Sequence[Step]],
+    *,
+    seed: int,
+) -> RecordedArray:
+    """Each camera's chain on its images; cameras without one record the ideal image.
+
+    Each camera draws from its own generator, seeded by `seed` and its name, independently of the other
+    cameras. The rig's cameras are transformed as the steps transform the pixels. Raises ValueError for a
+    camera that the rig does not have.
+    """
+    for name in chains:
+        rig.require(name)
+    recorded = {}
+    for name, image in images.items():
+        generator = generator_for(seed, name, device=image.device)
+        A = torch.eye(3, dtype=torch.float64)
+        for step in chains.get(name, ()):
+            A = step.pixel_matrix((image.shape[-2], image.shape[-1])) @ A
+            image = step.apply(image, generator)
+        recorded[name] = image
+        rig = rig.transformed(name, A, (image.shape[-2], image.shape[-1]))
+    return RecordedArray(recorded, rig)
+
+
+_CLASSES: tuple[type[Step], ...] = (
+    *(DecodeSRGB, EncodeSRGB, Spectral, Exposure, BoxBlur, GaussianBlur, MotionBlur),
+    *(Resample, Mosaic, Noise, Clip, Quantise, Jitter),
+)
+STEPS: dict[str, type[Step]] = {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", c.__name__).lower(): c for c in _CLASSES}
+"""Every step by its name in files."""
+
+
+def read_chain(value: Any, where: str = "chain") -> tuple[Step, ...]:
+    """The steps of a list as YAML has it. Raises ValueError naming the entry (`where`), the nearest name.
+
+    >>> read_chain(["decode-srgb", {"noise": {"full_well": 8000, "read": 3}}, {"quantise": 12}])
+    (DecodeSRGB(), Noise(full_well=8000.0, read=3.0, counts='gaussian'), Quantise(bits=12))
+    """
+    if not isinstance(value, list):
+        raise ValueError(
+            f"{where}: wanted a list of steps, such as [decode-srgb, {{noise: {{full_well: 8000}}}}]"
+        )
+    return tuple(_step(entry, f"{where}[{i}]") for i, entry in enumerate(value))
+
+
+def read_chains(value: Any, where: str = "sensors") -> dict[str, tuple[Step, ...]]:
+    """One chain for each camera, from a mapping of names to lists."""
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{where}: wanted a mapping of cameras to lists of steps")
+    return {str(name): read_chain(steps, f"{where}.{name}") for name, steps in value.items()}
+
+
+def _step(entry: Any, where: str) -> Step:
+    name, options = (
+        next(iter(entry.items())) if isinstance(entry, Mapping) and len(entry) == 1 else (entry, {})
+    )
+    if not isinstance(name, str):
+        raise ValueError(f"{where}: is {entry!r}; wanted a step's name, or one name with its options")
+    if name not in STEPS:
+        raise ValueError(f"{where}: no step is called '{name}'{near(name, STEPS)}")
+    kind = STEPS[name]
+    is_band = kind is Spectral and isinstance(options, Mapping) and options and "response" not in options
+    if isinstance(options, Mapping) and not is_band:
+        return from_document(kind, dict(options), f"{where}.{name}")
+    first = next((f.name for f in fields(kind)), None)  # type: ignore[arg-type]
+    if first is None:
+        raise ValueError(f"{where}.{name}: takes no options, got {options!r}")
+    return from_document(kind, {first: options}, f"{where}.{name}")
