@@ -319,7 +319,8 @@ def _regressed(chroma: Image, luma: Image, residual: Image) -> Image:
 
 def _blended(values: Image, weight: Image, guide: NDArray[np.uint8]) -> Image:
     """Values (h, w, c), replaced where their weight is low by those of what is connected in the guide."""
-    diffused = np.stack(filled(values.transpose(2, 0, 1), weight + 1e-4, guide, COLOUR_FILL), -1)
+    planes = filled(values.transpose(2, 0, 1), weight + 1e-4, guide, COLOUR_FILL)
+    diffused = np.ascontiguousarray(planes.transpose(1, 2, 0))
     return (weight[..., None] * values + (1 - weight[..., None]) * diffused).astype(np.float32)
 
 
