@@ -39,7 +39,7 @@ from pat.fusion.views import ViewFiles
 from pat.media.colour import linear_from_srgb, luminance, to_luma_chroma
 from pat.media.figures import colour_depth, save_panels
 from pat.media.images import read_image, write_image
-from pat.media.raw import as_bright
+from pat.media.raw import match_luminance
 from pat.media.video import write_video
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
@@ -245,7 +245,7 @@ def _still(job: SystemRun) -> tuple[list[str], Panels]:
         save_frame(frame, out, bits=16, view=view_of(read, alpha, bits=16))
     baseline = classical_baseline(read, images, alpha)
     if len(images) == 2:
-        baseline = as_bright(baseline, images[alpha], read[alpha].sensor)
+        baseline = match_luminance(baseline, images[alpha], read[alpha].sensor)
     rows = {"alpha alone": images[alpha].expand(3, -1, -1), "classical": baseline, "fusion": frame.image}
     extra: list[str] = []
     if recording.light:

@@ -2,7 +2,7 @@
 
 `matches`, `patch_matching` (matched points) -> `residuals` -> `hypotheses`, `evidence`, `doctor` (the usual
 mistakes) and `parameters`, `least_squares`, `depth_change`, `lenses`, `photometric`, `refinement` (a better
-rig) -> `from_images` (a rig from images alone) and `misfit` (whether a rig fits images at all).
+rig) -> `from_images` (a rig from images alone) and `rig_check` (whether a rig fits images at all).
 """
 
 from .. import _lazy
@@ -14,7 +14,7 @@ __getattr__ = _lazy(
     {
         "diagnose": "doctor",
         "match_cameras": "matches",
-        "misfit_warning": "misfit",
+        "misfit_warning": "rig_check",
         "refine": "refinement",
         "rig_from_images": "from_images",
     },

@@ -14,7 +14,7 @@ from arraygeom.atomic import write_text
 from experiments.names import refuse_unknown
 from experiments.patches import ScenePatches, draw_patches
 from experiments.sensors import read_chains
-from pat.cli import authors
+from pat.cli import research
 from pat.cli.options import MaybePath, Out, Weights, optional, progress, say, writable
 from pat.data.pairs import StereoPair, middlebury_pairs
 from pat.evaluation import protocols, stereo
@@ -53,7 +53,7 @@ def with_truth(items: Sequence[T], half: str) -> Sequence[T]:
 
 
 @dataclass
-class Pairs(authors.Evaluate):
+class Pairs(research.Evaluate):
     """Pairs of one half."""
 
     half: Half = "all"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from . import options
-from .fusing import fuse_with_progress
+from .fuse import fuse_with_progress
 from .options import Out, Weights, say
 
 

@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, NoReturn, Union
 
 import tyro
 
-from . import aligning, authors, calibration, demo, fusing, rigs
+from . import align, calibration, demo, fuse, research, rigs
 from .options import WARNED, refuse_missing, respelled, say, warn
 
 
@@ -24,8 +24,8 @@ class Pat:
     """Fuse the images of an array of unlike cameras into one."""
 
     users: ClassVar[Mapping[str, Any]] = {
-        "fuse": fusing.Fuse,
-        "align": aligning.Align,
+        "fuse": fuse.Fuse,
+        "align": align.Align,
         "show": rigs.Show,
         "explore": rigs.Explore,
         "calibrate": calibration.Calibrate,
@@ -34,16 +34,16 @@ class Pat:
         "demo": demo.Demo,
         "warm-up": demo.WarmUp,
     }
-    authors: ClassVar[Mapping[str, Any]] = {
-        "evaluate": authors.Evaluate,
-        "ablate": authors.Ablate,
-        "data": authors.Data,
-        "render": authors.Render,
-        "train": authors.Train,
-        "settings": authors.Settings,
-        "weights": authors.WeightsCommands,
+    research: ClassVar[Mapping[str, Any]] = {
+        "evaluate": research.Evaluate,
+        "ablate": research.Ablate,
+        "data": research.Data,
+        "render": research.Render,
+        "train": research.Train,
+        "settings": research.Settings,
+        "weights": research.WeightsCommands,
     }
-    commands: ClassVar[Mapping[str, Any]] = {**users, **authors}
+    commands: ClassVar[Mapping[str, Any]] = {**users, **research}
 
 
 def command_paths(group: Any = Pat, before: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
@@ -128,7 +128,7 @@ def _help(path: str, group: Any) -> str:
     """The help of a group of commands: a line for each, from its docstring."""
     parts = {"commands": group.commands}
     if group is Pat:
-        parts = {"commands": Pat.users, "for the development of networks": Pat.authors}
+        parts = {"commands": Pat.users, "for the development of networks": Pat.research}
     lines = [f"usage: {path} COMMAND ...", "", _first_line(group)]
     for title, commands in parts.items():
         lines += ["", f"{title}:"]

@@ -78,7 +78,7 @@ class Show:
 
 def warn_of_misfit(rig: Rig, images: Mapping[str, Tensor]) -> None:
     """Say so on standard error if a rig fits its images badly."""
-    from calib.images.misfit import misfit_warning
+    from calib.images.rig_check import misfit_warning
 
     if (warning := misfit_warning(rig, images)) is not None:
         say(f"pat: {warning}", style="yellow")

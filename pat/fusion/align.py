@@ -27,7 +27,7 @@ from arraygeom.undistortion import pixels_between, recorded_pixels, resampled, w
 
 from ..matching.match import Matcher, match
 from ..matching.matches import BetaMatches
-from ..matching.radiometry import Given
+from ..matching.radiometry import ResponseSpec
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
 from ..networks.weights import load_weights, weights_for
@@ -155,7 +155,7 @@ def align(
     fill: Fill = "none",
     max_memory: float | str | None = None,
     match_levels: bool = False,
-    response: Given = "fit",
+    response: ResponseSpec = "fit",
     correct: bool = True,
     noise: Noise | None = None,
     progress: Progress | None = None,

@@ -32,7 +32,7 @@ from ..matching.matches import BetaMatches
 from ..matching.normalisation import SETTINGS as NORMALISATION
 from ..matching.normalisation import Normalisation, combined_bands, moments
 from ..matching.positions import enlarged, normals, reduced
-from ..matching.radiometry import Given, Response, fit, given_response
+from ..matching.radiometry import Response, ResponseSpec, fit, given_response
 from ..matching.semi_global import CONSISTENT
 from ..networks.protocol import FusionNetwork
 from ..support.settings import size, tuned
@@ -100,7 +100,7 @@ class Corrections:
 
 @torch.no_grad()
 def find_corrections(
-    network: FusionNetwork, frame: FrameInputs, response: Given, *, align: bool
+    network: FusionNetwork, frame: FrameInputs, response: ResponseSpec, *, align: bool
 ) -> Corrections:
     """Alpha's response if it is to be fitted, and the betas' misalignments if these are asked for.
 
@@ -130,7 +130,7 @@ def find_corrections(
     return corrections
 
 
-def expected_work(frame: FrameInputs, response: Given, *, align: bool) -> float:
+def expected_work(frame: FrameInputs, response: ResponseSpec, *, align: bool) -> float:
     """About how much work `find_corrections` is, as a share of fusing the frame: mostly two passes."""
     return 2 * min(SETTINGS.pixels / math.prod(frame.hw), 1.0) if align or response == "fit" else 0.0
 

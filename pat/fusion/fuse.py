@@ -18,7 +18,7 @@ from arraygeom.threads import torch_in_one_thread
 from arraygeom.warned import warn
 
 from ..matching.match import Matcher, match
-from ..matching.radiometry import Given, given_response
+from ..matching.radiometry import ResponseSpec, given_response
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
 from ..support.blocks import without_autocast
@@ -74,7 +74,7 @@ class FuseSettings:
     field: ReceptiveField | Mapping[str, ReceptiveField | None] | None = None
     max_memory: float | str | None = None
     match_levels: bool = False
-    response: Given = "fit"
+    response: ResponseSpec = "fit"
     align: bool | None = None
     noise: Noise | None = None
     keep_alpha: bool = False
@@ -122,7 +122,7 @@ def fuse(
     to pinhole views (`pat.fusion.steps.undistort`), rotated betas made upright, and betas resized to alpha's
     angular resolution; the result is at alpha's own pixels all the same. Where alpha is known to measure the
     luminance of linear light and one beta the colours, the result is as bright in that sense
-    (`pat.media.raw.as_bright`).
+    (`pat.media.raw.match_luminance`).
 
     Args:
         network: for instance `load_weights("mono-colour")`; or, without rig, the images.

@@ -12,9 +12,9 @@ from arraygeom import Rig
 from arraygeom.warned import warn
 from calib.images.depth_change import share_outside
 from calib.images.matches import Pairs, match_cameras
-from calib.images.misfit import OUTSIDE, find_misfit
 from calib.images.refinement import refine_matches
 from calib.images.residuals import own_distance, related
+from calib.images.rig_check import OUTSIDE, find_misfit
 from calib.images.self_calibration import depth_bounds
 
 from ..support.settings import size

@@ -21,11 +21,11 @@ from arraygeom.threads import convolutions_in_parallel
 from arraygeom.warned import warn
 
 from ..matching.radiometry import Response
-from ..networks.collaborative import without_noise
+from ..networks.bm3d import without_noise
 from ..networks.weights import load_denoiser
 from ..sensors import NoiseLevel
 from ..support.settings import physics, size, tuned
-from .averaging import averaged_with_alike
+from .non_local_means import averaged_with_alike
 from .results import Frame
 from .steps import FusionStep
 from .views import Views

@@ -41,7 +41,7 @@ from arraygeom.undistortion import pixels_between
 from ..matching.inputs import box_around, ends_of
 from ..matching.normalisation import Moments, moments, normalised
 from ..media.images import Images
-from ..media.raw import LIGHT, as_bright
+from ..media.raw import LIGHT, match_luminance
 from ..networks.protocol import FusionNetwork, JoinsBands
 from .results import Frame
 from .views import Fields, Views, innermost
@@ -49,14 +49,14 @@ from .views import Fields, Views, innermost
 Undo = Callable[[Frame], Frame]
 
 
-class Done(NamedTuple):
+class StepResult(NamedTuple):
     """Views after a step, and how to take the fused frame back to those before it."""
 
     views: Views
     undo: Undo = lambda frame: frame
 
 
-FusionStep = Callable[[Views], Done]
+FusionStep = Callable[[Views], StepResult]
 
 
 def steps_for(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:
@@ -66,7 +66,7 @@ def steps_for(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:
     return [undistort, linear_luminance, upright, *resize, *radiometry, partial(join, network.joins_bands)]
 
 
-def undistort(views: Views) -> Done:
+def undistort(views: Views) -> StepResult:
     """Pinhole views in place of views with lenses (up to 62 degrees off axis), unless a field goes through
     lenses, or a camera has no pinhole view.
 
@@ -74,13 +74,13 @@ def undistort(views: Views) -> Done:
     alpha's own image, and what the pinhole view leaves out has confidence 0.
     """
     if not takes_pinhole_views(views):
-        return Done(views)
+        return StepResult(views)
     rig, images = without_lenses(views.rig, views.images)
     lens, pinhole = views.rig[views.alpha], rig[views.alpha]
     fields = {name: _for_pinhole(field, lens, pinhole) for name, field in views.fields.items()}
     straight, own = images[views.alpha], views.own
     undistorted = Views(rig, images, views.alpha, fields)
-    return Done(undistorted, lambda frame: _distorted(frame, straight, own, pinhole, lens))
+    return StepResult(undistorted, lambda frame: _distorted(frame, straight, own, pinhole, lens))
 
 
 def takes_pinhole_views(views: Views) -> bool:
@@ -90,25 +90,25 @@ def takes_pinhole_views(views: Views) -> bool:
     return any(map(has_lens, cameras)) and all(c.has_pinhole_view for c in cameras) and not through_lenses
 
 
-def linear_luminance(views: Views) -> Done:
+def linear_luminance(views: Views) -> StepResult:
     """The views as they are; undone, a frame in RGB betas' colours is as bright as alpha's camera saw it, if
-    that measured the luminance of light (`as_bright`)."""
+    that measured the luminance of light (`match_luminance`)."""
     own, sensor = views.own, views.rig[views.alpha].sensor
     if sensor.response != LIGHT or 3 not in [len(views.images[name]) for name in views.betas]:
-        return Done(views)
-    return Done(views, lambda frame: frame._replace(image=as_bright(frame.image, own, sensor)))
+        return StepResult(views)
+    return StepResult(views, lambda frame: frame._replace(image=match_luminance(frame.image, own, sensor)))
 
 
-def upright(views: Views) -> Done:
+def upright(views: Views) -> StepResult:
     """Betas rotated by about a quarter or half a turn against alpha are rotated back."""
     for name in views.betas:
         if k := quarter_turns(views.pair(name)):
             rotated = views.images[name].rot90(k, (-2, -1))
             views = views.replace({name: rotated}, rig=views.rig.rot90(name, k))
-    return Done(views)
+    return StepResult(views)
 
 
-def equal_resolution(network: FusionNetwork, views: Views) -> Done:
+def equal_resolution(network: FusionNetwork, views: Views) -> StepResult:
     """Betas at about alpha's angular resolution where views meet, less large parts alpha cannot see."""
     for name in views.betas:
         views = _cropped(network, views, name)
@@ -116,7 +116,7 @@ def equal_resolution(network: FusionNetwork, views: Views) -> Done:
         if image is not views.images[name]:
             rig = views.rig.resize(name, (image.shape[-2], image.shape[-1]))
             views = views.replace({name: image}, rig=rig)
-    return Done(views)
+    return StepResult(views)
 
 
 def _cropped(network: FusionNetwork, views: Views, name: str) -> Views:
@@ -137,7 +137,7 @@ def _cropped(network: FusionNetwork, views: Views, name: str) -> Views:
     return views.replace({name: views.images[name][..., top:bottom, left:right]}, rig=rig)
 
 
-def normalise_betas(views: Views, *, undone: bool = False) -> Done:
+def normalise_betas(views: Views, *, undone: bool = False) -> StepResult:
     """Each beta with alpha's mean and standard deviation: for cameras of other exposures or filters.
 
     `undone`: bands have their own scale in the result, as measurements need it; else that is as bright as
@@ -145,10 +145,10 @@ def normalise_betas(views: Views, *, undone: bool = False) -> Done:
     """
     in_one_exposure = views.replace({n: normalised(views.images[n], views.own) for n in views.betas})
     if not undone:
-        return Done(in_one_exposure)
+        return StepResult(in_one_exposure)
     own, scales = moments(views.own), [moments(views.images[name]) for name in views.betas]
     bands = [len(views.images[name]) for name in views.betas]
-    return Done(in_one_exposure, lambda frame: with_own_levels(frame, bands, own, scales))
+    return StepResult(in_one_exposure, lambda frame: with_own_levels(frame, bands, own, scales))
 
 
 def with_own_levels(frame: Frame, bands: Sequence[int], own: Moments, scales: Sequence[Moments]) -> Frame:
@@ -157,13 +157,13 @@ def with_own_levels(frame: Frame, bands: Sequence[int], own: Moments, scales: Se
     return frame._replace(image=torch.cat([own.matched(part, scale) for part, scale in parts]))
 
 
-def join(which: JoinsBands, views: Views) -> Done:
+def join(which: JoinsBands, views: Views) -> StepResult:
     """Betas that differ at most in sensors as one of several bands, under the first one's name; undone, bands
     in the rig's order."""
     names, bands = views.betas, {name: len(views.images[name]) for name in views.betas}
     groups = co_located(views.rig, names, views.fields, which)
     if len(groups) == len(names) or (which == "neighbours" and 3 in bands.values()):
-        return Done(views)
+        return StepResult(views)
     come = [(name, band) for group in groups for name in group for band in range(bands[name])]
     order = [come.index((name, band)) for name in names for band in range(bands[name])]
     joined = {group[0]: torch.cat([views.images[name] for name in group]) for group in groups}
@@ -173,7 +173,7 @@ def join(which: JoinsBands, views: Views) -> Done:
         return frame._replace(image=frame.image[order], by_band=by_band[order])
 
     joined_views = Views(views.rig, {views.alpha: views.own, **joined}, views.alpha, views.fields)
-    return Done(joined_views, back)
+    return StepResult(joined_views, back)
 
 
 def co_located(rig: Rig, names: Sequence[str], fields: Fields, which: JoinsBands) -> list[list[str]]:

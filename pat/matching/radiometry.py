@@ -141,7 +141,7 @@ class Response(NamedTuple):
         return (image * change[:, None, None]).sum(-3, keepdim=True)
 
 
-Given = Literal["fit", "rec601"] | tuple[float, float, float] | Response
+ResponseSpec = Literal["fit", "rec601"] | tuple[float, float, float] | Response
 """What is known of alpha's response: its weights of red, green and blue, or that it is to be fitted."""
 
 
@@ -154,7 +154,7 @@ def stated_response(weights: Sequence[float]) -> Response:
     return Response(values / values.sum(), gain=float(values.sum()))
 
 
-def given_response(response: Given) -> Response:
+def given_response(response: ResponseSpec) -> Response:
     """The response that is given, Rec. 601's if it is to be fitted. Raises ValueError for what is none."""
     if isinstance(response, Response):
         return response

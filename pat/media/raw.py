@@ -69,7 +69,7 @@ def developed_rig(rig: Rig, names: Iterable[str]) -> Rig:
     return rig
 
 
-def as_bright(
+def match_luminance(
     image: Float[Tensor, "3 h w"], alpha: Float[Tensor, "1 h w"], sensor: Sensor
 ) -> Float[Tensor, "3 h w"]:
     """The fused image with alpha's luminance of light, if alpha's camera measured that (`LIGHT`).

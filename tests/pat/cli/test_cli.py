@@ -17,7 +17,7 @@ from arraygeom import Camera, Pose, Rig, Sensor, intrinsics
 from arraygeom.io import write_rig
 from arraygeom.lenses import Equirectangular
 from arraygeom.text import UNSCALED
-from pat.cli.fusing import Fuse
+from pat.cli.fuse import Fuse
 from pat.cli.main import Pat, command_paths, main
 from pat.cli.options import read_frames, read_images, respelled
 from pat.data.sample_array import SAMPLE, load_motorcycle, load_sample

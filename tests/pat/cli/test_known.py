@@ -11,7 +11,7 @@ import torch
 from torch.nn.functional import interpolate
 
 from arraygeom import Camera, Pose, Rig, intrinsics
-from pat.cli.fusing import Fuse
+from pat.cli.fuse import Fuse
 from pat.cli.known import Known
 from pat.cli.main import main
 from pat.fusion.align import OCCLUDED

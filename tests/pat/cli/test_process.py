@@ -78,7 +78,7 @@ def test_help_lists_users_tools_before_authors_tools(capsys):
         "rig",
         "demo",
         "warm-up",
-        *Pat.authors,
+        *Pat.research,
     ]
     assert all(len(line) <= 120 for line in text.splitlines())
 

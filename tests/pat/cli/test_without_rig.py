@@ -16,7 +16,7 @@ from torch.nn.functional import avg_pool2d
 from arraygeom import Camera, Pose, Rig, Sensor, View
 from experiments.evaluation.paper import with_found_rig
 from pat import fuse, load_weights
-from pat.cli.fusing import Fuse
+from pat.cli.fuse import Fuse
 from pat.cli.main import main
 from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score

@@ -11,7 +11,7 @@ from pat.fusion.aligned_files import RecordedFiles
 from pat.fusion.views import ViewFiles
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.media.images import write_image
-from pat.media.raw import as_bright, demosaiced, develop, developed
+from pat.media.raw import demosaiced, develop, developed, match_luminance
 
 HW = (48, 64)
 
@@ -168,13 +168,13 @@ def test_a_image_is_as_bright_as_the_light_that_alpha_measured():
     fused = ground_truth - luminance(ground_truth) + alpha
     assert (fused - ground_truth).abs().max() > 0.02
     measured = developed(Sensor(response="mono", coding="linear"))
-    assert (as_bright(fused, alpha, measured) - ground_truth).abs().max() < 1e-4
+    assert (match_luminance(fused, alpha, measured) - ground_truth).abs().max() < 1e-4
     for unknown in (
         Sensor(response="mono"),
         Sensor(response="nir", coding="linear"),
         Sensor(coding="linear"),
     ):
-        assert as_bright(fused, alpha, developed(unknown)) is fused
+        assert match_luminance(fused, alpha, developed(unknown)) is fused
 
 
 def test_a_mosaic_makes_little_false_colour():

@@ -24,7 +24,7 @@ from .denoiser import opponent, opponent_deviation, rgb_of_opponent
 
 
 @dataclass(frozen=True)
-class CollaborativeSettings:
+class BM3DSettings:
     """Of the filter of alike blocks (Dabov et al. 2007)."""
 
     side: int = size(8, "Side of a block, pixels")
@@ -40,7 +40,7 @@ class CollaborativeSettings:
     kept: float = tuned(0.5, "Middlebury, tune half: share of the network's brightness that is kept")
 
 
-SETTINGS = CollaborativeSettings()
+SETTINGS = BM3DSettings()
 SIDE, STEP, ALIKE, RADIUS, ROWS = SETTINGS.side, SETTINGS.step, SETTINGS.alike, SETTINGS.radius, SETTINGS.rows
 """For the compiled loops, which read no attributes."""
 AS_RECORDED, KEPT = SETTINGS.as_recorded, SETTINGS.kept

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from arraygeom import Pose
-from calib.images import misfit
+from calib.images import rig_check
 from calib.images.depth_change import share_outside
 from calib.images.matches import PointMatches, match_cameras
-from calib.images.misfit import find_misfit, misfit_warning
+from calib.images.rig_check import find_misfit, misfit_warning
 from pat.cli.main import main
 from pat.media.images import write_image
 from tests.calib.scenes import rectified_images, rectified_pair, texture, vector
@@ -82,14 +82,14 @@ def test_show_warns(tmp_path, capsys):
 
 @pytest.mark.parametrize(("off", "sides"), [(0.0, [240]), (0.02, [240, 320])])
 def test_images_are_compared_at_full_size_only_where_small_ones_do_not_fit(monkeypatch, off, sides):
-    monkeypatch.setattr(misfit, "ROUGH_SIDE", 240)
+    monkeypatch.setattr(rig_check, "ROUGH_SIDE", 240)
     seen = []
 
     def noted(images):
         seen.append(max(images["left"].shape))
         return match_cameras(images)
 
-    monkeypatch.setattr(misfit, "match_cameras", noted)
+    monkeypatch.setattr(rig_check, "match_cameras", noted)
     found = find_misfit(rectified_pair().perturbed({"right.rotation": vector(off, 0, 0)}), rectified_images())
     assert seen == sides
     assert (found is None) == (off == 0)
@@ -105,7 +105,7 @@ def test_what_a_comparison_needs_is_imported_fast():
     """Nor does it take sympy, which `torch.broadcast_shapes` imports, to make a camera."""
     camera = "Camera(K=intrinsics(5.0, (4, 5)), cam_from_world=Pose.identity(), hw=(4, 5))"
     code = f"""
-import sys, calib.boards.rig_diff, calib.images.misfit
+import sys, calib.boards.rig_diff, calib.images.rig_check
 from arraygeom import Camera, Pose, intrinsics
 assert not {camera}.batch_shape
 print(*sys.modules)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from . import options
-from .fusing import files_by_camera, named_images
+from .fuse import files_by_camera, named_images
 from .known import Known
 from .options import FIRST, Out, say
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import pad
 
-from pat.fusion.averaging import averaged_with_alike, sums_of_alike
+from pat.fusion.non_local_means import averaged_with_alike, sums_of_alike
 from pat.media.colour import from_luma_chroma, luminance
 from pat.sensors import generator_for
 

@@ -6,7 +6,7 @@ import torch
 from scipy.fft import dctn, idctn
 from scipy.linalg import hadamard
 
-from pat.networks.collaborative import (
+from pat.networks.bm3d import (
     ALIKE,
     RADIUS,
     SIDE,

@@ -23,7 +23,7 @@ from ..support.settings import size, tuned
 
 
 @dataclass(frozen=True)
-class AveragingSettings:
+class NonLocalMeansSettings:
     """Of means over pixels that are alike."""
 
     scale: float = tuned(
@@ -33,7 +33,7 @@ class AveragingSettings:
     rows: int = size(16, "Rows that a thread works on at once: what it sums stays in its cache")
 
 
-SETTINGS = AveragingSettings()
+SETTINGS = NonLocalMeansSettings()
 
 
 def averaged_with_alike(
