@@ -119,7 +119,7 @@ def newton_step(value: Tensor, jacobian: Sequence[Tensor], target: Tensor) -> Te
 
 
 def keeps_orientation(jacobian: Sequence[Tensor]) -> Tensor:
-    """Whether (*n) a `PlaneMap` keeps orientation: past a fold it mirrors, past two it turns by 180 degrees."""
+    """Whether (*n) a `PlaneMap` keeps orientation: past a fold it mirrors, past two it is half turned."""
     xx, xy, yx, yy = jacobian
     return (xx * yy - xy * yx > 0) & (xx + yy > 0)
 
