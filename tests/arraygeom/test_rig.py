@@ -14,7 +14,6 @@ from arraygeom import (
     Pose,
     Rig,
     View,
-    depth_of,
     epipolar_distance,
     intrinsics,
     resize_matrix,
@@ -213,13 +212,3 @@ def test_fields_in_another_unit_are_the_same(field, moves, factor):
     found, wanted = (field(r.pair("alpha", "beta"), x) for r in (rig.scaled(factor), rig))
     for part, value in vars(wanted).items():
         torch.testing.assert_close(vars(found)[part], value, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("factor", [1e3, 1e-6])
-def test_depth_in_another_unit_is_the_same(factor):
-    """A baseline of less than a few nanometres gave no depth, whatever the unit."""
-    rig = random_rig(0)
-    seen = [rig[name].project(scene_points(rig)).x for name in ("alpha", "beta")]
-    found, wanted = (depth_of(r.pair("alpha", "beta"), *seen) for r in (rig.scaled(factor), rig))
-    assert torch.equal(found.valid, wanted.valid)
-    torch.testing.assert_close(found.depth, factor * wanted.depth)
