@@ -1,3 +1,4 @@
+import dataclasses
 import math
 import re
 
@@ -6,7 +7,10 @@ import torch
 
 from arraygeom import (
     Camera,
+    Curved,
     Distortion,
+    Epipolar,
+    EpipolarLine,
     Pose,
     Rig,
     View,
@@ -16,6 +20,8 @@ from arraygeom import (
     resize_matrix,
     rotation_from_vector,
 )
+from arraygeom.lenses import RollingShutter
+from arraygeom.pixels import pixel_grid
 from arraygeom.pose import rotation_error
 from arraygeom.summary import summarise_pairs
 from arraygeom.text import UNSCALED
@@ -217,3 +223,22 @@ def test_a_pixel_of_depth_is_what_moves_the_point_by_a_pixel(centre, turn, steps
             continue
         assert float((there.x - here.x).norm(dim=-1)[seen].median()) == pytest.approx(1, rel=0.2)
         assert expected is None or step == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-6])
+@pytest.mark.parametrize(
+    ("field", "moves"), [(Epipolar(), False), (EpipolarLine(), False), (Curved(9), False), (Curved(9), True)]
+)
+def test_fields_in_another_unit_are_the_same(field, moves, factor):
+    """A line began 0.1 mm from alpha, and infinity was at 100 km, whatever the rig's unit."""
+    rig = random_rig(0).replace(depth=(1.0, math.inf))
+    if moves:
+        velocity, rotation, readout = (
+            torch.tensor(v).double() for v in ([1.0, 0.2, 0.1], [0.1, 0.2, 0.3], 0.02)
+        )
+        shutter = RollingShutter(velocity=velocity, rotation=rotation, readout=readout)
+        rig = rig.with_camera("beta", dataclasses.replace(rig["beta"], distortion=shutter))
+    x = pixel_grid(rig["alpha"].hw).double()
+    found, wanted = (field(r.pair("alpha", "beta"), x) for r in (rig.scaled(factor), rig))
+    for part, value in vars(wanted).items():
+        torch.testing.assert_close(vars(found)[part], value, rtol=0, atol=1e-6)
