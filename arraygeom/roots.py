@@ -88,9 +88,9 @@ def solve_in_plane(
     rounding: float = 2.0,
     steps: int = 30,
 ) -> Tensor:
-    """Points whose images are `target`, by Newton, with halved steps where a whole one leaves where points
-    may be or does not help; the nearest that is found where there is none. `rounding`: of f's values, in
-    units of the last place.
+    """Points (*n, 2) whose images are `target` (*n, 2), by Newton from `start` on, with halved steps where a
+    whole one leaves where points may be (`within`, (*n)) or does not help; the nearest that is found where
+    there is none. `rounding`: of f's values, in units of the last place.
     """
     xy = start
     value, jacobian = f(xy)
@@ -110,7 +110,7 @@ def solve_in_plane(
 
 
 def newton_step(value: Tensor, jacobian: Sequence[Tensor], target: Tensor) -> Tensor:
-    """What to take from points whose images are `value` for `target`."""
+    """What to take from points whose images are `value` for `target`, each (*n, 2); `PlaneMap`'s Jacobian."""
     xx, xy, yx, yy = jacobian
     ex, ey = (value - target).unbind(-1)
     determinant = xx * yy - xy * yx
@@ -119,7 +119,7 @@ def newton_step(value: Tensor, jacobian: Sequence[Tensor], target: Tensor) -> Te
 
 
 def keeps_orientation(jacobian: Sequence[Tensor]) -> Tensor:
-    """Whether a map keeps orientation here: past a fold it mirrors, past two it rotates by 180 degrees."""
+    """Whether (*n) a `PlaneMap` keeps orientation: past a fold it mirrors, past two it is half turned."""
     xx, xy, yx, yy = jacobian
     return (xx * yy - xy * yx > 0) & (xx + yy > 0)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .camera import Camera
 from .fields import Curved, Epipolar, sampling_locations
-from .pixels import pixel_grid
+from .pixels import coarse_grid, pixel_grid
 from .rig import Pair, Rig
 from .segments import Segments
 from .text import angle
@@ -33,7 +33,8 @@ class PairSummary(NamedTuple):
     baseline: metres between the optical centres; rotation: degrees between the orientations.
     seen: share of alpha's pixels that have a segment in beta.
     length: (median, largest) length of their segments, pixels of beta.
-    depth_step: (near, far), the change of depth that moves the point by one pixel in beta, metres.
+    depth_step: (near, far), the change of depth that moves the point by one pixel in beta, metres: the median
+        of alpha's pixels whose point beta sees, NaN if it sees none.
     """
 
     alpha: str
@@ -45,6 +46,8 @@ class PairSummary(NamedTuple):
     depth_step: tuple[float, float] | None
 
 
+NEXT = 1 + 1e-6
+"""A depth times this is the next, where a change is asked for."""
 MOST_BETAS = 50
 """Of one alpha."""
 MOST_PIXELS = 1 << 18
@@ -124,9 +127,21 @@ def _segments(pair: Pair) -> tuple[float, tuple[float, float] | None]:
 
 
 def _depth_step(pair: Pair, baseline: float) -> tuple[float, float] | None:
-    """By the small-angle rule: depth^2 / (focal length of beta x baseline)."""
+    """`depth_step` of a pair."""
     if pair.depth is None or baseline == 0:
         return None
-    focal = pair.cameras[1].K[:2, :2].det().abs().sqrt()
-    near, far = (float(d.square() / (focal * baseline)) for d in pair.depth)
+    x = coarse_grid(pair.alpha.hw).reshape(-1, 2)
+    alpha, beta = (camera.to(torch.float64) for camera in pair.cameras)
+
+    def at(depth: float) -> float:
+        if math.isinf(depth):
+            return math.inf
+        here, there = (
+            beta.project(alpha.unproject(x, torch.full_like(x[..., 0], d))) for d in (depth, depth * NEXT)
+        )
+        seen = here.valid & there.valid & beta.contains(here.x)
+        moved = (there.x - here.x).detach().norm(dim=-1)[seen]
+        return float(depth * (NEXT - 1) / moved.median()) if len(moved) else math.nan
+
+    near, far = (at(float(bound)) for bound in pair.depth)
     return near, far

@@ -66,7 +66,7 @@ def depth_text(depth: tuple[Tensor, Tensor] | None, unit: str = "m") -> str:
 
 
 def angle(R: Tensor) -> Tensor:
-    """The angle of a rotation, radians; exact for small ones too."""
+    """The angle (*b) of a rotation (*b, 3, 3), radians; exact for small ones too."""
     R = R.detach()
     skew = torch.stack(
         [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1

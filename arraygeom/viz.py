@@ -99,7 +99,7 @@ def depth_outline(rig: Rig, cameras: Mapping[str, Camera], alpha: str | None) ->
     if rig.depth is None:
         return []
     camera = cameras[alpha or next(iter(cameras))]
-    limit = 6 * max(extent_of(cameras), 0.05)
+    limit = 6 * (extent_of(cameras) or 0.05)
     depths = [float(d) for d in rig.depth if float(d) <= limit]
     borders = [seen_at(camera, image_border(camera.hw), d) for d in depths]
     edges = zip(*(b[:: len(b) // 4][:4] for b in borders)) if len(borders) == 2 else []

@@ -139,7 +139,6 @@ class ScenePatches:
             rig.replace(cameras={name: ideal[name].camera for name in rig.names}),
             self.chains,
             seed=seed_for(self.seed, 0, index),
-            depth={name: view.depth[None] for name, view in ideal.items()},
         )
         own = ideal[self.alpha]
         images = {name: image[0] for name, image in recorded.images.items()}

@@ -11,7 +11,7 @@ or `Positions` over *n. The families here are frozen dataclasses; a plain functi
 A rig whose numbers have batch axes *b takes pixels (*b, ..., 2), or with axes of length 1 in place of *b.
 """
 
-from .approximation import approximated, placement_error
+from .approximation import approximated
 from .around import AroundDepth, AroundMatches
 from .curved import Curved, ThroughLenses
 from .default import FIELDS, default_field, named_field, recorded_field
@@ -52,7 +52,6 @@ __all__ = [
     "lazily",
     "named_field",
     "pinhole_track",
-    "placement_error",
     "ray_depth",
     "recorded_field",
     "sampling_locations",

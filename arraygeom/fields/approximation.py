@@ -5,10 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
-from jaxtyping import Float
-from torch import Tensor
-
-from ..homography import apply_homography, fit_homography, fit_similarity
+from ..homography import fit_homography, fit_similarity
 from ..pixels import coarse_grid
 from ..rig import Link, Pair
 from ..tracing import needs_numbers
@@ -37,12 +34,3 @@ def approximated(pair: Pair, kind: Literal["homography", "similarity"] = "homogr
     fit = fit_homography if kind == "homography" else fit_similarity
     H = fit(x[seen], (0.5 * (segments.start + segments.end))[seen])
     return dataclasses.replace(pair, link=Link(pair.fundamental, H))
-
-
-def placement_error(pair: Pair) -> Float[Tensor, ""]:
-    """Root mean square distance in pixels from H x to the middles of the pair's depth-bounded segments."""
-    x = coarse_grid(pair.alpha.hw).to(pair.cameras[0].K)
-    segments = Epipolar()(pair, x)
-    transformed = apply_homography(pair.homography, x)
-    off = (transformed.x - 0.5 * (segments.start + segments.end)).square().sum(-1)
-    return off[segments.valid & transformed.valid].mean().sqrt()

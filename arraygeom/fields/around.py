@@ -13,7 +13,7 @@ from torch import Tensor
 from ..camera import LensView, View
 from ..checks import check_above, check_field
 from ..epipolar import beside, segments_between
-from ..pixels import HW, floating, pixel_grid
+from ..pixels import HW, floating
 from ..rig import Pair
 from ..segments import Segments
 from ..undistortion import recorded_pixels, straight_pixels
@@ -81,13 +81,6 @@ class AroundMatches:
         _check_size(self.positions, None if self.views is None else self.views[0])
         if self.field is not None:
             check_field(self.field)
-
-    @classmethod
-    def from_disparity(cls, disparity: Float[Tensor, "h w"], tolerance: float = 1.0) -> AroundMatches:
-        """Of a rectified pair, alpha left: the point at x is at x - disparity in beta; NaN if unknown."""
-        h, w = disparity.shape
-        grid = pixel_grid((h, w), dtype=disparity.dtype, device=disparity.device)
-        return cls(torch.stack([grid[..., 0] - disparity, grid[..., 1]], -1), tolerance)
 
     @classmethod
     def from_points(

@@ -182,7 +182,8 @@ class RayCurve(NamedTuple):
         inverse = (torch.where(part.valid, v, 1.0) for v in ends)
         near_end, far_end = inverse
         if not beta.central:
-            near_end, far_end = near_end.clamp(min=REMOTE), far_end.clamp(min=REMOTE)
+            remote = REMOTE / beside(pose.t.norm(dim=-1) + near.to(x.dtype), x.ndim - 1)
+            near_end, far_end = torch.maximum(near_end, remote), torch.maximum(far_end, remote)
         first, last = (points.a + v[..., None] * points.b for v in (near_end, far_end))
         wide = beta.distortion is not None and limits is None and beta.central
         return cls(first, last, ahead & part.valid, beta, wide, (near_end, far_end))
@@ -267,7 +268,8 @@ class RayCurve(NamedTuple):
 
 
 REMOTE = 1e-5
-"""Inverse metres of infinity to a beta whose rays do not meet: there a point is not only a direction."""
+"""Inverse depth of infinity, in units of baseline plus near bound, to a beta whose rays do not meet: there a
+point is not only a direction."""
 
 
 def _lines(alpha: Camera, x: Tensor, bounds: str) -> tuple[Tensor | None, Tensor, Tensor]:

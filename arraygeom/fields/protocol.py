@@ -45,8 +45,16 @@ def sampling_locations(
 
 
 def answered(field: ReceptiveField, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
-    """What a field gives for pixels. Raises ValueError for what is not Segments or Positions of each."""
-    answer, name = field(pair, x), getattr(field, "__name__", type(field).__name__)
+    """What a field gives for pixels. Raises ValueError for what is not Segments or Positions of each.
+
+    What the field itself raises has a note of which it was.
+    """
+    name = getattr(field, "__name__", type(field).__name__)
+    try:
+        answer = field(pair, x)
+    except Exception as error:
+        error.add_note(f"raised by the field {name}")
+        raise
     if not isinstance(answer, Segments | Positions):
         raise ValueError(
             f"the field {name} gave a {type(answer).__name__}: fields give Segments or Positions"

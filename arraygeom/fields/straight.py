@@ -65,8 +65,12 @@ class EpipolarLine:
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Segments across beta's image. Raises ValueError for lenses."""
         if pair.link is None and pair.calibrated:
-            zero, infinite = (torch.tensor(d, dtype=torch.float64) for d in (NEAREST, torch.inf))
-            return _between(pair, zero, infinite, x)
+            baseline, *sides = (
+                t.detach().norm(dim=-1) for t in (pair.beta_from_alpha.t, *(c.t for c in pair.cameras))
+            )
+            infinite = torch.full_like(baseline, torch.inf)
+            is_rounding = baseline <= ROUNDED * torch.finfo(baseline.dtype).eps * sum(sides)
+            return _between(pair, torch.where(is_rounding, infinite, NEAREST * baseline), infinite, x)
         require_straight(pair)
         F, (h, w) = pair.fundamental, pair.beta.hw
 
@@ -79,8 +83,10 @@ class EpipolarLine:
         return segments_by_rows(across, pair, floating(x))
 
 
-NEAREST = 1e-4
-"""Where a line that has no near bound begins, metres from alpha."""
+NEAREST = 1e-3
+"""Where a line that has no near bound begins: its depth as a share of the baseline."""
+ROUNDED = 64
+"""A baseline of so many units in the last place of the cameras' translations is none."""
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ class RigSource:
         try:
             text = decoded(self.content(), "strict")
         except UnicodeDecodeError:
-            raise self.fail(None, "is not a text file") from None
+            raise self.fail(None, "is not text in UTF-8: save it as such") from None
         if not text.strip():
             raise self.fail(None, "is empty")
         if most is not None and len(text) > most:

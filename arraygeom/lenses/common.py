@@ -28,7 +28,7 @@ SOLVED = 64
 
 
 def angle_over_radius(u: Tensor, z: Tensor) -> Tensor:
-    """theta / r of the squared radius u and the depth z, by its series near the axis."""
+    """theta / r of the squared radius u = r^2 and the depth z, each (*n), by its series near the axis."""
     near = (z > 0) & (u < 1e-3 * z.square())
     z_near = torch.where(near, z, 1.0)
     t = torch.where(near, u, 0.0) / z_near.square()
@@ -39,7 +39,7 @@ def angle_over_radius(u: Tensor, z: Tensor) -> Tensor:
 
 
 def cosine_and_sinc(v: Tensor) -> tuple[Tensor, Tensor]:
-    """cos(theta) and sin(theta) / theta of the squared angle v, by their series near 0."""
+    """cos(theta) and sin(theta) / theta of the squared angle v = theta^2 (*n), by their series near 0."""
     near = v < 1e-3
     s, theta = torch.where(near, v, 0.0), torch.where(near, 1.0, v).sqrt()
     cosine = 1 - s * (1 / 2 - s * (1 / 24 - s * (1 / 720 - s / 40320)))
@@ -77,7 +77,7 @@ def _remembered(
 
 
 def unit(ray: Tensor) -> Tensor:
-    """Vectors at length 1."""
+    """Vectors (*n, k) at length 1."""
     return ray / norm(ray)[..., None]
 
 
@@ -88,12 +88,12 @@ def on_plane(X: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def norm(xy: Tensor) -> Tensor:
-    """Lengths of vectors."""
+    """Lengths (*n) of vectors (*n, k)."""
     return xy.square().sum(-1).sqrt()
 
 
 def finite_points(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Points with those that hold a NaN or an infinity at the origin, and which did not.
+    """Points (*n, k) with those that hold a NaN or an infinity at the origin, and which (*n) did not.
 
     Huge ones of float32 are brought nearer along their direction, as their squares would be infinite.
     """

@@ -12,7 +12,7 @@ from .common import MARGIN, SOLVED, TINY, angle_over_radius, cosine_and_sinc, on
 
 
 def fisheye_project(c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
-    """Points in the camera's frame to distorted normalised ones, and which are within the range."""
+    """Points (*n, 3) of the camera to distorted normalised ones (*n, 2), and which are in the range."""
     xy, z = X[..., :2], X[..., 2]
     u = xy.square().sum(-1)
     ratio = angle_over_radius(u, z)

@@ -77,11 +77,11 @@ def find_photos(folder: Path, *, patterns: Mapping[str, str] | None = None) -> P
     `patterns` maps camera names to patterns of file names, relative to the folder. Without it every subfolder
     with images or a video is a camera; where there is none, every prefix of file names before a final number
     (left01.jpg, right01.jpg), or every video. If each camera has one image, they are of one moment. Raises
-    FileNotFoundError and ValueError.
+    FileNotFoundError and ValueError, for images beside subfolders of images too.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder: give one with a subfolder for each camera")
-    cameras = _by_pattern(folder, patterns) if patterns else _by_folder(folder) or _by_name(folder)
+    cameras = _by_pattern(folder, patterns) if patterns else _by_folder_or_name(folder)
     if not cameras:
         raise ValueError(f"{folder}: no images or videos: give a folder with a subfolder for each camera")
     photos = {name: _moments(name, files) for name, files in cameras.items()}
@@ -123,6 +123,17 @@ def _by_pattern(folder: Path, patterns: Mapping[str, str]) -> dict[str, list[Pat
         if both := [file.name for file in files if file in others]:
             raise ValueError(f"{both[0]} is an image of {a} and of {b}: give patterns of which one fits it")
     return cameras
+
+
+def _by_folder_or_name(folder: Path) -> dict[str, list[Path]]:
+    folders, names = _by_folder(folder), _by_name(folder)
+    if folders and names:
+        raise ValueError(
+            f"{folder}: holds images, such as {next(iter(names.values()))[0].name}, and folders of images "
+            f"({', '.join(folders)}): move away those of no board, or give --camera NAME=PATTERN for each "
+            "camera"
+        )
+    return folders or names
 
 
 def _by_folder(folder: Path) -> dict[str, list[Path]]:

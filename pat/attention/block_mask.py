@@ -13,8 +13,8 @@ def segment_block_mask(segments: Segments, hw: HW, *, radius: float = 0.5, block
     """For `flex_attention`: alpha's pixels (Ha, Wa), row by row, attend to beta's in `radius` px of segments.
 
     `segments` (Ha, Wa) or, of a batch, (B, Ha, Wa); keys are beta's H W pixels, row by row. `block` is that
-    of the mask. A query without such a key gets zeros. `Segments.mask` is the same, dense, for
-    scaled_dot_product_attention.
+    of the mask. A query without such a key gets zeros. Torch asks for all pairs of pixels at once: for
+    features of some thousand pixels. `Segments.mask` is the same, dense, for scaled_dot_product_attention.
     """
     batch = segments.valid.shape[0] if segments.valid.ndim > 2 else None
     parts = (segments.start, segments.end, segments.valid)

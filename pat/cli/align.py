@@ -109,7 +109,7 @@ class Align(Known):
             if frame.name:
                 self.refuse_several()
             rig, known = self.with_known(frame.rig, frame.alpha, frame.files, options.field_named(self.field))
-            with options.working(f"aligning {frame.name}".strip()):
+            with options.working_by_plan(f"aligning {frame.name}".strip()) as announce:
                 aligned = align(
                     rig,
                     frame.images,
@@ -125,6 +125,8 @@ class Align(Known):
                     response=settings.response,
                     correct=self.correct,
                     noise=settings.noise,
+                    explain=lambda line: self.note(f"{frame.name}: {line}" if frame.name else line),
+                    announce=None if frame.name else announce,
                 )
             written = save_aligned(
                 aligned,
@@ -139,7 +141,8 @@ class Align(Known):
                 written.append(self.out / FOUND_RIG)
             if self.report and not frame.name:
                 texts = [str(message) for message in options.WARNED]
-                facts = Facts(frame.notes, texts, time.monotonic() - begin)
+                weights = () if self.weights is None else (f"weights: {self.weights}",)
+                facts = Facts((*weights, *self._notes, *frame.notes), texts, time.monotonic() - begin)
                 write_text(self.out / "index.html", aligned_page(aligned, frame.recorded, facts))
                 written.append(self.out / "index.html")
         prefix = f"{frame.name}_" if frame.name else ""

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from ..fusion.healing import Healed
     from ..fusion.report import Facts
     from ..fusion.results import Frame
-    from ..fusion.tiles import Plan
 
 LOG = logging.getLogger(__name__)
 
@@ -121,14 +120,14 @@ class Fuse(Known):
             exr_writer(self.out)
         self.image, with_rig = named_images(self.given, self.image, "fuse")
         self._settings()
-        options.device_of(self.device)
+        if options.device_of(self.device) != "cpu" and self.precision == "int8":
+            raise ValueError("--precision int8 is for the CPU: leave it out, or --device")
         if self.classical and not self.report:
             raise ValueError("--classical needs the page: leave out --no-report")
         if self.workers < 1 or (self.threads is not None and self.threads < 1):
             raise ValueError("--workers and --threads are 1 or more")
         from arraygeom.threads import limited_to
 
-        self._notes: list[str] = []
         with self.judged(), limited_to(self.threads):
             self._with_rig() if with_rig else self._without_rig()
 
@@ -314,7 +313,7 @@ class Fuse(Known):
                 device=self.device,
                 precision=self.precision,
                 settings=replace(self._settings(), field=field_given),
-                explain=self._note,
+                explain=self.note,
                 store=store,
             )
 
@@ -328,7 +327,7 @@ class Fuse(Known):
                 frame = fused(rig)
             frame, gain = self._exposed(frame)
             if image_array is None and not frame.depth.isfinite().any():
-                self._note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
+                self.note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
             bands = band_names(frame, (name for name in rig.betas(alpha) if name in files))
             written = save_frame(
                 frame,
@@ -343,9 +342,9 @@ class Fuse(Known):
             )
             shutil.rmtree(store, ignore_errors=True)
             if said := describe_bands(frame, bands, self.kind):
-                self._note(said)
+                self.note(said)
             if self.points:
-                self._note("points.ply: the pixels of known depth, in alpha's frame")
+                self.note("points.ply: the pixels of known depth, in alpha's frame")
             if self.report:
                 facts = self._facts(
                     rig, () if image_array is None else image_array.notes, time.monotonic() - begin
@@ -364,14 +363,14 @@ class Fuse(Known):
 
         if healed is None:
             return rig
-        self._note(healed.text)
+        self.note(healed.text)
         path = self.out / HEALED_RIG
         if path.resolve() == self.given[0].resolve():
-            self._note(f"the healed rig is not written: {path} is the one that was given: give another --out")
+            self.note(f"the healed rig is not written: {path} is the one that was given: give another --out")
         else:
             self.out.mkdir(parents=True, exist_ok=True)
             healed.rig.save(path)
-            self._note(f"the healed rig: {path}")
+            self.note(f"the healed rig: {path}")
         return healed.rig
 
     def _settings(self) -> FuseSettings:
@@ -390,11 +389,6 @@ class Fuse(Known):
         notes = [f"weights: {self.weights or 'mono-colour'}", *self._notes, *adopted]
         warned = [str(message) for message in options.WARNED]
         return Facts(notes, warned, seconds, peak_memory(), length_unit(rig))
-
-    def _note(self, line: str) -> None:
-        """Say a line, and keep it for the page."""
-        say(line)
-        self._notes.append(line)
 
     def _classical(self, rig: Rig, images: Mapping[str, Tensor], alpha: str, gain: float) -> Tensor | None:
         """The classical baseline, bright as the fused image; None, and a line, if cameras do not allow it."""
@@ -416,7 +410,7 @@ class Fuse(Known):
         gain = exposure_gain(frame.image) if self.exposure == "auto" else 1.0
         if gain != 1:
             what = "dark" if gain > 1 else "overexposed"
-            self._note(f"exposure: light times {gain:.2f}: the image is {what} (--exposure keep leaves it)")
+            self.note(f"exposure: light times {gain:.2f}: the image is {what} (--exposure keep leaves it)")
         return frame._replace(image=exposed(frame.image, gain)), gain
 
     def _many(self, rig: Rig, files: dict[str, list[Path]], alpha: str) -> None:
@@ -473,12 +467,7 @@ def fuse_with_progress(
     if where != "cpu":
         rig, images = rig.to(where), {name: image.to(where) for name, image in images.items()}
     options.say_when_compiling()
-    with options.working("fusing") as retitle:
-
-        def announce(plan: Plan) -> None:
-            say(f"plan: {plan}")
-            retitle("fusing" if plan.seconds is None else f"fusing, about {plan.duration} in all")
-
+    with options.working_by_plan("fusing") as announce:
         frame = fuse(network, rig, images, progress=_numbered, announce=announce, **further)
     return frame.mapped(lambda part: part.cpu())
 

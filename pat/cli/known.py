@@ -89,6 +89,7 @@ class Known:
         from ..support.memory import limited, parse_bytes
 
         limit = None if self.max_memory is None else parse_bytes(self.max_memory)
+        self._notes: list[str] = []
         try:
             with limited(limit), confidence_checked(strict=self.strict):
                 yield
@@ -126,9 +127,16 @@ class Known:
         options.say_when_compiling()
         with options.working("finding the rig"):
             array = array_from_images(first, alpha=self.alpha, weights=self.weights, focal=focal, say=say)
+        if self.weights is None:
+            say(f"weights: {array.weights} (--weights NAME takes others)")
         self.weights = array.weights
         self.normalise_radiometry |= array.match_levels
         return array
+
+    def note(self, line: str) -> None:
+        """Say a line, and keep it for the page."""
+        say(line)
+        self._notes.append(line)
 
     def refuse_several(self) -> None:
         """Raise ValueError if something is known, which is of a single frame."""

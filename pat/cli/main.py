@@ -89,8 +89,12 @@ def _run(arguments: list[str], group: Any, prog: str, *, debug: bool) -> None:
         _fail(error, f"{error}{remedy}", debug)
     except MemoryError as error:
         _fail(error, "out of memory: give smaller images, or --max-memory where there is one", debug)
-    except (RuntimeError, LookupError, ArithmeticError) as error:
-        _fail(error, f"{type(error).__name__}: {error} (--debug shows where)", debug)
+    except Exception as error:
+        notes = getattr(error, "__notes__", [])[:1]
+        if not (notes or isinstance(error, RuntimeError | LookupError | ArithmeticError)):
+            raise
+        said = ", ".join([f"{type(error).__name__}: {error}", *notes])
+        _fail(error, f"{said} (--debug shows where)", debug)
 
 
 def _fail(error: BaseException, text: str, debug: bool) -> NoReturn:

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
     from arraygeom import ReceptiveField, Rig
 
+    from ..fusion.tiles import Plan
+
 T = TypeVar("T")
 
 SHIPPED = Path(__file__).parents[1] / "networks" / "shipped"
@@ -377,6 +379,18 @@ def working(title: str) -> Iterator[Callable[[str], None]]:
 
         with steps_shown(show):
             yield lambda title: bar.update(task, description=title)
+
+
+@contextmanager
+def working_by_plan(title: str) -> Iterator[Callable[[Plan], None]]:
+    """A block as of `working`; gives a function that says the plan, and adds its time to the title."""
+    with working(title) as retitle:
+
+        def announce(plan: Plan) -> None:
+            say(f"plan: {plan}")
+            retitle(title if plan.seconds is None else f"{title}, about {plan.duration} in all")
+
+        yield announce
 
 
 @cache

@@ -27,6 +27,7 @@ from arraygeom import Camera, Pair, Rig
 from ..fusion.results import Frame
 from ..fusion.steps import undistort
 from ..fusion.views import Views
+from ..matching.filters import filled
 from ..media.colour import from_luma_chroma, luminance, luminance_of, to_bytes
 from ..media.figures import reduced
 from ..sensors import NoiseLevel
@@ -45,14 +46,8 @@ REGRESSION_RADIUS, REGRESSION_FLOOR = 3, 3e-3
 """Window and regulariser (variance of luminance) of the regression of colour on luminance."""
 
 
-class _Smoothing(NamedTuple):
-    """Strength of the edge-aware smoothing, and the difference of 8-bit luminance that counts as an edge."""
-
-    strength: float
-    edge: float
-
-
-DISPARITY_FILL, COLOUR_FILL = _Smoothing(50, 4), _Smoothing(300, 3)
+DISPARITY_FILL, COLOUR_FILL = (50, 4), (300, 3)
+"""Strength of the edge-aware smoothing, and the difference of 8-bit luminance that counts as an edge."""
 UNRECTIFIABLE = "the cameras look along the line between them: such a pair cannot be rectified"
 
 
@@ -234,8 +229,8 @@ def _correspondence(
     """`other` is luminance normalised to mono's, `inside` is 1 where it has content."""
     columns, rows = _grid(soft.shape)
     ours, consistent = checked_disparity(to_bytes(soft), to_bytes(other), max_disparity)
-    filled = _diffused(ours, consistent.astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
-    columns = columns - np.where(consistent, ours, filled)
+    diffused = filled(ours[None], consistent.astype(np.float32) + 1e-5, guide, DISPARITY_FILL)[0]
+    columns = columns - np.where(consistent, ours, diffused)
     seen = _sampled(inside, columns, rows) * (columns >= -0.5)
     return _Correspondence(columns, rows, seen, np.maximum(consistent, INCONSISTENT) * seen)
 
@@ -267,7 +262,7 @@ def _warped_chroma(
     chroma = _regressed(warped[..., [0, 2]] - warped_luma[..., None], warped_luma, mono - normalised)
     likeness = np.exp(-np.square(cv2.GaussianBlur(np.abs(soft - normalised), (0, 0), 1) / LIKENESS))
     weight = match.weight * likeness
-    return _blended(chroma, _diffused(chroma, weight + 1e-4, guide, COLOUR_FILL), weight)
+    return _blended(chroma, weight, guide)
 
 
 def _warped_band(mono: Image, band: Image, inside: Image, max_disparity: float, sharpness: float) -> Image:
@@ -275,8 +270,7 @@ def _warped_band(mono: Image, band: Image, inside: Image, max_disparity: float, 
     soft, guide = _softened(mono, sharpness), to_bytes(mono)
     match = _correspondence(soft, _normalised(band, mono, inside), guide, inside, max_disparity)
     difference = (_sampled(band, match.columns, match.rows) - soft)[..., None]
-    filled = _diffused(difference, match.weight + 1e-4, guide, COLOUR_FILL)
-    return _blended(difference, filled, match.weight)[..., 0]
+    return _blended(difference, match.weight, guide)[..., 0]
 
 
 def _softened(mono: Image, sharpness: float) -> Image:
@@ -323,19 +317,11 @@ def _regressed(chroma: Image, luma: Image, residual: Image) -> Image:
     return chroma + slope * np.clip(residual, -0.2, 0.2)[..., None]
 
 
-def _diffused(values: Image, weight: Image, guide: NDArray[np.uint8], how: _Smoothing) -> Image:
-    """The weighted mean of `values` over what is connected in `guide`. Weights must be positive."""
-
-    def smooth(plane: Image) -> Image:
-        return cv2.ximgproc.fastGlobalSmootherFilter(guide, plane.astype(np.float32), how.strength, how.edge)
-
-    total = smooth(weight)
-    planes = np.atleast_3d(values).transpose(2, 0, 1)
-    return np.stack([smooth(plane * weight) / total for plane in planes], -1).reshape(values.shape)
-
-
-def _blended(values: Image, filled: Image, weight: Image) -> Image:
-    return (weight[..., None] * values + (1 - weight[..., None]) * filled).astype(np.float32)
+def _blended(values: Image, weight: Image, guide: NDArray[np.uint8]) -> Image:
+    """Values (h, w, c), replaced where their weight is low by those of what is connected in the guide."""
+    planes = filled(values.transpose(2, 0, 1), weight + 1e-4, guide, COLOUR_FILL)
+    diffused = np.ascontiguousarray(planes.transpose(1, 2, 0))
+    return (weight[..., None] * values + (1 - weight[..., None]) * diffused).astype(np.float32)
 
 
 def _recoloured(alpha: Float[Tensor, "1 h w"], chroma: Image) -> Float[Tensor, "3 h w"]:

@@ -7,7 +7,7 @@ no colour of a network is in them.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, TypeGuard
@@ -39,7 +39,7 @@ from .fuse import Progress
 from .inputs import FrameInputs, Placement, prepared
 from .low_light import Noise, denoised_views
 from .steps import FusionStep, equal_resolution, has_lens, normalise_betas, undistort, undone, upright
-from .tiles import fused_in_tiles, plan_frame
+from .tiles import Plan, fused_in_tiles, plan_frame
 from .views import Views, check_bands
 
 LOG = logging.getLogger(__name__)
@@ -158,14 +158,17 @@ def align(
     response: ResponseSpec = "fit",
     correct: bool = True,
     noise: Noise | None = None,
+    explain: Callable[[str], None] | None = None,
     progress: Progress | None = None,
+    announce: Callable[[Plan], None] | None = None,
     matcher: Matcher = match,
 ) -> Aligned:
     """Every camera's own values at the pixels of camera `alpha`.
 
-    `rig`, `images`, `depth`, `field`, `max_memory`, `match_levels`, `response`, `noise`, `progress` and
-    `matcher` are as of `fuse`, and `correct` is its `align`; they serve to find where alpha's pixels are in
-    each beta. A pixel counts as occluded where the confidence that beta sees its point, and there, is low.
+    `rig`, `images`, `depth`, `field`, `max_memory`, `match_levels`, `response`, `noise`, `explain`,
+    `progress`, `announce` and `matcher` are as of `fuse`, and `correct` is its `align`; they serve to find
+    where alpha's pixels are in each beta. A pixel counts as occluded where the confidence that beta sees its
+    point, and there, is low.
 
     Args:
         recorded: the values to align, by camera, (C, H, W) of any type, as large as the images; by default
@@ -198,7 +201,11 @@ def align(
             )
         if isinstance(own, dict):  # others may be read from files, which takes time
             _as_array(own[name], name, rig[name].hw)
-    network = network or load_weights(weights_for([len(views.images[name]) for name in betas]))
+    if network is None:
+        weights = weights_for([len(views.images[name]) for name in betas])
+        network = load_weights(weights)
+        if explain:
+            explain(f"weights: {weights}")
     if not network.uses_matches:
         raise ValueError("these weights use no matches to align by: take others, such as mono-spectral")
     check_bands(views, network.bands)
@@ -208,12 +215,16 @@ def align(
         network,
         inputs,
         limit=limit,
-        estimate=False,
+        estimate=announce is not None,
         stored=False,
         before=expected_work(inputs, response, align=correct),
         kept=low_light.kept(inputs.hw, len(betas)),
     )
+    if announce:
+        announce(plan)
     corrections = find_corrections(network, inputs, response, align=correct)
+    for line in corrections.described(betas, inputs.hw) if explain else ():
+        explain(line)
     inputs = inputs._replace(inputs=corrections.applied(inputs.inputs, inputs.hw))
     with limited(limit), torch.no_grad():
         matches = matcher(inputs.inputs)

@@ -47,7 +47,7 @@ from .checks import confidence_checked
 from .frames import ImageFiles
 from .fuse import FuseSettings, fuse
 from .results import Frame, ImageFormat, band_names, save_frame, view_of
-from .sequence import KeyColour, SequenceFusion
+from .sequence import KeyColour, SequenceFusion, readable
 from .timeline import KeyFrame
 from .views import ViewFiles
 
@@ -243,10 +243,22 @@ class Batch:
             with confidence_checked(strict=self.strict):
                 frame = self._frame(i)
             view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
-            bands = band_names(frame, (name for name in self.rig.betas(self.alpha) if name in self.files))
+            bands = band_names(frame, self._betas) or self._propagated_bands(frame)
             save_frame(
                 frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i], bands=bands
             )
+
+    @property
+    def _betas(self) -> list[str]:
+        return [name for name in self.rig.betas(self.alpha) if name in self.files]
+
+    def _propagated_bands(self, frame: Frame) -> list[str]:
+        """As `band_names`, of a frame of several bands that does not say whose confidence is whose."""
+        if not self.sequence or not 1 < len(frame.image) == len(self._betas):
+            return []
+        frames = [self.fusion.frames[name] for name in self._betas]
+        images = [next(readable(of_one.__getitem__, range(len(of_one))), frame.image) for of_one in frames]
+        return self._betas if all(len(image) == 1 for image in images) else []
 
     def _frame(self, i: int) -> Frame:
         if not self.sequence:
@@ -339,14 +351,16 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
             f"{label}{path}: is a video, which only `pat fuse` without a rig reads: save its frames"
         )
     if path.is_dir():
-        files = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
+        files = _images_in(path)
     elif any(c in path.name for c in "*?["):
-        files = list(path.parent.glob(path.name))
+        files = [p for p in path.parent.glob(path.name) if p.is_file()]
     else:
         files = [path] if path.exists() else []
     files = sorted((p for p in files if p == path or not p.name.startswith(".")), key=_natural)
     if not files:
-        raise FileNotFoundError(f"{label}{path}: no image there: check the path")
+        below = [str(p) for p in sorted(path.iterdir()) if _images_in(p)] if path.is_dir() else []
+        advice = f"give a folder of images, such as {below[0]}" if below else "check the path"
+        raise FileNotFoundError(f"{label}{path}: no image there: {advice}")
     frames: dict[str, Path] = {}
     for file in files:
         if (other := frames.setdefault(file.stem, file)) != file:
@@ -355,6 +369,11 @@ def find_images(text: str | Path, *, name: str = "") -> list[Path]:
                 f"{label}{other} and {file.name} are one frame: give a pattern, such as '{pattern}'"
             )
     return files
+
+
+def _images_in(folder: Path) -> list[Path]:
+    files = folder.iterdir() if folder.is_dir() else ()
+    return [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

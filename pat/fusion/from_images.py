@@ -89,21 +89,10 @@ def array_from_images(
     line: fewer than two images, an image of one colour, images that do not show the same things, a focal
     length of no camera.
     """
-    if isinstance(sources, str | Path):
-        raise ValueError(f"an array has two images or more, got {sources}: give a list of them")
-    if not isinstance(sources, Mapping):
-        for source in sources:
-            if not isinstance(source, str | Path):
-                got = type(source).__name__
-                raise TypeError(
-                    f"an image is a {got} without a name: give files, or {{NAME: tensor}} by camera"
-                )
-        sources = camera_names([Path(path) for path in sources])
-    if len(sources) < 2:
-        raise ValueError(f"an array has two images or more, got {len(sources)}")
+    sources, focal = _by_camera(sources), focal or {}
     images = {name: image for name, image in sources.items() if isinstance(image, Tensor)}
     files = {name: Path(path) for name, path in sources.items() if not isinstance(path, Tensor)}
-    for name, length in (focal or {}).items():
+    for name, length in focal.items():
         if name not in sources or not 0 < length < math.inf:
             raise ValueError(
                 f"focal {name}={length:g}: no camera of {', '.join(sources)}, or not positive: mend it"
@@ -126,13 +115,7 @@ def array_from_images(
     names = _ordered_betas(images, alpha, note)
     images = {name: images[name] for name in (alpha, *names)}
     if tagged is None:
-        by_tags = {
-            n: focal_length(files[n], (x.shape[-2], x.shape[-1])) for n, x in images.items() if n in files
-        }
-        lengths = {n: length for n, length in {**by_tags, **(focal or {})}.items() if length and n in images}
-        for name, length in lengths.items():
-            by = "as given" if name in (focal or {}) else "by EXIF"
-            note(f"{name}: focal length {length:.0f} pixels, {by}")
+        lengths = _focal_lengths(images, files, focal, note)
         network = load_weights(weights or _weights_of(images, alpha))
         rig, names = found_rig(images, alpha, lengths, network, note)
         for name in names:
@@ -149,6 +132,34 @@ def array_from_images(
     if tagged is not None:
         recorded = rig.replace(cameras={n: rig[n].replace(sensor=tagged[n].sensor) for n in rig.names})
     return ImageArray(rig, recorded, images, alpha, weights, several, tuple(notes))
+
+
+def _by_camera(sources: ImageSources) -> Mapping[str, str | Path | Tensor]:
+    """Files or tensors by camera. Raises ValueError for fewer than two, TypeError for one without a name."""
+    if isinstance(sources, str | Path):
+        raise ValueError(f"an array has two images or more, got {sources}: give a list of them")
+    if not isinstance(sources, Mapping):
+        for source in sources:
+            if not isinstance(source, str | Path):
+                got = type(source).__name__
+                raise TypeError(
+                    f"an image is a {got} without a name: give files, or {{NAME: tensor}} by camera"
+                )
+        sources = camera_names([Path(path) for path in sources])
+    if len(sources) < 2:
+        raise ValueError(f"an array has two images or more, got {len(sources)}")
+    return sources
+
+
+def _focal_lengths(
+    images: Images, files: Mapping[str, Path], given: Mapping[str, float], note: Say
+) -> dict[str, float]:
+    """Those given, else those in the files' tags, pixels; of images without either none."""
+    by_tags = {n: focal_length(files[n], (x.shape[-2], x.shape[-1])) for n, x in images.items() if n in files}
+    lengths = {n: length for n, length in {**by_tags, **given}.items() if length and n in images}
+    for name, length in lengths.items():
+        note(f"{name}: focal length {length:.0f} pixels, {'as given' if name in given else 'by EXIF'}")
+    return lengths
 
 
 def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
@@ -291,13 +302,8 @@ def _calibrated(
         pair = self_calibrated(views, link, uncalibrated.matches[alpha, name], focal=focal)
         if pair is None or not pair.exact:
             links[alpha, name] = link
-            note(
-                next(
-                    line
-                    for line in uncalibrated.as_text().splitlines()
-                    if line.startswith(f"{alpha} > {name}")
-                )
-            )
+            lines = uncalibrated.as_text().splitlines()
+            note(next(line for line in lines if line.startswith(f"{alpha} > {name}")))
         if pair is None:
             note(
                 f"no depth by {name}: "

@@ -35,7 +35,7 @@ def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[T
 
 
 def box_mean(x: Tensor, radius: int) -> Tensor:
-    """Over squares around each pixel, as far as these are on the image."""
+    """Means of planes (*b, h, w) over squares of side 2 `radius` + 1, as far as these are on the image."""
     side = 2 * radius + 1
     if compilable(x) and not x.requires_grad:
         return _box_mean_of_numbers(x, radius)

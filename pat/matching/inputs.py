@@ -180,11 +180,13 @@ def box_around(points: Float[Tensor, "n 2"], hw: HW, halo: int, multiple: int) -
 
 
 def _ends_in(field: FieldOnGrid, box: Box, step: int) -> Float[Tensor, "n 2"]:
-    """The ends of the segments, or the positions, of every `step`-th pixel of a box."""
+    """The ends of the segments of every `step`-th pixel of a box; of positions, the corners of what each row
+    touches, asked for row by row."""
     top, bottom, left, right = box
     rows, columns = torch.arange(top, bottom, step), torch.arange(left, right, step)
     if field.pixels is None:
-        y, x = torch.meshgrid(rows, columns, indexing="ij")
-        return ends_of(field.at(torch.stack([x, y], -1).reshape(-1, 2).float()))
+        asked = (torch.stack([columns, y.expand_as(columns)], -1).float() for y in rows)
+        touched = [points for points in (ends_of(field.at(x)) for x in asked) if len(points)]
+        return torch.cat([torch.stack([p.amin(0), p.amax(0)]) for p in touched] or [torch.zeros(0, 2)])
     some = (slice(None), rows[:, None], columns)
     return ends_of(field.pixels[some])

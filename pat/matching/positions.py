@@ -75,5 +75,5 @@ def normals(segments: Segments) -> Float[Tensor, "*n 2"]:
 
 
 def enlarged(x: Tensor) -> Tensor:
-    """From half the size, each value four times."""
+    """Planes (*b, h, w) of half the size at full size: each value four times."""
     return x.repeat_interleave(FINE, -1).repeat_interleave(FINE, -2)

@@ -34,13 +34,14 @@ class ImageHeader(NamedTuple):
     """Stored (height, width), orientation tag (1 to 8; else 1), bits a value of TIFF, PNG, PNM (else 0).
 
     `tag` is where a TIFF file has its orientation: byte offset and struct format; None without one, and in
-    other files.
+    other files. `white` is the largest value that a PNM file states (else 0).
     """
 
     hw: HW
     orientation: int = 1
     bits: int = 0
     tag: tuple[int, str] | None = None
+    white: int = 0
 
     @property
     def upright(self) -> HW:
@@ -71,13 +72,15 @@ def _png(content: bytes) -> ImageHeader:
 
 
 def _pnm(content: bytes) -> ImageHeader | None:
-    """By hand: Pillow does not state the bits."""
+    """By hand: Pillow does not state the largest value."""
     gap = rb"(?:\s|#[^\n]*\n)+"
-    form = rb"P[1-6]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})\s(?:\s*(\d{1,5})\s)?"
+    largest = gap + rb"(\d{1,5})" if content[1:2] in b"2356" else rb"()"
+    form = rb"P[1-6]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})" + largest + rb"\s"
     header = re.match(form, content[:4096])
     if header is None:
         return None
-    return ImageHeader((int(header[2]), int(header[1])), bits=max(int(header[3] or 0).bit_length(), 8))
+    white = int(header[3] or 0)
+    return ImageHeader((int(header[2]), int(header[1])), bits=max(white.bit_length(), 8), white=white)
 
 
 def _tiff(content: bytes) -> ImageHeader | None:

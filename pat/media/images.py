@@ -88,8 +88,8 @@ def read_image(
     size than expected, or is larger than `MOST_PIXELS` where no size is.
     """
     label = f"{name}: {path}" if name else f"{path}"
-    planes, packed = _planes(Path(path), label, hw, orientation)
-    return torch.from_numpy(np.ascontiguousarray(_unit_range(planes, label, bits, packed)))
+    planes, white = _planes(Path(path), label, hw, orientation)
+    return torch.from_numpy(np.ascontiguousarray(_unit_range(planes, label, bits, white)))
 
 
 def read_recorded(
@@ -101,17 +101,16 @@ def read_recorded(
 ) -> NDArray[Any]:
     """Values (C, H, W) of an image file in its own type and counts; else, and in errors, as `read_image`.
 
-    Those of a TIFF or PNM file of less than 16 bits are as its camera counted them.
+    Those of a TIFF or PNM file that states a lower white are as its camera counted them.
     """
     label = f"{name}: {path}" if name else f"{path}"
-    planes, packed = _planes(Path(path), label, hw, orientation)
-    return np.ascontiguousarray(planes >> (16 - packed) if packed else planes)
+    return np.ascontiguousarray(_planes(Path(path), label, hw, orientation)[0])
 
 
 def _planes(
     path: Path, label: str, hw: HW | None, orientation: Literal["apply", "ignore"]
 ) -> tuple[NDArray, int]:
-    """The values (C, H, W) as OpenCV reads them, upright, and the bits of packed ones (else 0)."""
+    """The values (C, H, W) as stored, upright, and the white that a TIFF or PNM file states (else 0)."""
     if not path.is_file():
         raise FileNotFoundError(f"{label}: no such image: check the path")
     content = _png_of_raw(path, label) if path.suffix.lower() in RAW_SUFFIXES else path.read_bytes()
@@ -124,11 +123,11 @@ def _planes(
         warn(f"{label}: holds several images: the first is taken; save the others as files of their own")
     applied = _applied(header, orientation, label)
     _check_header(header.upright if applied > 1 else header.hw, hw, label)
-    values, packed = _decode(content, header, label)
-    values = _opaque(_upright(values, applied), content, label)
+    values, white = _decode(content, header, label)
+    values = _opaque(_upright(values, applied), content, label, white)
     if orientation == "apply":
         values = in_srgb(values, content, label)
-    return (values[None] if values.ndim == 2 else values[..., ::-1].transpose(2, 0, 1)), packed
+    return (values[None] if values.ndim == 2 else values[..., ::-1].transpose(2, 0, 1)), white
 
 
 def write_image(
@@ -239,9 +238,9 @@ def _upright(values: NDArray, orientation: int) -> NDArray:
 
 
 def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, int]:
-    """Values as stored, and the bits of a value where a TIFF or PNM file states less than 16; else 0.
+    """Values as stored, and the largest possible one where a TIFF or PNM file states it; else 0.
 
-    Those are shifted up to 16 bits, as OpenCV does in TIFF files alone.
+    OpenCV shifts those of TIFF files up to 16 bits, and scales those of 8 bits in PNM files of text to 255.
     """
     values = decoded(_without_orientation(content, header))
     page = first_tiff_page(content) if content[:4] in TIFF else None
@@ -253,8 +252,11 @@ def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, i
         raise ValueError(f"{label}: not an image that can be read: give a whole PNG, TIFF or JPEG file")
     if values.shape[:2] != header.hw:
         raise ValueError(f"{label}: its header says another size than its pixels have: save it again")
-    packed = header.bits if values.dtype == np.uint16 and header.bits < 16 else 0
-    return values << (16 - packed) if packed and page is None else values, packed
+    if page is not None and values.dtype == np.uint16 and header.bits < 16:
+        return values >> (16 - header.bits), 2**header.bits - 1
+    if content[:2] in (b"P2", b"P3") and values.dtype == np.uint8:
+        values = ((values.astype(np.uint16) * header.white + 254) // 255).astype(np.uint8)
+    return values, header.white
 
 
 def _as_tiff_states(values: NDArray | None, page: Any, content: bytes, label: str) -> NDArray | None:
@@ -311,22 +313,22 @@ def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | N
     return decoded(content, flags)
 
 
-def _opaque(values: NDArray, content: bytes, label: str) -> NDArray:
+def _opaque(values: NDArray, content: bytes, label: str, white: int) -> NDArray:
     """Values without an alpha channel, which OpenCV gives to three equal bands where a PNG file is grey."""
     if values.ndim == 2 or values.shape[2] == 3:
         return values
     if values.shape[2] != 4:
         raise ValueError(f"{label}: has {values.shape[2]} channels: {CHANNELS}")
-    full = np.iinfo(values.dtype).max if np.issubdtype(values.dtype, np.integer) else 1.0
+    full = white or (np.iinfo(values.dtype).max if np.issubdtype(values.dtype, np.integer) else 1.0)
     if (values[..., 3] != full).any():
         raise ValueError(f"{label}: has transparent pixels: flatten it and save it without alpha channel")
     grey = content.startswith(PNG) and content[25] == GREY_WITH_ALPHA
     return values[..., 0] if grey else values[..., :3]
 
 
-def _unit_range(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArray[np.float32]:
+def _unit_range(planes: NDArray, label: str, bits: int | None, white: int) -> NDArray[np.float32]:
     if planes.dtype in (np.uint8, np.uint16):
-        return _counts(planes, label, bits, packed)
+        return _counts(planes, label, bits, white or np.iinfo(planes.dtype).max)
     if not np.issubdtype(planes.dtype, np.floating):
         raise ValueError(f"{label}: has {planes.dtype} values: {KINDS}")
     if not np.isfinite(planes).all():
@@ -337,22 +339,22 @@ def _unit_range(planes: NDArray, label: str, bits: int | None, packed: int) -> N
     return planes.astype(np.float32)
 
 
-def _counts(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArray[np.float32]:
-    own = packed or 8 * planes.itemsize
-    white = 2 ** (bits or own) - 1
+def _counts(planes: NDArray, label: str, bits: int | None, white: int) -> NDArray[np.float32]:
+    own, largest = max(white.bit_length(), 8), int(planes.max())
     if bits and bits > own:
         raise ValueError(
             f"{label}: has {own} bits a value, the rig says {bits}: correct 'bits', or give the raw file"
         )
-    planes = planes >> (16 - packed) if packed else planes
-    largest = int(planes.max())
-    if own == 16 and not bits and 0 < largest < 2 ** max(FEW_BITS):
+    if largest > white:
+        raise ValueError(f"{label}: has values up to {largest}, its header says {white}: save it again")
+    if white == 2**16 - 1 and not bits and 0 < largest < 2 ** max(FEW_BITS):
         needed = next(n for n in FEW_BITS if largest < 2**n)
         warn(
             f"{label}: has 16 bits a value, and none above {largest}, so it is nearly black: "
             f"if its camera counts to {2**needed - 1}, state `bits: {needed}` in the rig file, "
             f"or save it with its values times {65535 // (2**needed - 1)}"
         )
+    white = 2**bits - 1 if bits else white
     if largest > white:
         raise ValueError(
             f"{label}: has values up to {largest}, the rig says {bits} bits (up to {white}): correct 'bits' "

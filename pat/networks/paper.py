@@ -153,7 +153,7 @@ class AttentionEngine(nn.Module):
             key.load_state_dict(self.query.state_dict())
 
     def compare(self, own: Tensor, others: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> list[Compared]:
-        """The query, each beta's key and value, and where they are compared."""
+        """Alpha's query, each beta's key and value, and where they are compared; of features (b, d, h, w)."""
         query, how = self.query(self.before(own)), self.interpolation
         scores = []
         for f, to_key, to_value, field in zip(others, self.key, self.value, fields):

@@ -43,8 +43,8 @@ SETTINGS = EightBitSettings()
 class Conv2d(nn.Conv2d):
     """A convolution that computes in 8 bits if it is to be `rounded`.
 
-    Not for gradients, on a GPU, or of other numbers than float32: then it is torch's. Weights that are
-    trained lose the range, which was another network's.
+    Not for gradients or of other numbers than float32: then it is torch's. Weights that are trained lose the
+    range, which was another network's. Raises ValueError on a GPU.
     """
 
     input_range: Tensor | None
@@ -56,6 +56,8 @@ class Conv2d(nn.Conv2d):
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h2 w2"]:
         """As of `torch.nn.Conv2d`."""
+        if self.rounded and x.device.type not in ("cpu", "meta"):
+            raise ValueError(f"int8 is for the CPU: leave the precision at float32 on {x.device.type}")
         if self.weight.requires_grad:
             self.input_range = None
         elif self.measuring:

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     NetworkConfig = GuidedPATConfig | PATConfig | BandwisePATConfig
 else:
     NetworkConfig = Union[tuple(CONFIGS.values())]  # noqa: UP007
-FieldName = Literal["epipolar", "line", "homography", "rectified", "nearest", "local", "dense"]
 UNSEEN = ("out", "device", "save", "tensorboard", "cache")
 """Entries that may differ between a run and its continuation: samples and steps do not depend on them."""
 
@@ -121,8 +120,8 @@ class TrainConfig:
     measured_from: tuple[Path, ...] = ()
     """Folders of Middlebury's stereo pairs, with the true disparity of both images."""
     recording: RecordingConfig = RecordingConfig()
-    field: FieldName = "epipolar"
-    """The receptive field, by name."""
+    field: str = "epipolar"
+    """The receptive field, by name, or MODULE:OBJECT for your own."""
     held_out: int = 12
     """One photograph in so many is for validation only."""
     seed: int = 0
@@ -190,8 +189,12 @@ def load_config(name: str | Path) -> TrainConfig:
 
 def parse_config(text: str, name: str = "config") -> TrainConfig:
     """A recipe from YAML text. Raises ValueError naming the entry."""
-    values = parse_yaml(text, name) or {}
+    values = parse_yaml(text, name)
     try:
+        if not values:
+            raise ValueError(
+                f"the recipe is empty: write entries (name: value), or take {', '.join(recipes())}"
+            )
         if not isinstance(values, Mapping):
             raise ValueError(f"wanted entries (name: value), got {values!r}")
         config = from_document(TrainConfig, {k: v for k, v in values.items() if k != "network"})

@@ -26,12 +26,15 @@ from .samples import Sample
 
 
 def image_loss(image: Tensor, ground_truth: Tensor) -> Tensor:
-    """Minus the mean PSNR over 10, with a floor on the error: every sample has the same weight."""
+    """Minus the mean PSNR over 10 of images (b, c, h, w) in 0..1, with a floor on the error.
+
+    Every sample has the same weight.
+    """
     return ((image - ground_truth).square().flatten(1).mean(1) + 1e-5).log10().mean()
 
 
 def structure_loss(image: Tensor, ground_truth: Tensor) -> Tensor:
-    """One minus the mean structural similarity in windows of 7x7 pixels (Wang et al. 2004)."""
+    """One minus the mean SSIM of images (b, c, h, w) in windows of 7x7 pixels (Wang et al. 2004)."""
 
     def mean(x: Tensor) -> Tensor:
         return avg_pool2d(x, 7, 1)

@@ -24,7 +24,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom import Camera, Epipolar, Pair, Pose, ReceptiveField, pixel_grid, rotation_from_vector, sample
-from arraygeom.fields import FIELDS, pinhole_track
+from arraygeom.fields import named_field, pinhole_track
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.sampling import Sampled
@@ -160,16 +160,14 @@ def made_ahead(samples: Iterator[list[Sample]], network: FusionNetwork) -> Itera
             yield given
 
 
-def scenes(
-    config: TrainConfig, *, field: ReceptiveField | None = None, device: str = "cpu"
-) -> tuple[SampleSource, SampleSource]:
+def scenes(config: TrainConfig, *, device: str = "cpu") -> tuple[SampleSource, SampleSource]:
     """Sources of samples to learn from and to validate on, from different photographs, scenes and pairs."""
+    field, n = named_field(config.field), config.held_out
     layered = config.rendered + config.pairs + config.measured < 1
     bank, unseen = photographs(config) if layered else (None, None)
-    look, n = field or FIELDS[config.field](), config.held_out
 
     def source(photos: PhotoBank | None, seed: int, choose: Callable[[int], bool]) -> SampleSource:
-        return source_of(config, photos, seed, look, device, crops(config, seed, device, choose))
+        return source_of(config, photos, seed, field, device, crops(config, seed, device, choose))
 
     learn = source(bank, config.seed + 1, lambda i: i % n != 0)
     return learn, source(unseen, config.seed + 2, lambda i: i % n == 0)

@@ -164,7 +164,12 @@ def fields_of(one: Drawn) -> list[tuple[str, Any, float | None, float | None]]:
     return [
         *both,
         ("Epipolar", ag.Epipolar(), near, far),
-        ("EpipolarLine", ag.EpipolarLine(), 1e-4, math.inf),
+        (
+            "EpipolarLine",
+            ag.EpipolarLine(),
+            1e-3 * max(float(one.pair.beta_from_alpha.t.norm()), 1e-3),
+            math.inf,
+        ),
         ("HomographyDisplacement", ag.HomographyDisplacement(), None, None),
         ("Widened", ag.Widened(ag.Epipolar(), along=2), near, far),
         ("Widened across", ag.Widened(ag.Epipolar(), 2, 1, samples=48), near, far),

@@ -126,12 +126,10 @@ def test_points_beside_each_other_keep_their_own_matches():
 
 def test_disparities_of_a_rectified_pair_without_calibration():
     pair = Pair(View(hw=HW), View(hw=HW))
-    disparity = torch.full(HW, 6.0)
-    disparity[20, 50] = math.nan
+    there = pixel_grid(HW) - torch.tensor([6.0, 0.0])
+    there[20, 50] = math.nan
     x = torch.tensor([[40.0, 20.0], [50.0, 20.0]], dtype=torch.float64)
-    found = AroundMatches(AroundMatches.from_disparity(disparity).positions, 2.0, field=Rectified(20.0))(
-        pair, x
-    )
+    found = AroundMatches(there, 2.0, field=Rectified(20.0))(pair, x)
     assert found.start[0].tolist() == pytest.approx([32.0, 20.0])
     assert found.end[0].tolist() == pytest.approx([36.0, 20.0])
     assert found.length[1] == 20

@@ -19,6 +19,12 @@ scipy_io = Oracle("scipy.io")
 FIXTURES = Path(__file__).parent / "fixtures"
 
 
+def test_text_of_another_encoding_is_said(tmp_path):
+    (tmp_path / "rig.yaml").write_bytes("format: arraygeom-rig 1\n# Größe\n".encode("latin-1"))
+    with pytest.raises(RigFileError, match=r"rig.yaml: is not text in UTF-8: save it as such"):
+        read_rig(tmp_path / "rig.yaml")
+
+
 TEXTS = sorted(
     f
     for f in FIXTURES.rglob("*")

@@ -1,3 +1,5 @@
+import dataclasses
+import math
 import re
 
 import pytest
@@ -5,16 +7,23 @@ import torch
 
 from arraygeom import (
     Camera,
+    Curved,
     Distortion,
+    Epipolar,
+    EpipolarLine,
     Pose,
     Rig,
     View,
     epipolar_distance,
     intrinsics,
+    pixel_grid,
     resize_matrix,
     rotation_from_vector,
 )
+from arraygeom.lenses import RollingShutter
+from arraygeom.pixels import pixel_grid
 from arraygeom.pose import rotation_error
+from arraygeom.summary import summarise_pairs
 from arraygeom.text import UNSCALED
 from tests.arraygeom.rigs import known_by_f, random_rig, scene_points, two_cameras
 
@@ -186,3 +195,50 @@ def test_cameras_at_one_position_are_one_sentence():
     bands = dict.fromkeys(("blue", "green", "red"), rig["alpha"])
     odd = [s for s in Rig({**bands, "beta": rig["beta"]}).check() if "same position" in s]
     assert odd == ["'blue', 'green' and 'red' are at the same position: between them depth has no effect"]
+
+
+@pytest.mark.parametrize(
+    ("centre", "turn", "steps"),
+    [
+        ((0.5, 0, 0), 0.0, (2 * 2 / 50, 10 * 10 / 50)),  # beside: depth^2 / (focal length x baseline)
+        ((0, 0, 12.0), math.pi, (None, None)),  # facing
+        ((0, 0, 1.0), 0.0, (None, None)),  # ahead
+        ((6.0, 0, 6.0), -math.pi / 2, (None, None)),  # from the side
+    ],
+)
+def test_a_pixel_of_depth_is_what_moves_the_point_by_a_pixel(centre, turn, steps):
+    K = intrinsics(100.0, (60, 100))
+    alpha = Camera(K=K, cam_from_world=Pose.identity(), hw=(60, 100))
+    R = rotation_from_vector(torch.tensor([0, turn, 0], dtype=torch.float64))
+    pose = Pose.from_centre(R, torch.tensor(centre, dtype=torch.float64))
+    beta = alpha.replace(cam_from_world=pose)
+    (summary,) = summarise_pairs(Rig({"alpha": alpha, "beta": beta}, depth=(2.0, 10.0)), "alpha")
+    x = pixel_grid((60, 100), dtype=torch.float64).reshape(-1, 2)
+    for depth, step, expected in zip((2.0, 10.0), summary.depth_step, steps):
+        here = beta.project(alpha.unproject(x, torch.full_like(x[:, 0], depth)))
+        there = beta.project(alpha.unproject(x, torch.full_like(x[:, 0], depth + step)))
+        seen = here.valid & there.valid & beta.contains(here.x)
+        if not seen.any():
+            assert math.isnan(step)
+            continue
+        assert float((there.x - here.x).norm(dim=-1)[seen].median()) == pytest.approx(1, rel=0.2)
+        assert expected is None or step == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-6])
+@pytest.mark.parametrize(
+    ("field", "moves"), [(Epipolar(), False), (EpipolarLine(), False), (Curved(9), False), (Curved(9), True)]
+)
+def test_fields_in_another_unit_are_the_same(field, moves, factor):
+    """A line began 0.1 mm from alpha, and infinity was at 100 km, whatever the rig's unit."""
+    rig = random_rig(0).replace(depth=(1.0, math.inf))
+    if moves:
+        velocity, rotation, readout = (
+            torch.tensor(v).double() for v in ([1.0, 0.2, 0.1], [0.1, 0.2, 0.3], 0.02)
+        )
+        shutter = RollingShutter(velocity=velocity, rotation=rotation, readout=readout)
+        rig = rig.with_camera("beta", dataclasses.replace(rig["beta"], distortion=shutter))
+    x = pixel_grid(rig["alpha"].hw).double()
+    found, wanted = (field(r.pair("alpha", "beta"), x) for r in (rig.scaled(factor), rig))
+    for part, value in vars(wanted).items():
+        torch.testing.assert_close(vars(found)[part], value, rtol=0, atol=1e-6)

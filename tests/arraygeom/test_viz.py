@@ -92,3 +92,11 @@ def test_residuals_state_their_median():
     title = figure.axes[1].get_title()
     assert "200 matches" in title
     assert 0.1 < float(title.split()[-2]) <= 0.3
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-3])
+def test_what_is_drawn_of_the_depth_range_is_the_same_in_another_unit(factor):
+    """Within 30 cm it was drawn however small the rig."""
+    rig = random_rig(0).scaled(0.01).replace(depth=(0.2, 0.25))
+    drawn = [len(viz.depth_outline(r, viz.calibrated(r), None)) for r in (rig, rig.scaled(factor))]
+    assert drawn[0] == drawn[1]

@@ -3,14 +3,15 @@
     python -m tests.benchmarks.bench_gradients [DEGREES ...]
 
 A window of the layered sample array; colour is rotated by so many degrees about its x axis (across the
-baseline) or y axis (along it). The error is the mean squared one of the fused image, the depth the mean
-inverse depth where confidence exceeds .7; differences are over .1 degrees either way, the median of pixels
-for depth.
+baseline), its y axis (along it) or its z axis, and moved along them, by 1 % of the baseline for each .1
+degrees. The error is the mean squared one of the fused image, the depth the mean inverse depth where
+confidence exceeds .7; differences are over .1 degrees, or 1 %, either way, the mean over the same pixels.
 """
 
 from __future__ import annotations
 
 import math
+from itertools import product
 
 import torch
 import tyro
@@ -21,8 +22,7 @@ from pat import fuse, load_weights
 from tests.benchmarks.printed import head
 from tests.pat.layered_array import load_sample
 
-HW, TOP, LEFT, STEP = (192, 256), 104, 192, math.radians(0.1)
-AXES = {"across": (1.0, 0.0, 0.0), "along": (0.0, 1.0, 0.0)}
+HW, TOP, LEFT, STEP = (192, 256), 104, 192, 0.1
 
 
 def rows(degrees: float) -> list[str]:
@@ -31,33 +31,33 @@ def rows(degrees: float) -> list[str]:
     window = (slice(None), slice(TOP, TOP + HW[0]), slice(LEFT, LEFT + HW[1]))
     images = sample.images | {"mono": sample.images["mono"][window]}
     rig, truth = sample.rig.crop("mono", TOP, LEFT, HW), sample.ground_truth[window]
+    units = {"rotation": math.radians(1), "translation": 0.1 * float(rig["colour"].centre.norm())}
     made = []
-    for name, axis in AXES.items():
+    for (kind, unit), axis in product(units.items(), range(3)):
+        way = unit * torch.eye(3, dtype=torch.float64)[axis]
 
         def fused(
-            angle: Tensor, axis: tuple[float, ...] = axis, **options: bool
+            far: Tensor, name: str = f"colour.{kind}", way: Tensor = way, **options: bool
         ) -> tuple[Tensor, Tensor, Tensor]:
-            moved = rig.perturbed({"colour.rotation": angle * torch.tensor(axis, dtype=torch.float64)})
+            moved = rig.perturbed({name: far * way})
             frame = fuse(network, moved, images, alpha="mono", align=False, **options)
             return (frame.image - truth).square().mean(), 1 / frame.depth, frame.confidence.detach()
 
-        angle = torch.tensor(math.radians(degrees), dtype=torch.float64, requires_grad=True)
-        error, inverse, confidence = fused(angle, differentiable=True)
-        around = [fused(angle.detach() + s) for s in (-STEP, STEP)]
+        far = torch.tensor(degrees, dtype=torch.float64, requires_grad=True)
+        error, inverse, confidence = fused(far, differentiable=True)
+        around = [fused(far.detach() + s) for s in (-STEP, STEP)]
         likely = (torch.stack([confidence, *(a[2] for a in around)]) > 0.7).all(0)
-        slopes = [
-            torch.autograd.grad(v, angle, retain_graph=True)[0] for v in (error, inverse[likely].mean())
-        ]
+        slopes = [torch.autograd.grad(v, far, retain_graph=True)[0] for v in (error, inverse[likely].mean())]
         changes = [(around[1][0] - around[0][0]) / (2 * STEP)]
-        changes.append((around[1][1] - around[0][1])[likely].median() / (2 * STEP))
+        changes.append((around[1][1] - around[0][1])[likely].mean() / (2 * STEP))
         cells = [f"{float(v):.3g}" for pair in zip(slopes, changes) for v in pair]
-        made.append(f"| {degrees:g} | {name} | {' | '.join(cells)} |")
+        made.append(f"| {degrees:g} | {kind} {'xyz'[axis]} | {' | '.join(cells)} |")
     return made
 
 
 def main(degrees: Positional[tuple[float, ...]] = (0, 0.1, 0.3)) -> None:
     """Print the table."""
-    print(head("degrees | rotation | error, gradient | difference | inverse depth, gradient | difference"))
+    print(head("degrees | motion | error, gradient | difference | inverse depth, gradient | difference"))
     for given in degrees:
         for row in rows(given):
             print(row, flush=True)

@@ -22,7 +22,7 @@ from unittest.mock import patch
 import torch
 import tyro
 
-from arraygeom.fields import FIELDS
+from arraygeom.fields import named_field
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.networks.weights import load_weights
 from pat.synthesis.photos import PhotoBank
@@ -120,7 +120,7 @@ class Bench:
         return Found(facts["psnr"], facts["matched"], seconds)
 
     def _source(self, config: TrainConfig, bank: PhotoBank, seed: int) -> SampleSource:
-        return source_of(config, bank, seed, FIELDS[config.field]())
+        return source_of(config, bank, seed, named_field(config.field))
 
 
 def unmatched(seen: object, given: Sample) -> torch.Tensor:

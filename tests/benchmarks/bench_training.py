@@ -15,7 +15,7 @@ from statistics import median
 import torch
 import tyro
 
-from arraygeom.fields import FIELDS
+from arraygeom.fields import named_field
 from pat.evaluation.ablation import sample_photographs
 from pat.networks.weights import Network, new_network, set_precision
 from pat.training.config import TrainConfig, load_config
@@ -25,7 +25,7 @@ from tests.benchmarks.printed import spread, timed
 
 
 def source(config: TrainConfig) -> SampleSource:
-    return source_of(config, sample_photographs(), 0, FIELDS[config.field]())
+    return source_of(config, sample_photographs(), 0, named_field(config.field))
 
 
 def stepped(objective: Objective, given: Sample, repeats: int) -> list[float]:

@@ -55,6 +55,15 @@ def test_a_folder_for_each_camera(tmp_path):
     assert photos["mono"][2].read().shape == (48, 64)
 
 
+def test_images_beside_folders_of_images_are_refused(tmp_path):
+    """Thumbnails were taken for the only camera, without a word."""
+    for name in ("left1", "right1", "thumbnails/left1", "thumbnails/right1"):
+        write(tmp_path / f"{name}.png")
+    with pytest.raises(ValueError, match=r"such as left1.png, and folders of images \(thumbnails\): move"):
+        find_photos(tmp_path)
+    assert len(find_photos(tmp_path, patterns={"left": "left*.png", "right": "right*.png"})) == 2
+
+
 def test_names_that_begin_with_the_camera(tmp_path):
     for name in ("left1", "left2", "right1", "right3"):
         write(tmp_path / f"{name}.png")
@@ -117,10 +126,10 @@ def test_missing_folders_and_broken_images(tmp_path):
     for i in (1, 2):
         with pytest.raises(ValueError, match=rf"a{i}\.png"):
             find_photos(tmp_path)["a"][i].read()
-    (tmp_path / "v").mkdir()
-    (tmp_path / "v" / "x.mp4").write_bytes(b"not a video")
+    (tmp_path / "films" / "v").mkdir(parents=True)
+    (tmp_path / "films" / "v" / "x.mp4").write_bytes(b"not a video")
     with pytest.raises(ValueError, match=r"x\.mp4"):
-        find_photos(tmp_path)
+        find_photos(tmp_path / "films")
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif", "webp"])

@@ -55,6 +55,21 @@ def test_files(folder, counts, capsys):  # noqa: F811
     assert "colour: sees " in capsys.readouterr().out
 
 
+def test_what_is_put_right_is_said_and_on_the_page(folder, counts, capsys):  # noqa: F811
+    colour = cv2.imread(str(counts / "colour.png"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(counts / "colour.png"), np.roll(colour, 1, axis=0))
+    page = (align(folder, counts) / "index.html").read_text()
+    said = capsys.readouterr().err
+    assert "plan: 1 piece, " in said
+    for words in (
+        "weights: mono-colour",
+        "alpha is 0.33 R + 0.33 G + 0.33 B",
+        "px off its search segments: put right",
+    ):
+        assert words in said
+        assert words in page.replace("&#x27;", "'")
+
+
 def test_warnings_are_said_once_and_are_on_the_page(folder, tmp_path, capsys):  # noqa: F811
     """Reading an image with a colour profile resets Python's record of what was warned of."""
     orientation = Image.Exif()
@@ -204,10 +219,11 @@ def test_bad_input_is_one_line(folder, tmp_path, capsys, options, message):  # n
     assert message in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_without_a_rig_the_files_rig_is_written(folder, counts):  # noqa: F811
+def test_without_a_rig_the_files_rig_is_written(folder, counts, capsys):  # noqa: F811
     """Its sensors are those of the files: it serves for the next frame."""
     out = counts / "found"
     main(["align", str(counts / "mono.png"), str(counts / "colour.png"), "-o", str(out), "--no-report"])
+    assert "weights: mono-colour (--weights NAME takes others)" in capsys.readouterr().err
     assert set(Rig.load(out / "found_rig.yaml").names) == {"mono", "colour"}
 
 

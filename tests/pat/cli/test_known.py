@@ -86,6 +86,18 @@ def test_what_the_post_hides_is_occluded(folder):
     assert view.valid[:, ON_POST.stop + 4 : -4].mean() > 0.9
 
 
+def test_what_a_field_of_ones_own_raises_is_a_line(folder, tmp_path, monkeypatch, capsys):
+    (tmp_path / "fields_of_mine.py").write_text("def slanted(pair, x):\n    return x + 'pixels'\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(SystemExit):
+        run(folder, "align", "--field", "fields_of_mine:slanted")
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("pat: TypeError: ")
+    assert last.endswith("'str', raised by the field slanted (--debug shows where)")
+    with pytest.raises(TypeError, match="str"):
+        run(folder, "align", "--field", "fields_of_mine:slanted", "--debug")
+
+
 def test_matches_guide_the_search(folder):
     run(folder, "align", "--matches", str(folder / "matches.csv"))
     inner = depth_of(folder)

@@ -56,7 +56,7 @@ def batch(material, out, **options) -> Batch:
     }
     options = {"weights": str(material / "tiny.safetensors"), "files": files, **options}
     options["settings"] = FuseSettings(**of_frames)
-    return Batch(rig=Rig.load(material / "rig.yaml"), alpha="fast", out=out, **options)
+    return Batch(**{"rig": Rig.load(material / "rig.yaml"), "alpha": "fast", "out": out, **options})
 
 
 def contents(out: Path) -> dict[str, bytes]:
@@ -89,6 +89,33 @@ def test_files_of_the_system_are_no_frames_and_two_of_one_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"2\.dng and 2\.png are one frame: give a pattern"):
         find_images(tmp_path, name="mono")
     assert len(find_images(tmp_path / "*.png")) == 2
+
+
+def test_folders_are_no_frames_and_those_that_hold_images_are_named(tmp_path):
+    for name in ("day/thumbnails/1.png", "day/2.png/x", "day/3.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    for given in (tmp_path / "day", tmp_path / "day" / "*"):
+        assert [path.name for path in find_images(given)] == ["3.png"]
+    with pytest.raises(FileNotFoundError, match=r"no image there: give a folder of images, such as .*day"):
+        find_images(tmp_path)
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_bands_of_a_sequence_are_called_as_their_cameras(material, tmp_path, alone):
+    """Propagated ones were fused_1 and fused_2, and three of them in no files of their own."""
+    rig, files = Rig.load(material / "rig.yaml"), {"fast": find_images(material / "fast")[:2]}
+    slow = read_image(find_images(material / "slow")[0])
+    for i, name in enumerate(("nir", "green", "blue")):
+        rig = rig.with_camera(name, rig["slow"].replace(K=rig["slow"].K * (1 + i * 1e-6)))
+        write_image(tmp_path / name / "1.png", slow[i : i + 1])
+        files[name] = find_images(tmp_path / name)
+    how = {"sequence": True, "alone": alone, "weights": "mono-spectral"}
+    for cameras in (list(files)[:3], list(files)):
+        out = tmp_path / f"of_{len(cameras)}"
+        batch(material, out, rig=rig, files={name: files[name] for name in cameras}, **how).run()
+        written = {path.name for path in out.glob("fast_8_fused_*.png")}
+        assert written == {f"fast_8_fused_{name}.png" for name in cameras[1:]}
 
 
 def test_a_stopped_sequence_is_resumed_to_the_same_bits(material, tmp_path, monkeypatch):

@@ -6,11 +6,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from arraygeom import Camera, Pose, Rig, intrinsics
+from arraygeom import Camera, Local, Pose, Rig, intrinsics, pixel_grid
+from arraygeom.fields.grid import FieldOnGrid
 from pat.fusion.fuse import fuse
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.views import Views
 from pat.matching.colour_transfer import transferred
+from pat.matching.inputs import Inputs, box_around
 from pat.matching.match import located, match
 from pat.matching.matches import Matches
 from pat.media.colour import luminance
@@ -54,6 +56,23 @@ def test_a_part_whose_segments_are_off_beta_has_some_of_beta(network, inputs, of
     assert min(part.betas[0].image.shape) > 0
     assert part.betas[0].field.straight.valid.any()
     assert fused_at_once(network, part).confidence[0].max() == 0
+
+
+def test_explicit_positions_of_a_part_are_never_all_held(flat):
+    """A part of alpha comes with what its positions, here a window a pixel, touch of beta."""
+    rig, images = flat
+    window, asked = Local(11), []
+
+    def field(pair, x):
+        asked.append(len(x))
+        return window(pair, x)
+
+    alpha, beta = images["mono"][None], images["colour"][None]
+    inputs = Inputs.of(alpha, [beta], [FieldOnGrid.of(field, rig.pair("mono", "colour"))])
+    box = inputs.touched(inputs.betas[0], (16, 48, 32, 64))
+    positions = window(rig.pair("mono", "colour"), pixel_grid((H, W))[16:48:2, 32:64:2].reshape(-1, 2))
+    assert box == box_around(positions.xy[positions.mask], (H, W), inputs.beta_halo, inputs.multiple)
+    assert max(asked) <= W
 
 
 def test_positions_are_where_the_wall_is(inputs):

@@ -80,16 +80,27 @@ def test_few_bits_in_sixteen_are_said_unless_they_are_stated(tmp_path, largest, 
         read_image(tmp_path / "a.png")
 
 
-@pytest.mark.parametrize("bits", [10, 12, 14, 16])
-def test_a_pnm_file_states_its_bits(tmp_path, bits):
-    """White of 14 bits was a quarter of white, without a word."""
-    white = 2**bits - 1
-    values = np.array([[0, 7, white // 2, white]], np.uint16)
-    (tmp_path / "a.pgm").write_bytes(b"P5 4 1 %d\n" % white + values.astype(">u2").tobytes())
-    assert np.array_equal(read_recorded(tmp_path / "a.pgm")[0], values)
+@pytest.mark.parametrize("white", [1, 31, 100, 255, 1000, 1023, 4095, 40000, 65535])
+@pytest.mark.parametrize("kind", [b"P2", b"P3", b"P5", b"P6"])
+def test_a_pnm_file_states_its_white(tmp_path, white, kind):
+    """White of 100 or 40000 was taken for grey, without a word, and what follows a comment for 8 bits."""
+    values = np.array([[0, white // 5, white // 2, white]], np.uint16)
+    stored = values.repeat(3) if kind in (b"P3", b"P6") else values
+    text = " ".join(map(str, stored.ravel().tolist())).encode() + b"\n"
+    content = text if kind < b"P5" else stored.astype(">u2" if white > 255 else "u1").tobytes()
+    (tmp_path / "a.pnm").write_bytes(kind + b" 4 1\n# 0 1\n%d\n" % white + content)
+    assert all(np.array_equal(band, values) for band in read_recorded(tmp_path / "a.pnm"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert torch.allclose(read_image(tmp_path / "a.pgm")[0], torch.from_numpy(values / white).float())
+        read = read_image(tmp_path / "a.pnm")
+    assert torch.allclose(read, torch.from_numpy(values / white).float().expand_as(read))
+
+
+@pytest.mark.parametrize(("white", "kind"), [(100, "u1"), (1000, ">u2")])
+def test_values_above_the_white_that_a_pnm_file_states_are_refused(tmp_path, white, kind):
+    (tmp_path / "a.pgm").write_bytes(b"P5 2 1 %d\n" % white + np.array([0, white + 1], kind).tobytes())
+    with pytest.raises(ValueError, match=f"a.pgm: has values up to {white + 1}, its header says {white}:"):
+        read_image(tmp_path / "a.pgm")
 
 
 def test_values_outside_the_range_are_cut(tmp_path):

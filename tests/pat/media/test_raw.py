@@ -98,6 +98,15 @@ def test_colours_come_back_from_behind_each_filter_pattern(tmp_path, pattern):
     assert off.max() < 0.08
 
 
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+def test_developing_a_mosaic_moves_nothing(pattern):
+    """A ramp has no curvature: inside the border it comes back exactly where it was."""
+    y, x = torch.meshgrid(torch.linspace(0.1, 0.4, 40), torch.linspace(0.1, 0.5, 60), indexing="ij")
+    ramp = torch.stack([x, y, x + y])
+    back = demosaiced(mosaic(ramp, pattern), pattern)
+    torch.testing.assert_close(back[:, 2:-2, 2:-2], ramp[:, 2:-2, 2:-2], atol=2e-3, rtol=0)
+
+
 def test_exposures_and_gains_are_brought_to_alphas():
     """The same light through four times the exposure, twice the gain and a white balance."""
     alpha, scene = Sensor(exposure=0.01), light(channels=3, white=0.2)

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from experiments.sensors import DecodeSRGB, EncodeSRGB, record
-from pat.sensors import Clip, Noise, NoiseLevel, generator_for
+from experiments.sensors import DecodeSRGB, EncodeSRGB
+from pat.sensors import Clip, Noise, NoiseLevel, generator_for, record
 from tests.pat.layered_array import load_sample
 
 LEVELS = {
@@ -51,7 +51,7 @@ def test_light_is_recorded_as_the_forward_model_does():
     """The same distribution as the chain of sensor steps."""
     image = torch.full((1, 1, 300, 300), 0.4)
     chain = [DecodeSRGB(), Noise(100, 3, counts="poisson"), Clip(), EncodeSRGB()]
-    other = record(image, chain, generator_for(0, "chain")).image
+    other = record(image, chain, generator_for(0, "chain"))
     ours = NoiseLevel.of_electrons(100, 3).recorded(image, generator_for(0, "ours"))
     quantiles = torch.linspace(0.02, 0.98, 13)
     a, b = (x.flatten().quantile(quantiles) for x in (ours, other))

@@ -8,20 +8,7 @@ import torch
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.pose import Pose
 from arraygeom.sensor import Band, Curve
-from experiments.sensors import (
-    Crop,
-    DecodeSRGB,
-    Demosaic,
-    DiscBlur,
-    EncodeSRGB,
-    Exposure,
-    Gamma,
-    Mosaic,
-    MotionBlur,
-    Spectral,
-    Vignetting,
-    record,
-)
+from experiments.sensors import DecodeSRGB, EncodeSRGB, Exposure, Mosaic, MotionBlur, Spectral
 from pat.sensors import (
     BoxBlur,
     Clip,
@@ -33,6 +20,7 @@ from pat.sensors import (
     Resample,
     augment,
     paper_cases,
+    record,
 )
 
 
@@ -45,7 +33,7 @@ def noise_image(*shape: int) -> torch.Tensor:
 
 
 def run(image: torch.Tensor, *steps, seed: int = 0) -> torch.Tensor:
-    return record(image, steps, generator(seed)).image
+    return record(image, steps, generator(seed))
 
 
 def test_linear_and_srgb_encoded_are_inverses_and_match_the_standard():
@@ -111,26 +99,18 @@ def test_points_stay_where_the_camera_of_the_resampled_image_puts_them(method, t
     x, y = camera.project(X).x
     rows, columns = torch.meshgrid(torch.arange(64.0), torch.arange(96.0), indexing="ij")
     dot = torch.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 4**2)).double()[None, None]
-    image, pixels = record(dot, [GaussianBlur(1.0), Resample(to, method)], generator())
-    new = camera.transformed(pixels, tuple(image.shape[-2:]))
+    image = run(dot, GaussianBlur(1.0), Resample(to, method))
+    new = camera.transformed(Resample(to, method).pixel_matrix((64, 96)), tuple(image.shape[-2:]))
     rows, columns = torch.meshgrid(*(torch.arange(float(n)) for n in image.shape[-2:]), indexing="ij")
     found = [(image[0, 0] * c).sum() / image.sum() for c in (columns, rows)]
     torch.testing.assert_close(torch.stack(found), new.project(X).x, atol=0.01, rtol=0)
-
-
-def test_maps_of_several_steps_compose():
-    image = noise_image(1, 1, 60, 80)
-    pixels = record(image, [Resample(0.5), BoxBlur(3), Resample((45, 20))], generator()).pixels
-    direct = Resample((45, 20)).pixel_matrix((60, 80))
-    torch.testing.assert_close(pixels, direct)
-    assert torch.equal(BoxBlur(3).pixel_matrix((60, 80)), torch.eye(3, dtype=torch.float64))
 
 
 def test_blurs_keep_flat_images_and_diffuse_a_point_as_stated():
     point = torch.zeros(1, 1, 41, 41, dtype=torch.float64)
     point[..., 20, 20] = 1
     x = torch.arange(41.0).double() - 20
-    for step, variance in ((BoxBlur(5), 2.0), (GaussianBlur(2.0), 4.0), (DiscBlur(6.0), 36 / 4)):
+    for step, variance in ((BoxBlur(5), 2.0), (GaussianBlur(2.0), 4.0)):
         assert torch.allclose(run(torch.ones(1, 2, 9, 9), step), torch.ones(1, 2, 9, 9))
         spread = run(point, step)[0, 0]
         assert spread.sum().item() == pytest.approx(1)
@@ -177,8 +157,24 @@ def test_a_curve_that_samples_a_band_weighs_as_the_band():
     torch.testing.assert_close(run(image, Spectral(curve)), run(image, Spectral(band)), atol=1e-6, rtol=0)
 
 
-def test_gamma_is_a_power():
-    assert run(torch.full((1, 1, 1, 1), 0.25), Gamma(2.0)).item() == pytest.approx(0.5)
+def test_motion_blur_is_as_long_as_shutter_times_velocity_and_stays_centred():
+    """A box of length L has variance L^2 / 12; looking up between pixels adds at most 1/4."""
+    point = torch.zeros(1, 1, 61, 81, dtype=torch.float64)
+    point[0, 0, 30, 40] = 1
+    spread = run(point, MotionBlur(0.02, (600.0, 0.0)))[0, 0]
+    x = torch.arange(81.0).double() - 40
+    assert spread.sum().item() == pytest.approx(1)
+    assert (12 * (spread.sum(0) * x**2).sum().item()) ** 0.5 == pytest.approx(12, rel=0.05)
+    assert spread[30].sum().item() == pytest.approx(1, abs=1e-9)
+    assert (spread.sum(0) * x).sum().item() == pytest.approx(0, abs=1e-9)
+
+
+def test_motion_blur_agrees_with_a_line_filter_of_opencv():
+    image = noise_image(1, 1, 61, 81)
+    mean = cv2.blur(image[0, 0].numpy(), (9, 1), borderType=cv2.BORDER_REPLICATE)
+    sampled = run(image, MotionBlur(1.0, (9.0, 0.0)))[0, 0].numpy()
+    assert np.abs(sampled - mean).max() < 0.06
+    assert np.abs(sampled - mean).mean() < 0.01
 
 
 def test_quantise_rounds_to_levels():
@@ -206,9 +202,9 @@ def test_jitter_changes_each_image_by_about_what_is_asked():
             [Spectral("luminance")],
             [Spectral(Band(560, 50))],
         ),
-        *([BoxBlur(3)], [GaussianBlur(0.8)], [DiscBlur(1.3)], [MotionBlur(1.0, (2.3, -1.1))]),
-        *([Resample(0.5)], [Resample((5, 9))], [Resample(2.0, "bicubic")], [Crop(1, 2, (3, 4))]),
-        *([Vignetting((-0.3, 0.1))], [Mosaic("GRBG"), Demosaic("GRBG")], [Noise(500, 3)], [Jitter()]),
+        *([BoxBlur(3)], [GaussianBlur(0.8)], [MotionBlur(1.0, (2.3, -1.1))]),
+        *([Resample(0.5)], [Resample((5, 9))], [Resample(2.0, "bicubic")]),
+        *([Mosaic("GRBG")], [Noise(500, 3)], [Jitter()]),
     ],
     ids=lambda steps: type(steps[0]).__name__,
 )
@@ -217,7 +213,7 @@ def test_gradients_in_the_image(steps):
     assert torch.autograd.gradcheck(lambda x: run(x, *steps), image)
 
 
-@pytest.mark.parametrize("step", [GaussianBlur, DiscBlur, Exposure])
+@pytest.mark.parametrize("step", [GaussianBlur, Exposure])
 def test_gradients_in_the_parameter(step):
     image = noise_image(1, 1, 9, 9)
     parameter = torch.tensor(1.23, dtype=torch.float64, requires_grad=True)

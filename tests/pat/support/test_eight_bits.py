@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from arraygeom.threads import limited_to, torch_in_one_thread
+from pat.cli.main import main
 from pat.networks.weights import misfit
 from pat.support.eight_bits import Conv2d, available, measured, packed, round_to_eight_bits
 
@@ -115,6 +116,20 @@ def test_a_change_of_weights_or_of_range_is_seen() -> None:
     assert not torch.equal(other(x), part(x)), "not unless it is to be"
     round_to_eight_bits(other)
     assert torch.equal(other(x), part(x))
+
+
+def test_on_a_gpu_it_is_refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """It was in float32 there, without a word."""
+
+    class OnGPU(Tensor):
+        device = torch.device("cuda")
+
+    with pytest.raises(ValueError, match="int8 is for the CPU: leave the precision at float32 on cuda"):
+        ranged(padding=1)(rand(1, 16, 8, 8).as_subclass(OnGPU))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    with pytest.raises(SystemExit):
+        main(["fuse", __file__, "--image", f"mono={__file__}", "--device", "auto", "--precision", "int8"])
+    assert "--precision int8 is for the CPU: leave it out, or --device" in capsys.readouterr().err
 
 
 def test_without_a_range_for_gradients_and_in_other_precisions_it_is_torchs() -> None:

@@ -82,6 +82,7 @@ def test_the_papers_recipes_are_the_papers():
         ("{rendered: 0.7, rendered_from: a, pairs: 0.7, pairs_from: [b]}", "of the batches, 1.4 in all"),
         ("{measured: 0.6, measured_from: [a], pairs: 0.6, pairs_from: [b]}", "of the batches, 1.2 in all"),
         ("attention: -1", "c: attention must be 0 or more"),
+        ("# to do", "c: the recipe is empty: write entries (name: value), or take mono-colour, "),
         ("[1, 2]", "c: wanted entries (name: value), got [1, 2]"),
         ("a: [", "c: not valid YAML at line 2"),
     ],

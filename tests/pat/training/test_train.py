@@ -1,5 +1,7 @@
 """Training: samples that agree with their geometry, a loss that goes down, a file that loads."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Generator
@@ -46,14 +48,14 @@ def test_positions_lie_on_the_segments(config):
             assert off[segments.valid & visible.reshape(len(visible), -1)].max() < 0.1
 
 
+def near_half(pair, x):
+    found = Epipolar()(pair, x)
+    return Segments(found.start, found.at(torch.full_like(found.start[..., 0], 0.5)), found.valid)
+
+
 def test_a_field_of_ones_own_trains(config):
-    """A field in a few lines, given to training, is where the samples look."""
-
-    def upper_half(pair, x):
-        found = Epipolar()(pair, x)
-        return Segments(found.start, found.at(torch.full_like(found.start[..., 0], 0.5)), found.valid)
-
-    learn, _ = scenes(config, field=upper_half)
+    """A field in a few lines, which a recipe names, is where the samples look."""
+    learn, _ = scenes(replace(config, field=f"{__name__}:near_half"))
     whole, _ = scenes(config)
     x = torch.tensor([[20.0, 15.0]])
     (mine, all_of_it) = (next(source(1)).fields[0].at(x) for source in (learn, whole))

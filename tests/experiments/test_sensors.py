@@ -1,82 +1,43 @@
-import cv2
-import numpy as np
 import pytest
 import torch
+import yaml
 
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.distortion import Distortion
 from arraygeom.pose import Pose, rotation_from_vector
 from arraygeom.rig import Rig
-from experiments.sensors import Crop, Defocus, Demosaic, Mosaic, MotionBlur, Vignetting, record, record_array
-from pat.sensors import BoxBlur, GaussianBlur, Noise, Resample
-
-PATTERNS = ["RGGB", "GRBG", "BGGR", "GBRG"]
+from arraygeom.sensor import Band, Curve
+from experiments.sensors import (
+    STEPS,
+    DecodeSRGB,
+    Mosaic,
+    MotionBlur,
+    Spectral,
+    read_chain,
+    read_chains,
+    record_array,
+)
+from pat.sensors import BoxBlur, Clip, GaussianBlur, Noise, Quantise, Resample, record
 
 
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
-def smooth(*shape: int, sigma: float = 4.0) -> torch.Tensor:
-    image = torch.rand(*shape, generator=generator(), dtype=torch.float64)
-    image = record(image, [GaussianBlur(sigma)], generator()).image
-    return ((image - image.min()) / (image.max() - image.min())).clamp(0, 1)
-
-
-@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("pattern", ["RGGB", "GRBG", "BGGR", "GBRG"])
 def test_a_mosaic_keeps_the_colours_its_name_says(pattern):
     image = torch.rand(2, 3, 6, 8, generator=generator())
-    raw = record(image, [Mosaic(pattern)], generator()).image
+    raw = Mosaic(pattern).apply(image, generator())
     for i, letter in enumerate(pattern):
         y, x = divmod(i, 2)
         assert torch.equal(raw[:, 0, y::2, x::2], image[:, "RGB".index(letter), y::2, x::2])
 
 
-@pytest.mark.parametrize("pattern", PATTERNS)
-@pytest.mark.parametrize(("method", "tolerance"), [("bilinear", 0.01), ("edge-aware", 0.01)])
-def test_smooth_images_come_back_from_mosaic_and_demosaic(pattern, method, tolerance):
-    image = smooth(2, 3, 60, 80)
-    back = record(image, [Mosaic(pattern), Demosaic(pattern, method)], generator()).image
-    error = (back - image)[..., 3:-3, 3:-3].abs()
-    assert error.mean() < tolerance / 4
-    assert error.max() < 4 * tolerance
-
-
-@pytest.mark.parametrize("pattern", PATTERNS)
-@pytest.mark.parametrize("method", ["bilinear", "edge-aware"])
-def test_demosaicing_moves_nothing(pattern, method):
-    """A ramp has no curvature: inside the border it comes back exactly where it was."""
-    y, x = torch.meshgrid(torch.linspace(0.1, 0.4, 40), torch.linspace(0.1, 0.5, 60), indexing="ij")
-    ramp = torch.stack([x, y, x + y])[None].double()
-    back = record(ramp, [Mosaic(pattern), Demosaic(pattern, method)], generator()).image
-    torch.testing.assert_close(back[..., 2:-2, 2:-2], ramp[..., 2:-2, 2:-2], atol=2e-3, rtol=0)
-
-
-def test_bilinear_agrees_with_opencv():
-    image = torch.rand(1, 3, 40, 60, generator=generator(), dtype=torch.float64)
-    raw = record(image, [Mosaic("RGGB")], generator()).image
-    wanted = (
-        cv2.cvtColor((raw[0, 0].numpy() * 65535).round().astype(np.uint16), cv2.COLOR_BayerRGGB2RGB) / 65535
-    )
-    back = record(raw, [Demosaic("RGGB")], generator()).image[0].movedim(0, -1).numpy()
-    np.testing.assert_allclose(back[2:-2, 2:-2], wanted[2:-2, 2:-2], atol=1e-4)
-
-
-def test_the_edge_aware_gradient_is_that_of_bilinear():
-    image = torch.rand(1, 3, 6, 8, generator=generator(), requires_grad=True)
-    gradients = []
-    for method in ("bilinear", "edge-aware"):
-        seen = record(image, [Mosaic(), Demosaic(method=method)], generator()).image
-        gradients.append(torch.autograd.grad(seen[:, 0].sum(), image)[0])
-    assert torch.equal(*gradients)
-
-
 CHAINS = {
     "half": [Resample(0.5)],
-    "crop then bicubic": [Crop(7, 12, (40, 60)), Resample((33, 51), "bicubic")],
     "all": [
-        *(Vignetting((-0.01,)), GaussianBlur(1.0), Defocus(2.0, 4.0, 25.0), MotionBlur(0.01, (100.0, 50.0))),
-        *(Crop(2, 4, (56, 84)), Resample(0.5, "bicubic"), BoxBlur(3), Mosaic(), Demosaic(), Noise(1e9)),
+        *(GaussianBlur(1.0), MotionBlur(0.01, (100.0, 50.0)), Resample((52, 78), "bicubic"), BoxBlur(3)),
+        *(Resample(0.5), Noise(1e9)),
     ],
     "none": [],
 }
@@ -101,8 +62,7 @@ def test_points_are_found_where_the_rig_of_the_recorded_images_projects_them(cha
     chains = {"left": CHAINS[chain], "right": CHAINS["half"]}
     for X in torch.tensor([[0.13, -0.07, 1.6], [-0.2, 0.1, 2.0]]).double():
         images = {n: _dot(c, X) for n, c in cameras.items()}
-        depth = {n: torch.full((1, *c.hw), 1.8).double() for n, c in cameras.items()}
-        recorded = record_array(images, rig, chains, seed=0, depth=depth)
+        recorded = record_array(images, rig, chains, seed=0)
         for name in cameras:
             wanted = recorded.rig[name].project(X).x
             assert recorded.rig[name].hw == tuple(recorded.images[name].shape[-2:])
@@ -138,10 +98,75 @@ def test_each_camera_draws_for_itself():
 
 
 def test_mistakes_are_named():
-    image = torch.rand(1, 3, 7, 8)
-    for step, words in ((Mosaic(), "even"), (Crop(4, 0, (5, 5)), "leaves the image")):
-        with pytest.raises(ValueError, match=words):
-            record(image, [step], generator())
+    with pytest.raises(ValueError, match="even"):
+        Mosaic().apply(torch.rand(1, 3, 7, 8), generator())
     rig = Rig({"mono": Camera(K=intrinsics(9.0, (8, 8)), cam_from_world=Pose.identity(), hw=(8, 8))})
     with pytest.raises(ValueError, match="did you mean 'mono'"):
         record_array({}, rig, {"mno": []}, seed=0)
+
+
+TEXT = """
+mono:
+  - decode-srgb
+  - spectral: luminance
+  - motion-blur: {shutter: 0.01, velocity: [300, 0]}
+  - resample: 0.5
+  - noise: {full_well: 8e3, read: 3, counts: poisson}
+  - clip
+  - quantise: 12
+blue:
+  - spectral: {centre: 450, width: 40}
+  - resample: {to: [10, 12], method: bicubic}
+  - mosaic: BGGR
+  - spectral: {response: {wavelength: [400, 500], response: [1, 1]}}
+"""
+
+
+def test_a_file_says_what_each_camera_does():
+    chains = read_chains(yaml.safe_load(TEXT))
+    assert chains["mono"] == (
+        *(DecodeSRGB(), Spectral("luminance"), MotionBlur(0.01, (300.0, 0.0)), Resample(0.5)),
+        *(Noise(8000.0, 3.0, "poisson"), Clip(), Quantise(12)),
+    )
+    assert chains["blue"] == (
+        *(Spectral(Band(450.0, 40.0)), Resample((10, 12), "bicubic")),
+        *(Mosaic("BGGR"), Spectral(Curve((400.0, 500.0), (1.0, 1.0)))),
+    )
+
+
+def test_every_step_has_a_name():
+    assert set(STEPS) >= {"box-blur", "motion-blur", "mosaic", "noise", "encode-srgb"}
+
+
+def test_a_chain_from_a_file_runs():
+    text = "[decode-srgb, {exposure: 0.5}, mosaic, encode-srgb, {quantise: 8}]"
+    chain = read_chain(yaml.safe_load(text))
+    assert record(torch.rand(1, 3, 8, 8), chain, torch.Generator()).shape == (1, 1, 8, 8)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[{nois: {full_well: 3}}]", r"chain\[0\]: no step is called 'nois'; did you mean 'noise'"),
+        (
+            "[clip, {noise: {fullwell: 3}}]",
+            r"chain\[1\].noise.fullwell: unknown key; did you mean 'full_well'",
+        ),
+        ("[{noise: {read: 3}}]", r"full_well: missing"),
+        ("[{noise: {full_well: many}}]", r"noise.full_well: is 'many'; wanted a number"),
+        ("[{noise: {full_well: -3}}]", r"full_well > 0"),
+        ("[{resample: {to: 0.5, method: cubic}}]", r"method: is 'cubic'; did you mean 'bicubic'"),
+        ("[{box-blur: 4}]", r"box-blur: the width of a box blur must be an odd"),
+        ("[{box-blur: 2.5}]", r"width: is 2.5; wanted a whole number"),
+        ("[{spectral: lumnance}]", r"did you mean 'luminance'"),
+        ("[{spectral: {center: 450, width: 3}}]", r"did you mean 'centre'"),
+        ("[{motion-blur: {shutter: 0, velocity: [3]}}]", r"velocity: has 1 entries; wanted 2"),
+        ("[{mosaic: RGBG}]", r"pattern: is 'RGBG'; did you mean 'RGGB'"),
+        ("[{clip: 3}]", r"clip: takes no options"),
+        ("[[clip]]", r"wanted a step's name"),
+        ("{clip: 1}", r"wanted a list of steps"),
+    ],
+)
+def test_typos_are_named_with_their_entry(text, words):
+    with pytest.raises(ValueError, match=words):
+        read_chain(yaml.safe_load(text))
