@@ -59,14 +59,14 @@ def missing(
     `position` is in pixels of the beta's image, which is enlarged from fewer.
     """
     scale = position.new_tensor(beta.enlargement[::-1])
-    hw = tuple(beta.image.shape[-2:])
+    hw = beta.image.shape[-2:]
     # The first pixel of the image within the first of those that it is enlarged from, all counted from there.
     first = (position.new_tensor(beta.offset) / scale).floor()
     begin = position.new_tensor(beta.offset) - first * scale
-    own_hw = tuple(int(n) for n in ((begin + position.new_tensor(hw[::-1])) / scale).ceil().flip(0))
+    width, height = ((begin + position.new_tensor(hw[::-1])) / scale).ceil().int().tolist()
     corner = (position + begin[:, None, None]).movedim(1, -1)
-    recorded, share = _recorded(image, corner, confidence, scale, own_hw)
-    shown = _before_enlargement(beta.image, begin, scale, own_hw)
+    recorded, share = _recorded(image, corner, confidence, scale, (height, width))
+    shown = _before_enlargement(beta.image, begin, scale, (height, width))
     seen = (share / scale.prod()).clamp(max=1)
     rest = (shown - recorded) * (share > 0)
     side = 2 * SETTINGS.radius + 1
