@@ -21,7 +21,6 @@ from arraygeom import (
     rotation_from_vector,
 )
 from arraygeom.lenses import RollingShutter
-from arraygeom.pixels import pixel_grid
 from arraygeom.pose import rotation_error
 from arraygeom.summary import summarise_pairs
 from arraygeom.text import UNSCALED
