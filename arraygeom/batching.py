@@ -57,8 +57,8 @@ class Batched:
         shape = self._batched()
 
         def chosen(t: Tensor, axes: int) -> Tensor:
-            own = t.shape[t.ndim - axes :]
-            return t if t.ndim == axes else t.expand(*shape, *own)[index]
+            trailing = t.shape[t.ndim - axes :]
+            return t if t.ndim == axes else t.expand(*shape, *trailing)[index]
 
         return map_tensors(self, chosen)
 

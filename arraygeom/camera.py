@@ -121,10 +121,10 @@ class LensView(View):
 
     def __init_subclass__(cls, **rest: Any) -> None:
         super().__init_subclass__(**rest)
-        own = [name for name in ("rays", "project_local") if name in vars(cls)]
-        if own and cls.__module__ != __name__:
+        overridden = [name for name in ("rays", "project_local") if name in vars(cls)]
+        if overridden and cls.__module__ != __name__:
             raise TypeError(
-                f"{cls.__name__} overrides {' and '.join(own)}, which fields do not ask: make it a "
+                f"{cls.__name__} overrides {' and '.join(overridden)}, which fields do not ask: make it a "
                 "arraygeom.lenses.CameraModel with project and unproject, "
                 "and give that to a Camera as `distortion`"
             )
@@ -178,8 +178,8 @@ class LensView(View):
             return True
         if not self.distortion.central or traced():
             return False
-        rays, seen = self.rays(coarse_grid(self.hw).to(self.K).reshape(*[1] * len(self.batch_shape), -1, 2))
-        return bool((seen & (rays[..., 2] > NARROW * rays.norm(dim=-1))).all())
+        rays, valid = self.rays(coarse_grid(self.hw).to(self.K).reshape(*[1] * len(self.batch_shape), -1, 2))
+        return bool((valid & (rays[..., 2] > NARROW * rays.norm(dim=-1))).all())
 
     @property
     def central(self) -> bool:

@@ -77,8 +77,8 @@ def has_further_images(content: bytes) -> bool:
     try:
         with _quiet_tiff(content) as file:
             first, second = file.pages.first, file.pages[1]
-            own, other = ((page.imagelength, page.imagewidth) for page in (first, second))
-            return bool(own == other and not second.subfiletype & (REDUCED | MASK))
+            first_size, second_size = ((page.imagelength, page.imagewidth) for page in (first, second))
+            return bool(first_size == second_size and not second.subfiletype & (REDUCED | MASK))
     except DAMAGED:
         return False
 

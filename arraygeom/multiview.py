@@ -66,10 +66,10 @@ def warp(
     """
     for what, plane, view in (("image", image, pair.beta), ("depth", depth, pair.alpha)):
         _check_size(f"the {what} given", plane, view.hw)
-    seen = _in_beta(pair, depth)
-    batch = max(len(image), len(seen.x))
-    values, inside = sample(image.expand(batch, *image.shape[1:]), seen.x, interpolation=interpolation)
-    valid = inside & seen.valid
+    projected = _in_beta(pair, depth)
+    batch = max(len(image), len(projected.x))
+    values, inside = sample(image.expand(batch, *image.shape[1:]), projected.x, interpolation=interpolation)
+    valid = inside & projected.valid
     return Sampled(torch.where(valid[:, None], values, 0.0), valid)
 
 
@@ -99,8 +99,8 @@ def _in_beta(pair: Pair, depth: Tensor, x: Tensor | None = None) -> Projected:
     alpha, beta = pair.cameras
     depth = floating(depth)
     x = pixel_grid(alpha.hw, dtype=depth.dtype, device=depth.device) if x is None else x
-    rays, seen = alpha.rays(x.reshape(*[1] * (depth.ndim + 1 - x.ndim), *x.shape))
-    known = depth.isfinite() & (depth > 0) & seen & (rays[..., 2] > 0)
+    rays, valid = alpha.rays(x.reshape(*[1] * (depth.ndim + 1 - x.ndim), *x.shape))
+    known = depth.isfinite() & (depth > 0) & valid & (rays[..., 2] > 0)
     scale = torch.where(known, depth, 1.0) / torch.where(rays[..., 2] > 0, rays[..., 2], 1.0)
     X = rays * scale[..., None]
     if not alpha.central:
@@ -138,20 +138,22 @@ def consistent_depth(
         raise ValueError(f"there is no depth map of '{alpha}', only of {', '.join(depths)}")
     for name, depth in depths.items():
         _check_size(f"the depth map of '{name}'", depth, rig[name].hw)
-    own = floating(depths[alpha])
-    x = pixel_grid(rig[alpha].hw, dtype=own.dtype, device=own.device)
-    total, count = own, torch.ones_like(own)
+    alpha_depth = floating(depths[alpha])
+    x = pixel_grid(rig[alpha].hw, dtype=alpha_depth.dtype, device=alpha_depth.device)
+    total, count = alpha_depth, torch.ones_like(alpha_depth)
     for name, other in depths.items():
         if name == alpha:
             continue
-        there = _in_beta(rig.pair(alpha, name), own)
+        there = _in_beta(rig.pair(alpha, name), alpha_depth)
         known = torch.where(other.isfinite(), other, 0.0)
-        sampled, inside = sample(known[None, None].to(own), there.x[None])
+        sampled, inside = sample(known[None, None].to(alpha_depth), there.x[None])
         back = _in_beta(rig.pair(name, alpha), sampled[0, 0], there.x)
         agrees = there.valid & inside[0] & back.valid
         agrees = (
-            agrees & ((back.x - x).square().sum(-1) < pixels**2) & ((back.depth - own).abs() < relative * own)
+            agrees
+            & ((back.x - x).square().sum(-1) < pixels**2)
+            & ((back.depth - alpha_depth).abs() < relative * alpha_depth)
         )
         total, count = total + torch.where(agrees, back.depth, 0.0), count + agrees
-    valid = (count > views) & own.isfinite() & (own > 0)
+    valid = (count > views) & alpha_depth.isfinite() & (alpha_depth > 0)
     return ConsistentDepth(torch.where(valid, total / count, 0.0), (count - 1).long(), valid)

@@ -93,8 +93,8 @@ def middle_intrinsics(
     """K of the smaller focal length that puts what both old images have in the middle near the new middle."""
     focal = torch.stack([(c.K[:2, :2].det().abs()).sqrt() for c in cameras]).min()
     rays = [_middle_ray(camera, R) for camera, R in zip(cameras, rotations)]
-    seen = torch.stack([ray[:2] / ray[2] for ray in rays])
-    centre = intrinsics(1.0, hw).to(focal)[:2, 2] - focal * seen.mean(0)
+    normalised = torch.stack([ray[:2] / ray[2] for ray in rays])
+    centre = intrinsics(1.0, hw).to(focal)[:2, 2] - focal * normalised.mean(0)
     return torch.cat(
         [torch.cat([focal * torch.eye(2).to(focal), centre[:, None]], 1), focal.new_tensor([[0, 0, 1.0]])]
     )

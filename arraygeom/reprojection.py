@@ -28,9 +28,11 @@ def projection_slopes(
     step = STEP * distance[..., None, None]
     offsets = torch.eye(3).to(X) * step
     around = torch.cat([X[..., None, :], X[..., None, :] + offsets, X[..., None, :] - offsets], -2)
-    seen = camera.project(around)
-    by_X = (seen.x[..., 1:4, :] - seen.x[..., 4:, :]) / (2 * step)
-    return Projected(*(part[..., 0, :] if part is seen.x else part[..., 0] for part in seen)), by_X.mT
+    projected = camera.project(around)
+    by_X = (projected.x[..., 1:4, :] - projected.x[..., 4:, :]) / (2 * step)
+    return Projected(
+        *(part[..., 0, :] if part is projected.x else part[..., 0] for part in projected)
+    ), by_X.mT
 
 
 def reprojection_residuals(

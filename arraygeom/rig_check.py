@@ -132,12 +132,12 @@ def _of_lens(name: str, camera: LensView) -> Iterator[str]:
     points = map_homogeneous(torch.linalg.inv(camera.K)[..., :2, :], _grid(camera).to(camera.K))
     directions, has_ray = lens.unproject(points)
     back, has_image = lens.project(lens.origins(points) + directions)
-    seen = has_ray & has_image
-    share = float(seen.double().mean())
+    valid = has_ray & has_image
+    share = float(valid.double().mean())
     if share < COVERED:
         yield f"the lens model of '{name}' covers {100 * share:.0f} % of its image: check the coefficients"
     off = ((back - points) @ camera.K[:2, :2].mT).norm(dim=-1)
-    off = torch.where(seen, off, 0.0)
+    off = torch.where(valid, off, 0.0)
     if not bool((off <= OFF_BACK).all()):
         yield (
             f"the model of '{name}', {lens.model}, projects the rays of its pixels up to "

@@ -103,9 +103,9 @@ def _angles(a: Float[Tensor, "n 3"], b: Float[Tensor, "1 3"]) -> Float[Tensor, "
 def _pair(alpha: str, beta: str, pair: Pair) -> PairSummary:
     pose = pair.beta_from_alpha
     rotation = math.degrees(float(angle(pose.R)))
-    seen, length = _segments(pair) if pair.depth is not None else (None, None)
+    visible_share, length = _segments(pair) if pair.depth is not None else (None, None)
     baseline = float(pose.centre.norm())
-    return PairSummary(alpha, beta, baseline, rotation, seen, length, _depth_step(pair, baseline))
+    return PairSummary(alpha, beta, baseline, rotation, visible_share, length, _depth_step(pair, baseline))
 
 
 def _segments(pair: Pair) -> tuple[float, tuple[float, float] | None]:

@@ -90,17 +90,17 @@ def _convolved(
     plain = x.device.type == "cpu" and tuple(stride) == (1, 1) and not isinstance(padding, str)
     if not plain or len(x) != 1 or weight[0].numel() * len(weight) * x[0, 0].numel() < WORTH_STRIPS:
         return torch.conv2d(x, weight, *further)
-    seen, above = dilation[0] * (weight.shape[2] - 1), padding[0]
+    reach, above = dilation[0] * (weight.shape[2] - 1), padding[0]
     width = x.shape[3] + 2 * padding[1] - dilation[1] * (weight.shape[3] - 1)
     order = torch.contiguous_format if x.is_contiguous() and weight.is_contiguous() else torch.channels_last
-    shape = 1, len(weight), x.shape[2] + 2 * above - seen, width
+    shape = 1, len(weight), x.shape[2] + 2 * above - reach, width
     out = torch.empty(shape, dtype=x.dtype, memory_format=order)
     rows = math.ceil(out.shape[2] / (STRIPS * threads()))
 
     def strip(top: int) -> None:
         bottom = min(top + rows, out.shape[2])
         first = max(top - above, 0)
-        convolved = torch.conv2d(x[:, :, first : max(bottom - above + seen, first + 1)], weight, *further)
+        convolved = torch.conv2d(x[:, :, first : max(bottom - above + reach, first + 1)], weight, *further)
         out[:, :, top:bottom] = convolved[:, :, top - first : bottom - first]
 
     in_parallel([partial(strip, top) for top in range(0, out.shape[2], rows)])

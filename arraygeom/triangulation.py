@@ -104,11 +104,11 @@ def depth_of(
             "rays of one of these cameras do not meet in a point: use arraygeom.fields.ray_depth"
         )
     pose = pair.beta_from_alpha
-    rays, seen = zip(*(c.to(x.dtype).rays(p) for c, p in ((alpha, x), (beta, x_beta))))
+    rays, has_ray = zip(*(c.to(x.dtype).rays(p) for c, p in ((alpha, x), (beta, x_beta))))
     (normalised, ahead), (normalised_beta, ahead_beta) = map(on_plane, rays)
     eye = torch.eye(3).to(pose.R).expand_as(pose.R)
     of_track = depth_from_track(track(eye, eye, pose, normalised), normalised_beta)
-    valid = of_track.valid & seen[0] & seen[1] & ahead & ahead_beta
+    valid = of_track.valid & has_ray[0] & has_ray[1] & ahead & ahead_beta
     depth = torch.where(valid, of_track.depth, 0.0)
     sigma = torch.zeros_like(depth) if deviation is None else deviation
     return Depth(depth, torch.where(valid, sigma * _metres_per_pixel(pair, x, depth, valid), 0.0), valid)
@@ -203,10 +203,10 @@ def _normal_equations(sights: Sequence[_Sight], chart: _Chart, p: Tensor) -> _No
     matrix, target = torch.zeros_like(slopes), torch.zeros_like(p)
     in_front, worst = torch.ones_like(p[..., 0], dtype=torch.bool), torch.zeros_like(p[..., 0])
     for sight in sights:
-        seen, by_X = projection_slopes(sight.camera, X, (X - sight.centre).norm(dim=-1))
-        used = sight.usable & seen.valid
+        projected, by_X = projection_slopes(sight.camera, X, (X - sight.centre).norm(dim=-1))
+        used = sight.usable & projected.valid
         J = torch.where(used[..., None, None], product(by_X, slopes), 0.0)
-        r = torch.where(used[..., None], sight.x - seen.x, 0.0)
+        r = torch.where(used[..., None], sight.x - projected.x, 0.0)
         matrix, target = matrix + product(J.mT, J), target + matvec(J.mT, r)
         in_front = in_front & (used | ~sight.usable)
         worst = torch.maximum(worst, r.detach().square().sum(-1))

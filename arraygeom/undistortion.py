@@ -40,8 +40,8 @@ def pinhole_view(camera: AnyLensView, *, widest: float = WIDEST) -> AnyLensView:
         raise ValueError(
             "no pixel of the image is within its lens's range: check the distortion's coefficients"
         )
-    seen = rays[near_axis]
-    x = product(seen[:, :2] / seen[:, 2:], camera.K[:2, :2].mT) + camera.K[:2, 2]
+    kept_rays = rays[near_axis]
+    x = product(kept_rays[:, :2] / kept_rays[:, 2:], camera.K[:2, :2].mT) + camera.K[:2, 2]
     low, high = x.detach().amin(0).floor(), x.detach().amax(0).ceil()
     K = camera.K.clone()
     K[:2, 2] = K[:2, 2] - low
@@ -144,9 +144,9 @@ def sampled_between(
     extended: bool = False,
 ) -> Sampled:
     """`resampled` with what `pixels_between` found, which several images of one camera share."""
-    x, seen = pixels
+    x, defined = pixels
     h, w = source.hw
     nearest = torch.minimum(x.clamp(min=0), x.new_tensor([w - 1, h - 1]))
-    inside = torch.where(seen[..., None], x, nearest if extended else 0.0)
+    inside = torch.where(defined[..., None], x, nearest if extended else 0.0)
     values, valid = sample(image[None], inside[None].to(image), interpolation=interpolation)
-    return Sampled(values * (seen | extended), valid & seen)
+    return Sampled(values * (defined | extended), valid & defined)

@@ -194,9 +194,9 @@ def near_line(pair: Pair, x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], half
     Distances are from the nearest point of the line. NaN where a lens has no ray.
     """
     F = pair.fundamental.to(torch.float64)
-    (own, _), (other, _) = pair.alpha.undistort(x.double()), pair.beta.undistort(y.double())
-    line = epipolar_lines(F, own)
-    nearest = other - epipolar_distance(F, own, other)[:, None] * direction(line[:, :2])
+    (x_pinhole, _), (y_pinhole, _) = pair.alpha.undistort(x.double()), pair.beta.undistort(y.double())
+    line = epipolar_lines(F, x_pinhole)
+    nearest = y_pinhole - epipolar_distance(F, x_pinhole, y_pinhole)[:, None] * direction(line[:, :2])
     along = torch.stack([-line[:, 1], line[:, 0]], -1)
     points = nearest[:, None] + torch.linspace(-half, half, 65).double()[:, None] * direction(along)[:, None]
     curve, valid = pair.beta.distort(points)

@@ -153,9 +153,9 @@ def aligned_scene(scene: AlignmentScene, min_confidence: float = LEAST_CONFIDENC
 
 def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow]:
     """The figures of every beta."""
-    own = shown_band(aligned[scene.alpha].values)
-    corners = cv2.goodFeaturesToTrack(own, POINTS, 1e-3, SPACING)[:, 0].round().astype(int)
-    h, w = own.shape
+    alpha_band = shown_band(aligned[scene.alpha].values)
+    corners = cv2.goodFeaturesToTrack(alpha_band, POINTS, 1e-3, SPACING)[:, 0].round().astype(int)
+    h, w = alpha_band.shape
     reach = PATCH + SEARCH
     corners = corners[((corners >= reach) & (corners < np.array([w, h]) - reach)).all(1)]
     straight, pinhole = without_lenses(scene.rig, scene.images)
@@ -170,8 +170,8 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
     rows = []
     for name in scene.rig.betas(scene.alpha):
         view, values = aligned[name], np.asarray(scene.recorded[name])
-        seen = view.valid[candidates[:, 1], candidates[:, 0]]
-        x = candidates[seen]
+        valid = view.valid[candidates[:, 1], candidates[:, 0]]
+        x = candidates[valid]
         planes = [np.nan_to_num(view.positions), by_homography(scene, name, straight, pinhole)]
         true, filled = None, None
         if truth is not None:
@@ -180,14 +180,14 @@ def alignment_rows(scene: AlignmentScene, aligned: Aligned) -> list[AlignmentRow
             true = float((error <= HALF_PIXEL).mean())
             filled = float((view.visibility[occluded] == SEEN).mean()) if occluded.any() else 0.0
         others = [shown_band(resampled_values(values, plane, "bilinear")) for plane in planes]
-        offsets, locatable = zip(*(local_offsets(own, other, x) for other in others))
+        offsets, locatable = zip(*(local_offsets(alpha_band, other, x) for other in others))
         located = locatable[0] | locatable[1]
         near = [float((off[located] <= HALF_PIXEL).mean()) for off in offsets]
         rows.append(
             AlignmentRow(
                 scene.name,
                 name,
-                seen=float(seen.mean()),
+                seen=float(valid.mean()),
                 located=float(located.mean()),
                 aligned=near[0],
                 homography=near[1],
@@ -217,8 +217,8 @@ def composites(scene: AlignmentScene, aligned: Aligned) -> dict[str, Float[Tenso
         )
         images[0].append(by_plane)
         images[1].append(np.where(view.valid, by_scene, 1.0))
-    own = aligned[scene.alpha].values[0]
-    green = own * (0.95 / np.percentile(own, 99))
+    alpha_band = aligned[scene.alpha].values[0]
+    green = alpha_band * (0.95 / np.percentile(alpha_band, 99))
     unseen = np.any([~aligned[name].valid for name in names], 0)
     titles = "by a homography", "by pat align, white where not seen"
     panels = {}
@@ -229,27 +229,27 @@ def composites(scene: AlignmentScene, aligned: Aligned) -> dict[str, Float[Tenso
 
 
 def local_offsets(
-    own: NDArray[np.uint8], other: NDArray[np.uint8], x: NDArray[Any]
+    alpha: NDArray[np.uint8], beta: NDArray[np.uint8], x: NDArray[Any]
 ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """How far the patch of `other` that is most like that of `own` at pixels x (n, 2) lies from there, and
+    """How far the patch of `beta` that is most like that of `alpha` at pixels x (n, 2) lies from there, and
     whether it can be located: it is like it, and its halves agree. Alike is by correlation squared, which
     does not depend on the sign of a band's contrast. The peak is found by a parabola.
     """
-    offsets, like = zip(*(_best_match(own, other, pixel) for pixel in x)) if len(x) else ([], [])
+    offsets, like = zip(*(_best_match(alpha, beta, pixel) for pixel in x)) if len(x) else ([], [])
     best = np.reshape(offsets, (len(x), len(PARTS), 2))
     agree = np.linalg.norm(best[:, 1:] - best[:, :1], axis=-1).max(1) <= HALF_PIXEL
     return np.linalg.norm(best[:, 0], axis=-1), agree & (np.array(like) >= ALIKE)
 
 
 def _best_match(
-    own: NDArray[np.uint8], other: NDArray[np.uint8], pixel: NDArray[Any]
+    alpha: NDArray[np.uint8], beta: NDArray[np.uint8], pixel: NDArray[Any]
 ) -> tuple[list[tuple[float, float]], float]:
     """Of the patch and its halves: the offset (y, x) of what is most like them; how like the patch is."""
     offsets, like = [], []
     for part in PARTS:
         rows, columns = (slice(at + s.start, at + s.stop) for at, s in zip(pixel[::-1], part))
         around = (slice(s.start - SEARCH, s.stop + SEARCH) for s in (rows, columns))
-        matched = cv2.matchTemplate(other[tuple(around)], own[rows, columns], cv2.TM_CCOEFF_NORMED)
+        matched = cv2.matchTemplate(beta[tuple(around)], alpha[rows, columns], cv2.TM_CCOEFF_NORMED)
         scores = np.square(np.nan_to_num(matched))
         best = np.unravel_index(int(scores.argmax()), scores.shape)
         like.append(float(scores[best]))
@@ -272,18 +272,18 @@ def by_homography(
 ) -> Float[np.ndarray, "h w 2"]:
     """Where alpha's recorded pixels are in beta's recorded image by the homography of lensless images."""
     alpha = scene.alpha
-    own, other = (shown_band(pinhole[n].numpy()) for n in (alpha, name))
-    H = torch.from_numpy(ecc_homography(own, other))
+    alpha_band, beta_band = (shown_band(pinhole[n].numpy()) for n in (alpha, name))
+    H = torch.from_numpy(ecc_homography(alpha_band, beta_band))
     x, _ = pixels_between(straight[alpha], scene.rig[alpha])
     return recorded_pixels(apply_homography(H, x).x, straight[name], scene.rig[name])[0].float().numpy()
 
 
-def ecc_homography(own: NDArray[np.uint8], other: NDArray[np.uint8]) -> Float[np.ndarray, "3 3"]:
-    """The homography `own` to `other` by enhanced correlation (Evangelidis, Psarakis 2008) of gradients.
+def ecc_homography(alpha: NDArray[np.uint8], beta: NDArray[np.uint8]) -> Float[np.ndarray, "3 3"]:
+    """The homography `alpha` to `beta` by enhanced correlation (Evangelidis, Psarakis 2008) of gradients.
 
     It starts from a translation by phase correlation, or from none; no level may lower the correlation.
     """
-    a, b = (_gradients(image, 0.5**LEVELS) for image in (own, other))
+    a, b = (_gradients(image, 0.5**LEVELS) for image in (alpha, beta))
     b = np.asarray(cv2.resize(b, a.shape[::-1]), np.float32)
     shifted = np.eye(3)
     shifted[:2, 2] = cv2.phaseCorrelate(a, b, cv2.createHanningWindow(a.shape[::-1], cv2.CV_32F))[0]
@@ -291,7 +291,7 @@ def ecc_homography(own: NDArray[np.uint8], other: NDArray[np.uint8]) -> Float[np
     ecc: Any = cv2.findTransformECC
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
     for level in range(LEVELS, -1, -1):
-        a, b = (_gradients(image, 0.5**level) for image in (own, other))
+        a, b = (_gradients(image, 0.5**level) for image in (alpha, beta))
         if level < LEVELS:
             H = SCALE @ H @ np.linalg.inv(SCALE)
         try:

@@ -134,8 +134,8 @@ def matched(network: GuidedPAT, pair: StereoPair, seed: int) -> Kept:
     known = Disparity(*(part[:h, :w] for part in pair.disparity))
     facts = matches.facts[0, :, : h // FINE, : w // FINE].half()
     blurs = torch.tensor(matches.comparison.whole.blurs)[:, 0]
-    truth, seen = (known.value * known.valid)[None].half(), known.regions().seen[None]
-    planes = alpha, beta, disparity, facts, truth, seen, blurs
+    truth, visible = (known.value * known.valid)[None].half(), known.regions().seen[None]
+    planes = alpha, beta, disparity, facts, truth, visible, blurs
     return Kept(*(part.contiguous() for part in planes))
 
 
@@ -149,7 +149,7 @@ def losses(
         g = generator_for(config.seed, "choice", step)
         of = [kinds[i % len(kinds)] for i in range(config.batch)]
         windows = [window(some[below(len(some), g)], config.side, g) for some in of]
-        inputs, options, truth, seen = (torch.cat(parts).to(config.device) for parts in zip(*windows))
+        inputs, options, truth, visible = (torch.cat(parts).to(config.device) for parts in zip(*windows))
         with torch.autocast(config.device, torch.bfloat16, enabled=config.device != "cpu"):
             answer = pixel_shuffle(network(inputs).float().flatten(1, 2), FINE)
             scores, logit, width = answer.split([CANDIDATES, 1, 1], 1)
@@ -157,7 +157,7 @@ def losses(
         near = (1 - FAR) / (1 + (apart / NEAR) ** 4) + FAR / (1 + apart)
         wrong = -(scores.log_softmax(1) + near.log()).logsumexp(1, keepdim=True)
         off = apart.gather(1, scores.argmax(1, keepdim=True))
-        right = (seen & (off <= 1)).to(logit)
+        right = (visible & (off <= 1)).to(logit)
         stated = binary_cross_entropy_with_logits(logit, right, reduction="none")
         beyond = off.clamp(min=0.02).log() - width
         interval = torch.maximum(SETTINGS.covered * beyond, (SETTINGS.covered - 1) * beyond)
@@ -171,7 +171,7 @@ def window(one: Kept, side: int, g: Generator) -> tuple[Tensor, Tensor, Tensor, 
     one = one.rows(FINE * below((h - side) // FINE + 1, g), side)
     one = one.upside_down() if below(2, g) else one
     alpha, beta, disparity, facts, truth = (part.float()[None] for part in one[:-2])
-    seen = one.seen[None]
+    visible = one.seen[None]
     level = Normalisation(torch.zeros(3, 1, 1, 1, 1), ([float(one.blurs[0])], [float(one.blurs[1])]))
     matches = BetaMatches(disparity, facts, Comparison(None, level, level))
     views = ComparedViews(another_response(alpha, g), beta, to_bytes(alpha[:, 0]), level.blurs[0])
@@ -180,7 +180,7 @@ def window(one: Kept, side: int, g: Generator) -> tuple[Tensor, Tensor, Tensor, 
     x = 0 if below(10, g) < 3 else FINE * below((w - side) // FINE + 1, g)
     half = inputs[..., x // FINE : (x + side) // FINE]
     columns = slice(x, x + side)
-    return half, options[..., columns], truth[..., columns], seen[..., columns]
+    return half, options[..., columns], truth[..., columns], visible[..., columns]
 
 
 def rows_of(hw: tuple[int, int]) -> Segments:

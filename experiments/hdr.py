@@ -32,17 +32,19 @@ def merged(frame: Frame, rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]],
     noise and error of each, and replaces it where alpha is saturated. `rig` has the exposures and gains.
     Raises ValueError if hardly a point is within the range of all cameras.
     """
-    own = linear_from_srgb(images[alpha])[0]
+    measured = linear_from_srgb(images[alpha])[0]
     names = [name for name in rig.betas(alpha) if name in images and images[name].shape[0] == 1]
     bands = torch.stack([_at_alpha(frame, rig, images[name], alpha, name) for name in names])
     scale = [light_of(rig[name].sensor, rig[alpha].sensor) for name in names]
     good = torch.stack([b.isfinite() & (b * s < WHITE) for b, s in zip(bands, scale)])
-    predicted, noise = _predicted(torch.where(good, bands, 0.0), good, scale, own)
+    predicted, noise = _predicted(torch.where(good, bands, 0.0), good, scale, measured)
     weight = torch.where(noise.isfinite(), frame.confidence / noise, 0.0)
-    own_weight = torch.where(own < WHITE, 1 / (own + READ_NOISE), 0.0)
-    total = weight + own_weight
-    light = torch.where(total > 0, (weight * predicted + own_weight * own) / total.clamp(min=1e-12), own)
-    light = torch.where((own >= WHITE) & noise.isfinite(), torch.maximum(predicted, own), light)
+    measured_weight = torch.where(measured < WHITE, 1 / (measured + READ_NOISE), 0.0)
+    total = weight + measured_weight
+    light = torch.where(
+        total > 0, (weight * predicted + measured_weight * measured) / total.clamp(min=1e-12), measured
+    )
+    light = torch.where((measured >= WHITE) & noise.isfinite(), torch.maximum(predicted, measured), light)
     return frame._replace(image=frame.image + srgb_from_linear(light[None]) - images[alpha])
 
 
@@ -64,20 +66,20 @@ FULL_WELL = 10_000.0
 
 
 def _predicted(
-    bands: Float[Tensor, "m h w"], good: Tensor, scale: Sequence[float], own: Float[Tensor, "h w"]
+    bands: Float[Tensor, "m h w"], good: Tensor, scale: Sequence[float], measured: Float[Tensor, "h w"]
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """Alpha's value predicted from the bands that are good at a pixel, and its variance, in 1 / FULL_WELL.
 
     Where none is good the variance is infinite.
     """
-    train = good.all(0) & (own < WHITE) & (own > 0.05)
+    train = good.all(0) & (measured < WHITE) & (measured > 0.05)
     if train.sum() < 100:
         raise ValueError("exposures cannot be merged: hardly a point is within the range of all cameras")
-    predicted, noise = torch.zeros_like(own), torch.full_like(own, torch.inf)
+    predicted, noise = torch.zeros_like(measured), torch.full_like(measured, torch.inf)
     for count in range(len(bands), 0, -1):
         for chosen in combinations(range(len(bands)), count):
             some = list(chosen)
-            weights, error = _fit(bands[some][:, train], own[train])
+            weights, error = _fit(bands[some][:, train], measured[train])
             error = math.hypot(error, MISPLACED)
             value = (weights[:, None, None] * bands[some]).sum(0).clamp(min=0)
             parts = zip(weights, [scale[i] for i in some], bands[some])
@@ -88,11 +90,11 @@ def _predicted(
     return predicted, noise
 
 
-def _fit(bands: Float[Tensor, "m n"], own: Float[Tensor, " n"]) -> tuple[Float[Tensor, " m"], float]:
+def _fit(bands: Float[Tensor, "m n"], measured: Float[Tensor, " n"]) -> tuple[Float[Tensor, " m"], float]:
     """Weights with which the bands sum up to alpha's value, and the median relative error of the sum."""
-    relative = 1 / (own + 0.02)
-    weights = torch.linalg.lstsq((bands * relative).T, (own * relative)[:, None]).solution[:, 0]
-    return weights, float(((weights @ bands - own) * relative).abs().median())
+    relative = 1 / (measured + 0.02)
+    weights = torch.linalg.lstsq((bands * relative).T, (measured * relative)[:, None]).solution[:, 0]
+    return weights, float(((weights @ bands - measured) * relative).abs().median())
 
 
 class DynamicRange(NamedTuple):

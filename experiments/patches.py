@@ -140,9 +140,9 @@ class ScenePatches:
             self.chains,
             seed=seed_for(self.seed, 0, index),
         )
-        own = ideal[self.alpha]
+        alpha_view = ideal[self.alpha]
         images = {name: image[0] for name, image in recorded.images.items()}
-        return Patch(images, srgb_image(own.rgb), own.depth, recorded.rig, self.alpha)
+        return Patch(images, srgb_image(alpha_view.rgb), alpha_view.depth, recorded.rig, self.alpha)
 
     def _read(self, scene: int) -> tuple[Rig, dict[str, RenderedView]]:
         """The rig and the views of a scene. Raises ValueError, naming the folder, if they are of no use."""
@@ -177,18 +177,19 @@ def windows(
 
     Raises ValueError for patches that do not fit, and a rig without a depth range.
     """
-    own, (h, w), r = views[alpha].camera, patches.hw, patches.reduce
-    top, left = patches.corners(own.hw)[number]
+    alpha_camera, (h, w), r = views[alpha].camera, patches.hw, patches.reduce
+    top, left = patches.corners(alpha_camera.hw)[number]
     made = {alpha: window(views[alpha], top, left, patches.hw, (h // r, w // r))}
     middle = torch.tensor([left + (w - 1) / 2, top + (h - 1) / 2], dtype=torch.float64)
-    X = own.unproject(middle, middle_depth(*rig.pair(alpha, alpha).depth_range).double())
+    X = alpha_camera.unproject(middle, middle_depth(*rig.pair(alpha, alpha).depth_range).double())
     for name in rig.betas(alpha):
-        beta = views[name].camera
-        hw = _beta_size(own, beta, patches)
-        x, _, valid = beta.project(X)
-        centre = x.tolist() if valid else [(n - 1) / 2 for n in beta.hw[::-1]]
+        beta_camera = views[name].camera
+        hw = _beta_size(alpha_camera, beta_camera, patches)
+        x, _, valid = beta_camera.project(X)
+        centre = x.tolist() if valid else [(n - 1) / 2 for n in beta_camera.hw[::-1]]
         top, left = (
-            min(max(round(c - (n - 1) / 2), 0), whole - n) for c, n, whole in zip(centre[::-1], hw, beta.hw)
+            min(max(round(c - (n - 1) / 2), 0), whole - n)
+            for c, n, whole in zip(centre[::-1], hw, beta_camera.hw)
         )
         made[name] = window(views[name], top, left, hw, (hw[0] // r, hw[1] // r))
     return made

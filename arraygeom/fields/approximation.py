@@ -25,12 +25,12 @@ def approximated(pair: Pair, kind: Literal["homography", "similarity"] = "homogr
         raise ValueError("fitting works on one pair at a time: take one of the batch")
     x = coarse_grid(pair.alpha.hw).to(alpha.K)
     segments = Epipolar()(pair, x)
-    seen = segments.valid
+    valid = segments.valid
     needs_numbers("which pixels an approximation is fitted to", segments.start)
-    if int(seen.sum()) < 4:
+    if int(valid.sum()) < 4:
         raise ValueError(
             "beta sees next to nothing of alpha's image between near and far: nothing to fit a map to"
         )
     fit = fit_homography if kind == "homography" else fit_similarity
-    H = fit(x[seen], (0.5 * (segments.start + segments.end))[seen])
+    H = fit(x[valid], (0.5 * (segments.start + segments.end))[valid])
     return dataclasses.replace(pair, link=Link(pair.fundamental, H))

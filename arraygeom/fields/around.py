@@ -114,8 +114,8 @@ class AroundMatches:
             raise ValueError(
                 "matches are parts of straight segments: give a field of segments, such as Epipolar"
             )
-        own, beta = self.views or (None, None)
-        there = _at_nearest(self.positions, x, pair.alpha, own).to(x)
+        alpha, beta = self.views or (None, None)
+        there = _at_nearest(self.positions, x, pair.alpha, alpha).to(x)
         known = there.isfinite().all(-1)
         there = torch.where(known[..., None], there, 0.0)
         if beta is not None:

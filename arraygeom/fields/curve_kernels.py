@@ -27,25 +27,25 @@ def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, 
     fractions of the nodes and `fractions` those of the samples.
     """
     nodes, samples = len(even), len(fractions)
-    s, x, y, seen = np.empty(nodes), np.empty(nodes), np.empty(nodes), np.empty(nodes, np.bool_)
+    s, x, y, visible = np.empty(nodes), np.empty(nodes), np.empty(nodes), np.empty(nodes, np.bool_)
     pieces = np.empty((4, nodes - 1))
     at, s_at, x_at, y_at = np.empty(samples), np.empty(samples), np.empty(samples), np.empty(samples)
-    seen_at = np.empty(samples, np.bool_)
+    visible_at = np.empty(samples, np.bool_)
     for p in range(begin, end):
         total = 0.0
         if valid[p]:
             _shares(first[p], last[p], lens.wide, even, s)
-            _project(first[p], last[p], s, lens, x, y, seen)
-            total = _pieces(x, y, seen, hw, pieces)
+            _project(first[p], last[p], s, lens, x, y, visible)
+            total = _pieces(x, y, visible, hw, pieces)
         if total > 0:
             _along(pieces, total, fractions, at)
             _shares(first[p], last[p], lens.wide, at, s_at)
-            _project(first[p], last[p], s_at, lens, x_at, y_at, seen_at)
+            _project(first[p], last[p], s_at, lens, x_at, y_at, visible_at)
         right, bottom = hw[1] - 0.5, hw[0] - 0.5
         for i in range(samples):
             near = (x_at[i] > -0.5 - FARTHEST_OFF) & (x_at[i] < right + FARTHEST_OFF)
             near = near & (y_at[i] > -0.5 - FARTHEST_OFF) & (y_at[i] < bottom + FARTHEST_OFF)
-            counts = (total > 0) & near & seen_at[i]
+            counts = (total > 0) & near & visible_at[i]
             mask[p, i] = counts
             xy[p, i, 0] = min(max(x_at[i], -0.5), right) if counts else 0.0
             xy[p, i, 1] = min(max(y_at[i], -0.5), bottom) if counts else 0.0
@@ -78,7 +78,7 @@ def _sinc(angle):
 
 
 @compiled(inline="always")
-def _project(first, last, s, lens, x, y, seen):
+def _project(first, last, s, lens, x, y, visible):
     """Beta's pixels of the points at shares s, and which it can see."""
     a, b = (first[0], first[1], first[2]), (last[0] - first[0], last[1] - first[1], last[2] - first[2])
     # A loop for each model, without branches within the first two: they become vector instructions.
@@ -86,18 +86,18 @@ def _project(first, last, s, lens, x, y, seen):
         for i in range(len(s)):
             X, Y, Z = a[0] + s[i] * b[0], a[1] + s[i] * b[1], a[2] + s[i] * b[2]
             z = Z if Z > 0 else 1.0
-            x[i], y[i], seen[i] = X / z, Y / z, (Z > 0) & (X * X + Y * Y + Z * Z > FRONT**2)
+            x[i], y[i], visible[i] = X / z, Y / z, (Z > 0) & (X * X + Y * Y + Z * Z > FRONT**2)
     elif lens.model == BROWN:
         for i in range(len(s)):
             X, Y, Z = a[0] + s[i] * b[0], a[1] + s[i] * b[1], a[2] + s[i] * b[2]
             inverse = 1 / (Z if Z > 0 else 1.0)
-            x[i], y[i], seen[i] = X * inverse, Y * inverse, (Z > 0) & (X * X + Y * Y + Z * Z > FRONT**2)
-        _brown(lens.c, lens.limit, x, y, seen)
+            x[i], y[i], visible[i] = X * inverse, Y * inverse, (Z > 0) & (X * X + Y * Y + Z * Z > FRONT**2)
+        _brown(lens.c, lens.limit, x, y, visible)
     else:
         for i in range(len(s)):
             X, Y, Z = a[0] + s[i] * b[0], a[1] + s[i] * b[1], a[2] + s[i] * b[2]
             x[i], y[i], inside = _fisheye(lens.c, lens.limit, X, Y, Z)
-            seen[i] = inside and X * X + Y * Y + Z * Z > FRONT**2
+            visible[i] = inside and X * X + Y * Y + Z * Z > FRONT**2
     K = lens.K
     for i in range(len(s)):
         u, v = x[i], y[i]
@@ -105,7 +105,7 @@ def _project(first, last, s, lens, x, y, seen):
 
 
 @compiled(inline="always")
-def _brown(c, limit, x, y, seen):
+def _brown(c, limit, x, y, visible):
     """Distorted normalised points, invalid ones unseen; `distortion._brown_distort` without a tilt."""
     farthest = 0.0
     for i in range(len(x)):
@@ -114,7 +114,7 @@ def _brown(c, limit, x, y, seen):
         for i in range(len(x)):
             squared = x[i] * x[i] + y[i] * y[i]
             pull = math.sqrt(limit / (squared if squared > limit else limit))
-            x[i], y[i], seen[i] = x[i] * pull, y[i] * pull, seen[i] & (squared < limit)
+            x[i], y[i], visible[i] = x[i] * pull, y[i] * pull, visible[i] & (squared < limit)
     k1, k2, p1, p2, k3, k4 = c[0], c[1], c[2], c[3], c[4], c[5]
     k5, k6, s1, s2, s3, s4 = c[6], c[7], c[8], c[9], c[10], c[11]
     for i in range(len(x)):
@@ -130,7 +130,7 @@ def _brown(c, limit, x, y, seen):
         xx = g + 2 * a * a * dg + 2 * p1 * b + 6 * p2 * a + prism_x * a
         yy = g + 2 * b * b * dg + 6 * p1 * b + 2 * p2 * a + prism_y * b
         determinant = xx * yy - (cross + prism_x * b) * (cross + prism_y * a)
-        seen[i] = seen[i] & (determinant > 0) & (xx + yy > 0)
+        visible[i] = visible[i] & (determinant > 0) & (xx + yy > 0)
 
 
 @compiled(inline="always")
@@ -154,7 +154,7 @@ def _fisheye(c, limit, x, y, z):
 
 
 @compiled(inline="always")
-def _pieces(x, y, seen, hw, out):
+def _pieces(x, y, visible, hw, out):
     """Of each piece between nodes from and to which fraction it is visible, its visible length, and the sum
     of the lengths up to its end; gives the whole length. `curved.visible_pieces`."""
     total = 0.0
@@ -167,7 +167,7 @@ def _pieces(x, y, seen, hw, out):
             else:
                 one, other = (-0.5 - a) * (1 / moves), (limit - a) * (1 / moves)
                 low, high = max(low, min(one, other)), min(high, max(one, other))
-        shown = (seen[i] or seen[i + 1]) and low <= high
+        shown = (visible[i] or visible[i + 1]) and low <= high
         length = 0.0
         if shown:
             length = math.sqrt((x[i + 1] - x[i]) ** 2 + (y[i + 1] - y[i]) ** 2 + 1e-6) * (high - low)

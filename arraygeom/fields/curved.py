@@ -64,11 +64,11 @@ class Curved:
         if curve.compilable and curve.valid.numel() > FEW:
             return curve.positions(self.nodes, self.samples)
         even = torch.linspace(0, 1, self.nodes, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], -1)
-        nodes, seen = curve.at(even)
-        pieces = visible_pieces(nodes, seen & curve.valid[..., None], pair.beta.hw, curve.longest_piece)
-        xy, seen = curve.at(along_pieces(pieces, sample_fractions(self.samples, like=x)))
+        nodes, visible = curve.at(even)
+        pieces = visible_pieces(nodes, visible & curve.valid[..., None], pair.beta.hw, curve.longest_piece)
+        xy, visible = curve.at(along_pieces(pieces, sample_fractions(self.samples, like=x)))
         xy, inside = _onto_edge(xy, pair.beta.hw, EDGE)
-        mask = inside & seen & (pieces.length.sum(-1, keepdim=True) > 0)
+        mask = inside & visible & (pieces.length.sum(-1, keepdim=True) > 0)
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
 
 
@@ -96,12 +96,12 @@ class ThroughLenses:
         alpha, beta = (_Straight.of(view) for view in (pair.alpha, pair.beta))
         link = None if pair.link is None else pair.link.transformed(alpha.A, beta.A)
         straight = dataclasses.replace(pair, alpha=alpha.pinhole, beta=beta.pinhole, link=link)
-        there, seen = alpha.undistort(floating(x))
+        there, valid = alpha.undistort(floating(x))
         locations = answered(self.field, straight, there)
         locations = locations.positions(self.samples) if isinstance(locations, Segments) else locations
         xy, shown = beta.distort(locations.xy)
         xy, inside = _onto_edge(xy, pair.beta.hw, ROUNDED)
-        mask = locations.mask & seen[..., None] & shown & inside
+        mask = locations.mask & valid[..., None] & shown & inside
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
 
 
@@ -232,11 +232,11 @@ class RayCurve(NamedTuple):
         weights = self._weights_in_angle(fraction) if self.wide else self._weights_in_pixels(fraction)
         s = (weights[1] / (weights[0] + weights[1]))[..., None]
         X = torch.lerp(self.first[..., None, :], self.last[..., None, :], s)
-        seen = X.square().sum(-1) > FRONT**2
+        far_enough = X.square().sum(-1) > FRONT**2
         if not self.beta.central:
             X = X / self._inverse_at(s[..., 0])[..., None]
         projected = self.beta.project_local(X)
-        return projected.x, projected.valid & seen
+        return projected.x, projected.valid & far_enough
 
     def inverse_depth(self, fraction: Tensor) -> Tensor:
         """The inverse depth (or distance) in alpha of the points at fractions (*n, l)."""
@@ -277,11 +277,11 @@ def _lines(alpha: Camera, x: Tensor, bounds: str) -> tuple[Tensor | None, Tensor
 
     The start is in the plane of depth 0, and None if it is alpha's origin.
     """
-    rays, seen = alpha.rays(x)
+    rays, valid = alpha.rays(x)
     start = None if alpha.central else alpha.ray_origins(x)
     if bounds == "distance":
-        return start, rays / rays.square().sum(-1, keepdim=True).clamp(min=TINY).sqrt(), seen
-    ahead = seen & (rays[..., 2] > FRONT)
+        return start, rays / rays.square().sum(-1, keepdim=True).clamp(min=TINY).sqrt(), valid
+    ahead = valid & (rays[..., 2] > FRONT)
     rays = rays / torch.where(ahead, rays[..., 2], 1.0)[..., None]
     return None if start is None else start - start[..., 2:] * rays, rays, ahead
 
@@ -354,20 +354,22 @@ class Pieces(NamedTuple):
     length: Float[Tensor, "*n m"]
 
 
-def visible_pieces(nodes: Float[Tensor, "*n k 2"], seen: Tensor, hw: HW, longest: float = math.inf) -> Pieces:
-    """The parts of a polyline that lie on the image, of pieces with a node that is `seen` (*n, k).
+def visible_pieces(
+    nodes: Float[Tensor, "*n k 2"], visible: Tensor, hw: HW, longest: float = math.inf
+) -> Pieces:
+    """The parts of a polyline that lie on the image, of pieces with a node that is `visible` (*n, k).
 
     Pieces of more than `longest` pixels are across a seam, and left out. A visible piece of no length counts
     as 1e-3 pixels, so that a curve that is a point is somewhere.
     """
     first, last = fractions_on_image(nodes[..., :-1, :], nodes[..., 1:, :], hw)
-    seen = (seen[..., :-1] | seen[..., 1:]) & (first <= last)
-    first, last = torch.where(seen, first, 0.0), torch.where(seen, last, 1.0)
+    visible = (visible[..., :-1] | visible[..., 1:]) & (first <= last)
+    first, last = torch.where(visible, first, 0.0), torch.where(visible, last, 1.0)
     if longest < math.inf:
-        seen = seen & (nodes.detach().diff(dim=-2).square().sum(-1) < longest**2)
-    step = torch.where(seen[..., None], nodes.diff(dim=-2), 0.0)
+        visible = visible & (nodes.detach().diff(dim=-2).square().sum(-1) < longest**2)
+    step = torch.where(visible[..., None], nodes.diff(dim=-2), 0.0)
     length = (step.square().sum(-1) + 1e-6).sqrt() * (last - first)
-    return Pieces(first, last, torch.where(seen, length, 0.0))
+    return Pieces(first, last, torch.where(visible, length, 0.0))
 
 
 def along_pieces(pieces: Pieces, u: Float[Tensor, " l"]) -> Float[Tensor, "*n l"]:

@@ -89,8 +89,8 @@ def natural_bounds(pair: Pair) -> Literal["depth", "distance"]:
     alpha = pair.cameras[0]
     if alpha.distortion is None or not alpha.distortion.sees_behind or traced():
         return "depth"
-    rays, seen = alpha.rays(coarse_grid(alpha.hw).to(alpha.K).reshape(*[1] * len(alpha.batch_shape), -1, 2))
-    return "distance" if bool((seen & (rays[..., 2] <= FRONT * rays.norm(dim=-1))).any()) else "depth"
+    rays, valid = alpha.rays(coarse_grid(alpha.hw).to(alpha.K).reshape(*[1] * len(alpha.batch_shape), -1, 2))
+    return "distance" if bool((valid & (rays[..., 2] <= FRONT * rays.norm(dim=-1))).any()) else "depth"
 
 
 def recorded_field(pair: Pair, *, samples: int = 256, nodes: int = 64) -> ReceptiveField:

@@ -101,5 +101,5 @@ def _apart(
     curve: RayCurve, fraction: Float[Tensor, "n l"], x_beta: Float[Tensor, "n 2"]
 ) -> Float[Tensor, "n l"]:
     """Squared pixels from positions to the points at fractions, infinite where beta does not see these."""
-    xy, seen = curve.at(fraction)
-    return torch.where(seen, (xy - x_beta[:, None].to(xy)).square().sum(-1), torch.inf)
+    xy, visible = curve.at(fraction)
+    return torch.where(visible, (xy - x_beta[:, None].to(xy)).square().sum(-1), torch.inf)

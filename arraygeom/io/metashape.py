@@ -49,8 +49,8 @@ def read(source: RigSource) -> Rig:
             views[sensor] = _sensor(source, sensors[sensor], f"sensor {sensor}")
         view, entry = views[sensor], f"{name}.transform"
         pose = source.at(transform, entry).words().pose_matrix().inverse()
-        own = scales.get(camera.get("component_id"))
-        metres = own if own is not None else scale if scale is not None else 1.0
+        component_scale = scales.get(camera.get("component_id"))
+        metres = component_scale if component_scale is not None else scale if scale is not None else 1.0
         pose = Pose(pose.R, pose.t * metres)
         cameras.append((name, Camera(K=view.K, cam_from_world=pose, hw=view.hw, distortion=view.distortion)))
     if left_out:

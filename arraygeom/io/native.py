@@ -154,15 +154,15 @@ def _camera(fields: Entry, origin: float) -> View:
 def _lens_view(fields: Entry, view: View, origin: float) -> View:
     """An uncalibrated view whose lens states its own scale and centre."""
     kind = CAMERA_MODELS.get(str(fields.get("model").value))
-    own = ("coefficients",) if kind is None else tuple(f.name for f in dataclasses.fields(kind))  # type: ignore[arg-type]
-    _check_keys(fields, ("model", *own, "scale", "centre", "K"))
+    keys = ("coefficients",) if kind is None else tuple(f.name for f in dataclasses.fields(kind))  # type: ignore[arg-type]
+    _check_keys(fields, ("model", *keys, "scale", "centre", "K"))
     if not ("scale" in fields or "K" in fields):
         raise fields.fail(
             "is of a camera without 'focal': "
             "add that, or `scale` (the pixels that count as 1 in the lens model)"
         )
     K = _intrinsics(fields, view.hw, origin, scale="scale")
-    stated = {key: value for key, value in fields.value.items() if key in ("model", *own)}
+    stated = {key: value for key, value in fields.value.items() if key in ("model", *keys)}
     return LensView(
         hw=view.hw, sensor=view.sensor, K=K, distortion=_lens(Entry(fields.source, stated, fields.name))
     )

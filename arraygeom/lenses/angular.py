@@ -109,8 +109,8 @@ class Equirectangular(CameraModel, name="equirectangular"):
         off = squared > 0
         level = torch.where(off, torch.where(off, squared, 1.0).sqrt(), 0.0)
         longitude = torch.atan2(torch.where(off, x, 0.0), torch.where(off, z, 1.0))
-        seen = finite & (off | (y != 0))
-        return torch.stack([longitude, torch.atan2(y, torch.where(seen, level, 1.0))], -1), seen
+        valid = finite & (off | (y != 0))
+        return torch.stack([longitude, torch.atan2(y, torch.where(valid, level, 1.0))], -1), valid
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
         """Unit directions."""

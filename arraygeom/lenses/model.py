@@ -124,9 +124,9 @@ class CameraModel(LensModel):
 
     def with_coefficients(self: AnyLens, coefficients: Float[Tensor, "*b n"]) -> AnyLens:
         """The same model with other numbers."""
-        own = self._own()  # type: ignore[attr-defined]
-        sizes = [t.shape[t.ndim - axes :].numel() for t, axes in own.values()]
-        parts = zip(own.items(), coefficients.split(sizes, -1))
+        tensors = self._own()  # type: ignore[attr-defined]
+        sizes = [t.shape[t.ndim - axes :].numel() for t, axes in tensors.values()]
+        parts = zip(tensors.items(), coefficients.split(sizes, -1))
         batch = coefficients.shape[:-1]
         new = {name: part.reshape((*batch, *t.shape[t.ndim - axes :])) for (name, (t, axes)), part in parts}
         return dataclasses.replace(self, **new)  # type: ignore[type-var]
@@ -204,5 +204,5 @@ def _kind(value: Any) -> str:
 def beside_points(number: Tensor, points: Tensor, axes: int = 0) -> Tensor:
     """A model's number (*b, and `axes` of its own) for points (*b, ..., k): 1-long axes for the points'."""
     batch = number.ndim - axes
-    own = number.shape[batch:]
-    return number.to(points).reshape((*number.shape[:batch], *[1] * (points.ndim - 1 - batch), *own))
+    trailing = number.shape[batch:]
+    return number.to(points).reshape((*number.shape[:batch], *[1] * (points.ndim - 1 - batch), *trailing))

@@ -115,14 +115,14 @@ class RollingShutter(BehindModel, name="rolling-shutter"):
         row, slope = before, torch.zeros_like(before)
         last, rounding = torch.zeros_like(before), torch.finfo(before.dtype).eps
         for _ in range(ROWS):
-            seen = self._through(self._at_rest(X, row))[0][..., 1]
+            projected = self._through(self._at_rest(X, row))[0][..., 1]
             step = row - last
             moved = step.abs() > rounding**0.5
-            slope = torch.where(moved, (seen - before) / torch.where(moved, step, 1.0), slope).clamp(
+            slope = torch.where(moved, (projected - before) / torch.where(moved, step, 1.0), slope).clamp(
                 max=STEEPEST
             )
-            last, before = row, seen
-            row = row + (seen - row) / (1 - slope)
+            last, before = row, projected
+            row = row + (projected - row) / (1 - slope)
             if not followed() and bool(((row - last).abs() <= SETTLED * rounding * (1 + row.abs())).all()):
                 break
         return row, slope
@@ -221,8 +221,8 @@ class FlatPort(BehindModel, name="flat-port"):
         share = torch.where(settled, share, 0.0)
         for _ in range(FOLLOWED if torch.is_grad_enabled() else 0):
             share = share + self._step(share, squared, depths)
-        xy, seen = self._through(to_homogeneous(X[..., :2] * share[..., None]))
-        return xy, valid & settled & seen
+        xy, lens_valid = self._through(to_homogeneous(X[..., :2] * share[..., None]))
+        return xy, valid & settled & lens_valid
 
     def unproject(self, xy: Tensor) -> tuple[Tensor, Tensor]:
         """Unit directions in the water, by Snell's law."""

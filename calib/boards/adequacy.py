@@ -146,13 +146,13 @@ def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarra
 
 def _gain(known: Intrinsics, X: np.ndarray) -> np.ndarray | None:
     """A view's information on the free intrinsics, its pose unknown; None if hardly any of it is visible."""
-    seen = known.camera.project_local(torch.from_numpy(X))
-    inside = (seen.valid & known.camera.contains(seen.x)).numpy()
+    projected = known.camera.project_local(torch.from_numpy(X))
+    inside = (projected.valid & known.camera.contains(projected.x)).numpy()
     if inside.sum() < 0.6 * len(X) or not inside.any():
         return None
     J = camera_jacobian(known.camera, X[inside]) / known.sigma
-    pose, own = J[..., :6].reshape(-1, 6), J[..., known.free].reshape(2 * int(inside.sum()), -1)
-    left = own - pose @ np.linalg.lstsq(pose, own, rcond=None)[0]
+    by_pose, by_intrinsics = J[..., :6].reshape(-1, 6), J[..., known.free].reshape(2 * int(inside.sum()), -1)
+    left = by_intrinsics - by_pose @ np.linalg.lstsq(by_pose, by_intrinsics, rcond=None)[0]
     return np.asarray(left.T @ left)
 
 

@@ -86,10 +86,10 @@ class BundleProblem:
 
     def on_board(self, name: str) -> Float[np.ndarray, "n 3"]:
         """The points that a camera observed, on the boards as they are shaped, metres."""
-        seen = self.seen[name]
+        observed = self.seen[name]
         if self.deformation is None:
-            return seen.p
-        return self.deformation.deformed(seen.p, self.deformation.part[seen.block])
+            return observed.p
+        return self.deformation.deformed(observed.p, self.deformation.part[observed.block])
 
     def rotated(self, name: str) -> Float[np.ndarray, "n 3"]:
         """The points that a camera observed, along the world's axes from the origin of their board."""
@@ -103,9 +103,9 @@ class BundleProblem:
     def residuals(self) -> dict[str, Float[np.ndarray, "_ 2"]]:
         """By camera: measured minus projected, pixels."""
         residuals = {}
-        for name, seen in self.seen.items():
+        for name, observed in self.seen.items():
             X = torch.from_numpy(self.world(name))
-            residuals[name] = seen.x - self.cameras[name].project(X).x.detach().numpy()
+            residuals[name] = observed.x - self.cameras[name].project(X).x.detach().numpy()
         return residuals
 
     def rms(self) -> float:
@@ -127,14 +127,14 @@ class BundleProblem:
 
     def of_boards(self, kept: Bool[np.ndarray, " b"]) -> BundleProblem:
         """The problem with some of its boards only."""
-        index, seen = np.cumsum(kept) - 1, {}
+        index, observations = np.cumsum(kept) - 1, {}
         for name, s in self.seen.items():
             mine = kept[s.block]
-            seen[name] = Observations(index[s.block[mine]], s.p[mine], s.x[mine])
+            observations[name] = Observations(index[s.block[mine]], s.p[mine], s.x[mine])
         return replace(
             self,
             boards=self.boards[torch.from_numpy(kept)],
-            seen=seen,
+            seen=observations,
             frames=tuple(key for key, keep in zip(self.frames, kept) if keep),
             deformation=self.deformation and replace(self.deformation, part=self.deformation.part[kept]),
         )
@@ -173,19 +173,19 @@ class InitialRig(NamedTuple):
 
     def problem(self, board: Board) -> BundleProblem:
         """What is to be adjusted."""
-        index, seen, free = {key: i for i, key in enumerate(self.boards)}, {}, {}
+        index, observations, free = {key: i for i, key in enumerate(self.boards)}, {}, {}
         for number, (name, camera) in enumerate(self.cameras.items()):
             detections = self.views[name].seen
             parts = [
                 (np.full(len(d.ids), index[key]), board.points[d.ids], d.x) for key, d in detections.items()
             ]
-            seen[name] = Observations(*(np.concatenate(part) for part in zip(*parts)))
+            observations[name] = Observations(*(np.concatenate(part) for part in zip(*parts)))
             free[name] = np.ones(len(parameter_names(camera)), dtype=bool)
             free[name][:6] = number > 0 or self.priors is not None
         priors = self.priors or {name: typical_prior(camera) for name, camera in self.cameras.items()}
         poses = stack(list(self.boards.values()))
         return BundleProblem(
-            self.cameras, poses, seen, tuple(self.boards), free, {}, priors, self.deformation
+            self.cameras, poses, observations, tuple(self.boards), free, {}, priors, self.deformation
         )
 
     def flat(self, board: Board) -> BoardDeformation | None:
@@ -250,28 +250,30 @@ def linearised(problem: BundleProblem) -> dict[str, Linearised]:
     first, rows = 0, {}
     total = len(problem.names) + shapes
     for name, camera in problem.cameras.items():
-        seen, free, sigma = problem.seen[name], problem.free[name], problem.sigma[name]
+        observed, free, sigma = problem.seen[name], problem.free[name], problem.sigma[name]
         last = first + int(free.sum())
         columns = np.array([*range(first, last), *range(total - shapes, total)], dtype=int)
         first = last
         x, by_camera = linear_projection(camera, problem.world(name))
-        r = seen.x - x
+        r = observed.x - x
         by_point = by_camera[..., 3:6] @ camera.R.numpy()
         by_board = np.concatenate([np.cross(problem.rotated(name)[:, None], by_point), by_point], -1)
         by_shared = np.concatenate([by_camera[..., free], by_point @ _by_deformation(problem, name)], -1)
         weight = np.sqrt(robust_weights(np.linalg.norm(r, axis=-1) / sigma)) / sigma
         wide = weight[:, None, None]
-        rows[name] = Linearised(weight[:, None] * r, wide * by_shared, wide * by_board, seen.block, columns)
+        rows[name] = Linearised(
+            weight[:, None] * r, wide * by_shared, wide * by_board, observed.block, columns
+        )
     return rows
 
 
 def _by_deformation(problem: BundleProblem, name: str) -> Float[np.ndarray, "n 3 s"]:
     """Derivatives of a camera's points in the world by the boards' deformations."""
-    seen = problem.seen[name]
+    observed = problem.seen[name]
     if problem.deformation is None:
-        return np.zeros((len(seen.block), 3, 0))
-    on_board = problem.deformation.jacobian(seen.p, problem.deformation.part[seen.block])
-    return problem.boards.R.numpy()[seen.block] @ on_board
+        return np.zeros((len(observed.block), 3, 0))
+    on_board = problem.deformation.jacobian(observed.p, problem.deformation.part[observed.block])
+    return problem.boards.R.numpy()[observed.block] @ on_board
 
 
 @dataclass(frozen=True)
@@ -324,10 +326,10 @@ def normal_equations(problem: BundleProblem, parts: Mapping[str, Linearised]) ->
         H[np.ix_(columns, columns)] += rows.T @ rows
         g[columns] += np.einsum("nip,ni->p", part.by_shared, part.r)
         if (prior := problem.priors.get(name)) is not None:
-            free, own = problem.free[name], columns[: len(columns) - shapes]
+            free, camera_columns = problem.free[name], columns[: len(columns) - shapes]
             information, slope = prior.equations(problem.cameras[name])
-            H[np.ix_(own, own)] += information[np.ix_(free, free)]
-            g[own] += slope[free]
+            H[np.ix_(camera_columns, camera_columns)] += information[np.ix_(free, free)]
+            g[camera_columns] += slope[free]
         B += block_sums(part.block, part.by_board.swapaxes(1, 2) @ part.by_board, b)
         h += block_sums(part.block, np.einsum("nid,ni->nd", part.by_board, part.r), b)
         W[:, columns] += block_sums(part.block, part.by_shared.swapaxes(1, 2) @ part.by_board, b)

@@ -156,11 +156,11 @@ def _charuco(grey: Grey, board: Charuco) -> Detection | None:
 
 
 def _april_grid(grey: Grey, board: AprilGrid) -> Detection | None:
-    seen = _tags(grey, board.dictionary, board.border)
-    tags = np.array([i for i in seen if i in board.markers], dtype=int)
+    markers = _tags(grey, board.dictionary, board.border)
+    tags = np.array([i for i in markers if i in board.markers], dtype=int)
     if 4 * len(tags) < FEWEST:
         return None
-    x = np.array([seen[i] for i in tags.tolist()])
+    x = np.array([markers[i] for i in tags.tolist()])
     tags -= board.markers[0]
     points = board.corners[tags].reshape(-1)
     # tags stand on their heads in Kalibr's files, and otherwise in others'
@@ -171,11 +171,14 @@ def _april_grid(grey: Grey, board: AprilGrid) -> Detection | None:
 
 def _known_points(grey: Grey, board: KnownPoints) -> Detection | None:
     """Corners, and centres by the diagonals, which lenses hardly move."""
-    seen = _tags(grey, board.dictionary, 1)
-    ids = [i for i, (marker, _) in enumerate(board.ids) if marker in seen]
+    markers = _tags(grey, board.dictionary, 1)
+    ids = [i for i, (marker, _) in enumerate(board.ids) if marker in markers]
     if len(ids) < FEWEST_KNOWN:
         return None
-    x = [_crossing(seen[m]) if corner < 0 else seen[m][corner] for m, corner in (board.ids[i] for i in ids)]
+    x = [
+        _crossing(markers[m]) if corner < 0 else markers[m][corner]
+        for m, corner in (board.ids[i] for i in ids)
+    ]
     return Detection(np.array(ids), np.array(x, dtype=np.float64))
 
 
@@ -336,9 +339,9 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
             f"is the size right (across x down)?{legacy if isinstance(board, Charuco) else ''}"
         )
     for name in OTHER_DICTIONARIES:
-        if len(seen := _tags(grey, name, 1)) >= 6:
+        if len(markers := _tags(grey, name, 1)) >= 6:
             return (
-                f"{len(seen)} markers of the dictionary {name} are visible, "
+                f"{len(markers)} markers of the dictionary {name} are visible, "
                 f"not of {board.dictionary}: name that one"
             )
     return None
@@ -389,9 +392,9 @@ def collect_folder(
     for name, moments in photos.items():
         images = {key: next(detections) for key in moments}
         views[name] = board_views(name, moments, images)
-        seen = {key: boards for key, (_, boards) in images.items() if boards}
-        notes += _missing(name, moments, seen, board)
-        shown.append(_greys([moments[key] for key in seen]))
+        with_board = {key: boards for key, (_, boards) in images.items() if boards}
+        notes += _missing(name, moments, with_board, board)
+        shown.append(_greys([moments[key] for key in with_board]))
     if other := other_size(chain.from_iterable(shown), board, larger=True):
         raise ValueError(
             f"the images show a chessboard with {other} inner corners and the board given is {board}: "
@@ -408,8 +411,10 @@ def detected(photo: Photo, key: FrameKey, board: Board) -> DetectedImage:
     """
     grey, detections, before = photo.read(), dict[FrameKey, Detection](), 0
     for index, member in enumerate(board.members):
-        if (seen := detect(grey, member)) is not None:
-            detections[f"{key} board {index + 1}" if index else key] = Detection(seen.ids + before, seen.x)
+        if (detection := detect(grey, member)) is not None:
+            detections[f"{key} board {index + 1}" if index else key] = Detection(
+                detection.ids + before, detection.x
+            )
         before += len(member.points)
     return (grey.shape[0], grey.shape[1]), detections
 
@@ -430,14 +435,14 @@ def board_views(
 
 
 def _missing(
-    name: str, moments: Mapping[FrameKey, Photo], seen: Collection[FrameKey], board: Board
+    name: str, moments: Mapping[FrameKey, Photo], with_board: Collection[FrameKey], board: Board
 ) -> Iterator[str]:
     """A note on a camera's images without the board. Raises ValueError if all are."""
-    why, missing = "", [photo for key, photo in moments.items() if key not in seen]
+    why, missing = "", [photo for key, photo in moments.items() if key not in with_board]
     if missing:
         labels = named([photo.label for photo in missing], NAMED)
         why = f"images ({labels}): {explain(_greys(missing), board.members[0])}"
-    if not seen:
+    if not with_board:
         raise ValueError(f"{name}: the board {board} is in none of {len(moments)} {why}")
     if missing:
         yield f"{name}: no board in {len(missing)} of {len(moments)} {why}"

@@ -114,17 +114,17 @@ def rig_near_start(
     The camera with most images keeps its orientation. Raises ValueError if the start has no such camera, or
     one of another size, if a camera shares no moment with another, or if none of its images fits the start.
     """
-    seen = []
+    cameras = []
     for name, v in views.items():
         camera = _start_camera(name, start, v, lens[name])
         others = [other.seen.keys() for n, other in views.items() if n != name]
         if others and not any(v.seen.keys() & keys for keys in others):
             raise ValueError(f"{name}: shares no frame with another camera: check the images' numbers")
         board_poses = {key: board_pose(camera, d, board) for key, d in v.seen.items()}
-        seen.append(CalibratedViews(name, camera, v, board_poses))
-    poses = _aligned(seen, board)
-    priors = {v.name: start_prior(v.camera, deviations) for v in seen}
-    initial = consistent_boards(seen, poses, board)
+        cameras.append(CalibratedViews(name, camera, v, board_poses))
+    poses = _aligned(cameras, board)
+    priors = {v.name: start_prior(v.camera, deviations) for v in cameras}
+    initial = consistent_boards(cameras, poses, board)
     if lost := [name for name, v in initial.views.items() if not v.seen]:
         raise ValueError(
             f"{lost[0]}: its boards are nowhere near where the start and the other cameras put them: "
@@ -146,26 +146,28 @@ def _start_camera(name: str, start: Rig, views: BoardViews, model_name: Lens) ->
         (h, w), (rows, columns) = camera.hw, views.hw
         raise ValueError(f"{name}: its images are {columns}x{rows} and the start states {w}x{h}")
     model, count = LENSES[model_name]
-    own = camera.distortion
-    if own is None and count:
+    distortion = camera.distortion
+    if distortion is None and count:
         lens = Distortion(model, torch.zeros(count, dtype=torch.float64))
         camera = camera.replace(distortion=lens.with_coefficients(pinhole_coefficients(lens)))
-    elif own is not None and own.model == model == BROWN_CONRADY:
-        missing = max(0, count - own.coefficients.shape[-1])
-        camera = camera.replace(distortion=own.with_coefficients(pad(own.coefficients, (0, missing))))
+    elif distortion is not None and distortion.model == model == BROWN_CONRADY:
+        missing = max(0, count - distortion.coefficients.shape[-1])
+        camera = camera.replace(
+            distortion=distortion.with_coefficients(pad(distortion.coefficients, (0, missing)))
+        )
     return camera.to(torch.float64)
 
 
-def _aligned(seen: Sequence[CalibratedViews], board: Board) -> dict[str, Pose]:
+def _aligned(cameras: Sequence[CalibratedViews], board: Board) -> dict[str, Pose]:
     """`cam_from_world` of all cameras, oriented by the frames that each shares with one before.
 
     The first is that with most images; then always those two that share most. Cameras that share none keep
     their own.
     """
-    first, symmetries = max(seen, key=lambda v: len(v.poses)), symmetry_poses(board)
+    first, symmetries = max(cameras, key=lambda v: len(v.poses)), symmetry_poses(board)
     poses = {first.name: first.camera.cam_from_world}
-    for _ in seen[1:]:
-        pairs = ((a, b) for a in seen for b in seen if a.name in poses and b.name not in poses)
+    for _ in cameras[1:]:
+        pairs = ((a, b) for a in cameras for b in cameras if a.name in poses and b.name not in poses)
         a, b = max(pairs, key=lambda pair: len(pair[0].poses.keys() & pair[1].poses.keys()))
         pose, nominal = b.camera.cam_from_world, a.camera.cam_from_world @ b.camera.cam_from_world.inverse()
         if shared := [key for key in b.poses if key in a.poses]:
@@ -242,19 +244,19 @@ def _prediction_errors(
     return np.array(errors)
 
 
-def _tolerance(seen: CalibratedViews) -> float:
+def _tolerance(camera: CalibratedViews) -> float:
     """Largest error of a prediction that agrees, pixels."""
-    return TOLERANCE * seen.views.hw[1]
+    return TOLERANCE * camera.views.hw[1]
 
 
 def _along_tree(
     cameras: Sequence[CalibratedViews], pairs: Mapping[tuple[str, str], RelativePose], board: Board
 ) -> dict[str, Pose]:
     """Prim's algorithm from the first camera, by the number of corners in agreeing frames."""
-    poses, seen = {cameras[0].name: Pose.identity()}, {c.name: c.views.seen for c in cameras}
+    poses, detections = {cameras[0].name: Pose.identity()}, {c.name: c.views.seen for c in cameras}
 
     def corners(edge: tuple[tuple[str, str], RelativePose]) -> int:
-        return sum(len(seen[name][key].ids) for name in edge[0] for key in edge[1].agreeing)
+        return sum(len(detections[name][key].ids) for name in edge[0] for key in edge[1].agreeing)
 
     consistent = {names: pair for names, pair in pairs.items() if pair.consistent}
     while len(poses) < len(cameras):
@@ -279,7 +281,7 @@ def _crossing(
 def consistent_boards(cameras: Sequence[CalibratedViews], poses: dict[str, Pose], board: Board) -> InitialRig:
     """Board poses from the camera most others agree with, other cameras' numbering made consistent."""
     boards: dict[FrameKey, Pose] = {}
-    seen: dict[str, dict[FrameKey, Detection]] = {c.name: {} for c in cameras}
+    detections: dict[str, dict[FrameKey, Detection]] = {c.name: {} for c in cameras}
     left_out = []
     for key in dict.fromkeys(key for c in cameras for key in c.views.seen):
         views = sorted((c for c in cameras if key in c.views.seen), key=lambda c: -len(c.views.seen[key].ids))
@@ -295,11 +297,11 @@ def consistent_boards(cameras: Sequence[CalibratedViews], poses: dict[str, Pose]
             if i == anchor or error.min() < 3 * _tolerance(camera):
                 detection = camera.views.seen[key]
                 numbers = board.symmetries[int(error.argmin())]
-                seen[camera.name][key] = Detection(numbers[detection.ids], detection.x)
+                detections[camera.name][key] = Detection(numbers[detection.ids], detection.x)
             else:
                 left_out.append((camera.name, key))
     placed = {c.name: c.camera.replace(cam_from_world=poses[c.name]) for c in cameras}
-    views_of = {c.name: BoardViews(c.views.hw, seen[c.name]) for c in cameras}
+    views_of = {c.name: BoardViews(c.views.hw, detections[c.name]) for c in cameras}
     return InitialRig(placed, boards, views_of, left_out)
 
 
@@ -337,24 +339,24 @@ def _explain_contradiction(a: CalibratedViews, b: CalibratedViews, board: Board)
     return "were the images taken at the same moments, with matching numbers, and without moving the cameras?"
 
 
-def _mirrored(seen: CalibratedViews, board: Board) -> CalibratedViews:
+def _mirrored(calibrated: CalibratedViews, board: Board) -> CalibratedViews:
     """The camera with its images mirrored."""
-    width, columns = seen.views.hw[1], board.columns
-    K = seen.camera.K.clone()
+    width, columns = calibrated.views.hw[1], board.columns
+    K = calibrated.camera.K.clone()
     K[0, 2] = width - 1 - K[0, 2]
-    camera = seen.camera.replace(K=K)
+    camera = calibrated.camera.replace(K=K)
     flipped = {}
-    for key, d in seen.views.seen.items():
+    for key, d in calibrated.views.seen.items():
         ids = (d.ids // columns) * columns + (columns - 1 - d.ids % columns)
         flipped[key] = Detection(ids, np.stack([width - 1 - d.x[:, 0], d.x[:, 1]], -1))
     poses = {key: board_pose(camera, d, board) for key, d in flipped.items()}
-    return CalibratedViews(seen.name, camera, BoardViews(seen.views.hw, flipped), poses)
+    return CalibratedViews(calibrated.name, camera, BoardViews(calibrated.views.hw, flipped), poses)
 
 
 def _shifted(a: CalibratedViews, b: CalibratedViews, shift: int) -> CalibratedViews:
     """b with each image renumbered as the one `shift` positions before it among all numbers of both."""
     keys = sorted({*a.views.seen, *b.views.seen}, key=lambda k: (isinstance(k, str), k))
     renamed = {key: keys[i - shift] for i, key in enumerate(keys) if 0 <= i - shift < len(keys)}
-    seen = {renamed[key]: d for key, d in b.views.seen.items() if key in renamed}
+    detections = {renamed[key]: d for key, d in b.views.seen.items() if key in renamed}
     poses = {renamed[key]: p for key, p in b.poses.items() if key in renamed}
-    return CalibratedViews(b.name, b.camera, BoardViews(b.views.hw, seen), poses)
+    return CalibratedViews(b.name, b.camera, BoardViews(b.views.hw, detections), poses)

@@ -136,7 +136,7 @@ def by_cameras(notes: Iterable[str]) -> list[str]:
 
 def summary(calibration: Calibration) -> str:
     """The calibration in a sentence or two."""
-    points = sum(len(seen.x) for seen in calibration.fit.problem.seen.values())
+    points = sum(len(observed.x) for observed in calibration.fit.problem.seen.values())
     cameras, frames = len(calibration.views), len(calibration.frames)
     text = (
         f"{cameras} camera{'s' * (cameras > 1)}, {frames} frame{'s' * (frames > 1)} of {calibration.board}, "
@@ -278,7 +278,7 @@ def draw_by_image(calibration: Calibration) -> Figure:
 
 def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figure:
     """One camera: observed points; median residuals of parts of the image, magnified; their scatter."""
-    seen, r = calibration.fit.problem.seen[name], calibration.fit.problem.residuals[name]
+    observed, r = calibration.fit.problem.seen[name], calibration.fit.problem.residuals[name]
     hw = calibration.views[name].hw
     figure = Figure(
         figsize=(10.4, 10.4 / 3.4 * min(1.6, max(0.8, 1.33 * hw[0] / hw[1])) + 0.5), layout="compressed"
@@ -288,10 +288,10 @@ def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figur
     left.imshow(
         np.where(covered.cells, np.nan, 1.0), extent=_extent(hw), cmap="Reds", vmin=0, vmax=4, aspect="equal"
     )
-    left.plot(*seen.x.T, ".", ms=1.5, color=COLOURS[0])
+    left.plot(*observed.x.T, ".", ms=1.5, color=COLOURS[0])
     left.set_title(f"points observed (red: none), {covered.share:.0%} covered", fontsize=9)
     show_image(middle, hw)
-    _draw_field(middle, seen.x, r, hw)
+    _draw_field(middle, observed.x, r, hw)
     limit = max(4 * calibration.fit.problem.sigma[name], 1e-3)
     right.plot(*np.clip(r, -limit, limit).T, ".", ms=1.5, color=COLOURS[0])
     right.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", xlabel="x (px)", ylabel="y (px)")

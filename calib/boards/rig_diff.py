@@ -267,12 +267,12 @@ def _tested(
     total, freedom = float(z @ z), int(counts.sum())
     best, motion, gain = "", np.zeros(6), -1.0
     for part, rows in zip(parts, _rows(parts)):
-        own = np.zeros((len(change), 6))
-        own[rows] = part.jacobians[1][..., :6].reshape(-1, 6)
-        own -= by_motion @ (by_motion.T @ own)
-        by_own = U.T @ own / s[:, None]
-        solution = np.linalg.lstsq(by_own, z, rcond=None)[0]
-        explained = total - float(np.square(z - by_own @ solution).sum())
+        jacobian = np.zeros((len(change), 6))
+        jacobian[rows] = part.jacobians[1][..., :6].reshape(-1, 6)
+        jacobian -= by_motion @ (by_motion.T @ jacobian)
+        whitened = U.T @ jacobian / s[:, None]
+        solution = np.linalg.lstsq(whitened, z, rcond=None)[0]
+        explained = total - float(np.square(z - whitened @ solution).sum())
         if explained > gain:
             best, motion, gain = part.name, solution, explained
     pose = b[best].cam_from_world

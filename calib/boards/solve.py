@@ -376,8 +376,8 @@ def _wrong_images(solved: Solved, single_rms: Mapping[str, float]) -> list[tuple
     for misfit in misfits(solved):
         if misfit.rms > _refused_from(single_rms[misfit.camera]):
             reasons.setdefault(misfit.frame, misfit.camera)
-    seen = {name: len(v.seen) for name, v in solved.views.items()}
-    many = many_wrong(list(reasons.values()), [name for name, _ in solved.left_out], seen)
+    counts = {name: len(v.seen) for name, v in solved.views.items()}
+    many = many_wrong(list(reasons.values()), [name for name, _ in solved.left_out], counts)
     return [] if many else [(camera, frame) for frame, camera in reasons.items()]
 
 
@@ -390,11 +390,11 @@ def _without(initial: InitialRig, images: Sequence[tuple[str, FrameKey]]) -> Ini
     return initial._replace(boards=boards, views=views, left_out=[*initial.left_out, *images])
 
 
-def many_wrong(wrong: Sequence[str], before: Sequence[str], seen: Mapping[str, int]) -> bool:
+def many_wrong(wrong: Sequence[str], before: Sequence[str], counts: Mapping[str, int]) -> bool:
     """Whether images found wrong, and those left out before (the camera of each), are more than `MANY_WRONG`
-    of all of a camera's; `seen` are those that are left of it."""
+    of all of a camera's; `counts` are those that are left of it."""
     return any(
-        wrong.count(n) + before.count(n) > MANY_WRONG * (seen[n] + before.count(n)) for n in set(wrong)
+        wrong.count(n) + before.count(n) > MANY_WRONG * (counts[n] + before.count(n)) for n in set(wrong)
     )
 
 

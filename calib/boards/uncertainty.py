@@ -164,13 +164,13 @@ class Intrinsics(NamedTuple):
 
 def intrinsics_of(fit: Solved, name: str) -> Intrinsics:
     """One camera of a fit; none of its intrinsics is free where the fit has no covariance."""
-    camera, seen = in_own_frame(fit.problem, name)
+    camera, points = in_own_frame(fit.problem, name)
     known = rig_covariance(fit) or RigCovariance((), np.zeros((0, 0)))
     mine = known.of(name, camera)
     mine[:6] = 0  # the pose
     free = mine.any(1)
     covariance = mine[free] @ known.matrix @ mine[free].T
-    return Intrinsics(camera, covariance, free, fit.problem.sigma[name], seen)
+    return Intrinsics(camera, covariance, free, fit.problem.sigma[name], points)
 
 
 def in_own_frame(problem: BundleProblem, name: str) -> tuple[Camera, Float[np.ndarray, "m 3"]]:
@@ -220,10 +220,12 @@ def compensation(by_pose: np.ndarray, moved: np.ndarray) -> np.ndarray:
     )
 
 
-def covered(x: Float[np.ndarray, "n 2"], seen: Float[np.ndarray, "m 2"], hw: HW) -> Bool[np.ndarray, " n"]:
+def covered(
+    x: Float[np.ndarray, "n 2"], observed: Float[np.ndarray, "m 2"], hw: HW
+) -> Bool[np.ndarray, " n"]:
     """Which pixels have a board point within a cell of the grid at which projections are compared."""
     reach = max(hw[0] / GRID[0], hw[1] / GRID[1])
-    nearest = np.array([np.linalg.norm(seen - each, axis=1).min() for each in x])
+    nearest = np.array([np.linalg.norm(observed - each, axis=1).min() for each in x])
     return np.asarray(nearest < reach)
 
 

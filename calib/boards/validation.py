@@ -96,7 +96,9 @@ def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np
     count = len(fit.problem.frames)
     even = np.arange(count) % 2 == 0
     parts = [fit.problem.of_boards(kept) for kept in (even, ~even)]
-    if count < FEWEST_TO_HALVE or not all(len(seen.x) for half in parts for seen in half.seen.values()):
+    if count < FEWEST_TO_HALVE or not all(
+        len(observed.x) for half in parts for observed in half.seen.values()
+    ):
         return {}
     try:
         halves = [readjusted(half) for half in parts]
@@ -104,8 +106,8 @@ def half_difference(fit: Solved, depth: float) -> dict[str, tuple[np.ndarray, np
         return {}
     differences = {}
     for name in fit.problem.cameras:
-        (a, seen), (b, _) = (in_own_frame(half, name) for half in halves)
-        motion = compensation(camera_jacobian(a, seen)[..., :6], _difference(a, b, seen))
+        (a, observed), (b, _) = (in_own_frame(half, name) for half in halves)
+        motion = compensation(camera_jacobian(a, observed)[..., :6], _difference(a, b, observed))
         x, X = grid_points(a, depth)
         near = np.logical_and(*(covered(x, half.seen[name].x, a.hw) for half in halves))
         x, X = x[near], X[near]
@@ -183,14 +185,14 @@ def _held_out(problem: BundleProblem, out: np.ndarray) -> Float[np.ndarray, " f"
     (name,) = fitted.cameras
     if fitted.deformation is not None and judged.deformation is not None:
         judged = replace(judged, deformation=replace(fitted.deformation, part=judged.deformation.part))
-    seen = Observations(judged.seen[name].block, judged.on_board(name), judged.seen[name].x)
+    observed = Observations(judged.seen[name].block, judged.on_board(name), judged.seen[name].x)
     fixed = {name: np.zeros(len(judged.free[name]), dtype=bool)}
     posed = replace(
-        judged, cameras=fitted.cameras, seen={name: seen}, free=fixed, priors={}, deformation=None
+        judged, cameras=fitted.cameras, seen={name: observed}, free=fixed, priors={}, deformation=None
     )
     squares = (readjusted(posed).residuals[name] ** 2).sum(-1)
-    count = np.bincount(seen.block)
-    return np.asarray(np.bincount(seen.block, squares) / np.maximum(2 * count - POSE, 1))
+    count = np.bincount(observed.block)
+    return np.asarray(np.bincount(observed.block, squares) / np.maximum(2 * count - POSE, 1))
 
 
 # Notes ------------------------------------------------------------------------------------------------------
@@ -218,8 +220,8 @@ def start_notes(
     """
     yield _gains(solved, deviations)
     for name, camera in solved.problem.cameras.items():
-        if (own := camera.distortion) is not None and own.model != LENSES[lens[name]][0]:
-            yield f"{name}: keeps the start's lens, {own.model}"
+        if (distortion := camera.distortion) is not None and distortion.model != LENSES[lens[name]][0]:
+            yield f"{name}: keeps the start's lens, {distortion.model}"
     yield from _far(solved)
     for name, key in solved.left_out:
         yield f"{name}: left out {key}: its board contradicts the start"

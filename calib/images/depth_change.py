@@ -121,10 +121,10 @@ def log_depths(
 
     None for too few.
     """
-    seen = ~torch.stack([observed_depths(rig, pairs) for rig in rigs]).isnan().any(0)
-    if int(seen.sum()) < FEW:
+    observable = ~torch.stack([observed_depths(rig, pairs) for rig in rigs]).isnan().any(0)
+    if int(observable.sum()) < FEW:
         return None
-    parts = zip(pairs.items(), seen.split([len(matches.alpha) for matches in pairs.values()]))
+    parts = zip(pairs.items(), observable.split([len(matches.alpha) for matches in pairs.values()]))
     kept = {names: matches.only(part) for (names, matches), part in parts if bool(part.any())}
     return lambda z: [match_depths(after(z), kept).depth.clamp(min=1e-6).log()]
 

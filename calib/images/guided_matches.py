@@ -44,7 +44,7 @@ def guided_matches(
 
     Images are to be alike in scale and orientation. `shown` says what of each image a camera recorded.
     """
-    own, other = (contrast_equalised(image) for image in (alpha, beta))
+    alpha_image, beta_image = (contrast_equalised(image) for image in (alpha, beta))
     solid = np.ones((2 * PATCH + 1, 2 * PATCH + 1), np.uint8)
     mask, valid = (
         np.asarray(
@@ -52,18 +52,18 @@ def guided_matches(
         )
         for part in shown
     )
-    corners = cv2.goodFeaturesToTrack(own, POINTS, 1e-3, SPACING, mask=mask)
+    corners = cv2.goodFeaturesToTrack(alpha_image, POINTS, 1e-3, SPACING, mask=mask)
     x = np.zeros((0, 2)) if corners is None else corners[:, 0].astype(np.float64)
     there = cv2.perspectiveTransform(x[:, None], beta_from_alpha.double().numpy())[:, 0] if len(x) else x
-    positions = [_most_alike(own, other, valid, *points, window) for points in zip(x, there)]
+    positions = [_most_alike(alpha_image, beta_image, valid, *points, window) for points in zip(x, there)]
     kept = [i for i, y in enumerate(positions) if y is not None]
     y = np.array([positions[i] for i in kept], np.float64).reshape(-1, 2)
     return PointMatches(torch.from_numpy(x[kept].round()), torch.from_numpy(y))
 
 
 def _most_alike(
-    own: NDArray[np.uint8],
-    other: NDArray[np.uint8],
+    alpha: NDArray[np.uint8],
+    beta: NDArray[np.uint8],
     valid: NDArray[Any],
     x: NDArray[np.float64],
     there: NDArray[np.float64],
@@ -71,12 +71,12 @@ def _most_alike(
 ) -> NDArray[np.float64] | None:
     """The position in beta of the patch most like that around a pixel; None where none is clearly so."""
     (column, row), (left, top) = (np.rint(p).astype(int) for p in (x, there - window))
-    patch = own[row - PATCH : row + PATCH + 1, column - PATCH : column + PATCH + 1]
+    patch = alpha[row - PATCH : row + PATCH + 1, column - PATCH : column + PATCH + 1]
     first, last = np.maximum([left, top], PATCH), np.array([left, top]) + 2 * window
-    last = np.minimum(last, np.array(other.shape[::-1]) - 1 - PATCH)
+    last = np.minimum(last, np.array(beta.shape[::-1]) - 1 - PATCH)
     if (last - first < 2 * PEAK).any() or patch.std() < 1:
         return None
-    searched = other[first[1] - PATCH : last[1] + PATCH + 1, first[0] - PATCH : last[0] + PATCH + 1]
+    searched = beta[first[1] - PATCH : last[1] + PATCH + 1, first[0] - PATCH : last[0] + PATCH + 1]
     alike = np.nan_to_num(cv2.matchTemplate(searched, patch, cv2.TM_CCOEFF_NORMED)) ** 2
     alike = np.where(valid[first[1] : last[1] + 1, first[0] : last[0] + 1] > 0, alike, 0)
     v, u = np.unravel_index(alike.argmax(), alike.shape)

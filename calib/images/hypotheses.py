@@ -93,10 +93,10 @@ def _is_plausible(rig: Rig, hypothesis: Hypothesis) -> bool:
     return nearer and (not changed or any(_beyond_drift(a.K, b.K) for a, b in changed))
 
 
-def _beyond_drift(own: Tensor, other: Tensor) -> bool:
+def _beyond_drift(K: Tensor, changed_K: Tensor) -> bool:
     """Whether a focal length or a principal point differs by more than `LARGEST_CHANGE` prior deviations."""
-    focal = (other / own - 1).diagonal()[:2].abs().max() / SIGMA["focal"]
-    centre = (other - own)[:2, 2].norm() / SIGMA["centre"]
+    focal = (changed_K / K - 1).diagonal()[:2].abs().max() / SIGMA["focal"]
+    centre = (changed_K - K)[:2, 2].norm() / SIGMA["centre"]
     return bool(torch.maximum(focal, centre) > LARGEST_CHANGE)
 
 

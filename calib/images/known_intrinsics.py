@@ -69,8 +69,8 @@ def centres_found(
     rig = rig.scaled((stated[first] or 1.0) / float(rig.pair(alpha, first).beta_from_alpha.t.norm()))
     facts = {}
     for name in rig.betas(alpha):
-        own = {pair: matches for pair, matches in near.items() if name in pair}
-        facts[name] = sum(len(matches.alpha) for matches in own.values()), median_off(rig, own)
+        of_beta = {pair: matches for pair, matches in near.items() if name in pair}
+        facts[name] = sum(len(matches.alpha) for matches in of_beta.values()), median_off(rig, of_beta)
     return rig.replace(depth=_depths(rig, near)), facts
 
 

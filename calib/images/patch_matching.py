@@ -81,19 +81,21 @@ def _step(
     of their positions by the residuals (worse axis, pixels)."""
     weight = weights / weights.sum()
     at = warps.y[:, None] + around @ warps.A.swapaxes(1, 2)
-    seen, across, down = (_sampled(p, at) for p in images)
-    seen, wanted = (v - (v @ weight)[:, None] for v in (seen, warps.values))
-    both, power, own = ((a * b) @ weight for a, b in ((seen, wanted), (seen, seen), (wanted, wanted)))
+    sampled, across, down = (_sampled(p, at) for p in images)
+    sampled, wanted = (v - (v @ weight)[:, None] for v in (sampled, warps.values))
+    both, power, wanted_power = (
+        (a * b) @ weight for a, b in ((sampled, wanted), (sampled, sampled), (wanted, wanted))
+    )
     gain = (both / (power + 1e-6))[:, None]
     J = np.stack([across, down, *(slope * part for slope in (across, down) for part in around.T)], -1)
     J = gain[..., None] * (J - (weight @ J)[:, None])
     weighted = (weight[:, None] * J).swapaxes(1, 2)
     H = weighted @ J
     H += np.eye(6) * (1e-3 * np.trace(H, axis1=1, axis2=2)[:, None, None] / 6 + 1e-9)
-    step = np.linalg.solve(H, weighted @ (wanted - gain * seen)[..., None])[..., 0]
+    step = np.linalg.solve(H, weighted @ (wanted - gain * sampled)[..., None])[..., 0]
     shift, affine = step[:, :2].clip(-0.5, 0.5), step[:, 2:].reshape(-1, 2, 2).clip(-0.1, 0.1)
-    correlation = both / np.sqrt(power * own + 1e-9)
-    left = ((wanted - gain * seen) ** 2) @ weight
+    correlation = both / np.sqrt(power * wanted_power + 1e-9)
+    left = ((wanted - gain * sampled) ** 2) @ weight
     covariance = np.linalg.inv(H)[:, :2, :2] * (left / weights.sum())[:, None, None]
     deviation = np.sqrt(np.linalg.eigvalsh(covariance)[:, 1])
     moved = warps._replace(y=warps.y + shift, A=warps.A + affine)

@@ -64,11 +64,11 @@ def photometric_errors(
     pair, x = rig.pair(*names).to(torch.float32), views[alpha].grid
     locations = recorded_field(pair, samples=64, nodes=16)(pair, x)
     columns, rows = x[0, :, 0].long(), x[:, 0, 1].long()
-    query, own = (image[:, :, rows][..., columns] for image in (views[alpha].keys, views[alpha].values))
+    query, value = (image[:, :, rows][..., columns] for image in (views[alpha].keys, views[alpha].values))
     attended = attend(query, views[beta].keys, views[beta].values, locations)
     valid = locations.mask.any(-1) if isinstance(locations, Positions) else locations.valid
     confidence = attended.peak[0].detach().sqrt()
-    return torch.where(valid, confidence * (attended.value - own)[0, 0], 0.0), valid
+    return torch.where(valid, confidence * (attended.value - value)[0, 0], 0.0), valid
 
 
 def patches(grey: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 25 h w"]:

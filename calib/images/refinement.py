@@ -252,7 +252,7 @@ class RefinementProblem:
 
         def residuals(z: Tensor) -> list[Tensor]:
             distances = sampson_of_pairs(self.after(z[: self.uncertain]), self.used)
-            return [part + own @ z[self.uncertain :] for part, own in zip(distances, columns)]
+            return [part + block @ z[self.uncertain :] for part, block in zip(distances, columns)]
 
         considered = self.uncertain - self.count + systematic.shape[1]
         unrestricted = solve(residuals, self.count, considered)

@@ -189,8 +189,8 @@ def dense_matches(
 ) -> PointMatches:
     """Points of texture in alpha with their positions in beta, from a depth map, refined by least squares."""
     alpha, beta = (camera.to(torch.float64) for camera in _pair(rig).cameras)
-    own, other = (contrast_equalised(images[name]) for name in rig.names)
-    corners = cv2.goodFeaturesToTrack(own, DENSE_POINTS, 1e-4, SPACING)
+    alpha_image, beta_image = (contrast_equalised(images[name]) for name in rig.names)
+    corners = cv2.goodFeaturesToTrack(alpha_image, DENSE_POINTS, 1e-4, SPACING)
     x = torch.from_numpy(np.zeros((0, 2)) if corners is None else corners[:, 0].astype(np.float64))
     column, row = x.round().long().unbind(-1)
     z = depth[row, column].double()
@@ -202,7 +202,7 @@ def dense_matches(
 
     y, step = in_beta(x), torch.eye(2, dtype=torch.float64)
     maps = torch.stack([in_beta(x + step[0]) - y, in_beta(x + step[1]) - y], -1)
-    refined, deviation = refine_points(own, other, x.numpy(), y.numpy(), maps.numpy())
+    refined, deviation = refine_points(alpha_image, beta_image, x.numpy(), y.numpy(), maps.numpy())
     return PointMatches(x, torch.from_numpy(refined)).only(torch.from_numpy(deviation < WELL_LOCALISED))
 
 
@@ -231,8 +231,8 @@ def _focal_lengths(views: Mapping[str, View], link: Link, focal: Mapping[str, fl
         1.0 if link.H is None else float(torch.linalg.det(link.H[:2, :2]).abs().sqrt() / link.H[2, 2].abs())
     )
     assumed = focal[beta] / ratio if beta in focal else FOCAL_SHARE * max(views[alpha].hw)
-    own = focal.get(alpha, assumed)
-    return {alpha: own, beta: focal.get(beta, own * ratio)}
+    alpha_focal = focal.get(alpha, assumed)
+    return {alpha: alpha_focal, beta: focal.get(beta, alpha_focal * ratio)}
 
 
 def initial_poses(

@@ -70,10 +70,10 @@ def captured(network: GuidedPAT, pair: StereoPair, seed: int, **options: Any) ->
     of `fuse`."""
     recorder = network.completion = Recorder()
     truth = fused_at_random(network, pair, seed, **options)
-    own, confidence, mixed, candidates = recorder.given
+    alpha, confidence, mixed, candidates = recorder.given
     colours = [to_luma_chroma(c)[1] for c in (mixed, *differences(confidence, mixed, candidates))]
     h, w = truth.shape[1:]
-    planes = torch.cat([own, confidence, *colours], 1)[0, :, :h, :w]
+    planes = torch.cat([alpha, confidence, *colours], 1)[0, :, :h, :w]
     return torch.cat([planes[:2], to_luma_chroma(truth)[1], planes[2:]])
 
 

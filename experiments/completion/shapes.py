@@ -99,10 +99,10 @@ def _window(labels: NDArray, value: NDArray, rng: np.random.Generator) -> tuple[
     which, value = which.reshape(HW), value[part] * scale
     softness, surfaces, soft = rng.uniform(0.6, 1.5), [], []
     for i in range(len(names)):
-        own = (which == i).astype(np.uint8)
-        soft.append(cv2.GaussianBlur(own.astype(np.float32), (0, 0), softness))
-        inner = cv2.erode(own, np.ones((5, 5), np.uint8), borderValue=(1,))
-        beyond = _nearest(value, (inner if inner.sum() > 20 else own) > 0)
+        mask = (which == i).astype(np.uint8)
+        soft.append(cv2.GaussianBlur(mask.astype(np.float32), (0, 0), softness))
+        inner = cv2.erode(mask, np.ones((5, 5), np.uint8), borderValue=(1,))
+        beyond = _nearest(value, (inner if inner.sum() > 20 else mask) > 0)
         surfaces.append(cv2.GaussianBlur(cv2.medianBlur(beyond, 5), (0, 0), 3))
     return np.argmax(soft, 0), np.stack(surfaces)
 
@@ -116,10 +116,10 @@ def _moved(disparity: NDArray, which: NDArray, rng: np.random.Generator) -> NDAr
     y, x = np.indices(HW)
     slopes = rng.normal(0, 0.015, 2)
     disparity = disparity + slopes[0] * (x - HW[1] / 2) + slopes[1] * (y - HW[0] / 2)
-    seen = np.take_along_axis(disparity, which[None], 0)
+    visible = np.take_along_axis(disparity, which[None], 0)
     least = rng.uniform(2, 20)
-    size = min(1, (MOST - least) / float(np.ptp(seen)))
-    return (least + (disparity - seen.min()) * size).astype(np.float32)
+    size = min(1, (MOST - least) / float(np.ptp(visible)))
+    return (least + (disparity - visible.min()) * size).astype(np.float32)
 
 
 def _texture(picture: Image, rng: np.random.Generator) -> Image:

@@ -99,9 +99,9 @@ def losses(
         inputs = features(facts[:, :1], facts[:, 1:2], [facts[:, 2:]])
         with torch.autocast(config.device, torch.bfloat16, enabled=config.device != "cpu"):
             answer = network.answer(inputs).float()
-        own, shares = answer.split([2, CANDIDATES], 1)
+        added, shares = answer.split([2, CANDIDATES], 1)
         _, confidence, mixed, apart = facts.split([1, 1, 2, 2 * CANDIDATES], 1)
-        change = (shares[:, :, None] * apart.unflatten(1, (-1, 2))).sum(1) + (1 - confidence) * own
+        change = (shares[:, :, None] * apart.unflatten(1, (-1, 2))).sum(1) + (1 - confidence) * added
         yield image_loss(*(from_luma_chroma(0 * confidence, c) for c in (mixed + change, truth)))
 
 

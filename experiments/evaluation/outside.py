@@ -54,8 +54,8 @@ def outside_markdown(rows: Sequence[OutsideRow]) -> str:
     """A line for each source: means over the pairs."""
     lines = []
     for source in distinct(row.source for row in rows):
-        own = [row for row in rows if row.source == source]
-        psnr, error, within, seconds = np.mean([row[2:] for row in own], 0)
+        of_source = [row for row in rows if row.source == source]
+        psnr, error, within, seconds = np.mean([row[2:] for row in of_source], 0)
         lines.append([source, f"{psnr:.2f}", f"{error:.2f}", f"{within:.1%}", f"{seconds:.1f}"])
     count = len(distinct(row.pair for row in rows))
     columns = [f"disparity, {count} pairs", "dB", "mean error, px", "within 1 px", "seconds"]

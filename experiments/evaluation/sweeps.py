@@ -282,8 +282,8 @@ def made(rig: Rig, bank: PhotoBank, number: int, seed: int = 0) -> RecordedScene
         RigBatch(cameras, near, far), g
     )
     position, visible = seen_at(pair, *(depth[0].double() for depth in batch.depth))
-    ground_truth, seen = (image[0] for image in batch.images)
-    images = recorded({ALPHA: luminance(ground_truth), BETA: seen}, g)
+    ground_truth, beta_image = (image[0] for image in batch.images)
+    images = recorded({ALPHA: luminance(ground_truth), BETA: beta_image}, g)
     return RecordedScene(images, ground_truth, position, visible)
 
 

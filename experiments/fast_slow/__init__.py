@@ -36,8 +36,8 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     ground_truth = []
     for name, frames in lights(stage).items():
         for lit in frames:
-            own = luminance(lit) if name == stage.alpha else banded(lit, rig[name].sensor.response)
-            raw[name].append(record(own, (Noise(8_000, 4), Clip()), generator)[0])
+            filtered = luminance(lit) if name == stage.alpha else banded(lit, rig[name].sensor.response)
+            raw[name].append(record(filtered, (Noise(8_000, 4), Clip()), generator)[0])
             if name == stage.alpha:
                 bands = [banded(lit, rig[b].sensor.response)[0] for b in rig.betas(name)]
                 ground_truth.append(srgb_from_linear(torch.cat(bands)))
@@ -62,9 +62,9 @@ def lights(stage: SystemScene | RenderedScene) -> Mapping[str, Iterable[Tensor]]
 
 def frame_times(stage: SystemScene, name: str) -> list[float]:
     """The times at which a camera records, seconds, for as long as alpha does."""
-    own, alpha = (stage.rig[n].sensor for n in (name, stage.alpha))
-    rate, last = own.frame_rate or 1.0, (FRAMES - 1) / (alpha.frame_rate or 1.0)
-    return [t for i in range(FRAMES) if (t := own.time_offset + i / rate) <= last + 0.5 / rate]
+    sensor, alpha_sensor = (stage.rig[n].sensor for n in (name, stage.alpha))
+    rate, last = sensor.frame_rate or 1.0, (FRAMES - 1) / (alpha_sensor.frame_rate or 1.0)
+    return [t for i in range(FRAMES) if (t := sensor.time_offset + i / rate) <= last + 0.5 / rate]
 
 
 def object_velocity(stage: SystemScene) -> tuple[Tensor, int]:

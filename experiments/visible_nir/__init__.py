@@ -31,10 +31,10 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
         infrared = stage.infrared("nir")
     else:
         infrared = linear_from_srgb(stage.seen("nir", stage.mixed(infrared_weights(stage)))[0][:, :1])
-    own, other = (hazed(*stage.seen(name)) for name in ("nir", "colour"))
+    nir_view, colour_view = (hazed(*stage.seen(name)) for name in ("nir", "colour"))
     nir = record(infrared, (Noise(8_000, 4), Clip()), generator)
-    colour = record(other, (Noise(6_000, 3), Clip()), generator)
-    chroma = to_luma_chroma(srgb_from_linear(own[0]))[1]
+    colour = record(colour_view, (Noise(6_000, 3), Clip()), generator)
+    chroma = to_luma_chroma(srgb_from_linear(nir_view[0]))[1]
     ground_truth = from_luma_chroma(srgb_from_linear(infrared[0]), chroma)
     return SystemRecording({"nir": [nir[0]], "colour": [colour[0]]}, [ground_truth.clamp(0, 1)])
 

@@ -278,7 +278,7 @@ def _forward(
     best = tl.zeros([PIXELS], tl.int32)
     mass, squared = tl.zeros([PIXELS], NUMBER), tl.zeros([PIXELS], NUMBER)
     mean_x, mean_y = tl.zeros([PIXELS], NUMBER), tl.zeros([PIXELS], NUMBER)
-    seen = tl.zeros([PIXELS, DV_BLOCK], NUMBER)
+    accumulated = tl.zeros([PIXELS, DV_BLOCK], NUMBER)
     for i in range(samples):
         x, y, counts = _sample(points, mask, fractions, place, alive, height, width, i, samples, STRAIGHT)
         pixel, across, below, u, v = _cell(x, y, height, width, NEAREST)
@@ -293,7 +293,7 @@ def _forward(
         keep, w = tl.exp(top - base), tl.exp(score - base)
         live = counts[:, None] & (cv < DV)[None, :]
         row = _blended(value, first + pixel, across, below, u, v, cv, DV, live, NEAREST, NUMBER)
-        seen = seen * keep[:, None] + w[:, None] * row
+        accumulated = accumulated * keep[:, None] + w[:, None] * row
         mass, mean_x, mean_y, squared = _update(x, y, w, keep, mass, mean_x, mean_y, squared, NUMBER)
         best = tl.where(score > top, i, best)
         top = new_top
@@ -307,8 +307,8 @@ def _forward(
     tl.store(logsum + p, tl.where(some, top + tl.log(whole), float("-inf")), mask=alive)
     tl.store(best_out + p, best, mask=alive)
     live = alive[:, None] & (cv < DV)[None, :]
-    seen = seen / whole[:, None]
-    tl.store(out + p[:, None] * DV + cv[None, :], seen.to(out.dtype.element_ty), mask=live)
+    accumulated = accumulated / whole[:, None]
+    tl.store(out + p[:, None] * DV + cv[None, :], accumulated.to(out.dtype.element_ty), mask=live)
 
 
 @compiled

@@ -376,8 +376,8 @@ class Fuse(Known):
     def _settings(self) -> FuseSettings:
         """What a frame and many frames have in common."""
         quiet = not self.sequence and self.luminance == "alpha"
-        own = {"align": self.align, "keep_alpha": self.keep_alpha, "luminance": self.luminance}
-        return self.settings(noise_by_default=quiet, **own)
+        arguments = {"align": self.align, "keep_alpha": self.keep_alpha, "luminance": self.luminance}
+        return self.settings(noise_by_default=quiet, **arguments)
 
     def _facts(self, rig: Rig, adopted: tuple[str, ...], seconds: float) -> Facts:
         """What the page says."""

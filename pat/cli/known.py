@@ -184,9 +184,9 @@ class Known:
             if alpha not in names:
                 continue
             (a, b) = (names, points) if names[0] == alpha else (names[::-1], points[::-1])
-            own, beta = rig[a[0]], rig[a[1]]
-            assert isinstance(own, LensView)
-            assert isinstance(beta, LensView)
+            alpha_view, beta_view = rig[a[0]], rig[a[1]]
+            assert isinstance(alpha_view, LensView)
+            assert isinstance(beta_view, LensView)
             if rig.pair(a[0], a[1]).calibrated:
                 found_depth = depth_of(rig.pair(a[0], a[1]), *b)
                 behind = float((~found_depth.valid).float().mean())
@@ -204,5 +204,7 @@ class Known:
                         "lines that the rig allows: are they of these images, x before y? Else mend the rig: "
                         "`pat rig doctor`"
                     )
-            fields[a[1]] = AroundMatches.from_points(*b, own.hw, views=(own, beta), field=field)
+            fields[a[1]] = AroundMatches.from_points(
+                *b, alpha_view.hw, views=(alpha_view, beta_view), field=field
+            )
         return fields

@@ -308,11 +308,11 @@ def _named_number(option: str, text: str) -> tuple[str, float]:
 
 
 def _once(option: str, pairs: Iterable[tuple[str, T]]) -> Iterator[tuple[str, T]]:
-    seen = set()
+    given = set()
     for name, value in pairs:
-        if name in seen:
+        if name in given:
             raise ValueError(f"{option}: '{name}' is given twice; give it once")
-        seen.add(name)
+        given.add(name)
         yield name, value
 
 

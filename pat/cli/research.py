@@ -120,9 +120,9 @@ class Ablate:
             cases = rendered_cases(self.rendered, seed=self.seed)
         else:
             cases = layered_cases(self.scenes, photos=self.photos, hw=self.hw, seed=self.seed)
-        chosen, own = families(), options.field_named(self.field)
-        if own is not None:
-            chosen[self.field] = FieldFamily(lambda disparity: own)
+        chosen, given_field = families(), options.field_named(self.field)
+        if given_field is not None:
+            chosen[self.field] = FieldFamily(lambda disparity: given_field)
         ablate(network, cases, out=self.out, chosen=chosen)
         print((self.out / "ablation.md").read_text(encoding="utf-8"), end="")
         say(f"written: {self.out / 'ablation.md'}, and its figures and numbers beside it")

@@ -213,8 +213,8 @@ class Info:
         lengths = "segment px, median - longest", f"depth step {unit}, near - far"
         of_pairs = Table("alpha > beta", baseline, "rotation deg", "seen", *lengths, box=None)
         for p in pairs:
-            seen = "" if p.seen is None else f"{p.seen:.0%}"
-            further = seen, _two(p.length, " - "), _two(p.depth_step, " - ")
+            share = "" if p.seen is None else f"{p.seen:.0%}"
+            further = share, _two(p.length, " - "), _two(p.depth_step, " - ")
             of_pairs.add_row(f"{p.alpha} > {p.beta}", f"{p.baseline:.4g}", f"{p.rotation:.2f}", *further)
         for table in (of_cameras, of_pairs)[: 1 + bool(pairs)]:
             Console().print(table)

@@ -199,9 +199,9 @@ def layered_cases(
     scenes, g = LayeredScenes(bank, rigs, hw=hw, seed=seed), Generator().manual_seed(seed)
     for number in range(count):
         made = scenes.sample(1, g)
-        ground_truth, seen = (image[0] for image in made.images)
+        ground_truth, beta_image = (image[0] for image in made.images)
         cameras = {name: camera[0].to(torch.float64) for name, camera in zip((ALPHA, BETA), made.cameras)}
-        yield _recorded(f"scene {number}", Rig(cameras), ground_truth, seen, made.depth[0][0], g)
+        yield _recorded(f"scene {number}", Rig(cameras), ground_truth, beta_image, made.depth[0][0], g)
 
 
 def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
@@ -222,19 +222,19 @@ def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
         scene, g = Rendered(path), Generator().manual_seed(seed)
         names = scene.rig.names[:2]
         frames = [scene.frame(name) for name in names]
-        ground_truth, seen = (srgb_image(f.rgb) for f in frames)
+        ground_truth, beta_image = (srgb_image(f.rgb) for f in frames)
         rig = Rig(dict(zip((ALPHA, BETA), (scene.rig[name] for name in names))))
-        return _recorded(str(path.relative_to(folder)), rig, ground_truth, seen, frames[0].depth, g)
+        return _recorded(str(path.relative_to(folder)), rig, ground_truth, beta_image, frames[0].depth, g)
 
     return map(case, folders)
 
 
 def _recorded(
-    name: str, rig: Rig, ground_truth: Tensor, seen: Tensor, depth: Tensor, g: Generator
+    name: str, rig: Rig, ground_truth: Tensor, beta_image: Tensor, depth: Tensor, g: Generator
 ) -> AblationCase:
     """The case of two ideal images: some noise, a depth range a little wider than the scene's."""
     known = depth[depth.isfinite()]
-    images = recorded({ALPHA: luminance(ground_truth), BETA: seen}, g)
+    images = recorded({ALPHA: luminance(ground_truth), BETA: beta_image}, g)
     rig = rig.replace(depth=(float(known.min()) / 1.1, float(known.max()) * 1.1))
     return AblationCase(name, rig, images, ground_truth, depth)
 

@@ -231,8 +231,8 @@ def _correspondence(
     ours, consistent = checked_disparity(to_bytes(soft), to_bytes(other), max_disparity)
     diffused = filled(ours[None], consistent.astype(np.float32) + 1e-5, guide, DISPARITY_FILL)[0]
     columns = columns - np.where(consistent, ours, diffused)
-    seen = _sampled(inside, columns, rows) * (columns >= -0.5)
-    return _Correspondence(columns, rows, seen, np.maximum(consistent, INCONSISTENT) * seen)
+    visible = _sampled(inside, columns, rows) * (columns >= -0.5)
+    return _Correspondence(columns, rows, visible, np.maximum(consistent, INCONSISTENT) * visible)
 
 
 def checked_disparity(

@@ -89,17 +89,17 @@ def clicked(scene: ExplorerScene, alpha: str, controls: Controls) -> tuple[Contr
 
 def moved_rig(rig: Rig, alpha: str, controls: Controls) -> Rig:
     """The rig, every calibrated beta moved, rotated about its centre, of another focal length and lens."""
-    own, cameras = rig[alpha], dict(rig.cameras)
+    alpha_view, cameras = rig[alpha], dict(rig.cameras)
     if all(controls[name] == DEFAULTS[name] for name in ("baseline", "rotation", "focal", "lens", "moved")):
         return rig
     turned = torch.tensor([0.0, math.radians(controls["rotation"]), 0.0], dtype=torch.float64)
     for name in rig.betas(alpha):
         beta = rig[name]
-        if not (isinstance(beta, Camera) and isinstance(own, Camera)):
+        if not (isinstance(beta, Camera) and isinstance(alpha_view, Camera)):
             continue
         right, forward = controls["moved"].get(name, (0.0, 0.0))
-        step = own.R.T @ own.R.new_tensor([right, 0.0, forward])
-        centre = own.centre + controls["baseline"] * (beta.centre - own.centre) + step
+        step = alpha_view.R.T @ alpha_view.R.new_tensor([right, 0.0, forward])
+        centre = alpha_view.centre + controls["baseline"] * (beta.centre - alpha_view.centre) + step
         K = torch.cat([beta.K[:2, :2] * controls["focal"], beta.K[:2, 2:]], 1)
         cameras[name] = beta.replace(
             K=torch.cat([K, beta.K[2:]]),
@@ -153,13 +153,13 @@ def drawn(beta: BetaReport) -> dict[str, Any]:
 
 def top_view(rig: Rig, alpha: str) -> list[dict[str, Any]]:
     """The cameras from above, in alpha's axes: each centre (right, forward) and where it looks; metres."""
-    own = rig[alpha]
-    if not isinstance(own, Camera):
+    alpha_view = rig[alpha]
+    if not isinstance(alpha_view, Camera):
         return []
     shown = []
     for name, camera in rig.cameras.items():
         if isinstance(camera, Camera):
-            centre, ahead = own.R @ (camera.centre - own.centre), own.R @ camera.R[2]
+            centre, ahead = alpha_view.R @ (camera.centre - alpha_view.centre), alpha_view.R @ camera.R[2]
             shown.append({"name": name, "at": rounded(centre[[0, 2]], 5), "ahead": rounded(ahead[[0, 2]], 4)})
     return shown
 
@@ -195,12 +195,12 @@ def slider_ranges(rig: Rig) -> list[list[Any]]:
 def choices(scene: ExplorerScene, controls: Controls) -> list[list[Any]]:
     """Name, label and options of each choice."""
     fields = [*FAMILIES, *scene.fields]
-    own = [name for name in (controls["field"], controls["second"]) if name not in ("none", *fields)]
+    unlisted = [name for name in (controls["field"], controls["second"]) if name not in ("none", *fields)]
     weights = [WINDOWS, *(scene.networks or [SHIPPED])]
     weights += [controls["weights"]] if controls["weights"] not in weights else []
     return [
-        ["field", "field", [*fields, *own]],
-        ["second", "compared with", ["none", *fields, *own]],
+        ["field", "field", [*fields, *unlisted]],
+        ["second", "compared with", ["none", *fields, *unlisted]],
         ["weights", "weights by", weights],
     ]
 

@@ -297,16 +297,16 @@ def match_offset(
         scores = correlations(*guides, pair, x, points)
         return points[scores.argmax()], float(scores.max())
 
-    on_line, own = best(best(line)[0] + fine * along)
+    on_line, line_score = best(best(line)[0] + fine * along)
     beside = best(line[:, None] + torch.arange(-ACROSS, ACROSS + 1).to(xy)[:, None] * across)[0]
-    beside, other = best(beside + fine[:, None] * across + fine * along)
+    beside, beside_score = best(beside + fine[:, None] * across + fine * along)
     distance = abs(float((beside - ends[0]) @ across))
-    if max(own, other) < CLEAR:
+    if max(line_score, beside_score) < CLEAR:
         return None
-    if other < own + BETTER:
-        return MatchOffset(on_line, 0.0, own)
+    if beside_score < line_score + BETTER:
+        return MatchOffset(on_line, 0.0, line_score)
     # at the edge it would be better beyond
-    return MatchOffset(beside, distance, other) if distance < ACROSS else None
+    return MatchOffset(beside, distance, beside_score) if distance < ACROSS else None
 
 
 def ends_of(locations: Segments | Positions) -> Float[Tensor, "2 2"] | None:
@@ -332,8 +332,8 @@ def correlations(
     """Normalised correlations (-1 to 1) of alpha's window at x with beta's at each of xy."""
     steps = (pixel_grid((2 * RADIUS + 1, 2 * RADIUS + 1), dtype=x.dtype) - RADIUS).reshape(-1, 2)
     transformed = steps @ jacobian(pair, x).T
-    own = window_features(alpha, x, steps)
-    return (window_features(beta, xy, transformed) @ own.T)[:, 0]
+    alpha_features = window_features(alpha, x, steps)
+    return (window_features(beta, xy, transformed) @ alpha_features.T)[:, 0]
 
 
 def jacobian(pair: Pair, x: Float[Tensor, "1 2"]) -> Float[Tensor, "2 2"]:
@@ -397,13 +397,13 @@ def fused_colour(
     scene: ExplorerScene, betas: Mapping[str, BetaReport], state: ExplorerState
 ) -> Float[Tensor, " c"]:
     """Alpha's luminance with the colour differences of the betas in colour, each weighted by its peak."""
-    own = sampled(scene.guides[state.alpha], pixel_of(state))[:, 0]
+    alpha_value = sampled(scene.guides[state.alpha], pixel_of(state))[:, 0]
     coloured = [s for s in betas.values() if len(s.value) == 3 and s.peak > 0]
     if not coloured:
-        return own
+        return alpha_value
     weights = sum(s.peak for s in coloured)
     differences = [s.value - luminance(s.value[:, None, None]).reshape(1) for s in coloured]
-    return own + sum((s.peak / weights) * difference for s, difference in zip(coloured, differences))
+    return alpha_value + sum((s.peak / weights) * difference for s, difference in zip(coloured, differences))
 
 
 def image_pixel(x: float, y: float, hw: HW) -> tuple[float, float]:

@@ -66,17 +66,17 @@ class LayeredSettings:
 
     def renderer(self, rig: Rig, limits: CheckLimits) -> Renderer:
         """A renderer that is ready."""
-        seen = rig_from_alpha(rig)
+        rig_batch = rig_from_alpha(rig)
         if self.photos:
             bank = PhotoBank.load(*self.photos, max_edge=self.edge)
         else:
             bank = PhotoBank(patterns(np.random.default_rng(0), 60))
-        scenes = LayeredScenes(bank, RigDistribution(), hw=seen.cameras[0].hw, layers=self.layers)
+        scenes = LayeredScenes(bank, RigDistribution(), hw=rig_batch.cameras[0].hw, layers=self.layers)
 
         def render(seed: int, out: Path) -> None:
             started = time.monotonic()
             generator = torch.Generator().manual_seed(seed)
-            batch = scenes.render(seen, generator, oversampling=self.oversampling)
+            batch = scenes.render(rig_batch, generator, oversampling=self.oversampling)
             frames = {
                 name: RenderedFrame(time=0.0, rgb=linear_from_srgb(image)[0], depth=depth[0], index=index[0])
                 for name, image, depth, index in zip(rig.names, batch.images, batch.depth, batch.index)
@@ -164,5 +164,7 @@ def rig_from_alpha(rig: Rig) -> RigBatch:
     near, far = (float(d) for d in rig.depth)
     far = min(far, FARTHEST * near)
     cameras = [c.to(torch.float64) for c in rig.cameras.values() if isinstance(c, Camera)]
-    seen = [stack([in_frame_of(cameras[0], c)]) for c in cameras]
-    return RigBatch(seen, torch.tensor([near], dtype=torch.float64), torch.tensor([far], dtype=torch.float64))
+    relative = [stack([in_frame_of(cameras[0], c)]) for c in cameras]
+    return RigBatch(
+        relative, torch.tensor([near], dtype=torch.float64), torch.tensor([far], dtype=torch.float64)
+    )

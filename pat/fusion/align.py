@@ -193,14 +193,14 @@ def align(
     limit = None if max_memory is None else parse_bytes(max_memory)
     rig = with_pixels(rig if depth is None else rig.replace(depth=depth))
     views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, field=field), noise)
-    betas, own = views.betas, images if recorded is None else recorded
+    betas, recordings = views.betas, images if recorded is None else recorded
     for name in (alpha, *betas):
-        if name not in own:
+        if name not in recordings:
             raise ValueError(
                 f"there are no recorded values of '{name}': give those of every camera with an image"
             )
-        if isinstance(own, dict):  # others may be read from files, which takes time
-            _as_array(own[name], name, rig[name].hw)
+        if isinstance(recordings, dict):  # others may be read from files, which takes time
+            _as_array(recordings[name], name, rig[name].hw)
     if network is None:
         weights = weights_for([len(views.images[name]) for name in betas])
         network = load_weights(weights)
@@ -231,7 +231,7 @@ def align(
         fused = fused_in_tiles(network, inputs, matches, plan.tiles, progress=progress)
         warn_of_confidence(network, fused.frame, inputs)
         depths = undone(fused.frame, undo).depth
-        values, hw = _as_array(own[alpha], alpha, rig[alpha].hw), rig[alpha].hw
+        values, hw = _as_array(recordings[alpha], alpha, rig[alpha].hw), rig[alpha].hw
         planes = pixel_grid(hw).numpy(), np.full(hw, SEEN, np.uint8), np.ones(hw, np.float32)
         names, response_of = _band_names(alpha, len(values)), rig[alpha].sensor.response
         aligned = {alpha: AlignedView(values, *planes, names, response_of)}
@@ -243,7 +243,7 @@ def align(
             if _is_undistorted(rig[alpha], pinhole):  # 0 where the pinhole view has none
                 assert isinstance(pinhole, LensView)
                 confidence = resampled(confidence, pinhole, rig[alpha], interpolation="bilinear").values[0]
-            values = _as_array(own[name], name, rig[name].hw)
+            values = _as_array(recordings[name], name, rig[name].hw)
             how = min_confidence, interpolation, fill
             aligned[name] = _aligned_view(rig[name], name, place, located, confidence[0], values, *how)
     return Aligned(alpha, aligned, depths.cpu().numpy())
@@ -266,7 +266,7 @@ def _located(
         where, inside = matches.positions(beta.field.straight, hw)
         return where[0, :h, :w], inside[0, :h, :w]
     assert isinstance(pinhole, LensView)
-    x, seen = pixels_between(pinhole, recorded)
+    x, valid = pixels_between(pinhole, recorded)
     disparity = _between_pixels(matches.surface[0, :, :h, :w], x)
 
     def at_points(x: Float[Tensor, "h w 2"], disparity: Float[Tensor, "h w"]) -> tuple[Tensor, Tensor]:
@@ -278,7 +278,7 @@ def _located(
         return where[0], inside[0]
 
     where, inside = chunked(at_points, x, disparity, axis=0)
-    return where, inside & seen
+    return where, inside & valid
 
 
 def _is_undistorted(recorded: View, now: View) -> TypeGuard[LensView]:
@@ -309,9 +309,9 @@ def _aligned_view(
     now = place.pair.beta
     assert isinstance(now, LensView)
     where, valid = chunked(lambda x: recorded_pixels(x, now, camera), located[0].double(), axis=0)
-    where, confidence, seen = where.float().cpu(), confidence.float().cpu(), confidence >= min_confidence
-    inside, seen = (located[1] & valid).cpu() & on_image(where, camera.hw), seen.cpu()
-    visibility = torch.where(inside, torch.where(seen, SEEN, OCCLUDED), OUTSIDE).to(torch.uint8).numpy()
+    where, confidence, visible = where.float().cpu(), confidence.float().cpu(), confidence >= min_confidence
+    inside, visible = (located[1] & valid).cpu() & on_image(where, camera.hw), visible.cpu()
+    visibility = torch.where(inside, torch.where(visible, SEEN, OCCLUDED), OUTSIDE).to(torch.uint8).numpy()
     taken = filled(resampled_values(values, where.numpy(), interpolation), visibility == SEEN, fill)
     return AlignedView(
         taken,

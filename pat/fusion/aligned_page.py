@@ -29,13 +29,13 @@ def aligned_page(aligned: Aligned, rig: Rig, facts: Facts) -> str:
     """The page; it needs no other file and no network."""
     h, w = aligned.depth.shape
     figures = {"size": f"{w} x {h} pixels", "bands": ", ".join(aligned.bands)}
-    seen = {name: view.valid for name, view in aligned.items() if name != aligned.alpha}
+    visible = {name: view.valid for name, view in aligned.items() if name != aligned.alpha}
     return filled_page(
         f"{', '.join(aligned)} at the pixels of {aligned.alpha}",
         (h, w),
         {name: data_url(image) for name, image in shown_layers(aligned, rig).items()},
-        {f"not seen by {name}": shares_layer(torch.from_numpy(v).float()) for name, v in seen.items()},
-        figures | {f"seen by {name}": f"{valid.mean():.1%}" for name, valid in seen.items()},
+        {f"not seen by {name}": shares_layer(torch.from_numpy(v).float()) for name, v in visible.items()},
+        figures | {f"seen by {name}": f"{valid.mean():.1%}" for name, valid in visible.items()},
         facts,
         RIG=rig_drawing(rig, aligned.alpha),
     )

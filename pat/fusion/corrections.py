@@ -200,24 +200,24 @@ def _of_beta(alpha: Tensor, before: Beta, beta: Beta, matches: BetaMatches, hw: 
     positions, valid = matches.positions(beta.field.straight, (beta.image.shape[-2], beta.image.shape[-1]))
     where = positions[0, :h, :w]
     luma = combined_bands(beta.image)
-    seen = sample(torch.cat([before.image, luma], 1), where.reshape(1, -1, 2).to(luma)).values
-    values = seen.reshape(seen.shape[1], h, w)
+    sampled = sample(torch.cat([before.image, luma], 1), where.reshape(1, -1, 2).to(luma)).values
+    values = sampled.reshape(sampled.shape[1], h, w)
     unlike, margin, _ = matches.facts[0]
     reliable = (unlike < CONSISTENT) & (margin > SETTINGS.margin)
     weight = (enlarged(reliable)[:h, :w] & valid[0, :h, :w]).to(alpha)
     whole = Normalisation.of(alpha, luma)
-    own = whole.softened(alpha)[:, :, :h, :w]
-    seen_there, wanted = (moments(image, weight[None, None]) for image in (values[-1:][None], own))
-    bright = seen_there.matched(luma, wanted, NORMALISATION.largest_gain)
+    alpha_soft = whole.softened(alpha)[:, :, :h, :w]
+    measured, wanted = (moments(image, weight[None, None]) for image in (values[-1:][None], alpha_soft))
+    bright = measured.matched(luma, wanted, NORMALISATION.largest_gain)
     soft = blurred(values[:-1][:, None], [ALIGNMENT.blur] * (len(values) - 1))[:, 0]
     normal = normals(beta.field.straight)[0, :h, :w]
-    return _Matches(soft, own[0, 0], bright[0, 0], where, normal.to(where), weight)
+    return _Matches(soft, alpha_soft[0, 0], bright[0, 0], where, normal.to(where), weight)
 
 
 def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
     h, w = frame.hw
-    own = blurred(frame.inputs.alpha[:, :, :h, :w], [ALIGNMENT.blur])[0, 0]
+    soft = blurred(frame.inputs.alpha[:, :, :h, :w], [ALIGNMENT.blur])[0, 0]
     colour = [(m, m.weight > 0) for m in matches if len(m.before) == 3]
     points = [of_beta.before[:, counts] for of_beta, counts in colour]
     places = [of_beta.place[counts] for of_beta, counts in colour]
-    return fit(torch.cat(points, 1), torch.cat([own[counts] for _, counts in colour]), torch.cat(places))
+    return fit(torch.cat(points, 1), torch.cat([soft[counts] for _, counts in colour]), torch.cat(places))

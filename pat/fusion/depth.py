@@ -65,11 +65,11 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
             whole = interpolate(of_beta.certainty.float(), scale_factor=FINE, mode="bilinear").to(
                 confidence[i]
             )
-            seen = beta.field.straight.valid & (output.confidence[i] > 0)
-            stated, half_width = torch.where(seen, whole[:, 0], 0.0), whole[:, 1]
-            own = (confidence[i] > stated) & beta.around
-            confidence[i] = torch.where(own, confidence[i], stated)
-            deviation[i] = torch.where(own, deviation[i], half_width / DEVIATIONS)
+            valid = beta.field.straight.valid & (output.confidence[i] > 0)
+            stated, half_width = torch.where(valid, whole[:, 0], 0.0), whole[:, 1]
+            kept = (confidence[i] > stated) & beta.around
+            confidence[i] = torch.where(kept, confidence[i], stated)
+            deviation[i] = torch.where(kept, deviation[i], half_width / DEVIATIONS)
     overall = output.overall if output.overall is None else torch.stack(confidence).amax(0)
     return output._replace(confidence=confidence, deviation=deviation, overall=overall)
 

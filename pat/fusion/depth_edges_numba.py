@@ -33,14 +33,14 @@ def weighted_medians(values, alpha, where, weights, radius, top, bottom, out):
             out[r, c] = r * width + c
             if not where[r, c]:
                 continue
-            own, n, total = alpha[r, c], 0, np.int32(0)
+            centre, n, total = alpha[r, c], 0, np.int32(0)
             low, high = np.float32(np.inf), np.float32(-np.inf)
             for y in range(max(r - radius, 0), min(r + radius + 1, height)):
                 for x in range(max(c - radius, 0), min(c + radius + 1, width)):
                     value = values[y, x]
                     if value == value:
                         some[n], place[n] = value, y * width + x
-                        share[n] = weights[min(int(abs(alpha[y, x] - own) * scale), last)]
+                        share[n] = weights[min(int(abs(alpha[y, x] - centre) * scale), last)]
                         total += share[n]
                         low, high = min(low, value), max(high, value)
                         n += 1

@@ -117,8 +117,8 @@ def _filled_rows(
         whole = inverse, torch.where(kept, certain, 0.0), alpha, filled
         matched, weight, grey, guess = (numpy_of(t[::FINE, ::FINE]) for t in whole)
         planes = Planes.through(matched, weight, np.stack([grey, *apart(guess)], -1), SETTINGS.reach)
-        seen = planes.at_pixels((h, w)), repeated(planes.around, (h, w))
-        value, around = (torch.from_numpy(t).to(inverse) for t in seen)
+        per_pixel = planes.at_pixels((h, w)), repeated(planes.around, (h, w))
+        value, around = (torch.from_numpy(t).to(inverse) for t in per_pixel)
         kept = certain >= SETTINGS.share * around
         filled = torch.where(kept, inverse, value.clamp(*bounds))
     changed = known & ~kept & (filled > 0)

@@ -123,9 +123,9 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
 def bytes_beside(inputs: Inputs, images: Iterable[Tensor]) -> float:
     """Memory of images whose pixels are not those of the inputs: the caller's."""
     held = inputs.alpha, *(beta.image for beta in inputs.betas)
-    own = {image.untyped_storage().data_ptr() for image in held}
+    addresses = {image.untyped_storage().data_ptr() for image in held}
     parts = {image.untyped_storage().data_ptr(): image.nbytes for image in images}
-    return float(sum(nbytes for place, nbytes in parts.items() if place not in own))
+    return float(sum(nbytes for place, nbytes in parts.items() if place not in addresses))
 
 
 def points_of(field: ReceptiveField) -> Callable[[Tensor], Tensor]:

@@ -123,11 +123,11 @@ class LowLight:
             return frame
         LOG.info("denoising the fused image")
         alpha, image, views = self.views.alpha, frame.image, self.prepared(steps)
-        own = views.pop(alpha)
+        alpha_view = views.pop(alpha)
         if all(view.recorded.shape[1] == 3 for view in views.values()):
             image = colours_averaged(image, [exposed(view, response) for view in views.values()], matched)
         if keep_alpha:
-            image = image + self._stepped(self.given.images, steps)[alpha] - own.denoised[0]
+            image = image + self._stepped(self.given.images, steps)[alpha] - alpha_view.denoised[0]
         return frame._replace(image=image)
 
     def prepared(self, steps: Sequence[FusionStep]) -> dict[str, NoisyView]:

@@ -62,37 +62,37 @@ def check_luminance(network: FusionNetwork, kept: Luminance, *, noisy: bool) -> 
 def with_alpha_detail(frame: Frame, alpha: Float[Tensor, "1 h w"]) -> Frame:
     """A frame of beta's luminance with the detail that alpha has and beta has not."""
     luma = luminance(frame.image)[None]
-    own, other = alpha[None].to(luma), torch.nan_to_num(luma)
-    normalisation = Normalisation.of(own, other)
-    soft = normalisation.softened(own)
-    detail = local_slope(other, soft) * SETTINGS.detail(own - soft)
+    alpha_luma, beta_luma = alpha[None].to(luma), torch.nan_to_num(luma)
+    normalisation = Normalisation.of(alpha_luma, beta_luma)
+    soft = normalisation.softened(alpha_luma)
+    detail = local_slope(beta_luma, soft) * SETTINGS.detail(alpha_luma - soft)
     return frame._replace(image=frame.image + detail[0])
 
 
-def with_own_colours(frame: Frame, own: Float[Tensor, "3 h w"]) -> Frame:
+def with_own_colours(frame: Frame, alpha: Float[Tensor, "3 h w"]) -> Frame:
     """A fused frame, chroma alpha's own where confidence is low, as the betas' cameras show such colours.
 
     Luminance stays. How the betas show alpha's colours is found where they see the same points.
     """
-    own = own.to(frame.image)
+    alpha = alpha.to(frame.image)
     step = max(int((frame.confidence.numel() / OWN_COLOUR.pixels) ** 0.5), 1)
     some = (..., slice(None, None, step), slice(None, None, step))
-    chroma = (to_luma_chroma(image[some])[1] for image in (own, frame.image))
+    chroma = (to_luma_chroma(image[some])[1] for image in (alpha, frame.image))
     terms, values = (part.flatten(1).detach().double() for part in chroma)
     weight = (frame.confidence[some].flatten().detach() > OWN_COLOUR.seen).double()
-    same = torch.eye(2, dtype=torch.float64, device=own.device)
+    same = torch.eye(2, dtype=torch.float64, device=alpha.device)
     change = same + least_squares(terms, (values - terms).T, weight, OWN_COLOUR.prior * same)
-    mix = partial(_mixed, change.T.to(own))
-    return frame._replace(image=chunked(mix, frame.image, own, frame.confidence[None]))
+    mix = partial(_mixed, change.T.to(alpha))
+    return frame._replace(image=chunked(mix, frame.image, alpha, frame.confidence[None]))
 
 
 def _mixed(
     change: Float[Tensor, "2 2"],
     image: Float[Tensor, "3 h w"],
-    own: Float[Tensor, "3 h w"],
+    alpha: Float[Tensor, "3 h w"],
     confidence: Float[Tensor, "1 h w"],
 ) -> Float[Tensor, "3 h w"]:
     share = ((confidence - OWN_COLOUR.unseen) / (OWN_COLOUR.seen - OWN_COLOUR.unseen)).clamp(0, 1)
     luma, chroma = to_luma_chroma(image)
-    there = torch.einsum("ij,jhw->ihw", change, to_luma_chroma(own)[1])
+    there = torch.einsum("ij,jhw->ihw", change, to_luma_chroma(alpha)[1])
     return from_luma_chroma(luma, share * chroma + (1 - share) * there)

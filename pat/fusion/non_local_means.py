@@ -48,8 +48,8 @@ def averaged_with_alike(
     `confidence` is 1, with noise of this standard deviation in the mean.
     """
     luma, counts = luminance(image), confidence.square()
-    own, recorded = ((colours - luminance(colours))[[0, 2]] for colours in (image, beta))
-    values = torch.cat([own + counts * recorded, 1 + counts])
+    image_chroma, beta_chroma = ((colours - luminance(colours))[[0, 2]] for colours in (image, beta))
+    values = torch.cat([image_chroma + counts * beta_chroma, 1 + counts])
     sums = sums_of_alike(image, values, SETTINGS.scale * deviation**0.5, SETTINGS.radius)
     return from_luma_chroma(luma, sums[:2] / sums[2:])
 
@@ -93,10 +93,10 @@ def add_alike(guide, values, radius, sharpness, top, out):
                 row = difference[y % 3]
                 row[:] = 0
                 for c in range(len(guide)):
-                    own = guide[c, around + top + y, radius : radius + width + 2]
-                    other = guide[c, around + top + y + dy, radius + dx : radius + dx + width + 2]
+                    guide_row = guide[c, around + top + y, radius : radius + width + 2]
+                    shifted_row = guide[c, around + top + y + dy, radius + dx : radius + dx + width + 2]
                     for x in range(width + 2):
-                        row[x] += (other[x] - own[x]) ** 2
+                        row[x] += (shifted_row[x] - guide_row[x]) ** 2
                 if y < 1:
                     continue
                 a, b, c0 = difference[0], difference[1], difference[2]
@@ -117,6 +117,6 @@ def add_alike(guide, values, radius, sharpness, top, out):
                     t *= t
                     weight[x] = t * t
                 for k in range(bands):
-                    seen = values[k, around + top + y - 1 + dy, around + dx : around + dx + width]
+                    values_row = values[k, around + top + y - 1 + dy, around + dx : around + dx + width]
                     for x in range(width):
-                        out[k, y - 1, x] += weight[x] * seen[x]
+                        out[k, y - 1, x] += weight[x] * values_row[x]

@@ -128,9 +128,9 @@ class SequenceFusion:
         `fetch` gives a key frame's colour, or None for one that could not be fused. Raises ValueError if none
         could.
         """
-        own = self.grey(i)
+        grey = self.grey(i)
         fetched = ((key, fetch(key)) for key in self._around(i, keys))
-        sources = [self._warped(i, own, key, colour) for key, colour in fetched if colour]
+        sources = [self._warped(i, grey, key, colour) for key, colour in fetched if colour]
         if not sources:
             raise ValueError(f"frame {i}: none of the key frames around it could be fused")
         return mixed(self.base(i), sources)
@@ -147,14 +147,14 @@ class SequenceFusion:
         longest = max(SETTINGS.intervals * self.timeline.interval * (1 - 1e-9), min(gaps.values()))
         return [k for k in keys if gaps[k.alpha] <= longest]
 
-    def _warped(self, i: int, own: Tensor, key: KeyFrame, colour: KeyColour) -> tuple[float, KeyColour]:
+    def _warped(self, i: int, grey: Tensor, key: KeyFrame, colour: KeyColour) -> tuple[float, KeyColour]:
         """How near a key frame is in time, 0 to 1, and its colour, warped to a frame."""
         gap = abs(self._time(key.alpha) - self._time(i))
         nearness = max(1 - gap / (SETTINGS.intervals * self.timeline.interval), 1e-3)
         if key.alpha == i:
             return nearness, colour
         LOG.info("motion of frame %d", i)
-        flow = flow_between(own, self.grey(key.alpha))
+        flow = flow_between(grey, self.grey(key.alpha))
         moved = warped(torch.cat([colour.added, colour.confidence[None]]), flow.step)
         known = (colour.inverse_depth[:1] > 0).to(colour.inverse_depth)
         share, *inverse = warped(torch.cat([known, colour.inverse_depth]), flow.step)
@@ -195,8 +195,8 @@ class SequenceFusion:
         match_levels = self.settings.match_levels
         levels = self._levels(images, i) if match_levels and not alone else None
         if levels is not None:
-            own, scales = levels
-            images = {name: scales[name].matched(image, own) for name, image in images.items()}
+            alpha_level, beta_levels = levels
+            images = {name: beta_levels[name].matched(image, alpha_level) for name, image in images.items()}
         frame = fuse(
             self.network,
             self.rig,
@@ -210,7 +210,9 @@ class SequenceFusion:
         )
         if levels is None or self.network.keeps_luminance:
             return frame
-        return with_own_levels(frame, [len(image) for image in images.values()], own, [*scales.values()])
+        return with_own_levels(
+            frame, [len(image) for image in images.values()], alpha_level, [*beta_levels.values()]
+        )
 
     def _given_field(self, name: str) -> ReceptiveField | None:
         """A beta's field, where one is given."""
@@ -275,8 +277,8 @@ class SequenceFusion:
         keys = self.timeline.key_frames()
         nearest = min(range(len(keys)), key=lambda k: abs(keys[k].alpha - i))
         around = keys[max(nearest - SETTINGS.neighbours, 0) : nearest + SETTINGS.neighbours + 1]
-        own = mean_moments(readable(self.grey, [k.alpha for k in around]))
-        return own, {
+        alpha_level = mean_moments(readable(self.grey, [k.alpha for k in around]))
+        return alpha_level, {
             name: mean_moments(readable(self.frames[name].__getitem__, [k.betas[name] for k in around]))
             for name in names
         }
@@ -289,7 +291,7 @@ def readable(read: Callable[[int], Tensor], numbers: Iterable[int]) -> Iterator[
             yield read(i)
 
 
-def mixed(own: Float[Tensor, "1 h w"], sources: Sequence[tuple[float, KeyColour]]) -> Frame:
+def mixed(base: Float[Tensor, "1 h w"], sources: Sequence[tuple[float, KeyColour]]) -> Frame:
     """Alpha's frame with the sources' colours, weighted by nearness in time and confidence.
 
     Confidence is the sources' own weighted mean, lowered where sources that are weighed about the same
@@ -306,7 +308,7 @@ def mixed(own: Float[Tensor, "1 h w"], sources: Sequence[tuple[float, KeyColour]
     inverse, half_width = (weights[:, None] * of_sources).sum(0) / weights.sum(0).clamp(min=1e-12)
     depth = torch.where(known, 1 / torch.where(known, inverse, 1.0), torch.nan)
     agreeing = torch.exp(-apart / UNLIKE**2)
-    return Frame(own + colour, depth, confidence * agreeing, torch.where(known, half_width, torch.nan))
+    return Frame(base + colour, depth, confidence * agreeing, torch.where(known, half_width, torch.nan))
 
 
 def fuse_sequence(

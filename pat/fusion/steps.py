@@ -78,9 +78,9 @@ def undistort(views: Views) -> StepResult:
     rig, images = without_lenses(views.rig, views.images)
     lens, pinhole = views.rig[views.alpha], rig[views.alpha]
     fields = {name: _for_pinhole(field, lens, pinhole) for name, field in views.fields.items()}
-    straight, own = images[views.alpha], views.own
+    straight, original = images[views.alpha], views.own
     undistorted = Views(rig, images, views.alpha, fields)
-    return StepResult(undistorted, lambda frame: _distorted(frame, straight, own, pinhole, lens))
+    return StepResult(undistorted, lambda frame: _distorted(frame, straight, original, pinhole, lens))
 
 
 def takes_pinhole_views(views: Views) -> bool:
@@ -93,10 +93,10 @@ def takes_pinhole_views(views: Views) -> bool:
 def linear_luminance(views: Views) -> StepResult:
     """The views as they are; undone, a frame in RGB betas' colours is as bright as alpha's camera saw it, if
     that measured the luminance of light (`match_luminance`)."""
-    own, sensor = views.own, views.rig[views.alpha].sensor
+    alpha, sensor = views.own, views.rig[views.alpha].sensor
     if sensor.response != LIGHT or 3 not in [len(views.images[name]) for name in views.betas]:
         return StepResult(views)
-    return StepResult(views, lambda frame: frame._replace(image=match_luminance(frame.image, own, sensor)))
+    return StepResult(views, lambda frame: frame._replace(image=match_luminance(frame.image, alpha, sensor)))
 
 
 def upright(views: Views) -> StepResult:
@@ -148,15 +148,17 @@ def normalise_betas(views: Views, *, undone: bool = False) -> StepResult:
     in_one_exposure = views.replace({n: normalised(views.images[n], views.own) for n in views.betas})
     if not undone:
         return StepResult(in_one_exposure)
-    own, scales = moments(views.own), [moments(views.images[name]) for name in views.betas]
+    alpha_level, beta_levels = moments(views.own), [moments(views.images[name]) for name in views.betas]
     bands = [len(views.images[name]) for name in views.betas]
-    return StepResult(in_one_exposure, lambda frame: with_own_levels(frame, bands, own, scales))
+    return StepResult(in_one_exposure, lambda frame: with_own_levels(frame, bands, alpha_level, beta_levels))
 
 
-def with_own_levels(frame: Frame, bands: Sequence[int], own: Moments, scales: Sequence[Moments]) -> Frame:
+def with_own_levels(
+    frame: Frame, bands: Sequence[int], alpha_level: Moments, beta_levels: Sequence[Moments]
+) -> Frame:
     """A frame whose bands, so many of each beta, have alpha's level, with each at its beta's own."""
-    parts = zip(frame.image.split(list(bands)), scales, strict=True)
-    return frame._replace(image=torch.cat([own.matched(part, scale) for part, scale in parts]))
+    parts = zip(frame.image.split(list(bands)), beta_levels, strict=True)
+    return frame._replace(image=torch.cat([alpha_level.matched(part, scale) for part, scale in parts]))
 
 
 def join(which: JoinsBands, views: Views) -> StepResult:
@@ -229,15 +231,15 @@ def _for_pinhole(field: ReceptiveField | None, lens: View, pinhole: View) -> Rec
         return dataclasses.replace(field, field=within)
     assert isinstance(pinhole, LensView)
     field.require(lens.hw)
-    x, seen = pixels_between(lens, pinhole)
+    x, defined = pixels_between(lens, pinhole)
     rays, valid = lens.to(torch.float64).rays(field.points(x))
     there = map_homogeneous(pinhole.K.double()[:2], rays[..., :2] / rays[..., 2:])
-    known = seen & valid & (rays[..., 2] > 0)
+    known = defined & valid & (rays[..., 2] > 0)
     step = torch.where(known[..., None], there - pixel_grid(pinhole.hw, dtype=torch.float64), 0.0)
     return Moved(within, step.movedim(-1, 0).to(field.displacement))
 
 
-def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens: View) -> Frame:
+def _distorted(frame: Frame, straight: Tensor, original: Tensor, pinhole: View, lens: View) -> Frame:
     """The frame at the pixels of alpha's own image."""
     if not has_lens(lens):
         return frame
@@ -254,7 +256,7 @@ def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens:
     if by_band is not None:
         bands = (resampled(b[None].float(), pinhole, lens, interpolation="bilinear") for b in by_band)
         by_band = torch.stack([band.values[0, 0].to(by_band) for band in bands])
-    return Frame(own + back[:-1], depth, back[-1], half_width, by_band)
+    return Frame(original + back[:-1], depth, back[-1], half_width, by_band)
 
 
 def of_size(image: Float[Tensor, "c h w"], hw: HW) -> Float[Tensor, "c h2 w2"]:

@@ -220,8 +220,8 @@ def _fused(
     hw = bottom - top, right - left
     depth, half_width, confidence = measured_depth(output, part, frame.placements, hw, (left, top))
     corners = [p.new_tensor(beta.offset)[:, None, None] for beta, p in zip(part.betas, output.position)]
-    seen = zip(output.position, corners, output.confidence)
-    matched = torch.stack([torch.cat([p[0] + corner, c]) for p, corner, c in seen]).to(output.image)
+    of_betas = zip(output.position, corners, output.confidence)
+    matched = torch.stack([torch.cat([p[0] + corner, c]) for p, corner, c in of_betas]).to(output.image)
     bands = [beta.image.shape[1] for beta in part.betas]
     by_band = output.image[0, :0]
     if len(bands) > 1 and sum(bands) == output.image.shape[1]:

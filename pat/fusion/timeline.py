@@ -93,9 +93,9 @@ class Timeline:
             nearest = (self.time(name, self.nearest(name, t)) for t in times)
             without = sum(abs(a - b) > 1 / self.rate(name) + 1e-9 for a, b in zip(nearest, times))
             if without:
-                own = self.time(name, 0), self.time(name, self.counts[name] - 1)
+                ends = self.time(name, 0), self.time(name, self.counts[name] - 1)
                 warn(
-                    f"'{name}' recorded from {own[0]:.4g} to {own[1]:.4g} s and '{self.alpha}' from "
+                    f"'{name}' recorded from {ends[0]:.4g} to {ends[1]:.4g} s and '{self.alpha}' from "
                     f"{times[0]:.4g} to {times[-1]:.4g} s: {without} of {len(times)} frames get colour from "
                     "its first or last one; check 'frame_rate' and 'time_offset', or give fewer frames"
                 )

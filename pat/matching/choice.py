@@ -124,13 +124,13 @@ def _chosen(inputs: Inputs, matches: BetaMatches, network: Choice) -> BetaMatche
 
 def candidates(matches: BetaMatches) -> Float[Tensor, "b n h w"]:
     """Disparities of each pixel to choose from; the first is its own."""
-    own = matches.disparity
+    disparity = matches.disparity
     consistent = enlarged(matches.facts[:, :1] < CONSISTENT)
-    along = [nearest_known(own, consistent, axis, back) for axis in (-2, -1) for back in (False, True)]
-    (h, w), most = own.shape[-2:], max(SETTINGS.around)
-    wide = pad(own, (most,) * 4, mode="replicate")
+    along = [nearest_known(disparity, consistent, axis, back) for axis in (-2, -1) for back in (False, True)]
+    (h, w), most = disparity.shape[-2:], max(SETTINGS.around)
+    wide = pad(disparity, (most,) * 4, mode="replicate")
     beside = [wide[..., most + y : most + y + h, most + x : most + x + w] for y, x in AROUND]
-    return torch.cat([own, *along, *beside], 1)
+    return torch.cat([disparity, *along, *beside], 1)
 
 
 def features(
@@ -150,11 +150,11 @@ def features(
     for i, image in enumerate(stacked_planes):
         one = min(i, len(segments.end) - 1)
         parts = views.alpha[i, 0], views.beta[i, 0], segments.end[one], extent.towards[one], options[i]
-        own, other, end, towards, each = map(numpy_of, parts)
+        alpha, beta, end, towards, each = map(numpy_of, parts)
         tasks = []
         for top, bottom in spans(sides[0], STRIP):
             rows, out = slice(FINE * top, FINE * bottom), image[top:bottom, :, FACTS:].numpy()
-            planes = own[rows], other, end[rows], towards[rows], each[:, rows]
+            planes = alpha[rows], beta, end[rows], towards[rows], each[:, rows]
             tasks.append(partial(kernels.compared, *planes, SETTINGS.scales, out))
         in_parallel(tasks)
     return stacked_planes.movedim(-1, 1).to(views.alpha)

@@ -17,16 +17,16 @@ def soft(x):
 
 
 @compiled(nogil=True, cache=True)
-def compared(own, other, end, towards, candidates, scales, out):
-    """Into `out` (h / 2, w / 2, 4 + 8 n), 2 x 2 pixels as channels: alpha `own` (h, w); of its candidates (n,
+def compared(alpha, beta, end, towards, candidates, scales, out):
+    """Into `out` (h / 2, w / 2, 4 + 8 n), 2 x 2 pixels as channels: `alpha` (h, w); of its candidates (n,
     h, w), disparities the first of which is the pixel's own, by how much they differ from that; by how much
-    alpha is brighter than beta `other` there; and whether the first is on beta. Where h or w are less than
+    alpha is brighter than `beta` there; and whether the first is on beta. Where h or w are less than
     `out` is, the last row or column again.
 
     `scales` are the differences of disparity and of brightness that count as a half, 1 at most.
     """
     n, height, width = candidates.shape
-    rows, columns = other.shape
+    rows, columns = beta.shape
     pixels, level = np.float32(1) / np.float32(scales[0]), np.float32(1) / np.float32(scales[1])
     right, bottom, zero, half = np.float32(columns - 1), np.float32(rows - 1), np.float32(0), np.float32(0.5)
     for row in range(2 * out.shape[0]):
@@ -44,12 +44,12 @@ def compared(own, other, end, towards, candidates, scales, out):
                         target[4 * k + at] = soft((far - candidates[0, r, c]) * pixels)
                     else:
                         on = -half <= x and x <= right + half and -half <= y and y <= bottom + half
-                        target[at] = own[r, c] - half
+                        target[at] = alpha[r, c] - half
                         target[8 * n + at] = np.float32(on)
                     x, y = min(max(x, zero), right), min(max(y, zero), bottom)
                     left, top = min(int(x), max(columns - 2, 0)), min(int(y), max(rows - 2, 0))
                     u, v = x - np.float32(left), y - np.float32(top)
                     beside, below = min(left + 1, columns - 1), min(top + 1, rows - 1)
-                    above = other[top, left] + u * (other[top, beside] - other[top, left])
-                    under = other[below, left] + u * (other[below, beside] - other[below, left])
-                    target[4 * (n + k) + at] = soft((own[r, c] - above - v * (under - above)) * level)
+                    above = beta[top, left] + u * (beta[top, beside] - beta[top, left])
+                    under = beta[below, left] + u * (beta[below, beside] - beta[below, left])
+                    target[4 * (n + k) + at] = soft((alpha[r, c] - above - v * (under - above)) * level)

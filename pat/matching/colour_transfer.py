@@ -104,8 +104,8 @@ def _transferred_piece(piece: Inputs, matches: Matches, sharing: Sequence[bool])
         mixed = sum(w * colour for w, (colour, _, _) in zip(weights, counting)) / torch.stack(weights).sum(0)
         shared = [diffused_from(mixed, alpha, torch.stack([weight for _, weight, _ in counting]).amax(0))]
     others = [one for one, counts in zip(of_each, sharing) if not counts]
-    own = [diffused_from(colour, alpha, weight) for colour, weight in others]
-    return [*shared, *own, *(colour for colour, _ in of_each)]
+    separate = [diffused_from(colour, alpha, weight) for colour, weight in others]
+    return [*shared, *separate, *(colour for colour, _ in of_each)]
 
 
 def transferred_bands(alpha: Tensor, beta: Beta, matches: BetaMatches) -> tuple[Tensor, Tensor]:
@@ -128,20 +128,20 @@ def matched_colours(
     """Beta's bands minus alpha at the matches, colour as in alpha's light, with the detail that alpha has and
     beta has not; their weight, 0 to 1."""
     bands, planes = beta.shape[1], torch.cat([beta, guide, normalisation.normalised(guide)], 1)
-    seen, valid = at_matches(planes, segments, disparity)
-    values, own, brightness = seen.split([bands, 1, 1], 1)
+    sampled, valid = at_matches(planes, segments, disparity)
+    values, luma, brightness = sampled.split([bands, 1, 1], 1)
     consistent = is_consistent(facts)
     brightness = normalised(brightness, alpha, valid * consistent, largest_gain=NORMALISATION.largest_gain)
     soft = normalisation.softened(alpha)
     weight = match_weight(brightness - soft, consistent, valid)
     if bands > 1:
-        colour, bright = _scaled_to_alpha(values - own, own, alpha, weight)
+        colour, bright = _scaled_to_alpha(values - luma, luma, alpha, weight)
         noise = colour_noise(brightness - soft, soft, weight * consistent)
         if float(noise.amax()) > SETTINGS.least_noise:
             colour = _without_noise(colour, bright, noise)
         radii = [round(SETTINGS.detail_radius * max(1.0, blur)) for blur in normalisation.blurs[0]]
         detailed = _each_detailed(colour, bright, alpha, radii)
-        matched = torch.lerp(colour, detailed, explained_share(own, soft, valid * consistent)) + own - alpha
+        matched = torch.lerp(colour, detailed, explained_share(luma, soft, valid * consistent)) + luma - alpha
     else:
         matched = _detailed(values, soft, alpha) - alpha
     return matched, weight
@@ -172,8 +172,10 @@ def _scaled_to_alpha(
     between.
     """
     least, most = 1e-3, SETTINGS.most_brighter
-    own, other = (box_mean(image * weight, SETTINGS.surroundings) + least for image in (alpha, brightness))
-    ratio = (own / other.clamp(min=least)).clamp(1 / most, most)
+    alpha_mean, beta_mean = (
+        box_mean(image * weight, SETTINGS.surroundings) + least for image in (alpha, brightness)
+    )
+    ratio = (alpha_mean / beta_mean.clamp(min=least)).clamp(1 / most, most)
     return colour * ratio**SETTINGS.saturation, brightness * ratio
 
 

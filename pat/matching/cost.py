@@ -46,10 +46,10 @@ def pixel_of(planes, i):
 
 
 @compiled(inline="always")
-def dissimilarity(own, other):
+def dissimilarity(alpha, beta):
     """The cost of a pixel of alpha and one of beta, less than `NOWHERE`."""
-    apart = min(abs(own[0] - other[0]) * BRIGHTNESS, TRUNCATED)
-    return np.uint8(_count(own[1] ^ other[1])) + np.uint8(apart)
+    apart = min(abs(alpha[0] - beta[0]) * BRIGHTNESS, TRUNCATED)
+    return np.uint8(_count(alpha[1] ^ beta[1])) + np.uint8(apart)
 
 
 @compiled(inline="always")

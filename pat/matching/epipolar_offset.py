@@ -129,10 +129,10 @@ class _Windows(NamedTuple):
         height, width = alpha.shape
         y, x = np.mgrid[:height, :width].astype(np.float32)
         design = np.stack([np.ones_like(x), (x + 0.5) / width - 0.5, (y + 0.5 - height / 2) / width])
-        own, other = (cv2.GaussianBlur(p, (0, 0), SETTINGS.blur) for p in (alpha, beta))
-        horizontal = cv2.Sobel(other, cv2.CV_32F, 1, 0, ksize=3) / 8
-        vertical = cv2.Sobel(other, cv2.CV_32F, 0, 1, ksize=3) / 8
-        return cls(own, other, (horizontal, vertical), position, normal, weight, design)
+        alpha_soft, beta_soft = (cv2.GaussianBlur(p, (0, 0), SETTINGS.blur) for p in (alpha, beta))
+        horizontal = cv2.Sobel(beta_soft, cv2.CV_32F, 1, 0, ksize=3) / 8
+        vertical = cv2.Sobel(beta_soft, cv2.CV_32F, 0, 1, ksize=3) / 8
+        return cls(alpha_soft, beta_soft, (horizontal, vertical), position, normal, weight, design)
 
     def _sampled(self, coefficients: NDArray[np.float64]) -> tuple[Image, Image, Image, Image]:
         """Beta and its gradients at the displaced matches, and the weight of those inside beta."""

@@ -110,8 +110,10 @@ def coarse_mix(
     `segments` (B or 1, h / factor, w / factor) and `blocks` (half as many) are of the centres of blocks of
     alpha's pixels, in pixels of the whole beta.
     """
-    own, bands = avg_pool2d(alpha, factor), avg_pool2d(beta, factor)
-    comparison = Comparison.of(own, bands, SpectralMix.equal(bands))
-    half = matched_at_half_size(comparison.half_views(own, bands), reduced(blocks, factor))
+    coarse_alpha, bands = avg_pool2d(alpha, factor), avg_pool2d(beta, factor)
+    comparison = Comparison.of(coarse_alpha, bands, SpectralMix.equal(bands))
+    half = matched_at_half_size(comparison.half_views(coarse_alpha, bands), reduced(blocks, factor))
     values, valid = at_matches(bands, reduced(segments, factor), half.disparity)
-    return SpectralMix.fitted(values, comparison.whole.softened(own), valid * is_consistent(half.facts))
+    return SpectralMix.fitted(
+        values, comparison.whole.softened(coarse_alpha), valid * is_consistent(half.facts)
+    )

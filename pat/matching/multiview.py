@@ -261,40 +261,48 @@ class _Sampled(NamedTuple):
     def against(self, other: _Sampled, x: Tensor, y: Tensor) -> Ambiguity:
         """The ambiguity with which most pixels agree."""
         both = self.known & other.known
-        own, w, rise, x, y = (plane[both] for plane in (self.w, other.w, self.pixels_per_w, x, y))
-        if len(own) < SETTINGS.sampled_rows:
+        measured, w, rise, x, y = (plane[both] for plane in (self.w, other.w, self.pixels_per_w, x, y))
+        if len(measured) < SETTINGS.sampled_rows:
             return NO_AMBIGUITY
         terms = torch.stack([w, x, y, torch.ones_like(x)], -1)
 
         def share(solution: Tensor) -> float:
-            return float(_agree(terms, own, rise, solution[:, None]).mean())
+            return float(_agree(terms, measured, rise, solution[:, None]).mean())
 
-        best, flat = _most_agreed(terms, own, rise), _most_agreed(terms[:, 1:], own, rise)
-        without = max(share(torch.eye(4)[0].to(own)), share(torch.cat([torch.zeros_like(flat[:1]), flat])))
+        best, flat = _most_agreed(terms, measured, rise), _most_agreed(terms[:, 1:], measured, rise)
+        without = max(
+            share(torch.eye(4)[0].to(measured)), share(torch.cat([torch.zeros_like(flat[:1]), flat]))
+        )
         if best[0] <= 0 or share(best) < without + SETTINGS.more:
             return NO_AMBIGUITY
         scale, *plane = best.tolist()
         return Ambiguity(scale, (plane[0], plane[1], plane[2]))
 
 
-def _most_agreed(terms: Float[Tensor, "n k"], own: Float[Tensor, " n"], rise: Tensor) -> Float[Tensor, " k"]:
+def _most_agreed(
+    terms: Float[Tensor, "n k"], measured: Float[Tensor, " n"], rise: Tensor
+) -> Float[Tensor, " k"]:
     """The factors of the terms with which most of what is measured agrees; then by least squares of that."""
     n, k = terms.shape
     size = terms.abs().amax(0).clamp(min=1e-12)
     scaled = terms / size
-    some = torch.randint(n, (SETTINGS.trials, k), generator=torch.Generator().manual_seed(0)).to(own.device)
-    trials, _ = torch.linalg.solve_ex(scaled[some], own[some])
+    some = torch.randint(n, (SETTINGS.trials, k), generator=torch.Generator().manual_seed(0)).to(
+        measured.device
+    )
+    trials, _ = torch.linalg.solve_ex(scaled[some], measured[some])
     trials = torch.where(trials.isfinite().all(1, keepdim=True), trials, 0.0).T
-    best = trials[:, _agree(scaled, own, rise, trials).sum(0).argmax()][:, None]
+    best = trials[:, _agree(scaled, measured, rise, trials).sum(0).argmax()][:, None]
     for _ in range(3):
-        weight = rise[:, None] * _agree(scaled, own, rise, best)
-        best = torch.linalg.lstsq(scaled * weight, own[:, None] * weight).solution
+        weight = rise[:, None] * _agree(scaled, measured, rise, best)
+        best = torch.linalg.lstsq(scaled * weight, measured[:, None] * weight).solution
     return best[:, 0] / size
 
 
-def _agree(terms: Tensor, own: Tensor, rise: Tensor, solutions: Float[Tensor, "k m"]) -> Float[Tensor, "n m"]:
+def _agree(
+    terms: Tensor, measured: Tensor, rise: Tensor, solutions: Float[Tensor, "k m"]
+) -> Float[Tensor, "n m"]:
     """1 where a solution is less than `NEAR` pixels from what is measured."""
-    return ((terms @ solutions - own[:, None]).abs() * rise[:, None] < NEAR).to(own)
+    return ((terms @ solutions - measured[:, None]).abs() * rise[:, None] < NEAR).to(measured)
 
 
 def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
@@ -317,13 +325,13 @@ def _of_beta(
     at: Callable[[tuple[int, int]], MatchedBeta],
     agreement: Agreement,
     strips: list[tuple[int, int]],
-    own: BetaMatches,
+    initial: BetaMatches,
 ) -> BetaMatches:
     """The matches of the beta that is `at` some rows."""
     buffer = at(strips[0]).depth_buffer()
     for top, bottom in strips:
         at((top, bottom)).enter(agreement.inverse_depth[0, top:bottom].to(buffer), buffer)
-    disparity, facts = torch.empty_like(own.disparity), torch.empty_like(own.facts)
+    disparity, facts = torch.empty_like(initial.disparity), torch.empty_like(initial.facts)
     for top, bottom in strips:
         view, half = at((top, bottom)), slice(top // FINE, bottom // FINE)
         inverse_depth = agreement.inverse_depth[0, top:bottom].to(buffer)
@@ -333,4 +341,4 @@ def _of_beta(
         unlike = torch.where(agreement.known[0, top:bottom], unlike, 1.0)
         facts[0, :1, half] = avg_pool2d(unlike[None], FINE)
         facts[0, 1:, half] = agreement.facts[:, half]
-    return replace(own, disparity=disparity, facts=facts, chosen=None)
+    return replace(initial, disparity=disparity, facts=facts, chosen=None)

@@ -122,9 +122,9 @@ class Normalisation(NamedTuple):
     @classmethod
     def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisation:
         """What makes the means and standard deviations the same, and then the sharpness."""
-        own, wanted = moments(beta), moments(alpha)
-        level = torch.stack([own.mean, own.gain(wanted, SETTINGS.largest_gain), wanted.mean])
-        return cls(level, equalising_blurs(alpha, own.matched(beta, wanted, SETTINGS.largest_gain)))
+        measured, wanted = moments(beta), moments(alpha)
+        level = torch.stack([measured.mean, measured.gain(wanted, SETTINGS.largest_gain), wanted.mean])
+        return cls(level, equalising_blurs(alpha, measured.matched(beta, wanted, SETTINGS.largest_gain)))
 
     def normalised(self, beta: Tensor) -> Tensor:
         """Beta's brightness (or that of a part of it) with alpha's mean and standard deviation."""
@@ -148,8 +148,10 @@ def equalising_blurs(
 
     Detail that only one has cannot be matched.
     """
-    own, its = ([_sharpness(p) for p in images] for images in (image, other))
-    return [_equal_blur(p, s) for p, s in zip(image, its)], [_equal_blur(p, s) for p, s in zip(other, own)]
+    image_sharpness, other_sharpness = ([_sharpness(p) for p in images] for images in (image, other))
+    return [_equal_blur(p, s) for p, s in zip(image, other_sharpness)], [
+        _equal_blur(p, s) for p, s in zip(other, image_sharpness)
+    ]
 
 
 def _equal_blur(image: Float[Tensor, "1 h w"], wanted: float) -> float:

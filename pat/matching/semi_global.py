@@ -108,11 +108,11 @@ class _Geometry(NamedTuple):
 
 def matched_at_half_size(views: ComparedViews, blocks: Segments) -> HalfSizeMatches:
     """Matches of views at half size; `blocks`: the segments of their pixels, in those of the whole beta."""
-    own, other = views.alpha, views.beta
-    geometry = geometry_of(blocks, len(own), (FINE * other.shape[-2], FINE * other.shape[-1]))
+    alpha, beta = views.alpha, views.beta
+    geometry = geometry_of(blocks, len(alpha), (FINE * beta.shape[-2], FINE * beta.shape[-1]))
     del blocks
     disparity, facts = matched_by_labels(views, geometry, Windows.all(geometry), HALF_SIZE)
-    return HalfSizeMatches(FINE * disparity[:, None].to(own), facts.movedim(-1, 1).to(own))
+    return HalfSizeMatches(FINE * disparity[:, None].to(alpha), facts.movedim(-1, 1).to(alpha))
 
 
 def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int = FINE) -> _Geometry:
@@ -143,8 +143,8 @@ def matched_by_labels(
     Where matching back from beta disagrees, disparity is diffused from where it does not, within what is
     connected in alpha.
     """
-    own, other = (numpy_of(image[:, 0]) for image in (views.alpha, views.beta))
-    disparity, measured = _matched_blocks(own, other, geometry, windows, settings, facts)
+    alpha, beta = (numpy_of(image[:, 0]) for image in (views.alpha, views.beta))
+    disparity, measured = _matched_blocks(alpha, beta, geometry, windows, settings, facts)
     consistent = (measured[..., 0] < settings.consistent).astype(np.float32)
     smooth = []
     for d, c, guide in zip(disparity, consistent, views.guides):
@@ -169,21 +169,21 @@ class _Image(NamedTuple):
 
 
 def _matched_blocks(
-    own: NDArray,
-    other: NDArray,
+    alpha: NDArray,
+    beta: NDArray,
     geometry: _Geometry,
     windows: Windows,
     settings: SemiGlobalSettings,
     facts: int,
 ) -> tuple[NDArray, NDArray]:
     """Disparity (B, h, w) in pixels of the beta given, and so many facts (B, h, w, facts)."""
-    (_, *hw), (_, rows, columns) = own.shape, other.shape
-    disparity, place = np.empty(own.shape, np.float32), np.empty(own.shape, np.int32)
-    measured = np.empty((*own.shape, facts), np.float32)
-    planes = in_parallel([partial(planes_of, image) for image in (*own, *other)])
+    (_, *hw), (_, rows, columns) = alpha.shape, beta.shape
+    disparity, place = np.empty(alpha.shape, np.float32), np.empty(alpha.shape, np.int32)
+    measured = np.empty((*alpha.shape, facts), np.float32)
+    planes = in_parallel([partial(planes_of, image) for image in (*alpha, *beta)])
     images, tasks, nbytes = [], [], 1.0
-    for i, (mine, its) in enumerate(zip(planes[: len(own)], planes[len(own) :])):
-        views = own[i], windows.first[i], *(g[i] for g in geometry), *mine
+    for i, (mine, its) in enumerate(zip(planes[: len(alpha)], planes[len(alpha) :])):
+        views = alpha[i], windows.first[i], *(g[i] for g in geometry), *mine
         images.append(_Image(views, flat(its), (rows, columns), (disparity[i], measured[i], place[i]), []))
         boxes = _boxes(hw, geometry.along[i], windows.first.shape[-1] * windows.labels, settings)
         tasks += [partial(_block, images[-1], box, windows, settings) for box in boxes]
@@ -216,10 +216,12 @@ def _block(image: _Image, box: Tile, windows: Windows, settings: SemiGlobalSetti
     """What is found of a block. What its pixels claim of beta goes into one of the tables, of which each is
     of one thread at a time; what all claim is the least of them."""
     inner, outer = map(slices, box)
-    guide, first, end, along, length, cut, *own = (np.ascontiguousarray(x[outer]) for x in image.views)
+    guide, first, end, along, length, cut, *alpha_planes = (
+        np.ascontiguousarray(x[outer]) for x in image.views
+    )
     labels, segments = (first, windows.labels), (end, along, length, cut)
     cost = np.empty((*length.shape, *windows.lanes), np.uint8)
-    kernels.costs(flat(own), image.other, *labels, *segments, *image.hw, cost)
+    kernels.costs(flat(alpha_planes), image.other, *labels, *segments, *image.hw, cost)
     total = np.empty(cost.shape, np.int16)
     step, jump = np.float32(settings.step), np.float32(settings.jump)
     kernels.aggregate(cost, guide, *labels, step, jump, total)

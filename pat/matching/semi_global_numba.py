@@ -66,8 +66,8 @@ def _count_within(length, first, count):
 
 
 @compiled(nogil=True, cache=True)
-def costs(own, other, first, count, end, along, length, cut, rows, columns, out):
-    """Cost of alpha's pixel and beta's by label: out (h, w, runs, lanes). `own`, `other`: flat `cost` planes.
+def costs(alpha, beta, first, count, end, along, length, cut, rows, columns, out):
+    """Cost of alpha's pixel and beta's by label: out (h, w, runs, lanes), of flat `cost` planes.
 
     The label l lies l pixels from `end` along the unit vectors `along`; those beyond `length` are nowhere,
     or, where it is beta's edge that cuts the segment, not seen.
@@ -76,7 +76,7 @@ def costs(own, other, first, count, end, along, length, cut, rows, columns, out)
     size, places, best_label = runs * lanes, np.empty(runs * lanes, np.int32), np.empty(lanes, np.uint8)
     for y in range(height):
         for x in range(width):
-            last, pixel = length[y, x] + HALF, pixel_of(own, y * width + x)
+            last, pixel = length[y, x] + HALF, pixel_of(alpha, y * width + x)
             for lane in range(0, size, LANES):
                 low, high = _halves(first[y, x], runs, lane)
                 _places(end[y, x], along[y, x], low, high, last, rows, columns, places[lane:])
@@ -85,7 +85,7 @@ def costs(own, other, first, count, end, along, length, cut, rows, columns, out)
                 within = _count_within(length[y, x], first[y, x, run], count)
                 at, costs = places[run * lanes :], out[y, x, run]
                 for k in range(within):
-                    best_label[k] = dissimilarity(pixel, pixel_of(other, max(at[k], 0)))
+                    best_label[k] = dissimilarity(pixel, pixel_of(beta, max(at[k], 0)))
                 for k in range(lanes):
                     cost = best_label[k] if at[k] >= 0 else NOWHERE
                     cost = cost if k < within else beyond
@@ -128,8 +128,8 @@ def _spread(code, path, small):
     """Of two runs, each in half a vector: what their labels, and those beside them, cost a neighbour that has
     not a penalty for a jump. One lane farther on, so that lane 0 is of the label before the run."""
     back = [[half + (k - n) % NARROW for half in (0, NARROW) for k in range(NARROW)] for n in (1, 2)]
-    own, before = (code.shuffle(path, None, lanes) for lanes in back)
-    return _lesser(code, own, code.add(_lesser(code, before, path), small))
+    one_back, two_back = (code.shuffle(path, None, lanes) for lanes in back)
+    return _lesser(code, one_back, code.add(_lesser(code, two_back, path), small))
 
 
 @instruction(lambda *_: types.UniTuple(types.int64, 4))
@@ -155,10 +155,10 @@ def _least(code, path):
 
 
 @compiled(inline="always")
-def _jumps(own, other, small, large, out):
+def _jumps(guide, beside, small, large, out):
     """Penalties of labels that differ by more than one, between pixels of alpha's brightness; in parts."""
-    for i in range(len(own)):
-        out[i] = np.int16(max(small + ONE, large / (ONE + abs(own[i] - other[i]) / EDGE)) * PARTS + HALF)
+    for i in range(len(guide)):
+        out[i] = np.int16(max(small + ONE, large / (ONE + abs(guide[i] - beside[i]) / EDGE)) * PARTS + HALF)
 
 
 @compiled(nogil=True, cache=True)
@@ -368,18 +368,18 @@ def regression(brightness, total, first, second, colour, product, floor, along, 
 
 
 @compiled(nogil=True, cache=True)
-def costs_at(own, other, places, out):
+def costs_at(alpha, beta, places, out):
     """Cost of alpha's pixel and beta's at each of its places, pixels of beta counted row by row (-1: none):
-    out (h, w, 1, lanes), of which those after the last place have no label. `own` and `other` are flat planes
-    of `cost`."""
+    out (h, w, 1, lanes), of which those after the last place have no label. `alpha` and `beta` are flat
+    planes of `cost`."""
     height, width, labels = places.shape
     for y in range(height):
         for x in range(width):
-            pixel, costs = pixel_of(own, y * width + x), out[y, x, 0]
+            pixel, costs = pixel_of(alpha, y * width + x), out[y, x, 0]
             costs[labels:] = NO_LABEL
             for label in range(labels):
                 at = places[y, x, label]
-                cost = dissimilarity(pixel, pixel_of(other, max(at, 0)))
+                cost = dissimilarity(pixel, pixel_of(beta, max(at, 0)))
                 costs[label] = cost if at >= 0 else NOWHERE
 
 

@@ -64,11 +64,11 @@ def matched_at_full_size(
 ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h2 w2"]]:
     """Disparity to a fraction of a pixel from that at half the size, and how far matching back from beta
     disagrees, 0 to 1, at half the size. Where it disagrees, disparity is diffused from where it does not."""
-    own, other = views.alpha, views.beta
-    geometry = geometry_of(segments, len(own), (other.shape[-2], other.shape[-1]), factor=1)
+    alpha, beta = views.alpha, views.beta
+    geometry = geometry_of(segments, len(alpha), (beta.shape[-2], beta.shape[-1]), factor=1)
     windows = Windows(np.stack([_runs(plane) for plane in numpy_of(half[:, 0])]), SETTINGS.run)
     labelled, measured = matched_by_labels(views, geometry, windows, FULL_SIZE, facts=1)
-    disparity, unlike = labelled[:, None].to(own), measured.movedim(-1, 1).to(own)
+    disparity, unlike = labelled[:, None].to(alpha), measured.movedim(-1, 1).to(alpha)
     near = interpolate(half, scale_factor=FINE, mode="bilinear")
     return _precise(views, segments, disparity, unlike < CONSISTENT, near), avg_pool2d(unlike, FINE)
 
@@ -80,10 +80,10 @@ def _precise(
     from there a step of least squares of the brightness around each pixel (Lucas and Kanade 1981); and the
     result on planes within surfaces. The less sharp beta is, the wider are windows, and the farther may steps
     be."""
-    own, other, guides, blurs = views
+    alpha, beta, guides, blurs = views
     near = consistent & ((disparity - rough).abs() < SETTINGS.same)
     start = torch.where(near, (disparity + rough) / 2, disparity)
-    rise, rest = _compared(own, other, segments, start)
+    rise, rest = _compared(alpha, beta, segments, start)
     positions = []
     for i, blur in enumerate(blurs):
         one = slice(i, i + 1)
@@ -144,22 +144,22 @@ def _agreement(rise: Tensor, rest: Tensor, radius: int) -> tuple[Tensor, Tensor]
 
 
 def _compared(
-    own: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"], segments: Segments, disparity: Tensor
+    alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"], segments: Segments, disparity: Tensor
 ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"]]:
     """Of each pixel: how much brighter beta is a pixel farther along its segment than at its match, and how
     much brighter alpha is than beta there."""
-    across, down = (torch.gradient(other, dim=side)[0] for side in (3, 2))
+    across, down = (torch.gradient(beta, dim=side)[0] for side in (3, 2))
     still = Segments(segments.start.detach(), segments.end.detach(), segments.valid)
     extent = Extent.of(segments)
     fixed = Extent(*(part.detach() for part in extent))
-    there = at_matches(torch.cat([other, across, down], 1), still, disparity, fixed)[0]
-    seen, across, down = there.split(1, 1)
+    there = at_matches(torch.cat([beta, across, down], 1), still, disparity, fixed)[0]
+    sampled, across, down = there.split(1, 1)
     if segments.end.requires_grad or segments.start.requires_grad:
         # Along these slopes: those of bicubic sampling itself are half as much again at whole pixels.
-        x, y = matches(segments, disparity, extent=extent).to(other)[:, None].unbind(-1)
-        seen = seen + across.detach() * (x - x.detach()) + down.detach() * (y - y.detach())
-    towards = fixed.towards.movedim(-1, 1).to(other)
-    return across * towards[:, :1] + down * towards[:, 1:], own - seen
+        x, y = matches(segments, disparity, extent=extent).to(beta)[:, None].unbind(-1)
+        sampled = sampled + across.detach() * (x - x.detach()) + down.detach() * (y - y.detach())
+    towards = fixed.towards.movedim(-1, 1).to(beta)
+    return across * towards[:, :1] + down * towards[:, 1:], alpha - sampled
 
 
 def _runs(half: NDArray[np.float32]) -> NDArray[np.int32]:

@@ -105,12 +105,14 @@ def write_points(
     known = depth.isfinite()
     x = pixel_grid(camera.hw, dtype=torch.float64)[known]
     colours = image.expand(3, -1, -1) if len(image) == 1 else image[:3]
-    own, to_point = camera.to(torch.float64), depth[known].double()
-    X = own.cam_from_world.apply((at_distance if along == "distance" else Camera.unproject)(own, x, to_point))
-    seen = X.isfinite().all(-1)
-    vertices = np.empty(int(seen.sum()), VERTEX)
-    vertices["X"] = X[seen].numpy()
-    vertices["colour"] = to_bytes(colours[:, known][:, seen]).T
+    double_camera, to_point = camera.to(torch.float64), depth[known].double()
+    X = double_camera.cam_from_world.apply(
+        (at_distance if along == "distance" else Camera.unproject)(double_camera, x, to_point)
+    )
+    finite = X.isfinite().all(-1)
+    vertices = np.empty(int(finite.sum()), VERTEX)
+    vertices["X"] = X[finite].numpy()
+    vertices["colour"] = to_bytes(colours[:, known][:, finite]).T
     with write_atomically(path) as temporary:
         temporary.write_bytes(PLY_HEADER.format(count=len(vertices)).encode() + vertices.tobytes())
     return len(vertices)

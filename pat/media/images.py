@@ -340,10 +340,10 @@ def _unit_range(planes: NDArray, label: str, bits: int | None, white: int) -> ND
 
 
 def _counts(planes: NDArray, label: str, bits: int | None, white: int) -> NDArray[np.float32]:
-    own, largest = max(white.bit_length(), 8), int(planes.max())
-    if bits and bits > own:
+    stored, largest = max(white.bit_length(), 8), int(planes.max())
+    if bits and bits > stored:
         raise ValueError(
-            f"{label}: has {own} bits a value, the rig says {bits}: correct 'bits', or give the raw file"
+            f"{label}: has {stored} bits a value, the rig says {bits}: correct 'bits', or give the raw file"
         )
     if largest > white:
         raise ValueError(f"{label}: has values up to {largest}, its header says {white}: save it again")

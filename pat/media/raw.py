@@ -79,7 +79,7 @@ def match_luminance(
     """
     if sensor.response != LIGHT:
         return image
-    return chunked(lambda part, own: part + _missing(part, linear_from_srgb(own)), image, alpha)
+    return chunked(lambda part, luma: part + _missing(part, linear_from_srgb(luma)), image, alpha)
 
 
 def _missing(image: Tensor, light: Tensor) -> Tensor:

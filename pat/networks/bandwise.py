@@ -50,12 +50,14 @@ class BandwisePAT(nn.Module):
 
     def explain(self, inputs: Inputs, matches: Matches) -> tuple[FusionOutput, list[BetaEstimate]]:
         """The same, with the estimate of each beta, which training supervises."""
-        alpha, own = inputs.alpha, self.single.encoder(inputs.alpha)
-        estimates = [self.single.estimate(own, alpha, *one) for one in zip(inputs.betas, matches.betas)]
-        parts = [self._of_beta(own, alpha, *one) for one in zip(estimates, matches.betas)]
+        alpha, encoded = inputs.alpha, self.single.encoder(inputs.alpha)
+        estimates = [self.single.estimate(encoded, alpha, *one) for one in zip(inputs.betas, matches.betas)]
+        parts = [self._of_beta(encoded, alpha, *one) for one in zip(estimates, matches.betas)]
         return output_of(torch.cat(parts, 1), estimates), estimates
 
-    def _of_beta(self, own: Encoded, alpha: Tensor, estimate: BetaEstimate, matches: BetaMatches) -> Tensor:
+    def _of_beta(
+        self, encoded: Encoded, alpha: Tensor, estimate: BetaEstimate, matches: BetaMatches
+    ) -> Tensor:
         """One beta's bands at alpha's view.
 
         The network's result for each is counted from its local regression on alpha: where a band is unlike
@@ -63,7 +65,7 @@ class BandwisePAT(nn.Module):
         """
         base, mix = matches.colours[1][:, 0].to(alpha), matches.comparison.mix
         bands = [
-            regressed + self.single.blended(own, regressed, [estimate.beyond(base, i)])
+            regressed + self.single.blended(encoded, regressed, [estimate.beyond(base, i)])
             for i, regressed in enumerate((alpha + base).split(1, 1))
         ]
         image = torch.cat(bands, 1)

@@ -146,10 +146,10 @@ def find_alike(guide, top, alike):
                 line[:] = 0
                 for c in range(len(guide)):
                     for y in range(RADIUS + STEP * (top + r), RADIUS + STEP * (top + r + 1)):
-                        own = guide[c, y, RADIUS : RADIUS + len(line)]
-                        other = guide[c, y + dy, RADIUS + dx : RADIUS + dx + len(line)]
+                        guide_row = guide[c, y, RADIUS : RADIUS + len(line)]
+                        shifted_row = guide[c, y + dy, RADIUS + dx : RADIUS + dx + len(line)]
                         for x in range(len(line)):
-                            line[x] += (other[x] - own[x]) ** 2
+                            line[x] += (shifted_row[x] - guide_row[x]) ** 2
                 for k in range(cells.shape[1]):
                     cells[r, k] = line[4 * k] + line[4 * k + 1] + line[4 * k + 2] + line[4 * k + 3]
             for r in range(rows):
@@ -206,7 +206,7 @@ def group_transform(blocks):
 def filter_groups(image, expected, variance, top, alike, cosines, window, out):
     """Add to `out` (2, c, rows, w), from its first row of blocks: filtered blocks, weighted, and weights."""
     rows, columns = alike.shape[:2]
-    seen = np.empty((SIDE * SIDE, ALIKE), np.float32)
+    group = np.empty((SIDE * SIDE, ALIKE), np.float32)
     known = np.empty((SIDE * SIDE, ALIKE), np.float32)
     spare = np.empty((SIDE * SIDE, ALIKE), np.float32)
     back = cosines.T.copy()
@@ -220,10 +220,10 @@ def filter_groups(image, expected, variance, top, alike, cosines, window, out):
                     noise += variance[c, y + SIDE // 2, x + SIDE // 2] / ALIKE
                     for i in range(SIDE):
                         for j in range(SIDE):
-                            seen[SIDE * i + j, n] = image[c, y + i, x + j]
+                            group[SIDE * i + j, n] = image[c, y + i, x + j]
                             known[SIDE * i + j, n] = expected[c, y + i, x + j]
-                block_transform(seen, spare, cosines)
-                group_transform(seen)
+                block_transform(group, spare, cosines)
+                group_transform(group)
                 block_transform(known, spare, cosines)
                 group_transform(known)
                 total = np.float32(1)
@@ -231,15 +231,15 @@ def filter_groups(image, expected, variance, top, alike, cosines, window, out):
                     for n in range(ALIKE):
                         power = known[i, n] * known[i, n]
                         share = power / (power + noise)
-                        seen[i, n] *= share
+                        group[i, n] *= share
                         total += share * share
-                group_transform(seen)
-                block_transform(seen, spare, back)
+                group_transform(group)
+                block_transform(group, spare, back)
                 counts = 1 / ((noise + np.float32(1e-8)) * total)
                 for n in range(ALIKE):
                     y, x = y0 + alike[r, k, n, 0] - STEP * top, x0 + alike[r, k, n, 1]
                     for i in range(SIDE):
                         for j in range(SIDE):
                             weight = counts * window[i, j]
-                            out[0, c, y + i, x + j] += weight * seen[SIDE * i + j, n]
+                            out[0, c, y + i, x + j] += weight * group[SIDE * i + j, n]
                             out[1, c, y + i, x + j] += weight

@@ -62,16 +62,16 @@ class Completion(nn.Module):
         colours = differences(confidence, mixed, candidates)
         inputs = features(alpha, confidence, [to_luma_chroma(colour)[1] for colour in (mixed, *colours)])
         del colours
-        own, *shares = self.answer(inputs).split([2] + [1] * CANDIDATES, 1)
+        added, *shares = self.answer(inputs).split([2] + [1] * CANDIDATES, 1)
         apart = differences(confidence, mixed, candidates)
         change = sum(share * difference for share, difference in zip(shares, apart))
-        own = (1 - confidence) * from_luma_chroma(torch.zeros_like(alpha), own)
-        return mixed + SETTINGS.strength * (change + own)
+        added = (1 - confidence) * from_luma_chroma(torch.zeros_like(alpha), added)
+        return mixed + SETTINGS.strength * (change + added)
 
     def answer(self, inputs: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o 2*h 2*w"]:
         """The chroma to add where a match is not certain, and the candidates' shares, by `features`."""
-        own, weights = pixel_shuffle(self.unet(inputs), 2).split([2, 1 + CANDIDATES], 1)
-        return torch.cat([own, weights.softmax(1)[:, 1:]], 1)
+        added, weights = pixel_shuffle(self.unet(inputs), 2).split([2, 1 + CANDIDATES], 1)
+        return torch.cat([added, weights.softmax(1)[:, 1:]], 1)
 
 
 def features(

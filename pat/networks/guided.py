@@ -164,10 +164,10 @@ class GuidedPAT(nn.Module):
         parts = len(bands) == 1 or wanted not in bands
         if parts and sum(bands) != wanted:
             raise ValueError(f"the betas have {sum(bands)} bands in all, this network makes {wanted}")
-        alpha, own = inputs.alpha, self.encoder(inputs.alpha)
-        estimates = [self.estimate(own, alpha, *one) for one in zip(inputs.betas, matches.betas)]
+        alpha, encoded = inputs.alpha, self.encoder(inputs.alpha)
+        estimates = [self.estimate(encoded, alpha, *one) for one in zip(inputs.betas, matches.betas)]
         used = estimates if parts else [combined([e for e, n in zip(estimates, bands) if n == wanted])]
-        residual = self.blended(own, alpha, used, complete=inputs.sees_luma)
+        residual = self.blended(encoded, alpha, used, complete=inputs.sees_luma)
         if self.config.keep_luminance:
             residual = residual - inputs.luminance * luminance(residual)
         output = output_of(alpha + residual, estimates)
@@ -175,7 +175,7 @@ class GuidedPAT(nn.Module):
 
     def blended(
         self,
-        own: Encoded,
+        encoded: Encoded,
         alpha: Float[Tensor, "b 1 h w"],
         estimates: Sequence[BetaEstimate],
         *,
@@ -187,7 +187,7 @@ class GuidedPAT(nn.Module):
         """
         confidence = _joined([s.blending.expand_as(s.colour) for s in estimates])
         colour = _joined([s.colour for s in estimates])
-        unseen, *fills = map(_joined, zip(*(self._fills(own, alpha, s) for s in estimates)))
+        unseen, *fills = map(_joined, zip(*(self._fills(encoded, alpha, s) for s in estimates)))
         recalled = by_example(alpha, colour, confidence)
         unseen = with_examples(unseen, recalled, confidence)
         mixed = with_less_noise(alpha, torch.lerp(unseen, colour, confidence), confidence)
@@ -195,20 +195,20 @@ class GuidedPAT(nn.Module):
             return mixed
         return self.completion(alpha, confidence[:, :1], mixed, (colour, *fills, recalled))
 
-    def _fills(self, own: Encoded, alpha: Tensor, estimate: BetaEstimate) -> tuple[Tensor, ...]:
+    def _fills(self, encoded: Encoded, alpha: Tensor, estimate: BetaEstimate) -> tuple[Tensor, ...]:
         """Colour for where beta does not see the point: the choice; and what it is of, propagated at 1/4 of
         the size to pixels that are similar in alpha, or diffused."""
         confidence = estimate.logit.sigmoid()
         weight = avg_pool2d(confidence, SETTINGS.coarse)
         colour = avg_pool2d(estimate.colour * confidence, SETTINGS.coarse) / (weight + SETTINGS.least_weight)
         for step in self.propagation:
-            colour, weight = step(own.quarter, colour, weight)
+            colour, weight = step(encoded.quarter, colour, weight)
         propagated = fitted(enlarge(colour), alpha, estimate.colour, confidence)
         choices = propagated, *estimate.diffused.to(colour).unbind(1)
         weights = estimate.choice.softmax(1).split(1, 1)
         return reduce(torch.add, (w * c for w, c in zip(weights, choices))), *choices
 
-    def estimate(self, own: Encoded, alpha: Tensor, beta: Beta, matched: BetaMatches) -> BetaEstimate:
+    def estimate(self, encoded: Encoded, alpha: Tensor, beta: Beta, matched: BetaMatches) -> BetaEstimate:
         """The estimate of one beta of any bands."""
         of, exactly = matched.comparison.combined, alpha.dtype if self.training else torch.float64
         bands, diffused = matched.colours
@@ -219,11 +219,11 @@ class GuidedPAT(nn.Module):
         del extent
         other = self.encoder(of(beta.image))
         value, attended, deviation, peak = attend_with_statistics(
-            self._key(own), self._key(other), beta.image, window, samples=self.config.taps
+            self._key(encoded), self._key(other), beta.image, window, samples=self.config.taps
         )
         del other, window
         facts = [of(value) - alpha, peak[:, None], deviation[:, None]]
-        judged = self._judged(own, matched, torch.cat(facts, 1), segments.valid[:, None])
+        judged = self._judged(encoded, matched, torch.cat(facts, 1), segments.valid[:, None])
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
         logit = torch.where(peak[:, None] > 0, logit, SETTINGS.nowhere)
         colour = torch.lerp(value - alpha, bands.to(value), exact.sigmoid())
@@ -232,13 +232,13 @@ class GuidedPAT(nn.Module):
             attended, deviation, peak, colour, diffused, logit, choice, position, alike, matched.prior
         )
 
-    def _judged(self, own: Encoded, of_beta: BetaMatches, facts: Tensor, valid: Tensor) -> Tensor:
+    def _judged(self, encoded: Encoded, of_beta: BetaMatches, facts: Tensor, valid: Tensor) -> Tensor:
         """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the semi-global match."""
         matched = torch.cat([avg_pool2d(of_beta.disparity, FINE) / 64, of_beta.facts], 1)
         samples = torch.cat([facts, facts[:, :1].abs(), valid.expand(len(facts), -1, -1, -1).to(facts)], 1)
         rough = torch.cat([avg_pool2d(matched, 2), avg_pool2d(samples, SETTINGS.coarse)], 1)
-        context = self.judge(stacked(own.quarter, rough))
-        return self.confidence(stacked(enlarge(context), own.half, matched, facts))
+        context = self.judge(stacked(encoded.quarter, rough))
+        return self.confidence(stacked(enlarge(context), encoded.half, matched, facts))
 
     def _key(self, features: Encoded) -> Tensor:
         """What queries and keys are at full size."""

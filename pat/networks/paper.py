@@ -80,11 +80,11 @@ class PAT(nn.Module):
         if len(inputs.betas) != self.config.betas:
             asked = f"this PAT is made for {self.config.betas} betas, got {len(inputs.betas)}"
             raise ValueError(f"{asked}: give as many cameras beside alpha, or other --weights")
-        own = self.features(self._channels(inputs.alpha))
-        others = [self.features(self._channels(beta.image)) for beta in inputs.betas]
-        compared = self.engine.compare(own, others, [beta.field for beta in inputs.betas])
+        alpha_features = self.features(self._channels(inputs.alpha))
+        beta_features = [self.features(self._channels(beta.image)) for beta in inputs.betas]
+        compared = self.engine.compare(alpha_features, beta_features, [beta.field for beta in inputs.betas])
         attended = [c.attended() for c in compared]
-        image = self.post(torch.cat([own, *(a.value for a in attended)], 1))
+        image = self.post(torch.cat([alpha_features, *(a.value for a in attended)], 1))
         if self.config.residual:
             alpha, s = inputs.alpha.expand(-1, self.config.out_channels, -1, -1), self.config.scale
             if s > 1:
@@ -152,11 +152,13 @@ class AttentionEngine(nn.Module):
             # each other.
             key.load_state_dict(self.query.state_dict())
 
-    def compare(self, own: Tensor, others: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> list[Compared]:
+    def compare(
+        self, alpha_features: Tensor, beta_features: Sequence[Tensor], fields: Sequence[FieldOnGrid]
+    ) -> list[Compared]:
         """Alpha's query, each beta's key and value, and where they are compared; of features (b, d, h, w)."""
-        query, how = self.query(self.before(own)), self.interpolation
+        query, how = self.query(self.before(alpha_features)), self.interpolation
         scores = []
-        for f, to_key, to_value, field in zip(others, self.key, self.value, fields):
+        for f, to_key, to_value, field in zip(beta_features, self.key, self.value, fields):
             after = self.before(f)
             value = to_value(after if self.values_after_block else f)
             locations = field.at if field.pixels is None else field.pixels.to(query)

@@ -83,12 +83,12 @@ def recalled(
     which several betas may have."""
     certain = confidence.amin(1, keepdim=True)
     weight, keys = avg_pool2d(certain, 2), surroundings(alpha)
-    seen = avg_pool2d(colour * certain, 2) / (weight + SETTINGS.least_weight)
+    value = avg_pool2d(colour * certain, 2) / (weight + SETTINGS.least_weight)
     counts = (weight.square() + SETTINGS.least_weight).log() * SETTINGS.certainty
     scores = counts - keys.square().sum(1, keepdim=True) / 2
     query, key = torch.cat([keys, torch.ones_like(weight)], 1), torch.cat([keys, scores], 1)
     del keys
-    return attend(query, key, seen, FIELD, interpolation="nearest", bias=nearness().to(alpha))
+    return attend(query, key, value, FIELD, interpolation="nearest", bias=nearness().to(alpha))
 
 
 def fitted(

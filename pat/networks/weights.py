@@ -150,11 +150,13 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
 def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
     """The first tensor missing, too many, or of another shape than the network's; empty if all fit. Ranges of
     convolutions in 8 bits may be missing."""
-    own, theirs = ({k: tuple(v.shape) for k, v in s.items()} for s in (network.state_dict(), state))
-    own |= {name: (2,) for name in eight_bits.names(network) if name in theirs}
-    for name in [*own, *theirs]:
-        if own.get(name) != theirs.get(name):
-            return f"{name} is {theirs.get(name, 'missing')}, wanted {own.get(name, 'none')}"
+    wanted_shapes, given_shapes = (
+        {k: tuple(v.shape) for k, v in s.items()} for s in (network.state_dict(), state)
+    )
+    wanted_shapes |= {name: (2,) for name in eight_bits.names(network) if name in given_shapes}
+    for name in [*wanted_shapes, *given_shapes]:
+        if wanted_shapes.get(name) != given_shapes.get(name):
+            return f"{name} is {given_shapes.get(name, 'missing')}, wanted {wanted_shapes.get(name, 'none')}"
     return ""
 
 

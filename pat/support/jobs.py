@@ -203,17 +203,17 @@ TRIES = 3
 
 def _in_processes(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
     """Outcomes as they come. Each process has a thread that waits for it, and with which it would die."""
-    own, processes, before = threading.local(), [], dict(os.environ)
+    thread_data, processes, before = threading.local(), [], dict(os.environ)
     fatal: list[JobError] = []
 
     def made(task: Task) -> TaskOutcome:
         if fatal:  # threads may come to many tasks before the job's own thread hears of it
             raise fatal[0]
-        if not hasattr(own, "process"):
-            own.process = _Process(workers)
-            processes.append(own.process)
+        if not hasattr(thread_data, "process"):
+            thread_data.process = _Process(workers)
+            processes.append(thread_data.process)
         try:
-            return own.process.made(task)
+            return thread_data.process.made(task)
         except JobError as error:
             fatal.append(error)
             raise

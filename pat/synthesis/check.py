@@ -58,10 +58,10 @@ def check_views(
     reasons = [r for name, figures in views.items() for r in _view_reasons(name, figures, limits)]
     reasons += [r for name, figures in pairs.items() for r in _pair_reasons(name, figures, limits)]
     for name in sorted({a for a, _ in together}):
-        seen = max(pairs[f"{a} > {b}"]["visible"] for a, b in together if a == name)
-        if seen < limits.overlap:
+        overlap = max(pairs[f"{a} > {b}"]["visible"] for a, b in together if a == name)
+        if overlap < limits.overlap:
             reasons.append(
-                f"{name}: the other cameras see {seen:.0%} of what it sees (at least {limits.overlap:.0%})"
+                f"{name}: the other cameras see {overlap:.0%} of what it sees (at least {limits.overlap:.0%})"
             )
     return {"accepted": not reasons, "reasons": reasons, "views": views, "pairs": pairs}
 

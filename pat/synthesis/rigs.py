@@ -82,10 +82,10 @@ def _general_beta(rigs: RigDistribution, alpha: Camera, near: Tensor, far: Tenso
     K = alpha.K.clone()
     K[:, 0, 0] *= resolution * log_uniform(rigs.focal_ratio, (batch,), g)
     K[:, 1, 1] = K[:, 0, 0]
-    seen = (R @ target[..., None])[..., 0] + t
+    target_in_beta = (R @ target[..., None])[..., 0] + t
     size = torch.tensor([hw[1], hw[0]], dtype=torch.float64)
     middle = (size - 1) / 2 + uniform((-rigs.decentring, rigs.decentring), (batch, 2), g) * size
-    K[:, :2, 2] = middle - K[:, :1, 0] * seen[:, :2] / seen[:, 2:]
+    K[:, :2, 2] = middle - K[:, :1, 0] * target_in_beta[:, :2] / target_in_beta[:, 2:]
     return Camera(K=K, cam_from_world=Pose(R, t), hw=hw)
 
 

@@ -47,8 +47,8 @@ def attention_loss(
     """
     part = (slice(None), slice(None, None, stride), slice(None, None, stride))
     losses = [
-        _of_beta(one.strided(stride), where[part], seen[part])
-        for one, where, seen in zip(compared, position, visible)
+        _of_beta(one.strided(stride), where[part], mask[part])
+        for one, where, mask in zip(compared, position, visible)
     ]
     return torch.stack(losses).mean()
 
@@ -58,8 +58,8 @@ def _of_beta(compared: Compared, position: Tensor, visible: Tensor) -> Tensor:
     valid, known = compared.segments.valid.expand_as(visible), (position != 0).any(-1)
     scores, inside = _true_scores(compared, target)
     total = log_sum(compared)
-    seen = _mean(total - scores, visible & valid & inside & target.on_segment)
-    return seen + UNSEEN * _mean(total - mean_score(compared), ~visible & valid & known)
+    visible_loss = _mean(total - scores, visible & valid & inside & target.on_segment)
+    return visible_loss + UNSEEN * _mean(total - mean_score(compared), ~visible & valid & known)
 
 
 def target_of(segments: Segments, samples: int, position: Float[Tensor, "b h w 2"]) -> Target:

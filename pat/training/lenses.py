@@ -42,8 +42,10 @@ def through_lenses(
         resampled(p, pinhole, lens, extended=True).values
         for p, pinhole, lens in zip(images.cpu(), pinholes, lenses)
     ]
-    seen = recorded(torch.cat(distorted).clamp(0, 1).to(images.device)).cpu()
-    back = [resampled(p, lens, pinhole, extended=True) for p, lens, pinhole in zip(seen, lenses, pinholes)]
+    captured = recorded(torch.cat(distorted).clamp(0, 1).to(images.device)).cpu()
+    back = [
+        resampled(p, lens, pinhole, extended=True) for p, lens, pinhole in zip(captured, lenses, pinholes)
+    ]
     values, valid = (torch.cat(parts) for parts in zip(*back))
     return Sampled(values.clamp(min=0).to(images), valid.to(images.device))
 

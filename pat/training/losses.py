@@ -74,9 +74,9 @@ class Objective(nn.Module):
             fused, compared = self.network.compare(sample.inputs)
             where = attention_loss(compared, sample.position, sample.visible)
             return self.image_loss(fused.image, sample.ground_truth) + self.attention * where
-        fused, seen = explained(self.network, sample)
+        fused, estimates = explained(self.network, sample)
         loss = self.image_loss(fused.image, sample.ground_truth)
-        return loss + match_loss(seen, sample) if seen else loss
+        return loss + match_loss(estimates, sample) if estimates else loss
 
 
 def explained(network: FusionNetwork, sample: Sample) -> tuple[FusionOutput, list[BetaEstimate]]:
@@ -86,15 +86,15 @@ def explained(network: FusionNetwork, sample: Sample) -> tuple[FusionOutput, lis
     return network.explain(sample.inputs, sample.matches or matched_for(network, sample.inputs))
 
 
-def match_loss(seen: list[BetaEstimate], sample: Sample) -> Tensor:
+def match_loss(estimates: list[BetaEstimate], sample: Sample) -> Tensor:
     """Error of position where beta sees the point, pixels, and of confidence; 0 without ground truth."""
     total = sample.ground_truth.new_zeros(())
-    for match, ground_truth, visible in zip(seen, sample.position, sample.visible):
+    for match, ground_truth, visible in zip(estimates, sample.position, sample.visible):
         off = (match.attended - ground_truth.movedim(-1, 1)).abs().sum(1)
         total = total + 0.02 * (off.clamp(max=6.0) * visible).sum() / visible.sum().clamp(min=1)
         good = (visible & (off.detach() < 1.5)).to(off)
         total = total + 0.05 * binary_cross_entropy_with_logits(match.logit[:, 0], good)
-    return total / len(seen)
+    return total / len(estimates)
 
 
 @torch.no_grad()

@@ -238,14 +238,14 @@ def degraded(
     betas, on_grid, position, visible = [], [], [], []
     for i, image in enumerate(images[1:], 1):
         band = image if two_views else image[:, i - 1 : i]
-        seen = recorded(band, cameras[i], g, recording, lost=LOST)
-        betas.append(enlarged(seen.values, scene.cameras[0].hw))
+        beta = recorded(band, cameras[i], g, recording, lost=LOST)
+        betas.append(enlarged(beta.values, scene.cameras[0].hw))
         if two_views and _chance(recording.paper, g):
             alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
         pair = pair_of(scene, i, g)
         on_grid.append(FieldOnGrid.of(field, perturbed(pair, recording.miscalibrated, g)))
         if scene.depth:
-            transferred = transfer(pair, scene.depth[0], scene.depth[i].masked_fill(~seen.valid, torch.nan))
+            transferred = transfer(pair, scene.depth[0], scene.depth[i].masked_fill(~beta.valid, torch.nan))
             position.append(transferred[0])
             visible.append(transferred[1])
     ground_truth = ideal if recording.ideal else ideal + (alpha - grey)

@@ -172,9 +172,13 @@ def beside(alpha: RenderedView, beta: RenderedView, size: HW, hw: HW, g: Generat
     near, far = (float(d) for d in bounds(alpha.depth[None])[0])
     share = float(torch.rand((), generator=g))
     depth = middle.new_tensor(1 / (share / near + (1 - share) / far))
-    seen = beta.camera.project(alpha.camera.unproject(middle, depth))
+    projected = beta.camera.project(alpha.camera.unproject(middle, depth))
     shift = DECENTRED * (2 * torch.rand(2, generator=g, dtype=torch.float64) - 1)
-    centre = seen.x if bool(seen.valid) else middle.new_tensor([beta.camera.hw[1] / 2, beta.camera.hw[0] / 2])
+    centre = (
+        projected.x
+        if bool(projected.valid)
+        else middle.new_tensor([beta.camera.hw[1] / 2, beta.camera.hw[0] / 2])
+    )
     x, y = (centre + shift * middle.new_tensor([wanted[1], wanted[0]])).tolist()
     top, left = (_inside(c - n / 2, n, whole) for c, n, whole in zip((y, x), wanted, beta.camera.hw))
     return finite_window(beta, top, left, wanted, size)

@@ -36,19 +36,19 @@ def attend_rows(query, key, value, out, bias, which, size, spacing, top):
             score = scores[i, first:last]
             score[:] = bias[t]
             for c in range(channels):
-                own, other = query[c, y, first:last], key[c, row, first + step : last + step]
+                query_row, sampled_row = query[c, y, first:last], key[c, row, first + step : last + step]
                 for x in range(last - first):
-                    score[x] += own[x] * other[x]
+                    score[x] += query_row[x] * sampled_row[x]
         _exponentiate(pointers((scores, total)), scores.shape)
         for c in range(len(value)):
             mean = out[c, y]
             mean[:] = 0
             for i, t in enumerate(which):
                 row, first, last, step = _sampled(t, y, size, spacing, height, width)
-                weight, other = scores[i, first:last], value[c, row, first + step : last + step]
+                weight, sampled_row = scores[i, first:last], value[c, row, first + step : last + step]
                 inner = mean[first:last]
                 for x in range(last - first):
-                    inner[x] += weight[x] * other[x]
+                    inner[x] += weight[x] * sampled_row[x]
             for x in range(width):
                 mean[x] /= total[x] if total[x] != 0 else np.float32(1)
 

@@ -123,8 +123,8 @@ def _wide(camera: Camera, upright: Camera, name: str) -> Lens:
         raise ValueError(f"camera '{name}': its lens model is valid for no pixel; check the coefficients")
     angle = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])[valid].max()
     if angle > WIDEST:
-        seen, most = (f"{math.degrees(a):.0f}" for a in (angle, WIDEST))
-        text = f"camera '{name}' sees {seen} degrees off its axis; a plane image covers at most {most}"
+        degrees, most = (f"{math.degrees(a):.0f}" for a in (angle, WIDEST))
+        text = f"camera '{name}' sees {degrees} degrees off its axis; a plane image covers at most {most}"
         raise ValueError(f"{text}: crop the camera")
     plane = rays[..., :2] / rays[..., 2:].clamp(min=1e-6)
     f = float(_finest(plane, valid))
