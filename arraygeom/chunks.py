@@ -136,27 +136,27 @@ class _Plane:
     transformations): gradients through writing in place copy the whole once a part.
     """
 
-    def __init__(self, part: Tensor, tile: Tile, lengths: Sequence[int], axes: Sequence[int]) -> None:
+    def __init__(self, block: Tensor, tile: Tile, lengths: Sequence[int], axes: Sequence[int]) -> None:
         self.axes = axes
-        self.factor = (tile.outer[1] - tile.outer[0]) // part.shape[axes[0]]
+        self.factor = (tile.outer[1] - tile.outer[0]) // block.shape[axes[0]]
         self.parts: list[Tensor] = []
         self.whole: Tensor | None = None
-        if len(axes) > 1 or not (part.requires_grad or transformations()):
-            shape = list(part.shape)
+        if len(axes) > 1 or not (block.requires_grad or transformations()):
+            shape = list(block.shape)
             for axis, n in zip(axes, lengths):
                 shape[axis] = n // self.factor
-            order = sorted(range(part.ndim), key=part.stride, reverse=True)
-            self.whole = torch.empty_permuted(shape, order, dtype=part.dtype, device=part.device)
+            order = sorted(range(block.ndim), key=block.stride, reverse=True)
+            self.whole = torch.empty_permuted(shape, order, dtype=block.dtype, device=block.device)
 
-    def add(self, part: Tensor, tile: Tile) -> None:
+    def add(self, block: Tensor, tile: Tile) -> None:
         """Keep the inner part of what was made of a tile."""
         inner, outer = (tuple(n // self.factor for n in box) for box in tile)
         begin = [n for n in outer[::2] for _ in range(2)]
-        part = _cut(part, tuple(n - first for n, first in zip(inner, begin)), self.axes)
+        block = _cut(block, tuple(n - first for n, first in zip(inner, begin)), self.axes)
         if self.whole is None:
-            self.parts.append(part)
+            self.parts.append(block)
         else:
-            _cut(self.whole, inner, self.axes).copy_(part)
+            _cut(self.whole, inner, self.axes).copy_(block)
 
     def tensor(self) -> Tensor:
         """All of it."""

@@ -123,11 +123,12 @@ def segments_between(
     Clipped to the image's area and to the front of beta, in closed form (`clipped`).
     """
     h, w = beta_hw
-    part = clipped(track, near, far, (-0.5, -0.5, w - 0.5, h - 0.5))
+    visible = clipped(track, near, far, (-0.5, -0.5, w - 0.5, h - 0.5))
     start, end = (
-        _place(part.P.unbind(-1), part.D.unbind(-1), s, part.valid, beta_hw) for s in (part.high, part.low)
+        _place(visible.P.unbind(-1), visible.D.unbind(-1), s, visible.valid, beta_hw)
+        for s in (visible.high, visible.low)
     )
-    return Segments(start, end, part.valid)
+    return Segments(start, end, visible.valid)
 
 
 class Clipped(NamedTuple):

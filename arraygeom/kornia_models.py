@@ -46,7 +46,7 @@ def to_kornia_model(camera: LensView) -> CameraModel:
         )
     focal_and_centre = torch.stack([K[..., 0, 0], K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]], -1)
     batch = broadcast_shapes(K.shape[:-2], numbers.shape[:-1])
-    params = torch.cat([part.expand(*batch, -1) for part in (focal_and_centre, numbers.to(K))], -1)
+    params = torch.cat([tensor.expand(*batch, -1) for tensor in (focal_and_centre, numbers.to(K))], -1)
     return CameraModel(ImageSize(*camera.hw), kind, params.flatten(0, -2) if params.ndim > 2 else params)
 
 

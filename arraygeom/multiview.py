@@ -100,14 +100,14 @@ def _in_beta(pair: Pair, depth: Tensor, x: Tensor | None = None) -> Projected:
     depth = floating(depth)
     x = pixel_grid(alpha.hw, dtype=depth.dtype, device=depth.device) if x is None else x
     rays, valid = alpha.rays(x.reshape(*[1] * (depth.ndim + 1 - x.ndim), *x.shape))
-    known = depth.isfinite() & (depth > 0) & valid & (rays[..., 2] > 0)
-    scale = torch.where(known, depth, 1.0) / torch.where(rays[..., 2] > 0, rays[..., 2], 1.0)
+    has_depth = depth.isfinite() & (depth > 0) & valid & (rays[..., 2] > 0)
+    scale = torch.where(has_depth, depth, 1.0) / torch.where(rays[..., 2] > 0, rays[..., 2], 1.0)
     X = rays * scale[..., None]
     if not alpha.central:
         start = alpha.ray_origins(x.reshape(*[1] * (depth.ndim + 1 - x.ndim), *x.shape))
         X = X + start - rays * (start[..., 2] / torch.where(rays[..., 2] > 0, rays[..., 2], 1.0))[..., None]
     projected = beta.project_local(pair.beta_from_alpha.apply(X))
-    return projected._replace(valid=projected.valid & known & beta.contains(projected.x))
+    return projected._replace(valid=projected.valid & has_depth & beta.contains(projected.x))
 
 
 class ConsistentDepth(NamedTuple):
@@ -145,8 +145,8 @@ def consistent_depth(
         if name == alpha:
             continue
         there = _in_beta(rig.pair(alpha, name), alpha_depth)
-        known = torch.where(other.isfinite(), other, 0.0)
-        sampled, inside = sample(known[None, None].to(alpha_depth), there.x[None])
+        filled = torch.where(other.isfinite(), other, 0.0)
+        sampled, inside = sample(filled[None, None].to(alpha_depth), there.x[None])
         back = _in_beta(rig.pair(name, alpha), sampled[0, 0], there.x)
         agrees = there.valid & inside[0] & back.valid
         agrees = (

@@ -22,7 +22,7 @@ def poses_from_essential(E: Float[Tensor, "*b 3 3"]) -> Pose:
     from kornia.geometry.epipolar import decompose_essential_matrix_no_svd
 
     R1, R2, t = (
-        part.reshape(*E.shape[:-2], *part.shape[1:]) for part in decompose_essential_matrix_no_svd(E)
+        factor.reshape(*E.shape[:-2], *factor.shape[1:]) for factor in decompose_essential_matrix_no_svd(E)
     )
     R, t = torch.stack([R1, R2, R1, R2], -3), t[..., 0]
     for _ in range(STEPS):
@@ -63,7 +63,9 @@ def relative_pose(
     best = in_front.sum(-1).argmax(-1, keepdim=True)
     axis = best.ndim - 1
     R, t, in_front = (
-        part.take_along_dim(best.reshape(*best.shape, *[1] * (part.ndim - best.ndim)), axis).squeeze(axis)
-        for part in (poses.R, poses.t, in_front)
+        candidates.take_along_dim(
+            best.reshape(*best.shape, *[1] * (candidates.ndim - best.ndim)), axis
+        ).squeeze(axis)
+        for candidates in (poses.R, poses.t, in_front)
     )
     return TwoViewPose(Pose(R, t), in_front)

@@ -31,7 +31,7 @@ def projection_slopes(
     projected = camera.project(around)
     by_X = (projected.x[..., 1:4, :] - projected.x[..., 4:, :]) / (2 * step)
     return Projected(
-        *(part[..., 0, :] if part is projected.x else part[..., 0] for part in projected)
+        *(values[..., 0, :] if values is projected.x else values[..., 0] for values in projected)
     ), by_X.mT
 
 

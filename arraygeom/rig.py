@@ -355,13 +355,13 @@ class Rig(Batched):
         "depth.near" and "depth.far" (metres), for instance ["colour.*", "depth.near"]. An uncalibrated view
         has its lens's. Raises ValueError for a pattern that matches nothing.
         """
-        known = self._parameter_shapes()
+        shapes = self._parameter_shapes()
         chosen: dict[str, Tensor] = {}
         for pattern in free:
-            names = fnmatch.filter(known, pattern)
+            names = fnmatch.filter(shapes, pattern)
             if not names:
-                raise ValueError(f"no rig parameter matches '{pattern}' (there are: {', '.join(known)})")
-            chosen |= {n: torch.zeros_like(known[n]).requires_grad_() for n in names}
+                raise ValueError(f"no rig parameter matches '{pattern}' (there are: {', '.join(shapes)})")
+            chosen |= {n: torch.zeros_like(shapes[n]).requires_grad_() for n in names}
         return chosen
 
     def perturbed(self, changes: Mapping[str, Tensor]) -> Rig:
@@ -422,17 +422,17 @@ class Rig(Batched):
 
     def _parameter_shapes(self) -> dict[str, Tensor]:
         """One tensor of the right shape, type and device for each parameter."""
-        known: dict[str, Tensor] = {}
+        shapes: dict[str, Tensor] = {}
         for name, camera in self.cameras.items():
             if isinstance(camera, Camera):
-                known |= {f"{name}.rotation": camera.t, f"{name}.translation": camera.t}
-                known |= {f"{name}.focal": camera.K[..., 0, :2], f"{name}.centre": camera.K[..., :2, 2]}
+                shapes |= {f"{name}.rotation": camera.t, f"{name}.translation": camera.t}
+                shapes |= {f"{name}.focal": camera.K[..., 0, :2], f"{name}.centre": camera.K[..., :2, 2]}
             lens = camera.distortion if isinstance(camera, LensView) else None
             if lens is not None and lens.coefficients.numel():
-                known[f"{name}.distortion"] = lens.coefficients
+                shapes[f"{name}.distortion"] = lens.coefficients
         if self.depth is not None:
-            known |= {"depth.near": self.depth[0], "depth.far": self.depth[1]}
-        return known
+            shapes |= {"depth.near": self.depth[0], "depth.far": self.depth[1]}
+        return shapes
 
 
 def _view(name: str, camera: Any) -> View:

@@ -70,12 +70,12 @@ class Sensor:
             check_above(0, itself=False, gain=gain)
         check_above(1, whole=True, bits=self.bits)
         check_above(0, black_level=self.black_level)
-        for name, value, known in (
+        for name, value, allowed in (
             ("coding", self.coding, CODINGS),
             ("bayer", self.bayer, (None, *PATTERNS)),
         ):
-            if value not in known:
-                raise ValueError(f"{name} is {value!r}: wanted {' or '.join(repr(v) for v in known if v)}")
+            if value not in allowed:
+                raise ValueError(f"{name} is {value!r}: wanted {' or '.join(repr(v) for v in allowed if v)}")
 
 
 torch.serialization.add_safe_globals([Band, Curve, Sensor])

@@ -155,8 +155,8 @@ def _ahead(function: Callable[[Any], Any], parts: Sequence[Any]) -> Iterator[Any
     count, work = threads(), _as_here(function)
     ahead: deque[Future[Any]] = deque()
     try:
-        for part in parts:
-            ahead.append(_pool(os.getpid(), count).submit(work, part))
+        for argument in parts:
+            ahead.append(_pool(os.getpid(), count).submit(work, argument))
             if len(ahead) > count:
                 yield ahead.popleft().result()
         while ahead:

@@ -169,7 +169,7 @@ def _sighted(
     finite = x.isfinite().all(-1)
     x = torch.where(finite[..., None], x, 0.0)
     centres, directions, usable = (
-        torch.stack(part) for part in zip(*(world_rays(c, p) for c, p in zip(cameras, x)))
+        torch.stack(tensors) for tensors in zip(*(world_rays(c, p) for c, p in zip(cameras, x)))
     )
     usable = usable & finite if seen is None else usable & finite & seen
     focal = [beside(c.K[..., :2, :2].det().abs(), x.ndim - 2).expand_as(u) for c, u in zip(cameras, usable)]

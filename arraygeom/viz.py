@@ -220,11 +220,11 @@ def draw_matches(
     count, half = 7, 18
     figure = new_figure(figsize=(1.55 * count, 3.7 * len(matches)), layout="constrained")
     parts: Any = figure.subfigures(len(matches), 1, squeeze=False)
-    for row, (part, (name, (x, y))) in enumerate(zip(parts[:, 0], matches.items())):
+    for row, (subfigure, (name, (x, y))) in enumerate(zip(parts[:, 0], matches.items())):
         near = near_line(rig.pair(alpha, name), x, y, 2 * half)
         chosen = _spread(x, min(count, len(x)))
         factor = max(rig[name].hw) / max(rig[alpha].hw)
-        axes = part.subplots(2, count, squeeze=False)
+        axes = subfigure.subplots(2, count, squeeze=False)
         for blank in axes.flat:
             blank.set_axis_off()
         for column, i in enumerate(chosen):
@@ -234,7 +234,7 @@ def draw_matches(
             below.plot(*numpy(near.curve[i]).T, color=COLOURS[1 + row % 7], lw=1.4)
             below.set_title(f"{float(near.distance[i]):.2f} px off", fontsize=9)
         median = float(near.distance.nanmedian())
-        part.suptitle(
+        subfigure.suptitle(
             f"{alpha} (above) and {name} (below): "
             f"{len(x)} matched points, {median:.2f} px from their lines (median)",
             fontsize=10,
@@ -245,8 +245,8 @@ def draw_matches(
 def _draw_patch(axes: Axes, hw: HW, image: Any, middle: np.ndarray, half: float) -> None:
     """An image around a point, which a small cross marks without covering it."""
     show_image(axes, hw, image)
-    for part in ([0.12, 0.35], [-0.12, -0.35]):
-        ends = np.array(part) * half
+    for span in ([0.12, 0.35], [-0.12, -0.35]):
+        ends = np.array(span) * half
         for dx, dy in ((ends, 0 * ends), (0 * ends, ends)):
             axes.plot(middle[0] + dx, middle[1] + dy, color="gold", lw=1.2)
     axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] + half, middle[1] - half))

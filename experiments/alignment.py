@@ -246,8 +246,8 @@ def _best_match(
 ) -> tuple[list[tuple[float, float]], float]:
     """Of the patch and its halves: the offset (y, x) of what is most like them; how like the patch is."""
     offsets, like = [], []
-    for part in PARTS:
-        rows, columns = (slice(at + s.start, at + s.stop) for at, s in zip(pixel[::-1], part))
+    for section in PARTS:
+        rows, columns = (slice(centre + s.start, centre + s.stop) for centre, s in zip(pixel[::-1], section))
         around = (slice(s.start - SEARCH, s.stop + SEARCH) for s in (rows, columns))
         matched = cv2.matchTemplate(beta[tuple(around)], alpha[rows, columns], cv2.TM_CCOEFF_NORMED)
         scores = np.square(np.nan_to_num(matched))
@@ -259,12 +259,12 @@ def _best_match(
 
 def _peak(scores: NDArray[Any], best: Sequence[Any], axis: int) -> float:
     """The position along an axis of the parabola's peak through the largest value and its neighbours."""
-    at = int(best[axis])
-    if not 0 < at < scores.shape[axis] - 1:
-        return float(at)
-    before, middle, after = np.take(scores, best[1 - axis], 1 - axis)[at - 1 : at + 2]
+    index = int(best[axis])
+    if not 0 < index < scores.shape[axis] - 1:
+        return float(index)
+    before, middle, after = np.take(scores, best[1 - axis], 1 - axis)[index - 1 : index + 2]
     bend = before - 2 * middle + after
-    return at + (0.0 if bend >= 0 else float(0.5 * (before - after) / bend))
+    return index + (0.0 if bend >= 0 else float(0.5 * (before - after) / bend))
 
 
 def by_homography(

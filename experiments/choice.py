@@ -82,7 +82,7 @@ class Kept(NamedTuple):
 
     def upside_down(self) -> Kept:
         """The mirror image."""
-        flipped = {n: part.flip(-2) for n, part in self._asdict().items() if n != "blurs"}
+        flipped = {n: plane.flip(-2) for n, plane in self._asdict().items() if n != "blurs"}
         return self._replace(**flipped)
 
 
@@ -109,7 +109,7 @@ def kept(folder: Path, network: GuidedPAT, pairs: Iterator[Made], without: Seque
         file = folder / f"{i:05}.safetensors"
         if not file.exists():
             pair = make()
-            if pair.disparity is None or any(part in pair.name for part in without):
+            if pair.disparity is None or any(fragment in pair.name for fragment in without):
                 continue
             write_tensors(file, matched(network, pair, i)._asdict())
         samples.append(Kept(**load_file(file)))
@@ -130,13 +130,16 @@ def matched(network: GuidedPAT, pair: StereoPair, seed: int) -> Kept:
     ((views, matches),) = given
     h, w = (n // FINE * FINE for n in truth.shape[1:])
     whole = (views.alpha, views.beta, matches.disparity)
-    alpha, beta, disparity = (part[0, :, :h, :w].half() for part in whole)
-    known = Disparity(*(part[:h, :w] for part in pair.disparity))
+    alpha, beta, disparity = (plane[0, :, :h, :w].half() for plane in whole)
+    true_disparity = Disparity(*(plane[:h, :w] for plane in pair.disparity))
     facts = matches.facts[0, :, : h // FINE, : w // FINE].half()
     blurs = torch.tensor(matches.comparison.whole.blurs)[:, 0]
-    truth, visible = (known.value * known.valid)[None].half(), known.regions().seen[None]
+    truth, visible = (
+        (true_disparity.value * true_disparity.valid)[None].half(),
+        true_disparity.regions().seen[None],
+    )
     planes = alpha, beta, disparity, facts, truth, visible, blurs
-    return Kept(*(part.contiguous() for part in planes))
+    return Kept(*(plane.contiguous() for plane in planes))
 
 
 def losses(
@@ -170,7 +173,7 @@ def window(one: Kept, side: int, g: Generator) -> tuple[Tensor, Tensor, Tensor, 
     h, w = one.alpha.shape[-2:]
     one = one.rows(FINE * below((h - side) // FINE + 1, g), side)
     one = one.upside_down() if below(2, g) else one
-    alpha, beta, disparity, facts, truth = (part.float()[None] for part in one[:-2])
+    alpha, beta, disparity, facts, truth = (plane.float()[None] for plane in one[:-2])
     visible = one.seen[None]
     level = Normalisation(torch.zeros(3, 1, 1, 1, 1), ([float(one.blurs[0])], [float(one.blurs[1])]))
     matches = BetaMatches(disparity, facts, Comparison(None, level, level))

@@ -71,7 +71,7 @@ class PatchGrid:
                 f"patches of {self.hw[1]}x{self.hw[0]} do not fit into an image "
                 f"of {hw[1]}x{hw[0]}: give smaller ones"
             )
-        tops, lefts = (_evenly(whole - part, n) for whole, part, n in zip(hw, self.hw, self.grid))
+        tops, lefts = (_evenly(whole - size, n) for whole, size, n in zip(hw, self.hw, self.grid))
         return [(top, left) for top in tops for left in lefts]
 
 

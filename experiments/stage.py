@@ -79,8 +79,8 @@ class SystemScene(LayeredScenes):
 
         def rendered(band: Box) -> RenderedView:
             top, bottom, left, right = band
-            part = camera.crop(top, left, (bottom - top, right - left))
-            image, depth = self._seen(layers or self.scene, part, factor)[:2]
+            cropped = camera.crop(top, left, (bottom - top, right - left))
+            image, depth = self._seen(layers or self.scene, cropped, factor)[:2]
             return image, depth[0]
 
         return assembled((h, w), ((tile, rendered(tile.outer)) for tile in tiles_of((h, w), (rows, w), 1)))

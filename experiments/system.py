@@ -365,7 +365,9 @@ def _confidence_line(frame: Frame, ground_truth: Tensor) -> list[str]:
     off = (to_luma_chroma(frame.image)[1] - to_luma_chroma(ground_truth)[1]).abs().amax(0).flatten()
     order = frame.confidence.flatten().argsort()
     quarter = len(order) // 4
-    high, low = (float((off[part] > WRONG).float().mean()) for part in (order[-quarter:], order[:quarter]))
+    high, low = (
+        float((off[pixels] > WRONG).float().mean()) for pixels in (order[-quarter:], order[:quarter])
+    )
     share = f"{high:.1%} of the quarter where confidence is highest, {low:.1%} where lowest."
     return ["", f"Wrong colours: {share}"]
 

@@ -46,12 +46,12 @@ class AroundDepth:
 
         def around(x: Tensor) -> Segments:
             depth = _at_nearest(self.depth, x, pair.alpha, self.view).to(x)
-            known = depth.isfinite() & (depth > 0)
+            has_depth = depth.isfinite() & (depth > 0)
             near = far = depth
-            if pair.depth is not None or not bool(known.all()):
+            if pair.depth is not None or not bool(has_depth.all()):
                 near, far = (beside(bound.to(x), x.ndim - 1) for bound in pair.depth_range)
-            near = torch.where(known, depth / (1 + self.tolerance), near)
-            far = torch.where(known, depth * (1 + self.tolerance), far)
+            near = torch.where(has_depth, depth / (1 + self.tolerance), near)
+            far = torch.where(has_depth, depth * (1 + self.tolerance), far)
             return segments_between(pinhole_track(pair, x), near, far, pair.beta.hw)
 
         return segments_by_rows(around, pair, floating(x))
@@ -116,17 +116,19 @@ class AroundMatches:
             )
         alpha, beta = self.views or (None, None)
         there = _at_nearest(self.positions, x, pair.alpha, alpha).to(x)
-        known = there.isfinite().all(-1)
-        there = torch.where(known[..., None], there, 0.0)
+        matched = there.isfinite().all(-1)
+        there = torch.where(matched[..., None], there, 0.0)
         if beta is not None:
             there, placed = straight_pixels(there.double(), pair.beta, beta)
-            there, known = there.to(x), known & placed
+            there, matched = there.to(x), matched & placed
         fraction, length = whole.fraction(there).clamp(0, 1), whole.length
-        known = known & whole.valid & ((whole.at(fraction) - there).norm(dim=-1) <= self.tolerance + BESIDE)
+        matched = (
+            matched & whole.valid & ((whole.at(fraction) - there).norm(dim=-1) <= self.tolerance + BESIDE)
+        )
         reach = self.tolerance / length.clamp(min=1e-6)
         low, high = ((fraction + step).clamp(0, 1) for step in (-reach, reach))
-        start = torch.where(known[..., None], whole.at(low), whole.start)
-        end = torch.where(known[..., None], whole.at(high), whole.end)
+        start = torch.where(matched[..., None], whole.at(low), whole.start)
+        end = torch.where(matched[..., None], whole.at(high), whole.end)
         return Segments(start, end, whole.valid)
 
 

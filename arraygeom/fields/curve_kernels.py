@@ -29,7 +29,7 @@ def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, 
     nodes, samples = len(even), len(fractions)
     s, x, y, visible = np.empty(nodes), np.empty(nodes), np.empty(nodes), np.empty(nodes, np.bool_)
     pieces = np.empty((4, nodes - 1))
-    at, s_at, x_at, y_at = np.empty(samples), np.empty(samples), np.empty(samples), np.empty(samples)
+    along, s_at, x_at, y_at = np.empty(samples), np.empty(samples), np.empty(samples), np.empty(samples)
     visible_at = np.empty(samples, np.bool_)
     for p in range(begin, end):
         total = 0.0
@@ -38,8 +38,8 @@ def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, 
             _project(first[p], last[p], s, lens, x, y, visible)
             total = _pieces(x, y, visible, hw, pieces)
         if total > 0:
-            _along(pieces, total, fractions, at)
-            _shares(first[p], last[p], lens.wide, at, s_at)
+            _along(pieces, total, fractions, along)
+            _shares(first[p], last[p], lens.wide, along, s_at)
             _project(first[p], last[p], s_at, lens, x_at, y_at, visible_at)
         right, bottom = hw[1] - 0.5, hw[0] - 0.5
         for i in range(samples):

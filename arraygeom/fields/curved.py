@@ -172,21 +172,23 @@ class RayCurve(NamedTuple):
         if beta.distortion is None:
             h, w = beta.hw
             pixels = Track(_each(beta.K, points.a), _each(beta.K, points.b))
-            part = clipped(pixels, near, far, (-0.5, -0.5, w - 0.5, h - 0.5))
+            visible = clipped(pixels, near, far, (-0.5, -0.5, w - 0.5, h - 0.5))
         elif limits is None:
-            part = clipped(points, near, far, None, in_front=not beta.distortion.sees_behind)
+            visible = clipped(points, near, far, None, in_front=not beta.distortion.sees_behind)
         else:
-            part = clipped(points, near, far, [beside(v, x.ndim - 1) for v in limits])
+            visible = clipped(points, near, far, [beside(v, x.ndim - 1) for v in limits])
         w_far, w_near = (beside(1 / d.to(x.dtype), x.ndim - 1) for d in (far, near))
-        ends = (w_far + torch.where(part.valid, s, 0.0) * (w_near - w_far) for s in (part.high, part.low))
-        inverse = (torch.where(part.valid, v, 1.0) for v in ends)
+        ends = (
+            w_far + torch.where(visible.valid, s, 0.0) * (w_near - w_far) for s in (visible.high, visible.low)
+        )
+        inverse = (torch.where(visible.valid, v, 1.0) for v in ends)
         near_end, far_end = inverse
         if not beta.central:
             remote = REMOTE / beside(pose.t.norm(dim=-1) + near.to(x.dtype), x.ndim - 1)
             near_end, far_end = torch.maximum(near_end, remote), torch.maximum(far_end, remote)
         first, last = (points.a + v[..., None] * points.b for v in (near_end, far_end))
         wide = beta.distortion is not None and limits is None and beta.central
-        return cls(first, last, ahead & part.valid, beta, wide, (near_end, far_end))
+        return cls(first, last, ahead & visible.valid, beta, wide, (near_end, far_end))
 
     @property
     def longest_piece(self) -> float:
@@ -202,12 +204,12 @@ class RayCurve(NamedTuple):
         lens = self.beta.distortion
         numbers = [self.first, self.last, self.beta.K, *([] if lens is None else [lens.coefficients])]
         free = torch.is_grad_enabled() and any(t.requires_grad for t in numbers)
-        known = lens is None or (
+        lens_compiled = lens is None or (
             isinstance(lens, Distortion)
             and lens.model in COMPILED_LENSES
             and lens.coefficients.shape[-1] < 14
         )
-        return not free and known and not self.beta.batch_shape and compilable(self.first)
+        return not free and lens_compiled and not self.beta.batch_shape and compilable(self.first)
 
     def positions(self, nodes: int, samples: int) -> Positions:
         """What `Curved` gives, by a compiled loop in float64."""

@@ -79,7 +79,7 @@ class NearestVoxels:
         n, size = len(line), line.dtype.itemsize
         xy = torch.from_numpy(np.empty((n, self.count, 2), f"f{size}"))
         mask = torch.from_numpy(np.empty((n, self.count), bool))
-        numbers = [part.contiguous().numpy() for part in (line, centre, usable)]
+        numbers = [tensor.contiguous().numpy() for tensor in (line, centre, usable)]
         rest = (self.window, xy.numpy().dtype.type(TIE / (hw[0] * hw[1])), hw, xy.numpy(), mask.numpy())
         in_parallel([partial(nearest_pixels, *span, *numbers, *rest) for span in spans(n, PIECE)])
         return xy, mask

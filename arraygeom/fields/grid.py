@@ -54,24 +54,24 @@ class FieldOnGrid:
         `hw` is the size of the grid if it is not alpha's, as for images that are padded at the bottom and the
         right.
         """
-        at, hw = lazily(field, pair), hw or pair.alpha.hw
+        evaluate, hw = lazily(field, pair), hw or pair.alpha.hw
         device = device_of(pair)
         # Explicit positions of a whole frame may not fit into memory: one point shows which kind the field
         # gives.
-        kind = at(torch.full((1, 2), 0.25, dtype=torch.float64))
+        kind = evaluate(torch.full((1, 2), 0.25, dtype=torch.float64))
         if isinstance(kind, Positions):
-            return cls(at, kind.xy.shape[-2], None)
-        pixels = _on_grid(at, hw, device=device)
+            return cls(evaluate, kind.xy.shape[-2], None)
+        pixels = _on_grid(evaluate, hw, device=device)
         h, w = pair.alpha.hw
         sparse = (..., slice(0, h, 4), slice(0, w, 4))
         longest = torch.where(pixels.valid[sparse], pixels.length[sparse].detach().float(), 0.0).max()
-        on_grid = cls(at, int(torch.ceil(longest)) + 1, pixels)
+        on_grid = cls(evaluate, int(torch.ceil(longest)) + 1, pixels)
         return replace(on_grid, blocks=on_grid.of_blocks(BLOCK)) if blocks and not on_grid.large else on_grid
 
     @classmethod
-    def evaluated(cls, at: Callable[[Tensor], Segments], hw: HW, samples: int) -> FieldOnGrid:
+    def evaluated(cls, evaluate: Callable[[Tensor], Segments], hw: HW, samples: int) -> FieldOnGrid:
         """A straight field, given as a function of alpha's pixels, on a grid of even sides."""
-        on_grid = cls(at, samples, _on_grid(at, hw))
+        on_grid = cls(evaluate, samples, _on_grid(evaluate, hw))
         return replace(on_grid, blocks=on_grid.of_blocks(BLOCK))
 
     def of_blocks(self, side: int) -> Segments:
@@ -130,7 +130,7 @@ class FieldOnGrid:
     def nbytes(self) -> int:
         """Memory held."""
         parts = [p for p in (self.pixels, self.blocks) if p is not None]
-        return sum(t.nbytes for part in parts for t in (part.start, part.end, part.valid))
+        return sum(t.nbytes for segments in parts for t in (segments.start, segments.end, segments.valid))
 
     def cut(self, box: Box, shift: tuple[int, int] = (0, 0)) -> FieldOnGrid:
         """The field of alpha's pixels in a box (even sides), for a beta that began at `shift` (x, y)."""
@@ -154,16 +154,16 @@ class FieldOnGrid:
             parts = [t if len(t) == 1 else t[i : i + 1] for t in vars(locations).values()]
             return type(locations)(*parts)
 
-        pixels, blocks = (part and one(part) for part in (self.pixels, self.blocks))
+        pixels, blocks = (segments and one(segments) for segments in (self.pixels, self.blocks))
         return FieldOnGrid(lambda x: one(self.at(x)), self.samples, pixels, blocks)  # type: ignore[arg-type]
 
 
-def _on_grid(at: At, hw: HW, side: int = 1, device: torch.device | None = None) -> Segments:
+def _on_grid(evaluate: At, hw: HW, side: int = 1, device: torch.device | None = None) -> Segments:
     """A straight field at the centres of h x w blocks of so many pixels as (B or 1, h, w)."""
     h, w = hw
 
     def segments(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
-        locations = at((torch.stack([x, y], -1).reshape(-1, 2) + 0.5) * side - 0.5)
+        locations = evaluate((torch.stack([x, y], -1).reshape(-1, 2) + 0.5) * side - 0.5)
         assert isinstance(locations, Segments)
         # Own fields may divide by zero where nothing is valid; compiled loops look up whatever is there.
         total, shape = locations.start + locations.end, (-1, *y.shape[1:])

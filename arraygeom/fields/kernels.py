@@ -86,12 +86,12 @@ def _sort(keys, n, limit, order, begins, buckets, ordered):
     for k in range(BUCKETS):
         begins[k + 1] += begins[k]
     for i in range(n):
-        at = begins[buckets[i]]
-        order[at], ordered[at] = i, keys[i]
-        begins[buckets[i]] = at + 1
+        slot = begins[buckets[i]]
+        order[slot], ordered[slot] = i, keys[i]
+        begins[buckets[i]] = slot + 1
     for i in range(1, n):
-        one, key, at = order[i], ordered[i], i
-        while at > 0 and ordered[at - 1] > key:
-            order[at], ordered[at] = order[at - 1], ordered[at - 1]
-            at -= 1
-        order[at], ordered[at] = one, key
+        one, key, slot = order[i], ordered[i], i
+        while slot > 0 and ordered[slot - 1] > key:
+            order[slot], ordered[slot] = order[slot - 1], ordered[slot - 1]
+            slot -= 1
+        order[slot], ordered[slot] = one, key

@@ -59,10 +59,10 @@ def answered(field: ReceptiveField, pair: Pair, x: Real[Tensor, "*n 2"]) -> Samp
         raise ValueError(
             f"the field {name} gave a {type(answer).__name__}: fields give Segments or Positions"
         )
-    for part, value in vars(answer).items():
+    for attribute, value in vars(answer).items():
         if not isinstance(value, Tensor):
             kind, held = type(answer).__name__, type(value).__name__
-            raise ValueError(f"the field {name} gave {kind} whose {part} is a {held}: give a tensor")
+            raise ValueError(f"the field {name} gave {kind} whose {attribute} is a {held}: give a tensor")
     shape = answer.valid.shape if isinstance(answer, Segments) else answer.mask.shape[:-1]
     batch = len(pair.batch_shape)
     if len(shape) != x.ndim - 1 or shape[batch:] != x.shape[batch:-1]:
@@ -85,8 +85,8 @@ def lazily(field: ReceptiveField, pair: Pair) -> Callable[[Tensor], SamplingLoca
 
 def device_of(pair: Pair) -> torch.device | None:
     """Where a pair's numbers are; None for one of which only the sizes are known."""
-    known = pair.alpha if isinstance(pair.alpha, Camera) else pair.link
-    return next((t.device for t, _ in tensors_of(known)), None)
+    calibration = pair.alpha if isinstance(pair.alpha, Camera) else pair.link
+    return next((t.device for t, _ in tensors_of(calibration)), None)
 
 
 def all_pixels(pair: Pair) -> Float[Tensor, "*b h w 2"]:
@@ -113,4 +113,4 @@ def segments_by_rows(f: Callable[[Tensor], Segments], pair: Pair, x: Float[Tenso
     if x.ndim <= axis + 1:
         return f(x)
     rows = max(1, CHUNK * x.shape[axis] * 2 // max(x.numel(), 1))
-    return Segments(*chunked(lambda part: vars(f(part)).values(), x, rows=rows, axis=axis))
+    return Segments(*chunked(lambda pixels: vars(f(pixels)).values(), x, rows=rows, axis=axis))

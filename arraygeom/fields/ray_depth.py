@@ -42,8 +42,8 @@ def ray_depth(
     near, far = pair.depth_range
 
     def of(x: Tensor, x_beta: Tensor, deviation: Tensor) -> tuple[Tensor, ...]:
-        known = x.isfinite().all(-1) & x_beta.isfinite().all(-1)
-        x, x_beta = (torch.where(known[:, None], p, 0.0) for p in (x, x_beta))
+        finite = x.isfinite().all(-1) & x_beta.isfinite().all(-1)
+        x, x_beta = (torch.where(finite[:, None], p, 0.0) for p in (x, x_beta))
         curve = RayCurve.of(pair, near, far, x, bounds)
         low, high = torch.zeros_like(x[:, :1]), torch.ones_like(x[:, :1])
         for count in (NODES, FINER, FINER, FINER):
@@ -53,7 +53,7 @@ def ray_depth(
             low, high = (fraction.gather(-1, (best + step).clamp(0, count - 1)) for step in (-1, 1))
         there = _nearest(curve, fraction.gather(-1, best).detach(), x_beta)
         inverse = curve.inverse_depth(there)[:, 0]
-        valid = known & curve.valid & apart.gather(-1, best)[:, 0].isfinite() & (inverse > 0)
+        valid = finite & curve.valid & apart.gather(-1, best)[:, 0].isfinite() & (inverse > 0)
         depth = torch.where(valid, 1 / torch.where(valid, inverse, 1.0), 0.0)
         return (
             depth,

@@ -96,8 +96,8 @@ def _follows_beta(field: ReceptiveField, pair: Pair) -> bool:
     if isinstance(field, ThroughLenses | Moved):
         return _follows_beta(field.field, pair)
     if isinstance(field, HomographyDisplacement):
-        known = pair.calibrated if pair.link is None else pair.link.H is not None
-        return field.displacement is not None and known
+        calibrated = pair.calibrated if pair.link is None else pair.link.H is not None
+        return field.displacement is not None and calibrated
     return isinstance(field, Epipolar | EpipolarLine | Curved)
 
 

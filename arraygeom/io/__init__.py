@@ -120,8 +120,8 @@ def recognise(path: str | Path) -> str:
     for name, reader in READERS.items():
         if reader.recognises(path, head):
             return name
-    known = ", ".join(READERS)
-    raise UnknownRigFormat(path, None, f"is not a rig file of a known format ({known}); or name its format")
+    formats = ", ".join(READERS)
+    raise UnknownRigFormat(path, None, f"is not a rig file of a known format ({formats}); or name its format")
 
 
 def _left_out(rig: Rig, format: str) -> str:

@@ -65,12 +65,12 @@ def _xmp(content: bytes) -> dict[tuple[str, str], str]:
     for described in root.iter("{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"):
         parts = [(key, value) for key, value in described.attrib.items()]
         parts += [
-            (child.tag, ",".join(text for part in child.itertext() if (text := part.strip())))
+            (child.tag, ",".join(text for raw in child.itertext() if (text := raw.strip())))
             for child in described
         ]
         for key, value in parts:
             uri, _, name = key.removeprefix("{").partition("}")
-            namespace = next((known for known in (PIX4D, DJI, MICASENSE) if known in uri), None)
+            namespace = next((candidate for candidate in (PIX4D, DJI, MICASENSE) if candidate in uri), None)
             if namespace and name:
                 tags[namespace, name] = value.strip()
     return tags

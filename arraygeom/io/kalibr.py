@@ -102,10 +102,10 @@ def _camera(fields: Entry, pose: Pose) -> Camera:
 
 def _lens(camera: str, before: list[float], fields: Entry) -> Distortion | None:
     """The lens of a camera model and a distortion model; `before` are the numbers before focal lengths."""
-    lens, _, known = MODELS[camera]
+    lens, _, supported = MODELS[camera]
     model = fields.get("distortion_model", "none")
-    if model.value not in known:
-        raise model.fail(f"is '{model.value}'; supported for {camera}: {', '.join(known)}: {AGAIN}")
+    if model.value not in supported:
+        raise model.fail(f"is '{model.value}'; supported for {camera}: {', '.join(supported)}: {AGAIN}")
     bent, count = DISTORTIONS.get(model.value, (None, 0))
     c = fields["distortion_coeffs"].numbers((count,)).tolist() if count else []
     if lens is not None:

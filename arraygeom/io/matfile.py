@@ -85,22 +85,22 @@ def _unpacked(data: memoryview) -> memoryview:
 
 
 def _elements(data: memoryview, order: str) -> Iterator[_Element]:
-    at = 0
-    while at < len(data):
-        if at + 8 > len(data):
+    offset = 0
+    while offset < len(data):
+        if offset + 8 > len(data):
             raise ValueError("it ends within a tag")
-        kind, length = struct.unpack_from(order + "II", data, at)
+        kind, length = struct.unpack_from(order + "II", data, offset)
         small = kind >> 16
         if small:
             if small > 4:
                 raise ValueError("a short element is too long")
-            yield _Element(kind & 0xFFFF, data[at + 4 : at + 4 + small])
-            at += 8
+            yield _Element(kind & 0xFFFF, data[offset + 4 : offset + 4 + small])
+            offset += 8
             continue
-        if at + 8 + length > len(data):
+        if offset + 8 + length > len(data):
             raise ValueError("it ends within an element")
-        yield _Element(kind, data[at + 8 : at + 8 + length])
-        at += 8 + length + (0 if kind == COMPRESSED else -length % 8)
+        yield _Element(kind, data[offset + 8 : offset + 8 + length])
+        offset += 8 + length + (0 if kind == COMPRESSED else -length % 8)
 
 
 def _check_matrix(data: memoryview, order: str, depth: int) -> str | None:
@@ -129,7 +129,8 @@ def _check_contents(parts: Iterator[_Element], order: str, depth: int, what: tup
     if kind in (CELL, STRUCT):
         wanted = count * (_fields(parts, order) if kind == STRUCT else 1)
         inner = [
-            _check_matrix(part.data, order, depth + 1) if len(part.data) else "" for part in _matrices(parts)
+            _check_matrix(element.data, order, depth + 1) if len(element.data) else ""
+            for element in _matrices(parts)
         ]
         if len(inner) != wanted:
             raise ValueError("a struct or cell has another number of entries than it states")
@@ -137,10 +138,10 @@ def _check_contents(parts: Iterator[_Element], order: str, depth: int, what: tup
     rest = list(parts)
     if len(rest) != (2 if is_complex else 1):
         raise ValueError("a matrix has another number of parts than it states")
-    for part in rest:
-        size = SIZES.get(part.kind)
+    for element in rest:
+        size = SIZES.get(element.kind)
         # Text may be coded with a varying number of bytes.
-        if size is None or (len(part.data) != count * size and not (kind == TEXT and part.kind == 16)):
+        if size is None or (len(element.data) != count * size and not (kind == TEXT and element.kind == 16)):
             raise ValueError("a matrix has another number of values than it states")
     return True
 
@@ -160,7 +161,7 @@ def _fields(parts: Iterator[_Element], order: str) -> int:
 
 
 def _matrices(parts: Iterator[_Element]) -> Iterator[_Element]:
-    for part in parts:
-        if part.kind != MATRIX:
+    for element in parts:
+        if element.kind != MATRIX:
             raise ValueError("an entry of a struct or cell is no matrix")
-        yield part
+        yield element

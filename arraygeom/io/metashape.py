@@ -33,7 +33,7 @@ def read(source: RigSource) -> Rig:
     if len(chunks) != 1:
         raise source.fail("chunk", f"occurs {len(chunks)} times: export one chunk's cameras")
     sensors = {sensor.get("id"): sensor for sensor in chunks[0].iter("sensor")}
-    scales = {part.get("id"): _scale(source, part) for part in chunks[0].iter("component")}
+    scales = {component.get("id"): _scale(source, component) for component in chunks[0].iter("component")}
     scale = _scale(source, chunks[0])
     views: dict[str, LensView] = {}
     cameras, left_out = [], []
@@ -105,9 +105,9 @@ def _lens(source: RigSource, calibration: ET.Element, entry: str) -> Distortion 
     return source.at([k1, k2, p2, p1, k3, k4, 0.0, 0.0], entry).lens(THIN_PRISM_FISHEYE)
 
 
-def _scale(source: RigSource, part: ET.Element) -> float | None:
+def _scale(source: RigSource, element: ET.Element) -> float | None:
     """Metres a unit of a chunk or a component, if that is known."""
-    text = part.findtext("transform/scale")
+    text = element.findtext("transform/scale")
     return None if text is None else source.at(text, "scale").words().number()
 
 

@@ -58,8 +58,8 @@ def _lens(model: Entry, numbers: Entry) -> LensModel | None:
     name = str(model.value)
     splined = SPLINED.fullmatch(name)
     if not splined and name not in LENSES and name != SPHERE:
-        known = ", ".join([*LENSES, SPHERE, "LENSMODEL_SPLINED_STEREOGRAPHIC"])
-        raise model.fail(f"is '{name}'; of mrcal's {known} are read: use mrcal-convert-lensmodel")
+        supported = ", ".join([*LENSES, SPHERE, "LENSMODEL_SPLINED_STEREOGRAPHIC"])
+        raise model.fail(f"is '{name}'; of mrcal's {supported} are read: use mrcal-convert-lensmodel")
     if not splined:
         rest = numbers.numbers((4 + LENSES.get(name, 0),))[4:]
         return Equirectangular() if name == SPHERE else model.source.at(rest, "intrinsics").brown_conrady()

@@ -218,15 +218,15 @@ def _lens(entry: Entry) -> LensModel | None:
 
 def _model(entry: Entry, kind: type[CameraModel]) -> CameraModel:
     """A camera model with its own numbers: tensors, models within it, and what is neither as it is."""
-    known = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    _check_keys(entry, ("model", *known))
+    fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    _check_keys(entry, ("model", *fields))
     numbers: dict[str, Any] = {}
     for name, value in entry.items():
         if isinstance(value.value, dict):
             numbers[name] = _lens(value)
         elif name != "model":
-            numbers[name] = value.tensor() if "Tensor" in str(known[name].type) else value.value
-    missing = [n for n, f in known.items() if n not in numbers and f.default is f.default_factory is MISSING]
+            numbers[name] = value.tensor() if "Tensor" in str(fields[name].type) else value.value
+    missing = [n for n, f in fields.items() if n not in numbers and f.default is f.default_factory is MISSING]
     if missing:
         raise entry.fail(f"has no {' or '.join(missing)}, which a {entry['model'].value} camera has")
     model = _made(entry, kind, **numbers)
@@ -237,16 +237,16 @@ def _model(entry: Entry, kind: type[CameraModel]) -> CameraModel:
 def _sensor(fields: Entry) -> Sensor:
     stated = {key: entry for key, entry in fields.items() if entry.value is not None}
     words = ("response", "coding", "bayer")
-    known: dict[str, Any] = {key: stated[key].value for key in words if key in stated}
-    if isinstance(known.get("response"), dict):
-        known["response"] = _response(stated["response"])
+    arguments: dict[str, Any] = {key: stated[key].value for key in words if key in stated}
+    if isinstance(arguments.get("response"), dict):
+        arguments["response"] = _response(stated["response"])
     numbers = ("frame_rate", "time_offset", "exposure", "bits", "black_level")
-    known |= {key: stated[key].number() for key in numbers if key in stated}
-    bits, black = known.get("bits"), known.get("black_level", 0.0)
+    arguments |= {key: stated[key].number() for key in numbers if key in stated}
+    bits, black = arguments.get("bits"), arguments.get("black_level", 0.0)
     if bits is not None:
         if bits not in range(1, 17):
             raise stated["bits"].fail(f"is {bits:g}; wanted a whole number from 1 to 16")
-        known["bits"] = int(bits)
+        arguments["bits"] = int(bits)
     if black and (bits is None or black >= 2**bits - 1):
         problem = "needs 'bits', the number of bits of a count: add it"
         raise stated["black_level"].fail(
@@ -255,8 +255,8 @@ def _sensor(fields: Entry) -> Sensor:
     if "gain" in stated:
         gain = stated["gain"]
         several = isinstance(gain.value, list)
-        known["gain"] = tuple(gain.numbers((3,)).tolist()) if several else gain.number()
-    return _made(fields, Sensor, **known)
+        arguments["gain"] = tuple(gain.numbers((3,)).tolist()) if several else gain.number()
+    return _made(fields, Sensor, **arguments)
 
 
 def _response(fields: Entry) -> Band | Curve:

@@ -37,7 +37,7 @@ PARTS = ("intrinsic", "extrinsic")
 
 def recognises(path: Path, head: str) -> bool:
     if path.is_dir():
-        return any(_named(path, part) for part in PARTS)
+        return any(_named(path, kind) for kind in PARTS)
     return "opencv-matrix" in head or "<opencv_storage>" in head
 
 
@@ -109,15 +109,15 @@ def _size(nodes: Entry, i: str, K: Tensor) -> HW:
 def _files(path: Path) -> list[Path]:
     """The file, or the two files of a pair."""
     if path.is_dir():
-        return [file for part in PARTS if (file := _named(path, part))]
-    for part, other in (PARTS, PARTS[::-1]):
-        if part in path.stem and (beside := path.with_name(path.name.replace(part, other))).exists():
+        return [file for kind in PARTS if (file := _named(path, kind))]
+    for kind, other in (PARTS, PARTS[::-1]):
+        if kind in path.stem and (beside := path.with_name(path.name.replace(kind, other))).exists():
             return [path, beside]
     return [path]
 
 
-def _named(folder: Path, part: str) -> Path | None:
-    candidates = [folder / f"{part}s{suffix}" for suffix in (".yml", ".yaml", ".xml", ".json")]
+def _named(folder: Path, kind: str) -> Path | None:
+    candidates = [folder / f"{kind}s{suffix}" for suffix in (".yml", ".yaml", ".xml", ".json")]
     return next((path for path in candidates if path.exists()), None)
 
 

@@ -136,8 +136,10 @@ def _image(path: Path, file: Path, images: Sequence[tuple[Path, int]]) -> int:
     end = file.absolute().parts
     below = [(len(name.parts), number) for name, number in alike if end[-len(name.parts) :] == name.parts]
     if len(alike) != 1 and not below:
-        known = ", ".join(str(name) for name, _ in alike or images[:5])
-        raise ValueError(f"{path}: has no image {file} (it has {known}, ...): give the images it was made of")
+        listed = ", ".join(str(name) for name, _ in alike or images[:5])
+        raise ValueError(
+            f"{path}: has no image {file} (it has {listed}, ...): give the images it was made of"
+        )
     return max(below)[1] if below else alike[0][1]
 
 

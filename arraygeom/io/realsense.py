@@ -42,9 +42,9 @@ def read(source: RigSource) -> Rig:
     for name, listed in INTRINSIC.findall(text):
         fields = source.at(dict(ENTRY.findall(listed)), name)
         hw = fields.listed("Width", "Height").words().size()
-        known = streams.get(name)
-        wanted = hw == source.hw if source.hw is not None else known is None or hw > known[0]
-        if wanted or known is None:
+        earlier = streams.get(name)
+        wanted = hw == source.hw if source.hw is not None else earlier is None or hw > earlier[0]
+        if wanted or earlier is None:
             streams[name] = hw, fields
     if not streams:
         raise source.fail(None, "has no `Intrinsic of`: print it with `rs-enumerate-devices -c`")

@@ -125,7 +125,7 @@ class RigSource:
         """Numbers by name, one a line, of the names that a pattern matches."""
         entries: dict[str, Tensor] = {}
         for line in self.text().splitlines():
-            name, separated, value = (part.strip() for part in line.partition(separator))
+            name, separated, value = (text.strip() for text in line.partition(separator))
             if not separated or not re.fullmatch(pattern, name):
                 continue
             if name in entries:

@@ -36,8 +36,8 @@ def _camera(source: RigSource) -> Camera:
     fields = source.at({name.lower(): value for name, value in stated})
     rotation, _, translation = text.partition("Rotation:")[2].partition("Translation:")
     R, t = (
-        source.at(re.findall(NUMBER, part, re.IGNORECASE), name).words()
-        for part, name in ((rotation, "Rotation"), (translation, "Translation"))
+        source.at(re.findall(NUMBER, section, re.IGNORECASE), name).words()
+        for section, name in ((rotation, "Rotation"), (translation, "Translation"))
     )
     R.numbers((3, 3))
     return Camera(

@@ -313,6 +313,6 @@ def _place(tags: ImageTags) -> tuple[float, float] | None:
         parts = tags.fields.get(number, ())
         if len(parts) != 3:
             return None
-        value = sum(float(part) / 60**i for i, part in enumerate(parts))
+        value = sum(float(component) / 60**i for i, component in enumerate(parts))
         degrees.append(-value if tags.fields.get(letter, ("",))[0] in ("S", "W") else value)
     return degrees[0], degrees[1]

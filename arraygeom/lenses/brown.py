@@ -58,21 +58,21 @@ def brown_derivatives(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     inside = squared < limit
     outside = torch.where(inside, 1.0, squared.clamp(min=TINY))
     pull = torch.where(inside, 1.0, (limit / outside).sqrt())
-    at = xy * pull[:, None]
-    planar, jacobian = _brown_planar(lens, at)
+    pulled = xy * pull[:, None]
+    planar, jacobian = _brown_planar(lens, pulled)
     along = torch.where(inside[:, None], 0.0, xy)
     moved = pull[:, None, None] * (
         torch.eye(2).to(xy) - along[:, :, None] * (along / outside[:, None])[:, None]
     )
     by_point = torch.stack(jacobian, -1).reshape(-1, 2, 2) @ moved
-    x, y = at.unbind(-1)
+    x, y = pulled.unbind(-1)
     u = x * x + y * y
     g = _radial_factor(lens, u)[0]
     powers = torch.stack([u, u * u, u**3], -1)
     if len(lens.k) > 3:
         k4, k5, k6 = lens.k[3:]
         powers = powers / (1 + u * (k4 + u * (k5 + u * k6)))[:, None]
-    radial, rational = (at[:, :, None] * f[:, None] for f in (powers, -g[:, None] * powers))
+    radial, rational = (pulled[:, :, None] * f[:, None] for f in (powers, -g[:, None] * powers))
     cross, none = 2 * x * y, torch.zeros_like(u)
     tangential = torch.stack([cross, u + 2 * x * x, u + 2 * y * y, cross], -1).reshape(-1, 2, 2)
     prism = torch.stack([u, u * u, none, none, none, none, u, u * u], -1).reshape(-1, 2, 4)

@@ -97,9 +97,11 @@ class CameraModel(LensModel):
     def __init_subclass__(cls, *, name: str = "", **rest: Any) -> None:
         super().__init_subclass__(**rest)
         cls.registered = name
-        known = CAMERA_MODELS.get(name)
-        if name and known is not None and known.__qualname__ != cls.__qualname__:
-            raise ValueError(f"a camera model named '{name}' exists: {known.__module__}.{known.__qualname__}")
+        existing = CAMERA_MODELS.get(name)
+        if name and existing is not None and existing.__qualname__ != cls.__qualname__:
+            raise ValueError(
+                f"a camera model named '{name}' exists: {existing.__module__}.{existing.__qualname__}"
+            )
         if name:
             CAMERA_MODELS[name] = cls
 
@@ -128,7 +130,9 @@ class CameraModel(LensModel):
         sizes = [t.shape[t.ndim - axes :].numel() for t, axes in tensors.values()]
         parts = zip(tensors.items(), coefficients.split(sizes, -1))
         batch = coefficients.shape[:-1]
-        new = {name: part.reshape((*batch, *t.shape[t.ndim - axes :])) for (name, (t, axes)), part in parts}
+        new = {
+            name: values.reshape((*batch, *t.shape[t.ndim - axes :])) for (name, (t, axes)), values in parts
+        }
         return dataclasses.replace(self, **new)  # type: ignore[type-var]
 
     def _text(self) -> str:

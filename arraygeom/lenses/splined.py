@@ -154,13 +154,13 @@ class Splined(CameraModel, name="splined"):
         """The displacements (*n, 2) and their derivatives by u's x and y."""
         ny, nx = self.knots.shape[-3:-1]
         spacing, knots = beside_points(self.spacing, u, 1), beside_points(self.knots, u, 3)
-        at = u / spacing + 0.5 * (u.new_tensor([nx, ny]) - 1)
+        position = u / spacing + 0.5 * (u.new_tensor([nx, ny]) - 1)
         side = SUPPORT[self.order]
         with torch.no_grad():  # the first of the knots that a point depends on
-            first = (at.round() if self.order == 2 else at.floor()) - 1
+            first = (position.round() if self.order == 2 else position.floor()) - 1
             last = first.new_tensor([nx - side, ny - side])
             first = torch.minimum(first.clamp(min=0), last)
-        weights, slopes = _basis(at - first, self.order)
+        weights, slopes = _basis(position - first, self.order)
         shape = broadcast_shapes(u.shape[:-1], knots.shape[:-3])
         batches = knots.shape[: self.knots.ndim - 3].numel()
         flat = knots.reshape(-1, 2)

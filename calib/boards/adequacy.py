@@ -82,8 +82,8 @@ def _missing(coverage: Coverage, board: Board) -> Iterator[str]:
     empty = [
         POSITIONS[i][j]
         for i, band in enumerate(thirds)
-        for j, part in enumerate(np.array_split(band, 3, axis=1))
-        if not part.any()
+        for j, cells in enumerate(np.array_split(band, 3, axis=1))
+        if not cells.any()
     ]
     if empty:
         yield f"no points at the {', '.join(empty)} of the image: the lens model is extrapolated there"
@@ -104,20 +104,22 @@ class NextView(NamedTuple):
     after: float
 
 
-def next_views(known: Intrinsics, board: Board, depth: float, *, count: int = 2) -> list[NextView]:
+def next_views(intrinsics: Intrinsics, board: Board, depth: float, *, count: int = 2) -> list[NextView]:
     """The views that lower a camera's uncertainty of projection most, one after the other.
 
     None where the image shows hardly any of the board in each, as a strip does, and of points in space.
     """
-    _, change = moved_pixels(known, depth)
+    _, change = moved_pixels(intrinsics, depth)
 
     def median(information: np.ndarray) -> float:
         covariance = np.linalg.inv(information)
         return float(np.median(np.sqrt(np.einsum("nif,fg,nig->n", change, covariance, change))))
 
-    gains = {text: _gain(known, X) for text, X in proposed_views(known.camera, board.members[0]).items()}
+    gains = {
+        text: _gain(intrinsics, X) for text, X in proposed_views(intrinsics.camera, board.members[0]).items()
+    }
     candidates = {text: gain for text, gain in gains.items() if gain is not None and board.flat}
-    information, proposals = np.linalg.inv(known.covariance), list[NextView]()
+    information, proposals = np.linalg.inv(intrinsics.covariance), list[NextView]()
     for _ in range(count if candidates else 0):
         after = {text: median(information + gain) for text, gain in candidates.items()}
         best = min(after, key=lambda text: after[text])
@@ -144,14 +146,17 @@ def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarra
     return proposals
 
 
-def _gain(known: Intrinsics, X: np.ndarray) -> np.ndarray | None:
+def _gain(intrinsics: Intrinsics, X: np.ndarray) -> np.ndarray | None:
     """A view's information on the free intrinsics, its pose unknown; None if hardly any of it is visible."""
-    projected = known.camera.project_local(torch.from_numpy(X))
-    inside = (projected.valid & known.camera.contains(projected.x)).numpy()
+    projected = intrinsics.camera.project_local(torch.from_numpy(X))
+    inside = (projected.valid & intrinsics.camera.contains(projected.x)).numpy()
     if inside.sum() < 0.6 * len(X) or not inside.any():
         return None
-    J = camera_jacobian(known.camera, X[inside]) / known.sigma
-    by_pose, by_intrinsics = J[..., :6].reshape(-1, 6), J[..., known.free].reshape(2 * int(inside.sum()), -1)
+    J = camera_jacobian(intrinsics.camera, X[inside]) / intrinsics.sigma
+    by_pose, by_intrinsics = (
+        J[..., :6].reshape(-1, 6),
+        J[..., intrinsics.free].reshape(2 * int(inside.sum()), -1),
+    )
     left = by_intrinsics - by_pose @ np.linalg.lstsq(by_pose, by_intrinsics, rcond=None)[0]
     return np.asarray(left.T @ left)
 
@@ -170,9 +175,9 @@ def coverage_advice(calibration: Calibration) -> Iterator[str]:
     """What each camera's images lack, and, where that is something, which views would help most."""
     for name, covered in coverages(calibration).items():
         yield from (f"{name}: {text}" for text in covered.missing)
-        known = intrinsics_of(calibration.fit, name)
-        depth, lacking = float(np.mean(covered.depths)), covered.missing and len(known.covariance)
-        if lacking and (views := next_views(known, calibration.board, depth)):
+        intrinsics = intrinsics_of(calibration.fit, name)
+        depth, lacking = float(np.mean(covered.depths)), covered.missing and len(intrinsics.covariance)
+        if lacking and (views := next_views(intrinsics, calibration.board, depth)):
             listed = "; then ".join(view.text for view in views)
             gain = f"uncertainty from {views[0].before:.2g} to {views[-1].after:.2g} px"
             yield f"{name}: two more views would help most: {listed} ({gain})"

@@ -110,9 +110,11 @@ class MarkedBoard(Board):
         self, axes: Any, number: int, left: float, top: float, side: float, *, border: int = 1, turns: int = 0
     ) -> None:
         """Draw a marker, runs of black bits as one rectangle each: no hairlines between bits."""
-        known = marker_dictionary(self.dictionary)
-        bits = known.markerSize + 2 * border
-        black = np.rot90(cv2.aruco.generateImageMarker(known, number, bits, borderBits=border) == 0, turns)
+        dictionary = marker_dictionary(self.dictionary)
+        bits = dictionary.markerSize + 2 * border
+        black = np.rot90(
+            cv2.aruco.generateImageMarker(dictionary, number, bits, borderBits=border) == 0, turns
+        )
         step = side / bits
         for row, line in enumerate(black):
             edges: np.ndarray = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))

@@ -141,19 +141,19 @@ class BundleProblem:
 
     def stepped(self, change: Float[np.ndarray, " c"], boards: Float[np.ndarray, "b 6"]) -> BundleProblem:
         """The problem after a change of its free parameters, deformations' last, and of the boards' poses."""
-        cameras, at = {}, 0
+        cameras, offset = {}, 0
         for name, camera in self.cameras.items():
             full = np.zeros(len(self.free[name]))
             count = int(self.free[name].sum())
-            full[self.free[name]] = change[at : at + count]
+            full[self.free[name]] = change[offset : offset + count]
             cameras[name] = changed(camera, torch.from_numpy(full))
-            at += count
+            offset += count
         rotation, translation = torch.from_numpy(boards).split(3, -1)
         return replace(
             self,
             cameras=cameras,
             boards=self.boards.perturbed(rotation, translation),
-            deformation=self.deformation and self.deformation.stepped(change[at:]),
+            deformation=self.deformation and self.deformation.stepped(change[offset:]),
         )
 
 
@@ -179,7 +179,7 @@ class InitialRig(NamedTuple):
             parts = [
                 (np.full(len(d.ids), index[key]), board.points[d.ids], d.x) for key, d in detections.items()
             ]
-            observations[name] = Observations(*(np.concatenate(part) for part in zip(*parts)))
+            observations[name] = Observations(*(np.concatenate(arrays) for arrays in zip(*parts)))
             free[name] = np.ones(len(parameter_names(camera)), dtype=bool)
             free[name][:6] = number > 0 or self.priors is not None
         priors = self.priors or {name: typical_prior(camera) for name, camera in self.cameras.items()}
@@ -320,19 +320,19 @@ def normal_equations(problem: BundleProblem, parts: Mapping[str, Linearised]) ->
     b, c = len(problem.frames), len(problem.names) + shapes
     H, g = np.zeros((c, c)), np.zeros(c)
     W, B, h = np.zeros((b, c, POSE)), np.zeros((b, POSE, POSE)), np.zeros((b, POSE))
-    for name, part in parts.items():
-        columns = part.columns
-        rows = part.by_shared.reshape(2 * len(part.r), len(columns))
+    for name, linear in parts.items():
+        columns = linear.columns
+        rows = linear.by_shared.reshape(2 * len(linear.r), len(columns))
         H[np.ix_(columns, columns)] += rows.T @ rows
-        g[columns] += np.einsum("nip,ni->p", part.by_shared, part.r)
+        g[columns] += np.einsum("nip,ni->p", linear.by_shared, linear.r)
         if (prior := problem.priors.get(name)) is not None:
             free, camera_columns = problem.free[name], columns[: len(columns) - shapes]
             information, slope = prior.equations(problem.cameras[name])
             H[np.ix_(camera_columns, camera_columns)] += information[np.ix_(free, free)]
             g[camera_columns] += slope[free]
-        B += block_sums(part.block, part.by_board.swapaxes(1, 2) @ part.by_board, b)
-        h += block_sums(part.block, np.einsum("nid,ni->nd", part.by_board, part.r), b)
-        W[:, columns] += block_sums(part.block, part.by_shared.swapaxes(1, 2) @ part.by_board, b)
+        B += block_sums(linear.block, linear.by_board.swapaxes(1, 2) @ linear.by_board, b)
+        h += block_sums(linear.block, np.einsum("nid,ni->nd", linear.by_board, linear.r), b)
+        W[:, columns] += block_sums(linear.block, linear.by_shared.swapaxes(1, 2) @ linear.by_board, b)
     if problem.deformation is not None:
         H[range(c - shapes, c), range(c - shapes, c)] += problem.deformation.information
         g[c - shapes :] -= problem.deformation.information * problem.deformation.values.ravel()
@@ -405,7 +405,7 @@ def linear_projection(
     """
     local = camera.cam_from_world.apply(torch.from_numpy(X)).detach()
     plane, *slopes = lens_derivatives(camera.distortion, local)
-    by_point, by_lens = (camera.K[:2, :2] @ part for part in slopes)
+    by_point, by_lens = (camera.K[:2, :2] @ slope for slope in slopes)
     rotational = torch.linalg.cross((local - camera.t)[:, None].expand_as(by_point), by_point)
     by_focal = focal_positions(camera.K) * plane[:, None]
     by_centre = torch.eye(2).to(plane).expand(len(X), 2, 2)

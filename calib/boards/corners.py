@@ -136,10 +136,10 @@ def _fitted(grey: Array, start: Array, shape: EdgeGeometry, clear: float) -> tup
     usable = (extent >= SHORTEST_EDGE) & (width >= NARROWEST_BAND) & (sine > 0.2)
     fitted, good = start.copy(), np.zeros(len(start), dtype=bool)
     if usable.any():
-        part = EdgeGeometry(*(v[usable] for v in shape))
-        at, misfit = _least_squares(grey, start[usable], part, extent[usable], width[usable])
-        near = np.linalg.norm(at - start[usable], axis=-1) < LARGEST_SHIFT * extent[usable]
-        fitted[usable], good[usable] = at, near & (misfit < MISFIT)
+        edges = EdgeGeometry(*(v[usable] for v in shape))
+        positions, misfit = _least_squares(grey, start[usable], edges, extent[usable], width[usable])
+        near = np.linalg.norm(positions - start[usable], axis=-1) < LARGEST_SHIFT * extent[usable]
+        fitted[usable], good[usable] = positions, near & (misfit < MISFIT)
     return fitted, good
 
 

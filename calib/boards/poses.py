@@ -240,7 +240,7 @@ def _prediction_errors(
         x, _, valid = camera.camera.project_local(X)
         distance = np.linalg.norm(x.numpy() - np.concatenate([d.x for d in detections]), axis=-1)
         distance = np.where(valid.numpy(), distance, np.inf)
-        errors.append([np.median(part) for part in np.split(distance, ends)])
+        errors.append([np.median(distances) for distances in np.split(distance, ends)])
     return np.array(errors)
 
 

@@ -75,7 +75,7 @@ def report_html(
 
     With the points `detected` in `photos`, the images that fit worst are drawn.
     """
-    covers, known = coverages(calibration), calibration.fit.covariance is not None
+    covers, has_covariance = coverages(calibration), calibration.fit.covariance is not None
     near, far = _depths(covers.values())
     parts = [
         f"<h1>{escape(title)}</h1><p>{escape(summary(calibration))}</p><ul>",
@@ -94,10 +94,10 @@ def report_html(
     for name in calibration.views:
         drawn = draw_camera(calibration, name, covers[name])
         parts.append(_section(f"{name}: coverage and residuals", "", drawn))
-    if known:
+    if has_covariance:
         drawn = draw_adequacy(calibration, (near, far))
         parts.append(_section("Adequacy of each camera", ADEQUACY, drawn))
-    if known and len(calibration.views) > 1:
+    if has_covariance and len(calibration.views) > 1:
         text = (
             "Standard deviation (pixels, worst direction) of the positions predicted in the other cameras "
             f"for pixels of the first, at {near:.3g} m (nearest board) and {far:.3g} m (furthest)."
@@ -309,20 +309,20 @@ def _draw_field(axes: Any, x: np.ndarray, r: np.ndarray, hw: tuple[int, int]) ->
     filled = [c for c in np.unique(cell) if (cell == c).sum() >= 3]
     if not filled:
         return
-    at = np.array([x[cell == c].mean(0) for c in filled])
+    centres = np.array([x[cell == c].mean(0) for c in filled])
     arrows = np.array([np.median(r[cell == c], axis=0) for c in filled])
-    longest = _draw_arrows(axes, at, arrows, 1.2 * hw[1] / columns, COLOURS[1])
+    longest = _draw_arrows(axes, centres, arrows, 1.2 * hw[1] / columns, COLOURS[1])
     axes.set_title(f"median residuals, longest {longest:.3f} px", fontsize=9)
 
 
-def draw_uncertainty(calibration: Calibration, at: tuple[float, float]) -> Figure:
+def draw_uncertainty(calibration: Calibration, depths: tuple[float, float]) -> Figure:
     """By beta (rows) and depth (columns): the predicted pixel's deviation, over the first camera's image."""
     covariance = rig_covariance(calibration.fit)
     assert covariance is not None
     alpha, *betas = calibration.views
     figure = Figure(figsize=(8.4, 2.6 * len(betas) + 0.3), layout="constrained")
-    for row, beta in zip(figure.subplots(len(betas), len(at), squeeze=False), betas):
-        for axes, depth in zip(row, at):
+    for row, beta in zip(figure.subplots(len(betas), len(depths), squeeze=False), betas):
+        for axes, depth in zip(row, depths):
             x, _ = grid_points(calibration.rig[alpha], depth)
             pixels = beta_covariance(calibration.rig, covariance, alpha, beta, x, depth)
             usable = np.isfinite(pixels).all((1, 2))
@@ -342,17 +342,17 @@ def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figu
     figure = Figure(figsize=(10.4, 2.5 * len(names) + 0.3), layout="constrained")
     halves = half_difference(calibration.fit, float(np.mean(depths)))
     for row, name in zip(figure.subplots(len(names), 3, squeeze=False), names):
-        known = intrinsics_of(calibration.fit, name)
+        intrinsics = intrinsics_of(calibration.fit, name)
         for axes, depth in zip(row, depths):
-            x, deviation = uncertainty(known, depth)
-            _map(axes, figure, known.camera.hw, x, deviation, f"{name}: uncertainty at {depth:.2g} m")
+            x, deviation = uncertainty(intrinsics, depth)
+            _map(axes, figure, intrinsics.camera.hw, x, deviation, f"{name}: uncertainty at {depth:.2g} m")
         x, off = halves.get(name, np.zeros((2, 0, 2)))
         if len(x) < 4:
             row[2].set_axis_off()
             row[2].set_title("too few frames to compare halves", fontsize=9)
             continue
         length = np.linalg.norm(off, axis=1)
-        _map(row[2], figure, known.camera.hw, x, length, f"{name}: halves of the frames")
+        _map(row[2], figure, intrinsics.camera.hw, x, length, f"{name}: halves of the frames")
         row[2].quiver(*x[::3].T, *off[::3].T, angles="xy", color="white", width=0.003)
     return figure
 

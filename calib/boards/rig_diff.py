@@ -138,28 +138,28 @@ def rig_difference(
     grids = {name: _points(a[name], b[name], depth) for name in names}
     motion = _best_motion(a, b, grids)
     parts = [_projections(a, b, motion, name, X) for name, (_, X, _) in grids.items()]
-    change = np.concatenate([part.change.ravel() for part in parts])
-    by_motion, _ = np.linalg.qr(np.concatenate([part.by_motion for part in parts]))
-    known = [c if c is not None else other for c, other in zip(covariances, covariances[::-1])]
+    change = np.concatenate([projected.change.ravel() for projected in parts])
+    by_motion, _ = np.linalg.qr(np.concatenate([projected.by_motion for projected in parts]))
+    by_rig = [c if c is not None else other for c, other in zip(covariances, covariances[::-1])]
     spread = None
-    if known[0] is not None and known[1] is not None:
-        roots, blocks = [_root(known[0]), _root(known[1])], []
-        for part in parts:
-            by_a = -part.jacobians[0] @ known[0].of(part.name, a[part.name]) @ roots[0]
-            by_b = part.jacobians[1] @ known[1].of(part.name, b[part.name]) @ roots[1]
+    if by_rig[0] is not None and by_rig[1] is not None:
+        roots, blocks = [_root(by_rig[0]), _root(by_rig[1])], []
+        for projected in parts:
+            by_a = -projected.jacobians[0] @ by_rig[0].of(projected.name, a[projected.name]) @ roots[0]
+            by_b = projected.jacobians[1] @ by_rig[1].of(projected.name, b[projected.name]) @ roots[1]
             blocks.append(np.concatenate([by_a, by_b], -1))
         spread = np.concatenate(blocks).reshape(len(change), -1)
         spread -= by_motion @ (by_motion.T @ spread)
     significance = None if spread is None else _tested(change, spread, by_motion, b, parts)
     cameras = {}
-    for (name, (x, _, z)), part, rows in zip(grids.items(), parts, _rows(parts)):
+    for (name, (x, _, z)), projected, rows in zip(grids.items(), parts, _rows(parts)):
         sigma = np.full(len(x), np.nan)
         if spread is not None:
             mine = spread[rows].reshape(len(x), 2, -1)
             sigma = worst_deviation(mine @ mine.swapaxes(-1, -2))
-        cameras[name] = Difference(x, z, part.change, sigma)
+        cameras[name] = Difference(x, z, projected.change, sigma)
     alpha, *betas = names
-    depths = {name: _depths(a, b, alpha, name, grids[alpha], known) for name in betas}
+    depths = {name: _depths(a, b, alpha, name, grids[alpha], by_rig) for name in betas}
     depths = {name: points for name, points in depths.items() if len(points.x)}
     return RigDifference(cameras, depths, alpha, motion, significance, length_unit(a))
 
@@ -197,7 +197,7 @@ def _points(camera: Camera, other: Camera, depth: tuple[float, float]) -> Grid:
         local = torch.from_numpy(X) @ camera.R.T + camera.t
         kept = other.project_local(local).valid.numpy()
         parts.append((x[kept], X[kept], np.full(int(kept.sum()), 1 / inverse)))
-    return tuple(np.concatenate(part) for part in zip(*parts))  # type: ignore[return-value]
+    return tuple(np.concatenate(arrays) for arrays in zip(*parts))  # type: ignore[return-value]
 
 
 class _Part(NamedTuple):
@@ -237,9 +237,11 @@ def _best_motion(a: Rig, b: Rig, grids: Mapping[str, Grid]) -> Pose:
     motion = b[first].cam_from_world.inverse() @ a[first].cam_from_world
     for _ in range(ITERATIONS):
         parts = [_projections(a, b, motion, name, X) for name, (_, X, _) in grids.items()]
-        change = np.concatenate([part.change.ravel() for part in parts])
-        step = np.linalg.lstsq(np.concatenate([part.by_motion for part in parts]), -change, rcond=None)[0]
-        motion = motion.perturbed(*(torch.from_numpy(part) for part in np.split(step, 2)))
+        change = np.concatenate([projected.change.ravel() for projected in parts])
+        step = np.linalg.lstsq(
+            np.concatenate([projected.by_motion for projected in parts]), -change, rcond=None
+        )[0]
+        motion = motion.perturbed(*(torch.from_numpy(p) for p in np.split(step, 2)))
         if np.abs(step).max() < CONVERGED:
             break
     return motion
@@ -252,7 +254,7 @@ def _root(covariance: RigCovariance) -> np.ndarray:
 
 def _rows(parts: list[_Part]) -> list[slice]:
     """The rows of each camera among the coordinates of all."""
-    ends = np.cumsum([0, *(part.change.size for part in parts)]).tolist()
+    ends = np.cumsum([0, *(projected.change.size for projected in parts)]).tolist()
     return [slice(start, end) for start, end in pairwise(ends)]
 
 
@@ -266,15 +268,15 @@ def _tested(
     z = U.T @ change / s
     total, freedom = float(z @ z), int(counts.sum())
     best, motion, gain = "", np.zeros(6), -1.0
-    for part, rows in zip(parts, _rows(parts)):
+    for projected, rows in zip(parts, _rows(parts)):
         jacobian = np.zeros((len(change), 6))
-        jacobian[rows] = part.jacobians[1][..., :6].reshape(-1, 6)
+        jacobian[rows] = projected.jacobians[1][..., :6].reshape(-1, 6)
         jacobian -= by_motion @ (by_motion.T @ jacobian)
         whitened = U.T @ jacobian / s[:, None]
         solution = np.linalg.lstsq(whitened, z, rcond=None)[0]
         explained = total - float(np.square(z - whitened @ solution).sum())
         if explained > gain:
-            best, motion, gain = part.name, solution, explained
+            best, motion, gain = projected.name, solution, explained
     pose = b[best].cam_from_world
     shift = pose.perturbed(*(torch.from_numpy(p) for p in np.split(motion, 2))).inverse().t - pose.inverse().t
     probability, degrees = float(chdtrc(freedom, total)), float(np.degrees(np.linalg.norm(motion[:3])))
@@ -283,7 +285,7 @@ def _tested(
 
 
 def _depths(
-    a: Rig, b: Rig, alpha: str, beta: str, grid: Grid, known: list[RigCovariance | None]
+    a: Rig, b: Rig, alpha: str, beta: str, grid: Grid, covariances: list[RigCovariance | None]
 ) -> Difference:
     """Depth of points by the second rig, found from the pixels at which the first one has them."""
     x, X, z = grid
@@ -298,21 +300,25 @@ def _depths(
     along = slope / np.square(slope).sum(1, keepdims=True)
     variance = np.zeros(len(z))
     for d in np.unique(z):
-        for covariance in known:
-            at = z == d
+        for covariance in covariances:
+            at_depth = z == d
             of_y = (
-                np.nan if covariance is None else beta_covariance(a, covariance, alpha, beta, x[at], float(d))
+                np.nan
+                if covariance is None
+                else beta_covariance(a, covariance, alpha, beta, x[at_depth], float(d))
             )
-            variance[at] += np.einsum("ni,nij,nj->n", along[at], of_y * np.ones((1, 2, 2)), along[at])
+            variance[at_depth] += np.einsum(
+                "ni,nij,nj->n", along[at_depth], of_y * np.ones((1, 2, 2)), along[at_depth]
+            )
     return Difference(x[valid], z[valid], change[valid], np.sqrt(variance)[valid])
 
 
 def _sizes(values: np.ndarray, sigma: np.ndarray, unit: str = "") -> str:
     """How large values are, and their standard deviations, if known."""
     rms, most = np.sqrt(np.square(values).mean()), np.abs(values).max()
-    stated, known = "", sigma[np.isfinite(sigma)]
-    if len(known):
-        stated = f" (both calibrations' deviations: {np.sqrt(np.square(known).mean()):.3f})"
+    stated, finite = "", sigma[np.isfinite(sigma)]
+    if len(finite):
+        stated = f" (both calibrations' deviations: {np.sqrt(np.square(finite).mean()):.3f})"
     return f"{rms:.3f}{unit} (RMS), {most:.3f}{unit} at most{stated}"
 
 
@@ -323,11 +329,11 @@ def draw_difference(difference: RigDifference) -> Figure:
         (f"depth by {difference.alpha} and {n}: %", d, 100 * d.change) for n, d in difference.depths.items()
     ]
     figure = Figure(figsize=(9, 2.7 * len(maps)), layout="constrained")
-    for row, (title, at, values) in zip(figure.subplots(len(maps), 2, squeeze=False), maps):
-        for axes, depth in zip(row, (at.depth.min(), at.depth.max())):
-            x, shown = at.x[at.depth == depth], values[at.depth == depth]
+    for row, (title, points, values) in zip(figure.subplots(len(maps), 2, squeeze=False), maps):
+        for axes, depth in zip(row, (points.depth.min(), points.depth.max())):
+            x, shown = points.x[points.depth == depth], values[points.depth == depth]
             most = float(np.nanquantile(np.abs(shown), 0.98))
-            cmap, least = ("viridis", 0.0) if at.change.ndim > 1 else ("RdBu", -most)
+            cmap, least = ("viridis", 0.0) if points.change.ndim > 1 else ("RdBu", -most)
             drawn = axes.scatter(*x.T, c=shown, s=22, marker="s", cmap=cmap, vmin=least, vmax=most)
             figure.colorbar(drawn, ax=axes)
             axes.set_title(f"{title}, {depth:.3g} {difference.unit}".replace("$", r"\$"), fontsize=9)

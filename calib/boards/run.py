@@ -216,12 +216,12 @@ def _advice(calibration: Calibration, name: str) -> str:
     stated = f" ± {deviation:.2g}" if deviation else ""
     parts = [f"<p>Focal length {float(calibration.rig[name].K[0, 0]):.1f} px{stated}.</p>"]
     covered = coverages(calibration)[name]
-    known = intrinsics_of(calibration.fit, name)
-    if len(known.covariance):
+    intrinsics = intrinsics_of(calibration.fit, name)
+    if len(intrinsics.covariance):
         parts += [
             f"<p><b>Next: {escape(best.text)}</b> (uncertainty of projection {best.before:.2g} px, "
             f"with it {best.after:.2g}).</p>"
-            for best in next_views(known, calibration.board, float(np.mean(covered.depths)), count=1)
+            for best in next_views(intrinsics, calibration.board, float(np.mean(covered.depths)), count=1)
         ]
     return "".join([*parts, *map(_note, covered.missing)])
 

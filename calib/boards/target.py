@@ -189,19 +189,19 @@ def _kalibr_target(path: Path) -> str:
     raise ValueError(f"{path}: not an aprilgrid of Kalibr's, nor a checkerboard of squares")
 
 
-def _counts(text: str, part: str, *, fewest: int) -> tuple[int, int]:
-    if not (match := re.fullmatch(r"(\d+)x(\d+)", part)):
-        raise ValueError(f"board '{text}': '{part}' is not a count like 8x6; write it like {FORMS}")
+def _counts(text: str, word: str, *, fewest: int) -> tuple[int, int]:
+    if not (match := re.fullmatch(r"(\d+)x(\d+)", word)):
+        raise ValueError(f"board '{text}': '{word}' is not a count like 8x6; write it like {FORMS}")
     columns, rows = int(match[1]), int(match[2])
     if not (fewest <= columns <= LARGEST and fewest <= rows <= LARGEST):
         raise ValueError(f"board '{text}': {columns}x{rows} is out of range; both are {fewest} to {LARGEST}")
     return columns, rows
 
 
-def _length(text: str, part: str) -> float:
-    match = re.fullmatch(r"(\d*\.?\d+) *(mm|cm|m|in)", part)
+def _length(text: str, word: str) -> float:
+    match = re.fullmatch(r"(\d*\.?\d+) *(mm|cm|m|in)", word)
     if not match or float(match[1]) == 0:
-        raise ValueError(f"board '{text}': '{part}' is not a length like 30mm (units: {', '.join(UNITS)})")
+        raise ValueError(f"board '{text}': '{word}' is not a length like 30mm (units: {', '.join(UNITS)})")
     return float(match[1]) * UNITS[match[2]]
 
 
@@ -298,7 +298,7 @@ def draw_board(board: Board, *, paper: str | None = None) -> Figure:
     width, height = (1e3 * v for v in board.extent)
     page = page_of(board)
     total = page if paper is None else _sheet(paper, page)
-    left, top = ((whole - part) / 2 + 1e3 * MARGIN for whole, part in zip(total, page))
+    left, top = ((whole - side) / 2 + 1e3 * MARGIN for whole, side in zip(total, page))
     figure = Figure(figsize=(total[0] / 25.4, total[1] / 25.4), facecolor="white")
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(-left, total[0] - left), ylim=(total[1] - top, -top))

@@ -165,11 +165,11 @@ class Intrinsics(NamedTuple):
 def intrinsics_of(fit: Solved, name: str) -> Intrinsics:
     """One camera of a fit; none of its intrinsics is free where the fit has no covariance."""
     camera, points = in_own_frame(fit.problem, name)
-    known = rig_covariance(fit) or RigCovariance((), np.zeros((0, 0)))
-    mine = known.of(name, camera)
+    of_rig = rig_covariance(fit) or RigCovariance((), np.zeros((0, 0)))
+    mine = of_rig.of(name, camera)
     mine[:6] = 0  # the pose
     free = mine.any(1)
-    covariance = mine[free] @ known.matrix @ mine[free].T
+    covariance = mine[free] @ of_rig.matrix @ mine[free].T
     return Intrinsics(camera, covariance, free, fit.problem.sigma[name], points)
 
 
@@ -190,10 +190,12 @@ def grid_points(camera: Camera, depth: float) -> tuple[Float[np.ndarray, "n 2"],
     return x[usable], X[usable]
 
 
-def uncertainty(known: Intrinsics, depth: float) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
+def uncertainty(
+    intrinsics: Intrinsics, depth: float
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
     """Standard deviations (pixels, worst direction) of projections at a depth (metres), over the image."""
-    x, change = moved_pixels(known, depth)
-    return x, worst_deviation(change @ known.covariance @ change.swapaxes(-1, -2))
+    x, change = moved_pixels(intrinsics, depth)
+    return x, worst_deviation(change @ intrinsics.covariance @ change.swapaxes(-1, -2))
 
 
 def worst_deviation(covariance: Float[np.ndarray, "n 2 2"]) -> Float[np.ndarray, " n"]:
@@ -201,16 +203,16 @@ def worst_deviation(covariance: Float[np.ndarray, "n 2 2"]) -> Float[np.ndarray,
     return np.asarray(np.sqrt(np.linalg.eigvalsh(covariance)[:, -1]))
 
 
-def moved_pixels(known: Intrinsics, depth: float) -> tuple[np.ndarray, np.ndarray]:
+def moved_pixels(intrinsics: Intrinsics, depth: float) -> tuple[np.ndarray, np.ndarray]:
     """Pixels, and how they move with the free intrinsics: (n, 2), (n, 2, f).
 
     That is after the motion of the camera that keeps the boards where they were seen best, so that points
     nearer or farther than the boards move more.
     """
-    x, X = grid_points(known.camera, depth)
-    J, at_boards = camera_jacobian(known.camera, X), camera_jacobian(known.camera, known.seen)
-    motion = compensation(at_boards[..., :6], at_boards[..., known.free])
-    return x, J[..., known.free] - J[..., :6] @ motion
+    x, X = grid_points(intrinsics.camera, depth)
+    J, at_boards = camera_jacobian(intrinsics.camera, X), camera_jacobian(intrinsics.camera, intrinsics.seen)
+    motion = compensation(at_boards[..., :6], at_boards[..., intrinsics.free])
+    return x, J[..., intrinsics.free] - J[..., :6] @ motion
 
 
 def compensation(by_pose: np.ndarray, moved: np.ndarray) -> np.ndarray:
@@ -256,12 +258,12 @@ def jackknife(problem: BundleProblem) -> Jackknife:
     equations = normal_equations(problem, parts)
     b, c = equations.W.shape[:2]
     H, g = np.zeros((b, c, c)), np.zeros((b, c))
-    for part in parts.values():
-        columns = part.columns
+    for linear in parts.values():
+        columns = linear.columns
         H[:, columns[:, None], columns] += block_sums(
-            part.block, part.by_shared.swapaxes(1, 2) @ part.by_shared, b
+            linear.block, linear.by_shared.swapaxes(1, 2) @ linear.by_shared, b
         )
-        g[:, columns] += block_sums(part.block, np.einsum("nip,ni->np", part.by_shared, part.r), b)
+        g[:, columns] += block_sums(linear.block, np.einsum("nip,ni->np", linear.by_shared, linear.r), b)
     total, Y, _ = equations.reduced(0.0)
     H -= Y @ equations.W.swapaxes(-1, -2)
     g -= np.einsum("bcd,bd->bc", Y, equations.h)

@@ -52,7 +52,7 @@ def epipolar_errors(
                 parts.append((one.x[i], other.x[j]))
         if not any(len(x) for x, _ in parts):
             continue
-        xa, xb = (torch.from_numpy(np.concatenate(part)) for part in zip(*parts))
+        xa, xb = (torch.from_numpy(np.concatenate(points)) for points in zip(*parts))
         pair, reverse = rig.pair(a, b), rig.pair(b, a)
         (pa, va), (pb, vb) = pair.alpha.undistort(xa), pair.beta.undistort(xb)
         forward = epipolar_distance(pair.fundamental, pa, pb).abs()
@@ -172,7 +172,7 @@ def _compared(name: str, views: BoardViews, board: Board) -> LensComparison:
     parts = [np.arange(len(frames)) % LENS_FOLDS == fold for fold in range(LENS_FOLDS)]
     return LensComparison(
         {
-            lens: np.concatenate([_held_out(problem, part) for part in parts])
+            lens: np.concatenate([_held_out(problem, held_out) for held_out in parts])
             for lens, problem in fitted.items()
             if problem.frames == frames
         }
@@ -275,7 +275,7 @@ def _far(fit: Solved) -> Iterator[str]:
     for name, camera in fit.problem.cameras.items():
         prior = fit.problem.priors[name]
         ratio = np.abs(prior.residual(camera)) / np.sqrt(np.linalg.inv(prior.information).diagonal())
-        parts = [part.max() for part in np.split(ratio[:10], [3, 6, 8])]
+        parts = [ratios.max() for ratios in np.split(ratio[:10], [3, 6, 8])]
         kinds = zip(("orientation", "position", "focal length", "principal point"), parts)
         if far := [f"{kind} ({worst:.0f} deviations)" for kind, worst in kinds if worst > FAR_FROM_START]:
             listed = ", ".join(far)

@@ -125,7 +125,7 @@ def log_depths(
     if int(observable.sum()) < FEW:
         return None
     parts = zip(pairs.items(), observable.split([len(matches.alpha) for matches in pairs.values()]))
-    kept = {names: matches.only(part) for (names, matches), part in parts if bool(part.any())}
+    kept = {names: matches.only(observed) for (names, matches), observed in parts if bool(observed.any())}
     return lambda z: [match_depths(after(z), kept).depth.clamp(min=1e-6).log()]
 
 
@@ -147,8 +147,8 @@ class DepthModes(NamedTuple):
     def kept(self) -> Bool[Tensor, " n"]:
         """Which modes may change."""
         significant = self.a.abs() > SIGNIFICANT_CHANGE * self.raised
-        known = (self.deviation < KNOWN_BETTER * self.prior) & (self.deviation < LARGEST_DEVIATION)
-        return (significant & known) | (self.deviation < NEGLIGIBLE)
+        determined = (self.deviation < KNOWN_BETTER * self.prior) & (self.deviation < LARGEST_DEVIATION)
+        return (significant & determined) | (self.deviation < NEGLIGIBLE)
 
     def gained(self, kept: Bool[Tensor, " n"]) -> float:
         """The variance of depth that some modes lose, relative to depth squared (mean over the points)."""
@@ -177,7 +177,7 @@ def depth_modes(
     norm = pattern.norm(dim=0)
     prior = (G.T @ (pattern / norm.clamp(min=1e-300))).norm(dim=0)
     a, jackknife = (
-        torch.linalg.solve_triangular(lower, part.T, upper=False).T @ V for part in (z[None], left_out)
+        torch.linalg.solve_triangular(lower, changes.T, upper=False).T @ V for changes in (z[None], left_out)
     )
     share = (len(left_out) - 1) / max(len(left_out), 1)
     raised = (share * jackknife.square().sum(0)).sqrt().clamp(min=1)

@@ -205,7 +205,7 @@ def _by_evidence(
     best = next(h for h in misfit if h in evidence_for and evidence_for[h].cost <= least + TIE)
     allowed = max(ROUGHLY if best.approximate else EXPLAINED[0], EXPLAINED[1] * misfit[given])
     parts = image_parts(given.rig, pairs)
-    rest = (inliers & (parts != part) for part in parts.unique().tolist())
+    rest = (inliers & (parts != number) for number in parts.unique().tolist())
     clear = (
         misfit[best] <= allowed
         and evidence_for[best].cost + MARGIN < drift.cost

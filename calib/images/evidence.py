@@ -140,7 +140,7 @@ class PointObservations(NamedTuple):
 def observations(rigs: Sequence[Rig], pairs: Pairs) -> PointObservations:
     """One pair of cameras after the other, under all rigs, batched by lens model."""
     parts = [_observations([rig.pair(*names) for rig in rigs], matches) for names, matches in pairs.items()]
-    return PointObservations(*(torch.cat(part, 1) for part in zip(*parts)))
+    return PointObservations(*(torch.cat(tensors, 1) for tensors in zip(*parts)))
 
 
 def _observations(pairs: Sequence[Pair], matches: PointMatches) -> PointObservations:

@@ -156,7 +156,7 @@ class TwoViews:
         rotated = a @ pose.R.T
         line = torch.linalg.cross(pose.t.expand_as(rotated), rotated)
         line_alpha = torch.linalg.cross(b, pose.t.expand_as(b)) @ pose.R
-        slopes = [part[:, :2] / length for part, length in zip((line_alpha, line), lengths)]
+        slopes = [lines[:, :2] / length for lines, length in zip((line_alpha, line), lengths)]
         return (b * line).sum(-1) / torch.cat(slopes, -1).square().sum(-1).clamp(min=1e-24).sqrt()
 
     def fitted(self, z: Tensor, *, fixed: int = 0) -> Tensor:
@@ -200,10 +200,10 @@ class FocalFit:
 
     def is_nearer(self) -> bool:
         """Whether points are nearer to lines than by the focal length assumed, in fits that held them out."""
-        points, part = self.views.points, held_out_parts(self.views.points)
-        distances = torch.zeros(2, len(part), dtype=torch.float64)
+        points, fold = self.views.points, held_out_parts(self.views.points)
+        distances = torch.zeros(2, len(fold), dtype=torch.float64)
         for held_out in range(HELD_OUT):
-            out = part == held_out
+            out = fold == held_out
             others = replace(self.views, points=points.only(~out))
             for row, first in enumerate((0.0, float(self.z[0]))):
                 z = torch.cat([self.z.new_tensor([first]), self.z[1:]])

@@ -107,7 +107,7 @@ def _fundamental(
     matches: PointMatches, K: Tensor | None, K_beta: Tensor | None
 ) -> tuple[Tensor, float, bool]:
     """F of all points; held-out points' median distance if fitted to the rest; whether by focal lengths."""
-    (used,), (held_out,) = (list(part.values()) for part in split([{("", ""): matches}]))
+    (used,), (held_out,) = (list(pairs.values()) for pairs in split([{("", ""): matches}]))
     fits: dict[bool, Callable[[PointMatches], Tensor]] = {False: fit_fundamental}
     if K is not None and K_beta is not None:
         fits[True] = partial(_by_focal, K=K, K_beta=K_beta)

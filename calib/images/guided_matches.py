@@ -48,9 +48,11 @@ def guided_matches(
     solid = np.ones((2 * PATCH + 1, 2 * PATCH + 1), np.uint8)
     mask, valid = (
         np.asarray(
-            cv2.erode(part.numpy().astype(np.uint8), solid, borderType=cv2.BORDER_CONSTANT, borderValue=(0,))
+            cv2.erode(
+                recorded.numpy().astype(np.uint8), solid, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)
+            )
         )
-        for part in shown
+        for recorded in shown
     )
     corners = cv2.goodFeaturesToTrack(alpha_image, POINTS, 1e-3, SPACING, mask=mask)
     x = np.zeros((0, 2)) if corners is None else corners[:, 0].astype(np.float64)

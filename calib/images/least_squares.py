@@ -54,7 +54,7 @@ class Evaluated(NamedTuple):
     @property
     def values(self) -> Float[Tensor, " m"]:
         """All of them, as constants."""
-        return torch.cat([part.detach() for part in self.parts])
+        return torch.cat([residuals.detach() for residuals in self.parts])
 
 
 class Solution(NamedTuple):
@@ -114,8 +114,8 @@ def shifts_left_out(
     changes = []
     for number in range(PARTS**2):
         mine = parts == number
-        part, slope = normal_equations(J[mine].T, r[mine], weight[mine])
-        changes.append(torch.linalg.solve(information - part, slope))
+        withheld, slope = normal_equations(J[mine].T, r[mine], weight[mine])
+        changes.append(torch.linalg.solve(information - withheld, slope))
     return torch.stack(changes)
 
 
@@ -134,10 +134,10 @@ def most_probable(
     """
     numbers = itertools.count(1)
 
-    def model(at: Evaluated) -> LocalModel[Evaluated]:
+    def model(evaluated: Evaluated) -> LocalModel[Evaluated]:
         number = next(numbers)
         log_step(LOG, 1 - FURTHER_STEPS / (number - 1 + FURTHER_STEPS), "step %d of the fit", number)
-        (r, J), z = _differentiated(at), at.z.detach()
+        (r, J), z = _differentiated(evaluated), evaluated.z.detach()
         information, slope = _normal_equations(r, J, z)
         information, slope = basis.T @ information @ basis, basis.T @ slope
         scale, diagonal = noise_scale(r), information.diagonal().diag()
@@ -147,7 +147,7 @@ def most_probable(
                 z + basis @ torch.linalg.solve(information + damping * diagonal, slope), residuals
             )
 
-        return LocalModel(cost(r, z, scale), lambda at: cost(at.values, at.z.detach(), scale), step)
+        return LocalModel(cost(r, z, scale), lambda other: cost(other.values, other.z.detach(), scale), step)
 
     def is_converged(before: Evaluated, after: Evaluated, *_: float) -> bool:
         return float((after.z - before.z).detach().abs().max()) < CONVERGED
@@ -189,17 +189,17 @@ def jacobian(
     return _differentiated(Evaluated.at(z, residuals))
 
 
-def _differentiated(at: Evaluated) -> tuple[Tensor, Tensor]:
+def _differentiated(evaluated: Evaluated) -> tuple[Tensor, Tensor]:
     rows = []
-    for part in at.parts:
-        u = torch.linspace(1, 2, len(part), dtype=part.dtype, requires_grad=True)
-        (slope,) = torch.autograd.grad(part, at.z, u, create_graph=True)
+    for residuals in evaluated.parts:
+        u = torch.linspace(1, 2, len(residuals), dtype=residuals.dtype, requires_grad=True)
+        (slope,) = torch.autograd.grad(residuals, evaluated.z, u, create_graph=True)
         depends = slope.detach() != 0
-        columns = torch.zeros(len(at.z), len(part), dtype=part.dtype)
+        columns = torch.zeros(len(evaluated.z), len(residuals), dtype=residuals.dtype)
         if bool(depends.any()):
-            basis = torch.eye(len(at.z)).to(slope)[depends]
+            basis = torch.eye(len(evaluated.z)).to(slope)[depends]
             (columns[depends],) = torch.autograd.grad(
                 slope, u, basis, is_grads_batched=True, retain_graph=True
             )
         rows.append(columns.T)
-    return at.values, torch.cat(rows)
+    return evaluated.values, torch.cat(rows)

@@ -113,7 +113,7 @@ def considered_parameters(
 def apply_change(rig: Rig, parameters: Sequence[FreeParameter], z: Float[Tensor, " n"]) -> Rig:
     """The rig after a change of each component by z standard deviations; differentiable in z."""
     parts = z.split([len(u.sigma) for u in parameters])
-    values = {u.name: u.root.to(part) @ part for u, part in zip(parameters, parts)}
+    values = {u.name: u.root.to(deviations) @ deviations for u, deviations in zip(parameters, parts)}
     links = {
         names: _perturbed_link(link, values.get(" > ".join(names)), rig, names)
         for names, link in rig.links.items()

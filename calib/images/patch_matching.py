@@ -80,14 +80,14 @@ def _step(
     """The patches after a step, their correlation before it, how far they moved, and the standard deviation
     of their positions by the residuals (worse axis, pixels)."""
     weight = weights / weights.sum()
-    at = warps.y[:, None] + around @ warps.A.swapaxes(1, 2)
-    sampled, across, down = (_sampled(p, at) for p in images)
+    positions = warps.y[:, None] + around @ warps.A.swapaxes(1, 2)
+    sampled, across, down = (_sampled(p, positions) for p in images)
     sampled, wanted = (v - (v @ weight)[:, None] for v in (sampled, warps.values))
     both, power, wanted_power = (
         (a * b) @ weight for a, b in ((sampled, wanted), (sampled, sampled), (wanted, wanted))
     )
     gain = (both / (power + 1e-6))[:, None]
-    J = np.stack([across, down, *(slope * part for slope in (across, down) for part in around.T)], -1)
+    J = np.stack([across, down, *(slope * offset for slope in (across, down) for offset in around.T)], -1)
     J = gain[..., None] * (J - (weight @ J)[:, None])
     weighted = (weight[:, None] * J).swapaxes(1, 2)
     H = weighted @ J

@@ -252,7 +252,7 @@ class RefinementProblem:
 
         def residuals(z: Tensor) -> list[Tensor]:
             distances = sampson_of_pairs(self.after(z[: self.uncertain]), self.used)
-            return [part + block @ z[self.uncertain :] for part, block in zip(distances, columns)]
+            return [distance + block @ z[self.uncertain :] for distance, block in zip(distances, columns)]
 
         considered = self.uncertain - self.count + systematic.shape[1]
         unrestricted = solve(residuals, self.count, considered)
@@ -415,11 +415,11 @@ def systematic_columns(rig: Rig, pairs: Pairs) -> Float[Tensor, "m s"]:
     columns = {name: slice(4 * i, 4 * i + 4) for i, name in enumerate(names)}
     parts = []
     for pair, matches in pairs.items():
-        part = torch.zeros(len(matches.alpha), 4 * len(names), dtype=torch.float64)
+        rows = torch.zeros(len(matches.alpha), 4 * len(names), dtype=torch.float64)
         if rig.pair(*pair).link is None and all(name in columns for name in pair):
             for name, modes in zip(pair, systematic_modes(rig.pair(*pair), matches)):
-                part[:, columns[name]] = SYSTEMATIC * modes
-        parts.append(part)
+                rows[:, columns[name]] = SYSTEMATIC * modes
+        parts.append(rows)
     return torch.cat(parts)
 
 

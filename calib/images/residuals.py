@@ -90,7 +90,7 @@ def _residuals(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, tu
 def sampson_of_pairs(rig: Rig, pairs: Pairs) -> list[Float[Tensor, " n"]]:
     """Sampson distances of the points of each pair, pixels; 0 where a pixel has no ray."""
     parts = [epipolar_residuals(rig.pair(*names), matches) for names, matches in pairs.items()]
-    return [torch.where(part.valid, part.sampson, 0.0) for part in parts]
+    return [torch.where(of_pair.valid, of_pair.sampson, 0.0) for of_pair in parts]
 
 
 def match_depths(rig: Rig, pairs: Pairs) -> MatchDepths:
@@ -100,7 +100,7 @@ def match_depths(rig: Rig, pairs: Pairs) -> MatchDepths:
         pair = rig.pair(*names)
         (a, b), _, valid = _rays(pair, *_for_each(pair, matches))
         depths.append(_depths(pair, a, b, valid))
-    return MatchDepths(*(torch.cat(part) for part in zip(*depths)))
+    return MatchDepths(*(torch.cat(tensors) for tensors in zip(*depths)))
 
 
 def _depths(pair: Pair, a: Tensor, b: Tensor, valid: Tensor) -> MatchDepths:
@@ -269,7 +269,7 @@ def split(
         return _joined(frames[:-held_out]), _joined(frames[-held_out:])
     (pairs,) = frames
     parts = {names: held_out_parts(matches) for names, matches in pairs.items()}
-    marks = {names: part == part.unique()[:1] for names, part in parts.items()}
+    marks = {names: fold == fold.unique()[:1] for names, fold in parts.items()}
     if all(bool(mark.all()) for mark in marks.values()):
         raise ValueError(
             "all points seen in two images are in one spot, so that none can be held out: "

@@ -69,10 +69,10 @@ def find_misfit(rig: Rig, images: Images) -> Misfit | None:
     if off <= max(BADLY, OF_OWN * own_distance(rig, pairs)) and not outside > OUTSIDE:
         return None
     points = sum(len(matches.alpha) for matches in pairs.values())
-    at = "" if scales[LARGEST_SIDE] == 1 else f", in images reduced to {LARGEST_SIDE} px"
+    reduced = "" if scales[LARGEST_SIDE] == 1 else f", in images reduced to {LARGEST_SIDE} px"
     text = (
         "the rig fits these images badly: "
-        f"{points} matched points lie {off:.1f} px from their lines (median{at})"
+        f"{points} matched points lie {off:.1f} px from their lines (median{reduced})"
     )
     if outside > OUTSIDE:
         text += f", {outside:.0%} of them behind the cameras or outside the depth range"

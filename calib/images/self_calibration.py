@@ -194,8 +194,8 @@ def dense_matches(
     x = torch.from_numpy(np.zeros((0, 2)) if corners is None else corners[:, 0].astype(np.float64))
     column, row = x.round().long().unbind(-1)
     z = depth[row, column].double()
-    known = z.isfinite() & (confidence[row, column] > LEAST_CONFIDENCE)
-    x, z = x[known], z[known]
+    reliable = z.isfinite() & (confidence[row, column] > LEAST_CONFIDENCE)
+    x, z = x[reliable], z[reliable]
 
     def in_beta(x: Tensor) -> Tensor:
         return beta.project(alpha.unproject(x, z)).x

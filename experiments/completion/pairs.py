@@ -53,7 +53,7 @@ def varied_pair(pair: StereoPair, seed: int) -> StereoPair:
     left, right = recoloured([larger(image).clamp(0, 1) for image in (pair.left, pair.right)], rng)
     most, truth = pair.max_disparity, None
     if pair.disparity is not None:
-        value, valid = (larger(part[None].float(), "nearest-exact")[0] for part in pair.disparity)
+        value, valid = (larger(plane[None].float(), "nearest-exact")[0] for plane in pair.disparity)
         truth = Disparity(value * width / size[1], valid > 0)
         most = float(pair.disparity.value.max())
     assert most is not None
@@ -89,8 +89,8 @@ def photo_pair(path: Path, behind: Path, seed: int) -> StereoPair:
     one, two = (torch.from_numpy(np.ascontiguousarray(x)).movedim(-1, 0) for x in (left, right))
     (base, sx, sy), (y, x) = planes[regions, :3].transpose(2, 0, 1), np.indices(regions.shape)
     truth = torch.from_numpy((base + sx * x + sy * y).astype(np.float32))
-    known = Disparity(truth, torch.ones_like(truth, dtype=torch.bool))
-    return StereoPair(f"{path.stem} {seed}", one, two, MOST + MARGIN, known)
+    true_disparity = Disparity(truth, torch.ones_like(truth, dtype=torch.bool))
+    return StereoPair(f"{path.stem} {seed}", one, two, MOST + MARGIN, true_disparity)
 
 
 def window_of(path: Path, rng: np.random.Generator) -> Image:
@@ -135,7 +135,9 @@ def _planes(regions: NDArray, rng: np.random.Generator) -> NDArray:
     ground, far = rng.uniform(0, 25), rng.uniform(6, 35)
     y, x = np.indices(regions.shape)
     count = np.bincount(regions.ravel(), minlength=n)
-    middle_y, middle_x = (np.bincount(regions.ravel(), part.ravel(), n) / count for part in (y, x))
+    middle_y, middle_x = (
+        np.bincount(regions.ravel(), coordinate.ravel(), n) / count for coordinate in (y, x)
+    )
     apart = np.where(rng.random(n) < 0.5, rng.normal(0, 1.5, n), rng.uniform(-12, 40, n))
     slopes = rng.normal(0, 0.02, (n, 2)) * (rng.random((n, 1)) < 0.5)
     disparity = np.clip(far + ground * middle_y / HW[0] + apart, 2, MOST)

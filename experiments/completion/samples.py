@@ -62,9 +62,9 @@ class PairTraining(Recipe):
             yield partial(photo_pair, files[i % len(files)], files[other], i)
 
     def _shape_pairs(self) -> Iterator[Made]:
-        files, known = self._photographs(), self._middlebury()
-        for i in range(self.shaped if known else 0):
-            yield partial(shape_pair, known[i % len(known)], files, i)
+        files, pairs = self._photographs(), self._middlebury()
+        for i in range(self.shaped if pairs else 0):
+            yield partial(shape_pair, pairs[i % len(pairs)], files, i)
 
     def _real_pairs(self) -> Iterator[Made]:
         """Each side as alpha, in turns."""

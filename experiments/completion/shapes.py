@@ -50,8 +50,8 @@ def shape_pair(pair: StereoPair, photos: Sequence[Path], seed: int) -> StereoPai
     if rng.random() < 0.5:
         one, two = recoloured([one, two], rng)
     truth = torch.from_numpy(np.take_along_axis(disparity, which[None], 0)[0])
-    known = Disparity(truth, torch.ones_like(truth, dtype=torch.bool))
-    return StereoPair(f"{pair.name} in other textures {seed}", one, two, MOST + MARGIN, known)
+    true_disparity = Disparity(truth, torch.ones_like(truth, dtype=torch.bool))
+    return StereoPair(f"{pair.name} in other textures {seed}", one, two, MOST + MARGIN, true_disparity)
 
 
 def _surfaces(disparity: Disparity) -> tuple[NDArray, NDArray]:
@@ -94,9 +94,9 @@ def _window(labels: NDArray, value: NDArray, rng: np.random.Generator) -> tuple[
         .clip(0, m - 1)
         for n, m in zip(HW, labels.shape)
     )
-    part = np.ix_(rows, columns)
-    names, which = np.unique(labels[part], return_inverse=True)
-    which, value = which.reshape(HW), value[part] * scale
+    window = np.ix_(rows, columns)
+    names, which = np.unique(labels[window], return_inverse=True)
+    which, value = which.reshape(HW), value[window] * scale
     softness, surfaces, soft = rng.uniform(0.6, 1.5), [], []
     for i in range(len(names)):
         mask = (which == i).astype(np.uint8)
@@ -139,12 +139,12 @@ def seen_from_right(which: NDArray, disparity: NDArray, textures: NDArray, hidde
     (h, w), fine = HW, HW[1] * SAMPLES
     x = (np.arange(fine) + 0.5) / SAMPLES - 0.5
     first = np.floor(x).clip(0, w - 2).astype(int)
-    part = (x - first).clip(0, 1).astype(np.float32)
+    fraction = (x - first).clip(0, 1).astype(np.float32)
     of, row = which[:, np.rint(x).clip(0, w - 1).astype(int)], np.arange(h)[:, None]
 
     def sampled(planes: NDArray) -> NDArray:
         one, two = planes[of, row, first], planes[of, row, first + 1]
-        share = part if one.ndim == 2 else part[:, None]
+        share = fraction if one.ndim == 2 else fraction[:, None]
         return one + share * (two - one)
 
     near, colours = sampled(disparity), sampled(textures)
@@ -154,8 +154,8 @@ def seen_from_right(which: NDArray, disparity: NDArray, textures: NDArray, hidde
     drawn = np.full(h * w * GRID, -1)
     drawn[(row * w * GRID + column)[on][order]] = np.flatnonzero(on)[order]
     drawn = drawn.reshape(h, w * GRID)
-    at = np.maximum.accumulate(np.where(drawn >= 0, np.arange(w * GRID), -1), 1)
-    close = (at >= 0) & (np.arange(w * GRID) - at <= 2)  # slopes stretch
-    drawn = np.where(close, np.take_along_axis(drawn, at.clip(0), 1), -1)
+    last_drawn = np.maximum.accumulate(np.where(drawn >= 0, np.arange(w * GRID), -1), 1)
+    close = (last_drawn >= 0) & (np.arange(w * GRID) - last_drawn <= 2)  # slopes stretch
+    drawn = np.where(close, np.take_along_axis(drawn, last_drawn.clip(0), 1), -1)
     image = np.where(close[..., None], colours.reshape(-1, 3)[drawn], np.repeat(hidden, GRID, 1))
     return image.reshape(h, w, GRID, 3).mean(2).astype(np.float32)

@@ -113,7 +113,7 @@ def unseeing(choices: Sequence[Path], pair: str) -> Choice:
         choice = read_choice(path)
         with safe_open(path, "pt") as file:
             recipe = json.loads((file.metadata() or {}).get("recipe", "{}"))
-        if any(part in pair for part in recipe.get("without", ())):
+        if any(fragment in pair for fragment in recipe.get("without", ())):
             return choice
     raise ValueError(f"no choice was trained without {pair}: train one (--without) and give its file")
 
@@ -132,8 +132,8 @@ def judged_pair(network: FusionNetwork, pair: StereoPair, condition: str, choice
 
     fused = rectified_fusion(network, noise=stated, matcher=matcher)(task.alpha, task.beta, PAPER_DISPARITY)
     assert fused.disparity is not None
-    (value, known), (h, w) = task.disparity, hw_of(task.alpha)
-    places = known.nonzero()
+    (value, valid), (h, w) = task.disparity, hw_of(task.alpha)
+    places = valid.nonzero()
     y, x = places[torch.randperm(len(places), generator=Generator().manual_seed(0))[:PIXELS]].unbind(-1)
     (matches,) = kept
     numbers = measured(matches, typical_facts(matches))[0, :, y // FINE, x // FINE].T
@@ -215,7 +215,7 @@ def held_markdown(held: dict[str, Held]) -> str:
     columns = ["condition", "right", "stated", "calibration error", "true position in the 90 % interval"]
     lines = []
     for name, one in held.items():
-        stated, right = (float((part * one.stated.share).sum()) for part in one.stated[:2])
+        stated, right = (float((values * one.stated.share).sum()) for values in one.stated[:2])
         lines.append([name, f"{right:.1%}", f"{stated:.1%}", f"{one.stated.error:.3f}", f"{one.covered:.1%}"])
     bins = [
         [f"{float(stated):.2f}", f"{float(right):.2f}", f"{float(share):.1%}"]

@@ -235,7 +235,11 @@ def _row(
 ) -> ConditionRow:
     image, truth = result.image.clamp(0, 1), task.ground_truth
     error = (image - truth).square().mean(0)
-    psnr = {n: -10 * math.log10(max(float(error[at].mean()), 1e-12)) for n, at in regions.items() if at.any()}
+    psnr = {
+        n: -10 * math.log10(max(float(error[region].mean()), 1e-12))
+        for n, region in regions.items()
+        if region.any()
+    }
     depth = depth_errors(result.disparity, task.disparity, regions)
     return ConditionRow(pair, condition, method, score(image, truth).ssim, psnr, *depth)
 
@@ -296,9 +300,9 @@ def _by_region(rows: Sequence[ConditionRow]) -> str:
 
 def _depth(rows: Sequence[ConditionRow]) -> str:
     lines = []
-    known = [r for r in rows if r.condition in ("ideal", "x1") and r.within_one is not None]
-    for condition, method in distinct((r.condition, r.method) for r in known):
-        matching = [r for r in known if (r.condition, r.method) == (condition, method)]
+    with_disparity = [r for r in rows if r.condition in ("ideal", "x1") and r.within_one is not None]
+    for condition, method in distinct((r.condition, r.method) for r in with_disparity):
+        matching = [r for r in with_disparity if (r.condition, r.method) == (condition, method)]
         shares = [100 * float(np.mean([r.within_one[i] for r in matching if r.within_one])) for i in range(2)]
         errors = [r.end_point_error for r in matching if r.end_point_error is not None]
         name = "OpenCV's SGBM" if method == "classical" else method
@@ -330,12 +334,14 @@ def save_curves(plots: Mapping[str, Curves], path: Path, *, ylabel: str) -> None
 
 def save_condition_curves(rows: Sequence[ConditionRow], path: Path) -> None:
     """A figure: mean PSNR against electrons at white, and against rows off, as far as evaluated."""
-    known = {row.condition for row in rows}
+    conditions = {row.condition for row in rows}
     axes = {
         "electrons at white": {50: "50 electrons", 200: "200 electrons", 1000: "1000 electrons"},
         "rows off (px)": {0: "ideal", 1: "rows off 1 px", 3: "rows off 3 px"},
     }
-    plots = {title: _curve(rows, points) for title, points in axes.items() if set(points.values()) <= known}
+    plots = {
+        title: _curve(rows, points) for title, points in axes.items() if set(points.values()) <= conditions
+    }
     if plots:
         save_curves(plots, path, ylabel="PSNR (dB)")
 

@@ -104,8 +104,8 @@ def rectified_cases(pairs: Iterable[StereoPair], *, linked: bool = False) -> Ite
         beta = enlarged(task.beta, (h, w))
         scene = RecordedScene({ALPHA: task.alpha, BETA: beta}, task.ground_truth, *_truth(task.disparity))
         rig = rectified_rig((h, w), {BETA: (h, w)}, PAPER_DISPARITY)
-        known = row_link((h, w)) if linked else rig.pair(ALPHA, BETA)
-        yield Case("F alone" if linked else "rectified pairs", pair.name, known, scene, PAPER_DISPARITY)
+        geometry = row_link((h, w)) if linked else rig.pair(ALPHA, BETA)
+        yield Case("F alone" if linked else "rectified pairs", pair.name, geometry, scene, PAPER_DISPARITY)
 
 
 def row_link(hw: tuple[int, int]) -> Pair:
@@ -175,12 +175,12 @@ def drawn_peaks(network: Comparing, cases: Iterable[Case]) -> dict[str, Tensor]:
         hw = hw_of(alpha)
         H = case.pair.homography_at(torch.tensor(torch.inf, dtype=torch.float64))
         at_infinity = apply_homography(H, pixel_grid(hw, dtype=torch.float64)).x
-        known = case.scene.visible
+        visible = case.scene.visible
         true, peak = ((x - at_infinity).norm(dim=-1) for x in (case.scene.position, result.peak[0]))
-        largest = true[known].quantile(0.99)
-        moved = torch.cat([torch.where(known, true, torch.nan), peak.clamp(max=largest)], 1)
+        largest = true[visible].quantile(0.99)
+        moved = torch.cat([torch.where(visible, true, torch.nan), peak.clamp(max=largest)], 1)
         true_drawn, found_drawn = colour_depth(1 / moved.clamp(min=0.1)).split(hw[1], dim=2)
-        wrong = known & ((result.peak[0] - case.scene.position).norm(dim=-1) > 1)
+        wrong = visible & ((result.peak[0] - case.scene.position).norm(dim=-1) > 1)
         red = torch.where(wrong, alpha.new_tensor([1.0, 0.0, 0.0])[:, None, None], alpha.expand(3, -1, -1))
         panels |= {
             f"{case.name}: alpha": alpha,

@@ -13,6 +13,6 @@ def of_half(pairs: Iterable[StereoPair], half: str) -> Iterator[StereoPair]:
     """The pairs of one half, "tune" (parts of their paths are in halves.yaml) or "report", or "all"."""
     listed = load_yaml(Path(__file__).with_name("halves.yaml").read_text(encoding="utf-8"))["tune"]
     for pair in pairs:
-        tune = any(f"/{part}/" in f"/{pair.name}/" for part in listed)
+        tune = any(f"/{folder}/" in f"/{pair.name}/" for folder in listed)
         if half == "all" or tune == (half == "tune"):
             yield pair

@@ -81,9 +81,9 @@ def _row(
     return OutsideRow(pair, source, psnr, error, within, seconds)
 
 
-def _around(disparity: Float[Tensor, "h w"], known: Tensor, tolerance: float) -> AroundDepth:
+def _around(disparity: Float[Tensor, "h w"], valid: Tensor, tolerance: float) -> AroundDepth:
     """The field around a disparity of a `rectified_rig`."""
-    depth = disparity.shape[1] / torch.where(known & (disparity > 0), disparity, torch.nan)
+    depth = disparity.shape[1] / torch.where(valid & (disparity > 0), disparity, torch.nan)
     return AroundDepth(depth, tolerance)
 
 
@@ -100,11 +100,11 @@ def _true(task: MonoColourTask) -> ReceptiveField:
 
 
 def _prior(task: MonoColourTask) -> ReceptiveField:
-    disparity, known = _truth(task)
+    disparity, valid = _truth(task)
     h, w = disparity.shape
     coarse = torch.rand(1, 1, h // BUMP + 2, w // BUMP + 2, generator=torch.Generator().manual_seed(0))
     error = interpolate(coarse, (h, w), mode="bilinear", align_corners=True)[0, 0]
-    return _around(disparity * (1 + PRIOR * (2 * error - 1)), known, PRIOR)
+    return _around(disparity * (1 + PRIOR * (2 * error - 1)), valid, PRIOR)
 
 
 def _truth(task: MonoColourTask) -> Disparity:

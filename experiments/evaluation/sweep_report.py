@@ -98,12 +98,12 @@ def _draw(axis: Axes, rows: Sequence[Row], measure: str) -> None:
     values = distinct(row.value for row in rows)
     for field in distinct(row.field for row in rows):
         drawn = {value: _drawn(rows, field, value, measure) for value in values}
-        known = [value for value in values if drawn[value]]
-        means = np.array([np.mean(drawn[value]) for value in known])
-        bounds = np.array([bootstrap_interval(drawn[value]) for value in known]).reshape(-1, 2)
-        spread = np.abs(np.nan_to_num(bounds.T - means)) if len(known) else None
+        measured = [value for value in values if drawn[value]]
+        means = np.array([np.mean(drawn[value]) for value in measured])
+        bounds = np.array([bootstrap_interval(drawn[value]) for value in measured]).reshape(-1, 2)
+        spread = np.abs(np.nan_to_num(bounds.T - means)) if len(measured) else None
         axis.errorbar(
-            known, means, yerr=spread, label=field, marker="o", markersize=3, capsize=2, linewidth=1
+            measured, means, yerr=spread, label=field, marker="o", markersize=3, capsize=2, linewidth=1
         )
     axis.set_ylabel(MEASURES[measure][0], fontsize=8)
     axis.tick_params(labelsize=8)

@@ -146,9 +146,13 @@ def _trees(rng: Generator) -> Iterator[Object]:
         green = 0.16 + 0.08 * float(rng.uniform())
         leaves = _leafy((0.02, 0.32 * green, 0.012), (0.35 * green, green, 0.03), 50 / height, "voronoi")
         for j in range(11):
-            at = rng.uniform(-1, 1, 3) * (0.22, 0.24, 0.22)
+            offset = rng.uniform(-1, 1, 3) * (0.22, 0.24, 0.22)
             radius = float(rng.uniform(0.26, 0.42)) * height
-            middle = (x + float(at[0]) * height, (-0.68 + float(at[1])) * height, z + float(at[2]) * height)
+            middle = (
+                x + float(offset[0]) * height,
+                (-0.68 + float(offset[1])) * height,
+                z + float(offset[2]) * height,
+            )
             yield _bush(f"crown{i}.{j}", middle, (radius, 0.8 * radius, radius), leaves, seed=100 * i + j)
 
 

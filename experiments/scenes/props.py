@@ -162,7 +162,7 @@ def on_path(item: Object, path: Sequence[tuple[float, Vec3]], spin: Vec3 = (0, 0
     length = path[-1][0] - start
     keys = []
     for time, position in path:
-        part = (time - start) / length
-        rotation = Rotation.from_rotvec(np.array(spin) * part) * Rotation.from_rotvec(first.rotation)
+        fraction = (time - start) / length
+        rotation = Rotation.from_rotvec(np.array(spin) * fraction) * Rotation.from_rotvec(first.rotation)
         keys.append(replace(first, position=position, rotation=vec(rotation.as_rotvec()), time=time))
     return replace(item, motion=Motion(tuple(keys)))

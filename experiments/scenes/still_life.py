@@ -143,9 +143,13 @@ def _book(rng: Generator, name: str, x: float, floor: float, wh: tuple[float, fl
     )
     bright = sum(colour) > 0.6
     label = plain(*((0.08, 0.05, 0.04) if bright else (0.62, 0.47, 0.20)), roughness=0.4)
-    for part in sorted(rng.choice([0.12, 0.2, 0.35, 0.6, 0.8, 0.88], int(rng.integers(1, 4)), replace=False)):
-        at = (x, floor - height * (1 - float(part)), z - 0.0005)
-        yield box(f"{name}.{part}", at, (width * 0.99, float(rng.uniform(0.004, 0.022)), 0.18), label)
+    for fraction in sorted(
+        rng.choice([0.12, 0.2, 0.35, 0.6, 0.8, 0.88], int(rng.integers(1, 4)), replace=False)
+    ):
+        position = (x, floor - height * (1 - float(fraction)), z - 0.0005)
+        yield box(
+            f"{name}.{fraction}", position, (width * 0.99, float(rng.uniform(0.004, 0.022)), 0.18), label
+        )
 
 
 def _plant(rng: Generator) -> Iterator[Object]:

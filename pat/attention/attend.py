@@ -145,10 +145,10 @@ def _attend(
     if backend == "local":
         raise RuntimeError(f"backend 'local' serves {LOCAL_SERVES} only: ask for 'auto'")
 
-    def run(q: Tensor, k: Tensor, v: Tensor, locations: Locations, part: Tensor | None) -> tuple[Tensor, ...]:
+    def run(q: Tensor, k: Tensor, v: Tensor, locations: Locations, bias: Tensor | None) -> tuple[Tensor, ...]:
         form = sample_positions(locations, q, samples)
         attended = _run(
-            AttentionInputs(q, k, v, form, _bias(part, q, form.samples), nearest), backend, measured
+            AttentionInputs(q, k, v, form, _bias(bias, q, form.samples), nearest), backend, measured
         )
         return attended if measured else attended[:1]
 
@@ -320,10 +320,10 @@ def _attend_by_rows(
         here, rows = at(x, y, Segments), x.shape[-2:]
         return here.start.unflatten(-2, rows), here.end.unflatten(-2, rows), here.valid.unflatten(-1, rows)
 
-    def attended(q: Tensor, x: Tensor, y: Tensor, *part: Tensor) -> tuple[Tensor, ...]:
+    def attended(q: Tensor, x: Tensor, y: Tensor, *bias_rows: Tensor) -> tuple[Tensor, ...]:
         positions = at(x, y, Positions)
         positions = Positions(positions.xy.unflatten(-3, x.shape), positions.mask.unflatten(-2, x.shape))
-        return run(q, key, value, positions, part[0].transpose(1, 2) if part else None)
+        return run(q, key, value, positions, bias_rows[0].transpose(1, 2) if bias_rows else None)
 
     first = at(x[:1], y[:1])
     if isinstance(first, Segments):

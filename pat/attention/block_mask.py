@@ -19,12 +19,12 @@ def segment_block_mask(segments: Segments, hw: HW, *, radius: float = 0.5, block
     batch = segments.valid.shape[0] if segments.valid.ndim > 2 else None
     parts = (segments.start, segments.end, segments.valid)
     starts, ends, valids = (
-        part.reshape(batch or 1, -1, *part.shape[segments.valid.ndim :]) for part in parts
+        tensor.reshape(batch or 1, -1, *tensor.shape[segments.valid.ndim :]) for tensor in parts
     )
     width = hw[1]
 
     def within(b: Tensor, h: Tensor, query: Tensor, key: Tensor) -> Tensor:
-        start, end, valid = (part[b if batch else 0, query] for part in (starts, ends, valids))
+        start, end, valid = (tensor[b if batch else 0, query] for tensor in (starts, ends, valids))
         dx, dy, u, v = end[0] - start[0], end[1] - start[1], key % width - start[0], key // width - start[1]
         along = ((u * dx + v * dy) / (dx * dx + dy * dy).clamp(min=1e-12)).clamp(0, 1)
         return valid & ((u - along * dx).square() + (v - along * dy).square() <= radius**2)

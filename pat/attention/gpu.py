@@ -161,10 +161,10 @@ def _sample(points, mask, fractions, place, alive, height, width, i, samples, ST
         y = y0 + u * (tl.load(points + 4 * place + 3, mask=alive, other=0) - y0)
         counts = alive & (tl.load(mask + place, mask=alive, other=0) != 0)
     else:
-        at = place * samples + i
-        x = tl.load(points + 2 * at, mask=alive, other=0)
-        y = tl.load(points + 2 * at + 1, mask=alive, other=0)
-        counts = alive & (tl.load(mask + at, mask=alive, other=0) != 0)
+        index = place * samples + i
+        x = tl.load(points + 2 * index, mask=alive, other=0)
+        y = tl.load(points + 2 * index + 1, mask=alive, other=0)
+        counts = alive & (tl.load(mask + index, mask=alive, other=0) != 0)
     counts = counts & (x >= -0.5 - SLACK) & (x <= width - 0.5 + SLACK)
     counts = counts & (y >= -0.5 - SLACK) & (y <= height - 0.5 + SLACK)
     return tl.where(counts, x, 0), tl.where(counts, y, 0), counts
@@ -314,13 +314,13 @@ def _forward(
 @compiled
 def _add(out, pixel, weight, x, channel, D, live, scale, FIXED):
     """Adds weight x to pixels of an image."""
-    at = out + pixel[:, None] * D + channel[None, :]
+    address = out + pixel[:, None] * D + channel[None, :]
     add = weight[:, None] * x
     if FIXED:
         add = add.to(tl.float64) * scale
-        tl.atomic_add(at, tl.floor(add + 0.5).to(tl.int64), mask=live)
+        tl.atomic_add(address, tl.floor(add + 0.5).to(tl.int64), mask=live)
     else:
-        tl.atomic_add(at, add, mask=live)
+        tl.atomic_add(address, add, mask=live)
 
 
 @compiled

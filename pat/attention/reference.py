@@ -82,9 +82,9 @@ def attend(inputs: AttentionInputs) -> Attended:
     query, positions, bias = inputs.query, inputs.positions, inputs.bias
     counted = accumulated(query)
 
-    def band(query: Tensor, points: Tensor, mask: Tensor, *part: Tensor) -> Attended:
+    def band(query: Tensor, points: Tensor, mask: Tensor, *bias_rows: Tensor) -> Attended:
         here = positions._replace(points=points, mask=mask)
-        biased = part[0].to(counted) if part else None
+        biased = bias_rows[0].to(counted) if bias_rows else None
         return _band(AttentionInputs(query.to(counted), key, value, here, biased, inputs.nearest))
 
     with torch.autocast(query.device.type, enabled=False):
@@ -116,13 +116,13 @@ def _band(inputs: AttentionInputs) -> Attended:
     xy = positions.positions().to(q.dtype)  # p r w l 2
     counts = positions.mask & on_image(xy, (key.shape[1], key.shape[2]))  # p r w l
     xy = torch.where(counts[..., None], xy, 0).expand(b, r, w, positions.samples, 2)
-    at = _nearest if nearest else _bilinear
+    interpolate = _nearest if nearest else _bilinear
 
-    score = torch.einsum("brwd,brwld->brwl", q, at(key, xy))
+    score = torch.einsum("brwd,brwld->brwl", q, interpolate(key, xy))
     if bias is not None:
         score = score + bias
     weight = _softmax(score, counts)
-    out = torch.einsum("brwl,brwld->brwd", weight, at(value, xy))
+    out = torch.einsum("brwl,brwld->brwd", weight, interpolate(value, xy))
     return Attended(out, *_statistics(weight, xy))
 
 

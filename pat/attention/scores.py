@@ -52,10 +52,10 @@ class Compared(NamedTuple):
 
     def strided(self, stride: int) -> Compared:
         """Of every `stride`-th row and column of alpha alone."""
-        part = (..., slice(None, None, stride), slice(None, None, stride))
+        sparse = (..., slice(None, None, stride), slice(None, None, stride))
         start, end, valid = self.segments.start, self.segments.end, self.segments.valid
-        few = Segments(start[(*part, slice(None))], end[(*part, slice(None))], valid[part])
-        return self._replace(query=self.query[part], locations=few)
+        few = Segments(start[(*sparse, slice(None))], end[(*sparse, slice(None))], valid[sparse])
+        return self._replace(query=self.query[sparse], locations=few)
 
 
 def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:

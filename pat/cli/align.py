@@ -108,7 +108,7 @@ class Align(Known):
         with folder_lock(self.out):
             if frame.name:
                 self.refuse_several()
-            rig, known = self.with_known(frame.rig, frame.alpha, frame.files, options.field_named(self.field))
+            rig, field = self.with_known(frame.rig, frame.alpha, frame.files, options.field_named(self.field))
             with options.working_by_plan(f"aligning {frame.name}".strip()) as announce:
                 aligned = align(
                     rig,
@@ -116,7 +116,7 @@ class Align(Known):
                     alpha=frame.alpha,
                     recorded=RecordedFiles(frame.recorded, frame.files),
                     network=None if self.weights is None else load_weights(self.weights),
-                    field=known,
+                    field=field,
                     interpolation=self.interpolation,
                     min_confidence=self.confidence,
                     fill=self.fill,

@@ -172,8 +172,8 @@ class Fuse(Known):
         levels = noise if isinstance(noise, dict) else {}
         for option, by_camera in {"--focal": focal, "--noise": levels}.items():
             if unknown := by_camera.keys() - cameras.keys():
-                known = ", ".join(cameras)
-                raise ValueError(f"{option}: no camera '{min(unknown)}'; the images' names are {known}")
+                names = ", ".join(cameras)
+                raise ValueError(f"{option}: no camera '{min(unknown)}'; the images' names are {names}")
         videos = [path for path in cameras.values() if path.suffix.lower() in options.VIDEO_SUFFIXES]
         if videos and (others := [path for path in cameras.values() if path not in videos]):
             raise ValueError(f"{videos[0]} is a video and {others[0]} is not: give images alone, or videos")
@@ -225,9 +225,9 @@ class Fuse(Known):
         from ..fusion.frame_matching import matched_frames, warn_of_gaps
         from ..fusion.results import check_no_result
 
-        known = [path for path in (self.depth_map, self.matches) if path is not None]
+        prior_files = [path for path in (self.depth_map, self.matches) if path is not None]
         check_no_result(
-            [*self.given, *known, *(path for paths in files.values() for path in paths)], self.out
+            [*self.given, *prior_files, *(path for paths in files.values() for path in paths)], self.out
         )
         timed = {"--frame-rate": self.frame_rate, "--time-offset": self.time_offset, "--speed": self.speed}
         if self.sequence:
@@ -304,10 +304,10 @@ class Fuse(Known):
         views = Views(rig, images, alpha, dict.fromkeys(images, field))
 
         def fused(rig: Rig) -> Frame:
-            known, field_given = self.with_known(rig, alpha, files, field)
+            rig, field_given = self.with_known(rig, alpha, files, field)
             return fuse_with_progress(
                 self.weights or "mono-colour",
-                known,
+                rig,
                 images,
                 alpha=alpha,
                 device=self.device,
@@ -469,7 +469,7 @@ def fuse_with_progress(
     options.say_when_compiling()
     with options.working_by_plan("fusing") as announce:
         frame = fuse(network, rig, images, progress=_numbered, announce=announce, **further)
-    return frame.mapped(lambda part: part.cpu())
+    return frame.mapped(lambda tensor: tensor.cpu())
 
 
 def _numbered(tiles: Iterable[Tile], count: int) -> Iterator[Tile]:

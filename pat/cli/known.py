@@ -158,9 +158,9 @@ class Known:
         assert self.depth_map is not None
         depth = read_depth(self.depth_map, hw=view.hw, scale=self.depth_scale)
         near, far = (float(bound) for bound in rig.depth)
-        known = depth[depth.isfinite()]
-        if float(((known < near) | (known > far)).float().mean()) > OUT_OF_RANGE:
-            some = known[:: len(known) // 100_000 + 1]  # torch takes quantiles of 2^24 numbers at most
+        finite = depth[depth.isfinite()]
+        if float(((finite < near) | (finite > far)).float().mean()) > OUT_OF_RANGE:
+            some = finite[:: len(finite) // 100_000 + 1]  # torch takes quantiles of 2^24 numbers at most
             low, high = some.quantile(torch.tensor([0.05, 0.95])).tolist()
             raise ValueError(
                 f"{self.depth_map}: holds {low:.3g} to {high:.3g} m, the rig's depth range is {near:g} to "

@@ -217,8 +217,8 @@ def reworded(box: str) -> str:
     lines = box.strip().splitlines()
     rows = [row.strip("│ ") for row in (lines[1:-1] if box.startswith("╭") else lines[2:])]
     said = [" ".join(text.split()) for text in re.split(r"[─-]{9,}", " ".join(rows))]
-    hints = [part for part in said[1:] if part.startswith("Perhaps you meant")]
-    text = " ".join(part for part in (*said[:1], *hints) if part)
+    hints = [sentence for sentence in said[1:] if sentence.startswith("Perhaps you meant")]
+    text = " ".join(sentence for sentence in (*said[:1], *hints) if sentence)
     for pattern, words in REWORDED:
         text = re.sub(pattern, words, text)
     return text

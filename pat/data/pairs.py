@@ -35,8 +35,8 @@ class Disparity(NamedTuple):
         column = (torch.arange(self.value.shape[1]).to(self.value) - self.value).round()
         on_right = self.valid & (column >= 0)
         index = torch.where(on_right, column, 0).long()
-        known = torch.where(on_right, self.value, 0)
-        front = torch.zeros_like(known).scatter_reduce(1, index, known, "amax")
+        disparity = torch.where(on_right, self.value, 0)
+        front = torch.zeros_like(disparity).scatter_reduce(1, index, disparity, "amax")
         hidden = front.gather(1, index) > self.value + 1
         return DisparityRegions(on_right & ~hidden, on_right & hidden, self.valid & ~on_right)
 

@@ -233,9 +233,9 @@ def _recorded(
     name: str, rig: Rig, ground_truth: Tensor, beta_image: Tensor, depth: Tensor, g: Generator
 ) -> AblationCase:
     """The case of two ideal images: some noise, a depth range a little wider than the scene's."""
-    known = depth[depth.isfinite()]
+    finite = depth[depth.isfinite()]
     images = recorded({ALPHA: luminance(ground_truth), BETA: beta_image}, g)
-    rig = rig.replace(depth=(float(known.min()) / 1.1, float(known.max()) * 1.1))
+    rig = rig.replace(depth=(float(finite.min()) / 1.1, float(finite.max()) * 1.1))
     return AblationCase(name, rig, images, ground_truth, depth)
 
 
@@ -312,12 +312,12 @@ def point_errors(case: AblationCase, depth: Float[Tensor, "h w"]) -> tuple[float
     x = pixel_grid(alpha.hw, dtype=torch.float64).reshape(-1, 2)
     unproject = at_distance if natural_bounds(case.rig.pair(ALPHA, BETA)) == "distance" else Camera.unproject
     ours, theirs = (beta.project(unproject(alpha, x, d.reshape(-1).double())) for d in (depth, case.depth))
-    known = theirs.valid & theirs.x.isfinite().all(-1)
-    compared = known & ours.valid & ours.x.isfinite().all(-1)
+    has_truth = theirs.valid & theirs.x.isfinite().all(-1)
+    compared = has_truth & ours.valid & ours.x.isfinite().all(-1)
     if not compared.any():
         return math.nan, math.nan
     error = (ours.x - theirs.x).norm(dim=-1)[compared]
-    return float(error.mean()), float((error <= 1).sum() / known.sum())
+    return float(error.mean()), float((error <= 1).sum() / has_truth.sum())
 
 
 def unsupported(field: ReceptiveField | None, rig: Rig) -> str:
@@ -374,8 +374,8 @@ def _scenes(count: int) -> str:
 
 def _mean(values: Sequence[float]) -> float:
     """Of those that are known; NaN if none is."""
-    known = [value for value in values if not math.isnan(value)]
-    return float(np.mean(known)) if known else math.nan
+    numbers = [value for value in values if not math.isnan(value)]
+    return float(np.mean(numbers)) if numbers else math.nan
 
 
 def crops(case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[AblationRow]) -> dict[str, Tensor]:

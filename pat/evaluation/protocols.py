@@ -50,8 +50,8 @@ def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
             "the mono + colour protocol needs equal sizes"
         )
     ground_truth, right = (cut_to_multiple(image, rate) for image in (pair.left, pair.right))
-    known = pair.disparity and Disparity(*(cut_to_multiple(plane, rate) for plane in pair.disparity))
-    return MonoColourTask(luminance(ground_truth), reduce_by(right, rate), ground_truth, known)
+    disparity = pair.disparity and Disparity(*(cut_to_multiple(plane, rate) for plane in pair.disparity))
+    return MonoColourTask(luminance(ground_truth), reduce_by(right, rate), ground_truth, disparity)
 
 
 def reduce_by(image: Float[Tensor, "c h w"], rate: int) -> Float[Tensor, "c hr wr"]:

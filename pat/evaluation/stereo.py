@@ -132,15 +132,18 @@ def _mean_cell(rows: Sequence[StereoRow]) -> str:
 
 def depth_markdown(rows: Sequence[StereoRow]) -> str:
     """Errors of known depth: end-point error in pixels / share within one pixel. Empty if none is known."""
-    known = [row for row in rows if row.end_point_error is not None]
-    if not known:
+    with_disparity = [row for row in rows if row.end_point_error is not None]
+    if not with_disparity:
         return ""
-    methods, rates = distinct(row.method for row in known), distinct(row.rate for row in known)
+    methods, rates = (
+        distinct(row.method for row in with_disparity),
+        distinct(row.rate for row in with_disparity),
+    )
     columns = [(method, rate) for method in methods for rate in rates]
-    groups = {key: [row for row in known if (row.method, row.rate) == key] for key in columns}
+    groups = {key: [row for row in with_disparity if (row.method, row.rate) == key] for key in columns}
     lines = [
         [pair, *(_depth_cell([row for row in groups[key] if row.pair == pair]) for key in columns)]
-        for pair in distinct(row.pair for row in known)
+        for pair in distinct(row.pair for row in with_disparity)
     ]
     lines.append(["**mean**", *(_depth_cell(groups[key]) for key in columns)])
     return markdown_table(["depth", *(f"{method}, {rate}x" for method, rate in columns)], lines)

@@ -115,7 +115,7 @@ def page(values: Mapping[str, Any], asks: str) -> str:
     # Nothing in a text may end the script, or be taken for a part of the page.
     data, asks = (text.replace("<", "\\u003c") for text in (json.dumps(values), asks))
     parts = {"MODULES": scripts, "DATA": data, "ASKS": asks}
-    return re.sub("|".join(parts), lambda part: parts[part[0]], PAGE)
+    return re.sub("|".join(parts), lambda match: parts[match[0]], PAGE)
 
 
 PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Receptive fields</title>

@@ -380,9 +380,9 @@ def joint_depth(betas: Mapping[str, BetaReport]) -> float:
     """The inverse of the mean inverse depth by all weights, metres; NaN if no sample has a depth."""
     inverse, total = 0.0, 0.0
     for beta in betas.values():
-        known = beta.depth.isfinite()
-        inverse += beta.peak * float((beta.weight[known] / beta.depth[known]).sum())
-        total += beta.peak * float(beta.weight[known].sum())
+        has_depth = beta.depth.isfinite()
+        inverse += beta.peak * float((beta.weight[has_depth] / beta.depth[has_depth]).sum())
+        total += beta.peak * float(beta.weight[has_depth].sum())
     return total / inverse if inverse > 0 else math.nan
 
 

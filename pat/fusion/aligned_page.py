@@ -125,5 +125,5 @@ def _index_colours(index: NDArray[np.float32]) -> Float[Tensor, "3 h w"]:
     value = torch.from_numpy(np.nan_to_num(index)).clamp(-1, 1)[..., None]
     brown, green = torch.lerp(stops[1], stops[0], -value), torch.lerp(stops[1], stops[2], value)
     colour = torch.where(value < 0, brown, green)
-    known = torch.from_numpy(np.isfinite(index))[..., None]
-    return torch.where(known, colour, 0.0).movedim(-1, 0)
+    finite = torch.from_numpy(np.isfinite(index))[..., None]
+    return torch.where(finite, colour, 0.0).movedim(-1, 0)

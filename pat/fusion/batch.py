@@ -281,9 +281,9 @@ def _plain(value: object) -> object:
         return vars(value)
     kind = type(value).__name__
     if FIELD_CLASSES.get(kind) is not type(value):
-        known = ", ".join(FIELD_CLASSES)
+        supported = ", ".join(FIELD_CLASSES)
         raise ValueError(
-            f"a batch's field is written to a file, which {value!r} cannot be: give one of {known}"
+            f"a batch's field is written to a file, which {value!r} cannot be: give one of {supported}"
         )
     return {"kind": kind, **vars(value)}
 
@@ -377,4 +377,4 @@ def _images_in(folder: Path) -> list[Path]:
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+    return [(int(token), "") if token.isdecimal() else (-1, token) for token in re.split(r"(\d+)", path.name)]

@@ -120,7 +120,7 @@ def find_corrections(
         LOG.info("pre-pass %d of at most %d", i + 1, SETTINGS.passes)
         inputs = corrections.applied(small.inputs, small.hw)
         parts = zip(small.inputs.betas, inputs.betas, located(inputs).betas)
-        matches = [_of_beta(inputs.alpha, *part, small.hw) for part in parts]
+        matches = [_of_beta(inputs.alpha, *of_beta, small.hw) for of_beta in parts]
         response_now = _fitted(small, matches) if fits else corrections.response
         steps = [fit_misalignment(*m[1:]) if align else Misalignment() for m in matches]
         moves = tuple(before + step for before, step in zip(corrections.misalignments, steps))

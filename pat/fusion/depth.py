@@ -75,20 +75,20 @@ def certain(output: FusionOutput, matches: Matches | None, inputs: Inputs) -> Fu
 
 
 def measured_depth(
-    output: FusionOutput, part: Inputs, placements: list[Placement], hw: HW, corner: tuple[int, int]
+    output: FusionOutput, inputs: Inputs, placements: list[Placement], hw: HW, corner: tuple[int, int]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Depth (h, w) from the calibrated betas, weighted by confidence in inverse depth, NaN where unknown; the
     half-width of its interval, as of `Frame`; and the image's confidence.
 
     A position whose depth is beyond the bounds that were searched counts as the end of its segment: a pixel
-    beyond the far end may otherwise stand for any distance. `corner` is the (x, y) of the part's first pixel
-    in alpha; `hw` the size of the part without padding.
+    beyond the far end may otherwise stand for any distance. `corner` is the (x, y) of the inputs' first
+    pixel in alpha; `hw` their size without padding.
     """
 
     def of_rows(tile: Tile) -> tuple[Tensor, ...]:
         (top, bottom), (left, above) = tile.inner, corner
         box = top, bottom, 0, hw[1]
-        betas = tuple(replace(beta, field=beta.field.cut(box)) for beta in part.betas)
+        betas = tuple(replace(beta, field=beta.field.cut(box)) for beta in inputs.betas)
         return _measured(output.cut(box), betas, placements, (bottom - top, hw[1]), (left, above + top))
 
     tiles = list(tiles_of(hw[:1], ROWS, 0))
@@ -125,7 +125,7 @@ def _measured(
                 some = Track(*(v.expand_as(track.a)[beyond] for v in track))
                 there = depth_from_track(some, moved + offset, half_width[beyond])
                 triangulated = Depth(
-                    *(t.masked_scatter(beyond, part) for t, part in zip(triangulated, there))
+                    *(t.masked_scatter(beyond, values) for t, values in zip(triangulated, there))
                 )
         elif pair.link is not None and pair.depth is not None:
             near, far = (bound.to(triangulated.depth) for bound in pair.depth)
@@ -136,8 +136,8 @@ def _measured(
         total = total + weight * inverse
         widths = widths + weight * triangulated.deviation.reshape(h, w) * inverse.square()
         weights = weights + weight
-    known = weights > 0
-    depth = torch.where(known, weights / torch.where(known, total, 1.0), torch.nan)
+    has_depth = weights > 0
+    depth = torch.where(has_depth, weights / torch.where(has_depth, total, 1.0), torch.nan)
     overall = torch.stack(output.confidence).amin(0) if output.overall is None else output.overall
-    half_width = torch.where(known, widths / torch.where(known, weights, 1.0), torch.nan)
+    half_width = torch.where(has_depth, widths / torch.where(has_depth, weights, 1.0), torch.nan)
     return depth.to(output.image), half_width.to(output.image), overall[0, :h, :w]

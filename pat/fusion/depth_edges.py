@@ -50,10 +50,10 @@ def beside_edges(
     An edge is where inverse depth changes by more than the width of its interval. Not where the search was
     around what is known of each pixel. Gradients are those of the pixel whose depth is taken.
     """
-    known = depth.isfinite() & (frame.confidence > 0)
-    if any(beta.around for beta in frame_inputs.inputs.betas) or not bool(known.any()):
+    has_depth = depth.isfinite() & (frame.confidence > 0)
+    if any(beta.around for beta in frame_inputs.inputs.betas) or not bool(has_depth.any()):
         return depth
-    likely = known & (frame.confidence >= frame.confidence[known].mean())
+    likely = has_depth & (frame.confidence >= frame.confidence[has_depth].mean())
     step = 2 * float(frame.half_width[likely].detach().nanmedian())
     if not step > 0:
         return depth
@@ -64,10 +64,10 @@ def beside_edges(
 
 def _taken(depth: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"], step: float) -> Float[Tensor, "h w"]:
     inverse, grey = numpy_of(1 / depth), numpy_of(alpha)
-    square, known = np.ones((2 * SETTINGS.near + 1,) * 2, np.uint8), np.isfinite(inverse)
-    greatest = cv2.dilate(np.where(known, inverse, 0), square)
-    least = cv2.erode(np.where(known, inverse, np.float32(np.inf)), square)
-    where = known & (greatest > least + np.float32(step))
+    square, finite = np.ones((2 * SETTINGS.near + 1,) * 2, np.uint8), np.isfinite(inverse)
+    greatest = cv2.dilate(np.where(finite, inverse, 0), square)
+    least = cv2.erode(np.where(finite, inverse, np.float32(np.inf)), square)
+    where = finite & (greatest > least + np.float32(step))
     weights = 4096 * np.exp(-np.square(np.arange(256) / (255 * SETTINGS.alike)) / 2)
     out = np.empty(inverse.shape, np.int64)
     rows = partial(kernels.weighted_medians, inverse, grey, where, weights.astype(np.int32), SETTINGS.radius)

@@ -66,15 +66,15 @@ def background_filled(frame: Frame, frame_inputs: FrameInputs) -> Float[Tensor, 
     if not steps:
         return depth
     every = (..., slice(None, None, 4), slice(None, None, 4), slice(None))
-    apart = torch.stack([(part.end[every] - part.start[every]).mean((0, 1, 2)) for part in steps])
+    apart = torch.stack([(segments.end[every] - segments.start[every]).mean((0, 1, 2)) for segments in steps])
     if apart.sum(0).norm() < SETTINGS.one_side * apart.norm(dim=1).sum():
         return depth
-    known = depth.isfinite() & (confidence > 0)
-    if not bool(known.any()):
+    has_depth = depth.isfinite() & (confidence > 0)
+    if not bool(has_depth.any()):
         return depth
     confidence, half_width = confidence.detach(), frame.half_width.detach()
-    least = SETTINGS.share * float(confidence[known].mean())
-    unit = float(half_width[known & (confidence >= least)].nanmedian())
+    least = SETTINGS.share * float(confidence[has_depth].mean())
+    unit = float(half_width[has_depth & (confidence >= least)].nanmedian())
     if not unit > 0:
         return depth
     farthest, nearest = (inverse / unit for inverse in _searched(frame_inputs.placements))
@@ -88,10 +88,10 @@ def background_filled(frame: Frame, frame_inputs: FrameInputs) -> Float[Tensor, 
 def _searched(placements: Sequence[Placement]) -> tuple[float, float]:
     """The least and the greatest inverse depth that was looked for; any, where nothing says."""
     stated = [place.pair.depth for place in placements if place.pair.calibrated]
-    known = [(float(far), float(near)) for near, far in filter(None, stated)]
-    if not known or len(known) < len(stated):
+    ranges = [(float(far), float(near)) for near, far in filter(None, stated)]
+    if not ranges or len(ranges) < len(stated):
         return 0.0, math.inf
-    far, near = zip(*known)
+    far, near = zip(*ranges)
     return 1 / max(far), 1 / min(near)
 
 
@@ -108,9 +108,9 @@ def _filled_rows(
     `least` is the confidence from which matches count before any plane is known; `bounds` are planes', in
     these units.
     """
-    (h, w), known = depth.shape, depth.isfinite()
-    inverse = torch.where(known, 1 / depth.detach(), 0.0) / unit
-    certain = torch.where(known, confidence, 0.0)
+    (h, w), has_depth = depth.shape, depth.isfinite()
+    inverse = torch.where(has_depth, 1 / depth.detach(), 0.0) / unit
+    certain = torch.where(has_depth, confidence, 0.0)
     kept = certain >= least
     filled = torch.where(kept, inverse, _background(inverse, kept))
     for apart in (_far_by_depth, _far_by_slope):
@@ -121,7 +121,7 @@ def _filled_rows(
         value, around = (torch.from_numpy(t).to(inverse) for t in per_pixel)
         kept = certain >= SETTINGS.share * around
         filled = torch.where(kept, inverse, value.clamp(*bounds))
-    changed = known & ~kept & (filled > 0)
+    changed = has_depth & ~kept & (filled > 0)
     return torch.where(changed, 1 / torch.where(changed, filled * unit, 1.0), depth)
 
 
@@ -135,8 +135,8 @@ def _far_by_slope(inverse: Plane) -> list[Plane]:
     return [np.diff(inverse, axis=axis, append=inverse.take([-1], axis)) for axis in (0, 1)]
 
 
-def _background(inverse: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """The farther of the nearest known ones to either side; as it is where a row has none."""
-    alone = torch.where(known, inverse, torch.nan)
-    beside = torch.fmin(*(nearest_known(alone, known, -1, back) for back in (False, True)))
+def _background(inverse: Float[Tensor, "h w"], kept: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """The farther of the nearest kept ones to either side; as it is where a row has none."""
+    alone = torch.where(kept, inverse, torch.nan)
+    beside = torch.fmin(*(nearest_known(alone, kept, -1, back) for back in (False, True)))
     return torch.where(beside.isnan(), inverse, beside)

@@ -321,10 +321,10 @@ def _calibrated(
             note(f"{alpha} > {name}: {points} points, {distance:.2f} px from their lines")
     if any(getattr(view, "distortion", None) is not None for view in uncalibrated.rig.cameras.values()):
         note(describe_lenses(uncalibrated.rig))
-    known = {alpha, *betas}
+    names = {alpha, *betas}
     if not pairs:
-        cameras = {name: view for name, view in uncalibrated.rig.cameras.items() if name in known}
-        links = {pair: link for pair, link in uncalibrated.rig.links.items() if known >= {*pair}}
+        cameras = {name: view for name, view in uncalibrated.rig.cameras.items() if name in names}
+        links = {pair: link for pair, link in uncalibrated.rig.links.items() if names >= {*pair}}
         return uncalibrated.rig.replace(cameras=cameras, links=links)
     first = next(iter(pairs))
     assumed = [name for name in (alpha, *pairs) if name not in focal]

@@ -65,7 +65,7 @@ class Placement(NamedTuple):
         near, far = (bound.to(triangulated.depth) for bound in pair.depth)
         beyond = ~(triangulated.valid & (triangulated.depth >= near) & (triangulated.depth <= far))
         there = on_curve(x[beyond], x_beta[beyond], deviation=deviation[beyond])
-        return Depth(*(t.masked_scatter(beyond, part) for t, part in zip(triangulated, there)))
+        return Depth(*(t.masked_scatter(beyond, values) for t, values in zip(triangulated, there)))
 
 
 class FrameInputs(NamedTuple):

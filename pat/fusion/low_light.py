@@ -98,9 +98,9 @@ class LowLight:
         if not self.noisy:
             return 0.0
         images = [*self.given.images.values(), *self.views.images.values()]
-        parts = [part for view in self.noisy.values() for part in view]
+        parts = [tensor for view in self.noisy.values() for tensor in view]
         kept_bytes = math.prod(hw) * betas * SETTINGS.found_bytes
-        return kept_bytes + sum({part.data_ptr(): part.nbytes for part in (*images, *parts)}.values())
+        return kept_bytes + sum({tensor.data_ptr(): tensor.nbytes for tensor in (*images, *parts)}.values())
 
     def corrected(
         self,
@@ -135,7 +135,7 @@ class LowLight:
         quiet = {n: NoisyView(x[None], x[None], 0 * x[None]) for n, x in self.views.images.items()}
         views = {**quiet, **self.noisy}
         parts = [self._stepped({name: view[i][0] for name, view in views.items()}, steps) for i in range(3)]
-        return {name: NoisyView(*(part[name][None] for part in parts)) for name in parts[0]}
+        return {name: NoisyView(*(images[name][None] for images in parts)) for name in parts[0]}
 
     def _stepped(self, images: Mapping[str, Tensor], steps: Sequence[FusionStep]) -> Mapping[str, Tensor]:
         views = self.views.replace(images)
@@ -183,8 +183,8 @@ def shown_noise(image: Float[Tensor, "c h w"]) -> float:
     """The standard deviation of the noise that the middle of an image shows."""
     side = SETTINGS.middle
     top, left = (max(n - side, 0) // 2 for n in image.shape[-2:])
-    part = image[None, :, top : top + side, left : left + side].detach().clamp(0, 1)
-    return float(NoiseLevel.estimated(part).deviation(part).mean())
+    middle = image[None, :, top : top + side, left : left + side].detach().clamp(0, 1)
+    return float(NoiseLevel.estimated(middle).deviation(middle).mean())
 
 
 def check_noise(noise: Noise | None) -> None:
@@ -249,8 +249,8 @@ def colours_averaged(
     if not deviation:
         return image
 
-    def averaged(part: Tensor, recorded: Tensor, confidence: Tensor) -> Tensor:
-        return averaged_with_alike(part[0], recorded[0], confidence[0], deviation)[None]
+    def averaged(fused: Tensor, recorded: Tensor, confidence: Tensor) -> Tensor:
+        return averaged_with_alike(fused[0], recorded[0], confidence[0], deviation)[None]
 
     return in_tiles(averaged, image[None], beta.recorded, confidence)[0]
 
@@ -260,7 +260,9 @@ def warped(
 ) -> tuple[NoisyView, Float[Tensor, "1 1 h w"]]:
     """All betas at alpha's pixels, mixed by their confidences; and the confidence of the mixture."""
     positions, confidence = matched[:, :2].movedim(1, -1), matched[:, 2]
-    images = [torch.cat([sample(part, x[None]).values for part in beta]) for beta, x in zip(betas, positions)]
+    images = [
+        torch.cat([sample(plane, x[None]).values for plane in beta]) for beta, x in zip(betas, positions)
+    ]
     weight = (confidence + 1e-6) / (confidence + 1e-6).sum(0)
     mixed = torch.stack([w * image for w, image in zip(weight, images)]).sum(0)
     return NoisyView(*mixed.split(1)), confidence.amax(0)[None, None]

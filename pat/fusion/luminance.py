@@ -78,7 +78,7 @@ def with_own_colours(frame: Frame, alpha: Float[Tensor, "3 h w"]) -> Frame:
     step = max(int((frame.confidence.numel() / OWN_COLOUR.pixels) ** 0.5), 1)
     some = (..., slice(None, None, step), slice(None, None, step))
     chroma = (to_luma_chroma(image[some])[1] for image in (alpha, frame.image))
-    terms, values = (part.flatten(1).detach().double() for part in chroma)
+    terms, values = (plane.flatten(1).detach().double() for plane in chroma)
     weight = (frame.confidence[some].flatten().detach() > OWN_COLOUR.seen).double()
     same = torch.eye(2, dtype=torch.float64, device=alpha.device)
     change = same + least_squares(terms, (values - terms).T, weight, OWN_COLOUR.prior * same)

@@ -62,10 +62,10 @@ def report_page(
         layers["classical"] = facts.classical
     layers["fused"] = frame.image
     overlays: dict[str, Callable[[], str]] = {"confidence": lambda: shares_layer(frame.confidence)}
-    known, extent, legend = frame.depth[frame.depth.isfinite()], "", ""
-    if len(known):
+    depths, extent, legend = frame.depth[frame.depth.isfinite()], "", ""
+    if len(depths):
         overlays["depth"] = lambda: data_url(colour_depth(frame.depth))
-        (near, far), unit = (f"{d:.3g}" for d in np.percentile(known.cpu().numpy(), (1, 99))), facts.unit
+        (near, far), unit = (f"{d:.3g}" for d in np.percentile(depths.cpu().numpy(), (1, 99))), facts.unit
         extent = f"{near} to {far} {unit}, for 98% of the pixels"
         legend = f"depth: near, {near} {unit} <i></i> far, {far} {unit}; unknown is black"
         legend = f'<p class="legend" hidden>{legend}</p>'

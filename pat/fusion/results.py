@@ -83,18 +83,20 @@ def save_frame(
     image in another format of a former one are gone. After an error all former files are as they were.
     Returns what was written.
     """
-    frame = frame.mapped(lambda part: part.detach().cpu())
+    frame = frame.mapped(lambda tensor: tensor.detach().cpu())
     prefix = f"{name}_" if name else ""
     last = f"{prefix}fused.{kind}"
-    depths = {f"{prefix}depth{part}" for part in (".tif", ".png", "_16.png", "_nearest.tif", "_farthest.tif")}
+    depths = {
+        f"{prefix}depth{suffix}" for suffix in (".tif", ".png", "_16.png", "_nearest.tif", "_farthest.tif")
+    }
     stale = depths | {f"{prefix}fused.{other}" for other in get_args(ImageFormat)}
     stale |= set() if name else {"points.ply", "index.html"}
     with write_together(out, last=last, stale=stale) as folder:
         confidence = partial(write_image, folder / f"{prefix}confidence.png", frame.confidence[None])
         tasks: list[Callable[[], object]] = [confidence]
         if frame.depth.isfinite().any():
-            for part, depth in zip(("", "_nearest", "_farthest"), (frame.depth, *frame.depth_interval)):
-                path = folder / f"{prefix}depth{part}.tif"
+            for suffix, depth in zip(("", "_nearest", "_farthest"), (frame.depth, *frame.depth_interval)):
+                path = folder / f"{prefix}depth{suffix}.tif"
                 tasks.append(partial(write_image, path, depth[None], bits=32, unknown=True))
             near = float(view.depth[0]) if view is not None and view.depth else None
             tasks.append(partial(write_depth, folder / f"{prefix}depth_16.png", frame.depth, near=near))
@@ -149,13 +151,13 @@ def write_depth(path: Path, depth: Float[Tensor, "h w"], *, near: float | None =
 
     The scale is in the file's text chunk "Description". 0 is unknown, 65535 that far or farther.
     """
-    known = depth.isfinite() & (depth > 0)
-    scale = depth_scale(near or float(depth[known].min() if known.any() else 1.0))
+    has_depth = depth.isfinite() & (depth > 0)
+    scale = depth_scale(near or float(depth[has_depth].min() if has_depth.any() else 1.0))
 
-    def counted(depth: Tensor, known: Tensor) -> Tensor:
-        return torch.where(known, (depth.double() * scale).round().clamp(1, MOST), 0.0).to(torch.uint16)
+    def counted(depth: Tensor, has_depth: Tensor) -> Tensor:
+        return torch.where(has_depth, (depth.double() * scale).round().clamp(1, MOST), 0.0).to(torch.uint16)
 
-    counts = chunked(counted, depth, known).numpy()
+    counts = chunked(counted, depth, has_depth).numpy()
     said = PngInfo()
     said.add_text("Description", f"depth: {scale:g} counts a metre; 0 is unknown, {MOST} that far or farther")
     Image.fromarray(counts).save(path, format="PNG", pnginfo=said, compress_level=4)
@@ -200,13 +202,13 @@ class Frame(NamedTuple):
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Frame:
         """The frame whose every part is changed, such as moved to another device."""
-        return Frame(*(part if part is None else change(part) for part in self))  # type: ignore[arg-type]
+        return Frame(*(tensor if tensor is None else change(tensor) for tensor in self))  # type: ignore[arg-type]
 
     def __repr__(self) -> str:
         """Sizes, the range of depth and the mean confidence, in a line."""
         bands, h, w = self.image.shape
-        known = self.depth[self.depth.isfinite()]
-        depth = f"depth {known.min():.3g} to {known.max():.3g}" if len(known) else "depth unknown"
+        finite = self.depth[self.depth.isfinite()]
+        depth = f"depth {finite.min():.3g} to {finite.max():.3g}" if len(finite) else "depth unknown"
         return f"Frame({w}x{h}, {bands} bands, {depth}, mean confidence {self.confidence.mean():.2f})"
 
     def _repr_png_(self) -> bytes:
@@ -215,7 +217,7 @@ class Frame(NamedTuple):
         parts = picture_of(self.image).expand(3, -1, -1), colour_depth(self.depth), confidence
         factor = min(SHOWN / max(self.image.shape[-2:]), 1.0)
         hw = [max(round(n * factor), 1) for n in self.image.shape[-2:]]
-        shown = [interpolate(part.detach().cpu().float()[None], size=hw, mode="area")[0] for part in parts]
+        shown = [interpolate(image.detach().cpu().float()[None], size=hw, mode="area")[0] for image in parts]
         values = (torch.cat(shown, -1).clamp(0, 1) * 255).round().to(torch.uint8)
         file = BytesIO()
         Image.fromarray(values.permute(1, 2, 0).numpy()).save(file, format="PNG")

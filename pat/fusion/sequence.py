@@ -156,8 +156,8 @@ class SequenceFusion:
         LOG.info("motion of frame %d", i)
         flow = flow_between(grey, self.grey(key.alpha))
         moved = warped(torch.cat([colour.added, colour.confidence[None]]), flow.step)
-        known = (colour.inverse_depth[:1] > 0).to(colour.inverse_depth)
-        share, *inverse = warped(torch.cat([known, colour.inverse_depth]), flow.step)
+        has_depth = (colour.inverse_depth[:1] > 0).to(colour.inverse_depth)
+        share, *inverse = warped(torch.cat([has_depth, colour.inverse_depth]), flow.step)
         # An unknown neighbour is not infinitely far away.
         inverse_depth = torch.where(share < 0.5, 0.0, torch.stack(inverse) / share.clamp(min=0.5))
         return nearness, KeyColour(moved[:-1], moved[-1] * flow.weight, inverse_depth)
@@ -304,11 +304,11 @@ def mixed(base: Float[Tensor, "1 h w"], sources: Sequence[tuple[float, KeyColour
     apart = (share * (added - colour).square()).sum((0, 1))
     confidence = (share[:, 0] * confidences).sum(0)
     weights = torch.where(of_sources[:, 0] > 0, weights, 0.0)
-    known = weights.sum(0) > 0
+    has_depth = weights.sum(0) > 0
     inverse, half_width = (weights[:, None] * of_sources).sum(0) / weights.sum(0).clamp(min=1e-12)
-    depth = torch.where(known, 1 / torch.where(known, inverse, 1.0), torch.nan)
+    depth = torch.where(has_depth, 1 / torch.where(has_depth, inverse, 1.0), torch.nan)
     agreeing = torch.exp(-apart / UNLIKE**2)
-    return Frame(base + colour, depth, confidence * agreeing, torch.where(known, half_width, torch.nan))
+    return Frame(base + colour, depth, confidence * agreeing, torch.where(has_depth, half_width, torch.nan))
 
 
 def fuse_sequence(

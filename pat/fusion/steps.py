@@ -158,7 +158,7 @@ def with_own_levels(
 ) -> Frame:
     """A frame whose bands, so many of each beta, have alpha's level, with each at its beta's own."""
     parts = zip(frame.image.split(list(bands)), beta_levels, strict=True)
-    return frame._replace(image=torch.cat([alpha_level.matched(part, scale) for part, scale in parts]))
+    return frame._replace(image=torch.cat([alpha_level.matched(planes, scale) for planes, scale in parts]))
 
 
 def join(which: JoinsBands, views: Views) -> StepResult:
@@ -234,8 +234,8 @@ def _for_pinhole(field: ReceptiveField | None, lens: View, pinhole: View) -> Rec
     x, defined = pixels_between(lens, pinhole)
     rays, valid = lens.to(torch.float64).rays(field.points(x))
     there = map_homogeneous(pinhole.K.double()[:2], rays[..., :2] / rays[..., 2:])
-    known = defined & valid & (rays[..., 2] > 0)
-    step = torch.where(known[..., None], there - pixel_grid(pinhole.hw, dtype=torch.float64), 0.0)
+    usable = defined & valid & (rays[..., 2] > 0)
+    step = torch.where(usable[..., None], there - pixel_grid(pinhole.hw, dtype=torch.float64), 0.0)
     return Moved(within, step.movedim(-1, 0).to(field.displacement))
 
 
@@ -249,9 +249,9 @@ def _distorted(frame: Frame, straight: Tensor, original: Tensor, pinhole: View, 
     back = resampled(shown, pinhole, lens, interpolation="bilinear").values[0]
     del shown
     inverse_depth, half_width = resampled(inverse, pinhole, lens, interpolation="nearest").values[0]
-    known = inverse_depth != 0
-    depth = torch.where(known, 1 / torch.where(known, inverse_depth, 1.0), torch.nan)
-    half_width = torch.where(known, half_width, torch.nan)
+    has_depth = inverse_depth != 0
+    depth = torch.where(has_depth, 1 / torch.where(has_depth, inverse_depth, 1.0), torch.nan)
+    half_width = torch.where(has_depth, half_width, torch.nan)
     by_band = frame.by_band
     if by_band is not None:
         bands = (resampled(b[None].float(), pinhole, lens, interpolation="bilinear") for b in by_band)

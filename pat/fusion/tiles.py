@@ -216,13 +216,13 @@ def _fused(
     if network.keeps_luminance and not inputs.denoised:
         output = back_projected(output, inputs)
     output = output.cut(box)
-    part = replace(inputs, betas=tuple(replace(beta, field=beta.field.cut(box)) for beta in inputs.betas))
+    cropped = replace(inputs, betas=tuple(replace(beta, field=beta.field.cut(box)) for beta in inputs.betas))
     hw = bottom - top, right - left
-    depth, half_width, confidence = measured_depth(output, part, frame.placements, hw, (left, top))
-    corners = [p.new_tensor(beta.offset)[:, None, None] for beta, p in zip(part.betas, output.position)]
+    depth, half_width, confidence = measured_depth(output, cropped, frame.placements, hw, (left, top))
+    corners = [p.new_tensor(beta.offset)[:, None, None] for beta, p in zip(cropped.betas, output.position)]
     of_betas = zip(output.position, corners, output.confidence)
     matched = torch.stack([torch.cat([p[0] + corner, c]) for p, corner, c in of_betas]).to(output.image)
-    bands = [beta.image.shape[1] for beta in part.betas]
+    bands = [beta.image.shape[1] for beta in cropped.betas]
     by_band = output.image[0, :0]
     if len(bands) > 1 and sum(bands) == output.image.shape[1]:
         by_band = torch.cat([c.expand(n, -1, -1) for c, n in zip(output.confidence, bands)])
@@ -257,7 +257,7 @@ def fused_in_tiles(
     else:
         parts = ((tile, make(tile)) for tile in shown)
     # A single tile is the frame as it is, with its gradients.
-    return FusedTile(*assembled(frame.hw, ((Tile(tile.inner, tile.inner), part) for tile, part in parts)))
+    return FusedTile(*assembled(frame.hw, ((Tile(tile.inner, tile.inner), fused) for tile, fused in parts)))
 
 
 def _digest(network: FusionNetwork, frame: FrameInputs) -> str:
@@ -265,7 +265,7 @@ def _digest(network: FusionNetwork, frame: FrameInputs) -> str:
     inputs = frame.inputs
     how = type(network).__name__, FusedTile._fields, inputs.luminance, inputs.bands, inputs.sees_luma
     module = network if isinstance(network, nn.Module) else nn.Module()
-    rounded = [name for name, part in module.named_modules() if "forward" in vars(part)]  # by `in_bfloat16`
+    rounded = [name for name, layer in module.named_modules() if "forward" in vars(layer)]  # by `in_bfloat16`
     digest = hashlib.sha256(f"{how} {rounded}".encode())
     parameters = module.state_dict().values()
     some = pixel_grid(inputs.hw, dtype=torch.float64)[::64, ::64].reshape(-1, 2)

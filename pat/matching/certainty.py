@@ -105,7 +105,7 @@ def measured(matches: BetaMatches, typical: Float[Tensor, "b 2"]) -> Float[Tenso
     assert matches.stated is not None
     facts = [matches.facts, *(box_mean(matches.facts, radius) for radius in SETTINGS.around)]
     ranges = (max_pool2d(_range(matches.surface, radius), FINE) for radius in SETTINGS.apart)
-    apart = [(part.clamp(min=0) + 0.1).log() for part in ranges]
+    apart = [(spread.clamp(min=0) + 0.1).log() for spread in ranges]
     blurs = torch.tensor(matches.comparison.whole.blurs).T  # of alpha and of beta, of each of the batch
     same = torch.cat([blurs.to(typical), typical], 1)[..., None, None]
     same = same.expand(*same.shape[:2], *matches.facts.shape[-2:])

@@ -107,16 +107,16 @@ def _chosen(inputs: Inputs, matches: BetaMatches, network: Choice) -> BetaMatche
     if (weight.dtype, weight.device) != (matches.facts.dtype, matches.facts.device):
         network = deepcopy(network).to(matches.facts)  # another thread may need it as it is
 
-    def of(piece: Inputs, part: BetaMatches) -> tuple[Tensor, Tensor]:
-        (beta,), (h, w) = piece.betas, part.disparity.shape[-2:]
+    def of(piece: Inputs, of_piece: BetaMatches) -> tuple[Tensor, Tensor]:
+        (beta,), (h, w) = piece.betas, of_piece.disparity.shape[-2:]
         views = matches.comparison.views(piece.alpha, beta.image)
         with torch.no_grad(), convolutions_in_parallel():
-            planes = features(views, beta.field.straight, part, candidates(part), typical)
+            planes = features(views, beta.field.straight, of_piece, candidates(of_piece), typical)
             answer = network(planes)
             del planes  # most of the memory; candidates are made twice for the same reason
             scores, stated = answer.split([CANDIDATES, 2], 1)
             best = pixel_shuffle(scores.max(1).indices.float(), FINE)[..., :h, :w].long()
-        return candidates(part).gather(1, best), stated.mean(2)[..., : h // FINE, : w // FINE]
+        return candidates(of_piece).gather(1, best), stated.mean(2)[..., : h // FINE, : w // FINE]
 
     disparity, stated = inputs.in_pieces(of, replace(matches, bands=None, diffused=None, certainty=None))
     return replace(matches, chosen=None if inputs.betas[0].around else disparity, stated=stated)

@@ -36,20 +36,20 @@ def compared(alpha, beta, end, towards, candidates, scales, out):
                 for column in range(first, min(first + COLUMNS, 2 * out.shape[1])):
                     c = min(column, width - 1)
                     target = out[row // 2, column // 2]
-                    at = 2 * (row % 2) + column % 2
+                    channel = 2 * (row % 2) + column % 2
                     far = candidates[k, r, c]
                     x = end[r, c, 0] + far * towards[r, c, 0]
                     y = end[r, c, 1] + far * towards[r, c, 1]
                     if k:
-                        target[4 * k + at] = soft((far - candidates[0, r, c]) * pixels)
+                        target[4 * k + channel] = soft((far - candidates[0, r, c]) * pixels)
                     else:
                         on = -half <= x and x <= right + half and -half <= y and y <= bottom + half
-                        target[at] = alpha[r, c] - half
-                        target[8 * n + at] = np.float32(on)
+                        target[channel] = alpha[r, c] - half
+                        target[8 * n + channel] = np.float32(on)
                     x, y = min(max(x, zero), right), min(max(y, zero), bottom)
                     left, top = min(int(x), max(columns - 2, 0)), min(int(y), max(rows - 2, 0))
                     u, v = x - np.float32(left), y - np.float32(top)
                     beside, below = min(left + 1, columns - 1), min(top + 1, rows - 1)
                     above = beta[top, left] + u * (beta[top, beside] - beta[top, left])
                     under = beta[below, left] + u * (beta[below, beside] - beta[below, left])
-                    target[4 * (n + k) + at] = soft((alpha[r, c] - above - v * (under - above)) * level)
+                    target[4 * (n + k) + channel] = soft((alpha[r, c] - above - v * (under - above)) * level)

@@ -84,7 +84,7 @@ def transferred(inputs: Inputs, matches: Matches) -> Matches:
 
     def of(piece: Inputs, there: Matches) -> list[Tensor]:
         parts = _transferred_piece(piece, there, sharing)
-        return [part if part.requires_grad or not large else part.half() for part in parts]
+        return [plane if plane.requires_grad or not large else plane.half() for plane in parts]
 
     parts = inputs.in_pieces(of, matches)
     bands, diffused = parts[-len(sharing) :], iter(parts[: -len(sharing)])

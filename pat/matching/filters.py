@@ -98,13 +98,13 @@ def smoothed(planes: Sequence[NDArray], guide: NDArray[np.uint8], how: tuple[flo
 
 
 def nearest_known(
-    x: Float[Tensor, "*b h w"], known: Bool[Tensor, "*b h w"], axis: int, back: bool
+    x: Float[Tensor, "*b h w"], valid: Bool[Tensor, "*b h w"], axis: int, back: bool
 ) -> Float[Tensor, "*b h w"]:
     """The value of the nearest known pixel before (or after) along an axis; the pixel's own if none is."""
     if back:
-        return nearest_known(x.flip(axis), known.flip(axis), axis, False).flip(axis)
+        return nearest_known(x.flip(axis), valid.flip(axis), axis, False).flip(axis)
     index = torch.arange(x.shape[axis], device=x.device).view(-1, *[1] * (-1 - axis))
-    last = torch.where(known, index, -1).cummax(axis).values
+    last = torch.where(valid, index, -1).cummax(axis).values
     return torch.where(last >= 0, x.gather(axis, last.clamp(min=0)), x)
 
 

@@ -102,7 +102,7 @@ class Matches:
     @property
     def nbytes(self) -> int:
         """Memory held, of a large frame: colours as float16, those that betas share counted once."""
-        colours = {id(part): part.numel() for beta in self.betas for part in beta.colours}
+        colours = {id(colour): colour.numel() for beta in self.betas for colour in beta.colours}
         planes = [2 * beta.disparity.nbytes + beta.facts.nbytes * 7 // 3 for beta in self.betas]
         return 2 * sum(colours.values()) + sum(planes)
 
@@ -110,9 +110,9 @@ class Matches:
         """Of a part of alpha. Colour that several betas share, they share there too."""
         shared: dict[int, Tensor | None] = {}
         parts = [(id(beta.diffused), beta.cut(box)) for beta in self.betas]
-        for key, part in parts:
-            shared.setdefault(key, part.diffused)
-        return Matches(tuple(replace(part, diffused=shared[key]) for key, part in parts))
+        for key, cropped in parts:
+            shared.setdefault(key, cropped.diffused)
+        return Matches(tuple(replace(cropped, diffused=shared[key]) for key, cropped in parts))
 
     def check(self, hw: HW, betas: int) -> None:
         """Raises ValueError unless they are finite, of an alpha of this size and of so many betas."""
@@ -122,7 +122,7 @@ class Matches:
                 f"these matches are of {w}x{h} pixels in {len(self.betas)} betas, "
                 f"the images are {width}x{height} with {betas}: match these images"
             )
-        if not all(bool(part.disparity.isfinite().all()) for part in self.betas):
+        if not all(bool(beta.disparity.isfinite().all()) for beta in self.betas):
             raise ValueError(
                 "these matches have disparities that are NaN or infinite: give any, with little certainty"
             )

@@ -129,8 +129,8 @@ class MatchedBeta:
         """Of the matches, and where these are consistent and have one."""
         x = self.segments.end + self.disparity[..., None] * self.extent.towards
         depth = depth_from_track(self.track, x)
-        known = depth.valid & self.segments.valid & (self.facts[0] < CONSISTENT)
-        return torch.where(known, 1 / torch.where(known, depth.depth, 1.0), 0.0), known
+        valid = depth.valid & self.segments.valid & (self.facts[0] < CONSISTENT)
+        return torch.where(valid, 1 / torch.where(valid, depth.depth, 1.0), 0.0), valid
 
     def _seen(self, inverse_depth: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
         """Beta's pixels as by `Track.at`, x and y apart, which takes a fraction of the time."""
@@ -191,10 +191,10 @@ class Agreement(NamedTuple):
     def of(cls, views: Sequence[MatchedBeta], like: Tensor) -> Agreement:
         """The inverse depth that is supported best, in the type of another tensor."""
         proposals = [view.inverse_depth for view in views]
-        weights = torch.stack([known * (0.1 + view.facts[1]) for view, (_, known) in zip(views, proposals)])
+        weights = torch.stack([valid * (0.1 + view.facts[1]) for view, (_, valid) in zip(views, proposals)])
         near = [[(v.disparity_of(w) - v.disparity).abs() < NEAR for v in views] for w, _ in proposals]
         support = torch.stack([weights * torch.stack(one) for one in near])  # proposal, beta, h, w
-        total = torch.where(torch.stack([known for _, known in proposals]), support.sum(1), -1.0)
+        total = torch.where(torch.stack([valid for _, valid in proposals]), support.sum(1), -1.0)
         best = total.argmax(0)[None, None].expand(1, *support.shape[1:])
         counts = support.gather(0, best)[0]
         precise = counts * torch.stack([view.extent.length.square() + 1 for view in views])
@@ -252,10 +252,10 @@ class _Sampled(NamedTuple):
         parts = []
         for pair in rows:
             view = MatchedBeta.of(beta, matches, pair)
-            w, known = view.inverse_depth
+            w, valid = view.inverse_depth
             little = 1e-3 * w + 1e-9
             rise = (view.disparity_of(w + little) - view.disparity_of(w)).abs() / little
-            parts.append([plane[:, :: SETTINGS.sampled_columns] for plane in (w, known, rise)])
+            parts.append([plane[:, :: SETTINGS.sampled_columns] for plane in (w, valid, rise)])
         return cls(*(torch.cat(planes) for planes in zip(*parts)))
 
     def against(self, other: _Sampled, x: Tensor, y: Tensor) -> Ambiguity:
@@ -308,13 +308,13 @@ def _agree(
 def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
     """Inverse depth diffused to where no match is consistent, and without outliers."""
     guide = to_bytes(inputs.alpha[0, 0])
-    plane, known = numpy_of(agreement.inverse_depth), agreement.known.cpu().numpy()
+    plane, valid = numpy_of(agreement.inverse_depth), agreement.known.cpu().numpy()
 
     def of(tile: Tile) -> Tensor:
-        part = (..., *slices(tile.outer))
-        weight = known[0][part].astype(np.float32) + 1e-5
-        smooth = filled(plane[part], weight, guide[part], DISPARITY_FILL)
-        median = cv2.medianBlur(np.where(known[part], plane[part], smooth)[0], 5)
+        index = (..., *slices(tile.outer))
+        weight = valid[0][index].astype(np.float32) + 1e-5
+        smooth = filled(plane[index], weight, guide[index], DISPARITY_FILL)
+        median = cv2.medianBlur(np.where(valid[index], plane[index], smooth)[0], 5)
         return torch.from_numpy(median)[None].to(inputs.alpha)
 
     tiles = ((tile, of(tile)) for tile in inputs.pieces)
@@ -322,18 +322,18 @@ def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
 
 
 def _of_beta(
-    at: Callable[[tuple[int, int]], MatchedBeta],
+    view_of: Callable[[tuple[int, int]], MatchedBeta],
     agreement: Agreement,
     strips: list[tuple[int, int]],
     initial: BetaMatches,
 ) -> BetaMatches:
-    """The matches of the beta that is `at` some rows."""
-    buffer = at(strips[0]).depth_buffer()
+    """The matches of the beta whose rows `view_of` gives."""
+    buffer = view_of(strips[0]).depth_buffer()
     for top, bottom in strips:
-        at((top, bottom)).enter(agreement.inverse_depth[0, top:bottom].to(buffer), buffer)
+        view_of((top, bottom)).enter(agreement.inverse_depth[0, top:bottom].to(buffer), buffer)
     disparity, facts = torch.empty_like(initial.disparity), torch.empty_like(initial.facts)
     for top, bottom in strips:
-        view, half = at((top, bottom)), slice(top // FINE, bottom // FINE)
+        view, half = view_of((top, bottom)), slice(top // FINE, bottom // FINE)
         inverse_depth = agreement.inverse_depth[0, top:bottom].to(buffer)
         there = view.disparity_of(inverse_depth).clamp(min=0)
         disparity[0, 0, top:bottom] = there.minimum(view.extent.length)

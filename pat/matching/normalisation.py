@@ -79,7 +79,7 @@ def normalised(
 
 def mean_moments(images: Iterable[Float[Tensor, "c h w"]]) -> Moments:
     """The means of several images' moments."""
-    return Moments(*(torch.stack(part).mean(0) for part in zip(*map(moments, images))))
+    return Moments(*(torch.stack(tensors).mean(0) for tensors in zip(*map(moments, images))))
 
 
 def explained_share(
@@ -173,7 +173,7 @@ def _sharpness(image: Float[Tensor, "1 h w"]) -> float:
     a side of less than 6 pixels."""
     half = avg_pool2d(image, FINE)
     differences = (half.diff(n=2, dim=axis).abs() for axis in (-1, -2))
-    return sum(float(part.mean()) for part in differences if part.numel()) + 1e-9
+    return sum(float(difference.mean()) for difference in differences if difference.numel()) + 1e-9
 
 
 class Comparison(NamedTuple):

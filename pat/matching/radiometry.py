@@ -309,9 +309,9 @@ class _Groups(NamedTuple):
         counts = torch.bincount(group, weight)
         planes = torch.cat([x, where.T, y[None], (y - rest).clamp(min=0.02)[None]])
         means = torch.stack([torch.bincount(group, weight * plane) for plane in planes]) / counts
-        at, level = means[:5].T / SETTINGS.near, means[6]
+        centres, level = means[:5].T / SETTINGS.near, means[6]
         brighter = (level / level.mean()).log()
-        alike = torch.exp(-torch.cdist(at, at).square() / 2) + brighter[:, None] * brighter
+        alike = torch.exp(-torch.cdist(centres, centres).square() / 2) + brighter[:, None] * brighter
         light = SETTINGS.light**2 * level[:, None] * level * alike
         variance = torch.bincount(group, weight * rest.square()) / counts
         noise = (variance + least**2) / SETTINGS.independent
@@ -371,19 +371,21 @@ class _Groups(NamedTuple):
     def _explained_by(self, model: Float[Tensor, " n"]) -> float:
         """The share of alpha's variance that a model of the groups explains."""
         unlike = self.y - self.counts @ self.y / self.counts.sum()
-        parts = (self.counts @ (part.square() + self.variance) for part in (self.y - model, unlike))
+        parts = (self.counts @ (residual.square() + self.variance) for residual in (self.y - model, unlike))
         left, whole = map(float, parts)
         return max(1 - left / whole, 0.0)
 
 
-def _grouped(at: Float[Tensor, "k n"], most: int) -> Int[Tensor, " n"]:
+def _grouped(points: Float[Tensor, "k n"], most: int) -> Int[Tensor, " n"]:
     """Which of at most so many groups points are in, of points near each other: halves of halves, each cut
     across where it is widest."""
-    parts = [torch.arange(at.shape[1])]
-    for _ in range(int(math.log2(min(most, at.shape[1] // SETTINGS.points_of_group)))):
-        ordered = [part[at[at[:, part].std(1).argmax(), part].argsort()] for part in parts]
-        parts = [half for part in ordered for half in part.tensor_split(2)]
-    group = torch.empty(at.shape[1], dtype=torch.long)
-    for label, part in enumerate(parts):
-        group[part] = label
+    parts = [torch.arange(points.shape[1])]
+    for _ in range(int(math.log2(min(most, points.shape[1] // SETTINGS.points_of_group)))):
+        ordered = [
+            members[points[points[:, members].std(1).argmax(), members].argsort()] for members in parts
+        ]
+        parts = [half for members in ordered for half in members.tensor_split(2)]
+    group = torch.empty(points.shape[1], dtype=torch.long)
+    for label, members in enumerate(parts):
+        group[members] = label
     return group

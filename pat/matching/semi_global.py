@@ -71,7 +71,7 @@ class HalfSizeMatches(NamedTuple):
     def cut(self, box: Box) -> HalfSizeMatches:
         """The part at alpha's (top, bottom, left, right), all even."""
         half = (..., *slices([n // FINE for n in box]))
-        return HalfSizeMatches(*(part[half] for part in self))
+        return HalfSizeMatches(*(plane[half] for plane in self))
 
 
 class Windows(NamedTuple):
@@ -233,5 +233,5 @@ def _block(image: _Image, box: Tile, windows: Windows, settings: SemiGlobalSetti
     corner = inner[0].start - outer[0].start, inner[1].start - outer[1].start
     kernels.winners(total, *labels, segments, image.hw, corner, jump, claims, parts)
     image.claims.append(claims)
-    for plane, part in zip(image.results, parts):
-        plane[inner] = part
+    for plane, result in zip(image.results, parts):
+        plane[inner] = result

@@ -83,11 +83,11 @@ def costs(alpha, beta, first, count, end, along, length, cut, rows, columns, out
             beyond = UNSEEN if cut[y, x] else NOWHERE
             for run in range(runs):
                 within = _count_within(length[y, x], first[y, x, run], count)
-                at, costs = places[run * lanes :], out[y, x, run]
+                targets, costs = places[run * lanes :], out[y, x, run]
                 for k in range(within):
-                    best_label[k] = dissimilarity(pixel, pixel_of(beta, max(at[k], 0)))
+                    best_label[k] = dissimilarity(pixel, pixel_of(beta, max(targets[k], 0)))
                 for k in range(lanes):
-                    cost = best_label[k] if at[k] >= 0 else NOWHERE
+                    cost = best_label[k] if targets[k] >= 0 else NOWHERE
                     cost = cost if k < within else beyond
                     costs[k] = cost if k < count else NO_LABEL
 
@@ -103,15 +103,15 @@ def _costs_at(code, cost, i: index):
 @instruction(lambda path, i, j: Vector(types.int16))
 def _load_halves(code, path, i: index, j: index):
     """Half a vector from either index."""
-    low, high = (code.get(code.kinds[0], path, at, NARROW) for at in (i, j))
+    low, high = (code.get(code.kinds[0], path, start, NARROW) for start in (i, j))
     return code.shuffle(low, high, [*range(LANES)])
 
 
 @instruction(lambda *_: types.void)
 def _store_halves(code, path, i: index, j: index, vector):
     """Stores half a vector at either index."""
-    for at, lanes in ((i, range(NARROW)), (j, range(NARROW, LANES))):
-        code.put(code.kinds[0], path, at, code.shuffle(vector, None, [*lanes]))
+    for start, lanes in ((i, range(NARROW)), (j, range(NARROW, LANES))):
+        code.put(code.kinds[0], path, start, code.shuffle(vector, None, [*lanes]))
 
 
 def _lesser(code, a, b):
@@ -136,7 +136,7 @@ def _spread(code, path, small):
 def _shifts(code, here, there, reach: index):
     """From the neighbour's first labels to a pixel's, or so far that they have no labels in common, not even
     beside them: to the first and second from the first and second, and from the second and first."""
-    a, b = (code.get(kind, at, ir.IntType(64)(0), 2) for kind, at in zip(code.kinds, (here, there)))
+    a, b = (code.get(kind, pointer, ir.IntType(64)(0), 2) for kind, pointer in zip(code.kinds, (here, there)))
     a, b = code.shuffle(a, None, [0, 1, 0, 1]), code.shuffle(b, None, [0, 1, 1, 0])
     most = code.repeat(code.trunc(reach, ir.IntType(32)), 4)
     least, shift = code.neg(most), code.sub(a, b)
@@ -196,7 +196,7 @@ def _sweep(way, shape, planes, guide, reach, pad, small, large, paths, fewest, j
     paths, fewest, ahead, above, behind, beside = pointers(
         (paths, fewest, jumps[0], jumps[1], jumps[2], jumps[3])
     )
-    known = cost, first, total, paths, fewest, runs, lanes, pad, reach, splat(np.int16(small * PARTS))
+    context = cost, first, total, paths, fewest, runs, lanes, pad, reach, splat(np.int16(small * PARTS))
     side, none = 3 * width + 4 * height + 4, 3 * width + 4 * height + 6
     step = 1 - 2 * way
     for row in range(height):
@@ -213,31 +213,31 @@ def _sweep(way, shape, planes, guide, reach, pad, small, large, paths, fewest, j
             p = y * width + x
             q = p - step * width
             before = i + 1 if row > 0 and i < width - 1 else none
-            _advance(known, p, p if before == none else q + step, before, i, ahead[x], way == 0)
+            _advance(context, p, p if before == none else q + step, before, i, ahead[x], way == 0)
             now = from_above + i
-            _advance(known, p, q if row > 0 else p, now + 1 if row > 0 else none, now, above[x], False)
+            _advance(context, p, q if row > 0 else p, now + 1 if row > 0 else none, now, above[x], False)
             now = from_behind + i
             before = now + 1 if row > 0 and i > 0 else none
-            _advance(known, p, p if before == none else q - step, before, now, behind[x], False)
+            _advance(context, p, p if before == none else q - step, before, now, behind[x], False)
             now, before = side + i % 2, side + (i + 1) % 2 if i > 0 else none
-            _advance(known, p, p if before == none else p - step, before, now, beside[x], False)
+            _advance(context, p, p if before == none else p - step, before, now, beside[x], False)
 
 
 @compiled(inline="always")
-def _advance(known, p, q, before, now, jump, is_first):
+def _advance(context, p, q, before, now, jump, is_first):
     """A path from pixel q, in slot `before`, to pixel p, in slot `now`, and its costs to the sums."""
-    cost, first, total, paths, fewest, runs, lanes, pad, reach, penalty = known
+    cost, first, total, paths, fewest, runs, lanes, pad, reach, penalty = context
     base, leap, lowest = splat(fewest[before]), splat(np.int16(fewest[before] + jump)), splat(WALL)
     stride = lanes + pad
     start, end = pad + before * runs * stride, pad + now * runs * stride
     ours, theirs = from_index(first, runs * p), from_index(first, runs * q)
     for lane in range(0, runs * lanes, LANES):
-        at = p * runs * lanes + lane
+        index = p * runs * lanes + lane
         stay = _reached(paths, start + lane, ours, theirs, reach, stride, runs, penalty)
-        path = add_int(_costs_at(cost, at), _subtract(_less(stay, leap), base))
+        path = add_int(_costs_at(cost, index), _subtract(_less(stay, leap), base))
         _keep(paths, end + lane, stride, runs, penalty, path)
         lowest = _less(lowest, path)
-        store(total, at, path if is_first else add_int(path, load(total, at)))
+        store(total, index, path if is_first else add_int(path, load(total, index)))
     fewest[now] = _least(lowest)
 
 
@@ -294,11 +294,11 @@ def winners(total, first, count, segments, hw, corner, large, claims, labels):
                 _places(end[here], along[here], low, high, far + HALF, rows, columns, places[lane:])
             best = np.int32(WALL) << 16
             for run in range(runs):
-                sums, start, at = total[here][run], starts[run], places[run * lanes :]
+                sums, start, targets = total[here][run], starts[run], places[run * lanes :]
                 within = _count_within(far, start, count)
                 for k in range(within):
                     claim = np.int32(sums[k]) << 16 | np.int32(start + k)
-                    place = at[k] if at[k] >= 0 else nowhere
+                    place = targets[k] if targets[k] >= 0 else nowhere
                     claims[place] = min(claims[place], claim)
                     best = min(best, claim)
                 # The very first label is taken if there is no other.
@@ -378,9 +378,9 @@ def costs_at(alpha, beta, places, out):
             pixel, costs = pixel_of(alpha, y * width + x), out[y, x, 0]
             costs[labels:] = NO_LABEL
             for label in range(labels):
-                at = places[y, x, label]
-                cost = dissimilarity(pixel, pixel_of(beta, max(at, 0)))
-                costs[label] = cost if at >= 0 else NOWHERE
+                target = places[y, x, label]
+                cost = dissimilarity(pixel, pixel_of(beta, max(target, 0)))
+                costs[label] = cost if target >= 0 else NOWHERE
 
 
 for _entry in (costs, aggregate, winners, regression, costs_at):

@@ -74,8 +74,8 @@ class SpectralMix(NamedTuple):
     ) -> SpectralMix:
         """The one most like alpha by weighted least squares, around each pixel's surroundings; twice, the
         second time without outliers."""
-        parts = [_mix(*part) for part in zip(bands.double(), alpha.double(), weight.double())]
-        return cls(*(torch.stack(part) for part in zip(*parts)))
+        parts = [_mix(*tensors) for tensors in zip(bands.double(), alpha.double(), weight.double())]
+        return cls(*(torch.stack(tensors) for tensors in zip(*parts)))
 
     def of(self, bands: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 h w"]:
         """The combination of these bands."""

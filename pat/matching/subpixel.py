@@ -138,7 +138,7 @@ def _step(views: ComparedViews, segments: Segments, disparity: Tensor) -> Float[
 
 def _agreement(rise: Tensor, rest: Tensor, radius: int) -> tuple[Tensor, Tensor]:
     """What rise and rest have in common within squares, and the rise's own, both less their means around."""
-    rise, rest = (part - box_mean(part, 2 * radius) for part in (rise, rest))
+    rise, rest = (values - box_mean(values, 2 * radius) for values in (rise, rest))
     common, slope = box_mean(torch.cat([rise * rest, rise.square()], 1), radius).split(1, 1)
     return common, slope
 
@@ -151,7 +151,7 @@ def _compared(
     across, down = (torch.gradient(beta, dim=side)[0] for side in (3, 2))
     still = Segments(segments.start.detach(), segments.end.detach(), segments.valid)
     extent = Extent.of(segments)
-    fixed = Extent(*(part.detach() for part in extent))
+    fixed = Extent(*(tensor.detach() for tensor in extent))
     there = at_matches(torch.cat([beta, across, down], 1), still, disparity, fixed)[0]
     sampled, across, down = there.split(1, 1)
     if segments.end.requires_grad or segments.start.requires_grad:

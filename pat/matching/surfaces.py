@@ -56,7 +56,7 @@ class Planes(NamedTuple):
         terms = np.empty((3, *values.shape, 4), np.float32)
         kernels.weighted_terms(values, weight, centre, reach, terms)
         over = cv2.ximgproc.createDTFilter(guide, reach, 1.0, cv2.ximgproc.DTF_RF)
-        sums = (over.filter(part) for part in terms)
+        sums = (over.filter(term) for term in terms)
         planes = np.empty((4, *values.shape), np.float32)
         kernels.planes_through(*sums, centre, reach, SETTINGS.level, planes)
         return cls(*planes)

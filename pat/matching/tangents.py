@@ -114,7 +114,7 @@ class _BlockCentres:
     def tangents(self, labels: Tensor) -> Segments:
         """The lines through the labels' positions along the curves, as long as these."""
         parts = [_tangents(self.at(rows, slice(None)), labels[rows]) for rows in self.by_rows()]
-        return Segments(*(torch.cat(part) for part in zip(*parts)))
+        return Segments(*(torch.cat(tensors) for tensors in zip(*parts)))
 
     def chosen(self, labels: Tensor) -> Segments:
         """Segments along x around the positions of whole labels, which a median makes agree with their
@@ -125,7 +125,7 @@ class _BlockCentres:
             index = labels[rows].long().to(locations.mask.device)[..., None]
             xy = locations.xy.gather(-2, index[..., None].expand(*index.shape, 2))[..., 0, :]
             parts.append((xy, locations.mask.gather(-1, index)[..., 0]))
-        xy, valid = (torch.cat(part) for part in zip(*parts))
+        xy, valid = (torch.cat(tensors) for tensors in zip(*parts))
         smooth = [cv2.medianBlur(numpy_of(plane), 5) for plane in xy.unbind(-1)]
         middle = torch.from_numpy(np.stack(smooth, -1)).to(xy)
         step = middle.new_tensor([HALF_WINDOW, 0.0])

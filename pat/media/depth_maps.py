@@ -61,10 +61,10 @@ def read_depth(path: str | Path, *, hw: HW | None = None, scale: float | None = 
     if scale is None:
         scale = 1.0 if np.issubdtype(values.dtype, np.floating) else _stated_scale(path) or MILLIMETRE
     depth = torch.from_numpy(values.astype(np.float32)) * scale
-    known = depth.isfinite() & (depth > 0)
-    if not known.any():
+    has_depth = depth.isfinite() & (depth > 0)
+    if not has_depth.any():
         raise ValueError(f"{path}: no pixel has a positive depth: is it a depth map?")
-    return torch.where(known, depth, torch.nan)
+    return torch.where(has_depth, depth, torch.nan)
 
 
 def _pfm(path: Path) -> NDArray[np.float32]:
@@ -102,17 +102,17 @@ def write_points(
     Coordinates are the camera's: x right, y down, z ahead, in the unit of the depth, which is `along` the
     axis, or the distance along the ray. An image of one band is grey.
     """
-    known = depth.isfinite()
-    x = pixel_grid(camera.hw, dtype=torch.float64)[known]
+    has_depth = depth.isfinite()
+    x = pixel_grid(camera.hw, dtype=torch.float64)[has_depth]
     colours = image.expand(3, -1, -1) if len(image) == 1 else image[:3]
-    double_camera, to_point = camera.to(torch.float64), depth[known].double()
+    double_camera, to_point = camera.to(torch.float64), depth[has_depth].double()
     X = double_camera.cam_from_world.apply(
         (at_distance if along == "distance" else Camera.unproject)(double_camera, x, to_point)
     )
     finite = X.isfinite().all(-1)
     vertices = np.empty(int(finite.sum()), VERTEX)
     vertices["X"] = X[finite].numpy()
-    vertices["colour"] = to_bytes(colours[:, known][:, finite]).T
+    vertices["colour"] = to_bytes(colours[:, has_depth][:, finite]).T
     with write_atomically(path) as temporary:
         temporary.write_bytes(PLY_HEADER.format(count=len(vertices)).encode() + vertices.tobytes())
     return len(vertices)

@@ -26,18 +26,18 @@ if TYPE_CHECKING:
 def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     """Inverse depth in colours, from its 1st to its 99th percentile; unknown depth is black."""
     depth = depth.detach().cpu()
-    known = depth.isfinite()
-    inverse = torch.where(known, 1 / torch.where(known, depth, 1.0), 0.0)
-    low, high = np.percentile(inverse[known].numpy(), (1, 99)) if known.any() else (0.0, 1.0)
+    has_depth = depth.isfinite()
+    inverse = torch.where(has_depth, 1 / torch.where(has_depth, depth, 1.0), 0.0)
+    low, high = np.percentile(inverse[has_depth].numpy(), (1, 99)) if has_depth.any() else (0.0, 1.0)
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
     turbo = torch.from_numpy(np.pad(table, ((0, 1), (0, 0))).T / np.float32(255))  # and black
 
-    def coloured(inverse: Tensor, known: Tensor) -> Tensor:
+    def coloured(inverse: Tensor, has_depth: Tensor) -> Tensor:
         scaled = (256 / max(high - low, 1e-12) * (inverse - low)).int().clamp_(0, 255)
-        which = torch.where(known, scaled, 256).flatten()
-        return turbo.index_select(1, which).view(3, *known.shape)
+        which = torch.where(has_depth, scaled, 256).flatten()
+        return turbo.index_select(1, which).view(3, *has_depth.shape)
 
-    return chunked(coloured, inverse, known)
+    return chunked(coloured, inverse, has_depth)
 
 
 def reduced(image: Float[Tensor, "c h w"], longest: int) -> Float[Tensor, "c h2 w2"]:

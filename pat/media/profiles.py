@@ -80,7 +80,7 @@ def with_srgb_profile(content: bytes, suffix: str) -> bytes:
         chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
         return content[:33] + chunk + content[33:]
     if suffix in (".jpg", ".jpeg"):
-        part = b"ICC_PROFILE\0\1\1" + srgb_profile()
-        assert len(part) < _JPEG_PART
-        return content[:2] + b"\xff\xe2" + struct.pack(">H", len(part) + 2) + part + content[2:]
+        segment = b"ICC_PROFILE\0\1\1" + srgb_profile()
+        assert len(segment) < _JPEG_PART
+        return content[:2] + b"\xff\xe2" + struct.pack(">H", len(segment) + 2) + segment + content[2:]
     return content

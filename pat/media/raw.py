@@ -79,7 +79,7 @@ def match_luminance(
     """
     if sensor.response != LIGHT:
         return image
-    return chunked(lambda part, luma: part + _missing(part, linear_from_srgb(luma)), image, alpha)
+    return chunked(lambda rgb, luma: rgb + _missing(rgb, linear_from_srgb(luma)), image, alpha)
 
 
 def _missing(image: Tensor, light: Tensor) -> Tensor:

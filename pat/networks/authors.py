@@ -102,14 +102,14 @@ def renamed(weights: Mapping[str, Tensor], config: PATConfig) -> dict[str, Tenso
 def _names(betas: int) -> Iterator[tuple[str, str]]:
     """Their name of each weight, and ours."""
     yield "init_feature.0.weight", "features.0.weight"
-    for part in (2, 4, 6):
-        yield from _block(f"init_feature.{part}", f"features.{part}")
-    for part in (3, 5):
+    for layer in (2, 4, 6):
+        yield from _block(f"init_feature.{layer}", f"features.{layer}")
+    for layer in (3, 5):
         for group in range(3):
             for branch in range(3):
-                theirs = f"init_feature.{part}.conv{branch + 1}_{group + 1}.0.weight"
-                yield theirs, f"features.{part}.groups.{group}.{branch}.weight"
-            yield f"init_feature.{part}.b_{group + 1}.weight", f"features.{part}.fuse.{group}.weight"
+                theirs = f"init_feature.{layer}.conv{branch + 1}_{group + 1}.0.weight"
+                yield theirs, f"features.{layer}.groups.{group}.{branch}.weight"
+            yield f"init_feature.{layer}.b_{group + 1}.weight", f"features.{layer}.fuse.{group}.weight"
     yield from _block("pam.rb", "engine.before")
     for kind in ("weight", "bias"):
         yield f"pam.b1.{kind}", f"engine.query.{kind}"
@@ -117,10 +117,10 @@ def _names(betas: int) -> Iterator[tuple[str, str]]:
             yield f"pam.b2s.{i}.{kind}", f"engine.key.{i}.{kind}"
             yield f"pam.b3s.{i}.{kind}", f"engine.value.{i}.{kind}"
         yield f"pam.fusion.{kind}", f"post.0.{kind}"
-    for part in range(4):
-        yield from _block(f"upscale.{part}", f"post.{part + 1}")
-    for part in (4, 6, 7):
-        yield f"upscale.{part}.weight", f"post.{part + 1}.weight"
+    for layer in range(4):
+        yield from _block(f"upscale.{layer}", f"post.{layer + 1}")
+    for layer in (4, 6, 7):
+        yield f"upscale.{layer}.weight", f"post.{layer + 1}.weight"
 
 
 def _block(theirs: str, ours: str) -> Iterator[tuple[str, str]]:

@@ -207,7 +207,7 @@ def filter_groups(image, expected, variance, top, alike, cosines, window, out):
     """Add to `out` (2, c, rows, w), from its first row of blocks: filtered blocks, weighted, and weights."""
     rows, columns = alike.shape[:2]
     group = np.empty((SIDE * SIDE, ALIKE), np.float32)
-    known = np.empty((SIDE * SIDE, ALIKE), np.float32)
+    pilot = np.empty((SIDE * SIDE, ALIKE), np.float32)
     spare = np.empty((SIDE * SIDE, ALIKE), np.float32)
     back = cosines.T.copy()
     for r in range(rows):
@@ -221,15 +221,15 @@ def filter_groups(image, expected, variance, top, alike, cosines, window, out):
                     for i in range(SIDE):
                         for j in range(SIDE):
                             group[SIDE * i + j, n] = image[c, y + i, x + j]
-                            known[SIDE * i + j, n] = expected[c, y + i, x + j]
+                            pilot[SIDE * i + j, n] = expected[c, y + i, x + j]
                 block_transform(group, spare, cosines)
                 group_transform(group)
-                block_transform(known, spare, cosines)
-                group_transform(known)
+                block_transform(pilot, spare, cosines)
+                group_transform(pilot)
                 total = np.float32(1)
                 for i in range(SIDE * SIDE):
                     for n in range(ALIKE):
-                        power = known[i, n] * known[i, n]
+                        power = pilot[i, n] * pilot[i, n]
                         share = power / (power + noise)
                         group[i, n] *= share
                         total += share * share

@@ -90,7 +90,7 @@ class PAT(nn.Module):
             if s > 1:
                 alpha = interpolate(alpha, scale_factor=s, mode="bicubic", align_corners=False)
             image = image + alpha
-        position, deviation, confidence = (list(part) for part in list(zip(*attended))[1:])
+        position, deviation, confidence = (list(tensors) for tensors in list(zip(*attended))[1:])
         return FusionOutput(image, position, deviation, confidence), compared
 
     def query_and_key(self, image: Float[Tensor, "b c h w"], beta: int = 0) -> QueryAndKey:

@@ -34,10 +34,10 @@ class FusionOutput(NamedTuple):
 
     def cut(self, box: Box) -> FusionOutput:
         """The part at (top, bottom, left, right); of an image that is not enlarged."""
-        part = (..., *slices(box))
-        position, deviation, confidence = ([t[part] for t in tensors] for tensors in self[1:4])
-        overall = None if self.overall is None else self.overall[part]
-        return FusionOutput(self.image[part], position, deviation, confidence, overall)
+        index = (..., *slices(box))
+        position, deviation, confidence = ([t[index] for t in tensors] for tensors in self[1:4])
+        overall = None if self.overall is None else self.overall[index]
+        return FusionOutput(self.image[index], position, deviation, confidence, overall)
 
 
 JoinsBands = Literal["no", "neighbours", "all"]

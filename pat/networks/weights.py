@@ -105,13 +105,13 @@ def set_precision(network: nn.Module, precision: Precision, *, compiled: bool = 
     if precision == "int8":
         eight_bits.round_to_eight_bits(network)
     inner = network.single if isinstance(network, BandwisePAT) else network
-    for part in inner.children():
-        if isinstance(part, (AttentionEngine, nn.ModuleList)):
+    for module in inner.children():
+        if isinstance(module, (AttentionEngine, nn.ModuleList)):
             continue
         if precision == "bfloat16":
-            in_bfloat16(part)
+            in_bfloat16(module)
         if compiled:
-            part.compile()
+            module.compile()
 
 
 def load_denoiser(path: str | Path = DENOISER) -> LowLightNetwork:

@@ -116,11 +116,11 @@ class NoiseLevel:
         return tuple(curve.expand(len(like), -1) for curve in curves)  # type: ignore[return-value]
 
 
-def _interpolated(x: Tensor, at: Float[Tensor, "b n"], values: Float[Tensor, "b n"]) -> Tensor:
+def _interpolated(x: Tensor, positions: Float[Tensor, "b n"], values: Float[Tensor, "b n"]) -> Tensor:
     """Values known at increasing positions, at those of x (B, ...); beyond the ends those of the ends."""
-    flat = x.flatten(1).clamp(at[:, :1], at[:, -1:])
-    i = torch.searchsorted(at.contiguous(), flat.contiguous()).clamp(1, at.shape[1] - 1)
-    low, high = at.gather(1, i - 1), at.gather(1, i)
+    flat = x.flatten(1).clamp(positions[:, :1], positions[:, -1:])
+    i = torch.searchsorted(positions.contiguous(), flat.contiguous()).clamp(1, positions.shape[1] - 1)
+    low, high = positions.gather(1, i - 1), positions.gather(1, i)
     share = (flat - low) / (high - low).clamp(min=1e-9)
     return torch.lerp(values.gather(1, i - 1), values.gather(1, i), share.clamp(0, 1)).reshape(x.shape)
 

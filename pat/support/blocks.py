@@ -72,17 +72,17 @@ def channels_last(x: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d h w"]:
 
 def stacked(*parts: Float[Tensor, "b _ _ _"]) -> Float[Tensor, "b d h w"]:
     """All parts' channels, `channels_last`; 2x2 pixels of parts twice the size as in `pixel_unshuffle`."""
-    h, w = (min(part.shape[side] for part in parts) for side in (-2, -1))
+    h, w = (min(tensor.shape[side] for tensor in parts) for side in (-2, -1))
     if not all(map(plain, parts)):
-        same = (part if part.shape[-1] == w else pixel_unshuffle(part, 2) for part in parts)
-        return torch.cat([channels_last(part) for part in same], 1)
-    counts = [part.shape[1] * (part.shape[-1] // w) ** 2 for part in parts]
+        same = (tensor if tensor.shape[-1] == w else pixel_unshuffle(tensor, 2) for tensor in parts)
+        return torch.cat([channels_last(tensor) for tensor in same], 1)
+    counts = [tensor.shape[1] * (tensor.shape[-1] // w) ** 2 for tensor in parts]
     out = parts[0].new_empty(len(parts[0]), h, w, sum(counts))
-    for part, target in zip(parts, out.split(counts, -1)):
-        if part.shape[-1] == w:
-            target.copy_(part.movedim(1, -1))
+    for tensor, target in zip(parts, out.split(counts, -1)):
+        if tensor.shape[-1] == w:
+            target.copy_(tensor.movedim(1, -1))
         else:
-            for image, of in zip(part.numpy(), target.numpy()):
+            for image, of in zip(tensor.numpy(), target.numpy()):
                 unshuffle(image[:, ::2], image[:, 1::2], of)
     return out.movedim(-1, 1)
 
@@ -132,14 +132,14 @@ def _in_turn(blocks: list[ResidualBlock]) -> nn.Module:
     return nn.Sequential(*blocks) if len(blocks) > 1 else blocks[0]
 
 
-def in_bfloat16(part: nn.Module) -> None:
-    """Let a part compute in bfloat16 where autocast does, with float32 output."""
-    part.forward = partial(_rounded, part)  # copies of a part have their own
+def in_bfloat16(module: nn.Module) -> None:
+    """Let a module compute in bfloat16 where autocast does, with float32 output."""
+    module.forward = partial(_rounded, module)  # copies of a module have their own
 
 
-def _rounded(part: nn.Module, *images: Any) -> Any:
+def _rounded(module: nn.Module, *images: Any) -> Any:
     with torch.autocast(images[0].device.type, torch.bfloat16):
-        answer = type(part).forward(part, *images)
+        answer = type(module).forward(module, *images)
     return tree_map(lambda t: t.float(), answer)
 
 

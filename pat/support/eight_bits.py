@@ -63,15 +63,15 @@ class Conv2d(nn.Conv2d):
         elif self.measuring:
             values = x.detach().flatten()[:: max(1, x.numel() // SETTINGS.samples)]
             ends = values.quantile(values.new_tensor([SETTINGS.beyond, 1 - SETTINGS.beyond]))
-            known = ends if self.input_range is None else torch.cat([ends, self.input_range])
-            self.input_range = torch.stack(known.aminmax())
+            extremes = ends if self.input_range is None else torch.cat([ends, self.input_range])
+            self.input_range = torch.stack(extremes.aminmax())
         elif self.rounded and self.input_range is not None and plain(x) and self.weight.dtype == x.dtype:
             return in_eight_bits(x, self, packed(self))
         return super().forward(x)
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *others: Any) -> None:
-        known = state_dict.get(prefix + RANGE)
-        self.input_range = None if known is None else torch.zeros(2, device=self.weight.device)
+        stored = state_dict.get(prefix + RANGE)
+        self.input_range = None if stored is None else torch.zeros(2, device=self.weight.device)
         super()._load_from_state_dict(state_dict, prefix, *others)
 
 
@@ -83,30 +83,30 @@ def plain(x: Tensor) -> bool:
 @contextmanager
 def measured(network: nn.Module) -> Iterator[None]:
     """Within this, convolutions compute as they are and keep the range of all that they are given."""
-    convolutions = [part for part in network.modules() if isinstance(part, Conv2d)]
-    for part in convolutions:
-        part.input_range, part.measuring = None, True
+    convolutions = [convolution for convolution in network.modules() if isinstance(convolution, Conv2d)]
+    for convolution in convolutions:
+        convolution.input_range, convolution.measuring = None, True
     try:
         yield
     finally:
-        for part in convolutions:
-            part.measuring = False
+        for convolution in convolutions:
+            convolution.measuring = False
 
 
 def names(network: nn.Module) -> list[str]:
     """Of the ranges that its convolutions may have."""
-    return [f"{name}.{RANGE}" for name, part in network.named_modules() if isinstance(part, Conv2d)]
+    return [f"{name}.{RANGE}" for name, module in network.named_modules() if isinstance(module, Conv2d)]
 
 
 def round_to_eight_bits(network: nn.Module) -> None:
     """Let convolutions compute in 8 bits. Raises ValueError if the processor cannot or a range is missing."""
     if not available():
         raise ValueError("this processor does not multiply 8-bit integers: leave the precision at float32")
-    convolutions = [part for part in network.modules() if isinstance(part, Conv2d)]
-    if not convolutions or any(part.input_range is None for part in convolutions):
+    convolutions = [convolution for convolution in network.modules() if isinstance(convolution, Conv2d)]
+    if not convolutions or any(convolution.input_range is None for convolution in convolutions):
         raise ValueError("these weights state no ranges for 8 bits: leave the precision at float32")
-    for part in convolutions:
-        part.rounded = True
+    for convolution in convolutions:
+        convolution.rounded = True
 
 
 class Packed(NamedTuple):
@@ -124,8 +124,8 @@ _PACKED: WeakKeyDictionary[Conv2d, tuple[object, Packed]] = WeakKeyDictionary()
 
 def packed(of: Conv2d) -> Packed:
     """Of these weights and this range; kept until they are others."""
-    known = of.weight, of.input_range
-    now = [(x.data_ptr(), 0 if x.is_inference() else x._version) for x in known if x is not None]
+    tensors = of.weight, of.input_range
+    now = [(x.data_ptr(), 0 if x.is_inference() else x._version) for x in tensors if x is not None]
     before, made = _PACKED.get(of, (None, None))
     if made is None or before != now:
         made = _made(of)
@@ -172,7 +172,7 @@ def in_eight_bits(x: Float[Tensor, "b i h w"], of: Conv2d, by: Packed) -> Float[
 
     if len(parts) == 1:
         return strip(*parts[0])
-    outputs = in_parallel([partial(strip, *part) for part in parts])
+    outputs = in_parallel([partial(strip, *arguments) for arguments in parts])
     each = len(parts) // len(x)
     return torch.cat([torch.cat(outputs[i : i + each], 2) for i in range(0, len(parts), each)])
 

@@ -85,8 +85,8 @@ def _in_use(folder: Path, owner: dict[str, object], advice: str) -> ValueError:
 
 
 def _unusable(folder: Path, error: OSError) -> ValueError:
-    at = Path(error.filename) if error.filename else folder
+    place = Path(error.filename) if error.filename else folder
     blocked = next((path for path in (folder, *folder.parents) if path.exists() and not path.is_dir()), None)
-    at = at.parent if at.name in (LOCK, OWNER) else at
-    reason = f"{blocked} is a file" if blocked else f"{at}: {error.strerror}"
+    place = place.parent if place.name in (LOCK, OWNER) else place
+    reason = f"{blocked} is a file" if blocked else f"{place}: {error.strerror}"
     return ValueError(f"{folder}: cannot write there ({reason}): give another folder")

@@ -60,8 +60,8 @@ def parse_yaml(text: str | bytes, name: str) -> Any:
         return load_yaml(text if isinstance(text, str) else text.decode("utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         line, problem = yaml_problem(error)
-        at = f" at line {line}" if line else ""
-        raise ValueError(f"{name}: not valid YAML{at}: {problem}") from None
+        position = f" at line {line}" if line else ""
+        raise ValueError(f"{name}: not valid YAML{position}: {problem}") from None
 
 
 def entries_of(path: Path) -> dict[str, Any]:
@@ -181,12 +181,12 @@ def _below(entry: str, key: object) -> str:
     return f"{entry}.{key}" if entry else str(key)
 
 
-def near(name: object, known: Iterable[object]) -> str:
+def near(name: object, choices: Iterable[object]) -> str:
     """The end of a message about an unknown name: the nearest known one, or all of them.
 
     >>> near("nois", ["noise", "clip"])
     "; did you mean 'noise'?"
     """
-    names = [str(k) for k in known]
+    names = [str(k) for k in choices]
     close = difflib.get_close_matches(str(name), names, 1)
     return f"; did you mean '{close[0]}'?" if close else f"; known here: {', '.join(names)}"

@@ -105,12 +105,12 @@ def _branches(rng: np.random.Generator) -> np.ndarray:
 
 
 def _grow(
-    mask: np.ndarray, rng: np.random.Generator, at: np.ndarray, angle: float, length: float, width: int
+    mask: np.ndarray, rng: np.random.Generator, start: np.ndarray, angle: float, length: float, width: int
 ) -> None:
     if width < 5:
         return
-    end = at + length * np.array([np.cos(angle), np.sin(angle)])
-    _line(mask, np.stack([at, end]), width)
+    end = start + length * np.array([np.cos(angle), np.sin(angle)])
+    _line(mask, np.stack([start, end]), width)
     for _ in range(rng.integers(2, 4)):
         _grow(mask, rng, end, angle + rng.normal(0, 0.6), length * rng.uniform(0.6, 0.85), width - 5)
 

@@ -37,8 +37,8 @@ def _window(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     h, w = image.shape[:2]
     side = min(h, w, 2 * _SIDE)
     y, x = rng.integers(h - side + 1), rng.integers(w - side + 1)
-    part = cv2.resize(image[y : y + side, x : x + side], (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
-    return part.astype(np.float32) / 255
+    window = cv2.resize(image[y : y + side, x : x + side], (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
+    return window.astype(np.float32) / 255
 
 
 def _smoothed(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -160,8 +160,8 @@ def _revolved(radius: Callable[[NDArray], NDArray], y: Callable[[NDArray], NDArr
 
 def _lathe(profile: tuple[tuple[float, float], ...]) -> _Surface:
     """The surface that a profile sweeps around the y axis; corners of the profile are points of it."""
-    at = np.arange(len(profile))
-    radius, y = (lambda t, v=v: np.interp(t * (len(profile) - 1), at, v) for v in np.array(profile).T)
+    index = np.arange(len(profile))
+    radius, y = (lambda t, v=v: np.interp(t * (len(profile) - 1), index, v) for v in np.array(profile).T)
     return _Surface(_revolved(radius, y), (_ROUND, len(profile) - 1))
 
 

@@ -45,9 +45,9 @@ def attention_loss(
     `position` (x, y in beta's pixels) is (0, 0) where it is not known, `visible` whether beta sees the point
     there.
     """
-    part = (slice(None), slice(None, None, stride), slice(None, None, stride))
+    sparse = (slice(None), slice(None, None, stride), slice(None, None, stride))
     losses = [
-        _of_beta(one.strided(stride), where[part], mask[part])
+        _of_beta(one.strided(stride), where[sparse], mask[sparse])
         for one, where, mask in zip(compared, position, visible)
     ]
     return torch.stack(losses).mean()
@@ -55,11 +55,11 @@ def attention_loss(
 
 def _of_beta(compared: Compared, position: Tensor, visible: Tensor) -> Tensor:
     target = target_of(compared.segments, compared.samples, position.to(compared.segments.start))
-    valid, known = compared.segments.valid.expand_as(visible), (position != 0).any(-1)
+    valid, has_position = compared.segments.valid.expand_as(visible), (position != 0).any(-1)
     scores, inside = _true_scores(compared, target)
     total = log_sum(compared)
     visible_loss = _mean(total - scores, visible & valid & inside & target.on_segment)
-    return visible_loss + UNSEEN * _mean(total - mean_score(compared), ~visible & valid & known)
+    return visible_loss + UNSEEN * _mean(total - mean_score(compared), ~visible & valid & has_position)
 
 
 def target_of(segments: Segments, samples: int, position: Float[Tensor, "b h w 2"]) -> Target:

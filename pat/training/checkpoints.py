@@ -54,8 +54,8 @@ def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer, av
     """Put the state of a run back. Raises ValueError if it is another network's."""
     parts: dict[str, dict[str, Tensor]] = {"network": {}, "average": {}, "optimiser": {}}
     for name, tensor in checkpoint.tensors.items():
-        part, _, rest = name.partition("/")
-        parts.setdefault(part, {})[rest] = tensor
+        section, _, rest = name.partition("/")
+        parts.setdefault(section, {})[rest] = tensor
     wrong = misfit(network, parts["network"]) or misfit(average, parts["average"])
     if wrong:
         raise ValueError(

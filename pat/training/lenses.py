@@ -114,6 +114,6 @@ class Spectra(NamedTuple):
 
     def of(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c h w"]:
         """The bands of a colour image."""
-        mixture, gamma, low, high = (part.to(image) for part in self)
+        mixture, gamma, low, high = (tensor.to(image) for tensor in self)
         mixed = torch.einsum("bck,bkhw->bchw", mixture, image).clamp(min=1e-6) ** gamma[..., None, None]
         return low[..., None, None] + (high - low)[..., None, None] * mixed

@@ -144,7 +144,7 @@ class Run:
     def _advance(self, samples: list[Sample], share: float) -> None:
         """One step of the optimiser. Raises FloatingPointError if loss or gradients are not finite."""
         self.adam.zero_grad()
-        losses = [self._backward(part, len(samples), last=part is samples[-1]) for part in samples]
+        losses = [self._backward(sample, len(samples), last=sample is samples[-1]) for sample in samples]
         norm = clip_grad_norm_(self.network.parameters(), self.config.clip)
         loss = self.here.mean(torch.stack(losses).mean())
         if not (torch.isfinite(norm) and torch.isfinite(loss)):
@@ -195,12 +195,12 @@ class Run:
     def _offence(self, samples: list[Sample]) -> str:
         """Save the groups of a failed step; the error message names the samples."""
         offences = []
-        for group, part in zip(self.groups, samples):
-            bad = [i for i in range(len(part.alpha)) if not self._is_finite(alone(part, i))]
+        for group, sample in zip(self.groups, samples):
+            bad = [i for i in range(len(sample.alpha)) if not self._is_finite(alone(sample, i))]
             offences += [f"sample {i} of group {group}" for i in bad]
             if bad or len(samples) == 1:
                 path = self.config.out / f"offending-step-{self.step}-group-{group}.safetensors"
-                save_sample(part, path, facts={"step": str(self.step), "samples": str(bad)})
+                save_sample(sample, path, facts={"step": str(self.step), "samples": str(bad)})
         who = ", ".join(offences) or "no single sample of this process"
         return (
             f"step {self.step}: the loss or its gradient is not finite, by {who}; the batch is in "

@@ -150,7 +150,7 @@ def made_ahead(samples: Iterator[list[Sample]], network: FusionNetwork) -> Itera
     """
 
     def following() -> list[Sample]:
-        return [part._replace(matches=matched_for(network, part.inputs)) for part in next(samples)]
+        return [group._replace(matches=matched_for(network, group.inputs)) for group in next(samples)]
 
     with ThreadPoolExecutor(1) as beside:
         coming = beside.submit(following)
@@ -330,7 +330,7 @@ def alone(sample: Sample, i: int) -> Sample:
     """The i-th of a group of samples."""
 
     def one(parts: Sequence[Tensor]) -> list[Tensor]:
-        return [part if len(part) == 1 else part[i : i + 1] for part in parts]
+        return [tensor if len(tensor) == 1 else tensor[i : i + 1] for tensor in parts]
 
     alpha, ground_truth = one([sample.alpha, sample.ground_truth])
     on_grid = [f.of_one(i) for f in sample.fields]

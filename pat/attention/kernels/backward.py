@@ -125,7 +125,7 @@ def _position_gradient(p, n, geometry, here, statistics, upstream, out):
             x1, y1 = x1 + u * dx, y1 + u * dy
             x0, y0 = x0 + dx - u * dx, y0 + dy - u * dy
         else:
-            at = 2 * (p * geometry.samples + i)
-            out[at], out[at + 1] = dx, dy
+            offset = 2 * (p * geometry.samples + i)
+            out[offset], out[offset + 1] = dx, dy
     if geometry.straight:
         out[4 * p], out[4 * p + 1], out[4 * p + 2], out[4 * p + 3] = x0, y0, x1, y1

@@ -45,10 +45,10 @@ def fill(numbers, first, last, filler):
 
 
 @compiled
-def copy(array, at, n, out):
-    """out[c] = array[at + c]."""
+def copy(array, start, n, out):
+    """out[c] = array[start + c]."""
     for c in range(n):
-        out[c] = array[at + c]
+        out[c] = array[start + c]
 
 
 @compiled
@@ -183,9 +183,9 @@ def scatter(taps, weights, last, x, channels, first_channel, last_channel, out):
         for t in range(0, _most(counts, pixels), CHUNK):
             for i in range(pixels):
                 end = min(t + CHUNK, of(counts, i)[0])
-                at = from_index(x, (taps.first + first + i) * channels)
+                source = from_index(x, (taps.first + first + i) * channels)
                 rows, weight = of(taps.rows, first + i), of(weights, first + i)
-                _scatter(rows, weight, t, end, at, channels, first_channel, last_channel, out)
+                _scatter(rows, weight, t, end, source, channels, first_channel, last_channel, out)
 
 
 @compiled
@@ -210,8 +210,8 @@ def _scatter_rows(n, lanes):
     def scatter_row(rows, weights, first, last, x, channels, c, out):
         row = load_row(x, c, n, lanes)
         for t in range(first, last):
-            at = rows[t] * channels + c
-            store_row(out, at, fma_row(weights[t], row, load_row(out, at, n, lanes)))
+            target = rows[t] * channels + c
+            store_row(out, target, fma_row(weights[t], row, load_row(out, target, n, lanes)))
 
     return scatter_row
 

@@ -56,7 +56,7 @@ def block_scratch(samples: int, channels: int, number: np.dtype) -> Block:
         kind: np.empty((BLOCK, ends[kind]), dtype)
         for kind, dtype in (("integer", np.int32), ("number", number))
     }
-    return Block(*(rooms[kind][:, part] for (_, kind, _), part in zip(LAYOUT, slices)))
+    return Block(*(rooms[kind][:, columns] for (_, kind, _), columns in zip(LAYOUT, slices)))
 
 
 class Geometry(NamedTuple):
@@ -165,7 +165,7 @@ def _pointed(kind):
         first = types.CPointer(kind.dtype)
         return first if kind.ndim == 1 else types.NamedTuple([first, types.intp], Column)
     if isinstance(kind, types.BaseTuple):
-        parts = [_pointed(part) for part in kind.types]
+        parts = [_pointed(member) for member in kind.types]
         return types.BaseTuple.from_types(parts, getattr(kind, "instance_class", None))
     return kind
 
@@ -178,7 +178,7 @@ def _point(code, kind, value):
         size = code.context.get_constant(types.intp, kind.dtype.bitwidth // 8)
         return _tuple(code, kind, [array.data, code.sdiv(code.parts(array.strides)[0], size)])
     if isinstance(kind, types.BaseTuple):
-        return _tuple(code, kind, [_point(code, *part) for part in zip(kind.types, code.parts(value))])
+        return _tuple(code, kind, [_point(code, *member) for member in zip(kind.types, code.parts(value))])
     return value
 
 

@@ -216,8 +216,8 @@ def add_totals(code, array, i: index, a, b, c, d):
 def _neighbours(code, p, q):
     """The sums of neighbours in two vectors; in each four of p's and q's, two of p first."""
     n = p.type.count
-    even = [at for k in range(0, n, 4) for at in (k, k + 2, n + k, n + k + 2)]
-    return code.fadd(code.shuffle(p, q, even), code.shuffle(p, q, [at + 1 for at in even]))
+    even = [lane for k in range(0, n, 4) for lane in (k, k + 2, n + k, n + k + 2)]
+    return code.fadd(code.shuffle(p, q, even), code.shuffle(p, q, [lane + 1 for lane in even]))
 
 
 def _wide_totals(code, a, b, c, d):
@@ -225,7 +225,7 @@ def _wide_totals(code, a, b, c, d):
 
     def folded(p, q):
         low = [*range(8), *range(16, 24)]
-        return code.fadd(code.shuffle(p, q, low), code.shuffle(p, q, [at + 8 for at in low]))
+        return code.fadd(code.shuffle(p, q, low), code.shuffle(p, q, [lane + 8 for lane in low]))
 
     v = _neighbours(code, folded(a, b), folded(c, d))
     v = code.fadd(*(code.shuffle(v, None, [k + n for n in (0, 1, 2, 3, 8, 9, 10, 11)]) for k in (0, 4)))
@@ -235,7 +235,7 @@ def _wide_totals(code, a, b, c, d):
 # ---- four numbers of each of some places ---------------------------------------------------------
 
 FOURS, PAIRS = (
-    [[at + n for k in range(0, LANES, 4) for at, n in zip((k + first,) * 4, steps)] for first in (0, 2)]
+    [[lane + n for k in range(0, LANES, 4) for lane, n in zip((k + first,) * 4, steps)] for first in (0, 2)]
     for steps in ((0, LANES, 1, LANES + 1), (0, 1, LANES, LANES + 1))
 )
 """Shuffles that transpose the 4 by 4 blocks side by side in four vectors."""
@@ -255,7 +255,7 @@ def load_fours(code, array, starts, i: index):
     def four(k):
         return code.get(code.kinds[0], array, code.at(starts, code.offset(i, k)), 4)
 
-    rows = [_side_by_side(code, [four(at) for at in range(k, LANES, 4)]) for k in range(4)]
+    rows = [_side_by_side(code, [four(lane) for lane in range(k, LANES, 4)]) for k in range(4)]
     return code.pack(_transpose(code, *rows))
 
 

@@ -129,8 +129,8 @@ def read_layers(path: Path) -> dict[str, Tensor]:
         raise ValueError(f"rendering needs OpenEXR to read what Blender writes: {compat.INSTALL}") from None
     layers: dict[str, Tensor] = {}
     with OpenEXR.File(str(path), separate_channels=True) as file:
-        for part in file.parts:
-            for name, channel in part.channels.items():
+        for layer in file.parts:
+            for name, channel in layer.channels.items():
                 short = name.split(".", 1)[1] if name.count(".") > 1 else name
                 layers[short] = torch.from_numpy(np.array(channel.pixels, dtype=np.float32))
     return layers
