@@ -6,7 +6,7 @@ too: what its image has more, within small neighbourhoods, is detail that the im
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
 
 import torch
 from jaxtyping import Float
@@ -16,35 +16,28 @@ from torch.nn.functional import avg_pool2d, grid_sample
 from ..matching.inputs import Beta, Inputs
 from ..media.colour import luminance
 from ..networks.protocol import FusionOutput
-from ..support.settings import size, tuned
 
-
-@dataclass(frozen=True)
-class BackProjectionSettings:
-    """Of the step."""
-
-    strength: float = tuned(0.75, "Middlebury, tune half: share of what is missing that is added")
-    radius: int = size(1, "Beta's own pixels around each whose mean is left as it is: views differ in colour")
-
-
-SETTINGS = BackProjectionSettings()
+RADIUS = 1
+"""Size: beta's own pixels around each whose mean is left as it is: views differ in colour."""
 
 
 def back_projected(output: FusionOutput, inputs: Inputs) -> FusionOutput:
     """The output with the colour that betas of fewer pixels recorded; its luminance is as it was.
 
-    Of betas with all bands of the image, or each the next ones of it.
+    Of betas with all bands of the image, or each the next ones of it. All of what is missing is added where
+    alpha has many more pixels, nothing where it has as many.
     """
     bands, image = [beta.image.shape[1] for beta in inputs.betas], output.image
-    each = sum(bands) == image.shape[1]
-    change, of = torch.zeros_like(image), 0
+    in_turn = sum(bands) == image.shape[1]
+    change, weight, first = torch.zeros_like(image), torch.zeros_like(image), 0
     for beta, count, position, confidence in zip(inputs.betas, bands, output.position, output.confidence):
-        shown = slice(of, of + count) if each else slice(None)
-        of += count if each else 0
-        if min(beta.enlargement) > 1 and (each or count == image.shape[1]):
+        shown = slice(first, first + count) if in_turn else slice(None)
+        first += count
+        if min(beta.enlargement) > 1 and (in_turn or count == image.shape[1]):
             lacks = missing(image[:, shown], position.to(image), confidence[:, None], beta)
-            change[:, shown] = change[:, shown] + lacks
-    change = SETTINGS.strength * change
+            change[:, shown] = change[:, shown] + (1 - 1 / math.prod(beta.enlargement)) * lacks
+            weight[:, shown] = weight[:, shown] + confidence[:, None]
+    change = change / weight.clamp(min=1)
     return output._replace(image=image + change - luminance(change))
 
 
@@ -69,8 +62,8 @@ def missing(
     shown = _before_enlargement(beta.image, begin, scale, (height, width))
     seen = (share / scale.prod()).clamp(max=1)
     rest = (shown - recorded) * (share > 0)
-    side = 2 * SETTINGS.radius + 1
-    mean = avg_pool2d(torch.cat([rest * seen, seen], 1), side, 1, SETTINGS.radius)
+    side = 2 * RADIUS + 1
+    mean = avg_pool2d(torch.cat([rest * seen, seen], 1), side, 1, RADIUS)
     rest = (rest - mean[:, :-1] / mean[:, -1:].clamp(min=1e-6)) * seen
     return _at(rest, (corner + 0.5) / scale - 0.5) * confidence
 
