@@ -223,7 +223,7 @@ def align(
     if announce:
         announce(plan)
     corrections = find_corrections(network, inputs, response, align=correct)
-    for line in corrections.described(betas, inputs.hw) if explain else ():
+    for line in corrections.described(inputs.hw) if explain else ():
         explain(line)
     inputs = inputs._replace(inputs=corrections.applied(inputs.inputs, inputs.hw))
     with limited(limit), torch.no_grad():

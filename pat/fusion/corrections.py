@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
@@ -60,34 +60,39 @@ SETTINGS = PrePassSettings()
 
 @dataclass(frozen=True)
 class Corrections:
-    """Alpha's response, and the misalignment of each beta, in order (none: all are right)."""
+    """Alpha's response, and the misalignment of each beta by camera (none: all are right)."""
 
     response: Response
-    misalignments: tuple[Misalignment, ...] = ()
+    misalignments: Mapping[str, Misalignment] = field(default_factory=dict)
 
     def applied(self, inputs: Inputs, hw: HW) -> Inputs:
         """The inputs put right; `hw` is alpha's size without padding.
 
-        Raises ValueError for misalignments of another number of betas.
+        Cameras of the same place may be one beta in one frame, and several in another. Raises ValueError for
+        misalignments of other cameras.
         """
-        if self.misalignments and len(self.misalignments) != len(inputs.betas):
+        cameras = [camera for beta in inputs.betas for camera in beta.cameras]
+        if self.misalignments and set(cameras) != set(self.misalignments):
             raise ValueError(
-                f"corrections are of {len(self.misalignments)} betas, this frame has {len(inputs.betas)}: "
+                f"corrections are of {_named(self.misalignments)}, this frame has {_named(cameras)}: "
                 "take those of a frame of the same cameras"
             )
         if not self.response.is_rec601:
             of_beta = self.response.of_beta
             even = (replace(b, image=of_beta(b.image)) if _is_rgb(b) else b for b in inputs.betas)
             inputs = replace(inputs, alpha=self.response.of_alpha(inputs.alpha), betas=tuple(even))
-        moves = self.misalignments or (Misalignment(),) * len(inputs.betas)
-        moved = zip(inputs.betas, moves, strict=True)
-        betas = tuple(replace(b, field=m.applied(b.field, hw)) for b, m in moved)
+        moved = zip(inputs.betas, self.of_betas(inputs))
+        betas = tuple(replace(beta, field=move.applied(beta.field, hw)) for beta, move in moved)
         return replace(inputs, betas=betas, sees_luma=self.response.explains)
 
-    def described(self, betas: Sequence[str], hw: HW) -> list[str]:
-        """A line for each thing that is put right, for betas by name; `hw` is alpha's size."""
+    def of_betas(self, inputs: Inputs) -> list[Misalignment]:
+        """The misalignment of each beta, in order."""
+        return [self.misalignments.get(beta.cameras[0], Misalignment()) for beta in inputs.betas]
+
+    def described(self, hw: HW) -> list[str]:
+        """A line for each thing that is put right; `hw` is alpha's size."""
         lines = [] if self.response.is_rec601 else [str(self.response)]
-        for name, move in zip(betas, self.misalignments):
+        for name, move in self.misalignments.items():
             if move != Misalignment():
                 off = f"'{name}' is up to {move.largest(hw):.1f} px off its search segments"
                 lines.append(f"{off}: put right for this frame; `pat rig refine` does so for the rig")
@@ -115,7 +120,6 @@ def find_corrections(
     if not network.uses_matches or not (fits or align):
         return corrections
     small = _reduced_frame(frame)
-    corrections = replace(corrections, misalignments=(Misalignment(),) * len(frame.inputs.betas))
     for i in range(SETTINGS.passes):
         LOG.info("pre-pass %d of at most %d", i + 1, SETTINGS.passes)
         inputs = corrections.applied(small.inputs, small.hw)
@@ -123,11 +127,16 @@ def find_corrections(
         matches = [_of_beta(inputs.alpha, *of_beta, small.hw) for of_beta in parts]
         response_now = _fitted(small, matches) if fits else corrections.response
         steps = [fit_misalignment(*m[1:]) if align else Misalignment() for m in matches]
-        moves = tuple(before + step for before, step in zip(corrections.misalignments, steps))
-        corrections = Corrections(response_now, moves)
+        moves = zip(inputs.betas, corrections.of_betas(inputs), steps)
+        by_camera = {camera: before + step for beta, before, step in moves for camera in beta.cameras}
+        corrections = Corrections(response_now, by_camera)
         if all(step.largest(small.hw) <= SETTINGS.settled for step in steps):
             break
     return corrections
+
+
+def _named(cameras: Iterable[str]) -> str:
+    return ", ".join(f"'{camera}'" for camera in cameras)
 
 
 def expected_work(frame: FrameInputs, response: ResponseSpec, *, align: bool) -> float:
@@ -158,7 +167,8 @@ def _reduced_frame(frame: FrameInputs) -> FrameInputs:
     for beta in inputs.betas:
         image = padded(avg_pool2d(beta.image, factor), inputs.multiple)
         track = beta.track and track_in(beta.track, whole, 1 / factor, offset)
-        betas.append(Beta(image, _reduced_field(beta.field, alpha, whole, factor), track=track))
+        small = _reduced_field(beta.field, alpha, whole, factor)
+        betas.append(Beta(image, small, track=track, cameras=beta.cameras))
     return frame._replace(inputs=replace(inputs, alpha=alpha, betas=tuple(betas)), hw=hw)
 
 

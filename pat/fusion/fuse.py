@@ -185,7 +185,7 @@ def fuse(
     if announce:
         announce(plan)
     fitted = corrections or find_corrections(network, inputs, response, align=align)
-    for line in fitted.described(betas, inputs.hw) if explain else ():
+    for line in fitted.described(inputs.hw) if explain else ():
         explain(line)
     right = fitted.applied(inputs.inputs, inputs.hw)
     right = replace(right, luminance=SHARES[luminance], denoised=noisy)

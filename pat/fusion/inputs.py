@@ -108,8 +108,15 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
             on_grid = along_tangents(alpha, combined_bands(image), on_grid, name)
         place = Placement(pair, points_of(field), bounds_of(field))
         around = isinstance(innermost(field), AroundDepth | AroundMatches)
-        track, enlargement = place.track if place.has_track else None, views.enlargement.get(name, (1.0, 1.0))
-        betas.append(Beta(image, on_grid, track=track, around=around, enlargement=enlargement))
+        beta = Beta(
+            image,
+            on_grid,
+            track=place.track if place.has_track else None,
+            around=around,
+            enlargement=views.enlargement.get(name, (1.0, 1.0)),
+            cameras=views.joined.get(name, (name,)),
+        )
+        betas.append(beta)
         if not on_grid.any_valid(pair.alpha.hw):
             unit = length_unit(views.rig)
             bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} {unit}"

@@ -176,7 +176,8 @@ def join(which: JoinsBands, views: Views) -> StepResult:
         by_band = frame.confidence.expand(len(order), -1, -1) if frame.by_band is None else frame.by_band
         return frame._replace(image=frame.image[order], by_band=by_band[order])
 
-    joined_views = dataclasses.replace(views, images={views.alpha: views.own, **joined})
+    cameras = {group[0]: tuple(group) for group in groups}
+    joined_views = dataclasses.replace(views, images={views.alpha: views.own, **joined}, joined=cameras)
     return StepResult(joined_views, back)
 
 

@@ -46,6 +46,8 @@ class Views:
     """Whether alpha's image was, before it was made grey."""
     enlargement: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     """How many times as high and wide a beta's image is as it was, if it was resized."""
+    joined: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    """The cameras whose bands a beta's image has, if they are several."""
 
     @classmethod
     def of(

@@ -36,7 +36,8 @@ class Beta:
     """One beta's image (B, C, H, W) and the field of alpha's pixels in it.
 
     `offset` is the (x, y) of its first pixel in the whole image, other than (0, 0) for a part of an image.
-    `enlargement` says how many times as high and wide it is as what the camera recorded.
+    `cameras` are the names of those whose bands it shows, one after another. `enlargement`
+    says how many times as high and wide it is as what the camera recorded.
     `track` gives the tracks of alpha's pixels (*n, 2) in the image of a calibrated beta. With `around` each
     segment is around what is known of its own pixel: positions along the segments of two pixels are not to be
     compared.
@@ -48,6 +49,7 @@ class Beta:
     track: Callable[[Tensor], Track] | None = None
     around: bool = False
     enlargement: tuple[float, float] = (1.0, 1.0)
+    cameras: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

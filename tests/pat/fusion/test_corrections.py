@@ -126,8 +126,8 @@ def test_found_corrections_serve_other_frames(sample, network, images):
 
 
 def test_corrections_of_other_betas_are_refused(sample, network, images):
-    found = Corrections(Response.rec601(), (Misalignment(),) * 2)
-    message = "corrections are of 2 betas, this frame has 1: take those of a frame of the same cameras"
+    found = Corrections(Response.rec601(), {"a": Misalignment(), "b": Misalignment()})
+    message = "corrections are of 'a', 'b', this frame has '.*': take those of a frame of the same cameras"
     with pytest.raises(ValueError, match=message):
         fuse(network, sample.rig, images, alpha=ALPHA, corrections=found)
 

@@ -178,6 +178,23 @@ def test_bands_keep_their_own_level_where_levels_are_matched():
     assert (first.image - alone.image).abs().mean() < 0.01
 
 
+@pytest.mark.parametrize("align", [True, False])
+def test_cameras_behind_filters_at_one_place_are_fused_between_key_frames_too(align):
+    """At key frames they are one beta of several bands; between, each one's points move by themselves."""
+    frames, ground_truth = moving.recording(13)
+    rig = moving.rig()
+    names = ["red", "green", "blue"]
+    views = {name: rig["slow"].replace(sensor=Sensor(frame_rate=moving.SLOW)) for name in names}
+    filtered = Rig({"fast": rig["fast"], **views}, depth=rig.depth)
+    bands = {name: [image[i : i + 1] for image in frames["slow"]] for i, name in enumerate(names)}
+    job = fuse_sequence(
+        load_weights("mono-colour"), filtered, {"fast": frames["fast"], **bands}, alpha="fast", align=align
+    )
+    errors = [(frame.image - truth).abs().mean() for frame, truth in zip(job, ground_truth)]
+    assert len(errors) == 13
+    assert max(errors) < 0.05
+
+
 def test_a_response_that_is_none_is_refused_of_sequences_too():
     """It was taken for an image that cannot be read, and left out."""
     frames, _ = moving.recording(2)
