@@ -35,7 +35,7 @@ def back_projected(output: FusionOutput, inputs: Inputs) -> FusionOutput:
         first += count
         if min(beta.enlargement) > 1 and (in_turn or count == image.shape[1]):
             lacks = missing(image[:, shown], position.to(image), confidence[:, None], beta)
-            change[:, shown] = change[:, shown] + (1 - 1 / math.prod(beta.enlargement)) * lacks
+            change[:, shown] = change[:, shown] + (1 - 1 / math.sqrt(math.prod(beta.enlargement))) * lacks
             weight[:, shown] = weight[:, shown] + confidence[:, None]
     change = change / weight.clamp(min=1)
     return output._replace(image=image + change - luminance(change))
