@@ -14,6 +14,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
 from ..matching.inputs import Beta, Inputs
+from ..matching.matches import BetaMatches, Matches
+from ..matching.positions import matches
 from ..media.colour import luminance
 from ..networks.protocol import FusionOutput
 
@@ -21,16 +23,18 @@ RADIUS = 1
 """Size: beta's own pixels around each whose mean is left as it is: views differ in colour."""
 
 
-def back_projected(output: FusionOutput, inputs: Inputs) -> FusionOutput:
+def back_projected(output: FusionOutput, found: Matches | None, inputs: Inputs) -> FusionOutput:
     """The output with the colour that betas of fewer pixels recorded; its luminance is as it was.
 
-    Of betas with all bands of the image, or each the next ones of it. All of what is missing is added where
+    The image is compared where its colour is from: at the matches `found`, or the positions without any. Of
+    betas with all bands of the image, or each the next ones of it. All of what is missing is added where
     alpha has many more pixels, nothing where it has as many.
     """
     bands, image = [beta.image.shape[1] for beta in inputs.betas], output.image
     in_turn = sum(bands) == image.shape[1]
     change, weight, first = torch.zeros_like(image), torch.zeros_like(image), 0
-    for beta, count, position, confidence in zip(inputs.betas, bands, output.position, output.confidence):
+    positions = output.position if found is None else map(_of_colour, inputs.betas, found.betas)
+    for beta, count, position, confidence in zip(inputs.betas, bands, positions, output.confidence):
         shown = slice(first, first + count) if in_turn else slice(None)
         first += count
         if min(beta.enlargement) > 1 and (in_turn or count == image.shape[1]):
@@ -39,6 +43,11 @@ def back_projected(output: FusionOutput, inputs: Inputs) -> FusionOutput:
             weight[:, shown] = weight[:, shown] + confidence[:, None]
     change = change / weight.clamp(min=1)
     return output._replace(image=image + change - luminance(change))
+
+
+def _of_colour(beta: Beta, found: BetaMatches) -> Float[Tensor, "b 2 h w"]:
+    """Where colour was taken from: the match, not what was chosen for depth."""
+    return matches(beta.field.straight, found.disparity).movedim(-1, 1)
 
 
 def missing(

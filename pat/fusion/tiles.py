@@ -214,7 +214,7 @@ def _fused(
     with convolutions_in_parallel():
         output = certain(network(inputs, matches), matches, inputs)
     if network.keeps_luminance and not inputs.denoised:
-        output = back_projected(output, inputs)
+        output = back_projected(output, matches, inputs)
     output = output.cut(box)
     cropped = replace(inputs, betas=tuple(replace(beta, field=beta.field.cut(box)) for beta in inputs.betas))
     hw = bottom - top, right - left
