@@ -1,0 +1,111 @@
+"""Colour put right by what betas recorded: what they would have recorded of the image is what they show."""
+
+import pytest
+import torch
+from torch.nn.functional import avg_pool2d, interpolate
+
+from arraygeom import pixel_grid
+from arraygeom.fields.grid import FieldOnGrid
+from pat.fusion.back_projection import _recorded, back_projected, missing
+from pat.matching.inputs import Beta, Inputs
+from pat.media.colour import luminance
+from pat.networks.protocol import FusionOutput
+
+H, W = 36, 48
+RATES = [2, 3, 4, (2, 3)]
+
+
+def colours(seed: int = 0) -> torch.Tensor:
+    noise = torch.rand(1, 3, H, W, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return 0.5 + (avg_pool2d(noise, 3, 1, 1) - 0.5)
+
+
+def enlarged_beta(image: torch.Tensor, rate, offset=(0, 0)) -> Beta:
+    """A beta at alpha's place, its image reduced by that rate and enlarged again, less an offset."""
+    down, across = rate if isinstance(rate, tuple) else (rate, rate)
+    recorded = avg_pool2d(image, (down, across))
+    again = interpolate(recorded, image.shape[-2:], mode="bicubic", align_corners=False)
+    x, y = offset
+    field = FieldOnGrid(lambda x: x, 2, None)
+    return Beta(again[..., y:, x:], field, offset=offset, enlargement=(float(down), float(across)))
+
+
+def position(offset=(0, 0)) -> torch.Tensor:
+    grid = pixel_grid((H, W), dtype=torch.float64).movedim(-1, 0)[None]
+    return grid - grid.new_tensor(offset)[:, None, None]
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_nothing_is_missing_where_beta_recorded_the_image(rate):
+    truth = colours()
+    lacks = missing(truth, position(), torch.ones(1, 1, H, W).double(), enlarged_beta(truth, rate))
+    assert lacks.abs().max() < 0.01
+    wrong = missing(colours(1), position(), torch.ones(1, 1, H, W).double(), enlarged_beta(truth, rate))
+    assert wrong.abs().max() > 0.05
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_detail_that_was_lost_comes_back(rate):
+    truth = colours()
+    beta = enlarged_beta(truth, rate)
+    blurred = avg_pool2d(torch.nn.functional.pad(truth, (3, 3, 3, 3), mode="replicate"), 7, 1)
+    lacks = missing(blurred, position(), torch.ones(1, 1, H, W).double(), beta)
+    before, after = (blurred - truth).square().mean(), (blurred + lacks - truth).square().mean()
+    assert after < 0.9 * before
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_parts_of_a_beta_give_the_same(rate):
+    truth, weight = colours(), torch.ones(1, 1, H, W).double()
+    image = colours(1)
+    of_whole = missing(image, position(), weight, enlarged_beta(truth, rate))
+    of_part = missing(image, position((6, 10)), weight, enlarged_beta(truth, rate, offset=(6, 10)))
+    inner = (..., slice(10 + 12, None), slice(6 + 12, None))
+    assert torch.allclose(of_whole[inner], of_part[inner], atol=1e-5)
+
+
+def test_luminance_stays_and_what_is_not_matched():
+    truth, image = colours(), colours(1)
+    confidence = torch.ones(1, H, W).double()
+    confidence[..., 24:] = 0
+    output = FusionOutput(image, [position()], [torch.ones(1, H, W)], [confidence])
+    inputs = Inputs(luminance(image), (enlarged_beta(truth, 2),))
+    better = back_projected(output, None, inputs).image
+    assert torch.allclose(luminance(better), luminance(image), atol=1e-9)
+    assert torch.equal(better[..., 24:], image[..., 24:])
+    assert (better - image)[..., :24].abs().max() > 0.01
+
+
+def test_bands_of_several_betas_are_each_ones_own():
+    truth, image = colours(), colours(1)
+    betas = tuple(enlarged_beta(truth[:, i : i + 1], 2) for i in range(3))
+    confidence = torch.ones(1, H, W).double()
+    output = FusionOutput(image, [position()] * 3, [confidence] * 3, [confidence] * 3)
+    together = FusionOutput(image, [position()], [confidence], [confidence])
+    apart = back_projected(output, None, Inputs(luminance(image), betas)).image
+    joined = back_projected(together, None, Inputs(luminance(image), (enlarged_beta(truth, 2),))).image
+    assert torch.allclose(apart, joined, atol=1e-9)
+
+
+def test_two_betas_of_the_same_colours_count_as_one():
+    truth, image = colours(), colours(1)
+    confidence, beta = torch.ones(1, H, W).double(), enlarged_beta(truth, 2)
+    one = FusionOutput(image, [position()], [confidence], [confidence])
+    two = FusionOutput(image, [position()] * 2, [confidence] * 2, [confidence] * 2)
+    expected = back_projected(one, None, Inputs(luminance(image), (beta,))).image
+    assert torch.allclose(back_projected(two, None, Inputs(luminance(image), (beta, beta))).image, expected)
+
+
+def test_gradients_are_those_of_differences():
+    truth, image = colours()[..., :12, :12], colours(1)[..., :12, :12].requires_grad_(True)
+    beta, weight = enlarged_beta(truth, 3), torch.full((1, 1, 12, 12), 0.8).double()
+    where = (position()[..., :12, :12] + 0.37).requires_grad_(True)
+    assert torch.autograd.gradcheck(lambda *x: missing(*x, weight, beta), (image, where))
+
+
+def test_a_pixel_between_two_of_beta_is_in_both_by_its_area():
+    image = torch.tensor([[1.0, 2.0, 3.0, 4.0]]).expand(1, 1, 2, 4)
+    corner = torch.stack(torch.meshgrid(torch.arange(4) + 0.5, torch.arange(2.0), indexing="xy"), -1)[None]
+    recorded, area = _recorded(image, corner, torch.ones(1, 1, 2, 4), torch.tensor([2.0, 2.0]), (1, 3))
+    assert torch.allclose(area, torch.tensor([[[[3.0, 4.0, 1.0]]]]))
+    assert torch.allclose(recorded, torch.tensor([[[[4 / 3, 3.0, 4.0]]]]))
