@@ -130,7 +130,8 @@ def _depth_step(pair: Pair, baseline: float) -> tuple[float, float] | None:
     """`depth_step` of a pair."""
     if pair.depth is None or baseline == 0:
         return None
-    x = coarse_grid(pair.alpha.hw).reshape(-1, 2)
+    spacing = max(16, math.ceil(math.sqrt(math.prod(pair.alpha.hw) / MOST_PIXELS)))
+    x = coarse_grid(pair.alpha.hw, spacing).reshape(-1, 2)
     alpha, beta = (camera.to(torch.float64) for camera in pair.cameras)
 
     def at(depth: float) -> float:

@@ -11,7 +11,9 @@ import math
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample
+from torch.nn.functional import avg_pool2d
+
+from arraygeom import sample
 
 from ..matching.inputs import Beta, Inputs
 from ..matching.matches import BetaMatches, Matches
@@ -120,6 +122,5 @@ def _grid(hw: tuple[int, int], like: Tensor) -> Float[Tensor, "1 h w 2"]:
 
 def _at(image: Float[Tensor, "b c h w"], x: Float[Tensor, "_ m n 2"]) -> Float[Tensor, "b c m n"]:
     """The image at positions (x, y), by cubic interpolation, the nearest values outside it."""
-    size = x.new_tensor([image.shape[-1], image.shape[-2]])
-    grid = ((2 * x + 1) / size - 1).expand(len(image), -1, -1, -1)
-    return grid_sample(image, grid, mode="bicubic", padding_mode="border", align_corners=False)
+    x = x.clamp(min=-0.5).minimum(x.new_tensor([image.shape[-1] - 0.5, image.shape[-2] - 0.5]))
+    return sample(image, x, interpolation="bicubic").values
