@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from arraygeom import sample
+from arraygeom import pixel_grid, sample
 
 from ..matching.inputs import Beta, Inputs
 from ..matching.matches import BetaMatches, Matches
@@ -25,17 +25,17 @@ RADIUS = 1
 """Size: beta's own pixels around each whose mean is left as it is: views differ in colour."""
 
 
-def back_projected(output: FusionOutput, found: Matches | None, inputs: Inputs) -> FusionOutput:
+def back_projected(output: FusionOutput, matched: Matches | None, inputs: Inputs) -> FusionOutput:
     """The output with the colour that betas of fewer pixels recorded; its luminance is as it was.
 
-    The image is compared where its colour is from: at the matches `found`, or the positions without any. Of
+    The image is compared where its colour is from: at the matches `matched`, or the positions without any. Of
     betas with all bands of the image, or each the next ones of it. All of what is missing is added where
     alpha has many more pixels, nothing where it has as many.
     """
     bands, image = [beta.image.shape[1] for beta in inputs.betas], output.image
     in_turn = sum(bands) == image.shape[1]
     change, weight, first = torch.zeros_like(image), torch.zeros_like(image), 0
-    positions = output.position if found is None else map(_of_colour, inputs.betas, found.betas)
+    positions = output.position if matched is None else map(_of_colour, inputs.betas, matched.betas)
     for beta, count, position, confidence in zip(inputs.betas, bands, positions, output.confidence):
         shown = slice(first, first + count) if in_turn else slice(None)
         first += count
@@ -47,9 +47,9 @@ def back_projected(output: FusionOutput, found: Matches | None, inputs: Inputs) 
     return output._replace(image=image + change - luminance(change))
 
 
-def _of_colour(beta: Beta, found: BetaMatches) -> Float[Tensor, "b 2 h w"]:
+def _of_colour(beta: Beta, matched: BetaMatches) -> Float[Tensor, "b 2 h w"]:
     """Where colour was taken from: the match, not what was chosen for depth."""
-    return matches(beta.field.straight, found.disparity).movedim(-1, 1)
+    return matches(beta.field.straight, matched.disparity).movedim(-1, 1)
 
 
 def missing(
@@ -71,11 +71,11 @@ def missing(
     corner = (position + begin[:, None, None]).movedim(1, -1)
     recorded, share = _recorded(image, corner, confidence, scale, (height, width))
     shown = _before_enlargement(beta.image, begin, scale, (height, width))
-    seen = (share / scale.prod()).clamp(max=1)
+    covered = (share / scale.prod()).clamp(max=1)
     rest = (shown - recorded) * (share > 0)
     side = 2 * RADIUS + 1
-    mean = avg_pool2d(torch.cat([rest * seen, seen], 1), side, 1, RADIUS)
-    rest = (rest - mean[:, :-1] / mean[:, -1:].clamp(min=1e-6)) * seen
+    mean = avg_pool2d(torch.cat([rest * covered, covered], 1), side, 1, RADIUS)
+    rest = (rest - mean[:, :-1] / mean[:, -1:].clamp(min=1e-6)) * covered
     return _at(rest, (corner + 0.5) / scale - 0.5) * confidence
 
 
@@ -108,16 +108,17 @@ def _before_enlargement(
 ) -> Float[Tensor, "b c hb wb"]:
     """The pixels from which an image was enlarged by cubic interpolation, to second order."""
     h, w = image.shape[-2:]
-    pixels = _grid(hw, image)
+    pixels = pixel_grid(hw, dtype=image.dtype, device=image.device)[None]
     centres = (pixels + 0.5) * scale - 0.5 - begin
     rough = _at(image, centres)
-    again = _at(_at(rough, (_grid((h, w), image) + begin + 0.5) / scale - 0.5), centres)
+    again = _at(
+        _at(
+            rough,
+            (pixel_grid((h, w), dtype=image.dtype, device=image.device)[None] + begin + 0.5) / scale - 0.5,
+        ),
+        centres,
+    )
     return 2 * rough - again
-
-
-def _grid(hw: tuple[int, int], like: Tensor) -> Float[Tensor, "1 h w 2"]:
-    y, x = (torch.arange(n, dtype=like.dtype, device=like.device) for n in hw)
-    return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)[None]
 
 
 def _at(image: Float[Tensor, "b c h w"], x: Float[Tensor, "_ m n 2"]) -> Float[Tensor, "b c m n"]:

@@ -264,9 +264,10 @@ def _digest(network: FusionNetwork, frame: FrameInputs) -> str:
     """Of all that a frame's tiles depend on; of fields of positions, those of some pixels."""
     inputs = frame.inputs
     how = type(network).__name__, FusedTile._fields, inputs.luminance, inputs.bands, inputs.sees_luma
+    recorded = inputs.denoised, [beta.enlargement for beta in inputs.betas]
     module = network if isinstance(network, nn.Module) else nn.Module()
     rounded = [name for name, layer in module.named_modules() if "forward" in vars(layer)]  # by `in_bfloat16`
-    digest = hashlib.sha256(f"{how} {rounded}".encode())
+    digest = hashlib.sha256(f"{how} {recorded} {rounded}".encode())
     parameters = module.state_dict().values()
     some = pixel_grid(inputs.hw, dtype=torch.float64)[::64, ::64].reshape(-1, 2)
     samples = [b.field.at(some) if b.field.pixels is None else b.field.pixels for b in inputs.betas]
