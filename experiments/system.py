@@ -16,7 +16,6 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
-from safetensors import safe_open
 from tifffile import imread
 from torch import Tensor
 
@@ -43,7 +42,7 @@ from pat.media.raw import match_luminance
 from pat.media.video import write_video
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
-from pat.support.tensor_files import write_tensors
+from pat.support.tensor_files import read_tensors, write_tensors
 
 SceneKind = Literal["layered", "rendered"]
 NAMES = ("wide-narrow", "visible-nir", "exposures", "fast-slow")
@@ -179,12 +178,10 @@ def recorded(
     module, cache = system.module, out / "recorded.safetensors"
     key = f"{system.name}, {scene}, seed {module.SEED}, textures {photos or 'our own'}\n{rig_text(rig)}"
     if cache.is_file():
-        with safe_open(cache, "pt") as file:
-            if file.metadata()["key"] == key:
-                say(f"using the recording in {out}")
-                names = file.keys()  # not a mapping: it cannot be iterated
-                tensors = {name: file.get_tensor(name) for name in names}
-                return SystemRecording.of(tensors), _files(out, json.loads(file.metadata()["counts"]))
+        tensors, facts = read_tensors(cache)
+        if facts["key"] == key:
+            say(f"using the recording in {out}")
+            return SystemRecording.of(tensors), _files(out, json.loads(facts["counts"]))
     say(f"rendering and recording {', '.join(f'{n} {rig[n].hw[1]}x{rig[n].hw[0]}' for n in rig.names)}")
     cache.unlink(missing_ok=True)
     recording = module.record_scene(_stage(system, rig, scene, photos))
