@@ -133,10 +133,8 @@ def matched(network: GuidedPAT, pair: StereoPair, seed: int) -> Kept:
     true_disparity = Disparity(*(plane[:h, :w] for plane in pair.disparity))
     facts = matches.facts[0, :, : h // FINE, : w // FINE].half()
     blurs = torch.tensor(matches.comparison.whole.blurs)[:, 0]
-    truth, visible = (
-        (true_disparity.value * true_disparity.valid)[None].half(),
-        true_disparity.regions().seen[None],
-    )
+    truth = (true_disparity.value * true_disparity.valid)[None].half()
+    visible = true_disparity.regions().seen[None]
     planes = alpha, beta, disparity, facts, truth, visible, blurs
     return Kept(*(plane.contiguous() for plane in planes))
 
