@@ -13,17 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from arraygeom import (
-    Curved,
-    Epipolar,
-    Moved,
-    Pair,
-    ReceptiveField,
-    Rig,
-    Sensor,
-    ThroughLenses,
-    Widened,
-)
+from arraygeom import Curved, Epipolar, Moved, Pair, ReceptiveField, Rig, Sensor, ThroughLenses, Widened
 from arraygeom.warned import warn
 
 from ..media.colour import luminance_of as grey
