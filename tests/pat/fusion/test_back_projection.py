@@ -104,7 +104,7 @@ def test_bands_of_several_betas_are_each_ones_own():
         output, matched_with(count=3), Inputs(luminance(image), betas), keeps_luminance=True
     ).image
     joined = back_projected(
-        together, None, Inputs(luminance(image), (enlarged_beta(truth, 2),)), keeps_luminance=True
+        together, matched_with(), Inputs(luminance(image), (enlarged_beta(truth, 2),)), keeps_luminance=True
     ).image
     assert torch.allclose(apart, joined, atol=1e-9)
 
