@@ -1,6 +1,7 @@
 """Bytes of image files, checked before a decoder that trusts them sees them.
 
-OpenCV 4.11 to 4.13 crash on damaged animated PNGs and take what is missing of a planar TIFF for black.
+OpenCV 4.11 to 4.13 crash on damaged animated PNGs, take what is missing of a planar TIFF for black, and do
+not read a PNM of text without a line break at its end.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any
 
 PNG = b"\x89PNG\r\n\x1a\n"
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+PNM_OF_TEXT = (b"P1", b"P2", b"P3")
 ANIMATION = (b"acTL", b"fcTL", b"fdAT")
 """Chunks of a PNG file beside those of its first image."""
 SEPARATE = 2
@@ -27,7 +29,8 @@ DAMAGED = (OSError, SyntaxError, ValueError, struct.error, LookupError, TypeErro
 
 
 def decodable(content: bytes) -> bytes | None:
-    """The bytes to give to OpenCV: a PNG without its animation, a TIFF if it is whole, others as they are.
+    """The bytes to give to OpenCV: a PNG without its animation, a TIFF if it is whole, a PNM of text with a
+    line break at its end, others as they are.
 
     None for a TIFF that lacks some of its pixels.
     """
@@ -36,7 +39,7 @@ def decodable(content: bytes) -> bytes | None:
         return PNG + b"".join(content[start:end] for kind, start, end in chunks if kind not in ANIMATION)
     if content[:4] in TIFF and not _is_whole(content):
         return None
-    return content
+    return content + b"\n" if content[:2] in PNM_OF_TEXT else content
 
 
 def png_chunks(content: bytes) -> list[tuple[bytes, int, int]]:

@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
-from safetensors.torch import load_file
 from torch import Generator, Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, pixel_shuffle
 
@@ -36,7 +35,7 @@ from pat.matching.positions import FINE
 from pat.media.colour import to_bytes
 from pat.networks.guided import GuidedPAT
 from pat.sensors import generator_for
-from pat.support.tensor_files import write_tensors
+from pat.support.tensor_files import read_tensors, write_tensors
 from pat.synthesis.rigs import below
 
 NEAR = 0.8
@@ -112,7 +111,7 @@ def kept(folder: Path, network: GuidedPAT, pairs: Iterator[Made], without: Seque
             if pair.disparity is None or any(fragment in pair.name for fragment in without):
                 continue
             write_tensors(file, matched(network, pair, i)._asdict())
-        samples.append(Kept(**load_file(file)))
+        samples.append(Kept(**read_tensors(file)[0]))
     return samples
 
 
@@ -134,10 +133,8 @@ def matched(network: GuidedPAT, pair: StereoPair, seed: int) -> Kept:
     true_disparity = Disparity(*(plane[:h, :w] for plane in pair.disparity))
     facts = matches.facts[0, :, : h // FINE, : w // FINE].half()
     blurs = torch.tensor(matches.comparison.whole.blurs)[:, 0]
-    truth, visible = (
-        (true_disparity.value * true_disparity.valid)[None].half(),
-        true_disparity.regions().seen[None],
-    )
+    truth = (true_disparity.value * true_disparity.valid)[None].half()
+    visible = true_disparity.regions().seen[None]
     planes = alpha, beta, disparity, facts, truth, visible, blurs
     return Kept(*(plane.contiguous() for plane in planes))
 

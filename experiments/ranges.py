@@ -15,8 +15,6 @@ from pathlib import Path
 from statistics import fmean, median
 
 import tyro
-from safetensors import safe_open
-from safetensors.torch import load_file
 
 from experiments.evaluation.commands import finished
 from experiments.evaluation.conditions import CONDITIONS
@@ -27,7 +25,7 @@ from pat.evaluation.protocols import rectified_fusion
 from pat.evaluation.tables import markdown_table
 from pat.networks.weights import SHIPPED, Network, load_weights
 from pat.support.eight_bits import measured, names, round_to_eight_bits
-from pat.support.tensor_files import write_tensors
+from pat.support.tensor_files import read_tensors, write_tensors
 
 RESULTS = Path("tests/benchmarks/RESULTS_int8.md")
 UNDER = ("ideal", "x1", "x4", "x8", "alpha random", "beta x .6", "200 electrons", "50 electrons")
@@ -50,10 +48,9 @@ def main(middlebury: Path) -> None:
     rows = [compared(network, rounded, [p for i, p in enumerate(pairs) if i % 3], name) for name in UNDER]
     heads = "condition", "PSNR, dB", "of single pairs", "time of a frame"
     finished(RESULTS, markdown_table(heads, rows))
-    with safe_open(path, framework="pt") as file:
-        facts = file.metadata()
+    tensors, facts = read_tensors(path)
     state = network.state_dict()
-    write_tensors(path, load_file(path) | {name: state[name] for name in names(network)}, facts)
+    write_tensors(path, tensors | {name: state[name] for name in names(network)}, facts)
 
 
 def compared(

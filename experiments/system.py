@@ -8,22 +8,23 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal, NamedTuple
 
+import cv2
+import numpy as np
 import torch
-from jaxtyping import Float
-from safetensors import safe_open
+from jaxtyping import Bool, Float
 from tifffile import imread
 from torch import Tensor
 
 from arraygeom import Rig
 from arraygeom.atomic import write_text
 from arraygeom.io.native import write as rig_text
-from experiments.flicker import flicker
 from experiments.hdr import merged, missed, tone_curve, usable_range
 from experiments.names import refuse_unknown
 from experiments.peaks import watch_peak
@@ -36,14 +37,14 @@ from pat.fusion.fuse import FuseSettings, fuse
 from pat.fusion.results import Frame, save_frame, view_of
 from pat.fusion.sequence import SequenceFusion
 from pat.fusion.views import ViewFiles
-from pat.media.colour import linear_from_srgb, luminance, to_luma_chroma
+from pat.media.colour import linear_from_srgb, luminance, to_bytes, to_luma_chroma
 from pat.media.figures import colour_depth, save_panels
 from pat.media.images import read_image, write_image
 from pat.media.raw import match_luminance
 from pat.media.video import write_video
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
-from pat.support.tensor_files import write_tensors
+from pat.support.tensor_files import read_tensors, write_tensors
 
 SceneKind = Literal["layered", "rendered"]
 NAMES = ("wide-narrow", "visible-nir", "exposures", "fast-slow")
@@ -179,12 +180,10 @@ def recorded(
     module, cache = system.module, out / "recorded.safetensors"
     key = f"{system.name}, {scene}, seed {module.SEED}, textures {photos or 'our own'}\n{rig_text(rig)}"
     if cache.is_file():
-        with safe_open(cache, "pt") as file:
-            if file.metadata()["key"] == key:
-                say(f"using the recording in {out}")
-                names = file.keys()  # not a mapping: it cannot be iterated
-                tensors = {name: file.get_tensor(name) for name in names}
-                return SystemRecording.of(tensors), _files(out, json.loads(file.metadata()["counts"]))
+        tensors, facts = read_tensors(cache)
+        if facts["key"] == key:
+            say(f"using the recording in {out}")
+            return SystemRecording.of(tensors), _files(out, json.loads(facts["counts"]))
     say(f"rendering and recording {', '.join(f'{n} {rig[n].hw[1]}x{rig[n].hw[0]}' for n in rig.names)}")
     cache.unlink(missing_ok=True)
     recording = module.record_scene(_stage(system, rig, scene, photos))
@@ -196,8 +195,7 @@ def recorded(
 
 def _stage(system: ArraySystem, rig: Rig, scene: SceneKind, photos: Path | None) -> Any:
     """The scene before the cameras, with what a system's module asks of it."""
-    from .rendered import RenderedScene
-    from .stage import SystemScene
+    from .stage import RenderedScene, SystemScene
 
     module = system.module
     if scene == "layered":
@@ -354,6 +352,32 @@ def _sequence_table(
     table = markdown_table(["", "PSNR, dB", "lowest", "SSIM", "flicker x 1000"], rows)
     note = "flicker is the mean change of chroma from frame to frame where nothing moves."
     return [f"Means over the frames; {note}", "", *table.splitlines()]
+
+
+STILL = 0.5
+"""Pixels that move less than this between two frames are still."""
+
+
+def flicker(images: Sequence[Float[Tensor, "3 h w"]], greys: Sequence[Float[Tensor, "1 h w"]]) -> float:
+    """Mean change of chroma (R - Y, B - Y) from frame to frame where nothing moves, 0..1.
+
+    `greys` are alpha's frames, which show what moves. Raises ValueError for fewer than two frames.
+    """
+    if len(images) < 2:
+        raise ValueError("flicker needs two frames or more")
+    changes = []
+    for (a, b), (grey_a, grey_b) in zip(pairwise(images), pairwise(greys)):
+        change = (to_luma_chroma(b)[1] - to_luma_chroma(a)[1]).abs().mean(0)
+        changes.append(float(change[still(grey_a, grey_b)].mean()))
+    return sum(changes) / len(changes)
+
+
+def still(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Bool[Tensor, "h w"]:
+    """Where nothing moves from frame a to b, and nothing near does."""
+    engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow = engine.calc(to_bytes(a[0]), to_bytes(b[0]), np.empty(0, np.float32))
+    moves = (np.square(flow).sum(-1) > STILL**2).astype(np.uint8)
+    return torch.from_numpy(cv2.dilate(moves, np.ones((9, 9), np.uint8)) == 0)
 
 
 WRONG = 0.1

@@ -187,9 +187,9 @@ GEOMETRY_MAY_USE = {
     "compiled.py": {"numba"},
     "opencv.py": {"cv2"},
     "image_bytes.py": {"tifffile"},
-    "image_tags.py": {"PIL"},
     "matfile.py": {"scipy"},
     "viz.py": {"matplotlib"},
+    "xmp.py": {"PIL"},
 }
 """What single files of arraygeom import when it is needed, and say so in one line where it is not there."""
 

@@ -11,12 +11,10 @@ or `Positions` over *n. The families here are frozen dataclasses; a plain functi
 A rig whose numbers have batch axes *b takes pixels (*b, ..., 2), or with axes of length 1 in place of *b.
 """
 
-from .approximation import approximated
 from .around import AroundDepth, AroundMatches
 from .curved import Curved, ThroughLenses
 from .default import FIELDS, default_field, named_field, recorded_field
 from .explicit import Dense, Local, NearestVoxels
-from .moved import Moved
 from .protocol import ReceptiveField, SamplingLocations, lazily, sampling_locations
 from .ray_depth import ray_depth
 from .straight import (
@@ -24,10 +22,11 @@ from .straight import (
     EpipolarLine,
     HomographyDisplacement,
     Rectified,
+    approximated,
     covering_displacement,
     pinhole_track,
 )
-from .widened import Widened
+from .widened import Moved, Widened
 
 __all__ = [
     "FIELDS",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, get_args
 
@@ -15,11 +15,11 @@ from ..camera import Camera
 from ..checks import check_above, check_bounds
 from ..chunks import chunked
 from ..epipolar import Track, epipolar_lines, segments_between, track
-from ..homography import apply_homography
-from ..pixels import HW, floating
-from ..rig import Depths, Pair, depth_range
+from ..homography import apply_homography, fit_homography, fit_similarity
+from ..pixels import HW, coarse_grid, floating
+from ..rig import Depths, Link, Pair, depth_range
 from ..segments import Segments, clip_to_image
-from ..tracing import followed
+from ..tracing import followed, needs_numbers
 from .protocol import CHUNK, all_pixels, segments_by_rows
 
 
@@ -217,6 +217,30 @@ def require_pinholes(pair: Pair) -> tuple[Camera, Camera]:
     alpha, beta = pair.cameras
     require_straight(pair)
     return alpha, beta
+
+
+def approximated(pair: Pair, kind: Literal["homography", "similarity"] = "homography") -> Pair:
+    """The pair with its exact F and the H that fits best to the middles of its depth-bounded segments.
+
+    Least squares in pixels of beta, over the segments that beta's image holds of every 16th alpha pixel:
+    what the paper calls the homography-based approximation. `HomographyDisplacement()` on the result takes
+    the displacement that covers near to far. Differentiable. Raises ValueError for uncalibrated or batched
+    pairs and where beta sees nothing between the bounds.
+    """
+    alpha, _ = pair.cameras
+    if alpha.K.ndim > 2:
+        raise ValueError("fitting works on one pair at a time: take one of the batch")
+    x = coarse_grid(pair.alpha.hw).to(alpha.K)
+    segments = Epipolar()(pair, x)
+    valid = segments.valid
+    needs_numbers("which pixels an approximation is fitted to", segments.start)
+    if int(valid.sum()) < 4:
+        raise ValueError(
+            "beta sees next to nothing of alpha's image between near and far: nothing to fit a map to"
+        )
+    fit = fit_homography if kind == "homography" else fit_similarity
+    H = fit(x[valid], (0.5 * (segments.start + segments.end))[valid])
+    return replace(pair, link=Link(pair.fundamental, H))
 
 
 def require_straight(pair: Pair) -> None:

@@ -88,10 +88,8 @@ def write(rig: Rig) -> dict[str, str]:
 
     Raises ValueError for what the format cannot hold.
     """
-    cameras, images = (
-        ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"],
-        ["# IMAGE_ID, QW..QZ, TX..TZ, CAMERA_ID, NAME"],
-    )
+    cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    images = ["# IMAGE_ID, QW..QZ, TX..TZ, CAMERA_ID, NAME"]
     for i, (name, camera) in enumerate(calibrated(rig, "COLMAP"), 1):
         if name != name.strip() or len(name.splitlines()) != 1:
             raise ValueError(

@@ -187,10 +187,8 @@ def _check_method(model: CameraModel, method: str, points: Tensor, like: tuple[T
             f"{name} raised {type(error).__name__} for points {_kind(points)}: {error}; points have any "
             "number of axes before their last, and numbers of the model those that `item_axes` states"
         ) from error
-    kinds, wanted = (
-        [_kind(v) for v in (answer if isinstance(answer, tuple) else (answer,))],
-        [*map(_kind, like)],
-    )
+    kinds = [_kind(v) for v in (answer if isinstance(answer, tuple) else (answer,))]
+    wanted = [*map(_kind, like)]
     if kinds != wanted:
         raise TypeError(
             f"{name} gives {' and '.join(kinds)} for points {_kind(points)}; "

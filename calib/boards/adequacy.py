@@ -153,10 +153,8 @@ def _gain(intrinsics: Intrinsics, X: np.ndarray) -> np.ndarray | None:
     if inside.sum() < 0.6 * len(X) or not inside.any():
         return None
     J = camera_jacobian(intrinsics.camera, X[inside]) / intrinsics.sigma
-    by_pose, by_intrinsics = (
-        J[..., :6].reshape(-1, 6),
-        J[..., intrinsics.free].reshape(2 * int(inside.sum()), -1),
-    )
+    by_pose = J[..., :6].reshape(-1, 6)
+    by_intrinsics = J[..., intrinsics.free].reshape(2 * int(inside.sum()), -1)
     left = by_intrinsics - by_pose @ np.linalg.lstsq(by_pose, by_intrinsics, rcond=None)[0]
     return np.asarray(left.T @ left)
 

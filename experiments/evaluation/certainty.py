@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
-from safetensors import safe_open
 from torch import Generator, Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
@@ -23,12 +22,13 @@ from pat.data.pairs import PAPER_DISPARITY, StereoPair
 from pat.evaluation.protocols import hw_of, rectified_fusion
 from pat.evaluation.tables import distinct, markdown_table
 from pat.matching.certainty import SETTINGS, CertaintyNetwork, measured, typical_facts
-from pat.matching.choice import Choice, read_choice
+from pat.matching.choice import Choice
 from pat.matching.inputs import Inputs
 from pat.matching.match import match
 from pat.matching.matches import BetaMatches, Matches
 from pat.matching.positions import FINE
 from pat.networks.protocol import FusionNetwork
+from pat.support.tensor_files import read_tensors, with_weights
 
 from .conditions import CONDITIONS, save_curves
 
@@ -110,9 +110,8 @@ def judged(
 def unseeing(choices: Sequence[Path], pair: str) -> Choice:
     """The first that was trained without the pair. Raises ValueError if none was, or for another file."""
     for path in choices:
-        choice = read_choice(path)
-        with safe_open(path, "pt") as file:
-            recipe = json.loads((file.metadata() or {}).get("recipe", "{}"))
+        choice = with_weights(Choice(), path)
+        recipe = json.loads(read_tensors(path)[1].get("recipe", "{}"))
         if any(fragment in pair for fragment in recipe.get("without", ())):
             return choice
     raise ValueError(f"no choice was trained without {pair}: train one (--without) and give its file")

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from experiments.exposures import banded
-from experiments.rendered import RenderedScene
-from experiments.stage import SystemScene, purpose_generator
+from experiments.stage import RenderedScene, SystemScene, purpose_generator
 from experiments.system import SystemRecording
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.sensors import Clip, Noise, record

@@ -9,9 +9,8 @@ from torch import Tensor
 
 from arraygeom import HomographyDisplacement
 from arraygeom.atomic import write_text
-from experiments.flicker import flicker
 from experiments.showcase import FAST, SCENE, SLOW, FastSlowArray, bright_gain, fast_and_slow_array
-from experiments.system import SystemResult, fused_frames
+from experiments.system import SystemResult, flicker, fused_frames
 from pat.cli.fuse import with_sensor
 from pat.evaluation.tables import markdown_table
 from pat.fusion.fuse import FuseSettings

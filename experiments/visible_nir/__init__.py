@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import torch
 
-from experiments.rendered import RenderedScene
-from experiments.stage import SystemScene, purpose_generator
+from experiments.stage import RenderedScene, SystemScene, purpose_generator
 from experiments.system import SystemRecording
 from pat.media.colour import from_luma_chroma, linear_from_srgb, srgb_from_linear, to_luma_chroma
 from pat.sensors import Clip, Noise, record

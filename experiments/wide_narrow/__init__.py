@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from arraygeom import Rig
-from experiments.rendered import RenderedScene
 from experiments.sensors import DecodeSRGB, Mosaic
-from experiments.stage import SystemScene, purpose_generator
+from experiments.stage import RenderedScene, SystemScene, purpose_generator
 from experiments.system import SystemRecording
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.sensors import Clip, GaussianBlur, Noise, record

@@ -101,12 +101,8 @@ def _(info, in_dims, *inputs):
     schema=f"({INPUTS}, {SAVED}, {OPTIONS}, bool[] wanted) -> (Tensor, Tensor, Tensor, Tensor, Tensor)",
 )
 def _attend_backward(*given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    tensors, saved, cotangents, (*form, _, backend, _, wanted) = (
-        given[:6],
-        given[6:10],
-        given[10:12],
-        given[12:],
-    )
+    tensors, saved, cotangents = given[:6], given[6:10], given[10:12]
+    *form, _, backend, _, wanted = given[12:]
     return compiled(backend).backward(_inputs(tensors, form), saved, cotangents, wanted)
 
 

@@ -115,6 +115,7 @@ class PrintBoard:
     """Sheet to centre the board on; without it the page is as large as the board with its margin."""
 
     def run(self) -> None:
+        """Write the board, and say what to print it on. Raises ValueError for what is no board or paper."""
         from calib.boards.target import page_note, parse_board, write_board
 
         say(f"written: {write_board(self.board, options.writable(self.out), paper=self.paper)}")

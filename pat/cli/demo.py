@@ -26,6 +26,7 @@ class Demo:
     weights: Weights = "mono-colour"
 
     def run(self) -> None:
+        """Fuse both arrays, and write and print what each method scores."""
         from arraygeom.atomic import write_text
 
         from ..data.sample_array import ALPHA, load_motorcycle, load_sample

@@ -7,7 +7,7 @@ import logging
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -293,7 +293,6 @@ class Fuse(Known):
 
         from ..fusion.inputs import measured_along
         from ..fusion.report import report_page
-        from ..fusion.results import band_names, describe_bands, save_frame, view_of
         from ..fusion.views import Views
         from ..media.raw import developed_rig
         from ..support.locks import folder_lock
@@ -301,7 +300,7 @@ class Fuse(Known):
         if self.points and not isinstance(rig[alpha], Camera):
             raise ValueError("--points needs a calibrated alpha, and the rig has only F for it: leave it out")
         begin, store, field = time.monotonic(), self.out / ".tiles", options.field_named(self.field)
-        views = Views(rig, images, alpha, dict.fromkeys(images, field))
+        along = measured_along(Views(rig, images, alpha, dict.fromkeys(images, field)))
 
         def fused(rig: Rig) -> Frame:
             rig, field_given = self.with_known(rig, alpha, files, field)
@@ -328,23 +327,9 @@ class Fuse(Known):
             frame, gain = self._exposed(frame)
             if image_array is None and not frame.depth.isfinite().any():
                 self.note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
-            bands = band_names(frame, (name for name in rig.betas(alpha) if name in files))
-            written = save_frame(
-                frame,
-                self.out,
-                bits=self.bits or 8,
-                kind=self.kind,
-                view=view_of(rig, alpha, bits=self.bits or 8, bands=len(frame.image)),
-                rig=None if image_array is None else image_array.recorded,
-                points=rig[alpha] if self.points else None,
-                along=measured_along(views),
-                bands=bands,
-            )
+            found = None if image_array is None else image_array.recorded
+            written = self._saved(frame, rig, alpha, files, along=along, rig=found)
             shutil.rmtree(store, ignore_errors=True)
-            if said := describe_bands(frame, bands, self.kind):
-                self.note(said)
-            if self.points:
-                self.note("points.ply: the pixels of known depth, in alpha's frame")
             if self.report:
                 facts = self._facts(
                     rig, () if image_array is None else image_array.notes, time.monotonic() - begin
@@ -356,6 +341,28 @@ class Fuse(Known):
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
         if self.report:
             say(f"to see the result, open {self.out / 'index.html'} in a browser")
+
+    def _saved(
+        self, frame: Frame, fused: Rig, alpha: str, files: Container[str], **further: Any
+    ) -> list[Path]:
+        """Write the files of a frame, `further` being options of `save_frame`, and note what some hold."""
+        from ..fusion.results import band_names, describe_bands, save_frame, view_of
+
+        bits, bands = (
+            self.bits or 8,
+            band_names(frame, (name for name in fused.betas(alpha) if name in files)),
+        )
+        further |= {
+            "view": view_of(fused, alpha, bits=bits, bands=len(frame.image)),
+            "points": fused[alpha] if self.points else None,
+            "bands": bands,
+        }
+        written = save_frame(frame, self.out, bits=bits, kind=self.kind, **further)
+        if said := describe_bands(frame, bands, self.kind):
+            self.note(said)
+        if self.points:
+            self.note("points.ply: the pixels of known depth, in alpha's frame")
+        return written
 
     def _healed(self, rig: Rig, healed: Healed | None) -> Rig:
         """The rig, or the one that its images healed, which is written beside the results."""

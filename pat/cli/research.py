@@ -135,6 +135,7 @@ class DataInfo:
     folder: RenderedFolder
 
     def run(self) -> None:
+        """Print the summary. Raises ValueError for a folder that `pat render` did not write."""
         from ..farm.job import summarise
 
         print(summarise(self.folder))
@@ -206,6 +207,7 @@ class Train:
         return cls(config=command_line(arguments))
 
     def run(self) -> None:
+        """Train, or continue a run that stopped. Raises ValueError for a recipe that its data do not suit."""
         from ..training.loop import train
 
         say(f"written: {train(self.config)}")

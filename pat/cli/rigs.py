@@ -34,7 +34,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from arraygeom import Rig
+    from arraygeom.summary import CameraSummary, PairSummary
     from calib.images.matches import Pairs
+    from calib.images.refined import Refinement
 
 
 @dataclass
@@ -141,6 +143,7 @@ class Explore:
     """Open the browser."""
 
     def run(self) -> None:
+        """Serve the explorer, or save its page. Raises ValueError for what it cannot show."""
         from ..explore import opened, serve
 
         if self.save is not None:
@@ -177,21 +180,15 @@ class Info:
     """Print JSON instead of tables."""
 
     def run(self) -> None:
-        from rich.console import Console
-        from rich.table import Table
-
+        """Print what is odd about the rig, and a line for each camera and each pair."""
         from arraygeom.io import ANY_SCALE, recognise
-        from arraygeom.rig_check import unit_oddity
         from arraygeom.summary import summarise_cameras, summarise_pairs
         from arraygeom.text import length_unit
 
         rig = load_rig(self.rig, self.depth)
         if rig.name:
             say(rig.name)
-        warned = unit_oddity(rig)  # by reading the file
-        for oddity in rig.check():
-            if warned is None or not oddity.endswith(warned):
-                say(f"pat: {oddity}", style="yellow")
+        warn_of_oddities(rig)
         unit = length_unit(rig)
         if (kind := recognise(self.rig)) in ANY_SCALE:
             unit = "units"
@@ -204,20 +201,38 @@ class Info:
         if self.json:
             document = {"cameras": [c._asdict() for c in cameras], "pairs": [p._asdict() for p in pairs]}
             return options.print_json(document)
-        fine, baseline = ("mm", "baseline m") if unit == "m" else (f"{unit}/1000", "baseline")
-        footprint = f"{fine} a pixel, near - far"
-        of_cameras = Table("camera", "pixels", "focal px", "view deg", footprint, box=None)
-        for c in cameras:
-            further = _two(c.focal), _two(c.field_of_view, " x "), _two(c.footprint, " - ")
-            of_cameras.add_row(c.name, f"{c.wh[0]}x{c.wh[1]}", *further)
-        lengths = "segment px, median - longest", f"depth step {unit}, near - far"
-        of_pairs = Table("alpha > beta", baseline, "rotation deg", "seen", *lengths, box=None)
-        for p in pairs:
-            share = "" if p.seen is None else f"{p.seen:.0%}"
-            further = share, _two(p.length, " - "), _two(p.depth_step, " - ")
-            of_pairs.add_row(f"{p.alpha} > {p.beta}", f"{p.baseline:.4g}", f"{p.rotation:.2f}", *further)
-        for table in (of_cameras, of_pairs)[: 1 + bool(pairs)]:
-            Console().print(table)
+        print_tables(cameras, pairs, unit)
+
+
+def warn_of_oddities(rig: Rig) -> None:
+    """Say on standard error what is odd about a rig, but for what reading its file has warned of."""
+    from arraygeom.rig_check import unit_oddity
+
+    warned = unit_oddity(rig)
+    for oddity in rig.check():
+        if warned is None or not oddity.endswith(warned):
+            say(f"pat: {oddity}", style="yellow")
+
+
+def print_tables(cameras: Sequence[CameraSummary], pairs: Sequence[PairSummary], unit: str) -> None:
+    """A table of cameras and, if there are any, one of pairs; lengths in metres or another unit."""
+    from rich.console import Console
+    from rich.table import Table
+
+    fine, baseline = ("mm", "baseline m") if unit == "m" else (f"{unit}/1000", "baseline")
+    footprint = f"{fine} a pixel, near - far"
+    of_cameras = Table("camera", "pixels", "focal px", "view deg", footprint, box=None)
+    for c in cameras:
+        further = _two(c.focal), _two(c.field_of_view, " x "), _two(c.footprint, " - ")
+        of_cameras.add_row(c.name, f"{c.wh[0]}x{c.wh[1]}", *further)
+    lengths = "segment px, median - longest", f"depth step {unit}, near - far"
+    of_pairs = Table("alpha > beta", baseline, "rotation deg", "seen", *lengths, box=None)
+    for p in pairs:
+        share = "" if p.seen is None else f"{p.seen:.0%}"
+        further = share, _two(p.length, " - "), _two(p.depth_step, " - ")
+        of_pairs.add_row(f"{p.alpha} > {p.beta}", f"{p.baseline:.4g}", f"{p.rotation:.2f}", *further)
+    for table in (of_cameras, of_pairs)[: 1 + bool(pairs)]:
+        Console().print(table)
 
 
 def _two(values: tuple[float, float] | None, between: str = ", ") -> str:
@@ -242,6 +257,7 @@ class Convert:
     """Format of the target."""
 
     def run(self) -> None:
+        """Write the rig. Raises ValueError for a size the file contradicts, and what OUT cannot hold."""
         from arraygeom.io import read_rig, write_rig
 
         hw = None if self.size is None else (self.size[1], self.size[0])
@@ -280,6 +296,7 @@ class Doctor:
     """Print JSON instead of text."""
 
     def run(self) -> None:
+        """Print the diagnosis, and write the repaired rig; exit status 4 if several repairs do as well."""
         from arraygeom.atomic import write_atomically
         from calib.images.doctor import diagnose
 
@@ -342,6 +359,7 @@ class Refine:
     """Write the refined rig in spite of objections."""
 
     def run(self) -> None:
+        """Print what changes, and write the rig; exit status 4 if it is refused though it does not fit."""
         from arraygeom.atomic import write_text
         from arraygeom.io.native import write
         from calib.images.refinement import refine
@@ -370,19 +388,23 @@ class Refine:
             )
         print(refined.as_text())
         if not refined.accepted:
-            force = ": --force writes it all the same" if refined.objections else ""
-            if not refined.held_out[1].median < refined.held_out[0].median / NEARER:
-                return say(f"no rig written{force}")
-            first = {text.partition("=")[0]: text.partition("=")[2] for text in self.image[::-1]}
-            say(
-                "no rig written, though points come far nearer to their lines: --force writes it all the "
-                f"same; or fuse without a rig: `pat fuse {' '.join(first.values())}`",
-                style="yellow",
-            )
-            sys.exit(REFUSED)
+            return self._refused(refined)
         notes = "".join(f"# {line}\n" for line in ["pat rig refine:", *refined.as_text().splitlines()])
         write_text(self.out, write(refined.rig) + notes)
         say(f"written: {self.out}")
+
+    def _refused(self, refined: Refinement) -> None:
+        """Say why no rig is written, and what to do; ends the command if points come far nearer."""
+        force = ": --force writes it all the same" if refined.objections else ""
+        if not refined.held_out[1].median < refined.held_out[0].median / NEARER:
+            return say(f"no rig written{force}")
+        first = {text.partition("=")[0]: text.partition("=")[2] for text in self.image[::-1]}
+        say(
+            "no rig written, though points come far nearer to their lines: --force writes it all the "
+            f"same; or fuse without a rig: `pat fuse {' '.join(first.values())}`",
+            style="yellow",
+        )
+        sys.exit(REFUSED)
 
 
 @dataclass
@@ -401,6 +423,7 @@ class RigFromImages:
     matches: MatchesFile = None
 
     def run(self) -> None:
+        """Write the rig and print its statistics. Raises ValueError for images with too little in common."""
         from calib.images.from_images import rig_from_images
 
         from ..media.images import read_image
@@ -438,6 +461,7 @@ class RigDiff:
     """Picture to write: how far pixels and depths differ, over the images."""
 
     def run(self) -> None:
+        """Print the comparison and the verdict. Raises ValueError for rigs of other cameras."""
         from calib.boards.rig_diff import draw_difference, rig_difference
         from calib.boards.uncertainty import RigCovariance
 

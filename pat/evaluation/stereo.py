@@ -135,10 +135,8 @@ def depth_markdown(rows: Sequence[StereoRow]) -> str:
     with_disparity = [row for row in rows if row.end_point_error is not None]
     if not with_disparity:
         return ""
-    methods, rates = (
-        distinct(row.method for row in with_disparity),
-        distinct(row.rate for row in with_disparity),
-    )
+    methods = distinct(row.method for row in with_disparity)
+    rates = distinct(row.rate for row in with_disparity)
     columns = [(method, rate) for method in methods for rate in rates]
     groups = {key: [row for row in with_disparity if (row.method, row.rate) == key] for key in columns}
     lines = [

@@ -18,10 +18,62 @@ OWN_NAMES = ("localhost", "127.0.0.1")
 
 
 class _Server(ThreadingHTTPServer):
+    """A server of an explorer's page and answers, one answer at a time."""
+
+    def __init__(self, explorer: Explorer, port: int) -> None:
+        super().__init__(("127.0.0.1", port), _Handler)
+        self.explorer, self.turn = explorer, threading.Lock()
+        self.page = page(explorer.values(), "asksServer()").encode()  # computes what answers would wait for
+
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A browser that leaves before it has its answer is no error."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+
+    def do_GET(self) -> None:
+        if self._is_own() and self.path == "/":
+            self._send(200, "text/html; charset=utf-8", self.server.page)
+        else:
+            self._refuse()
+
+    def do_POST(self) -> None:
+        length = self.headers.get("Content-Length", "")
+        short = length.isdecimal() and int(length) <= LARGEST
+        if not (self._is_own() and self.path == "/answer" and short):
+            self._refuse()
+            return
+        try:
+            controls = {**self.server.explorer.controls, **json.loads(self.rfile.read(int(length)))}
+        except (ValueError, TypeError):
+            self._send(400, "text/plain", b"the question is not a JSON object\n")
+            return
+        with self.server.turn:
+            text = json.dumps(self.server.explorer.answer(controls))
+        self._send(200, "application/json", text.encode())
+
+    def _is_own(self) -> bool:
+        hosts = [f"{name}:{self.server.server_port}" for name in OWN_NAMES]
+        origin = self.headers.get("Origin")
+        of_page = origin is None or origin.partition("://")[2] in hosts
+        return self.headers.get("Host") in hosts and of_page
+
+    def _refuse(self) -> None:
+        status, why = (404, b"nothing here\n") if self._is_own() else (403, b"for localhost alone\n")
+        self._send(status, "text/plain", why)
+
+    def _send(self, status: int, kind: str, body: bytes) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing of each request."""
 
 
 def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
@@ -33,55 +85,10 @@ def serve(explorer: Explorer, *, port: int = 0, browser: bool = True) -> None:
     """
     if not 0 <= port <= 65535:
         raise ValueError(f"--port {port}: wanted 1 to 65535, or 0 for a free one")
-    turn = threading.Lock()
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            if self._is_own() and self.path == "/":
-                self._send(200, "text/html; charset=utf-8", served)
-            else:
-                self._refuse()
-
-        def do_POST(self) -> None:
-            length = self.headers.get("Content-Length", "")
-            short = length.isdecimal() and int(length) <= LARGEST
-            if not (self._is_own() and self.path == "/answer" and short):
-                self._refuse()
-                return
-            try:
-                controls = {**explorer.controls, **json.loads(self.rfile.read(int(length)))}
-            except (ValueError, TypeError):
-                self._send(400, "text/plain", b"the question is not a JSON object\n")
-                return
-            with turn:
-                text = json.dumps(explorer.answer(controls))
-            self._send(200, "application/json", text.encode())
-
-        def _is_own(self) -> bool:
-            hosts = [f"{name}:{self.server.server_port}" for name in OWN_NAMES]  # type: ignore[attr-defined]
-            origin = self.headers.get("Origin")
-            of_page = origin is None or origin.partition("://")[2] in hosts
-            return self.headers.get("Host") in hosts and of_page
-
-        def _refuse(self) -> None:
-            status, why = (404, b"nothing here\n") if self._is_own() else (403, b"for localhost alone\n")
-            self._send(status, "text/plain", why)
-
-        def _send(self, status: int, kind: str, body: bytes) -> None:
-            self.send_response(status)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
-
-        def log_message(self, format: str, *args: Any) -> None:
-            """Say nothing of each request."""
-
     try:
-        server = _Server(("127.0.0.1", port), Handler)
+        server = _Server(explorer, port)
     except OSError as error:
         raise ValueError(f"--port {port}: {error.strerror}: give another, or 0 for a free one") from None
-    served = page(explorer.values(), "asksServer()").encode()  # computes what the first answer would wait for
     address = f"http://localhost:{server.server_port}"
     print(f"the explorer is at {address} (Ctrl+C ends it)", flush=True)
     if browser:

@@ -7,7 +7,7 @@ no colour of a network is in them.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, TypeGuard
@@ -194,13 +194,7 @@ def align(
     rig = with_pixels(rig if depth is None else rig.replace(depth=depth))
     views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, field=field), noise)
     betas, recordings = views.betas, images if recorded is None else recorded
-    for name in (alpha, *betas):
-        if name not in recordings:
-            raise ValueError(
-                f"there are no recorded values of '{name}': give those of every camera with an image"
-            )
-        if isinstance(recordings, dict):  # others may be read from files, which takes time
-            _as_array(recordings[name], name, rig[name].hw)
+    _check_recorded(rig, recordings, (alpha, *betas))
     if network is None:
         weights = weights_for([len(views.images[name]) for name in betas])
         network = load_weights(weights)
@@ -239,14 +233,30 @@ def align(
             LOG.info("aligning %s", name)
             place = inputs.placements[i]
             located = _located(inputs, i, matches.betas[i], rig[alpha])
-            confidence, pinhole = fused.matched[i, 2:], place.pair.alpha
-            if _is_undistorted(rig[alpha], pinhole):  # 0 where the pinhole view has none
-                assert isinstance(pinhole, LensView)
-                confidence = resampled(confidence, pinhole, rig[alpha], interpolation="bilinear").values[0]
+            confidence = _as_recorded(fused.matched[i, 2:], place.pair.alpha, rig[alpha])
             values = _as_array(recordings[name], name, rig[name].hw)
             how = min_confidence, interpolation, fill
-            aligned[name] = _aligned_view(rig[name], name, place, located, confidence[0], values, *how)
+            aligned[name] = _aligned_view(rig[name], name, place, located, confidence, values, *how)
     return Aligned(alpha, aligned, depths.cpu().numpy())
+
+
+def _check_recorded(rig: Rig, recordings: Recorded, names: Iterable[str]) -> None:
+    """Raises ValueError unless there are values of all these cameras, of the sizes that the rig says."""
+    for name in names:
+        if name not in recordings:
+            raise ValueError(
+                f"there are no recorded values of '{name}': give those of every camera with an image"
+            )
+        if isinstance(recordings, dict):  # others may be read from files, which takes time
+            _as_array(recordings[name], name, rig[name].hw)
+
+
+def _as_recorded(confidence: Float[Tensor, "1 h w"], now: View, recorded: View) -> Float[Tensor, "h2 w2"]:
+    """Confidence at alpha's recorded pixels; 0 where the view that its lens was taken out of has none."""
+    if _is_undistorted(recorded, now):
+        assert isinstance(now, LensView)
+        confidence = resampled(confidence, now, recorded, interpolation="bilinear").values[0]
+    return confidence[0]
 
 
 def _steps(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 from xml.sax.saxutils import escape
@@ -12,12 +12,12 @@ import tifffile
 import torch
 from numpy.typing import NDArray
 
-from arraygeom import Rig
 from arraygeom.atomic import write_together
 
 from ..media.images import read_recorded, write_image
 from ..media.raw import demosaiced, recorded_bands
 from .align import Aligned, AlignedView
+from .views import FilesOfCameras
 
 PositionFormat = Literal["npy", "tif", "none"]
 GREY = np.array([0, 128, 255], np.float32) / 255
@@ -29,24 +29,12 @@ LARGEST_TIFF = 2**32 - 2**25
 """Bytes up to which a TIFF file has offsets of 32 bits; tifffile's own limit."""
 
 
-class RecordedFiles(Mapping[str, NDArray[Any]]):
+class RecordedFiles(FilesOfCameras[NDArray[Any]]):
     """The values of an image file of each camera, read when asked for: counts, linear of raw ones.
 
     Those behind a colour filter pattern are demosaiced: red, green and blue counts. Asking raises as
     `read_recorded`.
     """
-
-    def __init__(self, rig: Rig, files: Mapping[str, str | Path]) -> None:
-        self.rig, self.files = rig, files
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.files)
-
-    def __len__(self) -> int:
-        return len(self.files)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self.files
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         view = self.rig[name]

@@ -21,8 +21,6 @@ from typing import Any
 
 import yaml
 from rich.console import Console
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor
 
 from arraygeom import Rig, ThroughLenses, Widened
@@ -42,7 +40,7 @@ from ..support.jobs import HERE, JobReport, OnError, Task, Workers, run_tasks
 from ..support.locks import folder_lock
 from ..support.memory import limited, parse_bytes
 from ..support.schema import entries_of
-from ..support.tensor_files import write_tensors
+from ..support.tensor_files import read_tensors, write_tensors
 from .checks import confidence_checked
 from .frames import ImageFiles
 from .fuse import FuseSettings, fuse
@@ -223,12 +221,10 @@ class Batch:
     def _fetch(self, key: KeyFrame) -> KeyColour | None:
         file = self._key_file(key)
         try:
-            return KeyColour(**load_file(file)) if file.exists() else None
-        except SafetensorError as error:
+            return KeyColour(**read_tensors(file)[0]) if file.exists() else None
+        except ValueError as error:
             image = self.files[self.alpha][key.alpha]
-            raise ValueError(
-                f"{image}: its colour in {file} is damaged ({error}): fuse again without --resume"
-            ) from None
+            raise ValueError(f"{image}: its colour, {error}: fuse again without --resume") from None
 
     def fuse_key(self, key: KeyFrame) -> None:
         """Write the colour of a key frame."""

@@ -71,7 +71,7 @@ class Corrections:
         Cameras of the same place may be one beta in one frame, and several in another. Raises ValueError for
         misalignments of other cameras.
         """
-        cameras = [camera for beta in inputs.betas for camera in beta.cameras]
+        cameras = [camera for names in inputs.cameras for camera in names]
         if self.misalignments and set(cameras) != set(self.misalignments):
             raise ValueError(
                 f"corrections are of {_named(self.misalignments)}, this frame has {_named(cameras)}: "
@@ -87,7 +87,7 @@ class Corrections:
 
     def of_betas(self, inputs: Inputs) -> list[Misalignment]:
         """The misalignment of each beta, in order."""
-        return [self.misalignments.get(beta.cameras[0], Misalignment()) for beta in inputs.betas]
+        return [self.misalignments.get(names[0], Misalignment()) for names in inputs.cameras]
 
     def described(self, hw: HW) -> list[str]:
         """A line for each thing that is put right; `hw` is alpha's size."""
@@ -127,8 +127,8 @@ def find_corrections(
         matches = [_of_beta(inputs.alpha, *of_beta, small.hw) for of_beta in parts]
         response_now = _fitted(small, matches) if fits else corrections.response
         steps = [fit_misalignment(*m[1:]) if align else Misalignment() for m in matches]
-        moves = zip(inputs.betas, corrections.of_betas(inputs), steps)
-        by_camera = {camera: before + step for beta, before, step in moves for camera in beta.cameras}
+        moves = zip(inputs.cameras, corrections.of_betas(inputs), steps)
+        by_camera = {camera: before + step for names, before, step in moves for camera in names}
         corrections = Corrections(response_now, by_camera)
         if all(step.largest(small.hw) <= SETTINGS.settled for step in steps):
             break

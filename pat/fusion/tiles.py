@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from arraygeom import pixel_grid
@@ -21,7 +20,7 @@ from arraygeom.threads import convolutions_in_parallel
 from ..matching.inputs import Inputs
 from ..matching.matches import Matches
 from ..networks.protocol import FusionNetwork, matched_for
-from ..support.tensor_files import write_tensors
+from ..support.tensor_files import read_tensors, write_tensors
 from .back_projection import back_projected
 from .depth import certain, measured_depth
 from .inputs import FrameInputs
@@ -213,8 +212,8 @@ def _fused(
     box = (top - tile.outer[0], bottom - tile.outer[0], left - tile.outer[2], right - tile.outer[2])
     with convolutions_in_parallel():
         output = certain(network(inputs, matches), matches, inputs)
-    if network.keeps_luminance and not inputs.denoised:
-        output = back_projected(output, matches, inputs)
+    if matches is not None and not inputs.denoised:
+        output = back_projected(output, matches, inputs, keeps_luminance=network.keeps_luminance)
     output = output.cut(box)
     cropped = replace(inputs, betas=tuple(replace(beta, field=beta.field.cut(box)) for beta in inputs.betas))
     hw = bottom - top, right - left
@@ -251,13 +250,21 @@ def fused_in_tiles(
         digest = _digest(network, frame)
         files = {t: store / f"{digest}_{'_'.join(map(str, (*t.inner, *t.outer)))}.safetensors" for t in tiles}
         for tile in shown:
-            if not files[tile].exists():
+            if not _is_whole(files[tile]):
                 write_tensors(files[tile], make(tile)._asdict())
-        parts = ((tile, FusedTile(**load_file(file))) for tile, file in files.items())
+        parts = ((tile, FusedTile(**read_tensors(file)[0])) for tile, file in files.items())
     else:
         parts = ((tile, make(tile)) for tile in shown)
     # A single tile is the frame as it is, with its gradients.
     return FusedTile(*assembled(frame.hw, ((Tile(tile.inner, tile.inner), fused) for tile, fused in parts)))
+
+
+def _is_whole(file: Path) -> bool:
+    try:
+        read_tensors(file)
+    except (OSError, ValueError):
+        return False
+    return True
 
 
 def _digest(network: FusionNetwork, frame: FrameInputs) -> str:

@@ -7,29 +7,20 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from arraygeom import (
-    Curved,
-    Epipolar,
-    Moved,
-    Pair,
-    ReceptiveField,
-    Rig,
-    Sensor,
-    ThroughLenses,
-    Widened,
-)
+from arraygeom import Curved, Epipolar, Moved, Pair, ReceptiveField, Rig, Sensor, ThroughLenses, Widened
 from arraygeom.warned import warn
 
 from ..media.colour import luminance_of as grey
 from ..media.images import Images, read_image
 from ..media.raw import develop, developed_rig, recorded_bands
 
+T = TypeVar("T")
 Fields = Mapping[str, ReceptiveField | None]
 """The field of each beta; None, or a beta that is missing, stands for the default."""
 
@@ -200,15 +191,11 @@ KEPT = 4_000_000
 """Values of an image up to which it is kept: reading it again takes longer than the memory is worth."""
 
 
-class ViewFiles(Mapping[str, Tensor]):
-    """An image file of each camera, read and developed when asked for; kept if it is small (`KEPT`).
+class FilesOfCameras(Mapping[str, T]):
+    """What an image file of each camera holds, read when asked for."""
 
-    Asking raises as `read_view` does.
-    """
-
-    def __init__(self, rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> None:
-        self.rig, self.files, self.alpha, self.like = rig, files, alpha, rig[alpha].sensor
-        self._kept: dict[str, Tensor] = {}
+    def __init__(self, rig: Rig, files: Mapping[str, str | Path]) -> None:
+        self.rig, self.files = rig, files
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.files)
@@ -218,6 +205,18 @@ class ViewFiles(Mapping[str, Tensor]):
 
     def __contains__(self, name: object) -> bool:
         return name in self.files
+
+
+class ViewFiles(FilesOfCameras[Tensor]):
+    """An image file of each camera, read and developed when asked for; kept if it is small (`KEPT`).
+
+    Asking raises as `read_view` does.
+    """
+
+    def __init__(self, rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> None:
+        super().__init__(rig, files)
+        self.alpha, self.like = alpha, rig[alpha].sensor
+        self._kept: dict[str, Tensor] = {}
 
     def __getitem__(self, name: str) -> Tensor:
         if name in self._kept:

@@ -18,13 +18,13 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
-from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import max_pool2d
 
 from arraygeom.chunks import ROWS, Tile, assembled, tiles_of
 
 from ..support.settings import size
+from ..support.tensor_files import with_weights
 from .filters import box_mean, numpy_of
 from .matches import BetaMatches, Matches
 from .positions import FINE
@@ -61,9 +61,7 @@ class CertaintyNetwork(nn.Sequential):
 @cache
 def fitted_network() -> CertaintyNetwork:
     """The one that ships."""
-    network = CertaintyNetwork()
-    network.load_state_dict(load_file(FITTED))
-    return network.eval().requires_grad_(False)
+    return with_weights(CertaintyNetwork(), FITTED)
 
 
 @torch.no_grad()

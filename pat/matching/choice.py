@@ -16,8 +16,6 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import pad, pixel_shuffle
 
@@ -27,6 +25,7 @@ from arraygeom.threads import convolutions_in_parallel, in_parallel
 
 from ..support.blocks import UNet
 from ..support.settings import size
+from ..support.tensor_files import with_weights
 from . import choice_numba as kernels
 from .certainty import typical_facts
 from .filters import nearest_known, numpy_of
@@ -78,17 +77,7 @@ class Choice(nn.Module):
 @cache
 def fitted_choice() -> Choice:
     """The one that ships."""
-    return read_choice(FITTED)
-
-
-def read_choice(path: Path) -> Choice:
-    """One that was trained. Raises ValueError for a file of anything else."""
-    network = Choice()
-    try:
-        network.load_state_dict(load_file(path))
-    except (RuntimeError, SafetensorError):
-        raise ValueError(f"{path}: not the weights of a choice: train one by experiments.choice") from None
-    return network.float().eval().requires_grad_(False)
+    return with_weights(Choice(), FITTED)
 
 
 def chosen(inputs: Inputs, matches: Matches, network: Choice | None = None) -> Matches:

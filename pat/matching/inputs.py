@@ -84,6 +84,11 @@ class Inputs:
         return self.alpha.shape[-2], self.alpha.shape[-1]
 
     @property
+    def cameras(self) -> list[tuple[str, ...]]:
+        """The names of each beta's cameras; of betas without any, their numbers from 1."""
+        return [beta.cameras or (str(number),) for number, beta in enumerate(self.betas, 1)]
+
+    @property
     def nbytes(self) -> int:
         """Memory of images and fields."""
         return self.alpha.nbytes + sum(beta.image.nbytes + beta.field.nbytes for beta in self.betas)

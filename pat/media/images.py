@@ -25,6 +25,7 @@ from arraygeom.image_bytes import (
     MINISBLACK,
     MINISWHITE,
     PNG,
+    PNM_OF_TEXT,
     SEPARATE,
     TIFF,
     decodable,
@@ -254,7 +255,7 @@ def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, i
         raise ValueError(f"{label}: its header says another size than its pixels have: save it again")
     if page is not None and values.dtype == np.uint16 and header.bits < 16:
         return values >> (16 - header.bits), 2**header.bits - 1
-    if content[:2] in (b"P2", b"P3") and values.dtype == np.uint8:
+    if content[:2] in PNM_OF_TEXT and values.dtype == np.uint8:
         values = ((values.astype(np.uint16) * header.white + 254) // 255).astype(np.uint8)
     return values, header.white
 
@@ -305,12 +306,17 @@ def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray | None
 
 
 def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | None:
-    """What OpenCV makes of an image file; None if it is none, has a side under `least` or too many pixels."""
+    """What OpenCV makes of an image file, 8 bits; None if it is none, has a side under `least` or too many
+    pixels."""
     content = path.read_bytes()
     header = image_header(content)
     if header is None or min(header.hw) < least or header.hw[0] * header.hw[1] > MOST_PIXELS:
         return None
-    return decoded(content, flags)
+    values = decoded(content, flags | (cv2.IMREAD_ANYDEPTH if header.white else 0))
+    if values is None or not header.white:
+        return values
+    full = 255 if content[:2] in PNM_OF_TEXT and values.dtype == np.uint8 else header.white
+    return np.rint(np.minimum(values / full, 1) * 255).astype(np.uint8)
 
 
 def _opaque(values: NDArray, content: bytes, label: str, white: int) -> NDArray:

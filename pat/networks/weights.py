@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from ..support import eight_bits
 from ..support.blocks import in_bfloat16
 from ..support.schema import from_document
-from ..support.tensor_files import undamaged, write_tensors
+from ..support.tensor_files import DAMAGED, not_whole, undamaged, write_tensors
 from .bandwise import BandwisePAT
 from .configs import CONFIGS
 from .denoiser import DenoiserConfig, LowLightNetwork
@@ -129,14 +129,14 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
             _check_shapes(path, network, config, {name: file.get_slice(name).get_shape() for name in names})
             state = {name: file.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:
-        if zipfile.is_zipfile(path):
+        if _is_of_pytorch(path):
             raise ValueError(
                 f"{path}: a checkpoint of PyTorch's: "
                 "`pat weights import` makes weights of one of the paper's authors"
             ) from None
-        raise ValueError(f"{path}: not a safetensors file ({error}); was it copied whole?") from None
+        raise ValueError(f"{path}: {not_whole(error)}") from None
     if not undamaged(state, metadata):
-        raise ValueError(f"{path}: its numbers are not those that were written: copy it again")
+        raise ValueError(f"{path}: {DAMAGED}")
     for name, tensor in state.items():
         if not tensor.is_floating_point() or not tensor.float().isfinite().all():
             raise ValueError(
@@ -145,6 +145,14 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
     made = network(config)
     made.load_state_dict(state)
     return made.eval().requires_grad_(False)
+
+
+def _is_of_pytorch(path: Path) -> bool:
+    """Whether torch.save wrote it: other archives, such as NumPy's, are zip files, too."""
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return any(Path(name).name == "data.pkl" for name in archive.namelist())
 
 
 def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:

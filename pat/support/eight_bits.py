@@ -164,10 +164,8 @@ def in_eight_bits(x: Float[Tensor, "b i h w"], of: Conv2d, by: Packed) -> Float[
         shape = 1, (last - first - 1) * down + tall, columns, x.shape[1]
         rounded = torch.empty(shape, dtype=torch.uint8, device=x.device)
         kernels.rounded(image, first * down - above, left, 1 / by.step, by.zero, rounded.numpy()[0])
-        inputs, weights = (
-            (rounded.movedim(-1, 1), by.step, by.zero),
-            (by.weights, by.steps, by.zeros, of.bias),
-        )
+        inputs = rounded.movedim(-1, 1), by.step, by.zero
+        weights = by.weights, by.steps, by.zeros, of.bias
         return torch.ops.onednn.qconv2d_pointwise(*inputs, *weights, *how)
 
     if len(parts) == 1:

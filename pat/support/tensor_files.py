@@ -5,13 +5,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeVar
 
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from arraygeom.atomic import write_atomically
+
+Network = TypeVar("Network", bound=nn.Module)
 
 
 def write_tensors(
@@ -29,6 +32,40 @@ def write_tensors(
         raise OSError(f"{path}: {' '.join(str(error).split())}") from None
 
 
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The tensors of a file, and its metadata.
+
+    Raises FileNotFoundError for no file, ValueError, which names it, for one that is damaged or is none.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except FileNotFoundError:
+        raise
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"{path}: {not_whole(error)}") from None
+    if not undamaged(tensors, metadata):
+        raise ValueError(f"{path}: {DAMAGED}")
+    return tensors, metadata
+
+
+def with_weights(network: Network, path: Path) -> Network:
+    """The network, ready for use, with the weights of a file. Raises as `read_tensors`, and for others."""
+    try:
+        network.load_state_dict(read_tensors(path)[0])
+    except RuntimeError:
+        name = type(network).__name__
+        raise ValueError(f"{path}: not the weights of a {name}: train it again, or copy it again") from None
+    return network.eval().requires_grad_(False)
+
+
+def not_whole(error: Exception) -> str:
+    """What to say of a file that safetensors refuses with this error."""
+    return f"not a safetensors file ({' '.join(str(error).split())}); was it copied whole?"
+
+
+DAMAGED = "its numbers are not those that were written: copy it again"
 DIGEST = "digest"
 """The entry of the metadata that holds the digest of all tensors."""
 

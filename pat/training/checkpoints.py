@@ -10,13 +10,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.swa_utils import AveragedModel
 
 from pat.networks.weights import misfit
-from pat.support.tensor_files import undamaged, write_tensors
+from pat.support.tensor_files import read_tensors, write_tensors
 
 FORMAT = "pat-checkpoint 1"
 RETAINED = 2
@@ -116,16 +115,12 @@ def newest_checkpoint(folder: Path) -> Checkpoint | None:
 
 def read_checkpoint(path: Path) -> Checkpoint | None:
     """A checkpoint, or None for a file that is damaged or is none."""
-    if not path.is_file():
-        return None
     try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        tensors, metadata = read_tensors(path)
         facts = json.loads(metadata.get("facts", "null"))
-    except (SafetensorError, OSError, RecursionError, ValueError):
+    except (OSError, RecursionError, ValueError):
         return None
-    whole = metadata.get("format") == FORMAT and _are_facts(facts) and undamaged(tensors, metadata)
+    whole = metadata.get("format") == FORMAT and _are_facts(facts)
     return Checkpoint(tensors, facts) if whole else None
 
 

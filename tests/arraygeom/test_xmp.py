@@ -9,8 +9,7 @@ import torch
 
 from arraygeom import Band, Rig
 from arraygeom.io import RigFileError, RigFileWarning, recognise
-from arraygeom.io.image_tags import ImageTags, image_tags
-from arraygeom.io.xmp import named_by_band
+from arraygeom.io.xmp import ImageTags, image_tags, named_by_band
 
 tifffile = pytest.importorskip("tifffile")
 

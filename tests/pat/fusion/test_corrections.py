@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from pat.evaluation.metrics import score
-from pat.fusion.corrections import Corrections
+from pat.fusion.corrections import Corrections, find_corrections
 from pat.fusion.fuse import corrections_of, fuse
+from pat.fusion.inputs import prepared
 from pat.fusion.sequence import SequenceFusion
+from pat.fusion.views import Views
 from pat.matching.epipolar_offset import Misalignment, fit_misalignment
 from pat.matching.radiometry import Response
 from pat.media.colour import luminance
@@ -130,6 +132,19 @@ def test_corrections_of_other_betas_are_refused(sample, network, images):
     message = "corrections are of 'a', 'b', this frame has '.*': take those of a frame of the same cameras"
     with pytest.raises(ValueError, match=message):
         fuse(network, sample.rig, images, alpha=ALPHA, corrections=found)
+
+
+def test_betas_without_names_are_corrected_too(middle, network):
+    """What was found was forgotten, and what was given ended in an IndexError."""
+    sample, images, _ = middle
+    frame, _ = prepared(network, Views.of(with_beta_rotated(sample.rig, 0.3), images, alpha=ALPHA), [])
+    named = find_corrections(network, frame, "fit", align=True)
+    (beta,) = frame.inputs.betas
+    unnamed = frame._replace(inputs=replace(frame.inputs, betas=(replace(beta, cameras=()),)))
+    found = find_corrections(network, unnamed, "fit", align=True)
+    assert found.misalignments == {"1": named.misalignments[BETA]} != {"1": Misalignment()}
+    for given in (found, Corrections(found.response)):
+        assert len(given.applied(unnamed.inputs, unnamed.hw).betas) == 1
 
 
 def test_a_sequence_finds_corrections_once(middle, network, monkeypatch):

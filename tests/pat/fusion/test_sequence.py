@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from arraygeom import Distortion, Epipolar, Moved, Rectified, Rig, Sensor, View, Widened, pixel_grid
-from experiments.flicker import flicker
+from experiments.system import flicker
 from pat.fusion.fuse import FuseSettings, fuse
 from pat.fusion.optical_flow import Flow, flow_between, warped
 from pat.fusion.sequence import KeyColour, SequenceFusion, fuse_sequence, mixed

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import resource
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -55,6 +56,9 @@ def test_a_checkpoint_of_pytorch_is_said_to_be_one(tmp_path):
     torch.save({"state_dict": {}}, tmp_path / "best.pth.tar")
     with pytest.raises(ValueError, match=r"best.pth.tar: .*`pat weights import`"):
         load_weights(tmp_path / "best.pth.tar")
+    np.savez(tmp_path / "archive.npz", a=np.zeros(3))
+    with pytest.raises(ValueError, match=r"archive.npz: not a safetensors file"):
+        load_weights(tmp_path / "archive.npz")
 
 
 def test_weights_of_another_architecture_are_refused(tmp_path):

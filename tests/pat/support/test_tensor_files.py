@@ -6,8 +6,9 @@ import resource
 import pytest
 import torch
 from safetensors.torch import load_file
+from torch import nn
 
-from pat.support.tensor_files import write_tensors
+from pat.support.tensor_files import read_tensors, with_weights, write_tensors
 
 
 def test_no_room_names_the_file_and_leaves_the_former_one(tmp_path):
@@ -22,3 +23,26 @@ def test_no_room_names_the_file_and_leaves_the_former_one(tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert os.listdir(tmp_path) == ["a.safetensors"]
     assert torch.equal(load_file(path)["a"], torch.arange(4.0))
+
+
+@pytest.mark.parametrize(
+    ("damage", "problem"),
+    [
+        (lambda content: content[:-4], "not a safetensors file"),
+        (lambda content: b"", "not a safetensors file"),
+        (lambda content: content[:-1] + bytes([content[-1] ^ 64]), "its numbers are not those"),
+    ],
+)
+def test_what_is_damaged_is_named(tmp_path, damage, problem):
+    """Of the weights that ship, it was a traceback, and one changed bit nothing."""
+    path = tmp_path / "a.safetensors"
+    write_tensors(path, nn.Linear(3, 2).state_dict())
+    assert with_weights(nn.Linear(3, 2), path).weight.shape == (2, 3)
+    with pytest.raises(ValueError, match=r"a\.safetensors: not the weights of a Linear"):
+        with_weights(nn.Linear(2, 2), path)
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(ValueError, match=rf"a\.safetensors: {problem}"):
+        read_tensors(path)
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match=r"a\.safetensors"):
+        read_tensors(path)
