@@ -240,7 +240,8 @@ def depth_from_track(
     (X, Y, Z), (DX, DY, DZ), (column, row) = a.unbind(-1), b.unbind(-1), x.unbind(-1)
     along_x, along_y = DX * Z - X * DZ, DY * Z - Y * DZ
     slope = (DX - column * DZ) * along_x + (DY - row * DZ) * along_y
-    moves = slope.abs() > FLAT * FLAT
+    size = (DX.square() + DY.square()) * Z.square() + (X.square() + Y.square()) * DZ.square()
+    moves = slope.abs() > FLAT * FLAT * size  # in proportion to the baseline: in any unit of length
     w = ((column * Z - X) * along_x + (row * Z - Y) * along_y) / torch.where(moves, slope, 1.0)
     z_ratio = Z + w * DZ
     valid = finite & moves & (w > 0) & (z_ratio > FRONT)

@@ -49,7 +49,7 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
         raise ValueError("rectification works on one pair at a time: take one of the batch")
     pose = pair.beta_from_alpha
     needs_numbers("whether a pair can be rectified", alpha.K, beta.K, pose.R, pose.t)
-    if not pose.t.norm() > 1e-12:
+    if not pose.t.norm() > 0:
         raise ValueError("two co-located cameras cannot be rectified: there is no baseline")
     R_alpha, R_beta = rectifying_rotations(pose)
     for camera, R in ((alpha, R_alpha), (beta, R_beta)):

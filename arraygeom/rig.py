@@ -99,13 +99,16 @@ class Pair(Batched):
 
     @property
     def beta_from_alpha(self) -> Pose:
-        """X_beta = R X_alpha + t."""
+        """X_beta = R X_alpha + t; t is 0 where it is no more than the rounding of the cameras' poses."""
         alpha, beta = self.cameras
         if checking():
             check_origin(alpha.t)
             check_origin(beta.t)
         # torch.compile cannot trace @ of these
-        return beta.cam_from_world.__matmul__(alpha.cam_from_world.inverse())
+        pose = beta.cam_from_world.__matmul__(alpha.cam_from_world.inverse())
+        baseline, *sides = (t.detach().norm(dim=-1, keepdim=True) for t in (pose.t, alpha.t, beta.t))
+        is_rounding = baseline <= ROUNDED * torch.finfo(baseline.dtype).eps * sum(sides)
+        return derived(Pose, pose.R, pose.t - torch.where(is_rounding, pose.t.detach(), 0.0))
 
     @property
     def depth_range(self) -> Depths:
@@ -121,9 +124,7 @@ class Pair(Batched):
     def fundamental(self) -> Float[Tensor, "*b 3 3"]:
         """F with x_beta^T F x_alpha = 0, from cameras or as given; between undistorted pixels through lenses.
 
-        0 where the cameras' baseline is no more than the rounding of their poses.
-
-        Raises ValueError if neither is known.
+        0 without a baseline. Raises ValueError if neither is known.
         """
         if self.link is not None:
             return self.link.F
@@ -132,10 +133,7 @@ class Pair(Batched):
                 "neither the cameras' calibration nor F is known for this pair: give the rig a link"
             )
         alpha, beta = self._central("fundamental matrix")
-        F = fundamental_matrix(alpha.K, beta.K, self.beta_from_alpha)
-        baseline, rounding = self.beta_from_alpha.t.norm(dim=-1), torch.finfo(alpha.t.dtype).eps
-        moved = baseline > 8 * rounding * (alpha.t.norm(dim=-1) + beta.t.norm(dim=-1))
-        return torch.where(moved[..., None, None], F, 0.0)
+        return fundamental_matrix(alpha.K, beta.K, self.beta_from_alpha)
 
     @property
     def homography(self) -> Float[Tensor, "*b 3 3"]:
@@ -184,6 +182,10 @@ class Pair(Batched):
         link = "" if self.link is None else f"link by {self.link._text()}"
         lengths = baseline_text(views, self.unit), depth_text(self.depth, self.unit)
         return "; ".join(filter(None, (named, *lengths, link)))
+
+
+ROUNDED = 8
+"""A baseline of so many units in the last place of the cameras' translations is none."""
 
 
 def middle_depth(near: Float[Tensor, "*b"], far: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:

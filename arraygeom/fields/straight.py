@@ -65,12 +65,9 @@ class EpipolarLine:
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Segments across beta's image. Raises ValueError for lenses."""
         if pair.link is None and pair.calibrated:
-            baseline, *sides = (
-                t.detach().norm(dim=-1) for t in (pair.beta_from_alpha.t, *(c.t for c in pair.cameras))
-            )
+            baseline = pair.beta_from_alpha.t.detach().norm(dim=-1)
             infinite = torch.full_like(baseline, torch.inf)
-            is_rounding = baseline <= ROUNDED * torch.finfo(baseline.dtype).eps * sum(sides)
-            return _between(pair, torch.where(is_rounding, infinite, NEAREST * baseline), infinite, x)
+            return _between(pair, torch.where(baseline > 0, NEAREST * baseline, infinite), infinite, x)
         require_straight(pair)
         F, (h, w) = pair.fundamental, pair.beta.hw
 
@@ -85,8 +82,6 @@ class EpipolarLine:
 
 NEAREST = 1e-3
 """Where a line that has no near bound begins: its depth as a share of the baseline."""
-ROUNDED = 64
-"""A baseline of so many units in the last place of the cameras' translations is none."""
 
 
 @dataclass(frozen=True)

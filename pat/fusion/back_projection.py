@@ -16,7 +16,7 @@ from torch.nn.functional import avg_pool2d
 from arraygeom import pixel_grid, sample
 
 from ..matching.inputs import Beta, Inputs
-from ..matching.matches import BetaMatches, Matches
+from ..matching.matches import Matches
 from ..matching.positions import matches
 from ..media.colour import luminance
 from ..networks.protocol import FusionOutput
@@ -25,31 +25,33 @@ RADIUS = 1
 """Size: beta's own pixels around each whose mean is left as it is: views differ in colour."""
 
 
-def back_projected(output: FusionOutput, matched: Matches | None, inputs: Inputs) -> FusionOutput:
-    """The output with the colour that betas of fewer pixels recorded; its luminance is as it was.
+def back_projected(
+    output: FusionOutput, matched: Matches, inputs: Inputs, *, keeps_luminance: bool
+) -> FusionOutput:
+    """The output with the colour that betas of fewer pixels recorded.
 
-    The image is compared where its colour is from: at the matches `matched`, or the positions without any. Of
-    betas with all bands of the image, or each the next ones of it. All of what is missing is added where
-    alpha has many more pixels, nothing where it has as many.
+    What alpha sees stays as it was: luminance, or the combination of a beta's bands that matching found.
+    The image is compared where its colour is from: at the matches, not what was chosen for depth. Of betas
+    with all bands of the image, or each the next ones of it. All of what is missing is added where alpha has
+    many more pixels, nothing where it has as many.
     """
     bands, image = [beta.image.shape[1] for beta in inputs.betas], output.image
     in_turn = sum(bands) == image.shape[1]
     change, weight, first = torch.zeros_like(image), torch.zeros_like(image), 0
-    positions = output.position if matched is None else map(_of_colour, inputs.betas, matched.betas)
-    for beta, count, position, confidence in zip(inputs.betas, bands, positions, output.confidence):
+    for beta, of_beta, count, confidence in zip(inputs.betas, matched.betas, bands, output.confidence):
         shown = slice(first, first + count) if in_turn else slice(None)
         first += count
         if min(beta.enlargement) > 1 and (in_turn or count == image.shape[1]):
+            position = matches(beta.field.straight, of_beta.disparity).movedim(-1, 1)
             lacks = missing(image[:, shown], position.to(image), confidence[:, None], beta)
-            change[:, shown] = change[:, shown] + (1 - 1 / math.sqrt(math.prod(beta.enlargement))) * lacks
+            lacks = (1 - 1 / math.sqrt(math.prod(beta.enlargement))) * lacks
+            if of_beta.comparison.mix is not None and not keeps_luminance:
+                alpha = of_beta.comparison.mix.of(image[:, shown])
+                lacks = of_beta.comparison.mix.reconciled(image[:, shown] + lacks, alpha) - image[:, shown]
+            change[:, shown] = change[:, shown] + lacks
             weight[:, shown] = weight[:, shown] + confidence[:, None]
     change = change / weight.clamp(min=1)
-    return output._replace(image=image + change - luminance(change))
-
-
-def _of_colour(beta: Beta, matched: BetaMatches) -> Float[Tensor, "b 2 h w"]:
-    """Where colour was taken from: the match, not what was chosen for depth."""
-    return matches(beta.field.straight, matched.disparity).movedim(-1, 1)
+    return output._replace(image=image + (change - luminance(change) if keeps_luminance else change))
 
 
 def missing(

@@ -212,8 +212,8 @@ def _fused(
     box = (top - tile.outer[0], bottom - tile.outer[0], left - tile.outer[2], right - tile.outer[2])
     with convolutions_in_parallel():
         output = certain(network(inputs, matches), matches, inputs)
-    if network.keeps_luminance and not inputs.denoised:
-        output = back_projected(output, matches, inputs)
+    if matches is not None and not inputs.denoised:
+        output = back_projected(output, matches, inputs, keeps_luminance=network.keeps_luminance)
     output = output.cut(box)
     cropped = replace(inputs, betas=tuple(replace(beta, field=beta.field.cut(box)) for beta in inputs.betas))
     hw = bottom - top, right - left

@@ -2,7 +2,19 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Camera, Distortion, Pair, Pose, depth_of, intrinsics, stack, triangulate
+from arraygeom import (
+    Camera,
+    Distortion,
+    Pair,
+    Pose,
+    Rig,
+    depth_of,
+    intrinsics,
+    rectify,
+    rotation_from_vector,
+    stack,
+    triangulate,
+)
 from arraygeom.fields.ray_depth import ray_depth
 from tests.arraygeom.rigs import random_camera, uniform
 from tests.oracles import Oracle
@@ -256,3 +268,42 @@ def test_depth_along_a_curve_has_the_gradients_of_depth_along_a_line():
         assert found.valid.all()
         slopes.append(torch.autograd.grad(found.depth.sum(), (x_beta, t), retain_graph=True))
     torch.testing.assert_close(slopes[1], slopes[0], rtol=2e-3, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    "lens", [None, Distortion("brown-conrady", torch.tensor([0.05, -0.01, 0, 0]).double())]
+)
+@pytest.mark.parametrize("unit", [1e-9, 1e-6, 1e6])
+def test_depth_is_found_in_any_unit_of_length(unit, lens):
+    cameras = array_of(2, lens=lens)
+    _, x = seen_points(cameras)
+    rig = Rig({"alpha": cameras[0], "beta": cameras[1]})
+    wanted = depth_of(rig.pair("alpha", "beta"), *x)
+    found = depth_of(rig.scaled(unit).pair("alpha", "beta"), *x)
+    assert found.valid.equal(wanted.valid)
+    torch.testing.assert_close(found.depth / unit, wanted.depth)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_baseline_that_is_rounding_is_none(dtype):
+    """Cameras in one place, turned differently: their poses' product has a translation of rounding."""
+    g = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        rotations = rotation_from_vector(torch.randn(2, 3, generator=g, dtype=dtype))
+        centre = torch.randn(3, generator=g, dtype=dtype)
+        K = intrinsics(500.0, (480, 640)).to(dtype)
+        poses = [Pose.from_centre(R, centre) for R in rotations]
+        pair = Pair(*(Camera(K=K, cam_from_world=pose, hw=(480, 640)) for pose in poses))
+        assert not pair.beta_from_alpha.t.any()
+        x = 400 * torch.rand(2, 20, 2, generator=g, dtype=dtype)
+        assert not depth_of(pair, *x).valid.any()
+        with pytest.raises(ValueError, match="no baseline"):
+            rectify(pair)
+
+
+def test_a_baseline_of_nothing_has_a_gradient():
+    translation = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    camera = array_of(1)[0]
+    moved = camera.replace(cam_from_world=Pose(camera.R, camera.t + translation))
+    (gradient,) = torch.autograd.grad(Pair(camera, moved).beta_from_alpha.t[0], translation)
+    assert gradient.tolist() == [1, 0, 0]

@@ -4,10 +4,13 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d, interpolate
 
-from arraygeom import pixel_grid
+from arraygeom import Segments, pixel_grid
 from arraygeom.fields.grid import FieldOnGrid
 from pat.fusion.back_projection import _recorded, back_projected, missing
 from pat.matching.inputs import Beta, Inputs
+from pat.matching.matches import BetaMatches, Matches
+from pat.matching.normalisation import Comparison, Normalisation
+from pat.matching.spectral_mix import SpectralMix
 from pat.media.colour import luminance
 from pat.networks.protocol import FusionOutput
 
@@ -26,13 +29,28 @@ def enlarged_beta(image: torch.Tensor, rate, offset=(0, 0)) -> Beta:
     recorded = avg_pool2d(image, (down, across))
     again = interpolate(recorded, image.shape[-2:], mode="bicubic", align_corners=False)
     x, y = offset
-    field = FieldOnGrid(lambda x: x, 2, None)
-    return Beta(again[..., y:, x:], field, offset=offset, enlargement=(float(down), float(across)))
+    return Beta(again[..., y:, x:], in_place(), offset=offset, enlargement=(float(down), float(across)))
 
 
 def position(offset=(0, 0)) -> torch.Tensor:
     grid = pixel_grid((H, W), dtype=torch.float64).movedim(-1, 0)[None]
     return grid - grid.new_tensor(offset)[:, None, None]
+
+
+def in_place() -> FieldOnGrid:
+    """Segments of a match of no disparity at the same pixel."""
+    end = pixel_grid((H, W), dtype=torch.float64)[None]
+    return FieldOnGrid(
+        lambda x: x, 2, Segments(end - end.new_tensor([8.0, 0.0]), end, torch.ones(1, H, W).bool())
+    )
+
+
+def matched_with(mix: SpectralMix | None = None, count: int = 1) -> Matches:
+    """Of betas at alpha's place, whose bands were combined so."""
+    level = Normalisation(torch.zeros(3, 1, 1, 1, 1), ([0.0], [0.0]))
+    comparison = Comparison(mix, level, level)
+    one = BetaMatches(torch.zeros(1, 1, H, W), torch.zeros(1, 1, H, W), comparison)
+    return Matches((one,) * count)
 
 
 @pytest.mark.parametrize("rate", RATES)
@@ -70,7 +88,7 @@ def test_luminance_stays_and_what_is_not_matched():
     confidence[..., 24:] = 0
     output = FusionOutput(image, [position()], [torch.ones(1, H, W)], [confidence])
     inputs = Inputs(luminance(image), (enlarged_beta(truth, 2),))
-    better = back_projected(output, None, inputs).image
+    better = back_projected(output, matched_with(), inputs, keeps_luminance=True).image
     assert torch.allclose(luminance(better), luminance(image), atol=1e-9)
     assert torch.equal(better[..., 24:], image[..., 24:])
     assert (better - image)[..., :24].abs().max() > 0.01
@@ -82,9 +100,30 @@ def test_bands_of_several_betas_are_each_ones_own():
     confidence = torch.ones(1, H, W).double()
     output = FusionOutput(image, [position()] * 3, [confidence] * 3, [confidence] * 3)
     together = FusionOutput(image, [position()], [confidence], [confidence])
-    apart = back_projected(output, None, Inputs(luminance(image), betas)).image
-    joined = back_projected(together, None, Inputs(luminance(image), (enlarged_beta(truth, 2),))).image
+    apart = back_projected(
+        output, matched_with(count=3), Inputs(luminance(image), betas), keeps_luminance=True
+    ).image
+    joined = back_projected(
+        together, matched_with(), Inputs(luminance(image), (enlarged_beta(truth, 2),)), keeps_luminance=True
+    ).image
     assert torch.allclose(apart, joined, atol=1e-9)
+
+
+def test_of_measured_bands_the_combination_that_alpha_sees_stays():
+    truth, image = colours(), colours(1)
+    weights = torch.tensor([[0.5, 0.3, 0.2]]).double()
+    slopes = torch.tensor([[0.8, 1.2, 1.2]]).double()  # weights @ slopes = 1
+    mix = SpectralMix(weights, torch.tensor([0.1]).double(), slopes, torch.tensor([1.0]).double())
+    confidence, beta = torch.ones(1, H, W).double(), enlarged_beta(truth, 2)
+    output, inputs = (
+        FusionOutput(image, [position()], [confidence], [confidence]),
+        Inputs(luminance(image), (beta,)),
+    )
+    better = back_projected(output, matched_with(mix), inputs, keeps_luminance=False).image
+    whole = back_projected(output, matched_with(), inputs, keeps_luminance=False).image
+    assert torch.allclose(mix.of(better), mix.of(image), atol=1e-6)
+    assert (better - image).abs().max() > 0.01
+    assert (mix.of(whole) - mix.of(image)).abs().max() > 0.01  # nothing is known to stay
 
 
 def test_two_betas_of_the_same_colours_count_as_one():
@@ -92,8 +131,15 @@ def test_two_betas_of_the_same_colours_count_as_one():
     confidence, beta = torch.ones(1, H, W).double(), enlarged_beta(truth, 2)
     one = FusionOutput(image, [position()], [confidence], [confidence])
     two = FusionOutput(image, [position()] * 2, [confidence] * 2, [confidence] * 2)
-    expected = back_projected(one, None, Inputs(luminance(image), (beta,))).image
-    assert torch.allclose(back_projected(two, None, Inputs(luminance(image), (beta, beta))).image, expected)
+    expected = back_projected(
+        one, matched_with(), Inputs(luminance(image), (beta,)), keeps_luminance=True
+    ).image
+    assert torch.allclose(
+        back_projected(
+            two, matched_with(count=2), Inputs(luminance(image), (beta, beta)), keeps_luminance=True
+        ).image,
+        expected,
+    )
 
 
 def test_gradients_are_those_of_differences():
