@@ -293,7 +293,7 @@ class Rig(Batched):
     def require(self, name: str) -> str:
         """The name itself. Raises ValueError if the rig has no such camera."""
         if name not in self.cameras:
-            near = difflib.get_close_matches(name, self.names, 1)
+            near = difflib.get_close_matches(str(name), self.names, 1)
             hint = f"; did you mean '{near[0]}'?" if near else ""
             raise ValueError(f"the rig has no camera '{name}'{hint} (it has: {', '.join(self.names)})")
         return name

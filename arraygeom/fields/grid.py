@@ -60,7 +60,7 @@ class FieldOnGrid:
         # gives.
         kind = evaluate(torch.full((1, 2), 0.25, dtype=torch.float64))
         if isinstance(kind, Positions):
-            return cls(evaluate, kind.xy.shape[-2], None)
+            return cls(lambda x: _finite(evaluate(x)), kind.xy.shape[-2], None)
         pixels = _on_grid(evaluate, hw, device=device)
         h, w = pair.alpha.hw
         sparse = (..., slice(0, h, 4), slice(0, w, 4))
@@ -173,6 +173,13 @@ def _on_grid(evaluate: At, hw: HW, side: int = 1, device: torch.device | None = 
 
     x, y = pixel_coordinates(hw, dtype=torch.float64, device=device)
     return Segments(*chunked(segments, x[None], y[None], rows=max(_CHUNK // max(w, 1), 1), axis=1))
+
+
+def _finite(locations: SamplingLocations) -> Positions:
+    """Positions of which none that counts is NaN or infinite: own fields may divide by zero."""
+    assert isinstance(locations, Positions)
+    finite = locations.xy.isfinite().all(-1)
+    return Positions(torch.where(finite[..., None], locations.xy, 0.0), locations.mask & finite)
 
 
 def _exact(segments: Segments) -> Segments:

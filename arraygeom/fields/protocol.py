@@ -70,7 +70,24 @@ def answered(field: ReceptiveField, pair: Pair, x: Real[Tensor, "*n 2"]) -> Samp
             f"the field {name} gave {tuple(shape)} pixels for {tuple(x.shape[:-1])}: a field is asked for x "
             "(*n, 2), and answers with Segments (*n), or Positions (*n, L)"
         )
+    _check_parts(answer, name)
     return answer
+
+
+def _check_parts(answer: SamplingLocations, name: str) -> None:
+    """Raises ValueError unless points are floats (..., 2), and bools (...) say which of them count."""
+    *points, counts = vars(answer).values()
+    fit = all(xy.is_floating_point() and xy.shape == (*counts.shape, 2) for xy in points)
+    some = isinstance(answer, Segments) or counts.shape[-1] > 0
+    if not (fit and some and counts.dtype == torch.bool and len({t.device for t in (*points, counts)}) == 1):
+        parts = ", ".join(f"{part} {t.dtype} {tuple(t.shape)} {t.device}" for part, t in vars(answer).items())
+        wanted = "start and end (*n, 2), valid (*n)"
+        if isinstance(answer, Positions):
+            wanted = "xy (*n, L, 2), mask (*n, L), L at least 1"
+        raise ValueError(
+            f"the field {name} gave {parts.replace('torch.', '')}: "
+            f"wanted {wanted}, floats and bools, on one device"
+        )
 
 
 def lazily(field: ReceptiveField, pair: Pair) -> Callable[[Tensor], SamplingLocations]:

@@ -89,6 +89,12 @@ class Diagnosis:
             return f"likely mistake: {self.named.words}" + (f"; or: {others}" if others else "")
         if self.healthy:
             return "nothing wrong: the points lie on their lines to the accuracy of their positions"
+        if self.before.misfit < HEALTHY_MISFIT:  # of the rig's own oddities, where lines say nothing
+            words = (
+                "none of the usual mistakes: the points lie on their lines, but behind the cameras, outside "
+                "the depth range or mirrored: check positions, rotations and depth range"
+            )
+            return "; ".join([words, *self.named.rig.check()])
         return (
             f"none of the usual mistakes, but the rig is {self.before.misfit:.2f} px off these images: "
             "it has drifted or was inaccurate from the beginning; "

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -18,7 +18,9 @@ from arraygeom.threads import torch_in_one_thread
 from arraygeom.tracing import transformations
 from arraygeom.warned import warn
 
+from ..matching.inputs import Inputs
 from ..matching.match import Matcher, match
+from ..matching.matches import Matches
 from ..matching.radiometry import ResponseSpec, given_response
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
@@ -37,6 +39,7 @@ from .tiles import LARGE, Plan, fused_in_tiles, plan_frame
 from .views import Views, check_bands
 
 LOG = logging.getLogger(__name__)
+T = TypeVar("T")
 
 ImageSources = Mapping[str, str | Path | Tensor] | Sequence[str | Path]
 """An image file or tensor (C, H, W) in 0..1 of each camera by name; or files alone, which name cameras."""
@@ -156,7 +159,7 @@ def fuse(
         LowConfidenceWarning: the images hardly match: the rig is probably wrong. A filter makes it an error,
             as `warnings.simplefilter("error", LowConfidenceWarning)`.
     """
-    settings = settings.changed(changes)
+    settings = _given(FuseSettings, settings).changed(changes)
     noise, luminance, response = settings.noise, settings.luminance, settings.response
     noise = "auto" if noise is None and rig is None and luminance == "alpha" else noise
     network, rig, images, alpha, grey_world = _with_rig(network, rig, images, alpha, explain)
@@ -190,7 +193,8 @@ def fuse(
     )
     if announce:
         announce(plan)
-    fitted = corrections or find_corrections(network, inputs, response, align=align)
+    fitted = corrections and _given(Corrections, corrections)
+    fitted = fitted or find_corrections(network, inputs, response, align=align)
     for line in fitted.described(inputs.hw) if explain else ():
         explain(line)
     right = fitted.applied(inputs.inputs, inputs.hw)
@@ -198,7 +202,7 @@ def fuse(
     inputs = inputs._replace(inputs=right)
     with limited(planned(limit, plan.memory, large=math.prod(inputs.hw) > LARGE)):
         with torch.set_grad_enabled(differentiable):
-            matches = matcher(inputs.inputs) if network.uses_matches else None
+            matches = _matched(matcher, inputs.inputs) if network.uses_matches else None
             LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
             fused = fused_in_tiles(
                 network, inputs, matches, plan.tiles, keep_matched=noisy, progress=progress, store=store
@@ -228,7 +232,12 @@ def _with_rig(
     explain: Callable[[str], None] | None,
 ) -> tuple[FusionNetwork, Rig, Images, str, bool]:
     """Network, rig, images, alpha, and whether to match levels; all found where the first is images alone."""
-    if isinstance(rig, Rig) and images is not None and alpha is not None and not isinstance(network, str):
+    if (
+        isinstance(network, FusionNetwork)
+        and isinstance(rig, Rig)
+        and images is not None
+        and alpha is not None
+    ):
         return network, rig, images, alpha, False
     if rig is not None or images is not None or not isinstance(network, Mapping | Sequence):
         raise TypeError(
@@ -257,10 +266,24 @@ def corrections_of(
 
     Arguments and errors are as of `fuse`.
     """
-    settings = settings.changed(changes)
+    settings = _given(FuseSettings, settings).changed(changes)
     views, _ = _seen(network, rig, images, alpha, settings, settings.noise)
     inputs, _ = prepared(network, views, steps_for(network, normalise=settings.match_levels))
     return find_corrections(network, inputs, settings.response, align=settings.align is not False)
+
+
+def _given(kind: type[T], value: T) -> T:
+    """The value, if it is of this kind. Raises TypeError."""
+    if not isinstance(value, kind):
+        raise TypeError(f"wanted {kind.__name__}, got a {type(value).__name__}")
+    return value
+
+
+def _matched(matcher: Matcher, inputs: Inputs) -> Matches:
+    """What a matcher finds. Raises TypeError or ValueError for what are no matches of these inputs."""
+    matches = _given(Matches, matcher(inputs))
+    matches.check(inputs.hw, len(inputs.betas))
+    return matches
 
 
 def _seen(

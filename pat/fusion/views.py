@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from arraygeom import Curved, Epipolar, Moved, Pair, ReceptiveField, Rig, Sensor, ThroughLenses, Widened
+from arraygeom.batching import tensors_of
 from arraygeom.warned import warn
 
 from ..media.colour import luminance_of as grey
@@ -122,8 +123,20 @@ def grey_alpha(name: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "1 h w
 
 
 def check_precision(views: Views, network: Any) -> None:
-    """Refuse images of another precision than a network's weights. Raises ValueError that says what to do."""
+    """Refuse images of another precision than a network's weights, and images or a rig on another device.
+
+    Raises ValueError that says what to do.
+    """
     weights = next(network.parameters(), None) if isinstance(network, nn.Module) else None
+    own = views.images[views.alpha].device
+    others = {f"the image of '{name}'": image.device for name, image in views.images.items()}
+    others["the rig"] = next((tensor.device for tensor, _ in tensors_of(views.rig)), own)
+    others["the network"] = own if weights is None else weights.device
+    for what, device in others.items():
+        if device != own:
+            raise ValueError(
+                f"the image of '{views.alpha}' is on {own}, {what} on {device}: give all on one device"
+            )
     for name, image in views.images.items():
         if weights is not None and image.dtype != weights.dtype:
             of_images, of_weights = (str(t.dtype).removeprefix("torch.") for t in (image, weights))
@@ -164,7 +177,12 @@ def checked_image(rig: Rig, images: Images, name: str) -> Tensor:
         raise TypeError(
             f"the image of '{name}' is a {type(image).__name__}: give a tensor, as `read_image` does"
         )
-    if image.ndim != 3 or not len(image) or image.dtype not in (torch.float32, torch.float64):
+    if image.is_meta or image.layout != torch.strided:
+        raise ValueError(
+            f"the image of '{name}' is {image.layout} on {image.device}: give a dense tensor with values"
+        )
+    as_stored = image.ndim == 3 and tuple(image.shape[:2]) == (h, w) != tuple(image.shape[1:])
+    if image.ndim != 3 or not len(image) or as_stored or image.dtype not in (torch.float32, torch.float64):
         got = f"{str(image.dtype).removeprefix('torch.')} of shape {tuple(image.shape)}"
         raise ValueError(f"the image of '{name}' is {got}: wanted float32 (C, H, W) in 0..1")
     if tuple(image.shape[1:]) != (h, w):
@@ -184,6 +202,8 @@ def checked_image(rig: Rig, images: Images, name: str) -> Tensor:
         raise ValueError(
             f"the image of '{name}' has values up to {largest:g}: divide them, images are in 0..1"
         )
+    if smallest == largest:
+        warn(f"the image of '{name}' is of one colour, with nothing to match: give another image")
     return image
 
 

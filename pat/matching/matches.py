@@ -23,6 +23,11 @@ def is_consistent(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]
     return enlarged((facts[:, :1] < CONSISTENT).to(facts))
 
 
+CHANNELS = {"disparity": 1, "chosen": 1, "facts": 3, "stated": 2, "certainty": 2, "bands": 0, "diffused": 0}
+"""Of each plane of `BetaMatches`; 0: as many as beta has bands."""
+AT_HALF_SIZE = ("facts", "stated", "certainty")
+
+
 @dataclass(frozen=True)
 class BetaMatches:
     """The matches of alpha's H x W pixels in one beta.
@@ -79,6 +84,31 @@ class BetaMatches:
         where = matches(segments, self.surface, beyond_edge=True)
         return where, segments.valid & on_image(where, hw)
 
+    def check(self, hw: HW) -> None:
+        """Raises ValueError unless its planes are tensors of finite floats, of an alpha of this size."""
+        for name, channels in CHANNELS.items():
+            plane = getattr(self, name)
+            if plane is None and name not in ("disparity", "facts"):
+                continue
+            h, w = (n // FINE for n in hw) if name in AT_HALF_SIZE else hw
+            floats = isinstance(plane, Tensor) and plane.ndim >= 4 and plane.is_floating_point()
+            if not floats or plane.shape[-2:] != (h, w) or plane.shape[-3] != (channels or plane.shape[-3]):
+                tensor = isinstance(plane, Tensor)
+                got = f"{plane.dtype} {tuple(plane.shape)}" if tensor else type(plane).__name__
+                raise ValueError(
+                    f"these matches' {name} is {got.removeprefix('torch.')}: wanted a tensor of floats "
+                    f"(B, {channels or 'bands'}, {h}, {w})"
+                )
+            if not bool(plane.isfinite().all()):
+                raise ValueError(f"these matches' {name} is NaN or infinite: give any, with little certainty")
+        if self.certainty is not None and not bool((self.certainty[:, 0] - 0.5).abs().max() <= 0.5):
+            raise ValueError("these matches' certainty is not within 0 to 1: give probabilities")
+        if self.disparity.dtype != self.facts.dtype:
+            both = " and ".join(f"{t.dtype}".removeprefix("torch.") for t in (self.disparity, self.facts))
+            raise ValueError(
+                f"these matches' disparity and facts are {both}: give one type, that of the images"
+            )
+
     def cut(self, box: Box) -> BetaMatches:
         """The part at alpha's (top, bottom, left, right), all even."""
         whole, half = slices(box), slices([n // FINE for n in box])
@@ -115,14 +145,13 @@ class Matches:
         return Matches(tuple(replace(cropped, diffused=shared[key]) for key, cropped in parts))
 
     def check(self, hw: HW, betas: int) -> None:
-        """Raises ValueError unless they are finite, of an alpha of this size and of so many betas."""
-        if self.hw != hw or len(self.betas) != betas:
-            (h, w), (height, width) = self.hw, hw
+        """Raises ValueError unless they are of so many betas, and `BetaMatches.check` has no objection."""
+        size = self.hw if self.betas else (0, 0)
+        if size != hw or len(self.betas) != betas:
+            (h, w), (height, width) = size, hw
             raise ValueError(
                 f"these matches are of {w}x{h} pixels in {len(self.betas)} betas, "
                 f"the images are {width}x{height} with {betas}: match these images"
             )
-        if not all(bool(beta.disparity.isfinite().all()) for beta in self.betas):
-            raise ValueError(
-                "these matches have disparities that are NaN or infinite: give any, with little certainty"
-            )
+        for beta in self.betas:
+            beta.check(hw)

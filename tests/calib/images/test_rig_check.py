@@ -47,6 +47,20 @@ def test_points_behind_the_cameras_and_wrong_units_are_named():
         assert "`pat rig doctor` says: likely mistake: " in found.text
 
 
+def test_cameras_at_one_position_are_named():
+    """All lines are points, and any point lies on them: the rig was "0.00 px off", and had drifted."""
+    rig = rectified_pair()
+    wrong = rig.with_camera("right", rig["right"].replace(cam_from_world=rig["left"].cam_from_world))
+    found = find_misfit(wrong, rectified_images())
+    assert found is not None
+    assert (
+        "`pat rig doctor` says: none of the usual mistakes: the points lie on their lines, but" in found.text
+    )
+    assert found.text.endswith(
+        "'left' and 'right' are at the same position: between them depth has no effect"
+    )
+
+
 def test_a_depth_range_without_the_scene_is_named_with_the_scenes_depth():
     rig, images = rectified_pair(), rectified_images()
     for depth, units in ((15.0, 20.0), False), ((200.0, 300.0), True):

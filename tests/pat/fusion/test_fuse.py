@@ -221,6 +221,44 @@ def test_what_is_no_field_or_no_list_is_refused_in_a_line():
         fuse("mono.png")
 
 
+@pytest.mark.parametrize(
+    ("image", "problem"),
+    [
+        (torch.zeros(3, 64, 96, device="meta"), "'colour' is torch.strided on meta: give a dense tensor"),
+        (torch.ones(3, 64, 96).to_sparse(), "'colour' is torch.sparse_coo on cpu: give a dense tensor"),
+        (torch.ones(64, 96, 3), r"float32 of shape \(64, 96, 3\): wanted float32 \(C, H, W\)"),
+    ],
+)
+def test_images_of_another_form_are_refused(image, problem):
+    images = {"mono": texture(1, (64, 96)), "colour": image}
+    with pytest.raises(ValueError, match=problem):
+        fuse(network_of("GuidedPAT"), rig_of((64, 96), (64, 96)), images, alpha="mono")
+
+
+def test_an_image_of_one_colour_is_named():
+    """As with images alone: a black frame was a rig that does not fit."""
+    images = {"mono": texture(1, (64, 96)), "colour": torch.ones(3, 64, 96)}
+    with pytest.warns(UserWarning, match="'colour' is of one colour, with nothing to match: give another"):
+        fuse(network_of("GuidedPAT"), rig_of((64, 96), (64, 96)), images, alpha="mono")
+
+
+def test_what_are_no_arguments_of_fuse_is_refused_in_a_line():
+    """A network elsewhere gave NaN, without a word; other things an AttributeError."""
+    rig, images = rig_of((64, 96), (64, 96)), {"mono": texture(1, (64, 96)), "colour": texture(3, (64, 96))}
+    network = network_of("GuidedPAT")
+    with pytest.raises(ValueError, match="'mono' is on cpu, the network on meta: give all on one device"):
+        fuse(network_of("GuidedPAT").to("meta"), rig, images, alpha="mono")
+    for no_network in (None, torch.nn.Linear(2, 2), print):
+        with pytest.raises(TypeError, match="fuse takes a network, a rig, images and alpha=NAME"):
+            fuse(no_network, rig, images, alpha="mono")
+    with pytest.raises(TypeError, match="wanted FuseSettings, got a dict"):
+        fuse(network, rig, images, alpha="mono", settings={"noise": None})
+    with pytest.raises(TypeError, match="wanted Corrections, got a dict"):
+        fuse(network, rig, images, alpha="mono", corrections={"colour": 1})
+    with pytest.raises(ValueError, match="the rig has no camera '0'"):
+        fuse(network, rig, images, alpha=0)
+
+
 def test_precision_is_that_of_the_weights():
     rig, images = rig_of((64, 96), (64, 96)), {"mono": texture(1, (64, 96)), "colour": texture(3, (64, 96))}
     network, double = network_of("GuidedPAT"), {name: image.double() for name, image in images.items()}

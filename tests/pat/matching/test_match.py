@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 
 from arraygeom import Camera, Local, Pose, Rig, intrinsics, pixel_grid
 from arraygeom.fields.grid import FieldOnGrid
@@ -15,6 +16,7 @@ from pat.matching.colour_transfer import transferred
 from pat.matching.inputs import Inputs, box_around
 from pat.matching.match import located, match
 from pat.matching.matches import Matches
+from pat.matching.positions import enlarged
 from pat.media.colour import luminance
 from pat.networks.protocol import FusionOutput, fused_at_once
 from pat.networks.weights import load_weights
@@ -161,15 +163,41 @@ def test_a_network_without_matches_is_not_matched_for(flat):
     assert float(frame.depth.nanmedian()) == pytest.approx(2 / (1 / 2 + 1 / 50), rel=0.01)
 
 
-def test_disparities_that_are_not_numbers_are_refused(network, flat):
-    """A few made the whole image and all depth NaN, without a word."""
+def holed(plane):
+    plane = plane.clone()
+    plane[..., 10:20, 10:20] = torch.nan
+    return plane
+
+
+@pytest.mark.parametrize(
+    ("plane", "change", "problem"),
+    [
+        ("disparity", holed, "disparity is NaN or infinite: give any, with little certainty"),
+        ("facts", holed, "facts is NaN"),
+        ("bands", holed, "bands is NaN"),
+        ("certainty", holed, "certainty is NaN"),
+        ("certainty", lambda plane: plane + 7, "certainty is not within 0 to 1"),
+        ("disparity", Tensor.double, "disparity and facts are float64 and float32: give one type"),
+        ("disparity", Tensor.long, r"disparity is int64 \(1, 1, 64, 96\): wanted a tensor of floats"),
+        ("chosen", Tensor.numpy, "chosen is ndarray: wanted a tensor"),
+        ("facts", lambda plane: enlarged(plane), r"facts is float32 .*: wanted .* \(B, 3, 32, 48\)"),
+        ("chosen", lambda plane: plane[..., ::2, ::2], r"chosen is float32 \(1, 1, 32, 48\): wanted"),
+    ],
+)
+def test_matches_of_ones_own_are_checked(network, flat, plane, change, problem):
+    """A few NaN made the image, the depth or the confidence NaN, without a word; the rest were tracebacks."""
     rig, images = flat
 
-    def holed(inputs):
-        found = match(inputs)
-        disparity = found.betas[0].disparity.clone()
-        disparity[..., 10:20, 10:20] = torch.nan
-        return Matches((replace(found.betas[0], disparity=disparity, chosen=None),))
+    def matcher(inputs):
+        (found,) = match(inputs).betas
+        return Matches((replace(found, **{plane: change(getattr(found, plane))}),))
 
-    with pytest.raises(ValueError, match="NaN or infinite: give any, with little certainty"):
-        fuse(network, rig, images, alpha="mono", matcher=holed)
+    with pytest.raises(ValueError, match=f"these matches' {problem}"):
+        fuse(network, rig, images, alpha="mono", matcher=matcher, align=False, response="rec601")
+
+
+@pytest.mark.parametrize("nonsense", [None, 3, []])
+def test_what_are_no_matches_is_refused(network, flat, nonsense):
+    rig, images = flat
+    with pytest.raises(TypeError, match="wanted Matches, got a "):
+        fuse(network, rig, images, alpha="mono", matcher=lambda inputs: nonsense)
