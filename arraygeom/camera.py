@@ -309,14 +309,18 @@ class Camera(LensView):
         """The camera of a kornia pinhole; a batch of one becomes a single camera unless `batched`.
 
         Of a `CameraModel`, which has no pose, at `cam_from_world`. Raises ValueError if the images of a batch
-        differ in size.
+        differ in size, TypeError for another kind of camera.
         """
         from kornia.geometry.camera import PinholeCamera
+        from kornia.sensors.camera import CameraModel
 
         from .kornia_models import from_kornia_model
 
-        if not isinstance(camera, PinholeCamera):
+        if isinstance(camera, CameraModel):
             return from_kornia_model(camera, cam_from_world)
+        if not isinstance(camera, PinholeCamera):
+            kind = type(camera).__name__
+            raise TypeError(f"a {kind} is none of kornia's PinholeCamera and CameraModel: make one of these")
         sizes = sorted(
             {(int(h), int(w)) for h, w in zip(camera.height.reshape(-1), camera.width.reshape(-1))}
         )

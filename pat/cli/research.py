@@ -95,7 +95,8 @@ class Ablate:
     scenes: int = 6
     """Number of scenes."""
     hw: Annotated[tuple[int, int], arg(metavar="H W")] = (240, 320)
-    """Height and width of both images."""
+    """Height and width of both images. The family `dense` compares each pixel with each: it takes longer than
+    all others together, and is left out where that does not fit into 2 GiB, as at 240 x 320."""
     seed: int = 0
     """Of the scenes."""
     field: FieldName = "auto"

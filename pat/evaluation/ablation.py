@@ -7,6 +7,7 @@ own.
 
 from __future__ import annotations
 
+import logging
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -64,6 +65,8 @@ from .baseline import classical
 from .metrics import bootstrap_interval, score
 from .rectified import rectified
 from .tables import distinct, markdown_table, write_csv
+
+LOG = logging.getLogger(__name__)
 
 ALPHA, BETA = "alpha", "beta"
 RIGS = RigDistribution(
@@ -291,6 +294,7 @@ def _case(
         notes[name] = unsupported(family.field(far), rig)
         if notes[name]:
             continue
+        LOG.info("%s: %s", case.name, name)
         try:
             image, depth = family.fuse(network, rig, case, far)
         except ValueError as error:

@@ -15,6 +15,7 @@ from torch import Tensor
 from arraygeom import ReceptiveField, Rig
 from arraygeom.chunks import Tile
 from arraygeom.threads import torch_in_one_thread
+from arraygeom.tracing import transformations
 from arraygeom.warned import warn
 
 from ..matching.inputs import Inputs
@@ -152,6 +153,7 @@ def fuse(
     Raises:
         ValueError: a camera that the rig lacks, an image of another size, a rig whose views do not overlap,
             bands that the network does not make, `differentiable` with `max_memory` or `store`.
+        NotImplementedError: within a transformation of `torch.func`.
 
     Warns:
         LowConfidenceWarning: the images hardly match: the rig is probably wrong. A filter makes it an error,
@@ -164,6 +166,10 @@ def fuse(
     align = not differentiable if settings.align is None else settings.align
     if differentiable and not (settings.max_memory is None and store is None):
         raise ValueError("differentiable=True fuses the whole frame at once: leave out max_memory and store")
+    if transformations():
+        raise NotImplementedError(
+            "fuse has no gradients by torch.func: ask for them by differentiable=True and torch.autograd"
+        )
     check_luminance(network, luminance, noisy=noise is not None)
     limit = None if settings.max_memory is None else parse_bytes(settings.max_memory)
     views, low_light = _seen(network, rig, images, alpha, settings, noise)

@@ -241,6 +241,15 @@ def test_rigs_go_there_and_back():
     assert {camera.batch_size for camera in shared.to_kornia().values()} == {2}
 
 
+def test_a_stereo_camera_of_kornia_is_refused():
+    from kornia.geometry.camera import StereoCamera
+
+    P = torch.tensor([[[500.0, 0, 320, 0], [0, 500, 240, 0], [0, 0, 1, 0]]])
+    right = P - torch.tensor([0.0, 0, 0, 50])[None, None] * torch.tensor([1.0, 0, 0])[None, :, None]
+    with pytest.raises(TypeError, match="StereoCamera is none of"):
+        Camera.from_kornia(StereoCamera(P, right))
+
+
 def test_unequal_batches_and_lenses_are_refused():
     with pytest.raises(ValueError, match=r"{'a': 2, 'b': 3}"):
         Rig.from_kornia({"a": pinhole(2), "b": pinhole(3)})

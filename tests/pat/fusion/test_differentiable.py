@@ -5,10 +5,9 @@ import math
 import pytest
 import torch
 
-from arraygeom import Pair, Rig
-from arraygeom.multiview import warp
+from arraygeom import Rig
 from pat import fuse, load_weights
-from pat.media.colour import luminance
+from tests.pat.fusion.recovering import recovered
 from tests.pat.layered_array import middle_of_sample
 
 
@@ -51,23 +50,12 @@ def test_a_rotation_is_recovered_through_the_fused_image(cropped):
     assert abs(math.degrees(angle.item())) < 0.02
 
 
-def test_a_rotation_is_recovered_from_images_alone(cropped):
+@pytest.mark.parametrize(("which", "steps"), [(("rz", "ty", "focal"), 3), (("ry",), 2)])
+def test_a_rig_is_recovered_from_images_alone(cropped, which, steps):
     """What alpha sees is in the colour image where the depth found says, in the rig as it should be."""
     rig, images, _ = cropped
-    network = load_weights("mono-colour")
-    angle = torch.tensor(math.radians(0.3), dtype=torch.float64, requires_grad=True)
-    optimiser = torch.optim.Rprop([angle], lr=math.radians(0.13), etas=(0.3, 1.01))
-    colour = luminance(images["colour"])[None].double()
-    for _ in range(8):
-        optimiser.zero_grad()
-        moved = rotated(rig, angle)
-        frame = fuse(network, moved, images, alpha="mono", differentiable=True)
-        pair = Pair(moved["mono"], moved["colour"])
-        seen, valid = warp(pair, colour, frame.depth[None].double(), interpolation="bicubic")
-        likely = valid[0] & (frame.confidence > 0.5)
-        (seen[0] - images["mono"])[:, likely].square().mean().backward()
-        optimiser.step()
-    assert abs(math.degrees(angle.item())) < 0.03
+    left = recovered(load_weights("mono-colour"), rig, images, which, steps=steps)[-1]
+    assert left.abs().max() < 0.1
 
 
 def test_depths_follow_a_rotation_along_the_segments(cropped):
@@ -119,3 +107,15 @@ def test_a_differentiable_fusion_is_of_the_whole_frame(cropped, tmp_path):
     for more in ({"max_memory": "2GiB"}, {"store": tmp_path}):
         with pytest.raises(ValueError, match="max_memory and store"):
             fuse(network, rig, images, alpha="mono", differentiable=True, **more)
+
+
+def test_a_transformation_of_torch_func_is_refused(cropped):
+    rig, images, _ = cropped
+    network = load_weights("mono-colour-small")
+
+    def depth(angle: torch.Tensor) -> torch.Tensor:
+        turned = rotated(rig, angle)
+        return fuse(network, turned, images, alpha="mono", align=False, differentiable=True).depth[96, 128]
+
+    with pytest.raises(NotImplementedError, match=r"torch\.autograd"):
+        torch.func.grad(depth)(torch.zeros((), dtype=torch.float64))
