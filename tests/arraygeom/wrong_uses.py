@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from arraygeom import (
     Band,
@@ -26,6 +27,7 @@ from arraygeom import (
     Pose,
     Rectified,
     Rig,
+    Segments,
     Sensor,
     ThroughLenses,
     Widened,
@@ -70,6 +72,16 @@ def lens(model: Any, coefficients: Any) -> Any:
 
 def toed_in(angle: float) -> torch.Tensor:
     return rotation_from_vector(torch.tensor([0.0, angle, 0.0], dtype=torch.float64))
+
+
+def with_parts(**changes: Callable[[Any], Any]) -> Any:
+    """A field whose segments' parts are changed so."""
+
+    def field(pair: Any, x: Any) -> Segments:
+        parts = vars(Epipolar()(pair, x))
+        return Segments(**{name: changes.get(name, lambda part: part)(part) for name, part in parts.items()})
+
+    return field
 
 
 def with_nan(t: torch.Tensor) -> torch.Tensor:
@@ -153,6 +165,9 @@ WRONG: dict[str, Callable[[], Any]] = {
     "across below 0": lambda: Widened(Epipolar(), across=-1.0),
     "widened class": lambda: Widened(Epipolar, across=1.0),
     "lenses on a class": lambda: ThroughLenses(Epipolar),
+    "field of whole numbers": lambda: sampling_locations(with_parts(start=Tensor.long), pair(), X),
+    "field of x alone": lambda: sampling_locations(with_parts(end=lambda end: end[..., :1]), pair(), X),
+    "field of weights": lambda: sampling_locations(with_parts(valid=Tensor.float), pair(), X),
     "moved by one plane": lambda: Moved(Epipolar(), torch.zeros(HW)),
     "frame rate below 0": lambda: Sensor(frame_rate=-30.0),
     "coding unknown": lambda: Sensor(coding="sRGB"),
