@@ -44,7 +44,8 @@ def match(inputs: Inputs, choice: Choice | None = None) -> Matches:
         raise ValueError(f"alpha has {w}x{h} pixels to match: pad both sides to whole multiples of {FINE}")
     matches = in_each_beta(inputs)
     if inputs.can_agree:
-        matches = agreed(inputs, with_certainty(chosen(inputs, matches, choice)))
+        with torch.no_grad():
+            matches = agreed(inputs, with_certainty(chosen(inputs, matches, choice)))
     if torch.is_grad_enabled():
         matches = following(inputs, matches)
     if not inputs.can_agree:
