@@ -32,9 +32,9 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
         flush(temporary)
         os.replace(temporary, path)
     except OSError as error:
-        if error.errno is None or error.filename not in (None, str(temporary)):
+        if error.filename not in (None, str(temporary)) or _speaks_for_itself(error):
             raise
-        raise OSError(error.errno, error.strerror, str(path)) from error
+        raise _naming(path, error, temporary) from error
     finally:
         with suppress(OSError):  # also where nothing can be written or removed
             temporary.unlink()
@@ -60,11 +60,25 @@ def write_together(folder: str | Path, *, last: str, stale: Iterable[str] = ()) 
         for file in sorted(temporary.iterdir(), key=lambda file: file.name == last):
             os.replace(file, folder / file.name)
     except OSError as error:
-        if error.errno is None or Path(error.filename or "").parent != temporary:
+        if (error.filename and Path(error.filename).parent != temporary) or _speaks_for_itself(error):
             raise
-        raise OSError(error.errno, error.strerror, str(folder / Path(error.filename).name)) from error
+        written = folder / Path(error.filename).name if error.filename else folder
+        raise _naming(written, error, temporary) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _speaks_for_itself(error: OSError) -> bool:
+    """Whether it is not the system's, nor a library's that could not write."""
+    return error.errno is None and type(error) is not OSError
+
+
+def _naming(path: Path, error: OSError, temporary: Path) -> OSError:
+    """The error, of `path` in place of a temporary one; NumPy's have a text alone, without a file."""
+    if error.errno is not None:
+        return OSError(error.errno, error.strerror, str(path))
+    text = str(error).replace(str(temporary), str(path))
+    return OSError(text if str(path) in text else f"{path}: not written whole ({text}): is there room?")
 
 
 def sweep(folder: Path, stem: str | None = None) -> None:

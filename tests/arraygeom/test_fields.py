@@ -17,6 +17,7 @@ from arraygeom import (
     NearestVoxels,
     Pair,
     Pose,
+    Positions,
     Rectified,
     Rig,
     Segments,
@@ -565,6 +566,10 @@ def test_what_a_field_gives_is_asked_wherever_it_is_called():
         object.__setattr__(found, "mask", None)
         return found
 
+    def without_samples(pair, x):
+        found = Epipolar()(pair, x).positions(8)
+        return Positions(found.xy[:, :0], found.mask[:, :0])
+
     def of_kind(**changes):
         def kind(pair, x):
             found = vars(Epipolar()(pair, x))
@@ -574,7 +579,7 @@ def test_what_a_field_gives_is_asked_wherever_it_is_called():
 
     wrong = {
         of_kind(end=lambda end: end.to("meta")): "end float32 .* meta, .* on one device",
-        lambda pair, x: Epipolar()(pair, x).positions(0): "mask bool .*: wanted xy .* L at least 1",
+        without_samples: "mask bool .*: wanted xy .* L at least 1",
         ends: "the field ends gave a tuple: fields give Segments or Positions",
         fewer: r"the field fewer gave \(1,\) pixels for \(2,\)",
         without_mask: "the field without_mask gave Positions whose mask is a NoneType",

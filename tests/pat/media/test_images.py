@@ -1,6 +1,8 @@
 import errno
 import io
 import os
+import re
+import resource
 import struct
 import sys
 import warnings
@@ -15,7 +17,7 @@ import tifffile
 import torch
 from PIL import Image, ImageOps
 
-from arraygeom.atomic import sweep, write_atomically
+from arraygeom.atomic import sweep, write_atomically, write_together
 from pat.media.colour import from_luma_chroma, luminance, to_luma_chroma
 from pat.media.headers import image_header
 from pat.media.images import decoded_photograph, read_image, read_recorded, write_image
@@ -326,6 +328,26 @@ def test_a_file_system_that_is_read_only_is_said_of_the_file_itself(tmp_path, mo
     ):
         temporary.write_text("a")
     assert caught.value.filename == str(tmp_path / "a.txt")
+
+
+def test_no_room_is_said_of_the_file_whoever_writes(tmp_path):
+    """NumPy's own error was "176128 requested and 101744 written"."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with (
+            pytest.raises(OSError, match=r"a\.npy: not written whole \(.* written\): is there room\?"),
+            write_atomically(tmp_path / "a.npy") as temporary,
+        ):
+            np.save(temporary, np.zeros(1000))
+        with (
+            pytest.raises(OSError, match=rf"{re.escape(str(tmp_path))}: not written whole \("),
+            write_together(tmp_path, last="b.npy") as folder,
+        ):
+            np.save(folder / "b.npy", np.zeros(1000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert os.listdir(tmp_path) == []
 
 
 def test_the_luminance_of_a_recoloured_image_is_the_given_one():
