@@ -238,16 +238,23 @@ class Rig(Batched):
         """The rig of kornia pinholes by name; `fields` are the rig's own, such as `depth`.
 
         Kornia's cameras are always batched: a batch of one becomes a single camera unless `batched`. Raises
-        ValueError for batches of unequal length. `Rig(cameras)` serves as well, for batches of one or more as
-        they come.
+        ValueError for batches of unequal length, TypeError for other cameras than kornia's pinholes by name.
+        `Rig(cameras)` serves as well, for batches of one or more as they come.
         """
-        lengths = {name: camera.batch_size for name, camera in cameras.items()}
+        if not isinstance(cameras, Mapping):
+            kind = type(cameras).__name__
+            raise TypeError(
+                f"a {kind} is no mapping of kornia's PinholeCamera by name: give each camera a name"
+            )
+        made = {name: Camera.from_kornia(camera, batched=True) for name, camera in cameras.items()}
+        lengths = {name: camera.batch_shape[0] for name, camera in made.items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(
                 f"a rig's cameras are batches of one length, got {lengths}: "
                 "expand those that are the same in all"
             )
-        made = {name: Camera.from_kornia(camera, batched=batched) for name, camera in cameras.items()}
+        if not batched and set(lengths.values()) == {1}:
+            made = {name: camera[0] for name, camera in made.items()}
         return cls(made, **fields)
 
     def to_kornia(self) -> dict[str, PinholeCamera]:

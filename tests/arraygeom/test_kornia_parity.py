@@ -320,3 +320,9 @@ def test_lenses_that_kornia_lacks_are_named():
             ALPHA.replace(distortion=lens).to_kornia()
     with pytest.raises(ValueError, match="skewed or rotated"):
         ALPHA.replace(distortion=Distortion("brown-conrady", LENS)).rot90(1).to_kornia()
+
+
+@pytest.mark.parametrize("cameras", [3, [None], {"left": None}])
+def test_other_things_than_kornias_pinholes_by_name_are_refused(cameras):
+    with pytest.raises(TypeError, match="PinholeCamera"):
+        Rig.from_kornia(cameras)
