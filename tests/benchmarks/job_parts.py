@@ -22,9 +22,12 @@ STAGES = {
     "field": ["arraygeom.fields.grid.FieldOnGrid.of"],
     "plan": ["pat.fusion.fuse.plan_frame"],
     "pre-pass": ["pat.fusion.fuse.find_corrections"],
-    "matching": ["pat.matching.match.located", "pat.matching.colour_transfer.transferred"],
+    "matching": [f"pat.matching.match.{name}" for name in ("located_in_one", "agreed", "transferred")],
+    "choice": ["pat.matching.match.chosen"],
     "attention": ["pat.attention.attend._attend"],
     "network": ["pat.networks.guided.GuidedPAT.forward"],
+    "completion": ["pat.networks.completion.Completion.forward"],
+    "back-projection": ["pat.fusion.tiles.back_projected"],
     "depth": ["pat.fusion.tiles.measured_depth", "pat.fusion.fuse.background_filled"],
     "write": ["pat.fusion.results.save_frame", "pat.fusion.report.report_page"],
 }

@@ -4,6 +4,9 @@ What they call is checked by mypy (`make check`); one once called a function who
 """
 
 import importlib
+import json
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -11,6 +14,7 @@ import pytest
 import tyro
 
 from tests.benchmarks import bench_doctor
+from tests.benchmarks.bench_job import STAGE_NAMES, Case, fuse_arguments
 from tests.benchmarks.printed import print_tables
 
 BENCHES = sorted(path.stem for path in Path(__file__).parent.glob("bench_*.py"))
@@ -26,6 +30,14 @@ def test_a_benchmark_begins(name, capsys):
         tyro.cli(getattr(module, begin), args=["--help"])
     assert ended.value.code == 0
     assert "usage" in capsys.readouterr().out
+
+
+def test_every_part_of_a_frame_is_met(tmp_path):
+    part = [sys.executable, "-m", "tests.benchmarks.job_parts"]
+    subprocess.run([*part, "scene", str(tmp_path), "96", "64", "1"], check=True)
+    fuse = fuse_arguments(Case("tiny", (96, 64)), tmp_path, tmp_path / "out")
+    printed = subprocess.run([*part, "stages", *fuse], capture_output=True, text=True, check=False).stdout
+    assert json.loads(printed.splitlines()[-1])["stages"].keys() == set(STAGE_NAMES)
 
 
 def test_the_doctors_mistakes_are_known_before_anything_is_read(tmp_path):
