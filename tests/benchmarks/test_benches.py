@@ -34,8 +34,8 @@ def test_a_benchmark_begins(name, capsys):
 
 def test_every_part_of_a_frame_is_met(tmp_path):
     part = [sys.executable, "-m", "tests.benchmarks.job_parts"]
-    subprocess.run([*part, "scene", str(tmp_path), "96", "64", "1"], check=True)
-    fuse = fuse_arguments(Case("tiny", (96, 64)), tmp_path, tmp_path / "out")
+    subprocess.run([*part, "scene", str(tmp_path), "160", "120", "1"], check=True)
+    fuse = fuse_arguments(Case("tiny", (160, 120)), tmp_path, tmp_path / "out")
     printed = subprocess.run([*part, "stages", *fuse], capture_output=True, text=True, check=False).stdout
     assert json.loads(printed.splitlines()[-1])["stages"].keys() == set(STAGE_NAMES)
 
