@@ -37,6 +37,8 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
     Raises FileNotFoundError for no file, ValueError, which names it, for one that is damaged or is none.
     """
+    if path.exists() and not path.is_file():  # a pipe would be waited for
+        raise ValueError(f"{path}: no file, but a folder or a pipe")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
