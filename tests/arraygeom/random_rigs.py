@@ -161,15 +161,11 @@ def fields_of(one: Drawn) -> list[tuple[str, Any, float | None, float | None]]:
     both += [("Widened(Curved)", ag.Widened(ag.Curved(48), 1.4, 2), near, far)]
     if one.pair.has_lens:
         return both
+    baseline = float(one.pair.beta_from_alpha.t.norm())
     return [
         *both,
         ("Epipolar", ag.Epipolar(), near, far),
-        (
-            "EpipolarLine",
-            ag.EpipolarLine(),
-            1e-3 * max(float(one.pair.beta_from_alpha.t.norm()), 1e-3),
-            math.inf,
-        ),
+        ("EpipolarLine", ag.EpipolarLine(), 1e-3 * (baseline or 1.0), math.inf),
         ("HomographyDisplacement", ag.HomographyDisplacement(), None, None),
         ("Widened", ag.Widened(ag.Epipolar(), along=2), near, far),
         ("Widened across", ag.Widened(ag.Epipolar(), 2, 1, samples=48), near, far),
