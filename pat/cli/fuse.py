@@ -348,10 +348,8 @@ class Fuse(Known):
         """Write the files of a frame, `further` being options of `save_frame`, and note what some hold."""
         from ..fusion.results import band_names, describe_bands, save_frame, view_of
 
-        bits, bands = (
-            self.bits or 8,
-            band_names(frame, (name for name in fused.betas(alpha) if name in files)),
-        )
+        bits = self.bits or 8
+        bands = band_names(frame, (name for name in fused.betas(alpha) if name in files))
         further |= {
             "view": view_of(fused, alpha, bits=bits, bands=len(frame.image)),
             "points": fused[alpha] if self.points else None,
