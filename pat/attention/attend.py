@@ -45,8 +45,9 @@ CHUNK_SAMPLES = 2**22
 CHUNK_PIXELS = 2**18
 """How many segments a callable is asked for at a time."""
 LOCAL_SERVES = (
-    "nearest values, without statistics, with gradients by query, key and value, a constant bias for each "
-    "sample or none, of `Local` windows of odd size and whole spacing in float32 images of one size on the CPU"
+    "nearest values, without statistics, their gradients by query, key and value and no other derivatives, "
+    "with a constant bias for each sample or none, of `Local` windows of odd size and whole spacing in "
+    "float32 images of one size on the CPU"
 )
 
 
@@ -192,13 +193,10 @@ def _local_serves(query: Tensor, key: Tensor, value: Tensor, field: Local, bias:
 
 
 def _attend_local(query: Tensor, key: Tensor, value: Tensor, field: Local, bias: Tensor | None) -> Tensor:
-    if not torch_op.wants_gradient(query, key, value):
-        return torch_op.compiled("cpu").forward_local(query, key, value, field, bias)[0]
-
     def again(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
         return attend(q, k, v, _lazily_between(q, k, field), interpolation="nearest", bias=bias)
 
-    return torch_op.AttendLocal.apply(query, key, value, field, bias, again)
+    return torch_op.attend_local(query, key, value, field, bias, again)
 
 
 def _lazily_between(query: Tensor, key: Tensor, field: Local | Dense) -> Callable[[Tensor], Locations]:

@@ -59,12 +59,12 @@ def forward_local(
 
 
 def backward_local(
-    inputs: tuple[Tensor, Tensor, Tensor],
+    inputs: Sequence[Tensor],
     field: Local,
     bias: Tensor | None,
-    outputs: tuple[Tensor, Tensor],
+    outputs: Sequence[Tensor],
     upstream: Tensor,
-    wanted: tuple[bool, bool, bool],
+    wanted: Sequence[bool],
 ) -> tuple[Tensor, ...]:
     """Gradients by query, key and value, `wanted` or not defined, from what `forward_local` gave."""
     planes, wide = [_planes(x) for x in inputs], _planes(upstream)

@@ -62,27 +62,31 @@ def is_seen_by_autograd_alone(*operands: Tensor | None) -> bool:
     return not followed() and all(type(t) in (Tensor, Parameter) for t in operands if t is not None)
 
 
-class AttendLocal(torch.autograd.Function):
-    """`cpu.forward_local` with gradients by query, key and value; those of these by `again`, the same values of
-    the three by the general operator."""
+def attend_local(
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    field: Local,
+    bias: Tensor | None,
+    again: Callable[[Tensor, Tensor, Tensor], Tensor],
+) -> Tensor:
+    """As `cpu.forward_local`, with gradients by query, key and value, and gradients of these by `again`: the
+    same values of the three by the general operator."""
+    if not wants_gradient(query, key, value):
+        return compiled("cpu").forward_local(query, key, value, field, bias)[0]
+    return _AttendLocal.apply(query, key, value, field, bias, again)
 
+
+class _AttendLocal(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any,
-        query: Tensor,
-        key: Tensor,
-        value: Tensor,
-        field: Local,
-        bias: Tensor | None,
-        again: Callable[[Tensor, Tensor, Tensor], Tensor],
-    ) -> Tensor:
+    def forward(ctx, query, key, value, field, bias, again):
         out, logsum = compiled("cpu").forward_local(query, key, value, field, bias)
         ctx.save_for_backward(query, key, value, bias, out, logsum)
         ctx.field, ctx.again = field, again
         return out
 
     @staticmethod
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx, upstream):
         *inputs, bias, out, logsum = ctx.saved_tensors
         wanted = ctx.needs_input_grad[:3]
         if torch.is_grad_enabled():

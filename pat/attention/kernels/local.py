@@ -108,12 +108,14 @@ def differentiate_rows(query, key, value, upstream, sums, gradients, wanted, bia
                 for c in range(channels if wanted[1] else 0):
                     _accumulate(by_key[c, y, first:last], slope, query[c, row, first + step : last + step])
                 for c in range(len(value) if wanted[2] else 0):
-                    _accumulate(by_value[c, y, first:last], weight, upstream[c, row, first + step : last + step])
+                    _accumulate(
+                        by_value[c, y, first:last], weight, upstream[c, row, first + step : last + step]
+                    )
 
 
 @compiled
 def _weigh(query, key, value, upstream, sums, bias, here, there, weight, slope):
-    """Weights of the pixels `there` (row, first, last) for those `here`, and the gradients by their scores."""
+    """Weights of the pixels `there` (row, first, last) for those `here`, and the gradients by scores."""
     (y, first, last), (row, start, stop) = here, there
     count = last - first
     logsum, mean_slope = sums[0, y, first:last], sums[1, y, first:last]
