@@ -23,6 +23,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -32,8 +33,10 @@ from torch import Generator, Tensor
 from arraygeom.pixels import pixel_grid
 from arraygeom.rig import Rig
 from arraygeom.sampling import sample
-from arraygeom.sensor import Band, Curve
+from arraygeom.sensor import Band, Curve, Sensor
+from pat.data.windows import read_view, scene_rig
 from pat.media.colour import REC601, linear_from_srgb, srgb_from_linear
+from pat.media.images import write_image
 from pat.sensors import BoxBlur, Clip, GaussianBlur, Jitter, Noise, Quantise, Resample, Step, generator_for
 from pat.support.schema import from_document, near
 
@@ -232,6 +235,35 @@ def record_array(
         recorded[name] = image
         rig = rig.transformed(name, A, (image.shape[-2], image.shape[-1]))
     return RecordedArray(recorded, rig)
+
+
+def record_rendered(
+    folder: Path, out: Path, chains: Mapping[str, Sequence[Step]] | None = None, *, seed: int = 0
+) -> None:
+    """Write the images (16-bit PNG) that a rig's cameras record of a rendered scene, and their rig.yaml.
+
+    `chains` are `default_chains` of the rig unless given. Raises ValueError for a scene that cannot be read.
+    """
+    rig = scene_rig(folder)
+    images = {name: read_view(folder, name).rgb[None] for name in rig.names}
+    recorded = record_array(images, rig, default_chains(rig) if chains is None else chains, seed=seed)
+    for name, image in recorded.images.items():
+        write_image(out / f"{name}.png", image[0], bits=16)
+    recorded.rig.save(out / "rig.yaml")
+
+
+def default_chains(rig: Rig) -> dict[str, tuple[Step, ...]]:
+    """Each camera's spectral response, a little noise, sRGB encoding, 8 bits."""
+    return {
+        name: (_spectral(c.sensor), Noise(8000, 3), Clip(), EncodeSRGB(), Quantise(8))
+        for name, c in rig.cameras.items()
+    }
+
+
+def _spectral(sensor: Sensor) -> Spectral:
+    if isinstance(sensor.response, Band | Curve):
+        return Spectral(sensor.response)
+    return Spectral("luminance" if sensor.response in ("mono", "luminance") else "rgb")
 
 
 _CLASSES: tuple[type[Step], ...] = (
