@@ -132,6 +132,7 @@ class Fuse(Known):
             self._with_rig() if with_rig else self._without_rig()
 
     def _with_rig(self) -> None:
+        """Fuse with the rig that is given, healed by the images where these say so clearly."""
         from ..fusion.healing import checked_rig
         from ..fusion.views import ViewFiles
         from ..media.raw import developed_rig
@@ -157,6 +158,7 @@ class Fuse(Known):
             self._one(developed_rig(rig, files), views, alpha, views.files, healing=compared.result)
 
     def _without_rig(self) -> None:
+        """Fuse images, folders or videos alone. Raises ValueError for options that need a rig."""
         from ..fusion.batch import find_images
         from ..fusion.from_images import camera_names, frames_of_videos
         from ..support.locks import folder_lock
@@ -428,6 +430,7 @@ class Fuse(Known):
         return frame._replace(image=exposed(frame.image, gain)), gain
 
     def _many(self, rig: Rig, files: dict[str, list[Path]], alpha: str) -> None:
+        """Fuse many frames, or a sequence, by workers; exit with status 1 if some fail."""
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 
