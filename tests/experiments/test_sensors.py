@@ -222,6 +222,6 @@ def test_rendered_scenes_are_recorded_by_a_file_of_steps(rendered, tmp_path, ref
     assert float(rig["colour"].K[0, 0]) == 35
     assert read_image(tmp_path / "out/000000/colour.png").shape == (1, 24, 32)
     sensors.write_text("mono: [{spectrl: luminance}]\n")
-    assert "no step is called 'spectrl'; did you mean 'spectral'" in " ".join(refusal(*arguments).split())
+    assert "no step is called 'spectrl'; did you mean 'spectral'" in refusal(*arguments)
     sensors.write_text("mno: [clip]\n")
-    assert "no camera 'mno'; did you mean 'mono'" in " ".join(refusal(*arguments).split())
+    assert "no camera 'mno'; did you mean 'mono'" in refusal(*arguments)
