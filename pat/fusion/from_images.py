@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
@@ -34,7 +35,7 @@ from ..networks.weights import Network, load_weights, weights_for
 from .fuse import ImageSources, fuse
 from .results import Frame
 from .steps import without_lenses
-from .views import is_in_colour, read_view
+from .views import is_in_colour, range_of, read_view
 
 LOG = logging.getLogger(__name__)
 
@@ -90,8 +91,10 @@ def array_from_images(
     length of no camera.
     """
     sources, focal = _by_camera(sources), focal or {}
-    images = {name: image for name, image in sources.items() if isinstance(image, Tensor)}
-    files = {name: Path(path) for name, path in sources.items() if not isinstance(path, Tensor)}
+    files = {name: Path(path) for name, path in sources.items() if isinstance(path, str | Path)}
+    images: dict[str, Any] = {name: image for name, image in sources.items() if name not in files}
+    for name, image in images.items():
+        range_of(name, image)
     for name, length in focal.items():
         if name not in sources or not 0 < length < math.inf:
             raise ValueError(

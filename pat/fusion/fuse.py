@@ -285,7 +285,7 @@ def _given(kind: type[T], value: T) -> T:
 def _matched(matcher: Matcher, inputs: Inputs) -> Matches:
     """What a matcher finds. Raises TypeError or ValueError for what are no matches of these inputs."""
     matches = _given(Matches, matcher(inputs))
-    matches.check(inputs.hw, len(inputs.betas))
+    matches.check(inputs)
     return matches
 
 
